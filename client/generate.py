@@ -70,9 +70,9 @@ OWN_ERRORS = {  # of the client, by their reason: base, meaning
 }
 RECORDING = {"messages": ros_messages, "writer": ros_recording}  # modules that the client has as they are, by its names
 OWN_IMPORTS = {  # what they import, as the client has it
-    "from ..probe import FloatArray\n": "from ..geometry import FloatArray\n",
-    "from ..pose import quaternion_from_pose\n": "import numpy as np\n",  # the function stands at the end
-    "from . import ros_messages as ros\n": "from . import messages as ros\n",
+    "from ultragray.probe import FloatArray\n": "from ..geometry import FloatArray\n",
+    "from ultragray.pose import quaternion_from_pose\n": "import numpy as np\n",  # the function stands at the end
+    "from ultragray.interchange import ros_messages as ros\n": "from . import messages as ros\n",
 }
 _ALSO = {"InvalidArgument": ["ValueError"], "DeadlineExceeded": ["TimeoutError"]}  # what they are beside
 

@@ -13,7 +13,7 @@ import os
 from importlib.util import find_spec
 from typing import TYPE_CHECKING, Any
 
-from .installation import __version__ as __version__
+from ultragray.installation import __version__ as __version__
 
 # torch reads it when it is imported. Its threads sleep while they wait for each other, and leave the processors to the
 # kernels' own threads and to other programs. If they spin, a training step takes half as long again on two cores, and
@@ -21,14 +21,14 @@ from .installation import __version__ as __version__
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 if TYPE_CHECKING:
-    from .errors import UltragrayError
-    from .localization.search import localize
-    from .localization.settings import Localization
-    from .pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
-    from .probe import ConvexProbe, ElevationBeam, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
-    from .rendering import Frames, render
-    from .scene import GaussianScene
-    from .scene_info import SceneHeader, SceneInfo, read_header
+    from ultragray.errors import UltragrayError
+    from ultragray.localization.search import localize
+    from ultragray.localization.settings import Localization
+    from ultragray.pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
+    from ultragray.probe import ConvexProbe, ElevationBeam, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
+    from ultragray.rendering import Frames, render
+    from ultragray.scene import GaussianScene
+    from ultragray.scene_info import SceneHeader, SceneInfo, read_header
 
 __all__ = [
     "ConvexProbe",

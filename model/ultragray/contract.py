@@ -24,7 +24,7 @@ from typing import Annotated, Any, ClassVar, Literal, NoReturn, TypeVar, Union, 
 
 import numpy as np
 
-from .errors import InvalidArgument, UltragrayError
+from ultragray.errors import InvalidArgument, UltragrayError
 
 _T = TypeVar("_T")
 _SHOWN_CHARACTERS = 100

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from .errors import InvalidImageSize
+from ultragray.errors import InvalidImageSize
 
 MAX_IMAGE_SIDE = 4096
 DEFAULT_IMAGE_SIDE = 512  # of a scene that does not know the size of its training images

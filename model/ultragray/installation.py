@@ -5,7 +5,7 @@ from __future__ import annotations
 import sys
 from pathlib import Path
 
-from .errors import ExtraMissing
+from ultragray.errors import ExtraMissing
 
 __version__ = "0.1.0"
 

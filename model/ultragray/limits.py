@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 import numpy.typing as npt
 
-from .errors import FrameTooCostly
+from ultragray.errors import FrameTooCostly
 
 Flag = npt.NDArray[np.int64]  # [1], in memory that the one who ends a rendering shares with the one who renders
 

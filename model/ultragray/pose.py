@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy as np
 
-from .errors import InvalidPose
-from .probe import FloatArray
+from ultragray.errors import InvalidPose
+from ultragray.probe import FloatArray
 
 ROTATION_TOLERANCE = 1e-3
 EXACT = 1e-14

@@ -9,24 +9,24 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .backends import cpu, cuda, reference
-from .backends.beam import beam_cm
-from .backends.ghost import GHOST_PLANES, add_ghosts
-from .backends.poses import ScenePoses, as_array, scene_poses
-from .contact.compression import at_rest
-from .contact.skin import Skin
-from .contact.touch import Touch
-from .errors import BackendUnavailable, InvalidArgument
-from .image_size import check_image_size
-from .installation import __version__
-from .limits import UNLIMITED, Limits
-from .outputs import OUTPUTS, PLANES, check_available, check_outputs
-from .probe import ElevationBeam, FloatArray, Probe
-from .probe.probe import BoolArray
-from .scene import GaussianScene
-from .settings import Contact
-from .tools import ScanView, Tool
-from .tools.drawing import ToolsInView
+from ultragray.backends import cpu, cuda, reference
+from ultragray.backends.beam import beam_cm
+from ultragray.backends.ghost import GHOST_PLANES, add_ghosts
+from ultragray.backends.poses import ScenePoses, as_array, scene_poses
+from ultragray.contact.compression import at_rest
+from ultragray.contact.skin import Skin
+from ultragray.contact.touch import Touch
+from ultragray.errors import BackendUnavailable, InvalidArgument
+from ultragray.image_size import check_image_size
+from ultragray.installation import __version__
+from ultragray.limits import UNLIMITED, Limits
+from ultragray.outputs import OUTPUTS, PLANES, check_available, check_outputs
+from ultragray.probe import ElevationBeam, FloatArray, Probe
+from ultragray.probe.probe import BoolArray
+from ultragray.scene import GaussianScene
+from ultragray.settings import Contact
+from ultragray.tools import ScanView, Tool
+from ultragray.tools.drawing import ToolsInView
 
 Backend = Callable[
     [GaussianScene, Probe, ScenePoses, int, int, Sequence[str], Limits, Tensor | None], dict[str, Tensor]

@@ -17,11 +17,11 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from .errors import InvalidArgument
-from .files.atomic import write_whole
-from .pose import check_poses
-from .probe import FloatArray
-from .scene_info import (
+from ultragray.errors import InvalidArgument
+from ultragray.files.atomic import write_whole
+from ultragray.pose import check_poses
+from ultragray.probe import FloatArray
+from ultragray.scene_info import (
     CORRECTIONS_TENSOR,
     LABELS_TENSOR,
     METADATA_KEY,

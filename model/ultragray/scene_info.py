@@ -16,14 +16,14 @@ from typing import Any
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
-from .confidence.assess import read_model
-from .contract import Contract, described, from_dict, to_dict
-from .errors import InvalidArgument, InvalidProbe, SceneFileInvalid
-from .files.format_version import require_version
-from .image_size import DEFAULT_IMAGE_SIDE
-from .pose import check_poses
-from .probe import ElevationBeam, FloatArray, Probe
-from .probe.elevation import PLANE
+from ultragray.confidence.assess import read_model
+from ultragray.contract import Contract, described, from_dict, to_dict
+from ultragray.errors import InvalidArgument, InvalidProbe, SceneFileInvalid
+from ultragray.files.format_version import require_version
+from ultragray.image_size import DEFAULT_IMAGE_SIDE
+from ultragray.pose import check_poses
+from ultragray.probe import ElevationBeam, FloatArray, Probe
+from ultragray.probe.elevation import PLANE
 
 FORMAT_VERSION = 1
 METADATA_KEY = "ultragray"

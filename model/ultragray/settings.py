@@ -12,15 +12,15 @@ from typing import Any
 
 import numpy as np
 
-from .contract import Contract, described
-from .display import AS_RENDERED, Display
-from .errors import InvalidArgument, InvalidImageSize, InvalidProbe, UnknownOutput
-from .image_size import MAX_IMAGE_SIDE, check_image_size
-from .outputs import OUTPUTS, check_available, check_outputs
-from .probe import ElevationBeam, Picture, Probe
-from .probe.elevation import MAX_THICKNESS_MM, PLANE
-from .scene_info import SceneInfo
-from .tools import MAX_TOOLS, Tool
+from ultragray.contract import Contract, described
+from ultragray.display import AS_RENDERED, Display
+from ultragray.errors import InvalidArgument, InvalidImageSize, InvalidProbe, UnknownOutput
+from ultragray.image_size import MAX_IMAGE_SIDE, check_image_size
+from ultragray.outputs import OUTPUTS, check_available, check_outputs
+from ultragray.probe import ElevationBeam, Picture, Probe
+from ultragray.probe.elevation import MAX_THICKNESS_MM, PLANE
+from ultragray.scene_info import SceneInfo
+from ultragray.tools import MAX_TOOLS, Tool
 
 
 class Encoding(str, Enum):

@@ -5,9 +5,8 @@ from __future__ import annotations
 import sys
 
 from ultragray.errors import UltragrayError
-
-from .server import run
-from .settings import load_settings
+from ultragray_service.server import run
+from ultragray_service.settings import load_settings
 
 
 def main() -> int:

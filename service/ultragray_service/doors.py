@@ -6,10 +6,9 @@ from dataclasses import dataclass
 
 from ultragray.contract import described
 from ultragray.installation import __version__
-
-from .access.addresses import is_loopback
-from .listening.sockets import authority
-from .settings import Settings
+from ultragray_service.access.addresses import is_loopback
+from ultragray_service.listening.sockets import authority
+from ultragray_service.settings import Settings
 
 _ANY = ("0.0.0.0", "::")  # not addresses that a browser can open
 _LABEL_WIDTH = 12

@@ -11,9 +11,8 @@ import sys
 import time
 from concurrent.futures import ThreadPoolExecutor
 
+from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings
 from ultragray_workers.rounds import Rounds
-
-from .settings import ENVIRONMENT_PREFIX, Settings
 
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 30.0
 _STEADY_S = 60.0  # a worker that lived so long is started again after the first wait

@@ -6,7 +6,7 @@ import os
 from collections.abc import Iterator
 from difflib import get_close_matches
 
-from .environment import COMMAND_VARIABLES, OTHER_VARIABLES, PREFIX
+from ultragray_service.environment import COMMAND_VARIABLES, OTHER_VARIABLES, PREFIX
 
 
 def unknown_variables() -> Iterator[str]:
@@ -25,8 +25,7 @@ def unknown_variables() -> Iterator[str]:
 def known_variables() -> tuple[str, ...]:
     """Every variable that is read, those of the settings included."""
     from ultragray.contract import annotated_fields
-
-    from .settings import Settings
+    from ultragray_service.settings import Settings
 
     settings = (f"{PREFIX}{item.name.upper()}" for item, _ in annotated_fields(Settings))
     return (*settings, *COMMAND_VARIABLES, *OTHER_VARIABLES)

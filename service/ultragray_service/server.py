@@ -14,25 +14,24 @@ from typing import Any
 
 import uvloop
 
+from ultragray_service.access.addresses import is_loopback
+from ultragray_service.core.state import Service
+from ultragray_service.doors import Doors
+from ultragray_service.embedded_worker import EmbeddedWorker
+from ultragray_service.http.app import create_app
+from ultragray_service.igtl.server import IgtlServer
+from ultragray_service.listening.connections import Connections
+from ultragray_service.listening.http_server import HttpServer
+from ultragray_service.listening.open_sockets import OpenSockets
+from ultragray_service.listening.sockets import authority, check_port_is_free, listen, raise_open_files_limit
+from ultragray_service.misspelt import unknown_variables
+from ultragray_service.rpc.server import GrpcServer
+from ultragray_service.service_manager import READY, STOPPING, ServiceManager
+from ultragray_service.settings import Settings
+from ultragray_service.telemetry.logs import configure_logging, is_for_people
+from ultragray_service.tls.watch import CertificateWatch
 from ultragray_workers.errors import StartupFailed
 from ultragray_workers.rounds import Rounds
-
-from .access.addresses import is_loopback
-from .core.state import Service
-from .doors import Doors
-from .embedded_worker import EmbeddedWorker
-from .http.app import create_app
-from .igtl.server import IgtlServer
-from .listening.connections import Connections
-from .listening.http_server import HttpServer
-from .listening.open_sockets import OpenSockets
-from .listening.sockets import authority, check_port_is_free, listen, raise_open_files_limit
-from .misspelt import unknown_variables
-from .rpc.server import GrpcServer
-from .service_manager import READY, STOPPING, ServiceManager
-from .settings import Settings
-from .telemetry.logs import configure_logging, is_for_people
-from .tls.watch import CertificateWatch
 
 _HEALTH_POLL_S = 0.2
 _CANCEL_WAIT_S = 1.0

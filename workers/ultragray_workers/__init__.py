@@ -9,9 +9,9 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .pool.pool import PoolConfig, PoolStatistics, RenderPool
-    from .pool.types import Priority, RenderRequest, RenderResult
-    from .scenes import SceneStore
+    from ultragray_workers.pool.pool import PoolConfig, PoolStatistics, RenderPool
+    from ultragray_workers.pool.types import Priority, RenderRequest, RenderResult
+    from ultragray_workers.scenes import SceneStore
 
 __all__ = [
     "PoolConfig",

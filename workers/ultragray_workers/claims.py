@@ -14,7 +14,7 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
-from .errors import StorageFull
+from ultragray_workers.errors import StorageFull
 
 LOCK_NAME = "lock"
 DELETED_PREFIX = ".deleted-"

@@ -10,14 +10,13 @@ from pathlib import Path
 from ultragray.errors import SceneFileInvalid
 from ultragray.files.atomic import file_sha256
 from ultragray.scene_info import SceneHeader, SceneInfo, read_header, scene_file_invalid
-
-from .errors import SceneNotFound, known_names
-from .scene_names import SUFFIX, SceneReference, base_name, check_scene_name
-from .shelves.bucket import BucketShelf
-from .shelves.folder import FolderShelf
-from .shelves.headers import KeptHeaders, floats_per_gaussian
-from .shelves.shelf import Shelf
-from .storage.local import FileVersion
+from ultragray_workers.errors import SceneNotFound, known_names
+from ultragray_workers.scene_names import SUFFIX, SceneReference, base_name, check_scene_name
+from ultragray_workers.shelves.bucket import BucketShelf
+from ultragray_workers.shelves.folder import FolderShelf
+from ultragray_workers.shelves.headers import KeptHeaders, floats_per_gaussian
+from ultragray_workers.shelves.shelf import Shelf
+from ultragray_workers.storage.local import FileVersion
 
 __all__ = ["SUFFIX", "SceneStore", "check_scene_file", "check_scene_name", "resident_bytes"]
 

@@ -10,8 +10,8 @@ import secrets
 import threading
 from collections.abc import Iterator
 
-from .errors import StorageUnavailable
-from .storage.storage import Storage
+from ultragray_workers.errors import StorageUnavailable
+from ultragray_workers.storage.storage import Storage
 
 PREFIX = "claims"
 REFRESH_S, DEAD_AFTER_S = 10.0, 60.0

@@ -16,8 +16,7 @@ from pathlib import Path
 from typing import IO
 
 from ultragray.files.atomic import sync, write_whole
-
-from .errors import RestoreRefused, StartupFailed
+from ultragray_workers.errors import RestoreRefused, StartupFailed
 
 FORMAT_VERSION = 1  # 0: folders of releases that wrote no version, which are laid out as those of version 1
 _VERSION_FILE, _LOCK_FILE, MARKER = "store.json", "store.lock", "restoring.json"

@@ -7,9 +7,9 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..errors import InvalidArgument
-from ..probe import ElevationBeam, Probe
-from ..probe.elevation import FWHM_PER_SIGMA
+from ultragray.errors import InvalidArgument
+from ultragray.probe import ElevationBeam, Probe
+from ultragray.probe.elevation import FWHM_PER_SIGMA
 
 
 def beam_cm(beam: ElevationBeam | Tensor | None, probe: Probe) -> Tensor | None:

@@ -12,16 +12,16 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from .. import _cpu
-from ..errors import BackendUnavailable
-from ..limits import UNLIMITED, GivenUp, Limits
-from ..outputs import PLANES, SUMS
-from ..probe import FloatArray, Probe
-from ..scene import PARAMETERS, GaussianScene
-from .beam import THIN, BeamVariance, Moments
-from .kind import Kind
-from .poses import ScenePoses, as_array, gradient_by_poses, want_gradient
-from .scan_lines import KernelLines
+from ultragray import _cpu
+from ultragray.backends.beam import THIN, BeamVariance, Moments
+from ultragray.backends.kind import Kind
+from ultragray.backends.poses import ScenePoses, as_array, gradient_by_poses, want_gradient
+from ultragray.backends.scan_lines import KernelLines
+from ultragray.errors import BackendUnavailable
+from ultragray.limits import UNLIMITED, GivenUp, Limits
+from ultragray.outputs import PLANES, SUMS
+from ultragray.probe import FloatArray, Probe
+from ultragray.scene import PARAMETERS, GaussianScene
 
 INSTRUCTION_SETS: tuple[str, ...] = tuple(_cpu.instruction_sets())  # what this processor can run, best first
 

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool1d
 
-from ..probe import Probe
+from ultragray.probe import Probe
 
 STRONG_BMODE = 0.6  # of an interface that mirrors
 LEAST_DEPTH_MM = 5.0  # below the face, whose own bright lines mirror nothing

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..scene import GaussianScene
+from ultragray.scene import GaussianScene
 
 MIN_WEIGHT_SUM = 1.0 / 255.0  # a label with less is not seen
 

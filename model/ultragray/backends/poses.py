@@ -7,9 +7,9 @@ from typing import Any, TypeAlias
 import torch
 from torch import Tensor
 
-from ..pose import check_poses
-from ..probe import FloatArray
-from ..scene import GaussianScene
+from ultragray.pose import check_poses
+from ultragray.probe import FloatArray
+from ultragray.scene import GaussianScene
 
 ScenePoses: TypeAlias = FloatArray | Tensor  # [C, 4, 4]; a tensor, float64 on the CPU, where it wants a gradient
 

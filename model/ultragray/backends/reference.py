@@ -14,13 +14,13 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..limits import UNLIMITED, Limits
-from ..outputs import INTENSITY_SUM, WEIGHT_SUM
-from ..probe import Probe
-from ..scene import GaussianScene
-from .cpu import footprint_pixels
-from .poses import ScenePoses, as_array
-from .scan_lines import KernelLines
+from ultragray.backends.cpu import footprint_pixels
+from ultragray.backends.poses import ScenePoses, as_array
+from ultragray.backends.scan_lines import KernelLines
+from ultragray.limits import UNLIMITED, Limits
+from ultragray.outputs import INTENSITY_SUM, WEIGHT_SUM
+from ultragray.probe import Probe
+from ultragray.scene import GaussianScene
 
 MIN_WEIGHT = 1.0 / 255.0  # the skip rule: a Gaussian is skipped where both w and α are below this
 MAX_WEIGHT = 0.999

@@ -7,8 +7,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..probe import FloatArray, Probe
-from ..probe.scan_lines import FannedLines, ParallelLines, RadialLines
+from ultragray.probe import FloatArray, Probe
+from ultragray.probe.scan_lines import FannedLines, ParallelLines, RadialLines
 
 
 class KernelLines(NamedTuple):

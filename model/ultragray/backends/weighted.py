@@ -12,13 +12,13 @@ from typing import NamedTuple
 
 from torch import Tensor
 
-from ..errors import BackendUnavailable
-from ..limits import UNLIMITED
-from ..outputs import INTENSITY_SUM, SUMS, WEIGHT_SUM
-from ..probe import Probe
-from ..scene import GaussianScene
-from . import cpu, cuda, reference
-from .poses import ScenePoses
+from ultragray.backends import cpu, cuda, reference
+from ultragray.backends.poses import ScenePoses
+from ultragray.errors import BackendUnavailable
+from ultragray.limits import UNLIMITED
+from ultragray.outputs import INTENSITY_SUM, SUMS, WEIGHT_SUM
+from ultragray.probe import Probe
+from ultragray.scene import GaussianScene
 
 _BACKENDS = {
     "reference": reference.render_outputs,

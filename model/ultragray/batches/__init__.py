@@ -6,8 +6,8 @@
 
 from __future__ import annotations
 
-from .manifest import MANIFEST_FILE, ShardEntry, manifest
-from .names import names_in, stands_for
-from .plan import SHARD_FRAMES, BatchPlan
+from ultragray.batches.manifest import MANIFEST_FILE, ShardEntry, manifest
+from ultragray.batches.names import names_in, stands_for
+from ultragray.batches.plan import SHARD_FRAMES, BatchPlan
 
 __all__ = ["MANIFEST_FILE", "SHARD_FRAMES", "BatchPlan", "ShardEntry", "manifest", "names_in", "stands_for"]

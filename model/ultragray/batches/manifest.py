@@ -6,8 +6,8 @@ from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from typing import Any
 
-from ..errors import InvalidArgument
-from .plan import BatchPlan
+from ultragray.batches.plan import BatchPlan
+from ultragray.errors import InvalidArgument
 
 MANIFEST_FILE = "manifest.json"
 

@@ -11,17 +11,17 @@ from typing import Any
 
 import numpy as np
 
-from ..confidence import Extrapolation
-from ..contract import to_dict
-from ..errors import InvalidArgument
-from ..pose import check_poses
-from ..probe import FloatArray, Probe
-from ..samplers import Assess, DrawnSampler, Sampler
-from ..samplers.confident import assessed_part
-from ..samplers.sampler import BLOCK_POSES
-from ..scene_info import SceneHeader
-from ..settings import Encoding, FrameSettings, Resolved
-from .names import name_range
+from ultragray.batches.names import name_range
+from ultragray.confidence import Extrapolation
+from ultragray.contract import to_dict
+from ultragray.errors import InvalidArgument
+from ultragray.pose import check_poses
+from ultragray.probe import FloatArray, Probe
+from ultragray.samplers import Assess, DrawnSampler, Sampler
+from ultragray.samplers.confident import assessed_part
+from ultragray.samplers.sampler import BLOCK_POSES
+from ultragray.scene_info import SceneHeader
+from ultragray.settings import Encoding, FrameSettings, Resolved
 
 SHARD_FRAMES = BLOCK_POSES  # of a shard where nothing else is asked for; a search draws no block twice then
 MAX_SHARDS = 20_000  # the queue keeps a row of each, and a manifest names them all

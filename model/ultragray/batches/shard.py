@@ -8,22 +8,22 @@ from pathlib import Path
 
 import torch
 
-from ..confidence import Assessor, Extrapolation
-from ..display.pixels import PixelArray
-from ..errors import InvalidArgument
-from ..files.atomic import file_sha256
-from ..interchange.exports import ExportHeader
-from ..interchange.exports.exporter import stored_pixels
-from ..interchange.rendering import render_portions, written_behind
-from ..limits import UNLIMITED, Limits
-from ..probe import FloatArray
-from ..rendering import renderer_name
-from ..samplers import Assess
-from ..scene import GaussianScene
-from ..scene_info import read_header
-from .manifest import ShardEntry
-from .plan import BatchPlan
-from .shard_tar import ShardTar
+from ultragray.batches.manifest import ShardEntry
+from ultragray.batches.plan import BatchPlan
+from ultragray.batches.shard_tar import ShardTar
+from ultragray.confidence import Assessor, Extrapolation
+from ultragray.display.pixels import PixelArray
+from ultragray.errors import InvalidArgument
+from ultragray.files.atomic import file_sha256
+from ultragray.interchange.exports import ExportHeader
+from ultragray.interchange.exports.exporter import stored_pixels
+from ultragray.interchange.rendering import render_portions, written_behind
+from ultragray.limits import UNLIMITED, Limits
+from ultragray.probe import FloatArray
+from ultragray.rendering import renderer_name
+from ultragray.samplers import Assess
+from ultragray.scene import GaussianScene
+from ultragray.scene_info import read_header
 
 
 class ShardRenderer:

@@ -14,10 +14,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..confidence import Extrapolation
-from ..display.pixels import PixelArray
-from ..errors import InvalidArgument
-from ..probe import FloatArray
+from ultragray.confidence import Extrapolation
+from ultragray.display.pixels import PixelArray
+from ultragray.errors import InvalidArgument
+from ultragray.probe import FloatArray
 
 _BLOCK, _RECORD = 512, 10_240  # bytes
 _MAX_MEMBER = 8**11 - 1  # bytes: what the field of a header holds

@@ -9,12 +9,12 @@ from typing import Any, Protocol
 import numpy as np
 import numpy.typing as npt
 
-from ..contract import described
-from ..errors import InvalidArgument
-from ..pose import check_poses
-from ..probe import FloatArray, Probe
-from .model import ConfidenceModel
-from .views import TrainingViews
+from ultragray.confidence.model import ConfidenceModel
+from ultragray.confidence.views import TrainingViews
+from ultragray.contract import described
+from ultragray.errors import InvalidArgument
+from ultragray.pose import check_poses
+from ultragray.probe import FloatArray, Probe
 
 SUPPORT_COVERAGE = 0.3  # γ below which a pixel's error is more than twice that of the others
 

@@ -17,11 +17,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ..probe import FloatArray, Probe
-from ..scene import GaussianScene
-from .assess import read_model
-from .uncertainty import DepthBands
-from .views import TrainingViews
+from ultragray.confidence.assess import read_model
+from ultragray.confidence.uncertainty import DepthBands
+from ultragray.confidence.views import TrainingViews
+from ultragray.probe import FloatArray, Probe
+from ultragray.scene import GaussianScene
 
 CELLS = 32  # a side; no more than pixels
 POINTS_PER_SIDE = 12

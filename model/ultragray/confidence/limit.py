@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ..errors import LowConfidence
-from .assess import Extrapolation
+from ultragray.confidence.assess import Extrapolation
+from ultragray.errors import LowConfidence
 
 
 def is_confident(extrapolation: Extrapolation, min_confidence: float) -> bool:

@@ -22,10 +22,10 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InvalidArgument
-from ..probe import FloatArray
-from .uncertainty import Uncertainty
-from .views import ViewMeasures
+from ultragray.confidence.uncertainty import Uncertainty
+from ultragray.confidence.views import ViewMeasures
+from ultragray.errors import InvalidArgument
+from ultragray.probe import FloatArray
 
 VERSION = 2
 NEAR_MM, DISTANCE_MM, ANGLE_DEG = 0.3, 5.0, 10.0  # units of the terms

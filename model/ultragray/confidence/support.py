@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..contact.touch import Touch
-from ..probe import FloatArray
-from .assess import SUPPORT_COVERAGE, Assessor, Extrapolation
+from ultragray.confidence.assess import SUPPORT_COVERAGE, Assessor, Extrapolation
+from ultragray.contact.touch import Touch
+from ultragray.probe import FloatArray
 
 
 class SupportWatch:

@@ -14,7 +14,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from ..errors import InvalidArgument
+from ultragray.errors import InvalidArgument
 
 TERMS = ("floor", "level", "level²", "texture", "gap 0.3 mm", "gap 1 mm", "gap 3 mm", "beyond", "thin", "shadow")
 DEPTHS = 8  # bands of depth of the training images, each with its level and spread

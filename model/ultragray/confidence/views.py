@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ..pose import check_poses
-from ..probe import FloatArray, Probe
+from ultragray.pose import check_poses
+from ultragray.probe import FloatArray, Probe
 
 POINTS_PER_SIDE = 6  # of the grid of image points at which distances are taken
 ANGLE_MM_PER_DEG = 0.02  # added to distances to choose the nearest view: of two about as near, the less turned one

@@ -11,7 +11,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..probe import FloatArray, Probe
+from ultragray.probe import FloatArray, Probe
 
 MOST_COMPRESSION = 0.5  # of the depth of the image: a face pressed in farther moves on through the tissue
 

@@ -15,8 +15,8 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import InvalidArgument
-from ..probe import FloatArray, Probe
+from ultragray.errors import InvalidArgument
+from ultragray.probe import FloatArray, Probe
 
 HeightArray: TypeAlias = npt.NDArray[np.float32]
 

@@ -8,9 +8,9 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
-from ..pose import check_poses
-from ..probe import FloatArray, Probe
-from .skin import COUPLING_MM, Skin
+from ultragray.contact.skin import COUPLING_MM, Skin
+from ultragray.pose import check_poses
+from ultragray.probe import FloatArray, Probe
 
 
 @dataclass(frozen=True, eq=False)

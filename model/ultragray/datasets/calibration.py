@@ -10,11 +10,11 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import DatasetInvalid
-from ..probe import FloatArray, LinearProbe
-from .images import CropBox
-from .region import ImageRegion
-from .sweep import IntArray
+from ultragray.datasets.images import CropBox
+from ultragray.datasets.region import ImageRegion
+from ultragray.datasets.sweep import IntArray
+from ultragray.errors import DatasetInvalid
+from ultragray.probe import FloatArray, LinearProbe
 
 SCALE_TOLERANCE = 1e-3  # relative; trackers write six digits
 SMALLEST_ANGLE_DEG = 45.0

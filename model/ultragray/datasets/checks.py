@@ -13,10 +13,10 @@ from itertools import pairwise
 
 import numpy as np
 
-from ..pose import rotation_angles_deg
-from ..probe import FloatArray, Probe
-from .sweep import Dataset, Sweep, corner_distances_mm
-from .swept_volume import swept_volume
+from ultragray.datasets.sweep import Dataset, Sweep, corner_distances_mm
+from ultragray.datasets.swept_volume import swept_volume
+from ultragray.pose import rotation_angles_deg
+from ultragray.probe import FloatArray, Probe
 
 JUMP_FACTOR = 5.0  # times the usual step
 JUMP_SPREADS = 8.0  # standard deviations, estimated from the median

@@ -10,9 +10,9 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import DatasetInvalid, InvalidArgument
-from ..image_size import MAX_IMAGE_SIDE
-from .sweep import ByteArray
+from ultragray.datasets.sweep import ByteArray
+from ultragray.errors import DatasetInvalid, InvalidArgument
+from ultragray.image_size import MAX_IMAGE_SIDE
 
 MAX_PIXEL_BYTES = 4 << 30  # of the frames in a file
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..contract import Contract, described
+from ultragray.contract import Contract, described
 
 
 @dataclass(frozen=True)

@@ -13,14 +13,14 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import CheckpointInvalid, DatasetInvalid, InvalidArgument, InvalidPose
-from ..files.atomic import atomic_path, write_whole
-from ..files.npy import map_npy
-from ..files.poses import read_pose_array
-from ..interchange.released_config import ReleasedConfig, probe_keys, read_released_config
-from ..probe import FloatArray, Probe
-from .images import grey_frames
-from .sweep import ByteArray, Dataset, Sweep, check_frame_poses
+from ultragray.datasets.images import grey_frames
+from ultragray.datasets.sweep import ByteArray, Dataset, Sweep, check_frame_poses
+from ultragray.errors import CheckpointInvalid, DatasetInvalid, InvalidArgument, InvalidPose
+from ultragray.files.atomic import atomic_path, write_whole
+from ultragray.files.npy import map_npy
+from ultragray.files.poses import read_pose_array
+from ultragray.interchange.released_config import ReleasedConfig, probe_keys, read_released_config
+from ultragray.probe import FloatArray, Probe
 
 CONFIG_NAME = "conf.json"
 

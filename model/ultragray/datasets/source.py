@@ -11,12 +11,12 @@ from fnmatch import fnmatchcase
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING
 
-from ..contract import Contract, described
-from ..errors import DatasetInvalid, InvalidArgument
-from ..installation import missing_extra
+from ultragray.contract import Contract, described
+from ultragray.errors import DatasetInvalid, InvalidArgument
+from ultragray.installation import missing_extra
 
 if TYPE_CHECKING:
-    from .sweep import Dataset, Sweep
+    from ultragray.datasets.sweep import Dataset, Sweep
 
 MAX_OPTION_LENGTH = 1000
 PHANTOM = "phantom"
@@ -110,7 +110,7 @@ def load_dataset(source: str | Path, options: SourceOptions | None = None) -> Da
     dataset = chosen.load(str(source), options)
     if options.image_size is None:
         return dataset
-    from .images import parse_image_size, resize_frames
+    from ultragray.datasets.images import parse_image_size, resize_frames
 
     size = parse_image_size(options.image_size)
     train, val = (replace(part, images=resize_frames(part.images, *size)) for part in (dataset.train, dataset.val))
@@ -132,34 +132,34 @@ def format_of(source: str | Path) -> DatasetFormat:
 
 
 def _load_released(source: str, options: SourceOptions) -> Dataset:
-    from .released import read_released
+    from ultragray.datasets.released import read_released
 
     return _split(read_released(source), options)
 
 
 def _load_phantom(source: str, options: SourceOptions) -> Dataset:
-    from .phantom import load_phantom
+    from ultragray.datasets.phantom import load_phantom
 
     return _split(load_phantom(), options)
 
 
 def _split(dataset: Dataset, options: SourceOptions) -> Dataset:
-    from .splits import split_parts
+    from ultragray.datasets.splits import split_parts
 
     train, val = split_parts(dataset.train, dataset.val, options.train_frames, options.val_frames)
     return replace(dataset, train=train, val=val)
 
 
 def _split_sequence(path: Path, options: SourceOptions, sweep: Sweep, frame_count: int) -> Dataset:
-    from .splits import split_sequence
-    from .sweep import Dataset
+    from ultragray.datasets.splits import split_sequence
+    from ultragray.datasets.sweep import Dataset
 
     parts = split_sequence(sweep, frame_count, options.train_frames, options.val_frames)
     return Dataset(path.name.split(".")[0], *parts)
 
 
 def _load_plus(source: str, options: SourceOptions) -> Dataset:
-    from .plus import read_plus_sweep
+    from ultragray.datasets.plus import read_plus_sweep
 
     path = Path(source)
     read = read_plus_sweep(
@@ -174,13 +174,13 @@ def _load_plus(source: str, options: SourceOptions) -> Dataset:
 
 
 def _check_released_upload(source: Path, folder: Path) -> None:
-    from .released import require_files_below
+    from ultragray.datasets.released import require_files_below
 
     require_files_below(source, folder)
 
 
 def _load_dicom(source: str, options: SourceOptions) -> Dataset:
-    from .dicom import read_dicom_sweep
+    from ultragray.datasets.dicom import read_dicom_sweep
 
     path = Path(source)
     read = read_dicom_sweep(path, frames=options.frames, crop=options.crop, fan=options.fan)
@@ -189,7 +189,7 @@ def _load_dicom(source: str, options: SourceOptions) -> Dataset:
 
 def _load_mcap(source: str, options: SourceOptions) -> Dataset:
     try:
-        from .mcap import read_mcap_sweep
+        from ultragray.datasets.mcap import read_mcap_sweep
     except ImportError as error:
         raise missing_extra(error, "an MCAP recording") from error
 

@@ -7,8 +7,8 @@ from __future__ import annotations
 
 import re
 
-from ..errors import InvalidArgument
-from .sweep import Sweep
+from ultragray.datasets.sweep import Sweep
+from ultragray.errors import InvalidArgument
 
 HELD_OUT_START, HELD_OUT_STEP = 2, 5  # of a single sequence: every fifth frame, from the third
 _PART = re.compile(r"(?P<start>\d{0,9})(?P<range>:(?P<stop>\d{0,9})(:(?P<step>\d{1,9}))?)?")

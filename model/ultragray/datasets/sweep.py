@@ -14,11 +14,11 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..contract import to_dict
-from ..errors import DatasetInvalid, InvalidPose
-from ..pose import check_poses
-from ..probe import FloatArray, Probe
-from .region import ImageRegion
+from ultragray.contract import to_dict
+from ultragray.datasets.region import ImageRegion
+from ultragray.errors import DatasetInvalid, InvalidPose
+from ultragray.pose import check_poses
+from ultragray.probe import FloatArray, Probe
 
 ByteArray: TypeAlias = npt.NDArray[np.uint8]
 IntArray: TypeAlias = npt.NDArray[np.int64]

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..probe import FloatArray, Probe
-from .sweep import Sweep
+from ultragray.datasets.sweep import Sweep
+from ultragray.probe import FloatArray, Probe
 
 VOXEL_MM = 1.0
 MAX_VOXELS = 8_000_000

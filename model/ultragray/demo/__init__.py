@@ -13,12 +13,12 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..datasets.phantom import PHANTOM_IMAGE_SIDE, PHANTOM_PROBE, freehand_poses
-from ..files.atomic import atomic_path
-from ..probe import FloatArray
+from ultragray.datasets.phantom import PHANTOM_IMAGE_SIDE, PHANTOM_PROBE, freehand_poses
+from ultragray.files.atomic import atomic_path
+from ultragray.probe import FloatArray
 
 if TYPE_CHECKING:
-    from ..scene import GaussianScene
+    from ultragray.scene import GaussianScene
 
 DEMO_FILE = Path(__file__).with_name("spine.ugr")
 DEMO_PROBE = PHANTOM_PROBE
@@ -31,7 +31,7 @@ def load_demo_scene() -> GaussianScene:
     Its metrics are those of the phantom's held-out sweep: those of `FrameMetrics`, and `shadow_mae` and
     `shadow_transmittance`, mean absolute error (in [0, 1]) and mean transmittance in the shadow of bone.
     """
-    from ..scene import GaussianScene
+    from ultragray.scene import GaussianScene
 
     return GaussianScene.load(DEMO_FILE)
 

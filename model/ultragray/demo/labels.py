@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from ..datasets.phantom import Tissue
-from ..datasets.phantom.anatomy import LabelArray
+from ultragray.datasets.phantom import Tissue
+from ultragray.datasets.phantom.anatomy import LabelArray
 
 LABELS: dict[int, tuple[str, tuple[Tissue, ...]]] = {
     1: ("bone", (Tissue.BONE,)),

@@ -1,5 +1,5 @@
 """Settings of a scanner's display, and frames as they look with them. Free of torch but for `frames`."""
 
-from .settings import AS_RENDERED, FRAME_RANGE_DB, Display, true_to_scale
+from ultragray.display.settings import AS_RENDERED, FRAME_RANGE_DB, Display, true_to_scale
 
 __all__ = ["AS_RENDERED", "FRAME_RANGE_DB", "Display", "true_to_scale"]

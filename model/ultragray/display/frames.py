@@ -10,10 +10,10 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, pad
 
-from ..outputs import OUTPUTS
-from ..probe import Probe
-from .scan_conversion import samples
-from .settings import FRAME_RANGE_DB, Display
+from ultragray.display.scan_conversion import samples
+from ultragray.display.settings import FRAME_RANGE_DB, Display
+from ultragray.outputs import OUTPUTS
+from ultragray.probe import Probe
 
 _CACHED_PICTURES = 8  # at 9 bytes a pixel
 _LARGEST_CACHED_PICTURE = 2**20  # pixels

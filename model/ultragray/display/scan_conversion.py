@@ -10,7 +10,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..probe import FloatArray, Probe
+from ultragray.probe import FloatArray, Probe
 
 FloatImage: TypeAlias = npt.NDArray[np.float32]
 ByteImage: TypeAlias = npt.NDArray[np.uint8]

@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..contract import Contract, described
-from ..errors import InvalidImageSize
-from ..image_size import MAX_IMAGE_SIDE
-from ..probe import FloatArray, Picture, Probe
-from ..probe.probe import length_field
+from ultragray.contract import Contract, described
+from ultragray.errors import InvalidImageSize
+from ultragray.image_size import MAX_IMAGE_SIDE
+from ultragray.probe import FloatArray, Picture, Probe
+from ultragray.probe.probe import length_field
 
 FRAME_RANGE_DB = 60.0  # a B-mode frame is taken as compressed logarithmically over this range, 1 being 0 dB
 MAX_TGC_POINTS = 16

@@ -12,14 +12,14 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 
-from ..datasets.sweep import Dataset, IntArray, Sweep, corner_distances_mm
-from ..display.scan_conversion import interpolated, pixel_places
-from ..errors import InvalidArgument
-from ..pose import check_poses
-from ..probe import FloatArray
-from .compounding import METHODS as VOLUME_METHODS
-from .compounding import VOXEL_MM, compound, pixel_positions_mm
-from .scoring import Evaluation, evaluate_frames, require_frames
+from ultragray.datasets.sweep import Dataset, IntArray, Sweep, corner_distances_mm
+from ultragray.display.scan_conversion import interpolated, pixel_places
+from ultragray.errors import InvalidArgument
+from ultragray.evaluation.compounding import METHODS as VOLUME_METHODS
+from ultragray.evaluation.compounding import VOXEL_MM, compound, pixel_positions_mm
+from ultragray.evaluation.scoring import Evaluation, evaluate_frames, require_frames
+from ultragray.pose import check_poses
+from ultragray.probe import FloatArray
 
 FrameArray = npt.NDArray[np.float32]
 BASELINES = (*VOLUME_METHODS, "linear", "nearest")

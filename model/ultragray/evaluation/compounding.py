@@ -19,10 +19,10 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ..datasets.sweep import IntArray, Sweep, corner_distances_mm
-from ..errors import InvalidArgument
-from ..pose import check_poses
-from ..probe import FloatArray, Probe
+from ultragray.datasets.sweep import IntArray, Sweep, corner_distances_mm
+from ultragray.errors import InvalidArgument
+from ultragray.pose import check_poses
+from ultragray.probe import FloatArray, Probe
 
 METHODS = ("median", "mean", "maximum")
 VOXEL_MM = 0.5

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ..errors import InvalidArgument, InvalidImageSize
+from ultragray.errors import InvalidArgument, InvalidImageSize
 
 MAX_PSNR_DB = 100.0
 SCALE_WEIGHTS = (0.0448, 0.2856, 0.3001, 0.2363, 0.1333)  # finest first

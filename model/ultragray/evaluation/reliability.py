@@ -10,11 +10,11 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from ..datasets.sweep import Sweep
-from ..outputs import UNCERTAINTY
-from ..rendering import render
-from ..scene import GaussianScene
-from .scoring import frames_at_once, require_frames
+from ultragray.datasets.sweep import Sweep
+from ultragray.evaluation.scoring import frames_at_once, require_frames
+from ultragray.outputs import UNCERTAINTY
+from ultragray.rendering import render
+from ultragray.scene import GaussianScene
 
 BINS = np.array([0.0, 0.01, 0.02, 0.03, 0.045, 0.065, 0.09, 0.12, 0.16, 0.22, 0.3, 1.0])  # of the expected deviation
 LEAST_SHARE = 0.001  # of all pixels: bins with fewer are left out, their figures would be chance

@@ -10,13 +10,13 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from ..datasets.sweep import Dataset, IntArray, Sweep
-from ..errors import DatasetInvalid, InvalidArgument
-from ..rendering import render
-from ..scene import GaussianScene
-from ..scene_info import SceneInfo
-from .metrics import FrameMetrics, frame_metrics, mean_metrics, ms_ssim_scales, std_metrics
-from .speckle import FrameSpeckle, SpeckleSummary, compare_speckle, summarize
+from ultragray.datasets.sweep import Dataset, IntArray, Sweep
+from ultragray.errors import DatasetInvalid, InvalidArgument
+from ultragray.evaluation.metrics import FrameMetrics, frame_metrics, mean_metrics, ms_ssim_scales, std_metrics
+from ultragray.evaluation.speckle import FrameSpeckle, SpeckleSummary, compare_speckle, summarize
+from ultragray.rendering import render
+from ultragray.scene import GaussianScene
+from ultragray.scene_info import SceneInfo
 
 CHUNK_PIXELS = 1 << 20  # rendered and measured at once: measuring takes about 200 bytes of each
 CHUNK_FRAMES = 32  # of a frame, rendering takes room for each Gaussian too

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from ..datasets.sweep import Sweep, spread_places
-from ..display.pixels import ByteArray, image_file, to_uint8
-from ..display.scan_conversion import with_square_pixels
-from ..files.atomic import write_whole
-from ..scene import GaussianScene
-from .metrics import FrameMetrics
-from .scoring import Evaluation, render_sweep
+from ultragray.datasets.sweep import Sweep, spread_places
+from ultragray.display.pixels import ByteArray, image_file, to_uint8
+from ultragray.display.scan_conversion import with_square_pixels
+from ultragray.evaluation.metrics import FrameMetrics
+from ultragray.evaluation.scoring import Evaluation, render_sweep
+from ultragray.files.atomic import write_whole
+from ultragray.scene import GaussianScene
 
 MAX_SIDE_PIXELS = 512  # of one panel
 GAP_PIXELS = 6

@@ -7,7 +7,7 @@ import shutil
 from contextlib import suppress
 from pathlib import Path
 
-from .atomic import atomic_path, sync
+from ultragray.files.atomic import atomic_path, sync
 
 
 def link_or_copy(source: Path, target: Path) -> None:

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InvalidPose
-from ..installation import missing_extra
-from ..interchange.ros_fields import check_fields
-from ..interchange.ros_messages import POSE
-from ..interchange.ros_poses import pose_of_message
-from ..probe import FloatArray
+from ultragray.errors import InvalidPose
+from ultragray.installation import missing_extra
+from ultragray.interchange.ros_fields import check_fields
+from ultragray.interchange.ros_messages import POSE
+from ultragray.interchange.ros_poses import pose_of_message
+from ultragray.probe import FloatArray
 
 PREFERRED = "/probe_pose"  # the end of the topic of the ROS 2 node
 

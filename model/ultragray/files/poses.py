@@ -9,11 +9,11 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import InvalidPose
-from ..pose import check_poses
-from ..probe import FloatArray
-from .mcap_poses import read_mcap_poses
-from .npy import map_npy
+from ultragray.errors import InvalidPose
+from ultragray.files.mcap_poses import read_mcap_poses
+from ultragray.files.npy import map_npy
+from ultragray.pose import check_poses
+from ultragray.probe import FloatArray
 
 
 def load_poses(path: str | Path) -> FloatArray:  # [P, 4, 4]

@@ -8,15 +8,15 @@ env = gymnasium.make("ultragray/StandardPlane-v0", scene="scene.ugr")
 
 from __future__ import annotations
 
-from ..installation import missing_extra
+from ultragray.installation import missing_extra
 
 try:
     import gymnasium
 except ImportError as error:
     raise missing_extra(error, "ultragray.gym") from None
 
-from .settings import StandardPlaneSettings
-from .standard_plane import StandardPlaneEnv
+from ultragray.gym.settings import StandardPlaneSettings
+from ultragray.gym.standard_plane import StandardPlaneEnv
 
 __all__ = ["STANDARD_PLANE", "StandardPlaneEnv", "StandardPlaneSettings"]
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..probe import FloatArray
-from ..samplers.rotations import about_axes, random_directions, rotations_of
+from ultragray.probe import FloatArray
+from ultragray.samplers.rotations import about_axes, random_directions, rotations_of
 
 
 def moved(pose: FloatArray, shift_mm: FloatArray, turn_deg: FloatArray, pivot_mm: float) -> FloatArray:

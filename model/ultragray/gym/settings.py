@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..contract import Contract, described
-from ..errors import InvalidImageSize
-from ..image_size import MAX_IMAGE_SIDE
-from ..settings import Contact
+from ultragray.contract import Contract, described
+from ultragray.errors import InvalidImageSize
+from ultragray.image_size import MAX_IMAGE_SIDE
+from ultragray.settings import Contact
 
 _ROOM_MM, _ROOM_DEG = 10.0, 10.0  # beyond twice the farthest start
 

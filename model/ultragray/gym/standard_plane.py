@@ -12,16 +12,16 @@ import numpy.typing as npt
 import torch
 from gymnasium import spaces
 
-from ..display.pixels import to_uint8
-from ..errors import InvalidArgument
-from ..pose import check_poses, position_distances_mm, rotation_angles_deg
-from ..probe import FloatArray, Probe
-from ..rendering import render, touch_of
-from ..scene import GaussianScene
-from ..settings import Contact
-from .motion import moved, random_motion
-from .settings import StandardPlaneSettings
-from .similarity import ByteImage, Target
+from ultragray.display.pixels import to_uint8
+from ultragray.errors import InvalidArgument
+from ultragray.gym.motion import moved, random_motion
+from ultragray.gym.settings import StandardPlaneSettings
+from ultragray.gym.similarity import ByteImage, Target
+from ultragray.pose import check_poses, position_distances_mm, rotation_angles_deg
+from ultragray.probe import FloatArray, Probe
+from ultragray.rendering import render, touch_of
+from ultragray.scene import GaussianScene
+from ultragray.settings import Contact
 
 Observation = Any  # uint8 [H, W, 1], or a dict with `frame` and `pose`
 START_CONTACT = 0.5  # the least share of contact at a start

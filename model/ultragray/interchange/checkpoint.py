@@ -20,13 +20,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..contract import checked_number, under
-from ..errors import CheckpointInvalid, InvalidArgument
-from ..files.poses import load_poses
-from ..probe import FloatArray
-from ..scene import PARAMETERS, GaussianScene
-from ..scene_info import SceneInfo, Vector
-from .released_config import ReleasedConfig, read_released_config, released_centre_mm
+from ultragray.contract import checked_number, under
+from ultragray.errors import CheckpointInvalid, InvalidArgument
+from ultragray.files.poses import load_poses
+from ultragray.interchange.released_config import ReleasedConfig, read_released_config, released_centre_mm
+from ultragray.probe import FloatArray
+from ultragray.scene import PARAMETERS, GaussianScene
+from ultragray.scene_info import SceneInfo, Vector
 
 _log = logging.getLogger(__name__)
 

@@ -21,13 +21,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..errors import InvalidArgument, InvalidProbe
-from ..files.atomic import write_whole
-from ..probe import Probe
-from ..scene import GaussianScene
-from ..scene_info import Vector
-from .released_config import WIDTH_KEY, probe_keys, released_centre_mm
-from .released_intensity import fit_released_intensity
+from ultragray.errors import InvalidArgument, InvalidProbe
+from ultragray.files.atomic import write_whole
+from ultragray.interchange.released_config import WIDTH_KEY, probe_keys, released_centre_mm
+from ultragray.interchange.released_intensity import fit_released_intensity
+from ultragray.probe import Probe
+from ultragray.scene import GaussianScene
+from ultragray.scene_info import Vector
 
 CONFIG_NAME = "conf.json"
 POSES_NAME = "poses_train.npy"

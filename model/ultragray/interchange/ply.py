@@ -21,11 +21,11 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from ..errors import SceneFileInvalid
-from ..files.atomic import atomic_path
-from ..probe import FloatArray
-from ..scene import GaussianScene
-from ..scene_info import MAX_SH_DEGREE, SceneInfo, info_from_json, info_to_json
+from ultragray.errors import SceneFileInvalid
+from ultragray.files.atomic import atomic_path
+from ultragray.probe import FloatArray
+from ultragray.scene import GaussianScene
+from ultragray.scene_info import MAX_SH_DEGREE, SceneInfo, info_from_json, info_to_json
 
 MAX_HEADER_BYTES = 1 << 24
 COMMENT_CHARACTERS = 200  # some readers keep a line in a buffer of 1024

@@ -14,11 +14,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..contract import checked_number
-from ..datasets.images import frame_size
-from ..errors import CheckpointInvalid, InvalidArgument, InvalidProbe
-from ..files.npy import map_npy
-from ..probe import ConvexProbe, FloatArray, LinearProbe, PhasedProbe, Probe
+from ultragray.contract import checked_number
+from ultragray.datasets.images import frame_size
+from ultragray.errors import CheckpointInvalid, InvalidArgument, InvalidProbe
+from ultragray.files.npy import map_npy
+from ultragray.probe import ConvexProbe, FloatArray, LinearProbe, PhasedProbe, Probe
 
 MAX_CONFIG_BYTES = 1 << 20
 WIDTH_KEY, ANGLE_KEY = "ultrasound_opening_width", "ultrasound_opening_angle"

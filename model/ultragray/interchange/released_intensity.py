@@ -14,8 +14,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..backends.reference import spherical_harmonics
-from ..scene import GaussianScene
+from ultragray.backends.reference import spherical_harmonics
+from ultragray.scene import GaussianScene
 
 LOWEST, HIGHEST = 0.5, 0.999
 MAX_TRAINING_VIEWS = 32

@@ -10,18 +10,18 @@ from typing import Any
 
 import torch
 
-from ..confidence import Assessor, Extrapolation, is_confident
-from ..confidence.support import SupportWatch
-from ..display.frames import show
-from ..display.pixels import PixelArray
-from ..evaluation.scoring import frames_at_once
-from ..limits import UNLIMITED, Limits
-from ..probe import FloatArray
-from ..rendering import render, renderer_name
-from ..scene import GaussianScene
-from ..settings import Below, Resolved
-from .exports import FORMATS, ExportHeader, check_format, export_to
-from .exports.png_folder import export_pngs
+from ultragray.confidence import Assessor, Extrapolation, is_confident
+from ultragray.confidence.support import SupportWatch
+from ultragray.display.frames import show
+from ultragray.display.pixels import PixelArray
+from ultragray.evaluation.scoring import frames_at_once
+from ultragray.interchange.exports import FORMATS, ExportHeader, check_format, export_to
+from ultragray.interchange.exports.png_folder import export_pngs
+from ultragray.limits import UNLIMITED, Limits
+from ultragray.probe import FloatArray
+from ultragray.rendering import render, renderer_name
+from ultragray.scene import GaussianScene
+from ultragray.settings import Below, Resolved
 
 __all__ = ["render_portions", "render_to_file"]
 

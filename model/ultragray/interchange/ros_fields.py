@@ -5,7 +5,7 @@ from __future__ import annotations
 import array
 from typing import Any
 
-from .ros_messages import IMAGE, POSE, TEXT
+from ultragray.interchange.ros_messages import IMAGE, POSE, TEXT
 
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 TRANSFORM = "geometry_msgs/msg/TransformStamped"

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from ..pose import pose_from_position_quaternion
-from ..probe import FloatArray
-from .ros_messages import MM_PER_M
+from ultragray.interchange.ros_messages import MM_PER_M
+from ultragray.pose import pose_from_position_quaternion
+from ultragray.probe import FloatArray
 
 
 def pose_of_message(message: Any, *, field: str) -> FloatArray:  # [4, 4] mm

@@ -12,8 +12,8 @@ from typing import IO, Any
 import numpy.typing as npt
 from mcap_ros2.writer import Writer
 
-from ..probe import FloatArray
-from . import ros_messages as ros
+from ultragray.interchange import ros_messages as ros
+from ultragray.probe import FloatArray
 
 TOPICS = "/ultragray"
 METADATA = "ultragray"  # the record of the origin: its objects as JSON

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ..evaluation.compounding import pixel_positions_mm
-from ..probe import Probe
+from ultragray.evaluation.compounding import pixel_positions_mm
+from ultragray.probe import Probe
 
 NEIGHBOURHOOD = 3.0  # times as wide as the smoothing
 LEAST_STRENGTH = 0.02  # of grey values in [0, 1]: what varies less is noise

@@ -12,9 +12,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..evaluation.compounding import pixel_positions_mm
-from ..probe import Probe
-from ..training.poses.trained import turned_by
+from ultragray.evaluation.compounding import pixel_positions_mm
+from ultragray.probe import Probe
+from ultragray.training.poses.trained import turned_by
 
 GRID = 16  # rows and columns of the image that are looked at
 

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ..display.pixels import ByteArray
-from ..errors import InvalidArgument
-from ..files.npy import map_npy
-from ..image_size import check_image_size
+from ultragray.display.pixels import ByteArray
+from ultragray.errors import InvalidArgument
+from ultragray.files.npy import map_npy
+from ultragray.image_size import check_image_size
 
 SUFFIXES = (".png", ".npy")
 _PNG = b"\x89PNG\r\n\x1a\n"

@@ -24,17 +24,17 @@ from torch import Tensor
 from torch.nn import functional
 from torch.quasirandom import SobolEngine
 
-from ..errors import InvalidArgument
-from ..image_size import check_image_size
-from ..limits import UNLIMITED, Limits
-from ..pose import check_poses
-from ..probe import Probe
-from ..rendering import render
-from ..scene import GaussianScene
-from .appearance import Scale
-from .motion import Motions
-from .settings import NEAR_DEG, NEAR_MM, Localization, LocalizationSettings
-from .sliding import IN_PLANE, places_after, slid
+from ultragray.errors import InvalidArgument
+from ultragray.image_size import check_image_size
+from ultragray.limits import UNLIMITED, Limits
+from ultragray.localization.appearance import Scale
+from ultragray.localization.motion import Motions
+from ultragray.localization.settings import NEAR_DEG, NEAR_MM, Localization, LocalizationSettings
+from ultragray.localization.sliding import IN_PLANE, places_after, slid
+from ultragray.pose import check_poses
+from ultragray.probe import Probe
+from ultragray.rendering import render
+from ultragray.scene import GaussianScene
 
 Rendered = Callable[[Tensor, int, int], Tensor]  # [C, 4, 4], rows, columns -> [C, rows, columns] in [0, 1]
 

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ..contract import Contract, described
-from ..errors import InvalidProbe
-from ..probe import FloatArray, Probe
+from ultragray.contract import Contract, described
+from ultragray.errors import InvalidProbe
+from ultragray.probe import FloatArray, Probe
 
 NEAR_MM, NEAR_DEG = 3.0, 5.0
 MOST_MM, MOST_DEG = 20.0, 30.0

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ..evaluation.compounding import pixel_positions_mm
-from ..probe import FloatArray, Probe
+from ultragray.evaluation.compounding import pixel_positions_mm
+from ultragray.probe import FloatArray, Probe
 
 IN_PLANE = (0, 2, 4)  # of the six numbers of a motion: shifts along lateral and axial axis, the turn about elevation
 

@@ -19,8 +19,8 @@ from enum import Enum
 from pathlib import Path
 from typing import Any
 
-from ..errors import InvalidArgument
-from ..files.atomic import write_whole
+from ultragray.errors import InvalidArgument
+from ultragray.files.atomic import write_whole
 
 USED_SHARE = 0.8  # of an equal time: a fit that took less was promised too few steps
 

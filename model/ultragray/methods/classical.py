@@ -5,13 +5,13 @@ from __future__ import annotations
 import time
 from dataclasses import dataclass
 
-from ..datasets.sweep import Dataset, Sweep
-from ..errors import InvalidArgument
-from ..evaluation.baselines import FrameArray, predict
-from ..evaluation.compounding import Volume, affordable_voxel_mm, compound
-from ..probe import FloatArray, Probe
-from .budget import Budget
-from .method import Cost, Description, FitRun, Fitted, Method
+from ultragray.datasets.sweep import Dataset, Sweep
+from ultragray.errors import InvalidArgument
+from ultragray.evaluation.baselines import FrameArray, predict
+from ultragray.evaluation.compounding import Volume, affordable_voxel_mm, compound
+from ultragray.methods.budget import Budget
+from ultragray.methods.method import Cost, Description, FitRun, Fitted, Method
+from ultragray.probe import FloatArray, Probe
 
 PAPER_VOXEL_MM = 0.25  # of the compounding that the UltraG-Ray paper compares with
 

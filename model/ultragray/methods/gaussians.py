@@ -9,17 +9,17 @@ from pathlib import Path
 
 import torch
 
-from ..datasets.sweep import Dataset
-from ..files.atomic import write_whole
-from ..probe import FloatArray, Probe
-from ..rendering import render
-from ..scene import GaussianScene
-from ..training import Progress, TrainingConfig, train
-from ..training.checkpointing import read_checkpoint_header
-from ..training.device import training_device
-from ..training.trainer import CHECKPOINT_FILE
-from .budget import Budget, BudgetKind
-from .method import Cost, Description, FitProgress, FitRun, Fitted, FrameArray, Method
+from ultragray.datasets.sweep import Dataset
+from ultragray.files.atomic import write_whole
+from ultragray.methods.budget import Budget, BudgetKind
+from ultragray.methods.method import Cost, Description, FitProgress, FitRun, Fitted, FrameArray, Method
+from ultragray.probe import FloatArray, Probe
+from ultragray.rendering import render
+from ultragray.scene import GaussianScene
+from ultragray.training import Progress, TrainingConfig, train
+from ultragray.training.checkpointing import read_checkpoint_header
+from ultragray.training.device import training_device
+from ultragray.training.trainer import CHECKPOINT_FILE
 
 SCENE_FILE = "scene.ugr"
 SECONDS_FILE = "seconds.json"  # that the fit took in all

@@ -20,15 +20,15 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from ..datasets.sweep import Dataset
-from ..errors import MemoryExceeded, TrainingDiverged, TrainingStateInvalid
-from ..files.atomic import write_whole
-from ..pose import check_poses
-from ..probe import FloatArray, Probe
-from ..training.device import training_device
-from .budget import Budget, Pace
-from .method import Cost, FitProgress, FitRun, Fitted, FrameArray, Method
-from .parts.subnormals import without_subnormals
+from ultragray.datasets.sweep import Dataset
+from ultragray.errors import MemoryExceeded, TrainingDiverged, TrainingStateInvalid
+from ultragray.files.atomic import write_whole
+from ultragray.methods.budget import Budget, Pace
+from ultragray.methods.method import Cost, FitProgress, FitRun, Fitted, FrameArray, Method
+from ultragray.methods.parts.subnormals import without_subnormals
+from ultragray.pose import check_poses
+from ultragray.probe import FloatArray, Probe
+from ultragray.training.device import training_device
 
 STATE_FILE, MODEL_FILE = "fit.safetensors", "model.safetensors"
 METADATA_KEY = "ultragray-method"

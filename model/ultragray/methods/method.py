@@ -17,9 +17,9 @@ from pathlib import Path
 import numpy as np
 import numpy.typing as npt
 
-from ..datasets.sweep import Dataset
-from ..probe import FloatArray, Probe
-from .budget import Budget
+from ultragray.datasets.sweep import Dataset
+from ultragray.methods.budget import Budget
+from ultragray.probe import FloatArray, Probe
 
 FrameArray = npt.NDArray[np.float32]
 

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from ..errors import InvalidArgument
+from ultragray.errors import InvalidArgument
 
 ALL = "all"
 NAMES = (

@@ -9,12 +9,12 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..datasets.sweep import Dataset
-from .budget import Budget
-from .learner import LearnedMethod, Learner
-from .method import Description
-from .parts.slices import SliceLearner, set_rate
-from .parts.space import Box
+from ultragray.datasets.sweep import Dataset
+from ultragray.methods.budget import Budget
+from ultragray.methods.learner import LearnedMethod, Learner
+from ultragray.methods.method import Description
+from ultragray.methods.parts.slices import SliceLearner, set_rate
+from ultragray.methods.parts.space import Box
 
 RANK, CELLS = 16, 128  # features of a plane, and its nodes along each side
 HIDDEN = 64

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from .classical import PAPER_VOXEL_MM, Compounding, FromFrames
-from .gaussians import SceneMethod
-from .implicitvol.method import ImplicitVol, RefinedImplicitVol
-from .method import Method
-from .names import chosen_names
-from .rapidvol import RapidVol
-from .ultragauss.method import UltraGauss
-from .ultranerf.method import VARIANTS as ULTRANERF
+from ultragray.methods.classical import PAPER_VOXEL_MM, Compounding, FromFrames
+from ultragray.methods.gaussians import SceneMethod
+from ultragray.methods.implicitvol.method import ImplicitVol, RefinedImplicitVol
+from ultragray.methods.method import Method
+from ultragray.methods.names import chosen_names
+from ultragray.methods.rapidvol import RapidVol
+from ultragray.methods.ultragauss.method import UltraGauss
+from ultragray.methods.ultranerf.method import VARIANTS as ULTRANERF
 
 METHODS: dict[str, Method] = {
     method.name: method

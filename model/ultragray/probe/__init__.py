@@ -9,15 +9,15 @@ A kind of probe is one class in one file (`linear.py`): its numbers, and the bun
 (`scan_lines.py`). `Probe` derives the rest, and nothing outside this package asks for a kind.
 """
 
-from .convex import ConvexProbe
-from .elevation import ElevationBeam
-from .linear import LinearProbe
-from .phased import PhasedProbe
-from .picture import Picture
-from .probe import Probe
-from .radial import RadialProbe
-from .scan_lines import FloatArray
-from .steered import SteeredProbe
+from ultragray.probe.convex import ConvexProbe
+from ultragray.probe.elevation import ElevationBeam
+from ultragray.probe.linear import LinearProbe
+from ultragray.probe.phased import PhasedProbe
+from ultragray.probe.picture import Picture
+from ultragray.probe.probe import Probe
+from ultragray.probe.radial import RadialProbe
+from ultragray.probe.scan_lines import FloatArray
+from ultragray.probe.steered import SteeredProbe
 
 __all__ = [
     "ConvexProbe",

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from ..contract import kind_field
-from .fan import Fan, opening_field
-from .probe import length_field
+from ultragray.contract import kind_field
+from ultragray.probe.fan import Fan, opening_field
+from ultragray.probe.probe import length_field
 
 
 @dataclass(frozen=True)

@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 
-from ..contract import Contract, described
-from ..errors import InvalidArgument
-from .probe import MAX_LENGTH_MM, length_field
+from ultragray.contract import Contract, described
+from ultragray.errors import InvalidArgument
+from ultragray.probe.probe import MAX_LENGTH_MM, length_field
 
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 MAX_THICKNESS_MM = 100.0

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
-from ..contract import described
-from .probe import Probe
-from .scan_lines import FannedLines
+from ultragray.contract import described
+from ultragray.probe.probe import Probe
+from ultragray.probe.scan_lines import FannedLines
 
 LARGEST_OPENING_DEG = 175.0
 SMALLEST_USUAL_OPENING_DEG = 5.0

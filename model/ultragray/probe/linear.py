@@ -6,9 +6,9 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
-from ..contract import kind_field
-from .probe import Probe, length_field, odd_length
-from .scan_lines import ParallelLines
+from ultragray.contract import kind_field
+from ultragray.probe.probe import Probe, length_field, odd_length
+from ultragray.probe.scan_lines import ParallelLines
 
 USUAL_WIDTHS_MM = (5.0, 200.0)
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .scan_lines import Box, FloatArray
+from ultragray.probe.scan_lines import Box, FloatArray
 
 
 @dataclass(frozen=True)

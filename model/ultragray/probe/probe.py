@@ -10,10 +10,10 @@ from typing import Any, ClassVar, TypeVar
 import numpy as np
 import numpy.typing as npt
 
-from ..contract import Family, annotated_fields, described
-from ..errors import InvalidProbe
-from .picture import Picture
-from .scan_lines import Box, FloatArray, Lines
+from ultragray.contract import Family, annotated_fields, described
+from ultragray.errors import InvalidProbe
+from ultragray.probe.picture import Picture
+from ultragray.probe.scan_lines import Box, FloatArray, Lines
 
 _P = TypeVar("_P", bound="Probe")
 BoolArray = npt.NDArray[np.bool_]

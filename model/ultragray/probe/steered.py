@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from ..contract import described, kind_field
-from .probe import Probe, length_field
-from .scan_lines import ParallelLines
+from ultragray.contract import described, kind_field
+from ultragray.probe.probe import Probe, length_field
+from ultragray.probe.scan_lines import ParallelLines
 
 LARGEST_STEERING_DEG = 45.0
 

@@ -14,13 +14,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..errors import InvalidArgument
-from ..localization.search import localize
-from ..localization.settings import NEAR_DEG, NEAR_MM, Localization
-from ..pose import check_poses
-from ..probe import FloatArray, Probe
-from ..scene import GaussianScene
-from .poses import LEVER_MM, PoseFit, pose_residuals, register_poses
+from ultragray.errors import InvalidArgument
+from ultragray.localization.search import localize
+from ultragray.localization.settings import NEAR_DEG, NEAR_MM, Localization
+from ultragray.pose import check_poses
+from ultragray.probe import FloatArray, Probe
+from ultragray.registration.poses import LEVER_MM, PoseFit, pose_residuals, register_poses
+from ultragray.scene import GaussianScene
 
 LEAST_FRAMES = 3
 OUTLIER = 3.0  # times the median residual

@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InvalidArgument
-from ..probe import FloatArray
+from ultragray.errors import InvalidArgument
+from ultragray.probe import FloatArray
 
 LEAST_POINTS = 3
 LEAST_SPREAD = 1e-3  # of the longest extent of the points, across it: less is a line

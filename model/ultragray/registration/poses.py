@@ -11,10 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import InvalidArgument
-from ..pose import check_poses
-from ..probe import FloatArray
-from .points import register_points
+from ultragray.errors import InvalidArgument
+from ultragray.pose import check_poses
+from ultragray.probe import FloatArray
+from ultragray.registration.points import register_points
 
 LEVER_MM = 50.0  # at which a turn weighs as a shift: about half the depth of an image
 LEAST_POSES = 3  # where the mounting is unknown, too

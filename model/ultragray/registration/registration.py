@@ -14,12 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from ..contract import Contract, described, from_dict, to_dict
-from ..errors import InvalidArgument, InvalidPose
-from ..files.atomic import write_whole
-from ..files.format_version import require_version
-from ..pose import check_poses
-from ..probe import FloatArray
+from ultragray.contract import Contract, described, from_dict, to_dict
+from ultragray.errors import InvalidArgument, InvalidPose
+from ultragray.files.atomic import write_whole
+from ultragray.files.format_version import require_version
+from ultragray.pose import check_poses
+from ultragray.probe import FloatArray
 
 FORMAT_VERSION = 1
 MAX_FILE_BYTES = 1 << 20

@@ -7,21 +7,21 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..datasets.sweep import Dataset, spread_places
-from ..evaluation.metrics import FrameMetrics
-from ..evaluation.scoring import Evaluation, render_sweep
-from ..methods.comparison.page import environment
-from ..methods.comparison.pictures import FrameOfPage, Shown, frames_of_page, telling_places
-from ..methods.comparison.place import frames_of
-from ..methods.comparison.plots import plot_distances
-from ..methods.comparison.result import Comparison, MethodResult
-from ..methods.comparison.run import SCENE
-from ..methods.comparison.tables import Row, metric_rows, rank_rows, speckle_rows
-from ..methods.gaussians import SCENE_FILE
-from ..scene import GaussianScene
-from ..scene_info import read_header
-from .plots import plot_counts, plot_frames, plot_tilt, plot_training
-from .study import GAUSSIAN_SHARES, Failed, TiltStudy, Trained
+from ultragray.datasets.sweep import Dataset, spread_places
+from ultragray.evaluation.metrics import FrameMetrics
+from ultragray.evaluation.scoring import Evaluation, render_sweep
+from ultragray.methods.comparison.page import environment
+from ultragray.methods.comparison.pictures import FrameOfPage, Shown, frames_of_page, telling_places
+from ultragray.methods.comparison.place import frames_of
+from ultragray.methods.comparison.plots import plot_distances
+from ultragray.methods.comparison.result import Comparison, MethodResult
+from ultragray.methods.comparison.run import SCENE
+from ultragray.methods.comparison.tables import Row, metric_rows, rank_rows, speckle_rows
+from ultragray.methods.gaussians import SCENE_FILE
+from ultragray.report.plots import plot_counts, plot_frames, plot_tilt, plot_training
+from ultragray.report.study import GAUSSIAN_SHARES, Failed, TiltStudy, Trained
+from ultragray.scene import GaussianScene
+from ultragray.scene_info import read_header
 
 NOT_PLOTTED = ("mean-", "maximum-")  # over the frames, where their lines would hide those of the median
 BESIDE = ("echo", "transmittance")  # what the rendering is made of

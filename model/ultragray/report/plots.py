@@ -7,14 +7,14 @@ from collections.abc import Mapping
 import numpy as np
 from matplotlib.ticker import MaxNLocator
 
-from ..evaluation.metrics import FrameMetrics
-from ..evaluation.reliability import Reliability
-from ..evaluation.scoring import Evaluation
-from ..methods.comparison.plots import figure as make_figure
-from ..methods.comparison.plots import line_style, svg
-from ..methods.comparison.ranks import LABELS
-from ..probe import FloatArray
-from .study import TiltStudy, Trained
+from ultragray.evaluation.metrics import FrameMetrics
+from ultragray.evaluation.reliability import Reliability
+from ultragray.evaluation.scoring import Evaluation
+from ultragray.methods.comparison.plots import figure as make_figure
+from ultragray.methods.comparison.plots import line_style, svg
+from ultragray.methods.comparison.ranks import LABELS
+from ultragray.probe import FloatArray
+from ultragray.report.study import TiltStudy, Trained
 
 COLOURS = {"scene": "#0b6e99", "median": "#d97706", "nearest": "#7c8a97", "linear": "#6d8f3c"}
 TILT_BINS = 6

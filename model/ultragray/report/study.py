@@ -11,21 +11,21 @@ from typing import TypeVar
 
 import numpy as np
 
-from ..datasets.sweep import Dataset, IntArray, Sweep
-from ..errors import DatasetInvalid, UltragrayError
-from ..evaluation.baselines import evaluate_baselines, nearest_frames
-from ..evaluation.compounding import METHODS as VOLUME_METHODS
-from ..evaluation.compounding import VOXEL_MM, mean_axes
-from ..evaluation.scoring import Evaluation, evaluate, require_frames
-from ..methods.classical import Compounding, FromFrames
-from ..methods.comparison.result import Comparison
-from ..methods.comparison.run import SCENE
-from ..methods.gaussians import SceneMethod
-from ..methods.method import Method
-from ..pose import rotation_angles_deg
-from ..probe import FloatArray
-from ..scene import GaussianScene
-from ..training import Progress, TrainingConfig, train
+from ultragray.datasets.sweep import Dataset, IntArray, Sweep
+from ultragray.errors import DatasetInvalid, UltragrayError
+from ultragray.evaluation.baselines import evaluate_baselines, nearest_frames
+from ultragray.evaluation.compounding import METHODS as VOLUME_METHODS
+from ultragray.evaluation.compounding import VOXEL_MM, mean_axes
+from ultragray.evaluation.scoring import Evaluation, evaluate, require_frames
+from ultragray.methods.classical import Compounding, FromFrames
+from ultragray.methods.comparison.result import Comparison
+from ultragray.methods.comparison.run import SCENE
+from ultragray.methods.gaussians import SceneMethod
+from ultragray.methods.method import Method
+from ultragray.pose import rotation_angles_deg
+from ultragray.probe import FloatArray
+from ultragray.scene import GaussianScene
+from ultragray.training import Progress, TrainingConfig, train
 
 LEAST_TILT_DEG = 3.0  # a sweep that turns less cannot show what tilting costs
 TILT_BASELINES = ("median", "nearest")

@@ -7,10 +7,10 @@ from typing import Literal
 
 import numpy as np
 
-from ..contract import described, kind_field
-from ..probe import FloatArray, Probe
-from .rotations import about_axes, random_directions
-from .sampler import MAX_DRAWN, DrawnSampler, count_field, seed_field
+from ultragray.contract import described, kind_field
+from ultragray.probe import FloatArray, Probe
+from ultragray.samplers.rotations import about_axes, random_directions
+from ultragray.samplers.sampler import MAX_DRAWN, DrawnSampler, count_field, seed_field
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ from typing import Literal
 
 import numpy as np
 
-from ..contract import kind_field
-from ..errors import InvalidArgument
-from ..probe import FloatArray, Probe
-from .rotations import about_axes, blended, random_directions
-from .sampler import MAX_DRAWN, DrawnSampler, count_field, seed_field
+from ultragray.contract import kind_field
+from ultragray.errors import InvalidArgument
+from ultragray.probe import FloatArray, Probe
+from ultragray.samplers.rotations import about_axes, blended, random_directions
+from ultragray.samplers.sampler import MAX_DRAWN, DrawnSampler, count_field, seed_field
 
 MAX_BASE_POSES = 10_000  # all are compared with all
 LARGEST_GAP = 4.0  # in median lengths of the links

@@ -8,10 +8,10 @@ from typing import Literal
 
 import numpy as np
 
-from ..contract import described, kind_field
-from ..probe import FloatArray, Probe
-from .rotations import about_axes
-from .sampler import Sampler
+from ultragray.contract import described, kind_field
+from ultragray.probe import FloatArray, Probe
+from ultragray.samplers.rotations import about_axes
+from ultragray.samplers.sampler import Sampler
 
 MAX_TILT_DEG = 90.0  # the beam lies along the skin then
 

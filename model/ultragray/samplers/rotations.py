@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..probe import FloatArray
+from ultragray.probe import FloatArray
 
 _NO_TURN = 1e-300  # rad
 

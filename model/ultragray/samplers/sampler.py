@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from ..contract import Family, described
-from ..errors import InvalidArgument
-from ..pose import check_poses
-from ..probe import FloatArray, Probe
+from ultragray.contract import Family, described
+from ultragray.errors import InvalidArgument
+from ultragray.pose import check_poses
+from ultragray.probe import FloatArray, Probe
 
 MAX_POSES = 100_000  # that are made at once
 MAX_DRAWN = 100_000_000  # of a batch that is made in shards: 20,000 files of 5,000 frames

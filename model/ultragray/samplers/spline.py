@@ -8,12 +8,12 @@ from typing import Literal
 
 import numpy as np
 
-from ..contract import described, kind_field
-from ..errors import InvalidArgument
-from ..pose import rotation_angles_deg
-from ..probe import FloatArray, Probe
-from .rotations import blended
-from .sampler import MAX_POSES, Sampler, count_field
+from ultragray.contract import described, kind_field
+from ultragray.errors import InvalidArgument
+from ultragray.pose import rotation_angles_deg
+from ultragray.probe import FloatArray, Probe
+from ultragray.samplers.rotations import blended
+from ultragray.samplers.sampler import MAX_POSES, Sampler, count_field
 
 SMALLEST_STEP_MM, SMALLEST_TURN_DEG = 1e-9, 1e-6
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-from ..contract import kind_field
-from ..probe import FloatArray, Probe
-from .sampler import Sampler
+from ultragray.contract import kind_field
+from ultragray.probe import FloatArray, Probe
+from ultragray.samplers.sampler import Sampler
 
 
 @dataclass(frozen=True)

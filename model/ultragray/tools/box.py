@@ -10,14 +10,14 @@ from typing import Literal
 import numpy as np
 from typing_extensions import Self
 
-from ..contract import described, kind_field
-from ..errors import InvalidArgument
-from ..pose import ROTATION_TOLERANCE, pose_from_position_quaternion, quaternion_from_pose
-from ..probe import FloatArray
-from ..probe.probe import MAX_LENGTH_MM
-from .crossing import Crossing, ScanView
-from .solid import Span, between_planes, crossing_of_solid, overlap
-from .tool import LEAST_THICKNESS_MM, Tool, ToolFrame, moved_point, point_field
+from ultragray.contract import described, kind_field
+from ultragray.errors import InvalidArgument
+from ultragray.pose import ROTATION_TOLERANCE, pose_from_position_quaternion, quaternion_from_pose
+from ultragray.probe import FloatArray
+from ultragray.probe.probe import MAX_LENGTH_MM
+from ultragray.tools.crossing import Crossing, ScanView
+from ultragray.tools.solid import Span, between_planes, crossing_of_solid, overlap
+from ultragray.tools.tool import LEAST_THICKNESS_MM, Tool, ToolFrame, moved_point, point_field
 
 
 @dataclass(frozen=True, kw_only=True)

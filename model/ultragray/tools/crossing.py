@@ -7,7 +7,7 @@ from functools import cached_property
 
 import numpy as np
 
-from ..probe import FloatArray, Probe
+from ultragray.probe import FloatArray, Probe
 
 LEAST_SLICE_SIGMA_MM = 0.1  # of the slice that tools are seen in, where the frames show a thinner one
 _LEAST_SPACING_MM = 1e-6

@@ -7,11 +7,11 @@ from typing import Literal
 
 import numpy as np
 
-from ..contract import kind_field
-from ..probe import FloatArray
-from .crossing import Crossing, ScanView
-from .shaft import Shaft
-from .solid import Span, between_planes, crossing_of_solid, overlap, within_radius
+from ultragray.contract import kind_field
+from ultragray.probe import FloatArray
+from ultragray.tools.crossing import Crossing, ScanView
+from ultragray.tools.shaft import Shaft
+from ultragray.tools.solid import Span, between_planes, crossing_of_solid, overlap, within_radius
 
 
 @dataclass(frozen=True, kw_only=True)

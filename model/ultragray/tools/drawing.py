@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .crossing import Crossing, ScanView
-from .tool import Tool
+from ultragray.tools.crossing import Crossing, ScanView
+from ultragray.tools.tool import Tool
 
 PULSE_SIGMA_MM = 0.15  # of the echo of a surface along the line
 HEAD_ON_SIGMA_DEG = 20.0  # by which the mirror's share of an echo falls off with the angle

@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from ..contract import from_dict, shown, under
-from ..errors import InvalidArgument
-from .tool import Tool
+from ultragray.contract import from_dict, shown, under
+from ultragray.errors import InvalidArgument
+from ultragray.tools.tool import Tool
 
 
 def load_tools(path: str | Path) -> tuple[Tool, ...]:

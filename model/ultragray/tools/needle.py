@@ -7,11 +7,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..contract import kind_field
-from ..pose import check_poses
-from ..probe import FloatArray, Probe
-from .crossing import Crossing, ScanView, covered, dot
-from .shaft import Shaft
+from ultragray.contract import kind_field
+from ultragray.pose import check_poses
+from ultragray.probe import FloatArray, Probe
+from ultragray.tools.crossing import Crossing, ScanView, covered, dot
+from ultragray.tools.shaft import Shaft
 
 _LEAST = 1e-12
 

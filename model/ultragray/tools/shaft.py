@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 
 from typing_extensions import Self
 
-from ..errors import InvalidArgument
-from ..probe import FloatArray
-from ..probe.probe import length_field
-from .tool import LEAST_THICKNESS_MM, Tool, ToolFrame, moved_point, point_field
+from ultragray.errors import InvalidArgument
+from ultragray.probe import FloatArray
+from ultragray.probe.probe import length_field
+from ultragray.tools.tool import LEAST_THICKNESS_MM, Tool, ToolFrame, moved_point, point_field
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -7,9 +7,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..probe import FloatArray
-from .crossing import Crossing, ScanView, dot
-from .tool import Tool
+from ultragray.probe import FloatArray
+from ultragray.tools.crossing import Crossing, ScanView, dot
+from ultragray.tools.tool import Tool
 
 _LAYERS = np.array([-1.2816, -0.5244, 0.0, 0.5244, 1.2816])  # σ: the middles of fifths of a Gaussian slice
 _LEAST = 1e-9

@@ -10,10 +10,10 @@ from typing import Any
 import numpy as np
 from typing_extensions import Self
 
-from ..contract import Family, described
-from ..pose import MAX_POSITION_MM
-from ..probe import FloatArray
-from .crossing import Crossing, ScanView
+from ultragray.contract import Family, described
+from ultragray.pose import MAX_POSITION_MM
+from ultragray.probe import FloatArray
+from ultragray.tools.crossing import Crossing, ScanView
 
 MAX_TOOLS = 8  # of one frame
 DEFAULT_LABEL = 255

@@ -7,18 +7,18 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from .config import TrainingConfig
-from .progress import Progress
+from ultragray.training.config import TrainingConfig
+from ultragray.training.progress import Progress
 
 if TYPE_CHECKING:
-    from .run import train
+    from ultragray.training.run import train
 
 __all__ = ["Progress", "TrainingConfig", "train"]
 
 
 def __getattr__(name: str) -> Any:
     if name == "train":
-        from .run import train
+        from ultragray.training.run import train
 
         globals()[name] = train
         return train

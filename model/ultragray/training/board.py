@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Mapping
 from pathlib import Path
 
-from ..errors import InvalidArgument
-from ..installation import install_advice
+from ultragray.errors import InvalidArgument
+from ultragray.installation import install_advice
 
 
 def require_tensorboard() -> None:

@@ -21,13 +21,13 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor
 
-from ..errors import InvalidArgument, TrainingStateInvalid
-from ..files.atomic import write_whole
-from ..files.format_version import require_version
-from ..scene_info import expected_shapes
-from .config import TrainingConfig
-from .steps.beam import expected_beam_tensors
-from .steps.optimizer import MOMENTS, is_trained
+from ultragray.errors import InvalidArgument, TrainingStateInvalid
+from ultragray.files.atomic import write_whole
+from ultragray.files.format_version import require_version
+from ultragray.scene_info import expected_shapes
+from ultragray.training.config import TrainingConfig
+from ultragray.training.steps.beam import expected_beam_tensors
+from ultragray.training.steps.optimizer import MOMENTS, is_trained
 
 FORMAT_VERSION = 2
 METADATA_KEY = "ultragray-training"

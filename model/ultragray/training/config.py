@@ -15,15 +15,15 @@ from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
-from ..contract import Contract, described
-from ..errors import InvalidArgument
-from ..probe import ElevationBeam
-from ..probe.elevation import MAX_THICKNESS_MM, MIN_DEPTH_OF_FIELD_MM
-from ..probe.probe import MAX_LENGTH_MM
-from ..scene_info import INTENSITIES, MAX_SH_DEGREE
+from ultragray.contract import Contract, described
+from ultragray.errors import InvalidArgument
+from ultragray.probe import ElevationBeam
+from ultragray.probe.elevation import MAX_THICKNESS_MM, MIN_DEPTH_OF_FIELD_MM
+from ultragray.probe.probe import MAX_LENGTH_MM
+from ultragray.scene_info import INTENSITIES, MAX_SH_DEGREE
 
 if typing.TYPE_CHECKING:
-    from .data.geometry import Geometry
+    from ultragray.training.data.geometry import Geometry
 
 if sys.version_info >= (3, 11):
     import tomllib

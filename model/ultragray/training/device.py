@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import torch
 
-from ..backends import cuda
-from ..errors import BackendUnavailable
+from ultragray.backends import cuda
+from ultragray.errors import BackendUnavailable
 
 
 def training_device(name: str, backend: str) -> torch.device:

@@ -12,12 +12,12 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ..datasets.sweep import Dataset
-from ..errors import MemoryExceeded, TrainingDiverged
-from ..evaluation.metrics import FrameMetrics
-from ..files.atomic import write_whole
-from .confidence.held_out import LEAST_HELD_OUT, held_out_frames
-from .config import USUAL_EFFORT, TrainingConfig
+from ultragray.datasets.sweep import Dataset
+from ultragray.errors import MemoryExceeded, TrainingDiverged
+from ultragray.evaluation.metrics import FrameMetrics
+from ultragray.files.atomic import write_whole
+from ultragray.training.confidence.held_out import LEAST_HELD_OUT, held_out_frames
+from ultragray.training.config import USUAL_EFFORT, TrainingConfig
 
 EFFORTS_FILE = "efforts.json"
 OTHER_EFFORTS = ((2.0, 3.0), (0.5, 0.25))  # upwards, then downwards, as long as each is better than the one before

@@ -12,14 +12,14 @@ from pathlib import Path
 
 import torch
 
-from ..datasets.sweep import Dataset
-from ..errors import MemoryExceeded
-from ..evaluation.scoring import CHUNK_PIXELS, frames_at_once
-from ..scene_info import expected_shapes
-from .config import TrainingConfig
-from .data.sampling import PREDICTED_PIXELS
-from .data.shadows import LOOKED_AT_FRAMES
-from .poses import overlap
+from ultragray.datasets.sweep import Dataset
+from ultragray.errors import MemoryExceeded
+from ultragray.evaluation.scoring import CHUNK_PIXELS, frames_at_once
+from ultragray.scene_info import expected_shapes
+from ultragray.training.config import TrainingConfig
+from ultragray.training.data.sampling import PREDICTED_PIXELS
+from ultragray.training.data.shadows import LOOKED_AT_FRAMES
+from ultragray.training.poses import overlap
 
 BASE_BYTES = 512 << 20  # the process with torch loaded, and the scratch memory of its kernels (measured: up to 500)
 COPIES = 16  # parameters, gradients, moments; what refinements, checkpoints and the kernel copy (measured: 14)

@@ -8,10 +8,10 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ..datasets.sweep import Sweep
-from ..display.pixels import image_file
-from ..evaluation.side_by_side import as_picture
-from ..files.atomic import write_whole
+from ultragray.datasets.sweep import Sweep
+from ultragray.display.pixels import image_file
+from ultragray.evaluation.side_by_side import as_picture
+from ultragray.files.atomic import write_whole
 
 FrameArray: TypeAlias = npt.NDArray[np.float32]
 MAX_SIDE_PIXELS = 256

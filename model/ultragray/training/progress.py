@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from ..files.atomic import write_whole
+from ultragray.files.atomic import write_whole
 
 SMOOTHING = 0.05  # weight of the newest step in the mean time of a step
 

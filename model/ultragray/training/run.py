@@ -11,17 +11,17 @@ from typing import Any, TypeAlias
 
 import torch
 
-from ..datasets.sweep import Dataset
-from ..errors import MemoryExceeded, TrainingDiverged, TrainingStateInvalid
-from ..evaluation.metrics import FrameMetrics
-from ..scene import GaussianScene
-from .board import require_tensorboard
-from .checkpointing import read_checkpoint_header
-from .confidence.calibration import fit_confidence, shorter, steps_of_fit
-from .config import TrainingConfig
-from .effort import choose_effort
-from .progress import Progress
-from .trainer import CHECKPOINT_FILE, Trainer
+from ultragray.datasets.sweep import Dataset
+from ultragray.errors import MemoryExceeded, TrainingDiverged, TrainingStateInvalid
+from ultragray.evaluation.metrics import FrameMetrics
+from ultragray.scene import GaussianScene
+from ultragray.training.board import require_tensorboard
+from ultragray.training.checkpointing import read_checkpoint_header
+from ultragray.training.confidence.calibration import fit_confidence, shorter, steps_of_fit
+from ultragray.training.config import TrainingConfig
+from ultragray.training.effort import choose_effort
+from ultragray.training.progress import Progress
+from ultragray.training.trainer import CHECKPOINT_FILE, Trainer
 
 FITTING = "fitting the confidence"
 

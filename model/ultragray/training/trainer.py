@@ -16,40 +16,40 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..backends import cuda
-from ..datasets.sweep import Dataset, spread_places
-from ..errors import DatasetInvalid, MemoryExceeded, TrainingDiverged, TrainingStateInvalid
-from ..evaluation.scoring import evaluate
-from ..files.atomic import remove_stale_temporaries, write_whole
-from ..rendering import Frames, choose_backend, render
-from ..scene import PARAMETERS, GaussianScene
-from ..scene_info import SceneInfo, check_training_pose_count
-from .board import Board
-from .checkpointing import (
+from ultragray.backends import cuda
+from ultragray.datasets.sweep import Dataset, spread_places
+from ultragray.errors import DatasetInvalid, MemoryExceeded, TrainingDiverged, TrainingStateInvalid
+from ultragray.evaluation.scoring import evaluate
+from ultragray.files.atomic import remove_stale_temporaries, write_whole
+from ultragray.rendering import Frames, choose_backend, render
+from ultragray.scene import PARAMETERS, GaussianScene
+from ultragray.scene_info import SceneInfo, check_training_pose_count
+from ultragray.training.board import Board
+from ultragray.training.checkpointing import (
     CheckpointHeader,
     check_same_run,
     check_tensors,
     read_checkpoint,
     write_checkpoint,
 )
-from .config import TrainingConfig
-from .data.between import ViewsBetween
-from .data.geometry import Geometry
-from .data.initial import initial_parameters
-from .data.neighbours import neighbours_of
-from .data.sampling import BatchSampler, out_of_plane_shift_mm, shift_out_of_plane
-from .data.shadows import Shadows
-from .device import forget_peak_memory, peak_memory_mb, training_device
-from .memory import check_comparison_memory, check_memory
-from .pictures import write_picture
-from .poses.refinement import PoseRefinement
-from .progress import Journal, Progress, StepTimer
-from .steps.beam import TrainedBeam
-from .steps.intensity import project_sh0
-from .steps.losses import SSIM_WINDOW, image_loss
-from .steps.optimizer import Optimizer, is_trained
-from .steps.refinement import PullStatistics, refine
-from .steps.schedule import Schedule
+from ultragray.training.config import TrainingConfig
+from ultragray.training.data.between import ViewsBetween
+from ultragray.training.data.geometry import Geometry
+from ultragray.training.data.initial import initial_parameters
+from ultragray.training.data.neighbours import neighbours_of
+from ultragray.training.data.sampling import BatchSampler, out_of_plane_shift_mm, shift_out_of_plane
+from ultragray.training.data.shadows import Shadows
+from ultragray.training.device import forget_peak_memory, peak_memory_mb, training_device
+from ultragray.training.memory import check_comparison_memory, check_memory
+from ultragray.training.pictures import write_picture
+from ultragray.training.poses.refinement import PoseRefinement
+from ultragray.training.progress import Journal, Progress, StepTimer
+from ultragray.training.steps.beam import TrainedBeam
+from ultragray.training.steps.intensity import project_sh0
+from ultragray.training.steps.losses import SSIM_WINDOW, image_loss
+from ultragray.training.steps.optimizer import Optimizer, is_trained
+from ultragray.training.steps.refinement import PullStatistics, refine
+from ultragray.training.steps.schedule import Schedule
 
 CHECKPOINT_FILE = "checkpoint.safetensors"
 JOURNAL_FILE = "metrics.jsonl"

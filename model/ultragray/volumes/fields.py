@@ -21,13 +21,13 @@ import numpy as np
 import numpy.typing as npt
 import torch
 
-from ..backends.labels import MIN_WEIGHT_SUM
-from ..backends.reference import MAX_WEIGHT, MIN_WEIGHT, intensity, inverse_root_covariance
-from ..limits import UNLIMITED, Limits
-from ..probe import FloatArray
-from ..scene import GaussianScene
-from .grid import VolumeGrid
-from .names import check_field
+from ultragray.backends.labels import MIN_WEIGHT_SUM
+from ultragray.backends.reference import MAX_WEIGHT, MIN_WEIGHT, intensity, inverse_root_covariance
+from ultragray.limits import UNLIMITED, Limits
+from ultragray.probe import FloatArray
+from ultragray.scene import GaussianScene
+from ultragray.volumes.grid import VolumeGrid
+from ultragray.volumes.names import check_field
 
 POINTS_AT_ONCE = 1 << 21  # voxels of a slab, and pairs of voxel and Gaussian: some 250 MB
 _RADIUS = math.sqrt(-2.0 * math.log(MIN_WEIGHT))

@@ -19,14 +19,14 @@ from typing import Any, BinaryIO
 import numpy as np
 import numpy.typing as npt
 
-from ..display.pixels import image_file
-from ..errors import InvalidArgument
-from ..files.atomic import atomic_path, write_whole
-from ..scene import GaussianScene
-from ..scene_info import SceneInfo
-from .fields import sample_slice, sample_volume
-from .grid import VolumeGrid
-from .names import SLICE_SUFFIXES, VOLUME_SUFFIXES
+from ultragray.display.pixels import image_file
+from ultragray.errors import InvalidArgument
+from ultragray.files.atomic import atomic_path, write_whole
+from ultragray.scene import GaussianScene
+from ultragray.scene_info import SceneInfo
+from ultragray.volumes.fields import sample_slice, sample_volume
+from ultragray.volumes.grid import VolumeGrid
+from ultragray.volumes.names import SLICE_SUFFIXES, VOLUME_SUFFIXES
 
 _COMPRESSION = 4  # of 1 to 9: beyond, seconds buy hardly a byte
 _UINT8, _FLOAT32 = 2, 16  # data types of NIfTI

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import InvalidArgument
-from ..pose import MAX_POSITION_MM
-from ..probe import FloatArray
-from ..scene_info import SceneInfo
+from ultragray.errors import InvalidArgument
+from ultragray.pose import MAX_POSITION_MM
+from ultragray.probe import FloatArray
+from ultragray.scene_info import SceneInfo
 
 MAX_VOXELS = 1 << 28
 MAX_SIDE = 32767  # NIfTI-1 counts voxels along an axis in 16 bits

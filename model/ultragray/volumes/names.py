@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..errors import InvalidArgument
+from ultragray.errors import InvalidArgument
 
 VOLUME_FIELDS = ("echo", "coverage", "attenuation", "labels")
 VOLUME_SUFFIXES = (".nii.gz", ".nii", ".nrrd")

@@ -7,11 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from ..contract import Contract, described
-from ..probe import FloatArray, Picture
-from ..settings import Encoding
-from .grid import SMALLEST_SPACING_MM, VolumeGrid
-from .names import VOLUME_FIELDS
+from ultragray.contract import Contract, described
+from ultragray.probe import FloatArray, Picture
+from ultragray.settings import Encoding
+from ultragray.volumes.grid import SMALLEST_SPACING_MM, VolumeGrid
+from ultragray.volumes.names import VOLUME_FIELDS
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -6,8 +6,7 @@ import ipaddress
 from collections.abc import Sequence
 
 from ultragray.errors import InvalidArgument
-
-from .principal import LOCAL, Principal, Role
+from ultragray_service.access.principal import LOCAL, Principal, Role
 
 _SOURCE = "igtl"
 _FIELD = "igtl_allow"

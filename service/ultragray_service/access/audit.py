@@ -23,11 +23,10 @@ import sqlalchemy as sa
 from sqlalchemy.exc import SQLAlchemyError
 
 from ultragray.errors import UltragrayError
+from ultragray_service.access.rules import Operation
+from ultragray_service.errors import LimitReached, PermissionDenied, RateLimited, Unauthenticated
 from ultragray_workers.jobs.queue.tables import AUDIT
 from ultragray_workers.rounds import Rounds
-
-from ..errors import LimitReached, PermissionDenied, RateLimited, Unauthenticated
-from .rules import Operation
 
 OK = "OK"
 OPENED = "OPENED"

@@ -5,7 +5,7 @@ from __future__ import annotations
 import base64
 from collections.abc import Iterable, Sequence
 
-from ..errors import Unauthenticated
+from ultragray_service.errors import Unauthenticated
 
 STREAM_PROTOCOL = "ultragray.v1"  # WebSocket subprotocol
 _KEY_PROTOCOL = "ultragray.key."

@@ -7,8 +7,8 @@ import time
 from collections.abc import Sequence
 from typing import Protocol
 
-from ..errors import Unauthenticated
-from .principal import LOCAL, Principal, Role
+from ultragray_service.access.principal import LOCAL, Principal, Role
+from ultragray_service.errors import Unauthenticated
 
 
 class Authenticator(Protocol):

@@ -14,13 +14,12 @@ import sqlalchemy as sa
 
 from ultragray.contract import described
 from ultragray.errors import InvalidArgument
+from ultragray_service.access.guard import digest_of
+from ultragray_service.access.limits.allowance import Number
+from ultragray_service.access.principal import Principal, Role
+from ultragray_service.errors import PermissionDenied, Unauthenticated
 from ultragray_workers.jobs.queue.owners import tell_change
 from ultragray_workers.jobs.queue.tables import KEYS
-
-from ..errors import PermissionDenied, Unauthenticated
-from .guard import digest_of
-from .limits.allowance import Number
-from .principal import Principal, Role
 
 _PREFIX = "ultragray_"  # so that people, and those who search files for secrets, know one when they see it
 _RANDOM_BYTES = 32

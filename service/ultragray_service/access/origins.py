@@ -12,9 +12,9 @@ import re
 from functools import lru_cache
 from urllib.parse import urlsplit
 
-from ..errors import HostRefused, OriginRefused
-from ..settings import Settings
-from .addresses import is_loopback
+from ultragray_service.access.addresses import is_loopback
+from ultragray_service.errors import HostRefused, OriginRefused
+from ultragray_service.settings import Settings
 
 _ANY = "*"
 _HOST = re.compile(r"(\[(?P<address>[0-9A-Fa-f:.]+)\]|(?P<name>[A-Za-z0-9._-]+))(:[0-9]{0,5})?", re.ASCII)

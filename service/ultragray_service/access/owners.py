@@ -12,6 +12,7 @@ from typing import TypeVar
 
 import sqlalchemy as sa
 
+from ultragray_service.access.principal import Principal, Role, acting
 from ultragray_workers.jobs.queue.owners import (
     NOBODYS,
     Kind,
@@ -22,8 +23,6 @@ from ultragray_workers.jobs.queue.owners import (
     read_owners,
 )
 from ultragray_workers.scene_names import base_name
-
-from .principal import Principal, Role, acting
 
 SPREAD_S = 2.0  # in which every service has read who owns what again, see `snapshot`
 

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 from ultragray.errors import UltragrayError
+from ultragray_service.access.owners import Owners, may_change, may_see
+from ultragray_service.access.principal import Principal, Role
+from ultragray_service.access.rules import Operation
+from ultragray_service.errors import PermissionDenied
 from ultragray_workers.errors import job_not_found
 from ultragray_workers.jobs.queue.owners import Kind
-
-from ..errors import PermissionDenied
-from .owners import Owners, may_change, may_see
-from .principal import Principal, Role
-from .rules import Operation
 
 
 def require_role(principal: Principal, operation: Operation) -> None:

@@ -8,9 +8,8 @@ from datetime import datetime, timezone
 from enum import Enum
 
 from ultragray.contract import described
+from ultragray_service.access.limits.allowance import Number
 from ultragray_workers.pool.fairness.turns import Caller
-
-from .limits.allowance import Number
 
 
 class Role(str, Enum):

@@ -10,9 +10,8 @@ from dataclasses import dataclass
 
 from starlette.routing import compile_path
 
+from ultragray_service.access.principal import Role
 from ultragray_workers.jobs.queue.owners import Kind
-
-from .principal import Role
 
 STREAM = "stream"  # the operation of poses in, frames out
 WATCH = "stream.watch"  # of somebody's stream

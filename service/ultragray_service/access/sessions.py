@@ -11,11 +11,10 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from ultragray.errors import UltragrayError
+from ultragray_service.access.guard import Guard
+from ultragray_service.access.principal import LOCAL, Principal
+from ultragray_service.errors import IssuerUnavailable
 from ultragray_workers.rounds import Rounds
-
-from ..errors import IssuerUnavailable
-from .guard import Guard
-from .principal import LOCAL, Principal
 
 LOOK_INTERVAL_S = 1.0
 

@@ -14,10 +14,9 @@ import sqlalchemy as sa
 from sqlalchemy.exc import SQLAlchemyError
 
 from ultragray.errors import UltragrayError
+from ultragray_service.access.keys import KeyStore, KnownKeys, read_keys
 from ultragray_workers.jobs.queue.tables import CHANGES
 from ultragray_workers.rounds import Rounds
-
-from .keys import KeyStore, KnownKeys, read_keys
 
 INTERVAL_S = 1.0
 _USES_EVERY = 30  # intervals

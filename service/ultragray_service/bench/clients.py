@@ -20,13 +20,12 @@ from websockets.sync.client import connect
 from ultragray.demo import copy_demo_scene, demo_poses
 from ultragray.probe import FloatArray
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
+from ultragray_service.bench.igtl import PingPong
+from ultragray_service.bench.kernel import BenchScene, bench_poses, measure_kernel, time_ms
+from ultragray_service.bench.report import Report, percentiles
+from ultragray_service.bench.served import pose_message, running_server
+from ultragray_service.remote.jobs import Jobs
 from ultragray_workers.errors import NotReady
-
-from ..remote.jobs import Jobs
-from .igtl import PingPong
-from .kernel import BenchScene, bench_poses, measure_kernel, time_ms
-from .report import Report, percentiles
-from .served import pose_message, running_server
 
 SCENE, AUGMENTED = "demo", "augmented"
 SIDE = 512

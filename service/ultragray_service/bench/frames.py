@@ -10,9 +10,9 @@ from typing import Any, TypeAlias
 
 import torch
 
-from .kernel import BenchScene, bench_scenes, measure_kernel
-from .report import Report, percentiles
-from .served import measure_served
+from ultragray_service.bench.kernel import BenchScene, bench_scenes, measure_kernel
+from ultragray_service.bench.report import Report, percentiles
+from ultragray_service.bench.served import measure_served
 
 Row: TypeAlias = dict[str, Any]
 COLUMNS = {

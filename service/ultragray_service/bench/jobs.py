@@ -24,13 +24,12 @@ from ultragray.datasets.phantom import load_phantom
 from ultragray.datasets.released import write_released
 from ultragray.demo import copy_demo_scene, demo_poses
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
+from ultragray_service.bench.kernel import time_ms
+from ultragray_service.bench.report import Report, percentiles
+from ultragray_service.bench.served import pose_message, running_server
+from ultragray_service.remote.jobs import Jobs
 from ultragray_workers.errors import NotReady
 from ultragray_workers.jobs.queue.database import JobDatabase
-
-from ..remote.jobs import Jobs
-from .kernel import time_ms
-from .report import Report, percentiles
-from .served import pose_message, running_server
 
 SCENE = "demo"
 SIDE = 512

@@ -20,9 +20,8 @@ from ultragray.backends import cpu
 from ultragray.datasets.sweep import spread_places
 from ultragray.demo import load_demo_scene
 from ultragray.probe import FloatArray, Probe
-
-from .kernel import PROBE, bench_poses, bench_scenes, time_ms
-from .report import Report
+from ultragray_service.bench.kernel import PROBE, bench_poses, bench_scenes, time_ms
+from ultragray_service.bench.report import Report
 
 ELSEWHERE_CM = 1e4  # so far away no Gaussian is cut
 LANES = {"avx512": 16, "avx2": 8, "baseline": 4}  # floats of a vector

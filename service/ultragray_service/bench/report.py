@@ -17,9 +17,8 @@ from rich.table import Table
 
 import ultragray
 from ultragray.files.atomic import write_whole
-
-from .kernel import time_yard_ms
-from .measured import measured
+from ultragray_service.bench.kernel import time_yard_ms
+from ultragray_service.bench.measured import measured
 
 TABLE_WIDTH = 110  # columns, where no terminal says
 

@@ -22,13 +22,12 @@ import grpc
 
 from ultragray.probe import FloatArray
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
+from ultragray_service.bench.kernel import BenchScene, bench_poses, time_ms
+from ultragray_service.bench.shared_file import SharedFile
+from ultragray_service.remote.connection import Connection
+from ultragray_service.remote.jobs import Jobs
 from ultragray_workers.errors import NotReady
 from ultragray_workers.jobs.worker.processes import account_of
-
-from ..remote.connection import Connection
-from ..remote.jobs import Jobs
-from .kernel import BenchScene, bench_poses, time_ms
-from .shared_file import SharedFile
 
 SCENE = "bench"
 IN_FLIGHT = 8

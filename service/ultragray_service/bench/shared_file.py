@@ -7,8 +7,7 @@ import os
 import secrets
 
 from ultragray_proto.v1 import rendering_pb2
-
-from ..rpc.shared_memory import FOLDER, FREE, HEADER_BYTES, TOKEN_BYTES
+from ultragray_service.rpc.shared_memory import FOLDER, FREE, HEADER_BYTES, TOKEN_BYTES
 
 _SLOT_BYTES = 4 * 2**20
 

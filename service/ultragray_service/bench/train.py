@@ -16,9 +16,8 @@ from ultragray.backends.spatial_order import spatial_order
 from ultragray.training.config import TEXTURE
 from ultragray.training.steps.losses import image_loss
 from ultragray.training.steps.optimizer import Optimizer
-
-from .kernel import BATCH, PROBE, BenchScene, Mark, bench_poses, elapsed_ms, finish, mark
-from .report import Report
+from ultragray_service.bench.kernel import BATCH, PROBE, BenchScene, Mark, bench_poses, elapsed_ms, finish, mark
+from ultragray_service.bench.report import Report
 
 CPU = torch.device("cpu")
 PARTS = ("forward", "loss", "backward", "optimizer")

@@ -6,8 +6,8 @@ from typing import Annotated
 
 import typer
 
-from .group import Entry, LazyGroup
-from .style import examples
+from ultragray_service.cli.group import Entry, LazyGroup
+from ultragray_service.cli.style import examples
 
 _SERVING, _SCENES, _SWEEPS = "Serve", "Scenes and frames", "Sweeps and training"
 _REMOTE, _INSTALLATION = "A running service (--address)", "An installation's folders"
@@ -79,8 +79,8 @@ def main(
     ] = False,
 ) -> None:
     """Look for environment variables that are misspelt, whatever the command; a service logs them itself."""
-    from ..misspelt import unknown_variables
-    from .style import warn
+    from ultragray_service.cli.style import warn
+    from ultragray_service.misspelt import unknown_variables
 
     if context.invoked_subcommand != "serve":
         for sentence in unknown_variables():

@@ -12,11 +12,10 @@ import typer
 from ultragray.demo import copy_demo_scene
 from ultragray.errors import InvalidArgument
 from ultragray.scene_info import read_header
+from ultragray_service.cli.options import FieldsOf, with_options
+from ultragray_service.cli.style import command_group, examples
+from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from ultragray_workers.scenes import SUFFIX, SceneStore
-
-from ..settings import ENVIRONMENT_PREFIX, Settings, load_settings
-from .options import FieldsOf, with_options
-from .style import command_group, examples
 
 DEMO_NAME = "demo"
 command_app = command_group()
@@ -89,7 +88,9 @@ def serve_scenes(scenes: Iterable[Path], options: Mapping[str, Any]) -> None:
 
 
 def _run(settings: Settings) -> None:
-    from ..server import run  # imports all that a service needs, which takes long: mistakes are told before
+    from ultragray_service.server import (
+        run,  # imports all that a service needs, which takes long: mistakes are told before
+    )
 
     run(settings)
 

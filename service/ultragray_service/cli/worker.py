@@ -13,14 +13,13 @@ from typing import Annotated, Any
 import typer
 
 from ultragray.errors import UltragrayError
+from ultragray_service.cli.options import FieldsOf, pairs_of, with_options
+from ultragray_service.cli.style import command_group, examples
+from ultragray_service.service_manager import ALIVE, READY, ServiceManager
+from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from ultragray_workers.errors import StartupFailed
 from ultragray_workers.niceness import let_frames_go_first
 from ultragray_workers.parent import end_with_parent
-
-from ..service_manager import ALIVE, READY, ServiceManager
-from ..settings import ENVIRONMENT_PREFIX, Settings, load_settings
-from .options import FieldsOf, pairs_of, with_options
-from .style import command_group, examples
 
 command_app = command_group()
 
@@ -73,11 +72,10 @@ def run_worker(
     """
     from opentelemetry import trace
 
+    from ultragray_service.telemetry.logs import configure_logging
+    from ultragray_service.telemetry.tracing import start_tracing
     from ultragray_workers.jobs.places import shared_storage
     from ultragray_workers.jobs.worker.worker import work
-
-    from ..telemetry.logs import configure_logging
-    from ..telemetry.tracing import start_tracing
 
     settings = load_settings(**overrides)
     configure_logging(settings.log_level, settings.log_format)

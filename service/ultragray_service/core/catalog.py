@@ -16,12 +16,11 @@ from typing import Any, TypeVar
 
 from ultragray.errors import InvalidArgument, SceneFileInvalid, UltragrayError
 from ultragray.scene_info import SceneHeader
+from ultragray_service.core.own_thread import in_own_thread
+from ultragray_service.views.scene_points import point_message
 from ultragray_workers.errors import SceneNotFound, SceneTooLarge
 from ultragray_workers.scenes import SceneStore
 from ultragray_workers.storage.local import FileVersion
-
-from ..views.scene_points import point_message
-from .own_thread import in_own_thread
 
 T = TypeVar("T")
 

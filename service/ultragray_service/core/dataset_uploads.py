@@ -13,20 +13,19 @@ from typing import Any, TypeVar
 from ultragray.contract import from_dict
 from ultragray.datasets.source import SourceOptions
 from ultragray.errors import DatasetInvalid
+from ultragray_service.access.audit import account
+from ultragray_service.access.limits.holdings import Holdings
+from ultragray_service.access.limits.slots import Slots
+from ultragray_service.access.owners import Claim, Owners
+from ultragray_service.arrival import arrival
+from ultragray_service.core.helper_processes import HelperProcesses
+from ultragray_service.core.own_thread import to_its_end
+from ultragray_service.settings import Settings
 from ultragray_workers.datasets.incoming import IncomingDataset, remove_stale
 from ultragray_workers.datasets.intake import take_in
 from ultragray_workers.datasets.store import DatasetRecord, DatasetStore, check_dataset_name
 from ultragray_workers.errors import Draining
 from ultragray_workers.jobs.queue.owners import Kind
-
-from ..access.audit import account
-from ..access.limits.holdings import Holdings
-from ..access.limits.slots import Slots
-from ..access.owners import Claim, Owners
-from ..arrival import arrival
-from ..settings import Settings
-from .helper_processes import HelperProcesses
-from .own_thread import to_its_end
 
 MAX_UPLOADS = 8
 CHECK_TIMEOUT_S = 1800.0

@@ -17,9 +17,8 @@ from ultragray.probe import FloatArray, Picture, Probe
 from ultragray.settings import Contact, Encoding, Resolved
 from ultragray.tools import Tool
 from ultragray.volumes.plane import SliceView
+from ultragray_service.core.poses import MatrixRows
 from ultragray_workers.pool.types import RenderResult
-
-from .poses import MatrixRows
 
 OutputName = Annotated[
     str,

@@ -13,10 +13,9 @@ from collections.abc import Callable
 from typing import Any
 
 from ultragray.errors import MemoryExceeded, UltragrayError, error_classes
+from ultragray_service.core.own_thread import in_own_thread
 from ultragray_workers.errors import DeadlineExceeded
 from ultragray_workers.helpers import helper
-
-from .own_thread import in_own_thread
 
 _log = logging.getLogger("ultragray.service")
 PATIENCE_S = 3600.0  # of a request that waits for the processes of others

@@ -11,20 +11,19 @@ from pathlib import Path
 from ultragray.errors import SceneFileInvalid
 from ultragray.files.atomic import sync
 from ultragray.scene_info import SceneHeader, read_header
+from ultragray_service.access.limits.holdings import Holdings
+from ultragray_service.access.limits.slots import Slots
+from ultragray_service.access.owners import Claim, Owners
+from ultragray_service.core.helper_processes import HelperProcesses
+from ultragray_service.core.own_thread import in_own_thread, to_its_end
+from ultragray_service.errors import SceneReadOnly
+from ultragray_service.settings import Settings
 from ultragray_workers.claims import storage_full
 from ultragray_workers.errors import SceneExists, SceneNotFound, UploadTooLarge
 from ultragray_workers.jobs.queue.owners import Kind
 from ultragray_workers.scene_names import SUFFIX, check_scene_name
 from ultragray_workers.scenes import SceneStore, check_scene_file
 from ultragray_workers.shelves.shelf import Shelf
-
-from ..access.limits.holdings import Holdings
-from ..access.limits.slots import Slots
-from ..access.owners import Claim, Owners
-from ..errors import SceneReadOnly
-from ..settings import Settings
-from .helper_processes import HelperProcesses
-from .own_thread import in_own_thread, to_its_end
 
 CHECK_TIMEOUT_S = 600.0
 MAX_IMPORTS = 4

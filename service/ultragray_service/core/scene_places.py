@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from pathlib import Path
 
+from ultragray_service.settings import Settings
 from ultragray_workers.errors import StartupFailed, StorageUnavailable
 from ultragray_workers.jobs.publication import SCENES_FOLDER
 from ultragray_workers.shelves.bucket import BucketShelf
@@ -16,8 +17,6 @@ from ultragray_workers.shelves.shelf import Shelf
 from ultragray_workers.storage.cache import Cache
 from ultragray_workers.storage.location import Location
 from ultragray_workers.storage.opening import open_storage
-
-from ..settings import Settings
 
 PATIENCE_S = 10.0  # of frames that wait for a scene
 

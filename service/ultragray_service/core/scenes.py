@@ -9,15 +9,14 @@ from ultragray.contract import described
 from ultragray.outputs import OUTPUTS
 from ultragray.probe import ElevationBeam, Probe
 from ultragray.scene_info import SceneHeader
+from ultragray_service.access.principal import iso_time
+from ultragray_service.core.catalog import CatalogEntry, finite_metrics
+from ultragray_service.core.frames import OutputName
+from ultragray_service.core.poses import PoseInBothForms, Position
+from ultragray_service.core.state import Service
+from ultragray_service.errors import Refusal
 from ultragray_workers.jobs.queue.owners import Kind, Ownership
 from ultragray_workers.scene_names import base_name
-
-from ..access.principal import iso_time
-from ..errors import Refusal
-from .catalog import CatalogEntry, finite_metrics
-from .frames import OutputName
-from .poses import PoseInBothForms, Position
-from .state import Service
 
 
 @dataclass(frozen=True)

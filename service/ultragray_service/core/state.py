@@ -11,6 +11,38 @@ from typing import Any
 
 from ultragray.errors import RenderFailed, UltragrayError
 from ultragray.probe import FloatArray
+from ultragray_service.access.addresses import is_loopback
+from ultragray_service.access.audit import AuditLog, account
+from ultragray_service.access.guard import Authenticator, EnvironmentKeys, Guard
+from ultragray_service.access.keys import KnownKeys
+from ultragray_service.access.limits.holdings import Holdings
+from ultragray_service.access.limits.limits import Limits
+from ultragray_service.access.oidc.tokens import OidcTokens
+from ultragray_service.access.origins import Origins
+from ultragray_service.access.owners import Owners
+from ultragray_service.access.permissions import require
+from ultragray_service.access.principal import Principal, act_as, caller
+from ultragray_service.access.rules import Operation
+from ultragray_service.access.sessions import Sessions
+from ultragray_service.access.snapshot import Snapshot
+from ultragray_service.core.catalog import SceneCatalog, scene_to_blame
+from ultragray_service.core.dataset_uploads import DatasetUploads
+from ultragray_service.core.helper_processes import HelperProcesses
+from ultragray_service.core.jobs.jobs import Jobs
+from ultragray_service.core.readiness.readiness import Readiness
+from ultragray_service.core.requests import Plan, RequestPlanner
+from ultragray_service.core.scene_imports import SceneImports
+from ultragray_service.core.scene_places import ScenePlaces
+from ultragray_service.core.streams.open_streams import OpenStreams
+from ultragray_service.doors import Doors
+from ultragray_service.registrations.registrations import Registrations
+from ultragray_service.settings import Settings
+from ultragray_service.telemetry.metrics import Metrics
+from ultragray_service.telemetry.tracing import start_tracing
+from ultragray_service.views.assessments import Assessing
+from ultragray_service.views.comparisons import Comparisons, simulated_sha256
+from ultragray_service.views.datasets import DatasetViews
+from ultragray_service.views.training import TrainingViews
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import Draining, NotReady, SceneNotFound, StartupFailed
 from ultragray_workers.jobs.places import shared_storage
@@ -20,39 +52,6 @@ from ultragray_workers.pool.pool import MAX_SCENE_CHANGES, PoolConfig, RenderPoo
 from ultragray_workers.pool.types import Destination, Priority, RenderRequest, RenderResult, S, SceneChangedError
 from ultragray_workers.pool.waiting import Turn
 from ultragray_workers.scenes import SceneStore
-
-from ..access.addresses import is_loopback
-from ..access.audit import AuditLog, account
-from ..access.guard import Authenticator, EnvironmentKeys, Guard
-from ..access.keys import KnownKeys
-from ..access.limits.holdings import Holdings
-from ..access.limits.limits import Limits
-from ..access.oidc.tokens import OidcTokens
-from ..access.origins import Origins
-from ..access.owners import Owners
-from ..access.permissions import require
-from ..access.principal import Principal, act_as, caller
-from ..access.rules import Operation
-from ..access.sessions import Sessions
-from ..access.snapshot import Snapshot
-from ..doors import Doors
-from ..registrations.registrations import Registrations
-from ..settings import Settings
-from ..telemetry.metrics import Metrics
-from ..telemetry.tracing import start_tracing
-from ..views.assessments import Assessing
-from ..views.comparisons import Comparisons, simulated_sha256
-from ..views.datasets import DatasetViews
-from ..views.training import TrainingViews
-from .catalog import SceneCatalog, scene_to_blame
-from .dataset_uploads import DatasetUploads
-from .helper_processes import HelperProcesses
-from .jobs.jobs import Jobs
-from .readiness.readiness import Readiness
-from .requests import Plan, RequestPlanner
-from .scene_imports import SceneImports
-from .scene_places import ScenePlaces
-from .streams.open_streams import OpenStreams
 
 
 class Phase(Enum):

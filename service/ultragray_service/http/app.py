@@ -19,15 +19,13 @@ from ultragray.errors import UltragrayError
 from ultragray.probe import Probe
 from ultragray.training.config import PRESETS, TrainingConfig
 from ultragray.volumes.plane import SliceSettings
-
-from ..access.rules import WEBSOCKET, HttpRules
-from ..core.state import Service
-from ..telemetry.tracing import Tracing
-from . import problems
-from .console import add_console
-from .docs import add_docs
-from .middleware import QUIET_PATHS, Authorize, CheckOrigin, LimitBody, RequestContext
-from .reading.bodies import (
+from ultragray_service.access.rules import WEBSOCKET, HttpRules
+from ultragray_service.core.state import Service
+from ultragray_service.http import problems
+from ultragray_service.http.console import add_console
+from ultragray_service.http.docs import add_docs
+from ultragray_service.http.middleware import QUIET_PATHS, Authorize, CheckOrigin, LimitBody, RequestContext
+from ultragray_service.http.reading.bodies import (
     SPECIFICATIONS,
     AssessBody,
     JobBody,
@@ -36,8 +34,8 @@ from .reading.bodies import (
     RenderBody,
     StreamMessage,
 )
-from .reading.json_body import adapter_of
-from .routes import (
+from ultragray_service.http.reading.json_body import adapter_of
+from ultragray_service.http.routes import (
     access,
     comparison,
     datasets,
@@ -49,10 +47,11 @@ from .routes import (
     stream,
     streams,
 )
-from .routes.geometry import probes, registrations
-from .routes.jobs import jobs, training, workers
-from .routes.rendering import render, slices
-from .stream_messages import FrameMessage, RefusalMessage
+from ultragray_service.http.routes.geometry import probes, registrations
+from ultragray_service.http.routes.jobs import jobs, training, workers
+from ultragray_service.http.routes.rendering import render, slices
+from ultragray_service.http.stream_messages import FrameMessage, RefusalMessage
+from ultragray_service.telemetry.tracing import Tracing
 
 _DESCRIPTION = """B-mode frames from trained 3D-Gaussian ultrasound scenes.
 

@@ -14,11 +14,10 @@ from starlette.responses import HTMLResponse, Response
 from starlette.staticfiles import StaticFiles
 from starlette.types import Scope
 
+from ultragray_service.errors import RouteNotFound
+from ultragray_service.http.docs import NOT_FRAMED
+from ultragray_service.http.revalidation import revalidated
 from ultragray_workers.storage.local import FileVersion
-
-from ..errors import RouteNotFound
-from .docs import NOT_FRAMED
-from .revalidation import revalidated
 
 CONSOLE_FOLDER = Path(__file__).resolve().parents[1] / "console"
 ASSETS_PATH = "/assets"

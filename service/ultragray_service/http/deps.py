@@ -8,8 +8,8 @@ from typing import Annotated, Any
 from fastapi import Depends, Path
 from starlette.requests import HTTPConnection
 
-from ..core.state import Service
-from .problems import PROBLEM_TYPE, Problem
+from ultragray_service.core.state import Service
+from ultragray_service.http.problems import PROBLEM_TYPE, Problem
 
 
 async def _service(connection: HTTPConnection) -> Service:  # async: FastAPI runs plain functions in a thread

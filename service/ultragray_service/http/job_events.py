@@ -13,10 +13,9 @@ from dataclasses import dataclass, replace
 from starlette.responses import StreamingResponse
 from starlette.types import Receive, Scope, Send
 
+from ultragray_service.core.jobs.hub import JobChange, JobWatch
+from ultragray_service.http.reading.json_body import adapter_of
 from ultragray_workers.jobs.job import Job
-
-from ..core.jobs.hub import JobChange, JobWatch
-from .reading.json_body import adapter_of
 
 EVENTS_TYPE = "text/event-stream"
 KEEP_ALIVE_S = 15.0

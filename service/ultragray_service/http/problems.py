@@ -16,10 +16,9 @@ from starlette.routing import Match
 
 from ultragray.contract import blamed, error_under, join, shown
 from ultragray.errors import InvalidArgument, UltragrayError
-
-from ..access.audit import account
-from ..errors import MethodNotAllowed, RouteNotFound, retry_after_s, statuses_of
-from ..telemetry.logs import request_id
+from ultragray_service.access.audit import account
+from ultragray_service.errors import MethodNotAllowed, RouteNotFound, retry_after_s, statuses_of
+from ultragray_service.telemetry.logs import request_id
 
 PROBLEM_TYPE = "application/problem+json"
 

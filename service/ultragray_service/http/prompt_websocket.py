@@ -10,7 +10,7 @@ from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIO
 from websockets.exceptions import InvalidState
 from websockets.frames import Frame
 
-from ..core.streams.buffers import hold_little
+from ultragray_service.core.streams.buffers import hold_little
 
 HAND_OVER = "ultragray.hand_over"  # of an ASGI message with bytes: to return once the client has taken it
 _FRAGMENTS = 32  # of a message that is handed over

@@ -12,17 +12,15 @@ from typing import Protocol
 
 from ultragray.errors import UltragrayError
 from ultragray.settings import FrameSettings
-from ultragray_workers.pool.types import RenderResult
-
-from ..core.state import Service
-from ..core.streams.answers import Answered
-from ..core.streams.buffers import hold_little
-from ..core.streams.open_streams import OpenStream
-from ..core.streams.unread import Unread
-from ..errors import IgtlMessageInvalid
-from .commands.answer import answer
-from .commands.scanner import Scanner, Setup
-from .contents import (
+from ultragray_service.core.state import Service
+from ultragray_service.core.streams.answers import Answered
+from ultragray_service.core.streams.buffers import hold_little
+from ultragray_service.core.streams.open_streams import OpenStream
+from ultragray_service.core.streams.unread import Unread
+from ultragray_service.errors import IgtlMessageInvalid
+from ultragray_service.igtl.commands.answer import answer
+from ultragray_service.igtl.commands.scanner import Scanner, Setup
+from ultragray_service.igtl.contents import (
     Status,
     pack_capability,
     pack_status,
@@ -31,13 +29,14 @@ from .contents import (
     unpack_position,
     unpack_transform,
 )
-from .feed import Feed
-from .frames import Frame, FrameMaker
-from .kinds import CAPABILITY, COMMAND_TYPES, HEARD, KINDS, POSE_TYPES, UNDERSTOOD
-from .messages import HEADER_BYTES, Header, Message, pack_message, unpack_header, unpack_message
-from .routes import SceneChooser
-from .states import OK, state_of
-from .waiting import PoseMessage, Underway, WaitingPoses
+from ultragray_service.igtl.feed import Feed
+from ultragray_service.igtl.frames import Frame, FrameMaker
+from ultragray_service.igtl.kinds import CAPABILITY, COMMAND_TYPES, HEARD, KINDS, POSE_TYPES, UNDERSTOOD
+from ultragray_service.igtl.messages import HEADER_BYTES, Header, Message, pack_message, unpack_header, unpack_message
+from ultragray_service.igtl.routes import SceneChooser
+from ultragray_service.igtl.states import OK, state_of
+from ultragray_service.igtl.waiting import PoseMessage, Underway, WaitingPoses
+from ultragray_workers.pool.types import RenderResult
 
 MAX_BODY_BYTES = 64 * 1024  # of a message that is read
 MAX_SKIPPED_BYTES = 64 * 2**20  # of a message that is not

@@ -13,9 +13,8 @@ import numpy.typing as npt
 from ultragray.errors import InvalidPose
 from ultragray.pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
 from ultragray.probe import FloatArray
-
-from ..errors import IgtlMessageInvalid
-from .messages import DEVICE_NAME_BYTES, pack_text, unpack_text
+from ultragray_service.errors import IgtlMessageInvalid
+from ultragray_service.igtl.messages import DEVICE_NAME_BYTES, pack_text, unpack_text
 
 TYPE_NAME_BYTES = 12
 

@@ -9,8 +9,8 @@ from collections.abc import Awaitable, Callable
 from contextlib import AbstractAsyncContextManager
 from dataclasses import dataclass
 
-from .frames import Frame
-from .messages import Message
+from ultragray_service.igtl.frames import Frame
+from ultragray_service.igtl.messages import Message
 
 Turn = Callable[[], AbstractAsyncContextManager[None]]
 

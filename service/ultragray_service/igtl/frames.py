@@ -13,15 +13,21 @@ from ultragray.display.settings import Display, true_to_scale
 from ultragray.registration.registration import Registration
 from ultragray.settings import Encoding, Resolved
 from ultragray.tools import Tool
+from ultragray_service.core.state import Service
+from ultragray_service.igtl.commands.scanner import Scanner
+from ultragray_service.igtl.contents import (
+    Image,
+    Instrument,
+    pack_image,
+    pack_instruments,
+    pack_position,
+    pack_transform,
+)
+from ultragray_service.igtl.messages import Message
+from ultragray_service.igtl.routes import SceneChooser, image_name
+from ultragray_service.igtl.waiting import PoseMessage, Underway
 from ultragray_workers.jobs.queue.owners import Kind, Ownership
 from ultragray_workers.pool.types import RenderResult
-
-from ..core.state import Service
-from .commands.scanner import Scanner
-from .contents import Image, Instrument, pack_image, pack_instruments, pack_position, pack_transform
-from .messages import Message
-from .routes import SceneChooser, image_name
-from .waiting import PoseMessage, Underway
 
 _SLICE_MM = 1.0  # nominal thickness: an image of one slice has none
 

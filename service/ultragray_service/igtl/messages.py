@@ -6,8 +6,8 @@ import struct
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from ..errors import IgtlMessageInvalid
-from .crc64 import crc64
+from ultragray_service.errors import IgtlMessageInvalid
+from ultragray_service.igtl.crc64 import crc64
 
 HEADER_BYTES = 58
 DEVICE_NAME_BYTES = 20

@@ -6,10 +6,9 @@ import re
 import time
 
 from ultragray.contract import shown
+from ultragray_service.core.catalog import SceneCatalog
+from ultragray_service.igtl.messages import DEVICE_NAME_BYTES, pack_text
 from ultragray_workers.errors import SceneNotFound
-
-from ..core.catalog import SceneCatalog
-from .messages import DEVICE_NAME_BYTES, pack_text
 
 _FRAME = re.compile(r".+To(?=[A-Z0-9])(?P<frame>.+)|.+?To(?P<other>.+)")  # of PLUS: ProbeToReference
 _NAMES_LIVE_S = 1.0

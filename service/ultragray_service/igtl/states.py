@@ -3,6 +3,16 @@
 from __future__ import annotations
 
 from ultragray.errors import BackendUnavailable, InvalidArgument, MemoryExceeded, SceneFileInvalid, UltragrayError
+from ultragray_service.errors import (
+    IgtlMessageInvalid,
+    LimitReached,
+    PermissionDenied,
+    RateLimited,
+    TooManyConnections,
+    Unauthenticated,
+    statuses_of,
+)
+from ultragray_service.igtl.contents import Status
 from ultragray_workers.errors import (
     DeadlineExceeded,
     Draining,
@@ -13,17 +23,6 @@ from ultragray_workers.errors import (
     SceneTooLarge,
     StorageUnavailable,
 )
-
-from ..errors import (
-    IgtlMessageInvalid,
-    LimitReached,
-    PermissionDenied,
-    RateLimited,
-    TooManyConnections,
-    Unauthenticated,
-    statuses_of,
-)
-from .contents import Status
 
 OK, UNKNOWN_ERROR, NOT_FOUND, ACCESS_DENIED, BUSY, TIMED_OUT = 1, 2, 4, 5, 6, 7
 CHECKSUM_ERROR, CONFIGURATION_ERROR, NO_RESOURCES, UNKNOWN_INSTRUCTION, NOT_READY, SHUTTING_DOWN = 9, 10, 11, 12, 13, 19

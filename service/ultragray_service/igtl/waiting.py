@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 
 from ultragray.probe import FloatArray
 from ultragray.registration.registration import Registration
+from ultragray_service.igtl.commands.scanner import Setup
+from ultragray_service.igtl.messages import Message
 from ultragray_workers.errors import QueueFull
 from ultragray_workers.pool.waiting import Turn
-
-from .commands.scanner import Setup
-from .messages import Message
 
 MAX_WAITING_DEVICES = 16
 

@@ -9,12 +9,11 @@ import socket
 import ssl
 from collections.abc import Callable
 
+from ultragray_service.errors import TooManyConnections
+from ultragray_service.listening.connections import Connections, Place
+from ultragray_service.listening.sockets import give_up_on_silent_peers
+from ultragray_service.tls.certificates import HANDSHAKE_TIMEOUT_S
 from ultragray_workers.rounds import Rounds
-
-from ..errors import TooManyConnections
-from ..tls.certificates import HANDSHAKE_TIMEOUT_S
-from .connections import Connections, Place
-from .sockets import give_up_on_silent_peers
 
 _RETRY_S = 0.1  # where there is no file descriptor for another connection
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from ipaddress import IPv6Address, ip_address
 
-from ..errors import TooManyConnections
+from ultragray_service.errors import TooManyConnections
 
 _IPV6_NETWORK_BITS = 64  # what one subscriber has
 

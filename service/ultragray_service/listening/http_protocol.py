@@ -13,13 +13,12 @@ from websockets.exceptions import InvalidHandshake
 from websockets.http11 import Request
 
 from ultragray.errors import UltragrayError
-
-from ..errors import HeadersTooLarge, RequestMalformed, RequestTooSlow, TargetTooLong
-from ..http.problems import problem_response
-from ..http.prompt_websocket import PromptWebSocket
-from ..telemetry.logs import choose_request_id, request_id
-from .connections import Place
-from .patience import Patience
+from ultragray_service.errors import HeadersTooLarge, RequestMalformed, RequestTooSlow, TargetTooLong
+from ultragray_service.http.problems import problem_response
+from ultragray_service.http.prompt_websocket import PromptWebSocket
+from ultragray_service.listening.connections import Place
+from ultragray_service.listening.patience import Patience
+from ultragray_service.telemetry.logs import choose_request_id, request_id
 
 MAX_PIPELINED = 32
 MAX_TARGET_BYTES = 16 * 1024

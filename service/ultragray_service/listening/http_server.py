@@ -13,15 +13,14 @@ import uvicorn
 from starlette.types import ASGIApp
 
 from ultragray.errors import UltragrayError
-
-from ..errors import statuses_of
-from ..http.prompt_websocket import PromptWebSocket
-from ..settings import Settings
-from ..telemetry.metrics import Metrics
-from ..tls.watch import CertificateWatch
-from .acceptor import Acceptor
-from .connections import Connections, Place
-from .http_protocol import BoundedHttp, HttpLimits, refusal_bytes
+from ultragray_service.errors import statuses_of
+from ultragray_service.http.prompt_websocket import PromptWebSocket
+from ultragray_service.listening.acceptor import Acceptor
+from ultragray_service.listening.connections import Connections, Place
+from ultragray_service.listening.http_protocol import BoundedHttp, HttpLimits, refusal_bytes
+from ultragray_service.settings import Settings
+from ultragray_service.telemetry.metrics import Metrics
+from ultragray_service.tls.watch import CertificateWatch
 
 MAX_STREAM_MESSAGE_BYTES = 2**16  # of a client, on a WebSocket
 _TICKS_PER_LOOK = 10  # of 0.1 s

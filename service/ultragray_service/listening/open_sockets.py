@@ -13,10 +13,9 @@ import os
 import socket
 import stat
 
+from ultragray_service.errors import TooManyConnections
+from ultragray_service.listening.connections import Connections, Place
 from ultragray_workers.rounds import Rounds
-
-from ..errors import TooManyConnections
-from .connections import Connections, Place
 
 INTERVAL_S = 0.25
 _OPEN_FILES = "/dev/fd"

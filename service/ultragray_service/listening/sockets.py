@@ -8,9 +8,8 @@ import resource
 import socket
 import sys
 
+from ultragray_service.settings import ENVIRONMENT_PREFIX
 from ultragray_workers.errors import StartupFailed
-
-from ..settings import ENVIRONMENT_PREFIX
 
 _BACKLOG = 2048
 

@@ -13,18 +13,17 @@ import sqlalchemy as sa
 from ultragray.contract import shown
 from ultragray.errors import InvalidArgument
 from ultragray.registration.registration import Registration
+from ultragray_service.access.limits.limits import Limits
+from ultragray_service.access.owners import Owners, may_change
+from ultragray_service.access.principal import acting
+from ultragray_service.core.catalog import SceneCatalog, page_of_names
+from ultragray_service.core.jobs.database_threads import DatabaseThreads
+from ultragray_service.errors import LimitReached, PermissionDenied
+from ultragray_service.registrations import store
+from ultragray_service.registrations.named import NamedRegistration, RegistrationPage
 from ultragray_workers.errors import RegistrationNotFound
 from ultragray_workers.jobs.queue.owners import Kind, Ownership
 from ultragray_workers.scene_names import base_name
-
-from ..access.limits.limits import Limits
-from ..access.owners import Owners, may_change
-from ..access.principal import acting
-from ..core.catalog import SceneCatalog, page_of_names
-from ..core.jobs.database_threads import DatabaseThreads
-from ..errors import LimitReached, PermissionDenied
-from . import store
-from .named import NamedRegistration, RegistrationPage
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
 

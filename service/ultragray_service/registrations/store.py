@@ -15,12 +15,11 @@ from sqlalchemy.dialects import postgresql, sqlite
 from ultragray.contract import from_dict, to_dict
 from ultragray.errors import UltragrayError
 from ultragray.registration.registration import Registration
+from ultragray_service.access.principal import Principal, Role, iso_time
+from ultragray_service.errors import LimitReached
+from ultragray_service.registrations.named import NamedRegistration
 from ultragray_workers.jobs.queue.owners import tell_change
 from ultragray_workers.jobs.queue.tables import REGISTRATIONS
-
-from ..access.principal import Principal, Role, iso_time
-from ..errors import LimitReached
-from .named import NamedRegistration
 
 _log = logging.getLogger("ultragray.service")
 _COLUMNS = REGISTRATIONS.c

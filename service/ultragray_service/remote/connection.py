@@ -15,9 +15,8 @@ from urllib.parse import quote, urlencode, urlsplit
 
 from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray.files.atomic import atomic_path
+from ultragray_service.tls.client import cut_off_hint, tls_problem
 from ultragray_workers.errors import NotReady
-
-from ..tls.client import cut_off_hint, tls_problem
 
 JSON = "application/json"
 _TIMEOUT_S = 60.0  # without a byte; event streams send a comment every 15 s

@@ -12,8 +12,7 @@ from urllib.parse import urlencode
 
 from ultragray.datasets.source import UPLOADED_FORMATS
 from ultragray.errors import DatasetInvalid, InvalidArgument
-
-from .connection import Connection, Count, route
+from ultragray_service.remote.connection import Connection, Count, route
 
 ARCHIVE_SUFFIXES = (".zip", ".tar", ".tar.gz", ".tgz")
 

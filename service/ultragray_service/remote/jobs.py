@@ -9,7 +9,7 @@ from http import HTTPStatus
 from pathlib import Path
 from typing import Any
 
-from .connection import Connection, Count, route
+from ultragray_service.remote.connection import Connection, Count, route
 
 
 class Jobs:

@@ -6,8 +6,7 @@ from typing import Any
 
 from ultragray.contract import to_dict
 from ultragray.registration.registration import Registration
-
-from .connection import Connection, route
+from ultragray_service.remote.connection import Connection, route
 
 
 class Registrations:

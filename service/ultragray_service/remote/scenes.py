@@ -12,8 +12,7 @@ import numpy as np
 
 from ultragray.pose import check_poses
 from ultragray.probe import FloatArray
-
-from .connection import Connection, Count, route
+from ultragray_service.remote.connection import Connection, Count, route
 
 
 @dataclass(frozen=True)

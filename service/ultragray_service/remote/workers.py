@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from .connection import Connection, route
+from ultragray_service.remote.connection import Connection, route
 
 
 class Workers:

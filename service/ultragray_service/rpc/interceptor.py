@@ -12,17 +12,16 @@ from typing import Any
 import grpc
 
 from ultragray.errors import UltragrayError
-
-from ..access.audit import NOBODY, Entry
-from ..access.credentials import offered_credential
-from ..access.principal import Principal
-from ..access.rules import GRPC_OPERATIONS, REFLECTION, Operation
-from ..core.state import Service
-from ..errors import statuses_of
-from ..telemetry.logs import choose_request_id, request_id
-from .handlers import Method, method_of, refusing_what_is_no_message, with_method
-from .peers import address_of
-from .status import REQUEST_ID_KEY, abort
+from ultragray_service.access.audit import NOBODY, Entry
+from ultragray_service.access.credentials import offered_credential
+from ultragray_service.access.principal import Principal
+from ultragray_service.access.rules import GRPC_OPERATIONS, REFLECTION, Operation
+from ultragray_service.core.state import Service
+from ultragray_service.errors import statuses_of
+from ultragray_service.rpc.handlers import Method, method_of, refusing_what_is_no_message, with_method
+from ultragray_service.rpc.peers import address_of
+from ultragray_service.rpc.status import REQUEST_ID_KEY, abort
+from ultragray_service.telemetry.logs import choose_request_id, request_id
 
 _OPEN_PREFIX = "/grpc.health.v1."
 OWN_PREFIX = "/ultragray."

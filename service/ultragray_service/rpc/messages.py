@@ -18,12 +18,11 @@ from ultragray.settings import RenderSettings, Resolved
 from ultragray.volumes.plane import SliceView
 from ultragray_proto.codec import MessageInvalid, from_message, to_message, words
 from ultragray_proto.v1 import geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2
+from ultragray_service.core.frames import FrameFacts, SliceFacts, settings_used
+from ultragray_service.core.poses import exact_pose
 from ultragray_workers.jobs.job import Job
 from ultragray_workers.jobs.kinds import KINDS, Specification
 from ultragray_workers.pool.types import RenderResult
-
-from ..core.frames import FrameFacts, SliceFacts, settings_used
-from ..core.poses import exact_pose
 
 
 def read(message: Any, cls: Any, **others: Any) -> Any:

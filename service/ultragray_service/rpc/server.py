@@ -24,23 +24,22 @@ from ultragray_proto.v1 import (
     workers_pb2,
     workers_pb2_grpc,
 )
-
-from ..access.rules import require_all_methods
-from ..core.readiness.readiness import Readiness
-from ..core.state import Service
-from ..settings import Settings
-from ..tls.certificates import HANDSHAKE_TIMEOUT_S, Certificates
-from ..tls.watch import CertificateWatch
-from .health import Health
-from .interceptor import CallContext
-from .services.access import AccessService
-from .services.datasets import DatasetService
-from .services.jobs import JobService
-from .services.registrations import RegistrationService
-from .services.rendering import RenderService
-from .services.scenes import SceneService
-from .services.workers import WorkerService
-from .traced import TracedCalls
+from ultragray_service.access.rules import require_all_methods
+from ultragray_service.core.readiness.readiness import Readiness
+from ultragray_service.core.state import Service
+from ultragray_service.rpc.health import Health
+from ultragray_service.rpc.interceptor import CallContext
+from ultragray_service.rpc.services.access import AccessService
+from ultragray_service.rpc.services.datasets import DatasetService
+from ultragray_service.rpc.services.jobs import JobService
+from ultragray_service.rpc.services.registrations import RegistrationService
+from ultragray_service.rpc.services.rendering import RenderService
+from ultragray_service.rpc.services.scenes import SceneService
+from ultragray_service.rpc.services.workers import WorkerService
+from ultragray_service.rpc.traced import TracedCalls
+from ultragray_service.settings import Settings
+from ultragray_service.tls.certificates import HANDSHAKE_TIMEOUT_S, Certificates
+from ultragray_service.tls.watch import CertificateWatch
 
 LEAST_MAX_MESSAGE_BYTES = 2 * 2**20  # room for a chunk of an upload
 LEAST_PING_INTERVAL_MS = 10_000

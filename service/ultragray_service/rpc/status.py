@@ -12,9 +12,8 @@ from google.rpc.error_details_pb2 import BadRequest, ErrorInfo, RetryInfo
 from google.rpc.status_pb2 import Status
 
 from ultragray.errors import InvalidArgument, UltragrayError
-
-from ..errors import retry_after_s, statuses_of
-from ..telemetry.logs import request_id
+from ultragray_service.errors import retry_after_s, statuses_of
+from ultragray_service.telemetry.logs import request_id
 
 ERROR_DOMAIN = "ultragray"
 REQUEST_ID_KEY = "x-request-id"

@@ -10,13 +10,12 @@ from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray.probe import FloatArray
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import rendering_pb2, scenes_pb2
-
-from ..core.streams.answers import Answered
-from ..core.streams.pose_stream import MAX_WINDOW, StreamMode
-from ..core.streams.stream import SceneSettings, checked_s
-from ..errors import Refusal
-from .messages import frame_message, read_pose, read_settings, read_word
-from .shared_memory import SharedMemory
+from ultragray_service.core.streams.answers import Answered
+from ultragray_service.core.streams.pose_stream import MAX_WINDOW, StreamMode
+from ultragray_service.core.streams.stream import SceneSettings, checked_s
+from ultragray_service.errors import Refusal
+from ultragray_service.rpc.messages import frame_message, read_pose, read_settings, read_word
+from ultragray_service.rpc.shared_memory import SharedMemory
 
 
 class _Message:

@@ -7,9 +7,9 @@ from typing import Any
 
 import grpc
 
-from ..telemetry.tracing import Tracing
-from .handlers import method_of, with_method
-from .interceptor import OWN_PREFIX
+from ultragray_service.rpc.handlers import method_of, with_method
+from ultragray_service.rpc.interceptor import OWN_PREFIX
+from ultragray_service.telemetry.tracing import Tracing
 
 
 class TracedCalls(grpc.aio.ServerInterceptor):  # type: ignore[misc]

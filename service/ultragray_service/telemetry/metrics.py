@@ -12,14 +12,13 @@ from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metri
 from prometheus_client.registry import Collector
 
 from ultragray.errors import UltragrayError
+from ultragray_service.access.principal import acting
+from ultragray_service.core.scene_places import ScenePlaces
+from ultragray_service.errors import statuses_of
+from ultragray_service.telemetry.statistics import Statistics
 from ultragray_workers.jobs.overview import JobsOverview
 from ultragray_workers.pool.pool import RenderPool
 from ultragray_workers.pool.types import LocalizeResult, RenderResult
-
-from ..access.principal import acting
-from ..core.scene_places import ScenePlaces
-from ..errors import statuses_of
-from .statistics import Statistics
 
 _MILLISECONDS = (0.5, 1, 2, 4, 6, 8, 12, 16, 24, 32, 64, 125, 250, 500, 1000, 2000, 5000, 10_000, 30_000)
 _SECONDS = tuple(ms / 1000 for ms in _MILLISECONDS)

@@ -17,9 +17,8 @@ from opentelemetry import propagate, trace
 from ultragray import __version__
 from ultragray.errors import InvalidArgument
 from ultragray.installation import missing_extra
+from ultragray_service.telemetry.logs import request_id
 from ultragray_workers.pool.types import RenderResult
-
-from .logs import request_id
 
 _ENDPOINTS = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")
 _PROTOCOLS = ("OTEL_EXPORTER_OTLP_TRACES_PROTOCOL", "OTEL_EXPORTER_OTLP_PROTOCOL")

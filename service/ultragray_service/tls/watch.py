@@ -7,11 +7,10 @@ import logging
 import time
 from datetime import datetime, timezone
 
+from ultragray_service.settings import Settings
+from ultragray_service.tls.certificates import CertificateFiles, Certificates
 from ultragray_workers.errors import StartupFailed
 from ultragray_workers.rounds import Rounds
-
-from ..settings import Settings
-from .certificates import CertificateFiles, Certificates
 
 _POLL_S = 1.0
 _REMIND_S = 3600.0

@@ -9,9 +9,8 @@ from ultragray.confidence import Assessor, Extrapolation
 from ultragray.contract import described
 from ultragray.probe import FloatArray, Probe
 from ultragray.scene_info import SceneHeader
-
-from ..core.catalog import SceneCatalog
-from ..registrations.registrations import Registrations
+from ultragray_service.core.catalog import SceneCatalog
+from ultragray_service.registrations.registrations import Registrations
 
 
 @dataclass(frozen=True)

@@ -13,17 +13,16 @@ from ultragray.contract import described
 from ultragray.datasets.source import PHANTOM
 from ultragray.demo import DEMO_FILE
 from ultragray.scene_info import read_header
+from ultragray_service.core.catalog import SceneCatalog
+from ultragray_service.core.helper_processes import HelperProcesses
+from ultragray_service.core.own_thread import in_own_thread
+from ultragray_service.core.poses import MatrixRows
+from ultragray_service.settings import Settings
+from ultragray_service.views.prepared import Preparation, Prepared
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import ArtifactNotFound, DatasetNotFound
 from ultragray_workers.helpers.comparison import FRAMES_NAME, compare
 from ultragray_workers.scenes import SceneStore
-
-from ..core.catalog import SceneCatalog
-from ..core.helper_processes import HelperProcesses
-from ..core.own_thread import in_own_thread
-from ..core.poses import MatrixRows
-from ..settings import Settings
-from .prepared import Preparation, Prepared
 
 _FORMAT = 3  # of what is kept of a comparison
 

@@ -7,13 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ultragray.contract import described
+from ultragray_service.core.helper_processes import HelperProcesses
+from ultragray_service.settings import Settings
+from ultragray_service.views.prepared import Prepared
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import ArtifactNotFound, DatasetNotFound
 from ultragray_workers.helpers.dataset_view import POSES_NAME, lay_out
-
-from ..core.helper_processes import HelperProcesses
-from ..settings import Settings
-from .prepared import Prepared
 
 
 @dataclass(frozen=True)

@@ -9,15 +9,14 @@ from ultragray.errors import InvalidArgument, RenderFailed
 from ultragray.localization.settings import LocalizationSettings
 from ultragray.probe import FloatArray
 from ultragray.settings import Encoding, FrameSettings
+from ultragray_service.access.audit import account
+from ultragray_service.access.principal import caller
+from ultragray_service.core.catalog import scene_to_blame
+from ultragray_service.core.poses import MatrixRows
+from ultragray_service.core.requests import Plan
+from ultragray_service.core.state import Service
 from ultragray_workers.pool.pool import MAX_SCENE_CHANGES
 from ultragray_workers.pool.types import LocalizeResult, Priority, RenderRequest, SceneChangedError, Sought
-
-from ..access.audit import account
-from ..access.principal import caller
-from ..core.catalog import scene_to_blame
-from ..core.poses import MatrixRows
-from ..core.requests import Plan
-from ..core.state import Service
 
 FRAMES_OF_A_SEARCH = 100  # that a search counts as: it takes as long, at 512x512
 

@@ -17,15 +17,14 @@ import numpy as np
 from ultragray.errors import DatasetInvalid, UltragrayError
 from ultragray.files.atomic import sync
 from ultragray.settings import Encoding
+from ultragray_service.core.helper_processes import HelperProcesses
+from ultragray_service.core.own_thread import in_own_thread, to_its_end
+from ultragray_service.settings import Settings
 from ultragray_workers.claims import claimed_folder, remove_abandoned, remove_whole, storage_full
 from ultragray_workers.errors import ArtifactNotFound, DatasetNotFound, Draining
 from ultragray_workers.helpers.helper import PROGRESS_NAME
 from ultragray_workers.helpers.picture_stack import read_picture
 from ultragray_workers.pool.process.encoding import encode_image
-
-from ..core.helper_processes import HelperProcesses
-from ..core.own_thread import in_own_thread, to_its_end
-from ..settings import Settings
 
 TIMEOUT_S = 1800.0
 KEPT_FOLDERS = 32

@@ -11,16 +11,15 @@ import numpy as np
 
 from ultragray.contract import described
 from ultragray.errors import TrainingStateInvalid
+from ultragray_service.core.helper_processes import HelperProcesses
+from ultragray_service.core.jobs.jobs import Jobs
+from ultragray_service.settings import Settings
+from ultragray_service.views.prepared import Prepared
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import ArtifactNotFound
 from ultragray_workers.helpers.training_preview import PICTURES, draw_preview
 from ultragray_workers.jobs.files import BASELINES_NAME, JOURNAL_NAME
 from ultragray_workers.jobs.store import Job, JobStore
-
-from ..core.helper_processes import HelperProcesses
-from ..core.jobs.jobs import Jobs
-from ..settings import Settings
-from .prepared import Prepared
 
 MAX_POINTS = 500
 

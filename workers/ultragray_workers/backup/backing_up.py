@@ -19,14 +19,13 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 import ultragray
-
-from ..errors import BackupInvalid, RestoreRefused
-from ..jobs.queue.database import CANCELLED, QUEUED, RUNNING, SUCCEEDED
-from . import manifest as manifests
-from .contents import DATA, Folders, StoredFile, files_of, job_id_of
-from .database_copy import Database
-from .manifest import FileEntry, Manifest
-from .objects import Objects
+from ultragray_workers.backup import manifest as manifests
+from ultragray_workers.backup.contents import DATA, Folders, StoredFile, files_of, job_id_of
+from ultragray_workers.backup.database_copy import Database
+from ultragray_workers.backup.manifest import FileEntry, Manifest
+from ultragray_workers.backup.objects import Objects
+from ultragray_workers.errors import BackupInvalid, RestoreRefused
+from ultragray_workers.jobs.queue.database import CANCELLED, QUEUED, RUNNING, SUCCEEDED
 
 _SETTLE_S = 5.0  # a job that is just being deleted has lost its folder, and soon its row
 _SETTLE_POLL_S = 0.1

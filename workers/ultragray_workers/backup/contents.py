@@ -7,14 +7,14 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from ..datasets.store import FOLDER as DATASETS
-from ..datasets.store import DatasetStore
-from ..jobs.folder import FOLDER as JOBS
-from ..jobs.folder import JobFolder
-from ..jobs.publication import SCENES_FOLDER
-from ..scenes import SUFFIX, SceneStore
-from ..storage.local import FileVersion
-from ..store import MARKER
+from ultragray_workers.datasets.store import FOLDER as DATASETS
+from ultragray_workers.datasets.store import DatasetStore
+from ultragray_workers.jobs.folder import FOLDER as JOBS
+from ultragray_workers.jobs.folder import JobFolder
+from ultragray_workers.jobs.publication import SCENES_FOLDER
+from ultragray_workers.scenes import SUFFIX, SceneStore
+from ultragray_workers.storage.local import FileVersion
+from ultragray_workers.store import MARKER
 
 DATA, ARTIFACTS = "data", "artifacts"
 _GROWING = (".txt", ".jsonl", ".log")

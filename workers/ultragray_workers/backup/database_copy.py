@@ -19,15 +19,15 @@ import sqlalchemy as sa
 from dbos import DBOS
 from psycopg import sql
 
-from ..errors import BackupInvalid, RestoreRefused
-from ..jobs.kinds import KINDS
-from ..jobs.queue import tables
-from ..jobs.queue.database import checked_url
-from ..jobs.queue.heartbeat import DEAD_AFTER_S
-from ..jobs.queue.internals import QUEUE_VERSION, SCHEMA, WORKFLOWS, latest_queue_version
-from ..jobs.queue.tables import SCHEMA_VERSION, WORKERS
-from .manifest import DatabaseEntry, TableEntry
-from .objects import Objects
+from ultragray_workers.backup.manifest import DatabaseEntry, TableEntry
+from ultragray_workers.backup.objects import Objects
+from ultragray_workers.errors import BackupInvalid, RestoreRefused
+from ultragray_workers.jobs.kinds import KINDS
+from ultragray_workers.jobs.queue import tables
+from ultragray_workers.jobs.queue.database import checked_url
+from ultragray_workers.jobs.queue.heartbeat import DEAD_AFTER_S
+from ultragray_workers.jobs.queue.internals import QUEUE_VERSION, SCHEMA, WORKFLOWS, latest_queue_version
+from ultragray_workers.jobs.queue.tables import SCHEMA_VERSION, WORKERS
 
 _SQLITE_WAIT_S = 60.0
 _NOT_COPIED = {QUEUE_VERSION.name, SCHEMA_VERSION.name, WORKERS.name}

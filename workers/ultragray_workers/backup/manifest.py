@@ -13,8 +13,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any
 
 from ultragray.files.atomic import write_whole
-
-from ..errors import BackupInvalid
+from ultragray_workers.errors import BackupInvalid
 
 FORMAT_VERSION = 1
 FOLDER = "manifests"

@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ultragray.files.atomic import file_sha256, sync
-
-from ..storage.local import FileVersion
+from ultragray_workers.storage.local import FileVersion
 
 FOLDER = "objects"
 _INCOMING = ".incoming-"

@@ -16,13 +16,18 @@ import sqlalchemy as sa
 
 from ultragray.files.atomic import atomic_path, file_sha256, sync
 from ultragray.files.link import link_or_copy
-
-from ..errors import BackupInvalid, RestoreRefused
-from ..jobs.queue import unfinished
-from ..jobs.queue.database import JobDatabase
-from ..jobs.queue.tables import WORKERS
-from ..scenes import SUFFIX
-from ..store import (
+from ultragray_workers.backup import manifest as manifests
+from ultragray_workers.backup.backing_up import alone_in
+from ultragray_workers.backup.contents import ARTIFACTS, Folders, files_of
+from ultragray_workers.backup.database_copy import Database
+from ultragray_workers.backup.manifest import FileEntry, Manifest
+from ultragray_workers.backup.objects import Objects
+from ultragray_workers.errors import BackupInvalid, RestoreRefused
+from ultragray_workers.jobs.queue import unfinished
+from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.queue.tables import WORKERS
+from ultragray_workers.scenes import SUFFIX
+from ultragray_workers.store import (
     PRIVATE_FILE,
     PRIVATE_FOLDER,
     closed_store,
@@ -30,12 +35,6 @@ from ..store import (
     restore_under_way,
     write_restore_marker,
 )
-from . import manifest as manifests
-from .backing_up import alone_in
-from .contents import ARTIFACTS, Folders, files_of
-from .database_copy import Database
-from .manifest import FileEntry, Manifest
-from .objects import Objects
 
 
 def restore(

@@ -18,10 +18,9 @@ import ultragray
 from ultragray.batches import BatchPlan
 from ultragray.errors import BackendUnavailable, InvalidArgument, RenderFailed, UltragrayError
 from ultragray.installation import missing_extra
-
-from ..errors import StorageUnavailable
-from ..storage.opening import open_storage
-from .place import ShardPlace
+from ultragray_workers.batches.place import ShardPlace
+from ultragray_workers.errors import StorageUnavailable
+from ultragray_workers.storage.opening import open_storage
 
 if TYPE_CHECKING:
     from ultragray.batches.shard import ShardRenderer
@@ -161,8 +160,7 @@ def _make_shard(
 def _renderer(plan: BatchPlan, scene: bytes, backend: str) -> ShardRenderer:
     global _held
     from ultragray.batches.shard import ShardRenderer
-
-    from ..pool.process.placement import render_device
+    from ultragray_workers.pool.process.placement import render_device
 
     wanted = f"{plan.identity} {backend}"
     if _held is None or _held[0] != wanted:

@@ -19,8 +19,7 @@ from pathlib import Path
 from ultragray.batches import MANIFEST_FILE, BatchPlan, ShardEntry, manifest
 from ultragray.errors import InvalidArgument
 from ultragray.files.atomic import sync
-
-from ..storage.storage import NotThere, Storage
+from ultragray_workers.storage.storage import NotThere, Storage
 
 _ENTRIES = "entries"
 _AT_ONCE = 16  # small requests to a bucket

@@ -14,8 +14,7 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 
 from ultragray.files.atomic import sync
-
-from ..claims import LOCK_NAME, claimed_folder, remove_abandoned
+from ultragray_workers.claims import LOCK_NAME, claimed_folder, remove_abandoned
 
 FOLDER = ".copies"
 _PREFIX, _CONTENT = ".fetching-", "content"

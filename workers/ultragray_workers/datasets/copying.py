@@ -9,11 +9,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ..errors import RestoreRefused
-from ..storage.storage import Storage
-from .shared_shelf import SharedShelf, without_shared_files
-from .shelf import FolderShelf
-from .store import FOLDER
+from ultragray_workers.datasets.shared_shelf import SharedShelf, without_shared_files
+from ultragray_workers.datasets.shelf import FolderShelf
+from ultragray_workers.datasets.store import FOLDER
+from ultragray_workers.errors import RestoreRefused
+from ultragray_workers.storage.storage import Storage
 
 
 @dataclass(frozen=True)

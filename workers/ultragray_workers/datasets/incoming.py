@@ -10,11 +10,10 @@ from typing import IO
 
 from ultragray.errors import DatasetInvalid
 from ultragray.files.atomic import sync
-
-from ..claims import DELETED_PREFIX, claimed_folder, remove_abandoned, storage_full
-from .shelf import FILES_NAME
-from .store import DatasetRecord, DatasetStore
-from .unpack import FileBudget, create_below
+from ultragray_workers.claims import DELETED_PREFIX, claimed_folder, remove_abandoned, storage_full
+from ultragray_workers.datasets.shelf import FILES_NAME
+from ultragray_workers.datasets.store import DatasetRecord, DatasetStore
+from ultragray_workers.datasets.unpack import FileBudget, create_below
 
 PREFIX = ".incoming-"
 ARCHIVE_NAME, DATASET_NAME = "archive", "dataset"

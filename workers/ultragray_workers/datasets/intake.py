@@ -11,13 +11,12 @@ from pathlib import Path
 
 from ultragray.errors import UltragrayError
 from ultragray.files.atomic import sync
-
-from ..claims import storage_full
-from .contents import find_source
-from .incoming import ARCHIVE_NAME, DATASET_NAME
-from .shelf import CONTACT_SHEET_NAME, FILES_NAME
-from .store import DatasetRecord, write_manifest
-from .unpack import unpack
+from ultragray_workers.claims import storage_full
+from ultragray_workers.datasets.contents import find_source
+from ultragray_workers.datasets.incoming import ARCHIVE_NAME, DATASET_NAME
+from ultragray_workers.datasets.shelf import CONTACT_SHEET_NAME, FILES_NAME
+from ultragray_workers.datasets.store import DatasetRecord, write_manifest
+from ultragray_workers.datasets.unpack import unpack
 
 
 def take_in(folder: str, name: str, options: dict[str, str], max_bytes: int) -> None:

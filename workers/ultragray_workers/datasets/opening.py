@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..storage.opening import open_storage
-from .copies import DEFAULT_MAX_BYTES
-from .store import DatasetStore
+from ultragray_workers.datasets.copies import DEFAULT_MAX_BYTES
+from ultragray_workers.datasets.store import DatasetStore
+from ultragray_workers.storage.opening import open_storage
 
 
 def open_datasets(

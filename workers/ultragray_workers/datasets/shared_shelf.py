@@ -19,13 +19,12 @@ from typing import Any
 
 from ultragray.errors import DatasetInvalid
 from ultragray.files.atomic import file_sha256
-
-from ..claims import is_claimed
-from ..errors import DatasetNotFound, StorageUnavailable
-from ..shared_claims import SharedClaims
-from ..storage.storage import Entry, NotThere, Storage
-from .copies import DEFAULT_MAX_BYTES, LocalCopies
-from .shelf import CONTACT_SHEET_NAME, FILES_NAME, MANIFEST_NAME
+from ultragray_workers.claims import is_claimed
+from ultragray_workers.datasets.copies import DEFAULT_MAX_BYTES, LocalCopies
+from ultragray_workers.datasets.shelf import CONTACT_SHEET_NAME, FILES_NAME, MANIFEST_NAME
+from ultragray_workers.errors import DatasetNotFound, StorageUnavailable
+from ultragray_workers.shared_claims import SharedClaims
+from ultragray_workers.storage.storage import Entry, NotThere, Storage
 
 MANIFESTS, FILES = "datasets", "dataset-files"  # prefixes of keys
 _AT_ONCE = 8  # files

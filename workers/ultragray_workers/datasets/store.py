@@ -17,14 +17,13 @@ from ultragray.errors import DatasetInvalid, InvalidArgument, UltragrayError
 from ultragray.files.atomic import write_whole
 from ultragray.files.format_version import require_version
 from ultragray.probe import Probe
-
-from ..errors import DatasetExists, DatasetInUse, DatasetNotFound, known_names
-from ..storage.storage import Storage
-from .contents import find_source
-from .copies import DEFAULT_MAX_BYTES
-from .shared_shelf import SharedShelf
-from .shelf import FILES_NAME as FILES_NAME
-from .shelf import MANIFEST_NAME, FolderShelf, Shelf
+from ultragray_workers.datasets.contents import find_source
+from ultragray_workers.datasets.copies import DEFAULT_MAX_BYTES
+from ultragray_workers.datasets.shared_shelf import SharedShelf
+from ultragray_workers.datasets.shelf import FILES_NAME as FILES_NAME
+from ultragray_workers.datasets.shelf import MANIFEST_NAME, FolderShelf, Shelf
+from ultragray_workers.errors import DatasetExists, DatasetInUse, DatasetNotFound, known_names
+from ultragray_workers.storage.storage import Storage
 
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset

@@ -15,8 +15,7 @@ from typing import IO, TypeVar
 
 from ultragray.errors import DatasetInvalid
 from ultragray.files.atomic import sync
-
-from ..errors import UploadTooLarge
+from ultragray_workers.errors import UploadTooLarge
 
 MAX_FILES = 1000
 MAX_ENTRIES = 10_000  # of an archive, folders included

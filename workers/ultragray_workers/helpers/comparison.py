@@ -6,10 +6,10 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ..datasets.copies import DEFAULT_MAX_BYTES
-from ..datasets.opening import open_datasets
-from .helper import write_progress
-from .picture_stack import write_stacks
+from ultragray_workers.datasets.copies import DEFAULT_MAX_BYTES
+from ultragray_workers.datasets.opening import open_datasets
+from ultragray_workers.helpers.helper import write_progress
+from ultragray_workers.helpers.picture_stack import write_stacks
 
 if TYPE_CHECKING:
     from ultragray.evaluation.scoring import Evaluation

@@ -15,10 +15,9 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ultragray.errors import MemoryExceeded, UltragrayError
-
-from ..claims import storage_full
-from ..niceness import let_frames_go_first
-from ..parent import end_with_parent
+from ultragray_workers.claims import storage_full
+from ultragray_workers.niceness import let_frames_go_first
+from ultragray_workers.parent import end_with_parent
 
 PROGRESS_NAME = "progress"  # in the folder that a process fills
 NICE_LEVEL = 10

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..datasets.copies import DEFAULT_MAX_BYTES
-from ..datasets.opening import open_datasets
-from .picture_stack import write_stacks
+from ultragray_workers.datasets.copies import DEFAULT_MAX_BYTES
+from ultragray_workers.datasets.opening import open_datasets
+from ultragray_workers.helpers.picture_stack import write_stacks
 
 PICTURES = ("truth", "rendering")
 

@@ -6,8 +6,8 @@ import contextlib
 from pathlib import Path
 from typing import Protocol, TypeAlias
 
-from .folder import Progress
-from .shared.reading import SharedFile, SharedLog
+from ultragray_workers.jobs.folder import Progress
+from ultragray_workers.jobs.shared.reading import SharedFile, SharedLog
 
 Artifact: TypeAlias = Path | SharedFile
 Log: TypeAlias = Path | SharedLog

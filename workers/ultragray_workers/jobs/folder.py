@@ -25,8 +25,7 @@ from typing import Any, ClassVar
 
 from ultragray.contract import described
 from ultragray.files.atomic import remove_stale_temporaries, sync, write_whole
-
-from ..datasets.copies import DEFAULT_MAX_BYTES
+from ultragray_workers.datasets.copies import DEFAULT_MAX_BYTES
 
 FOLDER, BATCH = "jobs", "batch"
 PHASES = ("baselines", "effort", "training", "evaluation", "confidence", "report")

@@ -11,14 +11,13 @@ from typing import Any
 from dbos import WorkflowStatus
 
 from ultragray.contract import described
-
-from .files import JobFiles
-from .folder import Outcome, Progress
-from .kinds import KINDS
-from .matching.demand import Demand
-from .matching.offer import LivingWorker, waits_for
-from .queue import database
-from .queue.owners import Ownership
+from ultragray_workers.jobs.files import JobFiles
+from ultragray_workers.jobs.folder import Outcome, Progress
+from ultragray_workers.jobs.kinds import KINDS
+from ultragray_workers.jobs.matching.demand import Demand
+from ultragray_workers.jobs.matching.offer import LivingWorker, waits_for
+from ultragray_workers.jobs.queue import database
+from ultragray_workers.jobs.queue.owners import Ownership
 
 MAX_PRIORITY = 1000
 PRIORITY_ZERO = MAX_PRIORITY + 1  # DBOS takes the lowest number first, from 1

@@ -6,13 +6,13 @@ import time
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
-from .job import STATUSES, JobState
-from .matching.demand import AUTO, CPU, CUDA
-from .matching.offer import waits_for
-from .queue import unfinished
-from .queue.attendance import WorkerState, list_workers, living_workers
-from .queue.database import JobDatabase
-from .queue.listing import count_by_status
+from ultragray_workers.jobs.job import STATUSES, JobState
+from ultragray_workers.jobs.matching.demand import AUTO, CPU, CUDA
+from ultragray_workers.jobs.matching.offer import waits_for
+from ultragray_workers.jobs.queue import unfinished
+from ultragray_workers.jobs.queue.attendance import WorkerState, list_workers, living_workers
+from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.queue.listing import count_by_status
 
 
 @dataclass(frozen=True)

@@ -6,16 +6,16 @@ import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
-from ..claims import out_of_sight
-from ..scenes import SUFFIX
-from ..storage.location import Location
-from ..storage.opening import PATIENCE_S, open_storage
-from ..storage.storage import Storage
-from .files import CHECKPOINT_NAME, Artifact, JobFiles, Log
-from .folder import JobFolder, Progress
-from .removal import locked
-from .requirements import keep_in_folder
-from .shared.files import SharedFiles
+from ultragray_workers.claims import out_of_sight
+from ultragray_workers.jobs.files import CHECKPOINT_NAME, Artifact, JobFiles, Log
+from ultragray_workers.jobs.folder import JobFolder, Progress
+from ultragray_workers.jobs.removal import locked
+from ultragray_workers.jobs.requirements import keep_in_folder
+from ultragray_workers.jobs.shared.files import SharedFiles
+from ultragray_workers.scenes import SUFFIX
+from ultragray_workers.storage.location import Location
+from ultragray_workers.storage.opening import PATIENCE_S, open_storage
+from ultragray_workers.storage.storage import Storage
 
 
 class FolderFiles:

@@ -9,15 +9,14 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ultragray.files.atomic import file_sha256
-
-from ..errors import SceneExists
-from ..scene_names import SUFFIX
-from ..shelves.folder import FolderShelf
-from ..shelves.index import SceneIndex
-from ..storage.storage import Storage
-from .folder import JobFolder
-from .queue.database import JobDatabase
-from .queue.owners import Kind, Ownership, claim_of_job, forget_owner
+from ultragray_workers.errors import SceneExists
+from ultragray_workers.jobs.folder import JobFolder
+from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.queue.owners import Kind, Ownership, claim_of_job, forget_owner
+from ultragray_workers.scene_names import SUFFIX
+from ultragray_workers.shelves.folder import FolderShelf
+from ultragray_workers.shelves.index import SceneIndex
+from ultragray_workers.storage.storage import Storage
 
 SCENES_FOLDER = "scenes"  # of the artifact folder: scenes that jobs made
 

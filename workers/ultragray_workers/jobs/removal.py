@@ -8,15 +8,15 @@ import time
 from collections.abc import Iterator
 from typing import TYPE_CHECKING
 
-from ..errors import JobInUse
-from .folder import JobFolder
-from .queue import runs
-from .queue.database import JobDatabase
-from .shards import claims
-from .shards.shares import forget_shares
+from ultragray_workers.errors import JobInUse
+from ultragray_workers.jobs.folder import JobFolder
+from ultragray_workers.jobs.queue import runs
+from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.shards import claims
+from ultragray_workers.jobs.shards.shares import forget_shares
 
 if TYPE_CHECKING:
-    from .files import JobFiles
+    from ultragray_workers.jobs.files import JobFiles
 
 _LOCK_WAIT_S = 2.0  # for the process of a job that was cancelled a moment ago
 _LOCK_POLL_S = 0.05

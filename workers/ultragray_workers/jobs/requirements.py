@@ -12,19 +12,18 @@ from ultragray.files.atomic import sync
 from ultragray.files.link import link_or_copy
 from ultragray.registration.registration import Registration
 from ultragray.scene_info import SceneHeader, read_header
-
-from ..claims import storage_full
-from ..datasets.store import DatasetStore
-from ..errors import SceneExists
-from ..scene_names import SUFFIX, base_name
-from ..scenes import SceneStore
-from .folder import JobFolder
-from .kinds import Specification
-from .kinds.base import Surroundings
-from .queue.owners import Kind
+from ultragray_workers.claims import storage_full
+from ultragray_workers.datasets.store import DatasetStore
+from ultragray_workers.errors import SceneExists
+from ultragray_workers.jobs.folder import JobFolder
+from ultragray_workers.jobs.kinds import Specification
+from ultragray_workers.jobs.kinds.base import Surroundings
+from ultragray_workers.jobs.queue.owners import Kind
+from ultragray_workers.scene_names import SUFFIX, base_name
+from ultragray_workers.scenes import SceneStore
 
 if TYPE_CHECKING:
-    from .files import JobFiles
+    from ultragray_workers.jobs.files import JobFiles
 
 
 @dataclass(frozen=True)

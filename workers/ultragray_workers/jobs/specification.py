@@ -12,8 +12,7 @@ from ultragray import contract
 from ultragray.errors import InvalidArgument
 from ultragray.probe import FloatArray
 from ultragray.samplers import MAX_POSES
-
-from .kinds.base import Specification
+from ultragray_workers.jobs.kinds.base import Specification
 
 _POSES, _POSE_COUNT = "poses", "pose_count"
 

@@ -21,10 +21,9 @@ from ultragray.batches import stands_for
 from ultragray.errors import InvalidArgument
 from ultragray.image_size import MAX_IMAGE_SIDE
 from ultragray.registration.registration import Registration
-
-from ..claims import is_claimed
-from ..datasets.store import DatasetStore
-from ..errors import (
+from ultragray_workers.claims import is_claimed
+from ultragray_workers.datasets.store import DatasetStore
+from ultragray_workers.errors import (
     ArtifactNotFound,
     DatasetNotFound,
     JobConflict,
@@ -37,30 +36,47 @@ from ..errors import (
     SceneNotFound,
     job_not_found,
 )
-from ..scenes import SceneStore
-from ..shared_claims import SharedClaims
-from ..storage.storage import Storage
-from ..store import OpenStore
-from .files import Artifact, read_log, size_of_log
-from .folder import JobFolder, Progress
-from .job import MAX_PRIORITY, PRIORITY_ZERO, STATUSES, Job, JobState, attribute, job_of_row, ownership_of
-from .kinds import Specification
-from .matching.offer import LivingWorker
-from .overview import JobsOverview, overview
-from .places import files_of_jobs
-from .publication import SCENES_FOLDER, give_name_back
-from .queue import attendance, database, runs, unfinished
-from .queue.attendance import Worker
-from .queue.database import JobDatabase
-from .queue.internals import MOST_RUNNING
-from .queue.listing import ids_of_owner, page_of_rows
-from .queue.owners import NOBODYS, Kind, Ownership, add_owner, claim_of_job, forget_owner, read_owner
-from .queue.wishes import Wanted
-from .removal import remove_job
-from .requirements import Requirements
-from .shards.shares import batch_of, cancel_shares
-from .specification import from_dict, in_short, to_dict, value_in
-from .tracing import TRACE, current_trace
+from ultragray_workers.jobs.files import Artifact, read_log, size_of_log
+from ultragray_workers.jobs.folder import JobFolder, Progress
+from ultragray_workers.jobs.job import (
+    MAX_PRIORITY,
+    PRIORITY_ZERO,
+    STATUSES,
+    Job,
+    JobState,
+    attribute,
+    job_of_row,
+    ownership_of,
+)
+from ultragray_workers.jobs.kinds import Specification
+from ultragray_workers.jobs.matching.offer import LivingWorker
+from ultragray_workers.jobs.overview import JobsOverview, overview
+from ultragray_workers.jobs.places import files_of_jobs
+from ultragray_workers.jobs.publication import SCENES_FOLDER, give_name_back
+from ultragray_workers.jobs.queue import attendance, database, runs, unfinished
+from ultragray_workers.jobs.queue.attendance import Worker
+from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.queue.internals import MOST_RUNNING
+from ultragray_workers.jobs.queue.listing import ids_of_owner, page_of_rows
+from ultragray_workers.jobs.queue.owners import (
+    NOBODYS,
+    Kind,
+    Ownership,
+    add_owner,
+    claim_of_job,
+    forget_owner,
+    read_owner,
+)
+from ultragray_workers.jobs.queue.wishes import Wanted
+from ultragray_workers.jobs.removal import remove_job
+from ultragray_workers.jobs.requirements import Requirements
+from ultragray_workers.jobs.shards.shares import batch_of, cancel_shares
+from ultragray_workers.jobs.specification import from_dict, in_short, to_dict, value_in
+from ultragray_workers.jobs.tracing import TRACE, current_trace
+from ultragray_workers.scenes import SceneStore
+from ultragray_workers.shared_claims import SharedClaims
+from ultragray_workers.storage.storage import Storage
+from ultragray_workers.store import OpenStore
 
 __all__ = ["SCENES_FOLDER", "Job", "JobState", "JobStore", "Progress"]
 

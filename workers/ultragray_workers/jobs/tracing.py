@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from dbos import WorkflowStatus
 from opentelemetry import propagate, trace
 
-from .job import attribute
+from ultragray_workers.jobs.job import attribute
 
 TRACE = "trace"  # the attribute of a job that names it
 

@@ -13,11 +13,9 @@ from typing import Any
 from ultragray.confidence import Extrapolation
 from ultragray.errors import RenderFailed, UltragrayError
 from ultragray.volumes.plane import SliceView
-
-from ..rounds import Rounds
-from .launcher import Launcher
-from .memory import MemoryPool, write_at
-from .messages import (
+from ultragray_workers.pool.launcher import Launcher
+from ultragray_workers.pool.memory import MemoryPool, write_at
+from ultragray_workers.pool.messages import (
     Answer,
     ForkWorker,
     LoadTask,
@@ -30,10 +28,11 @@ from .messages import (
     SliceTask,
     UnloadTask,
 )
-from .slot import Assignment, Command, Slot
-from .types import SceneChangedError, Sought
-from .waiting import Packing, Part, Step, Ticket, WaitingQueue
-from .watchdog import Patience
+from ultragray_workers.pool.slot import Assignment, Command, Slot
+from ultragray_workers.pool.types import SceneChangedError, Sought
+from ultragray_workers.pool.waiting import Packing, Part, Step, Ticket, WaitingQueue
+from ultragray_workers.pool.watchdog import Patience
+from ultragray_workers.rounds import Rounds
 
 _MAX_DEATHS = 5
 _MAX_KILLS = 2

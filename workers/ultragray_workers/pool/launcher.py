@@ -14,9 +14,9 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import Any
 
-from .channel import Channel
-from .messages import ForkTemplate, ForkWorker, Hello
-from .peer import Peer
+from ultragray_workers.pool.channel import Channel
+from ultragray_workers.pool.messages import ForkTemplate, ForkWorker, Hello
+from ultragray_workers.pool.peer import Peer
 
 _TEMPLATES = 2
 

@@ -11,9 +11,8 @@ from ultragray.localization.settings import Localization, LocalizationSettings
 from ultragray.probe import FloatArray
 from ultragray.settings import Resolved
 from ultragray.volumes.plane import SliceView
-
-from ..storage.local import FileVersion
-from .types import S
+from ultragray_workers.pool.types import S
+from ultragray_workers.storage.local import FileVersion
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from .channel import Channel
+from ultragray_workers.pool.channel import Channel
 
 _STOP_TIMEOUT_S = 2.0
 _POLL_INTERVAL_S = 0.002

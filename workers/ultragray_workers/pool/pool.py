@@ -18,18 +18,17 @@ from typing import Any, TypeVar
 
 from ultragray.contract import Contract, described
 from ultragray.errors import InvalidArgument, RenderFailed
-
-from ..errors import Draining, NotReady
-from ..scene_names import base_name
-from ..scenes import SceneStore
-from .channel import MAX_DESCRIPTORS
-from .dispatcher import Dispatcher
-from .launcher import Launcher
-from .memory import read_start
-from .messages import ForkWorker, LoadTask, Rendered, UnloadTask
-from .types import LocalizeResult, RenderRequest, RenderResult, S, SceneChangedError
-from .waiting import Expiry, Ticket, Turn, WaitingQueue
-from .watchdog import Patience
+from ultragray_workers.errors import Draining, NotReady
+from ultragray_workers.pool.channel import MAX_DESCRIPTORS
+from ultragray_workers.pool.dispatcher import Dispatcher
+from ultragray_workers.pool.launcher import Launcher
+from ultragray_workers.pool.memory import read_start
+from ultragray_workers.pool.messages import ForkWorker, LoadTask, Rendered, UnloadTask
+from ultragray_workers.pool.types import LocalizeResult, RenderRequest, RenderResult, S, SceneChangedError
+from ultragray_workers.pool.waiting import Expiry, Ticket, Turn, WaitingQueue
+from ultragray_workers.pool.watchdog import Patience
+from ultragray_workers.scene_names import base_name
+from ultragray_workers.scenes import SceneStore
 
 logger = logging.getLogger(__name__)
 

@@ -12,14 +12,13 @@ from dataclasses import dataclass, field
 from typing import Protocol
 
 from ultragray.errors import RenderFailed, UltragrayError
-
-from ..errors import Draining
-from .board import Board
-from .launcher import Launcher
-from .messages import Answer, ForkWorker, Hello, Loading, LoadTask, Task, UnloadTask
-from .peer import Peer
-from .waiting import Step
-from .watchdog import STUCK_AFTER_S, Patience, Watch
+from ultragray_workers.errors import Draining
+from ultragray_workers.pool.board import Board
+from ultragray_workers.pool.launcher import Launcher
+from ultragray_workers.pool.messages import Answer, ForkWorker, Hello, Loading, LoadTask, Task, UnloadTask
+from ultragray_workers.pool.peer import Peer
+from ultragray_workers.pool.waiting import Step
+from ultragray_workers.pool.watchdog import STUCK_AFTER_S, Patience, Watch
 
 logger = logging.getLogger(__name__)
 

@@ -13,9 +13,8 @@ from ultragray.localization.settings import Localization, LocalizationSettings
 from ultragray.probe import FloatArray
 from ultragray.settings import Resolved
 from ultragray.volumes.plane import SliceView
-
-from ..storage.local import FileVersion
-from .fairness.turns import UNKNOWN_CALLER, Caller
+from ultragray_workers.pool.fairness.turns import UNKNOWN_CALLER, Caller
+from ultragray_workers.storage.local import FileVersion
 
 S = TypeVar("S", bound=Resolved | SliceView, default=Resolved)  # settings of a frame, or of a slice
 

@@ -13,12 +13,11 @@ from typing import Any
 from ultragray.probe import FloatArray
 from ultragray.settings import Encoding, Resolved
 from ultragray.volumes.plane import SliceView
-
-from ..errors import DeadlineExceeded, QueueFull
-from .fairness.forecast import Forecast
-from .fairness.turns import Turns
-from .messages import Rendered
-from .types import Priority, RenderRequest
+from ultragray_workers.errors import DeadlineExceeded, QueueFull
+from ultragray_workers.pool.fairness.forecast import Forecast
+from ultragray_workers.pool.fairness.turns import Turns
+from ultragray_workers.pool.messages import Rendered
+from ultragray_workers.pool.types import Priority, RenderRequest
 
 _FULL_BATCH_PIXELS_PER_POSE = 512 * 512
 _ATTEMPTS_IN_COMPANY = 2

@@ -11,17 +11,16 @@ from dataclasses import dataclass, field
 from pathlib import Path
 
 from ultragray.scene_info import SceneHeader, read_header
-
-from ..claims import claimed_folder, remove_abandoned
-from ..errors import StorageUnavailable
-from ..rounds import Rounds
-from ..scene_names import SUFFIX
-from ..shared_claims import SharedClaims
-from ..storage.cache import Cache, Pin, cache_name
-from ..storage.storage import NotThere
-from .folder import MAKING_PREFIX
-from .headers import KeptHeaders, fetch_header
-from .index import FRESH_S, Placed, SceneIndex
+from ultragray_workers.claims import claimed_folder, remove_abandoned
+from ultragray_workers.errors import StorageUnavailable
+from ultragray_workers.rounds import Rounds
+from ultragray_workers.scene_names import SUFFIX
+from ultragray_workers.shared_claims import SharedClaims
+from ultragray_workers.shelves.folder import MAKING_PREFIX
+from ultragray_workers.shelves.headers import KeptHeaders, fetch_header
+from ultragray_workers.shelves.index import FRESH_S, Placed, SceneIndex
+from ultragray_workers.storage.cache import Cache, Pin, cache_name
+from ultragray_workers.storage.storage import NotThere
 
 LET_GO_S = 10.0  # after which a file that nobody has asked for may leave the cache
 HOUSEKEEPING_S = 3600.0

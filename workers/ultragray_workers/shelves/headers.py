@@ -17,8 +17,7 @@ from ultragray.scene_info import (
     read_header,
     scene_file_invalid,
 )
-
-from ..storage.storage import Storage
+from ultragray_workers.storage.storage import Storage
 
 V = TypeVar("V")
 

@@ -22,10 +22,9 @@ from pathlib import Path
 from typing import Any
 
 from ultragray.files.atomic import file_sha256
-
-from ..errors import SceneExists, StorageUnavailable
-from ..scene_names import SUFFIX, is_scene_name
-from ..storage.storage import Entry, NotThere, Storage
+from ultragray_workers.errors import SceneExists, StorageUnavailable
+from ultragray_workers.scene_names import SUFFIX, is_scene_name
+from ultragray_workers.storage.storage import Entry, NotThere, Storage
 
 OBJECTS, ENTRY_SUFFIX = "objects", ".json"
 FRESH_S = 2.0  # after which the list is read again by whoever follows it

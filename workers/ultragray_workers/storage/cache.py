@@ -22,9 +22,8 @@ from pathlib import Path, PurePosixPath
 from typing import IO
 
 from ultragray.files.atomic import file_sha256, remove_stale_temporaries
-
-from ..errors import StorageFull, StorageUnavailable
-from .storage import NotThere, Storage
+from ultragray_workers.errors import StorageFull, StorageUnavailable
+from ultragray_workers.storage.storage import NotThere, Storage
 
 _FILES, _FETCHING, _ROOM, _SPACE = "files", "fetching", "room", ".space"
 _WAIT_FOR_ROOM_S, _LOOK_EVERY_S = 30.0, 0.1

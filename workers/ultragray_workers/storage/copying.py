@@ -14,9 +14,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ultragray.files.atomic import file_sha256
-
-from ..errors import RestoreRefused, StorageUnavailable
-from .storage import NotThere, Storage
+from ultragray_workers.errors import RestoreRefused, StorageUnavailable
+from ultragray_workers.storage.storage import NotThere, Storage
 
 ARTIFACTS = "artifacts"  # the artifact folder, below a data folder
 _SCENES = re.compile(

@@ -13,8 +13,7 @@ from pathlib import Path
 
 from ultragray.files.atomic import TEMPORARY_SUFFIX, atomic_path, sync
 from ultragray.files.link import link_or_copy
-
-from .storage import Entry, NotThere, check_key
+from ultragray_workers.storage.storage import Entry, NotThere, check_key
 
 _LOCK = ".storage.lock"  # held while an object is compared and replaced
 _CHUNK_BYTES = 2**20

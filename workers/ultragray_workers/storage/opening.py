@@ -4,10 +4,10 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from .local import LocalStorage
-from .location import StorageUrl, parse_location
-from .remote import RemoteStorage
-from .storage import Storage
+from ultragray_workers.storage.local import LocalStorage
+from ultragray_workers.storage.location import StorageUrl, parse_location
+from ultragray_workers.storage.remote import RemoteStorage
+from ultragray_workers.storage.storage import Storage
 
 PATIENCE_S = 20.0
 

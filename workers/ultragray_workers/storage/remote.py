@@ -17,10 +17,9 @@ from typing import TYPE_CHECKING, Any
 from ultragray.errors import InvalidArgument
 from ultragray.files.atomic import atomic_path
 from ultragray.installation import missing_extra
-
-from ..errors import StorageUnavailable
-from .location import StorageUrl
-from .storage import Entry, NotThere, check_key
+from ultragray_workers.errors import StorageUnavailable
+from ultragray_workers.storage.location import StorageUrl
+from ultragray_workers.storage.storage import Entry, NotThere, check_key
 
 if TYPE_CHECKING:
     pass

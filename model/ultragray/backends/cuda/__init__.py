@@ -9,11 +9,20 @@ from collections.abc import Sequence
 
 from torch import Tensor
 
-from ...limits import UNLIMITED, Limits
-from ...probe import Probe
-from ...scene import GaussianScene
-from ..poses import ScenePoses
-from .device import available, device, device_count, interpreted, renderer, require, supports, upload
+from ultragray.backends.cuda.device import (
+    available,
+    device,
+    device_count,
+    interpreted,
+    renderer,
+    require,
+    supports,
+    upload,
+)
+from ultragray.backends.poses import ScenePoses
+from ultragray.limits import UNLIMITED, Limits
+from ultragray.probe import Probe
+from ultragray.scene import GaussianScene
 
 __all__ = [
     "available",
@@ -47,6 +56,6 @@ def render_outputs(
     limit, and the gradient by a beam; limits hold for frames without gradients.
     Raises MemoryExceeded where the device's memory does not suffice, FrameTooCostly and GivenUp.
     """
-    from .frames import render_frames
+    from ultragray.backends.cuda.frames import render_frames
 
     return render_frames(scene, probe, poses_cm, height, width, outputs, limits, beam, weighted)

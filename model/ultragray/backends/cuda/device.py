@@ -8,8 +8,8 @@ import os
 import torch
 from torch import Tensor
 
-from ...errors import BackendUnavailable
-from ...scene import GaussianScene
+from ultragray.errors import BackendUnavailable
+from ultragray.scene import GaussianScene
 
 
 def interpreted() -> bool:

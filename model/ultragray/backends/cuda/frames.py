@@ -11,16 +11,9 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ...errors import MemoryExceeded, TooManyPoses
-from ...limits import Limits
-from ...probe import Probe
-from ...scene import PARAMETERS, GaussianScene
-from ..beam import Moments
-from ..kind import Kind
-from ..poses import ScenePoses, as_array, gradient_by_poses, want_gradient
-from ..spatial_order import spatial_order
-from .device import upload
-from .launch import (
+from ultragray.backends.beam import Moments
+from ultragray.backends.cuda.device import upload
+from ultragray.backends.cuda.launch import (
     MAX_POSES,
     Gaussians,
     Geometry,
@@ -34,6 +27,13 @@ from .launch import (
     launching,
     view_table,
 )
+from ultragray.backends.kind import Kind
+from ultragray.backends.poses import ScenePoses, as_array, gradient_by_poses, want_gradient
+from ultragray.backends.spatial_order import spatial_order
+from ultragray.errors import MemoryExceeded, TooManyPoses
+from ultragray.limits import Limits
+from ultragray.probe import Probe
+from ultragray.scene import PARAMETERS, GaussianScene
 
 _SLICES = len(fields(Slices))
 WORKSPACE_BYTES = 1 << 30  # of slices and planes; poses beyond it are rendered in a further round

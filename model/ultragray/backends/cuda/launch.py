@@ -16,18 +16,18 @@ import torch
 import triton
 from torch import Tensor
 
-from ...outputs import INTENSITY_SUM, PLANES, SUMS, WEIGHT_SUM
-from ...probe import FloatArray, Probe
-from ...scene_info import expected_shapes
-from ..beam import THIN, BeamVariance
-from ..kind import Kind
-from ..scan_lines import KernelLines
-from .device import interpreted
-from .kernels import constants
-from .kernels.drawing import draw_tiles, finish_frames
-from .kernels.gathering import differentiate_pixels, gather_slices
-from .kernels.placing import place_gradients
-from .kernels.slicing import slice_gaussians
+from ultragray.backends.beam import THIN, BeamVariance
+from ultragray.backends.cuda.device import interpreted
+from ultragray.backends.cuda.kernels import constants
+from ultragray.backends.cuda.kernels.drawing import draw_tiles, finish_frames
+from ultragray.backends.cuda.kernels.gathering import differentiate_pixels, gather_slices
+from ultragray.backends.cuda.kernels.placing import place_gradients
+from ultragray.backends.cuda.kernels.slicing import slice_gaussians
+from ultragray.backends.kind import Kind
+from ultragray.backends.scan_lines import KernelLines
+from ultragray.outputs import INTENSITY_SUM, PLANES, SUMS, WEIGHT_SUM
+from ultragray.probe import FloatArray, Probe
+from ultragray.scene_info import expected_shapes
 
 MAX_POSES = 65_535  # of one launch, by CUDA's limit for a grid
 

@@ -9,12 +9,12 @@ from dataclasses import dataclass
 
 import torch
 
-from ...probe import FloatArray, Probe
-from ...scene import GaussianScene
-from .device import upload
-from .frames import sorted_gaussians
-from .kernels import constants
-from .launch import Geometry, cut, launching, shapes, view_table
+from ultragray.backends.cuda.device import upload
+from ultragray.backends.cuda.frames import sorted_gaussians
+from ultragray.backends.cuda.kernels import constants
+from ultragray.backends.cuda.launch import Geometry, cut, launching, shapes, view_table
+from ultragray.probe import FloatArray, Probe
+from ultragray.scene import GaussianScene
 
 # Floating-point operations, counted in the source; a fused multiply-add is two.
 OPERATIONS_PER_GAUSSIAN = 110  # the cull by the image plane

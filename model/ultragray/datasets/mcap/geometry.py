@@ -13,16 +13,16 @@ from typing import Any
 
 import numpy as np
 
-from ...contract import Contract, described, from_dict
-from ...errors import DatasetInvalid, InvalidArgument
-from ...probe import FloatArray, Probe
-from ...probe.fan import Fan
-from ...probe.picture import Picture
-from ..calibration import poses_from_image_transforms, region_of
-from ..images import parse_crop
-from ..plus.fan import FanGeometry, FanLines
-from ..region import ImageRegion
-from ..sweep import ByteArray, IntArray, Sweep
+from ultragray.contract import Contract, described, from_dict
+from ultragray.datasets.calibration import poses_from_image_transforms, region_of
+from ultragray.datasets.images import parse_crop
+from ultragray.datasets.plus.fan import FanGeometry, FanLines
+from ultragray.datasets.region import ImageRegion
+from ultragray.datasets.sweep import ByteArray, IntArray, Sweep
+from ultragray.errors import DatasetInvalid, InvalidArgument
+from ultragray.probe import FloatArray, Probe
+from ultragray.probe.fan import Fan
+from ultragray.probe.picture import Picture
 
 MAX_GEOMETRY_BYTES = 1 << 20
 SAME = 1e-6  # relative, of the places of pixels

@@ -7,11 +7,11 @@ from typing import Any
 import cv2
 import numpy as np
 
-from ...errors import DatasetInvalid
-from ...interchange.ros_fields import COMPRESSED
-from ...interchange.ros_messages import IMAGE
-from ..images import grey_frames
-from ..sweep import ByteArray
+from ultragray.datasets.images import grey_frames
+from ultragray.datasets.sweep import ByteArray
+from ultragray.errors import DatasetInvalid
+from ultragray.interchange.ros_fields import COMPRESSED
+from ultragray.interchange.ros_messages import IMAGE
 
 KINDS = (IMAGE, COMPRESSED)
 _FLAGS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION

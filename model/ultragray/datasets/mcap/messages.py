@@ -13,8 +13,8 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap_ros2.decoder import DecoderFactory
 
-from ...errors import DatasetInvalid
-from ...interchange.ros_fields import check_fields
+from ultragray.errors import DatasetInvalid
+from ultragray.interchange.ros_fields import check_fields
 
 MAX_RECORD_BYTES = 1 << 30  # of a chunk, compressed or not
 MAX_TIME_NS = (1 << 63) - 1

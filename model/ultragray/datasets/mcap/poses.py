@@ -10,15 +10,15 @@ from typing import Any, TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ...errors import DatasetInvalid, InvalidArgument, InvalidPose
-from ...interchange.ros_fields import TRANSFORM, TRANSFORMS
-from ...interchange.ros_messages import POSE
-from ...interchange.ros_poses import pose_of_parts
-from ...probe import FloatArray
-from ...samplers.rotations import blended
-from ..plus.transforms import TransformName, find_path
-from ..sweep import IntArray
-from .messages import StoredMessage, time_of
+from ultragray.datasets.mcap.messages import StoredMessage, time_of
+from ultragray.datasets.plus.transforms import TransformName, find_path
+from ultragray.datasets.sweep import IntArray
+from ultragray.errors import DatasetInvalid, InvalidArgument, InvalidPose
+from ultragray.interchange.ros_fields import TRANSFORM, TRANSFORMS
+from ultragray.interchange.ros_messages import POSE
+from ultragray.interchange.ros_poses import pose_of_parts
+from ultragray.probe import FloatArray
+from ultragray.samplers.rotations import blended
 
 TF = "/tf"
 MAX_GAP_NS = 200_000_000  # a hand that moves on goes another way within a longer time

@@ -14,15 +14,15 @@ from typing import Any
 
 import numpy as np
 
-from ...errors import DatasetInvalid, InvalidArgument
-from ...interchange.ros_messages import TEXT
-from ..images import MAX_PIXEL_BYTES
-from ..splits import parse_frame_ranges
-from ..sweep import ByteArray, IntArray, Sweep
-from .geometry import BESIDE, ImageGeometry, geometry_beside, read_geometry
-from .images import KINDS, grey_image
-from .messages import NS_PER_S, MessageFile, StoredMessage, time_of
-from .poses import MAX_GAP_NS, TF, TrackedPoses, Way
+from ultragray.datasets.images import MAX_PIXEL_BYTES
+from ultragray.datasets.mcap.geometry import BESIDE, ImageGeometry, geometry_beside, read_geometry
+from ultragray.datasets.mcap.images import KINDS, grey_image
+from ultragray.datasets.mcap.messages import NS_PER_S, MessageFile, StoredMessage, time_of
+from ultragray.datasets.mcap.poses import MAX_GAP_NS, TF, TrackedPoses, Way
+from ultragray.datasets.splits import parse_frame_ranges
+from ultragray.datasets.sweep import ByteArray, IntArray, Sweep
+from ultragray.errors import DatasetInvalid, InvalidArgument
+from ultragray.interchange.ros_messages import TEXT
 
 PREFERRED_IMAGES, PREFERRED_POSES, GEOMETRY = "/bmode", "/probe_pose", "/geometry"  # ends of the node's topics
 

@@ -7,9 +7,9 @@ Frame, mm. x to the patient's right, y caudal, z from the skin into the body; th
 the middle vertebra. The vertebrae are 35 mm apart, without end along y.
 """
 
-from .anatomy import Tissue, tissue_at
-from .imaging import bone_attenuation_db, simulate, tissues
-from .sweeps import PHANTOM_IMAGE_SIDE, PHANTOM_PROBE, freehand_poses, load_phantom
+from ultragray.datasets.phantom.anatomy import Tissue, tissue_at
+from ultragray.datasets.phantom.imaging import bone_attenuation_db, simulate, tissues
+from ultragray.datasets.phantom.sweeps import PHANTOM_IMAGE_SIDE, PHANTOM_PROBE, freehand_poses, load_phantom
 
 __all__ = [
     "PHANTOM_IMAGE_SIDE",

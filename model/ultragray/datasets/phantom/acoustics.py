@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...probe import FloatArray
-from .anatomy import Tissue
-from .bone import Floats
+from ultragray.datasets.phantom.anatomy import Tissue
+from ultragray.datasets.phantom.bone import Floats
+from ultragray.probe import FloatArray
 
 SPEED_MM_PER_US = 1.54
 FREQUENCY_MHZ = 5.0

@@ -10,9 +10,9 @@ from enum import IntEnum
 import numpy as np
 import numpy.typing as npt
 
-from ...errors import InvalidArgument
-from . import bone
-from .bone import Floats
+from ultragray.datasets.phantom import bone
+from ultragray.datasets.phantom.bone import Floats
+from ultragray.errors import InvalidArgument
 
 LabelArray = npt.NDArray[np.uint8]
 

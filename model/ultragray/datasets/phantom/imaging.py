@@ -14,14 +14,14 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ...errors import InvalidProbe
-from ...pose import check_poses
-from ...probe import FloatArray, Probe
-from ..sweep import ByteArray, IntArray
-from . import acoustics
-from .anatomy import Tissue, tissue_at
-from .bone import Floats
-from .scatterers import PER_MM3, Float32Array, ScattererField, Scatterers
+from ultragray.datasets.phantom import acoustics
+from ultragray.datasets.phantom.anatomy import Tissue, tissue_at
+from ultragray.datasets.phantom.bone import Floats
+from ultragray.datasets.phantom.scatterers import PER_MM3, Float32Array, ScattererField, Scatterers
+from ultragray.datasets.sweep import ByteArray, IntArray
+from ultragray.errors import InvalidProbe
+from ultragray.pose import check_poses
+from ultragray.probe import FloatArray, Probe
 
 Complex64Array = npt.NDArray[np.complex64]
 

@@ -11,9 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from . import anatomy, bone
-from .bone import Floats
-from .noise import LatticeNoise
+from ultragray.datasets.phantom import anatomy, bone
+from ultragray.datasets.phantom.bone import Floats
+from ultragray.datasets.phantom.noise import LatticeNoise
 
 Level = Callable[[Floats], Floats]  # [N, 3] -> [N]
 Present = Callable[[Floats], npt.NDArray[np.bool_]]  # [N, 3] -> [N]

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..sweep import IntArray
-from .bone import Floats, Triple
+from ultragray.datasets.phantom.bone import Floats, Triple
+from ultragray.datasets.sweep import IntArray
 
 _PERIOD = 32  # lattice cells, a power of two
 _LAST = _PERIOD - 1

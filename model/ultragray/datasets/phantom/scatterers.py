@@ -12,11 +12,11 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from ...probe import FloatArray
-from . import anatomy
-from .acoustics import backscatter_amplitudes
-from .bone import Floats
-from .interfaces import INTERFACES, Interface, fascicles
+from ultragray.datasets.phantom import anatomy
+from ultragray.datasets.phantom.acoustics import backscatter_amplitudes
+from ultragray.datasets.phantom.bone import Floats
+from ultragray.datasets.phantom.interfaces import INTERFACES, Interface, fascicles
+from ultragray.probe import FloatArray
 
 Float32Array = npt.NDArray[np.float32]
 

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ...errors import DatasetInvalid
-from ..sweep import Sweep
-from .imaging import bone_attenuation_db
-from .scatterers import Float32Array
+from ultragray.datasets.phantom.imaging import bone_attenuation_db
+from ultragray.datasets.phantom.scatterers import Float32Array
+from ultragray.datasets.sweep import Sweep
+from ultragray.errors import DatasetInvalid
 
 SHADOW_DB = 30.0  # taken by bone, there and back
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...errors import InvalidArgument
-from ...pose import check_poses
-from ...probe import FloatArray, LinearProbe
-from ..sweep import Dataset, Sweep
-from .imaging import simulate
+from ultragray.datasets.phantom.imaging import simulate
+from ultragray.datasets.sweep import Dataset, Sweep
+from ultragray.errors import InvalidArgument
+from ultragray.pose import check_poses
+from ultragray.probe import FloatArray, LinearProbe
 
 PHANTOM_PROBE = LinearProbe(width_mm=60.0, near_mm=0.0, far_mm=60.0)
 PHANTOM_IMAGE_SIDE = 256

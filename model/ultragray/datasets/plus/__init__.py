@@ -1,5 +1,5 @@
 """Sequences recorded with PLUS."""
 
-from .recording import read_plus_sweep
+from ultragray.datasets.plus.recording import read_plus_sweep
 
 __all__ = ["read_plus_sweep"]

@@ -17,15 +17,15 @@ from xml.etree.ElementTree import Element
 import cv2
 import numpy as np
 
-from ...contract import from_dict
-from ...display.settings import Display
-from ...errors import DatasetInvalid, InvalidArgument
-from ...image_size import MAX_IMAGE_SIDE
-from ...probe import ConvexProbe, FloatArray, PhasedProbe, Probe
-from ...probe.fan import LARGEST_OPENING_DEG, Fan
-from ..images import CropBox
-from ..sweep import ByteArray
-from .transforms import DeviceSet
+from ultragray.contract import from_dict
+from ultragray.datasets.images import CropBox
+from ultragray.datasets.plus.transforms import DeviceSet
+from ultragray.datasets.sweep import ByteArray
+from ultragray.display.settings import Display
+from ultragray.errors import DatasetInvalid, InvalidArgument
+from ultragray.image_size import MAX_IMAGE_SIDE
+from ultragray.probe import ConvexProbe, FloatArray, PhasedProbe, Probe
+from ultragray.probe.fan import LARGEST_OPENING_DEG, Fan
 
 SQUARE_TOLERANCE = 0.01
 SMALLEST_PIXEL_MM = 1e-6

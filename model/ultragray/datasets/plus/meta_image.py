@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ...errors import DatasetInvalid
-from .sequence import (
+from ultragray.datasets.plus.sequence import (
     StoredSequence,
     header_lines,
     pixel_shape,
@@ -14,6 +13,7 @@ from .sequence import (
     split_fields,
     whole_numbers,
 )
+from ultragray.errors import DatasetInvalid
 
 _DTYPES = {"MET_UCHAR": "u1", "MET_USHORT": "u2", "MET_SHORT": "i2"}
 _MOST_SIGNIFICANT_FIRST = ("BinaryDataByteOrderMSB", "ElementByteOrderMSB")

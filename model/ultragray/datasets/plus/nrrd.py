@@ -5,8 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import BinaryIO
 
-from ...errors import DatasetInvalid
-from .sequence import (
+from ultragray.datasets.plus.sequence import (
     StoredSequence,
     header_lines,
     pixel_shape,
@@ -15,6 +14,7 @@ from .sequence import (
     split_fields,
     whole_numbers,
 )
+from ultragray.errors import DatasetInvalid
 
 _DTYPES = {
     **dict.fromkeys(("uchar", "unsigned char", "uint8", "uint8_t"), "u1"),

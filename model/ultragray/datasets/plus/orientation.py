@@ -12,8 +12,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import DatasetInvalid
-from ..sweep import ByteArray
+from ultragray.datasets.sweep import ByteArray
+from ultragray.errors import DatasetInvalid
 
 UNKNOWN = ("", "XX")
 

@@ -11,19 +11,19 @@ from pathlib import Path
 
 import numpy as np
 
-from ...errors import DatasetInvalid, InvalidArgument, InvalidPose
-from ...pose import check_poses
-from ...probe import FloatArray, Probe
-from ..calibration import pixel_size_mm, poses_from_image_transforms, region_of
-from ..images import grey_frames, parse_crop
-from ..splits import parse_frame_ranges
-from ..sweep import Sweep
-from .fan import FanGeometry, FanLines, fan_of_device_set, fan_of_export, parse_fan, poses_of_fan
-from .meta_image import read_meta_image
-from .nrrd import read_nrrd
-from .orientation import UNKNOWN, orient_frames
-from .sequence import StoredSequence
-from .transforms import TransformName, find_path, parse_matrix, read_device_set, transform_name
+from ultragray.datasets.calibration import pixel_size_mm, poses_from_image_transforms, region_of
+from ultragray.datasets.images import grey_frames, parse_crop
+from ultragray.datasets.plus.fan import FanGeometry, FanLines, fan_of_device_set, fan_of_export, parse_fan, poses_of_fan
+from ultragray.datasets.plus.meta_image import read_meta_image
+from ultragray.datasets.plus.nrrd import read_nrrd
+from ultragray.datasets.plus.orientation import UNKNOWN, orient_frames
+from ultragray.datasets.plus.sequence import StoredSequence
+from ultragray.datasets.plus.transforms import TransformName, find_path, parse_matrix, read_device_set, transform_name
+from ultragray.datasets.splits import parse_frame_ranges
+from ultragray.datasets.sweep import Sweep
+from ultragray.errors import DatasetInvalid, InvalidArgument, InvalidPose
+from ultragray.pose import check_poses
+from ultragray.probe import FloatArray, Probe
 
 _READERS = {".mha": read_meta_image, ".mhd": read_meta_image, ".nrrd": read_nrrd, ".nhdr": read_nrrd}
 IMAGE, WORLDS = "Image", ("Reference", "Tracker", "World")

@@ -14,9 +14,9 @@ from typing import BinaryIO
 
 import numpy as np
 
-from ...errors import DatasetInvalid
-from ..images import MAX_PIXEL_BYTES
-from ..sweep import ByteArray
+from ultragray.datasets.images import MAX_PIXEL_BYTES
+from ultragray.datasets.sweep import ByteArray
+from ultragray.errors import DatasetInvalid
 
 MAX_HEADER_BYTES = 256 << 20
 MAX_LINE_BYTES = 1 << 20

@@ -13,8 +13,8 @@ from xml.etree import ElementTree
 
 import numpy as np
 
-from ...errors import DatasetInvalid
-from ...probe import FloatArray
+from ultragray.errors import DatasetInvalid
+from ultragray.probe import FloatArray
 
 MAX_DEVICE_SET_BYTES = 8 << 20
 _NAME = re.compile(r"([A-Z]\w*?)To([A-Z]\w*)")

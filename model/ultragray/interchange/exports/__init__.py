@@ -6,9 +6,9 @@ What a format can hold is known without importing what it needs. Free of torch.
 
 from __future__ import annotations
 
-from .exporter import Exporter, ExportHeader
-from .formats import FORMATS, Format, check_format, exporter_class, format_of
-from .writing import Add, export_to
+from ultragray.interchange.exports.exporter import Exporter, ExportHeader
+from ultragray.interchange.exports.formats import FORMATS, Format, check_format, exporter_class, format_of
+from ultragray.interchange.exports.writing import Add, export_to
 
 __all__ = [
     "FORMATS",

@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...confidence import Extrapolation, figure_arrays
-from ...contract import to_dict
-from ...display.pixels import PixelArray, to_uint8
-from ...errors import InvalidArgument
-from ...outputs import OUTPUTS
-from ...probe import FloatArray
-from ...settings import Resolved
+from ultragray.confidence import Extrapolation, figure_arrays
+from ultragray.contract import to_dict
+from ultragray.display.pixels import PixelArray, to_uint8
+from ultragray.errors import InvalidArgument
+from ultragray.outputs import OUTPUTS
+from ultragray.probe import FloatArray
+from ultragray.settings import Resolved
 
 FRAME_TIME_MS = 40.0  # rendered frames have no time of their own: formats that need one show 25 a second
 

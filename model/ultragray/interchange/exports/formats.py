@@ -9,11 +9,11 @@ import importlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from ...display.settings import true_to_scale
-from ...errors import InvalidArgument
-from ...installation import extra_of, missing_extra
-from ...settings import Resolved
-from .exporter import Exporter
+from ultragray.display.settings import true_to_scale
+from ultragray.errors import InvalidArgument
+from ultragray.installation import extra_of, missing_extra
+from ultragray.interchange.exports.exporter import Exporter
+from ultragray.settings import Resolved
 
 DTYPES = ("float32", "uint8")
 

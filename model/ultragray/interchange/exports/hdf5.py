@@ -10,8 +10,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from ...display.pixels import PixelArray
-from .exporter import Exporter
+from ultragray.display.pixels import PixelArray
+from ultragray.interchange.exports.exporter import Exporter
 
 
 class Hdf5Exporter(Exporter):

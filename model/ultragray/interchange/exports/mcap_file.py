@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from ...display.pixels import PixelArray
-from ..ros_recording import RosRecording
-from .exporter import FRAME_TIME_MS, Exporter
+from ultragray.display.pixels import PixelArray
+from ultragray.interchange.exports.exporter import FRAME_TIME_MS, Exporter
+from ultragray.interchange.ros_recording import RosRecording
 
 
 class McapExporter(Exporter):

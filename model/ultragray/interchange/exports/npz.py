@@ -11,8 +11,8 @@ from typing import IO
 
 import numpy as np
 
-from ...display.pixels import PixelArray
-from .exporter import Exporter
+from ultragray.display.pixels import PixelArray
+from ultragray.interchange.exports.exporter import Exporter
 
 
 class NpzExporter(Exporter):

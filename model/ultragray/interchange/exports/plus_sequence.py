@@ -14,9 +14,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ...display.pixels import PixelArray
-from ...probe import FloatArray
-from .exporter import FRAME_TIME_MS, Exporter
+from ultragray.display.pixels import PixelArray
+from ultragray.interchange.exports.exporter import FRAME_TIME_MS, Exporter
+from ultragray.probe import FloatArray
 
 FIELDS = {
     "distance_mm": "UltraGRayDistanceMm",

@@ -8,11 +8,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from ...confidence import Extrapolation
-from ...display.pixels import PixelArray, image_file
-from ...files.atomic import atomic_path
-from .exporter import ExportHeader
-from .writing import Add
+from ultragray.confidence import Extrapolation
+from ultragray.display.pixels import PixelArray, image_file
+from ultragray.files.atomic import atomic_path
+from ultragray.interchange.exports.exporter import ExportHeader
+from ultragray.interchange.exports.writing import Add
 
 FRAMES_FILE = "frames.json"
 

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ...display.pixels import PixelArray, image_file
-from .exporter import Exporter
+from ultragray.display.pixels import PixelArray, image_file
+from ultragray.interchange.exports.exporter import Exporter
 
 
 class TarExporter(Exporter):

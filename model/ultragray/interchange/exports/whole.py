@@ -6,10 +6,10 @@ import tempfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-from ...confidence import Extrapolation
-from ...display.pixels import PixelArray
-from .exporter import ExportHeader, stored_pixels
-from .formats import exporter_class
+from ultragray.confidence import Extrapolation
+from ultragray.display.pixels import PixelArray
+from ultragray.interchange.exports.exporter import ExportHeader, stored_pixels
+from ultragray.interchange.exports.formats import exporter_class
 
 
 def export_bytes(

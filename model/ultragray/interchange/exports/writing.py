@@ -9,11 +9,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TypeAlias
 
-from ...confidence import Extrapolation
-from ...display.pixels import PixelArray
-from ...files.atomic import atomic_path
-from .exporter import Exporter, ExportHeader, stored_pixels
-from .formats import exporter_class
+from ultragray.confidence import Extrapolation
+from ultragray.display.pixels import PixelArray
+from ultragray.files.atomic import atomic_path
+from ultragray.interchange.exports.exporter import Exporter, ExportHeader, stored_pixels
+from ultragray.interchange.exports.formats import exporter_class
 
 WAITING_PORTIONS = 2
 

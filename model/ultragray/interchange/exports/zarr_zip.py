@@ -10,8 +10,8 @@ import numpy.typing as npt
 import zarr
 from zarr.storage import ZipStore
 
-from ...display.pixels import PixelArray
-from .exporter import Exporter
+from ultragray.display.pixels import PixelArray
+from ultragray.interchange.exports.exporter import Exporter
 
 
 class ZarrExporter(Exporter):

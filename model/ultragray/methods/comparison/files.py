@@ -5,11 +5,11 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from ...datasets.sweep import Dataset
-from ...files.atomic import write_whole
-from .latex import latex_table
-from .page import render_comparison
-from .result import RESULT_FILE, Comparison
+from ultragray.datasets.sweep import Dataset
+from ultragray.files.atomic import write_whole
+from ultragray.methods.comparison.latex import latex_table
+from ultragray.methods.comparison.page import render_comparison
+from ultragray.methods.comparison.result import RESULT_FILE, Comparison
 
 TABLE_FILE, PAGE_FILE = "comparison.tex", "comparison.html"
 

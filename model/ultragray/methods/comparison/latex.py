@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from .ranks import METRICS, by_mean_rank, rank
-from .result import Comparison
-from .tables import COST_HEADINGS, Row, budget_text, cost_texts, metric_rows
+from ultragray.methods.comparison.ranks import METRICS, by_mean_rank, rank
+from ultragray.methods.comparison.result import Comparison
+from ultragray.methods.comparison.tables import COST_HEADINGS, Row, budget_text, cost_texts, metric_rows
 
 _ESCAPES = {
     "\\": r"\textbackslash{}",

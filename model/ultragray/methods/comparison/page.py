@@ -9,18 +9,26 @@ from pathlib import Path
 import numpy as np
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
-from ...datasets.sweep import Dataset
-from ...evaluation.scoring import Evaluation
-from ...evaluation.side_by_side import DIFFERENCE_GAIN
-from ...installation import __version__
-from ..gaussians import SceneMethod
-from ..method import Description
-from .pictures import FrameOfPage, Shown, frames_of_page, telling_places
-from .place import frames_of
-from .plots import plot_distances
-from .ranks import METRICS, by_mean_rank, rank
-from .result import Comparison, MethodResult
-from .tables import Row, budget_text, cost_texts, metric_rows, rank_rows, speckle_rows, steps_text
+from ultragray.datasets.sweep import Dataset
+from ultragray.evaluation.scoring import Evaluation
+from ultragray.evaluation.side_by_side import DIFFERENCE_GAIN
+from ultragray.installation import __version__
+from ultragray.methods.comparison.pictures import FrameOfPage, Shown, frames_of_page, telling_places
+from ultragray.methods.comparison.place import frames_of
+from ultragray.methods.comparison.plots import plot_distances
+from ultragray.methods.comparison.ranks import METRICS, by_mean_rank, rank
+from ultragray.methods.comparison.result import Comparison, MethodResult
+from ultragray.methods.comparison.tables import (
+    Row,
+    budget_text,
+    cost_texts,
+    metric_rows,
+    rank_rows,
+    speckle_rows,
+    steps_text,
+)
+from ultragray.methods.gaussians import SceneMethod
+from ultragray.methods.method import Description
 
 
 @dataclass(frozen=True)

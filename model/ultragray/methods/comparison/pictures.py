@@ -8,11 +8,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...datasets.sweep import Sweep
-from ...display.pixels import ByteArray, image_file
-from ...evaluation.scoring import Evaluation
-from ...evaluation.side_by_side import DIFFERENCE_GAIN, as_picture
-from ..method import FrameArray
+from ultragray.datasets.sweep import Sweep
+from ultragray.display.pixels import ByteArray, image_file
+from ultragray.evaluation.scoring import Evaluation
+from ultragray.evaluation.side_by_side import DIFFERENCE_GAIN, as_picture
+from ultragray.methods.method import FrameArray
 
 PICTURE_PIXELS = 240
 

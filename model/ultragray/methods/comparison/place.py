@@ -16,13 +16,13 @@ from typing import Any
 
 import numpy as np
 
-from ...datasets.sweep import ByteArray, Dataset
-from ...display.pixels import to_uint8
-from ...errors import TrainingStateInvalid
-from ...files.atomic import write_whole
-from ...files.npy import map_npy
-from ..method import FrameArray
-from .result import FORMAT_VERSION, MethodResult
+from ultragray.datasets.sweep import ByteArray, Dataset
+from ultragray.display.pixels import to_uint8
+from ultragray.errors import TrainingStateInvalid
+from ultragray.files.atomic import write_whole
+from ultragray.files.npy import map_npy
+from ultragray.methods.comparison.result import FORMAT_VERSION, MethodResult
+from ultragray.methods.method import FrameArray
 
 RUN_FILE, METHOD_FILE, FRAMES_FILE = "run.json", "result.json", "frames.npy"
 

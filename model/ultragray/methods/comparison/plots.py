@@ -12,9 +12,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 
-from ...evaluation.scoring import Evaluation
-from ...probe import FloatArray
-from .result import Distances
+from ultragray.evaluation.scoring import Evaluation
+from ultragray.methods.comparison.result import Distances
+from ultragray.probe import FloatArray
 
 SCENE_COLOUR = "#0b6e99"
 COLOURS = ("#d97706", "#6d8f3c", "#7c4dbe", "#c2405a", "#2a9d8f", "#8a6d3b", "#4c6ef5", "#7c8a97")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 
-from ...evaluation.scoring import Evaluation
+from ultragray.evaluation.scoring import Evaluation
 
 
 @dataclass(frozen=True)

@@ -8,16 +8,16 @@ from typing import Any
 
 import numpy as np
 
-from ...contract import to_dict
-from ...datasets.sweep import Dataset, IntArray
-from ...evaluation.baselines import nearest_frames
-from ...evaluation.metrics import FrameMetrics
-from ...evaluation.scoring import Evaluation
-from ...evaluation.speckle import FrameSpeckle, Speckle
-from ...files.format_version import require_version
-from ...pose import rotation_angles_deg
-from ...probe import FloatArray
-from ..method import Cost, Description
+from ultragray.contract import to_dict
+from ultragray.datasets.sweep import Dataset, IntArray
+from ultragray.evaluation.baselines import nearest_frames
+from ultragray.evaluation.metrics import FrameMetrics
+from ultragray.evaluation.scoring import Evaluation
+from ultragray.evaluation.speckle import FrameSpeckle, Speckle
+from ultragray.files.format_version import require_version
+from ultragray.methods.method import Cost, Description
+from ultragray.pose import rotation_angles_deg
+from ultragray.probe import FloatArray
 
 FORMAT_VERSION = 1
 RESULT_FILE = "comparison.json"

@@ -11,19 +11,19 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ...datasets.sweep import Dataset, Sweep, spread_places
-from ...errors import TrainingDiverged, UltragrayError
-from ...evaluation.scoring import evaluate_frames, require_frames
-from ...installation import __version__
-from ...machine import processor_name
-from ...training.device import training_device
-from ..budget import Budget, BudgetKind, Pace, Paces
-from ..gaussians import SceneMethod
-from ..method import FitProgress, FitRun, Fitted, FrameArray, Method
-from ..registry import chosen_methods
-from .place import Place
-from .result import Comparison, DatasetFacts, Distances, MethodResult
-from .settings import ComparisonSettings
+from ultragray.datasets.sweep import Dataset, Sweep, spread_places
+from ultragray.errors import TrainingDiverged, UltragrayError
+from ultragray.evaluation.scoring import evaluate_frames, require_frames
+from ultragray.installation import __version__
+from ultragray.machine import processor_name
+from ultragray.methods.budget import Budget, BudgetKind, Pace, Paces
+from ultragray.methods.comparison.place import Place
+from ultragray.methods.comparison.result import Comparison, DatasetFacts, Distances, MethodResult
+from ultragray.methods.comparison.settings import ComparisonSettings
+from ultragray.methods.gaussians import SceneMethod
+from ultragray.methods.method import FitProgress, FitRun, Fitted, FrameArray, Method
+from ultragray.methods.registry import chosen_methods
+from ultragray.training.device import training_device
 
 SCENE = SceneMethod.name
 EQUAL_TIME = "equal time"  # among the paces: the seconds of the scene

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ...contract import Contract, described
-from ..budget import BudgetKind
-from ..names import ALL, NAMES, chosen_names
+from ultragray.contract import Contract, described
+from ultragray.methods.budget import BudgetKind
+from ultragray.methods.names import ALL, NAMES, chosen_names
 
 EVERY_METHOD = (ALL,)
 

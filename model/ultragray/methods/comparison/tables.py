@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import astuple, dataclass, field
 
-from ...evaluation.scoring import Evaluation
-from ...evaluation.speckle import Speckle
-from ..budget import BudgetKind
-from .ranks import METRICS, rank, shown_value
-from .result import Comparison, MethodResult
+from ultragray.evaluation.scoring import Evaluation
+from ultragray.evaluation.speckle import Speckle
+from ultragray.methods.budget import BudgetKind
+from ultragray.methods.comparison.ranks import METRICS, rank, shown_value
+from ultragray.methods.comparison.result import Comparison, MethodResult
 
 COST_HEADINGS = ("steps", "training", "ms a frame", "MB")
 

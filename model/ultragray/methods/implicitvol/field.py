@@ -9,7 +9,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-from ..parts.encoding import encode, encoded_size
+from ultragray.methods.parts.encoding import encode, encoded_size
 
 WIDTH = 128
 FIRST_FREQUENCY = 30.0

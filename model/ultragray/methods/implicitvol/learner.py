@@ -6,11 +6,11 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ...datasets.sweep import Dataset
-from ...probe import FloatArray
-from ..parts.slices import SliceLearner, set_rate
-from .field import SineField
-from .poses import FramePoses
+from ultragray.datasets.sweep import Dataset
+from ultragray.methods.implicitvol.field import SineField
+from ultragray.methods.implicitvol.poses import FramePoses
+from ultragray.methods.parts.slices import SliceLearner, set_rate
+from ultragray.probe import FloatArray
 
 EPOCHS = 10_001  # of the paper
 RATE = 1e-3  # of the network and of the poses

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import torch
 
-from ...datasets.sweep import Dataset
-from ..budget import Budget
-from ..learner import LearnedMethod, Learner
-from ..method import Description
-from .learner import EPOCHS, FieldLearner, RefiningLearner
+from ultragray.datasets.sweep import Dataset
+from ultragray.methods.budget import Budget
+from ultragray.methods.implicitvol.learner import EPOCHS, FieldLearner, RefiningLearner
+from ultragray.methods.learner import LearnedMethod, Learner
+from ultragray.methods.method import Description
 
 PUBLISHED_FRAMES = 128  # of the paper's example
 SOURCE = "Yeung et al., arXiv 2109.12108"

@@ -15,10 +15,10 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from ...datasets.sweep import Sweep
-from ...evaluation.compounding import mean_axes
-from ...probe import FloatArray
-from ..parts.space import as_tensor
+from ultragray.datasets.sweep import Sweep
+from ultragray.evaluation.compounding import mean_axes
+from ultragray.methods.parts.space import as_tensor
+from ultragray.probe import FloatArray
 
 MIDDLE = np.array(0.5)  # of an image, down and across
 

@@ -8,12 +8,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...datasets.sweep import Dataset
-from ...evaluation.compounding import pixel_positions_mm
-from ...probe import FloatArray, Probe
-from ..learner import Learner
-from .similarity import Similarity
-from .space import as_tensor
+from ultragray.datasets.sweep import Dataset
+from ultragray.evaluation.compounding import pixel_positions_mm
+from ultragray.methods.learner import Learner
+from ultragray.methods.parts.similarity import Similarity
+from ultragray.methods.parts.space import as_tensor
+from ultragray.probe import FloatArray, Probe
 
 SIMILARITY = Similarity(window=5, is_padded=True)  # of ImplicitVol's loss
 

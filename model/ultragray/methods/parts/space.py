@@ -7,9 +7,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ...datasets.sweep import Sweep
-from ...evaluation.compounding import pixel_positions_mm
-from ...probe import FloatArray, Probe
+from ultragray.datasets.sweep import Sweep
+from ultragray.evaluation.compounding import pixel_positions_mm
+from ultragray.probe import FloatArray, Probe
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,11 +8,11 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor, nn
 
-from ...backends.weighted import WeightedSums
-from ...probe import FloatArray
-from ...scene import GaussianScene
-from ...scene_info import SceneInfo
-from .renderer import average, shadow
+from ultragray.backends.weighted import WeightedSums
+from ultragray.methods.ultragauss.renderer import average, shadow
+from ultragray.probe import FloatArray
+from ultragray.scene import GaussianScene
+from ultragray.scene_info import SceneInfo
 
 GAUSSIANS = ("means", "scales", "quats", "transmittances", "sh0")  # the parameters with a row for each Gaussian
 START_BACKGROUND_WEIGHT = 0.1  # of one Gaussian at its centre

@@ -8,19 +8,19 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from ...backends.poses import scene_poses
-from ...backends.weighted import WeightedSums, weighted_sums
-from ...datasets.sweep import Dataset
-from ...errors import DatasetInvalid
-from ...probe import FloatArray, Probe
-from ...scene import GaussianScene
-from ...training.data.geometry import Geometry
-from ...training.steps.losses import SSIM_WINDOW, image_loss
-from ...training.steps.refinement import PullStatistics
-from ..learner import Learner
-from ..parts.slices import frame_of_step
-from .field import GAUSSIANS, Field
-from .resampling import follow, is_due, resample
+from ultragray.backends.poses import scene_poses
+from ultragray.backends.weighted import WeightedSums, weighted_sums
+from ultragray.datasets.sweep import Dataset
+from ultragray.errors import DatasetInvalid
+from ultragray.methods.learner import Learner
+from ultragray.methods.parts.slices import frame_of_step
+from ultragray.methods.ultragauss.field import GAUSSIANS, Field
+from ultragray.methods.ultragauss.resampling import follow, is_due, resample
+from ultragray.probe import FloatArray, Probe
+from ultragray.scene import GaussianScene
+from ultragray.training.data.geometry import Geometry
+from ultragray.training.steps.losses import SSIM_WINDOW, image_loss
+from ultragray.training.steps.refinement import PullStatistics
 
 STRUCTURE = 0.5  # of the loss is 1 − SSIM, the rest L1
 RATES = {

@@ -6,14 +6,14 @@ from dataclasses import dataclass
 
 import torch
 
-from ...datasets.sweep import Dataset
-from ...training.config import TrainingConfig
-from ...training.data.geometry import Geometry
-from ..budget import Budget, BudgetKind
-from ..learner import LearnedMethod
-from ..method import Description
-from .learner import UltraGaussLearner
-from .start import even_start, wide_start
+from ultragray.datasets.sweep import Dataset
+from ultragray.methods.budget import Budget, BudgetKind
+from ultragray.methods.learner import LearnedMethod
+from ultragray.methods.method import Description
+from ultragray.methods.ultragauss.learner import UltraGaussLearner
+from ultragray.methods.ultragauss.start import even_start, wide_start
+from ultragray.training.config import TrainingConfig
+from ultragray.training.data.geometry import Geometry
 
 STEPS = 30_000
 GAUSSIANS = 300_000  # of the author's recipe

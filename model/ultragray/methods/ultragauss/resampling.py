@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ...training.config import TrainingConfig
-from ...training.steps.refinement import refine
+from ultragray.training.config import TrainingConfig
+from ultragray.training.steps.refinement import refine
 
 INTERVAL = 100  # steps
 FIRST, LAST = 500 / 30_000, 15_000 / 30_000  # as shares of the steps

@@ -6,12 +6,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...backends.spatial_order import spatial_order
-from ...datasets.sweep import Dataset
-from ...probe import FloatArray
-from ...probe.scan_lines import ParallelLines
-from ...training.data.geometry import Geometry
-from ..parts.space import Box
+from ultragray.backends.spatial_order import spatial_order
+from ultragray.datasets.sweep import Dataset
+from ultragray.methods.parts.space import Box
+from ultragray.probe import FloatArray
+from ultragray.probe.scan_lines import ParallelLines
+from ultragray.training.data.geometry import Geometry
 
 START_LOGIT = 1.0  # α = σ(1) = 0.731
 LOW, HIGH = 4.0, 5.0  # of the entries of L, in the normalised volume

@@ -11,7 +11,7 @@ from itertools import pairwise
 import torch
 from torch import Tensor, nn
 
-from ..parts.encoding import encode, encoded_size
+from ultragray.methods.parts.encoding import encode, encoded_size
 
 WIDTH = 128
 LAYERS_BEFORE_JOIN, LAYERS_AFTER_JOIN = 5, 3

@@ -8,16 +8,16 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ...datasets.sweep import Dataset, Sweep
-from ...errors import DatasetInvalid
-from ...probe import FloatArray, Probe
-from ..budget import Budget
-from ..learner import LearnedMethod, Learner
-from ..method import Description
-from ..parts.similarity import Similarity
-from ..parts.space import Box, as_tensor, pixel_points_mm
-from .field import Field
-from .renderer import Tissue, drawn_frame, expected_frame
+from ultragray.datasets.sweep import Dataset, Sweep
+from ultragray.errors import DatasetInvalid
+from ultragray.methods.budget import Budget
+from ultragray.methods.learner import LearnedMethod, Learner
+from ultragray.methods.method import Description
+from ultragray.methods.parts.similarity import Similarity
+from ultragray.methods.parts.space import Box, as_tensor, pixel_points_mm
+from ultragray.methods.ultranerf.field import Field
+from ultragray.methods.ultranerf.renderer import Tissue, drawn_frame, expected_frame
+from ultragray.probe import FloatArray, Probe
 
 PUBLISHED_STEPS = 200_000
 RATE = 1e-4

@@ -9,19 +9,19 @@ from typing import TypeAlias
 
 import numpy as np
 
-from ...confidence.assess import supported
-from ...confidence.model import ConfidenceModel, predicted, terms_of
-from ...confidence.views import TrainingViews
-from ...datasets.sweep import Dataset, Sweep, spread_places
-from ...evaluation.scoring import evaluate, evaluate_frames, render_sweep
-from ...probe import FloatArray
-from ...scene import GaussianScene
-from ..config import TrainingConfig
-from .fitting import Examples, fit_support, fit_weights
-from .hardness import hardness_of_views
-from .held_out import LEAST_HELD_OUT, held_out_frames
-from .one_sided import one_sided_examples
-from .residuals import fit_uncertainty
+from ultragray.confidence.assess import supported
+from ultragray.confidence.model import ConfidenceModel, predicted, terms_of
+from ultragray.confidence.views import TrainingViews
+from ultragray.datasets.sweep import Dataset, Sweep, spread_places
+from ultragray.evaluation.scoring import evaluate, evaluate_frames, render_sweep
+from ultragray.probe import FloatArray
+from ultragray.scene import GaussianScene
+from ultragray.training.confidence.fitting import Examples, fit_support, fit_weights
+from ultragray.training.confidence.hardness import hardness_of_views
+from ultragray.training.confidence.held_out import LEAST_HELD_OUT, held_out_frames
+from ultragray.training.confidence.one_sided import one_sided_examples
+from ultragray.training.confidence.residuals import fit_uncertainty
+from ultragray.training.config import TrainingConfig
 
 SHORTER, ENOUGH_STEPS = 0.25, 150  # share of the steps, and the number that is not cut: longer tells the same
 MEASURED_FRAMES = 96  # of those held out; of those trained from a third as many

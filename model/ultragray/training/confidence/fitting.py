@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...confidence.model import TERMS, Support, logistic, predicted, within
-from ...confidence.views import ViewMeasures
-from ...probe import FloatArray
+from ultragray.confidence.model import TERMS, Support, logistic, predicted, within
+from ultragray.confidence.views import ViewMeasures
+from ultragray.probe import FloatArray
 
 PRIOR_WEIGHTS = (3.6, 1.1, 1.5, 0.3, 0.6)  # about those of ten scenes; one that no view determines stays near its own
 PRIOR_STRENGTH = 0.1  # squared error that is added for a weight that is 1 away from its prior

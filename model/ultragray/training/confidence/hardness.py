@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...confidence.model import NEAR_MM
-from ...confidence.views import TrainingViews
-from ...datasets.sweep import Sweep
-from ...probe import FloatArray
-from .neighbours import Neighbours
+from ultragray.confidence.model import NEAR_MM
+from ultragray.confidence.views import TrainingViews
+from ultragray.datasets.sweep import Sweep
+from ultragray.probe import FloatArray
+from ultragray.training.confidence.neighbours import Neighbours
 
 MAX_FRAMES = 192  # that are predicted; the others take the hardness of their neighbours
 EXCLUDED_MM = (0.0, 1.5, 3.0, 5.0)  # frames within this distance of the one that is predicted are not used

@@ -6,9 +6,9 @@ import math
 
 import numpy as np
 
-from ...datasets.sweep import IntArray, Sweep
-from ...pose import rotation_angles_deg
-from ...probe import FloatArray
+from ultragray.datasets.sweep import IntArray, Sweep
+from ultragray.pose import rotation_angles_deg
+from ultragray.probe import FloatArray
 
 # Stretches of the sweep's path, as shares of its length: first and last, then gaps of several widths.
 STRETCHES = ((0.0, 0.06), (0.20, 0.23), (0.34, 0.39), (0.48, 0.57), (0.68, 0.69), (0.89, 1.0))

@@ -9,11 +9,11 @@ import numpy.typing as npt
 import torch
 from torch.nn import functional
 
-from ...confidence.views import TrainingViews, ViewMeasures
-from ...datasets.sweep import ByteArray, IntArray, Sweep, spread_places
-from ...evaluation.baselines import interpolate_planes
-from ...evaluation.metrics import frame_metrics
-from ...probe import FloatArray
+from ultragray.confidence.views import TrainingViews, ViewMeasures
+from ultragray.datasets.sweep import ByteArray, IntArray, Sweep, spread_places
+from ultragray.evaluation.baselines import interpolate_planes
+from ultragray.evaluation.metrics import frame_metrics
+from ultragray.probe import FloatArray
 
 PICTURE_SIDE = 64  # structure smaller than its pixels is speckle
 MOST_HELPERS = 16

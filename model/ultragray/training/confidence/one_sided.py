@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
-from ...confidence.model import TERMS, terms_of
-from ...confidence.views import POINTS_PER_SIDE, ViewMeasures
-from ...datasets.sweep import Sweep
-from ...probe import FloatArray
-from .fitting import Examples
-from .held_out import path_mm
-from .neighbours import Neighbours
+from ultragray.confidence.model import TERMS, terms_of
+from ultragray.confidence.views import POINTS_PER_SIDE, ViewMeasures
+from ultragray.datasets.sweep import Sweep
+from ultragray.probe import FloatArray
+from ultragray.training.confidence.fitting import Examples
+from ultragray.training.confidence.held_out import path_mm
+from ultragray.training.confidence.neighbours import Neighbours
 
 MAX_FRAMES = 96  # that are predicted
 BEYOND_MM = (0.0, 1.5, 3.0, 5.0, 8.0, 12.0)  # along the path: only frames farther away are used

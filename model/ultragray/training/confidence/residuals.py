@@ -7,14 +7,14 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-from ...confidence.deviation import CELLS, POINTS_PER_SIDE, in_cells, variance_terms, view_distances
-from ...confidence.uncertainty import DEPTHS, DepthBands, Uncertainty
-from ...confidence.views import FAR_MM, TrainingViews
-from ...datasets.sweep import ByteArray, Sweep
-from ...evaluation.scoring import frames_at_once
-from ...probe import FloatArray
-from ...rendering import render
-from ...scene import GaussianScene
+from ultragray.confidence.deviation import CELLS, POINTS_PER_SIDE, in_cells, variance_terms, view_distances
+from ultragray.confidence.uncertainty import DEPTHS, DepthBands, Uncertainty
+from ultragray.confidence.views import FAR_MM, TrainingViews
+from ultragray.datasets.sweep import ByteArray, Sweep
+from ultragray.evaluation.scoring import frames_at_once
+from ultragray.probe import FloatArray
+from ultragray.rendering import render
+from ultragray.scene import GaussianScene
 
 LOOKED_AT = 40_000  # cells, over all frames
 FAR_SHARE = 0.05  # of the weight of those cells: weight of places far from all views, where no frame shows the error

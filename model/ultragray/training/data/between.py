@@ -17,12 +17,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ...backends import cuda
-from ...datasets.sweep import IntArray, Sweep, spread_places
-from ...probe import FloatArray
-from ...samplers.rotations import blended
-from .blending import Blend, blend_by_pixel, blend_in_space
-from .neighbours import Neighbours
+from ultragray.backends import cuda
+from ultragray.datasets.sweep import IntArray, Sweep, spread_places
+from ultragray.probe import FloatArray
+from ultragray.samplers.rotations import blended
+from ultragray.training.data.blending import Blend, blend_by_pixel, blend_in_space
+from ultragray.training.data.neighbours import Neighbours
 
 EXACT = 1e-9  # a squared error that counts as none
 TRIED_FRAMES = 32  # enough to tell which blend is better

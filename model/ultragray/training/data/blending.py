@@ -9,9 +9,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ...backends import cuda
-from ...probe import FloatArray, Probe
-from ...probe.scan_lines import Lines, ParallelLines
+from ultragray.backends import cuda
+from ultragray.probe import FloatArray, Probe
+from ultragray.probe.scan_lines import Lines, ParallelLines
 
 ON_PLANE_MM = 1e-6  # distances are at least that: the nearer frame then has all the weight
 

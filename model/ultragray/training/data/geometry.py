@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ...datasets.sweep import Dataset, Sweep, corner_distances_mm
-from ...probe import FloatArray
-from .sampling import out_of_plane_range_mm
+from ultragray.datasets.sweep import Dataset, Sweep, corner_distances_mm
+from ultragray.probe import FloatArray
+from ultragray.training.data.sampling import out_of_plane_range_mm
 
 SCALE_MARGIN = 1.1  # of the released recipe
 FRAMES_AT_ONCE = 64

@@ -9,18 +9,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...backends.spatial_order import spatial_order
-from ...datasets.sweep import Dataset, IntArray
-from ...pose import quaternion_from_pose
-from ...probe import FloatArray
-from ...scene import PARAMETERS
-from ...scene_info import expected_shapes
-from ..config import TrainingConfig
-from ..steps.intensity import sh0_of_intensity
-from .between import draw_places
-from .geometry import Geometry
-from .neighbours import Neighbours
-from .shadows import SPENT, Shadows
+from ultragray.backends.spatial_order import spatial_order
+from ultragray.datasets.sweep import Dataset, IntArray
+from ultragray.pose import quaternion_from_pose
+from ultragray.probe import FloatArray
+from ultragray.scene import PARAMETERS
+from ultragray.scene_info import expected_shapes
+from ultragray.training.config import TrainingConfig
+from ultragray.training.data.between import draw_places
+from ultragray.training.data.geometry import Geometry
+from ultragray.training.data.neighbours import Neighbours
+from ultragray.training.data.shadows import SPENT, Shadows
+from ultragray.training.steps.intensity import sh0_of_intensity
 
 NO_ABSORPTION_LOGIT = 30.0  # τ = 1 to the last bit of a float32
 RELEASED_INTENSITY = 0.6  # of the released start: sh0 = (0.1 − 0.5) / 0.28209

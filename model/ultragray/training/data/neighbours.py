@@ -7,9 +7,9 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ...datasets.sweep import IntArray, Sweep
-from ...pose import rotation_angles_deg
-from ...probe import FloatArray
+from ultragray.datasets.sweep import IntArray, Sweep
+from ultragray.pose import rotation_angles_deg
+from ultragray.probe import FloatArray
 
 ALIKE_DEG = 20.0  # turned farther, a frame shows the same things from another side
 LEAST_ACROSS = 0.5  # of the way to a neighbour that leads across the image plane; else it lies beside

@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...datasets.sweep import IntArray, Sweep, corner_distances_mm, spread_places
-from ...probe import FloatArray
+from ultragray.datasets.sweep import IntArray, Sweep, corner_distances_mm, spread_places
+from ultragray.probe import FloatArray
 
 TELLING_NEIGHBOURS = 8  # with fewer, PSNR only says that speckle averages out
 MAX_SLICE_MM = 8.0  # no probe's slice is thicker

@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from ...datasets.sweep import Sweep, spread_places
+from ultragray.datasets.sweep import Sweep, spread_places
 
 USUAL = 0.7  # quantile over all scan lines at a depth: brighter than most shadows, less than a reflector
 LEAST_USUAL = 0.03  # grey value, of 1, below which a depth tells nothing

@@ -12,13 +12,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...datasets.sweep import Sweep
-from ...errors import DatasetInvalid
-from ...evaluation.scoring import frames_at_once, require_frames
-from ...rendering import render
-from ...scene import GaussianScene
-from ..steps.losses import SSIM_WINDOW, image_loss
-from .trained import Corrections
+from ultragray.datasets.sweep import Sweep
+from ultragray.errors import DatasetInvalid
+from ultragray.evaluation.scoring import frames_at_once, require_frames
+from ultragray.rendering import render
+from ultragray.scene import GaussianScene
+from ultragray.training.poses.trained import Corrections
+from ultragray.training.steps.losses import SSIM_WINDOW, image_loss
 
 STEPS = 60
 TEXTURE = 0.5  # share of SSIM in the loss that a frame is moved by

@@ -18,10 +18,10 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from ...datasets.sweep import IntArray, Sweep, spread_places
-from ...display.scan_conversion import FloatImage, interpolated_frames, pixel_places
-from ...probe import FloatArray
-from ...samplers.rotations import rotations_of
+from ultragray.datasets.sweep import IntArray, Sweep, spread_places
+from ultragray.display.scan_conversion import FloatImage, interpolated_frames, pixel_places
+from ultragray.probe import FloatArray
+from ultragray.samplers.rotations import rotations_of
 
 HalfArray: TypeAlias = npt.NDArray[np.float16]
 

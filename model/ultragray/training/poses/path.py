@@ -16,11 +16,11 @@ from itertools import pairwise
 
 import numpy as np
 
-from ...datasets.sweep import Sweep, corner_distances_mm
-from ...evaluation.compounding import mean_axes
-from ...probe import FloatArray
-from ...samplers.rotations import rotations_of, turns_of
-from .second_differences import likelihood_terms, smoothed
+from ultragray.datasets.sweep import Sweep, corner_distances_mm
+from ultragray.evaluation.compounding import mean_axes
+from ultragray.probe import FloatArray
+from ultragray.samplers.rotations import rotations_of, turns_of
+from ultragray.training.poses.second_differences import likelihood_terms, smoothed
 
 JUMP = 6.0  # median steps: a longer step begins a new sweep
 LEAST_FRAMES = 5  # of a sweep: fewer are not a path

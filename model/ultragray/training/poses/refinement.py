@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 from torch import Tensor
 
-from ...backends.poses import ScenePoses
-from ...datasets.sweep import Dataset
-from ...probe import FloatArray
-from .overlap import register_sweeps
-from .path import sweep_ranges, tracker_noise, without_noise
-from .trained import FrameCorrections, SweepCorrections
+from ultragray.backends.poses import ScenePoses
+from ultragray.datasets.sweep import Dataset
+from ultragray.probe import FloatArray
+from ultragray.training.poses.overlap import register_sweeps
+from ultragray.training.poses.path import sweep_ranges, tracker_noise, without_noise
+from ultragray.training.poses.trained import FrameCorrections, SweepCorrections
 
 _TRAINED: dict[str, type[FrameCorrections | SweepCorrections]] = {
     "frames": FrameCorrections,

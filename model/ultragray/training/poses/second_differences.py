@@ -10,7 +10,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from ...probe import FloatArray
+from ultragray.probe import FloatArray
 
 
 def likelihood_terms(bends: FloatArray, ratios: FloatArray) -> tuple[FloatArray, FloatArray]:

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ...files.atomic import write_whole
-from ...probe import FloatArray
+from ultragray.files.atomic import write_whole
+from ultragray.probe import FloatArray
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,6 +41,6 @@ class CorrectionSizes:
 
     def write_plot(self, path: Path) -> None:
         """Both over the frames, as SVG."""
-        from ...report.plots import plot_corrections
+        from ultragray.report.plots import plot_corrections
 
         write_whole(path, plot_corrections(self.shift_mm, self.turn_deg))

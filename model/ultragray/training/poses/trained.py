@@ -8,8 +8,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...datasets.sweep import Sweep
-from ...probe import FloatArray
+from ultragray.datasets.sweep import Sweep
+from ultragray.probe import FloatArray
 
 START = 0.1  # share of the run: before, there is no anatomy to compare with
 RATE = 0.01  # mm a step: at the end of a long run some tenths of a mm from where it began

@@ -8,9 +8,9 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
-from ...probe import ElevationBeam, Probe
-from ...probe.elevation import MAX_THICKNESS_MM
-from ..config import TrainingConfig
+from ultragray.probe import ElevationBeam, Probe
+from ultragray.probe.elevation import MAX_THICKNESS_MM
+from ultragray.training.config import TrainingConfig
 
 RATE = 0.05  # of Adam, for each of three numbers of the order of one
 BETAS = (0.8, 0.99)

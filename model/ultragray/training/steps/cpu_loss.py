@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from ... import _cpu
+from ultragray import _cpu
 
 
 def image_loss(rendered: Tensor, truth: Tensor, texture: float, *, instruction_set: str = "auto") -> Tensor:

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F  # noqa: N812 (torch's own name for it)
 from torch import Tensor
 
-from .cpu_loss import image_loss as kernel_image_loss
+from ultragray.training.steps.cpu_loss import image_loss as kernel_image_loss
 
 SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 import torch
 from torch import Tensor
 
-from ..config import TrainingConfig
+from ultragray.training.config import TrainingConfig
 
 MOMENTS = ("exp_avg", "exp_avg_sq")
 

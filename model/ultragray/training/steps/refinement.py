@@ -8,8 +8,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ...backends.spatial_order import spatial_order
-from ..config import TrainingConfig
+from ultragray.backends.spatial_order import spatial_order
+from ultragray.training.config import TrainingConfig
 
 SPLIT_SHRINK = 1.6  # standard deviations of the halves of a split Gaussian are divided by this
 

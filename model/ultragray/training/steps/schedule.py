@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..config import TrainingConfig
+from ultragray.training.config import TrainingConfig
 
 BEAM_INTENSITY_RATE = 3.0  # a beam dims what it spreads: intensities have further to go than from the frames' own
 

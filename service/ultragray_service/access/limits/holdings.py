@@ -8,6 +8,12 @@ from contextlib import contextmanager, suppress
 from datetime import datetime, time, timedelta, timezone
 
 from ultragray.errors import UltragrayError
+from ultragray_service.access.limits.allowance import GB
+from ultragray_service.access.limits.limits import Limits
+from ultragray_service.access.owners import Owners
+from ultragray_service.access.principal import acting
+from ultragray_service.core.jobs.jobs import Jobs
+from ultragray_service.errors import LimitReached
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import UploadTooLarge
 from ultragray_workers.jobs.files import Artifact
@@ -15,13 +21,6 @@ from ultragray_workers.jobs.queue.owners import Kind
 from ultragray_workers.jobs.shared.reading import SharedFile
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.scenes import SceneStore
-
-from ...core.jobs.jobs import Jobs
-from ...errors import LimitReached
-from ..owners import Owners
-from ..principal import acting
-from .allowance import GB
-from .limits import Limits
 
 
 class Room:

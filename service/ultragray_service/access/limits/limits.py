@@ -11,11 +11,10 @@ from dataclasses import replace
 from functools import lru_cache
 
 from ultragray.errors import TooManyPoses, UltragrayError
-
-from ...errors import LimitReached, RateLimited
-from ..principal import acting, caller
-from .allowance import Allowance, Number
-from .rates import WINDOW_S, Rate
+from ultragray_service.access.limits.allowance import Allowance, Number
+from ultragray_service.access.limits.rates import WINDOW_S, Rate
+from ultragray_service.access.principal import acting, caller
+from ultragray_service.errors import LimitReached, RateLimited
 
 
 class Limits:

@@ -6,9 +6,8 @@ from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+from ultragray_service.access.principal import caller
 from ultragray_workers.errors import QueueFull
-
-from ..principal import caller
 
 
 class Slots:

@@ -7,9 +7,8 @@ from typing import Any
 from urllib.parse import urlsplit
 
 from ultragray.errors import InvalidArgument
-
-from ..addresses import is_loopback
-from ..principal import Role
+from ultragray_service.access.addresses import is_loopback
+from ultragray_service.access.principal import Role
 
 
 def check_url(url: str, field: str) -> str:

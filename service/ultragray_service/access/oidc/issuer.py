@@ -18,10 +18,9 @@ from typing import Any
 import jwt
 
 from ultragray.errors import InvalidArgument
+from ultragray_service.access.oidc.claims import check_url
+from ultragray_service.errors import IssuerUnavailable, Unauthenticated
 from ultragray_workers.rounds import Rounds
-
-from ...errors import IssuerUnavailable, Unauthenticated
-from .claims import check_url
 
 DISCOVERY_PATH = "/.well-known/openid-configuration"
 REFRESH_S = 300.0

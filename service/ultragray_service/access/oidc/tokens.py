@@ -8,12 +8,12 @@ from typing import Any
 
 import jwt
 
-from ...errors import PermissionDenied, Unauthenticated
-from ...settings import Settings
-from ..guard import digest_of
-from ..principal import Principal, Role
-from .claims import claim_at, highest_role, parse_roles
-from .issuer import Issuer, SigningKey
+from ultragray_service.access.guard import digest_of
+from ultragray_service.access.oidc.claims import claim_at, highest_role, parse_roles
+from ultragray_service.access.oidc.issuer import Issuer, SigningKey
+from ultragray_service.access.principal import Principal, Role
+from ultragray_service.errors import PermissionDenied, Unauthenticated
+from ultragray_service.settings import Settings
 
 MAX_TOKEN_BYTES = 16_384
 LEEWAY_S = 30.0  # by which clocks may differ

@@ -19,12 +19,11 @@ from ultragray import GaussianScene
 from ultragray.backends import cuda
 from ultragray.backends.cuda.work import Work, count_work
 from ultragray.probe import FloatArray
+from ultragray_service.bench.cuda.gpu import Limits, gpu_document, measure_limits
+from ultragray_service.bench.kernel import PROBE, BenchScene, bench_poses, bench_scenes, elapsed_ms, finish, mark
+from ultragray_service.bench.report import Report, percentiles
+from ultragray_service.bench.served import measure_served
 from ultragray_workers.pool.process.transfer import to_uint8
-
-from ..kernel import PROBE, BenchScene, bench_poses, bench_scenes, elapsed_ms, finish, mark
-from ..report import Report, percentiles
-from ..served import measure_served
-from .gpu import Limits, gpu_document, measure_limits
 
 BATCHES = (1, 8, 64, 256)  # poses rendered by one call
 POSES = 256  # that the calls go through

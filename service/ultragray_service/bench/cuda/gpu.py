@@ -14,10 +14,9 @@ import triton
 import triton.language as tl
 
 from ultragray.backends import cuda
-
-from ..kernel import elapsed_ms, finish, mark
-from ..measured import measured
-from ..report import versions
+from ultragray_service.bench.kernel import elapsed_ms, finish, mark
+from ultragray_service.bench.measured import measured
+from ultragray_service.bench.report import versions
 
 COPY_BYTES = 2 << 30  # far more than any cache holds
 REPEATS = 10

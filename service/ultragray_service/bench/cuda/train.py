@@ -10,11 +10,10 @@ import torch
 
 from ultragray.backends import cuda
 from ultragray.training.device import forget_peak_memory, peak_memory_mb
-
-from ..kernel import BATCH
-from ..report import Report
-from ..train import PARTS, measure_training, training_scenes
-from .gpu import gpu_document
+from ultragray_service.bench.cuda.gpu import gpu_document
+from ultragray_service.bench.kernel import BATCH
+from ultragray_service.bench.report import Report
+from ultragray_service.bench.train import PARTS, measure_training, training_scenes
 
 STEPS = 200  # a tenth of them where it is to be quick
 

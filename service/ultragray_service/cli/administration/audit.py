@@ -10,10 +10,10 @@ from typing import Annotated
 
 import typer
 
-from ..options import with_options
-from ..output import print_table
-from ..style import Json, command_group, examples, to_json
-from .database import Where, opened_database
+from ultragray_service.cli.administration.database import Where, opened_database
+from ultragray_service.cli.options import with_options
+from ultragray_service.cli.output import print_table
+from ultragray_service.cli.style import Json, command_group, examples, to_json
 
 _COLUMNS = ("time", "who", "address", "what", "target", "result", "facts")
 _HOUR_S = 3600.0
@@ -38,7 +38,7 @@ def audit(
     where: Where,
 ) -> None:
     """Oldest first. What is not given here comes from the settings (ULTRAGRAY_…)."""
-    from ...access.audit import read_audit
+    from ultragray_service.access.audit import read_audit
 
     since_s = time.time() - since_hours * _HOUR_S
     with opened_database(where) as database:

@@ -8,12 +8,11 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ultragray.errors import InvalidArgument
+from ultragray_service.cli.administration.database import Where
+from ultragray_service.cli.options import with_options
+from ultragray_service.cli.style import Json, command_group, examples, tell, to_json
+from ultragray_service.settings import Settings, load_settings
 from ultragray_workers.errors import BackupInvalid
-
-from ...settings import Settings, load_settings
-from ..options import with_options
-from ..style import Json, command_group, examples, tell, to_json
-from .database import Where
 
 if TYPE_CHECKING:
     from ultragray_workers.backup.contents import Folders

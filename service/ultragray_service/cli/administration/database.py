@@ -7,9 +7,8 @@ from contextlib import contextmanager
 from typing import TYPE_CHECKING, Annotated, Any
 
 from ultragray.errors import InvalidArgument
-
-from ...settings import ENVIRONMENT_PREFIX, Settings, load_settings
-from ..options import FieldsOf
+from ultragray_service.cli.options import FieldsOf
+from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings, load_settings
 
 if TYPE_CHECKING:
     from ultragray_workers.jobs.queue.database import JobDatabase

@@ -12,16 +12,16 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ...access.limits.allowance import NAMES, read_limits
-from ...access.principal import Role
-from ...settings import Settings, load_settings
-from ..options import with_options
-from ..output import print_table
-from ..style import Json, command_group, examples, tell, to_json
-from .database import Where, opened_database
+from ultragray_service.access.limits.allowance import NAMES, read_limits
+from ultragray_service.access.principal import Role
+from ultragray_service.cli.administration.database import Where, opened_database
+from ultragray_service.cli.options import with_options
+from ultragray_service.cli.output import print_table
+from ultragray_service.cli.style import Json, command_group, examples, tell, to_json
+from ultragray_service.settings import Settings, load_settings
 
 if TYPE_CHECKING:
-    from ...access.keys import Key, KeyStore
+    from ultragray_service.access.keys import Key, KeyStore
 
 command_app = command_group("They live in the installation's database; changes count within two seconds.")
 
@@ -110,7 +110,7 @@ def revoke(
 
 @contextmanager
 def _key_store(where: dict[str, Any]) -> Iterator[KeyStore]:
-    from ...access.keys import KeyStore
+    from ultragray_service.access.keys import KeyStore
 
     with opened_database(where) as database:
         yield KeyStore(database.engine)

@@ -6,11 +6,11 @@ from typing import Annotated
 
 import typer
 
-from ...settings import load_settings
-from ..options import with_options
-from ..style import Json, command_group, examples, tell
-from .backup import BackupFolder, document_of, folders_of, in_words
-from .database import Where
+from ultragray_service.cli.administration.backup import BackupFolder, document_of, folders_of, in_words
+from ultragray_service.cli.administration.database import Where
+from ultragray_service.cli.options import with_options
+from ultragray_service.cli.style import Json, command_group, examples, tell
+from ultragray_service.settings import load_settings
 
 command_app = command_group()
 

@@ -9,10 +9,9 @@ from typing import Annotated
 import typer
 
 from ultragray.errors import InvalidArgument
-
-from ..options import with_options
-from ..style import Json, command_group, examples, tell
-from .backup import megabytes
+from ultragray_service.cli.administration.backup import megabytes
+from ultragray_service.cli.options import with_options
+from ultragray_service.cli.style import Json, command_group, examples, tell
 
 command_app = command_group("A place is a folder, or a bucket: s3://BUCKET/PREFIX, gs://, az://.")
 

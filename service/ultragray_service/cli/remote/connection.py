@@ -10,9 +10,9 @@ from typing import Annotated, Any, get_type_hints
 
 import typer
 
-from ...environment import ADDRESS, API_KEY, CA, CLIENT_CERTIFICATE, CLIENT_KEY
-from ..options import keyword, with_parameters
-from ..style import warn
+from ultragray_service.cli.options import keyword, with_parameters
+from ultragray_service.cli.style import warn
+from ultragray_service.environment import ADDRESS, API_KEY, CA, CLIENT_CERTIFICATE, CLIENT_KEY
 
 CONNECTION, TLS = "Connection", "TLS"
 
@@ -71,8 +71,8 @@ def with_connection(command: Callable[..., None]) -> Callable[..., None]:
         client_key: Path | None,
         **given: Any,
     ) -> None:
-        from ...remote.connection import Connection
-        from ...tls.client import client_context, exposes_key
+        from ultragray_service.remote.connection import Connection
+        from ultragray_service.tls.client import client_context, exposes_key
 
         connection = Connection(address, api_key, client_context(ca, client_certificate, client_key))
         if api_key is not None and exposes_key(address):

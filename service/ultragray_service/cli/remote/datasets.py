@@ -9,17 +9,16 @@ import typer
 
 from ultragray.datasets.source import UPLOAD_OPTIONS, SourceOptions
 from ultragray.errors import InvalidArgument
-
-from ..options import with_options
-from ..output import print_table
-from ..progress import transferred
-from ..scenes.show import print_facts
-from ..style import Json, command_group, examples, tell, to_json, warn
-from ..sweeps.source import SWEEP_MEANING
-from .connection import with_connection
+from ultragray_service.cli.options import with_options
+from ultragray_service.cli.output import print_table
+from ultragray_service.cli.progress import transferred
+from ultragray_service.cli.remote.connection import with_connection
+from ultragray_service.cli.scenes.show import print_facts
+from ultragray_service.cli.style import Json, command_group, examples, tell, to_json, warn
+from ultragray_service.cli.sweeps.source import SWEEP_MEANING
 
 if TYPE_CHECKING:
-    from ...remote.connection import Connection
+    from ultragray_service.remote.connection import Connection
 
 command_app = command_group("They are checked when they arrive; `ultragray jobs submit train NAME` trains from one.")
 DatasetName = Annotated[str, typer.Argument(metavar="NAME", help="Name of the dataset.", show_default=False)]
@@ -32,7 +31,7 @@ _COLUMNS = ("name", "format", "training", "held out", "pixels", "MB", "created",
 @with_connection
 def list_datasets(connection: Connection, json: Json = False) -> None:
     """List the datasets by name."""
-    from ...remote.datasets import Datasets
+    from ultragray_service.remote.datasets import Datasets
 
     found = Datasets(connection).all()
     if json:
@@ -45,7 +44,7 @@ def list_datasets(connection: Connection, json: Json = False) -> None:
 @with_connection
 def show(connection: Connection, name: DatasetName, json: Json = False) -> None:
     """Print size, probe and split of a dataset, and what its check warned of."""
-    from ...remote.datasets import Datasets
+    from ultragray_service.remote.datasets import Datasets
 
     found = Datasets(connection).get(name)
     if json:
@@ -77,7 +76,7 @@ def upload(
     source: SourceOptions,
 ) -> None:
     """Upload a sweep; the service checks it as `ultragray check` does, and keeps it."""
-    from ...remote.datasets import Datasets, archive_of
+    from ultragray_service.remote.datasets import Datasets, archive_of
 
     called = _name_of(sweep) if name is None else name
     options = {key: str(value) for key in UPLOAD_OPTIONS if (value := getattr(source, key)) is not None}
@@ -95,7 +94,7 @@ def upload(
 @with_connection
 def delete(connection: Connection, name: DatasetName, json: Json = False) -> None:
     """Delete a dataset that no job needs."""
-    from ...remote.datasets import Datasets
+    from ultragray_service.remote.datasets import Datasets
 
     Datasets(connection).delete(name)
     tell(f"{name} deleted", {"deleted": name}, as_json=json)

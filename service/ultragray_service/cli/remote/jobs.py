@@ -12,18 +12,17 @@ import typer
 from ultragray.batches import names_in
 from ultragray.contract import to_dict
 from ultragray.samplers import TrainingSampler
+from ultragray_service.cli.options import parameters_of, values_of, with_parameters
+from ultragray_service.cli.output import check_file, print_table
+from ultragray_service.cli.progress import counted, transferred
+from ultragray_service.cli.remote.connection import with_connection
+from ultragray_service.cli.scenes.show import print_facts
+from ultragray_service.cli.style import Force, Json, command_group, examples, output_option, tell, to_json, warn
 from ultragray_workers.jobs.kinds import KINDS, Specification
 
-from ..options import parameters_of, values_of, with_parameters
-from ..output import check_file, print_table
-from ..progress import counted, transferred
-from ..scenes.show import print_facts
-from ..style import Force, Json, command_group, examples, output_option, tell, to_json, warn
-from .connection import with_connection
-
 if TYPE_CHECKING:
-    from ...remote.connection import Connection
-    from ...remote.jobs import Jobs
+    from ultragray_service.remote.connection import Connection
+    from ultragray_service.remote.jobs import Jobs
 
 command_app = command_group("Work in the background, on a running service: it goes on when this command ends.")
 submit_app = command_group("Put a job into the queue; its id is printed.")
@@ -61,7 +60,7 @@ def list_jobs(
     json: Json = False,
 ) -> None:
     """List the jobs, newest first."""
-    from ...remote.jobs import Jobs
+    from ultragray_service.remote.jobs import Jobs
 
     jobs = Jobs(connection).newest(state=state, kind=kind, limit=limit)
     if json:
@@ -74,7 +73,7 @@ def list_jobs(
 @with_connection
 def show(connection: Connection, job: JobArgument, json: Json = False) -> None:
     """Print all that is known about a job."""
-    from ...remote.jobs import Jobs
+    from ultragray_service.remote.jobs import Jobs
 
     found = Jobs(connection).get(job)
     if json:
@@ -87,8 +86,8 @@ def show(connection: Connection, job: JobArgument, json: Json = False) -> None:
 @with_connection
 def watch(connection: Connection, job: JobArgument, json: Json = False) -> None:
     """Follow a job to its end. Exit code 0: it succeeded, 3: it failed, 4: it was cancelled."""
-    from ...remote.jobs import Jobs
-    from .watch import follow
+    from ultragray_service.cli.remote.watch import follow
+    from ultragray_service.remote.jobs import Jobs
 
     follow(Jobs(connection), job, as_json=json)
 
@@ -97,7 +96,7 @@ def watch(connection: Connection, job: JobArgument, json: Json = False) -> None:
 @with_connection
 def cancel(connection: Connection, job: JobArgument, json: Json = False) -> None:
     """Stop a job."""
-    from ...remote.jobs import Jobs
+    from ultragray_service.remote.jobs import Jobs
 
     cancelled = Jobs(connection).cancel(job)
     tell(f"{cancelled['id']} {cancelled['state']}", cancelled, as_json=json)
@@ -107,7 +106,7 @@ def cancel(connection: Connection, job: JobArgument, json: Json = False) -> None
 @with_connection
 def retry(connection: Connection, job: JobArgument, json: Json = False) -> None:
     """Put a new job in place of a failed or cancelled one; it goes on from the last checkpoint."""
-    from ...remote.jobs import Jobs
+    from ultragray_service.remote.jobs import Jobs
 
     again = Jobs(connection).retry(job)
     tell(again["id"], again, as_json=json)
@@ -117,7 +116,7 @@ def retry(connection: Connection, job: JobArgument, json: Json = False) -> None:
 @with_connection
 def delete(connection: Connection, job: JobArgument, json: Json = False) -> None:
     """Remove a finished job and its files; the scene that it trained stays."""
-    from ...remote.jobs import Jobs
+    from ultragray_service.remote.jobs import Jobs
 
     Jobs(connection).delete(job)
     tell(f"{job} deleted", {"deleted": job}, as_json=json)
@@ -132,7 +131,7 @@ def logs(
     json: Json = False,
 ) -> None:
     """Print the end of a job's log."""
-    from ...remote.jobs import Jobs
+    from ultragray_service.remote.jobs import Jobs
 
     log = Jobs(connection).log(job, max_bytes)
     if json:
@@ -157,7 +156,7 @@ def download(
     json: Json = False,
 ) -> None:
     """Download a file that a job made."""
-    from ...remote.jobs import Jobs
+    from ultragray_service.remote.jobs import Jobs
 
     if len(names := list(names_in(name))) > 1:
         _download_all(Jobs(connection), job, names, Path() if output is None else output, as_json=json, force=force)
@@ -207,8 +206,8 @@ def _submit(
     ] = False,
     json: Json = False,
 ) -> None:
-    from ...remote.jobs import Jobs
-    from .watch import follow
+    from ultragray_service.cli.remote.watch import follow
+    from ultragray_service.remote.jobs import Jobs
 
     jobs = Jobs(connection)
     beside = {"request_id": request_id, "priority": priority, "private": private}
@@ -253,7 +252,7 @@ for _kind, _class in Specification.members.items():
 
 
 def _print_jobs(jobs: list[dict[str, Any]]) -> None:
-    from .watch import amount
+    from ultragray_service.cli.remote.watch import amount
 
     print_table(_COLUMNS, [_row(job, amount(job)) for job in jobs])
 

@@ -7,13 +7,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ..output import print_table
-from ..scenes.show import print_facts
-from ..style import Json, command_group, examples, tell, to_json
-from .connection import with_connection
+from ultragray_service.cli.output import print_table
+from ultragray_service.cli.remote.connection import with_connection
+from ultragray_service.cli.scenes.show import print_facts
+from ultragray_service.cli.style import Json, command_group, examples, tell, to_json
 
 if TYPE_CHECKING:
-    from ...remote.connection import Connection
+    from ultragray_service.remote.connection import Connection
 
 command_app = command_group("Requests that name one have poses in the robot's or tracker's own frame.")
 RegistrationName = Annotated[str, typer.Argument(metavar="NAME", help="Name of the registration.", show_default=False)]
@@ -26,7 +26,7 @@ _COLUMNS = ("name", "scene", "residual mm", "changed", "owner")
 @with_connection
 def list_registrations(connection: Connection, json: Json = False) -> None:
     """List the registrations by name."""
-    from ...remote.registrations import Registrations
+    from ultragray_service.remote.registrations import Registrations
 
     found = Registrations(connection).all()
     if json:
@@ -39,7 +39,7 @@ def list_registrations(connection: Connection, json: Json = False) -> None:
 @with_connection
 def show(connection: Connection, name: RegistrationName, json: Json = False) -> None:
     """Print both links of a registration, mm, and how exact it is."""
-    from ...remote.registrations import Registrations
+    from ultragray_service.remote.registrations import Registrations
 
     found = Registrations(connection).get(name)
     if json:
@@ -64,8 +64,7 @@ def upload(
 ) -> None:
     """Have the service keep a registration, in place of one of that name which is yours."""
     from ultragray.registration.registration import load_registration
-
-    from ...remote.registrations import Registrations
+    from ultragray_service.remote.registrations import Registrations
 
     called = file.stem if name is None else name
     kept = Registrations(connection).put(called, scene, load_registration(file))
@@ -76,7 +75,7 @@ def upload(
 @with_connection
 def delete(connection: Connection, name: RegistrationName, json: Json = False) -> None:
     """Forget a registration. Jobs that were accepted with it keep it."""
-    from ...remote.registrations import Registrations
+    from ultragray_service.remote.registrations import Registrations
 
     Registrations(connection).delete(name)
     tell(f"{name} deleted", {"deleted": name}, as_json=json)

@@ -14,13 +14,12 @@ from ultragray.files.poses import load_poses
 from ultragray.probe import FloatArray, Probe
 from ultragray.samplers import Sampler
 from ultragray.settings import FrameSettings
-
-from ..output import OR_A_FOLDER, check_ending, check_file, check_folder, is_folder_name
-from ..progress import counted
+from ultragray_service.cli.output import OR_A_FOLDER, check_ending, check_file, check_folder, is_folder_name
+from ultragray_service.cli.progress import counted
 
 if TYPE_CHECKING:
-    from ...remote.connection import Connection
-    from ...remote.scenes import Scenes
+    from ultragray_service.remote.connection import Connection
+    from ultragray_service.remote.scenes import Scenes
 
 MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".npz": "application/x-npz"}
 SUFFIXES = tuple(MEDIA_TYPES)
@@ -68,7 +67,7 @@ def checked_kind(output: Path, settings: FrameSettings, *, force: bool) -> str |
 
 def render_remotely(connection: Connection, wanted: Wanted) -> dict[str, Any]:
     """Write the frames; what they are, for a program. Raises InvalidArgument and what the connection raises."""
-    from ...remote.scenes import Scenes
+    from ultragray_service.remote.scenes import Scenes
 
     given = None if wanted.pose_file is None else load_poses(wanted.pose_file)
     scenes = Scenes(connection)

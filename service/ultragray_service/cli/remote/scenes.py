@@ -10,17 +10,25 @@ import typer
 from ultragray.samplers import Sampler
 from ultragray.scene_info import read_header
 from ultragray.settings import FrameSettings, RenderSettings
-
-from ..options import FieldsOf, poses_option, with_options
-from ..output import SCENE_SUFFIX, check_file, print_table
-from ..progress import transferred
-from ..scenes.show import print_facts
-from ..style import Force, Json, command_group, examples, frames_in_words, output_option, tell, to_json
-from .connection import with_connection
-from .rendering import SUFFIXES, Wanted, checked_kind
+from ultragray_service.cli.options import FieldsOf, poses_option, with_options
+from ultragray_service.cli.output import SCENE_SUFFIX, check_file, print_table
+from ultragray_service.cli.progress import transferred
+from ultragray_service.cli.remote.connection import with_connection
+from ultragray_service.cli.remote.rendering import SUFFIXES, Wanted, checked_kind
+from ultragray_service.cli.scenes.show import print_facts
+from ultragray_service.cli.style import (
+    Force,
+    Json,
+    command_group,
+    examples,
+    frames_in_words,
+    output_option,
+    tell,
+    to_json,
+)
 
 if TYPE_CHECKING:
-    from ...remote.connection import Connection
+    from ultragray_service.remote.connection import Connection
 
 command_app = command_group("The service renders them for clients; `ultragray render` does without a service.")
 SceneName = Annotated[str, typer.Argument(metavar="NAME", help="Name of the scene.", show_default=False)]
@@ -31,7 +39,7 @@ _COLUMNS = ("name", "Gaussians", "image", "MB", "loaded", "owner", "error")
 @with_connection
 def list_scenes(connection: Connection, json: Json = False) -> None:
     """List the scenes by name."""
-    from ...remote.scenes import Scenes
+    from ultragray_service.remote.scenes import Scenes
 
     found = Scenes(connection).all()
     if json:
@@ -44,7 +52,7 @@ def list_scenes(connection: Connection, json: Json = False) -> None:
 @with_connection
 def show(connection: Connection, name: SceneName, json: Json = False) -> None:
     """Print probe, place, training poses and metrics of a scene; mm, in the frame of the training sweep."""
-    from ...remote.scenes import Scenes
+    from ultragray_service.remote.scenes import Scenes
 
     found = Scenes(connection).get(name)
     if json:
@@ -63,7 +71,7 @@ def upload(
     json: Json = False,
 ) -> None:
     """Have the service take a scene file in and render it."""
-    from ...remote.scenes import Scenes
+    from ultragray_service.remote.scenes import Scenes
 
     size = read_header(file).file_bytes
     called = file.stem if name is None else name
@@ -82,7 +90,7 @@ def download(
     json: Json = False,
 ) -> None:
     """Download a scene file."""
-    from ...remote.scenes import Scenes
+    from ultragray_service.remote.scenes import Scenes
 
     path = Path(f"{name}{SCENE_SUFFIX}") if output is None else output
     check_file(path, [SCENE_SUFFIX], force=force)
@@ -95,7 +103,7 @@ def download(
 @with_connection
 def delete(connection: Connection, name: SceneName, json: Json = False) -> None:
     """Delete a scene that was uploaded or trained there; scenes of the data folder stay."""
-    from ...remote.scenes import Scenes
+    from ultragray_service.remote.scenes import Scenes
 
     Scenes(connection).delete(name)
     tell(f"{name} deleted", {"deleted": name}, as_json=json)
@@ -124,7 +132,7 @@ def render(
     of_poses: Annotated[dict[str, Any], FieldsOf(RenderSettings, "registration")],
 ) -> None:
     """Have the service render a frame or some frames. Many thousands are a job: `ultragray jobs submit render`."""
-    from .rendering import render_remotely
+    from ultragray_service.cli.remote.rendering import render_remotely
 
     suffix = checked_kind(output, settings, force=force)
     wanted = Wanted(name, output, suffix, poses, sampler, of_poses.get("registration"), settings)

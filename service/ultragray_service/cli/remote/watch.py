@@ -10,11 +10,10 @@ from typing import Any
 
 import typer
 
+from ultragray_service.cli.group import INTERRUPTED
+from ultragray_service.cli.style import tell
+from ultragray_service.remote.jobs import Jobs
 from ultragray_workers.errors import NotReady
-
-from ...remote.jobs import Jobs
-from ..group import INTERRUPTED
-from ..style import tell
 
 JOB_FAILED = 3  # the exit code of a command that watched a job fail
 JOB_CANCELLED = 4

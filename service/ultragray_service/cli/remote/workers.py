@@ -6,14 +6,13 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ultragray_service.cli.output import print_table
+from ultragray_service.cli.remote.connection import with_connection
+from ultragray_service.cli.style import Json, command_group, examples, tell, to_json
 from ultragray_workers.jobs.matching.demand import GB
 
-from ..output import print_table
-from ..style import Json, command_group, examples, tell, to_json
-from .connection import with_connection
-
 if TYPE_CHECKING:
-    from ...remote.connection import Connection
+    from ultragray_service.remote.connection import Connection
 
 command_app = command_group("They obey within two seconds; `ultragray worker` starts one.")
 Name = Annotated[str, typer.Argument(help="Name of the worker.", show_default=False)]
@@ -24,7 +23,7 @@ _COLUMNS = ("name", "state", "job", "host", "pid", "devices", "labels", "version
 @with_connection
 def list_workers(connection: Connection, json: Json = False) -> None:
     """List the workers, also those that were lost within a day."""
-    from ...remote.workers import Workers
+    from ultragray_service.remote.workers import Workers
 
     workers = Workers(connection).all()
     if json:
@@ -55,7 +54,7 @@ def resume(connection: Connection, name: Name, json: Json = False) -> None:
 
 
 def _want(connection: Connection, name: str, wish: str, *, as_json: bool) -> None:
-    from ...remote.workers import Workers
+    from ultragray_service.remote.workers import Workers
 
     worker = Workers(connection).want(name, wish)
     at_hand = f", at the job {worker['job']}" if worker["job"] else ""

@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
-from ..output import SCENE_SUFFIX, check_file
-from ..style import Force, Json, command_group, examples, output_option, tell
+from ultragray_service.cli.output import SCENE_SUFFIX, check_file
+from ultragray_service.cli.style import Force, Json, command_group, examples, output_option, tell
 
 command_app = command_group()
 

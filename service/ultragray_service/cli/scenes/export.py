@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ultragray.scene_info import read_header
-
-from ..output import check_ending, check_file
-from ..style import Force, Json, SceneFile, command_group, examples, output_option, tell
+from ultragray_service.cli.output import check_ending, check_file
+from ultragray_service.cli.style import Force, Json, SceneFile, command_group, examples, output_option, tell
 
 if TYPE_CHECKING:
     from ultragray import GaussianScene

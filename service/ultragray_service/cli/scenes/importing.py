@@ -8,10 +8,9 @@ from typing import Annotated
 import typer
 
 from ultragray.errors import InvalidArgument
-
-from ..output import SCENE_SUFFIX, check_file
-from ..style import Force, Json, command_group, examples, output_option, tell
-from .export import EXCHANGED
+from ultragray_service.cli.output import SCENE_SUFFIX, check_file
+from ultragray_service.cli.scenes.export import EXCHANGED
+from ultragray_service.cli.style import Force, Json, command_group, examples, output_option, tell
 
 _CHECKPOINT = "Checkpoint (.pt)"
 command_app = command_group()

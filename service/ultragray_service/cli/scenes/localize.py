@@ -12,10 +12,9 @@ from ultragray.errors import InvalidArgument
 from ultragray.files.poses import load_poses
 from ultragray.localization.pixels import read_frame
 from ultragray.scene_info import read_header
-
-from ..output import check_file
-from ..progress import working
-from ..style import Backend, Force, Json, SceneFile, command_group, examples, output_option, tell
+from ultragray_service.cli.output import check_file
+from ultragray_service.cli.progress import working
+from ultragray_service.cli.style import Backend, Force, Json, SceneFile, command_group, examples, output_option, tell
 
 if TYPE_CHECKING:
     from ultragray import Localization

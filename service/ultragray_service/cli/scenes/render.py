@@ -12,10 +12,20 @@ from ultragray.errors import InvalidArgument
 from ultragray.interchange.exports.formats import DTYPES, FORMATS, check_format, exporter_class, format_of
 from ultragray.samplers import Sampler
 from ultragray.settings import FrameSettings
-
-from ..options import poses_option, with_options
-from ..output import OR_A_FOLDER, check_ending, check_file, check_folder, is_folder_name
-from ..style import COMPUTE, OUTPUT, Backend, Force, Json, SceneFile, command_group, examples, output_option, tell
+from ultragray_service.cli.options import poses_option, with_options
+from ultragray_service.cli.output import OR_A_FOLDER, check_ending, check_file, check_folder, is_folder_name
+from ultragray_service.cli.style import (
+    COMPUTE,
+    OUTPUT,
+    Backend,
+    Force,
+    Json,
+    SceneFile,
+    command_group,
+    examples,
+    output_option,
+    tell,
+)
 
 SHARDS = "Shards"
 SUFFIXES = tuple(one.suffix for one in FORMATS.values())
@@ -73,7 +83,7 @@ def render(
 ) -> None:
     """Each frame comes with its pose and with how far it can be trusted. Lengths are in mm, angles in degrees."""
     if on is not None:
-        from .sharding import Shards, render_shards
+        from ultragray_service.cli.scenes.sharding import Shards, render_shards
 
         shards = Shards.prepared(scene, poses, sampler, settings, dtype=dtype, shard_frames=shard_frames)
         told = render_shards(shards, output, on, backend=backend, threads=threads)
@@ -81,7 +91,7 @@ def render(
         return
     if shard_frames is not None:
         raise InvalidArgument("--shard-frames is of shards: name an engine with --on", field="shard_frames")
-    from .rendering import Task, render_frames
+    from ultragray_service.cli.scenes.rendering import Task, render_frames
 
     path = Path(output)
     format = checked_format(path, settings, dtype, force=force)

@@ -19,9 +19,8 @@ from ultragray.probe import FloatArray
 from ultragray.samplers import Sampler, TrainingSampler, assessed_poses
 from ultragray.scene_info import read_header
 from ultragray.settings import Encoding, FrameSettings, Resolved
-
-from ..progress import counted
-from ..style import frames_in_words
+from ultragray_service.cli.progress import counted
+from ultragray_service.cli.style import frames_in_words
 
 
 @dataclass(frozen=True)

@@ -16,11 +16,10 @@ from ultragray.samplers import Sampler
 from ultragray.samplers.confident import require_drawn
 from ultragray.scene_info import read_header
 from ultragray.settings import FrameSettings
+from ultragray_service.cli.progress import counted
+from ultragray_service.cli.style import frames_in_words
 from ultragray_workers.batches.on_ray import RayBatch, check_address
 from ultragray_workers.storage.opening import open_storage
-
-from ..progress import counted
-from ..style import frames_in_words
 
 
 @dataclass(frozen=True)

@@ -11,11 +11,10 @@ import typer
 from ultragray.contract import to_dict
 from ultragray.datasets.source import SourceOptions
 from ultragray.errors import InvalidArgument
-
-from ..options import with_options
-from ..output import SCENE_SUFFIX
-from ..style import Json, command_group, examples, to_json
-from ..sweeps.source import SWEEP_MEANING, read_dataset
+from ultragray_service.cli.options import with_options
+from ultragray_service.cli.output import SCENE_SUFFIX
+from ultragray_service.cli.style import Json, command_group, examples, to_json
+from ultragray_service.cli.sweeps.source import SWEEP_MEANING, read_dataset
 
 command_app = command_group()
 

@@ -12,11 +12,10 @@ import typer
 from ultragray.errors import InvalidArgument
 from ultragray.interchange.slicer import SlicerScene
 from ultragray.scene_info import read_header
-
-from ...igtl.routes import device_of, image_name
-from ..output import check_file
-from ..progress import working
-from ..style import Force, Json, SceneFile, command_group, examples, output_option, tell
+from ultragray_service.cli.output import check_file
+from ultragray_service.cli.progress import working
+from ultragray_service.cli.style import Force, Json, SceneFile, command_group, examples, output_option, tell
+from ultragray_service.igtl.routes import device_of, image_name
 
 command_app = command_group()
 

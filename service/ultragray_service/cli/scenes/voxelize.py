@@ -12,10 +12,9 @@ import typer
 from ultragray.errors import InvalidArgument
 from ultragray.scene_info import SceneInfo, read_header
 from ultragray.volumes.names import SLICE_SUFFIXES, VOLUME_FIELDS, VOLUME_SUFFIXES
-
-from ..output import check_file
-from ..progress import working
-from ..style import Force, Json, SceneFile, command_group, examples, output_option, tell, warn
+from ultragray_service.cli.output import check_file
+from ultragray_service.cli.progress import working
+from ultragray_service.cli.style import Force, Json, SceneFile, command_group, examples, output_option, tell, warn
 
 RIGHT, DOWN = "1,0,0", "0,0,1"
 command_app = command_group()

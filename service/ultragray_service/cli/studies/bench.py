@@ -11,9 +11,8 @@ from typing import Annotated
 import typer
 
 from ultragray.errors import InvalidArgument
-
-from ..output import check_file
-from ..style import COMPUTE, Force, Json, command_group, examples, output_option
+from ultragray_service.cli.output import check_file
+from ultragray_service.cli.style import COMPUTE, Force, Json, command_group, examples, output_option
 
 INSTEAD = "Instead of frames"
 command_app = command_group()
@@ -56,7 +55,7 @@ def bench(
     if output is not None:
         check_file(output, force=force)
 
-    from ...bench.command import chosen_bench
+    from ultragray_service.bench.command import chosen_bench
 
     run = chosen_bench(chosen[0] if chosen else "frames", backend)
     if not json:

@@ -10,13 +10,12 @@ import typer
 
 from ultragray.datasets.source import SourceOptions
 from ultragray.scene_info import read_header
-
-from ..options import with_options
-from ..output import check_folder
-from ..progress import working
-from ..style import Backend, Force, Json, SceneFile, command_group, examples, output_option, to_json
-from ..sweeps.source import SweepArgument, check_scene_fits, check_source, read_dataset
-from .tables import print_metrics, print_speckle
+from ultragray_service.cli.options import with_options
+from ultragray_service.cli.output import check_folder
+from ultragray_service.cli.progress import working
+from ultragray_service.cli.studies.tables import print_metrics, print_speckle
+from ultragray_service.cli.style import Backend, Force, Json, SceneFile, command_group, examples, output_option, to_json
+from ultragray_service.cli.sweeps.source import SweepArgument, check_scene_fits, check_source, read_dataset
 
 if TYPE_CHECKING:
     from ultragray.datasets.sweep import Sweep

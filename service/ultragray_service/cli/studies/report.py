@@ -15,11 +15,16 @@ import typer
 from ultragray.datasets.source import SourceOptions
 from ultragray.scene_info import read_header
 from ultragray.training.config import PRESET_MEANINGS, TrainingConfig
-
-from ..options import FieldsOf, with_options
-from ..output import check_file
-from ..style import Force, Json, Threads, command_group, examples, output_option, tell
-from ..sweeps.source import SweepArgument, check_scene_fits, check_source, read_dataset, warn_about_dataset
+from ultragray_service.cli.options import FieldsOf, with_options
+from ultragray_service.cli.output import check_file
+from ultragray_service.cli.style import Force, Json, Threads, command_group, examples, output_option, tell
+from ultragray_service.cli.sweeps.source import (
+    SweepArgument,
+    check_scene_fits,
+    check_source,
+    read_dataset,
+    warn_about_dataset,
+)
 
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset

@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import astuple
 from typing import TYPE_CHECKING
 
-from ..output import wide_console
+from ultragray_service.cli.output import wide_console
 
 if TYPE_CHECKING:
     from ultragray.evaluation.scoring import Evaluation

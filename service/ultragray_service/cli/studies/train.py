@@ -16,13 +16,22 @@ import typer
 from ultragray.datasets.source import SourceOptions
 from ultragray.errors import MemoryExceeded, TrainingDiverged, TrainingStateInvalid
 from ultragray.training.config import PRESET_MEANINGS, TrainingConfig, read_config_file
-
-from ..group import INTERRUPTED
-from ..options import FieldsOf, parse_settings, with_options
-from ..output import SCENE_SUFFIX, check_file
-from ..stopping import stop_on_signal
-from ..style import COMPUTE, Backend, Force, Json, Threads, command_group, examples, output_option, tell
-from ..sweeps.source import SweepArgument, check_source, read_dataset, warn_about_dataset
+from ultragray_service.cli.group import INTERRUPTED
+from ultragray_service.cli.options import FieldsOf, parse_settings, with_options
+from ultragray_service.cli.output import SCENE_SUFFIX, check_file
+from ultragray_service.cli.stopping import stop_on_signal
+from ultragray_service.cli.style import (
+    COMPUTE,
+    Backend,
+    Force,
+    Json,
+    Threads,
+    command_group,
+    examples,
+    output_option,
+    tell,
+)
+from ultragray_service.cli.sweeps.source import SweepArgument, check_source, read_dataset, warn_about_dataset
 
 if TYPE_CHECKING:
     from ultragray.scene import GaussianScene

@@ -8,10 +8,9 @@ import typer
 
 from ultragray.contract import to_dict
 from ultragray.datasets.source import SourceOptions
-
-from ..options import with_options
-from ..style import Json, command_group, examples, to_json
-from .source import SweepArgument, read_dataset
+from ultragray_service.cli.options import with_options
+from ultragray_service.cli.style import Json, command_group, examples, to_json
+from ultragray_service.cli.sweeps.source import SweepArgument, read_dataset
 
 if TYPE_CHECKING:
     from ultragray.datasets.checks import DatasetReport, SweepReport

@@ -11,11 +11,10 @@ import typer
 from ultragray.datasets.source import SourceOptions
 from ultragray.errors import InvalidArgument
 from ultragray.scene_info import SceneHeader, read_header
-
-from ..options import with_options
-from ..output import check_folder
-from ..style import Force, Json, command_group, examples, output_option, tell
-from .source import SweepArgument, read_dataset
+from ultragray_service.cli.options import with_options
+from ultragray_service.cli.output import check_folder
+from ultragray_service.cli.style import Force, Json, command_group, examples, output_option, tell
+from ultragray_service.cli.sweeps.source import SweepArgument, read_dataset
 
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset

@@ -6,11 +6,10 @@ from pathlib import Path
 from typing import Annotated
 
 from ultragray.datasets.source import SourceOptions
-
-from ..options import with_options
-from ..output import check_file
-from ..style import Force, Json, command_group, examples, output_option, tell
-from .source import SweepArgument, check_source, read_dataset
+from ultragray_service.cli.options import with_options
+from ultragray_service.cli.output import check_file
+from ultragray_service.cli.style import Force, Json, command_group, examples, output_option, tell
+from ultragray_service.cli.sweeps.source import SweepArgument, check_source, read_dataset
 
 command_app = command_group()
 

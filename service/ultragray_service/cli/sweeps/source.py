@@ -8,9 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from ultragray.datasets.source import FORMATS, PHANTOM, SourceOptions, format_of, load_dataset
-
-from ..progress import working
-from ..style import warn
+from ultragray_service.cli.progress import working
+from ultragray_service.cli.style import warn
 
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset

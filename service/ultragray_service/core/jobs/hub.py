@@ -8,11 +8,10 @@ from concurrent.futures import Executor
 from dataclasses import dataclass
 from functools import partial
 
+from ultragray_service.core.jobs.log import GrowingLog
 from ultragray_workers.errors import DatabaseUnavailable, StorageUnavailable
 from ultragray_workers.jobs.files import Log, size_of_log
 from ultragray_workers.jobs.store import Job
-
-from .log import GrowingLog
 
 READ_INTERVAL_S = 0.5
 

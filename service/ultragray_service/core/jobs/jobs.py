@@ -15,6 +15,13 @@ from sqlalchemy.exc import SQLAlchemyError
 from ultragray.contract import described, under
 from ultragray.errors import DatasetInvalid, InvalidArgument, SceneFileInvalid, UltragrayError
 from ultragray.registration.registration import Registration
+from ultragray_service.access.audit import account
+from ultragray_service.access.owners import may_see
+from ultragray_service.access.principal import acting
+from ultragray_service.core.catalog import MAX_PAGE_SIZE, scene_to_blame
+from ultragray_service.core.jobs.database_threads import PATIENCE_S, DatabaseThreads
+from ultragray_service.core.jobs.hub import JobHub
+from ultragray_service.settings import Settings
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import (
     DatasetNotFound,
@@ -32,14 +39,6 @@ from ultragray_workers.jobs.queue.database import JobDatabase
 from ultragray_workers.jobs.store import Admit, Job, JobState, JobStore
 from ultragray_workers.rounds import Rounds
 from ultragray_workers.scenes import SceneStore
-
-from ...access.audit import account
-from ...access.owners import may_see
-from ...access.principal import acting
-from ...settings import Settings
-from ..catalog import MAX_PAGE_SIZE, scene_to_blame
-from .database_threads import PATIENCE_S, DatabaseThreads
-from .hub import JobHub
 
 COUNT_INTERVAL_S = 10.0
 _BESIDE_SPECIFICATION = ("request_id", "priority")

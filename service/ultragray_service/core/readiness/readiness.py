@@ -8,11 +8,10 @@ from dataclasses import dataclass
 
 from ultragray.contract import described
 from ultragray.errors import UltragrayError
+from ultragray_service.core.readiness.watched import WatchedPart
+from ultragray_service.core.scene_places import ScenePlaces
 from ultragray_workers.errors import ArtifactFolderUnavailable, DatabaseUnavailable
 from ultragray_workers.jobs.queue.database import JobDatabase
-
-from ..scene_places import ScenePlaces
-from .watched import WatchedPart
 
 
 @dataclass(frozen=True)

@@ -7,10 +7,9 @@ import logging
 from collections.abc import Callable
 
 from ultragray.errors import UltragrayError
+from ultragray_service.core.own_thread import in_own_thread
 from ultragray_workers.errors import NotReady
 from ultragray_workers.rounds import Rounds
-
-from ..own_thread import in_own_thread
 
 CHECK_INTERVAL_S = 5.0
 PATIENCE_S = 5.0  # with a check that does not end

@@ -22,12 +22,11 @@ from typing import Literal
 
 from ultragray.contract import described
 from ultragray.errors import UltragrayError
+from ultragray_service.access.principal import Principal, Role, acting, caller
+from ultragray_service.core.poses import MatrixRows
+from ultragray_service.core.streams.answers import Answered
+from ultragray_service.errors import StreamNotFound
 from ultragray_workers.pool.types import RenderResult
-
-from ...access.principal import Principal, Role, acting, caller
-from ...errors import StreamNotFound
-from ..poses import MatrixRows
-from .answers import Answered
 
 Door = Literal["websocket", "grpc", "openigtlink"]
 

@@ -13,14 +13,13 @@ from typing import Any
 
 from ultragray.errors import UltragrayError
 from ultragray.probe import FloatArray
+from ultragray_service.core.requests import Plan
+from ultragray_service.core.state import Service
+from ultragray_service.core.streams.answers import Answered
+from ultragray_service.core.streams.open_streams import OpenStream
 from ultragray_workers.errors import Draining
 from ultragray_workers.pool.types import Destination, RenderResult
 from ultragray_workers.pool.waiting import Turn
-
-from ..requests import Plan
-from ..state import Service
-from .answers import Answered
-from .open_streams import OpenStream
 
 MAX_FRAMES_IN_FLIGHT = 8  # of an ordered stream; then it stops reading
 MAX_BYTES_IN_FLIGHT = 32 * 2**20  # of their frames, if there is more than one

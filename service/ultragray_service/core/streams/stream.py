@@ -7,13 +7,12 @@ from typing import Protocol
 from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray.probe import FloatArray
 from ultragray.settings import RenderSettings
+from ultragray_service.core.requests import Plan
+from ultragray_service.core.state import Service
+from ultragray_service.core.streams.answers import Answered
+from ultragray_service.core.streams.open_streams import OpenStream
+from ultragray_service.core.streams.pose_stream import Asked, PoseStream, StreamMode, unexpected
 from ultragray_workers.pool.types import Destination
-
-from ..requests import Plan
-from ..state import Service
-from .answers import Answered
-from .open_streams import OpenStream
-from .pose_stream import Asked, PoseStream, StreamMode, unexpected
 
 MAX_TIMEOUT_MS = 3_600_000.0
 

@@ -6,8 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ultragray.settings import Encoding
-
-from ...errors import NotAcceptable
+from ultragray_service.errors import NotAcceptable
 
 PNG = "image/png"
 JPEG = "image/jpeg"

@@ -16,13 +16,12 @@ from ultragray.localization.settings import LocalizationSettings
 from ultragray.probe import Probe
 from ultragray.registration.registration import Registration
 from ultragray.settings import FrameSettings, RenderSettings, registration_field
+from ultragray_service.core.poses import Pose, check_pose_count
+from ultragray_service.core.streams.pose_stream import MAX_WINDOW, StreamMode
+from ultragray_service.core.streams.stream import MAX_TIMEOUT_MS
+from ultragray_service.http.reading.large_json import INLINE_BYTES, Apart
 from ultragray_workers.jobs.job import MAX_PRIORITY
 from ultragray_workers.jobs.kinds import KINDS, Specification
-
-from ...core.poses import Pose, check_pose_count
-from ...core.streams.pose_stream import MAX_WINDOW, StreamMode
-from ...core.streams.stream import MAX_TIMEOUT_MS
-from .large_json import INLINE_BYTES, Apart
 
 _POSE_BYTES = 1024  # with room for indentation
 

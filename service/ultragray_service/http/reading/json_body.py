@@ -8,9 +8,9 @@ from typing import Any, TypeVar
 from pydantic import TypeAdapter, ValidationError
 from starlette.requests import Request
 
-from ...errors import UnsupportedMediaType
-from ..problems import invalid_argument
-from .large_json import INLINE_BYTES, Apart, read_large
+from ultragray_service.errors import UnsupportedMediaType
+from ultragray_service.http.problems import invalid_argument
+from ultragray_service.http.reading.large_json import INLINE_BYTES, Apart, read_large
 
 T = TypeVar("T")
 

@@ -16,8 +16,7 @@ from typing import Any, TypeVar
 
 from ultragray.contract import error_under
 from ultragray.errors import InvalidArgument, UltragrayError
-
-from ...errors import BodyTooLarge
+from ultragray_service.errors import BodyTooLarge
 
 INLINE_BYTES = 64 * 1024  # of a body that is read at once: a few milliseconds
 MAX_VALUES = 100_000  # of a body that has no limit of its own: about ten milliseconds

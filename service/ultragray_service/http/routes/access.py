@@ -8,10 +8,16 @@ from typing import Annotated
 from fastapi import APIRouter, Query
 
 from ultragray.contract import described
-
-from ...access.principal import Me, me
-from ...views.audited import DEFAULT_ENTRIES, DEFAULT_HOURS, MAX_ENTRIES, MAX_HOURS, AuditEntries, audit_entries
-from ..deps import ServiceDep, problems
+from ultragray_service.access.principal import Me, me
+from ultragray_service.http.deps import ServiceDep, problems
+from ultragray_service.views.audited import (
+    DEFAULT_ENTRIES,
+    DEFAULT_HOURS,
+    MAX_ENTRIES,
+    MAX_HOURS,
+    AuditEntries,
+    audit_entries,
+)
 
 
 @dataclass(frozen=True)

@@ -8,12 +8,12 @@ from fastapi import APIRouter, Path
 from starlette.requests import Request
 from starlette.responses import Response
 
-from ...views.comparisons import Comparison
-from ...views.datasets import DatasetPoses
-from ..deps import SceneName, ServiceDep, problems
-from ..reading.accept import PNG
-from ..revalidation import NOT_MODIFIED, revalidated
-from .datasets import DatasetName
+from ultragray_service.http.deps import SceneName, ServiceDep, problems
+from ultragray_service.http.reading.accept import PNG
+from ultragray_service.http.revalidation import NOT_MODIFIED, revalidated
+from ultragray_service.http.routes.datasets import DatasetName
+from ultragray_service.views.comparisons import Comparison
+from ultragray_service.views.datasets import DatasetPoses
 
 router = APIRouter(prefix="/v1", tags=["console"])
 

@@ -12,19 +12,18 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 
 from ultragray.datasets.source import UPLOAD_OPTIONS, UPLOADED_FORMATS
+from ultragray_service.core import datasets
+from ultragray_service.core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
+from ultragray_service.core.dataset_uploads import DatasetUpload
+from ultragray_service.core.datasets import DatasetPage, contact_sheet, dataset_page, with_owner
+from ultragray_service.core.helper_processes import PATIENCE_S
+from ultragray_service.errors import UnsupportedMediaType
+from ultragray_service.http.deps import ServiceDep, problems
+from ultragray_service.http.disconnect import finish_or_abandon
+from ultragray_service.http.reading.accept import PNG
+from ultragray_service.http.reading.multipart import FileParts
 from ultragray_workers.datasets.store import DatasetRecord
 from ultragray_workers.errors import UploadTooLarge
-
-from ...core import datasets
-from ...core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
-from ...core.dataset_uploads import DatasetUpload
-from ...core.datasets import DatasetPage, contact_sheet, dataset_page, with_owner
-from ...core.helper_processes import PATIENCE_S
-from ...errors import UnsupportedMediaType
-from ..deps import ServiceDep, problems
-from ..disconnect import finish_or_abandon
-from ..reading.accept import PNG
-from ..reading.multipart import FileParts
 
 router = APIRouter(prefix="/v1/datasets", tags=["datasets"])
 

@@ -9,10 +9,9 @@ from fastapi import APIRouter
 from starlette.responses import Response
 
 from ultragray.contract import described
-
-from ...core.readiness.readiness import Components
-from ..deps import ServiceDep, problems
-from ..problems import problem_response
+from ultragray_service.core.readiness.readiness import Components
+from ultragray_service.http.deps import ServiceDep, problems
+from ultragray_service.http.problems import problem_response
 
 
 @dataclass(frozen=True)

@@ -16,20 +16,26 @@ from starlette.responses import FileResponse, Response
 from ultragray.contract import described
 from ultragray.scene_info import SceneHeader
 from ultragray.training.poses.sizes import CorrectionSizes
+from ultragray_service.arrival import arrival
+from ultragray_service.core.helper_processes import PATIENCE_S
+from ultragray_service.core.scenes import Scene
+from ultragray_service.errors import UnsupportedMediaType
+from ultragray_service.http.deps import SceneName, ServiceDep, problems
+from ultragray_service.http.disconnect import finish_or_abandon
+from ultragray_service.http.reading.accept import RAW
+from ultragray_service.http.revalidation import NOT_MODIFIED, revalidated
+from ultragray_service.http.routes.datasets import Private
+from ultragray_service.views.scene_points import (
+    ALL_FIELDS,
+    DEFAULT_POINTS,
+    FIELDS,
+    MAX_POINTS,
+    MAX_POSES,
+    even_selection,
+)
 from ultragray_workers.errors import UploadTooLarge
 from ultragray_workers.jobs.queue.owners import Kind
 from ultragray_workers.scene_names import SUFFIX, base_name
-
-from ...arrival import arrival
-from ...core.helper_processes import PATIENCE_S
-from ...core.scenes import Scene
-from ...errors import UnsupportedMediaType
-from ...views.scene_points import ALL_FIELDS, DEFAULT_POINTS, FIELDS, MAX_POINTS, MAX_POSES, even_selection
-from ..deps import SceneName, ServiceDep, problems
-from ..disconnect import finish_or_abandon
-from ..reading.accept import RAW
-from ..revalidation import NOT_MODIFIED, revalidated
-from .datasets import Private
 
 
 @dataclass(frozen=True)

@@ -11,17 +11,16 @@ from starlette.requests import Request
 
 from ultragray.errors import InvalidArgument
 from ultragray.localization.settings import LocalizationSettings
-
-from ...core import scenes
-from ...core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
-from ...core.poses import check_pose_count, exact_poses
-from ...core.scenes import Scene, SceneLoaded, ScenePage
-from ...views.assessments import Assessments
-from ...views.localizing import Located, locate, sought_frame
-from ..deps import SceneName, ServiceDep, problems
-from ..disconnect import finish_or_abandon
-from ..reading.bodies import LARGE_IMAGE, AssessBody, LocalizeBody
-from ..reading.json_body import body_schema, read_json_body
+from ultragray_service.core import scenes
+from ultragray_service.core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
+from ultragray_service.core.poses import check_pose_count, exact_poses
+from ultragray_service.core.scenes import Scene, SceneLoaded, ScenePage
+from ultragray_service.http.deps import SceneName, ServiceDep, problems
+from ultragray_service.http.disconnect import finish_or_abandon
+from ultragray_service.http.reading.bodies import LARGE_IMAGE, AssessBody, LocalizeBody
+from ultragray_service.http.reading.json_body import body_schema, read_json_body
+from ultragray_service.views.assessments import Assessments
+from ultragray_service.views.localizing import Located, locate, sought_frame
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
 

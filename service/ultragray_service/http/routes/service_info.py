@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from fastapi import APIRouter
 
-from ...doors import ServiceInfo
-from ..deps import ServiceDep, problems
+from ultragray_service.doors import ServiceInfo
+from ultragray_service.http.deps import ServiceDep, problems
 
 router = APIRouter(prefix="/v1/service", tags=["service"])
 

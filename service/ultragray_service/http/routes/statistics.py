@@ -9,9 +9,8 @@ from prometheus_client import CONTENT_TYPE_LATEST
 from starlette.responses import Response
 
 from ultragray import __version__
-
-from ...telemetry.statistics import ServiceStatistics, memory_bytes
-from ..deps import ServiceDep, problems
+from ultragray_service.http.deps import ServiceDep, problems
+from ultragray_service.telemetry.statistics import ServiceStatistics, memory_bytes
 
 router = APIRouter()
 

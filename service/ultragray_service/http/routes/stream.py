@@ -14,20 +14,19 @@ from pydantic import Field, FiniteFloat, TypeAdapter
 from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray.probe import FloatArray
 from ultragray.settings import RenderSettings
+from ultragray_service.access.credentials import STREAM_PROTOCOL
+from ultragray_service.core.state import Service
+from ultragray_service.core.streams.answers import Answered
+from ultragray_service.core.streams.pose_stream import StreamMode
+from ultragray_service.core.streams.stream import FrameStream, Message, SceneSettings
+from ultragray_service.errors import statuses_of
+from ultragray_service.http.deps import SceneName
+from ultragray_service.http.problems import problem_response
+from ultragray_service.http.prompt_websocket import HAND_OVER
+from ultragray_service.http.reading.bodies import StreamMessage
+from ultragray_service.http.reading.json_body import read_json
+from ultragray_service.http.stream_messages import frame_bytes, refusal_text
 from ultragray_workers.errors import Draining
-
-from ...access.credentials import STREAM_PROTOCOL
-from ...core.state import Service
-from ...core.streams.answers import Answered
-from ...core.streams.pose_stream import StreamMode
-from ...core.streams.stream import FrameStream, Message, SceneSettings
-from ...errors import statuses_of
-from ..deps import SceneName
-from ..problems import problem_response
-from ..prompt_websocket import HAND_OVER
-from ..reading.bodies import StreamMessage
-from ..reading.json_body import read_json
-from ..stream_messages import frame_bytes, refusal_text
 
 router = APIRouter(prefix="/v1/scenes", tags=["render"])
 

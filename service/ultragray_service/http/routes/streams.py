@@ -13,17 +13,16 @@ from fastapi import APIRouter, Query, WebSocket, WebSocketDisconnect
 
 from ultragray.contract import described
 from ultragray.errors import UltragrayError
+from ultragray_service.access.credentials import STREAM_PROTOCOL
+from ultragray_service.core.state import Service
+from ultragray_service.core.streams.open_streams import StreamSummary, Watcher
+from ultragray_service.errors import statuses_of
+from ultragray_service.http.deps import ServiceDep, problems
+from ultragray_service.http.problems import problem_response
+from ultragray_service.http.prompt_websocket import HAND_OVER
+from ultragray_service.http.routes.stream import check_subprotocols
+from ultragray_service.http.stream_messages import frame_bytes, refusal_text
 from ultragray_workers.errors import Draining
-
-from ...access.credentials import STREAM_PROTOCOL
-from ...core.state import Service
-from ...core.streams.open_streams import StreamSummary, Watcher
-from ...errors import statuses_of
-from ..deps import ServiceDep, problems
-from ..problems import problem_response
-from ..prompt_websocket import HAND_OVER
-from ..stream_messages import frame_bytes, refusal_text
-from .stream import check_subprotocols
 
 router = APIRouter(prefix="/v1/streams", tags=["streams"])
 

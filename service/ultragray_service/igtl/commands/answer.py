@@ -6,12 +6,11 @@ from collections.abc import Mapping
 
 from ultragray.contract import shown
 from ultragray.errors import UltragrayError
-
-from ...errors import IgtlMessageInvalid
-from ..messages import Message
-from .contents import Command, pack_command, pack_string, unpack_command, unpack_string
-from .markup import Outcome, Reply, Request, read_request
-from .scanner import Scanner
+from ultragray_service.errors import IgtlMessageInvalid
+from ultragray_service.igtl.commands.contents import Command, pack_command, pack_string, unpack_command, unpack_string
+from ultragray_service.igtl.commands.markup import Outcome, Reply, Request, read_request
+from ultragray_service.igtl.commands.scanner import Scanner
+from ultragray_service.igtl.messages import Message
 
 _ASKS, _ANSWERS = "CMD_", "ACK_"  # beginnings of the names of devices whose STRING is a command, and a reply
 _SET, _GET = "SetUsParameter", "GetUsParameter"

@@ -5,8 +5,8 @@ from __future__ import annotations
 import struct
 from dataclasses import dataclass
 
-from ...errors import IgtlMessageInvalid
-from ..messages import pack_text, unpack_text
+from ultragray_service.errors import IgtlMessageInvalid
+from ultragray_service.igtl.messages import pack_text, unpack_text
 
 _NAME_BYTES = 128
 _COMMAND = struct.Struct(f">I{_NAME_BYTES}sHI")

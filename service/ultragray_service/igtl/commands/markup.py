@@ -11,8 +11,7 @@ from dataclasses import dataclass
 from xml.etree import ElementTree
 
 from ultragray.contract import shown
-
-from ...errors import IgtlMessageInvalid
+from ultragray_service.errors import IgtlMessageInvalid
 
 MAX_COMMAND_BYTES = 4096
 MAX_PARAMETERS = 32  # of one command

@@ -12,8 +12,7 @@ from ultragray.errors import InvalidArgument
 from ultragray.probe import FloatArray
 from ultragray.registration.registration import Registration
 from ultragray.tools import MAX_TOOLS, Tool
-
-from ..messages import DEVICE_NAME_BYTES
+from ultragray_service.igtl.messages import DEVICE_NAME_BYTES
 
 _DEVICE, _FRAME = "device", "frame"
 _EXAMPLE = '[{"kind": "needle", "tip_mm": [0, 0, 0], "hub_mm": [0, 0, -120], "device": "NeedleToReference"}]'

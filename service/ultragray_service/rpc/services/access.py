@@ -6,10 +6,9 @@ import grpc
 
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import access_pb2
-
-from ...access.principal import me
-from ...core.state import Service
-from ...views.audited import DEFAULT_ENTRIES, DEFAULT_HOURS, audit_entries
+from ultragray_service.access.principal import me
+from ultragray_service.core.state import Service
+from ultragray_service.views.audited import DEFAULT_ENTRIES, DEFAULT_HOURS, audit_entries
 
 
 class AccessService:

@@ -10,15 +10,14 @@ import grpc
 from ultragray.errors import InvalidArgument
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import geometry_pb2, jobs_pb2
+from ultragray_service.core.catalog import DEFAULT_PAGE_SIZE
+from ultragray_service.core.jobs.estimates import estimate
+from ultragray_service.core.jobs.log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
+from ultragray_service.core.state import Service
+from ultragray_service.rpc.messages import job_message, read_specification, read_word
 from ultragray_workers.errors import Draining
 from ultragray_workers.jobs.shared.reading import opened
 from ultragray_workers.jobs.store import JobStore
-
-from ...core.catalog import DEFAULT_PAGE_SIZE
-from ...core.jobs.estimates import estimate
-from ...core.jobs.log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
-from ...core.state import Service
-from ..messages import job_message, read_specification, read_word
 
 _CHUNK_BYTES = 2**20
 _LOOK_AROUND_S = 15.0  # how long a watch waits for news at a time

@@ -10,10 +10,9 @@ from ultragray.errors import InvalidArgument, InvalidPose
 from ultragray.registration.registration import Registration, rows
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import geometry_pb2, registrations_pb2
-
-from ...core.catalog import DEFAULT_PAGE_SIZE
-from ...core.state import Service
-from ..messages import read
+from ultragray_service.core.catalog import DEFAULT_PAGE_SIZE
+from ultragray_service.core.state import Service
+from ultragray_service.rpc.messages import read
 
 _LINKS = ("base_to_scene", "probe_to_flange")
 

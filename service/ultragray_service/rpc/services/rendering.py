@@ -17,16 +17,15 @@ from ultragray.probe import FloatArray, Probe
 from ultragray.volumes.plane import SliceSettings
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import rendering_pb2
+from ultragray_service.core.poses import check_pose_count, exact_poses
+from ultragray_service.core.requests import Plan
+from ultragray_service.core.state import Service
+from ultragray_service.core.streams.stream import FrameStream, checked_s
+from ultragray_service.rpc.messages import frame_message, read, read_pose, read_settings, slice_message
+from ultragray_service.rpc.stream import CallTransport
+from ultragray_service.views.localizing import locate, sought_frame
 from ultragray_workers.errors import QueueFull
 from ultragray_workers.pool.types import Priority, RenderResult
-
-from ...core.poses import check_pose_count, exact_poses
-from ...core.requests import Plan
-from ...core.state import Service
-from ...core.streams.stream import FrameStream, checked_s
-from ...views.localizing import locate, sought_frame
-from ..messages import frame_message, read, read_pose, read_settings, slice_message
-from ..stream import CallTransport
 
 _RETRY_S = 0.02
 _STREAM_NAME = "x-ultragray-stream-name"  # metadata

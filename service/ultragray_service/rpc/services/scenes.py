@@ -6,11 +6,10 @@ import grpc
 
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import scenes_pb2
-
-from ...core import scenes
-from ...core.catalog import DEFAULT_PAGE_SIZE
-from ...core.scenes import SceneLoaded
-from ...core.state import Service
+from ultragray_service.core import scenes
+from ultragray_service.core.catalog import DEFAULT_PAGE_SIZE
+from ultragray_service.core.scenes import SceneLoaded
+from ultragray_service.core.state import Service
 
 
 class SceneService:

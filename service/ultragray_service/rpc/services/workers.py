@@ -6,10 +6,9 @@ import grpc
 
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import workers_pb2
+from ultragray_service.core.state import Service
 from ultragray_workers.jobs.queue.wishes import Wanted
 from ultragray_workers.jobs.store import JobStore
-
-from ...core.state import Service
 
 
 class WorkerService:

@@ -3,12 +3,12 @@
 Modules that end in `_run` do the work of a kind and are imported in the job's process only.
 """
 
-from .base import Specification
-from .compare import CompareJob
-from .evaluate import EvaluateJob
-from .render import RenderJob
-from .train import TrainJob
-from .volumes.voxelize import VoxelizeJob
+from ultragray_workers.jobs.kinds.base import Specification
+from ultragray_workers.jobs.kinds.compare import CompareJob
+from ultragray_workers.jobs.kinds.evaluate import EvaluateJob
+from ultragray_workers.jobs.kinds.render import RenderJob
+from ultragray_workers.jobs.kinds.train import TrainJob
+from ultragray_workers.jobs.kinds.volumes.voxelize import VoxelizeJob
 
 __all__ = ["KINDS", "CompareJob", "EvaluateJob", "RenderJob", "Specification", "TrainJob", "VoxelizeJob"]
 

@@ -12,18 +12,16 @@ from typing_extensions import Self
 
 from ultragray.contract import Family, described
 from ultragray.scene_info import SceneHeader
-
-from ...scene_names import check_scene_name, check_scene_reference
-from ..matching.demand import AUTO, MAX_MEMORY_GB, check_device, check_labels
+from ultragray_workers.jobs.matching.demand import AUTO, MAX_MEMORY_GB, check_device, check_labels
+from ultragray_workers.scene_names import check_scene_name, check_scene_reference
 
 MAX_RUN_S = 31_536_000.0
 TOPIC = "Worker"
 
 if TYPE_CHECKING:
     from ultragray.registration.registration import Registration
-
-    from ..folder import Outcome
-    from ..worker.job_run import JobRun
+    from ultragray_workers.jobs.folder import Outcome
+    from ultragray_workers.jobs.worker.job_run import JobRun
 
 
 @dataclass(frozen=True)

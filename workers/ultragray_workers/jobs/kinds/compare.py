@@ -7,8 +7,7 @@ from typing import Literal
 
 from ultragray.contract import described, kind_field
 from ultragray.methods.comparison.settings import ComparisonSettings
-
-from .base import Specification
+from ultragray_workers.jobs.kinds.base import Specification
 
 
 @dataclass(frozen=True)

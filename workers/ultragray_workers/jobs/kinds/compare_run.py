@@ -11,11 +11,10 @@ from ultragray.errors import TrainingDiverged
 from ultragray.methods.comparison.files import write_comparison
 from ultragray.methods.comparison.place import RUN_FILE
 from ultragray.methods.comparison.run import ComparisonProgress, compare
-
-from ..folder import Outcome, Progress
-from ..worker.job_run import JobRun, Stopped
-from .compare import CompareJob
-from .earlier_run import take_over_run
+from ultragray_workers.jobs.folder import Outcome, Progress
+from ultragray_workers.jobs.kinds.compare import CompareJob
+from ultragray_workers.jobs.kinds.earlier_run import take_over_run
+from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 
 _LINES = 10  # of the log in a fit
 

@@ -8,9 +8,8 @@ from contextlib import suppress
 
 from ultragray.errors import TrainingStateInvalid
 from ultragray.files.atomic import TEMPORARY_SUFFIX
-
-from ..folder import JobFolder
-from ..worker.job_run import JobRun
+from ultragray_workers.jobs.folder import JobFolder
+from ultragray_workers.jobs.worker.job_run import JobRun
 
 
 def take_over_run(job_run: JobRun, begun: str) -> None:

@@ -6,8 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ultragray.contract import described, kind_field
-
-from .base import Specification
+from ultragray_workers.jobs.kinds.base import Specification
 
 
 @dataclass(frozen=True)

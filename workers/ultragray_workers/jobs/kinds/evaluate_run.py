@@ -19,11 +19,10 @@ from ultragray.evaluation.speckle import FrameSpeckle
 from ultragray.files.atomic import file_sha256
 from ultragray.scene import GaussianScene
 from ultragray.training.device import training_device
-
-from ...scenes import SUFFIX
-from ..folder import Outcome, Progress
-from ..worker.job_run import JobRun, Stopped
-from .evaluate import EvaluateJob
+from ultragray_workers.jobs.folder import Outcome, Progress
+from ultragray_workers.jobs.kinds.evaluate import EvaluateJob
+from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
+from ultragray_workers.scenes import SUFFIX
 
 RESULT_FILE = "evaluation.json"
 PICTURES = 8  # held-out frames, evenly spread

@@ -35,9 +35,8 @@ from ultragray.samplers import (
 from ultragray.samplers.confident import require_drawn
 from ultragray.scene_info import SceneHeader
 from ultragray.settings import Encoding, FrameSettings, Resolved, registration_field
-
-from ...errors import StorageFull
-from .base import Specification, Surroundings
+from ultragray_workers.errors import StorageFull
+from ultragray_workers.jobs.kinds.base import Specification, Surroundings
 
 ASSESSED_AT_ONCE = 250_000  # poses times training poses that submissions wait for: about a fifth of a second
 _MEMBER_BYTES = 1024  # of a shard, around the pixels of a member
@@ -102,7 +101,7 @@ class RenderJob(FrameSettings, Specification):
         check_format(self.file_format.name, self.outputs, self.dtype)
 
     def __eq__(self, other: object) -> bool:
-        from ..specification import to_dict  # imports the kinds
+        from ultragray_workers.jobs.specification import to_dict  # imports the kinds
 
         return isinstance(other, RenderJob) and to_dict(self) == to_dict(other)
 

@@ -15,12 +15,11 @@ from ultragray.scene import GaussianScene
 from ultragray.scene_info import SceneHeader, read_header
 from ultragray.settings import Encoding
 from ultragray.training.device import training_device
-
-from ...scenes import SUFFIX
-from ..folder import Outcome, Progress
-from ..worker.job_run import JobRun, Stopped
-from . import shards_run
-from .render import RenderJob
+from ultragray_workers.jobs.folder import Outcome, Progress
+from ultragray_workers.jobs.kinds import shards_run
+from ultragray_workers.jobs.kinds.render import RenderJob
+from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
+from ultragray_workers.scenes import SUFFIX
 
 ASSESSED_AT_ONCE = 100_000  # poses times training poses, of about a tenth of a second
 

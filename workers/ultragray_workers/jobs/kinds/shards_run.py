@@ -17,17 +17,16 @@ from ultragray.files.atomic import file_sha256
 from ultragray.limits import Limits
 from ultragray.scene_info import read_header
 from ultragray.training.device import training_device
-
-from ...batches.place import ShardPlace
-from ...errors import StorageUnavailable
-from ...scenes import SUFFIX
-from ...storage.opening import open_storage
-from ...storage.storage import Storage
-from ..folder import BATCH, FOLDER, Outcome, Progress
-from ..shards.queue import BatchFailed, ShardQueue
-from ..shards.shares import batch_of
-from ..worker.job_run import JobRun, Stopped
-from .render import RenderJob
+from ultragray_workers.batches.place import ShardPlace
+from ultragray_workers.errors import StorageUnavailable
+from ultragray_workers.jobs.folder import BATCH, FOLDER, Outcome, Progress
+from ultragray_workers.jobs.kinds.render import RenderJob
+from ultragray_workers.jobs.shards.queue import BatchFailed, ShardQueue
+from ultragray_workers.jobs.shards.shares import batch_of
+from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
+from ultragray_workers.scenes import SUFFIX
+from ultragray_workers.storage.opening import open_storage
+from ultragray_workers.storage.storage import Storage
 
 _RETRY_S = 2.0  # while the storage is away
 _PATIENCE_S = 600.0  # of a small request to it

@@ -9,8 +9,7 @@ from ultragray.contract import described, kind_field, shown
 from ultragray.errors import InvalidArgument
 from ultragray.machine import memory_bytes
 from ultragray.training.config import PRESET_MEANINGS, PRESETS, TrainingConfig
-
-from .base import Specification, Surroundings
+from ultragray_workers.jobs.kinds.base import Specification, Surroundings
 
 _MAX_SETTINGS, _MAX_SETTING_CHARACTERS = 100, 100
 _GIB = 1 << 30

@@ -23,16 +23,15 @@ from ultragray.training import train as train_scene
 from ultragray.training.pictures import pictures_in
 from ultragray.training.run import FITTING
 from ultragray.training.trainer import CHECKPOINT_FILE, JOURNAL_FILE
-
-from ...scenes import SUFFIX
-from ..files import BASELINES_NAME
-from ..folder import Outcome, Progress
-from ..worker.job_run import JobRun, Stopped
-from .curve import draw_training_curve
-from .earlier_run import take_over_run
-from .train import TrainJob
-from .training.baselines import write_baselines
-from .training.remaining import PICTURES, REPORT_FRAMES, Finishing
+from ultragray_workers.jobs.files import BASELINES_NAME
+from ultragray_workers.jobs.folder import Outcome, Progress
+from ultragray_workers.jobs.kinds.curve import draw_training_curve
+from ultragray_workers.jobs.kinds.earlier_run import take_over_run
+from ultragray_workers.jobs.kinds.train import TrainJob
+from ultragray_workers.jobs.kinds.training.baselines import write_baselines
+from ultragray_workers.jobs.kinds.training.remaining import PICTURES, REPORT_FRAMES, Finishing
+from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
+from ultragray_workers.scenes import SUFFIX
 
 CHECKPOINT_INTERVAL_S = 10.0
 _LINES = 20  # of the log in a run

@@ -8,8 +8,7 @@ from dataclasses import asdict, dataclass, fields
 from functools import lru_cache
 
 from ultragray.contract import described
-
-from .demand import AUTO, CPU, CUDA, GB, Demand, labels_in_words
+from ultragray_workers.jobs.matching.demand import AUTO, CPU, CUDA, GB, Demand, labels_in_words
 
 _NAMED_WORKERS = 3  # in a sentence
 

@@ -9,13 +9,12 @@ from enum import Enum
 import sqlalchemy as sa
 
 from ultragray.contract import described
-
-from ...errors import WorkerNotFound, known_names
-from ..matching.offer import LivingWorker, WorkerDevice, offer_of_json
-from .database import JobDatabase
-from .heartbeat import DEAD_AFTER_S, now_s
-from .tables import WORKERS
-from .wishes import Wanted, wanted_of
+from ultragray_workers.errors import WorkerNotFound, known_names
+from ultragray_workers.jobs.matching.offer import LivingWorker, WorkerDevice, offer_of_json
+from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.queue.heartbeat import DEAD_AFTER_S, now_s
+from ultragray_workers.jobs.queue.tables import WORKERS
+from ultragray_workers.jobs.queue.wishes import Wanted, wanted_of
 
 
 class WorkerState(str, Enum):

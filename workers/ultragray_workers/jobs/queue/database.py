@@ -14,14 +14,21 @@ from dbos import DBOS, DBOSClient, DBOSPortableJSONSerializer, EnqueueOptions, W
 from sqlalchemy.engine import ExceptionContext
 from sqlalchemy.exc import SQLAlchemyError
 
-from ...errors import DatabaseUnavailable, StartupFailed, StorageFull
-from ...storage.storage import Storage
-from ...store import PRIVATE_FILE, PRIVATE_FOLDER
-from ..matching.demand import Demand
-from . import runs, tables
-from .folder_identity import FolderIdentity, FolderPlace, StoragePlace, identify
-from .internals import SCHEMA, SQLITE_ISOLATION, SQLITE_SETTINGS, WORKFLOWS, put_back, take_back
-from .writable import WriteProbe
+from ultragray_workers.errors import DatabaseUnavailable, StartupFailed, StorageFull
+from ultragray_workers.jobs.matching.demand import Demand
+from ultragray_workers.jobs.queue import runs, tables
+from ultragray_workers.jobs.queue.folder_identity import FolderIdentity, FolderPlace, StoragePlace, identify
+from ultragray_workers.jobs.queue.internals import (
+    SCHEMA,
+    SQLITE_ISOLATION,
+    SQLITE_SETTINGS,
+    WORKFLOWS,
+    put_back,
+    take_back,
+)
+from ultragray_workers.jobs.queue.writable import WriteProbe
+from ultragray_workers.storage.storage import Storage
+from ultragray_workers.store import PRIVATE_FILE, PRIVATE_FOLDER
 
 APPLICATION = "ultragray"
 # Of the workflow's inputs and steps: workers take the jobs of their own version only, and make jobs of older ones that

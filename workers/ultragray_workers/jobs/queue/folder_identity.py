@@ -18,10 +18,9 @@ import sqlalchemy as sa
 
 from ultragray.errors import UltragrayError
 from ultragray.files.atomic import write_whole
-
-from ...errors import ArtifactFolderUnavailable, StartupFailed
-from ...storage.storage import NotThere, Storage
-from .tables import FOLDER
+from ultragray_workers.errors import ArtifactFolderUnavailable, StartupFailed
+from ultragray_workers.jobs.queue.tables import FOLDER
+from ultragray_workers.storage.storage import NotThere, Storage
 
 FILE = "folder_id"  # of the artifact folder, or the key of an object
 _PROBES = "probes"  # prefix of objects that are written and removed again

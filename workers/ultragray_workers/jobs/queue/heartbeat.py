@@ -20,13 +20,12 @@ from sqlalchemy.exc import SQLAlchemyError
 
 import ultragray
 from ultragray.errors import UltragrayError
-
-from ...rounds import Rounds
-from ..matching.offer import NO_OFFER, Offer
-from . import unfinished
-from .database import JobDatabase
-from .tables import WORKERS
-from .wishes import Wanted, wanted_of
+from ultragray_workers.jobs.matching.offer import NO_OFFER, Offer
+from ultragray_workers.jobs.queue import unfinished
+from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.queue.tables import WORKERS
+from ultragray_workers.jobs.queue.wishes import Wanted, wanted_of
+from ultragray_workers.rounds import Rounds
 
 BEAT_INTERVAL_S = 1.0
 DEAD_AFTER_S = 10.0

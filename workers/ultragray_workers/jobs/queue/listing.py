@@ -15,10 +15,9 @@ import sqlalchemy as sa
 from dbos import WorkflowStatus
 
 from ultragray.errors import InvalidArgument
-
-from ..kinds import KINDS
-from .database import JobDatabase
-from .internals import WORKFLOWS
+from ultragray_workers.jobs.kinds import KINDS
+from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.queue.internals import WORKFLOWS
 
 
 def count_by_status(jobs: JobDatabase) -> dict[str, int]:

@@ -12,7 +12,7 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.exc import IntegrityError
 
-from .tables import RUNS, USAGE
+from ultragray_workers.jobs.queue.tables import RUNS, USAGE
 
 PUBLISHED, CANCELLED = "published", "cancelled"
 

@@ -12,8 +12,8 @@ from contextlib import contextmanager
 
 import sqlalchemy as sa
 
-from ...errors import StartupFailed
-from .internals import QUEUE_VERSION, SCHEMA, latest_queue_version
+from ultragray_workers.errors import StartupFailed
+from ultragray_workers.jobs.queue.internals import QUEUE_VERSION, SCHEMA, latest_queue_version
 
 TABLES = sa.MetaData(schema=SCHEMA)
 WORKERS = sa.Table(

@@ -9,11 +9,11 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from ..kinds import KINDS, Specification
-from ..matching.demand import Demand, demand_of_key
-from . import database
-from .database import JobDatabase
-from .internals import WORKFLOWS
+from ultragray_workers.jobs.kinds import KINDS, Specification
+from ultragray_workers.jobs.matching.demand import Demand, demand_of_key
+from ultragray_workers.jobs.queue import database
+from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.queue.internals import WORKFLOWS
 
 _ROWS = WORKFLOWS.c
 

@@ -12,8 +12,8 @@ import uuid
 import sqlalchemy as sa
 from sqlalchemy.exc import SQLAlchemyError
 
-from ...errors import DatabaseUnavailable
-from .tables import WORKERS
+from ultragray_workers.errors import DatabaseUnavailable
+from ultragray_workers.jobs.queue.tables import WORKERS
 
 
 class WriteProbe:

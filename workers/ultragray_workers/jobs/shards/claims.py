@@ -8,9 +8,9 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from ..queue import database
-from ..queue.internals import WORKFLOWS
-from ..queue.tables import SHARDS
+from ultragray_workers.jobs.queue import database
+from ultragray_workers.jobs.queue.internals import WORKFLOWS
+from ultragray_workers.jobs.queue.tables import SHARDS
 
 MOST_TRIES = 20  # of one shard: after so many deaths of those who were at it, it is to blame
 _ROWS = SHARDS.c

@@ -9,14 +9,14 @@ from typing import Any
 
 from dbos import WorkflowStatus
 
-from ...errors import DatabaseUnavailable, StorageFull
-from ..folder import Outcome
-from ..queue import database, unfinished
-from ..queue.database import JobDatabase
-from . import claims
-from .channel import channel
-from .claims import Failed
-from .shares import SHARE_OF, call_help
+from ultragray_workers.errors import DatabaseUnavailable, StorageFull
+from ultragray_workers.jobs.folder import Outcome
+from ultragray_workers.jobs.queue import database, unfinished
+from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.shards import claims
+from ultragray_workers.jobs.shards.channel import channel
+from ultragray_workers.jobs.shards.claims import Failed
+from ultragray_workers.jobs.shards.shares import SHARE_OF, call_help
 
 _TELL_INTERVAL_S = 1.0
 LONGEST_SHARE_S = 60.0  # then a share ends, where other jobs wait

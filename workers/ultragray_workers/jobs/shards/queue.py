@@ -6,9 +6,8 @@ import time
 from collections.abc import Callable
 
 from ultragray.batches import BatchPlan
-
-from .channel import Channel
-from .claims import Failed
+from ultragray_workers.jobs.shards.channel import Channel
+from ultragray_workers.jobs.shards.claims import Failed
 
 _POLL_S = 0.2
 _ASK_AGAIN_S = 0.5  # while others are at the last shards

@@ -9,9 +9,9 @@ import sqlalchemy as sa
 from dbos import EnqueueOptions, WorkflowSerializationFormat, WorkflowStatus
 from dbos import error as dbos_error
 
-from ..queue import database, runs
-from ..queue.database import JobDatabase
-from ..queue.internals import WORKFLOWS
+from ultragray_workers.jobs.queue import database, runs
+from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.queue.internals import WORKFLOWS
 
 SHARE = "share"  # the name of its workflow
 SHARE_OF = "share_of"  # in its request: the batch

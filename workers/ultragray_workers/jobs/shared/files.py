@@ -7,13 +7,13 @@ import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 
-from ...errors import StorageUnavailable
-from ...scenes import SUFFIX
-from ...storage.storage import Entry, NotThere, Storage
-from ..files import CHECKPOINT_NAME, Artifact, Log
-from ..folder import Progress
-from .reading import SharedFile, SharedLog
-from .record import StoredFile, batch_prefix_of, prefix_of, read_record, record_key
+from ultragray_workers.errors import StorageUnavailable
+from ultragray_workers.jobs.files import CHECKPOINT_NAME, Artifact, Log
+from ultragray_workers.jobs.folder import Progress
+from ultragray_workers.jobs.shared.reading import SharedFile, SharedLog
+from ultragray_workers.jobs.shared.record import StoredFile, batch_prefix_of, prefix_of, read_record, record_key
+from ultragray_workers.scenes import SUFFIX
+from ultragray_workers.storage.storage import Entry, NotThere, Storage
 
 
 class SharedFiles:

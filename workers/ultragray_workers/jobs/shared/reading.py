@@ -9,8 +9,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import IO
 
-from ...storage.storage import Storage
-from .record import StoredFile, read_record
+from ultragray_workers.jobs.shared.record import StoredFile, read_record
+from ultragray_workers.storage.storage import Storage
 
 
 @dataclass(frozen=True)

@@ -20,8 +20,8 @@ from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
-from ...storage.storage import NotThere, Storage
-from ..folder import BATCH, FOLDER, Outcome, Progress
+from ultragray_workers.jobs.folder import BATCH, FOLDER, Outcome, Progress
+from ultragray_workers.storage.storage import NotThere, Storage
 
 FORMAT_VERSION = 1
 RECORD_NAME = "record.json"

@@ -8,8 +8,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from ultragray.files.atomic import TEMPORARY_SUFFIX
-
-from ..files import BASELINES_NAME, CONFIG_NAME, JOURNAL_NAME
+from ultragray_workers.jobs.files import BASELINES_NAME, CONFIG_NAME, JOURNAL_NAME
 
 # A checkpoint: they say nothing without it, and a journal grows all the time.
 _BESIDE = (JOURNAL_NAME, CONFIG_NAME, BASELINES_NAME)

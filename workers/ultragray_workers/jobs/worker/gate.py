@@ -13,13 +13,13 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 
-from ...errors import ArtifactFolderUnavailable, DatabaseUnavailable
-from ..matching.demand import Demand, demand_of_key
-from ..matching.offer import Offer
-from ..queue import heartbeat
-from ..queue.folder_identity import FolderIdentity
-from .device import DeviceLock
-from .processes import holder_of, is_stopped
+from ultragray_workers.errors import ArtifactFolderUnavailable, DatabaseUnavailable
+from ultragray_workers.jobs.matching.demand import Demand, demand_of_key
+from ultragray_workers.jobs.matching.offer import Offer
+from ultragray_workers.jobs.queue import heartbeat
+from ultragray_workers.jobs.queue.folder_identity import FolderIdentity
+from ultragray_workers.jobs.worker.device import DeviceLock
+from ultragray_workers.jobs.worker.processes import holder_of, is_stopped
 
 _log = logging.getLogger("ultragray.jobs")
 

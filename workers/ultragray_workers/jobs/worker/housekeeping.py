@@ -19,19 +19,18 @@ from pathlib import Path
 from sqlalchemy.exc import SQLAlchemyError
 
 from ultragray.errors import UltragrayError
-
-from ...claims import DELETED_PREFIX, remove_whole
-from ...datasets.shared_shelf import SharedShelf
-from ...datasets.store import FOLDER as DATASETS
-from ...errors import JobInUse, StorageUnavailable
-from ...rounds import Rounds
-from ...storage.storage import Storage
-from ..folder import FOLDER, JobFolder
-from ..kinds import KINDS
-from ..places import files_of_jobs
-from ..queue import database, unfinished
-from ..queue.database import JobDatabase
-from ..removal import remove_job
+from ultragray_workers.claims import DELETED_PREFIX, remove_whole
+from ultragray_workers.datasets.shared_shelf import SharedShelf
+from ultragray_workers.datasets.store import FOLDER as DATASETS
+from ultragray_workers.errors import JobInUse, StorageUnavailable
+from ultragray_workers.jobs.folder import FOLDER, JobFolder
+from ultragray_workers.jobs.kinds import KINDS
+from ultragray_workers.jobs.places import files_of_jobs
+from ultragray_workers.jobs.queue import database, unfinished
+from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.removal import remove_job
+from ultragray_workers.rounds import Rounds
+from ultragray_workers.storage.storage import Storage
 
 INTERVAL_S = 3600.0
 STEP_PAUSE_S = 1.0

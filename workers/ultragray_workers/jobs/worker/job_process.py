@@ -9,9 +9,9 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 
-from ..folder import JobFolder
-from .device import DeviceLock
-from .processes import holder_of, kill_group
+from ultragray_workers.jobs.folder import JobFolder
+from ultragray_workers.jobs.worker.device import DeviceLock
+from ultragray_workers.jobs.worker.processes import holder_of, kill_group
 
 STOP_WAIT_S = 10.0  # for the checkpoint of a training that is to stop
 _KILL_WAIT_S, _KILL_POLL_S = 5.0, 0.02

@@ -8,10 +8,10 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from ...datasets.opening import open_datasets
-from ...errors import StorageUnavailable
-from ..folder import JobFolder, Progress, Request
-from ..shards.channel import Channel
+from ultragray_workers.datasets.opening import open_datasets
+from ultragray_workers.errors import StorageUnavailable
+from ultragray_workers.jobs.folder import JobFolder, Progress, Request
+from ultragray_workers.jobs.shards.channel import Channel
 
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset

@@ -21,14 +21,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from ultragray.errors import InvalidArgument, MemoryExceeded, UltragrayError
-
-from ...claims import is_no_room, storage_full
-from ...niceness import let_frames_go_first
-from ...parent import end_with_parent
-from ..folder import JobFolder, Outcome
-from ..shards.channel import Channel
-from ..specification import from_dict
-from .job_run import JobRun, Stopped
+from ultragray_workers.claims import is_no_room, storage_full
+from ultragray_workers.jobs.folder import JobFolder, Outcome
+from ultragray_workers.jobs.shards.channel import Channel
+from ultragray_workers.jobs.specification import from_dict
+from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
+from ultragray_workers.niceness import let_frames_go_first
+from ultragray_workers.parent import end_with_parent
 
 STOPPED, STORAGE_FULL, FOLDER_LOST = 75, 73, 74
 _LOCK_POLL_S = 0.2

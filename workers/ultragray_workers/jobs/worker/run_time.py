@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from contextlib import suppress
 
-from ...errors import DatabaseUnavailable, StorageFull
-from ..queue import runs
-from ..queue.database import JobDatabase
+from ultragray_workers.errors import DatabaseUnavailable, StorageFull
+from ultragray_workers.jobs.queue import runs
+from ultragray_workers.jobs.queue.database import JobDatabase
 
 _SAVE_EVERY_S = 5.0
 

@@ -19,11 +19,9 @@ from typing import Protocol, TypeVar
 
 from ultragray.errors import TrainingStateInvalid
 from ultragray.files.atomic import file_sha256
-
-from ...errors import StorageUnavailable
-from ...storage.storage import NotThere, Storage
-from ..folder import JobFolder, Outcome
-from ..shared.record import (
+from ultragray_workers.errors import StorageUnavailable
+from ultragray_workers.jobs.folder import JobFolder, Outcome
+from ultragray_workers.jobs.shared.record import (
     JobRecord,
     LogPiece,
     StoredFile,
@@ -35,7 +33,8 @@ from ..shared.record import (
     read_record,
     record_key,
 )
-from ..shared.run_files import Version, copy_of, files_in, version_of
+from ultragray_workers.jobs.shared.run_files import Version, copy_of, files_in, version_of
+from ultragray_workers.storage.storage import NotThere, Storage
 
 TELL_INTERVAL_S = 1.0
 LAST_WAIT_S = 10.0  # for what a job leaves that goes on elsewhere

@@ -19,10 +19,9 @@ from dbos import WorkflowStatus
 from opentelemetry.trace import Status, StatusCode
 
 from ultragray.errors import MemoryExceeded
-
-from ...claims import is_no_room
-from ...datasets.copies import DEFAULT_MAX_BYTES
-from ...errors import (
+from ultragray_workers.claims import is_no_room
+from ultragray_workers.datasets.copies import DEFAULT_MAX_BYTES
+from ultragray_workers.errors import (
     ArtifactFolderUnavailable,
     DatabaseUnavailable,
     JobStalled,
@@ -30,25 +29,30 @@ from ...errors import (
     SceneExists,
     StorageFull,
 )
-from ...scenes import SUFFIX
-from ...storage.storage import Storage
-from ..folder import FOLDER, JobFolder, Outcome, Request
-from ..matching.demand import Demand
-from ..publication import give_name_back, publish_scene
-from ..queue import database, runs
-from ..queue.database import JobDatabase
-from ..shards.desk import BatchOver, ShardDesk
-from ..shards.shares import SHARE_OF, cancel_shares
-from ..shared.record import Superseded
-from ..specification import has_checkpoints, is_in_shards, value_in
-from ..tracing import job_span
-from .device import DeviceLock
-from .gate import Gate
-from .job_process import STOP_WAIT_S, end_process_of_another_worker, end_with_checkpoint, job_process
-from .run_job import STOPPED, STORAGE_FULL
-from .run_time import RunTime
-from .sharing import LAST_WAIT_S, InOneFolder, Sharing, ThroughStorage
-from .watchdog import Watchdog
+from ultragray_workers.jobs.folder import FOLDER, JobFolder, Outcome, Request
+from ultragray_workers.jobs.matching.demand import Demand
+from ultragray_workers.jobs.publication import give_name_back, publish_scene
+from ultragray_workers.jobs.queue import database, runs
+from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.shards.desk import BatchOver, ShardDesk
+from ultragray_workers.jobs.shards.shares import SHARE_OF, cancel_shares
+from ultragray_workers.jobs.shared.record import Superseded
+from ultragray_workers.jobs.specification import has_checkpoints, is_in_shards, value_in
+from ultragray_workers.jobs.tracing import job_span
+from ultragray_workers.jobs.worker.device import DeviceLock
+from ultragray_workers.jobs.worker.gate import Gate
+from ultragray_workers.jobs.worker.job_process import (
+    STOP_WAIT_S,
+    end_process_of_another_worker,
+    end_with_checkpoint,
+    job_process,
+)
+from ultragray_workers.jobs.worker.run_job import STOPPED, STORAGE_FULL
+from ultragray_workers.jobs.worker.run_time import RunTime
+from ultragray_workers.jobs.worker.sharing import LAST_WAIT_S, InOneFolder, Sharing, ThroughStorage
+from ultragray_workers.jobs.worker.watchdog import Watchdog
+from ultragray_workers.scenes import SUFFIX
+from ultragray_workers.storage.storage import Storage
 
 WATCH_INTERVAL_S = 0.25
 STUCK_AFTER_S = 60.0  # in which the supervision itself has not moved, such as on a share that does not answer

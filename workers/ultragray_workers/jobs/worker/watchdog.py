@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import time
 
-from .processes import Account, account_of
+from ultragray_workers.jobs.worker.processes import Account, account_of
 
 LEAST_CPU_S = 0.1  # of a process that gets on; waiting with a look now and then takes less
 LONGEST_STEP_S = 2.0  # between two looks; what is longer, this worker itself was stopped for

@@ -19,24 +19,23 @@ from typing import Any
 from dbos import DBOS, PortableWorkflowError, WorkflowSerializationFormat
 
 from ultragray.errors import InvalidArgument
-
-from ...datasets.copies import DEFAULT_MAX_BYTES
-from ...errors import StartupFailed
-from ...storage.local import LocalStorage
-from ...storage.storage import Storage
-from ...store import OpenStore
-from ..kinds import KINDS
-from ..matching.demand import check_labels
-from ..queue import database, unfinished
-from ..queue.database import JobDatabase, dbos_config, quiet_dbos
-from ..queue.heartbeat import Heartbeat
-from ..queue.internals import NotMine, leave_others_room, take_only_through
-from ..queue.wishes import Wanted
-from ..shards.shares import SHARE
-from .device import DeviceLock, devices_of
-from .gate import Gate
-from .housekeeping import Housekeeper
-from .supervision import Interrupted, Supervisor, WorkerConfig
+from ultragray_workers.datasets.copies import DEFAULT_MAX_BYTES
+from ultragray_workers.errors import StartupFailed
+from ultragray_workers.jobs.kinds import KINDS
+from ultragray_workers.jobs.matching.demand import check_labels
+from ultragray_workers.jobs.queue import database, unfinished
+from ultragray_workers.jobs.queue.database import JobDatabase, dbos_config, quiet_dbos
+from ultragray_workers.jobs.queue.heartbeat import Heartbeat
+from ultragray_workers.jobs.queue.internals import NotMine, leave_others_room, take_only_through
+from ultragray_workers.jobs.queue.wishes import Wanted
+from ultragray_workers.jobs.shards.shares import SHARE
+from ultragray_workers.jobs.worker.device import DeviceLock, devices_of
+from ultragray_workers.jobs.worker.gate import Gate
+from ultragray_workers.jobs.worker.housekeeping import Housekeeper
+from ultragray_workers.jobs.worker.supervision import Interrupted, Supervisor, WorkerConfig
+from ultragray_workers.storage.local import LocalStorage
+from ultragray_workers.storage.storage import Storage
+from ultragray_workers.store import OpenStore
 
 POLLING_INTERVAL_S = 0.25
 _NAMES_FOLDER = "workers"

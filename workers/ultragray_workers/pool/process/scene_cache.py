@@ -14,10 +14,9 @@ from ultragray.errors import MemoryExceeded, SceneFileInvalid, UltragrayError
 from ultragray.files.atomic import file_sha256
 from ultragray.scene import GaussianScene
 from ultragray.scene_info import read_header, scene_file_invalid
-
-from ...errors import SceneTooLarge
-from ...scenes import resident_bytes
-from ...storage.local import FileVersion
+from ultragray_workers.errors import SceneTooLarge
+from ultragray_workers.scenes import resident_bytes
+from ultragray_workers.storage.local import FileVersion
 
 MAX_SCENES = 256
 _READ_ATTEMPTS = 3

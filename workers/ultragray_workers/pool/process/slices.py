@@ -10,10 +10,9 @@ from ultragray.settings import Encoding
 from ultragray.volumes.fields import sample_slice
 from ultragray.volumes.files import as_grey
 from ultragray.volumes.plane import SliceView
-
-from ..memory import write_at
-from ..messages import RenderPart
-from .encoding import encode_image
+from ultragray_workers.pool.memory import write_at
+from ultragray_workers.pool.messages import RenderPart
+from ultragray_workers.pool.process.encoding import encode_image
 
 
 def write_slices(scene: GaussianScene, part: RenderPart[SliceView], memory: int, limits: Limits) -> int:

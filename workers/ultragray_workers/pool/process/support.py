@@ -7,8 +7,7 @@ from collections.abc import Sequence
 from ultragray.confidence import Extrapolation, is_confident, low_confidence
 from ultragray.errors import LowConfidence
 from ultragray.settings import Below
-
-from ..messages import RenderTask
+from ultragray_workers.pool.messages import RenderTask
 
 
 def below_limit(task: RenderTask, extrapolations: Sequence[Extrapolation]) -> list[bool]:

@@ -15,8 +15,8 @@ import traceback
 from pathlib import Path
 from typing import NoReturn
 
-from ..channel import Channel
-from ..messages import ForkWorker, Hello
+from ultragray_workers.pool.channel import Channel
+from ultragray_workers.pool.messages import ForkWorker, Hello
 
 
 def main(channel_descriptor: int) -> NoReturn:
@@ -26,7 +26,7 @@ def main(channel_descriptor: int) -> NoReturn:
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # no zombies
     import torch  # after the signals: it takes seconds
 
-    from .worker import run_worker
+    from ultragray_workers.pool.process.worker import run_worker
 
     if torch.version.cuda is not None:
         with contextlib.suppress(ImportError):

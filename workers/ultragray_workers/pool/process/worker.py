@@ -31,12 +31,11 @@ from ultragray.localization.pixels import read_grey, read_png
 from ultragray.probe import FloatArray
 from ultragray.rendering import renderer_name
 from ultragray.settings import Encoding, Resolved
-
-from ...errors import DeadlineExceeded
-from ..board import Board
-from ..channel import Channel
-from ..memory import read_start, write_at
-from ..messages import (
+from ultragray_workers.errors import DeadlineExceeded
+from ultragray_workers.pool.board import Board
+from ultragray_workers.pool.channel import Channel
+from ultragray_workers.pool.memory import read_start, write_at
+from ultragray_workers.pool.messages import (
     Answer,
     ForkWorker,
     Hello,
@@ -52,12 +51,12 @@ from ..messages import (
     Task,
     UnloadTask,
 )
-from .encoding import encode_image, encode_pixels, write_npz
-from .placement import render_device
-from .scene_cache import LoadedScene, SceneCache
-from .slices import write_slices
-from .support import below_limit, refusal
-from .transfer import CHUNK_POSES, Arriving, Wanted, render_to_host
+from ultragray_workers.pool.process.encoding import encode_image, encode_pixels, write_npz
+from ultragray_workers.pool.process.placement import render_device
+from ultragray_workers.pool.process.scene_cache import LoadedScene, SceneCache
+from ultragray_workers.pool.process.slices import write_slices
+from ultragray_workers.pool.process.support import below_limit, refusal
+from ultragray_workers.pool.process.transfer import CHUNK_POSES, Arriving, Wanted, render_to_host
 
 MAX_DETAIL_LENGTH = 2000
 

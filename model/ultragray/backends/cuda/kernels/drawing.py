@@ -8,8 +8,17 @@ row hands the factor to the tiles beneath.
 import triton
 import triton.language as tl
 
-from .constants import FIELDS, HALF_LOG2_E, LOG2_E, MAX_M2, MAX_WEIGHT, MIN_PSI, NOTHING, RECTANGLE
-from .profile import clipped_profile, cross, peak_of, polynomial_profile, shortest_turn
+from ultragray.backends.cuda.kernels.constants import (
+    FIELDS,
+    HALF_LOG2_E,
+    LOG2_E,
+    MAX_M2,
+    MAX_WEIGHT,
+    MIN_PSI,
+    NOTHING,
+    RECTANGLE,
+)
+from ultragray.backends.cuda.kernels.profile import clipped_profile, cross, peak_of, polynomial_profile, shortest_turn
 
 
 @triton.jit

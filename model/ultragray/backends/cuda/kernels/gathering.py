@@ -7,8 +7,17 @@ Thresholds and culls are held fixed; all else is the true gradient.
 import triton
 import triton.language as tl
 
-from .constants import FIELDS, GRADIENTS, HALF_LOG2_E, LOG2_E, MAX_M2, MAX_WEIGHT, MIN_PSI, RECTANGLE
-from .profile import cross, peak_of, profile_slopes, shortest_turn
+from ultragray.backends.cuda.kernels.constants import (
+    FIELDS,
+    GRADIENTS,
+    HALF_LOG2_E,
+    LOG2_E,
+    MAX_M2,
+    MAX_WEIGHT,
+    MIN_PSI,
+    RECTANGLE,
+)
+from ultragray.backends.cuda.kernels.profile import cross, peak_of, profile_slopes, shortest_turn
 
 
 @triton.jit(

@@ -6,9 +6,9 @@ One program owns BLOCK Gaussians and adds up what each pose says of them, pose a
 import triton
 import triton.language as tl
 
-from .constants import GRADIENTS, RECTANGLE, VIEW
-from .harmonics import harmonics_gradient
-from .slicing import place, spread_along_elevation
+from ultragray.backends.cuda.kernels.constants import GRADIENTS, RECTANGLE, VIEW
+from ultragray.backends.cuda.kernels.harmonics import harmonics_gradient
+from ultragray.backends.cuda.kernels.slicing import place, spread_along_elevation
 
 
 @triton.jit

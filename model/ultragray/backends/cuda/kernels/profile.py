@@ -3,7 +3,14 @@
 import triton
 import triton.language as tl
 
-from .constants import FULL_PROFILE, HALF_LOG2_E, MAX_M2, MAX_M2_ATTENUATION, MIN_VARIANCE_CM2, NODE
+from ultragray.backends.cuda.kernels.constants import (
+    FULL_PROFILE,
+    HALF_LOG2_E,
+    MAX_M2,
+    MAX_M2_ATTENUATION,
+    MIN_VARIANCE_CM2,
+    NODE,
+)
 
 
 @triton.jit

@@ -10,7 +10,7 @@ every time.
 import triton
 import triton.language as tl
 
-from .constants import (
+from ultragray.backends.cuda.kernels.constants import (
     CLIPPED_COST,
     EARLY_SIGMA_CM,
     FIELDS,
@@ -24,7 +24,7 @@ from .constants import (
     SPARE_ROWS,
     VIEW,
 )
-from .harmonics import activate, harmonics
+from ultragray.backends.cuda.kernels.harmonics import activate, harmonics
 
 
 @triton.jit

@@ -10,9 +10,8 @@ from starlette.requests import Request
 
 from ultragray.contract import described
 from ultragray.probe import Probe
-
-from ...deps import problems
-from ...reading.json_body import body_schema, read_json_body
+from ultragray_service.http.deps import problems
+from ultragray_service.http.reading.json_body import body_schema, read_json_body
 
 router = APIRouter(prefix="/v1/probes", tags=["probes"])
 

@@ -9,12 +9,11 @@ from starlette.requests import Request
 
 from ultragray.contract import from_dict, to_dict
 from ultragray.registration.registration import Registration
-
-from ....core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
-from ....registrations.named import NamedRegistration, RegistrationPage
-from ...deps import ServiceDep, problems
-from ...reading.bodies import RegistrationBody
-from ...reading.json_body import body_schema, read_json_body
+from ultragray_service.core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
+from ultragray_service.http.deps import ServiceDep, problems
+from ultragray_service.http.reading.bodies import RegistrationBody
+from ultragray_service.http.reading.json_body import body_schema, read_json_body
+from ultragray_service.registrations.named import NamedRegistration, RegistrationPage
 
 router = APIRouter(prefix="/v1/registrations", tags=["registrations"])
 

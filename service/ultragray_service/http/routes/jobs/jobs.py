@@ -12,23 +12,22 @@ from starlette.responses import FileResponse, PlainTextResponse, Response, Strea
 
 from ultragray.contract import under
 from ultragray.errors import InvalidArgument
+from ultragray_service.core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
+from ultragray_service.core.jobs.estimates import JobEstimate, estimate
+from ultragray_service.core.jobs.jobs import JobPage
+from ultragray_service.core.jobs.log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
+from ultragray_service.http.deps import ServiceDep, problems
+from ultragray_service.http.examples import JOB_EXAMPLES
+from ultragray_service.http.job_events import EVENTS_TYPE, JobEvents, LastEvent
+from ultragray_service.http.reading.accept import NPZ, PNG
+from ultragray_service.http.reading.bodies import SPECIFICATION, JobBody
+from ultragray_service.http.reading.json_body import body_schema, read_json_body
+from ultragray_service.http.routes.jobs.artifacts import SHOWN, shared_file_response
 from ultragray_workers.jobs.job import Job, JobState
 from ultragray_workers.jobs.kinds import KINDS, Specification
 from ultragray_workers.jobs.shared.reading import SharedFile
 from ultragray_workers.jobs.specification import from_dict
 from ultragray_workers.jobs.store import JobStore
-
-from ....core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
-from ....core.jobs.estimates import JobEstimate, estimate
-from ....core.jobs.jobs import JobPage
-from ....core.jobs.log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
-from ...deps import ServiceDep, problems
-from ...examples import JOB_EXAMPLES
-from ...job_events import EVENTS_TYPE, JobEvents, LastEvent
-from ...reading.accept import NPZ, PNG
-from ...reading.bodies import SPECIFICATION, JobBody
-from ...reading.json_body import body_schema, read_json_body
-from .artifacts import SHOWN, shared_file_response
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 

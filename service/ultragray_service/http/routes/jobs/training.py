@@ -7,10 +7,10 @@ from typing import Any
 from fastapi import APIRouter
 from starlette.responses import Response
 
-from ....views.training import TrainingCurve
-from ...deps import ServiceDep, problems
-from ...reading.accept import PNG
-from .jobs import JobId
+from ultragray_service.http.deps import ServiceDep, problems
+from ultragray_service.http.reading.accept import PNG
+from ultragray_service.http.routes.jobs.jobs import JobId
+from ultragray_service.views.training import TrainingCurve
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 

@@ -6,12 +6,11 @@ from typing import Annotated
 
 from fastapi import APIRouter, Path
 
+from ultragray_service.core.jobs.jobs import WorkerList
+from ultragray_service.http.deps import ServiceDep, problems
 from ultragray_workers.jobs.queue.attendance import Worker
 from ultragray_workers.jobs.queue.wishes import Wanted
 from ultragray_workers.jobs.store import JobStore
-
-from ....core.jobs.jobs import WorkerList
-from ...deps import ServiceDep, problems
 
 router = APIRouter(prefix="/v1/workers", tags=["jobs"])
 

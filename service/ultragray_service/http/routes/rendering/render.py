@@ -19,18 +19,17 @@ from ultragray.interchange.exports.formats import FORMATS, check_format, exporte
 from ultragray.interchange.exports.whole import export_bytes
 from ultragray.outputs import OUTPUTS
 from ultragray.settings import Resolved
+from ultragray_service.core.frames import settings_used
+from ultragray_service.core.poses import exact_poses
+from ultragray_service.core.state import Service
+from ultragray_service.http.deps import SCENE_NAME, problems
+from ultragray_service.http.disconnect import finish_or_abandon
+from ultragray_service.http.examples import RENDER_EXAMPLES
+from ultragray_service.http.reading.accept import DICOM, JPEG, NPZ, PNG, RAW, choose
+from ultragray_service.http.reading.bodies import RenderBody
+from ultragray_service.http.reading.json_body import body_schema, read_json_body
+from ultragray_service.telemetry.statistics import STAGES
 from ultragray_workers.pool.types import Priority, RenderResult
-
-from ....core.frames import settings_used
-from ....core.poses import exact_poses
-from ....core.state import Service
-from ....telemetry.statistics import STAGES
-from ...deps import SCENE_NAME, problems
-from ...disconnect import finish_or_abandon
-from ...examples import RENDER_EXAMPLES
-from ...reading.accept import DICOM, JPEG, NPZ, PNG, RAW, choose
-from ...reading.bodies import RenderBody
-from ...reading.json_body import body_schema, read_json_body
 
 router = APIRouter(prefix="/v1/scenes", tags=["render"])
 

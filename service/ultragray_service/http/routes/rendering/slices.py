@@ -13,15 +13,14 @@ from starlette.responses import Response
 
 from ultragray.settings import Encoding
 from ultragray.volumes.plane import SliceSettings, SliceView
+from ultragray_service.core.frames import SliceFacts
+from ultragray_service.http.deps import SceneName, ServiceDep, problems
+from ultragray_service.http.disconnect import finish_or_abandon
+from ultragray_service.http.examples import SLICE_EXAMPLES
+from ultragray_service.http.reading.accept import NPY, PNG, RAW, choose_of_slice
+from ultragray_service.http.reading.json_body import body_schema, read_json_body
+from ultragray_service.telemetry.statistics import STAGES
 from ultragray_workers.pool.types import RenderResult
-
-from ....core.frames import SliceFacts
-from ....telemetry.statistics import STAGES
-from ...deps import SceneName, ServiceDep, problems
-from ...disconnect import finish_or_abandon
-from ...examples import SLICE_EXAMPLES
-from ...reading.accept import NPY, PNG, RAW, choose_of_slice
-from ...reading.json_body import body_schema, read_json_body
 
 router = APIRouter(prefix="/v1/scenes", tags=["render"])
 

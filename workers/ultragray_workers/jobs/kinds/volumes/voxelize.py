@@ -11,9 +11,8 @@ from ultragray.contract import described, kind_field
 from ultragray.scene_info import SceneInfo
 from ultragray.volumes.grid import SMALLEST_SPACING_MM, VolumeGrid, parse_box
 from ultragray.volumes.names import VOLUME_FIELDS, VOLUME_SUFFIXES, check_field, voxel_bytes
-
-from ....errors import StorageFull
-from ..base import Specification, Surroundings
+from ultragray_workers.errors import StorageFull
+from ultragray_workers.jobs.kinds.base import Specification, Surroundings
 
 _MB = 1e6
 _FORMATS = tuple(suffix[1:] for suffix in VOLUME_SUFFIXES)

@@ -9,11 +9,10 @@ import time
 from ultragray.files.atomic import file_sha256
 from ultragray.scene import GaussianScene
 from ultragray.volumes.files import volume_facts, write_volume
-
-from ....scenes import SUFFIX
-from ...folder import Outcome, Progress
-from ...worker.job_run import JobRun, Stopped
-from .voxelize import VoxelizeJob
+from ultragray_workers.jobs.folder import Outcome, Progress
+from ultragray_workers.jobs.kinds.volumes.voxelize import VoxelizeJob
+from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
+from ultragray_workers.scenes import SUFFIX
 
 FACTS_FILE = "volume.json"
 
