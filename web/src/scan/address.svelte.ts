@@ -2,8 +2,8 @@
 
 import { untrack } from "svelte";
 
+import { router } from "../page/router.svelte";
 import { followLink, isAsLinked, isLink, linkOf } from "../session/link";
-import { router } from "../shell/router.svelte";
 import type { ScanState } from "./scan.svelte";
 
 const WRITTEN_EVERY_MS = 250;

@@ -1,10 +1,11 @@
 /** How poses are told in a session: against what, in which form. */
 
-import { fromPositionQuaternion, position, quaternion, withPosition, type Pose } from "../geometry/pose";
-import { placeIn, withPlaceIn, type Place, type Reference } from "../geometry/pose_frames";
-import type { PoseForm } from "../geometry/pose_text";
-import { flangePose, probePose, type Registered } from "../geometry/registered";
-import type { Session } from "../session/session.svelte";
+import {
+  flangePose, fromPositionQuaternion, type Place, placeIn, type Pose, position, probePose, quaternion,
+  type Reference, type Registered, withPlaceIn, withPosition,
+} from "../geometry/pose";
+import type { PoseForm } from "../geometry/pose_files";
+import { besideSession, type Session } from "../session/session.svelte";
 
 export const MOST_MM = 10_000; // beyond, a typed position is a slip
 
@@ -64,14 +65,5 @@ function replaced(vector: Place["position_mm"], index: number, value: number): P
   return vector.map((before, i) => (i === index ? value : before)) as unknown as Place["position_mm"];
 }
 
-const known = new WeakMap<Session, PoseTelling>();
-
 /** That of a session; the same for every view. */
-export function tellingOf(session: Session): PoseTelling {
-  const before = known.get(session);
-  if (before !== undefined) return before;
-  let begun!: PoseTelling;
-  $effect.root(() => void (begun = new PoseTelling(session)));
-  known.set(session, begun);
-  return begun;
-}
+export const tellingOf = besideSession((session) => new PoseTelling(session));

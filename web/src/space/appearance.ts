@@ -1,4 +1,6 @@
-/** How the Gaussians of a scene are shown: what the options of the 3D view say. */
+/** How the scene is shown in space: the options of the view, and the colours that stand for values. */
+
+import { type Colour, labelColour, ramp } from "../shared/colours";
 
 /** `shaded`: the volume as a body in light; `maximum`: the brightest along each line of sight; `splats`: each Gaussian. */
 export type Form = "shaded" | "maximum" | "splats" | "none";
@@ -36,4 +38,33 @@ export interface Cut {
   across: CutAcross;
   /** Along the axis that it is across, from the probe or in the scene. */
   at_mm: number;
+}
+
+/** Of a palette. */
+export const ENTRIES = 256;
+/** Of the intensity: from dark tissue to bright bone. */
+const TISSUE: readonly Colour[] = [
+  [38, 24, 30],
+  [112, 66, 60],
+  [186, 138, 108],
+  [232, 208, 172],
+  [255, 250, 238],
+];
+
+/** The colour of a share of the values, 0 to 1; of labels, the share is the label in 255ths. */
+export function colourOf(by: ColourBy, share: number): Colour {
+  if (by === "label") return share === 0 ? [120, 128, 136] : labelColour(Math.round(share * (ENTRIES - 1)));
+  if (by !== "intensity") return ramp(by, share);
+  const at = share * (TISSUE.length - 1);
+  const index = Math.min(TISSUE.length - 2, Math.floor(at));
+  const [low, high] = [TISSUE[index]!, TISSUE[index + 1]!];
+  return [0, 1, 2].map((i) => Math.round(low[i]! + (high[i]! - low[i]!) * (at - index))) as unknown as Colour;
+}
+
+/** Between which the middle 96 % of the values lie. */
+export function middleOf(values: Float32Array): [number, number] {
+  const sorted = values.sort();
+  const low = sorted[Math.floor(sorted.length * 0.02)] ?? 0;
+  const high = sorted[Math.floor(sorted.length * 0.98)] ?? 1;
+  return [low, high > low ? high : low + 1];
 }

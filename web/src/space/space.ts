@@ -1,29 +1,23 @@
 /** The scene in space: its Gaussians, the training planes, the skin, the probe with its live image. */
 
-import { AmbientLight, Color, DirectionalLight, Group, Mesh, Plane, Scene, Vector3, WebGLRenderer, type LineSegments } from "three";
+import {
+  AmbientLight, Color, DirectionalLight, Group, type LineSegments, Mesh, Plane, Scene, Vector3, WebGLRenderer,
+} from "three";
 
+import type { ImagePlane, Tool } from "../api/contract";
 import type { Gaussians } from "../api/gaussians";
 import type { Frame } from "../api/stream";
-import type { Tool } from "../api/tools";
-import type { Placed } from "../geometry/picture";
-import type { ImagePlane } from "../geometry/plane";
+import type { Placed } from "../geometry/plane";
 import type { Pose, Vector } from "../geometry/pose";
 import type { Skin } from "../geometry/skin";
 import type { Appearance, Cut, Form } from "./appearance";
-import { boxLines } from "./box_lines";
-import { Eye, SEEN_DEG } from "./camera";
+import { boxLines, drop, LiveImage, skinMesh, sweepPlanes, ToolBodies } from "./bodies";
 import { Cloud, OCCLUDERS, type Sight } from "./cloud";
-import { placeCut } from "./cut";
 import { DrawingLoop, drawnBySoftware } from "./drawing";
-import { drop } from "./drop";
-import { LiveImage } from "./image_plane";
-import { pointedAt } from "./pointing";
-import { ProbeHandle, type Gizmo } from "./probe_handle";
-import { skinMesh } from "./skin_mesh";
-import { sweepPlanes } from "./sweep";
-import { ToolBodies } from "./tool_bodies";
+import { Eye, placeCut, SEEN_DEG } from "./eye";
+import { type Gizmo, pointedAt, ProbeHandle } from "./probe_handle";
+import { type Box, type Look, lookFrom, type Sides, type Viewpoint } from "./viewpoints";
 import type { Volume } from "./volume";
-import { lookFrom, type Box, type Look, type Sides, type Viewpoint } from "./viewpoints";
 
 const SOFTWARE_PIXELS = 0.8; // of the pixels of the screen, each way
 const BACKGROUND = 0x12161b; // --space of styles.css

@@ -1,7 +1,6 @@
 /** From where the scene is looked at, so that left and right are those of the image, whatever the scene's own axes. */
 
-import { axis, type Pose, type Vector } from "../geometry/pose";
-import { cross, dot, length, plus, scaled, unit } from "../geometry/vector";
+import { axis, cross, dot, length, plus, type Pose, scaled, unit, type Vector } from "../geometry/pose";
 
 /** `behind`: as the image is seen; `side`: along its lateral axis; `top`: from above the probe; `whole`: between them. */
 export type Viewpoint = "whole" | "behind" | "side" | "top";

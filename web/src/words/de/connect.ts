@@ -1,6 +1,6 @@
 /** Confidence, poses and connections: what they say in German. */
 
-import type { PoseError } from "../../geometry/pose_faults";
+import type { PoseError } from "../../geometry/pose_files";
 import type { Words } from "../en/english";
 
 const SUFFIXES = ".json, .npy, .csv, .tum, .txt, .mha, .mhd";

@@ -1,11 +1,8 @@
 /** Confidence, poses and connections: what they say in English. */
 
-import type { PoseError } from "../../geometry/pose_faults";
-import type { PoseForm } from "../../geometry/pose_text";
-import type { Reference } from "../../geometry/pose_frames";
-import type { Language } from "../../connect/snippets";
-import type { Tone } from "../../session/familiar";
-import type { StreamSummary } from "../../api/streams";
+import type { StreamSummary } from "../../api/stream";
+import type { Reference } from "../../geometry/pose";
+import type { PoseError, PoseForm } from "../../geometry/pose_files";
 
 const SUFFIXES = ".json, .npy, .csv, .tum, .txt, .mha, .mhd";
 

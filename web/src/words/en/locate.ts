@@ -1,6 +1,6 @@
 /** Where a real frame was taken, in English. */
 
-import type { Within } from "../../api/localization";
+import type { Within } from "../../api/rendering";
 
 const within: Record<keyof Within, string> = { within_mm: "Off by", within_deg: "Turned by" };
 const withinMeans: Record<keyof Within, string> = {

@@ -1,6 +1,6 @@
 /** Maps, in English. */
 
-import type { Output } from "../../api/outputs";
+import type { Output } from "../../api/contract";
 
 const outputs: Record<Output, { title: string; meaning: string }> = {
   bmode: { title: "B-mode", meaning: "What a scanner shows: the echo times what is left of the beam." },

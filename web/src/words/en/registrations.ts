@@ -1,6 +1,6 @@
 /** Registrations of robots and trackers, in English. */
 
-import type { Reference } from "../../geometry/pose_frames";
+import type { Reference } from "../../geometry/pose";
 
 export const registrations = {
   title: "Registrations",

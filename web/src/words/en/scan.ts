@@ -1,8 +1,6 @@
 /** The Scan view in English. */
 
-import type { Contact } from "../../api/stream";
-import type { Command } from "../../scan/commands";
-import type { MarkKind } from "../../scan/marks.svelte";
+import type { Contact } from "../../api/contract";
 
 const kinds: Record<MarkKind, string> = { distance: "Measure", ellipse: "Ellipse", angle: "Angle", text: "Text" };
 const kindHints: Record<MarkKind, string> = {

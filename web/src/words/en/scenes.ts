@@ -1,7 +1,6 @@
 /** Scenes and service, in English. */
 
-import type { StageTimes } from "../../api/statistics";
-import type { Wish, WorkerState } from "../../api/workers";
+import type { StageTimes, Wish, WorkerState } from "../../api/service";
 
 const stages: Record<keyof StageTimes, string> = { queue: "queue", render: "render", encode: "encode" };
 const states: Record<WorkerState, string> = {

@@ -1,8 +1,6 @@
 /** The header, the key form and the menu of the key, in English. */
 
-import type { Me } from "../../api/access";
-import type { ViewName } from "../../shell/router.svelte";
-import type { ServiceStatus } from "../../shell/service.svelte";
+import type { Me } from "../../api/service";
 
 const views: Record<ViewName, string> = {
   scan: "Scan",

@@ -1,7 +1,5 @@
 /** space: what it says in English. */
 
-import type { ColourBy, CutAcross, Form, SolidBy } from "../../space/appearance";
-import type { Viewpoint } from "../../space/viewpoints";
 
 const viewpoints: Record<Viewpoint, string> = { whole: "Whole", behind: "Behind", side: "Side", top: "Top" };
 const forms: Record<Form, string> = {

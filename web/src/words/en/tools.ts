@@ -1,6 +1,6 @@
 /** Tools in the image, in English. */
 
-import type { ToolFrame, ToolKind } from "../../api/tools";
+import type { ToolFrame, ToolKind } from "../../api/contract";
 
 const kinds: Record<ToolKind, string> = { needle: "Needle", cylinder: "Cylinder", box: "Box" };
 const frames: Record<ToolFrame, string> = { scene: "Stays in the scene", probe: "Moves with the probe" };
