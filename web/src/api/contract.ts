@@ -13,10 +13,10 @@ export type Display = FrameHeader["display"];
 export type Contact = Schemas["Contact"];
 export type Output = Schemas["Scene"]["outputs"][number];
 
-/** Whether the pixels of an output are numbers that stand for something; else they are shares. */
+/** `isNumbers`: whether the pixels of an output are numbers that stand for something; else they are shares. */
 export const OUTPUTS = Object.fromEntries(
-  (outputs.items?.oneOf ?? []).map((one) => [one.const, { isNumbers: one["x-numbers"] ?? false }]),
-) as Record<Output, { isNumbers: boolean }>;
+  (outputs.items?.oneOf ?? []).map((one) => [one.const, { isNumbers: one["x-numbers"] ?? false, meaning: one.description ?? "" }]),
+) as Record<Output, { isNumbers: boolean; meaning: string }>;
 
 /** The settings that have a place of their own in the console. */
 const OF_THEIR_OWN = [

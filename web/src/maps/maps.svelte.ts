@@ -8,6 +8,7 @@ import { type Kept, router } from "../page/router.svelte";
 import { poseOrNull, poseValue } from "../session/link";
 import { besideSession, type Session } from "../session/session.svelte";
 import { Calm } from "../shared/asking.svelte";
+import { nameIn } from "../shared/text";
 import { words } from "../words/words.svelte";
 
 /** A pixel of the frame. */
@@ -30,7 +31,7 @@ export function labelNamesOf({ scene, tools }: Session): Record<string, string> 
   for (const [label, name] of Object.entries(scene.description?.label_names ?? {})) names[label] = [name];
   for (const { kind, label } of tools.all) {
     const known = (names[label] ??= []);
-    const name = words.tools.kinds[kind];
+    const name = nameIn(words.tools.kinds, kind);
     if (!known.includes(name)) known.push(name);
   }
   return Object.fromEntries(Object.entries(names).map(([label, known]) => [label, known.join(", ")]));

@@ -10,6 +10,7 @@ import { confidenceWords } from "../session/confidence.svelte";
 import { GREYS } from "../session/FrameCanvas.svelte";
 import { planes } from "../session/scene.svelte";
 import { saveBlob } from "../shared/asking.svelte";
+import { nameIn } from "../shared/text";
 import { words } from "../words/words.svelte";
 import { lettersOf, type Mark, type Marks, PLAYED_PER_SECOND, resultOf, type ScanState } from "./scan.svelte";
 
@@ -85,7 +86,7 @@ export class Sheet {
       new Date().toISOString(),
       said.slice(slice_thickness_mm),
       said.depthInCm,
-      ...(tools.length === 0 ? [] : [said.drawn(tools.map(({ kind }) => words.tools.kinds[kind]).join(", "))]),
+      ...(tools.length === 0 ? [] : [said.drawn(tools.map(({ kind }) => nameIn(words.tools.kinds, kind)).join(", "))]),
       ...(ghost === 0 ? [] : [words.tools.ghostMeans]),
     ];
     const measured = marks.filter(({ kind }) => kind !== "text").map((mark) => `${this.marks.letterOf(mark.id)}  ${resultOf(mark)}`);

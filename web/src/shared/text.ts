@@ -1,8 +1,9 @@
 /** Amounts, times, names and metrics as people read and write them. */
 
-import type { Probe } from "../api/contract";
+import { type Output, OUTPUTS, type Probe } from "../api/contract";
 import { labelOf } from "../api/described";
 import type { Metric } from "../api/scenes";
+import type { Named } from "../words/translated";
 import { language, words } from "../words/words.svelte";
 
 const UNITS = ["B", "KB", "MB", "GB", "TB"];
@@ -74,6 +75,7 @@ function readValue(text: string): unknown {
   }
 }
 
+/** The metrics of images. */
 export const LABELS: Record<Metric, { title: string; unit: string; digits: number; higherIsBetter: boolean }> = {
   psnr_db: { title: "PSNR", unit: "dB", digits: 2, higherIsBetter: true },
   ms_ssim: { title: "MS-SSIM", unit: "", digits: 3, higherIsBetter: true },
@@ -89,6 +91,16 @@ export function fieldLabel(name: string): { label: string; unit: string } {
   return { label: words.shared.field.labels[name] ?? label, unit };
 }
 
+/** The name of what the service has: as `names` have it, else as the service calls it. */
+export function nameIn(names: Named, name: string): string {
+  return names[name] ?? labelOf(name).label;
+}
+
+/** What an output is called and shows. */
+export function outputWords(output: Output): { title: string; meaning: string } {
+  return words.maps.outputs[output] ?? { title: labelOf(output).label, meaning: OUTPUTS[output].meaning };
+}
+
 /** A probe in words: "Convex, opening angle 60.0°, near 40.0 mm, far 90.0 mm". */
 export function probeInWords({ kind, ...numbers }: Probe): string {
   const described = Object.entries(numbers).map(([name, value]) => {
@@ -98,7 +110,7 @@ export function probeInWords({ kind, ...numbers }: Probe): string {
   return [fieldLabel(kind).label, ...described].join(", ");
 }
 
-/** The name of a metric of images. */
+/** The name of a metric. */
 export function metricTitle(metric: Metric): string {
   return words.shared.field.labels[metric] ?? LABELS[metric].title;
 }

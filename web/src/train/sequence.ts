@@ -1,6 +1,9 @@
 /** Frames out of a PLUS or 3D Slicer sequence (MetaImage or NRRD) on the person's own disk: it is looked at before it is sent. */
 
-import type { Size } from "./sweeps.svelte";
+export interface Size {
+  width: number;
+  height: number;
+}
 
 /** A frame in grey, brought to columns lateral and rows in depth, as the service reads it. */
 export interface SequenceFrame extends Size {

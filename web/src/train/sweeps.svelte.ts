@@ -4,7 +4,7 @@ import { explain } from "../api/client";
 import { type Dataset, type DatasetOptions, listDatasets, uploadDataset } from "../api/datasets";
 import { polled, Sending } from "../shared/asking.svelte";
 import { nameOfFile } from "../shared/text";
-import { Sequence, type SequenceFrame } from "./sequence";
+import { Sequence, type SequenceFrame, type Size } from "./sequence";
 
 const POLL_MS = 4000;
 
@@ -95,11 +95,6 @@ export interface Crop {
   right: number;
   top: number;
   bottom: number;
-}
-
-export interface Size {
-  width: number;
-  height: number;
 }
 
 export type Edge = keyof Crop;

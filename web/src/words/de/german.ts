@@ -1,19 +1,12 @@
-/** The German catalogue. */
+/** The German catalogue. A text that it lacks is shown in English. */
 
 import type { Words } from "../en/english";
-import { compare } from "./compare";
-import { connect } from "./connect";
-import { jobs } from "./jobs";
-import { locate } from "./locate";
-import { maps } from "./maps";
-import { registrations } from "./registrations";
-import { scan } from "./scan";
-import { scenes } from "./scenes";
-import { session } from "./session";
-import { shared } from "./shared";
-import { shell } from "./shell";
-import { space } from "./space";
-import { tools } from "./tools";
-import { train } from "./train";
+import type { Translated } from "../translated";
+import { scan, session, space, tools } from "./image";
+import { compare, maps, shared, shell } from "./page";
+import { connect, locate, registrations } from "./programs";
+import { jobs, scenes, train } from "./work";
 
-export const german: Words = { compare, connect, jobs, locate, maps, registrations, scan, scenes, session, shared, shell, space, tools, train };
+export const german: Translated<Words> = {
+  compare, connect, jobs, locate, maps, registrations, scan, scenes, session, shared, shell, space, tools, train,
+}; // prettier-ignore

@@ -1,7 +1,8 @@
-/** Confidence, poses and connections: what they say in German. */
+/** Poses, programs and frames from elsewhere, in German. */
 
 import type { PoseError } from "../../geometry/pose_files";
 import type { Words } from "../en/english";
+import type { Translated } from "../translated";
 
 const SUFFIXES = ".json, .npy, .csv, .tum, .txt, .mha, .mhd";
 
@@ -52,7 +53,7 @@ function poseError(error: PoseError): string {
   return fault(error);
 }
 
-export const connect: Words["connect"] = {
+export const connect: Translated<Words["connect"]> = {
   confidence: {
     title: "Verlässlichkeit",
     tones: { good: "Gut belegt", warn: "Teils geraten", bad: "Geraten" },
@@ -198,7 +199,7 @@ export const connect: Words["connect"] = {
     renderMeans: "Jede Lage wird im Hintergrund zu einem Bild, mit den Bildeinstellungen von jetzt",
     format: "Format des Datensatzes",
     progress: (done: number, all: number) => `${done} von ${all} Bildern`,
-    states: { queued: "Wartet", running: "Wird gerendert", succeeded: "Fertig", failed: "Gescheitert", cancelled: "Abgebrochen" } as Record<string, string>,
+    states: { queued: "Wartet", running: "Wird gerendert", succeeded: "Fertig", failed: "Gescheitert", cancelled: "Abgebrochen" },
     cancel: "Abbrechen",
     download: (name: string) => `${name} herunterladen`,
     may: (who: string) => `Nur ${who} dürfen Aufträge starten.`,
@@ -258,4 +259,72 @@ export const connect: Words["connect"] = {
     docs: "Dokumentation der API",
     waiting: "…",
   },
+};
+
+export const locate: Translated<Words["locate"]> = {
+  title: "Wo entstand dieses Bild?",
+  label: "Wo ein echtes Bild entstand",
+  choose: "Ein Bild wählen",
+  chooseHint: "PNG, wie das Gerät es speichert: eine Spalte je Scanlinie, nicht scankonvertiert",
+  size: (width, height) => `${width} × ${height} Pixel; hier ein anderes wählen`,
+  notPng: (name) => `${name} ist keine PNG-Datei.`,
+  damaged: (name) => `${name} ist beschädigt: Es lässt sich nicht als Bild zeigen.`,
+  scanConverted:
+    "Das sieht nach einem Bild vom Schirm aus: ein Fächer auf schwarzem Grund. So wird es kaum gefunden. Gebraucht wird das Bild vor der Scankonversion, Zeilen entlang der Tiefe, eine Spalte je Scanlinie.",
+  within: { within_mm: "Versatz", within_deg: "Drehung" },
+  withinMeans: {
+    within_mm: "Wie weit der Schallkopf daneben liegen darf, mm",
+    within_deg: "Um welchen Winkel der Schallkopf verdreht sein darf",
+  },
+  search: "Suchen",
+  searchMeans: "Das Bild um die jetzige Lage des Schallkopfs herum suchen",
+  fromHere: "von der jetzigen Lage aus",
+  searching: "Wird gesucht …",
+  rendering: "Das Bild von dort entsteht …",
+  stop: "Anhalten",
+  found: "Gefunden.",
+  notFound:
+    "Nicht gefunden. Den Schallkopf näher an die Stelle bringen, mehr Abweichung erlauben oder prüfen, ob Bild, Schallkopf und Szene zusammengehören.",
+  similarity: "Ähnlichkeit",
+  similarityMeans: "Korrelation der Strukturen des Bilds und der Szene dort, -1 bis 1; am richtigen Ort mehr als die Hälfte",
+  positionStd: "Position ±",
+  positionStdMeans: "Standardabweichungen entlang der lateralen, Elevations- und axialen Achse des Schallkopfs",
+  angleStd: "Winkel ±",
+  angleStdMeans: "Standardabweichungen um die laterale, Elevations- und axiale Achse",
+  fromStart: "Vom Start aus",
+  took: "Dauer der Suche",
+  seconds: (amount) => `${amount} s`,
+  take: "Dorthin",
+  takeMeans: "Nimmt die gefundene Lage als die des Schallkopfs",
+  frozen: "Das Bild ist eingefroren. Erst weiterlaufen lassen (F).",
+  pictures: "Wie beide Bilder gezeigt werden",
+  side: "Nebeneinander",
+  blend: "Überblenden",
+  given: "Gegeben",
+  rendered: "Gerendert",
+  shareOfRendered: "Anteil des gerenderten Bilds",
+};
+
+export const registrations: Translated<Words["registrations"]> = {
+  title: "Registrierungen",
+  none: "Keine gespeichert. Eine Registrierung sagt, wie die Lagen eines Roboters oder Trackers in eine Szene führen: ultragray calibrate findet sie.",
+  meaning: "Lagen werden gezeigt und getippt",
+  inScene: "des Schallkopfs, in der Szene",
+  into: (scene) => `nach ${scene}`,
+  residual: (amounts) => `Restfehler ${amounts}`,
+  residualMeans: "Quadratisches Mittel dessen, was beim Bestimmen übrig blieb",
+  noResidual: "Restfehler unbekannt",
+  references: (name) => ({
+    absolute: `Absolut, wie ${name} es angibt`,
+    relativeScene: `Relativ, entlang der Achsen von ${name}`,
+    relativeProbe: "Relativ, entlang der Achsen des Flansches",
+  }),
+  position: (name) => `Ort des Flansches, wie ${name} ihn angibt`,
+  angles: (name) => `Winkel gegen die Achsen von ${name}`,
+  about: (axis) => `Um ${axis}`,
+  form: (name) => `Flansch zu Basis, wie ${name} sie angibt`,
+  gone: (name, scene) =>
+    `${name} ${scene === null ? "ist nicht mehr gespeichert" : `gehört jetzt zur Szene ${scene}`}: Lagen sind wieder die des Schallkopfs.`,
+  tag: (name) => `nach ${name}`,
+  tagMeans: "Lagen werden nach dieser Registrierung angegeben; gewählt unten bei den Registrierungen",
 };

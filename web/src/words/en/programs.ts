@@ -1,55 +1,10 @@
-/** Confidence, poses and connections: what they say in English. */
+/** Poses, programs and frames from elsewhere, in English. */
 
-import type { StreamSummary } from "../../api/stream";
 import type { Reference } from "../../geometry/pose";
-import type { PoseError, PoseForm } from "../../geometry/pose_files";
+import type { PoseError } from "../../geometry/pose_files";
+import type { Named } from "../translated";
 
 const SUFFIXES = ".json, .npy, .csv, .tum, .txt, .mha, .mhd";
-
-const tones: Record<Tone, string> = { good: "Well supported", warn: "Partly a guess", bad: "A guess" };
-const warnings: Record<Tone, string> = {
-  good: "",
-  warn: "The training sweep shows this only in part",
-  bad: "The training sweep did not show this",
-};
-const references: Record<Reference, string> = {
-  absolute: "Absolute, in the scene",
-  relativeScene: "Relative, along the scene's axes",
-  relativeProbe: "Relative, along the probe's axes",
-};
-const forms: Record<PoseForm, string> = {
-  json: "JSON",
-  matrix: "Matrix",
-  quaternion: "Quaternion",
-  euler: "Euler angles",
-  numpy: "NumPy",
-  ros: "ROS",
-};
-const formUnits: Record<PoseForm, string> = {
-  json: "As the API takes it, mm",
-  matrix: "Probe to scene, row by row, mm",
-  quaternion: "x y z in mm, then w x y z",
-  euler: "x y z in mm, then tilt, rock and rotation in degrees, against the scene's axes",
-  numpy: "Probe to scene, mm",
-  ros: "geometry_msgs/Pose, metres",
-};
-const languages: Record<Language, string> = {
-  curl: "curl",
-  python: "Python",
-  grpc: "gRPC",
-  websocket: "WebSocket",
-  igtl: "OpenIGTLink",
-  ros: "ROS 2",
-};
-const needs: Record<Language, string> = {
-  curl: "Saves one frame as frame.png.",
-  python: "Needs the package ultragray-client.",
-  grpc: "Needs grpcurl. The service describes its own messages.",
-  websocket: "Needs the packages websockets and numpy. For live images from a moving probe.",
-  igtl: "Needs the package pyigtl. A device named after the scene gets its images back.",
-  ros: "Needs ROS 2 and the package ultragray-ros. Poses come in on /ultragray/probe_pose, in metres, images go out on /ultragray/bmode.",
-};
-const doors: Record<StreamSummary["door"], string> = { websocket: "WebSocket", grpc: "gRPC", openigtlink: "OpenIGTLink" };
 
 function fault({ fault: found }: PoseError): string {
   switch (found.kind) {
@@ -103,8 +58,12 @@ function poseError(error: PoseError): string {
 export const connect = {
   confidence: {
     title: "Confidence",
-    tones,
-    warnings,
+    tones: { good: "Well supported", warn: "Partly a guess", bad: "A guess" },
+    warnings: {
+      good: "",
+      warn: "The training sweep shows this only in part",
+      bad: "The training sweep did not show this",
+    },
     waiting: "Shown with the first frame.",
     notTold: "Not known: the scene does not tell what it was trained from.",
     similarity: "Expected similarity",
@@ -146,7 +105,11 @@ export const connect = {
     frozen: "of the frozen image",
     frozenMeans: "The image is frozen. Unfreeze it to move the probe.",
     told: "Shown as",
-    references,
+    references: {
+      absolute: "Absolute, in the scene",
+      relativeScene: "Relative, along the scene's axes",
+      relativeProbe: "Relative, along the probe's axes",
+    },
     against: "from",
     againstHome: "Home",
     againstMark: "the mark",
@@ -168,8 +131,22 @@ export const connect = {
     wrapped: (name: string, typed: string, shown: string) => `${name} ${typed}° is the same orientation as ${shown}.`,
     noNumber: (name: string) => `${name} must be a number. It was not changed.`,
     form: "Form of the pose",
-    forms,
-    formUnits,
+    forms: {
+      json: "JSON",
+      matrix: "Matrix",
+      quaternion: "Quaternion",
+      euler: "Euler angles",
+      numpy: "NumPy",
+      ros: "ROS",
+    },
+    formUnits: {
+      json: "As the API takes it, mm",
+      matrix: "Probe to scene, row by row, mm",
+      quaternion: "x y z in mm, then w x y z",
+      euler: "x y z in mm, then tilt, rock and rotation in degrees, against the scene's axes",
+      numpy: "Probe to scene, mm",
+      ros: "geometry_msgs/Pose, metres",
+    },
     textLabel: (form: string) => `Pose as ${form}, Enter applies`,
     copy: (form: string) => `Copy the pose as ${form}`,
     copied: "Copied",
@@ -223,7 +200,7 @@ export const connect = {
     renderMeans: "Every pose becomes a frame, with the image settings of now, in the background",
     format: "Format of the data set",
     progress: (done: number, all: number) => `${done} of ${all} frames`,
-    states: { queued: "Waits for its turn", running: "Rendering", succeeded: "Done", failed: "Failed", cancelled: "Cancelled" } as Record<string, string>,
+    states: { queued: "Waits for its turn", running: "Rendering", succeeded: "Done", failed: "Failed", cancelled: "Cancelled" } as Named,
     cancel: "Cancel",
     download: (name: string) => `Download ${name}`,
     may: (who: string) => `Only ${who} may start jobs.`,
@@ -231,8 +208,22 @@ export const connect = {
   connection: {
     title: "Connect",
     language: "Language of the example",
-    languages,
-    needs,
+    languages: {
+      curl: "curl",
+      python: "Python",
+      grpc: "gRPC",
+      websocket: "WebSocket",
+      igtl: "OpenIGTLink",
+      ros: "ROS 2",
+    },
+    needs: {
+      curl: "Saves one frame as frame.png.",
+      python: "Needs the package ultragray-client.",
+      grpc: "Needs grpcurl. The service describes its own messages.",
+      websocket: "Needs the packages websockets and numpy. For live images from a moving probe.",
+      igtl: "Needs the package pyigtl. A device named after the scene gets its images back.",
+      ros: "Needs ROS 2 and the package ultragray-ros. Poses come in on /ultragray/probe_pose, in metres, images go out on /ultragray/bmode.",
+    },
     intro: "How a program asks for this image:",
     copy: (language: string) => `Copy the example in ${language}`,
     copied: "Copied",
@@ -260,7 +251,7 @@ export const connect = {
     steered: (name: string) => `You moved the probe: no longer following ${name}.`,
     unnamed: "A program",
     page: "Another page of the console",
-    door: doors,
+    door: { websocket: "WebSocket", grpc: "gRPC", openigtlink: "OpenIGTLink" },
     rate: (poses: string, frames: string) => `${poses} poses/s, ${frames} frames/s`,
     idle: (time: string) => `quiet for ${time}`,
     age: (time: string) => `open for ${time}`,
@@ -276,4 +267,72 @@ export const connect = {
     docs: "API documentation",
     waiting: "…",
   },
+};
+
+export const locate = {
+  title: "Where was this frame taken?",
+  label: "Where a real frame was taken",
+  choose: "Choose a frame",
+  chooseHint: "PNG as the scanner stores it: a column a scan line, not scan-converted",
+  size: (width: number, height: number): string => `${width} × ${height} pixels; choose another one here`,
+  notPng: (name: string): string => `${name} is not a PNG file.`,
+  damaged: (name: string): string => `${name} is damaged: it cannot be shown as a picture.`,
+  scanConverted:
+    "This looks like a picture of the screen: a fan on black ground. It will hardly be found. Needed is the frame before scan conversion, rows along the depth, a column for each scan line.",
+  within: { within_mm: "Off by", within_deg: "Turned by" },
+  withinMeans: {
+    within_mm: "How far the probe may be off, mm",
+    within_deg: "By which angle the probe may be turned",
+  },
+  search: "Search",
+  searchMeans: "Look for the frame about where the probe is now",
+  fromHere: "from the present pose",
+  searching: "Searching …",
+  rendering: "Rendering what is there …",
+  stop: "Stop",
+  found: "Found.",
+  notFound:
+    "Not found. Move the probe nearer to where the frame was taken, allow it to be further off, or check that frame, probe and scene belong together.",
+  similarity: "Similarity",
+  similarityMeans: "Correlation of the structures of the frame and of the scene there, -1 to 1; the right place has more than half",
+  positionStd: "Position ±",
+  positionStdMeans: "Standard deviations along the probe's lateral, elevation and axial axis",
+  angleStd: "Angles ±",
+  angleStdMeans: "Standard deviations about the lateral, elevation and axial axis",
+  fromStart: "From the start",
+  took: "Search took",
+  seconds: (amount: string): string => `${amount} s`,
+  take: "Go there",
+  takeMeans: "Takes the pose that was found as that of the probe",
+  frozen: "The image is frozen. Unfreeze it first (F).",
+  pictures: "How both pictures are shown",
+  side: "Side by side",
+  blend: "Blend",
+  given: "Given",
+  rendered: "Rendered",
+  shareOfRendered: "Share of the rendered picture",
+};
+
+export const registrations = {
+  title: "Registrations",
+  none: "None is stored. A registration says how the poses of a robot or a tracker lead into a scene: ultragray calibrate finds one.",
+  meaning: "Poses are shown and typed",
+  inScene: "of the probe, in the scene",
+  into: (scene: string): string => `into ${scene}`,
+  residual: (amounts: string): string => `residual ${amounts}`,
+  residualMeans: "Root mean square of what was left when it was found",
+  noResidual: "residual not told",
+  references: (name: string): Record<Reference, string> => ({
+    absolute: `Absolute, as ${name} tells it`,
+    relativeScene: `Relative, along the axes of ${name}`,
+    relativeProbe: "Relative, along the flange's axes",
+  }),
+  position: (name: string): string => `Position of the flange, as ${name} tells it`,
+  angles: (name: string): string => `Angles against the axes of ${name}`,
+  about: (axis: string): string => `About ${axis}`,
+  form: (name: string): string => `Flange to base, as ${name} tells it`,
+  gone: (name: string, scene: string | null): string =>
+    `${name} ${scene === null ? "is not stored any more" : `is of the scene ${scene} now`}: poses are those of the probe again.`,
+  tag: (name: string): string => `by ${name}`,
+  tagMeans: "Poses are told by this registration; chosen below, among the registrations",
 };

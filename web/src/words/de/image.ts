@@ -1,8 +1,9 @@
-/** The Scan view in German. */
+/** The live image and the scene in space, in German. */
 
 import type { Words } from "../en/english";
+import type { Translated } from "../translated";
 
-export const scan: Words["scan"] = {
+export const scan: Translated<Words["scan"]> = {
   close: "Schließen",
   room: "Szene im Raum",
   group: (name) => `${name}: zeigen oder verbergen`,
@@ -178,4 +179,111 @@ export const scan: Words["scan"] = {
       edge: "Kanten",
     },
   },
+};
+
+export const session: Translated<Words["session"]> = {
+  link: {
+    refused: (values) =>
+      `Die Adresse enthält ${values.length === 1 ? "einen Wert, der nicht verwendbar ist" : "Werte, die nicht verwendbar sind"}; ohne sie geöffnet: ${values.join(", ")}.`,
+    pose: "sieben Zahlen: x, y, z, w, i, j, k",
+    quaternion: "das Quaternion muss die Länge 1 haben",
+    number: "keine Zahl",
+    count: (count) => `${count} Zahlen`,
+    within: (low, high) => `${low} bis ${high}`,
+    oneOf: (choices) => `eines von ${choices.join(", ")}`,
+  },
+  notice: {
+    missing: (scene) => `Hier gibt es keine Szene ${scene}.`,
+    thereAre: () => "Es gibt",
+    unreadable: (detail) => `Diese Szenendatei lässt sich nicht lesen: ${detail}`,
+    down: "Der Dienst antwortet nicht. Sobald er es wieder tut, geht das Bild von selbst weiter.",
+    barred:
+      "Der Dienst antwortet, aber es kommen keine Livebilder an. Etwas zwischen diesem Browser und dem Dienst hält die Liveverbindung auf; wer den Dienst betreibt, kann sie öffnen.",
+    barredKey: "Oder mit diesem Schlüssel sind schon so viele Streams offen, wie er darf.",
+  },
+};
+
+export const space: Translated<Words["space"]> = {
+  label: "Szene im Raum: Pfeiltasten drehen die Ansicht, + und − zoomen",
+  loading: "3D-Ansicht wird geladen …",
+  noWebGl: "Die 3D-Ansicht braucht WebGL, das dieser Browser nicht bietet. Alles andere funktioniert auch ohne.",
+  dragging: "Schallkopf ziehen",
+  move: "Schieben",
+  turn: "Drehen",
+  contact: "Kontakt",
+  contactMeaning: "Die Fläche des Schallkopfs bleibt auf der Haut. Bewegen entlang der Achse drückt.",
+  pressed: (depth_mm) => `${depth_mm.toFixed(1).replace(".", ",")} mm eingedrückt`,
+  noSkin: "Die Aufnahmen dieser Szene blicken in viele Richtungen: Es gibt keine Haut, auf der der Schallkopf bleiben könnte.",
+  options: "Optionen",
+  viewpoint: "Blick von",
+  viewpoints: { whole: "Ganz", behind: "Hinten", side: "Seite", top: "Oben" },
+  form: "Zeigen",
+  forms: {
+    shaded: "Schattiertes Volumen",
+    maximum: "Hellstes im Volumen",
+    splats: "Splats",
+    none: "Nichts",
+  },
+  colour: "Farbe",
+  colours: { label: "Gewebe", intensity: "Intensität", transmittance: "Durchlässigkeit", coverage: "Abdeckung" },
+  solid: "Deckend",
+  solids: { echo: "Helles Echo", shadow: "Wirft Schatten" },
+  threshold: "Ab",
+  thresholdMeaning: "Deckend ab",
+  opacity: "Deckkraft",
+  size: "Größe",
+  sizeMeaning: "Größe der Splats",
+  cut: "Schnitt",
+  cuts: {
+    none: "Kein Schnitt",
+    image: "In der Bildebene",
+    lateral: "Quer zu lateral, mit dem Schallkopf",
+    elevation: "Quer zur Elevation, mit dem Schallkopf",
+    axial: "Quer zur Tiefe, mit dem Schallkopf",
+    x: "Quer zu x der Szene",
+    y: "Quer zu y der Szene",
+    z: "Quer zu z der Szene",
+  },
+  cutAt: "Bei",
+  sweep: "Sweep",
+  skin: "Haut",
+  help: "Den Schallkopf am Gehäuse über die Haut ziehen; ein Doppelklick auf die Haut setzt ihn dorthin.",
+  legend: "Farben",
+  toggleLabel: "Zeigen oder weglassen",
+  building: "wird verfeinert …",
+};
+
+export const tools: Translated<Words["tools"]> = {
+  title: "Instrumente",
+  label: "Instrumente im Bild",
+  frozen: "Eingefroren: Das Bild behält seine Instrumente. Zum Ändern weiterlaufen lassen.",
+  add: "Neu",
+  addOne: (kind) => `${kind} einsetzen`,
+  kinds: { needle: "Nadel", cylinder: "Zylinder", box: "Quader" },
+  one: (place, kind) => `${place} ${kind}`,
+  chosen: "Instrument",
+  remove: "Entfernen",
+  full: (most) => `Ein Bild fasst höchstens ${most} Instrumente.`,
+  frame: "Bezug des Instruments",
+  frames: { scene: "Bleibt in der Szene", probe: "Folgt dem Schallkopf" },
+  toImage: "Ins Bild",
+  toImageMeans: "In die Bildebene setzen, wo der Schallkopf gerade ist",
+  tip: "Spitze",
+  middle: "Mitte",
+  placeOf: (what, axis) => `${what} ${axis}`,
+  direction: "Richtung",
+  steepness: "Neigung",
+  steepnessMeans: "Neigung: wie steil es entlang Z nach unten geht, von -89° bis 89°",
+  heading: "Kurs",
+  headingMeans: "Kurs: von X nach Y, entlang Z gesehen",
+  turn: "Drehung",
+  size: "Größe",
+  length: "Länge",
+  ghost: "Geister",
+  ghostMeans: "Geisterechos",
+  along: "Entlang der Achse",
+  advance: (by_mm) => (by_mm > 0 ? `Um ${by_mm} mm vorschieben` : `Um ${-by_mm} mm zurückziehen`),
+  seen: (what, beside_mm, depth_mm) => `${what}: ${beside_mm} mm neben dem Bild, ${depth_mm} mm tief`,
+  inPlane: (what, depth_mm) => `${what}: im Bild, ${depth_mm} mm tief`,
+  look: "Aussehen und Label",
 };
