@@ -9,7 +9,7 @@ const {
   angle_deg, anglesFrom, distance_mm, english, fromPositionQuaternion, german, IDENTITY, POSE_FORMS, placeIn, poseFileOf, poseFromText,
   poseText, readPoses, REFERENCES, withPlaceIn, WRITTEN,
 } = await bundled(`export * from "./geometry/pose"; export * from "./geometry/pose_files";
-  export { connect as english } from "./words/en/programs"; export { connect as german } from "./words/de/programs";`);
+  export { connect as english } from "./words/en/programs"; import { german as texts } from "./words/de/german"; export const german = texts.connect;`);
 
 const TURNED = fromPositionQuaternion([12.5, -3, 40], [0.5, 0.5, -0.5, 0.5]);
 const TILTED = fromPositionQuaternion([-1.25, 0, 0.5], [Math.cos(0.3), Math.sin(0.3), 0, 0]);

@@ -1,4 +1,4 @@
-/** What a catalogue of another language must be: as much of the English one as somebody has translated. */
+/** How the console speaks a language that is not translated whole: what a catalogue lacks is said in English. */
 
 /** Names of what the service has; what is not among them is called as the service calls it. */
 export type Named = Readonly<Record<string, string | undefined>>;
@@ -8,13 +8,14 @@ export type Translated<Part> = Part extends string | readonly unknown[] | ((...g
   ? Part
   : { readonly [Name in keyof Part]?: Translated<Part[Name]> };
 
-/** The English catalogue with the texts of another language over it, where there are such. */
-export function translated<Part extends object>(english: Part, other: Translated<Part>): Part {
-  const entries = Object.entries(other).map(([name, text]) => {
-    const before = english[name as keyof Part];
-    return [name, isPart(before) && isPart(text) ? translated(before, text) : text];
+/** A catalogue with the texts of another over it. A text in place of a sentence has {0}, {1} … where that is given something. */
+export function translated<Part extends object>(before: Part, other: object): Part {
+  const entries = Object.entries(other).map(([name, text]: [string, unknown]) => {
+    const known: unknown = before[name as keyof Part];
+    if (isPart(known) && isPart(text)) return [name, translated(known, text)];
+    return [name, typeof known === "function" && typeof text === "string" ? sentenceOf(text) : text];
   });
-  return { ...english, ...(Object.fromEntries(entries) as Partial<Part>) };
+  return { ...before, ...(Object.fromEntries(entries) as Partial<Part>) };
 }
 
 /** Where texts are missing, as "scan.cine.play". */
@@ -24,6 +25,10 @@ export function missingIn(english: object, other: object, within = ""): string[]
     if (found === undefined) return [within + name];
     return isPart(text) && isPart(found) ? missingIn(text, found, `${within}${name}.`) : [];
   });
+}
+
+function sentenceOf(text: string): (...given: unknown[]) => string {
+  return (...given) => text.replace(/\{(\d)\}/g, (_, place) => String(given[Number(place)]));
 }
 
 function isPart(value: unknown): value is object {

@@ -10,7 +10,7 @@ export type LanguageName = keyof typeof LANGUAGES;
 const STORAGE = "ultragray.language";
 const CATALOGUES: Record<LanguageName, () => Promise<Words>> = {
   en: async () => english,
-  de: async () => translated<Words>(english, (await import("./de/german")).german),
+  de: async () => translated(english, (await import("./de/german")).german),
 };
 
 class Language {
