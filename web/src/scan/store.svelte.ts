@@ -7,9 +7,9 @@ import { type Frame, outputPixels } from "../api/stream";
 import { depthTicks, ellipseOf, type EllipsePoints, extent_mm, pixelAt, type Placed, type PlanePoint } from "../geometry/plane";
 import { poseJson } from "../geometry/pose_files";
 import { confidenceWords } from "../session/confidence.svelte";
-import { GREYS } from "../session/FrameCanvas.svelte";
 import { planes } from "../session/scene.svelte";
 import { saveBlob } from "../shared/asking.svelte";
+import { colour, GREYS, paint } from "../shared/colours";
 import { nameIn } from "../shared/text";
 import { words } from "../words/words.svelte";
 import { lettersOf, type Mark, type Marks, PLAYED_PER_SECOND, resultOf, type ScanState } from "./scan.svelte";
@@ -111,14 +111,9 @@ export class Sheet {
 
   #drawPicture(frame: Frame): void {
     const { height, width } = frame.header;
-    const context = this.#picture.getContext("2d");
-    const pixels = outputPixels(frame, "bmode");
-    if (context === null || pixels === undefined) throw new Error(words.scan.store.noDrawing);
-    [this.#picture.width, this.#picture.height] = [width, height];
-    const image = context.createImageData(width, height);
-    const rgba = new Uint32Array(image.data.buffer);
-    for (let index = 0; index < rgba.length; index++) rgba[index] = GREYS[pixels[index]!]!;
-    context.putImageData(image, 0, 0);
+    const values = outputPixels(frame, "bmode");
+    if (values === undefined) throw new Error(words.scan.store.noDrawing);
+    paint(this.#picture, width, height, (pixels) => colour(pixels, values, GREYS));
     this.#context.drawImage(this.#picture, MARGINS.left, MARGINS.top, this.#width, this.#height);
   }
 
