@@ -7,7 +7,8 @@ from itertools import pairwise
 import numpy as np
 import torch
 
-from ultragray.confidence.deviation import CELLS, POINTS_PER_SIDE, in_cells, variance_terms, view_distances
+from ultragray.confidence.deviation import POINTS_PER_SIDE as DEVIATION_POINTS
+from ultragray.confidence.deviation import CELLS, in_cells, variance_terms, view_distances
 from ultragray.confidence.uncertainty import DEPTHS, DepthBands, Uncertainty
 from ultragray.confidence.views import FAR_MM, TrainingViews
 from ultragray.datasets.sweep import ByteArray, Sweep
@@ -73,7 +74,7 @@ def _bands(images: ByteArray) -> DepthBands:  # [F, H, W]
 def _far_away(bands: DepthBands) -> tuple[FloatArray, FloatArray]:  # [DEPTHS, TERMS], [DEPTHS]
     """The terms of a black frame far from every view, and its expected squared error, in the middle of each band."""
     dark, lit = torch.zeros(1, DEPTHS, 1), torch.ones(1, DEPTHS, 1)
-    far = np.full((1, POINTS_PER_SIDE, POINTS_PER_SIDE), FAR_MM)
+    far = np.full((1, DEVIATION_POINTS, DEVIATION_POINTS), FAR_MM)
     columns = [term.flatten() for term in variance_terms((dark, dark, lit), (far, far), bands)]
     squares = np.array(bands.spread) + np.square(bands.level)
     return torch.stack(columns, dim=1).double().numpy(), squares
