@@ -10,7 +10,7 @@ from starlette.responses import Response
 from ultragray_service.http.deps import ServiceDep, problems
 from ultragray_service.http.reading.accept import PNG
 from ultragray_service.http.routes.jobs.jobs import JobId
-from ultragray_service.views.training import TrainingCurve
+from ultragray_service.views.prepared import TrainingCurve
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
