@@ -40,9 +40,7 @@ from ultragray_service.settings import Settings
 from ultragray_service.telemetry.metrics import Metrics
 from ultragray_service.telemetry.tracing import start_tracing
 from ultragray_service.views.assessments import Assessing
-from ultragray_service.views.prepared import Comparisons, simulated_sha256
-from ultragray_service.views.prepared import DatasetViews
-from ultragray_service.views.prepared import TrainingViews
+from ultragray_service.views.prepared import Comparisons, DatasetViews, TrainingViews, simulated_sha256
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import Draining, NotReady, SceneNotFound, StartupFailed
 from ultragray_workers.jobs.places import shared_storage

@@ -12,8 +12,7 @@ from ultragray_service.http.deps import SceneName, ServiceDep, problems
 from ultragray_service.http.reading.accept import PNG
 from ultragray_service.http.revalidation import NOT_MODIFIED, revalidated
 from ultragray_service.http.routes.datasets import DatasetName
-from ultragray_service.views.prepared import Comparison
-from ultragray_service.views.prepared import DatasetPoses
+from ultragray_service.views.prepared import Comparison, DatasetPoses
 
 router = APIRouter(prefix="/v1", tags=["console"])
 
