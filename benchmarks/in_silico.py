@@ -9,8 +9,8 @@ from functools import partial
 import numpy as np
 
 from ultragray import LinearProbe, Probe
-from ultragray.datasets.phantom import PHANTOM_PROBE, freehand_poses, simulate
-from ultragray.datasets.sweep import Sweep
+from ultragray.learn.sweep import Sweep
+from ultragray.phantom import PHANTOM_PROBE, freehand_poses, simulate
 from ultragray.probe import FloatArray
 
 SIDE = 128

@@ -54,9 +54,9 @@ _SERVED = (
 _TRAINED = (
     *_KERNEL,
     "model/ultragray/datasets",
-    "model/ultragray/evaluation",
+    "model/ultragray/learn/evaluation",
     "model/ultragray/probe",
-    "model/ultragray/training",
+    "model/ultragray/learn/training",
 )
 _JOBS = ("workers/ultragray_workers/jobs", "workers/ultragray_workers/claims.py")
 _GPU = ("model/ultragray/backends/cuda", "model/ultragray/rendering.py", f"{_BENCH}/cuda")
@@ -65,7 +65,7 @@ _PRODUCT = ("model", "workers", "service", "proto", "client", "ros")
 _FILES = (
     Figures("benchmarks/results.json", "bench", (*_SERVED, f"{_BENCH}/frames.py")),
     Figures("benchmarks/kernel.json", "bench", (*_KERNEL, f"{_BENCH}/kernel_details.py")),
-    Figures("benchmarks/training.json", "bench", (*_KERNEL, "model/ultragray/training/steps", f"{_BENCH}/train.py")),
+    Figures("benchmarks/training.json", "bench", (*_KERNEL, "model/ultragray/learn/training", f"{_BENCH}/train.py")),
     Figures("benchmarks/jobs.json", "bench", (*_SERVED, *_JOBS, f"{_BENCH}/jobs.py")),
     Figures(
         "benchmarks/clients.json",
@@ -74,7 +74,7 @@ _FILES = (
     ),
     Figures("benchmarks/console.json", "bench-console", (*_SERVED, "web", "tests/console/measure.mjs")),
     Figures("benchmarks/cuda.json", "bench-cuda", _GPU),
-    Figures("benchmarks/cuda_training.json", "bench-cuda", (*_GPU, "model/ultragray/training/steps")),
+    Figures("benchmarks/cuda_training.json", "bench-cuda", (*_GPU, "model/ultragray/learn/training")),
     Figures(
         "benchmarks/results_tables.json",
         "results",
@@ -83,14 +83,14 @@ _FILES = (
     Figures(
         "benchmarks/methods_tables.json",
         "methods",
-        (*_TRAINED, "model/ultragray/methods", "benchmarks/methods_tables.py"),
+        (*_TRAINED, "studies/ultragray_studies", "benchmarks/methods_tables.py"),
     ),
     Figures("benchmarks/ablations.json", "ablations", (*_TRAINED, "benchmarks/ablations.py")),
     Figures("benchmarks/poses.json", "poses", (*_TRAINED, "benchmarks/poses.py")),
     Figures(
         "benchmarks/localization.json",
         "localization",
-        (*_KERNEL, "model/ultragray/localization", "benchmarks/localization.py"),
+        (*_KERNEL, "model/ultragray/learn/localization", "benchmarks/localization.py"),
     ),
     Figures(
         "benchmarks/confidence.json",
@@ -102,16 +102,16 @@ _FILES = (
         "libraries",
         (
             "model/ultragray/display",
-            "model/ultragray/evaluation/metrics.py",
+            "model/ultragray/learn/evaluation/metrics.py",
             "model/ultragray/datasets/images.py",
-            "model/ultragray/training/data/shadows.py",
+            "model/ultragray/learn/training/geometry.py",
             "benchmarks/libraries.py",
         ),
     ),
     Figures(
         "benchmarks/environment.json",
         "environment",
-        (*_KERNEL, "model/ultragray/contact", "model/ultragray/gym", "benchmarks/environment.py"),
+        (*_KERNEL, "model/ultragray/contact", "studies/ultragray_studies/gym", "benchmarks/environment.py"),
     ),
     Figures("benchmarks/ros.json", "ros", (*_SERVED, "client/ultragray_client", "ros", "benchmarks/ros.py")),
     Figures(
@@ -128,7 +128,7 @@ _FILES = (
     Figures(
         "benchmarks/shards.json",
         "test-shards",
-        (*_KERNEL, *_JOBS, "model/ultragray/batches", "workers/ultragray_workers/batches", "tests/batches"),
+        (*_KERNEL, *_JOBS, "model/ultragray/exchange/shards.py", "workers/ultragray_workers/batches", "tests/batches"),
     ),
     Figures("tests/long-run.json", "test-long", (*_PRODUCT, "tests", ":(exclude)tests/*-run.json")),
     Figures("tests/soak-run.json", "test-soak", (*_PRODUCT, "tests/soak")),

@@ -23,17 +23,16 @@ import torch
 
 from in_silico import IN_SILICO
 from registry import FIGURES, Document
-from ultragray.datasets.phantom.shadow import SHADOW_DB, BoneShadow
 from ultragray.datasets.source import PHANTOM, SourceOptions, load_dataset
-from ultragray.datasets.sweep import Dataset
-from ultragray.evaluation.baselines import BASELINES, evaluate_baselines, predict
-from ultragray.evaluation.compounding import affordable_voxel_mm
-from ultragray.evaluation.scoring import render_sweep
 from ultragray.files.atomic import write_whole
-from ultragray.report.study import train_and_evaluate
+from ultragray.learn.evaluation.baselines import BASELINES, affordable_voxel_mm, evaluate_baselines, predict
+from ultragray.learn.evaluation.scoring import render_sweep
+from ultragray.learn.sweep import Dataset
+from ultragray.learn.training import Progress, TrainingConfig
+from ultragray.phantom.imaging import SHADOW_DB, BoneShadow
 from ultragray.scene import GaussianScene
-from ultragray.training import Progress, TrainingConfig
 from ultragray_service.bench.measured import measured
+from ultragray_studies.report.study import train_and_evaluate
 
 SECONDS_PER_LINE = 15.0
 THIRD, BAND_SPACINGS = 3, 10

@@ -24,7 +24,7 @@ import unasync
 from ultragray.contract import Contract, Family, annotated_fields
 from ultragray.datasets.source import SourceOptions
 from ultragray.errors import error_classes
-from ultragray.interchange import ros_messages, ros_recording
+from ultragray.exchange import ros_messages, ros_recording
 from ultragray.pose import quaternion_from_pose
 from ultragray.probe import ElevationBeam
 from ultragray.settings import RenderSettings
@@ -72,7 +72,7 @@ RECORDING = {"messages": ros_messages, "writer": ros_recording}  # modules that 
 OWN_IMPORTS = {  # what they import, as the client has it
     "from ultragray.probe import FloatArray\n": "from ..geometry import FloatArray\n",
     "from ultragray.pose import quaternion_from_pose\n": "import numpy as np\n",  # the function stands at the end
-    "from ultragray.interchange import ros_messages as ros\n": "from . import messages as ros\n",
+    "from ultragray.exchange import ros_messages as ros\n": "from . import messages as ros\n",
 }
 _ALSO = {"InvalidArgument": ["ValueError"], "DeadlineExceeded": ["TimeoutError"]}  # what they are beside
 

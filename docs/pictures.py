@@ -36,14 +36,13 @@ from ultragray import GaussianScene, read_header, render
 from ultragray.confidence import Assessor, supported
 from ultragray.contract import to_dict
 from ultragray.datasets.mcap import read_mcap_sweep
-from ultragray.datasets.phantom import PHANTOM_PROBE, freehand_poses, simulate
 from ultragray.demo import DEMO_FILE
 from ultragray.display import Display
 from ultragray.display.frames import show
 from ultragray.display.pixels import to_uint8
-from ultragray.gym import StandardPlaneEnv
-from ultragray.interchange import ros_messages as ros
-from ultragray.interchange.rendering import render_to_file
+from ultragray.exchange import ros_messages as ros
+from ultragray.exchange.rendering import render_to_file
+from ultragray.phantom import PHANTOM_PROBE, freehand_poses, simulate
 from ultragray.pose import pose_from_position_quaternion
 from ultragray.registration.frames import register_frames
 from ultragray.samplers import AroundSampler
@@ -52,6 +51,7 @@ from ultragray.tools import DEFAULT_LABEL, Box, Cylinder, Needle, Tool, ToolFram
 from ultragray.volumes.fields import sample_slice
 from ultragray.volumes.grid import VolumeGrid
 from ultragray.volumes.names import VOLUME_FIELDS
+from ultragray_studies.gym import StandardPlaneEnv
 
 IMAGES = Path(__file__).resolve().parent / "images"
 EXAMPLES = IMAGES.parents[1] / "examples"

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ultragray.demo import DEMO_FILE
-from ultragray.gym import STANDARD_PLANE
+from ultragray_studies.gym import STANDARD_PLANE
 
 Floats = npt.NDArray[np.float64]
 

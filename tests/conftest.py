@@ -20,7 +20,7 @@ import torch
 
 from ultragray import ConvexProbe, Frames, GaussianScene, LinearProbe, Probe, SceneInfo
 from ultragray.backends import cuda
-from ultragray.interchange.released_config import stretch_released_far
+from ultragray.exchange.released_config import stretch_released_far
 from ultragray.outputs import PLANES
 from ultragray.probe import FloatArray
 from ultragray.scene import PARAMETERS

@@ -18,17 +18,21 @@ from .markdown import prose, sections
 # Public modules beside the packages' own names. A module without __all__ makes public what it defines.
 LIBRARY_MODULES = (
     *("ultragray.datasets", "ultragray.datasets.source", "ultragray.datasets.released", "ultragray.datasets.plus"),
-    *("ultragray.datasets.dicom", "ultragray.datasets.mcap", "ultragray.datasets.phantom", "ultragray.datasets.checks"),
-    *("ultragray.datasets.pictures", "ultragray.training", "ultragray.evaluation.metrics"),
-    *("ultragray.evaluation.scoring", "ultragray.evaluation.speckle", "ultragray.evaluation.side_by_side"),
-    *("ultragray.evaluation.compounding", "ultragray.evaluation.baselines", "ultragray.confidence"),
-    *("ultragray.contact", "ultragray.gym", "ultragray.tools"),
+    *("ultragray.datasets.dicom", "ultragray.datasets.mcap", "ultragray.phantom", "ultragray.datasets.checks"),
+    *("ultragray.datasets.pictures", "ultragray.learn.training", "ultragray.learn.evaluation.metrics"),
+    *(
+        "ultragray.learn.evaluation.scoring",
+        "ultragray.learn.evaluation.speckle",
+        "ultragray.learn.evaluation.side_by_side",
+    ),
+    *("ultragray.learn.evaluation.baselines", "ultragray.learn.evaluation.baselines", "ultragray.confidence"),
+    *("ultragray.contact", "ultragray_studies.gym", "ultragray.tools"),
     *("ultragray.volumes.grid", "ultragray.volumes.fields", "ultragray.volumes.files"),
     *(f"ultragray.registration.{name}" for name in ("registration", "points", "poses", "frames")),
     *("ultragray.samplers", "ultragray.contract", "ultragray.pose", "ultragray.rendering", "ultragray.demo"),
     *("ultragray.display.settings", "ultragray.display.frames", "ultragray.display.scan_conversion"),
-    *("ultragray.interchange.rendering", "ultragray.interchange.exports", "ultragray.interchange.exports.png_folder"),
-    *("ultragray.interchange.ply", "ultragray.interchange.checkpoint", "ultragray.interchange.checkpoint_export"),
+    *("ultragray.exchange.rendering", "ultragray.exchange.exports", "ultragray.exchange.exports.png_folder"),
+    *("ultragray.exchange.ply", "ultragray.exchange.checkpoint", "ultragray.exchange.checkpoint"),
     *("ultragray.files.poses", "ultragray.files.atomic"),
 )
 CLIENT_GROUPS = (

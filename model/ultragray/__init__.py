@@ -22,8 +22,8 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 if TYPE_CHECKING:
     from ultragray.errors import UltragrayError
-    from ultragray.localization.search import localize
-    from ultragray.localization.settings import Localization
+    from ultragray.learn.localization.search import localize
+    from ultragray.learn.localization.settings import Localization
     from ultragray.pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
     from ultragray.probe import ConvexProbe, ElevationBeam, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
     from ultragray.rendering import Frames, render
@@ -54,8 +54,8 @@ __all__ = [
 
 _MODULES = {
     "errors": ("UltragrayError",),
-    "localization.search": ("localize",),
-    "localization.settings": ("Localization",),
+    "learn.localization.search": ("localize",),
+    "learn.localization.settings": ("Localization",),
     "pose": ("check_poses", "pose_from_position_quaternion", "quaternion_from_pose"),
     "probe": ("ConvexProbe", "ElevationBeam", "LinearProbe", "PhasedProbe", "Probe", "RadialProbe", "SteeredProbe"),
     "rendering": ("Frames", "render"),

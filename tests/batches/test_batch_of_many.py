@@ -25,8 +25,8 @@ import numpy as np
 import pytest
 
 from ultragray import render
-from ultragray.batches import BatchPlan, names_in
 from ultragray.demo import copy_demo_scene
+from ultragray.exchange.batches import BatchPlan, names_in
 from ultragray.files.atomic import file_sha256, write_whole
 from ultragray.samplers import AroundSampler
 from ultragray.scene import GaussianScene

@@ -10,11 +10,11 @@ import pytest
 from ultragray.contract import Contract, Family, described
 from ultragray.datasets.source import DatasetFormat
 from ultragray.display import Display
-from ultragray.interchange.exports.exporter import Exporter
-from ultragray.interchange.exports.formats import Format
+from ultragray.exchange.exports.exporter import Exporter
+from ultragray.exchange.exports.formats import Format
+from ultragray.learn.training.config import PRESETS, TrainingConfig
 from ultragray.probe import Probe
 from ultragray.tools import Tool
-from ultragray.training.config import PRESETS, TrainingConfig
 from ultragray_service.errors import STATUSES
 from ultragray_workers.jobs.kinds import Specification
 

@@ -13,7 +13,8 @@ from safetensors import safe_open
 from ultragray import GaussianScene, PhasedProbe, SceneInfo, scene_info
 from ultragray.confidence import Extrapolation
 from ultragray.errors import error_classes
-from ultragray.interchange import checkpoint_export, ply
+from ultragray.exchange import checkpoint as checkpoint_export
+from ultragray.exchange import ply
 from ultragray.outputs import OUTPUTS
 from ultragray.settings import Encoding
 from ultragray_service.http.reading import accept

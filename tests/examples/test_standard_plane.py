@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ultragray.demo import DEMO_FILE
-from ultragray.gym import STANDARD_PLANE
+from ultragray_studies.gym import STANDARD_PLANE
 
 from .conftest import EXAMPLES
 

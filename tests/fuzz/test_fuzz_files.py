@@ -23,9 +23,9 @@ from mcap.writer import CompressionType
 from ultragray import GaussianScene
 from ultragray.datasets import Dataset
 from ultragray.datasets.released import write_released
-from ultragray.interchange.ply import write_ply
-from ultragray.training import train
-from ultragray.training.trainer import CHECKPOINT_FILE
+from ultragray.exchange.ply import write_ply
+from ultragray.learn.training import train
+from ultragray.learn.training.trainer import CHECKPOINT_FILE
 
 from ..dicom_files import FRAMES, write_cine
 from ..mcap_files import Bag

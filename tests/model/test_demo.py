@@ -17,8 +17,6 @@ import torch
 
 from ultragray import GaussianScene, LinearProbe, read_header, render
 from ultragray.datasets import Dataset, Sweep
-from ultragray.datasets.phantom import Tissue, load_phantom, simulate, sweeps, tissue_at
-from ultragray.datasets.phantom.shadow import BoneShadow
 from ultragray.demo import (
     DEMO_FILE,
     DEMO_IMAGE_SIDE,
@@ -29,9 +27,11 @@ from ultragray.demo import (
     make,
 )
 from ultragray.errors import InvalidArgument
-from ultragray.evaluation.compounding import pixel_positions_mm
-from ultragray.evaluation.scoring import evaluate, render_sweep
-from ultragray.training import TrainingConfig
+from ultragray.learn.evaluation.baselines import pixel_positions_mm
+from ultragray.learn.evaluation.scoring import evaluate, render_sweep
+from ultragray.learn.training import TrainingConfig
+from ultragray.phantom import Tissue, load_phantom, simulate, sweeps, tissue_at
+from ultragray.phantom.imaging import BoneShadow
 
 SIDE = 256
 MM_PER_PIXEL = 60.0 / SIDE

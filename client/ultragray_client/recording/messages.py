@@ -1,4 +1,4 @@
-# Generated from ultragray.interchange.ros_messages by client/generate.py; change that.
+# Generated from ultragray.exchange.ros_messages by client/generate.py; change that.
 """Standard messages of ROS 2 as files hold them: their definitions, and what of ours becomes which. Needs no ROS.
 
 ROS speaks metres: poses are converted here. A message is a dict of its fields. The Python client has a copy of this

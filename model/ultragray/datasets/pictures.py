@@ -10,9 +10,9 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from ultragray.datasets.sweep import Dataset, Sweep, spread_places
 from ultragray.display.scan_conversion import with_square_pixels
 from ultragray.files.atomic import atomic_path
+from ultragray.learn.sweep import Dataset, Sweep, spread_places
 from ultragray.probe import FloatArray
 
 TRAIN_COLOUR, VAL_COLOUR = "#1f77b4", "#d62728"

@@ -13,8 +13,8 @@ import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from ultragray.datasets.phantom import PHANTOM_IMAGE_SIDE, PHANTOM_PROBE, freehand_poses
 from ultragray.files.atomic import atomic_path
+from ultragray.phantom import PHANTOM_IMAGE_SIDE, PHANTOM_PROBE, freehand_poses
 from ultragray.probe import FloatArray
 
 if TYPE_CHECKING:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import numpy.typing as npt
 
-from ultragray.datasets.phantom import Tissue
-from ultragray.datasets.phantom.anatomy import LabelArray
+from ultragray.phantom import Tissue
+from ultragray.phantom.anatomy import LabelArray
 
 LABELS: dict[int, tuple[str, tuple[Tissue, ...]]] = {
     1: ("bone", (Tissue.BONE,)),

@@ -15,20 +15,20 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ultragray.datasets.phantom import load_phantom, tissue_at
-from ultragray.datasets.phantom.shadow import BoneShadow
-from ultragray.datasets.sweep import Dataset
 from ultragray.demo import DEMO_FILE
 from ultragray.demo.labels import LABEL_NAMES, labels_of
 from ultragray.display import true_to_scale
 from ultragray.display.frames import show
 from ultragray.display.pixels import image_file
-from ultragray.evaluation.scoring import render_sweep
 from ultragray.files.atomic import write_whole
+from ultragray.learn.evaluation.scoring import render_sweep
+from ultragray.learn.sweep import Dataset
+from ultragray.learn.training import Progress, TrainingConfig, train
+from ultragray.phantom import load_phantom, tissue_at
+from ultragray.phantom.imaging import BoneShadow
 from ultragray.probe import FloatArray, Probe, RadialProbe, SteeredProbe
 from ultragray.rendering import render
 from ultragray.scene import GaussianScene
-from ultragray.training import Progress, TrainingConfig, train
 
 DATASET_NAME = "demo lumbar spine (in silico)"
 MAX_GAUSSIANS = 50_000  # 3 MB, small enough to come with the code

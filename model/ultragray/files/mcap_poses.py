@@ -8,10 +8,9 @@ from typing import Any
 import numpy as np
 
 from ultragray.errors import InvalidPose
+from ultragray.exchange.ros_fields import check_fields, pose_of_message
+from ultragray.exchange.ros_messages import POSE
 from ultragray.installation import missing_extra
-from ultragray.interchange.ros_fields import check_fields
-from ultragray.interchange.ros_messages import POSE
-from ultragray.interchange.ros_poses import pose_of_message
 from ultragray.probe import FloatArray
 
 PREFERRED = "/probe_pose"  # the end of the topic of the ROS 2 node

@@ -15,8 +15,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ultragray.errors import InvalidArgument
-from ultragray.localization.search import localize
-from ultragray.localization.settings import NEAR_DEG, NEAR_MM, Localization
+from ultragray.learn.localization.search import localize
+from ultragray.learn.localization.settings import NEAR_DEG, NEAR_MM, Localization
 from ultragray.pose import check_poses
 from ultragray.probe import FloatArray, Probe
 from ultragray.registration.poses import LEVER_MM, PoseFit, pose_residuals, register_poses

@@ -17,8 +17,8 @@ import torch
 
 from ultragray import GaussianScene
 from ultragray.backends import cpu
-from ultragray.datasets.sweep import spread_places
 from ultragray.demo import load_demo_scene
+from ultragray.learn.sweep import spread_places
 from ultragray.probe import FloatArray, Probe
 from ultragray_service.bench.kernel import PROBE, bench_poses, bench_scenes, time_ms
 from ultragray_service.bench.report import Report

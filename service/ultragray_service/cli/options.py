@@ -271,7 +271,7 @@ def _parsed_json(text: str, name: str) -> Any:
 
 def parse_settings(settings: list[str]) -> dict[str, Any]:
     """NAME=VALUE pairs, the value as in TOML; a bare word is itself."""
-    from ultragray.training.config import parse_value
+    from ultragray.learn.training.config import parse_value
 
     return {name: parse_value(value) for name, value in pairs_of(settings, "--set").items()}
 

@@ -16,8 +16,8 @@ from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 
 from ultragray import __version__
 from ultragray.errors import UltragrayError
+from ultragray.learn.training.config import PRESETS, TrainingConfig
 from ultragray.probe import Probe
-from ultragray.training.config import PRESETS, TrainingConfig
 from ultragray.volumes.plane import SliceSettings
 from ultragray_service.access.rules import WEBSOCKET, HttpRules
 from ultragray_service.core.state import Service

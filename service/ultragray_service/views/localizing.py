@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from ultragray.contract import described
 from ultragray.errors import InvalidArgument, RenderFailed
-from ultragray.localization.settings import LocalizationSettings
+from ultragray.learn.localization.settings import LocalizationSettings
 from ultragray.probe import FloatArray
 from ultragray.settings import Encoding, FrameSettings
 from ultragray_service.access.audit import account

@@ -22,9 +22,9 @@ from ultragray import (
     render,
 )
 from ultragray.errors import InvalidArgument, SceneFileInvalid, UnknownOutput
-from ultragray.evaluation.compounding import pixel_positions_mm
-from ultragray.interchange.checkpoint_export import export_checkpoint
-from ultragray.interchange.ply import read_ply, write_ply
+from ultragray.exchange.checkpoint import export_checkpoint
+from ultragray.exchange.ply import read_ply, write_ply
+from ultragray.learn.evaluation.baselines import pixel_positions_mm
 from ultragray.probe import FloatArray
 
 PROBES = {

@@ -16,11 +16,10 @@ import pytest
 import torch
 
 from ultragray import GaussianScene, LinearProbe, render
-from ultragray.batches import SHARD_FRAMES, BatchPlan, ShardEntry, manifest, names_in, stands_for
-from ultragray.batches.shard import ShardRenderer
-from ultragray.batches.shard_tar import ShardTar
 from ultragray.confidence import Assessor, Extrapolation
 from ultragray.errors import FrameTooCostly, InvalidArgument
+from ultragray.exchange.batches import SHARD_FRAMES, BatchPlan, ShardEntry, manifest, names_in, stands_for
+from ultragray.exchange.shards import ShardRenderer, ShardTar
 from ultragray.files.atomic import file_sha256
 from ultragray.limits import Limits
 from ultragray.samplers import AroundSampler, FanSampler, SplineSampler

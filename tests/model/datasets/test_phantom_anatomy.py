@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ultragray.datasets.phantom import Tissue, anatomy, bone, tissue_at
-from ultragray.datasets.phantom.interfaces import INTERFACES
-from ultragray.datasets.phantom.noise import LatticeNoise
 from ultragray.errors import InvalidArgument
+from ultragray.phantom import Tissue, anatomy, tissue_at
+from ultragray.phantom import anatomy as bone
+from ultragray.phantom.anatomy import INTERFACES, LatticeNoise
 
 
 @pytest.mark.parametrize(

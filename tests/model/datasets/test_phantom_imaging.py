@@ -10,10 +10,11 @@ import numpy.typing as npt
 import pytest
 
 from ultragray import ConvexProbe, LinearProbe
-from ultragray.datasets.phantom import Tissue, anatomy, bone, bone_attenuation_db, imaging, simulate, tissue_at, tissues
-from ultragray.datasets.phantom.acoustics import ACOUSTICS, FREQUENCY_MHZ
-from ultragray.datasets.phantom.scatterers import NOTHING, PER_MM3, ScattererField, Scatterers
 from ultragray.errors import InvalidPose, InvalidProbe
+from ultragray.phantom import Tissue, anatomy, bone_attenuation_db, imaging, simulate, tissue_at, tissues
+from ultragray.phantom import anatomy as bone
+from ultragray.phantom.anatomy import ACOUSTICS, FREQUENCY_MHZ
+from ultragray.phantom.imaging import NOTHING, PER_MM3, ScattererField, Scatterers
 
 PROBE = LinearProbe(width_mm=24.0, near_mm=0.0, far_mm=50.0)
 HEIGHT, WIDTH = 214, 102  # about the phantom's own pixels

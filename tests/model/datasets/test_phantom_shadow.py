@@ -7,8 +7,8 @@ import pytest
 
 from ultragray import ConvexProbe, LinearProbe, Probe
 from ultragray.datasets import Sweep
-from ultragray.datasets.phantom.shadow import BoneShadow
 from ultragray.errors import DatasetInvalid
+from ultragray.phantom.imaging import BoneShadow
 
 PROBE = LinearProbe(width_mm=60.0, near_mm=0.0, far_mm=60.0)
 SIDE = 60  # a pixel a millimetre

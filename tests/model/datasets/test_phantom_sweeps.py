@@ -8,8 +8,8 @@ import numpy as np
 import numpy.typing as npt
 import pytest
 
-from ultragray.datasets.phantom import PHANTOM_PROBE, freehand_poses, load_phantom, sweeps
 from ultragray.errors import InvalidArgument
+from ultragray.phantom import PHANTOM_PROBE, freehand_poses, load_phantom, sweeps
 from ultragray.pose import check_poses
 
 

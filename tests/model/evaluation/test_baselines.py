@@ -12,7 +12,13 @@ from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe, RadialProbe,
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.source import load_dataset
 from ultragray.errors import DatasetInvalid, InvalidArgument
-from ultragray.evaluation.baselines import BASELINES, evaluate_baselines, interpolate_planes, nearest_frames, predict
+from ultragray.learn.evaluation.baselines import (
+    BASELINES,
+    evaluate_baselines,
+    interpolate_planes,
+    nearest_frames,
+    predict,
+)
 from ultragray.probe import FloatArray
 
 LINEAR = LinearProbe(width_mm=8.0, near_mm=0.0, far_mm=10.0)

@@ -13,9 +13,14 @@ from ultragray import ConvexProbe, LinearProbe, Probe, RadialProbe, SteeredProbe
 from ultragray.datasets import Sweep
 from ultragray.datasets.source import load_dataset
 from ultragray.errors import InvalidArgument
-from ultragray.evaluation import compounding
-from ultragray.evaluation.baselines import evaluate_baselines
-from ultragray.evaluation.compounding import affordable_voxel_mm, compound, mean_axes, pixel_positions_mm
+from ultragray.learn.evaluation import baselines as compounding
+from ultragray.learn.evaluation.baselines import (
+    affordable_voxel_mm,
+    compound,
+    evaluate_baselines,
+    mean_axes,
+    pixel_positions_mm,
+)
 from ultragray.probe import FloatArray
 
 HEIGHT, WIDTH = 12, 10

@@ -14,8 +14,8 @@ from skimage.measure import block_reduce
 from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 
 from ultragray.errors import InvalidArgument, InvalidImageSize
-from ultragray.evaluation import metrics
-from ultragray.evaluation.metrics import FrameMetrics, frame_metrics, mean_metrics, ms_ssim_scales, std_metrics
+from ultragray.learn.evaluation import metrics
+from ultragray.learn.evaluation.metrics import FrameMetrics, frame_metrics, mean_metrics, ms_ssim_scales, std_metrics
 
 
 def speckle(*shape: int, seed: int = 0) -> torch.Tensor:

@@ -14,7 +14,7 @@ from ultragray.confidence import ConfidenceModel
 from ultragray.confidence.uncertainty import DEPTHS, TERMS, DepthBands, Uncertainty
 from ultragray.datasets import Sweep
 from ultragray.errors import DatasetInvalid
-from ultragray.evaluation.reliability import compare_deviations, measure_reliability
+from ultragray.learn.evaluation.scoring import compare_deviations, measure_reliability
 
 PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 POSES = np.tile(np.eye(4), (4, 1, 1))

@@ -13,9 +13,9 @@ import torch
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, render
 from ultragray.datasets import Sweep
 from ultragray.errors import DatasetInvalid, InvalidArgument
-from ultragray.evaluation import scoring as evaluation
-from ultragray.evaluation.metrics import FrameMetrics, frame_metrics
-from ultragray.evaluation.scoring import evaluate, evaluate_frames, render_sweep
+from ultragray.learn.evaluation import scoring as evaluation
+from ultragray.learn.evaluation.metrics import FrameMetrics, frame_metrics
+from ultragray.learn.evaluation.scoring import evaluate, evaluate_frames, render_sweep
 from ultragray.probe import FloatArray
 
 

@@ -11,8 +11,8 @@ import pytest
 
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, Probe
 from ultragray.datasets import Sweep
-from ultragray.evaluation.scoring import evaluate, render_sweep
-from ultragray.evaluation.side_by_side import as_picture, side_by_side_panels, write_side_by_side
+from ultragray.learn.evaluation.scoring import evaluate, render_sweep
+from ultragray.learn.evaluation.side_by_side import as_picture, side_by_side_panels, write_side_by_side
 from ultragray.probe import FloatArray
 
 LINEAR = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=60.0)

@@ -16,10 +16,9 @@ from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, render
 from ultragray.contact import Skin, Touch
 from ultragray.display.pixels import to_uint8
 from ultragray.errors import InvalidArgument, InvalidPose, InvalidProbe
-from ultragray.gym import STANDARD_PLANE, StandardPlaneEnv
-from ultragray.gym.motion import moved
-from ultragray.gym.settings import StandardPlaneSettings
 from ultragray.settings import Contact
+from ultragray_studies.gym import STANDARD_PLANE, StandardPlaneEnv
+from ultragray_studies.gym.standard_plane import StandardPlaneSettings, moved
 
 LINEAR = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 CONVEX = ConvexProbe(opening_angle_deg=50.0, near_mm=20.0, far_mm=60.0)

@@ -17,8 +17,8 @@ import torch
 
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, render
 from ultragray.errors import CheckpointInvalid, InvalidArgument, InvalidPose
+from ultragray.exchange.checkpoint import import_checkpoint
 from ultragray.files.poses import load_poses
-from ultragray.interchange.checkpoint import import_checkpoint
 from ultragray.scene import PARAMETERS
 
 LINEAR_CONF = {

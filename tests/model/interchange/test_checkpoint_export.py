@@ -15,8 +15,7 @@ import torch
 
 from ultragray import ConvexProbe, ElevationBeam, GaussianScene, LinearProbe, PhasedProbe, Probe, SceneInfo, render
 from ultragray.errors import InvalidArgument
-from ultragray.interchange.checkpoint import import_checkpoint
-from ultragray.interchange.checkpoint_export import export_checkpoint
+from ultragray.exchange.checkpoint import export_checkpoint, import_checkpoint
 from ultragray.probe import FloatArray
 from ultragray.scene import PARAMETERS
 

@@ -19,8 +19,8 @@ from hypothesis import strategies as st
 
 from ultragray import ConvexProbe, ElevationBeam, GaussianScene, LinearProbe
 from ultragray.errors import SceneFileInvalid
-from ultragray.interchange import ply
-from ultragray.interchange.ply import read_ply, write_ply
+from ultragray.exchange import ply
+from ultragray.exchange.ply import read_ply, write_ply
 from ultragray.scene import PARAMETERS
 
 INFO = {

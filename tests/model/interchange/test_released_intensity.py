@@ -11,7 +11,7 @@ import torch
 
 from ultragray import GaussianScene
 from ultragray.backends.reference import intensity
-from ultragray.interchange.released_intensity import fit_released_intensity
+from ultragray.exchange.checkpoint import fit_released_intensity
 
 SceneMaker = Callable[..., GaussianScene]
 

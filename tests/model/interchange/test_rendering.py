@@ -16,9 +16,9 @@ from ultragray.confidence import SUPPORT_COVERAGE, Extrapolation
 from ultragray.contract import to_dict
 from ultragray.display import Display
 from ultragray.display.pixels import PixelArray
-from ultragray.interchange import rendering
-from ultragray.interchange.exports.npz import NpzExporter
-from ultragray.interchange.rendering import render_to_file
+from ultragray.exchange import rendering
+from ultragray.exchange.exports.npz import NpzExporter
+from ultragray.exchange.rendering import render_to_file
 from ultragray.settings import Below, Resolved
 
 PROBE = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=50.0)

@@ -12,12 +12,11 @@ import torch
 from torch import Tensor
 
 from ultragray import ConvexProbe, GaussianScene, Probe, localize, render
-from ultragray.datasets.phantom import PHANTOM_PROBE, freehand_poses, simulate
 from ultragray.demo import demo_poses, load_demo_scene
 from ultragray.errors import InvalidArgument, InvalidPose
-from ultragray.localization import search
-from ultragray.localization.motion import Motions
-from ultragray.localization.search import _deviations
+from ultragray.learn.localization import search
+from ultragray.learn.localization.search import Motions, _deviations
+from ultragray.phantom import PHANTOM_PROBE, freehand_poses, simulate
 from ultragray.pose import pose_from_position_quaternion
 from ultragray.probe import FloatArray
 

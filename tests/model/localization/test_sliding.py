@@ -7,9 +7,8 @@ import torch
 from torch import Tensor
 
 from ultragray import ConvexProbe, LinearProbe, Probe
-from ultragray.evaluation.compounding import pixel_positions_mm
-from ultragray.localization.motion import Motions
-from ultragray.localization.sliding import places_after, slid
+from ultragray.learn.evaluation.baselines import pixel_positions_mm
+from ultragray.learn.localization.search import Motions, places_after, slid
 
 ROWS, COLUMNS = 41, 21
 LINEAR = LinearProbe(40.0, 0.0, 80.0)

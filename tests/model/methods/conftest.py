@@ -11,11 +11,10 @@ import torch
 from torch import Tensor, nn
 
 from ultragray import LinearProbe
-from ultragray.datasets.sweep import Dataset, Sweep
-from ultragray.methods.budget import Budget
-from ultragray.methods.learner import LearnedMethod, Learner
-from ultragray.methods.method import Description
+from ultragray.learn.sweep import Dataset, Sweep
 from ultragray.probe import FloatArray, Probe
+from ultragray_studies.methods.learner import LearnedMethod, Learner
+from ultragray_studies.methods.method import Budget, Description
 
 SIDE = 32
 PROBE = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=20.0)

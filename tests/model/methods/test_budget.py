@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from ultragray.errors import InvalidArgument
-from ultragray.methods.budget import Budget, Pace, Paces
+from ultragray_studies.methods.method import Budget, Pace, Paces
 
 
 def never() -> Pace:

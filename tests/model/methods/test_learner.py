@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray.datasets.sweep import Dataset
 from ultragray.errors import TrainingDiverged, TrainingStateInvalid
-from ultragray.methods.budget import Budget, Pace
-from ultragray.methods.learner import MODEL_FILE, STATE_FILE
-from ultragray.methods.method import FitProgress, FitRun
+from ultragray.learn.sweep import Dataset
+from ultragray_studies.methods.learner import MODEL_FILE, STATE_FILE
+from ultragray_studies.methods.method import Budget, FitProgress, FitRun, Pace
 
 from .conftest import SIDE, MeanImage
 

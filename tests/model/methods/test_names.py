@@ -8,8 +8,8 @@ import sys
 import pytest
 
 from ultragray.errors import InvalidArgument
-from ultragray.methods.names import NAMES, chosen_names
-from ultragray.methods.registry import METHODS, chosen_methods
+from ultragray.learn.evaluation.methods import NAMES, chosen_names
+from ultragray_studies.methods.registry import METHODS, chosen_methods
 
 
 def test_the_names_are_those_of_the_registry_in_its_order() -> None:
@@ -33,7 +33,7 @@ def test_an_unknown_name_is_refused_with_those_that_there_are(names: tuple[str, 
 def test_the_settings_of_a_comparison_need_no_torch() -> None:
     program = (
         f"import sys; sys.path[:] = {sys.path!r}; "
-        "from ultragray.methods.comparison.settings import ComparisonSettings; "
+        "from ultragray.learn.evaluation.methods import ComparisonSettings; "
         "ComparisonSettings(methods=('median',)); print('torch' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", program], capture_output=True, check=True).stdout == b"False\n"

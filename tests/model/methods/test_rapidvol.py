@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray.methods.method import FitProgress, FitRun
-from ultragray.methods.rapidvol import RapidVol, TriPlaneLearner, TriPlanes
+from ultragray_studies.methods.method import FitProgress, FitRun
+from ultragray_studies.methods.rapidvol import RapidVol, TriPlaneLearner, TriPlanes
 
 from .volumes import along_elevation, one_frame, psnr_of_fit, seen, steps_of
 

@@ -7,12 +7,11 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 
-from ultragray.datasets.sweep import Dataset
 from ultragray.errors import InvalidArgument
-from ultragray.evaluation.baselines import predict
-from ultragray.methods.budget import Budget
-from ultragray.methods.method import Method
-from ultragray.methods.registry import METHODS, chosen_methods
+from ultragray.learn.evaluation.baselines import predict
+from ultragray.learn.sweep import Dataset
+from ultragray_studies.methods.method import Budget, Method
+from ultragray_studies.methods.registry import METHODS, chosen_methods
 
 
 @pytest.mark.parametrize("method", METHODS.values(), ids=METHODS)

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 
 from ultragray import LinearProbe, Probe
-from ultragray.datasets.sweep import Dataset, Sweep
-from ultragray.methods.budget import Budget, Pace, Paces
-from ultragray.methods.learner import LearnedMethod
-from ultragray.methods.parts.space import pixel_points_mm
+from ultragray.learn.sweep import Dataset, Sweep
 from ultragray.probe import FloatArray
+from ultragray_studies.methods.learner import LearnedMethod
+from ultragray_studies.methods.method import Budget, Pace, Paces
+from ultragray_studies.methods.parts import pixel_points_mm
 
 PROBE = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=25.0)
 

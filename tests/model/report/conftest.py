@@ -9,7 +9,7 @@ import pytest
 
 from ultragray import LinearProbe
 from ultragray.datasets import Dataset, Sweep
-from ultragray.training import TrainingConfig
+from ultragray.learn.training import TrainingConfig
 
 FRAMES, HEIGHT, WIDTH = 12, 20, 16
 LARGEST_TILT_DEG = 10.0

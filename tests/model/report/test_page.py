@@ -11,20 +11,20 @@ import numpy as np
 import pytest
 
 from ultragray.datasets import Dataset
-from ultragray.evaluation.metrics import FrameMetrics
-from ultragray.evaluation.scoring import Evaluation
-from ultragray.methods.comparison.result import Comparison, MethodResult
-from ultragray.methods.comparison.run import SCENE, compare_methods
-from ultragray.methods.comparison.settings import ComparisonSettings
-from ultragray.methods.comparison.tables import metric_rows
-from ultragray.methods.gaussians import GivenScene, SceneMethod
-from ultragray.methods.method import Method
-from ultragray.report import page as page_module
-from ultragray.report.page import ReportContent, render_page
-from ultragray.report.study import Failed, ablation_methods, baselines, study_tilt, train_and_evaluate
-from ultragray.training import TrainingConfig
-from ultragray.training.config import VIEWS_BETWEEN
-from ultragray.training.data.geometry import Geometry
+from ultragray.learn.evaluation.methods import ComparisonSettings
+from ultragray.learn.evaluation.metrics import FrameMetrics
+from ultragray.learn.evaluation.scoring import Evaluation
+from ultragray.learn.training import TrainingConfig
+from ultragray.learn.training.config import VIEWS_BETWEEN
+from ultragray.learn.training.geometry import Geometry
+from ultragray_studies.comparison.result import Comparison, MethodResult
+from ultragray_studies.comparison.run import SCENE, compare_methods
+from ultragray_studies.comparison.tables import metric_rows
+from ultragray_studies.methods.gaussians import GivenScene, SceneMethod
+from ultragray_studies.methods.method import Method
+from ultragray_studies.report import page as page_module
+from ultragray_studies.report.page import ReportContent, render_page
+from ultragray_studies.report.study import Failed, ablation_methods, baselines, study_tilt, train_and_evaluate
 
 VOID = {"meta", "img", "link", "br"}
 

@@ -11,9 +11,12 @@ import pytest
 
 from ultragray.datasets import Dataset
 from ultragray.errors import DatasetInvalid, TrainingDiverged
-from ultragray.evaluation.scoring import evaluate
-from ultragray.report import study
-from ultragray.report.study import (
+from ultragray.learn.evaluation.scoring import evaluate
+from ultragray.learn.training import Progress, TrainingConfig, train
+from ultragray.learn.training.trainer import JOURNAL_FILE
+from ultragray.scene import GaussianScene
+from ultragray_studies.report import study
+from ultragray_studies.report.study import (
     Failed,
     ablations,
     attempt,
@@ -23,9 +26,6 @@ from ultragray.report.study import (
     train_and_evaluate,
     trained_of_journal,
 )
-from ultragray.scene import GaussianScene
-from ultragray.training import Progress, TrainingConfig, train
-from ultragray.training.trainer import JOURNAL_FILE
 
 
 def test_a_training_is_followed_and_measured(turning_dataset: Dataset, small_config: TrainingConfig) -> None:

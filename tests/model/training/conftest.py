@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from ultragray import ConvexProbe, LinearProbe, Probe
-from ultragray.datasets.sweep import Dataset, Sweep
-from ultragray.training import TrainingConfig
+from ultragray.learn.sweep import Dataset, Sweep
+from ultragray.learn.training import TrainingConfig
 
 LINEAR = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=25.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0)

@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from ultragray import ElevationBeam, GaussianScene, LinearProbe, SceneInfo, render
-from ultragray.datasets.sweep import Dataset, Sweep
 from ultragray.errors import InvalidArgument
-from ultragray.training import TrainingConfig, train
-from ultragray.training.steps.beam import TrainedBeam
+from ultragray.learn.sweep import Dataset, Sweep
+from ultragray.learn.training import TrainingConfig, train
+from ultragray.learn.training.beam import TrainedBeam
 
 PROBE = LinearProbe(width_mm=20.0, near_mm=1.0, far_mm=25.0)
 SIDE, POINTS = 48, 60

@@ -8,10 +8,10 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ultragray.datasets.sweep import Dataset
-from ultragray.evaluation.baselines import predict
-from ultragray.evaluation.scoring import render_sweep
-from ultragray.training import TrainingConfig, train
+from ultragray.learn.evaluation.baselines import predict
+from ultragray.learn.evaluation.scoring import render_sweep
+from ultragray.learn.sweep import Dataset
+from ultragray.learn.training import TrainingConfig, train
 
 Datasets = Callable[..., Dataset]
 Configs = Callable[..., TrainingConfig]

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from ultragray.errors import InvalidArgument
-from ultragray.training.board import Board
+from ultragray.learn.training.progress import Board
 
 
 def shown(folder: Path, name: str) -> list[tuple[int, float]]:

@@ -12,8 +12,8 @@ import torch
 from safetensors.torch import save_file
 
 from ultragray.errors import TrainingStateInvalid
-from ultragray.training import TrainingConfig
-from ultragray.training.checkpointing import (
+from ultragray.learn.training import TrainingConfig
+from ultragray.learn.training.checkpointing import (
     FORMAT_VERSION,
     METADATA_KEY,
     CheckpointHeader,

@@ -12,16 +12,16 @@ from typing import Any
 
 import pytest
 
-from ultragray.datasets.sweep import Dataset
 from ultragray.errors import InvalidArgument
-from ultragray.training.config import (
+from ultragray.learn.sweep import Dataset
+from ultragray.learn.training.config import (
     VIEWS_BETWEEN,
     TrainingConfig,
     parse_value,
     read_config_file,
     scaled_transmittance_rate,
 )
-from ultragray.training.data.geometry import Geometry
+from ultragray.learn.training.geometry import Geometry
 
 
 def test_presets() -> None:
@@ -89,9 +89,9 @@ def test_an_unknown_setting_is_refused_with_the_known_ones() -> None:
 @pytest.mark.slow
 def test_a_configuration_needs_no_torch() -> None:
     program = (
-        f"import sys; sys.path[:] = {sys.path!r}; from ultragray.training import TrainingConfig; "
+        f"import sys; sys.path[:] = {sys.path!r}; from ultragray.learn.training import TrainingConfig; "
         "TrainingConfig.preset('fast', steps=3); print('torch' in sys.modules); "
-        "from ultragray.training import train; print('torch' in sys.modules)"
+        "from ultragray.learn.training import train; print('torch' in sys.modules)"
     )
     told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     assert told.split() == ["False", "True"]

@@ -12,8 +12,8 @@ import pytest
 
 from ultragray import GaussianScene
 from ultragray.backends import cuda
-from ultragray.datasets.sweep import Dataset
-from ultragray.training import Progress, TrainingConfig, train
+from ultragray.learn.sweep import Dataset
+from ultragray.learn.training import Progress, TrainingConfig, train
 
 Datasets = Callable[..., Dataset]
 Configs = Callable[..., TrainingConfig]

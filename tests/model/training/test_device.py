@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from ultragray.errors import BackendUnavailable
-from ultragray.training.device import peak_memory_mb, training_device
+from ultragray.learn.training.memory import peak_memory_mb, training_device
 
 
 @pytest.fixture

@@ -8,14 +8,13 @@ from pathlib import Path
 
 import pytest
 
-from ultragray.datasets.sweep import Dataset
 from ultragray.errors import MemoryExceeded
-from ultragray.evaluation.metrics import FrameMetrics
-from ultragray.training import Progress, TrainingConfig, train
-from ultragray.training.checkpointing import read_checkpoint_header
-from ultragray.training.effort import EFFORTS_FILE, choose_effort
-from ultragray.training.run import FITTING
-from ultragray.training.trainer import CHECKPOINT_FILE
+from ultragray.learn.evaluation.metrics import FrameMetrics
+from ultragray.learn.sweep import Dataset
+from ultragray.learn.training import Progress, TrainingConfig, train
+from ultragray.learn.training.checkpointing import read_checkpoint_header
+from ultragray.learn.training.run import EFFORTS_FILE, FITTING, choose_effort
+from ultragray.learn.training.trainer import CHECKPOINT_FILE
 
 Datasets = Callable[..., Dataset]
 OPEN = TrainingConfig(effort=None, max_gaussians=60, batch_size=3)

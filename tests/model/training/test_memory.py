@@ -12,11 +12,11 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray.datasets.sweep import Dataset
 from ultragray.errors import MemoryExceeded
-from ultragray.training import TrainingConfig, memory, train
-from ultragray.training.data.geometry import Geometry
-from ultragray.training.poses import overlap
+from ultragray.learn.sweep import Dataset
+from ultragray.learn.training import TrainingConfig, memory, train
+from ultragray.learn.training import alignment as overlap
+from ultragray.learn.training.geometry import Geometry
 
 
 def test_names_what_to_lower(tiny_dataset: Callable[..., Dataset]) -> None:
@@ -164,7 +164,7 @@ import sys; sys.path[:0] = {path!r}
 import importlib.util, pathlib, re, torch
 spec = importlib.util.spec_from_file_location("tiny", {conftest!r})
 tiny = importlib.util.module_from_spec(spec); spec.loader.exec_module(tiny)
-from ultragray.training import memory, train
+from ultragray.learn.training import memory, train
 torch.set_num_threads(1)
 dataset = tiny.make_tiny_dataset(**{data!r})
 config = tiny.make_tiny_config(steps=3, refinements=1, **{settings!r})

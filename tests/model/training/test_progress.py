@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ultragray.training.progress import Journal, StepTimer
+from ultragray.learn.training.progress import Journal, StepTimer
 
 
 def steps_in(path: Path) -> list[int]:

@@ -21,7 +21,6 @@ from safetensors import safe_open
 from safetensors.torch import save_file
 
 from ultragray import GaussianScene, scene_info
-from ultragray.datasets.sweep import Dataset
 from ultragray.errors import (
     BackendUnavailable,
     DatasetInvalid,
@@ -30,9 +29,10 @@ from ultragray.errors import (
     TrainingDiverged,
     TrainingStateInvalid,
 )
-from ultragray.training import Progress, TrainingConfig, train, trainer
-from ultragray.training.data.geometry import Geometry
-from ultragray.training.run import scene_of_checkpoint
+from ultragray.learn.sweep import Dataset
+from ultragray.learn.training import Progress, TrainingConfig, train, trainer
+from ultragray.learn.training.geometry import Geometry
+from ultragray.learn.training.run import scene_of_checkpoint
 
 from ...waiting import Deadline
 
@@ -111,7 +111,7 @@ import sys; sys.path[:0] = {path!r}
 import importlib.util, pathlib, torch
 spec = importlib.util.spec_from_file_location("tiny", {conftest!r})
 tiny = importlib.util.module_from_spec(spec); spec.loader.exec_module(tiny)
-from ultragray.training import train
+from ultragray.learn.training import train
 torch.set_num_threads(1)
 train(tiny.make_tiny_dataset(), tiny.make_tiny_config(), folder=pathlib.Path({folder!r}), checkpoint_interval_s=0.0)
 """

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from ultragray.datasets import Dataset, Sweep
-from ultragray.datasets.phantom import PHANTOM_PROBE as PROBE
-from ultragray.datasets.phantom import freehand_poses, simulate
+from ultragray.phantom import PHANTOM_PROBE as PROBE
+from ultragray.phantom import freehand_poses, simulate
 from ultragray_service.bench import jobs as bench
 from ultragray_service.bench import report
 from ultragray_service.bench.jobs import JobsExtent

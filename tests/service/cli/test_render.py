@@ -21,8 +21,8 @@ from ultragray.confidence import FIGURES, Assessor, ConfidenceModel, figure_arra
 from ultragray.contract import to_dict
 from ultragray.datasets.plus import read_plus_sweep
 from ultragray.display.scan_conversion import scan_convert, scan_convert_labels
+from ultragray.exchange import rendering
 from ultragray.files.atomic import file_sha256
-from ultragray.interchange import rendering
 from ultragray.samplers import FanSampler
 from ultragray.settings import Contact
 from ultragray.tools import Needle, ToolFrame

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from ultragray import GaussianScene, LinearProbe
-from ultragray.batches import BatchPlan
+from ultragray.exchange.batches import BatchPlan
 from ultragray.files.atomic import file_sha256
 from ultragray.samplers import AroundSampler
 from ultragray.scene_info import read_header

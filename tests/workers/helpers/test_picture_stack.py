@@ -9,7 +9,7 @@ import pytest
 
 from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe
 from ultragray.datasets import Sweep
-from ultragray.evaluation.side_by_side import as_picture
+from ultragray.learn.evaluation.side_by_side import as_picture
 from ultragray_workers.helpers.picture_stack import PICTURE_SIDE, read_picture, write_stacks
 
 PROBES = {

@@ -12,10 +12,10 @@ from ultragray_workers.helpers.helper import write_progress
 from ultragray_workers.helpers.picture_stack import write_stacks
 
 if TYPE_CHECKING:
-    from ultragray.evaluation.scoring import Evaluation
+    from ultragray.learn.evaluation.scoring import Evaluation
 
 FRAMES_NAME = "frames.json"
-CLASSICAL = ("median", "linear", "nearest")  # of ultragray.evaluation.baselines.BASELINES
+CLASSICAL = ("median", "linear", "nearest")  # of ultragray.learn.evaluation.baselines.BASELINES
 PICTURES = ("truth", "rendering", *CLASSICAL, "difference")
 _COMPARED = ("psnr_db", "ms_ssim", "gms", "gmsd")
 
@@ -37,11 +37,10 @@ def compare(
     import torch
 
     from ultragray.confidence import Assessor
-    from ultragray.datasets.phantom import load_phantom
-    from ultragray.evaluation.baselines import predict
-    from ultragray.evaluation.compounding import affordable_voxel_mm
-    from ultragray.evaluation.scoring import check_same_origin, evaluate_frames, render_sweep, require_frames
-    from ultragray.evaluation.side_by_side import DIFFERENCE_GAIN
+    from ultragray.learn.evaluation.baselines import affordable_voxel_mm, predict
+    from ultragray.learn.evaluation.scoring import check_same_origin, evaluate_frames, render_sweep, require_frames
+    from ultragray.learn.evaluation.side_by_side import DIFFERENCE_GAIN
+    from ultragray.phantom import load_phantom
     from ultragray.scene import GaussianScene
 
     torch.set_num_threads(1)

@@ -27,10 +27,10 @@ def draw_preview(
     import numpy as np
     import torch
 
-    from ultragray.evaluation.scoring import render_sweep
+    from ultragray.learn.evaluation.scoring import render_sweep
+    from ultragray.learn.training.checkpointing import read_checkpoint
     from ultragray.scene import PARAMETERS, GaussianScene
     from ultragray.scene_info import SceneInfo
-    from ultragray.training.checkpointing import read_checkpoint
 
     torch.set_num_threads(1)
     header, tensors = read_checkpoint(Path(checkpoint))

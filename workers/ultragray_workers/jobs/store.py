@@ -17,8 +17,8 @@ import sqlalchemy as sa
 from dbos import EnqueueOptions, WorkflowSerializationFormat, WorkflowStatus
 from dbos import error as dbos_error
 
-from ultragray.batches import stands_for
 from ultragray.errors import InvalidArgument
+from ultragray.exchange.batches import stands_for
 from ultragray.image_size import MAX_IMAGE_SIDE
 from ultragray.registration.registration import Registration
 from ultragray_workers.claims import is_claimed

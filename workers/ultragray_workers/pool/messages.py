@@ -7,7 +7,7 @@ from typing import Generic
 
 from ultragray.confidence import Extrapolation
 from ultragray.errors import UltragrayError
-from ultragray.localization.settings import Localization, LocalizationSettings
+from ultragray.learn.localization.settings import Localization, LocalizationSettings
 from ultragray.probe import FloatArray
 from ultragray.settings import Resolved
 from ultragray.volumes.plane import SliceView

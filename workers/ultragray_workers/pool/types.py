@@ -9,7 +9,7 @@ from typing import Generic, Protocol
 from typing_extensions import TypeVar
 
 from ultragray.confidence import Extrapolation
-from ultragray.localization.settings import Localization, LocalizationSettings
+from ultragray.learn.localization.settings import Localization, LocalizationSettings
 from ultragray.probe import FloatArray
 from ultragray.settings import Resolved
 from ultragray.volumes.plane import SliceView

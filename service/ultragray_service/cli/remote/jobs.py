@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import numpy as np
 import typer
 
-from ultragray.batches import names_in
 from ultragray.contract import to_dict
+from ultragray.exchange.batches import names_in
 from ultragray.samplers import TrainingSampler
 from ultragray_service.cli.options import parameters_of, values_of, with_parameters
 from ultragray_service.cli.output import check_file, print_table

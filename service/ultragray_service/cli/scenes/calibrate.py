@@ -173,7 +173,7 @@ def _read_points(path: Path) -> Any:
 
 
 def _read_frames(paths: list[Path]) -> list[Any]:
-    from ultragray.localization.pixels import read_frame
+    from ultragray.learn.localization.pixels import read_frame
 
     read = [read_frame(path) for path in paths]
     return list(read[0]) if len(read) == 1 and read[0].ndim == 3 else read

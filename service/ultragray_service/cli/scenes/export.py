@@ -52,7 +52,7 @@ def export(
 
 
 def _write_ply(scene: GaussianScene, output: Path) -> dict[str, Any]:
-    from ultragray.interchange.ply import write_ply
+    from ultragray.exchange.ply import write_ply
 
     write_ply(scene, output)
     poses = len(scene.training_poses)
@@ -66,7 +66,7 @@ def _write_ply(scene: GaussianScene, output: Path) -> dict[str, Any]:
 
 
 def _write_checkpoint(scene: GaussianScene, output: Path, replace: bool) -> dict[str, Any]:
-    from ultragray.interchange.checkpoint_export import export_checkpoint
+    from ultragray.exchange.checkpoint import export_checkpoint
 
     written = export_checkpoint(scene, output, replace=replace)
     x, y, z = written.centre_mm

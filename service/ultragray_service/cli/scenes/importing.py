@@ -100,12 +100,12 @@ def import_scene(
     check_file(output, [SCENE_SUFFIX], force=force)
 
     if config is None:
-        from ultragray.interchange.ply import read_ply
+        from ultragray.exchange.ply import read_ply
 
         scene = read_ply(file)
         place = f"{len(scene.training_poses)} training poses"
     else:
-        from ultragray.interchange.checkpoint import import_checkpoint
+        from ultragray.exchange.checkpoint import import_checkpoint
 
         try:
             scene = import_checkpoint(

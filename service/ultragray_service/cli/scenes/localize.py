@@ -10,7 +10,7 @@ import typer
 
 from ultragray.errors import InvalidArgument
 from ultragray.files.poses import load_poses
-from ultragray.localization.pixels import read_frame
+from ultragray.learn.localization.pixels import read_frame
 from ultragray.scene_info import read_header
 from ultragray_service.cli.output import check_file
 from ultragray_service.cli.progress import working
@@ -85,7 +85,7 @@ def _write_pose(path: Path, found: Localization) -> None:
 
 
 def _in_words(found: Localization, output: Path | None) -> str:
-    from ultragray.localization.search import FOUND_SIMILARITY
+    from ultragray.learn.localization.search import FOUND_SIMILARITY
 
     if not found.is_found:
         return (

@@ -7,9 +7,9 @@ from typing import Annotated
 
 import typer
 
-from ultragray.batches import SHARD_FRAMES
 from ultragray.errors import InvalidArgument
-from ultragray.interchange.exports.formats import DTYPES, FORMATS, check_format, exporter_class, format_of
+from ultragray.exchange.batches import SHARD_FRAMES
+from ultragray.exchange.exports.formats import DTYPES, FORMATS, check_format, exporter_class, format_of
 from ultragray.samplers import Sampler
 from ultragray.settings import FrameSettings
 from ultragray_service.cli.options import poses_option, with_options

@@ -93,7 +93,7 @@ def render_frames(
     """
     import torch
 
-    from ultragray.interchange.rendering import render_to_file
+    from ultragray.exchange.rendering import render_to_file
     from ultragray.scene import GaussianScene
     from ultragray_workers.pool.process.placement import render_device
 

@@ -7,11 +7,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from ultragray.batches import MANIFEST_FILE, BatchPlan
 from ultragray.errors import InvalidArgument, InvalidProbe
+from ultragray.exchange.batches import MANIFEST_FILE, BatchPlan
+from ultragray.exchange.exports.formats import check_format
 from ultragray.files.atomic import file_sha256
 from ultragray.files.poses import load_poses
-from ultragray.interchange.exports.formats import check_format
 from ultragray.samplers import Sampler
 from ultragray.samplers.confident import require_drawn
 from ultragray.scene_info import read_header

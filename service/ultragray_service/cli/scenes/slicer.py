@@ -10,7 +10,7 @@ import numpy as np
 import typer
 
 from ultragray.errors import InvalidArgument
-from ultragray.interchange.slicer import SlicerScene
+from ultragray.exchange.slicer import SlicerScene
 from ultragray.scene_info import read_header
 from ultragray_service.cli.output import check_file
 from ultragray_service.cli.progress import working

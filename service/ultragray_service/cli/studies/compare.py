@@ -14,7 +14,7 @@ import typer
 
 from ultragray.datasets.source import SourceOptions
 from ultragray.errors import TrainingStateInvalid
-from ultragray.methods.comparison.settings import ComparisonSettings
+from ultragray.learn.evaluation.methods import ComparisonSettings
 from ultragray_service.cli.group import INTERRUPTED
 from ultragray_service.cli.options import with_options
 from ultragray_service.cli.output import check_file
@@ -25,8 +25,8 @@ from ultragray_service.cli.sweeps.source import SweepArgument, check_source, rea
 
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset
-    from ultragray.methods.comparison.result import Comparison
-    from ultragray.methods.comparison.run import ComparisonProgress
+    from ultragray_studies.comparison.result import Comparison
+    from ultragray_studies.comparison.run import ComparisonProgress
 
 PAGE_SUFFIX, BESIDE_IT = ".html", (".json", ".tex")
 
@@ -67,11 +67,11 @@ def compare(
     check_source(sweep)
     if output is not None:
         _check_output(output, force=force)
-        import ultragray.methods.comparison.files  # noqa: F401  # packages that it lacks are told before all the work
+        import ultragray_studies.comparison.page  # noqa: F401  # packages that it lacks are told before all the work
 
-    from ultragray.evaluation.scoring import require_frames
-    from ultragray.methods.registry import chosen_methods
-    from ultragray.training.device import training_device
+    from ultragray.learn.evaluation.scoring import require_frames
+    from ultragray.learn.training.memory import training_device
+    from ultragray_studies.methods.registry import chosen_methods
 
     training_device(device, "auto")  # refused before the sweep is read, which may take long
     if threads:
@@ -102,7 +102,7 @@ def _check_output(output: Path, *, force: bool) -> None:
 
     TrainingStateInvalid where the folder of the run is another thing's: --force would remove it.
     """
-    from ultragray.methods.comparison.place import RUN_FILE
+    from ultragray_studies.comparison.place import RUN_FILE
 
     run = run_folder(output)
     is_a_run = (run / RUN_FILE).is_file()
@@ -116,7 +116,7 @@ def _check_output(output: Path, *, force: bool) -> None:
 def _compare(
     dataset: Dataset, settings: ComparisonSettings, device: str, run: Path, output: Path | None, *, as_json: bool
 ) -> None:
-    from ultragray.methods.comparison.run import compare as compare_methods
+    from ultragray_studies.comparison.run import compare as compare_methods
 
     last: ComparisonProgress | None = None
     with stop_on_signal() as should_stop, _progress_bar() as show:
@@ -154,7 +154,7 @@ def _print(comparison: Comparison, written: list[Path]) -> None:
 def _write(comparison: Comparison, dataset: Dataset, run: Path, output: Path) -> list[Path]:
     """The page and what stands beside it, of the names that the output gives them."""
     from ultragray.files.atomic import write_whole
-    from ultragray.methods.comparison.files import write_comparison
+    from ultragray_studies.comparison.page import write_comparison
 
     written = []
     for made in write_comparison(comparison, dataset, run):

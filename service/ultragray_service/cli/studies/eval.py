@@ -18,8 +18,8 @@ from ultragray_service.cli.style import Backend, Force, Json, SceneFile, command
 from ultragray_service.cli.sweeps.source import SweepArgument, check_scene_fits, check_source, read_dataset
 
 if TYPE_CHECKING:
-    from ultragray.datasets.sweep import Sweep
-    from ultragray.evaluation.reliability import Reliability
+    from ultragray.learn.evaluation.scoring import Reliability
+    from ultragray.learn.sweep import Sweep
     from ultragray.scene import GaussianScene
 
 command_app = command_group()
@@ -68,9 +68,8 @@ def evaluate(
     read_header(scene)
     check_source(sweep)
 
-    from ultragray.evaluation.reliability import measure_reliability
-    from ultragray.evaluation.scoring import evaluate as evaluate_scene
-    from ultragray.evaluation.scoring import require_frames
+    from ultragray.learn.evaluation.scoring import evaluate as evaluate_scene
+    from ultragray.learn.evaluation.scoring import measure_reliability, require_frames
     from ultragray.scene import GaussianScene
     from ultragray_workers.pool.process.placement import render_device
 
@@ -95,9 +94,9 @@ def evaluate(
         for value in poses.values():
             typer.echo(str(value))
     if output is not None:
-        from ultragray.evaluation.side_by_side import write_side_by_side
         from ultragray.files.atomic import write_whole
-        from ultragray.report.plots import plot_reliability
+        from ultragray.learn.evaluation.side_by_side import write_side_by_side
+        from ultragray.learn.report.plots import plot_reliability
 
         with working(f"drawing {len(frames)} pictures …"):
             paths = write_side_by_side(loaded, frames, evaluation.frames, output, backend=backend)
@@ -112,8 +111,8 @@ def evaluate(
 
 def _pose_figures(scene: GaussianScene, registered: Sweep | None, backend: str) -> dict[str, Any]:
     """How far a scene's training poses were corrected, and the scores of registered frames, by their key in JSON."""
-    from ultragray.training.poses.held_out import score_halves
-    from ultragray.training.poses.sizes import CorrectionSizes
+    from ultragray.learn.report.sizes import CorrectionSizes
+    from ultragray.learn.training.poses import score_halves
 
     found: dict[str, Any] = {}
     if scene.pose_corrections is not None:

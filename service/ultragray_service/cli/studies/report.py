@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ultragray.datasets.source import SourceOptions
+from ultragray.learn.training.config import PRESET_MEANINGS, TrainingConfig
 from ultragray.scene_info import read_header
-from ultragray.training.config import PRESET_MEANINGS, TrainingConfig
 from ultragray_service.cli.options import FieldsOf, with_options
 from ultragray_service.cli.output import check_file
 from ultragray_service.cli.style import Force, Json, Threads, command_group, examples, output_option, tell
@@ -28,8 +28,8 @@ from ultragray_service.cli.sweeps.source import (
 
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset
-    from ultragray.methods.method import FitProgress
-    from ultragray.training import Progress
+    from ultragray.learn.training import Progress
+    from ultragray_studies.methods.method import FitProgress
 
 TILT = "growing tilt"
 VoxelMm = Annotated[
@@ -83,15 +83,15 @@ def report(
 ) -> None:
     """The page is one self-contained HTML file: a scene, the baselines and the paper's ablations, measured alike."""
     check_file(output, [".html"], force=force)
-    import ultragray.report.page  # noqa: F401  # where its packages are missing, that is told before all the work
+    import ultragray_studies.report.page  # noqa: F401  # where its packages are missing, that is told before all the work
 
     config = TrainingConfig.preset(preset, **settings)
     if scene is not None:
         read_header(scene)
     check_source(sweep)
 
-    from ultragray.evaluation.compounding import affordable_voxel_mm
-    from ultragray.evaluation.scoring import require_frames
+    from ultragray.learn.evaluation.baselines import affordable_voxel_mm
+    from ultragray.learn.evaluation.scoring import require_frames
 
     if threads:
         import torch
@@ -110,11 +110,12 @@ def report(
 def _write_report(dataset: Dataset, config: TrainingConfig, output: Path, options: ReportOptions) -> dict[str, str]:
     """The studies that could not be finished, and why; the page has the others."""
     from ultragray.files.atomic import write_whole
-    from ultragray.methods.comparison.run import SCENE, ComparisonProgress, compare_methods
-    from ultragray.methods.comparison.settings import ComparisonSettings
-    from ultragray.methods.gaussians import GivenScene
-    from ultragray.report.page import ReportContent, render_page
-    from ultragray.report.study import (
+    from ultragray.learn.evaluation.methods import ComparisonSettings
+    from ultragray.scene import GaussianScene
+    from ultragray_studies.comparison.run import SCENE, ComparisonProgress, compare_methods
+    from ultragray_studies.methods.gaussians import GivenScene
+    from ultragray_studies.report.page import ReportContent, render_page
+    from ultragray_studies.report.study import (
         Failed,
         ablation_methods,
         attempt,
@@ -123,7 +124,6 @@ def _write_report(dataset: Dataset, config: TrainingConfig, output: Path, option
         study_tilt,
         train_and_evaluate,
     )
-    from ultragray.scene import GaussianScene
 
     given = None if options.scene is None else GaussianScene.load(options.scene)
     if given is not None:

@@ -9,8 +9,8 @@ from typing import TYPE_CHECKING
 from ultragray_service.cli.output import wide_console
 
 if TYPE_CHECKING:
-    from ultragray.evaluation.scoring import Evaluation
-    from ultragray.methods.comparison.result import Comparison
+    from ultragray.learn.evaluation.scoring import Evaluation
+    from ultragray_studies.comparison.result import Comparison
 
 
 def print_metrics(title: str, evaluations: Mapping[str, Evaluation]) -> None:
@@ -42,8 +42,8 @@ def print_comparison(comparison: Comparison) -> None:
     from rich.markup import escape
     from rich.table import Table
 
-    from ultragray.methods.comparison.ranks import METRICS, rank, shown_value
-    from ultragray.methods.comparison.tables import budget_text, steps_text
+    from ultragray.learn.report.tables import METRICS, rank, shown_value
+    from ultragray_studies.comparison.tables import budget_text, steps_text
 
     table = Table(box=None, pad_edge=False)
     heads = ("", *(metric.label for metric in METRICS), "steps", "training, s", "frame, ms", "MB", "mean rank")

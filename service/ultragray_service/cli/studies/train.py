@@ -15,7 +15,7 @@ import typer
 
 from ultragray.datasets.source import SourceOptions
 from ultragray.errors import MemoryExceeded, TrainingDiverged, TrainingStateInvalid
-from ultragray.training.config import PRESET_MEANINGS, TrainingConfig, read_config_file
+from ultragray.learn.training.config import PRESET_MEANINGS, TrainingConfig, read_config_file
 from ultragray_service.cli.group import INTERRUPTED
 from ultragray_service.cli.options import FieldsOf, parse_settings, with_options
 from ultragray_service.cli.output import SCENE_SUFFIX, check_file
@@ -34,8 +34,8 @@ from ultragray_service.cli.style import (
 from ultragray_service.cli.sweeps.source import SweepArgument, check_source, read_dataset, warn_about_dataset
 
 if TYPE_CHECKING:
+    from ultragray.learn.training import Progress
     from ultragray.scene import GaussianScene
-    from ultragray.training import Progress
 
 RUN = "Run"
 MEASURING = "measuring what was reached"
@@ -132,7 +132,7 @@ def train(
     check_file(output, [SCENE_SUFFIX], force=force or resume)
     chosen = _config_of(run, given)
 
-    from ultragray.training.device import training_device
+    from ultragray.learn.training.memory import training_device
 
     training_device(device, backend)  # refused before the sweep is read, which may take long
     if threads:
@@ -163,7 +163,7 @@ def _check_no_run(run: RunOptions, *, force: bool) -> None:
     """Raise TrainingStateInvalid where the folder of the run holds one that was stopped, and is not to be replaced."""
     if not run.folder.is_dir() or force:
         return
-    from ultragray.training.trainer import CHECKPOINT_FILE
+    from ultragray.learn.training.trainer import CHECKPOINT_FILE
 
     if (run.folder / CHECKPOINT_FILE).exists():
         raise TrainingStateInvalid(
@@ -173,7 +173,7 @@ def _check_no_run(run: RunOptions, *, force: bool) -> None:
 
 def _forget_run(run: RunOptions) -> None:
     """Remove the checkpoint of a run that is begun anew."""
-    from ultragray.training.trainer import CHECKPOINT_FILE
+    from ultragray.learn.training.trainer import CHECKPOINT_FILE
 
     (run.folder / CHECKPOINT_FILE).unlink(missing_ok=True)
 
@@ -182,7 +182,7 @@ def _check_resumable(run: RunOptions) -> None:
     """Raise TrainingStateInvalid, with the reason, where the folder of the run holds no checkpoint."""
     if not run.folder.is_dir():
         raise TrainingStateInvalid(f"{run.folder}: no such folder, so there is no checkpoint to resume from")
-    from ultragray.training.trainer import CHECKPOINT_FILE, CONFIG_FILE, JOURNAL_FILE
+    from ultragray.learn.training.trainer import CHECKPOINT_FILE, CONFIG_FILE, JOURNAL_FILE
 
     if (run.folder / CHECKPOINT_FILE).exists():
         return
@@ -201,8 +201,8 @@ def _config_of(run: RunOptions, given: Mapping[str, Any]) -> TrainingConfig:
     values = dict(given)
     preset = values.pop("preset", None)
     if run.resume and preset is None:
-        from ultragray.training.checkpointing import read_checkpoint_header
-        from ultragray.training.trainer import CHECKPOINT_FILE
+        from ultragray.learn.training.checkpointing import read_checkpoint_header
+        from ultragray.learn.training.trainer import CHECKPOINT_FILE
 
         stored = read_checkpoint_header(run.folder / CHECKPOINT_FILE).config
         return TrainingConfig.from_dict({**stored.to_dict(), **values})
@@ -210,9 +210,9 @@ def _config_of(run: RunOptions, given: Mapping[str, Any]) -> TrainingConfig:
 
 
 def _train(dataset: Any, config: TrainingConfig, run: RunOptions, *, as_json: bool) -> None:
-    from ultragray.training import train as train_scene
-    from ultragray.training.run import scene_of_checkpoint
-    from ultragray.training.trainer import CHECKPOINT_FILE
+    from ultragray.learn.training import train as train_scene
+    from ultragray.learn.training.run import scene_of_checkpoint
+    from ultragray.learn.training.trainer import CHECKPOINT_FILE
 
     started = time.monotonic()
     last: Progress | None = None

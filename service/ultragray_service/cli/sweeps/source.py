@@ -44,7 +44,7 @@ def warn_about_dataset(dataset: Dataset) -> None:
 
 def check_scene_fits(info: SceneInfo, dataset: Dataset) -> None:
     """Say on stderr what makes figures of a scene on a dataset doubtful; raises as `check_same_origin`."""
-    from ultragray.evaluation.scoring import check_same_origin
+    from ultragray.learn.evaluation.scoring import check_same_origin
 
     for text in check_same_origin(info, dataset):
         warn(text)

@@ -12,7 +12,7 @@ import numpy as np
 from ultragray.contract import Contract, annotated_fields, described
 from ultragray.errors import InvalidArgument, InvalidImageSize, InvalidPose
 from ultragray.image_size import MAX_IMAGE_SIDE
-from ultragray.localization.settings import LocalizationSettings
+from ultragray.learn.localization.settings import LocalizationSettings
 from ultragray.probe import Probe
 from ultragray.registration.registration import Registration
 from ultragray.settings import FrameSettings, RenderSettings, registration_field

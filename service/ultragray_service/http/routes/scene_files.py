@@ -14,8 +14,8 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import FileResponse, Response
 
 from ultragray.contract import described
+from ultragray.learn.report.sizes import CorrectionSizes
 from ultragray.scene_info import SceneHeader
-from ultragray.training.poses.sizes import CorrectionSizes
 from ultragray_service.arrival import arrival
 from ultragray_service.core.helper_processes import PATIENCE_S
 from ultragray_service.core.scenes import Scene

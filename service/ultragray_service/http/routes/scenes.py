@@ -10,7 +10,7 @@ from fastapi import APIRouter, Query
 from starlette.requests import Request
 
 from ultragray.errors import InvalidArgument
-from ultragray.localization.settings import LocalizationSettings
+from ultragray.learn.localization.settings import LocalizationSettings
 from ultragray_service.core import scenes
 from ultragray_service.core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
 from ultragray_service.core.poses import check_pose_count, exact_poses

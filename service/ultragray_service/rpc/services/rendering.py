@@ -12,7 +12,7 @@ import grpc
 
 from ultragray.contract import under
 from ultragray.errors import FrameTooCostly, InvalidArgument, LowConfidence
-from ultragray.localization.settings import LocalizationSettings
+from ultragray.learn.localization.settings import LocalizationSettings
 from ultragray.probe import FloatArray, Probe
 from ultragray.volumes.plane import SliceSettings
 from ultragray_proto.codec import to_message

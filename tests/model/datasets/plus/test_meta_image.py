@@ -9,7 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ultragray.datasets.plus.meta_image import read_meta_image
+from ultragray.datasets.plus_files import read_meta_image
 from ultragray.errors import DatasetInvalid
 
 

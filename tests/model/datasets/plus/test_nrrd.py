@@ -8,7 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ultragray.datasets.plus.nrrd import read_nrrd
+from ultragray.datasets.plus_files import read_nrrd
 from ultragray.errors import DatasetInvalid
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ultragray.datasets.plus.orientation import orient_frames
+from ultragray.datasets.plus_files import orient_frames
 from ultragray.errors import DatasetInvalid
 
 MF = np.arange(12, dtype=np.uint8).reshape(1, 3, 4)  # rows: depth, columns: towards the marked side

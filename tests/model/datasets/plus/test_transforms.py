@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ultragray.datasets.plus.transforms import find_path, parse_matrix, read_device_set, transform_name
+from ultragray.datasets.fan import find_path, parse_matrix, read_device_set, transform_name
 from ultragray.errors import DatasetInvalid
 
 

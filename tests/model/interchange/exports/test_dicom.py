@@ -19,7 +19,7 @@ from ultragray.confidence import Extrapolation
 from ultragray.display.frames import show
 from ultragray.display.scan_conversion import scan_convert
 from ultragray.errors import InvalidArgument
-from ultragray.interchange.exports import FORMATS, ExportHeader, export_to
+from ultragray.exchange.exports import FORMATS, ExportHeader, export_to
 from ultragray.settings import Resolved
 
 LINEAR = LinearProbe(width_mm=38.0, near_mm=2.0, far_mm=52.0)

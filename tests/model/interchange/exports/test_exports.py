@@ -24,10 +24,10 @@ from ultragray import LinearProbe
 from ultragray.confidence import FIGURES, Extrapolation, figure_arrays
 from ultragray.contract import to_dict
 from ultragray.errors import ExtraMissing, InvalidArgument
+from ultragray.exchange.exports import FORMATS, ExportHeader, check_format, export_to
+from ultragray.exchange.exports.exporter import stored_pixels
+from ultragray.exchange.exports.npz import NpzExporter
 from ultragray.installation import install_advice
-from ultragray.interchange.exports import FORMATS, ExportHeader, check_format, export_to
-from ultragray.interchange.exports.exporter import stored_pixels
-from ultragray.interchange.exports.npz import NpzExporter
 from ultragray.settings import Contact, Resolved
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
@@ -308,7 +308,7 @@ def test_a_full_disk_is_told_as_such(tmp_path: Path, format: str) -> None:
         "import numpy as np\n"
         "from ultragray import LinearProbe\n"
         "from ultragray.confidence import Extrapolation\n"
-        "from ultragray.interchange.exports import FORMATS, ExportHeader, export_to, exporter_class\n"
+        "from ultragray.exchange.exports import FORMATS, ExportHeader, export_to, exporter_class\n"
         f"path, format = {str(tmp_path / 'frames')!r}, {format!r}\n"
         "from ultragray.settings import Resolved\n"
         "poses, settings = np.tile(np.eye(4), (40, 1, 1)), Resolved(LinearProbe(40.0, 0.0, 50.0), 300, 300)\n"
@@ -372,7 +372,7 @@ def test_a_missing_package_is_named_with_its_extra(tmp_path: Path, format: str, 
     program = (
         f"import sys; sys.path[:] = {sys.path!r}; sys.modules[{package!r}] = None\n"
         "from ultragray.errors import ExtraMissing\n"
-        "from ultragray.interchange.exports import exporter_class\n"
+        "from ultragray.exchange.exports import exporter_class\n"
         f"try: exporter_class({format!r})\n"
         "except ExtraMissing as error: print(error)\n"
         "print('torch' in sys.modules)"

@@ -14,8 +14,8 @@ from mcap_ros2.decoder import DecoderFactory
 from ultragray import LinearProbe
 from ultragray.confidence import FIGURES, Extrapolation
 from ultragray.contract import to_dict
+from ultragray.exchange.exports import ExportHeader, export_to
 from ultragray.files.poses import load_poses
-from ultragray.interchange.exports import ExportHeader, export_to
 from ultragray.probe import FloatArray
 from ultragray.settings import Resolved
 

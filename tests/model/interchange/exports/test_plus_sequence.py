@@ -11,14 +11,14 @@ import torch
 
 from ultragray import ConvexProbe, LinearProbe, PhasedProbe
 from ultragray.confidence import Extrapolation
+from ultragray.datasets.fan import parse_matrix
 from ultragray.datasets.plus import read_plus_sweep
-from ultragray.datasets.plus.meta_image import read_meta_image
-from ultragray.datasets.plus.transforms import parse_matrix
+from ultragray.datasets.plus_files import read_meta_image
 from ultragray.display import Display
 from ultragray.display.frames import show
 from ultragray.display.scan_conversion import scan_convert
 from ultragray.errors import DatasetInvalid
-from ultragray.interchange.exports import FORMATS, ExportHeader, export_to
+from ultragray.exchange.exports import FORMATS, ExportHeader, export_to
 from ultragray.pose import pose_from_position_quaternion
 from ultragray.probe import Probe
 from ultragray.settings import Resolved

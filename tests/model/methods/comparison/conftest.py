@@ -13,13 +13,12 @@ from torch import Tensor
 from ultragray import LinearProbe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.errors import MemoryExceeded
-from ultragray.methods.budget import Budget, Pace, Paces
-from ultragray.methods.classical import Compounding, FromFrames
-from ultragray.methods.comparison.run import EQUAL_TIME
-from ultragray.methods.gaussians import SceneMethod
-from ultragray.methods.learner import Learned, LearnedMethod, Learner
-from ultragray.methods.method import Description, FitRun, Fitted, Method
 from ultragray.probe import FloatArray, Probe
+from ultragray_studies.comparison.run import EQUAL_TIME
+from ultragray_studies.methods.classical import Compounding, FromFrames
+from ultragray_studies.methods.gaussians import SceneMethod
+from ultragray_studies.methods.learner import Learned, LearnedMethod, Learner
+from ultragray_studies.methods.method import Budget, Description, FitRun, Fitted, Method, Pace, Paces
 
 FRAMES, SIDE = 12, 16
 

@@ -10,16 +10,15 @@ from pathlib import Path
 import numpy as np
 
 from ultragray.datasets import Dataset
-from ultragray.evaluation.metrics import FrameMetrics
-from ultragray.evaluation.scoring import Evaluation
-from ultragray.methods.budget import Paces
-from ultragray.methods.comparison.files import write_comparison
-from ultragray.methods.comparison.pictures import telling_places
-from ultragray.methods.comparison.plots import DISTANCE_BINS, binned_medians
-from ultragray.methods.comparison.result import Comparison
-from ultragray.methods.comparison.run import compare_methods
-from ultragray.methods.comparison.settings import ComparisonSettings
-from ultragray.methods.method import Method
+from ultragray.learn.evaluation.methods import ComparisonSettings
+from ultragray.learn.evaluation.metrics import FrameMetrics
+from ultragray.learn.evaluation.scoring import Evaluation
+from ultragray.learn.report.pictures import telling_places
+from ultragray.learn.report.plots import DISTANCE_BINS, binned_medians
+from ultragray_studies.comparison.page import write_comparison
+from ultragray_studies.comparison.result import Comparison
+from ultragray_studies.comparison.run import compare_methods
+from ultragray_studies.methods.method import Method, Paces
 
 VOID = {"meta", "img", "link", "br"}
 

@@ -5,13 +5,12 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ultragray.evaluation.metrics import FrameMetrics
-from ultragray.evaluation.scoring import Evaluation
-from ultragray.methods.comparison.latex import escaped, latex_table
-from ultragray.methods.comparison.ranks import by_mean_rank, rank
-from ultragray.methods.comparison.result import Comparison, DatasetFacts, Distances, MethodResult
-from ultragray.methods.comparison.tables import duration_text, rank_rows, steps_text
-from ultragray.methods.method import Description
+from ultragray.learn.evaluation.metrics import FrameMetrics
+from ultragray.learn.evaluation.scoring import Evaluation
+from ultragray.learn.report.tables import by_mean_rank, rank
+from ultragray_studies.comparison.result import Comparison, DatasetFacts, Distances, MethodResult
+from ultragray_studies.comparison.tables import duration_text, escaped, latex_table, rank_rows, steps_text
+from ultragray_studies.methods.method import Description
 
 
 def scores(psnr_db: float, ms_ssim: float, gms: float, gmsd: float) -> Evaluation:

@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 
 from ultragray.datasets import Dataset
-from ultragray.methods.budget import Paces
-from ultragray.methods.comparison.result import FORMAT_VERSION, Comparison, Distances
-from ultragray.methods.comparison.run import compare_methods
-from ultragray.methods.comparison.settings import ComparisonSettings
-from ultragray.methods.method import Method
+from ultragray.learn.evaluation.methods import ComparisonSettings
+from ultragray_studies.comparison.result import FORMAT_VERSION, Comparison, Distances
+from ultragray_studies.comparison.run import compare_methods
+from ultragray_studies.methods.method import Method, Paces
 
 
 def test_a_comparison_is_the_same_after_json(

@@ -12,20 +12,13 @@ import pytest
 
 from ultragray.datasets import Dataset
 from ultragray.errors import DatasetInvalid, InvalidArgument, TrainingStateInvalid
-from ultragray.evaluation.scoring import evaluate_frames
-from ultragray.methods.budget import Pace, Paces
-from ultragray.methods.classical import FromFrames
-from ultragray.methods.comparison.place import frames_of
-from ultragray.methods.comparison.result import Comparison
-from ultragray.methods.comparison.run import (
-    EQUAL_TIME,
-    ComparisonProgress,
-    compare,
-    compare_methods,
-    default_paces,
-)
-from ultragray.methods.comparison.settings import ComparisonSettings
-from ultragray.methods.method import Method
+from ultragray.learn.evaluation.methods import ComparisonSettings
+from ultragray.learn.evaluation.scoring import evaluate_frames
+from ultragray_studies.comparison.place import frames_of
+from ultragray_studies.comparison.result import Comparison
+from ultragray_studies.comparison.run import EQUAL_TIME, ComparisonProgress, compare, compare_methods, default_paces
+from ultragray_studies.methods.classical import FromFrames
+from ultragray_studies.methods.method import Method, Pace, Paces
 
 from .conftest import LevelMethod
 
@@ -154,8 +147,8 @@ def test_methods_may_be_added_to_a_comparison_later(
 def test_the_scene_is_fitted_where_the_equal_time_is_not_known_and_only_there(
     dataset: Dataset, level: LevelMethod, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    from ultragray.methods.comparison import run
-    from ultragray.methods.gaussians import SceneMethod
+    from ultragray_studies.comparison import run
+    from ultragray_studies.methods.gaussians import SceneMethod
 
     tiny = SceneMethod(settings={"steps": 3, "max_gaussians": 30, "batch_size": 2})
     monkeypatch.setattr(run, "SceneMethod", lambda: tiny)
@@ -178,7 +171,7 @@ def test_the_scene_is_fitted_where_the_equal_time_is_not_known_and_only_there(
 
 def test_where_the_scene_fails_there_is_no_equal_time(dataset: Dataset, level: LevelMethod, tmp_path: Path) -> None:
     from ultragray.errors import TrainingDiverged
-    from ultragray.methods.gaussians import SceneMethod
+    from ultragray_studies.methods.gaussians import SceneMethod
 
     class Diverging(SceneMethod):
         def fit(self, *arguments: Any, **options: Any) -> Any:

@@ -7,7 +7,7 @@ import math
 import pytest
 import torch
 
-from ultragray.methods.implicitvol.field import SineField, SineLayer
+from ultragray_studies.methods.implicitvol import SineField, SineLayer
 
 
 def new_field(seed: int = 0) -> SineField:

@@ -8,11 +8,16 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray.methods.implicitvol.learner import FieldLearner, RefiningLearner, published_epoch
-from ultragray.methods.implicitvol.method import ImplicitVol, RefinedImplicitVol
-from ultragray.methods.learner import LearnedMethod
-from ultragray.methods.method import FitProgress, FitRun
-from ultragray.methods.parts.space import pixel_points_mm
+from ultragray_studies.methods.implicitvol import (
+    FieldLearner,
+    ImplicitVol,
+    RefinedImplicitVol,
+    RefiningLearner,
+    published_epoch,
+)
+from ultragray_studies.methods.learner import LearnedMethod
+from ultragray_studies.methods.method import FitProgress, FitRun
+from ultragray_studies.methods.parts import pixel_points_mm
 
 from ..volumes import PROBE, along_elevation, one_frame, psnr_of_fit, seen, steps_of
 

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray.evaluation.compounding import mean_axes
-from ultragray.methods.implicitvol.poses import FramePoses, angles_of, rotation_of
-from ultragray.methods.parts.space import pixel_points_mm
+from ultragray.learn.evaluation.baselines import mean_axes
+from ultragray_studies.methods.implicitvol import FramePoses, angles_of, rotation_of
+from ultragray_studies.methods.parts import pixel_points_mm
 
 from ..volumes import PROBE, along_elevation, seen
 

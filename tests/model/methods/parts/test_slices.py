@@ -7,11 +7,10 @@ import pytest
 import torch
 
 from ultragray import ConvexProbe, Probe
-from ultragray.methods.budget import Budget
-from ultragray.methods.learner import LearnedMethod
-from ultragray.methods.parts.slices import SIMILARITY, SliceLearner, frame_of_step
-from ultragray.methods.parts.space import pixel_points_mm
-from ultragray.methods.registry import METHODS
+from ultragray_studies.methods.learner import LearnedMethod
+from ultragray_studies.methods.method import Budget
+from ultragray_studies.methods.parts import SIMILARITY, SliceLearner, frame_of_step, pixel_points_mm
+from ultragray_studies.methods.registry import METHODS
 
 from ..volumes import PROBE, along_elevation, seen
 

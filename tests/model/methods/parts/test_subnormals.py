@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 import torch
 
-from ultragray.methods.parts.subnormals import without_subnormals
+from ultragray_studies.methods.learner import without_subnormals
 
 LARGE = 4_000_000  # values: torch takes all its threads
 

@@ -9,14 +9,11 @@ import pytest
 import torch
 
 from ultragray import ConvexProbe, LinearProbe, Probe
-from ultragray.datasets.sweep import Dataset, Sweep
 from ultragray.errors import DatasetInvalid
-from ultragray.methods.budget import Budget, Pace, Paces
-from ultragray.methods.method import FitProgress, FitRun
-from ultragray.methods.registry import METHODS
-from ultragray.methods.ultragauss.learner import UltraGaussLearner
-from ultragray.methods.ultragauss.method import UltraGauss
-from ultragray.methods.ultragauss.start import even_start
+from ultragray.learn.sweep import Dataset, Sweep
+from ultragray_studies.methods.method import Budget, FitProgress, FitRun, Pace, Paces
+from ultragray_studies.methods.registry import METHODS
+from ultragray_studies.methods.ultragauss import UltraGauss, UltraGaussLearner, even_start
 
 LINEAR = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=25.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0)
@@ -71,8 +68,8 @@ def test_a_killed_fit_ends_in_the_model_of_an_undisturbed_one(
     variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Killed between two resamplings, each of which finds Gaussians to replace."""
-    monkeypatch.setattr("ultragray.methods.ultragauss.resampling.LEAST_WEIGHT", 0.6)
-    monkeypatch.setattr("ultragray.training.data.geometry.MIN_GAUSSIANS", 300)
+    monkeypatch.setattr("ultragray_studies.methods.ultragauss.LEAST_WEIGHT", 0.6)
+    monkeypatch.setattr("ultragray.learn.training.geometry.MIN_GAUSSIANS", 300)
     dataset, method = ball(4, 20, 16, CONVEX), METHODS[variant]
     budget, seen = budget_of(420, variant), []
 

@@ -10,8 +10,7 @@ import torch
 from ultragray import LinearProbe
 from ultragray.backends import cpu
 from ultragray.backends.weighted import WeightedSums, weighted_sums
-from ultragray.methods.ultragauss.field import Field
-from ultragray.methods.ultragauss.renderer import average, shadow
+from ultragray_studies.methods.ultragauss import Field, average, shadow
 
 # One pixel, whose middle lies at the depth of 1 cm on the axis of the probe.
 PROBE = LinearProbe(width_mm=2.0, near_mm=9.0, far_mm=11.0)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from ultragray.methods.ultragauss.resampling import follow, is_due, resample
+from ultragray_studies.methods.ultragauss import follow, is_due, resample
 
 
 def gaussians(count: int) -> dict[str, torch.Tensor]:

@@ -11,10 +11,10 @@ import pytest
 import torch
 
 from ultragray import ConvexProbe, LinearProbe, Probe
-from ultragray.datasets.sweep import Dataset, Sweep
-from ultragray.methods.parts.space import Box
-from ultragray.methods.ultragauss.start import even_start, wide_start
-from ultragray.training.steps.refinement import rotate
+from ultragray.learn.sweep import Dataset, Sweep
+from ultragray.learn.training.optimizer import rotate
+from ultragray_studies.methods.parts import Box
+from ultragray_studies.methods.ultragauss import even_start, wide_start
 
 LINEAR = LinearProbe(width_mm=20.0, near_mm=5.0, far_mm=25.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0)

@@ -7,12 +7,12 @@ import math
 import pytest
 import torch
 
-from ultragray.methods.parts.encoding import encode
-from ultragray.methods.ultranerf.field import Field
+from ultragray_studies.methods.parts import encode
+from ultragray_studies.methods.ultranerf import TissueField
 
 
-def field(seed: int = 0) -> Field:
-    return Field(torch.Generator().manual_seed(seed))
+def field(seed: int = 0) -> TissueField:
+    return TissueField(torch.Generator().manual_seed(seed))
 
 
 def test_a_point_becomes_itself_and_ten_octaves_of_sines_and_cosines() -> None:

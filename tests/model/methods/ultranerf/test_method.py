@@ -12,14 +12,13 @@ import torch
 
 from ultragray import ConvexProbe, LinearProbe
 from ultragray.datasets.source import load_dataset
-from ultragray.datasets.sweep import Dataset, Sweep
 from ultragray.errors import DatasetInvalid
-from ultragray.methods.budget import Budget, Pace, Paces
-from ultragray.methods.method import FitProgress, FitRun
-from ultragray.methods.registry import METHODS
-from ultragray.methods.ultranerf import method as ultranerf
-from ultragray.methods.ultranerf.method import VARIANTS, Coordinates, UltraNerf, UltraNerfLearner
+from ultragray.learn.sweep import Dataset, Sweep
 from ultragray.probe import Probe
+from ultragray_studies.methods import ultranerf
+from ultragray_studies.methods.method import Budget, FitProgress, FitRun, Pace, Paces
+from ultragray_studies.methods.registry import METHODS
+from ultragray_studies.methods.ultranerf import VARIANTS, Coordinates, UltraNerf, UltraNerfLearner
 
 SIDE = 24
 LINEAR = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=20.0)

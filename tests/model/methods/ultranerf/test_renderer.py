@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ultragray.methods.ultranerf.renderer import Tissue, drawn_frame, expected_frame, point_spread, transmission
+from ultragray_studies.methods.ultranerf import Tissue, drawn_frame, expected_frame, point_spread, transmission
 
 SPACING = 0.5
 

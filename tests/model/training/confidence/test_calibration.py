@@ -11,14 +11,14 @@ import pytest
 from ultragray import GaussianScene
 from ultragray.confidence import Assessor, ConfidenceModel
 from ultragray.confidence.uncertainty import TERMS
-from ultragray.datasets.phantom import PHANTOM_PROBE, freehand_poses, simulate
-from ultragray.datasets.sweep import Dataset, Sweep
 from ultragray.errors import TrainingDiverged
-from ultragray.evaluation.scoring import evaluate, render_sweep
+from ultragray.learn.evaluation.scoring import evaluate, render_sweep
+from ultragray.learn.sweep import Dataset, Sweep
+from ultragray.learn.training import Progress, TrainingConfig, run, train
+from ultragray.learn.training.confidence import fit_confidence, shorter
+from ultragray.learn.training.geometry import Geometry
+from ultragray.phantom import PHANTOM_PROBE, freehand_poses, simulate
 from ultragray.probe import FloatArray
-from ultragray.training import Progress, TrainingConfig, run, train
-from ultragray.training.confidence.calibration import fit_confidence, shorter
-from ultragray.training.data.geometry import Geometry
 
 Datasets = Callable[..., Dataset]
 Configs = Callable[..., TrainingConfig]

@@ -7,7 +7,7 @@ import pytest
 
 from ultragray.confidence.model import predicted
 from ultragray.confidence.views import ViewMeasures
-from ultragray.training.confidence.fitting import GAIN_QUANTILE, PRIOR_WEIGHTS, Examples, fit_support, fit_weights
+from ultragray.learn.training.confidence import GAIN_QUANTILE, PRIOR_WEIGHTS, Examples, fit_support, fit_weights
 
 
 def test_support_is_fitted_so_that_most_frames_keep_to_it() -> None:

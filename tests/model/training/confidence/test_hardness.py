@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from ultragray import LinearProbe
-from ultragray.datasets.sweep import Sweep
-from ultragray.training.confidence.hardness import hardness_of_views
+from ultragray.learn.sweep import Sweep
+from ultragray.learn.training.confidence import hardness_of_views
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=40.0)
 

@@ -7,8 +7,8 @@ import pytest
 
 from ultragray import LinearProbe
 from ultragray.confidence.model import DISTANCE_MM
-from ultragray.datasets.sweep import Sweep
-from ultragray.training.confidence.one_sided import BEYOND_MM, one_sided_examples
+from ultragray.learn.sweep import Sweep
+from ultragray.learn.training.confidence import BEYOND_MM, one_sided_examples
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=40.0)
 STEP_MM = 1.0

@@ -11,7 +11,7 @@ from ultragray import GaussianScene, LinearProbe, render
 from ultragray.confidence.uncertainty import DEPTHS, TERMS
 from ultragray.confidence.views import TrainingViews
 from ultragray.datasets import Sweep
-from ultragray.training.confidence.residuals import fit_uncertainty, likeliest_variances
+from ultragray.learn.training.confidence import fit_uncertainty, likeliest_variances
 
 PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 

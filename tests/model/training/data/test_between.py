@@ -9,11 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray.datasets.sweep import Dataset, Sweep
+from ultragray.learn.sweep import Dataset, Sweep
+from ultragray.learn.training.between import Places, ViewsBetween, draw_places, features_follow_probe, neighbours_of
+from ultragray.learn.training.losses import image_loss
 from ultragray.pose import rotation_angles_deg
-from ultragray.training.data.between import Places, ViewsBetween, draw_places, features_follow_probe
-from ultragray.training.data.neighbours import neighbours_of
-from ultragray.training.steps.losses import image_loss
 
 PIXELS_A_MM = 2.0
 

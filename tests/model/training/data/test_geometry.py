@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 from ultragray import LinearProbe
-from ultragray.datasets.sweep import Dataset
-from ultragray.training.data.geometry import Geometry, frame_spacing_mm
+from ultragray.learn.sweep import Dataset
+from ultragray.learn.training.geometry import Geometry, frame_spacing_mm
 
 
 def test_lengths_of_a_straight_sweep(tiny_dataset: Callable[..., Dataset]) -> None:

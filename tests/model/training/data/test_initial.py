@@ -12,13 +12,12 @@ import torch
 
 from ultragray import GaussianScene, Probe, SceneInfo
 from ultragray.backends import reference
-from ultragray.datasets.sweep import Dataset
-from ultragray.training import TrainingConfig
-from ultragray.training.data.geometry import Geometry
-from ultragray.training.data.initial import Start, initial_parameters
-from ultragray.training.data.neighbours import neighbours_of
-from ultragray.training.data.shadows import Shadows
-from ultragray.training.steps.refinement import rotate
+from ultragray.learn.sweep import Dataset
+from ultragray.learn.training import TrainingConfig
+from ultragray.learn.training.between import neighbours_of
+from ultragray.learn.training.geometry import Geometry, Shadows
+from ultragray.learn.training.initial import Start, initial_parameters
+from ultragray.learn.training.optimizer import rotate
 
 
 def whole_start_of(dataset: Dataset, config: TrainingConfig) -> Start:

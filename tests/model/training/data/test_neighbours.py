@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ultragray.datasets.sweep import Dataset, Sweep
-from ultragray.training.data.neighbours import neighbours_of
+from ultragray.learn.sweep import Dataset, Sweep
+from ultragray.learn.training.between import neighbours_of
 
 
 def moved(sweep: Sweep, y_mm: list[float], *, x_mm: list[float] | None = None) -> Sweep:

@@ -10,14 +10,14 @@ import pytest
 import torch
 
 from ultragray import LinearProbe
-from ultragray.datasets.sweep import Dataset, Sweep
-from ultragray.probe import FloatArray
-from ultragray.training.data.sampling import (
+from ultragray.learn.sweep import Dataset, Sweep
+from ultragray.learn.training.geometry import (
     BatchSampler,
     out_of_plane_range_mm,
     out_of_plane_shift_mm,
     shift_out_of_plane,
 )
+from ultragray.probe import FloatArray
 
 
 def test_every_frame_is_seen_equally_often() -> None:

@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from ultragray.datasets.sweep import ByteArray, Dataset, Sweep
-from ultragray.training.data.shadows import Shadows
+from ultragray.learn.sweep import ByteArray, Dataset, Sweep
+from ultragray.learn.training.geometry import Shadows
 
 HEIGHT, WIDTH = 100, 60
 

@@ -12,16 +12,14 @@ import pytest
 import torch
 
 from ultragray import GaussianScene, LinearProbe
-from ultragray.datasets.sweep import Dataset, Sweep
-from ultragray.samplers.rotations import rotations_of
-from ultragray.training import Progress, TrainingConfig, train
-from ultragray.training.poses import overlap, trained
-from ultragray.training.poses.held_out import score_halves
-from ultragray.training.poses.overlap import register_sweeps
-from ultragray.training.poses.path import sweep_ranges, tracker_noise, without_noise
-from ultragray.training.poses.refinement import PoseRefinement
-from ultragray.training.poses.sizes import CorrectionSizes
-from ultragray.training.poses.trained import SweepCorrections
+from ultragray.geometry.rotations import rotations_of
+from ultragray.learn.report.sizes import CorrectionSizes
+from ultragray.learn.sweep import Dataset, Sweep
+from ultragray.learn.training import Progress, TrainingConfig, train
+from ultragray.learn.training import alignment as overlap
+from ultragray.learn.training import poses as trained
+from ultragray.learn.training.alignment import register_sweeps, sweep_ranges, tracker_noise, without_noise
+from ultragray.learn.training.poses import PoseRefinement, SweepCorrections, score_halves
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 Datasets = Callable[..., Dataset]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ultragray.training.poses.second_differences import likelihood_terms, smoothed
+from ultragray.learn.training.alignment import likelihood_terms, smoothed
 
 RATIOS = np.array([1e-6, 1e-2, 1.0, 1e6])
 

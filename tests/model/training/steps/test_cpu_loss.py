@@ -6,8 +6,7 @@ import pytest
 import torch
 
 from ultragray.backends import cpu
-from ultragray.training.steps.cpu_loss import image_loss
-from ultragray.training.steps.losses import plain_image_loss
+from ultragray.learn.training.losses import kernel_image_loss, plain_image_loss
 
 
 @pytest.mark.parametrize("shape", [(3, 40, 53), (1, 11, 11), (2, 64, 16), (1, 12, 300)])
@@ -21,7 +20,7 @@ def test_value_and_gradient(shape: tuple[int, ...], instruction_set: str, textur
     expected = plain_image_loss(exact, truth.double(), texture)
     expected.backward()
     rendered.requires_grad_()
-    loss = image_loss(rendered, truth, texture, instruction_set=instruction_set)
+    loss = kernel_image_loss(rendered, truth, texture, instruction_set=instruction_set)
     (3.0 * loss).backward()
     assert loss.item() == pytest.approx(expected.item(), abs=1e-6)
     assert rendered.grad is not None
@@ -33,16 +32,16 @@ def test_value_and_gradient(shape: tuple[int, ...], instruction_set: str, textur
 
 def test_equal_images_cost_nothing() -> None:
     image = torch.rand(2, 20, 20)
-    assert image_loss(image, image, 0.5).item() == pytest.approx(0.0, abs=1e-6)
+    assert kernel_image_loss(image, image, 0.5).item() == pytest.approx(0.0, abs=1e-6)
 
 
 def test_a_batch_is_the_mean_of_its_images() -> None:
     rendered, truth = torch.rand(4, 30, 30), torch.rand(4, 30, 30)
-    alone = torch.stack([image_loss(rendered[i : i + 1], truth[i : i + 1], 0.5) for i in range(4)])
-    assert image_loss(rendered, truth, 0.5).item() == pytest.approx(alone.mean().item(), rel=1e-6)
+    alone = torch.stack([kernel_image_loss(rendered[i : i + 1], truth[i : i + 1], 0.5) for i in range(4)])
+    assert kernel_image_loss(rendered, truth, 0.5).item() == pytest.approx(alone.mean().item(), rel=1e-6)
 
 
 @pytest.mark.parametrize("shape", [(1, 10, 20), (1, 20, 10), (0, 20, 20)])
 def test_images_smaller_than_the_window_are_refused(shape: tuple[int, ...]) -> None:
     with pytest.raises(ValueError, match="11x11"):
-        image_loss(torch.rand(shape), torch.rand(shape), 0.5)
+        kernel_image_loss(torch.rand(shape), torch.rand(shape), 0.5)

@@ -7,8 +7,8 @@ import torch
 
 from ultragray import GaussianScene, SceneInfo
 from ultragray.backends import reference
+from ultragray.learn.training.intensity import project_sh0, sh0_of_intensity
 from ultragray.scene_info import expected_shapes
-from ultragray.training.steps.intensity import project_sh0, sh0_of_intensity
 
 
 def intensity_of(sh0: torch.Tensor, name: str) -> torch.Tensor:

@@ -6,7 +6,7 @@ import pytest
 import torch
 from pytorch_msssim import ssim as other_ssim
 
-from ultragray.training.steps.losses import image_loss, plain_image_loss, ssim
+from ultragray.learn.training.losses import image_loss, plain_image_loss, ssim
 
 
 def test_ssim_agrees_with_another_implementation() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from ultragray.training.steps.optimizer import Optimizer
+from ultragray.learn.training.optimizer import Optimizer
 
 RATES = {"means": 0.1, "sh0": 0.01}
 

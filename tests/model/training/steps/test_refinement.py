@@ -7,8 +7,8 @@ from typing import Any
 
 import torch
 
-from ultragray.training import TrainingConfig
-from ultragray.training.steps.refinement import PullStatistics, Refined, refine, rotate
+from ultragray.learn.training import TrainingConfig
+from ultragray.learn.training.optimizer import PullStatistics, Refined, refine, rotate
 
 SCENE_SCALE_CM = 10.0
 

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from ultragray.training import TrainingConfig
-from ultragray.training.steps.schedule import Schedule
+from ultragray.learn.training import TrainingConfig
+from ultragray.learn.training.optimizer import Schedule
 
 
 def schedule_of(**settings: object) -> Schedule:

@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from ultragray.errors import InvalidArgument, MemoryExceeded, TrainingDiverged
-from ultragray.evaluation.baselines import evaluate_baselines
-from ultragray.methods.classical import Compounding, FromFrames
+from ultragray.learn.evaluation.baselines import evaluate_baselines
+from ultragray_studies.methods.classical import Compounding, FromFrames
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import DatasetNotFound
 from ultragray_workers.jobs.folder import JobFolder, Outcome, Request

@@ -32,7 +32,7 @@ DISK_BYTES = 8 * 2**20
 DIVERGENCE = """
 import sys
 if "ultragray_workers.jobs.worker.run_job" in sys.orig_argv:
-    from ultragray.training import trainer
+    from ultragray.learn.training import trainer
     image_loss, calls = trainer.image_loss, []
     def broken(rendered, truth, texture):
         calls.append(None)

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ultragray.contract import described, kind_field
-from ultragray.methods.comparison.settings import ComparisonSettings
+from ultragray.learn.evaluation.methods import ComparisonSettings
 from ultragray_workers.jobs.kinds.base import Specification
 
 

@@ -8,9 +8,9 @@ import sys
 from dataclasses import replace
 
 from ultragray.errors import TrainingDiverged
-from ultragray.methods.comparison.files import write_comparison
-from ultragray.methods.comparison.place import RUN_FILE
-from ultragray.methods.comparison.run import ComparisonProgress, compare
+from ultragray_studies.comparison.page import write_comparison
+from ultragray_studies.comparison.place import RUN_FILE
+from ultragray_studies.comparison.run import ComparisonProgress, compare
 from ultragray_workers.jobs.folder import Outcome, Progress
 from ultragray_workers.jobs.kinds.compare import CompareJob
 from ultragray_workers.jobs.kinds.earlier_run import take_over_run

@@ -12,14 +12,13 @@ import numpy as np
 import numpy.typing as npt
 from typing_extensions import Self
 
-from ultragray.batches import BatchPlan
-from ultragray.batches.plan import SHARD_FRAMES
 from ultragray.confidence import Assessor, Extrapolation, require_confidence
 from ultragray.contact.skin import way_in
 from ultragray.contract import described, kind_field, shown, under
 from ultragray.errors import InvalidArgument
-from ultragray.interchange.exports import FORMATS, Format, check_format
-from ultragray.interchange.exports.formats import DTYPES
+from ultragray.exchange.batches import SHARD_FRAMES, BatchPlan
+from ultragray.exchange.exports import FORMATS, Format, check_format
+from ultragray.exchange.exports.formats import DTYPES
 from ultragray.outputs import OUTPUTS
 from ultragray.pose import check_poses
 from ultragray.probe import FloatArray, Picture, Probe

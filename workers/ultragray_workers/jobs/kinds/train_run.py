@@ -9,20 +9,20 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from ultragray.datasets.sweep import Dataset
-from ultragray.evaluation.side_by_side import write_spread
-from ultragray.methods.comparison.run import SCENE, compare_methods
-from ultragray.methods.comparison.settings import ComparisonSettings
-from ultragray.methods.gaussians import GivenScene
-from ultragray.report.page import ReportContent, render_page
-from ultragray.report.study import scene_evaluation, trained_of_journal
+from ultragray.learn.evaluation.methods import ComparisonSettings
+from ultragray.learn.evaluation.side_by_side import write_spread
+from ultragray.learn.sweep import Dataset
+from ultragray.learn.training import Progress as TrainingProgress
+from ultragray.learn.training import TrainingConfig
+from ultragray.learn.training import train as train_scene
+from ultragray.learn.training.pictures import pictures_in
+from ultragray.learn.training.run import FITTING
+from ultragray.learn.training.trainer import CHECKPOINT_FILE, JOURNAL_FILE
 from ultragray.scene import GaussianScene
-from ultragray.training import Progress as TrainingProgress
-from ultragray.training import TrainingConfig
-from ultragray.training import train as train_scene
-from ultragray.training.pictures import pictures_in
-from ultragray.training.run import FITTING
-from ultragray.training.trainer import CHECKPOINT_FILE, JOURNAL_FILE
+from ultragray_studies.comparison.run import SCENE, compare_methods
+from ultragray_studies.methods.gaussians import GivenScene
+from ultragray_studies.report.page import ReportContent, render_page
+from ultragray_studies.report.study import scene_evaluation, trained_of_journal
 from ultragray_workers.jobs.files import BASELINES_NAME
 from ultragray_workers.jobs.folder import Outcome, Progress
 from ultragray_workers.jobs.kinds.curve import draw_training_curve
@@ -40,7 +40,7 @@ _LINES = 20  # of the log in a run
 def run(job_run: JobRun, job: TrainJob) -> Outcome:
     """Trains, or goes on from the checkpoint that an earlier process left, and completes the artifacts.
 
-    Raises Stopped, DatasetNotFound, DatasetInvalid, InvalidArgument, and what `ultragray.training.train` raises.
+    Raises Stopped, DatasetNotFound, DatasetInvalid, InvalidArgument, and what `ultragray.learn.training.train` raises.
     """
     device = job_run.request.device
     config = TrainingConfig.preset(job.preset, **job.settings)

@@ -26,8 +26,8 @@ from ultragray.display.frames import show
 from ultragray.display.pixels import ByteArray, to_uint8
 from ultragray.display.settings import AS_RENDERED
 from ultragray.errors import MemoryExceeded, RenderFailed, UltragrayError
+from ultragray.learn.localization.pixels import read_grey, read_png
 from ultragray.limits import UNLIMITED, GivenUp, Limits
-from ultragray.localization.pixels import read_grey, read_png
 from ultragray.probe import FloatArray
 from ultragray.rendering import renderer_name
 from ultragray.settings import Encoding, Resolved

@@ -14,9 +14,8 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from ultragray.contract import to_dict
-from ultragray.interchange.exports.exporter import ExportHeader
-from ultragray.interchange.exports.formats import FORMATS, check_format, exporter_class
-from ultragray.interchange.exports.whole import export_bytes
+from ultragray.exchange.exports.exporter import ExportHeader
+from ultragray.exchange.exports.formats import FORMATS, check_format, export_bytes, exporter_class
 from ultragray.outputs import OUTPUTS
 from ultragray.settings import Resolved
 from ultragray_service.core.frames import settings_used

@@ -1,0 +1,1 @@
+"""A scene, its baselines and its ablations on one page."""
