@@ -16,8 +16,8 @@ from .calls.pose_exchange import StreamMode
 from .calls.tls import Tls
 from .contract import *  # noqa: F403
 from .errors import ClientError
-from .frames import Extrapolation, Frame, Picture, Slice, Timings
-from .geometry import Placement, PoseLike, Quaternion
+from .frames import Frame, Slice, Timings
+from .geometry import Picture, Placement, PoseLike, Quaternion
 from .jobs import Job, JobError, JobEvent, JobProgress, JobState
 from .recording.recording import Recording
 from .registrations import Registration
@@ -33,7 +33,6 @@ __all__ = [
     "Client",
     "ClientError",
     "ConfidenceFit",
-    "Extrapolation",
     "Frame",
     "FrameStream",
     "Job",

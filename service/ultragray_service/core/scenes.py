@@ -6,12 +6,11 @@ from dataclasses import dataclass
 
 from ultragray.confidence.assess import read_model
 from ultragray.contract import described
-from ultragray.outputs import OUTPUTS
+from ultragray.outputs import OUTPUT_SCHEMA, OUTPUTS
 from ultragray.probe import ElevationBeam, Probe
 from ultragray.scene_info import SceneHeader
 from ultragray_service.access.principal import iso_time
 from ultragray_service.core.catalog import CatalogEntry, finite_metrics
-from ultragray_service.core.frames import OutputName
 from ultragray_service.core.poses import PoseInBothForms, Position
 from ultragray_service.core.state import Service
 from ultragray_service.errors import Refusal
@@ -110,7 +109,7 @@ class Scene:
     metrics: dict[str, float]
     dataset_name: str | None
     dataset_sha256: str | None
-    outputs: list[OutputName] = described("What can be rendered of it.")
+    outputs: list[str] = described("What can be rendered of it.", schema={"items": OUTPUT_SCHEMA})
     label_names: dict[int, str] = described("What the values of the output labels mean; empty: it has none.")
     beam: ElevationBeam | None = described("Of the frames it was trained on; null: they are taken for planes.")
     confidence: ConfidenceFit | None = described("null: the scene cannot tell the confidence of its frames.")

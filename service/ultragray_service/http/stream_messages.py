@@ -6,7 +6,8 @@ from dataclasses import dataclass
 
 from ultragray.contract import described
 from ultragray.errors import UltragrayError
-from ultragray_service.core.frames import FrameHeader, settings_used
+from ultragray.settings import settings_used
+from ultragray_service.core.frames import FrameHeader
 from ultragray_service.core.streams.answers import Answered
 from ultragray_service.errors import Refusal
 from ultragray_service.http.reading.json_body import adapter_of

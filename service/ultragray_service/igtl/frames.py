@@ -4,15 +4,12 @@ from __future__ import annotations
 
 import json
 from dataclasses import asdict, dataclass, replace
-from functools import lru_cache
 
 import numpy as np
 
-from ultragray.contract import to_dict
-from ultragray.display.settings import Display, true_to_scale
+from ultragray.display.settings import true_to_scale
 from ultragray.registration.registration import Registration
-from ultragray.settings import Encoding, Resolved
-from ultragray.tools import Tool
+from ultragray.settings import Encoding, Resolved, settings_used
 from ultragray_service.core.state import Service
 from ultragray_service.igtl.commands.scanner import Scanner
 from ultragray_service.igtl.contents import (
@@ -68,8 +65,7 @@ class Frame:
             "scene": result.scene,
             "scene_sha256": result.scene_sha256,
             "renderer": result.renderer,
-            "slice_thickness_mm": repr(result.settings.beam.thickness_mm),
-            "display": _text(result.settings.display),
+            **settings_used(result.settings).texts(),
             **self._placing(),
             "replaced_poses": str(self.posed.replaced),
             **{name: f"{value:.3f}" for name, value in asdict(result.extrapolations[0]).items() if value is not None},
@@ -78,14 +74,9 @@ class Frame:
         }
 
     def _placing(self) -> dict[str, str]:
-        """What the frame can be rendered again with, beside its pose, where there is any."""
-        settings, found = self.result.settings, {}
-        if settings.registration is not None:
-            found["registration"] = settings.registration
-            found["probe_to_scene"] = json.dumps(self.result.poses[0].tolist(), separators=(",", ":"))
-        if settings.tools:
-            found["tools"] = f"[{','.join(map(_text, settings.tools))}]"
-        return found
+        """The pose in the scene, where a registration led there."""
+        is_led = self.result.settings.registration is not None
+        return {"probe_to_scene": json.dumps(self.result.poses[0].tolist(), separators=(",", ":"))} if is_led else {}
 
 
 class FrameMaker:
@@ -125,12 +116,6 @@ class FrameMaker:
         side = self._service.settings.max_image_side
         pixel_mm = true_to_scale(settings.probe, settings.height, side).pixel_mm
         return replace(settings, display=replace(settings.display, pixel_mm=pixel_mm))
-
-
-@lru_cache(maxsize=256)
-def _text(part: Display | Tool) -> str:
-    """A part of the settings as JSON."""
-    return json.dumps(to_dict(part, with_none=False), separators=(",", ":"))
 
 
 def image_of(result: RenderResult, registration: Registration | None = None) -> Image:

@@ -13,12 +13,10 @@ from fastapi import APIRouter
 from starlette.requests import Request
 from starlette.responses import Response
 
-from ultragray.contract import to_dict
 from ultragray.exchange.exports.exporter import ExportHeader
 from ultragray.exchange.exports.formats import FORMATS, check_format, export_bytes, exporter_class
 from ultragray.outputs import OUTPUTS
-from ultragray.settings import Resolved
-from ultragray_service.core.frames import settings_used
+from ultragray.settings import Resolved, settings_used
 from ultragray_service.core.poses import exact_poses
 from ultragray_service.core.state import Service
 from ultragray_service.http.deps import SCENE_NAME, problems
@@ -151,18 +149,5 @@ def render_headers(result: RenderResult) -> dict[str, str]:
 @lru_cache(maxsize=256)
 def _settings_headers(settings: Resolved) -> dict[str, str]:
     """The headers that settings alone decide."""
-    used = settings_used(settings)
-    asked = {} if used.contact is None else {"X-Ultragray-Contact": used.contact.value}
-    if used.tools:
-        asked["X-Ultragray-Tools"] = json.dumps(to_dict(used.tools))
-    if used.ghost:
-        asked["X-Ultragray-Ghost"] = repr(used.ghost)
-    if used.registration is not None:
-        asked["X-Ultragray-Registration"] = used.registration
-    return asked | {
-        "X-Ultragray-Dtype": settings.encoding.pixel_type.name,
-        "X-Ultragray-Outputs": ",".join(settings.outputs),
-        "X-Ultragray-Probe": json.dumps(to_dict(used.probe)),
-        "X-Ultragray-Slice-Thickness-Mm": repr(used.slice_thickness_mm),
-        "X-Ultragray-Picture": json.dumps(to_dict(used.picture)),
-    }
+    texts = {"dtype": settings.encoding.pixel_type.name, **settings_used(settings).texts()}
+    return {f"X-Ultragray-{name.replace('_', '-').title()}": text for name, text in texts.items()}
