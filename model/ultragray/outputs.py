@@ -17,9 +17,9 @@ from ultragray.errors import UnknownOutput
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from ultragray.probe import FloatArray, Probe
-    from ultragray.scene import GaussianScene
-    from ultragray.scene_info import SceneInfo
+    from ultragray.geometry.probe import FloatArray, Probe
+    from ultragray.scene.gaussians import GaussianScene
+    from ultragray.scene.info import SceneInfo
 
 PLANES = ("bmode", "echo", "transmittance", "coverage")  # what a backend draws, in [0, 1], with gradients
 WEIGHT_SUM, INTENSITY_SUM = "weight_sum", "intensity_sum"  # S and ΣI·w of docs/physics.md §3
@@ -91,7 +91,7 @@ def _register(name: str, meaning: str, **properties: Any) -> Output:
 
 
 def _labels(drawing: Drawing) -> Tensor:
-    from ultragray.backends.labels import render_labels  # needs torch
+    from ultragray.rendering.labels import render_labels  # needs torch
 
     labels = render_labels(drawing.scene, drawing.shape, lambda part: drawing.plane_of(part, WEIGHT_SUM))
     drawing.mark_tools(labels)
@@ -106,7 +106,7 @@ def _attenuation(drawing: Drawing) -> Tensor:
 
 
 def _uncertainty(drawing: Drawing) -> Tensor:
-    from ultragray.confidence.deviation import deviations  # needs torch
+    from ultragray.rendering.confidence import deviations  # needs torch
 
     planes = tuple(drawing.plane(name) for name in UNCERTAINTY.planes)
     return deviations(drawing.scene, planes, drawing.poses_mm, drawing.probe)

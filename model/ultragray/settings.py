@@ -14,14 +14,14 @@ from typing import Any
 import numpy as np
 
 from ultragray.contract import Contract, described, to_dict
-from ultragray.display import AS_RENDERED, Display
+from ultragray.rendering.display import AS_RENDERED, Display
 from ultragray.errors import InvalidArgument, InvalidImageSize, InvalidProbe, UnknownOutput
-from ultragray.image_size import MAX_IMAGE_SIDE, check_image_size
-from ultragray.outputs import OUTPUT_SCHEMA, OUTPUTS, check_available, check_outputs
-from ultragray.probe import ElevationBeam, Picture, Probe
-from ultragray.probe.elevation import MAX_THICKNESS_MM, PLANE
-from ultragray.scene_info import SceneInfo
-from ultragray.tools import MAX_TOOLS, Tool
+from ultragray.geometry.image_size import MAX_IMAGE_SIDE, check_image_size
+from ultragray.rendering.outputs import OUTPUT_SCHEMA, OUTPUTS, check_available, check_outputs
+from ultragray.geometry.probe import ElevationBeam, Picture, Probe
+from ultragray.geometry.probe import MAX_THICKNESS_MM, PLANE
+from ultragray.scene.info import SceneInfo
+from ultragray.rendering.tools import MAX_TOOLS, Tool
 
 
 class Encoding(str, Enum):
@@ -56,7 +56,7 @@ class Below(str, Enum):
 
 
 class Contact(str, Enum):
-    """What a frame shows of the probe's contact with the skin (`ultragray.contact`)."""
+    """What a frame shows of the probe's contact with the skin (`ultragray.rendering.contact`)."""
 
     AIR = "air"
     PRESSURE = "pressure"

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ultragray.contract import described
-from ultragray.probe.scan_lines import Box, FloatArray
+from ultragray.geometry.probe import Box, FloatArray
 
 
 @dataclass(frozen=True)

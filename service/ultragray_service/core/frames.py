@@ -7,13 +7,13 @@ from typing import Any
 
 from typing_extensions import Self
 
-from ultragray.confidence import Extrapolation
+from ultragray.scene.confidence import Extrapolation
 from ultragray.contract import described
-from ultragray.probe import FloatArray
-from ultragray.settings import Encoding, SettingsUsed
-from ultragray.volumes.plane import SliceView
+from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.settings import Encoding, SettingsUsed
+from ultragray.rendering.volumes import SliceView
 from ultragray_service.core.poses import MatrixRows
-from ultragray_workers.pool.types import RenderResult
+from ultragray_workers.pool.messages import RenderResult
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)

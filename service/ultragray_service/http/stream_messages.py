@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 from ultragray.contract import described
 from ultragray.errors import UltragrayError
-from ultragray.settings import settings_used
+from ultragray.rendering.settings import settings_used
 from ultragray_service.core.frames import FrameHeader
-from ultragray_service.core.streams.answers import Answered
+from ultragray_service.core.open_streams import Answered
 from ultragray_service.errors import Refusal
-from ultragray_service.http.reading.json_body import adapter_of
+from ultragray_service.http.bodies import adapter_of
 
 _ALIGNMENT = 8  # so that a client may look at float32 pixels where they lie
 

@@ -7,11 +7,11 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from ultragray.display.settings import true_to_scale
-from ultragray.registration.registration import Registration
-from ultragray.settings import Encoding, Resolved, settings_used
-from ultragray_service.core.state import Service
-from ultragray_service.igtl.commands.scanner import Scanner
+from ultragray.rendering.display import true_to_scale
+from ultragray.geometry.registration import Registration
+from ultragray.rendering.settings import Encoding, Resolved, settings_used
+from ultragray_service.service import Service
+from ultragray_service.igtl.commands import Scanner
 from ultragray_service.igtl.contents import (
     Image,
     Instrument,
@@ -22,9 +22,9 @@ from ultragray_service.igtl.contents import (
 )
 from ultragray_service.igtl.messages import Message
 from ultragray_service.igtl.routes import SceneChooser, image_name
-from ultragray_service.igtl.waiting import PoseMessage, Underway
+from ultragray_service.igtl.frames import PoseMessage, Underway
 from ultragray_workers.jobs.queue.owners import Kind, Ownership
-from ultragray_workers.pool.types import RenderResult
+from ultragray_workers.pool.messages import RenderResult
 
 _SLICE_MM = 1.0  # nominal thickness: an image of one slice has none
 

@@ -13,9 +13,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ultragray.display.pixels import PixelArray
+from ultragray.rendering.pixels import PixelArray
 from ultragray.exchange.exports.exporter import FRAME_TIME_MS, Exporter
-from ultragray.probe import FloatArray
+from ultragray.geometry.probe import FloatArray
 
 FIELDS = {
     "distance_mm": "UltraGRayDistanceMm",

@@ -15,18 +15,18 @@ from starlette.responses import Response
 
 from ultragray.exchange.exports.exporter import ExportHeader
 from ultragray.exchange.exports.formats import FORMATS, check_format, export_bytes, exporter_class
-from ultragray.outputs import OUTPUTS
-from ultragray.settings import Resolved, settings_used
+from ultragray.rendering.outputs import OUTPUTS
+from ultragray.rendering.settings import Resolved, settings_used
 from ultragray_service.core.poses import exact_poses
-from ultragray_service.core.state import Service
-from ultragray_service.http.deps import SCENE_NAME, problems
-from ultragray_service.http.disconnect import finish_or_abandon
-from ultragray_service.http.examples import RENDER_EXAMPLES
-from ultragray_service.http.reading.accept import DICOM, JPEG, NPZ, PNG, RAW, choose
-from ultragray_service.http.reading.bodies import RenderBody
-from ultragray_service.http.reading.json_body import body_schema, read_json_body
-from ultragray_service.telemetry.statistics import STAGES
-from ultragray_workers.pool.types import Priority, RenderResult
+from ultragray_service.service import Service
+from ultragray_service.http.dependencies import SCENE_NAME, problems
+from ultragray_service.http.dependencies import finish_or_abandon
+from ultragray_service.http.dependencies import RENDER_EXAMPLES
+from ultragray_service.http.accept import DICOM, JPEG, NPZ, PNG, RAW, choose
+from ultragray_service.http.bodies import RenderBody
+from ultragray_service.http.bodies import body_schema, read_json_body
+from ultragray_service.telemetry.metrics import STAGES
+from ultragray_workers.pool.messages import Priority, RenderResult
 
 router = APIRouter(prefix="/v1/scenes", tags=["render"])
 
