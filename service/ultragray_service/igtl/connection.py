@@ -12,11 +12,8 @@ from typing import Protocol
 
 from ultragray.errors import UltragrayError
 from ultragray.settings import FrameSettings
-from ultragray_service.core.state import Service
-from ultragray_service.core.streams.answers import Answered
-from ultragray_service.core.streams.buffers import hold_little
-from ultragray_service.core.streams.open_streams import OpenStream
-from ultragray_service.core.streams.unread import Unread
+from ultragray_service.core.open_streams import Answered, OpenStream
+from ultragray_service.core.unread import Unread, hold_little
 from ultragray_service.errors import IgtlMessageInvalid
 from ultragray_service.igtl.commands.answer import answer
 from ultragray_service.igtl.commands.scanner import Scanner, Setup
@@ -36,6 +33,7 @@ from ultragray_service.igtl.messages import HEADER_BYTES, Header, Message, pack_
 from ultragray_service.igtl.routes import SceneChooser
 from ultragray_service.igtl.states import OK, state_of
 from ultragray_service.igtl.waiting import PoseMessage, Underway, WaitingPoses
+from ultragray_service.service import Service
 from ultragray_workers.pool.types import RenderResult
 
 MAX_BODY_BYTES = 64 * 1024  # of a message that is read

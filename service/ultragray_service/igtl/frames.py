@@ -13,7 +13,6 @@ from ultragray.display.settings import Display, true_to_scale
 from ultragray.registration.registration import Registration
 from ultragray.settings import Encoding, Resolved
 from ultragray.tools import Tool
-from ultragray_service.core.state import Service
 from ultragray_service.igtl.commands.scanner import Scanner
 from ultragray_service.igtl.contents import (
     Image,
@@ -26,6 +25,7 @@ from ultragray_service.igtl.contents import (
 from ultragray_service.igtl.messages import Message
 from ultragray_service.igtl.routes import SceneChooser, image_name
 from ultragray_service.igtl.waiting import PoseMessage, Underway
+from ultragray_service.service import Service
 from ultragray_workers.jobs.queue.owners import Kind, Ownership
 from ultragray_workers.pool.types import RenderResult
 

@@ -14,13 +14,13 @@ import grpc
 from ultragray.errors import UltragrayError
 from ultragray_service.access.audit import NOBODY, Entry
 from ultragray_service.access.credentials import offered_credential
-from ultragray_service.access.principal import Principal
+from ultragray_service.access.principals import Principal
 from ultragray_service.access.rules import GRPC_OPERATIONS, REFLECTION, Operation
-from ultragray_service.core.state import Service
 from ultragray_service.errors import statuses_of
 from ultragray_service.rpc.handlers import Method, method_of, refusing_what_is_no_message, with_method
 from ultragray_service.rpc.peers import address_of
 from ultragray_service.rpc.status import REQUEST_ID_KEY, abort
+from ultragray_service.service import Service
 from ultragray_service.telemetry.logs import choose_request_id, request_id
 
 _OPEN_PREFIX = "/grpc.health.v1."

@@ -25,8 +25,7 @@ from ultragray_proto.v1 import (
     workers_pb2_grpc,
 )
 from ultragray_service.access.rules import require_all_methods
-from ultragray_service.core.readiness.readiness import Readiness
-from ultragray_service.core.state import Service
+from ultragray_service.core.readiness import Readiness
 from ultragray_service.rpc.health import Health
 from ultragray_service.rpc.interceptor import CallContext
 from ultragray_service.rpc.services.access import AccessService
@@ -37,9 +36,9 @@ from ultragray_service.rpc.services.rendering import RenderService
 from ultragray_service.rpc.services.scenes import SceneService
 from ultragray_service.rpc.services.workers import WorkerService
 from ultragray_service.rpc.traced import TracedCalls
+from ultragray_service.service import Service
 from ultragray_service.settings import Settings
-from ultragray_service.tls.certificates import HANDSHAKE_TIMEOUT_S, Certificates
-from ultragray_service.tls.watch import CertificateWatch
+from ultragray_service.tls.server import HANDSHAKE_TIMEOUT_S, Certificates, CertificateWatch
 
 LEAST_MAX_MESSAGE_BYTES = 2 * 2**20  # room for a chunk of an upload
 LEAST_PING_INTERVAL_MS = 10_000

@@ -10,9 +10,8 @@ from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray.probe import FloatArray
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import rendering_pb2, scenes_pb2
-from ultragray_service.core.streams.answers import Answered
-from ultragray_service.core.streams.pose_stream import MAX_WINDOW, StreamMode
-from ultragray_service.core.streams.stream import SceneSettings, checked_s
+from ultragray_service.core.open_streams import Answered
+from ultragray_service.core.streams import MAX_WINDOW, SceneSettings, StreamMode, checked_s
 from ultragray_service.errors import Refusal
 from ultragray_service.rpc.messages import frame_message, read_pose, read_settings, read_word
 from ultragray_service.rpc.shared_memory import SharedMemory

@@ -9,7 +9,7 @@ import grpc
 
 from ultragray_service.rpc.handlers import method_of, with_method
 from ultragray_service.rpc.interceptor import OWN_PREFIX
-from ultragray_service.telemetry.tracing import Tracing
+from ultragray_service.telemetry.logs import Tracing
 
 
 class TracedCalls(grpc.aio.ServerInterceptor):  # type: ignore[misc]

@@ -12,8 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ultragray_service.access.limits.allowance import NAMES, read_limits
-from ultragray_service.access.principal import Role
+from ultragray_service.access.principals import NAMES, Role, read_limits
 from ultragray_service.cli.administration.database import Where, opened_database
 from ultragray_service.cli.options import with_options
 from ultragray_service.cli.output import print_table

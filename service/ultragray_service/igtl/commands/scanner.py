@@ -12,9 +12,9 @@ from ultragray.display.settings import AS_RENDERED, FRAME_RANGE_DB
 from ultragray.errors import InvalidArgument, InvalidProbe
 from ultragray.probe import FloatArray, Probe
 from ultragray.settings import FrameSettings
+from ultragray_service.core.registrations import Registrations
 from ultragray_service.igtl.commands.tools import ClientTools, read_tools, tools_text
 from ultragray_service.igtl.routes import SceneChooser
-from ultragray_service.registrations.registrations import Registrations
 
 _NO_GAIN_PERCENT = 50.0
 _DB_A_PERCENT = FRAME_RANGE_DB / 100.0

@@ -6,8 +6,8 @@ import grpc
 
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import access_pb2
-from ultragray_service.access.principal import me
-from ultragray_service.core.state import Service
+from ultragray_service.access.principals import me
+from ultragray_service.service import Service
 from ultragray_service.views.audited import DEFAULT_ENTRIES, DEFAULT_HOURS, audit_entries
 
 

@@ -13,8 +13,8 @@ from ultragray_proto.v1 import geometry_pb2, jobs_pb2
 from ultragray_service.core.catalog import DEFAULT_PAGE_SIZE
 from ultragray_service.core.jobs.estimates import estimate
 from ultragray_service.core.jobs.log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
-from ultragray_service.core.state import Service
 from ultragray_service.rpc.messages import job_message, read_specification, read_word
+from ultragray_service.service import Service
 from ultragray_workers.errors import Draining
 from ultragray_workers.jobs.shared.reading import opened
 from ultragray_workers.jobs.store import JobStore

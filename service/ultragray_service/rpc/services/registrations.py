@@ -11,8 +11,8 @@ from ultragray.registration.registration import Registration, rows
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import geometry_pb2, registrations_pb2
 from ultragray_service.core.catalog import DEFAULT_PAGE_SIZE
-from ultragray_service.core.state import Service
 from ultragray_service.rpc.messages import read
+from ultragray_service.service import Service
 
 _LINKS = ("base_to_scene", "probe_to_flange")
 

@@ -9,7 +9,7 @@ from ultragray_proto.v1 import scenes_pb2
 from ultragray_service.core import scenes
 from ultragray_service.core.catalog import DEFAULT_PAGE_SIZE
 from ultragray_service.core.scenes import SceneLoaded
-from ultragray_service.core.state import Service
+from ultragray_service.service import Service
 
 
 class SceneService:

@@ -6,7 +6,7 @@ import grpc
 
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import workers_pb2
-from ultragray_service.core.state import Service
+from ultragray_service.service import Service
 from ultragray_workers.jobs.queue.wishes import Wanted
 from ultragray_workers.jobs.store import JobStore
 
