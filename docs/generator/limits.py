@@ -10,7 +10,8 @@ from ultragray_service.core import streams as pose_stream
 from ultragray_service.core import uploads as dataset_uploads
 from ultragray_service.errors import STATUSES
 from ultragray_service.http import protocol as http_server
-from ultragray_service.igtl import connection, waiting
+from ultragray_service.igtl import connection
+from ultragray_service.igtl import frames as waiting
 from ultragray_service.rpc import server as grpc_server
 from ultragray_service.rpc import shared_memory
 from ultragray_service.settings import LEAST_KEY_LENGTH
