@@ -21,7 +21,6 @@ from typing import Any, get_args, get_type_hints
 
 import unasync
 
-from ultragray.scene.confidence import Extrapolation
 from ultragray.contract import Contract, Family, annotated_fields
 from ultragray.datasets.source import SourceOptions
 from ultragray.errors import error_classes
@@ -30,6 +29,7 @@ from ultragray.geometry.pose import quaternion_from_pose
 from ultragray.geometry.probe import ElevationBeam
 from ultragray.rendering.settings import RenderSettings, SettingsUsed
 from ultragray.rendering.volumes import SliceSettings
+from ultragray.scene.confidence import Extrapolation
 from ultragray_service.errors import STATUSES
 from ultragray_workers.datasets.store import DatasetRecord
 from ultragray_workers.jobs.kinds import Specification
@@ -74,7 +74,7 @@ OWN_ERRORS = {  # of the client, by their reason: base, meaning
 RECORDING = {"messages": ros_messages, "writer": ros_recording}  # modules that the client has as they are, by its names
 OWN_IMPORTS = {  # what they import, as the client has it
     "from ultragray.geometry.probe import FloatArray\n": "from ..geometry import FloatArray\n",
-    "from ultragray.geometry.pose import quaternion_from_pose\n": "import numpy as np\n",  # the function stands at the end
+    "from ultragray.geometry.pose import quaternion_from_pose\n": "import numpy as np\n",  # it stands at the end
     "from ultragray.exchange import ros_messages as ros\n": "from . import messages as ros\n",
 }
 _ALSO = {"InvalidArgument": ["ValueError"], "DeadlineExceeded": ["TimeoutError"]}  # what they are beside

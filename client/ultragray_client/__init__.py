@@ -7,24 +7,37 @@ is told as one of `ultragray_client.errors`.
 
 from __future__ import annotations
 
+from ultragray_client.connection import Tls
+from ultragray_client.exchange import StreamMode
+from ultragray_client.frames import Localization
+from ultragray_client.records import (
+    AuditEntry,
+    ConfidenceFit,
+    Job,
+    JobError,
+    JobEvent,
+    JobProgress,
+    JobState,
+    Me,
+    Registration,
+    Role,
+    Scene,
+    SceneEntry,
+    Worker,
+    WorkerDevice,
+    WorkerState,
+)
+
 from . import contract, errors
-from ultragray_client.records import AuditEntry, Me, Role
 from .aio.client import AsyncClient
 from .aio.stream import AsyncFrameStream
-from ultragray_client.frames import Localization
-from ultragray_client.exchange import StreamMode
-from ultragray_client.connection import Tls
 from .contract import *  # noqa: F403
 from .errors import ClientError
 from .frames import Frame, Slice, Timings
 from .geometry import Picture, Placement, PoseLike, Quaternion
-from ultragray_client.records import Job, JobError, JobEvent, JobProgress, JobState
 from .recording.recording import Recording
-from ultragray_client.records import Registration
-from ultragray_client.records import ConfidenceFit, Scene, SceneEntry
 from .sync.client import Client
 from .sync.stream import FrameStream
-from ultragray_client.records import Worker, WorkerDevice, WorkerState
 
 __all__ = [
     "AsyncClient",

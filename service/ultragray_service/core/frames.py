@@ -7,11 +7,11 @@ from typing import Any
 
 from typing_extensions import Self
 
-from ultragray.scene.confidence import Extrapolation
 from ultragray.contract import described
 from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.settings import Encoding, SettingsUsed
 from ultragray.rendering.volumes import SliceView
+from ultragray.scene.confidence import Extrapolation
 from ultragray_service.core.poses import MatrixRows
 from ultragray_workers.pool.messages import RenderResult
 

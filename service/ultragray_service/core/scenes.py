@@ -4,16 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ultragray.scene.confidence import read_model
 from ultragray.contract import described
-from ultragray.rendering.outputs import OUTPUT_SCHEMA, OUTPUTS
 from ultragray.geometry.probe import ElevationBeam, Probe
+from ultragray.rendering.outputs import OUTPUT_SCHEMA, OUTPUTS
+from ultragray.scene.confidence import read_model
 from ultragray.scene.info import SceneHeader
 from ultragray_service.access.principals import iso_time
 from ultragray_service.core.catalog import CatalogEntry, finite_metrics
 from ultragray_service.core.poses import PoseInBothForms, Position
-from ultragray_service.service import Service
 from ultragray_service.errors import Refusal
+from ultragray_service.service import Service
 from ultragray_workers.jobs.queue.owners import Kind, Ownership
 from ultragray_workers.scene_names import base_name
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
-from ultragray.files.atomic import write_whole
+from ultragray.files import write_whole
 from ultragray.installation import __version__
 from ultragray.learn.evaluation.scoring import Evaluation
 from ultragray.learn.evaluation.side_by_side import DIFFERENCE_GAIN

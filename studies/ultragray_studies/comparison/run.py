@@ -12,12 +12,11 @@ import numpy as np
 import torch
 
 from ultragray.errors import TrainingDiverged, UltragrayError
-from ultragray.installation import __version__
+from ultragray.installation import __version__, processor_name
 from ultragray.learn.evaluation.methods import ComparisonSettings
 from ultragray.learn.evaluation.scoring import evaluate_frames, require_frames
 from ultragray.learn.sweep import Dataset, Sweep, spread_places
 from ultragray.learn.training.memory import training_device
-from ultragray.machine import processor_name
 from ultragray_studies.comparison.place import Place
 from ultragray_studies.comparison.result import Comparison, DatasetFacts, Distances, MethodResult
 from ultragray_studies.methods.gaussians import SceneMethod

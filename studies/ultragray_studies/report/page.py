@@ -12,8 +12,8 @@ from ultragray.learn.evaluation.scoring import Evaluation, render_sweep
 from ultragray.learn.report.pictures import FrameOfPage, Shown, frames_of_page, telling_places
 from ultragray.learn.report.plots import plot_counts, plot_distances, plot_frames, plot_tilt, plot_training
 from ultragray.learn.sweep import Dataset, spread_places
-from ultragray.scene import GaussianScene
-from ultragray.scene_info import read_header
+from ultragray.scene.gaussians import GaussianScene
+from ultragray.scene.info import read_header
 from ultragray_studies.comparison.page import environment
 from ultragray_studies.comparison.place import frames_of
 from ultragray_studies.comparison.result import Comparison, MethodResult

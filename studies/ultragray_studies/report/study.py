@@ -12,14 +12,14 @@ from typing import TypeVar
 import numpy as np
 
 from ultragray.errors import DatasetInvalid, UltragrayError
+from ultragray.geometry.pose import rotation_angles_deg
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation.baselines import FOLDS as VOLUME_METHODS
 from ultragray.learn.evaluation.baselines import VOXEL_MM, evaluate_baselines, mean_axes, nearest_frames
 from ultragray.learn.evaluation.scoring import Evaluation, evaluate, require_frames
 from ultragray.learn.sweep import Dataset, IntArray, Sweep
 from ultragray.learn.training import Progress, TrainingConfig, train
-from ultragray.pose import rotation_angles_deg
-from ultragray.probe import FloatArray
-from ultragray.scene import GaussianScene
+from ultragray.scene.gaussians import GaussianScene
 from ultragray_studies.comparison.result import Comparison
 from ultragray_studies.comparison.run import SCENE
 from ultragray_studies.methods.classical import Compounding, FromFrames

@@ -14,7 +14,7 @@ from ultragray.errors import DatasetInvalid, TrainingDiverged
 from ultragray.learn.evaluation.scoring import evaluate
 from ultragray.learn.training import Progress, TrainingConfig, train
 from ultragray.learn.training.trainer import JOURNAL_FILE
-from ultragray.scene import GaussianScene
+from ultragray.scene.gaussians import GaussianScene
 from ultragray_studies.report import study
 from ultragray_studies.report.study import (
     Failed,

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ultragray.scene.confidence import Extrapolation, figure_arrays
-from ultragray.rendering.pixels import PixelArray, to_uint8
 from ultragray.errors import InvalidArgument
-from ultragray.rendering.outputs import OUTPUTS
 from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.outputs import OUTPUTS
+from ultragray.rendering.pixels import PixelArray, to_uint8
 from ultragray.rendering.settings import Encoding, Resolved, SettingsUsed, settings_used
+from ultragray.scene.confidence import Extrapolation, figure_arrays
 
 FRAME_TIME_MS = 40.0  # rendered frames have no time of their own: formats that need one show 25 a second
 

@@ -8,10 +8,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ultragray.display.pixels import ByteArray, image_file
 from ultragray.learn.evaluation.scoring import Evaluation
 from ultragray.learn.evaluation.side_by_side import DIFFERENCE_GAIN, as_picture
 from ultragray.learn.sweep import Sweep
+from ultragray.rendering.pixels import ByteArray, image_file
 from ultragray_studies.methods.method import FrameArray
 
 PICTURE_PIXELS = 240

@@ -13,10 +13,10 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation.metrics import FrameMetrics
 from ultragray.learn.evaluation.scoring import Evaluation, Reliability
 from ultragray.learn.report.tables import LABELS
-from ultragray.probe import FloatArray
 from ultragray_studies.comparison.result import Distances
 from ultragray_studies.report.study import TiltStudy, Trained
 

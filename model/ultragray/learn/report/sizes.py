@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from ultragray.files.atomic import write_whole
-from ultragray.probe import FloatArray
+from ultragray.files import write_whole
+from ultragray.geometry.probe import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any, ClassVar
 from typing_extensions import Self
 
 from ultragray.contract import Family, described
-from ultragray.scene_info import SceneHeader
+from ultragray.scene.info import SceneHeader
 from ultragray_workers.jobs.matching.demand import AUTO, MAX_MEMORY_GB, check_device, check_labels
 from ultragray_workers.scene_names import check_scene_name, check_scene_reference
 
@@ -19,7 +19,7 @@ MAX_RUN_S = 31_536_000.0
 TOPIC = "Worker"
 
 if TYPE_CHECKING:
-    from ultragray.registration.registration import Registration
+    from ultragray.geometry.registration import Registration
     from ultragray_workers.jobs.folder import Outcome
     from ultragray_workers.jobs.worker.job_run import JobRun
 

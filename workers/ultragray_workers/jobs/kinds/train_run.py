@@ -18,7 +18,7 @@ from ultragray.learn.training import train as train_scene
 from ultragray.learn.training.pictures import pictures_in
 from ultragray.learn.training.run import FITTING
 from ultragray.learn.training.trainer import CHECKPOINT_FILE, JOURNAL_FILE
-from ultragray.scene import GaussianScene
+from ultragray.scene.gaussians import GaussianScene
 from ultragray_studies.comparison.run import SCENE, compare_methods
 from ultragray_studies.methods.gaussians import GivenScene
 from ultragray_studies.report.page import ReportContent, render_page
