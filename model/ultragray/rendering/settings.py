@@ -271,7 +271,7 @@ def settings_used(settings: Resolved) -> SettingsUsed:
 def _text(value: Any) -> str:
     if isinstance(value, list) and value and all(isinstance(one, str) for one in value):
         return ",".join(value)
-    return value if isinstance(value, str) else json.dumps(value, separators=(",", ":"))
+    return value if isinstance(value, str) else json.dumps(value)
 
 
 def _check_encoding(encoding: Encoding, outputs: tuple[str, ...]) -> None:
