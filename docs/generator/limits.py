@@ -5,7 +5,7 @@ from __future__ import annotations
 from ultragray import image_size, pose, scene_info
 from ultragray.probe import fan, probe
 from ultragray.tools import MAX_TOOLS
-from ultragray_service.core import catalog
+from ultragray_service.core import scenes as catalog
 from ultragray_service.core import streams as pose_stream
 from ultragray_service.core import uploads as dataset_uploads
 from ultragray_service.errors import STATUSES

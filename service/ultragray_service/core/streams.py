@@ -15,7 +15,7 @@ from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray.probe import FloatArray
 from ultragray.settings import RenderSettings
 from ultragray_service.core.open_streams import Answered, OpenStream
-from ultragray_service.core.requests import Plan
+from ultragray_service.core.rendering import Plan
 from ultragray_service.service import Service
 from ultragray_workers.errors import Draining
 from ultragray_workers.pool.types import Destination, RenderResult

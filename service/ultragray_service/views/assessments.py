@@ -9,8 +9,8 @@ from ultragray.confidence import Assessor, Extrapolation
 from ultragray.contract import described
 from ultragray.probe import FloatArray, Probe
 from ultragray.scene_info import SceneHeader
-from ultragray_service.core.catalog import SceneCatalog
 from ultragray_service.core.registrations import Registrations
+from ultragray_service.core.scenes import SceneCatalog
 
 
 @dataclass(frozen=True)

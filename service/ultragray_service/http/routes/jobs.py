@@ -19,11 +19,11 @@ from starlette.types import Receive, Scope, Send
 
 from ultragray.contract import under
 from ultragray.errors import InvalidArgument
-from ultragray_service.core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
 from ultragray_service.core.jobs.estimates import JobEstimate, estimate
 from ultragray_service.core.jobs.hub import JobChange, JobWatch
 from ultragray_service.core.jobs.jobs import JobPage, WorkerList
 from ultragray_service.core.jobs.log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
+from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
 from ultragray_service.http.accept import NPZ, PNG
 from ultragray_service.http.bodies import SPECIFICATION, JobBody, adapter_of, body_schema, read_json_body
 from ultragray_service.http.dependencies import JOB_EXAMPLES, ServiceDep, problems

@@ -8,8 +8,8 @@ from ultragray.datasets.source import UPLOAD_OPTIONS
 from ultragray.errors import InvalidArgument
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import datasets_pb2
-from ultragray_service.core.catalog import DEFAULT_PAGE_SIZE
 from ultragray_service.core.datasets import contact_sheet, dataset, dataset_page, with_owner
+from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE
 from ultragray_service.core.uploads import DatasetUpload
 from ultragray_service.service import Service
 

@@ -10,9 +10,9 @@ import grpc
 from ultragray.errors import InvalidArgument
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import geometry_pb2, jobs_pb2
-from ultragray_service.core.catalog import DEFAULT_PAGE_SIZE
 from ultragray_service.core.jobs.estimates import estimate
 from ultragray_service.core.jobs.log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
+from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE
 from ultragray_service.rpc.messages import job_message, read_specification, read_word
 from ultragray_service.service import Service
 from ultragray_workers.errors import Draining

@@ -10,7 +10,7 @@ from ultragray.errors import InvalidArgument, InvalidPose
 from ultragray.registration.registration import Registration, rows
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import geometry_pb2, registrations_pb2
-from ultragray_service.core.catalog import DEFAULT_PAGE_SIZE
+from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE
 from ultragray_service.rpc.messages import read
 from ultragray_service.service import Service
 

@@ -18,7 +18,7 @@ from ultragray.volumes.plane import SliceSettings
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import rendering_pb2
 from ultragray_service.core.poses import check_pose_count, exact_poses
-from ultragray_service.core.requests import Plan
+from ultragray_service.core.rendering import Plan
 from ultragray_service.core.streams import FrameStream, checked_s
 from ultragray_service.rpc.messages import frame_message, read, read_pose, read_settings, slice_message
 from ultragray_service.rpc.stream import CallTransport

@@ -7,8 +7,7 @@ import grpc
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import scenes_pb2
 from ultragray_service.core import scenes
-from ultragray_service.core.catalog import DEFAULT_PAGE_SIZE
-from ultragray_service.core.scenes import SceneLoaded
+from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE, SceneLoaded
 from ultragray_service.service import Service
 
 

@@ -17,7 +17,7 @@ from ultragray.scene_info import SceneInfo
 from ultragray.settings import Encoding, FrameSettings, Resolved
 from ultragray.volumes.names import check_field
 from ultragray.volumes.plane import SliceSettings, SliceView
-from ultragray_service.core.catalog import SceneCatalog
+from ultragray_service.core.scenes import SceneCatalog
 from ultragray_service.settings import Settings
 from ultragray_workers.pool.types import S
 from ultragray_workers.scene_names import base_name
