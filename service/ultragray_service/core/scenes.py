@@ -8,12 +8,15 @@ import binascii
 import math
 import re
 from bisect import bisect_right
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Awaitable, Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from contextvars import copy_context
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
+
+from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
+from prometheus_client.registry import Collector
 
 from ultragray.confidence.assess import read_model
 from ultragray.contract import described
@@ -21,17 +24,19 @@ from ultragray.errors import InvalidArgument, SceneFileInvalid, UltragrayError
 from ultragray.outputs import OUTPUTS
 from ultragray.probe import ElevationBeam, Probe
 from ultragray.scene_info import SceneHeader
+from ultragray_service.access.owners import Owners
 from ultragray_service.access.principals import iso_time
 from ultragray_service.core.frames import OutputName
+from ultragray_service.core.life import Life
 from ultragray_service.core.poses import PoseInBothForms, Position
 from ultragray_service.core.scene_points import point_message
 from ultragray_service.core.threads import in_own_thread
 from ultragray_service.errors import Refusal
-from ultragray_service.service import Service
 from ultragray_service.settings import Settings
 from ultragray_workers.errors import SceneNotFound, SceneTooLarge, StartupFailed, StorageUnavailable
 from ultragray_workers.jobs.publication import SCENES_FOLDER
 from ultragray_workers.jobs.queue.owners import Kind, Ownership
+from ultragray_workers.pool.pool import RenderPool
 from ultragray_workers.scene_names import base_name
 from ultragray_workers.scenes import SceneStore
 from ultragray_workers.shelves.bucket import BucketShelf
@@ -46,7 +51,7 @@ from ultragray_workers.storage.opening import open_storage
 PATIENCE_S = 10.0  # of frames that wait for a scene
 
 
-class ScenePlaces:
+class ScenePlaces(Collector):
     """`data`, whose scenes are the operator's, and `made`, whose scenes were imported or made by jobs."""
 
     def __init__(self, settings: Settings) -> None:
@@ -74,6 +79,21 @@ class ScenePlaces:
     def stale_problem(self) -> StorageUnavailable | None:
         """The same, once it lasts so long that scenes are not served any more."""
         return next((one.index.problem for one in self.buckets if not one.index.is_usable), None)
+
+    def collect(self) -> Iterator[Metric]:
+        """What Prometheus shows of the cache and the buckets."""
+        buckets, counts = self.buckets, self.cache.counts
+        counter, gauge = CounterMetricFamily, GaugeMetricFamily
+        yield counter("ultragray_scene_cache_hits", "Requests whose scene was cached.", counts.hits)
+        yield counter("ultragray_scene_cache_misses", "Scenes that were fetched from a bucket.", counts.misses)
+        yield counter("ultragray_scene_cache_fetched_bytes", "Bytes of those.", counts.fetched_bytes)
+        yield counter("ultragray_scene_cache_fetch_seconds", "Time that their fetches took in all.", counts.fetch_s)
+        held = self.cache.held_bytes() if buckets else 0
+        yield gauge("ultragray_scene_cache_bytes", "Bytes that the cache of this host holds.", held)
+        errors = sum(one.index.unavailable_total for one in buckets)
+        yield counter("ultragray_scene_list_errors", "Times that a bucket did not tell its scenes.", errors)
+        age = max((one.index.age_s for one in buckets), default=0.0)
+        yield gauge("ultragray_scene_list_age_seconds", "Age of the oldest list of the scenes of a bucket.", age)
 
     async def open(self) -> None:
         """Reads the lists of scenes, and follows their changes."""
@@ -397,22 +417,50 @@ class SceneLoaded:
         return cls(base_name(scene), loaded_processes > 0, loaded_processes)
 
 
-async def scene(service: Service, name: str) -> Scene:
-    """Raises SceneNotFound, SceneFileInvalid."""
-    header, name = await service.catalog.header(name), base_name(name)
-    loaded_processes = service.pool.loaded().get(name, 0)
-    return Scene.of(name, header, loaded_processes, service.owners.known(Kind.SCENE, name))
+class Scenes:
+    """The scenes of the service as all front doors tell them: read, listed, and loaded into the render processes."""
 
+    def __init__(
+        self,
+        catalog: SceneCatalog,
+        places: ScenePlaces,
+        store: SceneStore,
+        pool: RenderPool,
+        owners: Owners,
+        life: Life,
+    ) -> None:
+        self._catalog, self._places, self._store = catalog, places, store
+        self._pool, self._owners, self._life = pool, owners, life
 
-async def scene_page(service: Service, page_size: int, page_token: str) -> ScenePage:
-    """One page of scenes by name. Raises InvalidArgument."""
-    entries, next_page_token = await service.catalog.page(page_size, page_token)
-    loaded, removable = service.pool.loaded(), await service.imports.removable()
-    told = [
-        _entry(one, one.name in loaded, one.name in removable, service.owners.known(Kind.SCENE, one.name))
-        for one in entries
-    ]
-    return ScenePage(told, next_page_token)
+    async def get(self, name: str) -> Scene:
+        """All about one scene. Raises SceneNotFound, SceneFileInvalid."""
+        header, name = await self._catalog.header(name), base_name(name)
+        return Scene.of(name, header, self._pool.loaded().get(name, 0), self._owners.known(Kind.SCENE, name))
+
+    async def page(self, page_size: int, page_token: str) -> ScenePage:
+        """One page of scenes by name. Raises InvalidArgument."""
+        entries, next_page_token = await self._catalog.page(page_size, page_token)
+        loaded, removable = self._pool.loaded(), await asyncio.to_thread(self._store.names_of, self._places.made)
+        told = [
+            _entry(one, one.name in loaded, one.name in removable, self._owners.known(Kind.SCENE, one.name))
+            for one in entries
+        ]
+        return ScenePage(told, next_page_token)
+
+    async def load(self, scene: str) -> SceneLoaded:
+        """Loads a scene into every process. Raises SceneNotFound, SceneFileInvalid, SceneTooLarge."""
+        return await self._changed(self._pool.load, scene)
+
+    async def unload(self, scene: str) -> SceneLoaded:
+        """Frees a scene. Raises SceneNotFound."""
+        return await self._changed(self._pool.unload, scene)
+
+    async def _changed(self, change: Callable[[str], Awaitable[None]], scene: str) -> SceneLoaded:
+        self._life.require_serving()
+        with scene_to_blame():
+            name = await asyncio.to_thread(self._store.require, scene)
+            await change(name)
+        return SceneLoaded.of(scene, self._pool.loaded().get(name, 0))
 
 
 def _entry(entry: CatalogEntry, loaded: bool, removable: bool, ownership: Ownership) -> SceneEntry:

@@ -81,7 +81,7 @@ async def get_registration(service: ServiceDep, registration: Name) -> NamedRegi
 )
 async def put_registration(request: Request, service: ServiceDep, registration: Name) -> NamedRegistration:
     """Keeps a registration, in place of one of that name which is the key's own."""
-    service.require_serving()
+    service.life.require_serving()
     body = await read_json_body(request, RegistrationBody)
     content = {name: value for name, value in to_dict(body).items() if name != "scene"}
     return await service.registrations.put(registration, body.scene, from_dict(Registration, content))
@@ -90,5 +90,5 @@ async def put_registration(request: Request, service: ServiceDep, registration: 
 @registrations_router.delete("/{registration}", status_code=204, responses=problems(401, 403, 404, 422, 503))
 async def delete_registration(service: ServiceDep, registration: Name) -> None:
     """Forgets a registration."""
-    service.require_serving()
+    service.life.require_serving()
     await service.registrations.delete(registration)

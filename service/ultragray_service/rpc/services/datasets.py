@@ -8,7 +8,6 @@ from ultragray.datasets.source import UPLOAD_OPTIONS
 from ultragray.errors import InvalidArgument
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import datasets_pb2
-from ultragray_service.core.datasets import contact_sheet, dataset, dataset_page, with_owner
 from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE
 from ultragray_service.core.uploads import DatasetUpload
 from ultragray_service.service import Service
@@ -23,7 +22,7 @@ class DatasetService:
     async def UploadDataset(  # noqa: N802
         self, requests: object, context: grpc.aio.ServicerContext
     ) -> datasets_pb2.UploadDatasetResponse:
-        self._service.require_serving()
+        self._service.life.require_serving()
         first = await context.read()
         if first is grpc.aio.EOF or first.WhichOneof("part") != "header":
             raise InvalidArgument("the first message must hold the header", field="header")
@@ -34,25 +33,25 @@ class DatasetService:
                 await upload.begin_archive()
             await _receive(context, upload, archive=header.archive)
             record, is_new = await upload.finish()
-        told = to_message(with_owner(self._service, record), datasets_pb2.Dataset)
+        told = to_message(self._service.datasets.with_owner(record), datasets_pb2.Dataset)
         return datasets_pb2.UploadDatasetResponse(dataset=told, created=is_new)
 
     async def ListDatasets(  # noqa: N802
         self, request: datasets_pb2.ListDatasetsRequest, context: grpc.aio.ServicerContext
     ) -> datasets_pb2.ListDatasetsResponse:
         page_size = request.page_size or DEFAULT_PAGE_SIZE
-        page = await dataset_page(self._service, page_size, request.page_token)
+        page = await self._service.datasets.page(page_size, request.page_token)
         return to_message(page, datasets_pb2.ListDatasetsResponse)
 
     async def GetDataset(  # noqa: N802
         self, request: datasets_pb2.GetDatasetRequest, context: grpc.aio.ServicerContext
     ) -> datasets_pb2.Dataset:
-        return to_message(await dataset(self._service, request.dataset), datasets_pb2.Dataset)
+        return to_message(await self._service.datasets.get(request.dataset), datasets_pb2.Dataset)
 
     async def GetContactSheet(  # noqa: N802
         self, request: datasets_pb2.GetContactSheetRequest, context: grpc.aio.ServicerContext
     ) -> datasets_pb2.GetContactSheetResponse:
-        return datasets_pb2.GetContactSheetResponse(png=await contact_sheet(self._service.datasets, request.dataset))
+        return datasets_pb2.GetContactSheetResponse(png=await self._service.datasets.contact_sheet(request.dataset))
 
     async def DeleteDataset(  # noqa: N802
         self, request: datasets_pb2.DeleteDatasetRequest, context: grpc.aio.ServicerContext

@@ -32,7 +32,7 @@ class JobService:
     async def SubmitJob(  # noqa: N802
         self, request: jobs_pb2.SubmitJobRequest, context: grpc.aio.ServicerContext
     ) -> jobs_pb2.SubmitJobResponse:
-        self._service.require_serving()
+        self._service.life.require_serving()
         specification, field = await asyncio.to_thread(read_specification, request)  # of many poses
         job, is_new = await self._service.jobs.submit(
             specification,
@@ -46,9 +46,9 @@ class JobService:
     async def EstimateJob(  # noqa: N802
         self, request: jobs_pb2.SubmitJobRequest, context: grpc.aio.ServicerContext
     ) -> jobs_pb2.JobEstimate:
-        self._service.require_serving()
+        self._service.life.require_serving()
         specification, field = await asyncio.to_thread(read_specification, request)
-        found = await estimate(self._service, specification, field=field)
+        found = await estimate(self._service.rendering, specification, field=field)
         poses = [geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=pose)) for pose in found.poses]
         return to_message(replace(found, poses=[]), jobs_pb2.JobEstimate, poses=poses)
 
@@ -77,7 +77,7 @@ class JobService:
     async def RetryJob(  # noqa: N802
         self, request: jobs_pb2.RetryJobRequest, context: grpc.aio.ServicerContext
     ) -> jobs_pb2.Job:
-        self._service.require_serving()
+        self._service.life.require_serving()
         job, _ = await self._service.jobs.retry(request.job)
         return job_message(job)
 
@@ -113,7 +113,7 @@ class JobService:
     async def WatchJob(  # noqa: N802
         self, request: jobs_pb2.WatchJobRequest, context: grpc.aio.ServicerContext
     ) -> None:
-        self._service.require_serving()
+        self._service.life.require_serving()
         watch = await self._service.jobs.hub.watch(request.job)
         try:
             while (change := await watch.next(_LOOK_AROUND_S)) is not None:

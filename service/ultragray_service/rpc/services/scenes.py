@@ -6,8 +6,7 @@ import grpc
 
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import scenes_pb2
-from ultragray_service.core import scenes
-from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE, SceneLoaded
+from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE
 from ultragray_service.service import Service
 
 
@@ -20,22 +19,22 @@ class SceneService:
     async def ListScenes(  # noqa: N802
         self, request: scenes_pb2.ListScenesRequest, context: grpc.aio.ServicerContext
     ) -> scenes_pb2.ListScenesResponse:
-        page = await scenes.scene_page(self._service, request.page_size or DEFAULT_PAGE_SIZE, request.page_token)
+        page = await self._service.scenes.page(request.page_size or DEFAULT_PAGE_SIZE, request.page_token)
         return to_message(page, scenes_pb2.ListScenesResponse)
 
     async def GetScene(  # noqa: N802
         self, request: scenes_pb2.GetSceneRequest, context: grpc.aio.ServicerContext
     ) -> scenes_pb2.Scene:
-        return to_message(await scenes.scene(self._service, request.scene), scenes_pb2.Scene)
+        return to_message(await self._service.scenes.get(request.scene), scenes_pb2.Scene)
 
     async def LoadScene(  # noqa: N802
         self, request: scenes_pb2.LoadSceneRequest, context: grpc.aio.ServicerContext
     ) -> scenes_pb2.LoadSceneResponse:
-        loaded = SceneLoaded.of(request.scene, await self._service.load(request.scene))
+        loaded = await self._service.scenes.load(request.scene)
         return to_message(loaded, scenes_pb2.LoadSceneResponse)
 
     async def UnloadScene(  # noqa: N802
         self, request: scenes_pb2.UnloadSceneRequest, context: grpc.aio.ServicerContext
     ) -> scenes_pb2.UnloadSceneResponse:
-        loaded = SceneLoaded.of(request.scene, await self._service.unload(request.scene))
+        loaded = await self._service.scenes.unload(request.scene)
         return to_message(loaded, scenes_pb2.UnloadSceneResponse)
