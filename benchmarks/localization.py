@@ -30,7 +30,7 @@ from ultragray.phantom import PHANTOM_IMAGE_SIDE, PHANTOM_PROBE, freehand_poses,
 from ultragray.probe import FloatArray
 from ultragray.scene import GaussianScene
 from ultragray_service.bench.measured import measured
-from ultragray_studies.report.study import train_and_evaluate
+from ultragray_studies.report import train_and_evaluate
 
 OUTPUT = FIGURES["localization"].staged
 PHANTOM = "phantom"

@@ -96,7 +96,7 @@ def evaluate(
     if output is not None:
         from ultragray.files.atomic import write_whole
         from ultragray.learn.evaluation.side_by_side import write_side_by_side
-        from ultragray.learn.report.plots import plot_reliability
+        from ultragray.learn.report.plots import plot_corrections, plot_reliability
 
         with working(f"drawing {len(frames)} pictures …"):
             paths = write_side_by_side(loaded, frames, evaluation.frames, output, backend=backend)
@@ -105,7 +105,7 @@ def evaluate(
             write_whole(paths[-1], plot_reliability(reliability))
         if (corrections := poses.get("pose_corrections")) is not None:
             paths.append(output / "pose_corrections.svg")
-            corrections.write_plot(paths[-1])
+            write_whole(paths[-1], plot_corrections(corrections.shift_mm, corrections.turn_deg))
         typer.echo(f"wrote {len(paths)} pictures into {output}", err=json)
 
 
