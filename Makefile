@@ -10,7 +10,7 @@ KERNEL_SOURCES := $(wildcard model/kernels/*) CMakeLists.txt
 PACKAGES := . proto client ros
 PACKAGE_SOURCES := $(KERNEL_SOURCES) $(PACKAGES:%=%/pyproject.toml) $(wildcard distribution/*.py)
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
-GENERATED_TESTS := tests/proto tests/client/test_client_generated.py tests/documents/test_measured_tables.py tests/documents/test_public_names.py tests/benchmarks/test_registry.py tests/service/test_snapshots.py
+GENERATED_TESTS := tests/proto tests/client/test_client_generated.py tests/documents/test_measured_tables.py tests/documents/test_snapshots.py tests/benchmarks/test_registry.py
 PYTHON_SOURCES := model service workers proto client ros distribution tests benchmarks docs examples
 NPM := $(shell command -v npm)
 CONSOLE := service/ultragray_service/console/index.html
@@ -232,9 +232,11 @@ demo-scene: $(VENV)/installed  ## simulate the phantom, train the demo scene fro
 docs: $(VENV)/installed-dev  ## build the site of the documents into build/site; broken links and anchors fail
 	$(BIN)/python -m docs.generator
 
-generate: $(VENV)/installed-dev  ## rewrite what is generated: the gRPC stubs and most of the client
+generate: $(VENV)/installed-dev  ## rewrite all that is generated: gRPC contract, the client's part of it, snapshots, the console's types
 	$(BIN)/python proto/generate.py
 	$(BIN)/python client/generate.py
+	$(BIN)/python -m docs.generator.snapshots
+	@[ ! -d web/node_modules ] || npm --prefix web run --silent generate
 
 packages: $(VENV)/installed-dev $(CONSOLE)  ## build the four packages into dist: sdists, and wheels for this Python
 	for package in $(PACKAGES); do $(BIN)/python -m build --outdir dist $$package || exit 1; done

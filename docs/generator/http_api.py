@@ -9,8 +9,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-from ultragray_service.core.state import Service
 from ultragray_service.http.app import create_app
+from ultragray_service.service import Service
 from ultragray_service.settings import Settings
 
 from .markdown import code, codes, in_line, prose, sections, table

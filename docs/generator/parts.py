@@ -10,8 +10,8 @@ from ultragray.display.settings import Display
 from ultragray.scene_info import SceneInfo
 from ultragray.settings import RenderSettings
 from ultragray.volumes.plane import SliceSettings
-from ultragray_service.http.reading.bodies import RenderBody, StreamMessage
-from ultragray_service.http.stream_messages import FrameMessage
+from ultragray_service.http.bodies import RenderBody, StreamMessage
+from ultragray_service.http.routes.streams import FrameMessage
 from ultragray_studies.gym.standard_plane import StandardPlaneSettings
 
 from . import command_line, grpc_api, http_api, library, limits, python_api, service

@@ -13,8 +13,8 @@ from ultragray.contract import annotated_fields, range_of
 from ultragray.settings import Resolved
 from ultragray_client import errors as client_errors
 from ultragray_service import errors as service_errors
-from ultragray_service.core.state import Service
 from ultragray_service.errors import statuses_of
+from ultragray_service.service import Service
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings
 from ultragray_workers import errors as workers_errors
 from ultragray_workers.errors import QueueFull

@@ -17,9 +17,9 @@ from ultragray.exchange import checkpoint as checkpoint_export
 from ultragray.exchange import ply
 from ultragray.outputs import OUTPUTS
 from ultragray.settings import Encoding
-from ultragray_service.http.reading import accept
-from ultragray_service.igtl.kinds import CAPABILITY
-from ultragray_service.rpc import status
+from ultragray_service.http import accept
+from ultragray_service.igtl.contents import CAPABILITY
+from ultragray_service.rpc import calls as status
 from ultragray_workers.pool.process import encoding as pixels
 
 from .conftest import Generator

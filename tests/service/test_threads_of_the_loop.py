@@ -12,10 +12,11 @@ from typing import Any
 import pytest
 
 from ultragray import GaussianScene
-from ultragray_service.access.principal import LOCAL, act_as
-from ultragray_service.core import catalog, scene_imports
-from ultragray_service.core.helper_processes import HelperProcesses
-from ultragray_service.core.state import Service
+from ultragray_service.access.principals import LOCAL, act_as
+from ultragray_service.core import catalog
+from ultragray_service.core import uploads as scene_imports
+from ultragray_service.core.threads import HelperProcesses
+from ultragray_service.service import Service
 from ultragray_service.settings import load_settings
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.shelves import folder

@@ -9,12 +9,12 @@ from ultragray.contract import described
 from ultragray.outputs import OUTPUTS
 from ultragray.probe import ElevationBeam, Probe
 from ultragray.scene_info import SceneHeader
-from ultragray_service.access.principal import iso_time
+from ultragray_service.access.principals import iso_time
 from ultragray_service.core.catalog import CatalogEntry, finite_metrics
 from ultragray_service.core.frames import OutputName
 from ultragray_service.core.poses import PoseInBothForms, Position
-from ultragray_service.core.state import Service
 from ultragray_service.errors import Refusal
+from ultragray_service.service import Service
 from ultragray_workers.jobs.queue.owners import Kind, Ownership
 from ultragray_workers.scene_names import base_name
 

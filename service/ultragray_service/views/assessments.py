@@ -10,7 +10,7 @@ from ultragray.contract import described
 from ultragray.probe import FloatArray, Probe
 from ultragray.scene_info import SceneHeader
 from ultragray_service.core.catalog import SceneCatalog
-from ultragray_service.registrations.registrations import Registrations
+from ultragray_service.core.registrations import Registrations
 
 
 @dataclass(frozen=True)

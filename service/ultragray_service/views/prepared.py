@@ -29,10 +29,9 @@ from ultragray.files.atomic import sync
 from ultragray.scene_info import read_header
 from ultragray.settings import Encoding
 from ultragray_service.core.catalog import SceneCatalog
-from ultragray_service.core.helper_processes import HelperProcesses
 from ultragray_service.core.jobs.jobs import Jobs
-from ultragray_service.core.own_thread import in_own_thread, to_its_end
 from ultragray_service.core.poses import MatrixRows
+from ultragray_service.core.threads import HelperProcesses, in_own_thread, to_its_end
 from ultragray_service.settings import Settings
 from ultragray_workers.claims import claimed_folder, remove_abandoned, remove_whole, storage_full
 from ultragray_workers.datasets.store import DatasetStore

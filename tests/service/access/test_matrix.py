@@ -24,11 +24,11 @@ from ultragray_proto.v1 import (
     scenes_pb2,
     workers_pb2,
 )
-from ultragray_service.access.principal import Role
+from ultragray_service.access.principals import Role
 from ultragray_service.access.rules import GRPC_OPERATIONS, WEBSOCKET, HttpRules, Operation, require_all_methods
-from ultragray_service.core.state import Service
 from ultragray_service.http import app as http_app
 from ultragray_service.http.app import OWNED, ROLE, create_app
+from ultragray_service.service import Service
 from ultragray_service.settings import Settings
 
 from ..rpc.test_grpc_render import error_info

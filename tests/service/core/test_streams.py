@@ -11,9 +11,8 @@ from typing import Any
 import pytest
 
 from ultragray.errors import InvalidArgument, UltragrayError
-from ultragray_service.core.state import Service
-from ultragray_service.core.streams.pose_stream import Answered, PoseStream, StreamMode
-from ultragray_service.core.streams.stream import FrameStream
+from ultragray_service.core.streams import Answered, FrameStream, PoseStream, StreamMode
+from ultragray_service.service import Service
 from ultragray_service.settings import Settings
 
 

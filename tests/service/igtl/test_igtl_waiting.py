@@ -10,9 +10,9 @@ import pytest
 
 from ultragray.registration.registration import Registration, rows
 from ultragray.settings import FrameSettings
-from ultragray_service.igtl.commands.scanner import Setup
+from ultragray_service.igtl.commands import Setup
+from ultragray_service.igtl.frames import MAX_WAITING_DEVICES, PoseMessage, Underway, WaitingPoses
 from ultragray_service.igtl.messages import Message
-from ultragray_service.igtl.waiting import MAX_WAITING_DEVICES, PoseMessage, Underway, WaitingPoses
 from ultragray_workers.errors import QueueFull
 
 SETUP = Setup(FrameSettings())

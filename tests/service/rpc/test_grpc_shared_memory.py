@@ -17,7 +17,7 @@ import pytest
 
 from ultragray.errors import InvalidArgument
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
-from ultragray_service.rpc.peers import address_of
+from ultragray_service.rpc.calls import address_of
 from ultragray_service.rpc.shared_memory import FOLDER, SharedMemory
 from ultragray_workers.pool.types import Place
 

@@ -11,9 +11,8 @@ import grpc
 import pytest
 from google.protobuf.empty_pb2 import Empty
 
-from ultragray_service.core.state import Service
-from ultragray_service.rpc.interceptor import CallContext
-from ultragray_service.rpc.status import abort
+from ultragray_service.rpc.calls import CallContext, abort
+from ultragray_service.service import Service
 from ultragray_service.settings import load_settings
 from ultragray_workers.errors import DeadlineExceeded
 

@@ -7,9 +7,9 @@ import httpx
 import pytest
 from websockets.sync.client import connect
 
-from ultragray_service.core.state import Service
+from ultragray_service.service import Service
 from ultragray_service.settings import load_settings
-from ultragray_service.telemetry.statistics import STEP_S, STEPS, StageTimes, Statistics
+from ultragray_service.telemetry.metrics import STEP_S, STEPS, StageTimes, Statistics
 from ultragray_workers.errors import DeadlineExceeded
 
 from ..conftest import StartService

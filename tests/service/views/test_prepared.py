@@ -17,7 +17,7 @@ import pytest
 
 from ultragray.datasets.released import write_released
 from ultragray.errors import MemoryExceeded
-from ultragray_service.core.helper_processes import HelperProcesses
+from ultragray_service.core.threads import HelperProcesses
 from ultragray_service.settings import Settings
 from ultragray_service.views import prepared
 from ultragray_service.views.prepared import Preparation, Prepared

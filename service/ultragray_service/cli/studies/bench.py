@@ -11,8 +11,7 @@ from typing import Annotated
 import typer
 
 from ultragray.errors import InvalidArgument
-from ultragray_service.cli.output import check_file
-from ultragray_service.cli.style import COMPUTE, Force, Json, command_group, examples, output_option
+from ultragray_service.cli.terminal import COMPUTE, Force, Json, check_file, command_group, examples, output_option
 
 INSTEAD = "Instead of frames"
 command_app = command_group()

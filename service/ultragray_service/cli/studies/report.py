@@ -16,14 +16,16 @@ from ultragray.datasets.source import SourceOptions
 from ultragray.learn.training.config import PRESET_MEANINGS, TrainingConfig
 from ultragray.scene_info import read_header
 from ultragray_service.cli.options import FieldsOf, with_options
-from ultragray_service.cli.output import check_file
-from ultragray_service.cli.style import Force, Json, Threads, command_group, examples, output_option, tell
-from ultragray_service.cli.sweeps.source import (
-    SweepArgument,
-    check_scene_fits,
-    check_source,
-    read_dataset,
-    warn_about_dataset,
+from ultragray_service.cli.sweeps import SweepArgument, check_scene_fits, check_source, read_dataset, warn_about_dataset
+from ultragray_service.cli.terminal import (
+    Force,
+    Json,
+    Threads,
+    check_file,
+    command_group,
+    examples,
+    output_option,
+    tell,
 )
 
 if TYPE_CHECKING:

@@ -10,7 +10,7 @@ from ultragray.errors import InvalidArgument
 from ultragray.probe import FloatArray
 from ultragray.settings import Encoding
 from ultragray_service.core.requests import Plan
-from ultragray_service.core.state import Service
+from ultragray_service.service import Service
 from ultragray_workers.errors import DeadlineExceeded, QueueFull
 from ultragray_workers.jobs.kinds import RenderJob, Specification
 from ultragray_workers.pool.types import Priority
