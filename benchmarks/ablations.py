@@ -21,7 +21,7 @@ import torch
 
 from registry import FIGURES, Document
 from ultragray.datasets.source import PHANTOM, SourceOptions, load_dataset
-from ultragray.files.atomic import write_whole
+from ultragray.files import write_whole
 from ultragray.learn.evaluation.scoring import render_sweep
 from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import TrainingConfig

@@ -19,7 +19,7 @@ from pathlib import Path
 from rich.console import Console
 from rich.table import Table
 
-from ultragray.machine import processor_name
+from ultragray.installation import processor_name
 from ultragray_service.bench.kernel import BenchScene, bench_poses
 from ultragray_service.bench.served import DOORS, SCENE, WARM_UP, running_server
 

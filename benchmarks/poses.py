@@ -21,13 +21,13 @@ import torch
 
 from registry import FIGURES, Document
 from ultragray.datasets.source import load_dataset
-from ultragray.files.atomic import write_whole
+from ultragray.files import write_whole
+from ultragray.geometry.pose import rotation_angles_deg
+from ultragray.geometry.probe import FloatArray
 from ultragray.geometry.rotations import about_axes, random_directions
 from ultragray.learn.sweep import Dataset, Sweep
 from ultragray.learn.training import TrainingConfig
 from ultragray.learn.training.alignment import sweep_ranges
-from ultragray.pose import rotation_angles_deg
-from ultragray.probe import FloatArray
 from ultragray_service.bench.measured import measured
 from ultragray_studies.report import train_and_evaluate
 

@@ -24,13 +24,13 @@ import torch
 from in_silico import IN_SILICO
 from registry import FIGURES, Document
 from ultragray.datasets.source import PHANTOM, SourceOptions, load_dataset
-from ultragray.files.atomic import write_whole
+from ultragray.files import write_whole
 from ultragray.learn.evaluation.baselines import BASELINES, affordable_voxel_mm, evaluate_baselines, predict
 from ultragray.learn.evaluation.scoring import render_sweep
 from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import Progress, TrainingConfig
 from ultragray.phantom.imaging import SHADOW_DB, BoneShadow
-from ultragray.scene import GaussianScene
+from ultragray.scene.gaussians import GaussianScene
 from ultragray_service.bench.measured import measured
 from ultragray_studies.report import train_and_evaluate
 

@@ -10,7 +10,7 @@ from functools import partial
 from typing import Any
 
 from ultragray.errors import RenderFailed, UltragrayError
-from ultragray.probe import FloatArray
+from ultragray.geometry.probe import FloatArray
 from ultragray_service.access.audit import AuditLog, account
 from ultragray_service.access.credentials import Authenticator, EnvironmentKeys, Guard, Sessions
 from ultragray_service.access.keys import KnownKeys, Snapshot
@@ -39,8 +39,8 @@ from ultragray_workers.errors import Draining, NotReady, SceneNotFound, StartupF
 from ultragray_workers.jobs.places import shared_storage
 from ultragray_workers.jobs.queue.owners import Kind
 from ultragray_workers.jobs.store import JobStore
+from ultragray_workers.pool.messages import Destination, Priority, RenderRequest, RenderResult, S, SceneChangedError
 from ultragray_workers.pool.pool import MAX_SCENE_CHANGES, PoolConfig, RenderPool
-from ultragray_workers.pool.types import Destination, Priority, RenderRequest, RenderResult, S, SceneChangedError
 from ultragray_workers.pool.waiting import Turn
 from ultragray_workers.scenes import SceneStore
 

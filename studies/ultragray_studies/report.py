@@ -14,6 +14,8 @@ from typing import TypeVar
 import numpy as np
 
 from ultragray.errors import DatasetInvalid, UltragrayError
+from ultragray.geometry.pose import rotation_angles_deg
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation.baselines import FOLDS as VOLUME_METHODS
 from ultragray.learn.evaluation.baselines import VOXEL_MM, evaluate_baselines, mean_axes, nearest_frames
 from ultragray.learn.evaluation.metrics import FrameMetrics
@@ -23,10 +25,8 @@ from ultragray.learn.report.tables import Row, metric_rows
 from ultragray.learn.sweep import Dataset, IntArray, Sweep
 from ultragray.learn.training import Progress, TrainingConfig, train
 from ultragray.learn.training.progress import Course
-from ultragray.pose import rotation_angles_deg
-from ultragray.probe import FloatArray
-from ultragray.scene import GaussianScene
-from ultragray.scene_info import read_header
+from ultragray.scene.gaussians import GaussianScene
+from ultragray.scene.info import read_header
 from ultragray_studies.comparison.place import frames_of
 from ultragray_studies.comparison.plots import plot_counts, plot_distances, plot_tilt
 from ultragray_studies.comparison.result import Comparison, MethodResult

@@ -22,7 +22,7 @@ import pytest
 
 from ultragray.datasets import Dataset
 from ultragray.datasets.released import write_released
-from ultragray.files.atomic import file_sha256
+from ultragray.files import file_sha256
 from ultragray_service.bench.measured import measured
 
 from ..model.learn.training.conftest import make_tiny_dataset

@@ -17,8 +17,8 @@ import numpy as np
 import torch
 from websockets.sync.client import connect
 
-from ultragray.demo import copy_demo_scene, demo_poses
-from ultragray.probe import FloatArray
+from ultragray.geometry.probe import FloatArray
+from ultragray.phantom.demo import copy_demo_scene, demo_poses
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 from ultragray_service.bench.igtl import PingPong
 from ultragray_service.bench.kernel import BenchScene, bench_poses, measure_kernel, time_ms

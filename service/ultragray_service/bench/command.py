@@ -33,7 +33,7 @@ def chosen_bench(name: str, backend: str) -> Bench:
     if (module := _BENCHES.get((name, backend))) is None:
         raise InvalidArgument(f"--{name} goes without --backend", field="backend")
     if backend == "cuda":
-        from ultragray.backends import cuda
+        from ultragray.rendering.backends import cuda
 
         cuda.require()
     bench: Bench = importlib.import_module(f".{module}", __package__).run

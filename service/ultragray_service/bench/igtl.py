@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import socket
 
-from ultragray.probe import FloatArray
+from ultragray.geometry.probe import FloatArray
 from ultragray_service.igtl.contents import Image, pack_transform, unpack_image, unpack_status
 from ultragray_service.igtl.messages import HEADER_BYTES, Message, pack_message, unpack_header, unpack_message
 from ultragray_workers.errors import NotReady

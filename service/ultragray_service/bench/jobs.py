@@ -21,8 +21,8 @@ import sqlalchemy as sa
 
 from ultragray.datasets import Dataset
 from ultragray.datasets.released import write_released
-from ultragray.demo import copy_demo_scene, demo_poses
 from ultragray.phantom import load_phantom
+from ultragray.phantom.demo import copy_demo_scene, demo_poses
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 from ultragray_service.bench.kernel import time_ms
 from ultragray_service.bench.report import Report, percentiles

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 
 from ultragray import GaussianScene, LinearProbe, SceneInfo
-from ultragray.backends import cpu
-from ultragray.probe import FloatArray
+from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.backends import cpu
 
 BLOCK_CM = 5.0
 PROBE = LinearProbe(width_mm=50.0, near_mm=0.0, far_mm=50.0)

@@ -16,10 +16,10 @@ import numpy as np
 import torch
 
 from ultragray import GaussianScene
-from ultragray.backends import cpu
-from ultragray.demo import load_demo_scene
+from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.sweep import spread_places
-from ultragray.probe import FloatArray, Probe
+from ultragray.phantom.demo import load_demo_scene
+from ultragray.rendering.backends import cpu
 from ultragray_service.bench.kernel import PROBE, bench_poses, bench_scenes, time_ms
 from ultragray_service.bench.report import Report
 

@@ -10,8 +10,8 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from ultragray.backends import cpu
-from ultragray.machine import memory_bytes, processor_maker, processor_model, processor_name
+from ultragray.installation import memory_bytes, processor_maker, processor_model, processor_name
+from ultragray.rendering.backends import cpu
 
 ROOT = Path(__file__).resolve().parents[3]  # of the checkout, where this is one
 DIRTY = "-dirty"

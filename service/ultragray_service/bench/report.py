@@ -16,7 +16,7 @@ from rich.console import Console
 from rich.table import Table
 
 import ultragray
-from ultragray.files.atomic import write_whole
+from ultragray.files import write_whole
 from ultragray_service.bench.kernel import time_yard_ms
 from ultragray_service.bench.measured import measured
 

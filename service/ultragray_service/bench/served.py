@@ -20,7 +20,7 @@ from pathlib import Path
 
 import grpc
 
-from ultragray.probe import FloatArray
+from ultragray.geometry.probe import FloatArray
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
 from ultragray_service.bench.kernel import BenchScene, bench_poses, time_ms
 from ultragray_service.bench.shared_file import SharedFile

@@ -12,10 +12,10 @@ import numpy as np
 import torch
 
 from ultragray import GaussianScene, render
-from ultragray.backends.spatial_order import spatial_order
 from ultragray.learn.training.config import TEXTURE
 from ultragray.learn.training.losses import image_loss
 from ultragray.learn.training.optimizer import Optimizer
+from ultragray.rendering.backends.inputs import spatial_order
 from ultragray_service.bench.kernel import BATCH, PROBE, BenchScene, Mark, bench_poses, elapsed_ms, finish, mark
 from ultragray_service.bench.report import Report
 

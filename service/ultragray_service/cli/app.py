@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from difflib import get_close_matches
 from functools import cached_property
 from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
 from typing import Annotated, Any
 
 import typer
@@ -23,9 +24,7 @@ class Entry:
     """A command of the group that is not loaded yet."""
 
     name: str
-    app: (
-        str  # "module:name" of the typer app that holds the command, or the group of commands; .module: of this package
-    )
+    app: str  # "module:name" of the typer app of the command, or of the group of commands; .module: of this package
     panel: str
     summary: str  # the first line of its help
 
@@ -44,25 +43,30 @@ class Entry:
 
 
 class _Loaded(Mapping[str, Any]):
-    """Commands by name, each loaded when it is asked for."""
+    """Commands of a group by name, each loaded when it is asked for."""
 
-    def __init__(self, entries: tuple[Entry, ...]) -> None:
-        self._entries = {entry.name: entry for entry in entries}
-        self._commands: dict[str, Any] = {}
+    def __init__(self, group: LazyGroup) -> None:
+        self._group = group
 
     def __getitem__(self, name: str) -> Any:
-        if name not in self._commands:
-            self._commands[name] = self._entries[name].load()
-        return self._commands[name]
-
-    def __contains__(self, name: object) -> bool:
-        return name in self._entries
+        if (entry := self._group.entry(name)) is None:
+            raise KeyError(name)
+        return entry.load()
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._entries)
+        return iter(self._group.list_commands(None))
 
     def __len__(self) -> int:
-        return len(self._entries)
+        return len(self._group.list_commands(None))
+
+
+def _entries_of(point: EntryPoint) -> tuple[Entry, ...]:
+    """The entries of another package; none, and a warning, where it cannot be imported."""
+    try:
+        return tuple(point.load())
+    except ImportError as error:
+        typer.secho(f"warning: the commands of {point.value} are left out: {error}", fg=typer.colors.YELLOW, err=True)
+        return ()
 
 
 class LazyGroup(TyperGroup):
@@ -73,27 +77,40 @@ class LazyGroup(TyperGroup):
     """
 
     entries: tuple[Entry, ...] = ()
+    plugins: str | None = None  # group of the entry points of other packages, each a tuple of entries
 
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
-        self.commands = _Loaded(self.entries)  # type: ignore[assignment]  # nobody adds to it
+        self.commands = _Loaded(self)  # type: ignore[assignment]  # nobody adds to it
 
     @cached_property
-    def _descriptions(self) -> dict[str, TyperCommand]:
-        return {entry.name: entry.described() for entry in self.entries}
+    def _own(self) -> dict[str, Entry]:
+        return {entry.name: entry for entry in self.entries}
+
+    @cached_property
+    def _all(self) -> dict[str, Entry]:
+        """The own entries, and those of other packages; to find these takes some hundredths of a second."""
+        found = [] if self.plugins is None else entry_points(group=self.plugins)
+        return {**{entry.name: entry for point in found for entry in _entries_of(point)}, **self._own}
+
+    def entry(self, name: str) -> Entry | None:
+        """The entry of a command; None: there is none of that name."""
+        return self._own.get(name) or self._all.get(name)
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """The names, in the order of the entries."""
-        return list(self._descriptions)
+        """The names, the own ones first, in the order of the entries."""
+        return [*self._own, *(name for name in self._all if name not in self._own)]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """A command as lists show it; what runs comes from `resolve_command`."""
-        return self._descriptions.get(cmd_name)
+        entry = self.entry(cmd_name)
+        return None if entry is None else entry.described()
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
         """The command that the arguments begin with, loaded."""
         name, found, rest = super().resolve_command(ctx, args)
-        return name, found and self.commands[found.name or ""], rest
+        entry = self.entry(name or "")
+        return name, found if entry is None else entry.load(), rest
 
     def main(
         self,
@@ -187,6 +204,7 @@ _REMOTE, _INSTALLATION = "A running service (--address)", "An installation's fol
 
 
 class _Commands(LazyGroup):
+    plugins = "ultragray.commands"
     entries = (
         Entry("serve", ".serve:command_app", _SERVING, "Serve scenes over HTTP and gRPC, until Ctrl-C or SIGTERM."),
         Entry("worker", ".worker:command_app", _SERVING, "Take jobs from the queue, one at a time, until Ctrl-C."),

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ultragray.datasets.source import SourceOptions
-from ultragray.scene_info import read_header
+from ultragray.scene.info import read_header
 from ultragray_service.cli.options import with_options
 from ultragray_service.cli.sweeps import SweepArgument, check_scene_fits, check_source, read_dataset
 from ultragray_service.cli.terminal import (
@@ -31,7 +31,7 @@ from ultragray_service.cli.terminal import (
 if TYPE_CHECKING:
     from ultragray.learn.evaluation.scoring import Evaluation, Reliability
     from ultragray.learn.sweep import Sweep
-    from ultragray.scene import GaussianScene
+    from ultragray.scene.gaussians import GaussianScene
     from ultragray_studies.comparison.result import Comparison
 
 
@@ -83,8 +83,8 @@ def evaluate(
 
     from ultragray.learn.evaluation.scoring import evaluate as evaluate_scene
     from ultragray.learn.evaluation.scoring import measure_reliability, require_frames
-    from ultragray.scene import GaussianScene
-    from ultragray_workers.pool.process.placement import render_device
+    from ultragray.scene.gaussians import GaussianScene
+    from ultragray_workers.pool.scene_cache import render_device
 
     loaded = GaussianScene.load(scene).to(render_device(backend))
     read = read_dataset(sweep, source)
@@ -107,7 +107,7 @@ def evaluate(
         for value in poses.values():
             typer.echo(str(value))
     if output is not None:
-        from ultragray.files.atomic import write_whole
+        from ultragray.files import write_whole
         from ultragray.learn.evaluation.side_by_side import write_side_by_side
         from ultragray.learn.report.plots import plot_corrections, plot_reliability
 

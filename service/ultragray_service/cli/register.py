@@ -12,9 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ultragray.errors import InvalidArgument
-from ultragray.files.poses import load_poses
+from ultragray.exchange.poses import load_poses
 from ultragray.learn.localization.pixels import read_frame
-from ultragray.scene_info import read_header
+from ultragray.scene.info import read_header
 from ultragray_service.cli.terminal import (
     Backend,
     Force,
@@ -30,8 +30,8 @@ from ultragray_service.cli.terminal import (
 
 if TYPE_CHECKING:
     from ultragray import Localization
-    from ultragray.probe import FloatArray
-    from ultragray.registration.registration import Registration
+    from ultragray.geometry.probe import FloatArray
+    from ultragray.geometry.registration import Registration
 
 
 POSE_SUFFIXES = (".npy",)
@@ -92,7 +92,7 @@ def _write_pose(path: Path, found: Localization) -> None:
 
     import numpy as np
 
-    from ultragray.files.atomic import write_whole
+    from ultragray.files import write_whole
 
     data = io.BytesIO()
     np.save(data, found.pose)
@@ -150,8 +150,7 @@ def points(
     mounting = _mounting(probe_to_flange)
     import numpy as np
 
-    from ultragray.registration.points import register_points
-    from ultragray.registration.registration import Registration, rows
+    from ultragray.geometry.registration import Registration, register_points, rows
 
     fit = register_points(_read_points(in_base), _read_points(in_scene))
     registration = Registration(
@@ -190,7 +189,7 @@ def poses(
             "--find-mounting finds what --probe-to-flange gives: name one of them", field="find_mounting"
         )
     in_base, in_scene, mounting = load_poses(flange), load_poses(probe), _mounting(probe_to_flange)
-    from ultragray.registration.poses import register_poses, register_poses_and_mounting
+    from ultragray.geometry.registration import register_poses, register_poses_and_mounting
 
     if find_mounting:
         fit = register_poses_and_mounting(in_base, in_scene)
@@ -231,7 +230,7 @@ def frames(
     pixels = _read_frames(images)
 
     from ultragray import GaussianScene
-    from ultragray.registration.frames import register_frames
+    from ultragray.learn.registration import register_frames
 
     with working("looking for the frames …"):
         found = register_frames(
@@ -252,7 +251,7 @@ def frames(
 def _registration(fit: Any) -> Registration:
     import numpy as np
 
-    from ultragray.registration.registration import Registration, rows
+    from ultragray.geometry.registration import Registration, rows
 
     return Registration(
         base_to_scene=rows(fit.base_to_scene),
@@ -305,7 +304,7 @@ def _write(
     as_json: bool,
 ) -> None:
     from ultragray.contract import to_dict
-    from ultragray.registration.registration import save_registration
+    from ultragray.geometry.registration import save_registration
 
     save_registration(path, registration)
     document = to_dict(registration) | {"residuals_mm": residuals_mm, "residuals_deg": residuals_deg}

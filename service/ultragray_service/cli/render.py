@@ -15,17 +15,17 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from ultragray.confidence import CONTACT_SHARE, Assessor, Extrapolation, figure_arrays
 from ultragray.errors import InvalidArgument, InvalidProbe
 from ultragray.exchange.batches import MANIFEST_FILE, SHARD_FRAMES, BatchPlan
 from ultragray.exchange.exports.formats import DTYPES, FORMATS, check_format, exporter_class, format_of
-from ultragray.files.atomic import file_sha256
-from ultragray.files.poses import load_poses
-from ultragray.probe import FloatArray
+from ultragray.exchange.poses import load_poses
+from ultragray.files import file_sha256
+from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.settings import Encoding, FrameSettings, Resolved
 from ultragray.samplers import Sampler, TrainingSampler, assessed_poses
 from ultragray.samplers.confident import require_drawn
-from ultragray.scene_info import read_header
-from ultragray.settings import Encoding, FrameSettings, Resolved
+from ultragray.scene.confidence import CONTACT_SHARE, Assessor, Extrapolation, figure_arrays
+from ultragray.scene.info import read_header
 from ultragray_service.cli.options import poses_option, with_options
 from ultragray_service.cli.terminal import (
     COMPUTE,
@@ -210,8 +210,8 @@ def render_frames(
     import torch
 
     from ultragray.exchange.rendering import render_to_file
-    from ultragray.scene import GaussianScene
-    from ultragray_workers.pool.process.placement import render_device
+    from ultragray.scene.gaussians import GaussianScene
+    from ultragray_workers.pool.scene_cache import render_device
 
     scene = GaussianScene.load(task.scene_file)
     if threads:

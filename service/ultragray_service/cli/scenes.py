@@ -15,8 +15,8 @@ import typer
 from ultragray.contract import to_dict
 from ultragray.datasets.source import SourceOptions
 from ultragray.errors import InvalidArgument
-from ultragray.scene_info import SceneInfo, read_header
-from ultragray.volumes.names import SLICE_SUFFIXES, VOLUME_FIELDS, VOLUME_SUFFIXES
+from ultragray.rendering.volumes import SLICE_SUFFIXES, VOLUME_FIELDS, VOLUME_SUFFIXES
+from ultragray.scene.info import SceneInfo, read_header
 from ultragray_service.cli.options import with_options
 from ultragray_service.cli.sweeps import SWEEP_MEANING, read_dataset
 from ultragray_service.cli.terminal import (
@@ -49,8 +49,8 @@ def demo(
     json: Json = False,
 ) -> None:
     """It needs no data and no training: a first frame takes seconds."""
-    from ultragray.demo import copy_demo_scene
-    from ultragray.scene_info import read_header
+    from ultragray.phantom.demo import copy_demo_scene
+    from ultragray.scene.info import read_header
 
     check_file(output, [SCENE_SUFFIX], force=force)
     copy_demo_scene(output)
@@ -123,8 +123,8 @@ def print_facts(document: dict[str, Any]) -> None:
 
 def describe_scene(path: Path) -> dict[str, Any]:
     """The fields of SceneInfo without hardness, the file, and a summary of the poses. Raises SceneFileInvalid."""
-    from ultragray.files.atomic import file_sha256
-    from ultragray.scene_info import read_header
+    from ultragray.files import file_sha256
+    from ultragray.scene.info import read_header
 
     header = read_header(path)
     info, positions = header.info, header.training_poses[:, :3, 3]
@@ -409,8 +409,8 @@ def voxelize(
     info = read_header(scene).info
 
     from ultragray import GaussianScene
-    from ultragray.volumes.files import volume_facts, write_slice, write_volume
-    from ultragray.volumes.grid import VolumeGrid, parse_box, parse_numbers
+    from ultragray.rendering.volume_fields import volume_facts, write_slice, write_volume
+    from ultragray.rendering.volumes import VolumeGrid, parse_box, parse_numbers
 
     if plane_mm is None:
         if size_mm is not None:
@@ -472,8 +472,8 @@ def slicer(
 
     from ultragray import GaussianScene
     from ultragray.exchange.slicer import SlicerScene
-    from ultragray.volumes.files import write_volume
-    from ultragray.volumes.grid import VolumeGrid
+    from ultragray.rendering.volume_fields import write_volume
+    from ultragray.rendering.volumes import VolumeGrid
 
     grid = VolumeGrid.over_scene(header.info, None, spacing_mm)
     with working(f"sampling {' x '.join(map(str, grid.shape))} points …"):

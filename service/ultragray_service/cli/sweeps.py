@@ -11,7 +11,7 @@ import typer
 from ultragray.contract import to_dict
 from ultragray.datasets.source import FORMATS, PHANTOM, SourceOptions, format_of, load_dataset
 from ultragray.errors import InvalidArgument
-from ultragray.scene_info import SceneHeader, read_header
+from ultragray.scene.info import SceneHeader, read_header
 from ultragray_service.cli.options import with_options
 from ultragray_service.cli.terminal import (
     Force,
@@ -30,7 +30,7 @@ from ultragray_service.cli.terminal import (
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset
     from ultragray.datasets.checks import DatasetReport, SweepReport
-    from ultragray.scene_info import SceneInfo
+    from ultragray.scene.info import SceneInfo
 
 
 SWEEP_MEANING = "; ".join(one.meaning for one in FORMATS.values())

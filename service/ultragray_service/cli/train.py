@@ -36,7 +36,7 @@ from ultragray_service.cli.terminal import (
 
 if TYPE_CHECKING:
     from ultragray.learn.training import Progress
-    from ultragray.scene import GaussianScene
+    from ultragray.scene.gaussians import GaussianScene
 
 
 RUN = "Run"

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ultragray.errors import InvalidArgument, SceneFileInvalid, UltragrayError
-from ultragray.scene_info import SceneHeader
+from ultragray.scene.info import SceneHeader
 from ultragray_service.core.threads import in_own_thread
 from ultragray_service.settings import Settings
 from ultragray_service.views.scene_points import point_message

@@ -11,15 +11,14 @@ from typing import Generic
 
 from ultragray.contract import join, under
 from ultragray.errors import InvalidImageSize, TooManyPoses
-from ultragray.probe import FloatArray
-from ultragray.registration.registration import Registration
-from ultragray.scene_info import SceneInfo
-from ultragray.settings import Encoding, FrameSettings, Resolved
-from ultragray.volumes.names import check_field
-from ultragray.volumes.plane import SliceSettings, SliceView
+from ultragray.geometry.probe import FloatArray
+from ultragray.geometry.registration import Registration
+from ultragray.rendering.settings import Encoding, FrameSettings, Resolved
+from ultragray.rendering.volumes import SliceSettings, SliceView, check_field
+from ultragray.scene.info import SceneInfo
 from ultragray_service.core.catalog import SceneCatalog
 from ultragray_service.settings import Settings
-from ultragray_workers.pool.types import S
+from ultragray_workers.pool.messages import S
 from ultragray_workers.scene_names import base_name
 from ultragray_workers.storage.local import FileVersion
 

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from ultragray.confidence.assess import read_model
 from ultragray.contract import described
-from ultragray.outputs import OUTPUTS
-from ultragray.probe import ElevationBeam, Probe
-from ultragray.scene_info import SceneHeader
+from ultragray.geometry.probe import ElevationBeam, Probe
+from ultragray.rendering.outputs import OUTPUTS
+from ultragray.scene.confidence import read_model
+from ultragray.scene.info import SceneHeader
 from ultragray_service.access.principals import iso_time
 from ultragray_service.core.catalog import CatalogEntry, finite_metrics
 from ultragray_service.core.frames import OutputName

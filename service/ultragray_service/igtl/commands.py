@@ -10,12 +10,12 @@ from typing import Any
 from xml.etree import ElementTree
 
 from ultragray.contract import from_dict, shown, to_dict, under
-from ultragray.display.settings import AS_RENDERED, FRAME_RANGE_DB
 from ultragray.errors import InvalidArgument, InvalidProbe, UltragrayError
-from ultragray.probe import FloatArray, Probe
-from ultragray.registration.registration import Registration
-from ultragray.settings import FrameSettings
-from ultragray.tools import MAX_TOOLS, Tool
+from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.geometry.registration import Registration
+from ultragray.rendering.display import AS_RENDERED, FRAME_RANGE_DB
+from ultragray.rendering.settings import FrameSettings
+from ultragray.rendering.tools import MAX_TOOLS, Tool
 from ultragray_service.core.registrations import Registrations
 from ultragray_service.errors import IgtlMessageInvalid
 from ultragray_service.igtl.messages import DEVICE_NAME_BYTES, Message, pack_text, unpack_text

@@ -11,7 +11,7 @@ from dataclasses import replace
 from typing import Protocol
 
 from ultragray.errors import UltragrayError
-from ultragray.settings import FrameSettings
+from ultragray.rendering.settings import FrameSettings
 from ultragray_service.core.open_streams import Answered, OpenStream
 from ultragray_service.core.unread import Unread, hold_little
 from ultragray_service.errors import IgtlMessageInvalid
@@ -37,7 +37,7 @@ from ultragray_service.igtl.frames import Feed, Frame, FrameMaker, PoseMessage, 
 from ultragray_service.igtl.messages import HEADER_BYTES, Header, Message, pack_message, unpack_header, unpack_message
 from ultragray_service.igtl.routes import SceneChooser
 from ultragray_service.service import Service
-from ultragray_workers.pool.types import RenderResult
+from ultragray_workers.pool.messages import RenderResult
 
 MAX_BODY_BYTES = 64 * 1024  # of a message that is read
 MAX_SKIPPED_BYTES = 64 * 2**20  # of a message that is not

@@ -18,8 +18,8 @@ from ultragray.errors import (
     SceneFileInvalid,
     UltragrayError,
 )
-from ultragray.pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
-from ultragray.probe import FloatArray
+from ultragray.geometry.pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
+from ultragray.geometry.probe import FloatArray
 from ultragray_service.errors import (
     IgtlMessageInvalid,
     LimitReached,

@@ -14,11 +14,11 @@ from functools import lru_cache
 import numpy as np
 
 from ultragray.contract import to_dict
-from ultragray.display.settings import Display, true_to_scale
-from ultragray.probe import FloatArray
-from ultragray.registration.registration import Registration
-from ultragray.settings import Encoding, Resolved
-from ultragray.tools import Tool
+from ultragray.geometry.probe import FloatArray
+from ultragray.geometry.registration import Registration
+from ultragray.rendering.display import Display, true_to_scale
+from ultragray.rendering.settings import Encoding, Resolved
+from ultragray.rendering.tools import Tool
 from ultragray_service.igtl.commands import Scanner, Setup
 from ultragray_service.igtl.contents import (
     Image,
@@ -33,7 +33,7 @@ from ultragray_service.igtl.routes import SceneChooser, image_name
 from ultragray_service.service import Service
 from ultragray_workers.errors import QueueFull
 from ultragray_workers.jobs.queue.owners import Kind, Ownership
-from ultragray_workers.pool.types import RenderResult
+from ultragray_workers.pool.messages import RenderResult
 from ultragray_workers.pool.waiting import Turn
 
 MAX_WAITING_DEVICES = 16

@@ -13,9 +13,9 @@ import grpc
 
 from ultragray.contract import under
 from ultragray.errors import FrameTooCostly, InvalidArgument, LowConfidence, UltragrayError
+from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.localization.settings import LocalizationSettings
-from ultragray.probe import FloatArray, Probe
-from ultragray.volumes.plane import SliceSettings
+from ultragray.rendering.volumes import SliceSettings
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import rendering_pb2, scenes_pb2
 from ultragray_service.core.open_streams import Answered
@@ -28,7 +28,7 @@ from ultragray_service.rpc.shared_memory import SharedMemory
 from ultragray_service.service import Service
 from ultragray_service.views.localizing import locate, sought_frame
 from ultragray_workers.errors import QueueFull
-from ultragray_workers.pool.types import Priority, RenderResult
+from ultragray_workers.pool.messages import Priority, RenderResult
 
 
 class _Message:

@@ -11,7 +11,7 @@ import numpy as np
 from ultragray.contract import under
 from ultragray.datasets.source import UPLOAD_OPTIONS
 from ultragray.errors import InvalidArgument, InvalidPose
-from ultragray.registration.registration import Registration, rows
+from ultragray.geometry.registration import Registration, rows
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import (
     access_pb2,

@@ -12,7 +12,7 @@ from ultragray.errors import InvalidArgument
 from ultragray_proto.v1 import rendering_pb2
 from ultragray_service.access.principals import is_loopback
 from ultragray_service.rpc.calls import address_of
-from ultragray_workers.pool.types import Place
+from ultragray_workers.pool.messages import Place
 
 FOLDER = "/dev/shm"
 HEADER_BYTES = 4096

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ultragray.files.atomic import write_whole
+from ultragray.files import write_whole
 from ultragray.learn.evaluation.scoring import Evaluation
 from ultragray.learn.report.page import FrameOfPage, Shown, environment, frames_of_page, telling_places
 from ultragray.learn.report.tables import Row, by_mean_rank, metric_rows, rank, rank_rows, speckle_rows

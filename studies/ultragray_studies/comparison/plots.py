@@ -7,11 +7,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation.metrics import FrameMetrics
 from ultragray.learn.evaluation.scoring import Evaluation
 from ultragray.learn.report.plots import COLOURS, SCENE_COLOUR, line_style, make_figure, svg
 from ultragray.learn.report.tables import LABELS
-from ultragray.probe import FloatArray
 from ultragray_studies.comparison.result import Distances
 
 DISTANCE_BINS, LEAST_IN_BIN = 8, 3  # frames in fewer bins where there are not many

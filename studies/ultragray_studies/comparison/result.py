@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 
 from ultragray.contract import to_dict
-from ultragray.files.format_version import require_version
+from ultragray.files import require_version
+from ultragray.geometry.pose import rotation_angles_deg
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation.baselines import nearest_frames
 from ultragray.learn.evaluation.metrics import FrameMetrics
 from ultragray.learn.evaluation.scoring import Evaluation
 from ultragray.learn.evaluation.speckle import FrameSpeckle, Speckle
 from ultragray.learn.report.tables import DatasetFacts
 from ultragray.learn.sweep import Dataset, IntArray
-from ultragray.pose import rotation_angles_deg
-from ultragray.probe import FloatArray
 from ultragray_studies.methods.method import Cost, Description
 
 FORMAT_VERSION = 1

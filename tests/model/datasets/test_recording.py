@@ -12,7 +12,7 @@ from ultragray import LinearProbe
 from ultragray.datasets.plus import read_plus_sweep
 from ultragray.datasets.source import SourceOptions, load_dataset
 from ultragray.errors import DatasetInvalid, InvalidArgument
-from ultragray.pose import rotation_angles_deg
+from ultragray.geometry.pose import rotation_angles_deg
 
 ROWS, COLUMNS = 30, 20
 TURN = np.array([[0.0, -1, 0, 3], [1, 0, 0, 4], [0, 0, 1, 5], [0, 0, 0, 1]])

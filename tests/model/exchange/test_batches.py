@@ -16,15 +16,15 @@ import pytest
 import torch
 
 from ultragray import GaussianScene, LinearProbe, render
-from ultragray.confidence import Assessor, Extrapolation
 from ultragray.errors import FrameTooCostly, InvalidArgument
 from ultragray.exchange.batches import SHARD_FRAMES, BatchPlan, ShardEntry, manifest, names_in, stands_for
 from ultragray.exchange.shards import ShardRenderer, ShardTar
-from ultragray.files.atomic import file_sha256
-from ultragray.limits import Limits
+from ultragray.files import file_sha256
+from ultragray.rendering.limits import Limits
+from ultragray.rendering.settings import FrameSettings
 from ultragray.samplers import AroundSampler, FanSampler, SplineSampler
-from ultragray.scene_info import read_header
-from ultragray.settings import FrameSettings
+from ultragray.scene.confidence import Assessor, Extrapolation
+from ultragray.scene.info import read_header
 
 PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 TRAINING = np.tile(np.eye(4), (6, 1, 1))

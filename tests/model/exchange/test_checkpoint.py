@@ -18,8 +18,8 @@ import torch
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, render
 from ultragray.errors import CheckpointInvalid, InvalidArgument, InvalidPose
 from ultragray.exchange.checkpoint import import_checkpoint
-from ultragray.files.poses import load_poses
-from ultragray.scene import PARAMETERS
+from ultragray.exchange.poses import load_poses
+from ultragray.scene.gaussians import PARAMETERS
 
 LINEAR_CONF = {
     "images_file_train": "data/set/images_train.npy",

@@ -16,8 +16,8 @@ import torch
 from ultragray import ConvexProbe, ElevationBeam, GaussianScene, LinearProbe, PhasedProbe, Probe, SceneInfo, render
 from ultragray.errors import InvalidArgument
 from ultragray.exchange.checkpoint import export_checkpoint, import_checkpoint
-from ultragray.probe import FloatArray
-from ultragray.scene import PARAMETERS
+from ultragray.geometry.probe import FloatArray
+from ultragray.scene.gaussians import PARAMETERS
 
 LINEAR = LinearProbe(width_mm=30.0, near_mm=5.0, far_mm=46.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=50.0)

@@ -21,7 +21,7 @@ from ultragray import ConvexProbe, ElevationBeam, GaussianScene, LinearProbe
 from ultragray.errors import SceneFileInvalid
 from ultragray.exchange import ply
 from ultragray.exchange.ply import read_ply, write_ply
-from ultragray.scene import PARAMETERS
+from ultragray.scene.gaussians import PARAMETERS
 
 INFO = {
     "centre_mm": (12.5, -3.25, 0.1),

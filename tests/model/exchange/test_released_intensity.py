@@ -10,8 +10,8 @@ import pytest
 import torch
 
 from ultragray import GaussianScene
-from ultragray.backends.reference import intensity
 from ultragray.exchange.checkpoint import fit_released_intensity
+from ultragray.rendering.backends.reference import intensity
 
 SceneMaker = Callable[..., GaussianScene]
 

@@ -12,14 +12,14 @@ import numpy as np
 import pytest
 
 from ultragray import ConvexProbe, GaussianScene, render
-from ultragray.confidence import SUPPORT_COVERAGE, Extrapolation
 from ultragray.contract import to_dict
-from ultragray.display import Display
-from ultragray.display.pixels import PixelArray
 from ultragray.exchange import rendering
 from ultragray.exchange.exports.npz import NpzExporter
 from ultragray.exchange.rendering import render_to_file
-from ultragray.settings import Below, Resolved
+from ultragray.rendering.display import Display
+from ultragray.rendering.pixels import PixelArray
+from ultragray.rendering.settings import Below, Resolved
+from ultragray.scene.confidence import SUPPORT_COVERAGE, Extrapolation
 
 PROBE = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=50.0)
 POSES = np.tile(np.eye(4), (5, 1, 1))

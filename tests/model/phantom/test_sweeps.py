@@ -9,8 +9,8 @@ import numpy.typing as npt
 import pytest
 
 from ultragray.errors import InvalidArgument
+from ultragray.geometry.pose import check_poses
 from ultragray.phantom import PHANTOM_PROBE, freehand_poses, load_phantom, sweeps
-from ultragray.pose import check_poses
 
 
 def tilts_deg(poses: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:

@@ -10,7 +10,7 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
-from ultragray.backends import cuda
+from ultragray.rendering.backends import cuda
 from ultragray_service.bench import train as bench_train
 from ultragray_service.bench.kernel import BenchScene
 from ultragray_service.bench.served import FrontDoor, Served

@@ -12,7 +12,7 @@ import pytest
 import torch
 
 from ultragray import GaussianScene, LinearProbe, SceneInfo
-from ultragray.backends import cpu
+from ultragray.rendering.backends import cpu
 from ultragray_service.bench import kernel_details as bench
 from ultragray_service.bench import report
 from ultragray_service.bench.kernel_details import LANES, View

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ultragray.backends import cpu
+from ultragray.rendering.backends import cpu
 from ultragray_service.bench import measured
 
 

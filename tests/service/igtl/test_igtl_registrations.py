@@ -10,7 +10,7 @@ import numpy as np
 import pyigtl
 import pytest
 
-from ultragray.probe import FloatArray
+from ultragray.geometry.probe import FloatArray
 from ultragray_client import Client
 from ultragray_service.igtl.contents import NOT_FOUND, unpack_image, unpack_transform
 

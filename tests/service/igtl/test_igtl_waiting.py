@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ultragray.registration.registration import Registration, rows
-from ultragray.settings import FrameSettings
+from ultragray.geometry.registration import Registration, rows
+from ultragray.rendering.settings import FrameSettings
 from ultragray_service.igtl.commands import Setup
 from ultragray_service.igtl.frames import MAX_WAITING_DEVICES, PoseMessage, Underway, WaitingPoses
 from ultragray_service.igtl.messages import Message

@@ -13,7 +13,7 @@ from torch import Tensor
 from ultragray import LinearProbe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.errors import MemoryExceeded
-from ultragray.probe import FloatArray, Probe
+from ultragray.geometry.probe import FloatArray, Probe
 from ultragray_studies.comparison.run import EQUAL_TIME
 from ultragray_studies.methods.classical import Compounding, FromFrames
 from ultragray_studies.methods.gaussians import SceneMethod

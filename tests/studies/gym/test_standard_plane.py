@@ -13,10 +13,10 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, render
-from ultragray.contact import Skin, Touch
-from ultragray.display.pixels import to_uint8
 from ultragray.errors import InvalidArgument, InvalidPose, InvalidProbe
-from ultragray.settings import Contact
+from ultragray.rendering.contact import Skin, Touch
+from ultragray.rendering.pixels import to_uint8
+from ultragray.rendering.settings import Contact
 from ultragray_studies.gym import STANDARD_PLANE, StandardPlaneEnv
 from ultragray_studies.gym.standard_plane import StandardPlaneSettings, moved
 

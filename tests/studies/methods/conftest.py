@@ -11,8 +11,8 @@ import torch
 from torch import Tensor, nn
 
 from ultragray import LinearProbe
+from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.sweep import Dataset, Sweep
-from ultragray.probe import FloatArray, Probe
 from ultragray_studies.methods.learner import LearnedMethod, Learner
 from ultragray_studies.methods.method import Budget, Description
 

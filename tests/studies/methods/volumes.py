@@ -8,8 +8,8 @@ import numpy as np
 import torch
 
 from ultragray import LinearProbe, Probe
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.sweep import Dataset, Sweep
-from ultragray.probe import FloatArray
 from ultragray_studies.methods.learner import LearnedMethod
 from ultragray_studies.methods.method import Budget, Pace, Paces
 from ultragray_studies.methods.parts import pixel_points_mm

@@ -12,7 +12,7 @@ from ultragray.datasets import Dataset
 from ultragray.errors import DatasetInvalid, TrainingDiverged
 from ultragray.learn.evaluation.scoring import evaluate
 from ultragray.learn.training import Progress, TrainingConfig
-from ultragray.scene import GaussianScene
+from ultragray.scene.gaussians import GaussianScene
 from ultragray_studies import report as study
 from ultragray_studies.report import (
     Failed,

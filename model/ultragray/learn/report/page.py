@@ -15,7 +15,6 @@ import numpy as np
 import numpy.typing as npt
 from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
-from ultragray.display.pixels import ByteArray, image_file, to_uint8
 from ultragray.installation import __version__
 from ultragray.learn.evaluation.scoring import Evaluation, evaluate_frames, render_sweep
 from ultragray.learn.evaluation.side_by_side import DIFFERENCE_GAIN, as_picture
@@ -23,7 +22,8 @@ from ultragray.learn.report.plots import plot_frames, plot_training, svg
 from ultragray.learn.report.tables import METRICS, DatasetFacts, Row, metric_rows, rank_rows, speckle_rows
 from ultragray.learn.sweep import Dataset, Sweep, spread_places
 from ultragray.learn.training.progress import Course
-from ultragray.scene import GaussianScene
+from ultragray.rendering.pixels import ByteArray, image_file, to_uint8
+from ultragray.scene.gaussians import GaussianScene
 
 MADE_OF = ("echo", "transmittance")  # what the rendering is made of
 THIS_SCENE = "this scene"

@@ -14,10 +14,10 @@ from matplotlib.backends.backend_svg import FigureCanvasSVG
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
 
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation.scoring import Evaluation, Reliability
 from ultragray.learn.report.tables import LABELS
 from ultragray.learn.training.progress import Course
-from ultragray.probe import FloatArray
 
 SCENE_COLOUR = "#0b6e99"
 COLOURS = ("#d97706", "#6d8f3c", "#7c4dbe", "#c2405a", "#2a9d8f", "#8a6d3b", "#4c6ef5", "#7c8a97")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ultragray.probe import FloatArray
+from ultragray.geometry.probe import FloatArray
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,15 +8,15 @@ from pathlib import Path
 
 import torch
 
-from ultragray.backends import cuda
 from ultragray.errors import BackendUnavailable, MemoryExceeded
+from ultragray.installation import processor_name
 from ultragray.learn.evaluation.scoring import CHUNK_PIXELS, frames_at_once
 from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import alignment as overlap
 from ultragray.learn.training.config import TrainingConfig
 from ultragray.learn.training.geometry import LOOKED_AT_FRAMES, PREDICTED_PIXELS
-from ultragray.machine import processor_name
-from ultragray.scene_info import expected_shapes
+from ultragray.rendering.backends import cuda
+from ultragray.scene.info import expected_shapes
 
 
 def training_device(name: str, backend: str) -> torch.device:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ultragray.errors import InvalidArgument
-from ultragray.files.atomic import write_whole
+from ultragray.files import write_whole
 from ultragray.installation import install_advice
 
 SMOOTHING = 0.05  # weight of the newest step in the mean time of a step

@@ -1,7 +1,8 @@
 """`ultragray bench --backend cuda`: frames of a GPU, on the device, copied to the host, and served.
 
 Beside each rate stands the distance to the hardware's limit: the bytes that a frame moves and the operations that it
-takes, counted by `ultragray.backends.cuda.work`, times the rate, over what `measure_limits` found the device to do at
+takes, counted by `ultragray.rendering.backends.cuda.work`, times the rate, over what `measure_limits` found the device
+to do at
 most.
 """
 
@@ -16,14 +17,14 @@ from typing import Any, TypeAlias
 import torch
 
 from ultragray import GaussianScene
-from ultragray.backends import cuda
-from ultragray.backends.cuda.work import Work, count_work
-from ultragray.probe import FloatArray
+from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.backends import cuda
+from ultragray.rendering.backends.cuda.work import Work, count_work
 from ultragray_service.bench.cuda.gpu import Limits, gpu_document, measure_limits
 from ultragray_service.bench.kernel import PROBE, BenchScene, bench_poses, bench_scenes, elapsed_ms, finish, mark
 from ultragray_service.bench.report import Report, percentiles
 from ultragray_service.bench.served import measure_served
-from ultragray_workers.pool.process.transfer import to_uint8
+from ultragray_workers.pool.pixels import round_to_uint8
 
 BATCHES = (1, 8, 64, 256)  # poses rendered by one call
 POSES = 256  # that the calls go through
@@ -99,7 +100,7 @@ def _measure(
         views = poses_cm[first : first + poses]
         frames = cuda.render_outputs(scene, PROBE, views, bench.height, bench.width, ("bmode",))["bmode"]
         if what == ON_HOST:
-            host.copy_(to_uint8(frames), non_blocking=True)
+            host.copy_(round_to_uint8(frames), non_blocking=True)
 
     places = range(0, len(poses_cm), poses)
     for first in itertools.islice(itertools.cycle(places), 3):  # compiles, allocates

@@ -13,7 +13,7 @@ import torch
 import triton
 import triton.language as tl
 
-from ultragray.backends import cuda
+from ultragray.rendering.backends import cuda
 from ultragray_service.bench.kernel import elapsed_ms, finish, mark
 from ultragray_service.bench.measured import measured
 from ultragray_service.bench.report import versions

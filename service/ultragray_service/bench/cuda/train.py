@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from ultragray.backends import cuda
 from ultragray.learn.training.memory import forget_peak_memory, peak_memory_mb
+from ultragray.rendering.backends import cuda
 from ultragray_service.bench.cuda.gpu import gpu_document
 from ultragray_service.bench.kernel import BATCH
 from ultragray_service.bench.report import Report

@@ -62,7 +62,7 @@ def upload(
     json: Json = False,
 ) -> None:
     """Have the service keep a registration, in place of one of that name which is yours."""
-    from ultragray.registration.registration import load_registration
+    from ultragray.geometry.registration import load_registration
     from ultragray_service.remote.registrations import Registrations
 
     called = file.stem if name is None else name

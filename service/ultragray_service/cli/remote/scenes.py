@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ultragray.rendering.settings import FrameSettings, RenderSettings
 from ultragray.samplers import Sampler
-from ultragray.scene_info import read_header
-from ultragray.settings import FrameSettings, RenderSettings
+from ultragray.scene.info import read_header
 from ultragray_service.cli.options import FieldsOf, poses_option, with_options
 from ultragray_service.cli.remote.connection import with_connection
 from ultragray_service.cli.remote.rendering import SUFFIXES, Wanted, checked_kind

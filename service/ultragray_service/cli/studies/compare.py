@@ -161,7 +161,7 @@ def _print(comparison: Comparison, written: list[Path]) -> None:
 
 def _write(comparison: Comparison, dataset: Dataset, run: Path, output: Path) -> list[Path]:
     """The page and what stands beside it, of the names that the output gives them."""
-    from ultragray.files.atomic import write_whole
+    from ultragray.files import write_whole
     from ultragray_studies.comparison.page import write_comparison
 
     written = []

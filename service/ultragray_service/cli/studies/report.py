@@ -14,7 +14,7 @@ import typer
 
 from ultragray.datasets.source import SourceOptions
 from ultragray.learn.training.config import PRESET_MEANINGS, TrainingConfig
-from ultragray.scene_info import read_header
+from ultragray.scene.info import read_header
 from ultragray_service.cli.options import FieldsOf, with_options
 from ultragray_service.cli.sweeps import SweepArgument, check_scene_fits, check_source, read_dataset, warn_about_dataset
 from ultragray_service.cli.terminal import (
@@ -111,9 +111,9 @@ def report(
 
 def _write_report(dataset: Dataset, config: TrainingConfig, output: Path, options: ReportOptions) -> dict[str, str]:
     """The studies that could not be finished, and why; the page has the others."""
-    from ultragray.files.atomic import write_whole
+    from ultragray.files import write_whole
     from ultragray.learn.evaluation.methods import ComparisonSettings
-    from ultragray.scene import GaussianScene
+    from ultragray.scene.gaussians import GaussianScene
     from ultragray_studies.comparison.run import SCENE, ComparisonProgress, compare_methods
     from ultragray_studies.methods.gaussians import GivenScene
     from ultragray_studies.report import (

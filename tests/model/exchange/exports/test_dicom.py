@@ -15,12 +15,12 @@ from pydicom.dataset import Dataset, FileDataset
 from pydicom.uid import ExplicitVRLittleEndian, UltrasoundMultiFrameImageStorage
 
 from ultragray import ConvexProbe, LinearProbe
-from ultragray.confidence import Extrapolation
-from ultragray.display.frames import show
-from ultragray.display.scan_conversion import scan_convert
 from ultragray.errors import InvalidArgument
 from ultragray.exchange.exports import FORMATS, ExportHeader, export_to
-from ultragray.settings import Resolved
+from ultragray.geometry.scan_conversion import scan_convert
+from ultragray.rendering.frames import show
+from ultragray.rendering.settings import Resolved
+from ultragray.scene.confidence import Extrapolation
 
 LINEAR = LinearProbe(width_mm=38.0, near_mm=2.0, far_mm=52.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0)

@@ -21,14 +21,14 @@ import zarr
 from zarr.storage import ZipStore
 
 from ultragray import LinearProbe
-from ultragray.confidence import FIGURES, Extrapolation, figure_arrays
 from ultragray.contract import to_dict
 from ultragray.errors import ExtraMissing, InvalidArgument
 from ultragray.exchange.exports import FORMATS, ExportHeader, check_format, export_to
 from ultragray.exchange.exports.exporter import stored_pixels
 from ultragray.exchange.exports.npz import NpzExporter
 from ultragray.installation import install_advice
-from ultragray.settings import Contact, Resolved
+from ultragray.rendering.settings import Contact, Resolved
+from ultragray.scene.confidence import FIGURES, Extrapolation, figure_arrays
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 POSES = np.tile(np.eye(4), (5, 1, 1))
@@ -307,10 +307,10 @@ def test_a_full_disk_is_told_as_such(tmp_path: Path, format: str) -> None:
         "import errno, os, resource\n"
         "import numpy as np\n"
         "from ultragray import LinearProbe\n"
-        "from ultragray.confidence import Extrapolation\n"
+        "from ultragray.scene.confidence import Extrapolation\n"
         "from ultragray.exchange.exports import FORMATS, ExportHeader, export_to, exporter_class\n"
         f"path, format = {str(tmp_path / 'frames')!r}, {format!r}\n"
-        "from ultragray.settings import Resolved\n"
+        "from ultragray.rendering.settings import Resolved\n"
         "poses, settings = np.tile(np.eye(4), (40, 1, 1)), Resolved(LinearProbe(40.0, 0.0, 50.0), 300, 300)\n"
         "header = ExportHeader(settings, FORMATS[format].dtypes[0], poses, 'one', '0' * 64, 'r')\n"
         "exporter_class(format)\n"

@@ -12,12 +12,12 @@ from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 
 from ultragray import LinearProbe
-from ultragray.confidence import FIGURES, Extrapolation
 from ultragray.contract import to_dict
 from ultragray.exchange.exports import ExportHeader, export_to
-from ultragray.files.poses import load_poses
-from ultragray.probe import FloatArray
-from ultragray.settings import Resolved
+from ultragray.exchange.poses import load_poses
+from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.settings import Resolved
+from ultragray.scene.confidence import FIGURES, Extrapolation
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 FRAMES = 3

@@ -10,18 +10,18 @@ import pytest
 import torch
 
 from ultragray import ConvexProbe, LinearProbe, PhasedProbe
-from ultragray.confidence import Extrapolation
 from ultragray.datasets.fan import parse_matrix
 from ultragray.datasets.plus import read_plus_sweep
 from ultragray.datasets.plus_files import read_meta_image
-from ultragray.display import Display
-from ultragray.display.frames import show
-from ultragray.display.scan_conversion import scan_convert
 from ultragray.errors import DatasetInvalid
 from ultragray.exchange.exports import FORMATS, ExportHeader, export_to
-from ultragray.pose import pose_from_position_quaternion
-from ultragray.probe import Probe
-from ultragray.settings import Resolved
+from ultragray.geometry.pose import pose_from_position_quaternion
+from ultragray.geometry.probe import Probe
+from ultragray.geometry.scan_conversion import scan_convert
+from ultragray.rendering.display import Display
+from ultragray.rendering.frames import show
+from ultragray.rendering.settings import Resolved
+from ultragray.scene.confidence import Extrapolation
 
 FRAMES = np.random.default_rng(0).random((12, 20, 16), np.float32)
 TOLD = [Extrapolation(number / 3.0, 1234.5, None, 1e-4 * number) for number in range(12)]

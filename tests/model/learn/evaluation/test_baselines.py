@@ -12,6 +12,7 @@ from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe, RadialProbe,
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.source import load_dataset
 from ultragray.errors import DatasetInvalid, InvalidArgument
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation.baselines import (
     BASELINES,
     evaluate_baselines,
@@ -19,7 +20,6 @@ from ultragray.learn.evaluation.baselines import (
     nearest_frames,
     predict,
 )
-from ultragray.probe import FloatArray
 
 LINEAR = LinearProbe(width_mm=8.0, near_mm=0.0, far_mm=10.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=8.0, far_mm=20.0)

@@ -13,6 +13,7 @@ from ultragray import ConvexProbe, LinearProbe, Probe, RadialProbe, SteeredProbe
 from ultragray.datasets import Sweep
 from ultragray.datasets.source import load_dataset
 from ultragray.errors import InvalidArgument
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation import baselines as compounding
 from ultragray.learn.evaluation.baselines import (
     affordable_voxel_mm,
@@ -21,7 +22,6 @@ from ultragray.learn.evaluation.baselines import (
     mean_axes,
     pixel_positions_mm,
 )
-from ultragray.probe import FloatArray
 
 HEIGHT, WIDTH = 12, 10
 PROBE = LinearProbe(width_mm=WIDTH * 0.5, near_mm=0.0, far_mm=HEIGHT * 0.5)  # a pixel is a voxel of 0.5 mm

@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 
 from ultragray import GaussianScene, LinearProbe, render
-from ultragray.confidence import ConfidenceModel
-from ultragray.confidence.uncertainty import DEPTHS, TERMS, DepthBands, Uncertainty
 from ultragray.datasets import Sweep
 from ultragray.errors import DatasetInvalid
 from ultragray.learn.evaluation.scoring import compare_deviations, measure_reliability
+from ultragray.scene.confidence import DEPTHS, VARIANCE_TERMS, ConfidenceModel, DepthBands, Uncertainty
 
 PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 POSES = np.tile(np.eye(4), (4, 1, 1))
@@ -44,7 +43,7 @@ def test_what_is_too_sure() -> None:
 
 
 def test_of_a_scene(random_scene: Callable[..., GaussianScene]) -> None:
-    floor = tuple(0.4 if name == "floor" else 0.0 for name in TERMS)  # a variance of 0.4 times 0.001
+    floor = tuple(0.4 if name == "floor" else 0.0 for name in VARIANCE_TERMS)  # a variance of 0.4 times 0.001
     confidence = ConfidenceModel(
         (3.5, 1.2, 0.8, 0.1, 0.6),
         0.06,

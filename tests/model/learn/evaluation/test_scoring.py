@@ -13,10 +13,10 @@ import torch
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, render
 from ultragray.datasets import Sweep
 from ultragray.errors import DatasetInvalid, InvalidArgument
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation import scoring as evaluation
 from ultragray.learn.evaluation.metrics import FrameMetrics, frame_metrics
 from ultragray.learn.evaluation.scoring import evaluate, evaluate_frames, render_sweep
-from ultragray.probe import FloatArray
 
 
 @pytest.fixture(params=[LinearProbe(30.0, 0.0, 40.0), ConvexProbe(60.0, 10.0, 50.0)], ids=["linear", "convex"])

@@ -11,9 +11,9 @@ import pytest
 
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, Probe
 from ultragray.datasets import Sweep
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation.scoring import evaluate, render_sweep
 from ultragray.learn.evaluation.side_by_side import as_picture, side_by_side_panels, write_side_by_side
-from ultragray.probe import FloatArray
 
 LINEAR = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=60.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=50.0)

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from ultragray import ConvexProbe, LinearProbe
-from ultragray.display.settings import FRAME_RANGE_DB
 from ultragray.learn.evaluation.speckle import FrameArray, FrameSpeckle, Speckle, compare_speckle, summarize
+from ultragray.rendering.display import FRAME_RANGE_DB
 
 PROBE = LinearProbe(width_mm=38.4, near_mm=0.0, far_mm=25.6)  # 0.1 mm axial, 0.15 mm lateral at 256x256
 SIGMA_PIXELS = (1.2, 2.0)  # axial, lateral: of the amplitude's point spread

@@ -12,13 +12,13 @@ import torch
 from torch import Tensor
 
 from ultragray import ConvexProbe, GaussianScene, Probe, localize, render
-from ultragray.demo import demo_poses, load_demo_scene
 from ultragray.errors import InvalidArgument, InvalidPose
+from ultragray.geometry.pose import pose_from_position_quaternion
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.localization import search
 from ultragray.learn.localization.search import Motions, _deviations
 from ultragray.phantom import PHANTOM_PROBE, freehand_poses, simulate
-from ultragray.pose import pose_from_position_quaternion
-from ultragray.probe import FloatArray
+from ultragray.phantom.demo import demo_poses, load_demo_scene
 
 SIDE = 128
 FOUND_MM, FOUND_DEG = 0.5, 1.0

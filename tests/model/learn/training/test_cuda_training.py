@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from ultragray import GaussianScene
-from ultragray.backends import cuda
 from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import Progress, TrainingConfig, train
+from ultragray.rendering.backends import cuda
 
 Datasets = Callable[..., Dataset]
 Configs = Callable[..., TrainingConfig]

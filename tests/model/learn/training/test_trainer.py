@@ -20,7 +20,7 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import save_file
 
-from ultragray import GaussianScene, scene_info
+from ultragray import GaussianScene
 from ultragray.errors import (
     BackendUnavailable,
     DatasetInvalid,
@@ -33,6 +33,7 @@ from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import Progress, TrainingConfig, train, trainer
 from ultragray.learn.training.geometry import Geometry
 from ultragray.learn.training.run import scene_of_checkpoint
+from ultragray.scene import info as scene_info
 
 from ...waiting import Deadline
 

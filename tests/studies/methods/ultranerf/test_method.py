@@ -13,8 +13,8 @@ import torch
 from ultragray import ConvexProbe, LinearProbe
 from ultragray.datasets.source import load_dataset
 from ultragray.errors import DatasetInvalid
+from ultragray.geometry.probe import Probe
 from ultragray.learn.sweep import Dataset, Sweep
-from ultragray.probe import Probe
 from ultragray_studies.methods import ultranerf
 from ultragray_studies.methods.method import Budget, FitProgress, FitRun, Pace, Paces
 from ultragray_studies.methods.registry import METHODS

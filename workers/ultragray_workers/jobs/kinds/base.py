@@ -13,7 +13,7 @@ from typing_extensions import Self
 
 from ultragray.contract import Family, described
 from ultragray.errors import ExtraMissing
-from ultragray.scene_info import SceneHeader
+from ultragray.scene.info import SceneHeader
 from ultragray_workers.jobs.matching.demand import AUTO, MAX_MEMORY_GB, check_device, check_labels
 from ultragray_workers.scene_names import check_scene_name, check_scene_reference
 
@@ -22,7 +22,7 @@ TOPIC = "Worker"
 PLUGINS = "ultragray.job_kinds"  # entry points: the work of kinds that other distributions bring
 
 if TYPE_CHECKING:
-    from ultragray.registration.registration import Registration
+    from ultragray.geometry.registration import Registration
     from ultragray_workers.jobs.folder import Outcome
     from ultragray_workers.jobs.worker.job_run import JobRun
 

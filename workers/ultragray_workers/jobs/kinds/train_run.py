@@ -21,7 +21,7 @@ from ultragray.learn.training.pictures import pictures_in
 from ultragray.learn.training.progress import Course
 from ultragray.learn.training.run import FITTING
 from ultragray.learn.training.trainer import CHECKPOINT_FILE, JOURNAL_FILE
-from ultragray.scene import GaussianScene
+from ultragray.scene.gaussians import GaussianScene
 from ultragray_workers.jobs.files import BASELINES_NAME
 from ultragray_workers.jobs.folder import Outcome, Progress
 from ultragray_workers.jobs.kinds.earlier_run import take_over_run

@@ -9,16 +9,15 @@ import numpy as np
 import pytest
 
 from ultragray import GaussianScene
-from ultragray.confidence import Assessor, ConfidenceModel
-from ultragray.confidence.uncertainty import TERMS
 from ultragray.errors import TrainingDiverged
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation.scoring import evaluate, render_sweep
 from ultragray.learn.sweep import Dataset, Sweep
 from ultragray.learn.training import Progress, TrainingConfig, run, train
 from ultragray.learn.training.confidence import fit_confidence, shorter
 from ultragray.learn.training.geometry import Geometry
 from ultragray.phantom import PHANTOM_PROBE, freehand_poses, simulate
-from ultragray.probe import FloatArray
+from ultragray.scene.confidence import VARIANCE_TERMS, Assessor, ConfidenceModel
 
 Datasets = Callable[..., Dataset]
 Configs = Callable[..., TrainingConfig]
@@ -115,7 +114,7 @@ def test_it_can_be_left_out(tiny_dataset: Datasets, tiny_config: Configs) -> Non
     assert without.info.confidence == {}
     having = train(dataset, tiny_config())
     assert having.info.confidence["version"] == 2
-    assert len(having.info.confidence["uncertainty"]["variances"]) == len(TERMS)
+    assert len(having.info.confidence["uncertainty"]["variances"]) == len(VARIANCE_TERMS)
     assert having.means.equal(without.means)
 
 

@@ -5,9 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ultragray.confidence.model import predicted
-from ultragray.confidence.views import ViewMeasures
 from ultragray.learn.training.confidence import GAIN_QUANTILE, PRIOR_WEIGHTS, Examples, fit_support, fit_weights
+from ultragray.scene.confidence import ViewMeasures, predicted
 
 
 def test_support_is_fitted_so_that_most_frames_keep_to_it() -> None:

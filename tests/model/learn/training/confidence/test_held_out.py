@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from ultragray import LinearProbe
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.sweep import Sweep
 from ultragray.learn.training.confidence import LEAST_KEPT, MAX_SHARE, STRETCHES, TURNED, held_out_frames
 from ultragray.phantom import freehand_poses
-from ultragray.probe import FloatArray
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=40.0)
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from ultragray import LinearProbe
-from ultragray.confidence.model import DISTANCE_MM
 from ultragray.learn.sweep import Sweep
 from ultragray.learn.training.confidence import BEYOND_MM, one_sided_examples
+from ultragray.scene.confidence import DISTANCE_MM
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=40.0)
 STEP_MM = 1.0

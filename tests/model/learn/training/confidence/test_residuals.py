@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 
 from ultragray import GaussianScene, LinearProbe, render
-from ultragray.confidence.uncertainty import DEPTHS, TERMS
-from ultragray.confidence.views import TrainingViews
 from ultragray.datasets import Sweep
 from ultragray.learn.training.confidence import fit_uncertainty, likeliest_variances
+from ultragray.scene.confidence import DEPTHS, VARIANCE_TERMS, TrainingViews
 
 PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 
@@ -42,6 +41,6 @@ def test_errors_that_grow_away_from_the_views_do_so_in_the_model(random_scene: C
     images = (255.0 * np.clip(0.5 * rendered + 0.3 + noise, 0.0, 1.0)).round().astype(np.uint8)
     sweep = Sweep(images, poses, PROBE, np.arange(9), "noisy")
     found = fit_uncertainty(scene, TrainingViews(poses[:1], PROBE), sweep, backend="auto")
-    away = sum(found.variances[TERMS.index(name)] for name in ("gap 0.3 mm", "gap 1 mm", "gap 3 mm", "beyond"))
+    away = sum(found.variances[VARIANCE_TERMS.index(name)] for name in ("gap 0.3 mm", "gap 1 mm", "gap 3 mm", "beyond"))
     assert away > 0.1
     assert found.bands.level == pytest.approx([0.3 + 0.5 * rendered.mean()] * DEPTHS, abs=0.15)

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 import torch
 
+from ultragray.geometry.pose import rotation_angles_deg
 from ultragray.learn.sweep import Dataset, Sweep
 from ultragray.learn.training.between import Places, ViewsBetween, draw_places, features_follow_probe, neighbours_of
 from ultragray.learn.training.losses import image_loss
-from ultragray.pose import rotation_angles_deg
 
 PIXELS_A_MM = 2.0
 

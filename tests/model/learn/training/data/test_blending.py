@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 import torch
 
+from ultragray.geometry.pose import pose_from_position_quaternion
+from ultragray.geometry.probe import ConvexProbe, FloatArray, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
 from ultragray.learn.evaluation.baselines import interpolate_planes
 from ultragray.learn.sweep import Sweep
 from ultragray.learn.training.between import blend_in_space
-from ultragray.pose import pose_from_position_quaternion
-from ultragray.probe import ConvexProbe, FloatArray, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
 
 SIZE = 48
 PROBES = (

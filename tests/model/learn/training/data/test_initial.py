@@ -11,13 +11,13 @@ import pytest
 import torch
 
 from ultragray import GaussianScene, Probe, SceneInfo
-from ultragray.backends import reference
 from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import TrainingConfig
 from ultragray.learn.training.between import neighbours_of
 from ultragray.learn.training.geometry import Geometry, Shadows
 from ultragray.learn.training.initial import Start, initial_parameters
 from ultragray.learn.training.optimizer import rotate
+from ultragray.rendering.backends import reference
 
 
 def whole_start_of(dataset: Dataset, config: TrainingConfig) -> Start:

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from ultragray import LinearProbe
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.sweep import Dataset, Sweep
 from ultragray.learn.training.geometry import (
     BatchSampler,
@@ -17,7 +18,6 @@ from ultragray.learn.training.geometry import (
     out_of_plane_shift_mm,
     shift_out_of_plane,
 )
-from ultragray.probe import FloatArray
 
 
 def test_every_frame_is_seen_equally_often() -> None:

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 import torch
 
-from ultragray.backends import cpu
 from ultragray.learn.training.losses import kernel_image_loss, plain_image_loss
+from ultragray.rendering.backends import cpu
 
 
 @pytest.mark.parametrize("shape", [(3, 40, 53), (1, 11, 11), (2, 64, 16), (1, 12, 300)])

@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from ultragray import GaussianScene, SceneInfo
-from ultragray.backends import reference
 from ultragray.learn.training.intensity import project_sh0, sh0_of_intensity
-from ultragray.scene_info import expected_shapes
+from ultragray.rendering.backends import reference
+from ultragray.scene.info import expected_shapes
 
 
 def intensity_of(sh0: torch.Tensor, name: str) -> torch.Tensor:
