@@ -27,7 +27,7 @@ from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import TrainingConfig
 from ultragray.learn.training.config import TEXTURE
 from ultragray.phantom.imaging import BoneShadow
-from ultragray_service.bench.measured import DIRTY, measured
+from ultragray_studies.bench.report import DIRTY, measured
 from ultragray_studies.report import train_and_evaluate
 
 OUTPUT = FIGURES["ablations"].staged

@@ -28,7 +28,7 @@ from ultragray.geometry.rotations import about_axes, random_directions
 from ultragray.learn.sweep import Dataset, Sweep
 from ultragray.learn.training import TrainingConfig
 from ultragray.learn.training.alignment import sweep_ranges
-from ultragray_service.bench.measured import measured
+from ultragray_studies.bench.report import measured
 from ultragray_studies.report import train_and_evaluate
 
 OUTPUT = FIGURES["poses"].staged

@@ -31,7 +31,7 @@ from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import Progress, TrainingConfig
 from ultragray.phantom.imaging import SHADOW_DB, BoneShadow
 from ultragray.scene.gaussians import GaussianScene
-from ultragray_service.bench.measured import measured
+from ultragray_studies.bench.report import measured
 from ultragray_studies.report import train_and_evaluate
 
 SECONDS_PER_LINE = 15.0

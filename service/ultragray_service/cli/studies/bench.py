@@ -54,7 +54,7 @@ def bench(
     if output is not None:
         check_file(output, force=force)
 
-    from ultragray_service.bench.command import chosen_bench
+    from ultragray_studies.bench.command import chosen_bench
 
     run = chosen_bench(chosen[0] if chosen else "frames", backend)
     if not json:

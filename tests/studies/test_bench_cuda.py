@@ -11,10 +11,10 @@ import torch
 from typer.testing import CliRunner
 
 from ultragray.rendering.backends import cuda
-from ultragray_service.bench import train as bench_train
-from ultragray_service.bench.kernel import BenchScene
-from ultragray_service.bench.served import FrontDoor, Served
 from ultragray_service.cli.app import app
+from ultragray_studies.bench import parts as bench_train
+from ultragray_studies.bench.kernel import BenchScene
+from ultragray_studies.bench.served import FrontDoor, Served
 
 TINY = BenchScene(40, 0.2, height=24, width=20)
 
@@ -30,20 +30,19 @@ def benched(tmp_path_factory: pytest.TempPathFactory) -> Benched:
     """What the command printed, and its two documents."""
     if not cuda.available():
         pytest.skip("there is no GPU, and Triton is not installed, which could interpret the kernels")
-    from ultragray_service.bench.cuda import frames as cuda_frames
-    from ultragray_service.bench.cuda import train as cuda_train
+    from ultragray_studies.bench import cuda as bench_cuda
 
     folder = tmp_path_factory.mktemp("bench")
     printed, documents = "", []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cuda_frames, "bench_scenes", lambda quick: [TINY])
-        patch.setattr(cuda_train, "training_scenes", lambda: [TINY, TINY])
-        patch.setattr(cuda_frames, "measure_served", served)
+        patch.setattr(bench_cuda, "bench_scenes", lambda quick: [TINY])
+        patch.setattr(bench_cuda, "training_scenes", lambda: [TINY, TINY])
+        patch.setattr(bench_cuda, "measure_served", served)
         for name, value in {"POSES": 2, "BATCHES": (1, 2), "ROUNDS": 8}.items():
-            patch.setattr(cuda_frames, name, value)
-        for module in (cuda_train, bench_train):
+            patch.setattr(bench_cuda, name, value)
+        for module in (bench_cuda, bench_train):
             patch.setattr(module, "BATCH", 2)
-        patch.setattr(cuda_train, "STEPS", 20)
+        patch.setattr(bench_cuda, "STEPS", 20)
         for options in ([], ["--train"]):
             output = folder / "bench.json"
             arguments = ["bench", "--backend", "cuda", "--quick", "--force", "--output", str(output), *options]
@@ -96,7 +95,7 @@ def test_training_step(benched: Benched) -> None:
 def test_limits_are_those_of_multiply_adds() -> None:
     if not cuda.available():
         pytest.skip("there is no GPU, and Triton is not installed, which could interpret the kernel")
-    from ultragray_service.bench.cuda.gpu import LANES, multiply_add
+    from ultragray_studies.bench.cuda import LANES, multiply_add
 
     sums = torch.empty(2 * LANES, device=cuda.device())
     multiply_add[(2,)](sums, 0.5, 0.25, 3, LANES=LANES)

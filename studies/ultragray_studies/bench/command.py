@@ -1,4 +1,4 @@
-"""The benchmarks by name and backend: each is the `run` of a module, imported when it is chosen."""
+"""The benchmarks by name and backend: each is a function of a module that is imported when it is chosen."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from ultragray.errors import BackendUnavailable, InvalidArgument
 Bench = Callable[[Path | None, bool], None]  # the JSON file to write, and whether few repetitions do
 
 _BENCHES = {
-    ("frames", "cpu"): "frames",
-    ("frames", "cuda"): "cuda.frames",
-    ("train", "cpu"): "train",
-    ("train", "cuda"): "cuda.train",
-    ("jobs", "cpu"): "jobs",
-    ("clients", "cpu"): "clients",
-    ("kernel-details", "cpu"): "kernel_details",
+    ("frames", "cpu"): ("served", "bench_frames"),
+    ("frames", "cuda"): ("cuda", "bench_frames"),
+    ("train", "cpu"): ("parts", "bench_training"),
+    ("train", "cuda"): ("cuda", "bench_training"),
+    ("jobs", "cpu"): ("clients", "bench_jobs"),
+    ("clients", "cpu"): ("clients", "bench_clients"),
+    ("kernel-details", "cpu"): ("parts", "bench_kernel_details"),
 }
 BACKENDS = tuple(dict.fromkeys(backend for _, backend in _BENCHES))
 
@@ -30,11 +30,12 @@ def chosen_bench(name: str, backend: str) -> Bench:
     """
     if backend not in BACKENDS:
         raise BackendUnavailable(f"backend must be {' or '.join(BACKENDS)}, got {backend!r}", field="backend")
-    if (module := _BENCHES.get((name, backend))) is None:
+    if (place := _BENCHES.get((name, backend))) is None:
         raise InvalidArgument(f"--{name} goes without --backend", field="backend")
     if backend == "cuda":
         from ultragray.rendering.backends import cuda
 
         cuda.require()
-    bench: Bench = importlib.import_module(f".{module}", __package__).run
+    module, function = place
+    bench: Bench = getattr(importlib.import_module(f".{module}", __package__), function)
     return bench
