@@ -26,15 +26,15 @@ from matplotlib.figure import Figure
 
 from in_silico import IN_SILICO, Asked
 from registry import FIGURES, ROOT, Document
-from ultragray.confidence import Assessor
 from ultragray.datasets.source import load_dataset
-from ultragray.files.atomic import write_whole
+from ultragray.files import write_whole
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation.metrics import frame_metrics
 from ultragray.learn.evaluation.scoring import compare_deviations, render_sweep
 from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import TrainingConfig, train
-from ultragray.probe import FloatArray
-from ultragray_service.bench.measured import measured
+from ultragray.scene.confidence import Assessor
+from ultragray_studies.bench.report import measured
 
 OUTPUT = FIGURES["confidence"].staged
 IMAGES = ROOT / "docs" / "images"

@@ -25,10 +25,10 @@ from ultragray.contract import Contract, Family, annotated_fields
 from ultragray.datasets.source import SourceOptions
 from ultragray.errors import error_classes
 from ultragray.exchange import ros_messages, ros_recording
-from ultragray.pose import quaternion_from_pose
-from ultragray.probe import ElevationBeam
-from ultragray.settings import RenderSettings
-from ultragray.volumes.plane import SliceSettings
+from ultragray.geometry.pose import quaternion_from_pose
+from ultragray.geometry.probe import ElevationBeam
+from ultragray.rendering.settings import RenderSettings
+from ultragray.rendering.volumes import SliceSettings
 from ultragray_service.errors import STATUSES
 from ultragray_workers.datasets.store import DatasetRecord
 from ultragray_workers.jobs.kinds import Specification
@@ -70,8 +70,8 @@ OWN_ERRORS = {  # of the client, by their reason: base, meaning
 }
 RECORDING = {"messages": ros_messages, "writer": ros_recording}  # modules that the client has as they are, by its names
 OWN_IMPORTS = {  # what they import, as the client has it
-    "from ultragray.probe import FloatArray\n": "from ..geometry import FloatArray\n",
-    "from ultragray.pose import quaternion_from_pose\n": "import numpy as np\n",  # the function stands at the end
+    "from ultragray.geometry.probe import FloatArray\n": "from ..geometry import FloatArray\n",
+    "from ultragray.geometry.pose import quaternion_from_pose\n": "import numpy as np\n",  # it stands at the end
     "from ultragray.exchange import ros_messages as ros\n": "from . import messages as ros\n",
 }
 _ALSO = {"InvalidArgument": ["ValueError"], "DeadlineExceeded": ["TimeoutError"]}  # what they are beside

@@ -9,7 +9,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCE_ROOTS = [ROOT / name for name in ("model", "workers", "service", "client", "proto", "ros", "studies")]
-PROBE_PACKAGE = "ultragray.probe"
+PROBE_PACKAGE = "ultragray.geometry.probe"
 
 
 @cache

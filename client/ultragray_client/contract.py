@@ -128,7 +128,7 @@ class Below(str, Enum):
 
 
 class Contact(str, Enum):
-    """What a frame shows of the probe's contact with the skin (`ultragray.contact`)."""
+    """What a frame shows of the probe's contact with the skin (`ultragray.rendering.contact`)."""
 
     AIR = "air"
     PRESSURE = "pressure"

@@ -14,10 +14,9 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
+from ultragray_client.errors import InvalidPose
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import geometry_pb2
-
-from .errors import InvalidPose
 
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 

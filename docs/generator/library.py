@@ -6,12 +6,12 @@ import json
 from dataclasses import MISSING, Field
 from typing import Any
 
-from ultragray.confidence import FIGURES
 from ultragray.contract import annotated_fields, limits_in_words, to_dict
 from ultragray.exchange.exports import FORMATS
 from ultragray.learn.training.config import PRESETS, TrainingConfig
-from ultragray.outputs import OUTPUTS
+from ultragray.rendering.outputs import OUTPUTS
 from ultragray.samplers import Sampler
+from ultragray.scene.confidence import FIGURES
 from ultragray_studies.methods.registry import METHODS
 
 from .markdown import code, codes, in_line, summary, table

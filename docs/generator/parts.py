@@ -5,11 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from ultragray.confidence import Extrapolation
-from ultragray.display.settings import Display
-from ultragray.scene_info import SceneInfo
-from ultragray.settings import RenderSettings
-from ultragray.volumes.plane import SliceSettings
+from ultragray.rendering.display import Display
+from ultragray.rendering.settings import RenderSettings
+from ultragray.rendering.volumes import SliceSettings
+from ultragray.scene.confidence import Extrapolation
+from ultragray.scene.info import SceneInfo
 from ultragray_service.http.bodies import RenderBody, StreamMessage
 from ultragray_service.http.routes.streams import FrameMessage
 from ultragray_studies.gym.standard_plane import StandardPlaneSettings

@@ -34,8 +34,8 @@ from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.jobs.places import shared_storage
 from ultragray_workers.jobs.queue.owners import Kind
 from ultragray_workers.jobs.store import JobStore
+from ultragray_workers.pool.messages import RenderResult
 from ultragray_workers.pool.pool import PoolConfig, RenderPool
-from ultragray_workers.pool.types import RenderResult
 from ultragray_workers.scenes import SceneStore
 
 

@@ -9,9 +9,9 @@ import pytest
 
 from ultragray import ConvexProbe as LibraryConvexProbe
 from ultragray import GaussianScene, render
-from ultragray.display.frames import show
-from ultragray.display.settings import AS_RENDERED
-from ultragray.display.settings import Display as LibraryDisplay
+from ultragray.rendering.display import AS_RENDERED
+from ultragray.rendering.display import Display as LibraryDisplay
+from ultragray.rendering.frames import show
 from ultragray_client import ConvexProbe, Display, Encoding, Picture, Placement, Quaternion, RenderSettings, errors
 
 from ..service.conftest import DEMO_PROBE, HEIGHT, WIDTH

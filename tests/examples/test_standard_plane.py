@@ -11,7 +11,7 @@ import gymnasium
 import numpy as np
 import pytest
 
-from ultragray.demo import DEMO_FILE
+from ultragray.phantom.demo import DEMO_FILE
 from ultragray_studies.gym import STANDARD_PLANE
 
 from .conftest import EXAMPLES

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from websockets.sync.client import connect
 
-from ultragray.probe import FloatArray
+from ultragray.geometry.probe import FloatArray
 from ultragray_client import AroundSampler, Client, JobState, RenderJob, RenderSettings, errors
 from ultragray_service.access.keys import KeyStore
 from ultragray_service.access.principals import Role

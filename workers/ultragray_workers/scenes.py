@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ultragray.errors import SceneFileInvalid
-from ultragray.files.atomic import file_sha256
-from ultragray.scene_info import SceneHeader, SceneInfo, read_header, scene_file_invalid
+from ultragray.files import file_sha256
+from ultragray.scene.info import SceneHeader, SceneInfo, read_header, scene_file_invalid
 from ultragray_workers.errors import SceneNotFound, known_names
 from ultragray_workers.scene_names import SUFFIX, SceneReference, base_name, check_scene_name
 from ultragray_workers.shelves.bucket import BucketShelf
@@ -217,7 +217,7 @@ def check_scene_file(path: str) -> None:
     """Load a scene file that somebody sent, in a helper process. Raises SceneFileInvalid, which calls it the body."""
     try:
         read_header(path)
-        from ultragray.scene import GaussianScene  # torch, which a file that is no scene does not need
+        from ultragray.scene.gaussians import GaussianScene  # torch, which a file that is no scene does not need
 
         GaussianScene.load(path)
     except SceneFileInvalid as error:

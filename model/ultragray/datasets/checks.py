@@ -12,9 +12,9 @@ from itertools import pairwise
 
 import numpy as np
 
+from ultragray.geometry.pose import rotation_angles_deg
+from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.sweep import Dataset, Sweep, corner_distances_mm
-from ultragray.pose import rotation_angles_deg
-from ultragray.probe import FloatArray, Probe
 
 VOXEL_MM = 1.0
 MAX_VOXELS = 8_000_000

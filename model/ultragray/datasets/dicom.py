@@ -29,10 +29,10 @@ from ultragray.datasets.images import (
     region_of,
 )
 from ultragray.errors import DatasetInvalid, InvalidArgument, InvalidPose
-from ultragray.files.poses import load_poses
+from ultragray.exchange.poses import load_poses
+from ultragray.geometry.probe import FloatArray
 from ultragray.installation import missing_extra
 from ultragray.learn.sweep import ByteArray, IntArray, Sweep, parse_frame_ranges
-from ultragray.probe import FloatArray
 
 POSE_SUFFIXES = (".poses.npy", ".poses.json")
 MAX_HEADER_BYTES = 16 << 20  # of all that stands before the pixels

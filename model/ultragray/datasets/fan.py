@@ -16,12 +16,11 @@ import numpy as np
 
 from ultragray.contract import from_dict
 from ultragray.datasets.images import CropBox
-from ultragray.display.settings import Display
 from ultragray.errors import DatasetInvalid, InvalidArgument
-from ultragray.image_size import MAX_IMAGE_SIDE
+from ultragray.geometry.image_size import MAX_IMAGE_SIDE
+from ultragray.geometry.probe import LARGEST_OPENING_DEG, ConvexProbe, Fan, FloatArray, PhasedProbe, Probe
 from ultragray.learn.sweep import ByteArray
-from ultragray.probe import ConvexProbe, FloatArray, PhasedProbe, Probe
-from ultragray.probe.fan import LARGEST_OPENING_DEG, Fan
+from ultragray.rendering.display import Display
 
 MAX_DEVICE_SET_BYTES = 8 << 20
 _NAME = re.compile(r"([A-Z]\w*?)To([A-Z]\w*)")

@@ -12,9 +12,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ultragray.errors import DatasetInvalid, InvalidArgument
-from ultragray.image_size import MAX_IMAGE_SIDE
+from ultragray.geometry.image_size import MAX_IMAGE_SIDE
+from ultragray.geometry.probe import FloatArray, LinearProbe
 from ultragray.learn.sweep import ByteArray, ImageRegion, IntArray
-from ultragray.probe import FloatArray, LinearProbe
 
 MAX_PIXEL_BYTES = 4 << 30  # of the frames in a file
 

@@ -23,11 +23,9 @@ from ultragray.datasets.mcap_messages import KINDS, NS_PER_S, MessageFile, Store
 from ultragray.errors import DatasetInvalid, InvalidArgument, InvalidPose
 from ultragray.exchange.ros_fields import TRANSFORM, TRANSFORMS, pose_of_parts
 from ultragray.exchange.ros_messages import POSE, TEXT
+from ultragray.geometry.probe import Fan, FloatArray, Picture, Probe
 from ultragray.geometry.rotations import blended
 from ultragray.learn.sweep import ByteArray, ImageRegion, IntArray, Sweep, parse_frame_ranges
-from ultragray.probe import FloatArray, Probe
-from ultragray.probe.fan import Fan
-from ultragray.probe.picture import Picture
 
 MAX_GEOMETRY_BYTES = 1 << 20
 SAME = 1e-6  # relative, of the places of pixels

@@ -27,9 +27,9 @@ from ultragray.datasets.fan import (
 from ultragray.datasets.images import grey_frames, parse_crop, pixel_size_mm, poses_from_image_transforms, region_of
 from ultragray.datasets.plus_files import UNKNOWN, StoredSequence, orient_frames, read_meta_image, read_nrrd
 from ultragray.errors import DatasetInvalid, InvalidArgument, InvalidPose
+from ultragray.geometry.pose import check_poses
+from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.sweep import Sweep, parse_frame_ranges
-from ultragray.pose import check_poses
-from ultragray.probe import FloatArray, Probe
 
 _READERS = {".mha": read_meta_image, ".mhd": read_meta_image, ".nrrd": read_nrrd, ".nhdr": read_nrrd}
 IMAGE, WORLDS = "Image", ("Reference", "Tracker", "World")

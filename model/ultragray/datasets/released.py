@@ -15,12 +15,11 @@ import numpy as np
 
 from ultragray.datasets.images import grey_frames
 from ultragray.errors import CheckpointInvalid, DatasetInvalid, InvalidArgument, InvalidPose
+from ultragray.exchange.poses import read_pose_array
 from ultragray.exchange.released_config import ReleasedConfig, probe_keys, read_released_config
-from ultragray.files.atomic import atomic_path, write_whole
-from ultragray.files.npy import map_npy
-from ultragray.files.poses import read_pose_array
+from ultragray.files import atomic_path, map_npy, write_whole
+from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.sweep import ByteArray, Dataset, Sweep, check_frame_poses
-from ultragray.probe import FloatArray, Probe
 
 CONFIG_NAME = "conf.json"
 

@@ -16,16 +16,16 @@ from typing import Any
 
 import numpy as np
 
-from ultragray.confidence import Extrapolation
 from ultragray.contract import to_dict
 from ultragray.errors import InvalidArgument
-from ultragray.pose import check_poses
-from ultragray.probe import FloatArray, Probe
+from ultragray.geometry.pose import check_poses
+from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.rendering.settings import Encoding, FrameSettings, Resolved
 from ultragray.samplers import Assess, DrawnSampler, Sampler
 from ultragray.samplers.confident import assessed_part
 from ultragray.samplers.sampler import BLOCK_POSES
-from ultragray.scene_info import SceneHeader
-from ultragray.settings import Encoding, FrameSettings, Resolved
+from ultragray.scene.confidence import Extrapolation
+from ultragray.scene.info import SceneHeader
 
 _RANGE = re.compile(r"(?P<before>[^{}]*)\{(?P<first>\d{1,9})\.\.(?P<last>\d{1,9})\}(?P<after>[^{}]*)")
 

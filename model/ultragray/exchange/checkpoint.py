@@ -20,9 +20,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ultragray.backends.reference import spherical_harmonics
 from ultragray.contract import checked_number, under
 from ultragray.errors import CheckpointInvalid, InvalidArgument, InvalidProbe
+from ultragray.exchange.poses import load_poses
 from ultragray.exchange.released_config import (
     WIDTH_KEY,
     ReleasedConfig,
@@ -30,11 +30,11 @@ from ultragray.exchange.released_config import (
     read_released_config,
     released_centre_mm,
 )
-from ultragray.files.atomic import write_whole
-from ultragray.files.poses import load_poses
-from ultragray.probe import FloatArray, Probe
-from ultragray.scene import PARAMETERS, GaussianScene
-from ultragray.scene_info import SceneInfo, Vector
+from ultragray.files import write_whole
+from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.rendering.backends.reference import spherical_harmonics
+from ultragray.scene.gaussians import PARAMETERS, GaussianScene
+from ultragray.scene.info import SceneInfo, Vector
 
 _log = logging.getLogger(__name__)
 

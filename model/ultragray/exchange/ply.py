@@ -22,10 +22,10 @@ import numpy.typing as npt
 import torch
 
 from ultragray.errors import SceneFileInvalid
-from ultragray.files.atomic import atomic_path
-from ultragray.probe import FloatArray
-from ultragray.scene import GaussianScene
-from ultragray.scene_info import MAX_SH_DEGREE, SceneInfo, info_from_json, info_to_json
+from ultragray.files import atomic_path
+from ultragray.geometry.probe import FloatArray
+from ultragray.scene.gaussians import GaussianScene
+from ultragray.scene.info import MAX_SH_DEGREE, SceneInfo, info_from_json, info_to_json
 
 MAX_HEADER_BYTES = 1 << 24
 COMMENT_CHARACTERS = 200  # some readers keep a line in a buffer of 1024

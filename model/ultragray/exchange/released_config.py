@@ -17,8 +17,8 @@ from typing import Any
 from ultragray.contract import checked_number
 from ultragray.datasets.images import frame_size
 from ultragray.errors import CheckpointInvalid, InvalidArgument, InvalidProbe
-from ultragray.files.npy import map_npy
-from ultragray.probe import ConvexProbe, FloatArray, LinearProbe, PhasedProbe, Probe
+from ultragray.files import map_npy
+from ultragray.geometry.probe import ConvexProbe, FloatArray, LinearProbe, PhasedProbe, Probe
 
 MAX_CONFIG_BYTES = 1 << 20
 WIDTH_KEY, ANGLE_KEY = "ultrasound_opening_width", "ultrasound_opening_angle"

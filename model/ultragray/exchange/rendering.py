@@ -10,18 +10,17 @@ from typing import Any
 
 import torch
 
-from ultragray.confidence import Assessor, Extrapolation, is_confident
-from ultragray.confidence.support import SupportWatch
-from ultragray.display.frames import show
-from ultragray.display.pixels import PixelArray
 from ultragray.exchange.exports import FORMATS, ExportHeader, check_format, export_to
 from ultragray.exchange.exports.png_folder import export_pngs
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation.scoring import frames_at_once
-from ultragray.limits import UNLIMITED, Limits
-from ultragray.probe import FloatArray
-from ultragray.rendering import render, renderer_name
-from ultragray.scene import GaussianScene
-from ultragray.settings import Below, Resolved
+from ultragray.rendering.confidence import SupportWatch
+from ultragray.rendering.frames import render, renderer_name, show
+from ultragray.rendering.limits import UNLIMITED, Limits
+from ultragray.rendering.pixels import PixelArray
+from ultragray.rendering.settings import Below, Resolved
+from ultragray.scene.confidence import Assessor, Extrapolation, is_confident
+from ultragray.scene.gaussians import GaussianScene
 
 __all__ = ["render_portions", "render_to_file"]
 

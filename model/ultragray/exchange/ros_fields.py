@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from ultragray.exchange.ros_messages import IMAGE, MM_PER_M, POSE, TEXT
-from ultragray.pose import pose_from_position_quaternion
-from ultragray.probe import FloatArray
+from ultragray.geometry.pose import pose_from_position_quaternion
+from ultragray.geometry.probe import FloatArray
 
 COMPRESSED = "sensor_msgs/msg/CompressedImage"
 TRANSFORM = "geometry_msgs/msg/TransformStamped"

@@ -12,8 +12,8 @@ from typing import Any
 
 import numpy.typing as npt
 
-from ultragray.pose import quaternion_from_pose
-from ultragray.probe import FloatArray
+from ultragray.geometry.pose import quaternion_from_pose
+from ultragray.geometry.probe import FloatArray
 
 MM_PER_M = 1000.0
 NS_PER_S = 1_000_000_000

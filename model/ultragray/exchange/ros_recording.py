@@ -13,7 +13,7 @@ import numpy.typing as npt
 from mcap_ros2.writer import Writer
 
 from ultragray.exchange import ros_messages as ros
-from ultragray.probe import FloatArray
+from ultragray.geometry.probe import FloatArray
 
 TOPICS = "/ultragray"
 METADATA = "ultragray"  # the record of the origin: its objects as JSON

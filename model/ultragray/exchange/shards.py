@@ -12,20 +12,20 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ultragray.confidence import Assessor, Extrapolation
-from ultragray.display.pixels import PixelArray
 from ultragray.errors import InvalidArgument
 from ultragray.exchange.batches import BatchPlan, ShardEntry
 from ultragray.exchange.exports import ExportHeader
 from ultragray.exchange.exports.exporter import stored_pixels
 from ultragray.exchange.rendering import render_portions, written_behind
-from ultragray.files.atomic import file_sha256
-from ultragray.limits import UNLIMITED, Limits
-from ultragray.probe import FloatArray
-from ultragray.rendering import renderer_name
+from ultragray.files import file_sha256
+from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.frames import renderer_name
+from ultragray.rendering.limits import UNLIMITED, Limits
+from ultragray.rendering.pixels import PixelArray
 from ultragray.samplers import Assess
-from ultragray.scene import GaussianScene
-from ultragray.scene_info import read_header
+from ultragray.scene.confidence import Assessor, Extrapolation
+from ultragray.scene.gaussians import GaussianScene
+from ultragray.scene.info import read_header
 
 _BLOCK, _RECORD = 512, 10_240  # bytes
 _MAX_MEMBER = 8**11 - 1  # bytes: what the field of a header holds

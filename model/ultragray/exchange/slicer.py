@@ -10,8 +10,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
 
-from ultragray.files.atomic import write_whole
-from ultragray.probe import FloatArray
+from ultragray.files import write_whole
+from ultragray.geometry.probe import FloatArray
 
 _CONNECTOR, _TRANSFORM = "vtkMRMLIGTLConnectorNode1", "vtkMRMLLinearTransformNode1"
 _VOLUME, _DISPLAY = "vtkMRMLScalarVolumeNode1", "vtkMRMLScalarVolumeDisplayNode1"

@@ -1,1 +1,3 @@
-"""TODO: say what this package is for."""
+"""Where things are: poses, probes and their scan lines, registrations, scan conversion. The first storey; it imports
+what lies beneath alone, and no torch.
+"""

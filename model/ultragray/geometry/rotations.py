@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ultragray.probe import FloatArray
+from ultragray.geometry.probe import FloatArray
 
 _NO_TURN = 1e-300  # rad
 

@@ -15,8 +15,8 @@ import numpy.typing as npt
 
 from ultragray.contract import Contract, described, to_dict
 from ultragray.errors import DatasetInvalid, InvalidArgument, InvalidPose
-from ultragray.pose import check_poses
-from ultragray.probe import FloatArray, Probe
+from ultragray.geometry.pose import check_poses
+from ultragray.geometry.probe import FloatArray, Probe
 
 
 @dataclass(frozen=True)

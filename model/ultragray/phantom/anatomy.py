@@ -14,8 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ultragray.errors import InvalidArgument
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.sweep import IntArray
-from ultragray.probe import FloatArray
 
 Floats: TypeAlias = npt.NDArray[np.floating[Any]]  # computed in the type that comes in: float32 is twice as fast
 Place: TypeAlias = tuple[Floats, Floats | float, Floats]  # x, y, z, each [N]

@@ -14,6 +14,8 @@ import numpy as np
 import numpy.typing as npt
 
 from ultragray.errors import DatasetInvalid, InvalidProbe
+from ultragray.geometry.pose import check_poses
+from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.sweep import ByteArray, IntArray, Sweep
 from ultragray.phantom import anatomy
 from ultragray.phantom import anatomy as acoustics
@@ -26,8 +28,6 @@ from ultragray.phantom.anatomy import (
     fascicles,
     tissue_at,
 )
-from ultragray.pose import check_poses
-from ultragray.probe import FloatArray, Probe
 
 Float32Array = npt.NDArray[np.float32]
 

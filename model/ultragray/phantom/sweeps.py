@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from ultragray.errors import InvalidArgument
+from ultragray.geometry.pose import check_poses
+from ultragray.geometry.probe import FloatArray, LinearProbe
 from ultragray.learn.sweep import Dataset, Sweep
 from ultragray.phantom.imaging import simulate
-from ultragray.pose import check_poses
-from ultragray.probe import FloatArray, LinearProbe
 
 PHANTOM_PROBE = LinearProbe(width_mm=60.0, near_mm=0.0, far_mm=60.0)
 PHANTOM_IMAGE_SIDE = 256

@@ -12,7 +12,7 @@ from typing import Any
 
 from ultragray.contract import Contract, annotated_fields, described, from_text
 from ultragray.errors import InvalidArgument
-from ultragray_workers.pool.fairness.turns import Caller
+from ultragray_workers.pool.turns import Caller
 
 Number = int | float
 GB = 10**9

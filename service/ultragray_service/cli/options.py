@@ -29,9 +29,9 @@ import typer
 
 from ultragray.contract import Contract, Family, annotated_fields, from_dict, from_text, optional_of, range_of
 from ultragray.errors import InvalidArgument
-from ultragray.files.poses import load_poses
+from ultragray.exchange.poses import load_poses
+from ultragray.rendering.tools import Tool, load_tools
 from ultragray.samplers import Sampler
-from ultragray.tools import Tool, load_tools
 
 FLAGS = {
     "settings": ("--set",),

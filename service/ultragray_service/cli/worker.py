@@ -14,12 +14,11 @@ import typer
 
 from ultragray.errors import UltragrayError
 from ultragray_service.cli.options import FieldsOf, pairs_of, with_options
-from ultragray_service.cli.style import command_group, examples
+from ultragray_service.cli.terminal import command_group, examples
 from ultragray_service.server import ALIVE, READY, ServiceManager
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from ultragray_workers.errors import StartupFailed
-from ultragray_workers.niceness import let_frames_go_first
-from ultragray_workers.parent import end_with_parent
+from ultragray_workers.processes import end_with_parent, let_frames_go_first
 
 command_app = command_group()
 

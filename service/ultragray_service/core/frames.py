@@ -9,16 +9,16 @@ from typing import Annotated, Any
 from pydantic import WithJsonSchema
 from typing_extensions import Self
 
-from ultragray.confidence import Extrapolation
 from ultragray.contract import described
-from ultragray.display.settings import AS_RENDERED, Display
-from ultragray.outputs import OUTPUTS
-from ultragray.probe import FloatArray, Picture, Probe
-from ultragray.settings import Contact, Encoding, Resolved
-from ultragray.tools import Tool
-from ultragray.volumes.plane import SliceView
+from ultragray.geometry.probe import FloatArray, Picture, Probe
+from ultragray.rendering.display import AS_RENDERED, Display
+from ultragray.rendering.outputs import OUTPUTS
+from ultragray.rendering.settings import Contact, Encoding, Resolved
+from ultragray.rendering.tools import Tool
+from ultragray.rendering.volumes import SliceView
+from ultragray.scene.confidence import Extrapolation
 from ultragray_service.core.poses import MatrixRows
-from ultragray_workers.pool.types import RenderResult
+from ultragray_workers.pool.messages import RenderResult
 
 OutputName = Annotated[
     str,

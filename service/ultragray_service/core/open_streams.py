@@ -17,7 +17,7 @@ from ultragray.errors import UltragrayError
 from ultragray_service.access.principals import Principal, Role, acting, caller
 from ultragray_service.core.poses import MatrixRows
 from ultragray_service.errors import StreamNotFound
-from ultragray_workers.pool.types import RenderResult
+from ultragray_workers.pool.messages import RenderResult
 
 
 @dataclass(frozen=True, eq=False)

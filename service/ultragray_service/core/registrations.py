@@ -18,7 +18,7 @@ from sqlalchemy.dialects import postgresql, sqlite
 
 from ultragray.contract import described, from_dict, shown, to_dict
 from ultragray.errors import InvalidArgument, UltragrayError
-from ultragray.registration.registration import Registration
+from ultragray.geometry.registration import Registration
 from ultragray_service.access.limits import Limits
 from ultragray_service.access.owners import Owners, may_change
 from ultragray_service.access.principals import Principal, Role, acting, iso_time

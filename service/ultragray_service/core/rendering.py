@@ -15,12 +15,11 @@ from typing import Generic
 
 from ultragray.contract import join, under
 from ultragray.errors import InvalidImageSize, RenderFailed, TooManyPoses
-from ultragray.probe import FloatArray
-from ultragray.registration.registration import Registration
-from ultragray.scene_info import SceneHeader, SceneInfo
-from ultragray.settings import Encoding, FrameSettings, Resolved
-from ultragray.volumes.names import check_field
-from ultragray.volumes.plane import SliceSettings, SliceView
+from ultragray.geometry.probe import FloatArray
+from ultragray.geometry.registration import Registration
+from ultragray.rendering.settings import Encoding, FrameSettings, Resolved
+from ultragray.rendering.volumes import SliceSettings, SliceView, check_field
+from ultragray.scene.info import SceneHeader, SceneInfo
 from ultragray_service.access.audit import account
 from ultragray_service.access.limits import Limits
 from ultragray_service.access.owners import Owners
@@ -31,8 +30,8 @@ from ultragray_service.settings import Settings
 from ultragray_service.telemetry.metrics import Metrics
 from ultragray_workers.errors import NotReady, SceneNotFound
 from ultragray_workers.jobs.queue.owners import Kind
+from ultragray_workers.pool.messages import Destination, Priority, RenderRequest, RenderResult, S, SceneChangedError
 from ultragray_workers.pool.pool import MAX_SCENE_CHANGES, RenderPool
-from ultragray_workers.pool.types import Destination, Priority, RenderRequest, RenderResult, S, SceneChangedError
 from ultragray_workers.pool.waiting import Turn
 from ultragray_workers.scene_names import base_name
 from ultragray_workers.storage.local import FileVersion

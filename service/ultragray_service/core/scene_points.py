@@ -12,8 +12,8 @@ import numpy.typing as npt
 from safetensors import SafetensorError, safe_open
 
 from ultragray.errors import InvalidArgument
-from ultragray.probe import FloatArray
-from ultragray.scene_info import LABELS_TENSOR, SceneInfo, scene_file_invalid
+from ultragray.geometry.probe import FloatArray
+from ultragray.scene.info import LABELS_TENSOR, SceneInfo, scene_file_invalid
 
 FIELDS = ("x", "y", "z", "intensity", "transmittance", "deviation_mm")
 SHAPE_FIELDS = ("deviation_1_mm", "deviation_2_mm", "deviation_3_mm", "qw", "qx", "qy", "qz", "label")

@@ -18,12 +18,12 @@ from typing import Any, TypeVar
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
 
-from ultragray.confidence.assess import read_model
 from ultragray.contract import described
 from ultragray.errors import InvalidArgument, SceneFileInvalid, UltragrayError
-from ultragray.outputs import OUTPUTS
-from ultragray.probe import ElevationBeam, Probe
-from ultragray.scene_info import SceneHeader
+from ultragray.geometry.probe import ElevationBeam, Probe
+from ultragray.rendering.outputs import OUTPUTS
+from ultragray.scene.confidence import read_model
+from ultragray.scene.info import SceneHeader
 from ultragray_service.access.owners import Owners
 from ultragray_service.access.principals import iso_time
 from ultragray_service.core.frames import OutputName

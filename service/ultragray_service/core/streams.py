@@ -12,12 +12,12 @@ from functools import partial
 from typing import Any, Protocol
 
 from ultragray.errors import InvalidArgument, UltragrayError
-from ultragray.probe import FloatArray
-from ultragray.settings import RenderSettings
+from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.settings import RenderSettings
 from ultragray_service.core.open_streams import Answered, OpenStream
 from ultragray_service.core.rendering import Plan, Rendering
 from ultragray_workers.errors import Draining
-from ultragray_workers.pool.types import Destination, RenderResult
+from ultragray_workers.pool.messages import Destination, RenderResult
 from ultragray_workers.pool.waiting import Turn
 
 MAX_FRAMES_IN_FLIGHT = 8  # of an ordered stream; then it stops reading

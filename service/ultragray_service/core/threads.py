@@ -16,8 +16,8 @@ from functools import partial
 from typing import Any, TypeVar
 
 from ultragray.errors import MemoryExceeded, UltragrayError, error_classes
+from ultragray_workers import helpers as helper
 from ultragray_workers.errors import DeadlineExceeded
-from ultragray_workers.helpers import helper
 
 T = TypeVar("T")
 
@@ -52,7 +52,7 @@ async def to_its_end(work: Callable[[], T]) -> T:
         await asyncio.wait({working})
 
 
-# Work in helper processes (`ultragray_workers.helpers.helper`), awaited without blocking the event loop.
+# Work in helper processes (`ultragray_workers.helpers`), awaited without blocking the event loop.
 
 
 _log = logging.getLogger("ultragray.service")

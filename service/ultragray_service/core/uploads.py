@@ -17,8 +17,8 @@ from typing import Any, TypeVar
 from ultragray.contract import from_dict
 from ultragray.datasets.source import SourceOptions
 from ultragray.errors import DatasetInvalid, SceneFileInvalid, UltragrayError
-from ultragray.files.atomic import sync
-from ultragray.scene_info import SceneHeader, read_header
+from ultragray.files import sync
+from ultragray.scene.info import SceneHeader, read_header
 from ultragray_service.access.audit import account
 from ultragray_service.access.limits import Limits, Slots
 from ultragray_service.access.owners import Claim, Owners

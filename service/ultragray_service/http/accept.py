@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from ultragray.settings import Encoding
+from ultragray.rendering.settings import Encoding
 from ultragray_service.errors import NotAcceptable
 
 PNG = "image/png"

@@ -25,9 +25,9 @@ from starlette.types import Scope
 
 from ultragray import __version__
 from ultragray.errors import UltragrayError
+from ultragray.geometry.probe import Probe
 from ultragray.learn.training.config import PRESETS, TrainingConfig
-from ultragray.probe import Probe
-from ultragray.volumes.plane import SliceSettings
+from ultragray.rendering.volumes import SliceSettings
 from ultragray_service.access.rules import WEBSOCKET, HttpRules
 from ultragray_service.errors import RouteNotFound
 from ultragray_service.http import problems

@@ -19,11 +19,11 @@ from starlette.requests import Request
 
 from ultragray.contract import Contract, annotated_fields, described, error_under
 from ultragray.errors import InvalidArgument, InvalidImageSize, InvalidPose, UltragrayError
-from ultragray.image_size import MAX_IMAGE_SIDE
+from ultragray.geometry.image_size import MAX_IMAGE_SIDE
+from ultragray.geometry.probe import Probe
+from ultragray.geometry.registration import Registration
 from ultragray.learn.localization.settings import LocalizationSettings
-from ultragray.probe import Probe
-from ultragray.registration.registration import Registration
-from ultragray.settings import FrameSettings, RenderSettings, registration_field
+from ultragray.rendering.settings import FrameSettings, RenderSettings, registration_field
 from ultragray_service.core.poses import Pose, check_pose_count
 from ultragray_service.core.streams import MAX_TIMEOUT_MS, MAX_WINDOW, StreamMode
 from ultragray_service.errors import BodyTooLarge, UnsupportedMediaType

@@ -20,7 +20,7 @@ from opentelemetry import propagate, trace
 from ultragray import __version__
 from ultragray.errors import InvalidArgument
 from ultragray.installation import missing_extra
-from ultragray_workers.pool.types import RenderResult
+from ultragray_workers.pool.messages import RenderResult
 
 request_id: ContextVar[str] = ContextVar("request_id", default="")
 
@@ -162,7 +162,7 @@ class Tracing:
         if not trace.get_current_span().is_recording():
             return
         attributes: dict[str, str | int] = {
-            "ultragray.scene": result.scene,
+            "ultragray.scene.gaussians": result.scene,
             "ultragray.scene_sha256": result.scene_sha256,
             "ultragray.renderer": result.renderer,
             "ultragray.poses": len(result.poses),

@@ -22,8 +22,8 @@ from ultragray.errors import UltragrayError
 from ultragray_service.access.principals import acting
 from ultragray_service.errors import statuses_of
 from ultragray_workers.jobs.overview import JobsOverview
+from ultragray_workers.pool.messages import LocalizeResult, RenderResult
 from ultragray_workers.pool.pool import RenderPool
-from ultragray_workers.pool.types import LocalizeResult, RenderResult
 
 STEP_S = 5
 STEPS = 120

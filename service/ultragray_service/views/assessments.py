@@ -5,10 +5,10 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass
 
-from ultragray.confidence import Assessor, Extrapolation
 from ultragray.contract import described
-from ultragray.probe import FloatArray, Probe
-from ultragray.scene_info import SceneHeader
+from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.scene.confidence import Assessor, Extrapolation
+from ultragray.scene.info import SceneHeader
 from ultragray_service.core.registrations import Registrations
 from ultragray_service.core.scenes import SceneCatalog
 

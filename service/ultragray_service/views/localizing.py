@@ -6,16 +6,16 @@ from dataclasses import dataclass
 
 from ultragray.contract import described
 from ultragray.errors import InvalidArgument, RenderFailed
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.localization.settings import LocalizationSettings
-from ultragray.probe import FloatArray
-from ultragray.settings import Encoding, FrameSettings
+from ultragray.rendering.settings import Encoding, FrameSettings
 from ultragray_service.access.audit import account
 from ultragray_service.access.principals import caller
 from ultragray_service.core.poses import MatrixRows
 from ultragray_service.core.rendering import Plan, Rendering
 from ultragray_service.core.scenes import scene_to_blame
+from ultragray_workers.pool.messages import LocalizeResult, Priority, RenderRequest, SceneChangedError, Sought
 from ultragray_workers.pool.pool import MAX_SCENE_CHANGES
-from ultragray_workers.pool.types import LocalizeResult, Priority, RenderRequest, SceneChangedError, Sought
 
 FRAMES_OF_A_SEARCH = 100  # that a search counts as: it takes as long, at 512x512
 

@@ -23,11 +23,11 @@ import numpy as np
 
 from ultragray.contract import described
 from ultragray.datasets.source import PHANTOM
-from ultragray.demo import DEMO_FILE
 from ultragray.errors import DatasetInvalid, TrainingStateInvalid, UltragrayError
-from ultragray.files.atomic import sync
-from ultragray.scene_info import read_header
-from ultragray.settings import Encoding
+from ultragray.files import sync
+from ultragray.phantom.demo import DEMO_FILE
+from ultragray.rendering.settings import Encoding
+from ultragray.scene.info import read_header
 from ultragray_service.core.jobs.jobs import Jobs
 from ultragray_service.core.poses import MatrixRows
 from ultragray_service.core.scenes import SceneCatalog
@@ -36,15 +36,12 @@ from ultragray_service.settings import Settings
 from ultragray_workers.claims import claimed_folder, remove_abandoned, remove_whole, storage_full
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import ArtifactNotFound, DatasetNotFound, Draining
-from ultragray_workers.helpers.comparison import FRAMES_NAME, compare
-from ultragray_workers.helpers.dataset_view import POSES_NAME, lay_out
-from ultragray_workers.helpers.helper import PROGRESS_NAME
-from ultragray_workers.helpers.picture_stack import read_picture
-from ultragray_workers.helpers.training_preview import PICTURES, draw_preview
+from ultragray_workers.helpers import PROGRESS_NAME, read_picture
 from ultragray_workers.jobs.files import BASELINES_NAME, JOURNAL_NAME
 from ultragray_workers.jobs.store import Job, JobStore
-from ultragray_workers.pool.process.encoding import encode_image
+from ultragray_workers.pool.pixels import encode_image
 from ultragray_workers.scenes import SceneStore
+from ultragray_workers.views import FRAMES_NAME, POSES_NAME, PREVIEW_PICTURES, compare, draw_preview, lay_out
 
 TIMEOUT_S = 1800.0
 KEPT_FOLDERS = 32
@@ -373,7 +370,7 @@ class TrainingViews(Prepared):
                 await self.path(key, dataset=dataset.name, checkpoint=str(checkpoint))
             except TrainingStateInvalid:  # the training ended a moment ago
                 raise self._none(job) from None
-        if (png := await self.picture_png(key, 0, *PICTURES)) is None:  # the folder went this very moment
+        if (png := await self.picture_png(key, 0, *PREVIEW_PICTURES)) is None:  # the folder went this very moment
             raise self._none(job)
         return png
 
@@ -503,7 +500,7 @@ class Comparisons(Prepared):
         return (await self._wanted(scene))[0]
 
     async def frame_png(self, key: str, index: int, what: str) -> bytes:
-        """A picture of a held-out frame; `what` is one of `ultragray_workers.helpers.comparison.PICTURES`.
+        """A picture of a held-out frame; `what` is one of `ultragray_workers.views.PICTURES`.
 
         Raises ArtifactNotFound where there is none (yet).
         """

@@ -16,11 +16,10 @@ from typing import Any
 
 import numpy as np
 
-from ultragray.display.pixels import to_uint8
 from ultragray.errors import TrainingStateInvalid
-from ultragray.files.atomic import write_whole
-from ultragray.files.npy import map_npy
+from ultragray.files import map_npy, write_whole
 from ultragray.learn.sweep import ByteArray, Dataset
+from ultragray.rendering.pixels import to_uint8
 from ultragray_studies.comparison.result import FORMAT_VERSION, MethodResult
 from ultragray_studies.methods.method import FrameArray
 

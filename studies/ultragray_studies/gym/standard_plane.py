@@ -15,15 +15,15 @@ import torch
 from gymnasium import spaces
 
 from ultragray.contract import Contract, described
-from ultragray.display.pixels import to_uint8
 from ultragray.errors import InvalidArgument, InvalidImageSize
+from ultragray.geometry.image_size import MAX_IMAGE_SIDE
+from ultragray.geometry.pose import check_poses, position_distances_mm, rotation_angles_deg
+from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.geometry.rotations import about_axes, random_directions, rotations_of
-from ultragray.image_size import MAX_IMAGE_SIDE
-from ultragray.pose import check_poses, position_distances_mm, rotation_angles_deg
-from ultragray.probe import FloatArray, Probe
-from ultragray.rendering import render, touch_of
-from ultragray.scene import GaussianScene
-from ultragray.settings import Contact
+from ultragray.rendering.frames import render, touch_of
+from ultragray.rendering.pixels import to_uint8
+from ultragray.rendering.settings import Contact
+from ultragray.scene.gaussians import GaussianScene
 
 _ROOM_MM, _ROOM_DEG = 10.0, 10.0  # beyond twice the farthest start
 

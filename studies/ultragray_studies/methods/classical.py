@@ -6,9 +6,9 @@ import time
 from dataclasses import dataclass
 
 from ultragray.errors import InvalidArgument
+from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.evaluation.baselines import FrameArray, Volume, affordable_voxel_mm, compound, predict
 from ultragray.learn.sweep import Dataset, Sweep
-from ultragray.probe import FloatArray, Probe
 from ultragray_studies.methods.method import Budget, Cost, Description, FitRun, Fitted, Method
 
 PAPER_VOXEL_MM = 0.25  # of the compounding that the UltraG-Ray paper compares with

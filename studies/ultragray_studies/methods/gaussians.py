@@ -9,15 +9,15 @@ from pathlib import Path
 
 import torch
 
-from ultragray.files.atomic import write_whole
+from ultragray.files import write_whole
+from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import Progress, TrainingConfig, train
 from ultragray.learn.training.checkpointing import read_checkpoint_header
 from ultragray.learn.training.memory import training_device
 from ultragray.learn.training.trainer import CHECKPOINT_FILE
-from ultragray.probe import FloatArray, Probe
-from ultragray.rendering import render
-from ultragray.scene import GaussianScene
+from ultragray.rendering.frames import render
+from ultragray.scene.gaussians import GaussianScene
 from ultragray_studies.methods.method import (
     Budget,
     BudgetKind,

@@ -21,11 +21,11 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from ultragray.errors import MemoryExceeded, TrainingDiverged, TrainingStateInvalid
-from ultragray.files.atomic import write_whole
+from ultragray.files import write_whole
+from ultragray.geometry.pose import check_poses
+from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.sweep import Dataset
 from ultragray.learn.training.memory import training_device
-from ultragray.pose import check_poses
-from ultragray.probe import FloatArray, Probe
 from ultragray_studies.methods.method import Budget, Cost, FitProgress, FitRun, Fitted, FrameArray, Method, Pace
 
 T = TypeVar("T")

@@ -15,9 +15,9 @@ import numpy as np
 import numpy.typing as npt
 
 from ultragray.errors import InvalidArgument
-from ultragray.files.atomic import write_whole
+from ultragray.files import write_whole
+from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.sweep import Dataset
-from ultragray.probe import FloatArray, Probe
 
 USED_SHARE = 0.8  # of an equal time: a fit that took less was promised too few steps
 

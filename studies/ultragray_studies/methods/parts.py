@@ -12,9 +12,9 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.evaluation.baselines import pixel_positions_mm
 from ultragray.learn.sweep import Dataset, Sweep
-from ultragray.probe import FloatArray, Probe
 from ultragray_studies.methods.learner import Learner
 
 

@@ -15,8 +15,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ultragray.errors import DatasetInvalid
+from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.sweep import Dataset, Sweep
-from ultragray.probe import FloatArray, Probe
 from ultragray_studies.methods.learner import LearnedMethod, Learner
 from ultragray_studies.methods.method import Budget, Description
 from ultragray_studies.methods.parts import Box, Similarity, as_tensor, encode, encoded_size, pixel_points_mm

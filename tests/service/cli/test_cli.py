@@ -22,9 +22,9 @@ import typer
 
 import ultragray
 from ultragray import GaussianScene, LinearProbe
-from ultragray.demo import DEMO_FILE
 from ultragray.errors import InvalidArgument, SceneFileInvalid
-from ultragray.files.atomic import file_sha256
+from ultragray.files import file_sha256
+from ultragray.phantom.demo import DEMO_FILE
 from ultragray_service.cli.app import app
 from ultragray_service.cli.serve import ensure_scenes, link_scenes
 from ultragray_service.settings import Settings

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import pytest
 
-from ultragray.settings import Encoding
+from ultragray.rendering.settings import Encoding
 from ultragray_service.errors import NotAcceptable
 from ultragray_service.http.accept import JPEG, NPZ, PNG, RAW, Choice, choose
 

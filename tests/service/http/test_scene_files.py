@@ -19,7 +19,7 @@ import pytest
 from safetensors.numpy import save
 
 from ultragray import GaussianScene, SceneInfo
-from ultragray.scene_info import MAX_TRAINING_POSES, expected_shapes, info_to_json
+from ultragray.scene.info import MAX_TRAINING_POSES, expected_shapes, info_to_json
 from ultragray_service.core.scene_points import even_selection
 
 from ...waiting import wait_until

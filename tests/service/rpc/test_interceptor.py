@@ -11,8 +11,7 @@ import grpc
 import pytest
 from google.protobuf.empty_pb2 import Empty
 
-from ultragray_service.rpc.interceptor import CallContext
-from ultragray_service.rpc.status import abort
+from ultragray_service.rpc.calls import CallContext, abort
 from ultragray_service.settings import load_settings
 from ultragray_service.wiring import make_service
 from ultragray_workers.errors import DeadlineExceeded

@@ -201,7 +201,7 @@ def test_options_are_named_as_requests_write_them(
 def run_intake(given: dict[str, Any], memory_bytes: int) -> subprocess.CompletedProcess[str]:
     program = (
         "from ultragray_workers.datasets.intake import take_in; "
-        "from ultragray_workers.helpers.helper import answer_request; answer_request(take_in)"
+        "from ultragray_workers.helpers import answer_request; answer_request(take_in)"
     )
     request = {"arguments": given, "memory_bytes": memory_bytes, "what": "checking the dataset"}
     return subprocess.run([sys.executable, "-c", program], input=json.dumps(request), capture_output=True, text=True)

@@ -18,7 +18,7 @@ from pathlib import Path
 
 from ultragray.errors import InvalidArgument
 from ultragray.exchange.batches import MANIFEST_FILE, BatchPlan, ShardEntry, manifest
-from ultragray.files.atomic import sync
+from ultragray.files import sync
 from ultragray_workers.storage.storage import NotThere, Storage
 
 _ENTRIES = "entries"

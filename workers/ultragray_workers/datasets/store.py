@@ -13,10 +13,9 @@ from typing import TYPE_CHECKING, Any
 from ultragray.contract import Contract, described, from_dict, to_dict
 from ultragray.datasets.source import UPLOADED_FORMATS
 from ultragray.errors import DatasetInvalid, InvalidArgument, UltragrayError
-from ultragray.files.atomic import write_whole
-from ultragray.files.format_version import require_version
+from ultragray.files import require_version, write_whole
+from ultragray.geometry.probe import Probe
 from ultragray.learn.sweep import ImageRegion
-from ultragray.probe import Probe
 from ultragray_workers.datasets.contents import find_source
 from ultragray_workers.datasets.copies import DEFAULT_MAX_BYTES
 from ultragray_workers.datasets.shared_shelf import SharedShelf

@@ -19,8 +19,8 @@ from dbos import error as dbos_error
 
 from ultragray.errors import InvalidArgument
 from ultragray.exchange.batches import stands_for
-from ultragray.image_size import MAX_IMAGE_SIDE
-from ultragray.registration.registration import Registration
+from ultragray.geometry.image_size import MAX_IMAGE_SIDE
+from ultragray.geometry.registration import Registration
 from ultragray_workers.claims import is_claimed
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import (

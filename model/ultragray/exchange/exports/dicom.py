@@ -24,9 +24,9 @@ import numpy as np
 from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
 from pydicom.uid import UID, ExplicitVRLittleEndian, UltrasoundMultiFrameImageStorage
 
-from ultragray.display.pixels import PixelArray
 from ultragray.errors import InvalidArgument
 from ultragray.exchange.exports.exporter import FRAME_TIME_MS, Exporter, ExportHeader
+from ultragray.rendering.pixels import PixelArray
 
 PRIVATE_GROUP, PRIVATE_CREATOR, POSES_ELEMENT, FIGURES_ELEMENT, ORIGIN_ELEMENT = 0x0019, "ULTRAGRAY", 0x01, 0x02, 0x03
 MAX_PIXEL_BYTES = 2**32 - 2  # the length of an element (PS3.5 7.1.1)

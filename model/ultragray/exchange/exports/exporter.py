@@ -13,13 +13,13 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ultragray.confidence import Extrapolation, figure_arrays
 from ultragray.contract import to_dict
-from ultragray.display.pixels import PixelArray, to_uint8
 from ultragray.errors import InvalidArgument
-from ultragray.outputs import OUTPUTS
-from ultragray.probe import FloatArray
-from ultragray.settings import Resolved
+from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.outputs import OUTPUTS
+from ultragray.rendering.pixels import PixelArray, to_uint8
+from ultragray.rendering.settings import Resolved
+from ultragray.scene.confidence import Extrapolation, figure_arrays
 
 FRAME_TIME_MS = 40.0  # rendered frames have no time of their own: formats that need one show 25 a second
 
@@ -47,7 +47,8 @@ class ExportHeader:
     def origin(self) -> dict[str, Any]:
         """The origin of the frames and their display, as JSON holds it.
 
-        `picture` has the fields of `ultragray.probe.Picture`; `contact` is there where it was judged, `tools` and
+        `picture` has the fields of `ultragray.geometry.probe.Picture`; `contact` is there where it was judged, `tools`
+        and
         `ghost` where there were any.
         """
         contact, tools, ghost = self.settings.contact, self.settings.tools, self.settings.ghost

@@ -12,14 +12,14 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import TypeAlias
 
-from ultragray.confidence import Extrapolation
-from ultragray.display.pixels import PixelArray
-from ultragray.display.settings import true_to_scale
 from ultragray.errors import InvalidArgument
 from ultragray.exchange.exports.exporter import Exporter, ExportHeader, stored_pixels
-from ultragray.files.atomic import atomic_path
+from ultragray.files import atomic_path
 from ultragray.installation import extra_of, missing_extra
-from ultragray.settings import Resolved
+from ultragray.rendering.display import true_to_scale
+from ultragray.rendering.pixels import PixelArray
+from ultragray.rendering.settings import Resolved
+from ultragray.scene.confidence import Extrapolation
 
 DTYPES = ("float32", "uint8")
 

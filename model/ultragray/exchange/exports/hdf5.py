@@ -10,8 +10,8 @@ from typing import Any
 import h5py
 import numpy as np
 
-from ultragray.display.pixels import PixelArray
 from ultragray.exchange.exports.exporter import Exporter
+from ultragray.rendering.pixels import PixelArray
 
 
 class Hdf5Exporter(Exporter):

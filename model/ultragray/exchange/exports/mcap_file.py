@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
-from ultragray.display.pixels import PixelArray
 from ultragray.exchange.exports.exporter import FRAME_TIME_MS, Exporter
 from ultragray.exchange.ros_recording import RosRecording
+from ultragray.rendering.pixels import PixelArray
 
 
 class McapExporter(Exporter):

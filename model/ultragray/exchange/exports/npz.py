@@ -11,8 +11,8 @@ from typing import IO
 
 import numpy as np
 
-from ultragray.display.pixels import PixelArray
 from ultragray.exchange.exports.exporter import Exporter
+from ultragray.rendering.pixels import PixelArray
 
 
 class NpzExporter(Exporter):

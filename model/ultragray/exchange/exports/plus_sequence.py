@@ -14,9 +14,9 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ultragray.display.pixels import PixelArray
 from ultragray.exchange.exports.exporter import FRAME_TIME_MS, Exporter
-from ultragray.probe import FloatArray
+from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.pixels import PixelArray
 
 FIELDS = {
     "distance_mm": "UltraGRayDistanceMm",

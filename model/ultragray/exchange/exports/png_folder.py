@@ -8,11 +8,11 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from ultragray.confidence import Extrapolation
-from ultragray.display.pixels import PixelArray, image_file
 from ultragray.exchange.exports.exporter import ExportHeader
 from ultragray.exchange.exports.formats import Add
-from ultragray.files.atomic import atomic_path
+from ultragray.files import atomic_path
+from ultragray.rendering.pixels import PixelArray, image_file
+from ultragray.scene.confidence import Extrapolation
 
 FRAMES_FILE = "frames.json"
 

@@ -9,8 +9,8 @@ from collections.abc import Mapping
 
 import numpy as np
 
-from ultragray.display.pixels import PixelArray, image_file
 from ultragray.exchange.exports.exporter import Exporter
+from ultragray.rendering.pixels import PixelArray, image_file
 
 
 class TarExporter(Exporter):

@@ -10,8 +10,8 @@ import numpy.typing as npt
 import zarr
 from zarr.storage import ZipStore
 
-from ultragray.display.pixels import PixelArray
 from ultragray.exchange.exports.exporter import Exporter
+from ultragray.rendering.pixels import PixelArray
 
 
 class ZarrExporter(Exporter):

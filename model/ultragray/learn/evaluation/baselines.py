@@ -15,12 +15,12 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ultragray.display.scan_conversion import interpolated, pixel_places
 from ultragray.errors import InvalidArgument
+from ultragray.geometry.pose import check_poses
+from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.geometry.scan_conversion import interpolated, pixel_places
 from ultragray.learn.evaluation.scoring import Evaluation, evaluate_frames, require_frames
 from ultragray.learn.sweep import Dataset, IntArray, Sweep, corner_distances_mm
-from ultragray.pose import check_poses
-from ultragray.probe import FloatArray, Probe
 
 FOLDS = ("median", "mean", "maximum")
 VOXEL_MM = 0.5

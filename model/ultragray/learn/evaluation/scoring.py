@@ -14,10 +14,10 @@ from ultragray.errors import DatasetInvalid, InvalidArgument
 from ultragray.learn.evaluation.metrics import FrameMetrics, frame_metrics, mean_metrics, ms_ssim_scales, std_metrics
 from ultragray.learn.evaluation.speckle import FrameSpeckle, SpeckleSummary, compare_speckle, summarize
 from ultragray.learn.sweep import Dataset, IntArray, Sweep
-from ultragray.outputs import UNCERTAINTY
-from ultragray.rendering import render
-from ultragray.scene import GaussianScene
-from ultragray.scene_info import SceneInfo
+from ultragray.rendering.frames import render
+from ultragray.rendering.outputs import UNCERTAINTY
+from ultragray.scene.gaussians import GaussianScene
+from ultragray.scene.info import SceneInfo
 
 CHUNK_PIXELS = 1 << 20  # rendered and measured at once: measuring takes about 200 bytes of each
 CHUNK_FRAMES = 32  # of a frame, rendering takes room for each Gaussian too

@@ -9,13 +9,13 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from ultragray.display.pixels import ByteArray, image_file, to_uint8
-from ultragray.display.scan_conversion import with_square_pixels
-from ultragray.files.atomic import write_whole
+from ultragray.files import write_whole
+from ultragray.geometry.scan_conversion import with_square_pixels
 from ultragray.learn.evaluation.metrics import FrameMetrics
 from ultragray.learn.evaluation.scoring import Evaluation, render_sweep
 from ultragray.learn.sweep import Sweep, spread_places
-from ultragray.scene import GaussianScene
+from ultragray.rendering.pixels import ByteArray, image_file, to_uint8
+from ultragray.scene.gaussians import GaussianScene
 
 MAX_SIDE_PIXELS = 512  # of one panel
 GAP_PIXELS = 6

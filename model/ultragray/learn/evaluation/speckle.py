@@ -26,8 +26,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ultragray.display.settings import FRAME_RANGE_DB
-from ultragray.probe import FloatArray, Probe
+from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.rendering.display import FRAME_RANGE_DB
 
 WINDOW_PIXELS = 16
 BLACK, SATURATED = 0.02, 0.98

@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ultragray.display.pixels import ByteArray
 from ultragray.errors import InvalidArgument
-from ultragray.files.npy import map_npy
-from ultragray.image_size import check_image_size
+from ultragray.files import map_npy
+from ultragray.geometry.image_size import check_image_size
+from ultragray.rendering.pixels import ByteArray
 
 SUFFIXES = (".png", ".npy")
 _PNG = b"\x89PNG\r\n\x1a\n"

@@ -19,15 +19,15 @@ from torch.nn import functional
 from torch.quasirandom import SobolEngine
 
 from ultragray.errors import InvalidArgument
-from ultragray.image_size import check_image_size
+from ultragray.geometry.image_size import check_image_size
+from ultragray.geometry.pose import check_poses
+from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.evaluation.baselines import pixel_positions_mm
 from ultragray.learn.localization.settings import NEAR_DEG, NEAR_MM, Localization, LocalizationSettings
 from ultragray.learn.training.poses import turned_by
-from ultragray.limits import UNLIMITED, Limits
-from ultragray.pose import check_poses
-from ultragray.probe import FloatArray, Probe
-from ultragray.rendering import render
-from ultragray.scene import GaussianScene
+from ultragray.rendering.frames import render
+from ultragray.rendering.limits import UNLIMITED, Limits
+from ultragray.scene.gaussians import GaussianScene
 
 IN_PLANE = (0, 2, 4)  # of the six numbers of a motion: shifts along lateral and axial axis, the turn about elevation
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 from ultragray.contract import Contract, described
 from ultragray.errors import InvalidProbe
-from ultragray.probe import FloatArray, Probe
+from ultragray.geometry.probe import FloatArray, Probe
 
 NEAR_MM, NEAR_DEG = 3.0, 5.0
 MOST_MM, MOST_DEG = 20.0, 30.0

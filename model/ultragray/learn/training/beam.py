@@ -8,9 +8,8 @@ from collections.abc import Mapping
 import torch
 from torch import Tensor
 
+from ultragray.geometry.probe import MAX_THICKNESS_MM, ElevationBeam, Probe
 from ultragray.learn.training.config import TrainingConfig
-from ultragray.probe import ElevationBeam, Probe
-from ultragray.probe.elevation import MAX_THICKNESS_MM
 
 RATE = 0.05  # of Adam, for each of three numbers of the order of one
 BETAS = (0.8, 0.99)

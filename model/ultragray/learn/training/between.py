@@ -12,12 +12,11 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ultragray.backends import cuda
+from ultragray.geometry.pose import rotation_angles_deg
+from ultragray.geometry.probe import FloatArray, Lines, ParallelLines, Probe
 from ultragray.geometry.rotations import blended
 from ultragray.learn.sweep import IntArray, Sweep, spread_places
-from ultragray.pose import rotation_angles_deg
-from ultragray.probe import FloatArray, Probe
-from ultragray.probe.scan_lines import Lines, ParallelLines
+from ultragray.rendering.backends import cuda
 
 ALIKE_DEG = 20.0  # turned farther, a frame shows the same things from another side
 LEAST_ACROSS = 0.5  # of the way to a neighbour that leads across the image plane; else it lies beside

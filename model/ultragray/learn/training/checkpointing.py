@@ -22,12 +22,11 @@ from safetensors.torch import save
 from torch import Tensor
 
 from ultragray.errors import InvalidArgument, TrainingStateInvalid
-from ultragray.files.atomic import write_whole
-from ultragray.files.format_version import require_version
+from ultragray.files import require_version, write_whole
 from ultragray.learn.training.beam import expected_beam_tensors
 from ultragray.learn.training.config import TrainingConfig
 from ultragray.learn.training.optimizer import MOMENTS, is_trained
-from ultragray.scene_info import expected_shapes
+from ultragray.scene.info import expected_shapes
 
 FORMAT_VERSION = 2
 METADATA_KEY = "ultragray-training"

@@ -15,21 +15,35 @@ import numpy.typing as npt
 import torch
 from torch.nn import functional
 
-from ultragray.confidence.assess import supported
-from ultragray.confidence.deviation import CELLS, in_cells, variance_terms, view_distances
-from ultragray.confidence.deviation import POINTS_PER_SIDE as DEVIATION_POINTS
-from ultragray.confidence.model import NEAR_MM, TERMS, ConfidenceModel, Support, logistic, predicted, terms_of, within
-from ultragray.confidence.uncertainty import DEPTHS, DepthBands, Uncertainty
-from ultragray.confidence.views import FAR_MM, POINTS_PER_SIDE, TrainingViews, ViewMeasures
+from ultragray.geometry.pose import rotation_angles_deg
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation.baselines import interpolate_planes
 from ultragray.learn.evaluation.metrics import frame_metrics
 from ultragray.learn.evaluation.scoring import evaluate, evaluate_frames, frames_at_once, render_sweep
 from ultragray.learn.sweep import ByteArray, Dataset, IntArray, Sweep, spread_places
 from ultragray.learn.training.config import TrainingConfig
-from ultragray.pose import rotation_angles_deg
-from ultragray.probe import FloatArray
-from ultragray.rendering import render
-from ultragray.scene import GaussianScene
+from ultragray.rendering.confidence import CELLS, in_cells, variance_terms, view_distances
+from ultragray.rendering.confidence import POINTS_PER_SIDE as DEVIATION_POINTS
+from ultragray.rendering.frames import render
+from ultragray.scene.confidence import (
+    DEPTHS,
+    FAR_MM,
+    NEAR_MM,
+    POINTS_PER_SIDE,
+    TERMS,
+    ConfidenceModel,
+    DepthBands,
+    Support,
+    TrainingViews,
+    Uncertainty,
+    ViewMeasures,
+    logistic,
+    predicted,
+    supported,
+    terms_of,
+    within,
+)
+from ultragray.scene.gaussians import GaussianScene
 
 # Stretches of the sweep's path, as shares of its length: first and last, then gaps of several widths.
 STRETCHES = ((0.0, 0.06), (0.20, 0.23), (0.34, 0.39), (0.48, 0.57), (0.68, 0.69), (0.89, 1.0))

@@ -16,10 +16,8 @@ from typing import TYPE_CHECKING, Any
 
 from ultragray.contract import Contract, described
 from ultragray.errors import InvalidArgument
-from ultragray.probe import ElevationBeam
-from ultragray.probe.elevation import MAX_THICKNESS_MM, MIN_DEPTH_OF_FIELD_MM
-from ultragray.probe.probe import MAX_LENGTH_MM
-from ultragray.scene_info import INTENSITIES, MAX_SH_DEGREE
+from ultragray.geometry.probe import MAX_LENGTH_MM, MAX_THICKNESS_MM, MIN_DEPTH_OF_FIELD_MM, ElevationBeam
+from ultragray.scene.info import INTENSITIES, MAX_SH_DEGREE
 
 if TYPE_CHECKING:
     from ultragray.learn.training.geometry import Geometry

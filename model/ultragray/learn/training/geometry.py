@@ -12,8 +12,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.sweep import Dataset, IntArray, Sweep, corner_distances_mm, spread_places
-from ultragray.probe import FloatArray
 
 TELLING_NEIGHBOURS = 8  # with fewer, PSNR only says that speckle averages out
 MAX_SLICE_MM = 8.0  # no probe's slice is thicker

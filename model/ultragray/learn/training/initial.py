@@ -9,16 +9,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ultragray.backends.spatial_order import spatial_order
+from ultragray.geometry.pose import quaternion_from_pose
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.sweep import Dataset, IntArray
 from ultragray.learn.training.between import Neighbours, draw_places
 from ultragray.learn.training.config import TrainingConfig
 from ultragray.learn.training.geometry import SPENT, Geometry, Shadows
 from ultragray.learn.training.intensity import sh0_of_intensity
-from ultragray.pose import quaternion_from_pose
-from ultragray.probe import FloatArray
-from ultragray.scene import PARAMETERS
-from ultragray.scene_info import expected_shapes
+from ultragray.rendering.backends.inputs import spatial_order
+from ultragray.scene.gaussians import PARAMETERS
+from ultragray.scene.info import expected_shapes
 
 NO_ABSORPTION_LOGIT = 30.0  # τ = 1 to the last bit of a float32
 RELEASED_INTENSITY = 0.6  # of the released start: sh0 = (0.1 − 0.5) / 0.28209

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ultragray.backends.spatial_order import spatial_order
 from ultragray.learn.training.config import TrainingConfig
+from ultragray.rendering.backends.inputs import spatial_order
 
 BEAM_INTENSITY_RATE = 3.0  # a beam dims what it spreads: intensities have further to go than from the frames' own
 

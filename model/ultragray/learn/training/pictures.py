@@ -8,10 +8,10 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ultragray.display.pixels import image_file
-from ultragray.files.atomic import write_whole
+from ultragray.files import write_whole
 from ultragray.learn.evaluation.side_by_side import as_picture
 from ultragray.learn.sweep import Sweep
+from ultragray.rendering.pixels import image_file
 
 FrameArray: TypeAlias = npt.NDArray[np.float32]
 MAX_SIDE_PIXELS = 256

@@ -11,15 +11,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ultragray.backends.poses import ScenePoses
 from ultragray.errors import DatasetInvalid
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation.scoring import frames_at_once, require_frames
 from ultragray.learn.sweep import Dataset, Sweep
 from ultragray.learn.training.alignment import register_sweeps, sweep_ranges, tracker_noise, without_noise
 from ultragray.learn.training.losses import SSIM_WINDOW, image_loss
-from ultragray.probe import FloatArray
-from ultragray.rendering import render
-from ultragray.scene import GaussianScene
+from ultragray.rendering.backends.inputs import ScenePoses
+from ultragray.rendering.frames import render
+from ultragray.scene.gaussians import GaussianScene
 
 START = 0.1  # share of the run: before, there is no anatomy to compare with
 RATE = 0.01  # mm a step: at the end of a long run some tenths of a mm from where it began

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ultragray.errors import InvalidArgument
-from ultragray.files.atomic import write_whole
+from ultragray.files import write_whole
 from ultragray.installation import install_advice
 
 SMOOTHING = 0.05  # weight of the newest step in the mean time of a step
@@ -33,6 +33,30 @@ class Progress:
     val_step: int | None  # after which it was measured
     peak_memory_mb: float | None = None
     beside: str | None = None
+
+
+@dataclass(frozen=True)
+class Course:
+    """The way of a training that has ended."""
+
+    seconds: float  # of all steps
+    losses: list[float]  # of each step
+    val_psnr_db: dict[int, float]  # by step, over some held-out frames
+
+    @classmethod
+    def of_journal(cls, journal: Path) -> Course:
+        """As the `metrics.jsonl` of a run tells it. Raises OSError."""
+        lines = [json.loads(line) for line in journal.read_text(encoding="utf-8").splitlines()]
+        return cls(
+            seconds=float(lines[-1]["elapsed_s"]),
+            losses=[line["loss"] for line in lines],
+            val_psnr_db={line["step"]: line["val_psnr_db"] for line in lines if "val_psnr_db" in line},
+        )
+
+    @property
+    def step_s(self) -> float:
+        """The mean over the steps."""
+        return self.seconds / len(self.losses)
 
 
 class StepTimer:

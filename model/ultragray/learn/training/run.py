@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from ultragray.errors import MemoryExceeded, TrainingDiverged, TrainingStateInvalid
-from ultragray.files.atomic import write_whole
+from ultragray.files import write_whole
 from ultragray.learn.evaluation.metrics import FrameMetrics
 from ultragray.learn.sweep import Dataset
 from ultragray.learn.training.checkpointing import read_checkpoint_header
@@ -23,7 +23,7 @@ from ultragray.learn.training.confidence import LEAST_HELD_OUT, fit_confidence, 
 from ultragray.learn.training.config import USUAL_EFFORT, TrainingConfig
 from ultragray.learn.training.progress import Progress, require_tensorboard
 from ultragray.learn.training.trainer import CHECKPOINT_FILE, Trainer
-from ultragray.scene import GaussianScene
+from ultragray.scene.gaussians import GaussianScene
 
 EFFORTS_FILE = "efforts.json"
 OTHER_EFFORTS = ((2.0, 3.0), (0.5, 0.25))  # upwards, then downwards, as long as each is better than the one before

@@ -16,9 +16,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ultragray.backends import cuda
 from ultragray.errors import DatasetInvalid, MemoryExceeded, TrainingDiverged, TrainingStateInvalid
-from ultragray.files.atomic import remove_stale_temporaries, write_whole
+from ultragray.files import remove_stale_temporaries, write_whole
 from ultragray.learn.evaluation.scoring import evaluate
 from ultragray.learn.sweep import Dataset, spread_places
 from ultragray.learn.training.beam import TrainedBeam
@@ -46,9 +45,10 @@ from ultragray.learn.training.optimizer import Optimizer, PullStatistics, Schedu
 from ultragray.learn.training.pictures import write_picture
 from ultragray.learn.training.poses import PoseRefinement
 from ultragray.learn.training.progress import Board, Journal, Progress, StepTimer
-from ultragray.rendering import Frames, choose_backend, render
-from ultragray.scene import PARAMETERS, GaussianScene
-from ultragray.scene_info import SceneInfo, check_training_pose_count
+from ultragray.rendering.backends import cuda
+from ultragray.rendering.frames import Frames, choose_backend, render
+from ultragray.scene.gaussians import PARAMETERS, GaussianScene
+from ultragray.scene.info import SceneInfo, check_training_pose_count
 
 CHECKPOINT_FILE = "checkpoint.safetensors"
 JOURNAL_FILE = "metrics.jsonl"

@@ -11,8 +11,7 @@ from typing import Annotated
 import typer
 
 from ultragray.errors import InvalidArgument
-from ultragray_service.cli.output import check_file
-from ultragray_service.cli.style import COMPUTE, Force, Json, command_group, examples, output_option
+from ultragray_service.cli.terminal import COMPUTE, Force, Json, check_file, command_group, examples, output_option
 
 INSTEAD = "Instead of frames"
 command_app = command_group()
@@ -55,7 +54,7 @@ def bench(
     if output is not None:
         check_file(output, force=force)
 
-    from ultragray_service.bench.command import chosen_bench
+    from ultragray_studies.bench.command import chosen_bench
 
     run = chosen_bench(chosen[0] if chosen else "frames", backend)
     if not json:

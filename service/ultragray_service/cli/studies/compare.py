@@ -15,13 +15,21 @@ import typer
 from ultragray.datasets.source import SourceOptions
 from ultragray.errors import TrainingStateInvalid
 from ultragray.learn.evaluation.methods import ComparisonSettings
-from ultragray_service.cli.group import INTERRUPTED
+from ultragray_service.cli.app import INTERRUPTED
+from ultragray_service.cli.evaluate import print_comparison, print_speckle
 from ultragray_service.cli.options import with_options
-from ultragray_service.cli.output import check_file
-from ultragray_service.cli.stopping import stop_on_signal
-from ultragray_service.cli.studies.tables import print_comparison, print_speckle
-from ultragray_service.cli.style import COMPUTE, Json, Threads, command_group, examples, output_option, to_json
-from ultragray_service.cli.sweeps.source import SweepArgument, check_source, read_dataset, warn_about_dataset
+from ultragray_service.cli.sweeps import SweepArgument, check_source, read_dataset, warn_about_dataset
+from ultragray_service.cli.terminal import (
+    COMPUTE,
+    Json,
+    Threads,
+    check_file,
+    command_group,
+    examples,
+    output_option,
+    stop_on_signal,
+    to_json,
+)
 
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset
@@ -153,7 +161,7 @@ def _print(comparison: Comparison, written: list[Path]) -> None:
 
 def _write(comparison: Comparison, dataset: Dataset, run: Path, output: Path) -> list[Path]:
     """The page and what stands beside it, of the names that the output gives them."""
-    from ultragray.files.atomic import write_whole
+    from ultragray.files import write_whole
     from ultragray_studies.comparison.page import write_comparison
 
     written = []

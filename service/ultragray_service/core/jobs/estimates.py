@@ -7,12 +7,12 @@ from dataclasses import dataclass
 
 from ultragray.contract import described, under
 from ultragray.errors import InvalidArgument
-from ultragray.probe import FloatArray
-from ultragray.settings import Encoding
+from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.settings import Encoding
 from ultragray_service.core.rendering import Plan, Rendering
 from ultragray_workers.errors import DeadlineExceeded, QueueFull
 from ultragray_workers.jobs.kinds import RenderJob, Specification
-from ultragray_workers.pool.types import Priority
+from ultragray_workers.pool.messages import Priority
 
 MAX_POSES = 256  # that an estimate tells
 _TIMED_FRAMES = 2  # one after the other: the first may load the scene

@@ -14,7 +14,7 @@ from sqlalchemy.exc import SQLAlchemyError
 
 from ultragray.contract import described, under
 from ultragray.errors import DatasetInvalid, InvalidArgument, SceneFileInvalid, UltragrayError
-from ultragray.registration.registration import Registration
+from ultragray.geometry.registration import Registration
 from ultragray_service.access.audit import account
 from ultragray_service.access.owners import may_see
 from ultragray_service.access.principals import acting

@@ -17,9 +17,9 @@ from starlette.responses import Response
 from ultragray.contract import to_dict
 from ultragray.exchange.exports.exporter import ExportHeader
 from ultragray.exchange.exports.formats import FORMATS, check_format, export_bytes, exporter_class
-from ultragray.outputs import OUTPUTS
-from ultragray.settings import Encoding, Resolved
-from ultragray.volumes.plane import SliceSettings, SliceView
+from ultragray.rendering.outputs import OUTPUTS
+from ultragray.rendering.settings import Encoding, Resolved
+from ultragray.rendering.volumes import SliceSettings, SliceView
 from ultragray_service.core.frames import SliceFacts, settings_used
 from ultragray_service.core.poses import exact_poses
 from ultragray_service.http.accept import DICOM, JPEG, NPY, NPZ, PNG, RAW, choose, choose_of_slice
@@ -35,7 +35,7 @@ from ultragray_service.http.dependencies import (
 )
 from ultragray_service.service import Service
 from ultragray_service.telemetry.metrics import STAGES
-from ultragray_workers.pool.types import Priority, RenderResult
+from ultragray_workers.pool.messages import Priority, RenderResult
 
 router = APIRouter(prefix="/v1/scenes", tags=["render"])
 

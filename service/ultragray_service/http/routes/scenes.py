@@ -18,7 +18,7 @@ from ultragray.contract import described
 from ultragray.errors import InvalidArgument
 from ultragray.learn.localization.settings import LocalizationSettings
 from ultragray.learn.report.sizes import CorrectionSizes
-from ultragray.scene_info import SceneHeader
+from ultragray.scene.info import SceneHeader
 from ultragray_service.core.poses import check_pose_count, exact_poses
 from ultragray_service.core.scene_points import (
     ALL_FIELDS,

@@ -14,8 +14,8 @@ from pydantic import Field, FiniteFloat, TypeAdapter
 
 from ultragray.contract import described
 from ultragray.errors import InvalidArgument, UltragrayError
-from ultragray.probe import FloatArray
-from ultragray.settings import RenderSettings
+from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.settings import RenderSettings
 from ultragray_service.access.credentials import STREAM_PROTOCOL
 from ultragray_service.core.frames import FrameHeader, settings_used
 from ultragray_service.core.open_streams import Answered, StreamSummary, Watcher

@@ -17,7 +17,7 @@ import torch
 
 from ultragray.datasets.source import load_dataset
 from ultragray.learn.training import TrainingConfig, train
-from ultragray.scene import GaussianScene
+from ultragray.scene.gaussians import GaussianScene
 from ultragray_workers.errors import DatabaseUnavailable, StartupFailed
 from ultragray_workers.jobs.queue.database import JobDatabase, checked_url
 from ultragray_workers.jobs.store import Job, JobState, JobStore

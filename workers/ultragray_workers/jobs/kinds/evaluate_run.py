@@ -8,7 +8,7 @@ import time
 
 import numpy as np
 
-from ultragray.files.atomic import file_sha256
+from ultragray.files import file_sha256
 from ultragray.learn.evaluation.baselines import affordable_voxel_mm, evaluate_baselines
 from ultragray.learn.evaluation.metrics import FrameMetrics
 from ultragray.learn.evaluation.scoring import (
@@ -23,7 +23,7 @@ from ultragray.learn.evaluation.side_by_side import write_spread
 from ultragray.learn.evaluation.speckle import FrameSpeckle
 from ultragray.learn.sweep import Sweep
 from ultragray.learn.training.memory import training_device
-from ultragray.scene import GaussianScene
+from ultragray.scene.gaussians import GaussianScene
 from ultragray_workers.jobs.folder import Outcome, Progress
 from ultragray_workers.jobs.kinds.evaluate import EvaluateJob
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped

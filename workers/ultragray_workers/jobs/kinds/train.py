@@ -7,8 +7,8 @@ from typing import Any, Literal
 
 from ultragray.contract import described, kind_field, shown
 from ultragray.errors import InvalidArgument
+from ultragray.installation import memory_bytes
 from ultragray.learn.training.config import PRESET_MEANINGS, PRESETS, TrainingConfig
-from ultragray.machine import memory_bytes
 from ultragray_workers.jobs.kinds.base import Specification, Surroundings
 
 _MAX_SETTINGS, _MAX_SETTING_CHARACTERS = 100, 100

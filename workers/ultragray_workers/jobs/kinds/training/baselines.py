@@ -7,7 +7,7 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from ultragray.files.atomic import write_whole
+from ultragray.files import write_whole
 from ultragray.learn.evaluation.baselines import affordable_voxel_mm, evaluate_baselines
 from ultragray.learn.sweep import Dataset, spread_places
 from ultragray.learn.training.trainer import VALIDATION_FRAMES
