@@ -6,9 +6,10 @@ import asyncio
 import contextlib
 import json
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from contextlib import AbstractAsyncContextManager
 from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 
@@ -169,7 +170,7 @@ class Frame:
             "scene": result.scene,
             "scene_sha256": result.scene_sha256,
             "renderer": result.renderer,
-            **settings_used(result.settings).texts(),
+            **_settings_texts(result.settings),
             **self._placing(),
             "replaced_poses": str(self.posed.replaced),
             **{name: f"{value:.3f}" for name, value in asdict(result.extrapolations[0]).items() if value is not None},
@@ -181,6 +182,12 @@ class Frame:
         """The pose in the scene, where a registration led there."""
         is_led = self.result.settings.registration is not None
         return {"probe_to_scene": json.dumps(self.result.poses[0].tolist(), separators=(",", ":"))} if is_led else {}
+
+
+@lru_cache(maxsize=256)
+def _settings_texts(settings: Resolved) -> Mapping[str, str]:
+    """The part of the metadata that is the same for all frames of a device, until the scanner is set anew."""
+    return settings_used(settings).texts()
 
 
 class FrameMaker:

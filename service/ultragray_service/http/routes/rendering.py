@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import io
 import json
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from functools import lru_cache
 from typing import Any
 
@@ -17,7 +17,7 @@ from starlette.responses import Response
 from ultragray.exchange.exports.exporter import ExportHeader
 from ultragray.exchange.exports.formats import FORMATS, check_format, export_bytes, exporter_class
 from ultragray.rendering.outputs import OUTPUTS
-from ultragray.rendering.settings import Encoding, Resolved, settings_used
+from ultragray.rendering.settings import Encoding, Resolved, SettingsUsed, settings_used
 from ultragray.rendering.volumes import SliceSettings, SliceView
 from ultragray_service.core.frames import SliceFacts
 from ultragray_service.core.poses import exact_poses
@@ -38,24 +38,23 @@ from ultragray_workers.pool.messages import Priority, RenderResult
 
 router = APIRouter(prefix="/v1/scenes", tags=["render"])
 
+
+def _header_of(setting: str) -> str:
+    """The header of a setting as used: a text as it is, numbers, lists with commas, else JSON."""
+    return f"X-Ultragray-{setting.replace('_', '-').title()}"
+
+
 RENDER_HEADERS = {
     "X-Ultragray-Scene": "Name of the scene.",
     "X-Ultragray-Scene-Sha256": "SHA-256 of the scene file.",
     "X-Ultragray-Renderer": "Name, version and backend of the renderer.",
     "X-Ultragray-Shape": "Outputs, poses, height, width: 1,1,512,512.",
     "X-Ultragray-Dtype": "uint8 or float32 (little endian).",
-    "X-Ultragray-Outputs": "Outputs in the order of the data, with commas.",
     "X-Ultragray-Pose": "One pose only: the 4x4 matrix that was used, JSON. Of many, npz holds `poses`.",
-    "X-Ultragray-Probe": "The probe that was used, JSON.",
-    "X-Ultragray-Slice-Thickness-Mm": "As used: at the focus of the scene's beam; 0: a plane.",
-    "X-Ultragray-Contact": "As used, air or pressure; absent where contact was assumed.",
-    "X-Ultragray-Tools": "As used, JSON; absent where there were none.",
-    "X-Ultragray-Ghost": "As used; absent where there was none.",
-    "X-Ultragray-Registration": "That led the poses into the scene; absent where they were sent as they are.",
     "X-Ultragray-Confidence": "Of each pose, with commas; empty where the scene cannot tell.",
     "X-Ultragray-Extrapolation": "One pose only: distance_mm, angle_deg, confidence, supported_share, contact_share, "
     "JSON. Of many, npz holds them.",
-    "X-Ultragray-Picture": "Where the pixels lie in the image plane, JSON: column_unit, first, step.",
+    **{_header_of(one.name): one.metadata["description"] for one in fields(SettingsUsed)},
     "X-Ultragray-Queue-Ms": "Waiting time.",
     "X-Ultragray-Render-Ms": "Render time of the batch that the poses were in.",
     "X-Ultragray-Encode-Ms": "Encoding time.",
@@ -158,7 +157,7 @@ def render_headers(result: RenderResult) -> dict[str, str]:
 def _settings_headers(settings: Resolved) -> dict[str, str]:
     """The headers that settings alone decide."""
     texts = {"dtype": settings.encoding.pixel_type.name, **settings_used(settings).texts()}
-    return {f"X-Ultragray-{name.replace('_', '-').title()}": text for name, text in texts.items()}
+    return {_header_of(name): text for name, text in texts.items()}
 
 
 # Slices of a scene on any plane. The Accept header chooses the form.
