@@ -20,15 +20,15 @@ import numpy as np
 import torch
 
 from registry import FIGURES, Document
-from ultragray.datasets.phantom.shadow import BoneShadow
 from ultragray.datasets.source import PHANTOM, SourceOptions, load_dataset
-from ultragray.datasets.sweep import Dataset
-from ultragray.evaluation.scoring import render_sweep
-from ultragray.files.atomic import write_whole
-from ultragray.report.study import train_and_evaluate
-from ultragray.training import TrainingConfig
-from ultragray.training.config import TEXTURE
-from ultragray_service.bench.measured import DIRTY, measured
+from ultragray.files import write_whole
+from ultragray.learn.evaluation.scoring import render_sweep
+from ultragray.learn.sweep import Dataset
+from ultragray.learn.training import TrainingConfig
+from ultragray.learn.training.config import TEXTURE
+from ultragray.phantom.imaging import BoneShadow
+from ultragray_studies.bench.report import DIRTY, measured
+from ultragray_studies.report import train_and_evaluate
 
 OUTPUT = FIGURES["ablations"].staged
 SEEDS = (0, 1, 2)

@@ -26,16 +26,15 @@ from matplotlib.figure import Figure
 
 from in_silico import IN_SILICO, Asked
 from registry import FIGURES, ROOT, Document
-from ultragray.confidence import Assessor
 from ultragray.datasets.source import load_dataset
-from ultragray.datasets.sweep import Dataset
-from ultragray.evaluation.metrics import frame_metrics
-from ultragray.evaluation.reliability import compare_deviations
-from ultragray.evaluation.scoring import render_sweep
-from ultragray.files.atomic import write_whole
-from ultragray.probe import FloatArray
-from ultragray.training import TrainingConfig, train
-from ultragray_service.bench.measured import measured
+from ultragray.files import write_whole
+from ultragray.geometry.probe import FloatArray
+from ultragray.learn.evaluation.metrics import frame_metrics
+from ultragray.learn.evaluation.scoring import compare_deviations, render_sweep
+from ultragray.learn.sweep import Dataset
+from ultragray.learn.training import TrainingConfig, train
+from ultragray.scene.confidence import Assessor
+from ultragray_studies.bench.report import measured
 
 OUTPUT = FIGURES["confidence"].staged
 IMAGES = ROOT / "docs" / "images"

@@ -26,7 +26,7 @@ import poses
 import results_tables
 from registry import FIGURES, ROOT, Document, described, heads
 from scaling import tables
-from ultragray.files.atomic import write_whole
+from ultragray.files import write_whole
 
 
 def _everything(figures: Document) -> Document:

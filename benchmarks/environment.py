@@ -18,11 +18,11 @@ import numpy as np
 import torch
 
 from registry import FIGURES
-from ultragray.demo import DEMO_FILE
-from ultragray.files.atomic import write_whole
-from ultragray.gym import STANDARD_PLANE
-from ultragray.scene import GaussianScene
-from ultragray_service.bench.measured import measured
+from ultragray.files import write_whole
+from ultragray.phantom.demo import DEMO_FILE
+from ultragray.scene.gaussians import GaussianScene
+from ultragray_studies.bench.report import measured
+from ultragray_studies.gym import STANDARD_PLANE
 
 OUTPUT = FIGURES["environment"].staged
 SIDES = (64, 128, 256)

@@ -9,9 +9,9 @@ from functools import partial
 import numpy as np
 
 from ultragray import LinearProbe, Probe
-from ultragray.datasets.phantom import PHANTOM_PROBE, freehand_poses, simulate
-from ultragray.datasets.sweep import Sweep
-from ultragray.probe import FloatArray
+from ultragray.geometry.probe import FloatArray
+from ultragray.learn.sweep import Sweep
+from ultragray.phantom import PHANTOM_PROBE, freehand_poses, simulate
 
 SIDE = 128
 FIRST_MM = -36.0  # where the sweeps begin

@@ -30,16 +30,15 @@ from skimage.util import img_as_ubyte
 from registry import FIGURES
 from ultragray import ConvexProbe
 from ultragray.datasets.images import resize_frames
-from ultragray.datasets.phantom.imaging import simulate
-from ultragray.datasets.phantom.shadow import BoneShadow
-from ultragray.datasets.phantom.sweeps import PHANTOM_IMAGE_SIDE, PHANTOM_PROBE, freehand_poses
-from ultragray.datasets.sweep import Sweep
-from ultragray.display.pixels import to_uint8
-from ultragray.display.scan_conversion import interpolated, samples
-from ultragray.evaluation.metrics import frame_metrics, ms_ssim_scales
-from ultragray.files.atomic import write_whole
-from ultragray.training.data.shadows import Shadows
-from ultragray_service.bench.measured import measured
+from ultragray.files import write_whole
+from ultragray.geometry.scan_conversion import interpolated, samples
+from ultragray.learn.evaluation.metrics import frame_metrics, ms_ssim_scales
+from ultragray.learn.sweep import Sweep
+from ultragray.learn.training.geometry import Shadows
+from ultragray.phantom.imaging import BoneShadow, simulate
+from ultragray.phantom.sweeps import PHANTOM_IMAGE_SIDE, PHANTOM_PROBE, freehand_poses
+from ultragray.rendering.pixels import to_uint8
+from ultragray_studies.bench.report import measured
 
 OUTPUT = FIGURES["libraries"].staged
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=50.0, far_mm=150.0)

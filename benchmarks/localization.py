@@ -21,17 +21,16 @@ import numpy as np
 import torch
 
 from registry import FIGURES, Document
-from ultragray.datasets.phantom import PHANTOM_IMAGE_SIDE, PHANTOM_PROBE, freehand_poses, simulate
 from ultragray.datasets.source import load_dataset
-from ultragray.demo import load_demo_scene
-from ultragray.files.atomic import write_whole
-from ultragray.localization.motion import Motions
-from ultragray.localization.search import localize
-from ultragray.probe import FloatArray
-from ultragray.report.study import train_and_evaluate
-from ultragray.scene import GaussianScene
-from ultragray.training import TrainingConfig
-from ultragray_service.bench.measured import measured
+from ultragray.files import write_whole
+from ultragray.geometry.probe import FloatArray
+from ultragray.learn.localization.search import Motions, localize
+from ultragray.learn.training import TrainingConfig
+from ultragray.phantom import PHANTOM_IMAGE_SIDE, PHANTOM_PROBE, freehand_poses, simulate
+from ultragray.phantom.demo import load_demo_scene
+from ultragray.scene.gaussians import GaussianScene
+from ultragray_studies.bench.report import measured
+from ultragray_studies.report import train_and_evaluate
 
 OUTPUT = FIGURES["localization"].staged
 PHANTOM = "phantom"

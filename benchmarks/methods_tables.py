@@ -21,14 +21,14 @@ import torch
 
 from registry import FIGURES, ROOT, Document
 from ultragray.datasets.source import PHANTOM, load_dataset
-from ultragray.files.atomic import write_whole
-from ultragray.methods.budget import Paces
-from ultragray.methods.comparison.ranks import METRICS, by_mean_rank, rank, shown_value
-from ultragray.methods.comparison.result import Comparison
-from ultragray.methods.comparison.run import ComparisonProgress, compare
-from ultragray.methods.comparison.settings import ComparisonSettings
-from ultragray.methods.comparison.tables import COST_HEADINGS, cost_texts
-from ultragray_service.bench.measured import measured
+from ultragray.files import write_whole
+from ultragray.learn.evaluation.methods import ComparisonSettings
+from ultragray.learn.report.tables import METRICS, by_mean_rank, rank, shown_value
+from ultragray_studies.bench.report import measured
+from ultragray_studies.comparison.result import Comparison
+from ultragray_studies.comparison.run import ComparisonProgress, compare
+from ultragray_studies.comparison.tables import COST_HEADINGS, cost_texts
+from ultragray_studies.methods.method import Paces
 
 FOLDER = ROOT / "build" / "methods"
 SECONDS_PER_LINE = 15.0

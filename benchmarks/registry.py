@@ -35,18 +35,18 @@ class Figures:
         return STAGE / self.kept.name
 
 
-_BENCH = "service/ultragray_service/bench"
+_BENCH = "studies/ultragray_studies/bench"
 _KERNEL = (
     "CMakeLists.txt",
     "model/kernels",
-    "model/ultragray/backends",
-    ":(exclude)model/ultragray/backends/cuda",
-    "model/ultragray/rendering.py",
+    "model/ultragray/rendering/backends",
+    ":(exclude)model/ultragray/rendering/backends/cuda",
+    "model/ultragray/rendering/frames.py",
     f"{_BENCH}/kernel.py",
 )
 _SERVED = (
     *_KERNEL,
-    "model/ultragray/display",
+    "model/ultragray/rendering/display.py",
     "workers/ultragray_workers/pool",
     *(f"service/ultragray_service/{part}" for part in ("core", "http", "rpc", "listening", "server.py")),
     f"{_BENCH}/served.py",
@@ -54,19 +54,19 @@ _SERVED = (
 _TRAINED = (
     *_KERNEL,
     "model/ultragray/datasets",
-    "model/ultragray/evaluation",
-    "model/ultragray/probe",
-    "model/ultragray/training",
+    "model/ultragray/learn/evaluation",
+    "model/ultragray/geometry/probe.py",
+    "model/ultragray/learn/training",
 )
 _JOBS = ("workers/ultragray_workers/jobs", "workers/ultragray_workers/claims.py")
-_GPU = ("model/ultragray/backends/cuda", "model/ultragray/rendering.py", f"{_BENCH}/cuda")
+_GPU = ("model/ultragray/rendering/backends/cuda", "model/ultragray/rendering/frames.py", f"{_BENCH}/cuda.py")
 _PRODUCT = ("model", "workers", "service", "proto", "client", "ros")
 
 _FILES = (
-    Figures("benchmarks/results.json", "bench", (*_SERVED, f"{_BENCH}/frames.py")),
-    Figures("benchmarks/kernel.json", "bench", (*_KERNEL, f"{_BENCH}/kernel_details.py")),
-    Figures("benchmarks/training.json", "bench", (*_KERNEL, "model/ultragray/training/steps", f"{_BENCH}/train.py")),
-    Figures("benchmarks/jobs.json", "bench", (*_SERVED, *_JOBS, f"{_BENCH}/jobs.py")),
+    Figures("benchmarks/results.json", "bench", (*_SERVED, f"{_BENCH}/served.py")),
+    Figures("benchmarks/kernel.json", "bench", (*_KERNEL, f"{_BENCH}/parts.py")),
+    Figures("benchmarks/training.json", "bench", (*_KERNEL, "model/ultragray/learn/training", f"{_BENCH}/parts.py")),
+    Figures("benchmarks/jobs.json", "bench", (*_SERVED, *_JOBS, f"{_BENCH}/clients.py")),
     Figures(
         "benchmarks/clients.json",
         "bench",
@@ -74,7 +74,7 @@ _FILES = (
     ),
     Figures("benchmarks/console.json", "bench-console", (*_SERVED, "web", "tests/console/measure.mjs")),
     Figures("benchmarks/cuda.json", "bench-cuda", _GPU),
-    Figures("benchmarks/cuda_training.json", "bench-cuda", (*_GPU, "model/ultragray/training/steps")),
+    Figures("benchmarks/cuda_training.json", "bench-cuda", (*_GPU, "model/ultragray/learn/training")),
     Figures(
         "benchmarks/results_tables.json",
         "results",
@@ -83,35 +83,40 @@ _FILES = (
     Figures(
         "benchmarks/methods_tables.json",
         "methods",
-        (*_TRAINED, "model/ultragray/methods", "benchmarks/methods_tables.py"),
+        (*_TRAINED, "studies/ultragray_studies", "benchmarks/methods_tables.py"),
     ),
     Figures("benchmarks/ablations.json", "ablations", (*_TRAINED, "benchmarks/ablations.py")),
     Figures("benchmarks/poses.json", "poses", (*_TRAINED, "benchmarks/poses.py")),
     Figures(
         "benchmarks/localization.json",
         "localization",
-        (*_KERNEL, "model/ultragray/localization", "benchmarks/localization.py"),
+        (*_KERNEL, "model/ultragray/learn/localization", "benchmarks/localization.py"),
     ),
     Figures(
         "benchmarks/confidence.json",
         "confidence",
-        (*_TRAINED, "model/ultragray/confidence", "benchmarks/confidence.py", "benchmarks/in_silico.py"),
+        (*_TRAINED, "model/ultragray/scene/confidence.py", "benchmarks/confidence.py", "benchmarks/in_silico.py"),
     ),
     Figures(
         "benchmarks/libraries.json",
         "libraries",
         (
-            "model/ultragray/display",
-            "model/ultragray/evaluation/metrics.py",
+            "model/ultragray/rendering/display.py",
+            "model/ultragray/learn/evaluation/metrics.py",
             "model/ultragray/datasets/images.py",
-            "model/ultragray/training/data/shadows.py",
+            "model/ultragray/learn/training/geometry.py",
             "benchmarks/libraries.py",
         ),
     ),
     Figures(
         "benchmarks/environment.json",
         "environment",
-        (*_KERNEL, "model/ultragray/contact", "model/ultragray/gym", "benchmarks/environment.py"),
+        (
+            *_KERNEL,
+            "model/ultragray/rendering/contact.py",
+            "studies/ultragray_studies/gym",
+            "benchmarks/environment.py",
+        ),
     ),
     Figures("benchmarks/ros.json", "ros", (*_SERVED, "client/ultragray_client", "ros", "benchmarks/ros.py")),
     Figures(
@@ -128,7 +133,7 @@ _FILES = (
     Figures(
         "benchmarks/shards.json",
         "test-shards",
-        (*_KERNEL, *_JOBS, "model/ultragray/batches", "workers/ultragray_workers/batches", "tests/batches"),
+        (*_KERNEL, *_JOBS, "model/ultragray/exchange/shards.py", "workers/ultragray_workers/batches", "tests/batches"),
     ),
     Figures("tests/long-run.json", "test-long", (*_PRODUCT, "tests", ":(exclude)tests/*-run.json")),
     Figures("tests/soak-run.json", "test-soak", (*_PRODUCT, "tests/soak")),

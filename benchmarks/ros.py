@@ -24,11 +24,11 @@ from typing import Any
 import numpy as np
 
 from registry import FIGURES
-from ultragray.demo import copy_demo_scene, demo_poses
-from ultragray.files.atomic import write_whole
+from ultragray.files import write_whole
+from ultragray.phantom.demo import copy_demo_scene, demo_poses
 from ultragray_client import Client, RenderSettings
-from ultragray_service.bench.measured import measured
-from ultragray_service.bench.served import running_server
+from ultragray_studies.bench.report import measured
+from ultragray_studies.bench.served import running_server
 
 OUTPUT = FIGURES["ros"].staged
 SCENE = "demo"

@@ -7,7 +7,7 @@ import sys
 import time
 
 from ultragray import GaussianScene, __version__, render
-from ultragray.demo import DEMO_FILE
+from ultragray.phantom.demo import DEMO_FILE
 
 began = time.perf_counter()
 scene = GaussianScene.load(DEMO_FILE)

@@ -33,25 +33,24 @@ from mcap_ros2.decoder import DecoderFactory
 from mcap_ros2.writer import Writer
 
 from ultragray import GaussianScene, read_header, render
-from ultragray.confidence import Assessor, supported
 from ultragray.contract import to_dict
 from ultragray.datasets.mcap import read_mcap_sweep
-from ultragray.datasets.phantom import PHANTOM_PROBE, freehand_poses, simulate
-from ultragray.demo import DEMO_FILE
-from ultragray.display import Display
-from ultragray.display.frames import show
-from ultragray.display.pixels import to_uint8
-from ultragray.gym import StandardPlaneEnv
-from ultragray.interchange import ros_messages as ros
-from ultragray.interchange.rendering import render_to_file
-from ultragray.pose import pose_from_position_quaternion
-from ultragray.registration.frames import register_frames
+from ultragray.exchange import ros_messages as ros
+from ultragray.exchange.rendering import render_to_file
+from ultragray.geometry.pose import pose_from_position_quaternion
+from ultragray.learn.registration import register_frames
+from ultragray.phantom import PHANTOM_PROBE, freehand_poses, simulate
+from ultragray.phantom.demo import DEMO_FILE
+from ultragray.rendering.display import Display
+from ultragray.rendering.frames import show
+from ultragray.rendering.pixels import to_uint8
+from ultragray.rendering.settings import Contact, Encoding, FrameSettings
+from ultragray.rendering.tools import DEFAULT_LABEL, Box, Cylinder, Needle, Tool, ToolFrame
+from ultragray.rendering.volume_fields import sample_slice
+from ultragray.rendering.volumes import VOLUME_FIELDS, VolumeGrid
 from ultragray.samplers import AroundSampler
-from ultragray.settings import Contact, Encoding, FrameSettings
-from ultragray.tools import DEFAULT_LABEL, Box, Cylinder, Needle, Tool, ToolFrame
-from ultragray.volumes.fields import sample_slice
-from ultragray.volumes.grid import VolumeGrid
-from ultragray.volumes.names import VOLUME_FIELDS
+from ultragray.scene.confidence import Assessor, supported
+from ultragray_studies.gym import StandardPlaneEnv
 
 IMAGES = Path(__file__).resolve().parent / "images"
 EXAMPLES = IMAGES.parents[1] / "examples"

@@ -60,7 +60,7 @@ class SimulatedFrames(IterableDataset[Sample]):
             for frame in client.render_batch(self._scene, poses, RenderSettings(outputs=self._outputs)):
                 yield _sample(frame)
 
-    def _poses(self, scene: Scene) -> ultragray.probe.FloatArray:  # [count, 4, 4] mm
+    def _poses(self, scene: Scene) -> ultragray.geometry.probe.FloatArray:  # [count, 4, 4] mm
         """All poses of the epoch; `epoch` chooses others."""
         if scene.probe is None or not scene.training_poses:
             raise SystemExit(f"{scene.name} does not say which probe and poses it was trained with")

@@ -16,8 +16,8 @@ import gymnasium
 import numpy as np
 import numpy.typing as npt
 
-from ultragray.demo import DEMO_FILE
-from ultragray.gym import STANDARD_PLANE
+from ultragray.phantom.demo import DEMO_FILE
+from ultragray_studies.gym import STANDARD_PLANE
 
 Floats = npt.NDArray[np.float64]
 

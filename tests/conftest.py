@@ -19,12 +19,12 @@ import pytest
 import torch
 
 from ultragray import ConvexProbe, Frames, GaussianScene, LinearProbe, Probe, SceneInfo
-from ultragray.backends import cuda
-from ultragray.interchange.released_config import stretch_released_far
-from ultragray.outputs import PLANES
-from ultragray.probe import FloatArray
-from ultragray.scene import PARAMETERS
-from ultragray_service.bench.measured import measured
+from ultragray.exchange.released_config import stretch_released_far
+from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.backends import cuda
+from ultragray.rendering.outputs import PLANES
+from ultragray.scene.gaussians import PARAMETERS
+from ultragray_studies.bench.report import measured
 
 from .object_storage import new_bucket, object_proxy, object_server
 from .postgres import new_database, postgres

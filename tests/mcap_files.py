@@ -12,8 +12,8 @@ from mcap_ros2.writer import Writer
 
 from ultragray import LinearProbe
 from ultragray.contract import to_dict
-from ultragray.interchange import ros_messages as ros
-from ultragray.pose import pose_from_position_quaternion
+from ultragray.exchange import ros_messages as ros
+from ultragray.geometry.pose import pose_from_position_quaternion
 
 SECOND = 1_000_000_000
 START_NS = 1_700_000_000 * SECOND

@@ -119,11 +119,11 @@ def fork(
     return WarmProcess(int(connection.recv(16)), connection)
 
 
-WARM_TEMPLATES = WarmServer("torch", "ultragray_workers.pool.process.worker")
+WARM_TEMPLATES = WarmServer("torch", "ultragray_workers.pool.worker")
 
 
 def start_template(path: Path, descriptor: int) -> WarmProcess:
-    """As ultragray_workers.pool.launcher.start_template."""
+    """As ultragray_workers.pool.processes.start_template."""
     with open(os.devnull, "r+b") as null:
         files = (null.fileno(), 1, 2, descriptor)
         return fork(path, "template", [], environment=os.environ, folder=Path.cwd(), files=files)
@@ -131,7 +131,7 @@ def start_template(path: Path, descriptor: int) -> WarmProcess:
 
 def template(descriptor: int) -> int:
     """The template process of a pool."""
-    from ultragray_workers.pool.process.template import main
+    from ultragray_workers.pool.template import main
 
     main(descriptor)
 
@@ -139,7 +139,7 @@ def template(descriptor: int) -> int:
 def service(templates: str) -> int:
     """The service, whose pool has its template forked as well."""
     from ultragray_service.__main__ import main
-    from ultragray_workers.pool import launcher
+    from ultragray_workers.pool import processes as launcher
 
     launcher.start_template = lambda descriptor: start_template(Path(templates), descriptor)  # type: ignore[assignment,return-value]
     return main()

@@ -1,7 +1,7 @@
 /** Writes what the console knows of the service, from its OpenAPI document: types, and descriptions to draw forms from.
  *
  * `npm run generate`; `build`, `check` and `dev` do it first. A document that is not that of the service fails
- * tests/service/test_snapshots.py.
+ * tests/documents/test_snapshots.py.
  */
 
 import { existsSync, mkdirSync, readFileSync, writeFileSync } from "node:fs";

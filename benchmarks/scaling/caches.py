@@ -10,7 +10,7 @@ from enum import IntEnum
 
 from .costs import SceneCosts, Storage
 
-MAX_SCENES = 256  # that a render process keeps loaded, see ultragray_workers.pool.process.scene_cache
+MAX_SCENES = 256  # that a render process keeps loaded, see ultragray_workers.pool.scene_cache
 
 
 class Source(IntEnum):

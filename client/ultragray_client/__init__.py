@@ -7,24 +7,37 @@ is told as one of `ultragray_client.errors`.
 
 from __future__ import annotations
 
+from ultragray_client.connection import Tls
+from ultragray_client.exchange import StreamMode
+from ultragray_client.frames import Localization
+from ultragray_client.records import (
+    AuditEntry,
+    ConfidenceFit,
+    Job,
+    JobError,
+    JobEvent,
+    JobProgress,
+    JobState,
+    Me,
+    Registration,
+    Role,
+    Scene,
+    SceneEntry,
+    Worker,
+    WorkerDevice,
+    WorkerState,
+)
+
 from . import contract, errors
-from .access import AuditEntry, Me, Role
 from .aio.client import AsyncClient
 from .aio.stream import AsyncFrameStream
-from .calls.localization import Localization
-from .calls.pose_exchange import StreamMode
-from .calls.tls import Tls
 from .contract import *  # noqa: F403
 from .errors import ClientError
-from .frames import Extrapolation, Frame, Picture, Slice, Timings
-from .geometry import Placement, PoseLike, Quaternion
-from .jobs import Job, JobError, JobEvent, JobProgress, JobState
+from .frames import Frame, Slice, Timings
+from .geometry import Picture, Placement, PoseLike, Quaternion
 from .recording.recording import Recording
-from .registrations import Registration
-from .scenes import ConfidenceFit, Scene, SceneEntry
 from .sync.client import Client
 from .sync.stream import FrameStream
-from .workers import Worker, WorkerDevice, WorkerState
 
 __all__ = [
     "AsyncClient",
@@ -33,7 +46,6 @@ __all__ = [
     "Client",
     "ClientError",
     "ConfidenceFit",
-    "Extrapolation",
     "Frame",
     "FrameStream",
     "Job",

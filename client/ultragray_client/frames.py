@@ -4,21 +4,21 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from dataclasses import field as field_of
+from enum import Enum
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from ultragray_client.contract import Additions, Encoding, Extrapolation, Probe, RenderSettings, SettingsUsed
+from ultragray_client.errors import InvalidArgument
+from ultragray_client.geometry import FloatArray, PoseLike, pose_message
+from ultragray_client.messages import message_of
 from ultragray_proto.codec import from_message, words
 from ultragray_proto.v1 import rendering_pb2
-
-from .contract import Contact, Display, Encoding, Probe, RenderSettings, Tool
-from .errors import InvalidArgument
-from .geometry import FloatArray
-from .messages import message_of
 
 _PIXEL_TYPES: dict[str, np.dtype[Any]] = {
     Encoding.UINT8: np.dtype("u1"),
@@ -37,74 +37,18 @@ class Timings:
     encode_ms: float
 
 
-@dataclass(frozen=True)
-class Extrapolation:
-    """Distance of a frame from what its scene was trained on; None: the scene cannot tell."""
-
-    distance_mm: float | None  # to the nearest training views, a mean over the image
-    angle_deg: float | None  # likewise
-    confidence: float | None  # the MS-SSIM, 0 to 1, that a real frame is expected to have with this one
-    supported_share: float | None  # of the pixels, by Gaussians
-    contact_share: float | None = None  # of the scan lines, with the skin; None: `contact` was not asked for
-
-
-@dataclass(frozen=True)
-class Picture:
-    """The places of pixels in the image plane of the probe.
-
-    Columns are mm along x (`column_unit` "mm"), or scan lines of a fan at degrees from its axis ("deg"); rows are mm
-    along z, or mm of range. The first values are those of the centre of pixel (0, 0), the steps lead to the next one.
-    """
-
-    column_unit: str
-    first_column: float
-    first_row_mm: float
-    column_step: float  # negative where left and right are exchanged
-    row_step_mm: float
-
-    def pixel_to_probe(self) -> FloatArray:  # [4, 4]
-        """Takes (column, row, k, 1) to mm in the probe's frame, k in mm against the elevation y.
-
-        Pixels are counted from 0 at their centres. Raises InvalidArgument where columns are angles.
-        """
-        if self.column_unit != "mm":
-            raise InvalidArgument(
-                f"no matrix takes pixels whose columns are in {self.column_unit} to mm; "
-                "ask for square ones: display=Display(pixel_mm=...)",
-                field="display.pixel_mm",
-            )
-        return np.array(
-            [
-                [self.column_step, 0.0, 0.0, self.first_column],
-                [0.0, 0.0, -1.0, 0.0],
-                [0.0, self.row_step_mm, 0.0, self.first_row_mm],
-                [0.0, 0.0, 0.0, 1.0],
-            ]
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Frame(SettingsUsed):
     """A frame, and all that is needed to render it again. `frame["bmode"]` is one of its arrays."""
 
     arrays: Mapping[str, npt.NDArray[Any]]  # by output, each [H, W], read-only: uint8 of 0 to 255, or float32 of 0 to 1
     pose: FloatArray  # [4, 4] mm, as used
-    probe: Probe
     scene: str
     scene_sha256: str  # of the scene file
     renderer: str  # name, version and backend
     sequence: int  # in a batch from 0; in a stream that of its pose, from 1
     timings: Timings
     extrapolation: Extrapolation
-    picture: Picture  # where the pixels lie
-    rendered_height: int  # depth samples, before `display` was applied
-    rendered_width: int  # scan lines, likewise
-    slice_thickness_mm: float = 0.0  # as used, at the focus of the scene's beam; 0: a plane
-    contact: Contact | None = None  # as used; None: it was assumed
-    tools: tuple[Tool, ...] = ()  # as used
-    ghost: float = 0.0  # as used; 0: none
-    registration: str | None = None  # that led the pose into the scene; None: none, it was sent as it is
-    display: Display | None = None  # as used; None: none was asked for
     dropped: int = 0  # in a stream: poses that newer ones replaced since the frame before
     latency_ms: float | None = None  # in a stream: from `measured_ns` of the pose to the arrival of the frame here
 
@@ -124,6 +68,34 @@ class Frame:
         with `Display(pixel_mm=...)`.
         """
         return self.pose @ self.picture.pixel_to_probe()
+
+
+def origin_of(frame: Frame) -> dict[str, Any]:
+    """The origin of a frame and its settings as used, as JSON holds them; as the files of jobs have it."""
+    found: dict[str, Any] = {name: getattr(frame, name) for name in ("scene", "scene_sha256", "renderer")}
+    plain = {one.name: one.default for one in fields(Additions)}  # as they are where they were not asked for
+    for one in fields(SettingsUsed):
+        value = getattr(frame, one.name)
+        if one.name not in plain or value != plain[one.name]:
+            found[one.name] = _plain(value)
+    picture = frame.picture
+    found["picture"] = {
+        "height": frame.height,
+        "width": frame.width,
+        "column_unit": picture.column_unit,
+        "first": (picture.first_column, picture.first_row_mm),
+        "step": (picture.column_step, picture.row_step_mm),
+    }
+    return found
+
+
+def _plain(value: Any) -> Any:
+    """A value of the contract as JSON holds it."""
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, tuple):
+        return [_plain(one) for one in value]
+    return {one.name: _plain(getattr(value, one.name)) for one in fields(value)} if is_dataclass(value) else value
 
 
 @dataclass(frozen=True, eq=False)
@@ -171,3 +143,57 @@ def frame_from_message(message: rendering_pb2.Frame, *, sequence: int = 0, dropp
         dropped=dropped,
         latency_ms=None if sent_ns is None else (time.monotonic_ns() - sent_ns) / 1e6,
     )
+
+
+# Real frames looked for in scenes, from the arrays of a caller to what the service found.
+
+
+@dataclass(frozen=True, eq=False)
+class Localization:
+    """Where a real frame was taken, and how certain that is. The standard deviations hold where `is_found` does."""
+
+    pose: FloatArray  # [4, 4] mm, probe to scene; not to be used where it is not found
+    flange_to_base: FloatArray | None  # [4, 4] mm, the same as the pose of the registration; None: none was named
+    registration: str | None  # that led the start into the scene
+    similarity: float  # correlation of the structures of the frame and of the scene there, -1 to 1
+    is_found: bool  # whether that is as high as only the right place has it
+    position_std_mm: tuple[float, float, float]  # along the probe's lateral, elevation and axial axis
+    angle_std_deg: tuple[float, float, float]  # about them, through the middle of the image
+    shift_mm: float  # of the middle of the image, from the start
+    turn_deg: float
+    scene: str
+    scene_sha256: str  # of the scene file
+    renderer: str  # name, version and backend
+    queue_ms: float
+    search_ms: float
+
+
+def localize_message(
+    scene: str,
+    image: npt.ArrayLike | bytes,
+    start: PoseLike,
+    probe: Probe | None,
+    registration: str | None,
+    within_mm: float,
+    within_deg: float,
+) -> rendering_pb2.LocalizeRequest:
+    """The request of a search. Raises InvalidArgument for what is no grey image, and InvalidPose."""
+    asked = {"probe": probe, "registration": registration, "within_mm": within_mm, "within_deg": within_deg}
+    request = message_of(asked, rendering_pb2.LocalizeRequest, scene=scene, start=pose_message(start, field="start"))
+    if isinstance(image, bytes):
+        request.image = image
+        return request
+    pixels = np.asarray(image)
+    if pixels.ndim != 2 or (pixels.dtype != np.uint8 and pixels.dtype.kind != "f"):
+        raise InvalidArgument(
+            "image must be the bytes of a PNG file or grey values [H, W], uint8 or floating point, "
+            f"got {pixels.dtype} {list(pixels.shape)}",
+            field="image",
+        )
+    if pixels.dtype != np.uint8:
+        if not (np.isfinite(pixels).all() and pixels.min(initial=0.0) >= 0.0 and pixels.max(initial=0.0) <= 1.0):
+            raise InvalidArgument("image of floating point must hold finite values in [0, 1]", field="image")
+        pixels = np.rint(255.0 * pixels).astype(np.uint8)
+    request.image = pixels.tobytes()
+    request.image_height, request.image_width = pixels.shape
+    return request

@@ -6,13 +6,13 @@ import json
 from dataclasses import MISSING, Field
 from typing import Any
 
-from ultragray.confidence import FIGURES
 from ultragray.contract import annotated_fields, limits_in_words, to_dict
-from ultragray.interchange.exports import FORMATS
-from ultragray.methods.registry import METHODS
-from ultragray.outputs import OUTPUTS
+from ultragray.exchange.exports import FORMATS
+from ultragray.learn.training.config import PRESETS, TrainingConfig
+from ultragray.rendering.outputs import OUTPUTS
 from ultragray.samplers import Sampler
-from ultragray.training.config import PRESETS, TrainingConfig
+from ultragray.scene.confidence import FIGURES
+from ultragray_studies.methods.registry import METHODS
 
 from .markdown import code, codes, in_line, summary, table
 

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
-from ultragray import image_size, pose, scene_info
-from ultragray.probe import fan, probe
-from ultragray.tools import MAX_TOOLS
-from ultragray_service.core import catalog, dataset_uploads
-from ultragray_service.core.streams import pose_stream
+from ultragray.geometry import image_size, pose, probe
+from ultragray.geometry import probe as fan
+from ultragray.rendering.tools import MAX_TOOLS
+from ultragray.scene import info as scene_info
+from ultragray_service.core import scenes as catalog
+from ultragray_service.core import streams as pose_stream
+from ultragray_service.core import uploads as dataset_uploads
 from ultragray_service.errors import STATUSES
-from ultragray_service.igtl import connection, waiting
-from ultragray_service.listening import http_server
+from ultragray_service.http import protocol as http_server
+from ultragray_service.igtl import connection
+from ultragray_service.igtl import frames as waiting
 from ultragray_service.rpc import server as grpc_server
 from ultragray_service.rpc import shared_memory
 from ultragray_service.settings import LEAST_KEY_LENGTH
-from ultragray_service.tls.certificates import HANDSHAKE_TIMEOUT_S
+from ultragray_service.tls.server import HANDSHAKE_TIMEOUT_S
 from ultragray_workers import scene_names
 from ultragray_workers.datasets import store as dataset_store
 from ultragray_workers.datasets import unpack as dataset_unpack
-from ultragray_workers.pool.process import encoding
+from ultragray_workers.pool import pixels as encoding
 
 from .markdown import code, table
 

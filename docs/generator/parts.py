@@ -5,14 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from functools import partial
 
-from ultragray.confidence import Extrapolation
-from ultragray.display.settings import Display
-from ultragray.gym.settings import StandardPlaneSettings
-from ultragray.scene_info import SceneInfo
-from ultragray.settings import RenderSettings
-from ultragray.volumes.plane import SliceSettings
-from ultragray_service.http.reading.bodies import RenderBody, StreamMessage
-from ultragray_service.http.stream_messages import FrameMessage
+from ultragray.rendering.display import Display
+from ultragray.rendering.settings import RenderSettings
+from ultragray.rendering.volumes import SliceSettings
+from ultragray.scene.confidence import Extrapolation
+from ultragray.scene.info import SceneInfo
+from ultragray_service.http.bodies import RenderBody, StreamMessage
+from ultragray_service.http.routes.streams import FrameMessage
+from ultragray_studies.gym.standard_plane import StandardPlaneSettings
 
 from . import command_line, grpc_api, http_api, library, limits, python_api, service
 

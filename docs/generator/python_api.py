@@ -17,19 +17,43 @@ from .markdown import prose, sections
 
 # Public modules beside the packages' own names. A module without __all__ makes public what it defines.
 LIBRARY_MODULES = (
-    *("ultragray.datasets", "ultragray.datasets.source", "ultragray.datasets.released", "ultragray.datasets.plus"),
-    *("ultragray.datasets.dicom", "ultragray.datasets.mcap", "ultragray.datasets.phantom", "ultragray.datasets.checks"),
-    *("ultragray.datasets.pictures", "ultragray.training", "ultragray.evaluation.metrics"),
-    *("ultragray.evaluation.scoring", "ultragray.evaluation.speckle", "ultragray.evaluation.side_by_side"),
-    *("ultragray.evaluation.compounding", "ultragray.evaluation.baselines", "ultragray.confidence"),
-    *("ultragray.contact", "ultragray.gym", "ultragray.tools"),
-    *("ultragray.volumes.grid", "ultragray.volumes.fields", "ultragray.volumes.files"),
-    *(f"ultragray.registration.{name}" for name in ("registration", "points", "poses", "frames")),
-    *("ultragray.samplers", "ultragray.contract", "ultragray.pose", "ultragray.rendering", "ultragray.demo"),
-    *("ultragray.display.settings", "ultragray.display.frames", "ultragray.display.scan_conversion"),
-    *("ultragray.interchange.rendering", "ultragray.interchange.exports", "ultragray.interchange.exports.png_folder"),
-    *("ultragray.interchange.ply", "ultragray.interchange.checkpoint", "ultragray.interchange.checkpoint_export"),
-    *("ultragray.files.poses", "ultragray.files.atomic"),
+    "ultragray.datasets",
+    "ultragray.datasets.source",
+    "ultragray.datasets.released",
+    "ultragray.datasets.plus",
+    "ultragray.datasets.dicom",
+    "ultragray.datasets.mcap",
+    "ultragray.phantom",
+    "ultragray.datasets.checks",
+    "ultragray.datasets.pictures",
+    "ultragray.learn.training",
+    "ultragray.learn.evaluation.metrics",
+    "ultragray.learn.evaluation.scoring",
+    "ultragray.learn.evaluation.speckle",
+    "ultragray.learn.evaluation.side_by_side",
+    "ultragray.learn.evaluation.baselines",
+    "ultragray.scene.confidence",
+    "ultragray.rendering.contact",
+    "ultragray_studies.gym",
+    "ultragray.rendering.tools",
+    "ultragray.rendering.volumes",
+    "ultragray.rendering.volume_fields",
+    "ultragray.samplers",
+    "ultragray.contract",
+    "ultragray.geometry.pose",
+    "ultragray.rendering.frames",
+    "ultragray.phantom.demo",
+    "ultragray.rendering.display",
+    "ultragray.geometry.scan_conversion",
+    "ultragray.exchange.rendering",
+    "ultragray.exchange.exports",
+    "ultragray.exchange.exports.png_folder",
+    "ultragray.exchange.ply",
+    "ultragray.exchange.checkpoint",
+    "ultragray.exchange.poses",
+    "ultragray.files",
+    "ultragray.geometry.registration",
+    "ultragray.learn.registration",
 )
 CLIENT_GROUPS = (
     *("ultragray_client.sync.scenes.Scenes", "ultragray_client.sync.datasets.Datasets"),
@@ -157,7 +181,7 @@ def members(cls: type[Any]) -> Iterator[tuple[str, Any]]:
     found: dict[str, Any] = {}
     public = [Contract, *(base for base in cls.__mro__[1:] if _is_public(base))]
     for base in reversed(cls.__mro__):
-        if _is_own(base) and not any(issubclass(one, base) for one in public):
+        if _is_own(base) and not any(base in one.__mro__ for one in public):
             for name, value in vars(base).items():
                 if name.startswith("_") or inspect.isclass(value):
                     continue

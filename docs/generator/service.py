@@ -10,11 +10,11 @@ from prometheus_client.metrics_core import Metric
 
 from ultragray import LinearProbe, errors
 from ultragray.contract import annotated_fields, range_of
-from ultragray.settings import Resolved
+from ultragray.rendering.settings import Resolved
 from ultragray_client import errors as client_errors
 from ultragray_service import errors as service_errors
-from ultragray_service.core.state import Service
 from ultragray_service.errors import statuses_of
+from ultragray_service.service import Service
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings
 from ultragray_workers import errors as workers_errors
 from ultragray_workers.errors import QueueFull
@@ -22,7 +22,7 @@ from ultragray_workers.jobs.job import JobState
 from ultragray_workers.jobs.matching.demand import AUTO
 from ultragray_workers.jobs.overview import JobsOverview
 from ultragray_workers.jobs.queue.attendance import WorkerState
-from ultragray_workers.pool.types import RenderResult
+from ultragray_workers.pool.messages import RenderResult
 
 from .http_api import temporary_service
 from .markdown import code, codes, in_line, summary, table

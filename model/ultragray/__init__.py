@@ -22,13 +22,21 @@ os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 if TYPE_CHECKING:
     from ultragray.errors import UltragrayError
-    from ultragray.localization.search import localize
-    from ultragray.localization.settings import Localization
-    from ultragray.pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
-    from ultragray.probe import ConvexProbe, ElevationBeam, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
-    from ultragray.rendering import Frames, render
-    from ultragray.scene import GaussianScene
-    from ultragray.scene_info import SceneHeader, SceneInfo, read_header
+    from ultragray.geometry.pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
+    from ultragray.geometry.probe import (
+        ConvexProbe,
+        ElevationBeam,
+        LinearProbe,
+        PhasedProbe,
+        Probe,
+        RadialProbe,
+        SteeredProbe,
+    )
+    from ultragray.learn.localization.search import localize
+    from ultragray.learn.localization.settings import Localization
+    from ultragray.rendering.frames import Frames, render
+    from ultragray.scene.gaussians import GaussianScene
+    from ultragray.scene.info import SceneHeader, SceneInfo, read_header
 
 __all__ = [
     "ConvexProbe",
@@ -54,13 +62,21 @@ __all__ = [
 
 _MODULES = {
     "errors": ("UltragrayError",),
-    "localization.search": ("localize",),
-    "localization.settings": ("Localization",),
-    "pose": ("check_poses", "pose_from_position_quaternion", "quaternion_from_pose"),
-    "probe": ("ConvexProbe", "ElevationBeam", "LinearProbe", "PhasedProbe", "Probe", "RadialProbe", "SteeredProbe"),
-    "rendering": ("Frames", "render"),
-    "scene": ("GaussianScene",),
-    "scene_info": ("SceneHeader", "SceneInfo", "read_header"),
+    "learn.localization.search": ("localize",),
+    "learn.localization.settings": ("Localization",),
+    "geometry.pose": ("check_poses", "pose_from_position_quaternion", "quaternion_from_pose"),
+    "geometry.probe": (
+        "ConvexProbe",
+        "ElevationBeam",
+        "LinearProbe",
+        "PhasedProbe",
+        "Probe",
+        "RadialProbe",
+        "SteeredProbe",
+    ),
+    "rendering.frames": ("Frames", "render"),
+    "scene.gaussians": ("GaussianScene",),
+    "scene.info": ("SceneHeader", "SceneInfo", "read_header"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
 

@@ -1,8 +1,13 @@
-"""What is installed: the version, which every frame and report names, and the extras that bring optional packages."""
+"""This installation and the machine that it runs on: the version, which every frame and report names, the extras that
+bring optional packages, processor and memory.
+"""
 
 from __future__ import annotations
 
+import os
+import platform
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 from ultragray.errors import ExtraMissing
@@ -66,3 +71,49 @@ def missing_extra(error: ImportError, purpose: str, *, field: str | None = None)
     if extra is None:
         raise error
     return ExtraMissing(f"{purpose} needs {module}, which is not installed: {install_advice(extra)}", field=field)
+
+
+# Facts about the machine that this process runs on.
+
+
+_GROUP_LIMITS = (  # of the control group that a container is
+    Path("/sys/fs/cgroup/memory.max"),
+    Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
+)
+
+
+def processor_name() -> str:
+    """Name of the processor where the system tells it, else its architecture."""
+    return _cpu_info().get("model name") or platform.processor() or platform.machine()
+
+
+def processor_maker() -> str | None:
+    """The maker as the processor names itself, such as AuthenticAMD, or its number on Arm; None where nothing tells."""
+    told = _cpu_info()
+    return told.get("vendor_id") or told.get("CPU implementer")
+
+
+def processor_model() -> str | None:
+    """The maker's numbers for the generation: a virtual machine often hides it from the name."""
+    told = _cpu_info()
+    if "cpu family" in told:
+        return f"family {told['cpu family']}, model {told.get('model')}"
+    return f"part {told['CPU part']}" if "CPU part" in told else None
+
+
+def _cpu_info() -> dict[str, str]:
+    """What Linux says of the first processor."""
+    path = Path("/proc/cpuinfo")
+    if not path.exists():
+        return {}
+    pairs = (line.partition(":") for line in reversed(path.read_text().splitlines()))
+    return {name.strip(): value.strip() for name, _, value in pairs}  # the first of a name comes last, and stays
+
+
+def memory_bytes() -> int:
+    """The memory of the machine, or of the container where that may have less."""
+    found = [os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")]
+    for limit in _GROUP_LIMITS:
+        with suppress(OSError, ValueError):  # another layout, or "max": no limit
+            found.append(int(limit.read_text(encoding="ascii")))
+    return min(found)

@@ -1,4 +1,4 @@
-"""One codec between dataclasses and messages, for the service and for its clients.
+"""One codec between dataclasses and messages, for the service and for its clients: by names and descriptors alone.
 
 A field of a message and the attribute of the same name of a dataclass hold the same:
 
@@ -17,14 +17,16 @@ has the name of the attribute, or is all there is in the attribute's message.
 
 A value that a message leaves out is the dataclass's default, else None. Fields without presence are left out where they
 are 0, empty or UNSPECIFIED; messages where they would say what the default of the dataclass says.
+
+What a pair of a class and a descriptor needs is worked out once: `_writers` and `_reader` give the steps of it.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Mapping
-from dataclasses import MISSING, Field, fields, is_dataclass
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import MISSING, fields
 from enum import Enum
 from functools import cache, partial, reduce
 from operator import or_
@@ -38,10 +40,9 @@ from google.protobuf.struct_pb2 import Struct, Value
 _M = TypeVar("_M")
 _Convert = Callable[[Any], Any]
 
-_STRUCT = "google.protobuf.Struct"
-_MATRIX = "ultragray.v1.Matrix"
+_STRUCT, _MATRIX = "google.protobuf.Struct", "ultragray.v1.Matrix"
 _WORD_START = re.compile(r"(?<!^)(?=[A-Z])")
-_KEEP_DEFAULT, _REQUIRED = object(), object()
+_LEFT_OUT = object()  # in place of a value: the dataclass keeps its default
 
 
 class MessageInvalid(ValueError):
@@ -69,7 +70,7 @@ def to_message(value: Any, cls: type[_M], **others: Any) -> _M:
     Raises MessageInvalid for a word that its closed set does not have.
     """
     descriptor: Descriptor = cls.DESCRIPTOR  # type: ignore[attr-defined]
-    return cls(**_fields_of(value, descriptor, frozenset(others)), **others)
+    return cls(**_written(descriptor, value, others))
 
 
 def from_message(message: Any, cls: type[_M], **others: Any) -> _M:
@@ -89,60 +90,58 @@ def words(enum: EnumDescriptor) -> Mapping[int, str]:
     return {one.number: one.name.removeprefix(prefix).lower() for one in enum.values if one.number != 0}
 
 
-def _fields_of(value: Any, descriptor: Descriptor, others: frozenset[str] = frozenset()) -> dict[str, Any]:
-    """The fields of a message that a value has, but for `others`."""
-    if isinstance(value, Mapping):
-        return _writer(frozenset(value), descriptor, others)(value.__getitem__)
-    cls: Any = type(value)
-    return _writer(cls, descriptor, others)(partial(getattr, value))
+def _at(path: str, convert: _Convert, value: Any) -> Any:
+    """What `convert` makes of the value at a path. Raises MessageInvalid with the path."""
+    try:
+        return convert(value)
+    except MessageInvalid as error:
+        raise error.under(path) from error.original
+
+
+# From a dataclass to a message: the keyword arguments of its class.
+
+
+def _written(descriptor: Descriptor, value: Any, others: Mapping[str, Any] | None = None) -> dict[str, Any]:
+    get, cls = (value.get, dict) if isinstance(value, Mapping) else (partial(_attribute, value), type(value))
+    found = dict(others or {})
+    for name, convert, is_message in _writers(descriptor):
+        if name in found or (one := get(name)) is None:
+            continue
+        default = getattr(cls, name, None) if is_message else None  # where the class has one
+        if default is not None and one == default:
+            continue
+        found[name] = _at(name, convert, one)
+    for name, kinds in _oneofs(descriptor).items():
+        if kinds.keys().isdisjoint(found) and (one := get(name)) is not None:
+            found |= _member_written(kinds, one)
+    return found
+
+
+def _attribute(value: Any, name: str) -> Any:
+    return getattr(value, name, None)
 
 
 @cache
-def _writer(cls: Any, descriptor: Descriptor, others: frozenset[str]) -> Callable[[_Convert], dict[str, Any]]:
-    """Makes the fields of a message, but for `others`, from what gives a value by the name of its attribute or key.
-
-    The names are those of a class, or a set of keys.
-    """
-    defaults = {one.name: one.default for one in fields(cls)} if is_dataclass(cls) else {}
-
-    def has(name: str) -> bool:
-        given = name in cls if isinstance(cls, frozenset) else name in defaults or hasattr(cls, name)
-        return given and name not in others
-
-    steps = [(one.name, _field_writer(one, defaults.get(one.name))) for one in descriptor.fields if has(one.name)]
-    oneofs = [(name, _oneof_writer(kinds)) for name, kinds in _oneofs(descriptor).items() if has(name)]
-
-    def write(get: _Convert) -> dict[str, Any]:
-        found = {}
-        for name, convert in steps:
-            value = get(name)
-            try:
-                if value is not None and (value := convert(value)) is not None:
-                    found[name] = value
-            except MessageInvalid as error:
-                raise error.under(name) from None
-        for name, convert in oneofs:
-            found |= convert(get(name))
-        return found
-
-    return write
+def _writers(descriptor: Descriptor) -> tuple[tuple[str, _Convert, bool], ...]:
+    """Each field, how its value is written, and whether that is one message, which its default leaves out."""
+    found = []
+    for field in descriptor.fields:
+        convert = dict if _is_map(field) else _value_writer(field)
+        is_message = field.message_type is not None and not field.is_repeated
+        if field.is_repeated and not _is_map(field):
+            convert = partial(_list_of, convert)
+        found.append((field.name, convert, is_message))
+    return tuple(found)
 
 
-def _field_writer(field: FieldDescriptor, default: Any) -> _Convert:
-    if _is_map(field):
-        return dict
-    convert = _value_writer(field)
-    if field.is_repeated:
-        return lambda values: [convert(value) for value in values]
-    if field.message_type is None or default is None or default is MISSING:
-        return convert
-    return lambda value: None if value == default else convert(value)
+def _list_of(convert: _Convert, values: Iterable[Any]) -> list[Any]:
+    return [convert(value) for value in values]
 
 
 def _value_writer(field: FieldDescriptor) -> _Convert:
-    if field.enum_type is not None:
-        return _word_writer({word: number for number, word in words(field.enum_type).items()})
     descriptor = field.message_type
+    if field.enum_type is not None:
+        return partial(_number_of_word, {word: number for number, word in words(field.enum_type).items()})
     if descriptor is None:
         return lambda value: value.value if isinstance(value, Enum) else value
     if descriptor.full_name == _STRUCT:
@@ -150,33 +149,27 @@ def _value_writer(field: FieldDescriptor) -> _Convert:
     if descriptor.full_name == _MATRIX:
         return lambda array: {"values": np.ravel(array).tolist()}
     if kinds := _only_oneof(descriptor):
-        return _oneof_writer(kinds)
+        return partial(_member_written, kinds)
     names = [one.name for one in descriptor.fields]
 
     def convert(value: Any) -> Any:
         if isinstance(value, (tuple, list, np.ndarray)):
             return dict(zip(names, map(float, value), strict=True))
-        return _fields_of(value, descriptor)
+        return _written(descriptor, value)
 
     return convert
 
 
-def _word_writer(numbers: Mapping[str, int]) -> _Convert:
-    def number(value: Any) -> int:
-        word = value.value if isinstance(value, Enum) else value
-        if word not in numbers:
-            raise MessageInvalid(f"must be one of {', '.join(numbers)}, got {word!r}")
-        return numbers[word]
-
-    return number
+def _number_of_word(numbers: Mapping[str, int], value: Any) -> int:
+    word = value.value if isinstance(value, Enum) else value
+    if word not in numbers:
+        raise MessageInvalid(f"must be one of {', '.join(numbers)}, got {word!r}")
+    return numbers[word]
 
 
-def _oneof_writer(kinds: Mapping[str, Descriptor]) -> Callable[[Any], dict[str, Any]]:
-    def convert(value: Any) -> dict[str, Any]:
-        kind = value["kind"] if isinstance(value, Mapping) else value.kind
-        return {kind: _fields_of(value, kinds[kind])}
-
-    return convert
+def _member_written(kinds: Mapping[str, Descriptor], value: Any) -> dict[str, Any]:
+    kind = value["kind"] if isinstance(value, Mapping) else value.kind
+    return {kind: _written(kinds[kind], value)}
 
 
 def _struct_of(values: Mapping[str, Any]) -> Struct:
@@ -185,9 +178,12 @@ def _struct_of(values: Mapping[str, Any]) -> Struct:
     return struct
 
 
+# From a message to a dataclass.
+
+
 @cache
-def _reader(descriptor: Descriptor, annotation: Any, others: frozenset[str] = frozenset()) -> Callable[..., Any]:
-    """Reads a message as what an annotation says, but for the attributes `others`."""
+def _reader(descriptor: Descriptor, annotation: Any, known: frozenset[str] = frozenset()) -> Callable[..., Any]:
+    """Reads a message as what an annotation says; attributes that are `known` otherwise are its keyword arguments."""
     kind, _ = _optional_of(annotation)
     if descriptor.full_name == _STRUCT:
         return _dict_of
@@ -195,28 +191,34 @@ def _reader(descriptor: Descriptor, annotation: Any, others: frozenset[str] = fr
         return lambda message: np.array(message.values, np.float64).reshape(4, 4)
     if (members := _members(kind)) is not None:
         if kinds := _only_oneof(descriptor):
-            return _oneof_reader(descriptor.oneofs[0].name, kinds, members)
-        return _flat_reader(descriptor, members)
+            return partial(_read_member, descriptor.oneofs[0].name, kinds, members)
+        return partial(_read_flat_member, members, known)
     if get_origin(kind) is dict:
         return lambda message: {field.name: value for field, value in message.ListFields()}
     if get_origin(kind) is tuple:
         names = [one.name for one in descriptor.fields]
         return lambda message: tuple([getattr(message, name) for name in names])
-    return _dataclass_reader(descriptor, kind, others)
+    return _dataclass_reader(descriptor, kind, known)
 
 
-def _dataclass_reader(descriptor: Descriptor, cls: Any, others: frozenset[str] = frozenset()) -> Callable[..., Any]:
-    hints = get_type_hints(cls)
-    known = {*descriptor.fields_by_name, *_oneofs(descriptor)} - others
-    steps = [
-        (one.name, _attribute_reader(descriptor, one, hints[one.name]))
-        for one in fields(cls)
-        if one.init and one.name in known
-    ]
+@cache
+def _dataclass_reader(descriptor: Descriptor, cls: Any, known: frozenset[str]) -> Callable[..., Any]:
+    hints, oneofs, steps = get_type_hints(cls), _oneofs(descriptor), []
+    for one in fields(cls):
+        kind, is_optional = _optional_of(hints[one.name])
+        has_default = one.default is not MISSING or one.default_factory is not MISSING
+        left_out = _LEFT_OUT if has_default else None
+        is_required = not has_default and not is_optional
+        if not one.init or one.name in known:
+            continue
+        if (field := descriptor.fields_by_name.get(one.name)) is not None:
+            steps.append((one.name, _field_reader(field, kind, left_out, is_required)))
+        elif one.name in oneofs:
+            steps.append((one.name, _oneof_reader(one.name, oneofs[one.name], kind, left_out, is_required)))
 
     def read(message: Any, **values: Any) -> Any:
         for name, step in steps:
-            if name not in values and (value := step(message)) is not _KEEP_DEFAULT:
+            if (value := step(message)) is not _LEFT_OUT:
                 values[name] = value
         try:
             return cls(**values)
@@ -226,65 +228,47 @@ def _dataclass_reader(descriptor: Descriptor, cls: Any, others: frozenset[str] =
     return read
 
 
-def _attribute_reader(descriptor: Descriptor, attribute: Field[Any], annotation: Any) -> _Convert:
-    """Reads an attribute from its field of a message; _KEEP_DEFAULT where that is left out."""
-    name, (kind, is_optional) = attribute.name, _optional_of(annotation)
-    left_out = None if is_optional else _REQUIRED
-    if attribute.default is not MISSING or attribute.default_factory is not MISSING:
-        left_out = _KEEP_DEFAULT
-    if name not in descriptor.fields_by_name:
-        read_member = _oneof_reader(name, _oneofs(descriptor)[name], _members(kind) or {})
-        if left_out is _REQUIRED:
-            return read_member
-        return lambda message: left_out if message.WhichOneof(name) is None else read_member(message)
-    field = descriptor.fields_by_name[name]
-    convert = _field_reader(field, kind)
+def _oneof_reader(name: str, kinds: Mapping[str, Descriptor], kind: Any, left_out: Any, is_required: bool) -> _Convert:
+    read_member = partial(_read_member, name, kinds, _members(kind) or {})
+    if is_required:
+        return read_member
+    return lambda message: left_out if message.WhichOneof(name) is None else read_member(message)
+
+
+def _field_reader(field: FieldDescriptor, kind: Any, left_out: Any, is_required: bool) -> _Convert:
+    """Reads a field of a message as what an annotation without None says."""
+    name, convert = field.name, _values_reader(field, kind)
 
     def read(message: Any) -> Any:
         value = getattr(message, name)
-        is_left_out = not message.HasField(name) if field.has_presence else not value
-        if is_left_out and (left_out is not _REQUIRED or field.has_presence):
-            if left_out is _REQUIRED:
+        if not (message.HasField(name) if field.has_presence else value):
+            if not is_required:
+                return left_out
+            if field.has_presence:
                 raise MessageInvalid("is required", field=name)
-            return left_out
-        try:
-            return convert(value)
-        except MessageInvalid as error:
-            raise error.under(name) from error.original
+        return _at(name, convert, value)
 
     return read
 
 
-def _field_reader(field: FieldDescriptor, kind: Any) -> _Convert:
-    """Reads the value of a field as what an annotation without None says."""
+def _values_reader(field: FieldDescriptor, kind: Any) -> _Convert:
     if _is_map(field):
         return dict
     if not field.is_repeated:
         return _value_reader(field, kind)
-    container = get_origin(kind) or kind
-    convert = _value_reader(field, get_args(kind)[0])
+    container, convert = get_origin(kind) or kind, _value_reader(field, get_args(kind)[0])
     if field.message_type is None:
         return lambda values: container([convert(value) for value in values])
-
-    def read(messages: Any) -> Any:
-        found = []
-        for index, message in enumerate(messages):
-            try:
-                found.append(convert(message))
-            except MessageInvalid as error:
-                raise error.under(f"[{index}]") from error.original
-        return container(found)
-
-    return read
+    return lambda values: container([_at(f"[{index}]", convert, value) for index, value in enumerate(values)])
 
 
 def _value_reader(field: FieldDescriptor, kind: Any) -> _Convert:
+    is_enum = isinstance(kind, type) and issubclass(kind, Enum)
     if field.message_type is not None:
         return _reader(field.message_type, kind)
     if field.enum_type is None:
-        return kind if isinstance(kind, type) and issubclass(kind, Enum) else lambda value: value
-    enum = field.enum_type
-    values = {one.value: one for one in kind} if isinstance(kind, type) and issubclass(kind, Enum) else None
+        return kind if is_enum else lambda value: value
+    enum, values = field.enum_type, {one.value: one for one in kind} if is_enum else None
     known = {
         number: word if values is None else values[word]
         for number, word in words(enum).items()
@@ -300,49 +284,32 @@ def _value_reader(field: FieldDescriptor, kind: Any) -> _Convert:
     return read
 
 
-def _oneof_reader(name: str, kinds: Mapping[str, Descriptor], members: Mapping[str, Any]) -> Callable[..., Any]:
-    """Reads the member of a family that a oneof holds."""
-
-    def read(message: Any, **others: Any) -> Any:
-        kind = message.WhichOneof(name)
-        if kind not in members:
-            raise MessageInvalid(f"must be one of {', '.join(members)}, got {kind or 'none'}", field=name)
-        try:
-            return _reader(kinds[kind], members[kind])(getattr(message, kind), **others)
-        except MessageInvalid as error:
-            raise error.under(kind) from error.original
-
-    return read
+def _read_member(
+    name: str, kinds: Mapping[str, Descriptor], members: Mapping[str, Any], message: Any, **others: Any
+) -> Any:
+    """The member of a family that the oneof of a name holds."""
+    kind = message.WhichOneof(name)
+    if kind not in members:
+        raise MessageInvalid(f"must be one of {', '.join(members)}, got {kind or 'none'}", field=name)
+    read = _reader(kinds[kind], members[kind], frozenset(others))
+    return _at(kind, partial(read, **others), getattr(message, kind))
 
 
-def _flat_reader(descriptor: Descriptor, members: Mapping[str, Any]) -> Callable[..., Any]:
-    """Reads the member of a family from a message that has the fields of all of them."""
-
-    def read(message: Any, **others: Any) -> Any:
-        if message.kind not in members:
-            raise MessageInvalid(f"must be one of {', '.join(members)}, got {message.kind!r}", field="kind")
-        member = members[message.kind]
-        takes = {one.name for one in fields(member)} | {"kind"}
-        for field, _ in message.ListFields():
-            if field.name not in takes:
-                raise MessageInvalid(f"must be left out: kind {message.kind} does not take it", field=field.name)
-        return _reader_of_member(descriptor, member)(message, **others)
-
-    return read
-
-
-_reader_of_member = cache(_dataclass_reader)
+def _read_flat_member(members: Mapping[str, Any], known: frozenset[str], message: Any, **others: Any) -> Any:
+    """The member of a family that a message tells which has the fields of all of them."""
+    if message.kind not in members:
+        raise MessageInvalid(f"must be one of {', '.join(members)}, got {message.kind!r}", field="kind")
+    member = members[message.kind]
+    takes = {one.name for one in fields(member)} | {"kind"}
+    for field, _ in message.ListFields():
+        if field.name not in takes:
+            raise MessageInvalid(f"must be left out: kind {message.kind} does not take it", field=field.name)
+    return _dataclass_reader(message.DESCRIPTOR, member, known)(message, **others)
 
 
 def _dict_of(struct: Struct) -> dict[str, Any]:
     """A Struct holds every number as a double: those without a fraction become integers again."""
-    found = {}
-    for name, value in struct.fields.items():
-        try:
-            found[name] = _plain(value)
-        except MessageInvalid as error:
-            raise error.under(name) from None
-    return found
+    return {name: _at(name, _plain, value) for name, value in struct.fields.items()}
 
 
 def _plain(value: Value) -> Any:
@@ -366,7 +333,8 @@ def _is_map(field: FieldDescriptor) -> bool:
     return field.message_type is not None and field.message_type.GetOptions().map_entry
 
 
-def _oneofs(descriptor: Descriptor) -> dict[str, dict[str, Descriptor]]:
+@cache
+def _oneofs(descriptor: Descriptor) -> Mapping[str, Mapping[str, Descriptor]]:
     """The oneofs of messages, not those that proto3 makes of `optional`: the messages by the names of their fields."""
     return {
         one.name: {field.name: field.message_type for field in one.fields}
@@ -375,7 +343,7 @@ def _oneofs(descriptor: Descriptor) -> dict[str, dict[str, Descriptor]]:
     }
 
 
-def _only_oneof(descriptor: Descriptor) -> dict[str, Descriptor] | None:
+def _only_oneof(descriptor: Descriptor) -> Mapping[str, Descriptor] | None:
     """The oneof of a message that has nothing else."""
     kinds = next(iter(_oneofs(descriptor).values()), None)
     return kinds if kinds is not None and len(kinds) == len(descriptor.fields) else None

@@ -32,12 +32,11 @@ from ultragray_client.errors import (
     Unauthenticated,
     Unimplemented,
 )
+from ultragray_ros.newest import Problems
+from ultragray_ros.topics import Publishers, TransformedPoses
 
 from . import messages, parameters
 from .newest import NewestFrames
-from .problems import Problems
-from .publishers import Publishers
-from .transforms import TransformedPoses
 
 API_KEY = "ULTRAGRAY_API_KEY"  # parameters are read by everybody on the network, the environment is not
 NEWEST = QoSProfile(depth=1, reliability=ReliabilityPolicy.BEST_EFFORT)  # fits publishers of either reliability

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 from ultragray.contract import described
 from ultragray.installation import __version__
-from ultragray_service.access.addresses import is_loopback
-from ultragray_service.listening.sockets import authority
+from ultragray_service.access.principals import is_loopback
+from ultragray_service.listening import authority
 from ultragray_service.settings import Settings
 
 _ANY = ("0.0.0.0", "::")  # not addresses that a browser can open

@@ -1,4 +1,4 @@
-"""Both servers in one process on one event loop, from start to a clean stop."""
+"""The process of the service: opens the doors, tells where they are, brings its worker along, and drains at a stop."""
 
 from __future__ import annotations
 
@@ -7,31 +7,158 @@ import contextlib
 import ctypes
 import gc
 import logging
+import os
 import signal
+import socket
+import subprocess
 import sys
+import time
 from collections.abc import Awaitable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from typing import Any
 
 import uvloop
 
-from ultragray_service.access.addresses import is_loopback
-from ultragray_service.core.state import Service
+from ultragray_service.access.principals import is_loopback
 from ultragray_service.doors import Doors
-from ultragray_service.embedded_worker import EmbeddedWorker
 from ultragray_service.http.app import create_app
+from ultragray_service.http.protocol import HttpServer
 from ultragray_service.igtl.server import IgtlServer
-from ultragray_service.listening.connections import Connections
-from ultragray_service.listening.http_server import HttpServer
-from ultragray_service.listening.open_sockets import OpenSockets
-from ultragray_service.listening.sockets import authority, check_port_is_free, listen, raise_open_files_limit
+from ultragray_service.listening import (
+    Connections,
+    OpenSockets,
+    authority,
+    check_port_is_free,
+    listen,
+    raise_open_files_limit,
+)
 from ultragray_service.misspelt import unknown_variables
 from ultragray_service.rpc.server import GrpcServer
-from ultragray_service.service_manager import READY, STOPPING, ServiceManager
-from ultragray_service.settings import Settings
+from ultragray_service.service import Service
+from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings
 from ultragray_service.telemetry.logs import configure_logging, is_for_people
-from ultragray_service.tls.watch import CertificateWatch
+from ultragray_service.tls.server import CertificateWatch
+from ultragray_service.wiring import make_service
 from ultragray_workers.errors import StartupFailed
 from ultragray_workers.rounds import Rounds
+
+_FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 30.0
+_STEADY_S = 60.0  # a worker that lived so long is started again after the first wait
+_STOP_WAIT_S = 20.0  # beside what a job has to end
+_PASSED_ON = (
+    "data_folder",
+    "artifact_folder",
+    "cache_folder",
+    "max_cache_bytes",
+    "database_url",
+    "training_threads",
+    "job_nice",
+    "max_footprint_pixels",
+    "job_drain_timeout_s",
+    "job_retention_days",
+    "log_format",
+    "log_level",
+)
+
+_log = logging.getLogger("ultragray.service")
+
+
+class EmbeddedWorker:
+    """Its methods belong to the event loop's thread, which must be the main one: the worker dies with it."""
+
+    def __init__(self, settings: Settings) -> None:
+        self._settings = settings
+        self._stop = asyncio.Event()
+        self._process: subprocess.Popen[bytes] | None = None
+        self._task: asyncio.Task[None] | None = None
+        self._thread = ThreadPoolExecutor(1, "embedded-worker")  # not the loop's, which others need
+
+    def start(self) -> None:
+        """Starts the worker and returns at once; nothing where the settings want none."""
+        if self._settings.embedded_worker:
+            self._task = asyncio.create_task(self._keep_alive())
+
+    async def stop(self) -> None:
+        """Ends the worker, which puts the job at hand back into the queue."""
+        self._stop.set()
+        if self._process is not None and self._process.poll() is None:
+            self._process.terminate()
+        if self._task is None:
+            return
+        try:
+            await asyncio.wait({self._task}, timeout=_STOP_WAIT_S + self._settings.job_drain_timeout_s)
+        finally:  # also where the caller was cancelled
+            if self._process is not None and self._process.poll() is None:
+                self._process.kill()
+        await self._task
+
+    async def _keep_alive(self) -> None:
+        wait_s = _FIRST_WAIT_S
+        rounds = Rounds("the watch over the worker for jobs", _log)
+        while not self._stop.is_set():
+            started = time.monotonic()
+            with rounds.round():  # a process that cannot be started, for want of memory or files, can be later
+                self._process = self._spawn()
+                code = await asyncio.get_running_loop().run_in_executor(self._thread, self._process.wait)
+                if self._stop.is_set():
+                    return
+                if time.monotonic() - started > _STEADY_S:
+                    wait_s = _FIRST_WAIT_S
+                _log.warning(f"the worker for jobs ended with {code}; the next one starts in {wait_s:g} s")
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._stop.wait(), wait_s)
+            wait_s = min(2.0 * wait_s, _LONGEST_WAIT_S)
+
+    def _spawn(self) -> subprocess.Popen[bytes]:
+        values = {name: getattr(self._settings, name) for name in _PASSED_ON}
+        given = {ENVIRONMENT_PREFIX + name.upper(): str(value) for name, value in values.items() if value is not None}
+        # Not asyncio's: it forks, which gRPC complains about.
+        return subprocess.Popen(
+            [sys.executable, "-m", "ultragray_service.cli.worker", str(os.getpid())],
+            stdin=subprocess.DEVNULL,
+            env={**os.environ, **given, "PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
+            start_new_session=True,  # Ctrl-C is for the service, which then stops the worker
+        )
+
+
+# The words that systemd understands: the process is ready, still alive, stopping. Without systemd they go nowhere.
+#
+# A unit of `Type=notify` names a socket in NOTIFY_SOCKET; one with `WatchdogSec` expects a word within that time, and
+# restarts a process from which it hears none.
+
+
+READY, ALIVE, STOPPING = "READY=1", "WATCHDOG=1", "STOPPING=1"
+_WORDS_WITHIN_TIMEOUT = 3
+
+
+class ServiceManager:
+    """The service manager that started this process, if one did."""
+
+    def __init__(self) -> None:
+        """Takes its variables out of the environment: they are not for processes that this one starts."""
+        address = os.environ.pop("NOTIFY_SOCKET", "")
+        self._address = f"\0{address[1:]}" if address.startswith("@") else address  # of Linux's abstract names
+        timeout_us, pid = os.environ.pop("WATCHDOG_USEC", ""), os.environ.pop("WATCHDOG_PID", "")
+        is_watched = timeout_us.isdigit() and pid in ("", str(os.getpid()))
+        # Seconds between two words that the process is alive; None: nobody waits for them.
+        self.alive_every_s = int(timeout_us) / 1e6 / _WORDS_WITHIN_TIMEOUT if is_watched and self._address else None
+
+    def tell(self, word: str) -> None:
+        """Sends READY, ALIVE or STOPPING. Does not block: one that is too busy to listen is told the next time."""
+        if self._address:
+            with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK) as sender:
+                sender.sendto(word.encode(), self._address)
+
+    async def tell_alive(self) -> None:
+        """Tells for as long as the event loop turns that it does."""
+        while self.alive_every_s is not None:
+            self.tell(ALIVE)
+            await asyncio.sleep(self.alive_every_s)
+
+
+# Both servers in one process on one event loop, from start to a clean stop.
+
 
 _HEALTH_POLL_S = 0.2
 _CANCEL_WAIT_S = 1.0
@@ -41,8 +168,6 @@ _LARGE_BLOCK_BYTES = 2**20
 _LOOPBACK = "127.0.0.1"
 _DOORS = 3
 _OTHER_FILES = 1024
-
-_log = logging.getLogger("ultragray.service")
 
 
 def run(settings: Settings) -> None:
@@ -66,7 +191,7 @@ async def serve(settings: Settings) -> None:
     signals = _StopSignals()
     manager = ServiceManager()
     certificates = CertificateWatch.of(settings)
-    service = Service(settings)
+    service = make_service(settings)
     if certificates is not None:
         service.metrics.tell_certificate_expiry(lambda: certificates.current.not_after)
     await service.open()
@@ -99,7 +224,7 @@ async def serve(settings: Settings) -> None:
                 await signals.stop.wait()
             manager.tell(STOPPING)
             if settings.drain_delay_s:
-                service.begin_leaving()
+                service.life.begin_leaving()
                 _log.info(f"not ready any more; stopping in {settings.drain_delay_s:g} s")
                 await signals.unless_forced(asyncio.sleep(settings.drain_delay_s))
             _log.info("stopping: frames that wait are answered first; Ctrl-C again stops at once")

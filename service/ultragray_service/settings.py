@@ -10,11 +10,10 @@ from typing import Any
 
 from ultragray.contract import Contract, annotated_fields, described, from_text
 from ultragray.errors import InvalidArgument
-from ultragray.image_size import MAX_IMAGE_SIDE
-from ultragray.probe.elevation import MAX_THICKNESS_MM
-from ultragray_service.access.addresses import parse_allowed
-from ultragray_service.access.limits.allowance import NAMES, Allowance, of_key
-from ultragray_service.access.oidc.claims import check_url, parse_roles
+from ultragray.geometry.image_size import MAX_IMAGE_SIDE
+from ultragray.geometry.probe import MAX_THICKNESS_MM
+from ultragray_service.access.oidc import check_url, parse_roles
+from ultragray_service.access.principals import NAMES, Allowance, of_key, parse_allowed
 from ultragray_service.environment import PREFIX
 from ultragray_workers.jobs.kinds.base import MAX_RUN_S
 from ultragray_workers.pool.pool import MAX_BATCH_POSES

@@ -25,14 +25,14 @@ import numpy as np
 import pytest
 
 from ultragray import render
-from ultragray.batches import BatchPlan, names_in
-from ultragray.demo import copy_demo_scene
-from ultragray.files.atomic import file_sha256, write_whole
+from ultragray.exchange.batches import BatchPlan, names_in
+from ultragray.files import file_sha256, write_whole
+from ultragray.phantom.demo import copy_demo_scene
+from ultragray.rendering.settings import FrameSettings
 from ultragray.samplers import AroundSampler
-from ultragray.scene import GaussianScene
-from ultragray.scene_info import read_header
-from ultragray.settings import FrameSettings
-from ultragray_service.bench.measured import measured
+from ultragray.scene.gaussians import GaussianScene
+from ultragray.scene.info import read_header
+from ultragray_studies.bench.report import measured
 from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 

@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-from ultragray.methods.comparison.settings import ComparisonSettings
+from ultragray.learn.evaluation.methods import ComparisonSettings
 
 from ..scripts import benchmark
 

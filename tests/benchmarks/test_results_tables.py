@@ -16,8 +16,8 @@ from ultragray import LinearProbe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.source import SourceOptions, load_dataset
 from ultragray.errors import DatasetInvalid
-from ultragray.training.config import VIEWS_BETWEEN
-from ultragray.training.data.geometry import Geometry
+from ultragray.learn.training.config import VIEWS_BETWEEN
+from ultragray.learn.training.geometry import Geometry
 
 from ..scripts import benchmark
 

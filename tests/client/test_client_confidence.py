@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ultragray import GaussianScene, render
-from ultragray.confidence import Assessor
+from ultragray.scene.confidence import Assessor
 from ultragray_client import (
     AroundSampler,
     Below,

@@ -9,9 +9,9 @@ import pytest
 
 from ultragray import ConvexProbe as LibraryConvexProbe
 from ultragray import GaussianScene, render
-from ultragray.display.frames import show
-from ultragray.display.settings import AS_RENDERED
-from ultragray.display.settings import Display as LibraryDisplay
+from ultragray.rendering.display import AS_RENDERED
+from ultragray.rendering.display import Display as LibraryDisplay
+from ultragray.rendering.frames import show
 from ultragray_client import ConvexProbe, Display, Encoding, Picture, Placement, Quaternion, RenderSettings, errors
 
 from ..service.conftest import DEMO_PROBE, HEIGHT, WIDTH
@@ -56,8 +56,7 @@ def test_every_way_takes_them(client: Any) -> None:
 
 def test_defaults_are_those_of_the_service(client: Any) -> None:
     assert vars(Display()) == vars(AS_RENDERED)
-    assert client.render("demo", np.eye(4)).display is None
-    assert client.render("demo", np.eye(4), RenderSettings(display=Display())).display is None
+    assert client.render("demo", np.eye(4)).display == Display()
     assert client.render("demo", np.eye(4), RenderSettings(display=Display(flip=True))).display == Display(flip=True)
 
 

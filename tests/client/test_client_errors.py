@@ -12,11 +12,11 @@ from google.rpc.status_pb2 import Status
 from ultragray import errors as library_errors
 from ultragray.errors import UltragrayError, error_classes
 from ultragray_client import errors
-from ultragray_client.calls.statuses import error_of_call, error_of_frame
+from ultragray_client.connection import error_of_call, error_of_frame
 from ultragray_proto.v1 import scenes_pb2
 from ultragray_service import errors as service_errors
 from ultragray_service.errors import STATUSES
-from ultragray_service.rpc.status import status_of
+from ultragray_service.rpc.calls import status_of
 from ultragray_workers import errors as workers_errors
 
 MODULES = (library_errors, workers_errors, service_errors)

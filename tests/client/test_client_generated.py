@@ -8,8 +8,8 @@ from types import ModuleType
 
 import pytest
 
-from ultragray import settings
-from ultragray.display import AS_RENDERED
+from ultragray.rendering import settings
+from ultragray.rendering.display import AS_RENDERED
 from ultragray_client import Display, RenderSettings
 from ultragray_service.errors import STATUSES
 

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 from ultragray_client import JobState, RenderJob, RenderSettings, errors
-from ultragray_client.calls.downloads import downloaded
-from ultragray_client.calls.retries import Retries
-from ultragray_client.jobs import Watch
+from ultragray_client.connection import Retries
+from ultragray_client.conversations import downloaded
+from ultragray_client.records import Watch
 from ultragray_client.sync.connection import Connection
 from ultragray_proto.v1 import jobs_pb2
 

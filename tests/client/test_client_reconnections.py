@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 from ultragray_client import RenderSettings, errors
-from ultragray_client.calls.unanswered import Unanswered
+from ultragray_client.exchange import Unanswered
 from ultragray_proto.v1 import rendering_pb2
 
 from ..service.conftest import RunningService, StartService

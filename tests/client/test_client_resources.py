@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ultragray.machine import memory_bytes
+from ultragray.installation import memory_bytes
 from ultragray_client import (
     AroundSampler,
     Box,

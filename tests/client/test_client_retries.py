@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ultragray_client import RenderSettings, errors
-from ultragray_client.calls.retries import Retries
+from ultragray_client.connection import Retries
 
 from ..service.conftest import RunningService, StartService
 from ..waiting import at_this_load

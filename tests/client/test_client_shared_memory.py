@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 
 from ultragray_client import Frame, RenderSettings, errors
-from ultragray_client.calls import shared_memory
-from ultragray_client.calls.shared_memory import SLOTS, SharedMemory
+from ultragray_client import exchange as shared_memory
+from ultragray_client.exchange import SLOTS, SharedMemory
 from ultragray_proto.v1 import rendering_pb2
 
 from ..service.conftest import ROOT, RunningService
@@ -161,7 +161,7 @@ def test_the_memory_of_a_stream_goes_with_its_last_frame(client: Any, client_ser
 
 FORKED = """
 import os
-from ultragray_client.calls.shared_memory import SharedMemory
+from ultragray_client.exchange import SharedMemory
 from ultragray_proto.v1 import rendering_pb2
 
 memory = SharedMemory()

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ultragray_client import RenderSettings, errors
-from ultragray_client.calls.pose_exchange import PoseExchange
+from ultragray_client.exchange import PoseExchange
 from ultragray_client.frames import settings_message
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2
 

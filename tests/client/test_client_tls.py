@@ -11,7 +11,7 @@ import pytest
 import trustme
 
 from ultragray_client import Tls, errors
-from ultragray_client.calls.tls import warn_of_open_key
+from ultragray_client.connection import warn_of_open_key
 
 from ..certificates import Mounted, write_client
 from ..service.conftest import RunningService, StartService

@@ -41,7 +41,7 @@ export class Service {
     service.folder = mkdtempSync(path.join(tmpdir(), "ultragray-console-"));
     service.data = path.join(service.folder, "data");
     mkdirSync(service.data);
-    copyFileSync(path.join(ROOT, "model/ultragray/demo/spine.ugr"), path.join(service.data, "demo.ugr"));
+    copyFileSync(path.join(ROOT, "model/ultragray/phantom/spine.ugr"), path.join(service.data, "demo.ugr"));
     service.port = await freePort();
     service.url = `http://127.0.0.1:${service.port}`;
     service.environment = environment;

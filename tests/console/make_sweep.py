@@ -16,12 +16,11 @@ import numpy as np
 import torch
 
 from ultragray import ElevationBeam, GaussianScene, LinearProbe, render
-from ultragray.confidence import ConfidenceModel
-from ultragray.confidence.uncertainty import DEPTHS, TERMS, DepthBands, Uncertainty
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
 from ultragray.datasets.source import load_dataset
-from ultragray.demo import demo_poses, load_demo_scene
+from ultragray.phantom.demo import demo_poses, load_demo_scene
+from ultragray.scene.confidence import DEPTHS, VARIANCE_TERMS, ConfidenceModel, DepthBands, Uncertainty
 
 SIDE = 64
 PROBE = LinearProbe(width_mm=60.0, near_mm=0.0, far_mm=60.0)
@@ -59,7 +58,7 @@ def refined(scene: GaussianScene) -> GaussianScene:
     corrections = np.tile(np.eye(4), (count, 1, 1))
     corrections[:, 0, 3] = SHIFT_MM * np.arange(count)
     bands = DepthBands((0.3,) * DEPTHS, (0.04,) * DEPTHS)
-    uncertainty = Uncertainty(tuple(VARIANCES.get(name, 0.0) for name in TERMS), bands)
+    uncertainty = Uncertainty(tuple(VARIANCES.get(name, 0.0) for name in VARIANCE_TERMS), bands)
     confidence = ConfidenceModel((3.5, 1.2, 0.8, 0.1, 0.6), 0.06, (0.0,) * count, 20, 0.04, uncertainty=uncertainty)
     info = replace(scene.info, beam=ElevationBeam(BEAM_MM), confidence=confidence.to_dict())
     return replace(scene, info=info, pose_corrections=corrections)

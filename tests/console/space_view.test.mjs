@@ -14,7 +14,7 @@ const LATEST_MS = 150; // a click shows, on a machine with nothing else to do
 const at = tested({
   prepare: ({ service }) => {
     const script = path.join(ROOT, "tests/console/turned_scene.py");
-    const demo = path.join(ROOT, "model/ultragray/demo/spine.ugr");
+    const demo = path.join(ROOT, "model/ultragray/phantom/spine.ugr");
     for (const [name, angles] of Object.entries({ upside: ["0", "0", "180"], lying: ["0", "90", "30"] })) {
       const environment = { ...process.env, PYTHONPATH: SOURCES };
       execFileSync(PYTHON, [script, demo, path.join(service.data, `${name}.ugr`), ...angles], { env: environment });

@@ -8,8 +8,8 @@ from typing import Any
 
 import pytest
 
-from ultragray.demo import copy_demo_scene
 from ultragray.installation import __version__
+from ultragray.phantom.demo import copy_demo_scene
 
 from ..surroundings import ROOT
 from .projects import FOLDERS, packages, project, pyproject

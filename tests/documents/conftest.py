@@ -10,7 +10,7 @@ from types import ModuleType
 
 import pytest
 
-from ultragray.demo import copy_demo_scene
+from ultragray.phantom.demo import copy_demo_scene
 
 from ..scripts import loaded_package
 from ..service.conftest import StartService, service_starter

@@ -9,12 +9,12 @@ import pytest
 
 from ultragray.contract import Contract, Family, described
 from ultragray.datasets.source import DatasetFormat
-from ultragray.display import Display
-from ultragray.interchange.exports.exporter import Exporter
-from ultragray.interchange.exports.formats import Format
-from ultragray.probe import Probe
-from ultragray.tools import Tool
-from ultragray.training.config import PRESETS, TrainingConfig
+from ultragray.exchange.exports.exporter import Exporter
+from ultragray.exchange.exports.formats import Format
+from ultragray.geometry.probe import Probe
+from ultragray.learn.training.config import PRESETS, TrainingConfig
+from ultragray.rendering.display import Display
+from ultragray.rendering.tools import Tool
 from ultragray_service.errors import STATUSES
 from ultragray_workers.jobs.kinds import Specification
 

@@ -10,16 +10,18 @@ import numpy as np
 import torch
 from safetensors import safe_open
 
-from ultragray import GaussianScene, PhasedProbe, SceneInfo, scene_info
-from ultragray.confidence import Extrapolation
+from ultragray import GaussianScene, PhasedProbe, SceneInfo
 from ultragray.errors import error_classes
-from ultragray.interchange import checkpoint_export, ply
-from ultragray.outputs import OUTPUTS
-from ultragray.settings import Encoding
-from ultragray_service.http.reading import accept
-from ultragray_service.igtl.kinds import CAPABILITY
-from ultragray_service.rpc import status
-from ultragray_workers.pool.process import encoding as pixels
+from ultragray.exchange import checkpoint as checkpoint_export
+from ultragray.exchange import ply
+from ultragray.rendering.outputs import OUTPUTS
+from ultragray.rendering.settings import Encoding
+from ultragray.scene import info as scene_info
+from ultragray.scene.confidence import Extrapolation
+from ultragray_service.http import accept
+from ultragray_service.igtl.contents import CAPABILITY
+from ultragray_service.rpc import calls as status
+from ultragray_workers.pool import pixels
 
 from .conftest import Generator
 from .tables import code, rows

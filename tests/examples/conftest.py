@@ -10,7 +10,7 @@ from types import ModuleType
 
 import pytest
 
-from ultragray.demo import DEMO_FILE
+from ultragray.phantom.demo import DEMO_FILE
 
 from ..service.conftest import ROOT, RunningService, StartService, start_shared_service
 

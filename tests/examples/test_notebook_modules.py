@@ -9,7 +9,7 @@ from types import ModuleType
 import pytest
 import torch
 
-from ultragray.demo import DEMO_FILE
+from ultragray.phantom.demo import DEMO_FILE
 from ultragray_client import Client
 from ultragray_client.errors import Unavailable
 

@@ -11,8 +11,8 @@ import gymnasium
 import numpy as np
 import pytest
 
-from ultragray.demo import DEMO_FILE
-from ultragray.gym import STANDARD_PLANE
+from ultragray.phantom.demo import DEMO_FILE
+from ultragray_studies.gym import STANDARD_PLANE
 
 from .conftest import EXAMPLES
 

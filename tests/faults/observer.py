@@ -14,7 +14,7 @@ import cv2
 import httpx
 import numpy as np
 
-from ultragray.scene import GaussianScene
+from ultragray.scene.gaussians import GaussianScene
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 from ultragray_workers.storage.local import FileVersion
 

@@ -18,7 +18,7 @@ from typing import Any
 import httpx
 import pytest
 
-from ultragray.demo import copy_demo_scene
+from ultragray.phantom.demo import copy_demo_scene
 from ultragray_workers.backup.contents import Folders
 from ultragray_workers.jobs.folder import JobFolder
 

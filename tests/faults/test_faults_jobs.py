@@ -25,8 +25,8 @@ from google.protobuf.json_format import ParseDict
 
 from ultragray import GaussianScene, render
 from ultragray.datasets.source import load_dataset
-from ultragray.demo import copy_demo_scene
-from ultragray.training import TrainingConfig, train
+from ultragray.learn.training import TrainingConfig, train
+from ultragray.phantom.demo import copy_demo_scene
 from ultragray_proto.v1 import jobs_pb2, jobs_pb2_grpc
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from ultragray.demo import copy_demo_scene
+from ultragray.phantom.demo import copy_demo_scene
 from ultragray_workers.errors import DatabaseUnavailable
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 

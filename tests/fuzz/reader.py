@@ -20,11 +20,11 @@ from ultragray import GaussianScene, LinearProbe, render
 from ultragray.datasets.checks import check_dataset
 from ultragray.datasets.source import SourceOptions, load_dataset
 from ultragray.errors import UltragrayError
-from ultragray.files.poses import load_poses
-from ultragray.interchange.checkpoint import import_checkpoint
-from ultragray.interchange.ply import read_ply
-from ultragray.scene_info import read_header
-from ultragray.training.checkpointing import check_tensors, read_checkpoint
+from ultragray.exchange.checkpoint import import_checkpoint
+from ultragray.exchange.ply import read_ply
+from ultragray.exchange.poses import load_poses
+from ultragray.learn.training.checkpointing import check_tensors, read_checkpoint
+from ultragray.scene.info import read_header
 from ultragray_workers.datasets.contents import find_source
 from ultragray_workers.datasets.unpack import unpack
 

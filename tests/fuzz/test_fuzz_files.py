@@ -23,9 +23,9 @@ from mcap.writer import CompressionType
 from ultragray import GaussianScene
 from ultragray.datasets import Dataset
 from ultragray.datasets.released import write_released
-from ultragray.interchange.ply import write_ply
-from ultragray.training import train
-from ultragray.training.trainer import CHECKPOINT_FILE
+from ultragray.exchange.ply import write_ply
+from ultragray.learn.training import train
+from ultragray.learn.training.trainer import CHECKPOINT_FILE
 
 from ..dicom_files import FRAMES, write_cine
 from ..mcap_files import Bag
@@ -39,7 +39,7 @@ from ..model.datasets.conftest import (
     write_mha,
     write_nrrd,
 )
-from ..model.training.conftest import make_tiny_config, make_tiny_dataset
+from ..model.learn.training.conftest import make_tiny_config, make_tiny_dataset
 from .conftest import EnterDoor
 from .mutations import Strategy, as_json, chosen_parts, mutated_bytes, mutated_json, mutated_lines, places
 from .reading import ReaderProcess

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import strategies as st
 
-from ultragray_service.igtl.commands.contents import Command, pack_command
+from ultragray_service.igtl.commands import Command, pack_command
 from ultragray_service.igtl.contents import Instrument, pack_instruments, pack_position, pack_transform
 from ultragray_service.igtl.messages import HEADER_BYTES, Message, pack_message, unpack_header
 

@@ -8,7 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
-from ultragray.demo import copy_demo_scene
+from ultragray.phantom.demo import copy_demo_scene
 
 from ..waiting import wait_until
 

@@ -20,7 +20,7 @@ import pytest
 
 from ultragray.datasets.released import write_released
 from ultragray.datasets.source import load_dataset
-from ultragray.training import TrainingConfig, train
+from ultragray.learn.training import TrainingConfig, train
 from ultragray_proto.v1 import jobs_pb2, jobs_pb2_grpc
 from ultragray_workers.storage.opening import open_storage
 

@@ -18,7 +18,7 @@ import httpx
 import pytest
 
 from ultragray.datasets.released import write_released
-from ultragray.demo import copy_demo_scene
+from ultragray.phantom.demo import copy_demo_scene
 
 from ..service.conftest import StartService, service_starter
 from ..service.test_lifecycle import IDENTITY

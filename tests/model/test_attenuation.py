@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from ultragray import GaussianScene, LinearProbe, render
-from ultragray.outputs import SPENT_BEAM
+from ultragray.rendering.outputs import SPENT_BEAM
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 

@@ -17,21 +17,14 @@ import torch
 
 from ultragray import GaussianScene, LinearProbe, read_header, render
 from ultragray.datasets import Dataset, Sweep
-from ultragray.datasets.phantom import Tissue, load_phantom, simulate, sweeps, tissue_at
-from ultragray.datasets.phantom.shadow import BoneShadow
-from ultragray.demo import (
-    DEMO_FILE,
-    DEMO_IMAGE_SIDE,
-    DEMO_PROBE,
-    copy_demo_scene,
-    demo_poses,
-    load_demo_scene,
-    make,
-)
 from ultragray.errors import InvalidArgument
-from ultragray.evaluation.compounding import pixel_positions_mm
-from ultragray.evaluation.scoring import evaluate, render_sweep
-from ultragray.training import TrainingConfig
+from ultragray.learn.evaluation.baselines import pixel_positions_mm
+from ultragray.learn.evaluation.scoring import evaluate, render_sweep
+from ultragray.learn.training import TrainingConfig
+from ultragray.phantom import Tissue, load_phantom, simulate, sweeps, tissue_at
+from ultragray.phantom import make_demo as make
+from ultragray.phantom.demo import DEMO_FILE, DEMO_IMAGE_SIDE, DEMO_PROBE, copy_demo_scene, demo_poses, load_demo_scene
+from ultragray.phantom.imaging import BoneShadow
 
 SIDE = 256
 MM_PER_PIXEL = 60.0 / SIDE
@@ -110,7 +103,7 @@ def test_the_file_is_small_and_describes_itself(phantom: Dataset) -> None:
 
 def test_copying_it_needs_no_torch(tmp_path: Path) -> None:
     program = (
-        "import sys; from ultragray.demo import copy_demo_scene; copy_demo_scene(sys.argv[1]); "
+        "import sys; from ultragray.phantom.demo import copy_demo_scene; copy_demo_scene(sys.argv[1]); "
         "print('torch' in sys.modules)"
     )
     copy = tmp_path / "copy.ugr"

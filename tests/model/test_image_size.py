@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ultragray.errors import InvalidImageSize
-from ultragray.image_size import MAX_IMAGE_SIDE, check_image_size
+from ultragray.geometry.image_size import MAX_IMAGE_SIDE, check_image_size
 
 
 @pytest.mark.parametrize("side", [1, 512, MAX_IMAGE_SIDE, np.int64(7)])

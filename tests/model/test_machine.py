@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ultragray import machine
+from ultragray import installation as machine
 
 
 def test_what_the_system_tells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -8,7 +8,7 @@ import pytest
 
 from ultragray import SceneInfo
 from ultragray.errors import UnknownOutput
-from ultragray.outputs import OUTPUTS, check_available, check_outputs
+from ultragray.rendering.outputs import OUTPUTS, check_available, check_outputs
 
 
 def test_outputs_keep_their_order_without_repetitions() -> None:

@@ -9,7 +9,7 @@ import torch
 
 from ultragray import Frames, GaussianScene, LinearProbe
 from ultragray.datasets import Dataset, Sweep
-from ultragray.scene_info import SceneHeader
+from ultragray.scene.info import SceneHeader
 
 PROBE = LinearProbe(40.0, 0.0, 50.0)
 IN_WORDS = "linear probe (width 40 mm, near 0 mm, far 50 mm)"

@@ -20,9 +20,9 @@ from safetensors.torch import save
 
 from ultragray import GaussianScene, LinearProbe, SceneInfo, read_header
 from ultragray.errors import InvalidArgument, SceneFileInvalid
-from ultragray.files.atomic import file_sha256
-from ultragray.scene import PARAMETERS
-from ultragray.scene_info import METADATA_KEY, info_to_json
+from ultragray.files import file_sha256
+from ultragray.scene.gaussians import PARAMETERS
+from ultragray.scene.info import METADATA_KEY, info_to_json
 
 
 def splats(count: int = 4, sh_degree: int = 1) -> dict[str, torch.Tensor]:

@@ -16,7 +16,7 @@ from safetensors.numpy import save_file
 
 from ultragray import ConvexProbe, ElevationBeam, GaussianScene, LinearProbe, PhasedProbe, SceneInfo, read_header
 from ultragray.errors import InvalidArgument, SceneFileInvalid
-from ultragray.scene_info import (
+from ultragray.scene.info import (
     MAX_HEADER_BYTES,
     MAX_TRAINING_POSES,
     expected_shapes,

@@ -6,7 +6,7 @@ import pytest
 
 from ultragray import ElevationBeam, LinearProbe, SceneInfo
 from ultragray.errors import InvalidArgument
-from ultragray.settings import Encoding, FrameSettings, Resolved
+from ultragray.rendering.settings import Encoding, FrameSettings, Resolved
 
 FOCUSED = ElevationBeam(thickness_mm=2.0, focus_mm=30.0, depth_of_field_mm=20.0)
 PLANE = ElevationBeam(thickness_mm=0.0)

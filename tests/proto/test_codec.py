@@ -10,12 +10,12 @@ import numpy.typing as npt
 import pytest
 from google.protobuf.descriptor import Descriptor
 
-from ultragray.confidence import Extrapolation
-from ultragray.display.settings import Display
-from ultragray.outputs import OUTPUTS
-from ultragray.probe import Probe
+from ultragray.geometry.probe import Probe
+from ultragray.rendering.display import Display
+from ultragray.rendering.outputs import OUTPUTS
+from ultragray.rendering.settings import FRAME_ENCODINGS, RenderSettings
 from ultragray.samplers import Sampler as PoseSampler
-from ultragray.settings import FRAME_ENCODINGS, RenderSettings
+from ultragray.scene.confidence import Extrapolation
 from ultragray_proto.codec import MessageInvalid, from_message, to_message, words
 from ultragray_proto.v1 import datasets_pb2, geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2
 from ultragray_service.core import scenes

@@ -17,7 +17,7 @@ from websockets.asyncio.client import connect
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
 from ultragray import GaussianScene, render
-from ultragray.files.atomic import file_sha256
+from ultragray.files import file_sha256
 from ultragray_client import AsyncClient, RenderJob, RenderSettings, StreamMode
 
 SIDE = 16  # pixels

@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from ultragray_client import Client, Frame, RenderSettings
-from ultragray_ros.newest import NewestFrames
-from ultragray_ros.problems import Problems
+from ultragray_ros.newest import NewestFrames, Problems
 
 from ..client.proxy import Proxy
 from ..service.conftest import RunningService
@@ -137,7 +136,7 @@ def test_closing_ends_a_wait_for_a_frame(ros_service: RunningService) -> None:
 
 def test_problems_are_told_once_in_a_while_by_their_kind(monkeypatch: pytest.MonkeyPatch) -> None:
     now = [100.0]
-    monkeypatch.setattr("ultragray_ros.problems.time.monotonic", lambda: now[0])
+    monkeypatch.setattr("ultragray_ros.newest.time.monotonic", lambda: now[0])
     told: list[str] = []
     problems = Problems(told.append)
     for _ in range(4):

@@ -44,8 +44,8 @@ def test_each_transform_becomes_a_pose_once(ros: Any, monkeypatch: pytest.Monkey
     monkeypatch.setitem(sys.modules, "tf2_ros", stand_in)
     from geometry_msgs.msg import TransformStamped
 
-    from ultragray_ros.problems import Problems
-    from ultragray_ros.transforms import TransformedPoses
+    from ultragray_ros.newest import Problems
+    from ultragray_ros.topics import TransformedPoses
 
     taken: list[Any] = []
     told: list[str] = []

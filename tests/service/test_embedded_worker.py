@@ -12,8 +12,8 @@ from pathlib import Path
 
 import pytest
 
-from ultragray_service import embedded_worker
-from ultragray_service.embedded_worker import EmbeddedWorker
+from ultragray_service import server as embedded_worker
+from ultragray_service.server import EmbeddedWorker
 from ultragray_service.settings import Settings
 
 from ..waiting import at_this_load

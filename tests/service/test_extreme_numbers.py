@@ -18,7 +18,7 @@ from hypothesis import strategies as st
 from websockets.sync.client import ClientConnection, connect
 
 from ultragray.contract import Contract, Family, annotated_fields, optional_of
-from ultragray.settings import RenderSettings
+from ultragray.rendering.settings import RenderSettings
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2
 
 from .conftest import RunningService

@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import sqlalchemy as sa
 
-from ultragray_service.registrations import store
-from ultragray_service.registrations.named import NamedRegistration
-from ultragray_service.registrations.registrations import Registrations
+from ultragray_service.core import registrations as store
+from ultragray_service.core.registrations import NamedRegistration, Registrations
 
 UNUSED: Any = None
 

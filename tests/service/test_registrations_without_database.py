@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import sqlalchemy as sa
 
-from ultragray_service.access.snapshot import INTERVAL_S
+from ultragray_service.access.keys import INTERVAL_S
 from ultragray_workers.jobs.queue.database import JobDatabase
 from ultragray_workers.jobs.queue.owners import tell_change
 from ultragray_workers.jobs.queue.tables import REGISTRATIONS

@@ -17,7 +17,7 @@ import pytest
 from websockets.sync.client import connect
 
 from ultragray import GaussianScene, render
-from ultragray.confidence import Assessor, ConfidenceModel
+from ultragray.scene.confidence import Assessor, ConfidenceModel
 from ultragray_proto.v1 import (
     geometry_pb2,
     jobs_pb2,

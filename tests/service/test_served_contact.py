@@ -15,7 +15,7 @@ from websockets.sync.client import connect
 
 import ultragray_client
 from ultragray import GaussianScene, render
-from ultragray.settings import Contact
+from ultragray.rendering.settings import Contact
 from ultragray_client.contract import RenderSettings
 from ultragray_client.errors import InvalidArgument
 

@@ -12,8 +12,8 @@ from websockets.sync.client import connect
 
 from ultragray import ConvexProbe, GaussianScene, render
 from ultragray.contract import to_dict
-from ultragray.display.frames import show
-from ultragray.display.settings import Display
+from ultragray.rendering.display import Display
+from ultragray.rendering.frames import show
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2
 
 from .conftest import DEMO_PROBE, HEIGHT, WIDTH, RunningService

@@ -15,9 +15,9 @@ import numpy as np
 import pytest
 
 from ultragray import render
-from ultragray.demo import DEMO_FILE, demo_poses, load_demo_scene
-from ultragray.display.pixels import image_file, to_uint8
-from ultragray.probe import FloatArray
+from ultragray.geometry.probe import FloatArray
+from ultragray.phantom.demo import DEMO_FILE, demo_poses, load_demo_scene
+from ultragray.rendering.pixels import image_file, to_uint8
 from ultragray_client import Client
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 

@@ -14,10 +14,10 @@ import numpy as np
 import pytest
 from websockets.sync.client import connect
 
-from ultragray.probe import FloatArray
+from ultragray.geometry.probe import FloatArray
 from ultragray_client import AroundSampler, Client, JobState, RenderJob, RenderSettings, errors
 from ultragray_service.access.keys import KeyStore
-from ultragray_service.access.principal import Role
+from ultragray_service.access.principals import Role
 from ultragray_workers.jobs.queue.database import JobDatabase
 
 from .conftest import RunningService, StartService

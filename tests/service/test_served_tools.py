@@ -16,9 +16,9 @@ from websockets.sync.client import connect
 import ultragray_client
 from ultragray import GaussianScene, render
 from ultragray.contract import to_dict
-from ultragray.display.pixels import to_uint8
-from ultragray.settings import FrameSettings
-from ultragray.tools import MAX_TOOLS, Box, Cylinder, Needle, Tool, ToolFrame
+from ultragray.rendering.pixels import to_uint8
+from ultragray.rendering.settings import FrameSettings
+from ultragray.rendering.tools import MAX_TOOLS, Box, Cylinder, Needle, Tool, ToolFrame
 from ultragray_client.contract import RenderSettings
 from ultragray_client.errors import InvalidArgument, UnknownOutput
 

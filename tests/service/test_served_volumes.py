@@ -19,9 +19,8 @@ import SimpleITK
 import torch
 
 from ultragray import GaussianScene, SceneInfo
-from ultragray.volumes.fields import sample_slice, sample_volume
-from ultragray.volumes.grid import VolumeGrid
-from ultragray.volumes.names import VOLUME_FIELDS
+from ultragray.rendering.volume_fields import sample_slice, sample_volume
+from ultragray.rendering.volumes import VOLUME_FIELDS, VolumeGrid
 from ultragray_client import Client, SliceSettings, VoxelizeJob
 from ultragray_client.errors import InvalidArgument, SceneNotFound
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from ultragray_service.service_manager import ALIVE, READY, STOPPING, ServiceManager
+from ultragray_service.server import ALIVE, READY, STOPPING, ServiceManager
 
 from .conftest import RunningService
 

@@ -5,10 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from ultragray import LinearProbe
-from ultragray.probe import FloatArray
-from ultragray.settings import Resolved
+from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.settings import Resolved
 from ultragray_workers import Priority, RenderRequest
-from ultragray_workers.pool.fairness.turns import UNKNOWN_CALLER, Caller
+from ultragray_workers.pool.turns import UNKNOWN_CALLER, Caller
 
 PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 HEIGHT, WIDTH = 24, 32

@@ -15,10 +15,10 @@ import numpy as np
 import pytest
 
 from ultragray import GaussianScene, render
-from ultragray.confidence import FIGURES
-from ultragray.settings import Encoding
+from ultragray.rendering.settings import Encoding
+from ultragray.scene.confidence import FIGURES
 from ultragray_workers import PoolConfig, RenderPool, RenderRequest, RenderResult, SceneStore
-from ultragray_workers.pool import launcher
+from ultragray_workers.pool import processes as launcher
 
 from ..conftest import RUN
 from ..waiting import Deadline, wait_until
@@ -133,7 +133,7 @@ def open_channels_and_memories() -> set[str]:
 
 
 _NAMES = ("ug-worker", "ug-template")
-_TEMPLATE = b"ultragray_workers.pool.process.template"
+_TEMPLATE = b"ultragray_workers.pool.template"
 
 
 def _pool_processes() -> dict[int, str]:

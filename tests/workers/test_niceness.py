@@ -12,7 +12,7 @@ import pytest
 LEVEL = min(19, os.nice(0) + 5)
 PROGRAM = (
     f"import sys; sys.path[:] = {sys.path!r}; import os\n"
-    f"from ultragray_workers.niceness import let_frames_go_first; let_frames_go_first({LEVEL})\n"
+    f"from ultragray_workers.processes import let_frames_go_first; let_frames_go_first({LEVEL})\n"
     "print(os.nice(0), open('/proc/self/autogroup').read() if os.path.exists('/proc/self/autogroup') else '')"
 )
 

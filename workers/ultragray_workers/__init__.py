@@ -9,8 +9,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from ultragray_workers.pool.messages import Priority, RenderRequest, RenderResult
     from ultragray_workers.pool.pool import PoolConfig, PoolStatistics, RenderPool
-    from ultragray_workers.pool.types import Priority, RenderRequest, RenderResult
     from ultragray_workers.scenes import SceneStore
 
 __all__ = [
@@ -25,7 +25,7 @@ __all__ = [
 
 _MODULES = {
     "pool.pool": ("PoolConfig", "PoolStatistics", "RenderPool"),
-    "pool.types": ("Priority", "RenderRequest", "RenderResult"),
+    "pool.messages": ("Priority", "RenderRequest", "RenderResult"),
     "scenes": ("SceneStore",),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}

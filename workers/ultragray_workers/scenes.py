@@ -8,8 +8,8 @@ from contextlib import contextmanager
 from pathlib import Path
 
 from ultragray.errors import SceneFileInvalid
-from ultragray.files.atomic import file_sha256
-from ultragray.scene_info import SceneHeader, SceneInfo, read_header, scene_file_invalid
+from ultragray.files import file_sha256
+from ultragray.scene.info import SceneHeader, SceneInfo, read_header, scene_file_invalid
 from ultragray_workers.errors import SceneNotFound, known_names
 from ultragray_workers.scene_names import SUFFIX, SceneReference, base_name, check_scene_name
 from ultragray_workers.shelves.bucket import BucketShelf
@@ -40,9 +40,10 @@ class SceneStore:
     What blocks raises StorageUnavailable where a bucket does not answer.
     """
 
-    def __init__(self, *places: Path | Shelf) -> None:
+    def __init__(self, *places: Path | Shelf, hides: Callable[[str], bool] = lambda name: False) -> None:
+        """`hides`: whether a scene is hidden from whoever asks, who does not find it then."""
         self.shelves = tuple(FolderShelf(place) if isinstance(place, Path) else place for place in places)
-        self.hides: Callable[[str], bool] = lambda name: False  # from whoever asks: what is hidden is not found
+        self.hides = hides
         self._headers: KeptHeaders[FileVersion] = KeptHeaders()
         self._hashes: dict[str, tuple[FileVersion, str]] = {}
         self._hashing = threading.Lock()
@@ -216,7 +217,7 @@ def check_scene_file(path: str) -> None:
     """Load a scene file that somebody sent, in a helper process. Raises SceneFileInvalid, which calls it the body."""
     try:
         read_header(path)
-        from ultragray.scene import GaussianScene  # torch, which a file that is no scene does not need
+        from ultragray.scene.gaussians import GaussianScene  # torch, which a file that is no scene does not need
 
         GaussianScene.load(path)
     except SceneFileInvalid as error:

@@ -15,7 +15,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
-from ultragray.files.atomic import sync, write_whole
+from ultragray.files import sync, write_whole
 from ultragray_workers.errors import RestoreRefused, StartupFailed
 
 FORMAT_VERSION = 1  # 0: folders of releases that wrote no version, which are laid out as those of version 1

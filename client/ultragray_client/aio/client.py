@@ -6,15 +6,14 @@ from collections.abc import AsyncIterator, Iterable
 
 import numpy.typing as npt
 
+from ultragray_client.connection import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_S, ApiKey, Tls
+from ultragray_client.conversations import Batch
+from ultragray_client.exchange import PoseExchange, StreamMode
+from ultragray_client.frames import Localization, localize_message
+from ultragray_client.records import AuditEntry, Me
 from ultragray_proto.codec import from_message
 from ultragray_proto.v1 import access_pb2, access_pb2_grpc, rendering_pb2, rendering_pb2_grpc
 
-from ..access import AuditEntry, Me
-from ..calls.batch import Batch
-from ..calls.connection import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_S, ApiKey
-from ..calls.localization import Localization, localize_message
-from ..calls.pose_exchange import PoseExchange, StreamMode
-from ..calls.tls import Tls
 from ..contract import Probe, RenderSettings, SliceSettings
 from ..frames import Extrapolation, Frame, Slice, frame_from_message, settings_message, slice_from_message
 from ..geometry import PoseLike, pose_message, pose_messages

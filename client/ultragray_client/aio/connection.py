@@ -7,19 +7,22 @@ from collections.abc import AsyncGenerator, AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from typing import Any, TypeAlias, TypeVar
 
-from ..calls.connection import (
+from ultragray_client.connection import (
     LONGEST_PAUSE_OF_STREAMS_S,
     PAGE_SIZE,
     ApiKey,
     Conversation,
+    Retries,
+    Tls,
+    check_address,
     check_reconnect,
     check_timeout,
+    client_errors,
     metadata_of,
+    warn_of_open_key,
 )
-from ..calls.pose_exchange import PoseExchange
-from ..calls.retries import Retries
-from ..calls.statuses import client_errors
-from ..calls.tls import Tls, check_address, warn_of_open_key
+from ultragray_client.exchange import PoseExchange
+
 from ..errors import ClientError, NotFound
 from .transport import PoseCall, open_channel
 

@@ -6,11 +6,11 @@ from collections.abc import AsyncIterator
 from functools import partial
 from pathlib import Path
 
+from ultragray_client.conversations import Upload
 from ultragray_proto.codec import from_message
 from ultragray_proto.v1 import datasets_pb2, datasets_pb2_grpc
 
 from ..contract import Dataset, DatasetOptions
-from ..datasets import Upload
 from .connection import AsyncConnection
 from .transport import run_blocking
 

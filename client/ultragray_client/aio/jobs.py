@@ -6,11 +6,11 @@ from collections.abc import AsyncIterator
 from contextlib import aclosing
 from pathlib import Path
 
+from ultragray_client.conversations import downloaded
+from ultragray_client.records import Job, JobEvent, JobFilter, JobState, Watch, job_from_message, submission
 from ultragray_proto.v1 import jobs_pb2, jobs_pb2_grpc
 
-from ..calls.downloads import downloaded
 from ..contract import Specification
-from ..jobs import Job, JobEvent, JobFilter, JobState, Watch, job_from_message, submission
 from ..messages import message_of
 from .connection import AsyncConnection
 from .transport import run_blocking

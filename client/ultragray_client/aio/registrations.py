@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ultragray_client.records import Registration
 from ultragray_proto.codec import from_message
 from ultragray_proto.v1 import geometry_pb2, registrations_pb2, registrations_pb2_grpc
 
 from ..errors import InvalidPose
 from ..messages import message_of
-from ..registrations import Registration
 from .connection import AsyncConnection
 
 

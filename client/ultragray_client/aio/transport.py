@@ -9,13 +9,17 @@ from typing import Any, ParamSpec, TypeVar
 
 import grpc
 
-from ..calls.connection import CHANNEL_OPTIONS
-from ..calls.newest_answers import NewestAnswers
-from ..calls.pose_exchange import MAX_WAITING, TAKES_NO_MORE, Answer, PoseExchange, StreamMode
-from ..calls.retries import Retries
-from ..calls.statuses import error_of_call
-from ..calls.tls import Tls
-from ..calls.unanswered import Unanswered
+from ultragray_client.connection import CHANNEL_OPTIONS, Retries, Tls, error_of_call
+from ultragray_client.exchange import (
+    MAX_WAITING,
+    TAKES_NO_MORE,
+    Answer,
+    NewestAnswers,
+    PoseExchange,
+    StreamMode,
+    Unanswered,
+)
+
 from ..errors import ClientError, StreamEnded
 
 P = ParamSpec("P")

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from ultragray_client.records import Worker, worker_from_message
 from ultragray_proto.v1 import workers_pb2, workers_pb2_grpc
 
-from ..workers import Worker, worker_from_message
 from .connection import AsyncConnection
 
 

@@ -1,4 +1,4 @@
-# Generated from ultragray.interchange.ros_recording by client/generate.py; change that.
+# Generated from ultragray.exchange.ros_recording by client/generate.py; change that.
 """Frames as messages of ROS 2 in an MCAP file, on the topics of the ROS 2 node, with their definitions.
 
 The extra `mcap`. The Python client has a copy of this module (client/generate.py): the same frames are the same bytes.

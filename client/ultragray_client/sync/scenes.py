@@ -3,9 +3,9 @@
 
 from __future__ import annotations
 
+from ultragray_client.records import Scene, SceneEntry, entry_from_message, scene_from_message
 from ultragray_proto.v1 import scenes_pb2, scenes_pb2_grpc
 
-from ..scenes import Scene, SceneEntry, entry_from_message, scene_from_message
 from .connection import Connection
 
 

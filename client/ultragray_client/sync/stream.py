@@ -5,7 +5,8 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from ..calls.pose_exchange import PoseExchange
+from ultragray_client.exchange import PoseExchange
+
 from ..errors import StreamEnded
 from ..frames import Frame
 from ..geometry import PoseLike

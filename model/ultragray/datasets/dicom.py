@@ -18,15 +18,21 @@ from typing import Any
 
 import numpy as np
 
-from ultragray.datasets.calibration import pixel_size_mm, poses_from_image_transforms, region_of
-from ultragray.datasets.images import MAX_PIXEL_BYTES, CropBox, grey_frames, parse_crop
-from ultragray.datasets.plus.fan import FanGeometry, FanLines, parse_fan
-from ultragray.datasets.splits import parse_frame_ranges
-from ultragray.datasets.sweep import ByteArray, IntArray, Sweep
+from ultragray.datasets.fan import FanGeometry, FanLines, parse_fan
+from ultragray.datasets.images import (
+    MAX_PIXEL_BYTES,
+    CropBox,
+    grey_frames,
+    parse_crop,
+    pixel_size_mm,
+    poses_from_image_transforms,
+    region_of,
+)
 from ultragray.errors import DatasetInvalid, InvalidArgument, InvalidPose
-from ultragray.files.poses import load_poses
+from ultragray.exchange.poses import load_poses
+from ultragray.geometry.probe import FloatArray
 from ultragray.installation import missing_extra
-from ultragray.probe import FloatArray
+from ultragray.learn.sweep import ByteArray, IntArray, Sweep, parse_frame_ranges
 
 POSE_SUFFIXES = (".poses.npy", ".poses.json")
 MAX_HEADER_BYTES = 16 << 20  # of all that stands before the pixels

@@ -10,10 +10,10 @@ import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from ultragray.datasets.sweep import Dataset, Sweep, spread_places
-from ultragray.display.scan_conversion import with_square_pixels
-from ultragray.files.atomic import atomic_path
-from ultragray.probe import FloatArray
+from ultragray.files import atomic_path
+from ultragray.geometry.probe import FloatArray
+from ultragray.geometry.scan_conversion import with_square_pixels
+from ultragray.learn.sweep import Dataset, Sweep, spread_places
 
 TRAIN_COLOUR, VAL_COLOUR = "#1f77b4", "#d62728"
 MAX_PLANES = 16  # outlines of one part: more are a thicket; the path of the probe shows every frame

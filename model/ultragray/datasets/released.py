@@ -1,6 +1,6 @@
 """Datasets in the layout of the released trainer: conf.json, images_*.npy, poses_*.npy or .json.
 
-conf.json says where the planes are, in centimetres and degrees (`ultragray.interchange.released_config`); poses are in
+conf.json says where the planes are, in centimetres and degrees (`ultragray.exchange.released_config`); poses are in
 mm. Rows lie where Sweep puts them, as measured from the image: the stretch of docs/physics.md §3 is for released
 checkpoints only.
 """
@@ -14,13 +14,12 @@ from typing import Any
 import numpy as np
 
 from ultragray.datasets.images import grey_frames
-from ultragray.datasets.sweep import ByteArray, Dataset, Sweep, check_frame_poses
 from ultragray.errors import CheckpointInvalid, DatasetInvalid, InvalidArgument, InvalidPose
-from ultragray.files.atomic import atomic_path, write_whole
-from ultragray.files.npy import map_npy
-from ultragray.files.poses import read_pose_array
-from ultragray.interchange.released_config import ReleasedConfig, probe_keys, read_released_config
-from ultragray.probe import FloatArray, Probe
+from ultragray.exchange.poses import read_pose_array
+from ultragray.exchange.released_config import ReleasedConfig, probe_keys, read_released_config
+from ultragray.files import atomic_path, map_npy, write_whole
+from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.learn.sweep import ByteArray, Dataset, Sweep, check_frame_poses
 
 CONFIG_NAME = "conf.json"
 

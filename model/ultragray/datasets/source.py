@@ -16,7 +16,8 @@ from ultragray.errors import DatasetInvalid, InvalidArgument
 from ultragray.installation import missing_extra
 
 if TYPE_CHECKING:
-    from ultragray.datasets.sweep import Dataset, Sweep
+    from ultragray.learn.sweep import Dataset, Sweep
+
 
 MAX_OPTION_LENGTH = 1000
 PHANTOM = "phantom"
@@ -138,21 +139,20 @@ def _load_released(source: str, options: SourceOptions) -> Dataset:
 
 
 def _load_phantom(source: str, options: SourceOptions) -> Dataset:
-    from ultragray.datasets.phantom import load_phantom
+    from ultragray.phantom import load_phantom
 
     return _split(load_phantom(), options)
 
 
 def _split(dataset: Dataset, options: SourceOptions) -> Dataset:
-    from ultragray.datasets.splits import split_parts
+    from ultragray.learn.sweep import split_parts
 
     train, val = split_parts(dataset.train, dataset.val, options.train_frames, options.val_frames)
     return replace(dataset, train=train, val=val)
 
 
 def _split_sequence(path: Path, options: SourceOptions, sweep: Sweep, frame_count: int) -> Dataset:
-    from ultragray.datasets.splits import split_sequence
-    from ultragray.datasets.sweep import Dataset
+    from ultragray.learn.sweep import Dataset, split_sequence
 
     parts = split_sequence(sweep, frame_count, options.train_frames, options.val_frames)
     return Dataset(path.name.split(".")[0], *parts)

@@ -6,13 +6,17 @@ A sampler is made of numbers, travels as a JSON object with a `kind`, and makes 
 
 from __future__ import annotations
 
-from ultragray.samplers.around import AroundSampler
 from ultragray.samplers.confident import Assess, assessed_poses, confident_poses
-from ultragray.samplers.covered import CoveredSampler
-from ultragray.samplers.fan import FanSampler
-from ultragray.samplers.sampler import MAX_POSES, DrawnSampler, Sampler
-from ultragray.samplers.spline import SplineSampler
-from ultragray.samplers.training import TrainingSampler
+from ultragray.samplers.sampler import (
+    MAX_POSES,
+    AroundSampler,
+    CoveredSampler,
+    DrawnSampler,
+    FanSampler,
+    Sampler,
+    SplineSampler,
+    TrainingSampler,
+)
 
 __all__ = [
     "MAX_POSES",

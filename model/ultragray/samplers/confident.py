@@ -8,11 +8,11 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from ultragray.confidence import Extrapolation, is_confident, require_confidence
 from ultragray.errors import InvalidArgument, LowConfidence
-from ultragray.pose import check_poses
-from ultragray.probe import FloatArray, Probe
+from ultragray.geometry.pose import check_poses
+from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.samplers.sampler import BLOCK_POSES, DrawnSampler, Sampler, seed_of
+from ultragray.scene.confidence import Extrapolation, is_confident, require_confidence
 
 MOST_DRAWS_PER_POSE, LEAST_DRAWS = 20, 1000  # where so many do not suffice, the search is given up
 SMALLEST_ROUND = 64

@@ -60,9 +60,9 @@ class UploadDatasetResponse(_message.Message):
     def __init__(self, dataset: _Optional[_Union[Dataset, _Mapping]] = ..., created: _Optional[bool] = ...) -> None: ...
 
 class Dataset(_message.Message):
-    __slots__ = ("name", "kind", "sha256", "bytes", "created_at", "train_frames", "val_frames", "height", "width", "probe", "warnings", "options", "owner", "private", "region")
-    NAME_FIELD_NUMBER: _ClassVar[int]
+    __slots__ = ("kind", "name", "sha256", "bytes", "created_at", "train_frames", "val_frames", "height", "width", "probe", "warnings", "options", "owner", "private", "region")
     KIND_FIELD_NUMBER: _ClassVar[int]
+    NAME_FIELD_NUMBER: _ClassVar[int]
     SHA256_FIELD_NUMBER: _ClassVar[int]
     BYTES_FIELD_NUMBER: _ClassVar[int]
     CREATED_AT_FIELD_NUMBER: _ClassVar[int]
@@ -76,8 +76,8 @@ class Dataset(_message.Message):
     OWNER_FIELD_NUMBER: _ClassVar[int]
     PRIVATE_FIELD_NUMBER: _ClassVar[int]
     REGION_FIELD_NUMBER: _ClassVar[int]
-    name: str
     kind: str
+    name: str
     sha256: str
     bytes: int
     created_at: str
@@ -91,7 +91,7 @@ class Dataset(_message.Message):
     owner: str
     private: bool
     region: ImageRegion
-    def __init__(self, name: _Optional[str] = ..., kind: _Optional[str] = ..., sha256: _Optional[str] = ..., bytes: _Optional[int] = ..., created_at: _Optional[str] = ..., train_frames: _Optional[int] = ..., val_frames: _Optional[int] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., warnings: _Optional[_Iterable[str]] = ..., options: _Optional[_Union[DatasetOptions, _Mapping]] = ..., owner: _Optional[str] = ..., private: _Optional[bool] = ..., region: _Optional[_Union[ImageRegion, _Mapping]] = ...) -> None: ...
+    def __init__(self, kind: _Optional[str] = ..., name: _Optional[str] = ..., sha256: _Optional[str] = ..., bytes: _Optional[int] = ..., created_at: _Optional[str] = ..., train_frames: _Optional[int] = ..., val_frames: _Optional[int] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., warnings: _Optional[_Iterable[str]] = ..., options: _Optional[_Union[DatasetOptions, _Mapping]] = ..., owner: _Optional[str] = ..., private: _Optional[bool] = ..., region: _Optional[_Union[ImageRegion, _Mapping]] = ...) -> None: ...
 
 class ImageRegion(_message.Message):
     __slots__ = ("image_width", "image_height", "left", "top", "width", "height", "lateral_mm", "axial_mm", "image_to_probe")

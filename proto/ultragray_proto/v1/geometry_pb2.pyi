@@ -60,16 +60,6 @@ class Pose(_message.Message):
     placement: Placement
     def __init__(self, matrix: _Optional[_Union[Matrix, _Mapping]] = ..., placement: _Optional[_Union[Placement, _Mapping]] = ...) -> None: ...
 
-class LinearProbe(_message.Message):
-    __slots__ = ("width_mm", "near_mm", "far_mm")
-    WIDTH_MM_FIELD_NUMBER: _ClassVar[int]
-    NEAR_MM_FIELD_NUMBER: _ClassVar[int]
-    FAR_MM_FIELD_NUMBER: _ClassVar[int]
-    width_mm: float
-    near_mm: float
-    far_mm: float
-    def __init__(self, width_mm: _Optional[float] = ..., near_mm: _Optional[float] = ..., far_mm: _Optional[float] = ...) -> None: ...
-
 class ConvexProbe(_message.Message):
     __slots__ = ("opening_angle_deg", "near_mm", "far_mm")
     OPENING_ANGLE_DEG_FIELD_NUMBER: _ClassVar[int]
@@ -79,6 +69,16 @@ class ConvexProbe(_message.Message):
     near_mm: float
     far_mm: float
     def __init__(self, opening_angle_deg: _Optional[float] = ..., near_mm: _Optional[float] = ..., far_mm: _Optional[float] = ...) -> None: ...
+
+class LinearProbe(_message.Message):
+    __slots__ = ("width_mm", "near_mm", "far_mm")
+    WIDTH_MM_FIELD_NUMBER: _ClassVar[int]
+    NEAR_MM_FIELD_NUMBER: _ClassVar[int]
+    FAR_MM_FIELD_NUMBER: _ClassVar[int]
+    width_mm: float
+    near_mm: float
+    far_mm: float
+    def __init__(self, width_mm: _Optional[float] = ..., near_mm: _Optional[float] = ..., far_mm: _Optional[float] = ...) -> None: ...
 
 class PhasedProbe(_message.Message):
     __slots__ = ("opening_angle_deg", "far_mm")
@@ -132,27 +132,27 @@ class Probe(_message.Message):
     steered: SteeredProbe
     def __init__(self, linear: _Optional[_Union[LinearProbe, _Mapping]] = ..., convex: _Optional[_Union[ConvexProbe, _Mapping]] = ..., phased: _Optional[_Union[PhasedProbe, _Mapping]] = ..., radial: _Optional[_Union[RadialProbe, _Mapping]] = ..., steered: _Optional[_Union[SteeredProbe, _Mapping]] = ...) -> None: ...
 
-class Needle(_message.Message):
-    __slots__ = ("tip_mm", "hub_mm", "diameter_mm", "frame", "brightness", "roughness", "reverberation", "opacity", "label")
-    TIP_MM_FIELD_NUMBER: _ClassVar[int]
-    HUB_MM_FIELD_NUMBER: _ClassVar[int]
-    DIAMETER_MM_FIELD_NUMBER: _ClassVar[int]
+class Box(_message.Message):
+    __slots__ = ("centre_mm", "quaternion", "size_mm", "frame", "brightness", "roughness", "reverberation", "opacity", "label")
+    CENTRE_MM_FIELD_NUMBER: _ClassVar[int]
+    QUATERNION_FIELD_NUMBER: _ClassVar[int]
+    SIZE_MM_FIELD_NUMBER: _ClassVar[int]
     FRAME_FIELD_NUMBER: _ClassVar[int]
     BRIGHTNESS_FIELD_NUMBER: _ClassVar[int]
     ROUGHNESS_FIELD_NUMBER: _ClassVar[int]
     REVERBERATION_FIELD_NUMBER: _ClassVar[int]
     OPACITY_FIELD_NUMBER: _ClassVar[int]
     LABEL_FIELD_NUMBER: _ClassVar[int]
-    tip_mm: Position
-    hub_mm: Position
-    diameter_mm: float
+    centre_mm: Position
+    quaternion: Quaternion
+    size_mm: Size
     frame: ToolFrame
     brightness: float
     roughness: float
     reverberation: float
     opacity: float
     label: int
-    def __init__(self, tip_mm: _Optional[_Union[Position, _Mapping]] = ..., hub_mm: _Optional[_Union[Position, _Mapping]] = ..., diameter_mm: _Optional[float] = ..., frame: _Optional[_Union[ToolFrame, str]] = ..., brightness: _Optional[float] = ..., roughness: _Optional[float] = ..., reverberation: _Optional[float] = ..., opacity: _Optional[float] = ..., label: _Optional[int] = ...) -> None: ...
+    def __init__(self, centre_mm: _Optional[_Union[Position, _Mapping]] = ..., quaternion: _Optional[_Union[Quaternion, _Mapping]] = ..., size_mm: _Optional[_Union[Size, _Mapping]] = ..., frame: _Optional[_Union[ToolFrame, str]] = ..., brightness: _Optional[float] = ..., roughness: _Optional[float] = ..., reverberation: _Optional[float] = ..., opacity: _Optional[float] = ..., label: _Optional[int] = ...) -> None: ...
 
 class Cylinder(_message.Message):
     __slots__ = ("tip_mm", "hub_mm", "diameter_mm", "frame", "brightness", "roughness", "reverberation", "opacity", "label")
@@ -176,27 +176,27 @@ class Cylinder(_message.Message):
     label: int
     def __init__(self, tip_mm: _Optional[_Union[Position, _Mapping]] = ..., hub_mm: _Optional[_Union[Position, _Mapping]] = ..., diameter_mm: _Optional[float] = ..., frame: _Optional[_Union[ToolFrame, str]] = ..., brightness: _Optional[float] = ..., roughness: _Optional[float] = ..., reverberation: _Optional[float] = ..., opacity: _Optional[float] = ..., label: _Optional[int] = ...) -> None: ...
 
-class Box(_message.Message):
-    __slots__ = ("centre_mm", "quaternion", "size_mm", "frame", "brightness", "roughness", "reverberation", "opacity", "label")
-    CENTRE_MM_FIELD_NUMBER: _ClassVar[int]
-    QUATERNION_FIELD_NUMBER: _ClassVar[int]
-    SIZE_MM_FIELD_NUMBER: _ClassVar[int]
+class Needle(_message.Message):
+    __slots__ = ("tip_mm", "hub_mm", "diameter_mm", "frame", "brightness", "roughness", "reverberation", "opacity", "label")
+    TIP_MM_FIELD_NUMBER: _ClassVar[int]
+    HUB_MM_FIELD_NUMBER: _ClassVar[int]
+    DIAMETER_MM_FIELD_NUMBER: _ClassVar[int]
     FRAME_FIELD_NUMBER: _ClassVar[int]
     BRIGHTNESS_FIELD_NUMBER: _ClassVar[int]
     ROUGHNESS_FIELD_NUMBER: _ClassVar[int]
     REVERBERATION_FIELD_NUMBER: _ClassVar[int]
     OPACITY_FIELD_NUMBER: _ClassVar[int]
     LABEL_FIELD_NUMBER: _ClassVar[int]
-    centre_mm: Position
-    quaternion: Quaternion
-    size_mm: Size
+    tip_mm: Position
+    hub_mm: Position
+    diameter_mm: float
     frame: ToolFrame
     brightness: float
     roughness: float
     reverberation: float
     opacity: float
     label: int
-    def __init__(self, centre_mm: _Optional[_Union[Position, _Mapping]] = ..., quaternion: _Optional[_Union[Quaternion, _Mapping]] = ..., size_mm: _Optional[_Union[Size, _Mapping]] = ..., frame: _Optional[_Union[ToolFrame, str]] = ..., brightness: _Optional[float] = ..., roughness: _Optional[float] = ..., reverberation: _Optional[float] = ..., opacity: _Optional[float] = ..., label: _Optional[int] = ...) -> None: ...
+    def __init__(self, tip_mm: _Optional[_Union[Position, _Mapping]] = ..., hub_mm: _Optional[_Union[Position, _Mapping]] = ..., diameter_mm: _Optional[float] = ..., frame: _Optional[_Union[ToolFrame, str]] = ..., brightness: _Optional[float] = ..., roughness: _Optional[float] = ..., reverberation: _Optional[float] = ..., opacity: _Optional[float] = ..., label: _Optional[int] = ...) -> None: ...
 
 class Size(_message.Message):
     __slots__ = ("x", "y", "z")

@@ -41,115 +41,6 @@ JOB_STATE_SUCCEEDED: JobState
 JOB_STATE_FAILED: JobState
 JOB_STATE_CANCELLED: JobState
 
-class TrainJob(_message.Message):
-    __slots__ = ("dataset", "scene", "preset", "settings", "device", "max_run_s", "min_memory_gb", "worker_labels")
-    class WorkerLabelsEntry(_message.Message):
-        __slots__ = ("key", "value")
-        KEY_FIELD_NUMBER: _ClassVar[int]
-        VALUE_FIELD_NUMBER: _ClassVar[int]
-        key: str
-        value: str
-        def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
-    DATASET_FIELD_NUMBER: _ClassVar[int]
-    SCENE_FIELD_NUMBER: _ClassVar[int]
-    PRESET_FIELD_NUMBER: _ClassVar[int]
-    SETTINGS_FIELD_NUMBER: _ClassVar[int]
-    DEVICE_FIELD_NUMBER: _ClassVar[int]
-    MAX_RUN_S_FIELD_NUMBER: _ClassVar[int]
-    MIN_MEMORY_GB_FIELD_NUMBER: _ClassVar[int]
-    WORKER_LABELS_FIELD_NUMBER: _ClassVar[int]
-    dataset: str
-    scene: str
-    preset: str
-    settings: _struct_pb2.Struct
-    device: str
-    max_run_s: float
-    min_memory_gb: int
-    worker_labels: _containers.ScalarMap[str, str]
-    def __init__(self, dataset: _Optional[str] = ..., scene: _Optional[str] = ..., preset: _Optional[str] = ..., settings: _Optional[_Union[_struct_pb2.Struct, _Mapping]] = ..., device: _Optional[str] = ..., max_run_s: _Optional[float] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ...) -> None: ...
-
-class RenderJob(_message.Message):
-    __slots__ = ("scene", "poses", "sampler", "height", "width", "outputs", "format", "pose_count", "dtype", "min_confidence", "probe", "display", "below_min_confidence", "slice_thickness_mm", "contact", "tools", "ghost", "max_run_s", "shard_frames", "device", "min_memory_gb", "worker_labels", "registration")
-    class WorkerLabelsEntry(_message.Message):
-        __slots__ = ("key", "value")
-        KEY_FIELD_NUMBER: _ClassVar[int]
-        VALUE_FIELD_NUMBER: _ClassVar[int]
-        key: str
-        value: str
-        def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
-    SCENE_FIELD_NUMBER: _ClassVar[int]
-    POSES_FIELD_NUMBER: _ClassVar[int]
-    SAMPLER_FIELD_NUMBER: _ClassVar[int]
-    HEIGHT_FIELD_NUMBER: _ClassVar[int]
-    WIDTH_FIELD_NUMBER: _ClassVar[int]
-    OUTPUTS_FIELD_NUMBER: _ClassVar[int]
-    FORMAT_FIELD_NUMBER: _ClassVar[int]
-    POSE_COUNT_FIELD_NUMBER: _ClassVar[int]
-    DTYPE_FIELD_NUMBER: _ClassVar[int]
-    MIN_CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
-    PROBE_FIELD_NUMBER: _ClassVar[int]
-    DISPLAY_FIELD_NUMBER: _ClassVar[int]
-    BELOW_MIN_CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
-    SLICE_THICKNESS_MM_FIELD_NUMBER: _ClassVar[int]
-    CONTACT_FIELD_NUMBER: _ClassVar[int]
-    TOOLS_FIELD_NUMBER: _ClassVar[int]
-    GHOST_FIELD_NUMBER: _ClassVar[int]
-    MAX_RUN_S_FIELD_NUMBER: _ClassVar[int]
-    SHARD_FRAMES_FIELD_NUMBER: _ClassVar[int]
-    DEVICE_FIELD_NUMBER: _ClassVar[int]
-    MIN_MEMORY_GB_FIELD_NUMBER: _ClassVar[int]
-    WORKER_LABELS_FIELD_NUMBER: _ClassVar[int]
-    REGISTRATION_FIELD_NUMBER: _ClassVar[int]
-    scene: str
-    poses: _containers.RepeatedCompositeFieldContainer[_geometry_pb2.Pose]
-    sampler: PoseSampler
-    height: int
-    width: int
-    outputs: _containers.RepeatedScalarFieldContainer[_rendering_pb2.Output]
-    format: str
-    pose_count: int
-    dtype: str
-    min_confidence: float
-    probe: _geometry_pb2.Probe
-    display: _rendering_pb2.Display
-    below_min_confidence: _rendering_pb2.BelowConfidence
-    slice_thickness_mm: float
-    contact: _rendering_pb2.Contact
-    tools: _containers.RepeatedCompositeFieldContainer[_geometry_pb2.Tool]
-    ghost: float
-    max_run_s: float
-    shard_frames: int
-    device: str
-    min_memory_gb: int
-    worker_labels: _containers.ScalarMap[str, str]
-    registration: str
-    def __init__(self, scene: _Optional[str] = ..., poses: _Optional[_Iterable[_Union[_geometry_pb2.Pose, _Mapping]]] = ..., sampler: _Optional[_Union[PoseSampler, _Mapping]] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[_rendering_pb2.Output, str]]] = ..., format: _Optional[str] = ..., pose_count: _Optional[int] = ..., dtype: _Optional[str] = ..., min_confidence: _Optional[float] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., display: _Optional[_Union[_rendering_pb2.Display, _Mapping]] = ..., below_min_confidence: _Optional[_Union[_rendering_pb2.BelowConfidence, str]] = ..., slice_thickness_mm: _Optional[float] = ..., contact: _Optional[_Union[_rendering_pb2.Contact, str]] = ..., tools: _Optional[_Iterable[_Union[_geometry_pb2.Tool, _Mapping]]] = ..., ghost: _Optional[float] = ..., max_run_s: _Optional[float] = ..., shard_frames: _Optional[int] = ..., device: _Optional[str] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ..., registration: _Optional[str] = ...) -> None: ...
-
-class EvaluateJob(_message.Message):
-    __slots__ = ("dataset", "scene", "baselines", "max_run_s", "device", "min_memory_gb", "worker_labels")
-    class WorkerLabelsEntry(_message.Message):
-        __slots__ = ("key", "value")
-        KEY_FIELD_NUMBER: _ClassVar[int]
-        VALUE_FIELD_NUMBER: _ClassVar[int]
-        key: str
-        value: str
-        def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
-    DATASET_FIELD_NUMBER: _ClassVar[int]
-    SCENE_FIELD_NUMBER: _ClassVar[int]
-    BASELINES_FIELD_NUMBER: _ClassVar[int]
-    MAX_RUN_S_FIELD_NUMBER: _ClassVar[int]
-    DEVICE_FIELD_NUMBER: _ClassVar[int]
-    MIN_MEMORY_GB_FIELD_NUMBER: _ClassVar[int]
-    WORKER_LABELS_FIELD_NUMBER: _ClassVar[int]
-    dataset: str
-    scene: str
-    baselines: bool
-    max_run_s: float
-    device: str
-    min_memory_gb: int
-    worker_labels: _containers.ScalarMap[str, str]
-    def __init__(self, dataset: _Optional[str] = ..., scene: _Optional[str] = ..., baselines: _Optional[bool] = ..., max_run_s: _Optional[float] = ..., device: _Optional[str] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ...) -> None: ...
-
 class CompareJob(_message.Message):
     __slots__ = ("dataset", "methods", "budget", "times", "seed", "max_run_s", "device", "min_memory_gb", "worker_labels")
     class WorkerLabelsEntry(_message.Message):
@@ -179,6 +70,58 @@ class CompareJob(_message.Message):
     worker_labels: _containers.ScalarMap[str, str]
     def __init__(self, dataset: _Optional[str] = ..., methods: _Optional[_Iterable[str]] = ..., budget: _Optional[str] = ..., times: _Optional[float] = ..., seed: _Optional[int] = ..., max_run_s: _Optional[float] = ..., device: _Optional[str] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ...) -> None: ...
 
+class EvaluateJob(_message.Message):
+    __slots__ = ("dataset", "scene", "baselines", "max_run_s", "device", "min_memory_gb", "worker_labels")
+    class WorkerLabelsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: str
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
+    DATASET_FIELD_NUMBER: _ClassVar[int]
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    BASELINES_FIELD_NUMBER: _ClassVar[int]
+    MAX_RUN_S_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_FIELD_NUMBER: _ClassVar[int]
+    MIN_MEMORY_GB_FIELD_NUMBER: _ClassVar[int]
+    WORKER_LABELS_FIELD_NUMBER: _ClassVar[int]
+    dataset: str
+    scene: str
+    baselines: bool
+    max_run_s: float
+    device: str
+    min_memory_gb: int
+    worker_labels: _containers.ScalarMap[str, str]
+    def __init__(self, dataset: _Optional[str] = ..., scene: _Optional[str] = ..., baselines: _Optional[bool] = ..., max_run_s: _Optional[float] = ..., device: _Optional[str] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ...) -> None: ...
+
+class TrainJob(_message.Message):
+    __slots__ = ("dataset", "scene", "preset", "settings", "device", "max_run_s", "min_memory_gb", "worker_labels")
+    class WorkerLabelsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: str
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
+    DATASET_FIELD_NUMBER: _ClassVar[int]
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    PRESET_FIELD_NUMBER: _ClassVar[int]
+    SETTINGS_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_FIELD_NUMBER: _ClassVar[int]
+    MAX_RUN_S_FIELD_NUMBER: _ClassVar[int]
+    MIN_MEMORY_GB_FIELD_NUMBER: _ClassVar[int]
+    WORKER_LABELS_FIELD_NUMBER: _ClassVar[int]
+    dataset: str
+    scene: str
+    preset: str
+    settings: _struct_pb2.Struct
+    device: str
+    max_run_s: float
+    min_memory_gb: int
+    worker_labels: _containers.ScalarMap[str, str]
+    def __init__(self, dataset: _Optional[str] = ..., scene: _Optional[str] = ..., preset: _Optional[str] = ..., settings: _Optional[_Union[_struct_pb2.Struct, _Mapping]] = ..., device: _Optional[str] = ..., max_run_s: _Optional[float] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ...) -> None: ...
+
 class VoxelizeJob(_message.Message):
     __slots__ = ("scene", "field", "spacing_mm", "box_mm", "format", "max_run_s", "device", "min_memory_gb", "worker_labels")
     class WorkerLabelsEntry(_message.Message):
@@ -207,6 +150,63 @@ class VoxelizeJob(_message.Message):
     min_memory_gb: int
     worker_labels: _containers.ScalarMap[str, str]
     def __init__(self, scene: _Optional[str] = ..., field: _Optional[str] = ..., spacing_mm: _Optional[float] = ..., box_mm: _Optional[str] = ..., format: _Optional[str] = ..., max_run_s: _Optional[float] = ..., device: _Optional[str] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ...) -> None: ...
+
+class RenderJob(_message.Message):
+    __slots__ = ("pose_count", "scene", "poses", "sampler", "height", "width", "outputs", "format", "dtype", "min_confidence", "probe", "display", "below_min_confidence", "max_run_s", "slice_thickness_mm", "shard_frames", "contact", "tools", "ghost", "device", "min_memory_gb", "worker_labels", "registration")
+    class WorkerLabelsEntry(_message.Message):
+        __slots__ = ("key", "value")
+        KEY_FIELD_NUMBER: _ClassVar[int]
+        VALUE_FIELD_NUMBER: _ClassVar[int]
+        key: str
+        value: str
+        def __init__(self, key: _Optional[str] = ..., value: _Optional[str] = ...) -> None: ...
+    POSE_COUNT_FIELD_NUMBER: _ClassVar[int]
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    POSES_FIELD_NUMBER: _ClassVar[int]
+    SAMPLER_FIELD_NUMBER: _ClassVar[int]
+    HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    WIDTH_FIELD_NUMBER: _ClassVar[int]
+    OUTPUTS_FIELD_NUMBER: _ClassVar[int]
+    FORMAT_FIELD_NUMBER: _ClassVar[int]
+    DTYPE_FIELD_NUMBER: _ClassVar[int]
+    MIN_CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
+    PROBE_FIELD_NUMBER: _ClassVar[int]
+    DISPLAY_FIELD_NUMBER: _ClassVar[int]
+    BELOW_MIN_CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
+    MAX_RUN_S_FIELD_NUMBER: _ClassVar[int]
+    SLICE_THICKNESS_MM_FIELD_NUMBER: _ClassVar[int]
+    SHARD_FRAMES_FIELD_NUMBER: _ClassVar[int]
+    CONTACT_FIELD_NUMBER: _ClassVar[int]
+    TOOLS_FIELD_NUMBER: _ClassVar[int]
+    GHOST_FIELD_NUMBER: _ClassVar[int]
+    DEVICE_FIELD_NUMBER: _ClassVar[int]
+    MIN_MEMORY_GB_FIELD_NUMBER: _ClassVar[int]
+    WORKER_LABELS_FIELD_NUMBER: _ClassVar[int]
+    REGISTRATION_FIELD_NUMBER: _ClassVar[int]
+    pose_count: int
+    scene: str
+    poses: _containers.RepeatedCompositeFieldContainer[_geometry_pb2.Pose]
+    sampler: PoseSampler
+    height: int
+    width: int
+    outputs: _containers.RepeatedScalarFieldContainer[_rendering_pb2.Output]
+    format: str
+    dtype: str
+    min_confidence: float
+    probe: _geometry_pb2.Probe
+    display: _rendering_pb2.Display
+    below_min_confidence: _rendering_pb2.BelowConfidence
+    max_run_s: float
+    slice_thickness_mm: float
+    shard_frames: int
+    contact: _rendering_pb2.Contact
+    tools: _containers.RepeatedCompositeFieldContainer[_geometry_pb2.Tool]
+    ghost: float
+    device: str
+    min_memory_gb: int
+    worker_labels: _containers.ScalarMap[str, str]
+    registration: str
+    def __init__(self, pose_count: _Optional[int] = ..., scene: _Optional[str] = ..., poses: _Optional[_Iterable[_Union[_geometry_pb2.Pose, _Mapping]]] = ..., sampler: _Optional[_Union[PoseSampler, _Mapping]] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[_rendering_pb2.Output, str]]] = ..., format: _Optional[str] = ..., dtype: _Optional[str] = ..., min_confidence: _Optional[float] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., display: _Optional[_Union[_rendering_pb2.Display, _Mapping]] = ..., below_min_confidence: _Optional[_Union[_rendering_pb2.BelowConfidence, str]] = ..., max_run_s: _Optional[float] = ..., slice_thickness_mm: _Optional[float] = ..., shard_frames: _Optional[int] = ..., contact: _Optional[_Union[_rendering_pb2.Contact, str]] = ..., tools: _Optional[_Iterable[_Union[_geometry_pb2.Tool, _Mapping]]] = ..., ghost: _Optional[float] = ..., device: _Optional[str] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ..., registration: _Optional[str] = ...) -> None: ...
 
 class PoseSampler(_message.Message):
     __slots__ = ("kind", "count", "translation_mm", "rotation_deg", "seed", "spacing_mm", "tilt_deg", "step_deg")
@@ -371,7 +371,7 @@ class JobEvent(_message.Message):
     def __init__(self, job: _Optional[_Union[Job, _Mapping]] = ..., log: _Optional[str] = ...) -> None: ...
 
 class Job(_message.Message):
-    __slots__ = ("id", "kind", "state", "request_id", "train", "render", "evaluate", "compare", "voxelize", "priority", "created_at", "started_at", "finished_at", "error", "progress", "artifacts", "metrics", "worker", "retry_of", "attempts", "owner", "private")
+    __slots__ = ("kind", "train", "render", "evaluate", "compare", "voxelize", "id", "state", "request_id", "priority", "created_at", "started_at", "finished_at", "error", "progress", "artifacts", "metrics", "worker", "retry_of", "attempts", "owner", "private")
     class MetricsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -379,15 +379,15 @@ class Job(_message.Message):
         key: str
         value: float
         def __init__(self, key: _Optional[str] = ..., value: _Optional[float] = ...) -> None: ...
-    ID_FIELD_NUMBER: _ClassVar[int]
     KIND_FIELD_NUMBER: _ClassVar[int]
-    STATE_FIELD_NUMBER: _ClassVar[int]
-    REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
     TRAIN_FIELD_NUMBER: _ClassVar[int]
     RENDER_FIELD_NUMBER: _ClassVar[int]
     EVALUATE_FIELD_NUMBER: _ClassVar[int]
     COMPARE_FIELD_NUMBER: _ClassVar[int]
     VOXELIZE_FIELD_NUMBER: _ClassVar[int]
+    ID_FIELD_NUMBER: _ClassVar[int]
+    STATE_FIELD_NUMBER: _ClassVar[int]
+    REQUEST_ID_FIELD_NUMBER: _ClassVar[int]
     PRIORITY_FIELD_NUMBER: _ClassVar[int]
     CREATED_AT_FIELD_NUMBER: _ClassVar[int]
     STARTED_AT_FIELD_NUMBER: _ClassVar[int]
@@ -401,15 +401,15 @@ class Job(_message.Message):
     ATTEMPTS_FIELD_NUMBER: _ClassVar[int]
     OWNER_FIELD_NUMBER: _ClassVar[int]
     PRIVATE_FIELD_NUMBER: _ClassVar[int]
-    id: str
     kind: JobKind
-    state: JobState
-    request_id: str
     train: TrainJob
     render: RenderJob
     evaluate: EvaluateJob
     compare: CompareJob
     voxelize: VoxelizeJob
+    id: str
+    state: JobState
+    request_id: str
     priority: int
     created_at: str
     started_at: str
@@ -423,7 +423,7 @@ class Job(_message.Message):
     attempts: int
     owner: str
     private: bool
-    def __init__(self, id: _Optional[str] = ..., kind: _Optional[_Union[JobKind, str]] = ..., state: _Optional[_Union[JobState, str]] = ..., request_id: _Optional[str] = ..., train: _Optional[_Union[TrainJob, _Mapping]] = ..., render: _Optional[_Union[RenderJob, _Mapping]] = ..., evaluate: _Optional[_Union[EvaluateJob, _Mapping]] = ..., compare: _Optional[_Union[CompareJob, _Mapping]] = ..., voxelize: _Optional[_Union[VoxelizeJob, _Mapping]] = ..., priority: _Optional[int] = ..., created_at: _Optional[str] = ..., started_at: _Optional[str] = ..., finished_at: _Optional[str] = ..., error: _Optional[_Union[_scenes_pb2.Error, _Mapping]] = ..., progress: _Optional[_Union[JobProgress, _Mapping]] = ..., artifacts: _Optional[_Iterable[str]] = ..., metrics: _Optional[_Mapping[str, float]] = ..., worker: _Optional[str] = ..., retry_of: _Optional[str] = ..., attempts: _Optional[int] = ..., owner: _Optional[str] = ..., private: _Optional[bool] = ...) -> None: ...
+    def __init__(self, kind: _Optional[_Union[JobKind, str]] = ..., train: _Optional[_Union[TrainJob, _Mapping]] = ..., render: _Optional[_Union[RenderJob, _Mapping]] = ..., evaluate: _Optional[_Union[EvaluateJob, _Mapping]] = ..., compare: _Optional[_Union[CompareJob, _Mapping]] = ..., voxelize: _Optional[_Union[VoxelizeJob, _Mapping]] = ..., id: _Optional[str] = ..., state: _Optional[_Union[JobState, str]] = ..., request_id: _Optional[str] = ..., priority: _Optional[int] = ..., created_at: _Optional[str] = ..., started_at: _Optional[str] = ..., finished_at: _Optional[str] = ..., error: _Optional[_Union[_scenes_pb2.Error, _Mapping]] = ..., progress: _Optional[_Union[JobProgress, _Mapping]] = ..., artifacts: _Optional[_Iterable[str]] = ..., metrics: _Optional[_Mapping[str, float]] = ..., worker: _Optional[str] = ..., retry_of: _Optional[str] = ..., attempts: _Optional[int] = ..., owner: _Optional[str] = ..., private: _Optional[bool] = ...) -> None: ...
 
 class JobProgress(_message.Message):
     __slots__ = ("step", "steps", "loss", "val_psnr_db", "gaussians", "frames_done", "frames", "rate_per_s", "seconds_left", "waits_for", "method", "method_number", "methods", "phase")

@@ -133,26 +133,26 @@ class AssessPosesResponse(_message.Message):
     def __init__(self, extrapolations: _Optional[_Iterable[_Union[Extrapolation, _Mapping]]] = ...) -> None: ...
 
 class LocalizeRequest(_message.Message):
-    __slots__ = ("scene", "image", "image_height", "image_width", "start", "probe", "within_mm", "within_deg", "registration")
+    __slots__ = ("scene", "image", "image_height", "image_width", "start", "registration", "probe", "within_mm", "within_deg")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     IMAGE_FIELD_NUMBER: _ClassVar[int]
     IMAGE_HEIGHT_FIELD_NUMBER: _ClassVar[int]
     IMAGE_WIDTH_FIELD_NUMBER: _ClassVar[int]
     START_FIELD_NUMBER: _ClassVar[int]
+    REGISTRATION_FIELD_NUMBER: _ClassVar[int]
     PROBE_FIELD_NUMBER: _ClassVar[int]
     WITHIN_MM_FIELD_NUMBER: _ClassVar[int]
     WITHIN_DEG_FIELD_NUMBER: _ClassVar[int]
-    REGISTRATION_FIELD_NUMBER: _ClassVar[int]
     scene: str
     image: bytes
     image_height: int
     image_width: int
     start: _geometry_pb2.Pose
+    registration: str
     probe: _geometry_pb2.Probe
     within_mm: float
     within_deg: float
-    registration: str
-    def __init__(self, scene: _Optional[str] = ..., image: _Optional[bytes] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., start: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., within_mm: _Optional[float] = ..., within_deg: _Optional[float] = ..., registration: _Optional[str] = ...) -> None: ...
+    def __init__(self, scene: _Optional[str] = ..., image: _Optional[bytes] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., start: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., registration: _Optional[str] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., within_mm: _Optional[float] = ..., within_deg: _Optional[float] = ...) -> None: ...
 
 class AlongAxes(_message.Message):
     __slots__ = ("lateral", "elevation", "axial")
@@ -289,26 +289,26 @@ class SliceSize(_message.Message):
     def __init__(self, width: _Optional[float] = ..., height: _Optional[float] = ...) -> None: ...
 
 class Slice(_message.Message):
-    __slots__ = ("scene", "scene_sha256", "field", "height", "width", "encoding", "data", "pixel_to_scene", "timings")
+    __slots__ = ("data", "timings", "scene", "scene_sha256", "field", "height", "width", "encoding", "pixel_to_scene")
+    DATA_FIELD_NUMBER: _ClassVar[int]
+    TIMINGS_FIELD_NUMBER: _ClassVar[int]
     SCENE_FIELD_NUMBER: _ClassVar[int]
     SCENE_SHA256_FIELD_NUMBER: _ClassVar[int]
     FIELD_FIELD_NUMBER: _ClassVar[int]
     HEIGHT_FIELD_NUMBER: _ClassVar[int]
     WIDTH_FIELD_NUMBER: _ClassVar[int]
     ENCODING_FIELD_NUMBER: _ClassVar[int]
-    DATA_FIELD_NUMBER: _ClassVar[int]
     PIXEL_TO_SCENE_FIELD_NUMBER: _ClassVar[int]
-    TIMINGS_FIELD_NUMBER: _ClassVar[int]
+    data: bytes
+    timings: Timings
     scene: str
     scene_sha256: str
     field: str
     height: int
     width: int
     encoding: Encoding
-    data: bytes
     pixel_to_scene: _geometry_pb2.Matrix
-    timings: Timings
-    def __init__(self, scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., field: _Optional[str] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., data: _Optional[bytes] = ..., pixel_to_scene: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ...) -> None: ...
+    def __init__(self, data: _Optional[bytes] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., field: _Optional[str] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., pixel_to_scene: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ...) -> None: ...
 
 class SharedMemory(_message.Message):
     __slots__ = ("name", "token", "slots", "slot_bytes")
@@ -345,60 +345,64 @@ class RenderStreamRequest(_message.Message):
     def __init__(self, sequence: _Optional[int] = ..., settings: _Optional[_Union[RenderSettings, _Mapping]] = ..., pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., mode: _Optional[_Union[StreamMode, str]] = ..., timeout_ms: _Optional[float] = ..., client_time_ns: _Optional[int] = ..., window: _Optional[int] = ..., acknowledged: _Optional[int] = ..., shared_memory: _Optional[_Union[SharedMemory, _Mapping]] = ...) -> None: ...
 
 class Frame(_message.Message):
-    __slots__ = ("sequence", "scene", "scene_sha256", "renderer", "pose", "probe", "slice_thickness_mm", "contact", "tools", "ghost", "registration", "height", "width", "outputs", "encoding", "data", "shared_data", "timings", "error", "dropped", "extrapolation", "display", "picture", "rendered_height", "rendered_width", "client_time_ns")
+    __slots__ = ("sequence", "data", "shared_data", "timings", "error", "dropped", "client_time_ns", "scene", "scene_sha256", "renderer", "pose", "probe", "height", "width", "outputs", "encoding", "display", "picture", "rendered_height", "rendered_width", "extrapolation", "slice_thickness_mm", "contact", "tools", "ghost", "registration", "min_confidence", "below_min_confidence")
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
-    SCENE_FIELD_NUMBER: _ClassVar[int]
-    SCENE_SHA256_FIELD_NUMBER: _ClassVar[int]
-    RENDERER_FIELD_NUMBER: _ClassVar[int]
-    POSE_FIELD_NUMBER: _ClassVar[int]
-    PROBE_FIELD_NUMBER: _ClassVar[int]
-    SLICE_THICKNESS_MM_FIELD_NUMBER: _ClassVar[int]
-    CONTACT_FIELD_NUMBER: _ClassVar[int]
-    TOOLS_FIELD_NUMBER: _ClassVar[int]
-    GHOST_FIELD_NUMBER: _ClassVar[int]
-    REGISTRATION_FIELD_NUMBER: _ClassVar[int]
-    HEIGHT_FIELD_NUMBER: _ClassVar[int]
-    WIDTH_FIELD_NUMBER: _ClassVar[int]
-    OUTPUTS_FIELD_NUMBER: _ClassVar[int]
-    ENCODING_FIELD_NUMBER: _ClassVar[int]
     DATA_FIELD_NUMBER: _ClassVar[int]
     SHARED_DATA_FIELD_NUMBER: _ClassVar[int]
     TIMINGS_FIELD_NUMBER: _ClassVar[int]
     ERROR_FIELD_NUMBER: _ClassVar[int]
     DROPPED_FIELD_NUMBER: _ClassVar[int]
-    EXTRAPOLATION_FIELD_NUMBER: _ClassVar[int]
+    CLIENT_TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    SCENE_FIELD_NUMBER: _ClassVar[int]
+    SCENE_SHA256_FIELD_NUMBER: _ClassVar[int]
+    RENDERER_FIELD_NUMBER: _ClassVar[int]
+    POSE_FIELD_NUMBER: _ClassVar[int]
+    PROBE_FIELD_NUMBER: _ClassVar[int]
+    HEIGHT_FIELD_NUMBER: _ClassVar[int]
+    WIDTH_FIELD_NUMBER: _ClassVar[int]
+    OUTPUTS_FIELD_NUMBER: _ClassVar[int]
+    ENCODING_FIELD_NUMBER: _ClassVar[int]
     DISPLAY_FIELD_NUMBER: _ClassVar[int]
     PICTURE_FIELD_NUMBER: _ClassVar[int]
     RENDERED_HEIGHT_FIELD_NUMBER: _ClassVar[int]
     RENDERED_WIDTH_FIELD_NUMBER: _ClassVar[int]
-    CLIENT_TIME_NS_FIELD_NUMBER: _ClassVar[int]
+    EXTRAPOLATION_FIELD_NUMBER: _ClassVar[int]
+    SLICE_THICKNESS_MM_FIELD_NUMBER: _ClassVar[int]
+    CONTACT_FIELD_NUMBER: _ClassVar[int]
+    TOOLS_FIELD_NUMBER: _ClassVar[int]
+    GHOST_FIELD_NUMBER: _ClassVar[int]
+    REGISTRATION_FIELD_NUMBER: _ClassVar[int]
+    MIN_CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
+    BELOW_MIN_CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
     sequence: int
-    scene: str
-    scene_sha256: str
-    renderer: str
-    pose: _geometry_pb2.Matrix
-    probe: _geometry_pb2.Probe
-    slice_thickness_mm: float
-    contact: Contact
-    tools: _containers.RepeatedCompositeFieldContainer[_geometry_pb2.Tool]
-    ghost: float
-    registration: str
-    height: int
-    width: int
-    outputs: _containers.RepeatedScalarFieldContainer[Output]
-    encoding: Encoding
     data: bytes
     shared_data: SharedData
     timings: Timings
     error: _scenes_pb2.Error
     dropped: int
-    extrapolation: Extrapolation
+    client_time_ns: int
+    scene: str
+    scene_sha256: str
+    renderer: str
+    pose: _geometry_pb2.Matrix
+    probe: _geometry_pb2.Probe
+    height: int
+    width: int
+    outputs: _containers.RepeatedScalarFieldContainer[Output]
+    encoding: Encoding
     display: Display
     picture: Picture
     rendered_height: int
     rendered_width: int
-    client_time_ns: int
-    def __init__(self, sequence: _Optional[int] = ..., scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., renderer: _Optional[str] = ..., pose: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., slice_thickness_mm: _Optional[float] = ..., contact: _Optional[_Union[Contact, str]] = ..., tools: _Optional[_Iterable[_Union[_geometry_pb2.Tool, _Mapping]]] = ..., ghost: _Optional[float] = ..., registration: _Optional[str] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., data: _Optional[bytes] = ..., shared_data: _Optional[_Union[SharedData, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., error: _Optional[_Union[_scenes_pb2.Error, _Mapping]] = ..., dropped: _Optional[int] = ..., extrapolation: _Optional[_Union[Extrapolation, _Mapping]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., picture: _Optional[_Union[Picture, _Mapping]] = ..., rendered_height: _Optional[int] = ..., rendered_width: _Optional[int] = ..., client_time_ns: _Optional[int] = ...) -> None: ...
+    extrapolation: Extrapolation
+    slice_thickness_mm: float
+    contact: Contact
+    tools: _containers.RepeatedCompositeFieldContainer[_geometry_pb2.Tool]
+    ghost: float
+    registration: str
+    min_confidence: float
+    below_min_confidence: BelowConfidence
+    def __init__(self, sequence: _Optional[int] = ..., data: _Optional[bytes] = ..., shared_data: _Optional[_Union[SharedData, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., error: _Optional[_Union[_scenes_pb2.Error, _Mapping]] = ..., dropped: _Optional[int] = ..., client_time_ns: _Optional[int] = ..., scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., renderer: _Optional[str] = ..., pose: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., picture: _Optional[_Union[Picture, _Mapping]] = ..., rendered_height: _Optional[int] = ..., rendered_width: _Optional[int] = ..., extrapolation: _Optional[_Union[Extrapolation, _Mapping]] = ..., slice_thickness_mm: _Optional[float] = ..., contact: _Optional[_Union[Contact, str]] = ..., tools: _Optional[_Iterable[_Union[_geometry_pb2.Tool, _Mapping]]] = ..., ghost: _Optional[float] = ..., registration: _Optional[str] = ..., min_confidence: _Optional[float] = ..., below_min_confidence: _Optional[_Union[BelowConfidence, str]] = ...) -> None: ...
 
 class SharedData(_message.Message):
     __slots__ = ("slot", "bytes")

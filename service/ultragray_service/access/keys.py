@@ -3,23 +3,26 @@
 from __future__ import annotations
 
 import json
+import logging
 import re
 import secrets
+import threading
 import time
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from types import MappingProxyType
 
 import sqlalchemy as sa
+from sqlalchemy.exc import SQLAlchemyError
 
 from ultragray.contract import described
-from ultragray.errors import InvalidArgument
-from ultragray_service.access.guard import digest_of
-from ultragray_service.access.limits.allowance import Number
-from ultragray_service.access.principal import Principal, Role
+from ultragray.errors import InvalidArgument, UltragrayError
+from ultragray_service.access.credentials import digest_of
+from ultragray_service.access.principals import Number, Principal, Role
 from ultragray_service.errors import PermissionDenied, Unauthenticated
 from ultragray_workers.jobs.queue.owners import tell_change
-from ultragray_workers.jobs.queue.tables import KEYS
+from ultragray_workers.jobs.queue.tables import CHANGES, KEYS
+from ultragray_workers.rounds import Rounds
 
 _PREFIX = "ultragray_"  # so that people, and those who search files for secrets, know one when they see it
 _RANDOM_BYTES = 32
@@ -182,3 +185,69 @@ class KnownKeys:
         """When keys were used last, by their ids, since the last call."""
         taken, self._used_at_s = self._used_at_s, {}
         return dict(taken)  # a request may still be writing into the other one
+
+
+# The copy in memory of what the jobs' database knows of keys, owners and registrations, a second or two old.
+#
+# Requests are checked against the copy: no frame waits for the database. While the database is away the last copy
+# holds, and so do the times at which keys expire.
+
+
+INTERVAL_S = 1.0
+_USES_EVERY = 30  # intervals
+_COPIED = "keys, owners and registrations"
+
+_log = logging.getLogger("ultragray.access")
+
+
+class Snapshot:
+    """Reads what is copied again whenever something of it changed, in a thread of its own."""
+
+    def __init__(self, engine: sa.Engine, keys: KnownKeys, copies: Sequence[Callable[[sa.Connection], None]]) -> None:
+        """Fills `keys`, and calls `copies` to be filled: the first copy is there when this returns.
+
+        Raises DatabaseUnavailable.
+        """
+        self._engine, self._keys, self._copies = engine, keys, copies
+        self._number: int | None = None
+        self._is_away = False
+        self._stop = threading.Event()
+        self.refresh()
+        self._thread = threading.Thread(target=self._run, name="access", daemon=True)
+        self._thread.start()
+
+    def refresh(self) -> None:
+        """Reads what changed since the last call. Raises DatabaseUnavailable."""
+        with self._engine.connect() as connection:
+            number = connection.execute(sa.select(CHANGES.c.number)).scalar()  # first: what follows is as new or newer
+            if number != self._number:
+                self._keys.replace(read_keys(connection))
+                for copy in self._copies:
+                    copy(connection)
+                self._number = number
+
+    def close(self) -> None:
+        """Ends the thread."""
+        self._stop.set()
+        self._thread.join()
+
+    def _run(self) -> None:
+        rounds, round_number = Rounds(f"the watch over {_COPIED}", _log), 0
+        while not self._stop.wait(INTERVAL_S):
+            round_number += 1
+            with rounds.round():
+                self._look(notes_uses=round_number % _USES_EVERY == 0)
+
+    def _look(self, *, notes_uses: bool) -> None:
+        try:
+            self.refresh()
+            if notes_uses:
+                KeyStore(self._engine).note_uses(self._keys.take_uses())
+        except (UltragrayError, SQLAlchemyError) as error:
+            if not self._is_away:
+                _log.warning(f"{_COPIED} stay as they are for now: {str(error).splitlines()[0]}")
+            self._is_away = True
+        else:
+            if self._is_away:
+                _log.warning(f"{_COPIED} are read again")
+            self._is_away = False

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import ipaddress
 import re
+from collections.abc import Sequence
 from functools import lru_cache
 from urllib.parse import urlsplit
 
-from ultragray_service.access.addresses import is_loopback
+from ultragray_service.access.principals import is_loopback
 from ultragray_service.errors import HostRefused, OriginRefused
-from ultragray_service.settings import Settings
 
 _ANY = "*"
 _HOST = re.compile(r"(\[(?P<address>[0-9A-Fa-f:.]+)\]|(?P<name>[A-Za-z0-9._-]+))(:[0-9]{0,5})?", re.ASCII)
@@ -23,12 +23,13 @@ _HOST = re.compile(r"(\[(?P<address>[0-9A-Fa-f:.]+)\]|(?P<name>[A-Za-z0-9._-]+))
 class Origins:
     """Checks the headers of requests that browsers sent; those of other programs have no Origin."""
 
-    def __init__(self, settings: Settings) -> None:
-        self._pages = frozenset(settings.cors_origins)
-        self._hosts = frozenset(name.lower() for name in (settings.host, *settings.allowed_hosts))
+    def __init__(self, host: str, *, names: Sequence[str], pages: Sequence[str]) -> None:
+        """`host`: that the service listens at; `names`: others that it is known as; `pages`: origins of other sites."""
+        self._pages = frozenset(pages)
+        self._hosts = frozenset(name.lower() for name in (host, *names))
         # An address is not a name that anybody could point here. It is checked all the same where only this machine is
         # served, which no other address can be the right one of.
-        self._any_address = not is_loopback(settings.host)
+        self._any_address = not is_loopback(host)
         self._is_allowed_host = lru_cache(maxsize=256)(self._allows_host)
 
     def require_host(self, host: str | None) -> None:

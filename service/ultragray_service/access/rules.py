@@ -10,7 +10,7 @@ from dataclasses import dataclass
 
 from starlette.routing import compile_path
 
-from ultragray_service.access.principal import Role
+from ultragray_service.access.principals import Role
 from ultragray_workers.jobs.queue.owners import Kind
 
 STREAM = "stream"  # the operation of poses in, frames out

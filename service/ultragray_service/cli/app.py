@@ -1,49 +1,261 @@
-"""The command line `ultragray`. Its commands stand in one table here; each is imported when it is used."""
+"""The command line `ultragray`: a table of commands, each imported when it is used; mistakes are told in one line."""
 
 from __future__ import annotations
 
-from typing import Annotated
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from difflib import get_close_matches
+from functools import cached_property
+from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
+from typing import Annotated, Any
 
 import typer
+from typer.core import TyperCommand, TyperGroup
 
-from ultragray_service.cli.group import Entry, LazyGroup
-from ultragray_service.cli.style import examples
+from ultragray_service.cli.terminal import examples
+
+USER_ERROR = 2  # the exit code of a mistake that the caller can mend
+INTERRUPTED = 130  # the exit code of a command that Ctrl-C or SIGTERM stopped
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A command of the group that is not loaded yet."""
+
+    name: str
+    app: str  # "module:name" of the typer app of the command, or of the group of commands; .module: of this package
+    panel: str
+    summary: str  # the first line of its help
+
+    def load(self) -> Any:
+        """The command, or the group of commands, with its whole help. Imports its module."""
+        module, _, name = self.app.partition(":")
+        command = typer.main.get_command(getattr(import_module(module, __package__), name))
+        command.name = self.name
+        command.help = "\n\n".join(filter(None, (self.summary, command.help)))
+        command.rich_help_panel = self.panel  # type: ignore[attr-defined]
+        return command
+
+    def described(self) -> TyperCommand:
+        """A command that has a name and a line of help, for lists, and cannot be run."""
+        return TyperCommand(self.name, help=self.summary, rich_help_panel=self.panel)
+
+
+class _Loaded(Mapping[str, Any]):
+    """Commands of a group by name, each loaded when it is asked for."""
+
+    def __init__(self, group: LazyGroup) -> None:
+        self._group = group
+
+    def __getitem__(self, name: str) -> Any:
+        if (entry := self._group.entry(name)) is None:
+            raise KeyError(name)
+        return entry.load()
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._group.list_commands(None))
+
+    def __len__(self) -> int:
+        return len(self._group.list_commands(None))
+
+
+def _entries_of(point: EntryPoint) -> tuple[Entry, ...]:
+    """The entries of another package; none, and a warning, where it cannot be imported."""
+    try:
+        return tuple(point.load())
+    except ImportError as error:
+        typer.secho(f"warning: the commands of {point.value} are left out: {error}", fg=typer.colors.YELLOW, err=True)
+        return ()
+
+
+class LazyGroup(TyperGroup):
+    """A group whose commands are loaded when they run; lists of them need only the entries.
+
+    Mistakes end the process with one line on stderr, `error: …`, and exit code 2. So do the errors of the project and
+    of the file system.
+    """
+
+    entries: tuple[Entry, ...] = ()
+    plugins: str | None = None  # group of the entry points of other packages, each a tuple of entries
+
+    def __init__(self, **attributes: Any) -> None:
+        super().__init__(**attributes)
+        self.commands = _Loaded(self)  # type: ignore[assignment]  # nobody adds to it
+
+    @cached_property
+    def _own(self) -> dict[str, Entry]:
+        return {entry.name: entry for entry in self.entries}
+
+    @cached_property
+    def _all(self) -> dict[str, Entry]:
+        """The own entries, and those of other packages; to find these takes some hundredths of a second."""
+        found = [] if self.plugins is None else entry_points(group=self.plugins)
+        return {**{entry.name: entry for point in found for entry in _entries_of(point)}, **self._own}
+
+    def entry(self, name: str) -> Entry | None:
+        """The entry of a command; None: there is none of that name."""
+        return self._own.get(name) or self._all.get(name)
+
+    def list_commands(self, ctx: Any) -> list[str]:
+        """The names, the own ones first, in the order of the entries."""
+        return [*self._own, *(name for name in self._all if name not in self._own)]
+
+    def get_command(self, ctx: Any, cmd_name: str) -> Any:
+        """A command as lists show it; what runs comes from `resolve_command`."""
+        entry = self.entry(cmd_name)
+        return None if entry is None else entry.described()
+
+    def resolve_command(self, ctx: Any, args: list[str]) -> Any:
+        """The command that the arguments begin with, loaded."""
+        name, found, rest = super().resolve_command(ctx, args)
+        entry = self.entry(name or "")
+        return name, found if entry is None else entry.load(), rest
+
+    def main(
+        self,
+        args: Sequence[str] | None = None,
+        prog_name: str | None = None,
+        complete_var: str | None = None,
+        standalone_mode: bool = True,
+        windows_expand_args: bool = True,
+        **extra: Any,
+    ) -> Any:
+        """Run the command line; in standalone mode the process ends with its exit code."""
+        prog_name = prog_name or "ultragray"  # also by `python -m` and the like
+        if not standalone_mode:
+            return super().main(args, prog_name, complete_var, False, windows_expand_args, **extra)
+        try:
+            code = super().main(args, prog_name, complete_var, False, windows_expand_args, **extra)
+        except typer.TyperException as error:
+            if type(error).__name__ != "NoArgsIsHelpError":  # the help has been printed
+                _say_error(_in_one_line(error))
+            raise SystemExit(USER_ERROR) from None
+        except typer.Abort:
+            raise SystemExit(INTERRUPTED) from None
+        raise SystemExit(code if isinstance(code, int) else 0)
+
+    def invoke(self, ctx: Any) -> Any:
+        """Run the command; errors of the project and of the file system become a line and exit code 2."""
+        from ultragray.errors import UltragrayError
+        from ultragray.installation import missing_extra
+
+        try:
+            return super().invoke(ctx)
+        except BrokenPipeError:  # `ultragray show scene.ugr | head`: nobody is left to tell
+            raise
+        except UltragrayError as error:
+            message = error.detail
+        except ModuleNotFoundError as error:
+            message = missing_extra(error, "this command").detail
+        except OSError as error:
+            message = f"{error.filename}: {error.strerror}" if error.filename and error.strerror else str(error)
+        _say_error(message)
+        raise typer.Exit(USER_ERROR)
+
+
+def _say_error(message: str) -> None:
+    typer.secho(f"error: {message}", fg=typer.colors.RED, err=True)
+
+
+def _in_one_line(error: typer.TyperException) -> str:
+    """The sentence of a mistake in the command line, with what was perhaps meant, and where the help is."""
+    context = getattr(error, "ctx", None)
+    option = getattr(error, "option_name", None)
+    if option is not None and type(error).__name__ == "NoSuchOption":
+        sentence = f"no such option: {option}{_perhaps(option, _options_of(context))}"
+    else:
+        sentence = _about_value(error) or " ".join(error.format_message().split()).rstrip(".")
+        sentence = sentence[:1].lower() + sentence[1:]
+    return sentence if context is None else f"{sentence} (see `{context.command_path} --help`)"
+
+
+def _about_value(error: typer.TyperException) -> str | None:
+    """The sentence for a value that an option cannot take, with the value; None for other mistakes."""
+    parameter, reasons = getattr(error, "param", None), getattr(error.__cause__, "errors", None)
+    if parameter is None or reasons is None:  # of pydantic's ValidationError, which typer reads values with
+        return None
+    reason = reasons()[0]
+    message, _, choices = str(reason["msg"]).partition(" is not one of ")
+    if choices:
+        expected = f"must be one of {choices.rstrip('.')}".replace("'", "")
+    else:
+        expected = message.partition(",")[0].replace("Input should be", "must be")
+    name = parameter.opts[0] if parameter.param_type_name == "option" else parameter.display_name_raw.upper()
+    return f"{name} {expected}, got {reason['input']!r}" if "must be" in expected else None
+
+
+def _options_of(context: Any) -> list[str]:
+    if context is None:
+        return []
+    return [name for parameter in context.command.get_params(context) for name in parameter.opts if name[:2] == "--"]
+
+
+def _perhaps(word: str, known: list[str]) -> str:
+    found = get_close_matches(word, known, n=2)
+    return f"; did you mean {' or '.join(found)}?" if found else ""
+
+
+# The command line `ultragray`. Its commands stand in one table here; each is imported when it is used.
+
 
 _SERVING, _SCENES, _SWEEPS = "Serve", "Scenes and frames", "Sweeps and training"
 _REMOTE, _INSTALLATION = "A running service (--address)", "An installation's folders"
 
 
 class _Commands(LazyGroup):
+    plugins = "ultragray.commands"
     entries = (
-        Entry("serve", "serve", _SERVING, "Serve scenes over HTTP and gRPC, until Ctrl-C or SIGTERM."),
-        Entry("worker", "worker", _SERVING, "Take jobs from the queue, one at a time, until Ctrl-C."),
-        Entry("demo", "scenes.demo", _SCENES, "Write the built-in demo scene."),
-        Entry("show", "scenes.show", _SCENES, "Print what a scene file or a sweep says about itself."),
-        Entry("render", "scenes.render", _SCENES, "Render frames from poses into one file or a folder of PNGs."),
-        Entry("export", "scenes.export", _SCENES, "Write a scene as PLY or as a checkpoint of the released code."),
-        Entry("localize", "scenes.localize", _SCENES, "Find the pose of a real frame in a scene."),
-        Entry("calibrate", "scenes.calibrate", _SCENES, "Register a robot or tracker to a scene."),
-        Entry("voxelize", "scenes.voxelize", _SCENES, "Sample a scene on a grid: a NIfTI or NRRD volume, or a slice."),
-        Entry("slicer", "scenes.slicer", _SCENES, "Write a scene file of 3D Slicer that shows a served scene live."),
-        Entry("import", "scenes.importing", _SCENES, "Turn a PLY file or a released checkpoint into a scene file."),
-        Entry("check", "sweeps.check", _SWEEPS, "Tell what is in a sweep, and what looks wrong."),
-        Entry("draw", "sweeps.draw", _SWEEPS, "Draw the image planes in space and a contact sheet of the frames."),
-        Entry("convert", "sweeps.convert", _SWEEPS, "Write a sweep in the layout of the released trainer."),
-        Entry("train", "studies.train", _SWEEPS, "Train a scene from a tracked sweep."),
-        Entry("eval", "studies.eval", _SWEEPS, "Measure a scene on the held-out frames of a sweep."),
-        Entry("compare", "studies.compare", _SWEEPS, "Compare this and other methods on the same frames."),
-        Entry("report", "studies.report", _SWEEPS, "Train, measure and compare; write one HTML page."),
-        Entry("bench", "studies.bench", _SWEEPS, "Measure the kernel and the service on this machine."),
-        Entry("scenes", "remote.scenes", _REMOTE, "List, upload, download, delete and render scenes."),
-        Entry("datasets", "remote.datasets", _REMOTE, "List, upload and delete the sweeps that trainings use."),
-        Entry("registrations", "remote.registrations", _REMOTE, "List, upload and delete registrations of robots."),
-        Entry("jobs", "remote.jobs", _REMOTE, "Submit, watch and fetch trainings, evaluations and batch renderings."),
-        Entry("workers", "remote.workers", _REMOTE, "List the workers of the jobs; pause, drain and resume them."),
-        Entry("keys", "administration.keys", _INSTALLATION, "Make, list and revoke API keys."),
-        Entry("backup", "administration.backup", _INSTALLATION, "Save scenes, datasets, jobs and their database."),
-        Entry("restore", "administration.restore", _INSTALLATION, "Make an installation what it was at a backup."),
-        Entry("storage", "administration.storage", _INSTALLATION, "Copy scenes into a bucket, or out of it."),
-        Entry("audit", "administration.audit", _INSTALLATION, "Print who did what: the audit log."),
+        Entry("serve", ".serve:command_app", _SERVING, "Serve scenes over HTTP and gRPC, until Ctrl-C or SIGTERM."),
+        Entry("worker", ".worker:command_app", _SERVING, "Take jobs from the queue, one at a time, until Ctrl-C."),
+        Entry("demo", ".scenes:demo_app", _SCENES, "Write the built-in demo scene."),
+        Entry("show", ".scenes:show_app", _SCENES, "Print what a scene file or a sweep says about itself."),
+        Entry("render", ".render:command_app", _SCENES, "Render frames from poses into one file or a folder of PNGs."),
+        Entry("export", ".scenes:export_app", _SCENES, "Write a scene as PLY or as a checkpoint of the released code."),
+        Entry("localize", ".register:localize_app", _SCENES, "Find the pose of a real frame in a scene."),
+        Entry("calibrate", ".register:calibrate_app", _SCENES, "Register a robot or tracker to a scene."),
+        Entry(
+            "voxelize", ".scenes:voxelize_app", _SCENES, "Sample a scene on a grid: a NIfTI or NRRD volume, or a slice."
+        ),
+        Entry(
+            "slicer", ".scenes:slicer_app", _SCENES, "Write a scene file of 3D Slicer that shows a served scene live."
+        ),
+        Entry("import", ".scenes:import_app", _SCENES, "Turn a PLY file or a released checkpoint into a scene file."),
+        Entry("check", ".sweeps:check_app", _SWEEPS, "Tell what is in a sweep, and what looks wrong."),
+        Entry("draw", ".sweeps:draw_app", _SWEEPS, "Draw the image planes in space and a contact sheet of the frames."),
+        Entry("convert", ".sweeps:convert_app", _SWEEPS, "Write a sweep in the layout of the released trainer."),
+        Entry("train", ".train:command_app", _SWEEPS, "Train a scene from a tracked sweep."),
+        Entry("eval", ".evaluate:command_app", _SWEEPS, "Measure a scene on the held-out frames of a sweep."),
+        Entry("scenes", ".remote.scenes:command_app", _REMOTE, "List, upload, download, delete and render scenes."),
+        Entry(
+            "datasets",
+            ".remote.datasets:command_app",
+            _REMOTE,
+            "List, upload and delete the sweeps that trainings use.",
+        ),
+        Entry(
+            "registrations",
+            ".remote.registrations:command_app",
+            _REMOTE,
+            "List, upload and delete registrations of robots.",
+        ),
+        Entry(
+            "jobs",
+            ".remote.jobs:command_app",
+            _REMOTE,
+            "Submit, watch and fetch trainings, evaluations and batch renderings.",
+        ),
+        Entry(
+            "workers",
+            ".remote.workers:command_app",
+            _REMOTE,
+            "List the workers of the jobs; pause, drain and resume them.",
+        ),
+        Entry("keys", ".administration:keys_app", _INSTALLATION, "Make, list and revoke API keys."),
+        Entry("backup", ".administration:backup_app", _INSTALLATION, "Save scenes, datasets, jobs and their database."),
+        Entry("restore", ".administration:restore_app", _INSTALLATION, "Make an installation what it was at a backup."),
+        Entry("storage", ".administration:storage_app", _INSTALLATION, "Copy scenes into a bucket, or out of it."),
+        Entry("audit", ".administration:audit_app", _INSTALLATION, "Print who did what: the audit log."),
     )
 
 
@@ -79,7 +291,7 @@ def main(
     ] = False,
 ) -> None:
     """Look for environment variables that are misspelt, whatever the command; a service logs them itself."""
-    from ultragray_service.cli.style import warn
+    from ultragray_service.cli.terminal import warn
     from ultragray_service.misspelt import unknown_variables
 
     if context.invoked_subcommand != "serve":

@@ -29,9 +29,9 @@ import typer
 
 from ultragray.contract import Contract, Family, annotated_fields, from_dict, from_text, optional_of, range_of
 from ultragray.errors import InvalidArgument
-from ultragray.files.poses import load_poses
+from ultragray.exchange.poses import load_poses
+from ultragray.rendering.tools import Tool, load_tools
 from ultragray.samplers import Sampler
-from ultragray.tools import Tool, load_tools
 
 FLAGS = {
     "settings": ("--set",),
@@ -271,7 +271,7 @@ def _parsed_json(text: str, name: str) -> Any:
 
 def parse_settings(settings: list[str]) -> dict[str, Any]:
     """NAME=VALUE pairs, the value as in TOML; a bare word is itself."""
-    from ultragray.training.config import parse_value
+    from ultragray.learn.training.config import parse_value
 
     return {name: parse_value(value) for name, value in pairs_of(settings, "--set").items()}
 

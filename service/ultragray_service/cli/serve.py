@@ -9,11 +9,11 @@ from typing import Annotated, Any
 
 import typer
 
-from ultragray.demo import copy_demo_scene
 from ultragray.errors import InvalidArgument
-from ultragray.scene_info import read_header
+from ultragray.phantom.demo import copy_demo_scene
+from ultragray.scene.info import read_header
 from ultragray_service.cli.options import FieldsOf, with_options
-from ultragray_service.cli.style import command_group, examples
+from ultragray_service.cli.terminal import command_group, examples
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from ultragray_workers.scenes import SUFFIX, SceneStore
 

@@ -14,12 +14,11 @@ import typer
 
 from ultragray.errors import UltragrayError
 from ultragray_service.cli.options import FieldsOf, pairs_of, with_options
-from ultragray_service.cli.style import command_group, examples
-from ultragray_service.service_manager import ALIVE, READY, ServiceManager
+from ultragray_service.cli.terminal import command_group, examples
+from ultragray_service.server import ALIVE, READY, ServiceManager
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from ultragray_workers.errors import StartupFailed
-from ultragray_workers.niceness import let_frames_go_first
-from ultragray_workers.parent import end_with_parent
+from ultragray_workers.processes import end_with_parent, let_frames_go_first
 
 command_app = command_group()
 
@@ -72,8 +71,7 @@ def run_worker(
     """
     from opentelemetry import trace
 
-    from ultragray_service.telemetry.logs import configure_logging
-    from ultragray_service.telemetry.tracing import start_tracing
+    from ultragray_service.telemetry.logs import configure_logging, start_tracing
     from ultragray_workers.jobs.places import shared_storage
     from ultragray_workers.jobs.worker.worker import work
 

@@ -12,8 +12,8 @@ from pydantic import Field
 
 from ultragray.contract import Contract
 from ultragray.errors import InvalidArgument, InvalidPose, TooManyPoses
-from ultragray.pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
-from ultragray.probe import FloatArray
+from ultragray.geometry.pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
+from ultragray.geometry.probe import FloatArray
 
 _CHECKED_INLINE = 16  # more go to a thread, so that the loop keeps answering
 

@@ -1,31 +1,37 @@
-"""The FastAPI application."""
+"""The FastAPI application: routes, documentation, the console, and what stands around every request."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+import asyncio
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
 
 from fastapi import FastAPI
 from fastapi.exceptions import RequestValidationError
+from fastapi.openapi.docs import get_swagger_ui_html
 from fastapi.telemetry import TelemetryConfig
 from pydantic import TypeAdapter
 from starlette.exceptions import HTTPException
 from starlette.middleware.cors import CORSMiddleware
+from starlette.middleware.gzip import GZipMiddleware
+from starlette.requests import Request
+from starlette.responses import HTMLResponse, Response
 from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
+from starlette.staticfiles import StaticFiles
+from starlette.types import Scope
 
 from ultragray import __version__
 from ultragray.errors import UltragrayError
-from ultragray.probe import Probe
-from ultragray.training.config import PRESETS, TrainingConfig
-from ultragray.volumes.plane import SliceSettings
+from ultragray.geometry.probe import Probe
+from ultragray.learn.training.config import PRESETS, TrainingConfig
+from ultragray.rendering.volumes import SliceSettings
 from ultragray_service.access.rules import WEBSOCKET, HttpRules
-from ultragray_service.core.state import Service
+from ultragray_service.errors import RouteNotFound
 from ultragray_service.http import problems
-from ultragray_service.http.console import add_console
-from ultragray_service.http.docs import add_docs
-from ultragray_service.http.middleware import QUIET_PATHS, Authorize, CheckOrigin, LimitBody, RequestContext
-from ultragray_service.http.reading.bodies import (
+from ultragray_service.http.bodies import (
     SPECIFICATIONS,
     AssessBody,
     JobBody,
@@ -33,25 +39,141 @@ from ultragray_service.http.reading.bodies import (
     RegistrationBody,
     RenderBody,
     StreamMessage,
+    adapter_of,
 )
-from ultragray_service.http.reading.json_body import adapter_of
-from ultragray_service.http.routes import (
-    access,
-    comparison,
-    datasets,
-    health,
-    scene_files,
-    scenes,
-    service_info,
-    statistics,
-    stream,
-    streams,
+from ultragray_service.http.dependencies import revalidated
+from ultragray_service.http.middleware import QUIET_PATHS, Authorize, CheckOrigin, LimitBody, RequestContext
+from ultragray_service.http.routes import datasets, geometry, health, jobs, rendering, scenes, streams
+from ultragray_service.http.routes.streams import FrameMessage, RefusalMessage
+from ultragray_service.service import Service
+from ultragray_service.telemetry.logs import Tracing
+from ultragray_workers.storage.local import FileVersion
+
+DOCS_PATH = "/docs"
+# No page of another site shows this one within itself, where its visitors would click on what they do not see.
+NOT_FRAMED = {"Content-Security-Policy": "frame-ancestors 'none'", "X-Frame-Options": "DENY"}
+_STATIC_PATH = f"{DOCS_PATH}/static"
+
+
+def add_docs(app: FastAPI) -> None:
+    """Serves the pages under /docs."""
+    app.mount(_STATIC_PATH, StaticFiles(packages=[("fastapi_offline", "static")]))
+    page = get_swagger_ui_html(
+        openapi_url=str(app.openapi_url),
+        title=app.title,
+        swagger_js_url=f"{_STATIC_PATH}/swagger-ui-bundle.js",
+        swagger_css_url=f"{_STATIC_PATH}/swagger-ui.css",
+        swagger_favicon_url=f"{_STATIC_PATH}/favicon.png",
+    )
+
+    page.headers.update(NOT_FRAMED)
+
+    @app.get(DOCS_PATH, include_in_schema=False)
+    async def docs() -> HTMLResponse:
+        return page
+
+
+# The console: the page that a browser gets at /, from the files that `make console` built.
+
+
+CONSOLE_FOLDER = Path(__file__).resolve().parents[1] / "console"
+ASSETS_PATH = "/assets"
+_PAGE_NAME = "index.html"
+_BESIDE = {"favicon.svg": "image/svg+xml", "licences.txt": "text/plain"}  # the page: file name and media type
+CONSOLE_PATHS = ("/", *(f"/{name}" for name in _BESIDE))  # and below ASSETS_PATH: a page cannot send a key for itself
+_HOST = re.compile(r"[A-Za-z0-9._:\[\]-]+")
+_POLICY = (
+    "default-src 'self'",
+    "img-src 'self' blob:",  # frames, and files that are saved
+    "object-src 'none'",
+    "base-uri 'none'",
+    "form-action 'none'",
+    NOT_FRAMED["Content-Security-Policy"],
 )
-from ultragray_service.http.routes.geometry import probes, registrations
-from ultragray_service.http.routes.jobs import jobs, training, workers
-from ultragray_service.http.routes.rendering import render, slices
-from ultragray_service.http.stream_messages import FrameMessage, RefusalMessage
-from ultragray_service.telemetry.tracing import Tracing
+_PAGE_HEADERS = {
+    "Cross-Origin-Opener-Policy": "same-origin",
+    "Permissions-Policy": "camera=(), geolocation=(), microphone=()",
+    "Referrer-Policy": "no-referrer",
+    "X-Content-Type-Options": "nosniff",
+    "Cache-Control": "no-cache",
+}
+_ASSET_HEADERS = {"X-Content-Type-Options": "nosniff", "Cache-Control": "public, max-age=31536000, immutable"}
+_NOT_BUILT = """<!doctype html>
+<html lang="en">
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<title>UltraG-Ray</title>
+<h1>UltraG-Ray</h1>
+<p>The service runs. Its console was not built: with Node 20 or newer, run <code>make console</code> in the sources,
+then load this page again.</p>
+<p>Everything can be done without it, too: <a href="/docs">try the routes</a>, or use the command line and the Python
+client.</p>
+</html>
+"""
+
+
+def add_console(
+    app: FastAPI, folder: Path = CONSOLE_FOLDER, *, token_origin: Callable[[], str | None] = lambda: None
+) -> None:
+    """Serves the console in `folder`, which may be built while the service runs; without it, a page that says how.
+
+    `token_origin`: the one other site that the page may ask, for the tokens of those who sign in there.
+    """
+    app.mount(ASSETS_PATH, GZipMiddleware(_Assets(directory=folder / "assets", check_dir=False), minimum_size=1024))
+
+    @app.api_route("/", methods=["GET", "HEAD"], include_in_schema=False)
+    async def console(request: Request) -> Response:
+        try:
+            return await _file(request, folder / _PAGE_NAME, "text/html", token_origin())
+        except FileNotFoundError:
+            return HTMLResponse(_NOT_BUILT, headers=_headers(request, token_origin()))
+
+    async def beside(request: Request) -> Response:
+        name = request.url.path[1:]
+        try:
+            return await _file(request, folder / name, _BESIDE[name], None)
+        except FileNotFoundError:
+            raise RouteNotFound(f"there is no route /{name}: the console was not built") from None
+
+    for name in _BESIDE:
+        app.add_api_route(f"/{name}", beside, methods=["GET", "HEAD"], include_in_schema=False)
+
+
+async def _file(request: Request, path: Path, media_type: str, token_origin: str | None) -> Response:
+    """Raises FileNotFoundError."""
+
+    async def whole() -> Response:
+        return Response(await asyncio.to_thread(path.read_bytes), media_type=media_type)
+
+    response = await revalidated(request, FileVersion.of(path).tag, whole)
+    response.headers.update(_headers(request, token_origin))
+    return response
+
+
+def _headers(request: Request, token_origin: str | None) -> Mapping[str, str]:
+    """'self' is no WebSocket to some browsers, so that those of this host are named."""
+    host = request.headers.get("host", "")
+    sockets = f" ws://{host} wss://{host}" if _HOST.fullmatch(host) else ""
+    tokens = "" if token_origin is None else f" {token_origin}"
+    policy = "; ".join((*_POLICY, f"connect-src 'self'{sockets}{tokens}"))
+    return {**NOT_FRAMED, **_PAGE_HEADERS, "Content-Security-Policy": policy}
+
+
+class _Assets(StaticFiles):
+    """Files whose names change with their content."""
+
+    async def check_config(self) -> None:
+        """No folder yet is no mistake: each file is not found."""
+
+    async def get_response(self, path: str, scope: Scope) -> Response:
+        response = await super().get_response(path, scope)
+        response.headers.update(_ASSET_HEADERS)
+        return response
+
+
+# The FastAPI application.
+
 
 _DESCRIPTION = """B-mode frames from trained 3D-Gaussian ultrasound scenes.
 
@@ -73,23 +195,23 @@ _SECURITY_SCHEMES = {
 
 # render comes first: its route is the one that must be found fast
 _ROUTERS = (
-    render.router,
-    slices.router,
-    stream.router,
-    scenes.router,
-    scene_files.router,
-    probes.router,
-    registrations.router,
-    datasets.router,
-    comparison.router,
-    jobs.router,
-    training.router,
-    workers.router,
+    rendering.router,
+    rendering.slices_router,
     streams.router,
-    statistics.router,
-    service_info.router,
+    scenes.router,
+    scenes.files_router,
+    geometry.router,
+    geometry.registrations_router,
+    datasets.router,
+    datasets.comparison_router,
+    jobs.router,
+    jobs.training_router,
+    jobs.workers_router,
+    streams.streams_router,
+    health.statistics_router,
+    health.service_router,
     health.router,
-    access.router,
+    health.access_router,
 )
 
 _READ: tuple[Any, ...] = (
@@ -138,7 +260,7 @@ def create_app(service: Service) -> FastAPI:
             allow_origins=list(service.settings.cors_origins),
             allow_methods=["GET", "POST", "PUT", "DELETE"],
             allow_headers=["*"],
-            expose_headers=["Retry-After", *{**render.RENDER_HEADERS, **slices.SLICE_HEADERS}],
+            expose_headers=["Retry-After", *{**rendering.RENDER_HEADERS, **rendering.SLICE_HEADERS}],
         )
     app.add_middleware(CheckOrigin, guard=service.guard, origins=service.origins)
     app.add_middleware(RequestContext, metrics=service.metrics)

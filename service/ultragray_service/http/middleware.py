@@ -12,16 +12,14 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from ultragray.errors import UltragrayError
 from ultragray_service.access.audit import NOBODY
-from ultragray_service.access.credentials import credentials_of_subprotocols, offered_credential
-from ultragray_service.access.guard import Guard
+from ultragray_service.access.credentials import Guard, credentials_of_subprotocols, offered_credential
 from ultragray_service.access.origins import Origins
 from ultragray_service.access.rules import UNKNOWN, WEBSOCKET, HttpRules, Operation
-from ultragray_service.core.state import Service
 from ultragray_service.errors import BodyTooLarge, HostRefused, OriginRefused
 from ultragray_service.http.problems import problem_response
-from ultragray_service.telemetry.logs import choose_request_id, request_id
+from ultragray_service.service import Service
+from ultragray_service.telemetry.logs import REQUEST_ID_ATTRIBUTE, choose_request_id, request_id
 from ultragray_service.telemetry.metrics import Metrics
-from ultragray_service.telemetry.tracing import REQUEST_ID_ATTRIBUTE
 
 REQUEST_ID_HEADER = "X-Request-Id"
 QUIET_PATHS = ("/v1/health/", "/metrics")
@@ -155,7 +153,9 @@ class Authorize:
             credential = offered_credential(headers.getlist("authorization"), keys)
             principal = service.guard.authenticate(credential)
         connection = f"{address}:{port}"
-        async with service.permitted(principal, credential, operation, target, address=address, connection=connection):
+        async with service.admission.permitted(
+            principal, credential, operation, target, address=address, connection=connection
+        ):
             await self._app(scope, receive, send)
 
 

@@ -11,32 +11,33 @@ from dataclasses import replace
 from typing import Protocol
 
 from ultragray.errors import UltragrayError
-from ultragray.settings import FrameSettings
-from ultragray_service.core.state import Service
-from ultragray_service.core.streams.answers import Answered
-from ultragray_service.core.streams.buffers import hold_little
-from ultragray_service.core.streams.open_streams import OpenStream
-from ultragray_service.core.streams.unread import Unread
+from ultragray.rendering.settings import FrameSettings
+from ultragray_service.core.open_streams import Answered, OpenStream
+from ultragray_service.core.unread import Unread, hold_little
 from ultragray_service.errors import IgtlMessageInvalid
-from ultragray_service.igtl.commands.answer import answer
-from ultragray_service.igtl.commands.scanner import Scanner, Setup
+from ultragray_service.igtl.commands import Scanner, Setup, answer
 from ultragray_service.igtl.contents import (
+    CAPABILITY,
+    COMMAND_TYPES,
+    HEARD,
+    KINDS,
+    OK,
+    POSE_TYPES,
+    UNDERSTOOD,
     Status,
     pack_capability,
     pack_status,
+    state_of,
     unpack_instruments,
     unpack_interval_s,
     unpack_position,
     unpack_transform,
 )
-from ultragray_service.igtl.feed import Feed
-from ultragray_service.igtl.frames import Frame, FrameMaker
-from ultragray_service.igtl.kinds import CAPABILITY, COMMAND_TYPES, HEARD, KINDS, POSE_TYPES, UNDERSTOOD
+from ultragray_service.igtl.frames import Feed, Frame, FrameMaker, PoseMessage, Underway, WaitingPoses
 from ultragray_service.igtl.messages import HEADER_BYTES, Header, Message, pack_message, unpack_header, unpack_message
 from ultragray_service.igtl.routes import SceneChooser
-from ultragray_service.igtl.states import OK, state_of
-from ultragray_service.igtl.waiting import PoseMessage, Underway, WaitingPoses
-from ultragray_workers.pool.types import RenderResult
+from ultragray_service.service import Service
+from ultragray_workers.pool.messages import RenderResult
 
 MAX_BODY_BYTES = 64 * 1024  # of a message that is read
 MAX_SKIPPED_BYTES = 64 * 2**20  # of a message that is not
@@ -173,7 +174,7 @@ class Connection:
         elif message.type_name == "GET_CAPABIL":
             await self._send(_reply("CAPABILITY", message, pack_capability(CAPABILITY)))
         elif message.type_name == "GET_STATUS":
-            self._service.require_frames()
+            self._service.rendering.require_frames()
             await self._send(_reply("STATUS", message, pack_status(Status(OK, 0, "OK", "ready"))))
         elif prefix == "GET_":
             await self._send(self._newest_frame(KINDS[suffix], message))

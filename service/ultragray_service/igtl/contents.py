@@ -1,20 +1,73 @@
-"""The contents of OpenIGTLink messages: poses, instruments, images, states, requests. All numbers are big-endian."""
+"""The types of messages and what they hold: poses, instruments, images, states, requests. Numbers are big-endian."""
 
 from __future__ import annotations
 
 import math
 import struct
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from ultragray.errors import InvalidPose
-from ultragray.pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
-from ultragray.probe import FloatArray
-from ultragray_service.errors import IgtlMessageInvalid
+from ultragray.errors import (
+    BackendUnavailable,
+    InvalidArgument,
+    InvalidPose,
+    MemoryExceeded,
+    SceneFileInvalid,
+    UltragrayError,
+)
+from ultragray.geometry.pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
+from ultragray.geometry.probe import FloatArray
+from ultragray_service.errors import (
+    IgtlMessageInvalid,
+    LimitReached,
+    PermissionDenied,
+    RateLimited,
+    TooManyConnections,
+    Unauthenticated,
+    statuses_of,
+)
 from ultragray_service.igtl.messages import DEVICE_NAME_BYTES, pack_text, unpack_text
+from ultragray_workers.errors import (
+    DeadlineExceeded,
+    Draining,
+    NotReady,
+    QueueFull,
+    RegistrationNotFound,
+    SceneNotFound,
+    SceneTooLarge,
+    StorageUnavailable,
+)
+
+POSE_TYPES = ("TRANSFORM", "POSITION", "TDATA", "QTDATA")
+COMMAND_TYPES = ("COMMAND", "STRING")
+
+KINDS: Mapping[str, str] = {  # by what stands behind GET_, STT_ and STP_: a type has at most 12 letters
+    "IMAGE": "IMAGE",
+    "TRANSFOR": "TRANSFORM",
+    "TRANS": "TRANSFORM",  # in older documents of the protocol
+    "POSITION": "POSITION",
+    "TDATA": "TDATA",
+    "QTDATA": "QTDATA",
+}
+
+_PREFIXES = ("GET_", "STT_", "STP_")
+CAPABILITY = (
+    *POSE_TYPES,
+    *COMMAND_TYPES,
+    "GET_CAPABIL",
+    "GET_STATUS",
+    *(f"{prefix}{suffix}" for suffix in KINDS if suffix != "TRANS" for prefix in _PREFIXES),
+)
+UNDERSTOOD = frozenset({*CAPABILITY, *(f"{prefix}TRANS" for prefix in _PREFIXES)})
+
+HEARD = ("STATUS", "CAPABILITY", "RTS_")  # beginnings of types that are answers themselves
+
+
+# The contents of OpenIGTLink messages: poses, instruments, images, states, requests. All numbers are big-endian.
+
 
 TYPE_NAME_BYTES = 12
 
@@ -200,3 +253,40 @@ def _placed(values: bytes, what: str) -> FloatArray:
     else:
         w = math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))
     return pose_from_position_quaternion(position, (w, x, y, z), field=what)
+
+
+# Errors as OpenIGTLink states: the protocol's own list of codes, and one table from ours to it.
+
+
+OK, UNKNOWN_ERROR, NOT_FOUND, ACCESS_DENIED, BUSY, TIMED_OUT = 1, 2, 4, 5, 6, 7
+CHECKSUM_ERROR, CONFIGURATION_ERROR, NO_RESOURCES, UNKNOWN_INSTRUCTION, NOT_READY, SHUTTING_DOWN = 9, 10, 11, 12, 13, 19
+
+_CODES: dict[type[UltragrayError], int] = {
+    SceneNotFound: NOT_FOUND,
+    RegistrationNotFound: NOT_FOUND,
+    PermissionDenied: ACCESS_DENIED,
+    Unauthenticated: ACCESS_DENIED,
+    QueueFull: BUSY,
+    TooManyConnections: BUSY,
+    RateLimited: BUSY,
+    LimitReached: BUSY,
+    DeadlineExceeded: TIMED_OUT,
+    InvalidArgument: CONFIGURATION_ERROR,
+    SceneFileInvalid: CONFIGURATION_ERROR,
+    MemoryExceeded: NO_RESOURCES,
+    SceneTooLarge: NO_RESOURCES,
+    IgtlMessageInvalid: UNKNOWN_INSTRUCTION,
+    BackendUnavailable: UNKNOWN_INSTRUCTION,
+    NotReady: NOT_READY,
+    StorageUnavailable: NOT_READY,
+    Draining: SHUTTING_DOWN,
+}
+
+
+def state_of(error: UltragrayError) -> Status:
+    """The state that tells an error: code of the list, HTTP status as sub-code, reason as name, detail as text."""
+    if isinstance(error, IgtlMessageInvalid) and error.field == "crc":
+        code = CHECKSUM_ERROR
+    else:
+        code = next((code for kind, code in _CODES.items() if isinstance(error, kind)), UNKNOWN_ERROR)
+    return Status(code, statuses_of(error).http, error.reason, error.detail)

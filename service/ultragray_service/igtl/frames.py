@@ -1,20 +1,23 @@
-"""A rendered frame, and the messages that carry it."""
+"""Poses of a client's devices that wait, the frames that they become, and the messages that tell a frame."""
 
 from __future__ import annotations
 
+import asyncio
+import contextlib
 import json
+import time
+from collections.abc import Awaitable, Callable, Mapping
+from contextlib import AbstractAsyncContextManager
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 
-from ultragray.contract import to_dict
-from ultragray.display.settings import Display, true_to_scale
-from ultragray.registration.registration import Registration
-from ultragray.settings import Encoding, Resolved
-from ultragray.tools import Tool
-from ultragray_service.core.state import Service
-from ultragray_service.igtl.commands.scanner import Scanner
+from ultragray.geometry.probe import FloatArray
+from ultragray.geometry.registration import Registration
+from ultragray.rendering.display import true_to_scale
+from ultragray.rendering.settings import Encoding, Resolved, settings_used
+from ultragray_service.igtl.commands import Scanner, Setup
 from ultragray_service.igtl.contents import (
     Image,
     Instrument,
@@ -25,9 +28,108 @@ from ultragray_service.igtl.contents import (
 )
 from ultragray_service.igtl.messages import Message
 from ultragray_service.igtl.routes import SceneChooser, image_name
-from ultragray_service.igtl.waiting import PoseMessage, Underway
+from ultragray_service.service import Service
+from ultragray_workers.errors import QueueFull
 from ultragray_workers.jobs.queue.owners import Kind, Ownership
-from ultragray_workers.pool.types import RenderResult
+from ultragray_workers.pool.messages import RenderResult
+from ultragray_workers.pool.waiting import Turn
+
+MAX_WAITING_DEVICES = 16
+
+
+@dataclass(frozen=True, eq=False)
+class PoseMessage:
+    """A pose [4, 4] mm of a client's message, under the name of its device."""
+
+    message: Message
+    pose: FloatArray
+    arrived: float  # time.perf_counter(), s
+    replaced: int = 0  # poses of the device that were dropped for this one
+
+
+@dataclass(eq=False)
+class Underway:
+    """A request to the render pool; while it waits there, a newer pose takes its turn, unless the setup has changed."""
+
+    posed: PoseMessage
+    turn: Turn
+    setup: Setup | None = None  # that it is rendered with, once that is known
+    registration: Registration | None = None  # likewise
+
+    @property
+    def pose(self) -> FloatArray:  # [4, 4] mm, exact
+        """The pose of the probe in the scene."""
+        return self._placed(self.posed.pose)
+
+    def give_to(self, posed: PoseMessage, deadline: float, setup: Setup) -> bool:
+        """Whether a newer pose, of a client with that setup now, has taken the turn."""
+        if self.setup is not setup or not self.turn.give_to(self._placed(posed.pose)[None], deadline):
+            return False
+        self.posed = replace(posed, replaced=self.posed.replaced + 1)
+        return True
+
+    def _placed(self, pose: FloatArray) -> FloatArray:
+        return pose if self.registration is None else self.registration.probe_to_scene(pose)
+
+
+class WaitingPoses:
+    """Takes poses as they come and gives them out one after another, each device in its turn."""
+
+    def __init__(self) -> None:
+        self._poses: dict[str, PoseMessage] = {}
+        self._underway: Underway | None = None
+        self._come = asyncio.Event()
+        self._settled = asyncio.Event()
+        self._settled.set()
+
+    def put(self, posed: PoseMessage, deadline: float, setup: Setup) -> bool:
+        """Takes a pose, to begin by `deadline` (time.monotonic(), s), of a client with that setup now; whether it
+        replaced an older one.
+
+        Raises QueueFull where too many devices wait.
+        """
+        name, underway = posed.message.device_name, self._underway
+        older = self._poses.get(name)
+        if older is None and underway is not None and underway.posed.message.device_name == name:
+            if underway.give_to(posed, deadline, setup):
+                return True
+        elif older is None and len(self._poses) >= MAX_WAITING_DEVICES:
+            raise QueueFull(f"at most {MAX_WAITING_DEVICES} devices of a client may wait for their frames")
+        self._poses[name] = posed if older is None else replace(posed, replaced=older.replaced + 1)
+        self._come.set()
+        self._settled.clear()
+        return older is not None
+
+    def again(self, posed: PoseMessage) -> None:
+        """Takes a pose that was there before and is to be rendered with another setup.
+
+        One of its device that still waits will be.
+        """
+        if posed.message.device_name not in self._poses:
+            self._poses[posed.message.device_name] = posed
+            self._come.set()
+            self._settled.clear()
+
+    async def come(self) -> None:
+        """Waits for a pose. What was given out before has its answer by now."""
+        self._underway = None
+        if not self._poses:
+            self._settled.set()
+            self._come.clear()
+            await self._come.wait()
+
+    def take(self) -> Underway:
+        """Takes a pose out, of which there is one."""
+        self._underway = Underway(self._poses.pop(next(iter(self._poses))), Turn())
+        return self._underway
+
+    async def settled(self) -> None:
+        """Waits until every pose so far was answered or replaced."""
+        await self._settled.wait()
+
+
+# A rendered frame, and the messages that carry it.
+
 
 _SLICE_MM = 1.0  # nominal thickness: an image of one slice has none
 
@@ -68,8 +170,7 @@ class Frame:
             "scene": result.scene,
             "scene_sha256": result.scene_sha256,
             "renderer": result.renderer,
-            "slice_thickness_mm": repr(result.settings.beam.thickness_mm),
-            "display": _text(result.settings.display),
+            **_settings_texts(result.settings),
             **self._placing(),
             "replaced_poses": str(self.posed.replaced),
             **{name: f"{value:.3f}" for name, value in asdict(result.extrapolations[0]).items() if value is not None},
@@ -78,14 +179,15 @@ class Frame:
         }
 
     def _placing(self) -> dict[str, str]:
-        """What the frame can be rendered again with, beside its pose, where there is any."""
-        settings, found = self.result.settings, {}
-        if settings.registration is not None:
-            found["registration"] = settings.registration
-            found["probe_to_scene"] = json.dumps(self.result.poses[0].tolist(), separators=(",", ":"))
-        if settings.tools:
-            found["tools"] = f"[{','.join(map(_text, settings.tools))}]"
-        return found
+        """The pose in the scene, where a registration led there."""
+        is_led = self.result.settings.registration is not None
+        return {"probe_to_scene": json.dumps(self.result.poses[0].tolist(), separators=(",", ":"))} if is_led else {}
+
+
+@lru_cache(maxsize=256)
+def _settings_texts(settings: Resolved) -> Mapping[str, str]:
+    """The part of the metadata that is the same for all frames of a device, until the scanner is set anew."""
+    return settings_used(settings).texts()
 
 
 class FrameMaker:
@@ -102,7 +204,7 @@ class FrameMaker:
 
         Raises SceneNotFound, RegistrationNotFound, and what RequestPlanner.plan and Service.render raise.
         """
-        self._service.require_serving()
+        self._service.life.require_serving()
         scene = await self._scenes.choose(underway.posed.message.device_name)
         ownership = self._service.owners.known(Kind.SCENE, scene)
         setup, found = self._scanner.setup, None
@@ -116,7 +218,7 @@ class FrameMaker:
 
         planner = self._service.planner
         plan = await planner.plan(scene, asked, Encoding.UINT8, complete=complete)
-        result = await self._service.render(
+        result = await self._service.rendering.render(
             plan, underway.pose[None], deadline=planner.deadline(None), turn=underway.turn
         )
         return Frame(underway.posed, result, image_of(result, found), ownership, found)
@@ -125,12 +227,6 @@ class FrameMaker:
         side = self._service.settings.max_image_side
         pixel_mm = true_to_scale(settings.probe, settings.height, side).pixel_mm
         return replace(settings, display=replace(settings.display, pixel_mm=pixel_mm))
-
-
-@lru_cache(maxsize=256)
-def _text(part: Display | Tool) -> str:
-    """A part of the settings as JSON."""
-    return json.dumps(to_dict(part, with_none=False), separators=(",", ":"))
 
 
 def image_of(result: RenderResult, registration: Registration | None = None) -> Image:
@@ -147,3 +243,69 @@ def image_of(result: RenderResult, registration: Registration | None = None) -> 
     pixels = np.frombuffer(result.data, np.uint8).reshape(picture.height, picture.width)
     to_scene = result.poses[0] @ in_probe
     return Image(pixels, to_scene if registration is None else registration.in_base(to_scene))
+
+
+# Subscriptions of a client: the newest frame that it has not seen, at most as often as it asked for.
+
+
+EnterTurn = Callable[[], AbstractAsyncContextManager[None]]
+
+
+@dataclass
+class _Subscription:
+    name: str
+    interval_s: float
+    version: int
+    due: float = 0.0  # time.monotonic(), s
+
+
+class Feed:
+    """The subscriptions of one client, by kind of message. Holds one frame for each at most."""
+
+    def __init__(self, turn: EnterTurn, send: Callable[[Message], Awaitable[None]]) -> None:
+        """`turn` is entered for each message, and waits until the client has read what came before."""
+        self._turn = turn
+        self._send = send
+        self._subscriptions: dict[str, _Subscription] = {}
+        self._fresh: dict[str, Frame] = {}
+        self._changed = asyncio.Event()
+
+    def start(self, kind: str, name: str, interval_s: float, version: int) -> None:
+        """From now on frames that go by `name` are told as messages of `kind`."""
+        self._subscriptions[kind] = _Subscription(name, interval_s, version)
+        self._changed.set()
+
+    def stop(self, kind: str) -> None:
+        """No longer."""
+        self._subscriptions.pop(kind, None)
+        self._fresh.pop(kind, None)
+
+    def offer(self, frame: Frame, *, is_own: bool) -> None:
+        """A frame was rendered; its sender gets the image anyway."""
+        for kind, subscription in self._subscriptions.items():
+            if frame.goes_by(subscription.name) and not (is_own and kind == "IMAGE"):
+                self._fresh[kind] = frame
+                self._changed.set()
+
+    async def run(self) -> None:
+        """Sends until cancelled. Raises what `send` raises."""
+        while True:
+            await self._wait(self._next_due())
+            now = time.monotonic()
+            for kind in [kind for kind in self._fresh if self._subscriptions[kind].due <= now]:
+                async with self._turn():
+                    if (frame := self._fresh.pop(kind, None)) is not None:  # may have been stopped meanwhile
+                        subscription = self._subscriptions[kind]
+                        subscription.due = time.monotonic() + subscription.interval_s
+                        await self._send(frame.message(kind, subscription.version))
+
+    def _next_due(self) -> float | None:
+        return min((self._subscriptions[kind].due for kind in self._fresh), default=None)
+
+    async def _wait(self, until: float | None) -> None:
+        """Until that time.monotonic(), or a change."""
+        timeout_s = None if until is None else until - time.monotonic()
+        if timeout_s is None or timeout_s > 0:
+            with contextlib.suppress(asyncio.TimeoutError):
+                await asyncio.wait_for(self._changed.wait(), timeout_s)
+        self._changed.clear()

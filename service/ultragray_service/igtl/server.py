@@ -9,17 +9,16 @@ import socket
 import time
 
 from ultragray.errors import UltragrayError
-from ultragray_service.access.addresses import AddressRoles
 from ultragray_service.access.audit import NOBODY, Entry
 from ultragray_service.access.owners import may_see
-from ultragray_service.access.principal import LOCAL, Principal, act_as, acting
+from ultragray_service.access.principals import LOCAL, AddressRoles, Principal, act_as, acting
 from ultragray_service.access.rules import IGTL
-from ultragray_service.core.state import Service
 from ultragray_service.errors import LimitReached, PermissionDenied, RateLimited, TooManyConnections, Unauthenticated
 from ultragray_service.igtl.connection import SEND_TIMEOUT_S, Connection
 from ultragray_service.igtl.frames import Frame
 from ultragray_service.igtl.routes import SceneChooser
-from ultragray_service.listening.connections import Connections
+from ultragray_service.listening import Connections
+from ultragray_service.service import Service
 from ultragray_workers.errors import Draining
 from ultragray_workers.jobs.queue.owners import Kind
 

@@ -14,7 +14,7 @@ from typing import IO, Any
 from urllib.parse import quote, urlencode, urlsplit
 
 from ultragray.errors import InvalidArgument, UltragrayError
-from ultragray.files.atomic import atomic_path
+from ultragray.files import atomic_path
 from ultragray_service.tls.client import cut_off_hint, tls_problem
 from ultragray_workers.errors import NotReady
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from ultragray.contract import to_dict
-from ultragray.registration.registration import Registration
+from ultragray.geometry.registration import Registration
 from ultragray_service.remote.connection import Connection, route
 
 

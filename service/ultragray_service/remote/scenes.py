@@ -10,8 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ultragray.pose import check_poses
-from ultragray.probe import FloatArray
+from ultragray.geometry.pose import check_poses
+from ultragray.geometry.probe import FloatArray
 from ultragray_service.remote.connection import Connection, Count, route
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from typing import Any
 
 import grpc
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
@@ -25,21 +26,20 @@ from ultragray_proto.v1 import (
     workers_pb2_grpc,
 )
 from ultragray_service.access.rules import require_all_methods
-from ultragray_service.core.readiness.readiness import Readiness
-from ultragray_service.core.state import Service
-from ultragray_service.rpc.health import Health
-from ultragray_service.rpc.interceptor import CallContext
-from ultragray_service.rpc.services.access import AccessService
-from ultragray_service.rpc.services.datasets import DatasetService
-from ultragray_service.rpc.services.jobs import JobService
-from ultragray_service.rpc.services.registrations import RegistrationService
-from ultragray_service.rpc.services.rendering import RenderService
-from ultragray_service.rpc.services.scenes import SceneService
-from ultragray_service.rpc.services.workers import WorkerService
-from ultragray_service.rpc.traced import TracedCalls
+from ultragray_service.core.readiness import Readiness
+from ultragray_service.rpc.calls import CallContext, TracedCalls
+from ultragray_service.rpc.rendering import RenderService
+from ultragray_service.rpc.resources import (
+    AccessService,
+    DatasetService,
+    JobService,
+    RegistrationService,
+    SceneService,
+    WorkerService,
+)
+from ultragray_service.service import Service
 from ultragray_service.settings import Settings
-from ultragray_service.tls.certificates import HANDSHAKE_TIMEOUT_S, Certificates
-from ultragray_service.tls.watch import CertificateWatch
+from ultragray_service.tls.server import HANDSHAKE_TIMEOUT_S, Certificates, CertificateWatch
 
 LEAST_MAX_MESSAGE_BYTES = 2 * 2**20  # room for a chunk of an upload
 LEAST_PING_INTERVAL_MS = 10_000
@@ -168,3 +168,23 @@ def _connection_options(settings: Settings) -> list[tuple[str, int]]:
         ("grpc.keepalive_time_ms", round(1000 * settings.idle_timeout_s)),
         ("grpc.keepalive_timeout_ms", round(1000 * settings.transfer_patience_s)),
     ]
+
+
+# grpc.health.v1, with the method that the library's servicer leaves out.
+
+
+class Health(health.aio.HealthServicer):  # type: ignore[misc]
+    """Tells what `set` was told."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self._statuses: dict[str, Any] = {}
+
+    async def set(self, service: str, status: Any) -> None:
+        self._statuses[service] = status
+        await super().set(service, status)
+
+    async def List(self, request: Any, context: Any) -> Any:  # noqa: N802  # the name of the method
+        """The health of all services."""
+        statuses = {name: health_pb2.HealthCheckResponse(status=status) for name, status in self._statuses.items()}
+        return health_pb2.HealthListResponse(statuses=statuses)

@@ -10,9 +10,9 @@ from contextlib import suppress
 
 from ultragray.errors import InvalidArgument
 from ultragray_proto.v1 import rendering_pb2
-from ultragray_service.access.addresses import is_loopback
-from ultragray_service.rpc.peers import address_of
-from ultragray_workers.pool.types import Place
+from ultragray_service.access.principals import is_loopback
+from ultragray_service.rpc.calls import address_of
+from ultragray_workers.pool.messages import Place
 
 FOLDER = "/dev/shm"
 HEADER_BYTES = 4096

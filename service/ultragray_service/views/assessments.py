@@ -5,12 +5,12 @@ from __future__ import annotations
 import asyncio
 from dataclasses import dataclass
 
-from ultragray.confidence import Assessor, Extrapolation
 from ultragray.contract import described
-from ultragray.probe import FloatArray, Probe
-from ultragray.scene_info import SceneHeader
-from ultragray_service.core.catalog import SceneCatalog
-from ultragray_service.registrations.registrations import Registrations
+from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.scene.confidence import Assessor, Extrapolation
+from ultragray.scene.info import SceneHeader
+from ultragray_service.core.registrations import Registrations
+from ultragray_service.core.scenes import SceneCatalog
 
 
 @dataclass(frozen=True)

@@ -13,7 +13,7 @@ import sqlalchemy as sa
 from ultragray.contract import described
 from ultragray.errors import InvalidArgument
 from ultragray_service.access.audit import Entry, read_audit
-from ultragray_service.access.principal import iso_time
+from ultragray_service.access.principals import iso_time
 
 DEFAULT_HOURS = 24.0
 DEFAULT_ENTRIES = 1000

@@ -1,30 +1,47 @@
-"""Pictures and figures that helper processes make in the background, once each, and that are kept in folders."""
+"""Pictures and figures that helper processes make in the background, once each, and that are kept in folders.
+
+`Prepared` keeps the folders; after it come those of a data set's frames, of a training while it runs, and of a scene
+beside the held-out frames of its data set.
+"""
 
 from __future__ import annotations
 
 import asyncio
+import contextlib
+import json
 import logging
 import os
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import ClassVar, Literal
 
 import numpy as np
 
-from ultragray.errors import DatasetInvalid, UltragrayError
-from ultragray.files.atomic import sync
-from ultragray.settings import Encoding
-from ultragray_service.core.helper_processes import HelperProcesses
-from ultragray_service.core.own_thread import in_own_thread, to_its_end
+from ultragray.contract import described
+from ultragray.datasets.source import PHANTOM
+from ultragray.errors import DatasetInvalid, TrainingStateInvalid, UltragrayError
+from ultragray.files import sync
+from ultragray.phantom.demo import DEMO_FILE
+from ultragray.rendering.settings import Encoding
+from ultragray.scene.info import read_header
+from ultragray_service.core.jobs.jobs import Jobs
+from ultragray_service.core.poses import MatrixRows
+from ultragray_service.core.scenes import SceneCatalog
+from ultragray_service.core.threads import HelperProcesses, in_own_thread, to_its_end
 from ultragray_service.settings import Settings
 from ultragray_workers.claims import claimed_folder, remove_abandoned, remove_whole, storage_full
+from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import ArtifactNotFound, DatasetNotFound, Draining
-from ultragray_workers.helpers.helper import PROGRESS_NAME
-from ultragray_workers.helpers.picture_stack import read_picture
-from ultragray_workers.pool.process.encoding import encode_image
+from ultragray_workers.helpers import PROGRESS_NAME, read_picture
+from ultragray_workers.jobs.files import BASELINES_NAME, JOURNAL_NAME
+from ultragray_workers.jobs.store import Job, JobStore
+from ultragray_workers.pool.pixels import encode_image
+from ultragray_workers.scenes import SceneStore
+from ultragray_workers.views import FRAMES_NAME, POSES_NAME, PREVIEW_PICTURES, compare, draw_preview, lay_out
 
 TIMEOUT_S = 1800.0
 KEPT_FOLDERS = 32
@@ -239,3 +256,276 @@ def _size_bytes(folder: Path) -> int:
         return sum(path.stat().st_size for path in folder.iterdir())
     except FileNotFoundError:
         return 0
+
+
+# The poses and the frames of a dataset, one by one.
+
+
+@dataclass(frozen=True)
+class DatasetPoses:
+    """The poses of a dataset."""
+
+    train: list[list[float]] = described("16 numbers each, row by row, mm.")
+    val: list[list[float]] = described("Of the held-out frames.")
+
+
+class DatasetViews(Prepared):
+    """Laid out at the first look, and kept by the content of the dataset."""
+
+    name, what, fill = "dataset-views", "laying out the frames of the dataset", staticmethod(lay_out)
+
+    def __init__(self, store: DatasetStore, settings: Settings, processes: HelperProcesses) -> None:
+        super().__init__(settings, processes)
+        self._store = store
+
+    async def key(self, name: str) -> str:
+        """The content of a dataset. Raises DatasetNotFound, DatasetInvalid."""
+        return (await asyncio.to_thread(self._store.get, name)).sha256
+
+    async def poses_json(self, name: str) -> bytes:
+        """The JSON of DatasetPoses.
+
+        Raises DatasetNotFound, DatasetInvalid, MemoryExceeded, StorageFull, DeadlineExceeded, Draining.
+        """
+        folder = await self._laid_out(name)
+        try:
+            return await asyncio.to_thread((folder / POSES_NAME).read_bytes)
+        except FileNotFoundError:
+            raise _deleted(name) from None
+
+    async def frame_png(self, name: str, part: str, index: int) -> bytes:
+        """One frame of `part` (train or val). Raises as `poses_json`; DatasetNotFound also for no such frame."""
+        key = (await self._laid_out(name)).name
+        if (png := await self.picture_png(key, index, part)) is None:
+            raise DatasetNotFound(f"the dataset {name!r} has no frame {index} in its part {part}", field="index")
+        return png
+
+    async def _laid_out(self, name: str) -> Path:
+        try:
+            return await self.path(await self.key(name), dataset=name)
+        except ArtifactNotFound:
+            raise _deleted(name) from None
+
+
+def _deleted(name: str) -> DatasetNotFound:
+    return DatasetNotFound(f"the dataset {name!r} has been deleted", field="dataset")
+
+
+# A training while it runs: its curve, and a frame as the last checkpoint renders it.
+
+
+MAX_POINTS = 500
+
+
+@dataclass(frozen=True)
+class CurvePoint:
+    """Neighbouring steps of a training as one."""
+
+    step: int = described("The last of them.")
+    loss: float = described("Their mean.")
+    val_psnr_db: float | None = described("On held-out frames, measured last; null where it was not.")
+
+
+@dataclass(frozen=True)
+class TrainingCurve:
+    """A training so far."""
+
+    points: list[CurvePoint] = described(f"At most {MAX_POINTS}; none before the first step.")
+    baselines: dict[str, float] = described(
+        "PSNR in dB of classical methods on the frames of val_psnr_db, by name (linear: between the nearest frames; "
+        "median: compounded); empty where they were not measured."
+    )
+
+
+class TrainingViews(Prepared):
+    """Curves and previews of trainings, running or finished. A preview is kept by job, checkpoint and dataset."""
+
+    name, what, fill = "previews", "rendering the training as it is", staticmethod(draw_preview)
+
+    def __init__(self, jobs: Jobs, datasets: DatasetStore, settings: Settings, processes: HelperProcesses) -> None:
+        super().__init__(settings, processes)
+        self._jobs = jobs
+        self._datasets = datasets
+
+    async def curve(self, job_id: str) -> TrainingCurve:
+        """The training so far. Raises JobNotFound."""
+        journal, baselines = await self._jobs.do(_texts, job_id)
+        return TrainingCurve(_curve_of(journal), json.loads(baselines or "{}"))
+
+    async def preview_png(self, job_id: str) -> bytes:
+        """Truth, and to its right the rendering, PNG.
+
+        Raises JobNotFound, ArtifactNotFound without a checkpoint, DatasetNotFound, and as `Prepared.path`.
+        """
+        job = await self._jobs.do(JobStore.get, job_id)
+        await self.settled(lambda key: key.startswith(f"{job_id}-"))  # one a job at a time: the newest
+        with contextlib.ExitStack() as stack:
+            newest = await asyncio.to_thread(stack.enter_context, self._jobs.files.checkpoint(job.id))
+            if newest is None:
+                raise self._none(job)
+            checkpoint, version = newest
+            dataset = await asyncio.to_thread(self._datasets.get, job.specification["dataset"])
+            key = f"{job.id}-{version}-{dataset.sha256}"
+            try:
+                await self.path(key, dataset=dataset.name, checkpoint=str(checkpoint))
+            except TrainingStateInvalid:  # the training ended a moment ago
+                raise self._none(job) from None
+        if (png := await self.picture_png(key, 0, *PREVIEW_PICTURES)) is None:  # the folder went this very moment
+            raise self._none(job)
+        return png
+
+    async def forget_job(self, job_id: str) -> None:
+        """Remove the previews of a job."""
+        await self.forget(lambda key: key.startswith(f"{job_id}-"))
+
+    def _none(self, job: Job) -> ArtifactNotFound:
+        return ArtifactNotFound(f"the job {job.id} has no checkpoint to render (any more)", field="job")
+
+
+def _texts(jobs: JobStore, job_id: str) -> tuple[str | None, str | None]:
+    known = jobs.get(job_id).id
+    return jobs.files.text_of_run(known, JOURNAL_NAME), jobs.files.text_of_run(known, BASELINES_NAME)
+
+
+def _curve_of(journal: str | None) -> list[CurvePoint]:
+    complete = [line for line in (journal or "").splitlines(keepends=True) if line.endswith("\n")]  # one may be half
+    lines = [json.loads(line) for line in complete]
+    width = max(1, -(-len(lines) // MAX_POINTS))
+    groups = [lines[start : start + width] for start in range(0, len(lines), width)]
+    return [
+        CurvePoint(
+            step=int(group[-1]["step"]),
+            loss=float(np.mean([line["loss"] for line in group])),
+            val_psnr_db=next((line["val_psnr_db"] for line in reversed(group) if "val_psnr_db" in line), None),
+        )
+        for group in groups
+    ]
+
+
+# A scene beside the held-out frames of the dataset that it was trained from.
+
+
+_FORMAT = 3  # of what is kept of a comparison
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparedFrame:
+    """How near the scene, and the classical ways (median compounding, linear between frames, the nearest frame), come.
+
+    To a held-out frame.
+    """
+
+    index: int
+    frame_number: int = described("As the dataset numbers it.")
+    pose: MatrixRows = described("Probe to scene, in mm.")
+    confidence: float | None = described("Expected MS-SSIM; null where the scene was trained without confidence.")
+    psnr_db: float
+    ms_ssim: float
+    gms: float
+    gmsd: float
+    histogram_distance: float = described("Between the grey values of both frames, in [0, 1].")
+    median_psnr_db: float
+    median_ms_ssim: float
+    median_gms: float
+    median_gmsd: float
+    median_histogram_distance: float
+    linear_psnr_db: float
+    linear_ms_ssim: float
+    linear_gms: float
+    linear_gmsd: float
+    linear_histogram_distance: float
+    nearest_psnr_db: float
+    nearest_ms_ssim: float
+    nearest_gms: float
+    nearest_gmsd: float
+    nearest_histogram_distance: float
+
+
+@dataclass(frozen=True, kw_only=True)
+class Comparison:
+    """A scene beside the held-out frames of its dataset."""
+
+    state: Literal["running", "ready", "failed"] = described("A failed one is tried again after a minute.")
+    progress: float = described("0 to 1.")
+    dataset: str = described(f"Its name; {PHANTOM}: the built-in phantom, simulated for the demo scene.")
+    frames: list[ComparedFrame] = described("Empty until it is ready.")
+    reason: str | None = described("Why it failed: one sentence.")
+    error: str | None = described("Why it failed: the stable reason, such as DATASET_INVALID.")
+
+
+class Comparisons(Prepared):
+    """Computed at the first look, and kept by the hashes of scene and dataset."""
+
+    name, what, fill = "comparisons", "comparing the scene", staticmethod(compare)
+
+    def __init__(
+        self,
+        scenes: SceneStore,
+        catalog: SceneCatalog,
+        datasets: DatasetStore,
+        settings: Settings,
+        processes: HelperProcesses,
+    ) -> None:
+        super().__init__(settings, processes)
+        self._scenes = scenes
+        self._catalog = catalog
+        self._datasets = datasets
+
+    async def get(self, scene: str) -> Comparison:
+        """Begin the comparison unless it is there; how far it is.
+
+        Raises SceneNotFound, SceneFileInvalid, DatasetNotFound where the service has not the scene's dataset.
+        """
+        key, dataset, path = await self._wanted(scene)
+        preparation = await self.prepare(key, dataset=dataset, scene_path=str(path))
+        frames: list[ComparedFrame] = []
+        if preparation.state == "ready":
+            try:
+                document = await asyncio.to_thread((self.folder / key / FRAMES_NAME).read_bytes)
+                frames = [ComparedFrame(**frame) for frame in json.loads(document)]
+            except FileNotFoundError:  # it went this very moment
+                preparation = Preparation("running", 0.0)
+        reason, error = (preparation.error.detail, preparation.error.reason) if preparation.error else (None, None)
+        return Comparison(
+            state=preparation.state,
+            progress=preparation.progress,
+            dataset=dataset or PHANTOM,
+            frames=frames,
+            reason=reason,
+            error=error,
+        )
+
+    async def key(self, scene: str) -> str:
+        """The key of a comparison, ready or not. Raises as `get`."""
+        return (await self._wanted(scene))[0]
+
+    async def frame_png(self, key: str, index: int, what: str) -> bytes:
+        """A picture of a held-out frame; `what` is one of `ultragray_workers.views.PICTURES`.
+
+        Raises ArtifactNotFound where there is none (yet).
+        """
+        if (png := await self.picture_png(key, index, what)) is None:
+            raise ArtifactNotFound(f"the comparison is not ready, or has no frame {index}", field="index")
+        return png
+
+    async def _wanted(self, scene: str) -> tuple[str, str | None, Path]:
+        """The key, the name of the dataset (None: the built-in phantom), the file of the scene."""
+        header = await self._catalog.header(scene)
+        wanted = header.info.dataset_sha256
+        present = await asyncio.to_thread(self._datasets.names_by_content)
+        if wanted not in present and wanted != await asyncio.to_thread(simulated_sha256):
+            trained_from = header.info.dataset_name
+            named = "" if trained_from is None else f" ({str(trained_from)[:128]!r})"
+            raise DatasetNotFound(
+                f"the dataset that the scene {scene!r} was trained from{named} is not among those of the service",
+                field="scene",
+            )
+        path = await asyncio.to_thread(self._scenes.path, scene)
+        scene_sha256 = await in_own_thread(lambda: self._scenes.sha256(scene))
+        return f"{_FORMAT}-{scene_sha256}-{wanted}", present.get(str(wanted)), path
+
+
+@cache
+def simulated_sha256() -> str | None:
+    """Of the dataset that the demo scene was trained from: it needs no upload, since it can be simulated."""
+    return read_header(DEMO_FILE).info.dataset_sha256

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from ultragray.backends import cuda
+from ultragray.rendering.backends import cuda
 
 # The cases of tests that stay; of tests that are not here none does. They take most branches of the kernels.
 IN_EVERY_RUN = {

@@ -22,9 +22,9 @@ from ultragray import (
     SteeredProbe,
     render,
 )
-from ultragray.backends import cpu
 from ultragray.errors import BackendUnavailable
-from ultragray.outputs import PLANES
+from ultragray.rendering.backends import cpu
+from ultragray.rendering.outputs import PLANES
 
 RENDERERS = ("reference", "cuda", "cpu", *(f"cpu-{name}" for name in cpu.INSTRUCTION_SETS))
 LINEAR = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)

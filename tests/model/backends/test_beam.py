@@ -21,13 +21,12 @@ from ultragray import (
     SteeredProbe,
     render,
 )
-from ultragray.backends import cpu, cuda, reference
-from ultragray.backends.beam import beam_cm
-from ultragray.backends.poses import scene_poses
 from ultragray.errors import InvalidArgument
-from ultragray.limits import UNLIMITED
-from ultragray.outputs import PLANES, WEIGHT_SUM
-from ultragray.rendering import footprint_pixels
+from ultragray.rendering.backends import cpu, cuda, reference
+from ultragray.rendering.backends.inputs import beam_cm, scene_poses
+from ultragray.rendering.frames import footprint_pixels
+from ultragray.rendering.limits import UNLIMITED
+from ultragray.rendering.outputs import PLANES, WEIGHT_SUM
 
 LINEAR = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 HEIGHT, WIDTH = 37, 53

@@ -14,8 +14,8 @@ import pytest
 import torch
 
 from ultragray import GaussianScene, LinearProbe, render
-from ultragray.backends import cpu
 from ultragray.errors import BackendUnavailable
+from ultragray.rendering.backends import cpu
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 SceneMaker = Callable[..., GaussianScene]

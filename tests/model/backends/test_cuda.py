@@ -14,15 +14,15 @@ import pytest
 import torch
 
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, render
-from ultragray.backends import cuda
 from ultragray.errors import BackendUnavailable, MemoryExceeded
-from ultragray.outputs import PLANES
-from ultragray.rendering import renderer_name
+from ultragray.rendering.backends import cuda
+from ultragray.rendering.frames import renderer_name
+from ultragray.rendering.outputs import PLANES
 
 pytest.importorskip("triton", reason="the package triton is not installed, which runs these kernels")
 
-from ultragray.backends.cuda import frames, launch
-from ultragray.backends.cuda.work import count_work
+from ultragray.rendering.backends.cuda import frames, launch
+from ultragray.rendering.backends.cuda.work import count_work
 
 LINEAR = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=60.0)

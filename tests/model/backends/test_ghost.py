@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from ultragray import GaussianScene, LinearProbe, RadialProbe, render
-from ultragray.backends.ghost import LEAST_DEPTH_MM, add_ghosts
-from ultragray.tools import Needle
+from ultragray.rendering.overlays import LEAST_DEPTH_MM, add_ghosts
+from ultragray.rendering.tools import Needle
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 SIDE = 100  # rows of half a millimetre

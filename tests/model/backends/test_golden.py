@@ -10,7 +10,7 @@ import pytest
 import torch
 
 from ultragray import GaussianScene
-from ultragray.rendering import render
+from ultragray.rendering.frames import render
 
 FILES = ("g01", "g03", "g05", "g06", "g08")
 

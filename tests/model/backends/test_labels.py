@@ -22,10 +22,10 @@ from ultragray import (
     render,
 )
 from ultragray.errors import InvalidArgument, SceneFileInvalid, UnknownOutput
-from ultragray.evaluation.compounding import pixel_positions_mm
-from ultragray.interchange.checkpoint_export import export_checkpoint
-from ultragray.interchange.ply import read_ply, write_ply
-from ultragray.probe import FloatArray
+from ultragray.exchange.checkpoint import export_checkpoint
+from ultragray.exchange.ply import read_ply, write_ply
+from ultragray.geometry.probe import FloatArray
+from ultragray.learn.evaluation.baselines import pixel_positions_mm
 
 PROBES = {
     "linear": LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0),

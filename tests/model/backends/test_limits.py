@@ -12,10 +12,10 @@ import pytest
 import torch
 
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, Probe, RadialProbe, render
-from ultragray.backends import reference
 from ultragray.errors import FrameTooCostly
-from ultragray.limits import GivenUp, Limits
-from ultragray.rendering import footprint_pixels
+from ultragray.rendering.backends import reference
+from ultragray.rendering.frames import footprint_pixels
+from ultragray.rendering.limits import GivenUp, Limits
 
 LINEAR = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 PROBES = [

@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe, render
-from ultragray.backends import cpu, cuda
-from ultragray.backends.poses import scene_poses
-from ultragray.outputs import PLANES
+from ultragray.rendering.backends import cpu, cuda
+from ultragray.rendering.backends.inputs import scene_poses
+from ultragray.rendering.outputs import PLANES
 
 LINEAR = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=60.0)

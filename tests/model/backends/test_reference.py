@@ -11,8 +11,8 @@ import pytest
 import torch
 
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, SceneInfo, render
-from ultragray.backends.reference import spherical_harmonics
-from ultragray.outputs import PLANES
+from ultragray.rendering.backends.reference import spherical_harmonics
+from ultragray.rendering.outputs import PLANES
 
 LINEAR = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=30.0)
 CONVEX = ConvexProbe(opening_angle_deg=50.0, near_mm=10.0, far_mm=40.0)

@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, RadialProbe, SceneInfo, render
-from ultragray.backends import cpu, cuda
-from ultragray.backends.poses import scene_poses
-from ultragray.backends.weighted import WeightedSums, weighted_sums
 from ultragray.errors import BackendUnavailable
-from ultragray.outputs import SUMS
+from ultragray.rendering.backends import cpu, cuda
+from ultragray.rendering.backends.inputs import scene_poses
+from ultragray.rendering.backends.weighted import WeightedSums, weighted_sums
+from ultragray.rendering.outputs import SUMS
 
 HEIGHT, WIDTH = 37, 53
 KERNELS = ("cuda", *cpu.INSTRUCTION_SETS)

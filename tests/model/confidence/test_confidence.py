@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, SceneInfo, read_header
-from ultragray.confidence import SUPPORT_COVERAGE, Assessor, ConfidenceModel, Extrapolation, supported
 from ultragray.errors import InvalidArgument, InvalidPose, SceneFileInvalid
-from ultragray.probe import FloatArray
+from ultragray.geometry.probe import FloatArray
+from ultragray.scene.confidence import SUPPORT_COVERAGE, Assessor, ConfidenceModel, Extrapolation, supported
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 MODEL = ConfidenceModel((3.5, 1.2, 0.8, 0.1, 0.6), 0.06, (0.0, 0.5, 1.0), 20, 0.04)
@@ -100,7 +100,7 @@ def test_a_scene_file_with_a_damaged_model_is_refused(
 
 def test_no_torch_is_needed() -> None:
     program = (
-        "import sys, numpy as np; from ultragray import SceneInfo; from ultragray.confidence import Assessor; "
+        "import sys, numpy as np; from ultragray import SceneInfo; from ultragray.scene.confidence import Assessor; "
         "Assessor(SceneInfo(), np.zeros((0, 4, 4))).assess(np.eye(4)); assert 'torch' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", program], check=True)

@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ultragray.confidence import FIGURES, Extrapolation, figure_arrays
+from ultragray.scene.confidence import FIGURES, Extrapolation, figure_arrays
 
 
 def test_each_figure_is_an_array_and_nan_where_it_is_not_known() -> None:

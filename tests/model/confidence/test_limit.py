@@ -2,8 +2,8 @@ from __future__ import annotations
 
 import pytest
 
-from ultragray.confidence import Extrapolation, is_confident, require_confidence
 from ultragray.errors import LowConfidence
+from ultragray.scene.confidence import Extrapolation, is_confident, require_confidence
 
 NEAR = Extrapolation(0.5, 1.0, 0.8, None)
 FAR = Extrapolation(12.34, 5.67, 0.3, None)

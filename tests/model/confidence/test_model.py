@@ -9,10 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ultragray.confidence import ConfidenceModel
-from ultragray.confidence.model import Support
-from ultragray.confidence.views import ViewMeasures
 from ultragray.errors import InvalidArgument
+from ultragray.scene.confidence import ConfidenceModel, Support, ViewMeasures
 
 MODEL = ConfidenceModel(
     weights=(3.5, 1.2, 0.8, 0.1, 0.6),

@@ -12,15 +12,16 @@ import pytest
 import torch
 
 from ultragray import GaussianScene, LinearProbe, SceneInfo, render
-from ultragray.confidence import ConfidenceModel
-from ultragray.confidence.deviation import CELLS, variance_terms
-from ultragray.confidence.uncertainty import DEPTHS, TERMS, DepthBands, Uncertainty
 from ultragray.errors import InvalidArgument, UnknownOutput
-from ultragray.probe import FloatArray
+from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.confidence import CELLS, variance_terms
+from ultragray.scene.confidence import DEPTHS, VARIANCE_TERMS, ConfidenceModel, DepthBands, Uncertainty
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 EACH = {"floor": 1.0, "level²": 0.02, "texture": 0.5, "gap 1 mm": 0.6, "beyond": 0.4, "thin": 0.05}
-MODEL = Uncertainty(tuple(EACH.get(name, 0.0) for name in TERMS), DepthBands((0.3,) * DEPTHS, (0.04,) * DEPTHS))
+MODEL = Uncertainty(
+    tuple(EACH.get(name, 0.0) for name in VARIANCE_TERMS), DepthBands((0.3,) * DEPTHS, (0.04,) * DEPTHS)
+)
 
 
 def moved(*elevations_mm: float) -> FloatArray:
@@ -88,7 +89,7 @@ def test_terms_are_as_many_as_named_and_never_negative() -> None:
     planes = tuple(torch.rand(2, 24, 20, generator=torch.Generator().manual_seed(place)) for place in range(3))
     distances = (np.full((2, 12, 12), 0.7), np.full((2, 12, 12), 1.4))
     terms = list(variance_terms(planes, distances, MODEL.bands))
-    assert len(terms) == len(TERMS)
+    assert len(terms) == len(VARIANCE_TERMS)
     assert all(term.shape == (2, 24, 20) and bool((term >= 0.0).all()) for term in terms)
     large = tuple(torch.rand(1, 100, 300) for _ in range(3))
     assert {term.shape for term in variance_terms(large, (np.ones((1, 12, 12)),) * 2, MODEL.bands)} == {
@@ -104,7 +105,7 @@ def test_json_and_back() -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"variances": [1.0]}, f"variances must be {len(TERMS)} numbers"),
+        ({"variances": [1.0]}, f"variances must be {len(VARIANCE_TERMS)} numbers"),
         ({"level": [-1.0] * DEPTHS}, f"level must be {DEPTHS} numbers, at least 0"),
         ({"spread": [float("nan")] * DEPTHS}, "spread must be"),
         ({"spread": "much"}, "spread must be numbers"),

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
-from ultragray.confidence.views import MAX_VIEWS, POINTS_PER_SIDE, TrainingViews
 from ultragray.errors import InvalidPose
-from ultragray.probe import FloatArray
+from ultragray.geometry.probe import FloatArray
+from ultragray.scene.confidence import MAX_VIEWS, POINTS_PER_SIDE, TrainingViews
 
 LINEAR = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=40.0, far_mm=120.0)

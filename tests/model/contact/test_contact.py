@@ -10,13 +10,12 @@ import pytest
 import torch
 
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, render
-from ultragray.backends import cpu
-from ultragray.contact import MOST_COMPRESSION
-from ultragray.contact.compression import at_rest
 from ultragray.errors import InvalidArgument
-from ultragray.outputs import PLANES
-from ultragray.probe import FloatArray
-from ultragray.settings import Contact
+from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.backends import cpu
+from ultragray.rendering.contact import MOST_COMPRESSION, at_rest
+from ultragray.rendering.outputs import PLANES
+from ultragray.rendering.settings import Contact
 
 PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 SIZE = {"height": 48, "width": 40}

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
-from ultragray.contact import COUPLING_MM, MARGIN_MM, Skin, Touch
 from ultragray.errors import InvalidArgument
-from ultragray.probe import FloatArray
+from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.contact import COUPLING_MM, MARGIN_MM, Skin, Touch
 
 WIDTH = 32
 PROBES = [

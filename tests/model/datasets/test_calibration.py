@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 
 from ultragray import LinearProbe
-from ultragray.datasets.calibration import poses_from_image_transforms
-from ultragray.datasets.images import CropBox
+from ultragray.datasets.images import CropBox, poses_from_image_transforms
 from ultragray.errors import DatasetInvalid
 
 PATH = Path("s.mha")

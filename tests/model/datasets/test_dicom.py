@@ -20,8 +20,8 @@ from pydicom.uid import UID, DeflatedExplicitVRLittleEndian, JPEG2000Lossless, J
 from ultragray import ConvexProbe, LinearProbe
 from ultragray.datasets import dicom
 from ultragray.datasets.source import SourceOptions, load_dataset
-from ultragray.display.scan_conversion import scan_convert
 from ultragray.errors import DatasetInvalid, ExtraMissing, InvalidArgument
+from ultragray.geometry.scan_conversion import scan_convert
 
 from ...dicom_files import FRAMES, POSES, region, write_cine
 

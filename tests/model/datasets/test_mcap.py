@@ -14,18 +14,18 @@ import pytest
 from mcap.writer import CompressionType
 
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, SteeredProbe
-from ultragray.confidence import Extrapolation
 from ultragray.contract import to_dict
 from ultragray.datasets import Dataset
-from ultragray.datasets.mcap import messages
-from ultragray.datasets.mcap import recording as mcap_recording
+from ultragray.datasets import mcap as mcap_recording
+from ultragray.datasets import mcap_messages as messages
 from ultragray.datasets.source import SourceOptions, load_dataset
-from ultragray.display import Display
 from ultragray.errors import DatasetInvalid, ExtraMissing, InvalidArgument
-from ultragray.interchange import ros_messages as ros
-from ultragray.interchange.rendering import render_to_file
-from ultragray.pose import pose_from_position_quaternion
-from ultragray.settings import Resolved
+from ultragray.exchange import ros_messages as ros
+from ultragray.exchange.rendering import render_to_file
+from ultragray.geometry.pose import pose_from_position_quaternion
+from ultragray.rendering.display import Display
+from ultragray.rendering.settings import Resolved
+from ultragray.scene.confidence import Extrapolation
 
 from ...mcap_files import (
     COMPRESSED,

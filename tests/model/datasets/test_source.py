@@ -10,7 +10,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from ultragray.datasets import Dataset, Sweep, phantom
+from ultragray import phantom
+from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
 from ultragray.datasets.source import EVERY_FORMAT_TAKES, FORMATS, SourceOptions, load_dataset
 from ultragray.errors import DatasetInvalid, InvalidArgument

@@ -7,8 +7,8 @@ from collections.abc import Callable
 import pytest
 
 from ultragray.datasets import Sweep
-from ultragray.datasets.splits import parse_frame_ranges, split_parts, split_sequence
 from ultragray.errors import InvalidArgument
+from ultragray.learn.sweep import parse_frame_ranges, split_parts, split_sequence
 
 
 def numbers(parts: tuple[Sweep, Sweep]) -> tuple[list[int], list[int]]:

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ultragray.datasets import Sweep
-from ultragray.datasets.sweep import corner_distances_mm
+from ultragray.learn.sweep import corner_distances_mm
 
 
 def test_distances_are_means_over_the_corners(make_sweep: Callable[..., Sweep]) -> None:

@@ -10,7 +10,7 @@ import pytest
 
 from ultragray import ConvexProbe
 from ultragray.datasets import Sweep
-from ultragray.datasets.swept_volume import MAX_VOXELS, swept_volume
+from ultragray.datasets.checks import MAX_VOXELS, swept_volume
 
 
 @pytest.mark.parametrize(("step_mm", "coverage"), [(0.5, 1.0), (2.0, 0.5), (4.0, 0.25)])

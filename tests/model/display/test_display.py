@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
-from ultragray.display.frames import show
-from ultragray.display.scan_conversion import scan_convert, scan_convert_labels
-from ultragray.display.settings import Display
 from ultragray.errors import InvalidArgument, InvalidImageSize
+from ultragray.geometry.scan_conversion import scan_convert, scan_convert_labels
+from ultragray.rendering.display import Display
+from ultragray.rendering.frames import show
 
 LINEAR = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=40.0, far_mm=100.0)

@@ -9,7 +9,7 @@ import pytest
 from skimage.transform import warp
 
 from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe
-from ultragray.display.scan_conversion import samples, scan_convert, scan_convert_labels
+from ultragray.geometry.scan_conversion import samples, scan_convert, scan_convert_labels
 
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=50.0, far_mm=150.0)
 PHASED = PhasedProbe(opening_angle_deg=90.0, far_mm=120.0)

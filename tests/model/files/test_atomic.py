@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ultragray.files.atomic import atomic_path, remove_stale_temporaries
+from ultragray.files import atomic_path, remove_stale_temporaries
 
 
 @pytest.fixture

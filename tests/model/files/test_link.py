@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from ultragray.files.link import link_or_copy
+from ultragray.files import link_or_copy
 
 
 @pytest.fixture

@@ -10,8 +10,8 @@ import pytest
 from mcap_ros2.writer import Writer
 
 from ultragray.errors import InvalidPose
-from ultragray.files.poses import load_poses
-from ultragray.interchange.ros_messages import DEFINITIONS, IMAGE, POSE, pose_message
+from ultragray.exchange.poses import load_poses
+from ultragray.exchange.ros_messages import DEFINITIONS, IMAGE, POSE, pose_message
 
 from ...mcap_files import Bag
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ultragray.files.npy import map_npy
+from ultragray.files import map_npy
 
 
 def npy(path: Path, array: np.ndarray) -> bytes:

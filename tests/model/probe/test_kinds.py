@@ -7,7 +7,7 @@ import pytest
 
 from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
 from ultragray.contract import from_dict, to_dict
-from ultragray.display.scan_conversion import scan_convert
+from ultragray.geometry.scan_conversion import scan_convert
 
 PROBES = [
     LinearProbe(width_mm=40.0, near_mm=10.0, far_mm=50.0),

@@ -11,7 +11,7 @@ import pytest
 from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe
 from ultragray.contract import from_dict
 from ultragray.errors import InvalidProbe
-from ultragray.interchange.released_config import stretch_released_far
+from ultragray.exchange.released_config import stretch_released_far
 
 LINEAR = LinearProbe(width_mm=40.0, near_mm=10.0, far_mm=50.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=50.0, far_mm=150.0)

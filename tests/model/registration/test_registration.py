@@ -10,13 +10,20 @@ import numpy as np
 import pytest
 
 from ultragray import render
-from ultragray.demo import demo_poses, load_demo_scene
 from ultragray.errors import InvalidArgument, InvalidPose
-from ultragray.probe import FloatArray
-from ultragray.registration.frames import register_frames
-from ultragray.registration.points import register_points
-from ultragray.registration.poses import pose_residuals, register_poses, register_poses_and_mounting
-from ultragray.registration.registration import Registration, load_registration, rows, save_registration
+from ultragray.geometry.probe import FloatArray
+from ultragray.geometry.registration import (
+    Registration,
+    load_registration,
+    pose_residuals,
+    register_points,
+    register_poses,
+    register_poses_and_mounting,
+    rows,
+    save_registration,
+)
+from ultragray.learn.registration import register_frames
+from ultragray.phantom.demo import demo_poses, load_demo_scene
 
 
 def motion(rng: np.random.Generator, turn_deg: float = 60.0, shift_mm: float = 100.0) -> FloatArray:

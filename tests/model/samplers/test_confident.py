@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from ultragray import LinearProbe
-from ultragray.confidence import Extrapolation
 from ultragray.errors import LowConfidence
 from ultragray.samplers import (
     AroundSampler,
@@ -17,6 +16,7 @@ from ultragray.samplers import (
     TrainingSampler,
     confident_poses,
 )
+from ultragray.scene.confidence import Extrapolation
 
 PROBE = LinearProbe(40.0, 0.0, 50.0)
 BASE = np.tile(np.eye(4), (20, 1, 1))

@@ -9,10 +9,10 @@ import numpy as np
 import pytest
 
 from ultragray import ConvexProbe, LinearProbe
-from ultragray.confidence import Extrapolation
 from ultragray.contract import from_dict, to_dict
 from ultragray.errors import InvalidArgument, LowConfidence
-from ultragray.pose import check_poses, position_distances_mm, rotation_angles_deg
+from ultragray.geometry.pose import check_poses, position_distances_mm, rotation_angles_deg
+from ultragray.geometry.rotations import rotations_of, turns_of
 from ultragray.samplers import (
     AroundSampler,
     CoveredSampler,
@@ -23,8 +23,8 @@ from ultragray.samplers import (
     assessed_poses,
 )
 from ultragray.samplers.confident import assessed_part
-from ultragray.samplers.rotations import rotations_of, turns_of
 from ultragray.samplers.sampler import BLOCK_POSES
+from ultragray.scene.confidence import Extrapolation
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 

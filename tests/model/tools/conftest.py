@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
-from ultragray.probe import FloatArray
+from ultragray.geometry.probe import FloatArray
 
 LINEAR = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 PROBES: tuple[Probe, ...] = (

@@ -9,8 +9,8 @@ import pytest
 
 from ultragray.contract import from_dict, to_dict
 from ultragray.errors import InvalidArgument
-from ultragray.settings import FrameSettings
-from ultragray.tools import MAX_TOOLS, Box, Cylinder, Needle, ToolFrame, load_tools
+from ultragray.rendering.settings import FrameSettings
+from ultragray.rendering.tools import MAX_TOOLS, Box, Cylinder, Needle, ToolFrame, load_tools
 
 TOOLS = (
     Needle(tip_mm=(1.0, 2.0, 3.0), hub_mm=(4.0, 5.0, 6.0), label=3),

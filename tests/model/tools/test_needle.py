@@ -11,8 +11,8 @@ import torch
 
 from ultragray import ElevationBeam, Frames, GaussianScene, LinearProbe, Probe, RadialProbe, render
 from ultragray.errors import InvalidArgument
-from ultragray.probe import FloatArray
-from ultragray.tools import Needle, ToolFrame
+from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.tools import Needle, ToolFrame
 
 from .conftest import LINEAR, PROBES
 

@@ -10,8 +10,8 @@ import torch
 
 from ultragray import ElevationBeam, Frames, GaussianScene, LinearProbe, Probe, render
 from ultragray.errors import InvalidArgument
-from ultragray.pose import pose_from_position_quaternion
-from ultragray.tools import Box, Cylinder, ScanView, Tool, ToolFrame
+from ultragray.geometry.pose import pose_from_position_quaternion
+from ultragray.rendering.tools import Box, Cylinder, ScanView, Tool, ToolFrame
 
 from .conftest import LINEAR, PROBES
 

@@ -10,13 +10,13 @@ import pytest
 import torch
 
 from ultragray import ElevationBeam, GaussianScene, LinearProbe, Probe, render
-from ultragray.backends import cpu
 from ultragray.errors import UnknownOutput
-from ultragray.outputs import PLANES
-from ultragray.probe import FloatArray
-from ultragray.scene_info import SceneInfo
-from ultragray.settings import Contact
-from ultragray.tools import Box, Cylinder, Needle, ToolFrame
+from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.backends import cpu
+from ultragray.rendering.outputs import PLANES
+from ultragray.rendering.settings import Contact
+from ultragray.rendering.tools import Box, Cylinder, Needle, ToolFrame
+from ultragray.scene.info import SceneInfo
 
 from .conftest import LINEAR, PROBES
 

@@ -10,11 +10,11 @@ import pytest
 
 from ultragray import GaussianScene
 from ultragray.errors import FrameTooCostly, InvalidArgument
-from ultragray.limits import GivenUp, Limits
-from ultragray.pose import check_poses
-from ultragray.settings import Encoding
-from ultragray.volumes.fields import sample_slice
-from ultragray.volumes.plane import SliceSettings
+from ultragray.geometry.pose import check_poses
+from ultragray.rendering.limits import GivenUp, Limits
+from ultragray.rendering.settings import Encoding
+from ultragray.rendering.volume_fields import sample_slice
+from ultragray.rendering.volumes import SliceSettings
 
 PLANE = SliceSettings(origin_mm=(3, -2, 10), right=(2, 1, 0), down=(0, 0, 4), size_mm=(12, 7.5), spacing_mm=0.5)
 

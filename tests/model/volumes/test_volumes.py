@@ -15,12 +15,10 @@ import torch
 
 from ultragray import GaussianScene, LinearProbe, render
 from ultragray.errors import InvalidArgument
-from ultragray.probe import FloatArray
-from ultragray.volumes import fields as fields_module
-from ultragray.volumes.fields import sample_slice, sample_volume
-from ultragray.volumes.files import write_slice, write_volume
-from ultragray.volumes.grid import MAX_VOXELS, VolumeGrid, parse_box, parse_numbers
-from ultragray.volumes.names import VOLUME_FIELDS
+from ultragray.geometry.probe import FloatArray
+from ultragray.rendering import volume_fields as fields_module
+from ultragray.rendering.volume_fields import sample_slice, sample_volume, write_slice, write_volume
+from ultragray.rendering.volumes import MAX_VOXELS, VOLUME_FIELDS, VolumeGrid, parse_box, parse_numbers
 
 CENTRE_MM = (12.0, -34.0, 56.0)
 GRID = VolumeGrid.over_box((-4, -38, 70), (28, -29, 84.5), 1.5)  # 22 x 6 x 10

@@ -14,7 +14,7 @@ import pytest
 import sqlalchemy as sa
 
 from ultragray_service.access.keys import KeyStore
-from ultragray_service.access.principal import Role
+from ultragray_service.access.principals import Role
 from ultragray_workers.jobs.queue.database import JobDatabase
 from ultragray_workers.jobs.queue.tables import KEYS
 

@@ -8,8 +8,7 @@ from pathlib import Path
 import pytest
 
 from ultragray.errors import InvalidArgument
-from ultragray_service.access.addresses import AddressRoles
-from ultragray_service.access.principal import LOCAL, Principal, Role
+from ultragray_service.access.principals import LOCAL, AddressRoles, Principal, Role
 from ultragray_service.igtl.contents import Status
 from ultragray_service.settings import load_settings
 

@@ -19,7 +19,7 @@ from ultragray_proto.v1 import geometry_pb2, jobs_pb2, jobs_pb2_grpc, rendering_
 from ultragray_service.access import audit
 from ultragray_service.access.audit import MAX_WAITING, AuditLog, Entry, read_audit
 from ultragray_service.access.keys import KeyStore
-from ultragray_service.access.principal import Role
+from ultragray_service.access.principals import Role
 from ultragray_workers.jobs.queue.database import JobDatabase
 
 from ...postgres import PostgresServer

@@ -4,8 +4,8 @@ import time
 
 import pytest
 
-from ultragray_service.access.guard import EnvironmentKeys, Guard
-from ultragray_service.access.principal import LOCAL, Principal, Role
+from ultragray_service.access.credentials import EnvironmentKeys, Guard
+from ultragray_service.access.principals import LOCAL, Principal, Role
 from ultragray_service.errors import Unauthenticated
 
 KEY = "0123456789abcdef"

@@ -10,7 +10,7 @@ import httpx
 import pytest
 
 from ultragray_service.access.keys import KeyStore
-from ultragray_service.access.principal import Role
+from ultragray_service.access.principals import Role
 from ultragray_service.igtl.contents import unpack_status
 from ultragray_workers.jobs.queue.database import JobDatabase
 

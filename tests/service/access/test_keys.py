@@ -13,9 +13,8 @@ import sqlalchemy as sa
 from typer.testing import Result
 
 from ultragray.errors import InvalidArgument
-from ultragray_service.access.keys import KeyStore, KnownKeys
-from ultragray_service.access.principal import Principal, Role
-from ultragray_service.access.snapshot import Snapshot
+from ultragray_service.access.keys import KeyStore, KnownKeys, Snapshot
+from ultragray_service.access.principals import Principal, Role
 from ultragray_service.errors import Unauthenticated
 from ultragray_workers.errors import DatabaseUnavailable
 from ultragray_workers.jobs.queue import tables

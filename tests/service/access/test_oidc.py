@@ -18,12 +18,12 @@ from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
 from jwt.algorithms import RSAAlgorithm
 
 from ultragray.errors import InvalidArgument, UltragrayError
-from ultragray_service.access.oidc import issuer as issuer_module
-from ultragray_service.access.oidc.claims import claim_at, parse_roles
-from ultragray_service.access.oidc.tokens import LEEWAY_S, MAX_TOKEN_BYTES, OidcTokens
-from ultragray_service.access.principal import Role
+from ultragray_service.access import oidc as issuer_module
+from ultragray_service.access.oidc import LEEWAY_S, MAX_TOKEN_BYTES, OidcTokens, claim_at, parse_roles
+from ultragray_service.access.principals import Role
 from ultragray_service.errors import IssuerUnavailable
 from ultragray_service.settings import load_settings
+from ultragray_service.wiring import oidc_tokens
 
 from ...waiting import Deadline
 from .identity_provider import IdentityProvider
@@ -39,7 +39,7 @@ def provider() -> Iterator[IdentityProvider]:
 
 @asynccontextmanager
 async def following(provider: IdentityProvider, **settings: str) -> AsyncIterator[OidcTokens]:
-    tokens = OidcTokens.of(load_settings(**{**provider.settings(), **settings}))
+    tokens = oidc_tokens(load_settings(**{**provider.settings(), **settings}))
     assert tokens is not None
     task = asyncio.ensure_future(tokens.issuer.follow())
     try:
@@ -280,7 +280,7 @@ def test_an_issuer_that_is_away_leaves_the_keys_that_are_known(
 
 def test_an_issuer_of_another_name_is_not_believed(provider: IdentityProvider) -> None:
     async def run() -> None:
-        tokens = OidcTokens.of(load_settings(**{**provider.settings(), "oidc_issuer": provider.url + "/"}))
+        tokens = oidc_tokens(load_settings(**{**provider.settings(), "oidc_issuer": provider.url + "/"}))
         assert tokens is not None
         task = asyncio.ensure_future(tokens.issuer.follow())
         await until(lambda: "calls itself" in str(tokens.issuer.problem))

@@ -13,7 +13,7 @@ import pytest
 from ultragray_client import Client
 from ultragray_proto.v1 import scenes_pb2, scenes_pb2_grpc
 from ultragray_service.access.keys import KeyStore
-from ultragray_service.access.principal import Role
+from ultragray_service.access.principals import Role
 from ultragray_workers.jobs.queue.database import JobDatabase
 
 from ...waiting import wait_until

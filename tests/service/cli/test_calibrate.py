@@ -9,9 +9,9 @@ import cv2
 import numpy as np
 
 from ultragray import render
-from ultragray.demo import DEMO_FILE, demo_poses, load_demo_scene
-from ultragray.probe import FloatArray
-from ultragray.registration.registration import load_registration
+from ultragray.geometry.probe import FloatArray
+from ultragray.geometry.registration import load_registration
+from ultragray.phantom.demo import DEMO_FILE, demo_poses, load_demo_scene
 
 from .command_line import refused, run
 

@@ -22,9 +22,9 @@ import typer
 
 import ultragray
 from ultragray import GaussianScene, LinearProbe
-from ultragray.demo import DEMO_FILE
 from ultragray.errors import InvalidArgument, SceneFileInvalid
-from ultragray.files.atomic import file_sha256
+from ultragray.files import file_sha256
+from ultragray.phantom.demo import DEMO_FILE
 from ultragray_service.cli.app import app
 from ultragray_service.cli.serve import ensure_scenes, link_scenes
 from ultragray_service.settings import Settings
@@ -101,7 +101,7 @@ def test_completion_knows_commands_and_options() -> None:
         program = "from ultragray_service.cli.app import app; app(prog_name='ultragray')"
         return subprocess.run(python(program), env=environment, capture_output=True, text=True, check=False).stdout
 
-    assert completed("ultragray re").split() == ["render", "report", "registrations", "restore"]
+    assert completed("ultragray re").split() == ["render", "registrations", "restore", "report"]
     assert completed("ultragray scenes do").split() == ["download"]
     assert "--outputs" in completed("ultragray render --out").split()
 

@@ -17,9 +17,9 @@ import pytest
 from ultragray import LinearProbe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import read_released, write_released
-from ultragray.evaluation.baselines import evaluate_baselines
-from ultragray.methods.names import NAMES
-from ultragray.training.trainer import JOURNAL_FILE
+from ultragray.learn.evaluation.baselines import evaluate_baselines
+from ultragray.learn.evaluation.methods import NAMES
+from ultragray.learn.training.trainer import JOURNAL_FILE
 
 from ...waiting import Deadline
 from .command_line import python, refused, run
@@ -100,7 +100,7 @@ def test_a_comparison_of_which_nothing_could_be_measured_ends_with_an_error(tmp_
 
 
 def test_what_is_learned_without_an_output_is_told_to_be_lost(sweep: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ultragray.methods.comparison.run.compare", lambda *_, **__: None)  # as if stopped at once
+    monkeypatch.setattr("ultragray_studies.comparison.run.compare", lambda *_, **__: None)  # as if stopped at once
     result = run("compare", sweep, "--methods", "median,rapidvol")
     assert "with --output PAGE.html" in result.stderr
     assert "nothing is kept" in result.stderr

@@ -16,11 +16,10 @@ from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import read_released, write_released
 from ultragray.errors import MemoryExceeded, TrainingDiverged
-from ultragray.evaluation.reliability import measure_reliability
-from ultragray.evaluation.scoring import evaluate
-from ultragray.methods import gaussians
-from ultragray.report import study
-from ultragray.training import TrainingConfig, train
+from ultragray.learn.evaluation.scoring import evaluate, measure_reliability
+from ultragray.learn.training import TrainingConfig, train
+from ultragray_studies.methods import gaussians
+from ultragray_studies.report import study
 
 from .command_line import refused, run
 

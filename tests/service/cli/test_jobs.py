@@ -23,7 +23,7 @@ from typer.testing import CliRunner, Result
 from ultragray import LinearProbe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
-from ultragray.files.atomic import file_sha256
+from ultragray.files import file_sha256
 from ultragray_service.cli.app import app
 from ultragray_service.cli.remote.watch import JOB_CANCELLED, JOB_FAILED, results
 

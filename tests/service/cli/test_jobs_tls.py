@@ -8,8 +8,7 @@ import pytest
 import trustme
 from typer.testing import CliRunner, Result
 
-from ultragray_service.cli.app import app
-from ultragray_service.cli.group import USER_ERROR
+from ultragray_service.cli.app import USER_ERROR, app
 from ultragray_service.tls.client import exposes_key
 
 from ...certificates import Mounted, write_client

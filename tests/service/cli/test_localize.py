@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from ultragray import render
-from ultragray.demo import DEMO_FILE, demo_poses, load_demo_scene
-from ultragray.display.pixels import image_file
-from ultragray.probe import FloatArray
+from ultragray.geometry.probe import FloatArray
+from ultragray.phantom.demo import DEMO_FILE, demo_poses, load_demo_scene
+from ultragray.rendering.pixels import image_file
 
 from .command_line import refused, run
 

@@ -13,7 +13,7 @@ from typer.testing import CliRunner
 
 from ultragray.contract import Contract, described
 from ultragray.errors import InvalidArgument
-from ultragray.probe import LinearProbe, Probe
+from ultragray.geometry.probe import LinearProbe, Probe
 from ultragray.samplers import FanSampler, Sampler
 from ultragray_service.cli.options import FieldsOf, with_options
 

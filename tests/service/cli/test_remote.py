@@ -14,7 +14,7 @@ from typer.testing import CliRunner, Result
 from ultragray import LinearProbe, read_header
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
-from ultragray.registration.registration import Registration, rows, save_registration
+from ultragray.geometry.registration import Registration, rows, save_registration
 from ultragray_service.cli.app import app
 
 from ..conftest import HEIGHT, WIDTH, RunningService, StartService

@@ -16,16 +16,16 @@ import torch
 
 import ultragray
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, SceneInfo, render
-from ultragray.backends import cpu
-from ultragray.confidence import FIGURES, Assessor, ConfidenceModel, figure_arrays
 from ultragray.contract import to_dict
 from ultragray.datasets.plus import read_plus_sweep
-from ultragray.display.scan_conversion import scan_convert, scan_convert_labels
-from ultragray.files.atomic import file_sha256
-from ultragray.interchange import rendering
+from ultragray.exchange import rendering
+from ultragray.files import file_sha256
+from ultragray.geometry.scan_conversion import scan_convert, scan_convert_labels
+from ultragray.rendering.backends import cpu
+from ultragray.rendering.settings import Contact
+from ultragray.rendering.tools import Needle, ToolFrame
 from ultragray.samplers import FanSampler
-from ultragray.settings import Contact
-from ultragray.tools import Needle, ToolFrame
+from ultragray.scene.confidence import FIGURES, Assessor, ConfidenceModel, figure_arrays
 
 from .command_line import refused, run
 

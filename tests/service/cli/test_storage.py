@@ -6,7 +6,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
-from ultragray.demo import copy_demo_scene
+from ultragray.phantom.demo import copy_demo_scene
 from ultragray_workers.storage.opening import open_storage
 
 from ...workers.jobs.conftest import store_dataset

@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from ultragray import LinearProbe
-from ultragray.datasets import Dataset, Sweep, phantom
+from ultragray import LinearProbe, phantom
+from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
 from ultragray.datasets.source import load_dataset
 from ultragray_service.cli.app import app

@@ -20,8 +20,8 @@ from typer.testing import CliRunner, Result
 from ultragray import GaussianScene, LinearProbe
 from ultragray.datasets.source import load_dataset
 from ultragray.installation import install_advice
-from ultragray.training import TrainingConfig, trainer
-from ultragray.training.data.geometry import Geometry
+from ultragray.learn.training import TrainingConfig, trainer
+from ultragray.learn.training.geometry import Geometry
 from ultragray_service.cli.app import app
 
 from ...mcap_files import PROBE, recorded

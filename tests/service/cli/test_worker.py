@@ -15,7 +15,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from ultragray.demo import copy_demo_scene
+from ultragray.phantom.demo import copy_demo_scene
 from ultragray.samplers import AroundSampler
 from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.store import Job, JobState, JobStore

@@ -15,7 +15,7 @@ import pytest
 from ultragray import LinearProbe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
-from ultragray.demo import copy_demo_scene
+from ultragray.phantom.demo import copy_demo_scene
 
 from .command_line import python, run
 

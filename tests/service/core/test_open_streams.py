@@ -8,9 +8,8 @@ from typing import Any
 import pytest
 
 from ultragray.errors import UltragrayError
-from ultragray_service.access.principal import Principal, Role, act_as
-from ultragray_service.core.streams.answers import Answered
-from ultragray_service.core.streams.open_streams import MAX_NAME, OpenStream, OpenStreams
+from ultragray_service.access.principals import Principal, Role, act_as
+from ultragray_service.core.open_streams import MAX_NAME, Answered, OpenStream, OpenStreams
 from ultragray_service.errors import StreamNotFound
 
 ALICE, BOB = (Principal(name, Role.READER, "key") for name in ("alice", "bob"))

@@ -7,7 +7,7 @@ import threading
 
 import pytest
 
-from ultragray_service.core.own_thread import in_own_thread
+from ultragray_service.core.threads import in_own_thread
 
 
 def test_results_and_errors_come_back() -> None:

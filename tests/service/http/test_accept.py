@@ -2,9 +2,9 @@ from __future__ import annotations
 
 import pytest
 
-from ultragray.settings import Encoding
+from ultragray.rendering.settings import Encoding
 from ultragray_service.errors import NotAcceptable
-from ultragray_service.http.reading.accept import JPEG, NPZ, PNG, RAW, Choice, choose
+from ultragray_service.http.accept import JPEG, NPZ, PNG, RAW, Choice, choose
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ import httpx
 import pytest
 from fastapi import FastAPI
 
-from ultragray_service.http.console import CONSOLE_FOLDER, add_console
+from ultragray_service.http.app import CONSOLE_FOLDER, add_console
 
 from ..conftest import StartService
 

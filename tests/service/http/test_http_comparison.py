@@ -20,11 +20,11 @@ import pytest
 from ultragray import GaussianScene, LinearProbe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
-from ultragray.demo import DEMO_FILE
-from ultragray.scene_info import read_header
+from ultragray.phantom.demo import DEMO_FILE
+from ultragray.scene.info import read_header
 from ultragray_proto.v1 import datasets_pb2, datasets_pb2_grpc
-from ultragray_workers.helpers.comparison import PICTURES
-from ultragray_workers.helpers.helper import PROGRESS_NAME
+from ultragray_workers.helpers import PROGRESS_NAME
+from ultragray_workers.views import PICTURES
 
 from ...waiting import Deadline, wait_until
 from ..conftest import RunningService, StartService, make_scene

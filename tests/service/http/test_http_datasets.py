@@ -21,7 +21,7 @@ import pytest
 from ultragray import LinearProbe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
-from ultragray_service.core.dataset_uploads import MAX_UPLOADS
+from ultragray_service.core.uploads import MAX_UPLOADS
 from ultragray_workers.claims import LOCK_NAME
 
 from ...dicom_files import write_cine

@@ -14,7 +14,7 @@ import httpx
 import pytest
 from pydantic import TypeAdapter
 
-from ultragray_service.http.reading.bodies import SPECIFICATIONS
+from ultragray_service.http.bodies import SPECIFICATIONS
 from ultragray_workers.jobs.kinds import Specification
 
 from ...waiting import at_this_load, wait_until

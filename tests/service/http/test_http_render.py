@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from ultragray import GaussianScene, LinearProbe, render
-from ultragray.confidence import FIGURES
+from ultragray.scene.confidence import FIGURES
 
 from ..conftest import HEIGHT, WIDTH, RunningService
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import pytest
 
 from ultragray.errors import InvalidArgument
-from ultragray_service.http.reading.multipart import FileParts
+from ultragray_service.http.bodies import FileParts
 
 TYPE = "multipart/form-data; boundary=x"
 BODY = (

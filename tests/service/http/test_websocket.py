@@ -20,7 +20,7 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 from websockets.sync.client import ClientConnection, connect
 
 from ultragray import GaussianScene, render
-from ultragray_service.http.stream_messages import FrameMessage, RefusalMessage
+from ultragray_service.http.routes.streams import FrameMessage, RefusalMessage
 
 from ...waiting import wait_until
 from ..conftest import HEIGHT, WIDTH, RunningService

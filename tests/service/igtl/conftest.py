@@ -141,7 +141,7 @@ def moved(x_mm: float) -> np.ndarray:
 
 def random_pose(seed: int) -> Any:
     """A pose [4, 4] mm near the scenes of the tests, as exact as float32 numbers are."""
-    from ultragray.pose import pose_from_position_quaternion
+    from ultragray.geometry.pose import pose_from_position_quaternion
 
     rng = np.random.default_rng(seed)
     quaternion = np.array([1.0, 0.0, 0.0, 0.0]) + rng.normal(0, 0.1, 4)

@@ -14,17 +14,18 @@ import pyigtl
 import pytest
 
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
-from ultragray_service.igtl.commands.contents import (
+from ultragray_service.igtl.commands import (
+    MAX_COMMAND_BYTES,
+    MAX_PARAMETERS,
+    PARAMETERS,
     Command,
     pack_command,
     pack_string,
     unpack_command,
     unpack_string,
 )
-from ultragray_service.igtl.commands.markup import MAX_COMMAND_BYTES, MAX_PARAMETERS
-from ultragray_service.igtl.commands.scanner import PARAMETERS
 from ultragray_service.igtl.contents import unpack_image, unpack_status
-from ultragray_service.igtl.crc64 import crc64
+from ultragray_service.igtl.messages import crc64
 
 from ...documents.tables import code, rows
 from ..conftest import DEMO_PROBE, RunningService

@@ -11,7 +11,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from ultragray.errors import InvalidPose, UltragrayError
-from ultragray.pose import check_poses
+from ultragray.geometry.pose import check_poses
 from ultragray_service.errors import IgtlMessageInvalid
 from ultragray_service.igtl.contents import (
     Image,

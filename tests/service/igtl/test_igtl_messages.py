@@ -12,12 +12,12 @@ from pyigtl.messages import MessageBase
 
 from ultragray_service.errors import IgtlMessageInvalid
 from ultragray_service.igtl.contents import unpack_image, unpack_transform
-from ultragray_service.igtl.crc64 import crc64
 from ultragray_service.igtl.messages import (
     DEVICE_NAME_BYTES,
     HEADER_BYTES,
     Header,
     Message,
+    crc64,
     pack_message,
     pack_text,
     unpack_header,

@@ -8,14 +8,14 @@ import pytest
 import torch
 
 from ultragray import ConvexProbe, LinearProbe
-from ultragray.confidence import Extrapolation
-from ultragray.display.frames import show
-from ultragray.display.scan_conversion import scan_convert
-from ultragray.display.settings import true_to_scale
-from ultragray.probe import Probe
-from ultragray.settings import Resolved
+from ultragray.geometry.probe import Probe
+from ultragray.geometry.scan_conversion import scan_convert
+from ultragray.rendering.display import true_to_scale
+from ultragray.rendering.frames import show
+from ultragray.rendering.settings import Resolved
+from ultragray.scene.confidence import Extrapolation
 from ultragray_service.igtl.frames import image_of
-from ultragray_workers.pool.types import RenderResult
+from ultragray_workers.pool.messages import RenderResult
 
 from .conftest import FAN, random_pose
 

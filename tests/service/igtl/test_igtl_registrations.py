@@ -10,10 +10,9 @@ import numpy as np
 import pyigtl
 import pytest
 
-from ultragray.probe import FloatArray
+from ultragray.geometry.probe import FloatArray
 from ultragray_client import Client
-from ultragray_service.igtl.contents import unpack_image, unpack_transform
-from ultragray_service.igtl.states import NOT_FOUND
+from ultragray_service.igtl.contents import NOT_FOUND, unpack_image, unpack_transform
 
 from ..conftest import RunningService, StartService
 from .conftest import Peer, address_of, moved, pyigtl_client

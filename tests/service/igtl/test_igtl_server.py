@@ -12,8 +12,8 @@ import numpy as np
 import pyigtl
 import pytest
 
-from ultragray.display.scan_conversion import scan_convert
-from ultragray.pose import check_poses
+from ultragray.geometry.pose import check_poses
+from ultragray.geometry.scan_conversion import scan_convert
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 from ultragray_service.igtl.contents import (
     Instrument,

@@ -21,8 +21,8 @@ import numpy.typing as npt
 import pyigtl
 import pytest
 
-from ultragray.pose import check_poses
-from ultragray.scene_info import read_header
+from ultragray.geometry.pose import check_poses
+from ultragray.scene.info import read_header
 
 from ..cli.command_line import refused, run
 from ..conftest import DEMO_PROBE, HEIGHT, WIDTH, RunningService, make_scene

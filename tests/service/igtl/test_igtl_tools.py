@@ -12,8 +12,8 @@ import pyigtl
 import pytest
 
 from ultragray.contract import from_dict
-from ultragray.probe import FloatArray
-from ultragray.tools import MAX_TOOLS, Needle, Tool
+from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.tools import MAX_TOOLS, Needle, Tool
 from ultragray_client import Client, RenderSettings
 from ultragray_client.contract import Box as ClientBox
 from ultragray_client.contract import Needle as ClientNeedle

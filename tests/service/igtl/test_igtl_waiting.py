@@ -8,11 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ultragray.registration.registration import Registration, rows
-from ultragray.settings import FrameSettings
-from ultragray_service.igtl.commands.scanner import Setup
+from ultragray.geometry.registration import Registration, rows
+from ultragray.rendering.settings import FrameSettings
+from ultragray_service.igtl.commands import Setup
+from ultragray_service.igtl.frames import MAX_WAITING_DEVICES, PoseMessage, Underway, WaitingPoses
 from ultragray_service.igtl.messages import Message
-from ultragray_service.igtl.waiting import MAX_WAITING_DEVICES, PoseMessage, Underway, WaitingPoses
 from ultragray_workers.errors import QueueFull
 
 SETUP = Setup(FrameSettings())

@@ -17,9 +17,9 @@ import pytest
 
 from ultragray.errors import InvalidArgument
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
-from ultragray_service.rpc.peers import address_of
+from ultragray_service.rpc.calls import address_of
 from ultragray_service.rpc.shared_memory import FOLDER, SharedMemory
-from ultragray_workers.pool.types import Place
+from ultragray_workers.pool.messages import Place
 
 from ...file_sizes import files_of_at_most
 from ...waiting import wait_until

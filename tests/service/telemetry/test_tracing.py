@@ -16,7 +16,7 @@ from opentelemetry.proto.trace.v1.trace_pb2 import Span, Status
 
 from ultragray.errors import InvalidArgument
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
-from ultragray_service.telemetry.tracing import start_tracing
+from ultragray_service.telemetry.logs import start_tracing
 
 from ...waiting import wait_until
 from ..conftest import RunningService

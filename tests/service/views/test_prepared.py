@@ -17,7 +17,7 @@ import pytest
 
 from ultragray.datasets.released import write_released
 from ultragray.errors import MemoryExceeded
-from ultragray_service.core.helper_processes import HelperProcesses
+from ultragray_service.core.threads import HelperProcesses
 from ultragray_service.settings import Settings
 from ultragray_service.views import prepared
 from ultragray_service.views.prepared import Preparation, Prepared
@@ -25,7 +25,7 @@ from ultragray_workers import claims
 from ultragray_workers.datasets.intake import check_files
 from ultragray_workers.datasets.store import DatasetStore, write_manifest
 from ultragray_workers.errors import ArtifactNotFound, DatasetNotFound, DeadlineExceeded, Draining, StorageFull
-from ultragray_workers.helpers.dataset_view import lay_out
+from ultragray_workers.views import lay_out
 
 from ...file_sizes import files_of_at_most
 from ..http.test_http_comparison import DATASET

@@ -13,8 +13,8 @@ import numpy as np
 import pytest
 
 from ultragray.datasets.released import write_released
-from ultragray.training.trainer import CHECKPOINT_FILE, CONFIG_FILE, JOURNAL_FILE
-from ultragray_service.views.training import MAX_POINTS
+from ultragray.learn.training.trainer import CHECKPOINT_FILE, CONFIG_FILE, JOURNAL_FILE
+from ultragray_service.views.prepared import MAX_POINTS
 from ultragray_workers.jobs.files import CHECKPOINT_NAME, CONFIG_NAME, JOURNAL_NAME
 
 from ...waiting import wait_until

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ultragray.demo import copy_demo_scene
+from ultragray.phantom.demo import copy_demo_scene
 from ultragray_workers.backup.contents import Folders
 from ultragray_workers.jobs.queue.database import JobDatabase
 from ultragray_workers.jobs.store import JobStore

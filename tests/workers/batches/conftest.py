@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 from ultragray import GaussianScene, LinearProbe
-from ultragray.batches import BatchPlan
-from ultragray.files.atomic import file_sha256
+from ultragray.exchange.batches import BatchPlan
+from ultragray.files import file_sha256
+from ultragray.rendering.settings import FrameSettings
 from ultragray.samplers import AroundSampler
-from ultragray.scene_info import read_header
-from ultragray.settings import FrameSettings
+from ultragray.scene.info import read_header
 from ultragray_workers.storage.opening import open_storage
 from ultragray_workers.storage.storage import Storage
 

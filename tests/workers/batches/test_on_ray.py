@@ -14,9 +14,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from ultragray.batches import names_in
-from ultragray.batches.shard import ShardRenderer
 from ultragray.errors import BackendUnavailable, InvalidArgument
+from ultragray.exchange.batches import names_in
+from ultragray.exchange.shards import ShardRenderer
 from ultragray_workers.batches import on_ray
 from ultragray_workers.batches.on_ray import RayBatch
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import pytest
 import torch
 
-from ultragray.batches import BatchPlan
-from ultragray.batches.shard import ShardRenderer
 from ultragray.errors import InvalidArgument
+from ultragray.exchange.batches import BatchPlan
+from ultragray.exchange.shards import ShardRenderer
 from ultragray_workers.batches.place import ShardPlace
 from ultragray_workers.storage.opening import open_storage
 from ultragray_workers.storage.storage import Storage

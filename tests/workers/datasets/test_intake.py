@@ -201,7 +201,7 @@ def test_options_are_named_as_requests_write_them(
 def run_intake(given: dict[str, Any], memory_bytes: int) -> subprocess.CompletedProcess[str]:
     program = (
         "from ultragray_workers.datasets.intake import take_in; "
-        "from ultragray_workers.helpers.helper import answer_request; answer_request(take_in)"
+        "from ultragray_workers.helpers import answer_request; answer_request(take_in)"
     )
     request = {"arguments": given, "memory_bytes": memory_bytes, "what": "checking the dataset"}
     return subprocess.run([sys.executable, "-c", program], input=json.dumps(request), capture_output=True, text=True)
@@ -262,11 +262,9 @@ def test_a_manifest_of_an_earlier_version_is_read(
 
 def test_deletion(store: DatasetStore, receive: Receive, files: dict[str, bytes]) -> None:
     add(store, receive, files, "tiny")
-    store.in_use = lambda name: f"job 7 ({name})"
     with pytest.raises(DatasetInUse, match=r"needed by job 7 \(tiny\)"):
-        store.delete("tiny")
+        store.delete("tiny", lambda name: f"job 7 ({name})")
     assert store.names() == ["tiny"]
-    store.in_use = lambda name: None
     store.delete("tiny")
     assert leftovers(store) == []
     for call in (store.get, store.delete, store.load, store.contact_sheet):

@@ -9,8 +9,8 @@ import pytest
 
 from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe
 from ultragray.datasets import Sweep
-from ultragray.evaluation.side_by_side import as_picture
-from ultragray_workers.helpers.picture_stack import PICTURE_SIDE, read_picture, write_stacks
+from ultragray.learn.evaluation.side_by_side import as_picture
+from ultragray_workers.helpers import PICTURE_SIDE, read_picture, write_stacks
 
 PROBES = {
     "linear": LinearProbe(30.0, 0.0, 60.0),

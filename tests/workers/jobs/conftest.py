@@ -19,7 +19,7 @@ import pytest
 
 from ultragray import LinearProbe
 from ultragray.datasets.released import write_released
-from ultragray.datasets.sweep import Dataset, Sweep
+from ultragray.learn.sweep import Dataset, Sweep
 from ultragray_workers.datasets.store import FILES_NAME, DatasetRecord, write_manifest
 from ultragray_workers.jobs.kinds import TrainJob
 from ultragray_workers.jobs.queue.database import SQLITE_FILE, JobDatabase

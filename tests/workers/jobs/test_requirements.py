@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from ultragray import GaussianScene, LinearProbe
-from ultragray.confidence import ConfidenceModel
 from ultragray.errors import InvalidArgument, InvalidImageSize, InvalidProbe, LowConfidence, UnknownOutput
 from ultragray.samplers import AroundSampler, SplineSampler, TrainingSampler
+from ultragray.scene.confidence import ConfidenceModel
 from ultragray_workers.errors import DatabaseUnavailable, SceneNotFound, StorageFull
 from ultragray_workers.jobs import requirements
 from ultragray_workers.jobs.kinds import RenderJob, render

@@ -6,11 +6,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from ultragray.display import Display
 from ultragray.errors import InvalidArgument
-from ultragray.probe import ConvexProbe
+from ultragray.geometry.probe import ConvexProbe
+from ultragray.rendering.display import Display
+from ultragray.rendering.settings import Below
 from ultragray.samplers import AroundSampler, FanSampler, SplineSampler, TrainingSampler
-from ultragray.settings import Below
 from ultragray_workers.jobs.kinds import RenderJob, TrainJob
 from ultragray_workers.jobs.specification import from_dict, in_short, to_dict
 

@@ -127,7 +127,7 @@ def test_scene_name_is_free_again_after_cancelling(store: JobStore) -> None:
 def test_scenes_of_the_service_may_be_rendered_and_not_replaced(
     artifact_folder: Path, tmp_path: Path, database_url: str | None
 ) -> None:
-    from ultragray.demo import copy_demo_scene
+    from ultragray.phantom.demo import copy_demo_scene
 
     (tmp_path / "data").mkdir()
     copy_demo_scene(tmp_path / "data" / "demo.ugr")

@@ -12,12 +12,12 @@ import pytest
 import torch
 
 from ultragray import GaussianScene, SceneInfo
-from ultragray.demo import DEMO_FILE
 from ultragray.errors import FrameTooCostly, RenderFailed
-from ultragray.rendering import footprint_pixels
+from ultragray.phantom.demo import DEMO_FILE
+from ultragray.rendering.frames import footprint_pixels
 from ultragray_workers import PoolConfig, Priority
 from ultragray_workers.errors import DeadlineExceeded
-from ultragray_workers.pool import watchdog
+from ultragray_workers.pool import processes as watchdog
 
 from ..asking import HEIGHT, PROBE, WIDTH, asking
 
@@ -217,7 +217,7 @@ def test_a_load_that_hangs_is_ended(run, open_pool, until):
 
 
 def test_a_pool_whose_workers_are_stuck_is_not_ready(run, open_pool, random_poses, until, monkeypatch):
-    monkeypatch.setattr("ultragray_workers.pool.slot.STUCK_AFTER_S", 0.5)
+    monkeypatch.setattr("ultragray_workers.pool.processes.STUCK_AFTER_S", 0.5)
     assert watchdog.STUCK_AFTER_S <= 10.0
 
     async def main():

@@ -5,9 +5,9 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ultragray.display.pixels import to_uint8
-from ultragray.settings import Encoding
-from ultragray_workers.pool.process.encoding import encode_image, encode_pixels
+from ultragray.rendering.pixels import to_uint8
+from ultragray.rendering.settings import Encoding
+from ultragray_workers.pool.pixels import encode_image, encode_pixels
 
 
 def test_uint8_saturates_and_rounds():

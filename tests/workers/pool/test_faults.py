@@ -12,7 +12,7 @@ import time
 import pytest
 
 from ultragray.errors import RenderFailed
-from ultragray.settings import Encoding
+from ultragray.rendering.settings import Encoding
 from ultragray_workers import Priority
 
 from ..asking import asking

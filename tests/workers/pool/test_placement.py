@@ -5,9 +5,9 @@ from __future__ import annotations
 import pytest
 import torch
 
-from ultragray.backends import cuda
 from ultragray.errors import BackendUnavailable
-from ultragray_workers.pool.process.placement import render_device
+from ultragray.rendering.backends import cuda
+from ultragray_workers.pool.scene_cache import render_device
 
 CPU = torch.device("cpu")
 

@@ -15,8 +15,8 @@ import pytest
 
 from ultragray import ConvexProbe
 from ultragray.errors import BackendUnavailable, InvalidArgument, SceneFileInvalid
-from ultragray.files.atomic import file_sha256
-from ultragray.settings import Encoding
+from ultragray.files import file_sha256
+from ultragray.rendering.settings import Encoding
 from ultragray_workers import PoolConfig, Priority, RenderPool, SceneStore
 from ultragray_workers.errors import DeadlineExceeded, Draining, NotReady, QueueFull, SceneNotFound, SceneTooLarge
 

@@ -15,7 +15,7 @@ import torch
 
 from ultragray import ConvexProbe, render
 from ultragray.errors import BackendUnavailable, MemoryExceeded
-from ultragray.settings import Encoding
+from ultragray.rendering.settings import Encoding
 from ultragray_workers import PoolConfig, RenderPool, SceneStore
 
 from ..asking import asking

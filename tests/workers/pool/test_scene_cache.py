@@ -9,11 +9,11 @@ import torch
 
 from ultragray import GaussianScene
 from ultragray.errors import MemoryExceeded, SceneFileInvalid
-from ultragray.files.atomic import file_sha256
+from ultragray.files import file_sha256
 from ultragray_workers import SceneStore
 from ultragray_workers.errors import SceneTooLarge
-from ultragray_workers.pool.process import scene_cache
-from ultragray_workers.pool.process.scene_cache import SceneCache
+from ultragray_workers.pool import scene_cache
+from ultragray_workers.pool.scene_cache import SceneCache
 from ultragray_workers.scenes import resident_bytes
 
 CPU = torch.device("cpu")

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray.settings import Encoding
-from ultragray_workers.pool.process import encoding
-from ultragray_workers.pool.process.transfer import CHUNK_POSES, render_to_host, to_uint8
+from ultragray.rendering.settings import Encoding
+from ultragray_workers.pool import pixels as encoding
+from ultragray_workers.pool.pixels import CHUNK_POSES, render_to_host, round_to_uint8
 
 UINT8, FLOAT32 = np.dtype("u1"), np.dtype("<f4")
 POSES = 2 * CHUNK_POSES + 3
@@ -71,7 +71,7 @@ def test_rounding_equals_the_encoders():
     values = [*(np.arange(511) / 510), 1.0, 1.0 + 1e-6, 3.0, *np.random.default_rng(0).random(1000)]
     frames = np.array(values, np.float32).reshape(1, 2, -1)
     before = frames.copy()
-    np.testing.assert_array_equal(to_uint8(torch.from_numpy(frames)).numpy(), encoding.to_uint8(frames))
+    np.testing.assert_array_equal(round_to_uint8(torch.from_numpy(frames)).numpy(), encoding.to_uint8(frames))
     np.testing.assert_array_equal(frames, before)
 
 

@@ -12,8 +12,7 @@ import pytest
 
 from ultragray_workers import Priority
 from ultragray_workers.errors import QueueFull
-from ultragray_workers.pool.fairness.forecast import Forecast
-from ultragray_workers.pool.fairness.turns import Caller, Turns
+from ultragray_workers.pool.turns import Caller, Forecast, Turns
 from ultragray_workers.pool.waiting import Ticket, WaitingQueue
 
 from ..asking import asking

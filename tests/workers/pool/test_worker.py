@@ -2,8 +2,8 @@
 
 from typing import get_args
 
-from ultragray.probe.scan_lines import Lines
-from ultragray_workers.pool.process.worker import example_probes
+from ultragray.geometry.probe import Lines
+from ultragray_workers.pool.worker import example_probes
 
 
 def test_every_bundle_of_scan_lines_is_warmed_up():

@@ -13,7 +13,7 @@ from pathlib import Path
 import pytest
 
 from ultragray.errors import SceneFileInvalid
-from ultragray.scene_info import read_header
+from ultragray.scene.info import read_header
 from ultragray_workers.errors import SceneExists, SceneNotFound, StorageUnavailable
 from ultragray_workers.scenes import SceneStore
 from ultragray_workers.shelves import bucket as bucket_module

@@ -135,7 +135,7 @@ def test_a_version_that_has_gone_is_not_there(cache: Cache, source: SlowStorage)
 DIES = """
 import os, sys
 from pathlib import Path
-from ultragray.files.atomic import atomic_path
+from ultragray.files import atomic_path
 from ultragray_workers.storage.cache import Cache
 from ultragray_workers.storage.local import LocalStorage
 

@@ -12,7 +12,7 @@ from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-from ultragray.files.atomic import write_whole
+from ultragray.files import write_whole
 from ultragray_workers.errors import BackupInvalid
 
 FORMAT_VERSION = 1

@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from ultragray.files.atomic import file_sha256, sync
+from ultragray.files import file_sha256, sync
 from ultragray_workers.storage.local import FileVersion
 
 FOLDER = "objects"

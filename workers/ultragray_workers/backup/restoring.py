@@ -14,8 +14,7 @@ from pathlib import Path
 
 import sqlalchemy as sa
 
-from ultragray.files.atomic import atomic_path, file_sha256, sync
-from ultragray.files.link import link_or_copy
+from ultragray.files import atomic_path, file_sha256, link_or_copy, sync
 from ultragray_workers.backup import manifest as manifests
 from ultragray_workers.backup.backing_up import alone_in
 from ultragray_workers.backup.contents import ARTIFACTS, Folders, files_of

@@ -15,15 +15,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import ultragray
-from ultragray.batches import BatchPlan
 from ultragray.errors import BackendUnavailable, InvalidArgument, RenderFailed, UltragrayError
+from ultragray.exchange.batches import BatchPlan
 from ultragray.installation import missing_extra
 from ultragray_workers.batches.place import ShardPlace
 from ultragray_workers.errors import StorageUnavailable
 from ultragray_workers.storage.opening import open_storage
 
 if TYPE_CHECKING:
-    from ultragray.batches.shard import ShardRenderer
+    from ultragray.exchange.shards import ShardRenderer
 
 LOCAL, REMOTE = "ray", "ray://"
 MOST_TRIES = 20  # of one shard, whose worker died
@@ -159,8 +159,8 @@ def _make_shard(
 
 def _renderer(plan: BatchPlan, scene: bytes, backend: str) -> ShardRenderer:
     global _held
-    from ultragray.batches.shard import ShardRenderer
-    from ultragray_workers.pool.process.placement import render_device
+    from ultragray.exchange.shards import ShardRenderer
+    from ultragray_workers.pool.scene_cache import render_device
 
     wanted = f"{plan.identity} {backend}"
     if _held is None or _held[0] != wanted:

@@ -16,9 +16,9 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 
-from ultragray.batches import MANIFEST_FILE, BatchPlan, ShardEntry, manifest
 from ultragray.errors import InvalidArgument
-from ultragray.files.atomic import sync
+from ultragray.exchange.batches import MANIFEST_FILE, BatchPlan, ShardEntry, manifest
+from ultragray.files import sync
 from ultragray_workers.storage.storage import NotThere, Storage
 
 _ENTRIES = "entries"

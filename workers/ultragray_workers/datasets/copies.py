@@ -13,7 +13,7 @@ import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from ultragray.files.atomic import sync
+from ultragray.files import sync
 from ultragray_workers.claims import LOCK_NAME, claimed_folder, remove_abandoned
 
 FOLDER = ".copies"

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import IO
 
 from ultragray.errors import DatasetInvalid
-from ultragray.files.atomic import sync
+from ultragray.files import sync
 from ultragray_workers.claims import DELETED_PREFIX, claimed_folder, remove_abandoned, storage_full
 from ultragray_workers.datasets.shelf import FILES_NAME
 from ultragray_workers.datasets.store import DatasetRecord, DatasetStore

@@ -10,7 +10,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 
 from ultragray.errors import UltragrayError
-from ultragray.files.atomic import sync
+from ultragray.files import sync
 from ultragray_workers.claims import storage_full
 from ultragray_workers.datasets.contents import find_source
 from ultragray_workers.datasets.incoming import ARCHIVE_NAME, DATASET_NAME

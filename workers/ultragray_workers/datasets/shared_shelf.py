@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from ultragray.errors import DatasetInvalid
-from ultragray.files.atomic import file_sha256
+from ultragray.files import file_sha256
 from ultragray_workers.claims import is_claimed
 from ultragray_workers.datasets.copies import DEFAULT_MAX_BYTES, LocalCopies
 from ultragray_workers.datasets.shelf import CONTACT_SHEET_NAME, FILES_NAME, MANIFEST_NAME

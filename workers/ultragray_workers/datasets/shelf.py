@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Protocol
 
-from ultragray.files.atomic import sync
+from ultragray.files import sync
 from ultragray_workers.claims import is_claimed, out_of_sight
 
 MANIFEST_NAME, FILES_NAME, CONTACT_SHEET_NAME = "dataset.json", "files", "contact_sheet.png"

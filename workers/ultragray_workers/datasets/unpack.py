@@ -14,7 +14,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO, TypeVar
 
 from ultragray.errors import DatasetInvalid
-from ultragray.files.atomic import sync
+from ultragray.files import sync
 from ultragray_workers.errors import UploadTooLarge
 
 MAX_FILES = 1000

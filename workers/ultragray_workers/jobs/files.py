@@ -11,7 +11,7 @@ from ultragray_workers.jobs.shared.reading import SharedFile, SharedLog
 
 Artifact: TypeAlias = Path | SharedFile
 Log: TypeAlias = Path | SharedLog
-# Of a run; `ultragray.training`, which writes all but the last, imports torch.
+# Of a run; `ultragray.learn.training`, which writes all but the last, imports torch.
 JOURNAL_NAME, CHECKPOINT_NAME, CONFIG_NAME = "metrics.jsonl", "checkpoint.safetensors", "config.json"
 BASELINES_NAME = "baselines.json"  # what classical methods reach, PSNR in dB by their names
 

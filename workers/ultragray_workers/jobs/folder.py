@@ -24,7 +24,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 from ultragray.contract import described
-from ultragray.files.atomic import remove_stale_temporaries, sync, write_whole
+from ultragray.files import remove_stale_temporaries, sync, write_whole
 from ultragray_workers.datasets.copies import DEFAULT_MAX_BYTES
 
 FOLDER, BATCH = "jobs", "batch"
@@ -101,7 +101,7 @@ class Request:
     device: str  # cpu, cuda or cuda:N
     threads: int
     nice: int
-    max_footprint_pixels: int | None = None  # of a frame, see ultragray.limits; None: no limit
+    max_footprint_pixels: int | None = None  # of a frame, see ultragray.rendering.limits; None: no limit
     storage: str | None = None  # that several hosts share; None: all is in the artifact folder
     max_copies_bytes: int = DEFAULT_MAX_BYTES  # of shared datasets on this host
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from ultragray.files.atomic import file_sha256
+from ultragray.files import file_sha256
 from ultragray_workers.errors import SceneExists
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.queue.database import JobDatabase

@@ -8,10 +8,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ultragray.files.atomic import sync
-from ultragray.files.link import link_or_copy
-from ultragray.registration.registration import Registration
-from ultragray.scene_info import SceneHeader, read_header
+from ultragray.files import link_or_copy, sync
+from ultragray.geometry.registration import Registration
+from ultragray.scene.info import SceneHeader, read_header
 from ultragray_workers.claims import storage_full
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import SceneExists

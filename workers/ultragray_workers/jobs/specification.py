@@ -10,7 +10,7 @@ import numpy as np
 
 from ultragray import contract
 from ultragray.errors import InvalidArgument
-from ultragray.probe import FloatArray
+from ultragray.geometry.probe import FloatArray
 from ultragray.samplers import MAX_POSES
 from ultragray_workers.jobs.kinds.base import Specification
 

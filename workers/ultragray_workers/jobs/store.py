@@ -17,10 +17,10 @@ import sqlalchemy as sa
 from dbos import EnqueueOptions, WorkflowSerializationFormat, WorkflowStatus
 from dbos import error as dbos_error
 
-from ultragray.batches import stands_for
 from ultragray.errors import InvalidArgument
-from ultragray.image_size import MAX_IMAGE_SIDE
-from ultragray.registration.registration import Registration
+from ultragray.exchange.batches import stands_for
+from ultragray.geometry.image_size import MAX_IMAGE_SIDE
+from ultragray.geometry.registration import Registration
 from ultragray_workers.claims import is_claimed
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import (

@@ -10,11 +10,10 @@ from collections.abc import Awaitable, Iterable
 from dataclasses import replace
 from typing import Any
 
-from ultragray.confidence import Extrapolation
 from ultragray.errors import RenderFailed, UltragrayError
-from ultragray.volumes.plane import SliceView
-from ultragray_workers.pool.launcher import Launcher
-from ultragray_workers.pool.memory import MemoryPool, write_at
+from ultragray.rendering.volumes import SliceView
+from ultragray.scene.confidence import Extrapolation
+from ultragray_workers.pool.channel import MemoryPool, write_at
 from ultragray_workers.pool.messages import (
     Answer,
     ForkWorker,
@@ -25,13 +24,13 @@ from ultragray_workers.pool.messages import (
     Rendered,
     RenderPart,
     RenderTask,
+    SceneChangedError,
     SliceTask,
+    Sought,
     UnloadTask,
 )
-from ultragray_workers.pool.slot import Assignment, Command, Slot
-from ultragray_workers.pool.types import SceneChangedError, Sought
+from ultragray_workers.pool.processes import Assignment, Command, Launcher, Patience, Slot
 from ultragray_workers.pool.waiting import Packing, Part, Step, Ticket, WaitingQueue
-from ultragray_workers.pool.watchdog import Patience
 from ultragray_workers.rounds import Rounds
 
 _MAX_DEATHS = 5

@@ -19,14 +19,21 @@ from typing import Any, TypeVar
 from ultragray.contract import Contract, described
 from ultragray.errors import InvalidArgument, RenderFailed
 from ultragray_workers.errors import Draining, NotReady
-from ultragray_workers.pool.channel import MAX_DESCRIPTORS
+from ultragray_workers.pool.channel import MAX_DESCRIPTORS, read_start
 from ultragray_workers.pool.dispatcher import Dispatcher
-from ultragray_workers.pool.launcher import Launcher
-from ultragray_workers.pool.memory import read_start
-from ultragray_workers.pool.messages import ForkWorker, LoadTask, Rendered, UnloadTask
-from ultragray_workers.pool.types import LocalizeResult, RenderRequest, RenderResult, S, SceneChangedError
+from ultragray_workers.pool.messages import (
+    ForkWorker,
+    LoadTask,
+    LocalizeResult,
+    Rendered,
+    RenderRequest,
+    RenderResult,
+    S,
+    SceneChangedError,
+    UnloadTask,
+)
+from ultragray_workers.pool.processes import Launcher, Patience
 from ultragray_workers.pool.waiting import Expiry, Ticket, Turn, WaitingQueue
-from ultragray_workers.pool.watchdog import Patience
 from ultragray_workers.scene_names import base_name
 from ultragray_workers.scenes import SceneStore
 
@@ -62,7 +69,9 @@ class PoolConfig(Contract):
     memory_budget_bytes: int = described(
         "Of loaded scenes, per process, where they are rendered.", 4 * 2**30, low=1, high=2**63
     )
-    max_footprint_pixels: int = described("Cost of a frame, see ultragray.limits.", 2**31, low=1, high=2**63 - 1)
+    max_footprint_pixels: int = described(
+        "Cost of a frame, see ultragray.rendering.limits.", 2**31, low=1, high=2**63 - 1
+    )
     worker_grace_s: float = described(
         "How long a process may leave a task untouched, or owe its answer after the deadline.",
         5.0,
@@ -93,8 +102,13 @@ class PoolStatistics:
 class RenderPool:
     """Worker processes and the queue before them. All its methods belong to one event loop."""
 
-    def __init__(self, store: SceneStore, config: PoolConfig) -> None:
-        self.on_rendered: Callable[[RenderResult[Any]], None] | None = None
+    def __init__(
+        self,
+        store: SceneStore,
+        config: PoolConfig,
+        on_rendered: Callable[[RenderResult[Any]], None] = lambda result: None,
+    ) -> None:
+        self.on_rendered = on_rendered
         self._store = store
         self._waiting = WaitingQueue(
             config.queue_limit_frames,
@@ -150,8 +164,7 @@ class RenderPool:
         MemoryExceeded, RenderFailed; SceneChangedError where the request is for another version of the scene's file.
         """
         result = await self._answered(request, turn or Turn(), _frames)
-        if self.on_rendered is not None:
-            self.on_rendered(result)
+        self.on_rendered(result)
         return result
 
     async def localize(self, request: RenderRequest) -> LocalizeResult:

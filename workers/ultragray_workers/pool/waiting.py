@@ -10,14 +10,12 @@ from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
-from ultragray.probe import FloatArray
-from ultragray.settings import Encoding, Resolved
-from ultragray.volumes.plane import SliceView
+from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.settings import Encoding, Resolved
+from ultragray.rendering.volumes import SliceView
 from ultragray_workers.errors import DeadlineExceeded, QueueFull
-from ultragray_workers.pool.fairness.forecast import Forecast
-from ultragray_workers.pool.fairness.turns import Turns
-from ultragray_workers.pool.messages import Rendered
-from ultragray_workers.pool.types import Priority, RenderRequest
+from ultragray_workers.pool.messages import Priority, Rendered, RenderRequest
+from ultragray_workers.pool.turns import Forecast, Turns
 
 _FULL_BATCH_PIXELS_PER_POSE = 512 * 512
 _ATTEMPTS_IN_COMPANY = 2

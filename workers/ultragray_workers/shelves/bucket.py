@@ -10,7 +10,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
-from ultragray.scene_info import SceneHeader, read_header
+from ultragray.scene.info import SceneHeader, read_header
 from ultragray_workers.claims import claimed_folder, remove_abandoned
 from ultragray_workers.errors import StorageUnavailable
 from ultragray_workers.rounds import Rounds

@@ -6,9 +6,8 @@ import contextlib
 from collections.abc import Iterator
 from pathlib import Path
 
-from ultragray.files.atomic import file_sha256, sync
-from ultragray.files.link import link_or_copy
-from ultragray.scene_info import SceneHeader, read_header
+from ultragray.files import file_sha256, link_or_copy, sync
+from ultragray.scene.info import SceneHeader, read_header
 from ultragray_workers.claims import claimed_folder, is_claimed, remove_abandoned
 from ultragray_workers.errors import SceneExists
 from ultragray_workers.scene_names import SUFFIX, is_scene_name

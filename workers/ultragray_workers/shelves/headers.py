@@ -9,7 +9,7 @@ from collections import OrderedDict
 from typing import Generic, TypeVar
 
 from ultragray.errors import SceneFileInvalid
-from ultragray.scene_info import (
+from ultragray.scene.info import (
     CORRECTIONS_TENSOR,
     SceneHeader,
     SceneInfo,

@@ -21,7 +21,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
-from ultragray.files.atomic import file_sha256
+from ultragray.files import file_sha256
 from ultragray_workers.errors import SceneExists, StorageUnavailable
 from ultragray_workers.scene_names import SUFFIX, is_scene_name
 from ultragray_workers.storage.storage import Entry, NotThere, Storage

@@ -6,7 +6,7 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 from typing import Protocol
 
-from ultragray.scene_info import SceneHeader
+from ultragray.scene.info import SceneHeader
 
 
 class Shelf(Protocol):

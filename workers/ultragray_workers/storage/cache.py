@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO
 
-from ultragray.files.atomic import file_sha256, remove_stale_temporaries
+from ultragray.files import file_sha256, remove_stale_temporaries
 from ultragray_workers.errors import StorageFull, StorageUnavailable
 from ultragray_workers.storage.storage import NotThere, Storage
 

@@ -13,7 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 
-from ultragray.files.atomic import file_sha256
+from ultragray.files import file_sha256
 from ultragray_workers.errors import RestoreRefused, StorageUnavailable
 from ultragray_workers.storage.storage import NotThere, Storage
 

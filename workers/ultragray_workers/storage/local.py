@@ -11,8 +11,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from ultragray.files.atomic import TEMPORARY_SUFFIX, atomic_path, sync
-from ultragray.files.link import link_or_copy
+from ultragray.files import TEMPORARY_SUFFIX, atomic_path, link_or_copy, sync
 from ultragray_workers.storage.storage import Entry, NotThere, check_key
 
 _LOCK = ".storage.lock"  # held while an object is compared and replaced

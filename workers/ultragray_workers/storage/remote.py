@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ultragray.errors import InvalidArgument
-from ultragray.files.atomic import atomic_path
+from ultragray.files import atomic_path
 from ultragray.installation import missing_extra
 from ultragray_workers.errors import StorageUnavailable
 from ultragray_workers.storage.location import StorageUrl

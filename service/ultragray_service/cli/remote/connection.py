@@ -11,7 +11,7 @@ from typing import Annotated, Any, get_type_hints
 import typer
 
 from ultragray_service.cli.options import keyword, with_parameters
-from ultragray_service.cli.style import warn
+from ultragray_service.cli.terminal import warn
 from ultragray_service.environment import ADDRESS, API_KEY, CA, CLIENT_CERTIFICATE, CLIENT_KEY
 
 CONNECTION, TLS = "Connection", "TLS"

@@ -10,12 +10,10 @@ import typer
 from ultragray.datasets.source import UPLOAD_OPTIONS, SourceOptions
 from ultragray.errors import InvalidArgument
 from ultragray_service.cli.options import with_options
-from ultragray_service.cli.output import print_table
-from ultragray_service.cli.progress import transferred
 from ultragray_service.cli.remote.connection import with_connection
-from ultragray_service.cli.scenes.show import print_facts
-from ultragray_service.cli.style import Json, command_group, examples, tell, to_json, warn
-from ultragray_service.cli.sweeps.source import SWEEP_MEANING
+from ultragray_service.cli.scenes import print_facts
+from ultragray_service.cli.sweeps import SWEEP_MEANING
+from ultragray_service.cli.terminal import Json, command_group, examples, print_table, tell, to_json, transferred, warn
 
 if TYPE_CHECKING:
     from ultragray_service.remote.connection import Connection

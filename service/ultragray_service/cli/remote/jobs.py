@@ -9,15 +9,26 @@ from typing import TYPE_CHECKING, Annotated, Any, get_type_hints
 import numpy as np
 import typer
 
-from ultragray.batches import names_in
 from ultragray.contract import to_dict
+from ultragray.exchange.batches import names_in
 from ultragray.samplers import TrainingSampler
 from ultragray_service.cli.options import parameters_of, values_of, with_parameters
-from ultragray_service.cli.output import check_file, print_table
-from ultragray_service.cli.progress import counted, transferred
 from ultragray_service.cli.remote.connection import with_connection
-from ultragray_service.cli.scenes.show import print_facts
-from ultragray_service.cli.style import Force, Json, command_group, examples, output_option, tell, to_json, warn
+from ultragray_service.cli.scenes import print_facts
+from ultragray_service.cli.terminal import (
+    Force,
+    Json,
+    check_file,
+    command_group,
+    counted,
+    examples,
+    output_option,
+    print_table,
+    tell,
+    to_json,
+    transferred,
+    warn,
+)
 from ultragray_workers.jobs.kinds import KINDS, Specification
 
 if TYPE_CHECKING:

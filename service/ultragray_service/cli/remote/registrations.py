@@ -7,10 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ultragray_service.cli.output import print_table
 from ultragray_service.cli.remote.connection import with_connection
-from ultragray_service.cli.scenes.show import print_facts
-from ultragray_service.cli.style import Json, command_group, examples, tell, to_json
+from ultragray_service.cli.scenes import print_facts
+from ultragray_service.cli.terminal import Json, command_group, examples, print_table, tell, to_json
 
 if TYPE_CHECKING:
     from ultragray_service.remote.connection import Connection
@@ -63,7 +62,7 @@ def upload(
     json: Json = False,
 ) -> None:
     """Have the service keep a registration, in place of one of that name which is yours."""
-    from ultragray.registration.registration import load_registration
+    from ultragray.geometry.registration import load_registration
     from ultragray_service.remote.registrations import Registrations
 
     called = file.stem if name is None else name

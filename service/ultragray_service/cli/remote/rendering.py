@@ -9,13 +9,12 @@ from typing import TYPE_CHECKING, Any
 
 from ultragray.contract import from_dict, to_dict
 from ultragray.errors import InvalidArgument
-from ultragray.files.atomic import write_whole
-from ultragray.files.poses import load_poses
-from ultragray.probe import FloatArray, Probe
+from ultragray.exchange.poses import load_poses
+from ultragray.files import write_whole
+from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.rendering.settings import FrameSettings
 from ultragray.samplers import Sampler
-from ultragray.settings import FrameSettings
-from ultragray_service.cli.output import OR_A_FOLDER, check_ending, check_file, check_folder, is_folder_name
-from ultragray_service.cli.progress import counted
+from ultragray_service.cli.terminal import OR_A_FOLDER, check_ending, check_file, check_folder, counted, is_folder_name
 
 if TYPE_CHECKING:
     from ultragray_service.remote.connection import Connection

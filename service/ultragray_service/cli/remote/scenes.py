@@ -7,24 +7,26 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from ultragray.rendering.settings import FrameSettings, RenderSettings
 from ultragray.samplers import Sampler
-from ultragray.scene_info import read_header
-from ultragray.settings import FrameSettings, RenderSettings
+from ultragray.scene.info import read_header
 from ultragray_service.cli.options import FieldsOf, poses_option, with_options
-from ultragray_service.cli.output import SCENE_SUFFIX, check_file, print_table
-from ultragray_service.cli.progress import transferred
 from ultragray_service.cli.remote.connection import with_connection
 from ultragray_service.cli.remote.rendering import SUFFIXES, Wanted, checked_kind
-from ultragray_service.cli.scenes.show import print_facts
-from ultragray_service.cli.style import (
+from ultragray_service.cli.scenes import print_facts
+from ultragray_service.cli.terminal import (
+    SCENE_SUFFIX,
     Force,
     Json,
+    check_file,
     command_group,
     examples,
     frames_in_words,
     output_option,
+    print_table,
     tell,
     to_json,
+    transferred,
 )
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ from typing import Any
 
 import typer
 
-from ultragray_service.cli.group import INTERRUPTED
-from ultragray_service.cli.style import tell
+from ultragray_service.cli.app import INTERRUPTED
+from ultragray_service.cli.terminal import tell
 from ultragray_service.remote.jobs import Jobs
 from ultragray_workers.errors import NotReady
 

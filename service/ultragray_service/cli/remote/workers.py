@@ -6,9 +6,8 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from ultragray_service.cli.output import print_table
 from ultragray_service.cli.remote.connection import with_connection
-from ultragray_service.cli.style import Json, command_group, examples, tell, to_json
+from ultragray_service.cli.terminal import Json, command_group, examples, print_table, tell, to_json
 from ultragray_workers.jobs.matching.demand import GB
 
 if TYPE_CHECKING:

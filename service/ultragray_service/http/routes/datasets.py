@@ -1,27 +1,33 @@
-"""Datasets: uploaded, checked, listed, looked at, deleted."""
+"""Data sets: uploaded, checked, listed, looked at, compared with scenes, deleted."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import AsyncIterator
 from inspect import Parameter, Signature
-from typing import Annotated, Any
+from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Depends, Path, Query
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 
 from ultragray.datasets.source import UPLOAD_OPTIONS, UPLOADED_FORMATS
-from ultragray_service.core import datasets
-from ultragray_service.core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
-from ultragray_service.core.dataset_uploads import DatasetUpload
-from ultragray_service.core.datasets import DatasetPage, contact_sheet, dataset_page, with_owner
-from ultragray_service.core.helper_processes import PATIENCE_S
+from ultragray_service.core.datasets import DatasetPage
+from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
+from ultragray_service.core.threads import PATIENCE_S
+from ultragray_service.core.uploads import DatasetUpload
 from ultragray_service.errors import UnsupportedMediaType
-from ultragray_service.http.deps import ServiceDep, problems
-from ultragray_service.http.disconnect import finish_or_abandon
-from ultragray_service.http.reading.accept import PNG
-from ultragray_service.http.reading.multipart import FileParts
+from ultragray_service.http.accept import PNG
+from ultragray_service.http.bodies import FileParts
+from ultragray_service.http.dependencies import (
+    NOT_MODIFIED,
+    SceneName,
+    ServiceDep,
+    finish_or_abandon,
+    problems,
+    revalidated,
+)
+from ultragray_service.views.prepared import Comparison, DatasetPoses
 from ultragray_workers.datasets.store import DatasetRecord
 from ultragray_workers.errors import UploadTooLarge
 
@@ -95,7 +101,7 @@ async def put_dataset(
     private: Private = False,
 ) -> DatasetRecord:
     """Uploads a dataset, checks it as `ultragray check` does, and keeps it. Empty options: as it is stored."""
-    service.require_serving()
+    service.life.require_serving()
     media_type = _media_type(request)
     announced = request.headers.get("content-length", "")
     if announced.isdigit() and int(announced) > service.settings.max_dataset_bytes:
@@ -111,7 +117,7 @@ async def put_dataset(
         deadline = time.monotonic() + PATIENCE_S
         record, is_new = await finish_or_abandon(upload.finish(), request.receive, deadline)
     response.status_code = 201 if is_new else 200
-    return with_owner(service, record)
+    return service.datasets.with_owner(record)
 
 
 @router.get("", responses=problems(401, 422, 503))
@@ -119,13 +125,13 @@ async def list_datasets(
     service: ServiceDep, page_size: PageSize = DEFAULT_PAGE_SIZE, page_token: PageToken = ""
 ) -> DatasetPage:
     """The datasets by name."""
-    return await dataset_page(service, page_size, page_token)
+    return await service.datasets.page(page_size, page_token)
 
 
 @router.get("/{dataset}", responses=problems(401, 404, 422, 503))
 async def get_dataset(service: ServiceDep, dataset: DatasetName) -> DatasetRecord:
     """Size, probe, split, and what the check warned of."""
-    return await datasets.dataset(service, dataset)
+    return await service.datasets.get(dataset)
 
 
 @router.get(
@@ -135,7 +141,7 @@ async def get_dataset(service: ServiceDep, dataset: DatasetName) -> DatasetRecor
 )
 async def get_contact_sheet(service: ServiceDep, dataset: DatasetName) -> Response:
     """A picture of the dataset, PNG."""
-    return Response(await contact_sheet(service.datasets, dataset), media_type=PNG)
+    return Response(await service.datasets.contact_sheet(dataset), media_type=PNG)
 
 
 @router.delete("/{dataset}", status_code=204, responses=problems(401, 403, 404, 409, 422, 503))
@@ -183,3 +189,80 @@ async def _blocks(request: Request, upload: DatasetUpload) -> AsyncIterator[byte
             raise ClientDisconnect
         more = message.get("more_body", False)
         yield message.get("body", b"")
+
+
+# Pictures to compare: a scene beside the frames held out from it, and the frames and poses of a dataset.
+
+
+comparison_router = APIRouter(prefix="/v1", tags=["console"])
+
+FrameIndex = Annotated[int, Path(ge=0, description="Place of the frame, from 0.")]
+_Answers2 = dict[int | str, dict[str, Any]]
+_FRAME_PICTURE: _Answers2 = {
+    200: {
+        "description": "8-bit grey, square pixels, 512 on the longer side.",
+        "content": {PNG: {"schema": {"type": "string", "format": "binary"}}},
+    },
+    304: {"description": NOT_MODIFIED},
+}
+_POSES: _Answers2 = {200: {"model": DatasetPoses}, 304: {"description": NOT_MODIFIED}}
+
+
+@comparison_router.get("/scenes/{scene}/comparison", responses=problems(401, 404, 422, 503))
+async def get_comparison(service: ServiceDep, scene: SceneName) -> Comparison:
+    """Metrics on the held-out frames of the scene's dataset. The first request begins to compute them."""
+    service.life.require_serving()
+    return await service.comparisons.get(scene)
+
+
+@comparison_router.get(
+    "/scenes/{scene}/comparison/{index}/{what}.png",
+    response_class=Response,
+    responses=_FRAME_PICTURE | problems(401, 404, 422),
+)
+async def get_compared_picture(
+    request: Request,
+    service: ServiceDep,
+    scene: SceneName,
+    index: FrameIndex,
+    what: Literal["truth", "rendering", "median", "linear", "nearest", "difference"],
+) -> Response:
+    """A picture of a held-out frame; difference: three times the absolute one between truth and rendering."""
+    key = await service.comparisons.key(scene)
+
+    async def picture() -> Response:
+        return Response(await service.comparisons.frame_png(key, index, what), media_type=PNG)
+
+    return await revalidated(request, f"{key}-{what}-{index}", picture)
+
+
+@comparison_router.get(
+    "/datasets/{dataset}/poses",
+    response_class=Response,
+    responses=_POSES | problems(401, 404, 422, 500, 503, 504, 507),
+)
+async def get_dataset_poses(request: Request, service: ServiceDep, dataset: DatasetName) -> Response:
+    """Probe to scene, of the training frames and the held-out ones."""
+    service.life.require_serving()
+
+    async def poses() -> Response:
+        return Response(await service.dataset_views.poses_json(dataset), media_type="application/json")
+
+    return await revalidated(request, f"{await service.dataset_views.key(dataset)}-poses", poses)
+
+
+@comparison_router.get(
+    "/datasets/{dataset}/frames/{part}/{index}",
+    response_class=Response,
+    responses=_FRAME_PICTURE | problems(401, 404, 422, 500, 503, 504, 507),
+)
+async def get_dataset_frame(
+    request: Request, service: ServiceDep, dataset: DatasetName, part: Literal["train", "val"], index: FrameIndex
+) -> Response:
+    """A frame of a dataset; those of convex and phased probes as fans."""
+    service.life.require_serving()
+
+    async def frame() -> Response:
+        return Response(await service.dataset_views.frame_png(dataset, part, index), media_type=PNG)
+
+    return await revalidated(request, f"{await service.dataset_views.key(dataset)}-{part}-{index}", frame)

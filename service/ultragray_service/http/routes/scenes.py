@@ -1,26 +1,53 @@
-"""The scenes of the data folder."""
+"""Scenes: listed, described, imported, downloaded, deleted, loaded."""
 
 from __future__ import annotations
 
 import asyncio
 import base64
-from typing import Annotated
+import json
+import time
+from collections.abc import AsyncIterator
+from dataclasses import dataclass
+from typing import Annotated, Any
 
 from fastapi import APIRouter, Query
-from starlette.requests import Request
+from starlette.requests import ClientDisconnect, Request
+from starlette.responses import FileResponse, Response
 
+from ultragray.contract import described
 from ultragray.errors import InvalidArgument
-from ultragray.localization.settings import LocalizationSettings
-from ultragray_service.core import scenes
-from ultragray_service.core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
+from ultragray.learn.localization.settings import LocalizationSettings
+from ultragray.learn.report.sizes import CorrectionSizes
+from ultragray.scene.info import SceneHeader
 from ultragray_service.core.poses import check_pose_count, exact_poses
-from ultragray_service.core.scenes import Scene, SceneLoaded, ScenePage
-from ultragray_service.http.deps import SceneName, ServiceDep, problems
-from ultragray_service.http.disconnect import finish_or_abandon
-from ultragray_service.http.reading.bodies import LARGE_IMAGE, AssessBody, LocalizeBody
-from ultragray_service.http.reading.json_body import body_schema, read_json_body
+from ultragray_service.core.scene_points import (
+    ALL_FIELDS,
+    DEFAULT_POINTS,
+    FIELDS,
+    MAX_POINTS,
+    MAX_POSES,
+    even_selection,
+)
+from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE, Scene, SceneLoaded, ScenePage
+from ultragray_service.core.threads import PATIENCE_S
+from ultragray_service.core.uploads import arrival
+from ultragray_service.errors import UnsupportedMediaType
+from ultragray_service.http.accept import RAW
+from ultragray_service.http.bodies import LARGE_IMAGE, AssessBody, LocalizeBody, body_schema, read_json_body
+from ultragray_service.http.dependencies import (
+    NOT_MODIFIED,
+    SceneName,
+    ServiceDep,
+    finish_or_abandon,
+    problems,
+    revalidated,
+)
+from ultragray_service.http.routes.datasets import Private
 from ultragray_service.views.assessments import Assessments
 from ultragray_service.views.localizing import Located, locate, sought_frame
+from ultragray_workers.errors import UploadTooLarge
+from ultragray_workers.jobs.queue.owners import Kind
+from ultragray_workers.scene_names import SUFFIX, base_name
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
 
@@ -33,13 +60,13 @@ async def list_scenes(
     service: ServiceDep, page_size: PageSize = DEFAULT_PAGE_SIZE, page_token: PageToken = ""
 ) -> ScenePage:
     """The scenes by name. New files appear without a restart; one that cannot be read has an `error`."""
-    return await scenes.scene_page(service, page_size, page_token)
+    return await service.scenes.page(page_size, page_token)
 
 
 @router.get("/{scene}", responses=problems(401, 404, 422))
 async def get_scene(service: ServiceDep, scene: SceneName) -> Scene:
     """Probe, bounds, centre, training poses and metrics; mm, in the frame of the training sweep."""
-    return await scenes.scene(service, scene)
+    return await service.scenes.get(scene)
 
 
 @router.post("/{scene}:assess", openapi_extra=body_schema(AssessBody), responses=problems(401, 404, 413, 415, 422))
@@ -64,7 +91,7 @@ async def localize(request: Request, service: ServiceDep, scene: SceneName) -> L
     asked = LocalizationSettings(probe=body.probe, within_mm=body.within_mm, within_deg=body.within_deg)
     image = await asyncio.to_thread(_bytes_of, body.image)
     sought = sought_frame(image, body.image_height, body.image_width, asked)
-    work = locate(service, scene, sought, body.start.exact("start"), deadline, body.registration)
+    work = locate(service.rendering, scene, sought, body.start.exact("start"), deadline, body.registration)
     return await finish_or_abandon(work, request.receive, deadline)
 
 
@@ -78,10 +105,140 @@ def _bytes_of(text: str) -> bytes:
 @router.post("/{scene}:load", responses=problems(401, 403, 404, 422, 503, 507))
 async def load_scene(service: ServiceDep, scene: SceneName) -> SceneLoaded:
     """Loads the scene into every worker ahead of its first frame (rendering also loads on demand)."""
-    return SceneLoaded.of(scene, await service.load(scene))
+    return await service.scenes.load(scene)
 
 
 @router.post("/{scene}:unload", responses=problems(401, 403, 404, 422, 503))
 async def unload_scene(service: ServiceDep, scene: SceneName) -> SceneLoaded:
     """Frees the scene's memory; no error where it is not loaded."""
-    return SceneLoaded.of(scene, await service.unload(scene))
+    return await service.scenes.unload(scene)
+
+
+# Scene files: downloaded, imported, deleted, and looked into.
+
+
+@dataclass(frozen=True)
+class ScenePoses:
+    """Training poses of a scene, evenly taken."""
+
+    poses: list[list[float]] = described("16 numbers each, row by row, mm.")
+    shift_mm: list[float] | None = described("How far each was corrected in the training; null: none was.", None)
+    turn_deg: list[float] | None = described("And turned.", None)
+
+
+files_router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
+
+PointLimit = Annotated[int, Query(ge=1, le=MAX_POINTS, description="Gaussians at most.")]
+PointFields = Annotated[
+    list[str] | None,
+    Query(
+        max_length=len(ALL_FIELDS),
+        description=f"What is told of each, in the order asked for; the first {len(FIELDS)} where nothing is asked "
+        f"for: {', '.join(ALL_FIELDS)}.",
+    ),
+]
+_BINARY = {"schema": {"type": "string", "format": "binary"}}
+_Answers = dict[int | str, dict[str, Any]]
+_POINTS: _Answers = {
+    200: {
+        "description": "The length of the JSON that follows (uint32, little endian), the JSON with `count`, `fields` "
+        "and `total`, then float32 [count, fields] from a multiple of 8 bytes.",
+        "content": {RAW: _BINARY},
+    },
+    304: {"description": NOT_MODIFIED},
+}
+_POSES: _Answers = {200: {"model": ScenePoses}, 304: {"description": NOT_MODIFIED}}
+_FILE: _Answers = {200: {"description": "The scene file.", "content": {RAW: _BINARY}}}
+_IMPORT: dict[str, Any] = {
+    "requestBody": {"required": True, "description": "A scene file (.ugr).", "content": {RAW: _BINARY}}
+}
+
+
+@files_router.get("/{scene}/gaussians", response_class=Response, responses=_POINTS | problems(401, 404, 422))
+async def get_gaussians(
+    request: Request,
+    service: ServiceDep,
+    scene: SceneName,
+    limit: PointLimit = DEFAULT_POINTS,
+    fields: PointFields = None,
+) -> Response:
+    """Gaussians as points: position, intensity, transmittance and size, or `fields`; always the same even selection."""
+
+    async def points() -> Response:
+        return Response(await service.catalog.points(scene, limit, fields or FIELDS), media_type=RAW)
+
+    return await revalidated(request, (await service.catalog.version(scene)).tag, points)
+
+
+@files_router.get("/{scene}/training-poses", response_class=Response, responses=_POSES | problems(401, 404, 422))
+async def get_training_poses(request: Request, service: ServiceDep, scene: SceneName) -> Response:
+    """The poses that the scene was trained from, at most 10,000 of them, evenly taken."""
+
+    async def poses() -> Response:
+        header = await service.catalog.header(scene)
+        return Response(await asyncio.to_thread(_poses_json, header), media_type="application/json")
+
+    return await revalidated(request, (await service.catalog.version(scene)).tag, poses)
+
+
+@files_router.get("/{scene}/file", response_class=FileResponse, responses=_FILE | problems(401, 404, 422))
+async def download_scene(service: ServiceDep, scene: SceneName) -> FileResponse:
+    """Downloads the scene file. Ranges are answered, so that a download can go on."""
+    await service.catalog.header(scene)
+    path = await asyncio.to_thread(service.scene_store.path, scene)
+    return FileResponse(path, media_type=RAW, filename=f"{base_name(scene)}{SUFFIX}")
+
+
+@files_router.put(
+    "/{scene}",
+    status_code=201,
+    openapi_extra=_IMPORT,
+    responses=problems(401, 403, 409, 413, 415, 422, 429, 500, 503, 504, 507),
+)
+async def import_scene(request: Request, service: ServiceDep, scene: SceneName, private: Private = False) -> Scene:
+    """Takes a scene file in and serves it. It is checked first, and appears whole or not at all."""
+    service.life.require_serving()
+    if request.headers.get("content-encoding", "identity").lower() != "identity":
+        raise UnsupportedMediaType("the body must not be compressed", field="Content-Encoding")
+    limit = service.settings.max_dataset_bytes
+    announced = request.headers.get("content-length", "")
+    if announced.isdigit() and int(announced) > limit:
+        raise UploadTooLarge(f"a scene file may have at most {limit} bytes, {announced} were announced", field="body")
+    async with service.imports.receive(scene, _blocks(request, service)) as received:
+        deadline = time.monotonic() + PATIENCE_S
+        header = await finish_or_abandon(
+            service.imports.accept(received, scene, private=private), request.receive, deadline
+        )
+    return Scene.of(scene, header, 0, service.owners.known(Kind.SCENE, scene))
+
+
+@files_router.delete("/{scene}", status_code=204, responses=problems(401, 403, 404, 422, 503))
+async def delete_scene(service: ServiceDep, scene: SceneName) -> None:
+    """Deletes a scene that was imported or that a job made, and frees its memory. Others are not the service's."""
+    service.life.require_serving()
+    await service.imports.delete(scene)
+    await service.pool.forget(scene)
+
+
+def _poses_json(header: SceneHeader) -> bytes:
+    poses, corrections = header.training_poses, header.pose_corrections
+    chosen = even_selection(len(poses), MAX_POSES)
+    sizes: dict[str, Any] = {"shift_mm": None, "turn_deg": None}
+    if corrections is not None:
+        sizes = CorrectionSizes.of(corrections[chosen], poses[chosen]).to_dict()
+    return json.dumps({"poses": poses[chosen].reshape(-1, 16).tolist(), **sizes}).encode()
+
+
+async def _blocks(request: Request, service: ServiceDep) -> AsyncIterator[bytes]:
+    """The body as it comes. Raises ClientDisconnect, and as `arrival`."""
+    stopping: asyncio.Future[Any] = asyncio.ensure_future(service.life.draining.wait())
+    more = True
+    try:
+        while more:
+            message = await arrival(request.receive(), service.settings.upload_idle_timeout_s, stopping)
+            if message["type"] == "http.disconnect":
+                raise ClientDisconnect
+            more = message.get("more_body", False)
+            yield message.get("body", b"")
+    finally:
+        stopping.cancel()

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from ultragray.errors import InvalidArgument
-from ultragray_service.access.limits.allowance import NAMES, Allowance, read_limits
+from ultragray_service.access.principals import NAMES, Allowance, read_limits
 from ultragray_service.settings import Settings, load_settings
 
 from ...cli.command_line import run

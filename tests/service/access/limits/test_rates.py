@@ -5,7 +5,7 @@ import time
 
 import pytest
 
-from ultragray_service.access.limits.rates import WINDOW_S, Rate
+from ultragray_service.access.limits import WINDOW_S, Rate
 
 
 def test_a_client_has_so_many_in_any_second_and_is_told_when_there_are_more() -> None:

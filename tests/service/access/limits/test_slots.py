@@ -9,7 +9,7 @@ from pathlib import Path
 import httpx
 import pytest
 
-from ultragray_service.core.scene_imports import MAX_IMPORTS
+from ultragray_service.core.uploads import MAX_IMPORTS
 
 from ...conftest import DEMO_PROBE, make_scene
 from .conftest import Limited

@@ -12,9 +12,9 @@ import torch
 
 from ultragray import ConvexProbe, GaussianScene
 from ultragray.errors import DatasetInvalid
-from ultragray.evaluation.baselines import BASELINES
-from ultragray.evaluation.scoring import evaluate
-from ultragray.probe import Probe
+from ultragray.geometry.probe import Probe
+from ultragray.learn.evaluation.baselines import BASELINES
+from ultragray.learn.evaluation.scoring import evaluate
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import DatasetNotFound, SceneNotFound
 from ultragray_workers.jobs.folder import JobFolder, Request

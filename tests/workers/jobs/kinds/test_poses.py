@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 from ultragray import LinearProbe
-from ultragray.confidence import Extrapolation
 from ultragray.errors import InvalidArgument, LowConfidence
 from ultragray.samplers import AroundSampler, FanSampler, TrainingSampler
+from ultragray.scene.confidence import Extrapolation
 from ultragray_workers.jobs.kinds import RenderJob
 
 PROBE = LinearProbe(40.0, 0.0, 50.0)

@@ -13,17 +13,17 @@ import pytest
 import torch
 
 from ultragray import ConvexProbe, ElevationBeam, GaussianScene, LinearProbe, render
-from ultragray.confidence import Assessor, ConfidenceModel, figure_arrays
 from ultragray.contract import to_dict as to_json
 from ultragray.datasets.plus import read_plus_sweep
-from ultragray.display import Display
-from ultragray.display.frames import show
 from ultragray.errors import ExtraMissing, FrameTooCostly, InvalidArgument, InvalidProbe, LowConfidence
-from ultragray.files.poses import load_poses
-from ultragray.interchange import rendering
+from ultragray.exchange import rendering
+from ultragray.exchange.poses import load_poses
+from ultragray.rendering.display import Display
+from ultragray.rendering.frames import show
+from ultragray.rendering.settings import Below
+from ultragray.rendering.tools import Cylinder, Needle, ToolFrame
 from ultragray.samplers import AroundSampler, CoveredSampler, FanSampler, SplineSampler, TrainingSampler
-from ultragray.settings import Below
-from ultragray.tools import Cylinder, Needle, ToolFrame
+from ultragray.scene.confidence import Assessor, ConfidenceModel, figure_arrays
 from ultragray_workers.jobs.folder import JobFolder, Request
 from ultragray_workers.jobs.kinds import RenderJob, render_run
 from ultragray_workers.jobs.specification import from_dict, to_dict
@@ -187,7 +187,7 @@ def test_a_missing_package_is_told_before_anything_is_rendered(
     work: Callable[..., JobRun], monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setitem(sys.modules, "h5py", None)
-    monkeypatch.delitem(sys.modules, "ultragray.interchange.exports.hdf5", raising=False)
+    monkeypatch.delitem(sys.modules, "ultragray.exchange.exports.hdf5", raising=False)
     job = RenderJob(scene="one", sampler=TrainingSampler(), format="hdf5")
     with pytest.raises(ExtraMissing, match=r"pip install 'ultragray\[hdf5\]'"):
         render_run.run(work(job), job)

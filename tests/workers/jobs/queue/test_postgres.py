@@ -16,8 +16,8 @@ import sqlalchemy as sa
 import torch
 
 from ultragray.datasets.source import load_dataset
-from ultragray.scene import GaussianScene
-from ultragray.training import TrainingConfig, train
+from ultragray.learn.training import TrainingConfig, train
+from ultragray.scene.gaussians import GaussianScene
 from ultragray_workers.errors import DatabaseUnavailable, StartupFailed
 from ultragray_workers.jobs.queue.database import JobDatabase, checked_url
 from ultragray_workers.jobs.store import Job, JobState, JobStore

@@ -14,10 +14,10 @@ import pytest
 import sqlalchemy as sa
 
 from ultragray import render
-from ultragray.demo import copy_demo_scene
+from ultragray.phantom.demo import copy_demo_scene
 from ultragray.samplers import AroundSampler
-from ultragray.scene import GaussianScene
-from ultragray.scene_info import read_header
+from ultragray.scene.gaussians import GaussianScene
+from ultragray.scene.info import read_header
 from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.queue.internals import WORKFLOWS
 from ultragray_workers.jobs.queue.tables import SHARDS

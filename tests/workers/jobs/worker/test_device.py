@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pytest
 
-from ultragray.machine import memory_bytes
+from ultragray.installation import memory_bytes
 from ultragray_workers.errors import StartupFailed
 from ultragray_workers.jobs.matching.offer import WorkerDevice
 from ultragray_workers.jobs.store import Job, JobState, JobStore

@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ultragray.demo import copy_demo_scene
+from ultragray.phantom.demo import copy_demo_scene
 from ultragray_workers.errors import StorageFull
 from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.kinds.render import Poses
@@ -32,7 +32,7 @@ DISK_BYTES = 8 * 2**20
 DIVERGENCE = """
 import sys
 if "ultragray_workers.jobs.worker.run_job" in sys.orig_argv:
-    from ultragray.training import trainer
+    from ultragray.learn.training import trainer
     image_loss, calls = trainer.image_loss, []
     def broken(rendered, truth, texture):
         calls.append(None)

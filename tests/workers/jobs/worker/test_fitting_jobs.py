@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from ultragray.machine import memory_bytes
+from ultragray.installation import memory_bytes
 from ultragray_workers.jobs.matching.demand import Demand
 from ultragray_workers.jobs.matching.offer import WorkerDevice
 from ultragray_workers.jobs.queue.database import JobDatabase

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ultragray.demo import copy_demo_scene
+from ultragray.phantom.demo import copy_demo_scene
 from ultragray_workers.errors import WorkerNotFound
 from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.queue.attendance import Worker, WorkerState

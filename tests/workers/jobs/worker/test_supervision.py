@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import sqlalchemy as sa
 
-from ultragray.demo import copy_demo_scene
+from ultragray.phantom.demo import copy_demo_scene
 from ultragray_workers.errors import JobFinished
 from ultragray_workers.jobs import publication
 from ultragray_workers.jobs.folder import JobFolder, Outcome, Progress

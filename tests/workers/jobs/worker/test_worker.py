@@ -16,9 +16,9 @@ import pytest
 import torch
 
 from ultragray.datasets.source import load_dataset
+from ultragray.learn.training import TrainingConfig, train
 from ultragray.samplers import AroundSampler
-from ultragray.scene import GaussianScene
-from ultragray.training import TrainingConfig, train
+from ultragray.scene.gaussians import GaussianScene
 from ultragray_workers.errors import JobFinished, JobNotFinished, StartupFailed
 from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.store import Job, JobState, JobStore

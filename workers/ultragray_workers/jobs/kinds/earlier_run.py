@@ -7,7 +7,7 @@ import shutil
 from contextlib import suppress
 
 from ultragray.errors import TrainingStateInvalid
-from ultragray.files.atomic import TEMPORARY_SUFFIX
+from ultragray.files import TEMPORARY_SUFFIX
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.worker.job_run import JobRun
 

@@ -8,17 +8,22 @@ import time
 
 import numpy as np
 
-from ultragray.datasets.sweep import Sweep
-from ultragray.evaluation.baselines import evaluate_baselines
-from ultragray.evaluation.compounding import affordable_voxel_mm
-from ultragray.evaluation.metrics import FrameMetrics
-from ultragray.evaluation.reliability import measure_reliability
-from ultragray.evaluation.scoring import Evaluation, check_same_origin, evaluate, frames_at_once, require_frames
-from ultragray.evaluation.side_by_side import write_spread
-from ultragray.evaluation.speckle import FrameSpeckle
-from ultragray.files.atomic import file_sha256
-from ultragray.scene import GaussianScene
-from ultragray.training.device import training_device
+from ultragray.files import file_sha256
+from ultragray.learn.evaluation.baselines import affordable_voxel_mm, evaluate_baselines
+from ultragray.learn.evaluation.metrics import FrameMetrics
+from ultragray.learn.evaluation.scoring import (
+    Evaluation,
+    check_same_origin,
+    evaluate,
+    frames_at_once,
+    measure_reliability,
+    require_frames,
+)
+from ultragray.learn.evaluation.side_by_side import write_spread
+from ultragray.learn.evaluation.speckle import FrameSpeckle
+from ultragray.learn.sweep import Sweep
+from ultragray.learn.training.memory import training_device
+from ultragray.scene.gaussians import GaussianScene
 from ultragray_workers.jobs.folder import Outcome, Progress
 from ultragray_workers.jobs.kinds.evaluate import EvaluateJob
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped

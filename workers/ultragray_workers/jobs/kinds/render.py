@@ -12,18 +12,17 @@ import numpy as np
 import numpy.typing as npt
 from typing_extensions import Self
 
-from ultragray.batches import BatchPlan
-from ultragray.batches.plan import SHARD_FRAMES
-from ultragray.confidence import Assessor, Extrapolation, require_confidence
-from ultragray.contact.skin import way_in
 from ultragray.contract import described, kind_field, shown, under
 from ultragray.errors import InvalidArgument
-from ultragray.interchange.exports import FORMATS, Format, check_format
-from ultragray.interchange.exports.formats import DTYPES
-from ultragray.outputs import OUTPUTS
-from ultragray.pose import check_poses
-from ultragray.probe import FloatArray, Picture, Probe
-from ultragray.registration.registration import Registration
+from ultragray.exchange.batches import SHARD_FRAMES, BatchPlan
+from ultragray.exchange.exports import FORMATS, Format, check_format
+from ultragray.exchange.exports.formats import DTYPES
+from ultragray.geometry.pose import check_poses
+from ultragray.geometry.probe import FloatArray, Picture, Probe
+from ultragray.geometry.registration import Registration
+from ultragray.rendering.contact import way_in
+from ultragray.rendering.outputs import OUTPUTS
+from ultragray.rendering.settings import Encoding, FrameSettings, Resolved, registration_field
 from ultragray.samplers import (
     MAX_POSES,
     Assess,
@@ -33,8 +32,8 @@ from ultragray.samplers import (
     assessed_poses,
 )
 from ultragray.samplers.confident import require_drawn
-from ultragray.scene_info import SceneHeader
-from ultragray.settings import Encoding, FrameSettings, Resolved, registration_field
+from ultragray.scene.confidence import Assessor, Extrapolation, require_confidence
+from ultragray.scene.info import SceneHeader
 from ultragray_workers.errors import StorageFull
 from ultragray_workers.jobs.kinds.base import Specification, Surroundings
 

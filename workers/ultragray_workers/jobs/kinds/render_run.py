@@ -5,16 +5,16 @@ from __future__ import annotations
 import sys
 import time
 
-from ultragray.confidence import Assessor, Extrapolation
-from ultragray.files.atomic import file_sha256
-from ultragray.interchange.rendering import render_to_file
-from ultragray.limits import Limits
-from ultragray.probe import FloatArray, Probe
+from ultragray.exchange.rendering import render_to_file
+from ultragray.files import file_sha256
+from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.learn.training.memory import training_device
+from ultragray.rendering.limits import Limits
+from ultragray.rendering.settings import Encoding
 from ultragray.samplers import Assess
-from ultragray.scene import GaussianScene
-from ultragray.scene_info import SceneHeader, read_header
-from ultragray.settings import Encoding
-from ultragray.training.device import training_device
+from ultragray.scene.confidence import Assessor, Extrapolation
+from ultragray.scene.gaussians import GaussianScene
+from ultragray.scene.info import SceneHeader, read_header
 from ultragray_workers.jobs.folder import Outcome, Progress
 from ultragray_workers.jobs.kinds import shards_run
 from ultragray_workers.jobs.kinds.render import RenderJob

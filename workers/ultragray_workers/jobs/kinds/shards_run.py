@@ -10,13 +10,13 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 from pathlib import Path
 
-from ultragray.batches import MANIFEST_FILE, BatchPlan, ShardEntry
-from ultragray.batches.shard import ShardRenderer
 from ultragray.errors import UltragrayError
-from ultragray.files.atomic import file_sha256
-from ultragray.limits import Limits
-from ultragray.scene_info import read_header
-from ultragray.training.device import training_device
+from ultragray.exchange.batches import MANIFEST_FILE, BatchPlan, ShardEntry
+from ultragray.exchange.shards import ShardRenderer
+from ultragray.files import file_sha256
+from ultragray.learn.training.memory import training_device
+from ultragray.rendering.limits import Limits
+from ultragray.scene.info import read_header
 from ultragray_workers.batches.place import ShardPlace
 from ultragray_workers.errors import StorageUnavailable
 from ultragray_workers.jobs.folder import BATCH, FOLDER, Outcome, Progress

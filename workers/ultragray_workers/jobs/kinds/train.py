@@ -7,8 +7,8 @@ from typing import Any, Literal
 
 from ultragray.contract import described, kind_field, shown
 from ultragray.errors import InvalidArgument
-from ultragray.machine import memory_bytes
-from ultragray.training.config import PRESET_MEANINGS, PRESETS, TrainingConfig
+from ultragray.installation import memory_bytes
+from ultragray.learn.training.config import PRESET_MEANINGS, PRESETS, TrainingConfig
 from ultragray_workers.jobs.kinds.base import Specification, Surroundings
 
 _MAX_SETTINGS, _MAX_SETTING_CHARACTERS = 100, 100
@@ -52,7 +52,7 @@ class TrainJob(Specification):
     def check(self, surroundings: Surroundings) -> None:
         """Raises InvalidArgument for more memory than this machine has, unless it is to be a GPU's.
 
-        The worker allows no more than its own machine has left, either, see `ultragray.training.memory`.
+        The worker allows no more than its own machine has left, either, see `ultragray.learn.training.memory`.
         """
         memory_gb = TrainingConfig.preset(self.preset, **self.settings).memory_gb
         if memory_gb is None or self.device.startswith("cuda"):

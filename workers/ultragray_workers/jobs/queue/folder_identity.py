@@ -17,7 +17,7 @@ from typing import Protocol
 import sqlalchemy as sa
 
 from ultragray.errors import UltragrayError
-from ultragray.files.atomic import write_whole
+from ultragray.files import write_whole
 from ultragray_workers.errors import ArtifactFolderUnavailable, StartupFailed
 from ultragray_workers.jobs.queue.tables import FOLDER
 from ultragray_workers.storage.storage import NotThere, Storage

@@ -103,7 +103,7 @@ REGISTRATIONS = sa.Table(  # of robots and trackers to scenes
     sa.Column("scene", sa.Text, nullable=False),
     sa.Column("owner", sa.Text, nullable=False),
     sa.Column("changed_at_s", sa.Double, nullable=False),
-    sa.Column("document", sa.Text, nullable=False),  # JSON of an ultragray.registration.registration.Registration
+    sa.Column("document", sa.Text, nullable=False),  # JSON of an ultragray.geometry.registration.Registration
     sa.Column("private_to", sa.Text),  # the owner of the scene, which was private when this was put; NULL: it was not
 )
 SCHEMA_VERSION = sa.Table("ultragray_schema", TABLES, sa.Column("version", sa.Integer, nullable=False))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 
-from ultragray.batches import BatchPlan
+from ultragray.exchange.batches import BatchPlan
 from ultragray_workers.jobs.shards.channel import Channel
 from ultragray_workers.jobs.shards.claims import Failed
 

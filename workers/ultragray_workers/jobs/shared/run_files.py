@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 
-from ultragray.files.atomic import TEMPORARY_SUFFIX
+from ultragray.files import TEMPORARY_SUFFIX
 from ultragray_workers.jobs.files import BASELINES_NAME, CONFIG_NAME, JOURNAL_NAME
 
 # A checkpoint: they say nothing without it, and a journal grows all the time.

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import IO
 
 from ultragray.errors import InvalidArgument
-from ultragray.machine import memory_bytes, processor_name
+from ultragray.installation import memory_bytes, processor_name
 from ultragray_workers.errors import StartupFailed
 from ultragray_workers.jobs.matching.demand import AUTO, CPU, CUDA, check_device
 from ultragray_workers.jobs.matching.offer import WorkerDevice

@@ -26,8 +26,7 @@ from ultragray_workers.jobs.folder import JobFolder, Outcome
 from ultragray_workers.jobs.shards.channel import Channel
 from ultragray_workers.jobs.specification import from_dict
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
-from ultragray_workers.niceness import let_frames_go_first
-from ultragray_workers.parent import end_with_parent
+from ultragray_workers.processes import end_with_parent, let_frames_go_first
 
 STOPPED, STORAGE_FULL, FOLDER_LOST = 75, 73, 74
 _LOCK_POLL_S = 0.2

@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Protocol, TypeVar
 
 from ultragray.errors import TrainingStateInvalid
-from ultragray.files.atomic import file_sha256
+from ultragray.files import file_sha256
 from ultragray_workers.errors import StorageUnavailable
 from ultragray_workers.jobs.folder import JobFolder, Outcome
 from ultragray_workers.jobs.shared.record import (

@@ -79,7 +79,8 @@ def work(
     host's own then, with copies of datasets of at most `max_copies_bytes`. No other worker may have the `name` (None:
     that of the host, numbered); a worker that is started again under its name goes on with its jobs at once. `threads`
     0: all cores but one. A render job fails at a frame that costs more than `max_footprint_pixels`, see
-    ultragray.limits. Finished jobs are removed after `retention_days`; a job fails whose process does not get on for
+    ultragray.rendering.limits. Finished jobs are removed after `retention_days`; a job fails whose process does not get
+    on for
     `stall_timeout_s`, or that runs for `max_run_s` in all; 0: never. Threads of DBOS are left behind: end the process
     by os._exit. Raises StartupFailed.
     """

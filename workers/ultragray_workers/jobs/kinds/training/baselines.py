@@ -7,11 +7,10 @@ from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
-from ultragray.datasets.sweep import Dataset, spread_places
-from ultragray.evaluation.baselines import evaluate_baselines
-from ultragray.evaluation.compounding import affordable_voxel_mm
-from ultragray.files.atomic import write_whole
-from ultragray.training.trainer import VALIDATION_FRAMES
+from ultragray.files import write_whole
+from ultragray.learn.evaluation.baselines import affordable_voxel_mm, evaluate_baselines
+from ultragray.learn.sweep import Dataset, spread_places
+from ultragray.learn.training.trainer import VALIDATION_FRAMES
 
 METHODS = ("linear", "median")
 MAX_PIXELS = 1 << 26  # of the sweep: about ten seconds; a larger one begins at once, without the lines

@@ -6,11 +6,10 @@ import time
 
 import numpy as np
 
-from ultragray.datasets.sweep import Dataset
-from ultragray.evaluation.scoring import evaluate_frames
-from ultragray.training import TrainingConfig
-from ultragray.training.confidence.calibration import BLACK_FRAMES, MEASURED_FRAMES
-from ultragray.training.confidence.held_out import LEAST_HELD_OUT, held_out_frames
+from ultragray.learn.evaluation.scoring import evaluate_frames
+from ultragray.learn.sweep import Dataset
+from ultragray.learn.training import TrainingConfig
+from ultragray.learn.training.confidence import BLACK_FRAMES, LEAST_HELD_OUT, MEASURED_FRAMES, held_out_frames
 
 STEP_RENDERINGS = 3.0  # what a view of a step costs, with its gradients, in renderings of a frame
 CONFIDENCE_RENDERINGS = 4.0  # of a frame by which the confidence is fitted: image, coverage and uncertainty

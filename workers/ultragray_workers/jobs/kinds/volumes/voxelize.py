@@ -8,9 +8,16 @@ from dataclasses import dataclass
 from typing import Literal
 
 from ultragray.contract import described, kind_field
-from ultragray.scene_info import SceneInfo
-from ultragray.volumes.grid import SMALLEST_SPACING_MM, VolumeGrid, parse_box
-from ultragray.volumes.names import VOLUME_FIELDS, VOLUME_SUFFIXES, check_field, voxel_bytes
+from ultragray.rendering.volumes import (
+    SMALLEST_SPACING_MM,
+    VOLUME_FIELDS,
+    VOLUME_SUFFIXES,
+    VolumeGrid,
+    check_field,
+    parse_box,
+    voxel_bytes,
+)
+from ultragray.scene.info import SceneInfo
 from ultragray_workers.errors import StorageFull
 from ultragray_workers.jobs.kinds.base import Specification, Surroundings
 

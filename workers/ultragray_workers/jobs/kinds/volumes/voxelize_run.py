@@ -6,9 +6,9 @@ import json
 import sys
 import time
 
-from ultragray.files.atomic import file_sha256
-from ultragray.scene import GaussianScene
-from ultragray.volumes.files import volume_facts, write_volume
+from ultragray.files import file_sha256
+from ultragray.rendering.volume_fields import volume_facts, write_volume
+from ultragray.scene.gaussians import GaussianScene
 from ultragray_workers.jobs.folder import Outcome, Progress
 from ultragray_workers.jobs.kinds.volumes.voxelize import VoxelizeJob
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped

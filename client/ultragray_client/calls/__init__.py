@@ -1,1 +1,0 @@
-"""Calls as asyncio and threads both make them: messages, attempts, errors; no input or output."""

@@ -1,0 +1,297 @@
+"""The messages of a stream of poses, whatever carries them.
+
+Poses wait for their answers, answers wait for the caller, and pixels may come through shared memory.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import mmap
+import os
+import secrets
+import time
+import weakref
+from collections import deque
+from contextlib import suppress
+from dataclasses import dataclass
+from enum import Enum
+from pathlib import Path
+from typing import Any
+
+from ultragray_client.connection import error_of_frame
+from ultragray_client.errors import Draining, InvalidArgument
+from ultragray_client.frames import Frame, frame_from_message
+from ultragray_client.geometry import PoseLike, pose_message
+from ultragray_proto.v1 import rendering_pb2
+
+SLOTS = 16
+SLOT_BYTES = 16 * 2**20  # whose pages take memory only once a frame was written there
+
+_FOLDER = Path("/dev/shm")
+_HEADER_BYTES = 4096
+_TOKEN_BYTES = 32
+_FREE = 1
+
+
+class SharedMemory:
+    """A file that the service writes frames into.
+
+    A slot is free again when no array refers to it any more. The service removes the name of the file when it has
+    opened it; `close`, or the end of this object, removes that of a file that it did not open.
+    """
+
+    def __init__(self) -> None:
+        """Raises InvalidArgument where this system has no such memory."""
+        self._token = secrets.token_bytes(_TOKEN_BYTES)
+        path = _FOLDER / f"ultragray-{secrets.token_hex(16)}"
+        size = _HEADER_BYTES + SLOTS * SLOT_BYTES
+        try:
+            descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
+            self._remove = weakref.finalize(self, _remove, path)
+            try:
+                os.ftruncate(descriptor, size)
+                os.pwrite(descriptor, self._token + bytes([_FREE]) * SLOTS, 0)
+                self._map = mmap.mmap(descriptor, size)
+            finally:
+                os.close(descriptor)
+        except OSError as error:
+            raise InvalidArgument(
+                f"shared_memory cannot be had on this system: {error}", field="shared_memory"
+            ) from None
+        self._name = path.name
+        self._process = os.getpid()
+        self._lent: dict[int, weakref.ref[Any]] = {}
+
+    def message(self) -> rendering_pb2.SharedMemory:
+        """The file, as the service is told of it."""
+        return rendering_pb2.SharedMemory(name=self._name, token=self._token, slots=SLOTS, slot_bytes=SLOT_BYTES)
+
+    def taken(self, message: rendering_pb2.Frame) -> Any:
+        """The pixels of a frame, a buffer whose slot is not free while anything refers to it; None: the message has
+        them.
+        """
+        if not message.HasField("shared_data"):
+            return None
+        slot, size = message.shared_data.slot, message.shared_data.bytes
+        pixels = (ctypes.c_ubyte * size).from_buffer(self._map, _HEADER_BYTES + slot * SLOT_BYTES)
+        self._lent[slot] = weakref.ref(pixels, lambda _: self._free(slot))
+        return pixels
+
+    def skip(self, message: rendering_pb2.Frame) -> None:
+        """Frees the slot of a frame that nobody will look at."""
+        if message.HasField("shared_data"):
+            self._free(message.shared_data.slot)
+
+    def close(self) -> None:
+        """Removes the name of the file, should it still be there; frames stay as they are."""
+        self._remove()
+
+    def _free(self, slot: int) -> None:
+        if os.getpid() == self._process:  # a child by fork has its own references to what its parent still looks at
+            self._map[_TOKEN_BYTES + slot] = _FREE
+
+
+def _remove(path: Path) -> None:
+    with suppress(OSError):
+        path.unlink()
+
+
+# The messages of a stream, there and back.
+
+
+MAX_WAITING = 64  # poses of an ordered stream; then its sender waits
+WINDOW = 2  # answers of a latest stream that may wait for the caller: one comes while the other is looked at
+TAKES_NO_MORE = "the stream takes no more poses: done_sending was called, or it is over"
+
+
+class StreamMode(str, Enum):
+    """The fate of a pose that still waits when the next one comes."""
+
+    ORDERED = "ordered"  # every pose gets its frame, in order
+    LATEST = "latest"  # for control loops: the newer pose takes its place; it gets no frame and is counted
+
+
+@dataclass(frozen=True, eq=False)
+class Answer:
+    """A message of the service, and the memory that its pixels may lie in: each connection has its own."""
+
+    message: rendering_pb2.Frame
+    memory: SharedMemory | None
+
+    def skip(self) -> None:
+        """Nobody wants the frame."""
+        if self.memory is not None:
+            self.memory.skip(self.message)
+
+
+class PoseExchange:
+    """The messages of a stream: poses numbered from 1 (0 are its settings), and their frames."""
+
+    def __init__(
+        self, settings: rendering_pb2.RenderSettings, mode: StreamMode | str, *, shared_memory: bool = False
+    ) -> None:
+        """Raises InvalidArgument for a mode that does not exist, and where this system cannot share memory."""
+        try:
+            self.mode = StreamMode(mode)
+        except ValueError:
+            names = ", ".join(known.value for known in StreamMode)
+            raise InvalidArgument(f"mode must be one of {names}, got {mode!r}", field="mode") from None
+        self._settings = settings
+        self._sequence = 0
+        self._dropped = 0
+        self._memory = SharedMemory() if shared_memory else None
+        self._is_open = False
+
+    @property
+    def scene(self) -> str:
+        """The scene whose frames are asked for."""
+        return str(self._settings.scene)
+
+    def opening(self) -> rendering_pb2.RenderStreamRequest:
+        """The first message of a connection: settings and mode, no pose. If they are refused, the first answer says so.
+
+        Raises InvalidArgument where there is no memory to share any more: each connection has its own.
+        """
+        if self._memory is not None and self._is_open:
+            self._memory.close()
+            self._memory = SharedMemory()
+        self._is_open = True
+        mode = f"STREAM_MODE_{self.mode.name}"
+        window = WINDOW if self.mode is StreamMode.LATEST else None
+        memory = None if self._memory is None else self._memory.message()
+        return rendering_pb2.RenderStreamRequest(
+            settings=self._settings, mode=mode, window=window, shared_memory=memory
+        )
+
+    def acknowledgement(self, sequence: int) -> rendering_pb2.RenderStreamRequest:
+        """The message that the answer of that sequence was taken: a newer one may come."""
+        return rendering_pb2.RenderStreamRequest(acknowledged=sequence)
+
+    def pose(
+        self, pose: PoseLike, timeout_s: float | None, measured_ns: int | None
+    ) -> rendering_pb2.RenderStreamRequest:
+        """The message of the next pose. Raises InvalidPose."""
+        message = rendering_pb2.RenderStreamRequest(
+            sequence=self._sequence + 1,
+            pose=pose_message(pose),
+            timeout_ms=None if timeout_s is None else 1000.0 * timeout_s,
+            client_time_ns=time.monotonic_ns() if measured_ns is None else measured_ns,
+        )
+        self._sequence += 1
+        return message
+
+    def arrived(self, message: rendering_pb2.Frame) -> Answer:
+        """A message that came over the connection that was opened last."""
+        return Answer(message, self._memory)
+
+    def frame(self, answer: Answer, dropped_here: int = 0) -> Frame:
+        """The frame of an answer, with what was dropped since the one before.
+
+        Raises ClientError, with the sequence of the pose, where the service told an error in its place.
+        """
+        message = answer.message
+        self._dropped += message.dropped + dropped_here
+        if message.HasField("error"):
+            raise error_of_frame(message.error, message.sequence)
+        dropped, self._dropped = self._dropped, 0
+        data = None if answer.memory is None else answer.memory.taken(message)
+        return frame_from_message(message, sequence=message.sequence, dropped=dropped, data=data)
+
+    def close(self) -> None:
+        """No frames are asked for any more; those that came stay."""
+        if self._memory is not None:
+            self._memory.close()
+
+
+# The answers of a latest stream that have come and wait for the caller.
+
+
+class NewestAnswers:
+    """Answers in their order; of frames that nobody came for, only the newest one is kept."""
+
+    def __init__(self) -> None:
+        self._waiting: deque[Answer] = deque()
+        self._skipped = 0
+
+    def __len__(self) -> int:
+        return len(self._waiting)
+
+    def put(self, answer: Answer) -> None:
+        """An answer has come. It takes the place of a frame; a refusal that waits is kept, and told before it."""
+        if self._waiting and not any(one.message.HasField("error") for one in (self._waiting[-1], answer)):
+            skipped = self._waiting.pop()
+            self._skipped += 1 + skipped.message.dropped
+            skipped.skip()
+        self._waiting.append(answer)
+
+    def take(self) -> Answer:
+        """The oldest of those that are kept."""
+        return self._waiting.popleft()
+
+    def take_skipped(self) -> int:
+        """The number of poses without a frame for the caller since the last call: skipped here, and dropped before."""
+        skipped, self._skipped = self._skipped, 0
+        return skipped
+
+
+# The poses of a stream that have no answer yet, for when its connection is lost.
+
+
+_LEAST_TIMEOUT_MS = 1e-3  # of a pose whose time has passed: the service tells that it came too late
+
+
+class Unanswered:
+    """The poses that another connection is asked for: all without an answer, of a latest stream the newest alone."""
+
+    def __init__(self, *, newest_alone: bool, goes_on: bool = True) -> None:
+        """`goes_on`: whether the stream may go on over another connection."""
+        self._newest_alone, self._goes_on = newest_alone, goes_on
+        self._waiting: dict[int, tuple[rendering_pb2.RenderStreamRequest, float]] = {}  # by sequence, with send times
+        self._open = 0  # poses of which nothing was told: no answer, and not that a newer one took their place
+        self._replaced_at_last = 0  # poses that newer ones replaced, told with answers that the caller does not get
+
+    def __bool__(self) -> bool:
+        return bool(self._waiting)
+
+    def sent(self, message: rendering_pb2.RenderStreamRequest) -> None:
+        """A pose goes out."""
+        if self._newest_alone:
+            self._waiting.clear()
+        self._waiting[message.sequence] = message, time.monotonic()
+        self._open += 1
+
+    def replaced(self) -> None:
+        """A newer pose took the place of one before that went out."""
+        self._open -= 1
+
+    def answered(self, message: rendering_pb2.Frame) -> bool:
+        """A frame came, or why there is none; with the number of poses that newer ones replaced in the service.
+
+        False where the service stops and refused the pose: another one will be asked for it.
+        """
+        self._open -= message.dropped
+        if self._goes_on and message.error.reason == Draining.reason:
+            self._replaced_at_last += message.dropped
+            return False
+        self._open -= 1 if message.sequence else 0  # 0: of the settings
+        self._waiting.pop(message.sequence, None)
+        return True
+
+    def again(self) -> list[rendering_pb2.RenderStreamRequest]:
+        """The poses to send over another connection, in their order, each with what is left of its time."""
+        return [_with_time_left(message, sent) for message, sent in self._waiting.values()]
+
+    def take_lost(self) -> int:
+        """The number of poses since the last call that the caller hears nothing of, and that are not sent again."""
+        lost = self._open - len(self._waiting) + self._replaced_at_last
+        self._open, self._replaced_at_last = len(self._waiting), 0
+        return lost
+
+
+def _with_time_left(message: rendering_pb2.RenderStreamRequest, sent: float) -> rendering_pb2.RenderStreamRequest:
+    if not message.HasField("timeout_ms"):
+        return message
+    again = rendering_pb2.RenderStreamRequest()
+    again.CopyFrom(message)
+    again.timeout_ms = max(message.timeout_ms - 1000.0 * (time.monotonic() - sent), _LEAST_TIMEOUT_MS)
+    return again

@@ -1,1 +1,0 @@
-"""The backends: the reference, the C++ kernel of the CPU, the Triton kernels of the GPU."""

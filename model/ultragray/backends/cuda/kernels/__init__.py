@@ -1,1 +1,0 @@
-"""The code of the device. Triton's compiler reads these functions; they carry no Python types. Lengths are in cm."""

@@ -1,0 +1,508 @@
+"""MCAP files with images and poses of ROS 2, as `ros2 bag record -s mcap` writes them. The extra `mcap`.
+
+First the geometry of the image, then the poses of the probe, then the sweep of both.
+"""
+
+from __future__ import annotations
+
+import json
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from ultragray.contract import Contract, described, from_dict
+from ultragray.datasets.fan import FanGeometry, FanLines, TransformName, find_path
+from ultragray.datasets.images import MAX_PIXEL_BYTES, parse_crop, poses_from_image_transforms, region_of
+from ultragray.datasets.mcap_messages import KINDS, NS_PER_S, MessageFile, StoredMessage, grey_image, time_of
+from ultragray.errors import DatasetInvalid, InvalidArgument, InvalidPose
+from ultragray.exchange.ros_fields import TRANSFORM, TRANSFORMS, pose_of_parts
+from ultragray.exchange.ros_messages import POSE, TEXT
+from ultragray.geometry.probe import Fan, FloatArray, Picture, Probe
+from ultragray.geometry.rotations import blended
+from ultragray.learn.sweep import ByteArray, ImageRegion, IntArray, Sweep, parse_frame_ranges
+
+MAX_GEOMETRY_BYTES = 1 << 20
+SAME = 1e-6  # relative, of the places of pixels
+
+
+@dataclass(frozen=True)
+class PixelGrid(Contract):
+    """The `picture` of a geometry: the place of pixel (0, 0), and the way to the next one."""
+
+    column_unit: str = described("mm along x, or deg from the axis of a fan.", choices=("mm", "deg"))
+    first_column: float = described("Of the first column.")
+    first_row_mm: float = described("Of the first row.")
+    column_step: float = described("To the next column; negative where left and right are exchanged.")
+    row_step_mm: float = described("To the next row.", above=0.0)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.column_step == 0.0:
+            raise InvalidArgument("column_step must not be 0", field="column_step")
+
+
+@dataclass(frozen=True)
+class ImageGeometry:
+    """A probe and the grid of the pixels; None: they are the probe's own scan lines, from its near to its far."""
+
+    probe: Probe
+    grid: PixelGrid | None
+
+    def sweep(
+        self,
+        images: ByteArray,  # [F, rows, columns]
+        poses: FloatArray,  # [F, 4, 4] mm
+        numbers: IntArray,
+        path: Path,
+        notes: tuple[str, ...],
+        crop: str | None,
+    ) -> Sweep:
+        """The frames as scan lines. Raises InvalidArgument for a crop of what is not in mm, DatasetInvalid."""
+        size = images.shape[1], images.shape[2]
+        probe, picture = self.probe, self._picture(size)
+        if picture.step[0] < 0.0:
+            images, picture = images[:, :, ::-1], picture.flipped()
+        shown = self._as_lines(picture, path)
+        if shown is not None and crop is None:
+            return Sweep(np.ascontiguousarray(images), poses, shown, numbers, str(path), notes)
+        pixel_mm, image_to_probe = picture.step, _pixel_to_probe(picture)
+        if picture.column_unit == "mm" and probe.is_true_to_scale:
+            box = parse_crop(crop, *size)
+            poses, probe = poses_from_image_transforms(poses @ image_to_probe, box, numbers, path)
+            images = images[:, box.top : box.bottom, box.left : box.right]
+        elif crop is not None:
+            raise InvalidArgument(f"crop is for the images of linear probes, these are of {probe}", field="crop")
+        elif picture.column_unit == "mm" and isinstance(probe, Fan):
+            lines = FanLines(_fan_on_screen(probe, picture), size, pixel_mm)
+            images, box = lines.frames(images), lines.box
+            probe = _fan_on_screen(probe, picture).probe()
+        else:
+            raise DatasetInvalid(
+                f"{path}: its images cannot be brought back to the scan lines of {probe}: record them without pixel_mm"
+            )
+        region: ImageRegion = region_of(size, box, pixel_mm, image_to_probe)
+        return Sweep(np.ascontiguousarray(images), poses, probe, numbers, str(path), notes, region)
+
+    def _picture(self, size: tuple[int, int]) -> Picture:
+        if self.grid is None:
+            return self.probe.frame_picture(*size)
+        first, step = (self.grid.first_column, self.grid.first_row_mm), (self.grid.column_step, self.grid.row_step_mm)
+        return Picture(*size, self.grid.column_unit, first, step)
+
+    def _as_lines(self, picture: Picture, path: Path) -> Probe | None:
+        """The probe whose own scan lines the pixels are; it may end before `far_mm`. None: they are others."""
+        far_mm = picture.first[1] + (picture.height - 0.5) * picture.step[1]
+        try:
+            shown = self.probe if far_mm > self.probe.far_mm * (1 - SAME) else self.probe.ending_at(far_mm)
+        except InvalidArgument as error:
+            raise DatasetInvalid(f"{path}: its geometry cannot be: {error}") from error
+        own = shown.frame_picture(picture.height, picture.width)
+        places = np.array([own.first, own.step]), np.array([picture.first, picture.step])
+        is_own = own.column_unit == picture.column_unit and np.allclose(*places, rtol=SAME, atol=SAME)
+        return shown if is_own else None
+
+
+def _pixel_to_probe(picture: Picture) -> FloatArray:  # [4, 4] mm
+    return np.array(
+        [
+            [picture.step[0], 0.0, 0.0, picture.first[0]],
+            [0.0, 0.0, -1.0, 0.0],
+            [0.0, picture.step[1], 0.0, picture.first[1]],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+
+
+def _fan_on_screen(probe: Fan, picture: Picture) -> FanGeometry:
+    far_mm = min(probe.far_mm, picture.first[1] + (picture.height - 0.5) * picture.step[1])
+    half_deg = probe.opening_angle_deg / 2
+    apex_column, apex_row = (-first / step for first, step in zip(picture.first, picture.step, strict=True))
+    return FanGeometry(-half_deg, half_deg, probe.near_mm, far_mm, apex_column, apex_row)
+
+
+def read_geometry(text: str | bytes, where: str) -> ImageGeometry:
+    """The geometry of a JSON document. Raises DatasetInvalid, naming `where`."""
+    try:
+        document: Any = json.loads(text)
+        if not isinstance(document, dict) or "probe" not in document:
+            raise ValueError("it must be an object with a probe")
+        picture = document.get("picture")
+        probe = from_dict(Probe, document["probe"])
+        return ImageGeometry(probe, None if picture is None else from_dict(PixelGrid, picture))
+    except (ValueError, RecursionError) as error:
+        raise DatasetInvalid(f"{where}: the geometry of its images cannot be read: {error}") from error
+
+
+def geometry_beside(path: Path) -> ImageGeometry | None:
+    """The geometry in the file `STEM.geometry.json` beside a recording; None where there is none."""
+    beside = path.with_name(f"{path.stem}{BESIDE}")
+    if not beside.is_file():
+        return None
+    if beside.stat().st_size > MAX_GEOMETRY_BYTES:
+        raise DatasetInvalid(f"{beside}: too large for a geometry: over {MAX_GEOMETRY_BYTES >> 20} MiB")
+    return read_geometry(beside.read_bytes(), str(beside))
+
+
+BESIDE = ".geometry.json"
+
+
+# Poses at the times of images: from the tracked poses before and after, position linear, orientation by slerp.
+
+
+TF = "/tf"
+MAX_GAP_NS = 200_000_000  # a hand that moves on goes another way within a longer time
+
+BoolArray: TypeAlias = npt.NDArray[np.bool_]
+_Stamped: TypeAlias = tuple[int, Any, Any]  # time in ns, position in metres, orientation
+
+
+@dataclass(frozen=True, eq=False)
+class PoseTrack:
+    """Poses over time, ascending; one that is fixed has no times."""
+
+    times_ns: IntArray  # [P], of a fixed one [0]
+    poses: FloatArray  # [P, 4, 4] mm, of a fixed one [1, 4, 4]
+
+    def fixed(self) -> PoseTrack:
+        """The last pose alone, for all times."""
+        return PoseTrack(self.times_ns[:0], self.poses[-1:])
+
+    def at(self, times_ns: IntArray) -> tuple[FloatArray, BoolArray]:  # [F] -> [F, 4, 4], [F]
+        """The pose at each time, and whether it is known: at the time of a pose, or between two at most 0.2 s apart."""
+        if not len(self.times_ns):
+            return np.repeat(self.poses, len(times_ns), axis=0), np.ones(len(times_ns), bool)
+        after = np.minimum(np.searchsorted(self.times_ns, times_ns), len(self.times_ns) - 1)
+        exact = self.times_ns[after] == times_ns
+        before = np.where(exact, after, np.maximum(after - 1, 0))
+        gaps = self.times_ns[after] - self.times_ns[before]
+        known = exact | ((self.times_ns[before] < times_ns) & (times_ns < self.times_ns[after]) & (gaps <= MAX_GAP_NS))
+        shares = np.where(known, (times_ns - self.times_ns[before]) / np.maximum(gaps, 1), 0.0)
+        first, second = self.poses[before], self.poses[after]
+        found = first.copy()
+        found[:, :3, :3] = blended(first[:, :3, :3], second[:, :3, :3], shares)
+        found[:, :3, 3] += shares[:, None] * (second[:, :3, 3] - first[:, :3, 3])
+        return found, known
+
+
+@dataclass(frozen=True)
+class Way:
+    """Poses over time, step by step from the probe's frame to the one that they are in."""
+
+    name: str  # the topic, or the frames of tf, such as probeTobase
+    steps: tuple[tuple[PoseTrack, bool], ...]  # True: inverted
+    lost: int  # poses that are none, such as of a tracker that lost the probe
+
+    def at(self, times_ns: IntArray) -> tuple[FloatArray, BoolArray]:  # [F] -> [F, 4, 4], [F]
+        """The pose at each time, and whether it is known."""
+        poses, known = np.tile(np.eye(4), (len(times_ns), 1, 1)), np.ones(len(times_ns), bool)
+        for track, is_inverted in self.steps:
+            found, is_known = track.at(times_ns)
+            poses = (np.linalg.inv(found) if is_inverted else found) @ poses
+            known &= is_known
+        return poses, known
+
+    @property
+    def span_ns(self) -> tuple[int, int]:
+        """The times between which there are poses."""
+        moving = [track.times_ns for track, _ in self.steps if len(track.times_ns)]
+        return max(int(times[0]) for times in moving), min(int(times[-1]) for times in moving)
+
+
+class TrackedPoses:
+    """The poses of a file by topic, and the transforms of tf by their frames."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+        self._poses: dict[str, list[_Stamped]] = {}
+        self._tracked: dict[str, set[TransformName]] = {}  # what the transforms of a topic are of, by topic
+        self._transforms: dict[TransformName, list[_Stamped]] = {}  # from child to parent
+        self._fixed: dict[TransformName, _Stamped] = {}
+
+    @property
+    def topics(self) -> list[str]:
+        """Those that poses may be taken from; `/tf` stands for all transforms."""
+        return sorted(self._poses) + ([TF] if self._transforms else [])
+
+    def take(self, message: StoredMessage) -> None:
+        """Keep the poses of a message; other messages are passed over. Raises DatasetInvalid where it is damaged."""
+        if message.kind == POSE:
+            stamped = message.decode()
+            parts = stamped.pose.position, stamped.pose.orientation
+            self._poses.setdefault(message.topic, []).append((time_of(stamped.header, message.log_time_ns), *parts))
+        elif message.kind == TRANSFORM:
+            transform = message.decode()
+            self._poses.setdefault(message.topic, []).append(_stamped(transform, message))
+            self._tracked.setdefault(message.topic, set()).add(_name_of(transform))
+        elif message.kind == TRANSFORMS:
+            for transform in message.decode().transforms:
+                name = _name_of(transform)
+                if message.topic.endswith("_static"):
+                    self._fixed[name] = _stamped(transform, message)
+                else:
+                    self._transforms.setdefault(name, []).append(_stamped(transform, message))
+
+    def way(self, topic: str, frame: str, transform: str | None) -> Way:
+        """The poses of a topic, or of tf those between two frames that `transform` names, such as probeTobase.
+
+        None: from `frame`, the one of the images, as far up as tf leads. Raises DatasetInvalid where there is no such
+        way or all of its poses are none, InvalidArgument for a transform of a topic and for frames that there are not.
+        """
+        if topic == TF:
+            return self._way_of_transforms(frame, transform)
+        if transform is not None:
+            raise InvalidArgument(f"transform is for the poses of {TF}, these are of {topic}", field="transform")
+        if len(tracked := self._tracked.get(topic, set())) > 1:
+            names = ", ".join(sorted(map("To".join, tracked)))
+            raise DatasetInvalid(
+                f"{self._path}: {topic} must tell the poses of one thing, it tells those of {len(tracked)}: {names}; "
+                f"record them as tf, or on topics of their own"
+            )
+        track, lost = self._track(self._poses[topic], topic)
+        return Way(topic, ((track, False),), lost)
+
+    def _way_of_transforms(self, frame: str, transform: str | None) -> Way:
+        names = {*self._transforms, *self._fixed}
+        frames = sorted({one for name in names for one in name})
+        example, known = "To".join(min(names)), ", ".join(frames)
+        if transform is None:
+            start, goal = frame, _root(frame, dict(sorted(names)))
+            if goal == start:
+                raise DatasetInvalid(
+                    f"{self._path}: tf leads nowhere from the frame of the images, {frame!r}: say with transform "
+                    f"between which frames of tf, such as {example}; there are {known}"
+                )
+        else:
+            pairs = [(a, b) for a in frames for b in frames if a != b and f"{a}To{b}" == transform]
+            if not pairs:
+                raise InvalidArgument(
+                    f"transform must be two frames of tf, such as {example}; there are {known}, got {transform[:80]!r}",
+                    field="transform",
+                )
+            start, goal = pairs[0]
+        way = find_path(names, start, goal)
+        if way is None or all(name not in self._transforms for name, _ in way):
+            raise DatasetInvalid(f"{self._path}: no tracked transforms of tf lead from {start} to {goal}")
+        steps, lost = [], 0
+        for name, is_inverted in way:
+            is_tracked = name in self._transforms
+            stamped = self._transforms[name] if is_tracked else [self._fixed[name]]
+            track, lost_here = self._track(stamped, "To".join(name))
+            steps.append((track if is_tracked else track.fixed(), is_inverted))
+            lost += lost_here
+        return Way(f"{start}To{goal}", tuple(steps), lost)
+
+    def _track(self, stamped: Sequence[_Stamped], name: str) -> tuple[PoseTrack, int]:
+        """The poses over time, and how many are none."""
+        found: dict[int, FloatArray] = {}
+        problems: list[str] = []
+        for time_ns, position, turn in stamped:
+            try:
+                found[time_ns] = pose_of_parts(position, turn, field="a pose")
+            except InvalidPose as error:
+                problems.append(error.detail)
+        if not found:
+            raise DatasetInvalid(f"{self._path}: none of the {len(stamped)} poses of {name} is one: {problems[0]}")
+        times = sorted(found)
+        track = PoseTrack(np.array(times, np.int64), np.array([found[time_ns] for time_ns in times]))
+        return track, len({time_ns for time_ns, _, _ in stamped} - set(times))
+
+
+def _name_of(transform: Any) -> TransformName:
+    """Child and parent."""
+    return transform.child_frame_id.lstrip("/"), transform.header.frame_id.lstrip("/")
+
+
+def _stamped(transform: Any, message: StoredMessage) -> _Stamped:
+    parts = transform.transform.translation, transform.transform.rotation
+    return time_of(transform.header, message.log_time_ns), *parts
+
+
+def _root(frame: str, parents: Mapping[str, str]) -> str:
+    """The frame that tf leads up to from this one, by the parent of each."""
+    seen = {frame}
+    while (parent := parents.get(frame)) is not None and parent not in seen:
+        seen.add(parent)
+        frame = parent
+    return frame
+
+
+# A recorded sweep out of an MCAP file: one topic of images, the poses at their times, and their geometry.
+#
+# The file is read three times, a message at a time: for poses and geometry, for the times of the images that were
+# chosen, and for the pixels of those that have a pose.
+
+
+PREFERRED_IMAGES, PREFERRED_POSES, GEOMETRY = "/bmode", "/probe_pose", "/geometry"  # ends of the node's topics
+
+
+def read_mcap_sweep(
+    path: Path,
+    *,
+    frames: str | None = None,
+    crop: str | None = None,
+    transform: str | None = None,
+    image_topic: str | None = None,
+    pose_topic: str | None = None,
+) -> tuple[Sweep, int]:
+    """The images of one topic that have a pose, and how many images it has.
+
+    `frames` (ranges, `parse_frame_ranges`) chooses among them; `crop` is "columns,rows" of images of a linear probe.
+    Of several topics, that of images which ends in /bmode and that of poses which ends in /probe_pose are taken unless
+    `image_topic` and `pose_topic` name others; `/tf` stands for the transforms of tf, of which `transform`, such as
+    probeTobase, names two frames. A pose lies between those before and after the image (position linear, orientation
+    by slerp), at most 0.2 s apart; the notes say how many images have none. Raises DatasetInvalid, naming the file, the
+    frame and the reason; InvalidArgument for options that do not fit.
+    """
+    file = MessageFile(path)
+    contents = _Contents(file)
+    topic = _chosen(path, "image_topic", image_topic, sorted(contents.image_counts), PREFERRED_IMAGES, contents)
+    source = _chosen(path, "pose_topic", pose_topic, contents.poses.topics, PREFERRED_POSES, contents)
+    count = contents.image_counts[topic]
+    numbers = range(count) if frames is None else parse_frame_ranges(frames, count, option="frames")
+    times = _ImageTimes(file, topic, numbers)
+    way = contents.poses.way(source, times.frame_id, transform)
+    poses, known = way.at(times.times_ns)
+    if not known.any():
+        raise DatasetInvalid(f"{path}: none of {len(known)} images has a pose: {_why_none(times.times_ns, way)}")
+    with_pose = times.numbers[known]
+    geometry = contents.geometry_of(topic, times.log_times_ns[known], with_pose)
+    images = _read_images(file, topic, with_pose)
+    notes = _notes(file, way, source == TF and transform is None, times.numbers[~known])
+    return geometry.sweep(images, poses[known], with_pose, path, notes, crop), count
+
+
+class _Contents:
+    """The poses, the geometries and the topics of a file."""
+
+    def __init__(self, file: MessageFile) -> None:
+        self.poses = TrackedPoses(file.path)
+        self.image_counts: Counter[str] = Counter()
+        self.kinds: dict[str, str] = {}
+        self._geometries: dict[str, list[tuple[int, str]]] = {}  # time of writing and text, by topic
+        self._path = file.path
+        for message in file.messages():
+            self.kinds[message.topic] = message.kind
+            if message.kind in KINDS:
+                self.image_counts[message.topic] += 1
+            elif message.kind == TEXT and message.topic.endswith(GEOMETRY):
+                self._geometries.setdefault(message.topic, []).append((message.log_time_ns, message.decode().data))
+            else:
+                self.poses.take(message)
+
+    def geometry_of(self, topic: str, log_times_ns: IntArray, numbers: IntArray) -> ImageGeometry:
+        """The one geometry of images. Raises DatasetInvalid where there is none, or it changes among them."""
+        if (given := geometry_beside(self._path)) is not None:
+            return given
+        near = [told for name, told in self._geometries.items() if topic.startswith(name.removesuffix(GEOMETRY[1:]))]
+        if len(near) != 1:
+            raise DatasetInvalid(
+                f"{self._path}: it does not say which probe its images are of, on a topic beside {topic} that ends in "
+                f"{GEOMETRY}: say it in {self._path.stem}{BESIDE} beside the file, such as "
+                '{"probe": {"kind": "linear", "width_mm": 40, "near_mm": 0, "far_mm": 50}}'
+            )
+        told = sorted(near[0])
+        times = [time_ns for time_ns, _ in told]
+        texts = [told[max(0, bisect_right(times, int(time_ns)) - 1)][1] for time_ns in log_times_ns]
+        known = {text: read_geometry(text, str(self._path)) for text in dict.fromkeys(texts)}
+        for number, text in zip(numbers, texts, strict=True):
+            if known[text] != known[texts[0]]:
+                raise DatasetInvalid(
+                    f"{self._path}: frame {number}: its geometry is another one than that of frame {numbers[0]}: "
+                    f"choose those of one geometry with frames, such as {numbers[0]}:{number}"
+                )
+        return known[texts[0]]
+
+
+def _chosen(path: Path, option: str, asked: str | None, topics: list[str], preferred: str, contents: _Contents) -> str:
+    """The topic that was asked for; else the only one, or the only one that ends as the node's do."""
+    noun = option.removesuffix("_topic") + "s"
+    listed = ", ".join(topics) or ", ".join(f"{topic} ({kind})" for topic, kind in sorted(contents.kinds.items()))
+    if asked is not None:
+        if asked not in topics:
+            raise InvalidArgument(f"{option} must be one of {listed or 'no topics'}, got {asked[:80]!r}", field=option)
+        return asked
+    found = topics if len(topics) == 1 else [topic for topic in topics if topic.endswith(preferred)]
+    if len(found) != 1:
+        needed = f"choose one with {option}" if topics else f"a sweep needs a topic of {noun}"
+        raise DatasetInvalid(f"{path}: {needed}: there are {listed or 'no messages'}")
+    return found[0]
+
+
+def _chosen_images(file: MessageFile, topic: str, numbers: Any) -> Iterator[tuple[int, StoredMessage]]:
+    """The images with these numbers, counted in their topic."""
+    wanted = {int(number) for number in numbers}
+    number = 0
+    for message in file.messages():
+        if message.topic == topic:
+            if number in wanted:
+                yield number, message
+            number += 1
+
+
+class _ImageTimes:
+    """The times of images, [F] each, and the frame that they are in."""
+
+    def __init__(self, file: MessageFile, topic: str, numbers: Any) -> None:
+        found, self.frame_id = [], ""
+        for number, message in _chosen_images(file, topic, numbers):
+            header = message.decode().header
+            self.frame_id = self.frame_id or header.frame_id.lstrip("/")
+            found.append((number, time_of(header, message.log_time_ns), message.log_time_ns))
+        self.numbers, self.times_ns, self.log_times_ns = np.array(found, np.int64).reshape(-1, 3).T
+
+
+def _read_images(file: MessageFile, topic: str, numbers: IntArray) -> ByteArray:  # [F, rows, columns]
+    """Raises DatasetInvalid, naming the frame, where the size changes, or all of them are too large."""
+    images: ByteArray | None = None
+    for place, (number, message) in enumerate(_chosen_images(file, topic, numbers)):
+        image = grey_image(message.decode(), message.kind, f"{file.path}: frame {number}")
+        if images is None:
+            if image.size * len(numbers) > MAX_PIXEL_BYTES:
+                raise DatasetInvalid(
+                    f"{file.path}: its frames must have at most {MAX_PIXEL_BYTES:,} pixels, {len(numbers)} of "
+                    f"{image.shape[1]} x {image.shape[0]} have more: choose some with frames"
+                )
+            images = np.empty((len(numbers), *image.shape), np.uint8)
+        if image.shape != images.shape[1:]:
+            first = numbers[0]
+            raise DatasetInvalid(
+                f"{file.path}: frame {number} has {image.shape[1]} x {image.shape[0]} pixels, frame {first} "
+                f"{images.shape[2]} x {images.shape[1]}: choose those of one size with frames, such as {first}:{number}"
+            )
+        images[place] = image
+    assert images is not None  # there are numbers
+    return images
+
+
+def _why_none(times_ns: IntArray, way: Way) -> str:
+    begin, end = (time_ns / NS_PER_S for time_ns in way.span_ns)
+    first, last = times_ns[0] / NS_PER_S, times_ns[-1] / NS_PER_S
+    if last < begin or end < first:
+        return (
+            f"images are stamped {first:.3f} to {last:.3f} s, poses of {way.name} {begin:.3f} to {end:.3f} s: were the "
+            "clocks other ones?"
+        )
+    return f"those of {way.name} before and after an image must be at most {MAX_GAP_NS / 1e6:g} ms apart"
+
+
+def _notes(file: MessageFile, way: Way, is_way_guessed: bool, left_out: IntArray) -> tuple[str, ...]:
+    notes = []
+    if file.broke_off:
+        notes.append("the file breaks off: its recording was not finished; it was read as far as it goes")
+    if is_way_guessed:
+        notes.append(f"poses are taken from tf: {way.name}")
+    if way.lost:
+        notes.append(f"{way.lost} poses of {way.name} are none, such as of a probe that was lost, and were passed over")
+    if len(left_out):
+        listed = ", ".join(map(str, left_out[:10])) + (", …" if len(left_out) > 10 else "")
+        notes.append(
+            f"images without poses at most {MAX_GAP_NS / 1e6:g} ms apart around them were left out: {listed} "
+            f"({len(left_out)} in all)"
+        )
+    return tuple(notes)

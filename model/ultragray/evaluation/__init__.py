@@ -1,1 +1,0 @@
-"""The quality of a scene: metrics on held-out frames, beside classical baselines."""

@@ -1,0 +1,144 @@
+"""DICOM: Ultrasound Multi-frame Image Storage (PS3.3 A.7), 8-bit MONOCHROME2, uncompressed. The extra `dicom`.
+
+The one item of SequenceOfUltrasoundRegions (C.8.5.5) covers the
+whole image; its physical values are the probe frame in cm: x lateral, y depth. The patient is the same for every file
+and no person. The UIDs are 2.25 and a UUID (PS3.5 B.2) made of what the frames are made of: that of the study, of the
+scene's hash; those of the series and the image, also of the renderer, the probe, the size and the poses. So the same
+frames have the same UIDs wherever they are rendered. Of the creator ULTRAGRAY are the private elements (0019,1001), OD:
+the poses [C, 4, 4], mm, and (0019,1002), OF: the figures [C, 4] of each frame in the order of `confidence.FIGURES`
+(and a fifth, the share of contact, where that was asked for), NaN
+where one is not known, and (0019,1003), UT: the origin as JSON, probe and display settings included.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import struct
+import uuid
+from collections.abc import Mapping
+from fractions import Fraction
+
+import numpy as np
+from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
+from pydicom.uid import UID, ExplicitVRLittleEndian, UltrasoundMultiFrameImageStorage
+
+from ultragray.errors import InvalidArgument
+from ultragray.exchange.exports.exporter import FRAME_TIME_MS, Exporter, ExportHeader
+from ultragray.rendering.pixels import PixelArray
+
+PRIVATE_GROUP, PRIVATE_CREATOR, POSES_ELEMENT, FIGURES_ELEMENT, ORIGIN_ELEMENT = 0x0019, "ULTRAGRAY", 0x01, 0x02, 0x03
+MAX_PIXEL_BYTES = 2**32 - 2  # the length of an element (PS3.5 7.1.1)
+TISSUE_2D, TISSUE, CENTIMETRES = 1, 1, 3  # C.8.5.5.1.1, .2, .15
+MAX_WORDS_BYTES = 64  # of a value of VR LO, with its padding
+_UIDS = uuid.UUID("0f2bb0a1-93a5-5ab2-8a2c-5d1f1e4a7c60")
+
+
+class DicomExporter(Exporter):
+    """A writer of the data set at once, then of the frames into its last element, then of the figures."""
+
+    def _open(self) -> None:
+        header = self._header
+        self._bytes = math.prod(header.shape)
+        if self._bytes > MAX_PIXEL_BYTES:
+            raise InvalidArgument(
+                f"format dicom holds at most {MAX_PIXEL_BYTES:,} pixels in a file, {len(header.poses):,} frames of "
+                f"{header.settings.picture.height}x{header.settings.picture.width} are {self._bytes:,}",
+                field="format",
+            )
+        self._file = self._held.enter_context(self._path.open("wb"))
+        self._data_set().save_as(self._file, enforce_file_format=True)
+        padded = self._bytes + self._bytes % 2
+        self._file.write(struct.pack("<HH2sHI", 0x7FE0, 0x0010, b"OB", 0, padded))  # PixelData
+
+    def _write(self, frames: Mapping[str, PixelArray], count: int) -> None:
+        self._file.write(frames["bmode"].data)
+
+    def _finish(self) -> None:
+        self._file.write(b"\0" * (self._bytes % 2))
+        self._file.seek(0)
+        self._data_set().save_as(self._file, enforce_file_format=True)
+
+    def _data_set(self) -> FileDataset:
+        image_uid, series_uid, study_uid = map(UID, _uids(self._header))
+        meta = FileMetaDataset()
+        meta.MediaStorageSOPClassUID = UltrasoundMultiFrameImageStorage
+        meta.MediaStorageSOPInstanceUID = image_uid
+        meta.TransferSyntaxUID = ExplicitVRLittleEndian
+        data = FileDataset(self._path, {}, file_meta=meta, preamble=b"\0" * 128)
+        data.SpecificCharacterSet = "ISO_IR 192"
+        data.SOPClassUID, data.SOPInstanceUID = UltrasoundMultiFrameImageStorage, image_uid
+        data.StudyInstanceUID, data.SeriesInstanceUID = study_uid, series_uid
+        self._describe(data)
+        self._describe_pixels(data)
+        data.SequenceOfUltrasoundRegions = [self._region()]
+        poses = np.ascontiguousarray(self._header.poses, "<f8")
+        figures = np.stack(list(self._figures().values()), axis=1).astype("<f4")
+        block = data.private_block(PRIVATE_GROUP, PRIVATE_CREATOR, create=True)
+        block.add_new(POSES_ELEMENT, "OD", poses.tobytes())
+        block.add_new(FIGURES_ELEMENT, "OF", figures.tobytes())
+        block.add_new(ORIGIN_ELEMENT, "UT", json.dumps(self._header.origin()))
+        return data
+
+    def _describe(self, data: Dataset) -> None:
+        """The modules Patient, General Study, General Series, General Equipment and General Image."""
+        header = self._header
+        data.PatientName, data.PatientID = "UltraG-Ray^Simulated", "ULTRAGRAY"
+        data.PatientBirthDate = data.PatientSex = ""
+        data.PatientIdentityRemoved, data.DeidentificationMethod = "YES", "simulated, of no person"
+        data.StudyDate = data.StudyTime = data.ReferringPhysicianName = data.StudyID = data.AccessionNumber = ""
+        data.StudyDescription = _words(header.scene)
+        data.Modality, data.SeriesNumber, data.Laterality = "US", 1, ""
+        data.Manufacturer, data.ManufacturerModelName = "UltraG-Ray", "UltraG-Ray"
+        data.SoftwareVersions = _words(header.renderer)
+        data.InstanceNumber, data.PatientOrientation = 1, ""
+        data.ImageType = ["DERIVED", "PRIMARY"]
+        data.DerivationDescription = f"rendered from the scene with SHA-256 {header.scene_sha256}"
+        data.BurnedInAnnotation, data.LossyImageCompression = "NO", "00"
+
+    def _describe_pixels(self, data: Dataset) -> None:
+        """The modules Image Pixel, Cine, Multi-frame and US Image."""
+        picture = self._header.settings.picture
+        data.SamplesPerPixel, data.PhotometricInterpretation, data.PixelRepresentation = 1, "MONOCHROME2", 0
+        data.BitsAllocated, data.BitsStored, data.HighBit = 8, 8, 7
+        data.Rows, data.Columns = picture.height, picture.width
+        data.NumberOfFrames = len(self._header.poses)
+        data.FrameTime, data.FrameIncrementPointer = f"{FRAME_TIME_MS:g}", 0x00181063
+        data.RecommendedDisplayFrameRate = round(1000.0 / FRAME_TIME_MS)
+        aspect = Fraction(picture.step[1] / abs(picture.step[0])).limit_denominator(10_000)
+        if aspect != 1 and aspect != 0:
+            data.PixelAspectRatio = [aspect.numerator, aspect.denominator]
+
+    def _region(self) -> Dataset:
+        picture = self._header.settings.picture
+        region = Dataset()
+        region.RegionSpatialFormat, region.RegionDataType = TISSUE_2D, TISSUE
+        region.RegionFlags = 0  # high priority, not protected from scaling
+        region.RegionLocationMinX0 = region.RegionLocationMinY0 = 0
+        region.RegionLocationMaxX1, region.RegionLocationMaxY1 = picture.width - 1, picture.height - 1
+        region.ReferencePixelX0 = region.ReferencePixelY0 = 0
+        region.PhysicalUnitsXDirection = region.PhysicalUnitsYDirection = CENTIMETRES
+        region.ReferencePixelPhysicalValueX = picture.first[0] / 10.0
+        region.ReferencePixelPhysicalValueY = picture.first[1] / 10.0
+        region.PhysicalDeltaX, region.PhysicalDeltaY = picture.step[0] / 10.0, picture.step[1] / 10.0
+        return region
+
+
+def _uids(header: ExportHeader) -> tuple[str, str, str]:
+    """The UIDs of the image, the series and the study."""
+    poses = hashlib.sha256(np.ascontiguousarray(header.poses, "<f8").tobytes()).hexdigest()
+    made_of = json.dumps([header.origin(), header.settings.height, header.settings.width, poses], sort_keys=True)
+    image, series = (f"{name} {made_of}" for name in ("image", "series"))
+    names = (image, series, f"study {header.scene_sha256}")
+    image_uid, series_uid, study_uid = (f"2.25.{uuid.uuid5(_UIDS, name).int}" for name in names)
+    return image_uid, series_uid, study_uid
+
+
+def _words(text: str) -> str:
+    """A value of VR LO: one line without backslashes, cut to its greatest length."""
+    line = " ".join(text.replace("\\", "/").split())
+    return line.encode()[:MAX_WORDS_BYTES].decode(errors="ignore")
+
+
+EXPORTER = DicomExporter

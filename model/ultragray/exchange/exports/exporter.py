@@ -1,0 +1,121 @@
+"""The parts of every export: the header that its frames share, and the base of the formats."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Mapping, Sequence
+from contextlib import ExitStack, suppress
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ultragray.errors import InvalidArgument
+from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.outputs import OUTPUTS
+from ultragray.rendering.pixels import PixelArray, to_uint8
+from ultragray.rendering.settings import Encoding, Resolved, SettingsUsed, settings_used
+from ultragray.scene.confidence import Extrapolation, figure_arrays
+
+FRAME_TIME_MS = 40.0  # rendered frames have no time of their own: formats that need one show 25 a second
+
+
+@dataclass(frozen=True)
+class ExportHeader:
+    """The facts that the frames of an export share, and all it takes to render them again."""
+
+    settings: Resolved
+    dtype: str  # "uint8": round(255·x), or "float32"; labels are uint8 as they are
+    poses: FloatArray  # [C, 4, 4] mm
+    scene: str
+    scene_sha256: str
+    renderer: str
+
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """[C, H, W] of each output. Raises InvalidImageSize for a huge picture."""
+        return len(self.poses), self.settings.picture.height, self.settings.picture.width
+
+    def pixel_type(self, output: str) -> np.dtype[Any]:
+        """The type that the pixels of an output are stored in."""
+        return np.dtype("<u1" if OUTPUTS[output].is_numbers or self.dtype == "uint8" else "<f4")
+
+    @property
+    def settings_used(self) -> SettingsUsed:
+        """The settings as used."""
+        return settings_used(replace(self.settings, encoding=Encoding(self.dtype)))
+
+    def origin(self) -> dict[str, Any]:
+        """The origin of the frames and their settings as used, as JSON holds them."""
+        made_of = {"scene": self.scene, "scene_sha256": self.scene_sha256, "renderer": self.renderer}
+        return {**made_of, **self.settings_used.document()}
+
+
+class Exporter(ABC):
+    """Writer of one format: takes the frames in order, in portions; only `close` makes the file whole.
+
+    Portions are arrays [B, H, W] by output, already of their pixel type (`stored_pixels`). A subclass keeps what must
+    be released in `_held`.
+    """
+
+    def __init__(self, path: Path, header: ExportHeader) -> None:
+        """Open the file. Raises InvalidArgument for frames that the format cannot hold, OSError."""
+        self._path, self._header, self._done = path, header, 0
+        self._extrapolations: list[Extrapolation] = []  # of the frames that are there
+        self._held = ExitStack()
+        try:
+            self._open()
+        except BaseException:
+            self._held.close()
+            raise
+
+    def add(self, frames: Mapping[str, PixelArray], extrapolations: Sequence[Extrapolation]) -> None:
+        """The next frames, each output [B, H, W], and the extrapolation of each, [B]. Raises OSError."""
+        count = len(next(iter(frames.values())))
+        self._extrapolations.extend(extrapolations)
+        self._write(frames, count)
+        self._done += count
+
+    def close(self) -> None:
+        """Make the file whole, after the last frame. Raises OSError, InvalidArgument for fewer frames than poses."""
+        try:
+            if self._done != len(self._header.poses):
+                raise InvalidArgument(
+                    f"an export of {len(self._header.poses)} poses needs as many frames, got {self._done}",
+                    field="poses",
+                )
+            self._finish()
+        finally:
+            self._held.close()
+
+    def abandon(self) -> None:
+        """Release the file, which is worth nothing; instead of `close`, where the frames end too early."""
+        with suppress(Exception):  # on a full disk, closing fails as writing did
+            self._held.close()
+
+    def _figures(self) -> dict[str, npt.NDArray[np.float32]]:
+        """The figures of all frames by name, [C]; NaN where one is not known, or the frame is still to come."""
+        missing = len(self._header.poses) - len(self._extrapolations)
+        judged = None if self._header.settings.contact is None else math.nan
+        unknown = Extrapolation(None, None, None, None, contact_share=judged)
+        return figure_arrays([*self._extrapolations, *[unknown] * missing])
+
+    @abstractmethod
+    def _open(self) -> None:
+        """Make the file."""
+
+    @abstractmethod
+    def _write(self, frames: Mapping[str, PixelArray], count: int) -> None:
+        """Write frames `_done` to `_done` + count; their extrapolations are in `_extrapolations` already."""
+
+    def _finish(self) -> None:
+        """Write what comes after the last frame."""
+        return
+
+
+def stored_pixels(frames: PixelArray, stored: np.dtype[Any]) -> PixelArray:  # [B, H, W] -> [B, H, W]
+    """Rendered frames in [0, 1] (or labels, uint8) as they are stored, C order."""
+    return np.ascontiguousarray(to_uint8(frames) if stored == np.uint8 else frames, stored)

@@ -1,0 +1,232 @@
+"""The formats of rendered frames by name, and files of them: whole or not at all, or as bytes."""
+
+from __future__ import annotations
+
+import importlib
+import queue
+import tempfile
+import threading
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import TypeAlias
+
+from ultragray.errors import InvalidArgument
+from ultragray.exchange.exports.exporter import Exporter, ExportHeader, stored_pixels
+from ultragray.files import atomic_path
+from ultragray.installation import extra_of, missing_extra
+from ultragray.rendering.display import true_to_scale
+from ultragray.rendering.pixels import PixelArray
+from ultragray.rendering.settings import Resolved
+from ultragray.scene.confidence import Extrapolation
+
+DTYPES = ("float32", "uint8")
+
+
+@dataclass(frozen=True)
+class Format:
+    """One format. `dtypes`: the pixel types that it can hold, its default first; labels are uint8 in each."""
+
+    name: str
+    suffix: str  # of its files
+    meaning: str
+    module: str
+    dtypes: tuple[str, ...] = DTYPES
+    bmode_only: bool = False
+    in_mm: bool = False  # whether a pixel has one size in mm: fans are scan-converted
+    package: str | None = None  # what it needs beyond the core's dependencies, as it is imported
+
+    @property
+    def extra(self) -> str | None:
+        """The extra that brings its package."""
+        return None if self.package is None else extra_of(self.package)
+
+    def shown(self, settings: Resolved) -> Resolved:
+        """The settings as frames have them in a file of this format: scan-converted where it must be."""
+        if not self.in_mm or settings.display.pixel_mm is not None:
+            return settings
+        pixel_mm = true_to_scale(settings.probe, settings.height).pixel_mm
+        return replace(settings, display=replace(settings.display, pixel_mm=pixel_mm))
+
+
+_ALL = (
+    Format("npz", ".npz", "NumPy arrays, the npz keys, not compressed; objects of the origin as JSON", "npz"),
+    Format(
+        "tar",
+        ".tar",
+        "WebDataset, for any reader of tar: 000000.bmode.png (float32: .npy) of each output and 000000.json with pose, "
+        "figures and origin; then 000001 and so on",
+        "webdataset",
+        dtypes=("uint8", "float32"),
+    ),
+    Format(
+        "zarr",
+        ".zarr.zip",
+        "A Zarr 3 group in a zip: an array of each output in chunks of a frame, poses, figures; origin as attributes",
+        "zarr_zip",
+        package="zarr",
+    ),
+    Format(
+        "hdf5",
+        ".h5",
+        "HDF5: a data set of each output in chunks of a frame, poses, figures; origin as attributes, objects as JSON",
+        "hdf5",
+        package="h5py",
+    ),
+    Format(
+        "dicom",
+        ".dcm",
+        "A DICOM ultrasound multi-frame image: bmode alone, true to scale",
+        "dicom",
+        dtypes=("uint8",),
+        bmode_only=True,
+        in_mm=True,
+        package="pydicom",
+    ),
+    Format(
+        "plus",
+        ".igs.mha",
+        "A PLUS sequence: bmode alone, true to scale",
+        "plus_sequence",
+        dtypes=("uint8",),
+        bmode_only=True,
+        in_mm=True,
+    ),
+    Format(
+        "mcap",
+        ".mcap",
+        "MCAP, messages of ROS 2: a topic of images for each output, poses in metres, figures; origin as metadata",
+        "mcap_file",
+        dtypes=("uint8", "float32"),
+        package="mcap_ros2",
+    ),
+)
+FORMATS: dict[str, Format] = {format.name: format for format in _ALL}
+
+
+def format_of(file_name: str) -> str | None:
+    """The name of the format that the suffix of a file stands for; None where it stands for none."""
+    return next((format.name for format in _ALL if file_name.endswith(format.suffix)), None)
+
+
+def check_format(name: str, outputs: Sequence[str], dtype: str | None) -> str:
+    """The pixel type for these outputs in a format: `dtype`, or where that is None the format's default.
+
+    Raises InvalidArgument for an unknown format, and for outputs or a type that it cannot hold.
+    """
+    if not isinstance(name, str) or name not in FORMATS:
+        raise InvalidArgument(f"format must be one of {', '.join(FORMATS)}, got {name!r:.100}", field="format")
+    chosen = FORMATS[name]
+    if dtype is not None and (not isinstance(dtype, str) or dtype not in DTYPES):
+        raise InvalidArgument(f"dtype must be one of {', '.join(DTYPES)}, got {dtype!r:.100}", field="dtype")
+    if dtype is not None and dtype not in chosen.dtypes:
+        raise InvalidArgument(f"dtype must be {chosen.dtypes[0]} in format {name}, got {dtype}", field="dtype")
+    if chosen.bmode_only and tuple(outputs) != ("bmode",):
+        given = ", ".join(outputs)
+        raise InvalidArgument(f"outputs must be bmode alone in format {name}, got {given}", field="outputs")
+    return dtype or chosen.dtypes[0]
+
+
+def exporter_class(name: str) -> type[Exporter]:
+    """The exporter of a format. Raises ExtraMissing where a package that it needs is not installed."""
+    chosen = FORMATS[name]
+    try:
+        module = importlib.import_module(f".{chosen.module}", __package__)
+    except ImportError as error:
+        raise missing_extra(error, f"format {name}", field="format") from error
+    found: type[Exporter] = module.EXPORTER
+    return found
+
+
+# Writing an export beside the rendering: a thread takes the frames, two portions may wait.
+
+
+WAITING_PORTIONS = 2
+
+# The next frames, each output [B, H, W], and the extrapolation of each, [B]; neither is changed after.
+Add: TypeAlias = Callable[[Mapping[str, PixelArray], Sequence[Extrapolation]], None]
+Portion: TypeAlias = tuple[Mapping[str, PixelArray], Sequence[Extrapolation]]
+
+
+@contextmanager
+def export_to(path: str | Path, format: str, header: ExportHeader) -> Iterator[Add]:
+    """A function that takes the rendered frames in order; at the end `path` is there, whole, or not at all.
+
+    The frames are converted and written by a thread of its own: the function returns at once unless two portions
+    wait. An error of the writing is raised by the next call, or at the end. Raises ExtraMissing, InvalidArgument,
+    OSError.
+    """
+    make = exporter_class(format)
+    with atomic_path(path) as temporary:
+        exporter = make(temporary, header)
+        try:
+            with _beside(exporter, header) as add:
+                yield add
+        except BaseException:
+            exporter.abandon()
+            raise
+        exporter.close()
+
+
+@contextmanager
+def _beside(exporter: Exporter, header: ExportHeader) -> Iterator[Add]:
+    waiting: queue.Queue[Portion | None] = queue.Queue(WAITING_PORTIONS)
+    failed: list[BaseException] = []
+    given_up = threading.Event()
+
+    def write() -> None:
+        while (portion := waiting.get()) is not None:
+            if failed or given_up.is_set():
+                continue
+            frames, extrapolations = portion
+            try:
+                stored = {
+                    name: stored_pixels(frames[name], header.pixel_type(name)) for name in header.settings.outputs
+                }
+                exporter.add(stored, extrapolations)
+            except BaseException as error:
+                failed.append(error)
+
+    def add(frames: Mapping[str, PixelArray], extrapolations: Sequence[Extrapolation]) -> None:
+        if failed:
+            raise failed[0]
+        waiting.put((frames, extrapolations))
+
+    writer = threading.Thread(target=write, name="export")
+    writer.start()
+    try:
+        yield add
+    except BaseException:
+        given_up.set()
+        raise
+    finally:
+        waiting.put(None)
+        writer.join()
+    if failed:
+        raise failed[0]
+
+
+# An export that is small enough to be answered at once: its file as bytes.
+
+
+def export_bytes(
+    format: str, header: ExportHeader, frames: Mapping[str, PixelArray], extrapolations: Sequence[Extrapolation]
+) -> bytes:
+    """The file of a format with all frames, each output [C, H, W], and the extrapolation of each, [C].
+
+    Raises ExtraMissing, InvalidArgument for frames that the format cannot hold, OSError.
+    """
+    make = exporter_class(format)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "export")
+        exporter = make(path, header)
+        try:
+            exporter.add(
+                {name: stored_pixels(frames[name], header.pixel_type(name)) for name in frames}, extrapolations
+            )
+        except BaseException:
+            exporter.abandon()
+            raise
+        exporter.close()
+        return path.read_bytes()

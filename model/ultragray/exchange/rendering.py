@@ -1,0 +1,138 @@
+"""Rendering to files: the frames of many poses, portion by portion, into an archive or a folder of PNGs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from ultragray.exchange.exports import FORMATS, ExportHeader, check_format, export_to
+from ultragray.exchange.exports.png_folder import export_pngs
+from ultragray.geometry.probe import FloatArray
+from ultragray.learn.evaluation.scoring import frames_at_once
+from ultragray.rendering.confidence import SupportWatch
+from ultragray.rendering.frames import render, renderer_name, show
+from ultragray.rendering.limits import UNLIMITED, Limits
+from ultragray.rendering.pixels import PixelArray
+from ultragray.rendering.settings import Below, Resolved
+from ultragray.scene.confidence import Assessor, Extrapolation, is_confident
+from ultragray.scene.gaussians import GaussianScene
+
+__all__ = ["render_portions", "render_to_file"]
+
+
+def render_to_file(
+    path: Path,
+    format: str | None,
+    scene: GaussianScene,
+    settings: Resolved,
+    poses: FloatArray,  # [C, 4, 4] mm
+    extrapolations: Sequence[Extrapolation],  # [C]
+    *,
+    dtype: str | None = None,
+    scene_name: str,
+    scene_sha256: str,
+    backend: str = "auto",
+    limits: Limits = UNLIMITED,
+    before_portion: Callable[[int], object] | None = None,
+) -> list[Extrapolation]:  # [C]
+    """Render frames into a file of a format (None: a folder of PNGs), which appears whole or not at all.
+
+    `scene` lies where the backend renders; `poses` and `extrapolations` are those of `assessed_poses`. `before_portion`
+    is told how many frames are done, at last all of them; to stop, it raises. Returns the extrapolations with what the
+    support of each frame tells. Raises what `render` raises, InvalidArgument, ExtraMissing and OSError.
+    """
+    if format is not None:
+        dtype = check_format(format, settings.outputs, dtype)
+        settings = FORMATS[format].shown(settings)
+    header = ExportHeader(
+        settings=settings,
+        dtype=dtype or "uint8",
+        poses=poses,
+        scene=scene_name,
+        scene_sha256=scene_sha256,
+        renderer=renderer_name(backend, scene),
+    )
+    found: list[Extrapolation] = []
+    exporting = export_pngs(path, header) if format is None else export_to(path, format, header)
+    portions = render_portions(
+        scene, settings, poses, extrapolations, backend=backend, limits=limits, before_portion=before_portion
+    )
+    with exporting as add, written_behind(add) as write:
+        for frames, figures in portions:
+            write(frames, figures)
+            found.extend(figures)
+    return found
+
+
+def render_portions(
+    scene: GaussianScene,
+    settings: Resolved,
+    poses: FloatArray,  # [C, 4, 4] mm
+    extrapolations: Sequence[Extrapolation],  # [C]
+    *,
+    backend: str = "auto",
+    limits: Limits = UNLIMITED,
+    before_portion: Callable[[int], object] | None = None,
+    assessor: Assessor | None = None,
+) -> Iterator[tuple[dict[str, PixelArray], list[Extrapolation]]]:  # [B, H, W] by output, [B]
+    """The frames of many poses as they are shown, a portion at a time, with all figures of each.
+
+    `before_portion` is told how many frames are done, at last all of them; to stop, it raises. `assessor`: the scene's,
+    where the caller has one. Raises what `render` raises.
+    """
+    limit = settings.min_confidence if settings.below_min_confidence is Below.MASK else None
+    masked = [limit is not None and not is_confident(one, limit) for one in extrapolations]
+    wanted = tuple(dict.fromkeys((*settings.outputs, "coverage")))
+    portion = frames_at_once(settings.height, settings.width)
+    assessor = assessor or Assessor(scene.info, scene.training_poses)
+    for first in range(0, len(poses), portion):
+        if before_portion is not None:
+            before_portion(first)
+        places = slice(first, first + portion)
+        with torch.no_grad():
+            frames = render(
+                scene,
+                settings.probe,
+                poses[places],
+                height=settings.height,
+                width=settings.width,
+                outputs=wanted,
+                backend=backend,
+                limits=limits.after(first),
+                beam=settings.beam,
+                contact=settings.contact,
+                tools=settings.tools,
+                ghost=settings.ghost,
+            )
+            assert frames.coverage is not None
+            watch = SupportWatch(masked[places])
+            blackened = watch.look(frames.coverage, frames.touch)
+            asked = {name: getattr(frames, name) for name in settings.outputs}
+            shown = show(asked, settings.probe, settings.display, blackened)
+            figures = watch.completed(assessor, extrapolations[places], 0)
+        yield {name: pixels.cpu().numpy() for name, pixels in shown.items()}, figures
+    if before_portion is not None:
+        before_portion(len(poses))
+
+
+@contextmanager
+def written_behind(write: Callable[..., object]) -> Iterator[Callable[..., None]]:
+    """The same in a thread of its own, so that a portion is written while the next one is rendered, and not more than
+    one waits. Raises what `write` raises, at the next call or at the end."""
+    with ThreadPoolExecutor(1, "writer") as thread:
+        latest: Future[object] | None = None
+
+        def later(*arguments: Any) -> None:
+            nonlocal latest
+            if latest is not None:
+                latest.result()
+            latest = thread.submit(write, *arguments)
+
+        yield later
+        if latest is not None:
+            latest.result()

@@ -1,0 +1,189 @@
+"""Files written whole or not at all, linked, checked for their version, and mapped. Beneath all that reads or writes
+one.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import errno
+import glob
+import hashlib
+import math
+import os
+import shutil
+import tempfile
+from collections.abc import Iterator
+from contextlib import suppress
+from pathlib import Path
+from tokenize import TokenError
+from typing import Any, BinaryIO
+
+import numpy as np
+import numpy.typing as npt
+
+TEMPORARY_SUFFIX = ".tmp"
+_OF_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
+
+
+@contextlib.contextmanager
+def atomic_path(path: str | Path) -> Iterator[Path]:
+    """A temporary path beside `path`; on success it is synced and renamed to `path`, on failure removed."""
+    path = Path(path)
+    temporary: Path | None = None
+    try:
+        descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=TEMPORARY_SUFFIX)
+        os.close(descriptor)
+        temporary = Path(name)
+        yield temporary
+        temporary.chmod(0o666 & ~_umask())
+        sync(temporary)
+        temporary.replace(path)
+        sync(path.parent)
+    except OSError as error:
+        if not _is_about_temporary(error, path):
+            raise
+        raise OSError(error.errno, error.strerror, str(path)) from error  # the caller knows of no other file
+    finally:
+        if temporary is not None:
+            temporary.unlink(missing_ok=True)
+
+
+def _is_about_temporary(error: OSError, path: Path) -> bool:
+    """Whether an error names the temporary file of `path`, or is one of writing that names no file."""
+    if error.filename is None:
+        return error.errno in _OF_WRITING
+    named = Path(os.fsdecode(error.filename))
+    return named.parent == path.parent and named.name.startswith(f".{path.name}.")
+
+
+def remove_stale_temporaries(path: str | Path) -> None:
+    """Removes what processes killed inside `atomic_path(path)` left; nobody may be writing `path` meanwhile."""
+    path = Path(path)
+    prefix = f".{path.name}."
+    for found in path.parent.glob(f"{glob.escape(prefix)}*{TEMPORARY_SUFFIX}"):
+        if "." not in found.name.removeprefix(prefix).removesuffix(TEMPORARY_SUFFIX):  # else another file's
+            found.unlink(missing_ok=True)
+
+
+def write_whole(path: str | Path, content: str | bytes) -> None:
+    """Write a file of this content (text as UTF-8), or leave what was there."""
+    with atomic_path(path) as temporary:
+        temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def sync(path: Path) -> None:
+    """Make a file, or the names in a folder, survive a loss of power; folders where their file system can."""
+    descriptor = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(descriptor)
+    except OSError:
+        if not path.is_dir():
+            raise
+    finally:
+        os.close(descriptor)
+
+
+def _umask() -> int:
+    mask = os.umask(0)
+    os.umask(mask)
+    return mask
+
+
+def file_sha256(path: str | Path) -> str:
+    """The hash that names a scene in every frame rendered from it: SHA-256 of its file, hexadecimal."""
+    digest = hashlib.sha256()
+    with Path(path).open("rb") as file:
+        while block := file.read(1 << 20):
+            digest.update(block)
+    return digest.hexdigest()
+
+
+# A second name for a file that never changes.
+
+
+def link_or_copy(source: Path, target: Path) -> None:
+    """Makes `target` the same file as `source`, or a whole copy where that cannot be; an existing target stays.
+
+    What is there then survives a loss of power. Raises OSError.
+    """
+    with suppress(FileExistsError):
+        try:
+            os.link(source.resolve(), target)
+        except FileExistsError:
+            raise
+        except OSError:  # another file system, or one without links
+            _copy(source, target)
+    sync(target.parent)
+
+
+def _copy(source: Path, target: Path) -> None:
+    with atomic_path(target) as temporary:
+        shutil.copyfile(source, temporary)
+        sync(temporary)
+        try:
+            os.link(temporary, target)  # unlike a rename, never over what appeared meanwhile
+        except FileExistsError:
+            raise
+        except OSError:
+            if target.exists():
+                raise FileExistsError from None
+
+
+# The version that a file of ours names: one of this release, or a sentence that says what to do.
+
+
+def require_version(found: Any, known: int) -> None:
+    """Raises ValueError where a file is of another version than the release reads."""
+    if type(found) is int and found > known:
+        raise ValueError(
+            f"its format_version is {found}, this release reads {known}: a newer release wrote it, use that one or a "
+            "newer one to read it"
+        )
+    if type(found) is not int or found != known:
+        raise ValueError(f"its format_version is {found!r}, this release reads {known}")
+
+
+# One array of numbers in a `.npy` file, mapped and not read; what is wrong with a file, in our words.
+#
+# The header is checked before numpy maps the file: its own messages advise to unpickle what is no array.
+
+
+_DAMAGED = "its .npy header is damaged or truncated"
+_MAGIC, _ZIP_MAGIC = b"\x93NUMPY", b"PK\x03\x04"
+
+
+def map_npy(path: Path) -> npt.NDArray[Any]:
+    """The array of a `.npy` file as a read-only mapping, which cannot be larger than its file.
+
+    Raises ValueError with the reason as a clause: no `.npy` file, an archive, truncated, or of Python objects. Raises
+    OSError where the file cannot be read. Never runs code from the file.
+    """
+    with path.open("rb") as file:
+        shape, dtype = _read_header(file)
+        missing = file.tell() + math.prod(shape) * dtype.itemsize - path.stat().st_size
+    if missing > 0:
+        raise ValueError(f"it is truncated: {missing} bytes are missing")
+    try:
+        return np.asarray(np.load(path, mmap_mode="r", allow_pickle=False))
+    except OverflowError:
+        raise ValueError(_DAMAGED) from None  # sizes that no array has, one of them 0
+
+
+def _read_header(file: BinaryIO) -> tuple[tuple[int, ...], np.dtype[Any]]:
+    start = file.read(len(_MAGIC))
+    if start.startswith(_ZIP_MAGIC):
+        raise ValueError("it is an archive (.npz), where one array (.npy) is expected")
+    if start != _MAGIC:
+        raise ValueError("it does not start as a .npy file does")
+    file.seek(0)
+    try:
+        version = np.lib.format.read_magic(file)
+        read = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
+        shape, _, dtype = read(file)
+    except (ValueError, TypeError, SyntaxError, TokenError, RecursionError):
+        raise ValueError(_DAMAGED) from None
+    if dtype.hasobject:
+        raise ValueError("it holds Python objects, where numbers are expected")
+    if any(size < 0 for size in shape):
+        raise ValueError(_DAMAGED)
+    return shape, dtype

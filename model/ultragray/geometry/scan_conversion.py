@@ -1,0 +1,78 @@
+"""Scan conversion: frames, one column a scan line, as pictures of the image plane with square pixels. Free of torch.
+
+Interpolation is bilinear, pixels outside the image are 0. `frames.show` does the same where the frames are tensors.
+"""
+
+from __future__ import annotations
+
+from typing import Any, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from ultragray.geometry.probe import FloatArray, Probe
+
+FloatImage: TypeAlias = npt.NDArray[np.float32]
+ByteImage: TypeAlias = npt.NDArray[np.uint8]
+BoolArray: TypeAlias = npt.NDArray[np.bool_]
+IntArray: TypeAlias = npt.NDArray[np.int64]
+_NOT_ONE_MORE = 1.0 + 1e-9  # pixel, by rounding
+
+
+def scan_convert(frame: npt.NDArray[Any], probe: Probe, pixel_mm: float) -> FloatImage:  # [H, W] -> [H', W']
+    """A frame as the picture `probe.picture(pixel_mm)`."""
+    rows, columns, inside = samples(probe, frame.shape, pixel_mm)
+    return np.where(inside, interpolated(frame, rows, columns), 0.0).astype(np.float32)
+
+
+def scan_convert_labels(labels: ByteImage, probe: Probe, pixel_mm: float) -> ByteImage:  # [H, W] -> [H', W']
+    """The same of labels, which are not mixed: each pixel has that of the nearest sample."""
+    rows, columns, inside = samples(probe, labels.shape, pixel_mm)
+    nearest = labels[np.rint(rows).astype(np.intp), np.rint(columns).astype(np.intp) % labels.shape[1]]
+    return np.where(inside, nearest, 0).astype(np.uint8)
+
+
+def with_square_pixels(frame: FloatImage, probe: Probe, longer_side: int) -> FloatImage:  # [H, W] -> [H', W']
+    """A frame as a picture whose longer side has `longer_side` pixels."""
+    return scan_convert(frame, probe, probe.box_mm.longer_side / longer_side * _NOT_ONE_MORE)
+
+
+def samples(
+    probe: Probe, shape: tuple[int, ...], pixel_mm: float
+) -> tuple[FloatArray, FloatArray, BoolArray]:  # [H', W'] each
+    """Row and column of each pixel of a picture in a frame of `shape` [H, W], and whether it lies in the frame."""
+    x, z = probe.picture(pixel_mm).positions_mm()
+    rows, columns = probe.image_coordinates(x, z)
+    inside = ~np.isnan(rows)
+    return *pixel_places(probe, shape, np.where(inside, rows, 0.0), np.where(inside, columns, 0.0)), inside
+
+
+def pixel_places(
+    probe: Probe, shape: tuple[int, ...], rows: FloatArray, columns: FloatArray
+) -> tuple[FloatArray, FloatArray]:
+    """Image coordinates, from 0 to 1, in rows and columns of a frame of `shape` [H, W], none beyond its outer pixels.
+
+    Columns of scan lines that go all the way round lie from −½ to W − ½: the first follows the last.
+    """
+    height, width = shape
+    i, j = np.clip(rows * height - 0.5, 0, height - 1), columns * width - 0.5
+    return i, j if probe.lines.wrap else np.clip(j, 0, width - 1)
+
+
+def interpolated(frame: npt.NDArray[Any], rows: FloatArray, columns: FloatArray) -> FloatArray:
+    """A frame [H, W] between its pixels, at places as `pixel_places` gives them."""
+    return interpolated_frames(frame[None], 0, rows, columns)
+
+
+def interpolated_frames(
+    frames: npt.NDArray[Any], which: IntArray | int, rows: FloatArray, columns: FloatArray
+) -> FloatArray:  # [F, H, W], [...] each -> [...]
+    """Frames between their pixels, each place in the frame whose number `which` gives."""
+    _, height, width = frames.shape
+    i, j = np.floor(rows).astype(np.intp), np.floor(columns).astype(np.intp)
+    down, right = rows - i, columns - j
+    below, beside = np.minimum(i + 1, height - 1), (j + 1) % width
+    upper = frames[which, i, j] * (1 - right) + frames[which, i, beside] * right
+    lower = frames[which, below, j] * (1 - right) + frames[which, below, beside] * right
+    values: FloatArray = upper * (1 - down) + lower * down
+    return values

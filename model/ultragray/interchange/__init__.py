@@ -1,1 +1,0 @@
-"""Foreign formats: the released checkpoints, PLY, and the files that frames are exported to."""

@@ -1,0 +1,1 @@
+"""Where a frame was taken: the search for its pose in a scene."""

@@ -1,0 +1,60 @@
+"""Real frames as callers give them: files, the bytes of a PNG file, or grey pixels row by row. Free of torch."""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ultragray.errors import InvalidArgument
+from ultragray.files import map_npy
+from ultragray.geometry.image_size import check_image_size
+from ultragray.rendering.pixels import ByteArray
+
+SUFFIXES = (".png", ".npy")
+_PNG = b"\x89PNG\r\n\x1a\n"
+_SIZE_AT = 16  # bytes of a PNG file, where width and height stand
+
+
+def read_frame(path: Path) -> Any:  # [H, W]
+    """The frame of a `.png` file, or the array of a `.npy` one. Raises InvalidArgument, naming the file."""
+    suffix = path.suffix.lower()
+    if suffix not in SUFFIXES:
+        raise InvalidArgument(f"a frame must end in {' or '.join(SUFFIXES)}, got {str(path)!r}", field="image")
+    try:
+        return map_npy(path) if suffix == ".npy" else read_png(path.read_bytes())
+    except (OSError, ValueError) as error:
+        raise InvalidArgument(f"{path} cannot be read as a frame: {error}", field="image") from None
+
+
+def read_png(data: bytes) -> ByteArray:  # [H, W]
+    """The frame of a PNG file; colours become their luma, 16 bits become 8.
+
+    Raises InvalidArgument, InvalidImageSize.
+    """
+    if not data.startswith(_PNG) or len(data) < _SIZE_AT + 8:
+        raise InvalidArgument("image must be a PNG file, which it is not", field="image")
+    width, height = struct.unpack_from(">II", data, _SIZE_AT)
+    check_image_size(height, width)  # before it takes the memory that the file says
+    import cv2
+
+    try:
+        pixels = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_GRAYSCALE)
+    except cv2.error:
+        pixels = None
+    if pixels is None:
+        raise InvalidArgument("image is a damaged PNG file", field="image")
+    return np.asarray(pixels, np.uint8)
+
+
+def read_grey(data: bytes, height: int, width: int) -> ByteArray:  # [H, W]
+    """The frame of uint8 pixels, row by row. Raises InvalidArgument, InvalidImageSize."""
+    check_image_size(height, width)
+    if len(data) != height * width:
+        raise InvalidArgument(
+            f"image must hold image_height x image_width = {height * width} bytes of grey pixels, got {len(data)}",
+            field="image",
+        )
+    return np.frombuffer(data, np.uint8).reshape(height, width)

@@ -1,0 +1,363 @@
+"""Poses put right before a training: the noise of the tracker along the path, and sweeps registered to each other
+where they overlap.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
+from itertools import pairwise
+from typing import NamedTuple, TypeAlias
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from ultragray.geometry.probe import FloatArray
+from ultragray.geometry.rotations import rotations_of, turns_of
+from ultragray.geometry.scan_conversion import FloatImage, interpolated_frames, pixel_places
+from ultragray.learn.evaluation.baselines import mean_axes
+from ultragray.learn.sweep import IntArray, Sweep, corner_distances_mm, spread_places
+
+
+def likelihood_terms(bends: FloatArray, ratios: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """log det(ρ·1 + D·Dᵀ) [R] and bᵀ(ρ·1 + D·Dᵀ)⁻¹b [R, K] for each ratio ρ [R] and each column b of `bends` [B, K]."""
+    log_determinants = np.zeros(len(ratios))
+    squares = np.zeros((len(ratios), bends.shape[1]))
+    one_back, two_back = np.zeros_like(squares), np.zeros_like(squares)  # rows of L⁻¹b
+    for bend, (first, second, diagonal) in zip(bends, _factor_rows(len(bends), ratios), strict=True):
+        solved = bend - first[:, None] * one_back - second[:, None] * two_back
+        log_determinants += np.log(diagonal)
+        squares += solved * solved / diagonal[:, None]
+        one_back, two_back = solved, one_back
+    return log_determinants, squares
+
+
+def smoothed(values: FloatArray, ratio: float) -> FloatArray:  # [F] -> [F]
+    """The path p of least ρ·|values − p|² + |D·p|², which is values − Dᵀ(ρ·1 + D·Dᵀ)⁻¹D·values. F is at least 4."""
+    solution = np.diff(values, 2)
+    first, second, diagonal = np.array([*_factor_rows(len(solution), np.array([ratio]))])[..., 0].T
+    for row in range(len(solution)):  # negative places are multiplied by the zeros of the first two rows
+        solution[row] -= first[row] * solution[row - 1] + second[row] * solution[row - 2]
+    solution /= diagonal
+    for row in reversed(range(len(solution))):
+        solution[row - 1] -= first[row] * solution[row]
+        solution[row - 2] -= second[row] * solution[row]
+    return values - np.convolve(solution, [1.0, -2.0, 1.0])
+
+
+def _factor_rows(count: int, ratios: FloatArray) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
+    """Row by row, for each ratio [R]: the entries of L one and two columns left of the diagonal, and that of d."""
+    first = np.zeros_like(ratios)
+    one_back = two_back = np.full_like(ratios, np.inf)  # d of the rows before
+    for _ in range(count):
+        rest = -4.0 - first
+        first, second = rest / one_back, 1.0 / two_back
+        diagonal = 6.0 + ratios - first * rest - second
+        yield first, second, diagonal
+        one_back, two_back = diagonal, one_back
+
+
+# Estimates from the tracked path alone: where a new sweep begins, the tracker's noise, and the path without it.
+#
+# A hand or a robot moves a probe smoothly, while a tracker's errors differ from frame to frame. A pose has six
+# coordinates: the position of the probe's origin along the sweep's mean axes, and the turn from its mean orientation.
+# The second differences of each are the sum of two independent parts: those of the path, with variance q, and those
+# of the tracker's error, D·e with variance r of e. The two parts have different spectra, so q and r are found by
+# maximum likelihood; the path is then the posterior mean. A tracker's errors have the same size along all three axes,
+# but a probe that moves unevenly along its path looks noisy in that direction: the smallest r of the three is taken
+# for all.
+
+
+JUMP = 6.0  # median steps: a longer step begins a new sweep
+LEAST_FRAMES = 5  # of a sweep: fewer are not a path
+RATIOS = 10.0 ** np.arange(-6.0, 6.01, 0.25)  # of the variances q/r that are tried
+TINY = 1e-300  # a variance whose logarithm is finite
+GOOD_MM, GOOD_DEG = 0.2, 0.2  # a tracker's error below these, standard deviation along an axis, is left alone
+_NUMBERS = 6
+
+
+@dataclass(frozen=True)
+class TrackerNoise:
+    """Standard deviations, along each axis, of a tracker's errors from frame to frame."""
+
+    position_mm: float
+    turn_deg: float
+
+    @property
+    def is_small(self) -> bool:
+        """Whether the poses are good as they are."""
+        return self.position_mm < GOOD_MM and self.turn_deg < GOOD_DEG
+
+
+def sweep_ranges(sweep: Sweep) -> list[range]:
+    """The places of the frames of each sweep, in order: a new one begins where the path jumps."""
+    corners = sweep.corners_mm()
+    steps = corner_distances_mm(corners[1:], corners[:-1])
+    starts = [0]
+    moves = steps[steps > 0.0]  # a tracker may repeat its last pose
+    for place in np.flatnonzero(steps > JUMP * np.median(moves)) + 1 if len(moves) else ():
+        if place - starts[-1] >= LEAST_FRAMES and len(sweep) - place >= LEAST_FRAMES:
+            starts.append(int(place))
+    return [range(first, last) for first, last in pairwise([*starts, len(sweep)])]
+
+
+def tracker_noise(poses: FloatArray, ranges: Sequence[range]) -> TrackerNoise:  # [F, 4, 4] mm
+    """The tracker's errors, estimated from the path alone; 0 where the path is too short for an estimate."""
+    position, turn = _Likelihood.of(_coordinates(poses, ranges), ranges).noise_variances()
+    return TrackerNoise(float(np.sqrt(position)), float(np.sqrt(turn)))
+
+
+def without_noise(poses: FloatArray, ranges: Sequence[range]) -> FloatArray:  # [F, 4, 4] mm -> [F, 4, 4] mm
+    """The likeliest path of each sweep."""
+    coordinates = _coordinates(poses, ranges)
+    likelihood = _Likelihood.of(coordinates, ranges)
+    noise = np.repeat(likelihood.noise_variances(), 3)
+    cleaned = coordinates.copy()
+    for number in range(_NUMBERS):
+        if noise[number] == 0.0:
+            continue
+        ratio = likelihood.best_ratio(number, noise[number])
+        for frames in _long_enough(ranges):
+            cleaned[frames, number] = smoothed(coordinates[frames, number], ratio)
+    found = poses.copy()
+    for frames in ranges:
+        axes = mean_axes(poses[frames])
+        found[frames, :3, 3] = cleaned[frames, :3] @ axes.T
+        found[frames, :3, :3] = axes @ rotations_of(np.radians(cleaned[frames, 3:]))
+    return found
+
+
+def _coordinates(poses: FloatArray, ranges: Sequence[range]) -> FloatArray:  # [F, 6] mm, degrees
+    found = np.zeros((len(poses), _NUMBERS))
+    for frames in ranges:
+        axes = mean_axes(poses[frames])
+        found[frames, :3] = poses[frames, :3, 3] @ axes
+        found[frames, 3:] = np.degrees(turns_of(axes.T @ poses[frames, :3, :3]))
+    return found
+
+
+def _long_enough(ranges: Sequence[range]) -> list[range]:
+    return [frames for frames in ranges if len(frames) >= LEAST_FRAMES]
+
+
+@dataclass(frozen=True, eq=False)
+class _Likelihood:
+    """How likely the second differences of each coordinate are, for each of RATIOS q/r.
+
+    Their covariance is r·(q/r·1 + D·Dᵀ).
+    """
+
+    count: int  # of second differences
+    log_determinants: FloatArray  # [R], without r
+    squares: FloatArray  # [R, 6] of the differences, weighted by the inverse, without r
+
+    @classmethod
+    def of(cls, coordinates: FloatArray, ranges: Sequence[range]) -> _Likelihood:  # [F, 6]
+        bends = [np.diff(coordinates[frames], 2, axis=0) for frames in _long_enough(ranges)]
+        terms = [likelihood_terms(some, RATIOS) for some in bends]
+        nothing = np.zeros(len(RATIOS)), np.zeros((len(RATIOS), _NUMBERS))
+        log_determinants, squares = (np.sum(part, axis=0) for part in zip(nothing, *terms, strict=True))
+        return cls(sum(map(len, bends)), log_determinants, squares)
+
+    def noise_variances(self) -> tuple[float, float]:
+        """The likeliest r: of position, mm², and of turn, degrees²."""
+        variances = self.squares / max(self.count, 1)
+        costs = self.count * np.log(np.maximum(variances, TINY)) + self.log_determinants[:, None]
+        best = variances[costs.argmin(axis=0), np.arange(_NUMBERS)]
+        return float(best[:3].min()), float(best[3:].min())
+
+    def best_ratio(self, number: int, noise: float) -> float:
+        """The likeliest q/r of one coordinate where r is `noise`."""
+        return float(RATIOS[(self.log_determinants + self.squares[:, number] / noise).argmin()])
+
+
+# The registration of whole sweeps that cross: each is moved until its frames agree with those of the sweeps before
+# it.
+#
+# Each point of a frame is predicted from the two nearest planes of the other side, one on either side of the point,
+# weighted by their inverse distances. The motion that maximises the correlation of predicted and true values is
+# searched with large steps first, then with small ones. The mean brightness of a wider neighbourhood is subtracted
+# before: shadows turn with the probe, and with them two sweeps that cross correlate best where they are parallel (6
+# mm and 6° off on the simulated liver).
+
+
+HalfArray: TypeAlias = npt.NDArray[np.float16]
+
+POINTS = 6_000
+ROUNDS = 6  # of one size of step
+_OVERLAP_NUMBERS = 6  # of a motion: turns about x, y, z of the probe in degrees, shifts in mm
+_UNITS = np.eye(_OVERLAP_NUMBERS)
+_WITHIN_THE_PLANE = (1, 3, 5)
+
+
+class Level(NamedTuple):
+    """One round of the climb."""
+
+    pixels: tuple[float, float]  # standard deviations: of a blur, and of the neighbourhood that is taken off
+    steps: tuple[float, ...]  # degrees and mm
+    numbers: tuple[int, ...] = tuple(range(_OVERLAP_NUMBERS))
+
+
+LEVELS = (
+    Level((4.0, 30.0), (4.0, 2.0, 1.0), _WITHIN_THE_PLANE),
+    Level((2.0, 10.0), (2.0, 1.0, 0.5)),
+    Level((0.0, 5.0), (1.0, 0.5, 0.25, 0.125)),
+)
+FRAMES = 300  # of either side that are compared, evenly spread: bounds time and memory for long sweeps
+LARGEST_GAP = 3.0  # times the spacing of frames: farther planes predict nothing
+LEAST_POINTS = 0.1  # of all: sweeps with less in common are not compared
+LEAST_GAIN = 0.05  # of the correlation, about that of 1 mm; the best match is off by some tenths of a mm itself
+
+
+def register_sweeps(sweep: Sweep, ranges: Sequence[range]) -> FloatArray:  # [S, 4, 4]
+    """The motion of each sweep, left-multiplied to its poses, that makes it agree with those before it.
+
+    The identity for the first, and where sweeps have too little in common, or agree as they are.
+    """
+    motions = np.tile(np.eye(4), (len(ranges), 1, 1))
+    poses = sweep.poses.copy()
+    for number in range(1, len(ranges)):
+        placed, moving = np.concatenate(ranges[:number]), np.array(ranges[number])
+        motion = _Match(_portion(sweep, poses, moving), _portion(sweep, poses, placed)).climb()
+        if motion is not None:
+            motions[number] = motion
+            poses[moving] = motion @ poses[moving]
+    return motions
+
+
+def _portion(sweep: Sweep, poses: FloatArray, places: IntArray) -> Sweep:
+    """At most FRAMES of the frames at these places, with these poses [F, 4, 4] of the whole sweep."""
+    chosen = places[spread_places(len(places), FRAMES)]
+    return replace(sweep.select(chosen), poses=poses[chosen])
+
+
+class _Crossing(NamedTuple):
+    """Points of one side that lie between two planes of the other, near enough to be predicted by both."""
+
+    points: IntArray  # [P] places of the points among those that were drawn
+    planes: IntArray  # [2, P] places of the nearest frames on either side of each point
+    distances_mm: FloatArray  # [2, P]
+    rows: FloatArray  # [2, P] image coordinates of each point in the planes
+    columns: FloatArray  # [2, P]
+
+
+class _Match:
+    """The search for the motion of one side, `moving`, that makes it agree with the other, which stays."""
+
+    def __init__(self, moving: Sweep, placed: Sweep) -> None:
+        self._probe, self._sweeps = moving.probe, (moving, placed)
+        rng = np.random.default_rng(0)
+        self._frames = [rng.choice(len(sweep), POINTS) for sweep in self._sweeps]
+        self._rows, self._columns = rng.random((2, POINTS)), rng.random((2, POINTS))
+        middles = [sweep.corners_mm().mean(axis=1) for sweep in self._sweeps]
+        self._centre = middles[0].mean(axis=0)
+        self._axes = moving.poses[len(moving) // 2, :3, :3]
+        steps = [np.linalg.norm(np.diff(middle, axis=0), axis=1) for middle in middles]
+        self._gap_mm = LARGEST_GAP * float(np.median(np.concatenate(steps)))
+
+    def climb(self) -> FloatArray | None:  # [4, 4]
+        """The motion of the best correlation; None where the sides do not meet as they are, or little is gained."""
+        here, gain = np.zeros(_OVERLAP_NUMBERS), 0.0
+        if not _has_enough(self._crossings(here)):
+            return None  # any agreement found elsewhere would be chance
+        for level in LEVELS:
+            here, gain = self._climb_level(level, here)
+        return self._motion(here) if gain >= LEAST_GAIN else None
+
+    def _climb_level(self, level: Level, start: FloatArray) -> tuple[FloatArray, float]:  # [6] -> [6]
+        """The best numbers that are found from `start`, and what the correlation gains against no motion."""
+        details = [_detail(sweep, *level.pixels) for sweep in self._sweeps]
+        correlation = partial(self._correlation, details)
+        here = _climbed(correlation, start, level)
+        return here, correlation(here) - correlation(np.zeros(_OVERLAP_NUMBERS))
+
+    def _motion(self, numbers: FloatArray) -> FloatArray:  # [6] degrees, mm -> [4, 4]
+        motion = np.eye(4)
+        motion[:3, :3] = rotations_of(np.radians(self._axes @ numbers[:3])[None])[0]
+        motion[:3, 3] = self._centre - motion[:3, :3] @ self._centre + self._axes @ numbers[3:]
+        return motion
+
+    def _correlation(self, details: Sequence[HalfArray], numbers: FloatArray) -> float:
+        """Of the true and the predicted details of both sides; −∞ where they have too little in common."""
+        crossings = self._crossings(numbers)
+        if not _has_enough(crossings):
+            return -np.inf
+        truth, predicted = [], []
+        for side, crossing in enumerate(crossings):
+            frames = self._frames[side][crossing.points]
+            rows, columns = self._rows[side][crossing.points], self._columns[side][crossing.points]
+            truth.append(self._sampled(details[side], frames, rows, columns))
+            values = self._sampled(details[1 - side], crossing.planes, crossing.rows, crossing.columns)
+            weights = 1.0 / np.maximum(crossing.distances_mm, 1e-6)
+            predicted.append((weights * values).sum(axis=0) / weights.sum(axis=0))
+        return float(np.corrcoef(np.concatenate(truth), np.concatenate(predicted))[0, 1])
+
+    def _crossings(self, numbers: FloatArray) -> list[_Crossing]:
+        """Of the points of either side, the moving one having been moved."""
+        moving, placed = (sweep.poses for sweep in self._sweeps)
+        poses = (self._motion(numbers) @ moving, placed)
+        return [self._crossing(side, poses[side], poses[1 - side]) for side in range(2)]
+
+    def _crossing(self, side: int, poses: FloatArray, others: FloatArray) -> _Crossing:
+        local, own = self._probe.points_mm(self._rows[side], self._columns[side]), poses[self._frames[side]]
+        points = np.einsum("pij,pj->pi", own[:, :3, :3], local) + own[:, :3, 3]
+        planes, distances = _nearest_planes(points, others)
+        seen = np.einsum("spi,spij->spj", points - others[planes, :3, 3], others[planes, :3, :3])
+        rows, columns = self._probe.image_coordinates(seen[..., 0], seen[..., 2])
+        known = np.flatnonzero((~np.isnan(rows) & (distances < self._gap_mm)).all(axis=0))
+        return _Crossing(known, planes[:, known], distances[:, known], rows[:, known], columns[:, known])
+
+    def _sampled(self, details: HalfArray, frames: IntArray, rows: FloatArray, columns: FloatArray) -> FloatArray:
+        return interpolated_frames(details, frames, *pixel_places(self._probe, details.shape[1:], rows, columns))
+
+
+def _has_enough(crossings: Sequence[_Crossing]) -> bool:
+    return sum(len(crossing.points) for crossing in crossings) >= LEAST_POINTS * 2 * POINTS
+
+
+def _nearest_planes(points: FloatArray, poses: FloatArray) -> tuple[IntArray, FloatArray]:  # [P, 3], [F, 4, 4]
+    """The nearest of the image planes on either side of each point, and its distance, mm: [2, P] both.
+
+    The distance is infinite where there is no plane on that side.
+    """
+    normals, origins = poses[:, :3, 1], poses[:, :3, 3]
+    heights = points @ normals.T - np.einsum("fi,fi->f", normals, origins)  # [P, F]
+    sides = [np.where(height >= 0.0, height, np.inf) for height in (heights, -heights)]
+    planes = np.stack([side.argmin(axis=1) for side in sides])
+    return planes, np.stack([side[np.arange(len(points)), at] for side, at in zip(sides, planes, strict=True)])
+
+
+def _climbed(score: Callable[[FloatArray], float], start: FloatArray, level: Level) -> FloatArray:  # [6] -> [6]
+    """Hooke and Jeeves: each number is moved a step up or down, then all of them again by what was gained."""
+    here, best = start, score(start)
+    for step in level.steps:
+        for _ in range(ROUNDS):
+            before = here
+            for number in level.numbers:
+                for moved in (here + step * _UNITS[number], here - step * _UNITS[number]):
+                    if (gained := score(moved)) > best:
+                        here, best = moved, gained
+                        break
+            if here is before:
+                break
+            onwards = 2.0 * here - before
+            if (gained := score(onwards)) > best:
+                here, best = onwards, gained
+    return here
+
+
+def _detail(sweep: Sweep, blur: float, around: float) -> HalfArray:  # [F, H, W]
+    """Structure wider than one standard deviation and narrower than the other, in pixels."""
+    details = np.empty(sweep.images.shape, np.float16)
+    for image, detail in zip(sweep.images, details, strict=True):
+        grey = image / np.float32(255.0)
+        detail[:] = _blurred(grey, blur) - _blurred(grey, around)
+    return details
+
+
+def _blurred(image: FloatImage, sigma: float) -> FloatImage:  # [H, W] -> [H, W]
+    if sigma == 0.0:
+        return image
+    return cv2.GaussianBlur(image, (0, 0), sigma, borderType=cv2.BORDER_REPLICATE).astype(np.float32, copy=False)

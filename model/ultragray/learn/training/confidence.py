@@ -1,0 +1,455 @@
+"""The fit of a scene's confidence and uncertainty: a shorter training holds frames out, and what it reaches on them
+says what to expect elsewhere.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from itertools import pairwise
+from typing import TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+import torch
+from torch.nn import functional
+
+from ultragray.geometry.pose import rotation_angles_deg
+from ultragray.geometry.probe import FloatArray
+from ultragray.learn.evaluation.baselines import interpolate_planes
+from ultragray.learn.evaluation.metrics import frame_metrics
+from ultragray.learn.evaluation.scoring import evaluate, evaluate_frames, frames_at_once, render_sweep
+from ultragray.learn.sweep import ByteArray, Dataset, IntArray, Sweep, spread_places
+from ultragray.learn.training.config import TrainingConfig
+from ultragray.rendering.confidence import CELLS, in_cells, variance_terms, view_distances
+from ultragray.rendering.confidence import POINTS_PER_SIDE as DEVIATION_POINTS
+from ultragray.rendering.frames import render
+from ultragray.scene.confidence import (
+    DEPTHS,
+    FAR_MM,
+    NEAR_MM,
+    POINTS_PER_SIDE,
+    TERMS,
+    ConfidenceModel,
+    DepthBands,
+    Support,
+    TrainingViews,
+    Uncertainty,
+    ViewMeasures,
+    logistic,
+    predicted,
+    supported,
+    terms_of,
+    within,
+)
+from ultragray.scene.gaussians import GaussianScene
+
+# Stretches of the sweep's path, as shares of its length: first and last, then gaps of several widths.
+STRETCHES = ((0.0, 0.06), (0.20, 0.23), (0.34, 0.39), (0.48, 0.57), (0.68, 0.69), (0.89, 1.0))
+TURNED = (0.73, 0.83)  # in which frames are left out by their tilt instead
+TURNED_SHARE = 1 / 3
+LEAST_TILT_DEG = 2.0  # smaller differences are unsteadiness of the hand
+SINGLE_EVERY = 12  # of the frames that are left
+LEAST_KEPT = 4
+MAX_SHARE = 0.45
+LEAST_HELD_OUT = 3  # fewer tell nothing
+
+
+def held_out_frames(sweep: Sweep) -> IntArray:  # [H] places, ascending
+    """Frames of some stretches of the path, the most tilted ones of another stretch, and single ones; maybe none.
+
+    All frames of a stretch are left out, whichever pass of the probe they come from. At most MAX_SHARE of the frames
+    and never more than leave LEAST_KEPT: single frames are given up first, then the last ones of the path.
+    """
+    along = path_mm(sweep)
+    path = along / (float(np.ptp(along)) or 1.0)
+    chosen = np.zeros(len(sweep), bool)
+    for first, last in STRETCHES:
+        chosen |= (path >= first) & (path <= last)
+    stretch = np.flatnonzero((path > TURNED[0]) & (path < TURNED[1]) & ~chosen)
+    chosen[stretch[_most_tilted(sweep.poses[stretch])]] = True
+    stretches = np.flatnonzero(chosen)
+    rest = np.flatnonzero(~chosen)
+    singles = rest[np.argsort(path[rest], kind="stable")][SINGLE_EVERY // 2 :: SINGLE_EVERY]
+    wanted = np.concatenate([stretches[np.argsort(path[stretches], kind="stable")], singles])
+    allowed = min(math.floor(MAX_SHARE * len(sweep)), len(sweep) - LEAST_KEPT)
+    return np.sort(wanted[: max(allowed, 0)]).astype(np.int64)
+
+
+def path_mm(sweep: Sweep) -> FloatArray:  # [F], from 0 on
+    """The place of each frame along the direction in which the middles of the images spread most."""
+    middles = sweep.corners_mm().mean(axis=1)
+    offsets = middles - middles.mean(axis=0)
+    _, _, directions = np.linalg.svd(offsets, full_matrices=False)
+    places: FloatArray = offsets @ directions[0]
+    places -= places.min()
+    return places
+
+
+def _most_tilted(poses: FloatArray) -> IntArray:  # [F, 4, 4] -> [≤ F]
+    """Those turned farthest to one side of the others, where the orientations differ by LEAST_TILT_DEG or more."""
+    if len(poses) < 3:
+        return np.zeros(0, np.int64)
+    angles = rotation_angles_deg(poses, poses)
+    farthest = angles[int(np.unravel_index(angles.argmax(), angles.shape)[0])]
+    if farthest.max() < LEAST_TILT_DEG:
+        return np.zeros(0, np.int64)
+    count = max(1, round(TURNED_SHARE * len(poses)))
+    return np.argsort(farthest, kind="stable")[:count].astype(np.int64)
+
+
+# Frames of a sweep, predicted from other frames of it by linear interpolation: no learning, small pictures.
+
+
+PICTURE_SIDE = 64  # structure smaller than its pixels is speckle
+MOST_HELPERS = 16
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """How near to a frame a prediction from other frames came, and how its pose lies to those."""
+
+    row: int  # of Neighbours.targets
+    ms_ssim: float
+    measures: ViewMeasures  # of one pose; its weights are of the helpers
+
+
+class Neighbours:
+    """At most `most` frames of a sweep, its `targets`, each to be predicted from others."""
+
+    def __init__(self, sweep: Sweep, most: int) -> None:
+        self.targets: IntArray = spread_places(len(sweep), most)
+        self._small = replace(sweep, images=_pooled(sweep.images))
+        views = TrainingViews(sweep.poses, sweep.probe)
+        self._distances_mm = views.mean_distances_mm(sweep.poses[self.targets], sweep.probe)  # [T, F]
+        self._distances_mm[np.arange(len(self.targets)), self.targets] = -1.0  # never its own helper
+        self.weights: FloatArray = views.measure(sweep.poses[self.targets], sweep.probe).weights  # [T, F]
+
+    def helpers(self, row: int, beyond_mm: float, among: npt.NDArray[np.bool_] | None = None) -> tuple[int, ...]:
+        """The MOST_HELPERS frames nearest to a target, of those farther away than this and, if given, `among` [F]."""
+        distances = self._distances_mm[row]
+        allowed = distances > beyond_mm if among is None else (distances > beyond_mm) & among
+        order = np.argsort(distances, kind="stable")
+        return tuple(order[allowed[order]][:MOST_HELPERS].tolist())
+
+    def predict(self, row: int, helpers: tuple[int, ...]) -> Prediction:
+        """Predicts a target from these frames."""
+        some, target = self._small.select(list(helpers)), self.targets[row]
+        pose = self._small.poses[target : target + 1]
+        picture = torch.from_numpy(interpolate_planes(some, pose))
+        truth = torch.from_numpy(self._small.images[target : target + 1]).float().div_(255.0)
+        measures = TrainingViews(some.poses, some.probe).measure(pose, some.probe)
+        return Prediction(row, frame_metrics(picture, truth)[0].ms_ssim, measures)
+
+
+def _pooled(images: ByteArray) -> ByteArray:  # [F, H, W] -> [F, h, w]
+    """Means of blocks, as many that the shorter side keeps PICTURE_SIDE pixels or its own."""
+    height, width = images.shape[1:]
+    shares = min(1.0, PICTURE_SIDE / min(height, width))
+    size = (max(1, round(height * shares)), max(1, round(width * shares)))
+    pooled = [functional.adaptive_avg_pool2d(torch.from_numpy(image)[None].float(), size)[0] for image in images]
+    return torch.stack(pooled).round().to(torch.uint8).numpy()
+
+
+# The difficulty of predicting each training view from the other frames alone.
+
+
+MAX_FRAMES = 192  # that are predicted; the others take the hardness of their neighbours
+EXCLUDED_MM = (0.0, 1.5, 3.0, 5.0)  # frames within this distance of the one that is predicted are not used
+LIMITS = (0.02, 0.995)  # of an MS-SSIM whose logit is taken
+SMOOTHING = 0.01
+
+
+def hardness_of_views(sweep: Sweep) -> FloatArray:  # [F]
+    """The shortfall of each frame's prediction by others against the usual one at such distances, in logits.
+
+    Some frames are interpolated linearly between others, once with all of them and then without those near by; what
+    the distances do not explain is the hardness, smoothed over the views around.
+    """
+    neighbours = Neighbours(sweep, MAX_FRAMES)
+    found, measured = [], []
+    for row in range(len(neighbours.targets)):
+        for helpers in dict.fromkeys(neighbours.helpers(row, excluded_mm) for excluded_mm in EXCLUDED_MM):
+            if len(helpers) < 2:
+                continue
+            prediction = neighbours.predict(row, helpers)
+            measured.append(prediction.ms_ssim)
+            near = prediction.measures.distance_mm[0].mean()
+            between = prediction.measures.interpolation_mm[0].mean()
+            found.append((row, 1.0, np.log(between + NEAR_MM), near, np.log(near + NEAR_MM)))
+    if not found:
+        return np.zeros(len(sweep))
+    table = np.array(found)
+    quality = np.clip(np.array(measured), *LIMITS)
+    logits = np.log(quality / (1.0 - quality))
+    terms = table[:, 1:]
+    fitted = np.linalg.solve(terms.T @ terms + SMOOTHING * len(terms) * np.diag([0.0, 1.0, 1.0, 1.0]), terms.T @ logits)
+    misses = terms @ fitted - logits
+    rows = table[:, 0].astype(np.int64)
+    targets = neighbours.targets
+    counts = np.bincount(rows, minlength=len(targets))
+    own = np.bincount(rows, misses, len(targets)) / np.maximum(counts, 1)  # [T]
+    weights = TrainingViews(sweep.poses[targets], sweep.probe).measure(sweep.poses, sweep.probe).weights  # [F, T]
+    return weights @ own
+
+
+# The fit of the model of `confidence` to frames whose scores are known.
+
+
+PRIOR_WEIGHTS = (3.6, 1.1, 1.5, 0.3, 0.6)  # about those of ten scenes; one that no view determines stays near its own
+PRIOR_STRENGTH = 0.1  # squared error that is added for a weight that is 1 away from its prior
+SHIFT_STRENGTH = 0.02  # the same of the shift between a scene's frames and interpolated ones, whose prior is 0
+GAIN_QUANTILE = 0.85  # share of the frames, of those that the gain is fitted on, that stay below the limit
+LEAST_SHARE = 0.02  # of supported pixels: fewer are taken as this many
+REACHES_MM = np.geomspace(0.2, 30.0, 60)  # values of r that are tried
+FIT_STEPS = 100
+
+
+@dataclass(frozen=True, eq=False)
+class Examples:
+    """Frames with the terms of their poses and the MS-SSIM that they reached."""
+
+    terms: FloatArray  # [C, K, 1 + TERMS]
+    ms_ssim: FloatArray  # [C]
+
+
+def fit_support(
+    measures: ViewMeasures,
+    shares: FloatArray,  # [C] of supported pixels
+    ms_ssim: FloatArray,  # [C]
+    black_ms_ssim: float,
+) -> Support:
+    """The gain, at least 1, that holds for GAIN_QUANTILE of the frames; share and reach of the least squared error."""
+    reached = (ms_ssim - black_ms_ssim) / ((1.0 - black_ms_ssim) * np.maximum(shares, LEAST_SHARE))
+    found = []
+    for reach_mm in REACHES_MM:
+        near = within(measures.distance_mm, reach_mm)
+        share = min(1.0, max(LEAST_SHARE, float(near @ shares) / max(float(near @ near), 1e-9)))
+        found.append((float(np.square(share * near - shares).sum()), share, float(reach_mm)))
+    _, share, reach_mm = min(found)
+    return Support(max(1.0, float(np.quantile(reached, GAIN_QUANTILE))), share, reach_mm)
+
+
+def fit_weights(
+    rendered: Examples,
+    black_ms_ssim: float,
+    interpolated: Examples | None = None,
+) -> FloatArray:  # [1 + TERMS]
+    """The weights with the least squared error of the figure, and little away from PRIOR_WEIGHTS; only w₀ may be < 0.
+
+    Interpolated frames, as many as they may be, count as much as the rendered ones. They reach other scores at the
+    same place: a shift of w₀, fitted too, is theirs alone, so that they tell how scores fall and not how high they are.
+    Levenberg-Marquardt steps; a weight that would turn negative is held at 0.
+    """
+    parts = [rendered] if interpolated is None or not len(interpolated.ms_ssim) else [rendered, interpolated]
+    counts = [len(part.ms_ssim) for part in parts]
+    shifted = np.repeat([0.0, 1.0][: len(parts)], counts)  # [C]
+    shares = np.repeat([counts[0] / count for count in counts], counts)  # [C] of each squared error
+    terms = np.concatenate([part.terms for part in parts])
+    terms = np.concatenate([terms, np.broadcast_to(shifted[:, None, None], (*terms.shape[:2], 1))], axis=2)
+    ms_ssim = np.concatenate([part.ms_ssim for part in parts])
+    prior = np.array([*PRIOR_WEIGHTS, 0.0])
+    strength = np.array([PRIOR_STRENGTH] * len(PRIOR_WEIGHTS) + [SHIFT_STRENGTH])
+    bounded = slice(1, 1 + TERMS)
+    weights, damping = prior.copy(), 1.0
+
+    def cost(candidate: FloatArray) -> float:
+        misses = predicted(candidate, terms, black_ms_ssim) - ms_ssim
+        return float(shares @ np.square(misses) + strength @ np.square(candidate - prior))
+
+    for _ in range(FIT_STEPS):
+        curve = logistic(terms @ weights)
+        slope = (1.0 - black_ms_ssim) * ((curve * (1.0 - curve))[..., None] * terms).mean(axis=1)
+        misses = predicted(weights, terms, black_ms_ssim) - ms_ssim
+        gradient = slope.T @ (shares * misses) + strength * (weights - prior)
+        free = np.ones(len(weights), bool)
+        free[bounded] = (weights[bounded] > 0.0) | (gradient[bounded] < 0.0)
+        curvature = (slope.T * shares) @ slope + np.diag(strength + damping)
+        step = np.zeros_like(weights)
+        step[free] = np.linalg.solve(curvature[np.ix_(free, free)], -gradient[free])
+        candidate = weights + step
+        candidate[bounded] = np.maximum(candidate[bounded], 0.0)
+        if cost(candidate) < cost(weights):
+            weights, damping = candidate, max(0.3 * damping, 1e-6)
+        else:
+            damping = min(4.0 * damping, 1e6)
+    return weights[:-1]
+
+
+# Frames predicted from one side only: how fast anatomy changes along a sweep, where no frame was held out.
+
+
+ONE_SIDED_FRAMES = 96  # that are predicted
+BEYOND_MM = (0.0, 1.5, 3.0, 5.0, 8.0, 12.0)  # along the path: only frames farther away are used
+
+
+def one_sided_examples(sweep: Sweep, hardness: FloatArray) -> Examples:
+    """Some frames of a sweep, each extrapolated from those before it and from those behind it, ever farther away.
+
+    `hardness` [F] of its frames. A sweep of one or two frames has no examples.
+    """
+    neighbours, path = Neighbours(sweep, ONE_SIDED_FRAMES), path_mm(sweep)
+    predictions = []
+    for row, target in enumerate(neighbours.targets):
+        for ahead in (path - path[target], path[target] - path):
+            choices = (neighbours.helpers(row, beyond_mm, among=ahead > beyond_mm) for beyond_mm in BEYOND_MM)
+            predictions += [neighbours.predict(row, helpers) for helpers in dict.fromkeys(choices) if len(helpers) > 1]
+    if not predictions:
+        return Examples(np.zeros((0, POINTS_PER_SIDE**2, 1 + TERMS)), np.zeros(0))
+    names = ("nearest_mm", "distance_mm", "interpolation_mm", "angle_deg")
+    distances = {name: np.concatenate([getattr(one.measures, name) for one in predictions]) for name in names}
+    measures = ViewMeasures(**distances, weights=neighbours.weights[[one.row for one in predictions]])
+    return Examples(terms_of(measures, hardness), np.array([one.ms_ssim for one in predictions]))
+
+
+# The fit of a scene's uncertainty: the variances that explain the errors of frames that a training did not see.
+
+
+LOOKED_AT = 40_000  # cells, over all frames
+FAR_SHARE = 0.05  # of the weight of those cells: weight of places far from all views, where no frame shows the error
+ITERATIONS = 300
+
+
+def fit_uncertainty(scene: GaussianScene, views: TrainingViews, sweep: Sweep, *, backend: str) -> Uncertainty:
+    """The variances that make the errors of the scene on the frames of a sweep likeliest.
+
+    `views` are those that the scene was trained from. Far from them no errors are known, and there the variance is
+    to be that of the training images.
+    """
+    bands = _bands(sweep.images)
+    stride = max(1, len(sweep) * CELLS**2 // LOOKED_AT) | 1  # odd, while CELLS is even: cells of every column are taken
+    terms, squares = [], []
+    portion = frames_at_once(sweep.height, sweep.width)
+    with torch.no_grad():
+        for first in range(0, len(sweep), portion):
+            some = sweep.select(np.arange(first, min(first + portion, len(sweep))))
+            frames = render(scene, some.probe, some.poses, height=some.height, width=some.width, backend=backend)
+            planes = tuple(frames[name].cpu() for name in ("bmode", "coverage", "transmittance"))
+            distances = view_distances(views, some.poses, some.probe)
+            columns = [term.flatten()[::stride] for term in variance_terms(planes, distances, bands)]
+            terms.append(torch.stack(columns, dim=1).double().numpy())
+            errors = torch.from_numpy(some.images).float().div_(255.0) - planes[0]
+            squares.append(in_cells(errors.square()).flatten()[::stride].double().numpy())
+    far_terms, far_squares = _far_away(bands)
+    weight = FAR_SHARE * sum(map(len, squares)) / len(far_squares)
+    variances = likeliest_variances(
+        np.concatenate([*terms, far_terms]),
+        np.concatenate([*squares, far_squares]),
+        np.concatenate([*(np.ones(len(some)) for some in squares), np.full(len(far_squares), weight)]),
+    )
+    return Uncertainty(tuple(variances.tolist()), bands)
+
+
+def likeliest_variances(terms: FloatArray, squares: FloatArray, weights: FloatArray) -> FloatArray:  # [M, K], [M], [M]
+    """c ≥ 0 for which terms @ c fits squared errors best, their spread taken as growing with them (Poisson's deviance).
+
+    Multiplicative updates (Richardson 1972, Lucy 1974), which keep every cₖ positive and always gain.
+    """
+    found = np.full(terms.shape[1], 0.05)
+    sums = np.maximum(terms.T @ weights, 1e-12)
+    for _ in range(ITERATIONS):
+        expected = np.maximum(terms @ found, 1e-9)
+        found = found * (terms.T @ (weights * squares / expected)) / sums
+    return found
+
+
+def _bands(images: ByteArray) -> DepthBands:  # [F, H, W]
+    edges = np.linspace(0, images.shape[1], DEPTHS + 1).round().astype(int)
+    bands = [images[:, low:high] / np.float32(255.0) for low, high in pairwise(edges)]
+    return DepthBands(tuple(float(band.mean()) for band in bands), tuple(float(band.var()) for band in bands))
+
+
+def _far_away(bands: DepthBands) -> tuple[FloatArray, FloatArray]:  # [DEPTHS, TERMS], [DEPTHS]
+    """The terms of a black frame far from every view, and its expected squared error, in the middle of each band."""
+    dark, lit = torch.zeros(1, DEPTHS, 1), torch.ones(1, DEPTHS, 1)
+    far = np.full((1, DEVIATION_POINTS, DEVIATION_POINTS), FAR_MM)
+    columns = [term.flatten() for term in variance_terms((dark, dark, lit), (far, far), bands)]
+    squares = np.array(bands.spread) + np.square(bands.level)
+    return torch.stack(columns, dim=1).double().numpy(), squares
+
+
+# The model of `confidence`, fitted on frames that a shorter training of its own did not see.
+
+
+SHORTER, ENOUGH_STEPS = 0.25, 150  # share of the steps, and the number that is not cut: longer tells the same
+MEASURED_FRAMES = 96  # of those held out; of those trained from a third as many
+BLACK_FRAMES = 32
+
+TrainShorter: TypeAlias = Callable[[Dataset], GaussianScene | None]
+
+
+def shorter(config: TrainingConfig, share: float) -> TrainingConfig:
+    """The configuration of a training on `share` of the frames, with nothing left open: a quarter of the steps, or
+    ENOUGH_STEPS."""
+    assert config.steps is not None
+    assert config.max_gaussians is not None
+    assert config.initial_gaussians is not None
+    return replace(
+        config,
+        steps=min(config.steps, max(math.ceil(SHORTER * config.steps), ENOUGH_STEPS)),
+        max_gaussians=math.ceil(share * config.max_gaussians),
+        initial_gaussians=math.ceil(share * config.initial_gaussians),
+    )
+
+
+def steps_of_fit(config: TrainingConfig, sweep: Sweep) -> float:
+    """The steps of a run on all frames of the sweep that take about as long as the shorter training; 0 without one."""
+    held_out = len(held_out_frames(sweep))
+    if held_out < LEAST_HELD_OUT:
+        return 0.0
+    share = 1.0 - held_out / len(sweep)
+    steps = shorter(config, share).steps
+    assert steps is not None
+    return share * steps
+
+
+def fit_confidence(dataset: Dataset, train_shorter: TrainShorter, *, backend: str) -> ConfidenceModel | None:
+    """Holds frames of `dataset.train` out, trains from the others and fits the model to the scores of those held out.
+
+    How fast scores fall farther away is told by frames that are extrapolated from others without learning, too.
+
+    None where there are too few frames, or where `train_shorter` returns none.
+    """
+    sweep = dataset.train
+    held_out = held_out_frames(sweep)
+    if len(held_out) < LEAST_HELD_OUT:
+        return None
+    kept = np.setdiff1d(np.arange(len(sweep)), held_out)
+    part = Dataset(dataset.name, train=sweep.select(kept), val=sweep.select([]))
+    scene = train_shorter(part)
+    if scene is None:
+        return None
+    seen = kept[spread_places(len(kept), MEASURED_FRAMES // 3)]
+    unseen = held_out[spread_places(len(held_out), MEASURED_FRAMES)]
+    both = sweep.select(np.concatenate([unseen, seen]))
+    ms_ssim, shares = _measured(scene, both, backend)
+    views = TrainingViews(part.train.poses, sweep.probe)
+    measures = views.measure(both.poses, sweep.probe)
+    terms = terms_of(measures, hardness_of_views(part.train))
+    black, hardness = _black_ms_ssim(sweep), hardness_of_views(sweep)
+    weights = fit_weights(Examples(terms, ms_ssim), black, one_sided_examples(sweep, hardness))
+    misses = np.abs(predicted(weights, terms, black) - ms_ssim)[: len(unseen)]
+    return ConfidenceModel(
+        weights=tuple(weights.tolist()),
+        black_ms_ssim=black,
+        hardness=tuple(hardness.tolist()),
+        fitted_on=len(unseen),
+        error=float(misses.mean()),
+        support=fit_support(measures, shares, ms_ssim, black),
+        fitted_to_mm=float(measures.distance_mm.max()),
+        uncertainty=fit_uncertainty(scene, views, both, backend=backend),
+    )
+
+
+def _measured(scene: GaussianScene, sweep: Sweep, backend: str) -> tuple[FloatArray, FloatArray]:  # [F], [F]
+    """MS-SSIM and the share of supported pixels of each frame."""
+    ms_ssim = [frame.ms_ssim for frame in evaluate(scene, sweep, backend=backend).frames]
+    coverage = render_sweep(scene, sweep, output="coverage", backend=backend)
+    return np.array(ms_ssim), supported(coverage).mean(axis=(1, 2))
+
+
+def _black_ms_ssim(sweep: Sweep) -> float:
+    """The mean score of a black frame against the training frames."""
+    some = sweep.select(spread_places(len(sweep), BLACK_FRAMES))
+    return evaluate_frames(np.zeros(some.images.shape, np.float32), some).mean.ms_ssim

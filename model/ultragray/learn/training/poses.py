@@ -1,0 +1,293 @@
+"""Poses that are trained with the scene: corrections of sweeps or of single frames, and what the held-out frames gain
+from them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from ultragray.errors import DatasetInvalid
+from ultragray.geometry.probe import FloatArray
+from ultragray.learn.evaluation.scoring import frames_at_once, require_frames
+from ultragray.learn.sweep import Dataset, Sweep
+from ultragray.learn.training.alignment import register_sweeps, sweep_ranges, tracker_noise, without_noise
+from ultragray.learn.training.losses import SSIM_WINDOW, image_loss
+from ultragray.rendering.backends.inputs import ScenePoses
+from ultragray.rendering.frames import render
+from ultragray.scene.gaussians import GaussianScene
+
+START = 0.1  # share of the run: before, there is no anatomy to compare with
+RATE = 0.01  # mm a step: at the end of a long run some tenths of a mm from where it began
+WITHIN_THE_PLANE = (0.1, 1.0, 0.1, 1.0, 0.1, 1.0)  # a frame's own image hardly shows moves out of its plane
+SMOOTHNESS = 1e-3  # weight of the squared second differences of neighbouring corrections, mm²
+
+
+class Corrections:
+    """One rigid motion for each group of frames, left-multiplied to their poses: a turn about their middle and a shift.
+
+    `groups` holds the places of the frames of each group. A motion is trained as a twist, three numbers of its turn and
+    three of its shift along the axes of the probe, all in mm: of the turn, radians times the mean distance of the
+    image's corners from its middle, which is how far it moves them. `ease` [6] scales the numbers, and with them how
+    fast each is trained.
+    """
+
+    def __init__(self, sweep: Sweep, groups: Sequence[Sequence[int]], ease: Sequence[float] = (1.0,) * 6) -> None:
+        corners = sweep.corners_mm()  # [F, K, 3]
+        self._group_of = torch.zeros(len(sweep), dtype=torch.int64)
+        for number, places in enumerate(groups):
+            self._group_of[list(places)] = number
+        middles = corners.mean(axis=1)
+        middle_frames = [places[len(places) // 2] for places in groups]
+        self._axes = torch.from_numpy(sweep.poses[middle_frames, :3, :3])  # [G, 3, 3]
+        self._ease = torch.tensor(ease, dtype=torch.float64)
+        self._middles = torch.from_numpy(np.stack([middles[list(places)].mean(axis=0) for places in groups]))  # [G, 3]
+        self._lever_mm = float(np.linalg.norm(corners - middles[:, None], axis=-1).mean())
+        self._twists = torch.zeros((len(groups), 6), dtype=torch.float64, requires_grad=True)
+        self._adam = torch.optim.Adam([self._twists], lr=0.0, betas=(0.9, 0.99), eps=1e-12)
+
+    @property
+    def group_count(self) -> int:
+        return len(self._twists)
+
+    def corrected(self, places: Tensor, poses: FloatArray) -> Tensor:  # [b], [b, 4, 4] -> [b, 4, 4] mm
+        """Poses of the frames at these places, moved by their corrections, with their graph."""
+        return self._motions(self._group_of[places]) @ torch.from_numpy(poses)
+
+    def all_motions(self) -> FloatArray:  # [F, 4, 4]
+        """The correction of every frame."""
+        with torch.no_grad():
+            found: FloatArray = self._motions(self._group_of).numpy()
+        return found
+
+    def update(self, rate: float) -> None:
+        """One update of every group by its own gradient, at `rate` mm."""
+        self._adam.param_groups[0]["lr"] = rate
+        self._adam.step()
+        self._adam.zero_grad(set_to_none=True)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The state, for a checkpoint."""
+        state = self._adam.state.get(self._twists, {})
+        return {"twists": self._twists.detach(), **state}
+
+    def load(self, tensors: Mapping[str, Tensor]) -> None:
+        """Inverse of `tensors`."""
+        with torch.no_grad():
+            self._twists.copy_(tensors["twists"])
+        state = {name: value for name, value in tensors.items() if name != "twists"}
+        if state:
+            self._adam.state[self._twists] = state
+
+    def _motions(self, groups: Tensor) -> Tensor:  # [b] -> [b, 4, 4]
+        twists, middles, axes = self._twists[groups] * self._ease, self._middles[groups], self._axes[groups]
+        rotations = turned_by(torch.einsum("gij,gj->gi", axes, twists[:, :3]) / self._lever_mm)
+        shifts = middles - torch.einsum("gij,gj->gi", rotations, middles)
+        shifts = shifts + torch.einsum("gij,gj->gi", axes, twists[:, 3:])
+        upper = torch.cat([rotations, shifts[..., None]], dim=-1)
+        last = upper.new_tensor([0.0, 0.0, 0.0, 1.0]).expand(len(upper), 1, 4)
+        return torch.cat([upper, last], dim=1)
+
+
+class FrameCorrections(Corrections):
+    """A correction for each frame. Their mean is the identity, and those of neighbours are alike."""
+
+    def __init__(self, sweep: Sweep, ranges: Sequence[range]) -> None:
+        super().__init__(sweep, [[place] for place in range(len(sweep))], WITHIN_THE_PLANE)
+        self._ranges = ranges
+
+    def step(self, done: float) -> None:
+        """One update by the gradient of a step, `done` being the share of the run that is done."""
+        self._roughness().backward()  # type: ignore[no-untyped-call]
+        self.update(_rate(done))
+        with torch.no_grad():
+            self._remove_common_motion()
+
+    def _roughness(self) -> Tensor:
+        bends = [torch.diff(self._twists[sweep.start : sweep.stop], 2, dim=0).square().sum() for sweep in self._ranges]
+        return SMOOTHNESS * torch.stack(bends).sum()
+
+    def _remove_common_motion(self) -> None:
+        """Takes the mean of all turns and shifts, in the tracker's axes, off each."""
+        parts = self._twists.reshape(-1, 2, 3)
+        common = torch.einsum("gij,gpj->pi", self._axes, parts) / len(parts)
+        parts -= torch.einsum("gij,pi->gpj", self._axes, common)
+
+
+class SweepCorrections(Corrections):
+    """A correction for each sweep as a whole; that of the first is the identity."""
+
+    def __init__(self, sweep: Sweep, ranges: Sequence[range]) -> None:
+        super().__init__(sweep, ranges)
+
+    def step(self, done: float) -> None:
+        """One update by the gradient of a step, `done` being the share of the run that is done."""
+        self.update(_rate(done))
+        with torch.no_grad():
+            self._twists[0] = 0.0
+
+
+def _rate(done: float) -> float:  # mm a step
+    return RATE * (0.0 if done < START else 1.0 - done)
+
+
+def turned_by(turns: Tensor) -> Tensor:  # [G, 3] rad -> [G, 3, 3]
+    """The rotations of turns, each an axis times an angle; differentiable, also at 0."""
+    x, y, z = turns.unbind(-1)
+    zero = torch.zeros_like(x)
+    cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(-1, 3, 3)
+    rotations: Tensor = torch.linalg.matrix_exp(cross)
+    return rotations
+
+
+# Pose refinement of a training run: before it by the path and the images, and in it together with the scene.
+
+
+_TRAINED: dict[str, type[FrameCorrections | SweepCorrections]] = {
+    "frames": FrameCorrections,
+    "sweeps": SweepCorrections,
+}
+
+
+class PoseRefinement:
+    """The corrections of the training frames, left-multiplied to their poses; `dataset` is the one to train from."""
+
+    def __init__(
+        self, dataset: Dataset, tracked: FloatArray, trained: FrameCorrections | SweepCorrections | None
+    ) -> None:
+        """`dataset` has the poses that the training begins with, `tracked` [F, 4, 4] (mm) are those of its frames."""
+        self.dataset, self._tracked, self._trained = dataset, tracked, trained
+
+    @classmethod
+    def of(cls, dataset: Dataset, mode: str) -> PoseRefinement:
+        """Estimates the poses that the training begins with.
+
+        `frames`: the tracker's noise is taken out of each sweep, each sweep is registered as a whole to those that it
+        crosses, and in the training every frame has a correction of its own. `sweeps`: only whole sweeps move. With
+        `none`, and where the poses are good (little noise, sweeps agree), they stay and none is trained.
+        """
+        tracked = dataset.train.poses
+        if mode == "none":
+            return cls(dataset, tracked, None)
+        ranges = sweep_ranges(dataset.train)
+        poses = tracked.copy()
+        if mode == "frames" and not tracker_noise(poses, ranges).is_small:
+            poses = without_noise(poses, ranges)
+        for frames, motion in zip(ranges, register_sweeps(replace(dataset.train, poses=poses), ranges), strict=True):
+            poses[frames] = motion @ poses[frames]
+        if np.array_equal(poses, tracked):
+            return cls(dataset, tracked, None)
+        train = replace(dataset.train, poses=poses)
+        return cls(replace(dataset, train=train), tracked, _TRAINED[mode](train, ranges))
+
+    @property
+    def group_count(self) -> int:
+        """The number of corrections that are trained: 0 where none is."""
+        return 0 if self._trained is None else self._trained.group_count
+
+    def corrected(self, places: Tensor, poses: FloatArray) -> ScenePoses:  # [b], [b, 4, 4] mm -> [b, 4, 4] mm
+        """Poses of a batch as they are by now, with the graph of their corrections where these are trained."""
+        return poses if self._trained is None else self._trained.corrected(places, poses)
+
+    def step(self, done: float) -> None:
+        """One update after a step's backward pass, `done` being the share of the run that is done."""
+        if self._trained is not None:
+            self._trained.step(done)
+
+    def poses(self) -> FloatArray:  # [F, 4, 4] mm
+        """The corrected poses of all training frames, as they are by now."""
+        poses = self.dataset.train.poses
+        return poses if self._trained is None else self._trained.all_motions() @ poses
+
+    def corrections(self) -> FloatArray | None:  # [F, 4, 4]
+        """The motions that are left-multiplied to the tracker's poses; None where these stay."""
+        return None if self._trained is None else self.poses() @ np.linalg.inv(self._tracked)
+
+    def tensors(self) -> dict[str, Tensor]:
+        """The state of the trained corrections, for a checkpoint."""
+        return {} if self._trained is None else self._trained.tensors()
+
+    def load(self, tensors: Mapping[str, Tensor]) -> None:
+        """Inverse of `tensors`."""
+        if self._trained is not None:
+            self._trained.load(tensors)
+
+
+# Scores of held-out frames whose poses may be wrong: each is registered by one half and scored on the other half.
+#
+# A frame whose pose is off by a millimetre scores badly even in a perfect scene. Registering all of it first would
+# score the scene too well, so a frame is moved by its left half alone and scored on its right half, and the other way
+# round.
+
+
+STEPS = 60
+TEXTURE = 0.5  # share of SSIM in the loss that a frame is moved by
+HELD_OUT_RATE = 0.1  # mm a step, falling to 0
+
+
+@dataclass(frozen=True)
+class HalvesScore:
+    """Mean PSNR of the halves of held-out frames, dB, and by how much registration moved their middles, mm."""
+
+    as_given_psnr_db: float
+    registered_psnr_db: float
+    moved_mm: float
+
+    def to_dict(self) -> dict[str, float]:
+        """A JSON object."""
+        return asdict(self)
+
+    def __str__(self) -> str:
+        return (
+            f"halves of frames: {self.as_given_psnr_db:.2f} dB as given, {self.registered_psnr_db:.2f} dB registered "
+            f"by the other half, which moved them by {self.moved_mm:.2f} mm"
+        )
+
+
+def score_halves(scene: GaussianScene, sweep: Sweep, *, backend: str = "auto") -> HalvesScore:
+    """Of all frames of a sweep. Raises DatasetInvalid where there are none, or halves are too narrow to compare."""
+    require_frames(sweep)
+    middle = sweep.width // 2
+    if min(middle, sweep.height) < SSIM_WINDOW:
+        raise DatasetInvalid(
+            f"{sweep.source}: to be registered by halves, frames must have at least {SSIM_WINDOW} rows and "
+            f"{2 * SSIM_WINDOW} columns, got {sweep.height}x{sweep.width}"
+        )
+    halves = (slice(0, middle), slice(middle, sweep.width))
+    given, registered, moved = [], [], []
+    count = frames_at_once(sweep.height, sweep.width)
+    for first in range(0, len(sweep), count):
+        some = sweep.select(np.arange(first, min(first + count, len(sweep))))
+        truth = torch.from_numpy(some.images).to(scene.means.device).float() / 255.0
+        as_given = _rendered(scene, some, torch.from_numpy(some.poses), backend).detach()
+        for fitted, scored in (halves, halves[::-1]):
+            poses = _fitted(scene, some, truth, fitted, backend)
+            given.append(_psnr_db(as_given[..., scored], truth[..., scored]))
+            registered.append(_psnr_db(_rendered(scene, some, poses, backend)[..., scored], truth[..., scored]))
+            centre = torch.from_numpy(np.append(sweep.probe.corners_mm().mean(axis=0), 1.0))
+            moved.append(((poses - torch.from_numpy(some.poses)) @ centre).norm(dim=1))
+    return HalvesScore(*(float(torch.cat(part).mean()) for part in (given, registered, moved)))
+
+
+def _fitted(scene: GaussianScene, sweep: Sweep, truth: Tensor, columns: slice, backend: str) -> Tensor:  # [F, 4, 4]
+    corrections = Corrections(sweep, [[place] for place in range(len(sweep))])
+    places = torch.arange(len(sweep))
+    target = truth[..., columns].contiguous()
+    for step in range(STEPS):
+        frames = _rendered(scene, sweep, corrections.corrected(places, sweep.poses), backend)
+        (len(sweep) * image_loss(frames[..., columns].contiguous(), target, TEXTURE)).backward()  # type: ignore[no-untyped-call]
+        corrections.update(HELD_OUT_RATE * (1.0 - step / STEPS))
+    return corrections.corrected(places, sweep.poses).detach()
+
+
+def _rendered(scene: GaussianScene, sweep: Sweep, poses: Tensor, backend: str) -> Tensor:  # [F, H, W]
+    height, width = sweep.height, sweep.width
+    return render(scene, sweep.probe, poses, height=height, width=width, outputs=("bmode",), backend=backend)["bmode"]
+
+
+def _psnr_db(frames: Tensor, truth: Tensor) -> Tensor:  # [F, H, W] both -> [F]
+    return -10.0 * (frames.detach() - truth).square().mean(dim=(1, 2)).clamp(min=1e-10).log10().cpu()

@@ -1,1 +1,0 @@
-"""Where in a scene a real frame was taken: its pose, found from the image."""

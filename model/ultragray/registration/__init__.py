@@ -1,1 +1,0 @@
-"""The frames of robots and trackers against a scene's: registered from points, poses or real frames."""

@@ -1,0 +1,92 @@
+"""Settings of a scanner's display, and frames as they look with them. Free of torch but for `frames`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ultragray.contract import Contract, described
+from ultragray.errors import InvalidImageSize
+from ultragray.geometry.image_size import MAX_IMAGE_SIDE
+from ultragray.geometry.probe import FloatArray, Picture, Probe, length_field
+
+# The settings of a scanner's display: gain, dynamic range, time-gain compensation, depth, flip, scan conversion.
+#
+# Free of torch; `show` in `ultragray.rendering.frames` applies it.
+
+
+FRAME_RANGE_DB = 60.0  # a B-mode frame is taken as compressed logarithmically over this range, 1 being 0 dB
+MAX_TGC_POINTS = 16
+
+
+@dataclass(frozen=True)
+class Display(Contract):
+    """Settings of a display. The defaults show frames as they are.
+
+    Gain, dynamic range, time-gain compensation and edge enhancement change B-mode only; the others change every output.
+    Raises InvalidArgument for numbers beyond the limits.
+    """
+
+    __topic__ = "Display"
+    gain_db: float = described("Added to every echo.", 0.0, low=-100.0, high=100.0)
+    dynamic_range_db: float = described("From white down to black.", FRAME_RANGE_DB, low=1.0, high=200.0)
+    tgc_db: tuple[float, ...] = described(
+        "Gains at evenly spaced depths from the first row shown to the last, linear in between.",
+        (),
+        low=-100.0,
+        high=100.0,
+        most=MAX_TGC_POINTS,
+    )
+    depth_mm: float | None = length_field("Deeper rows, counted from the face, are cut off.", default=None, low=1e-3)
+    flip: bool = described("Left and right change places.", False)
+    pixel_mm: float | None = described("Scan conversion to square pixels of this size.", None, low=1e-3, high=100.0)
+    edge: float = described(
+        "Edge enhancement: how much of what a blur over 3x3 samples takes away is added.", 0.0, low=0.0, high=4.0
+    )
+
+    @property
+    def changes_tone(self) -> bool:
+        """Whether B-mode values are changed."""
+        return self.gain_db != 0.0 or self.dynamic_range_db != FRAME_RANGE_DB or any(self.tgc_db)
+
+    def rows_shown(self, probe: Probe, height: int) -> int:
+        """The number of H rows that are not cut off, at least one."""
+        if self.depth_mm is None:
+            return height
+        share = (probe.face_depth_mm + self.depth_mm - probe.near_mm) / probe.scan_line_length_mm
+        return max(1, round(height * min(share, 1.0)))
+
+    def picture(self, probe: Probe, height: int, width: int) -> Picture:
+        """Size and place of what frames of height x width are shown as. Raises InvalidImageSize for a huge one."""
+        rows = self.rows_shown(probe, height)
+        shown = probe.cropped(rows / height)
+        picture = shown.frame_picture(rows, width) if self.pixel_mm is None else shown.picture(self.pixel_mm)
+        if max(picture.height, picture.width) > MAX_IMAGE_SIDE:
+            raise InvalidImageSize(
+                f"a picture may have at most {MAX_IMAGE_SIDE} pixels on a side, pixels of {self.pixel_mm:g} mm make it "
+                f"{picture.height}x{picture.width}",
+                field="pixel_mm",
+            )
+        return picture.flipped() if self.flip else picture
+
+    def gains(self, rows: int) -> FloatArray:  # [rows]
+        """The gain that is added to each row shown, in dB."""
+        gains = np.full(rows, self.gain_db)
+        if self.tgc_db:
+            points = np.linspace(0.0, 1.0, len(self.tgc_db))
+            gains += np.interp((np.arange(rows) + 0.5) / rows, points, self.tgc_db)
+        return gains
+
+
+AS_RENDERED = Display()
+
+
+def true_to_scale(probe: Probe, height: int, max_side: int = MAX_IMAGE_SIDE) -> Display:
+    """Shows frames with one size of a pixel: as they are where they are true to scale, else scan-converted.
+
+    Pixels are then as large as a depth sample, or larger where a side would have more than `max_side` of them.
+    """
+    if probe.is_true_to_scale:
+        return AS_RENDERED
+    return Display(pixel_mm=max(probe.scan_line_length_mm / height, probe.box_mm.longer_side / (max_side - 1)))

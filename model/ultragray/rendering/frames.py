@@ -1,0 +1,390 @@
+"""render(): poses in, frames out, on the backend that fits."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn.functional import avg_pool2d, grid_sample, pad
+
+from ultragray.errors import BackendUnavailable, InvalidArgument
+from ultragray.geometry.image_size import check_image_size
+from ultragray.geometry.probe import BoolArray, ElevationBeam, FloatArray, Probe
+from ultragray.geometry.scan_conversion import samples
+from ultragray.installation import __version__
+from ultragray.rendering.backends import cpu, cuda, reference
+from ultragray.rendering.backends.inputs import ScenePoses, as_array, beam_cm, scene_poses
+from ultragray.rendering.contact import Skin, Touch, at_rest
+from ultragray.rendering.display import FRAME_RANGE_DB, Display
+from ultragray.rendering.limits import UNLIMITED, Limits
+from ultragray.rendering.outputs import OUTPUTS, PLANES, check_available, check_outputs
+from ultragray.rendering.overlays import GHOST_PLANES, ToolsInView, add_ghosts
+from ultragray.rendering.settings import Contact
+from ultragray.rendering.tools import ScanView, Tool
+from ultragray.scene.gaussians import GaussianScene
+
+Backend = Callable[
+    [GaussianScene, Probe, ScenePoses, int, int, Sequence[str], Limits, Tensor | None], dict[str, Tensor]
+]
+
+
+class Frames(Mapping[str, Tensor]):
+    """Rendered frames by output, each [C, H, W]: `frames["bmode"]`, or `frames.bmode`, None where it was not asked for.
+
+    `ultragray.rendering.outputs` says what each means. Amounts lie in [0, 1]; labels are uint8, of which
+    `scene.info.label_names`
+    tells the meaning, 0 where there is none.
+    """
+
+    def __init__(self, outputs: Mapping[str, Tensor], touch: Touch | None = None) -> None:
+        self._outputs = dict(outputs)
+        self.touch = touch
+        """The contact of each pose with the skin; None where it was assumed."""
+
+    def __getitem__(self, name: str) -> Tensor:
+        return self._outputs[name]
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self._outputs)
+
+    def __len__(self) -> int:
+        return len(self._outputs)
+
+    def __getattr__(self, name: str) -> Tensor | None:
+        if name not in OUTPUTS:
+            raise AttributeError(f"there is no output {name!r}: outputs are {', '.join(OUTPUTS)}")
+        return self._outputs.get(name)
+
+    def __repr__(self) -> str:
+        count, height, width = next(iter(self._outputs.values())).shape if self._outputs else (0, 0, 0)
+        return f"Frames({count:,} of {height}x{width}: {', '.join(self._outputs)})"
+
+
+View = tuple[Probe, ScenePoses, int, int]  # poses [C, 4, 4] in cm about the scene's centre; height and width
+ENDED_BY_AIR = ("bmode", "transmittance")  # planes that are 0 along a scan line without contact: no beam gets out
+
+
+class Drawing:
+    """Views of a scene by one backend: the planes that outputs are derived from."""
+
+    def __init__(
+        self,
+        draw: Backend,
+        scene: GaussianScene,
+        view: View,
+        limits: Limits,
+        beam: Tensor | None,
+        touching: BoolArray | None = None,
+        tools: ToolsInView | None = None,
+        ghost: float = 0.0,
+    ) -> None:
+        """`beam`: [3] in cm; `touching`: [C, W], whether scan lines have contact, None: all have."""
+        self.scene = scene
+        self.shape = (len(view[1]), view[2], view[3])
+        self._draw, self._view, self._limits, self._beam = draw, view, limits, beam
+        self._touching, self._tools, self._ghost = touching, tools, ghost
+        self._planes: dict[str, Tensor] = {}
+
+    @property
+    def probe(self) -> Probe:
+        return self._view[0]
+
+    @property
+    def poses_mm(self) -> FloatArray:
+        """[C, 4, 4] mm, in the frame of the sweep that the scene was trained from."""
+        return _in_mm(self.scene, self._view[1])
+
+    def draw(self, planes: Sequence[str]) -> None:
+        """Draws planes of the whole scene at once."""
+        if planes:
+            drawn = self._draw(self.scene, *self._view, self._needed(planes), self._limits, self._beam)
+            self._planes = dict(drawn)
+        if self._tools is not None:
+            self._tools.draw(self._planes, self.shape[1], self.scene.means)
+        if self._touching is not None and not self._touching.all():
+            for name in set(ENDED_BY_AIR) & set(self._planes):
+                plane = self._planes[name]
+                self._planes[name] = plane * torch.from_numpy(self._touching).to(plane)[:, None]
+        if self._ghost and "bmode" in self._planes:
+            add_ghosts(self._planes, self.probe, self._ghost)
+
+    def _needed(self, planes: Sequence[str]) -> Sequence[str]:
+        """The planes to draw for these: those with them that tools and ghosts follow from."""
+        if self._ghost and set(GHOST_PLANES) & set(planes):
+            return tuple(dict.fromkeys((*planes, *GHOST_PLANES)))
+        if self._tools is not None and "bmode" in planes:
+            return tuple(dict.fromkeys((*planes, "transmittance")))
+        return planes
+
+    def plane(self, name: str) -> Tensor:  # [C, H, W]
+        """One of the planes that were drawn."""
+        return self._planes[name]
+
+    def plane_of(self, part: GaussianScene, name: str) -> Tensor:  # [C, H, W]
+        """A plane of some of the scene's Gaussians alone."""
+        return self._draw(part, *self._view, (name,), self._limits, self._beam)[name]
+
+    def mark_tools(self, labels: Tensor) -> None:
+        """Puts the labels of tools into labels [C, H, W], where they are."""
+        if self._tools is not None:
+            self._tools.mark(labels)
+
+
+def render(
+    scene: GaussianScene,
+    probe: Probe | None,
+    poses: Any,  # [C, 4, 4] or [4, 4] mm, probe→scene
+    *,
+    height: int,
+    width: int,
+    outputs: Sequence[str] = PLANES,
+    backend: str = "auto",
+    limits: Limits = UNLIMITED,
+    beam: ElevationBeam | Tensor | None = None,
+    contact: Contact | None = None,
+    tools: Sequence[Tool] = (),
+    ghost: float = 0.0,
+) -> Frames:
+    """Frames [C, height, width] of a scene seen by `probe` (None: the probe the scene was trained with) from `poses`.
+
+    Poses are rigid probe→scene transforms in mm, in the frame of the sweep that the scene was trained from.
+    Backends: `reference` computes in the dtype of the scene's tensors, where they are; `cpu` in float32 on as many
+    threads as torch.get_num_threads(); `cuda` in float32 on the GPU that holds the scene (`scene.to("cuda")`). `auto`
+    takes the fast one for where the scene is. All are differentiable with respect to the scene's tensors, and to poses
+    that are a torch tensor (`cpu` and `cuda` once), labels apart; the gradients are the true ones (docs/physics.md §4).
+    `beam` is how thick a slice the frames show, instead of the scene's own (None); a thickness of 0 mm is an infinitely
+    thin one. A tensor [3] of its thickness, focus and depth of field in mm is differentiable too.
+    `contact` makes scan lines off the skin dark, and compresses tissue under pressure (`ultragray.rendering.contact`);
+    the
+    result's `touch` tells where. It follows from the poses alone, has no gradient, and is the same on every backend.
+    `tools`, such as needles, are drawn into the frames (`ultragray.rendering.tools`); labels then are there for every
+    scene.
+    `ghost`, 0 to 1, is the share that a mirror image has of what is heard beyond the first strong interface
+    (`ultragray.rendering.overlays`). Both are the same on every backend, have no gradient, and let that of the planes
+    pass.
+    `limits` bound the cost of each frame and can end the rendering (`ultragray.rendering.limits`), but for frames with
+    gradients:
+    FrameTooCostly, GivenUp.
+    Raises InvalidPose, InvalidProbe, InvalidImageSize, UnknownOutput (also for labels of a scene that carries none),
+    BackendUnavailable, MemoryExceeded where the GPU's memory does not suffice, and InvalidArgument for a contact that
+    is none, and where contact is asked for and the scene knows no skin.
+    """
+    chosen = check_outputs(outputs)
+    check_available(chosen, scene.info, with_tools=bool(tools))
+    check_image_size(height, width)
+    view = (
+        scene.info.probe_or(probe),
+        scene_poses(scene, poses),
+        int(height),
+        int(width),
+    )
+    draw = _BACKENDS[choose_backend(backend, scene)]
+    contact = _checked_contact(contact)
+    planes = list(dict.fromkeys(plane for name in chosen for plane in OUTPUTS[name].planes))
+    touch = touch_of(scene, view[0], poses, view[3]) if contact is not None else None
+    drawn = []
+    for first, seen, touching in _views(view, touch, compressed=contact is Contact.PRESSURE):
+        shown = beam_cm(scene.info.beam if beam is None else beam, seen[0])
+        sight = _tools_in_view(tools, view, slice(first, first + len(seen[1])), scene, shown)
+        drawing = Drawing(draw, scene, seen, limits.after(first), shown, touching, sight, ghost)
+        drawing.draw(planes)
+        drawn.append({name: OUTPUTS[name].derive(drawing) for name in chosen})
+    whole = drawn[0] if len(drawn) == 1 else {name: torch.cat([one[name] for one in drawn]) for name in chosen}
+    return Frames(whole, touch)
+
+
+def _tools_in_view(
+    tools: Sequence[Tool], view: View, places: slice, scene: GaussianScene, beam: Tensor | None
+) -> ToolsInView | None:
+    """Tools as some poses of a view see them: rigid, where they are, whatever pressure does to the tissue."""
+    if not tools:
+        return None
+    probe, poses, _, width = view
+    poses_mm = _in_mm(scene, poses)[places]
+    if beam is None:
+        return ToolsInView(tools, ScanView(probe, poses_mm, width))
+    sigma, focus, rayleigh = (10.0 * beam.detach()).tolist()
+    return ToolsInView(tools, ScanView(probe, poses_mm, width, (sigma, focus, rayleigh)))
+
+
+def _in_mm(scene: GaussianScene, poses: ScenePoses) -> FloatArray:  # [C, 4, 4] cm -> [C, 4, 4] mm
+    """Poses of the scene's frame in that of the sweep that it was trained from."""
+    moved = as_array(poses).copy()
+    moved[:, :3, 3] = 10.0 * moved[:, :3, 3] + np.asarray(scene.info.centre_mm)
+    return moved
+
+
+def _checked_contact(contact: Any) -> Contact | None:
+    """A Contact also by its word."""
+    if contact is None:
+        return None
+    try:
+        return Contact(contact)
+    except ValueError:
+        words = ", ".join(one.value for one in Contact)
+        raise InvalidArgument(f"contact must be one of {words}, or None, got {contact!r}", field="contact") from None
+
+
+def touch_of(scene: GaussianScene, probe: Probe, poses: Any, width: int) -> Touch:  # [C, 4, 4] or [4, 4] mm
+    """The contact of a probe with the skin under the scene's training views.
+
+    Raises InvalidPose, and InvalidArgument where the scene knows no skin.
+    """
+    skin = scene.prepared("skin", lambda: Skin.under(scene.training_poses, scene.info.probe))
+    return Touch.of(skin, probe, poses, width)
+
+
+def _views(
+    view: View, touch: Touch | None, *, compressed: bool
+) -> Iterator[tuple[int, View, BoolArray | None]]:  # first pose, view, [C, W]
+    """What is drawn at once, in order: all poses, or each alone where pressure makes the probe of each another one."""
+    if touch is None:
+        yield 0, view, None
+    elif not compressed or not touch.pressed_mm.any():
+        yield 0, view, touch.lines
+    else:
+        probe, poses, height, width = view
+        for place, pressed_mm in enumerate(touch.pressed_mm.tolist()):
+            longer, motion_mm = at_rest(probe, pressed_mm)
+            motion_cm = motion_mm.copy()
+            motion_cm[:3, 3] /= 10.0
+            one = poses[place : place + 1]
+            moved = one @ (torch.from_numpy(motion_cm) if isinstance(one, Tensor) else motion_cm)
+            yield place, (longer, moved, height, width), touch.lines[place : place + 1]
+
+
+def footprint_pixels(
+    scene: GaussianScene,
+    probe: Probe | None,
+    poses: Any,  # [C, 4, 4] or [4, 4] mm, probe→scene
+    *,
+    height: int,
+    width: int,
+    limits: Limits = UNLIMITED,
+    beam: ElevationBeam | None = None,
+) -> list[int]:  # [C]
+    """The cost of each frame of a scene (`ultragray.rendering.limits`), without drawing it: by the CPU, wherever the
+    scene is.
+
+    Raises InvalidPose, InvalidProbe, InvalidImageSize, and GivenUp.
+    """
+    check_image_size(height, width)
+    view = scene.info.probe_or(probe), as_array(scene_poses(scene, poses)), int(height), int(width)
+    return cpu.footprint_pixels(scene, *view, limits, beam_cm(beam or scene.info.beam, view[0]))
+
+
+_BACKENDS: dict[str, Backend] = {
+    "reference": reference.render_outputs,
+    "cpu": cpu.render_outputs,
+    "cuda": cuda.render_outputs,
+}
+
+
+def choose_backend(name: str, scene: GaussianScene) -> str:
+    """The backend that `name` (auto: the best) means for a scene.
+
+    Raises BackendUnavailable for an unknown name and for one that cannot render the scene here.
+    """
+    if name == "auto":
+        if scene.means.is_cuda and cuda.supports(scene):
+            return "cuda"
+        return "cpu" if cpu.supports(scene) else "reference"
+    if name not in _BACKENDS:
+        raise BackendUnavailable(f"backend must be one of auto, {', '.join(_BACKENDS)}, got {name!r}", field="backend")
+    if name == "cuda":
+        cuda.require()
+    if name != "reference" and not (cpu if name == "cpu" else cuda).supports(scene):
+        place = "on the CPU" if name == "cpu" else f"on the device {cuda.device()}"
+        raise BackendUnavailable(
+            f"backend {name} renders float32 scenes {place}, got {scene.means.dtype} on {scene.means.device}",
+            field="backend",
+        )
+    return name
+
+
+def renderer_name(backend: str, scene: GaussianScene) -> str:
+    """The name of a scene's renderer, as in every frame: `ultragray/0.1.0 cpu-avx512`, `ultragray/0.1.0 cuda-sm90`."""
+    chosen = choose_backend(backend, scene)
+    if chosen == "cpu":
+        by = f"cpu-{cpu.INSTRUCTION_SETS[0]}"
+    else:
+        by = cuda.renderer(scene.means.device) if chosen == "cuda" else chosen
+    return f"ultragray/{__version__} {by}"
+
+
+# Rendered frames as a sonographer has set the display: the pixel work, where the frames are.
+
+
+_CACHED_PICTURES = 8  # at 9 bytes a pixel
+_LARGEST_CACHED_PICTURE = 2**20  # pixels
+
+
+def show(
+    frames: Mapping[str, Tensor], probe: Probe, display: Display, blackened: Tensor | None = None
+) -> dict[str, Tensor]:
+    """Each output [C, H, W] as `display` shows it, [C, H', W'] of `Display.picture`, in the type that it had.
+
+    Pixels that are `blackened`, [C, H, W] bool, are 0 in every output but those that tell support, whatever the gain.
+    """
+    shown = {}
+    for name, pixels in frames.items():
+        rows = display.rows_shown(probe, pixels.shape[1])
+        shown[name] = pixels[:, :rows]
+        if OUTPUTS[name].is_toned and display.changes_tone:
+            shown[name] = _toned(shown[name], display)
+        if OUTPUTS[name].is_toned and display.edge:
+            shown[name] = _edged(shown[name], display.edge)
+        if blackened is not None and not OUTPUTS[name].tells_support:
+            shown[name] = shown[name].masked_fill(blackened[:, :rows], 0)
+        if display.pixel_mm is not None:
+            cropped = probe.cropped(rows / pixels.shape[1])
+            shown[name] = _scan_converted(shown[name], cropped, display.pixel_mm, nearest=OUTPUTS[name].is_numbers)
+        if display.flip:
+            shown[name] = shown[name].flip(2)
+        shown[name] = shown[name].contiguous()
+    return shown
+
+
+def _toned(bmode: Tensor, display: Display) -> Tensor:  # [C, H, W] -> [C, H, W]
+    """Grey levels of each echo raised by its gain: 0 dB is white, `dynamic_range_db` below it black."""
+    gains = torch.from_numpy(display.gains(bmode.shape[1])).to(bmode)[:, None]
+    scale = FRAME_RANGE_DB / display.dynamic_range_db
+    return (bmode * scale + (1.0 - scale + gains / display.dynamic_range_db)).clamp_(0.0, 1.0)
+
+
+def _edged(bmode: Tensor, edge: float) -> Tensor:  # [C, H, W] -> [C, H, W]
+    """Unsharp masking by the mean of 3x3 samples; at the border the outermost ones count twice."""
+    blurred = avg_pool2d(pad(bmode[None], (1, 1, 1, 1), mode="replicate"), 3, stride=1)[0]
+    return (bmode + edge * (bmode - blurred)).clamp_(0.0, 1.0)
+
+
+def _scan_converted(frames: Tensor, probe: Probe, pixel_mm: float, *, nearest: bool) -> Tensor:  # -> [C, H', W']
+    _, height, width = frames.shape
+    picture = probe.picture(pixel_mm)
+    is_small = picture.height * picture.width <= _LARGEST_CACHED_PICTURE
+    grid, inside = (_cached_grid if is_small else _grid)(probe, height, width, pixel_mm, frames.device)
+    floats = frames if frames.is_floating_point() else frames.float()
+    if probe.lines.wrap:
+        floats = torch.cat([floats[..., -1:], floats, floats[..., :1]], dim=-1)
+    mode = "nearest" if nearest else "bilinear"
+    shown = grid_sample(floats[None], grid.to(floats), mode, padding_mode="border", align_corners=False)[0]
+    shown *= inside
+    return shown if frames.is_floating_point() else shown.round_().to(frames.dtype)
+
+
+def _grid(
+    probe: Probe, height: int, width: int, pixel_mm: float, device: torch.device
+) -> tuple[Tensor, Tensor]:  # [1, H', W', 2], [H', W']
+    """The place of each pixel of the picture, from −1 to 1 across the frame, and whether anything is there."""
+    rows, columns, inside = samples(probe, (height, width), pixel_mm)
+    if probe.lines.wrap:  # the frame is then given the first column once more after the last, and the other way round
+        columns, width = columns + 1.0, width + 2
+    grid = np.stack([(2 * columns + 1) / width - 1, (2 * rows + 1) / height - 1], axis=-1)
+    return torch.from_numpy(grid.astype(np.float32))[None].to(device), torch.from_numpy(inside).to(device)
+
+
+_cached_grid = lru_cache(maxsize=_CACHED_PICTURES)(_grid)

@@ -1,0 +1,181 @@
+"""The outputs of a renderer: what can be asked for at each pixel, and how each follows from what the backends draw.
+
+To add an output, register it here; its number on the wire goes into `proto/ultragray/v1/rendering.proto`. Free of
+torch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Protocol
+
+import numpy as np
+
+from ultragray.errors import UnknownOutput
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+    from ultragray.geometry.probe import FloatArray, Probe
+    from ultragray.scene.gaussians import GaussianScene
+    from ultragray.scene.info import SceneInfo
+
+
+PLANES = ("bmode", "echo", "transmittance", "coverage")  # what a backend draws, in [0, 1], with gradients
+WEIGHT_SUM, INTENSITY_SUM = "weight_sum", "intensity_sum"  # S and ΣI·w of docs/physics.md §3
+SUMS = (WEIGHT_SUM, INTENSITY_SUM)  # which backends draw too, with gradients
+SPENT_BEAM = 1e-4  # a transmittance below it is noise: nothing can be said of what is taken from it
+_AMOUNTS, _NUMBERS = np.dtype("<f4"), np.dtype("u1")
+
+
+class Drawing(Protocol):
+    """Views of a scene by one backend: what outputs are derived from."""
+
+    @property
+    def scene(self) -> GaussianScene: ...
+    @property
+    def shape(self) -> tuple[int, int, int]:
+        """C, H, W."""
+
+    @property
+    def probe(self) -> Probe: ...
+    @property
+    def poses_mm(self) -> FloatArray:
+        """[C, 4, 4] mm, in the frame of the sweep that the scene was trained from."""
+
+    def plane(self, name: str) -> Tensor:  # [C, H, W]
+        """One of the planes that the output names."""
+
+    def plane_of(self, part: GaussianScene, name: str) -> Tensor:  # [C, H, W]
+        """A plane of some of the scene's Gaussians alone."""
+
+    def mark_tools(self, labels: Tensor) -> None:
+        """Puts the labels of tools into labels [C, H, W], where they are."""
+
+
+@dataclass(frozen=True)
+class Output:
+    """One quantity of each pixel."""
+
+    name: str
+    meaning: str
+    planes: tuple[str, ...]
+    """The planes that the backends draw for it."""
+    derive: Callable[[Drawing], Tensor]
+    """The output [C, H, W] of a drawing."""
+    dtype: np.dtype[Any] = _AMOUNTS
+    """float32: amounts in [0, 1]. uint8: numbers that stand for something, which nothing may interpolate or scale."""
+    is_toned: bool = False
+    """Whether gain, dynamic range and time-gain compensation change it."""
+    shows_tools_alone: bool = False
+    """Whether a scene that does not give it gives it of tools."""
+    tells_support: bool = False
+    """Whether it keeps its values where pixels without support are blackened."""
+    lacks: Callable[[SceneInfo], str | None] = lambda _: None
+    """The scenes that give it, in words, where a scene does not; None where it does."""
+
+    @property
+    def is_numbers(self) -> bool:
+        """Whether its pixels are numbers, not amounts."""
+        return self.dtype == _NUMBERS
+
+
+OUTPUTS: dict[str, Output] = {}
+
+
+def _register(name: str, meaning: str, **properties: Any) -> Output:
+    properties.setdefault("planes", (name,))
+    properties.setdefault("derive", lambda drawing: drawing.plane(name))
+    OUTPUTS[name] = Output(name, meaning, **properties)
+    return OUTPUTS[name]
+
+
+def _labels(drawing: Drawing) -> Tensor:
+    from ultragray.rendering.labels import render_labels  # needs torch
+
+    labels = render_labels(drawing.scene, drawing.shape, lambda part: drawing.plane_of(part, WEIGHT_SUM))
+    drawing.mark_tools(labels)
+    return labels
+
+
+def _attenuation(drawing: Drawing) -> Tensor:
+    transmittance = drawing.plane("transmittance")
+    above = transmittance.roll(1, dims=1)
+    above[:, 0] = 1.0
+    return (1.0 - transmittance / above.clamp(min=SPENT_BEAM)).clamp(0.0, 1.0) * (above >= SPENT_BEAM)
+
+
+def _uncertainty(drawing: Drawing) -> Tensor:
+    from ultragray.rendering.confidence import deviations  # needs torch
+
+    planes = tuple(drawing.plane(name) for name in UNCERTAINTY.planes)
+    return deviations(drawing.scene, planes, drawing.poses_mm, drawing.probe)
+
+
+def _lacks_uncertainty(info: SceneInfo) -> str | None:
+    return None if info.confidence.get("uncertainty") else "whose training fitted its uncertainty; this one has none"
+
+
+def _lacks_labels(info: SceneInfo) -> str | None:
+    return None if info.label_names else "whose Gaussians carry labels; this one's carry none"
+
+
+BMODE = _register("bmode", "B = E T, what a scanner shows", is_toned=True)
+ECHO = _register("echo", "E, the reflected intensity")
+TRANSMITTANCE = _register("transmittance", "T, what is left of the beam at that depth")
+COVERAGE = _register("coverage", "1 - exp(-S): how far Gaussians support the pixel", tells_support=True)
+ATTENUATION = _register(
+    "attenuation",
+    "1 - T of the pixel alone: the share of the beam that reaches it and ends there; 0 where none does",
+    planes=("transmittance",),
+    derive=_attenuation,
+)
+LABELS = _register(
+    "labels",
+    "the label that weighs most, 0: none; of a scene with label_names, or of frames with tools",
+    planes=(),
+    derive=_labels,
+    dtype=_NUMBERS,
+    shows_tools_alone=True,
+    lacks=_lacks_labels,
+)
+UNCERTAINTY = _register(
+    "uncertainty",
+    "standard deviation that the error of bmode is expected to have; of a scene whose training fitted it",
+    planes=("bmode", "coverage", "transmittance"),
+    derive=_uncertainty,
+    tells_support=True,
+    lacks=_lacks_uncertainty,
+)
+
+
+OUTPUT_SCHEMA: dict[str, Any] = {  # JSON Schema of the name of an output
+    "type": "string",
+    "oneOf": [
+        {"const": output.name, "description": output.meaning, "x-numbers": output.is_numbers}
+        for output in OUTPUTS.values()
+    ],
+}
+
+
+def check_outputs(outputs: Sequence[str], *, field: str = "outputs") -> tuple[str, ...]:
+    """`outputs` without repetitions, in the given order. Raises UnknownOutput for an unknown name or an empty list."""
+    names = (outputs,) if isinstance(outputs, str) else tuple(outputs)
+    for name in names:
+        if name not in OUTPUTS:
+            raise UnknownOutput(f"{field} must be some of {', '.join(OUTPUTS)}, got {name!r}", field=field)
+    if not names:
+        raise UnknownOutput(f"{field} must name at least one of {', '.join(OUTPUTS)}, got none", field=field)
+    return tuple(dict.fromkeys(names))
+
+
+def check_available(
+    outputs: Sequence[str], info: SceneInfo, *, with_tools: bool = False, field: str = "outputs"
+) -> None:
+    """Raises UnknownOutput for outputs that a scene cannot give."""
+    for name in outputs:
+        if with_tools and OUTPUTS[name].shows_tools_alone:
+            continue
+        if (lacking := OUTPUTS[name].lacks(info)) is not None:
+            raise UnknownOutput(f"{field} may name {name} only for a scene {lacking}", field=field)

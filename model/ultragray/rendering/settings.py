@@ -1,0 +1,283 @@
+"""Settings of frames, as every door takes them beside the scene and the poses: content, display and encoding.
+
+A request's settings are checked and completed once, by `resolved`; what comes after trusts the result. Free of torch.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import MISSING, dataclass, fields
+from enum import Enum
+from functools import cached_property, lru_cache
+from typing import Any
+
+import numpy as np
+
+from ultragray.contract import Contract, described, to_dict
+from ultragray.errors import InvalidArgument, InvalidImageSize, InvalidProbe, UnknownOutput
+from ultragray.geometry.image_size import MAX_IMAGE_SIDE, check_image_size
+from ultragray.geometry.probe import MAX_THICKNESS_MM, PLANE, ElevationBeam, Picture, Probe
+from ultragray.rendering.display import AS_RENDERED, Display
+from ultragray.rendering.outputs import OUTPUT_SCHEMA, OUTPUTS, check_available, check_outputs
+from ultragray.rendering.tools import MAX_TOOLS, Tool
+from ultragray.scene.info import SceneInfo
+
+
+class Encoding(str, Enum):
+    """The form that pixels come in."""
+
+    UINT8 = "uint8"
+    FLOAT32 = "float32"
+    PNG = "png"
+    JPEG = "jpeg"
+    NPZ = "npz"
+
+    @property
+    def is_image_file(self) -> bool:
+        """Whether it holds exactly one frame of one output."""
+        return self in (Encoding.PNG, Encoding.JPEG)
+
+    @property
+    def pixel_type(self) -> np.dtype[Any]:
+        """The type that pixels are rounded to."""
+        return np.dtype("<f4") if self in (Encoding.FLOAT32, Encoding.NPZ) else np.dtype("u1")
+
+
+FRAME_ENCODINGS = tuple(one.value for one in Encoding if one is not Encoding.NPZ)
+"""Those of one frame; npz is an archive of many."""
+
+
+class Below(str, Enum):
+    """The fate of a frame whose confidence is below the limit."""
+
+    REFUSE = "refuse"
+    MASK = "mask"
+
+
+class Contact(str, Enum):
+    """What a frame shows of the probe's contact with the skin (`ultragray.rendering.contact`)."""
+
+    AIR = "air"
+    PRESSURE = "pressure"
+
+
+@dataclass(frozen=True, kw_only=True)
+class FrameSettings(Contract):
+    """Settings of what is rendered, but for the scene and the poses. None: as the scene has it.
+
+    Raises InvalidProbe, InvalidImageSize, UnknownOutput, InvalidArgument.
+    """
+
+    __topic__ = "Frames"
+    height: int | None = described(
+        "Depth samples. Default: as trained, else 512.", None, low=1, high=MAX_IMAGE_SIDE, error=InvalidImageSize
+    )
+    width: int | None = described(
+        "Scan lines. Default: as trained, else 512.", None, low=1, high=MAX_IMAGE_SIDE, error=InvalidImageSize
+    )
+    probe: Probe | None = described("Instead of the scene's own.", None, error=InvalidProbe)
+    min_confidence: float | None = described(
+        "What is below is refused, or masked.", None, low=0.0, high=1.0, topic="Confidence"
+    )
+    below_min_confidence: Below = described(
+        "mask: pixels of such frames that Gaussians do not support are 0.", Below.REFUSE, topic="Confidence"
+    )
+    slice_thickness_mm: float | None = described(
+        "Full width at half maximum along elevation at the focus of the scene's beam; 0: a plane. Default: as trained.",
+        None,
+        low=0.0,
+        high=MAX_THICKNESS_MM,
+    )
+    contact: Contact | None = described(
+        "air: scan lines whose face is off the skin are dark. pressure: and a face that is pressed in compresses the "
+        "tissue. Default: contact is assumed.",
+        None,
+    )
+    tools: tuple[Tool, ...] | None = described(
+        "Needles and the like in the image; labels then are there for every scene.", None, most=MAX_TOOLS
+    )
+    ghost: float | None = described(
+        "Second echo: share of what is heard beyond the first strong interface that is the mirror image of what lies "
+        "before it. Default: 0.",
+        None,
+        low=0.0,
+        high=1.0,
+    )
+    display: Display | None = described("Gain, depth, scan conversion ...; default: as rendered.", None)
+    outputs: tuple[str, ...] = described(f"Some of {', '.join(OUTPUTS)}.", ("bmode",), error=UnknownOutput)
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        object.__setattr__(self, "outputs", check_outputs(self.outputs))
+
+    @property
+    def least_confidence(self) -> float | None:
+        """The confidence without which poses are refused, or left out by a sampler; None: any."""
+        return self.min_confidence if self.below_min_confidence is Below.REFUSE else None
+
+    def resolved(self, info: SceneInfo, encoding: Encoding, *, max_image_side: int = MAX_IMAGE_SIDE) -> Resolved:
+        """The settings for a scene, with nothing left open.
+
+        Raises InvalidProbe where neither side knows a probe, InvalidImageSize beyond `max_image_side`, UnknownOutput
+        for outputs that the scene cannot give, InvalidArgument for a confidence that it cannot tell and for an encoding
+        that cannot hold the outputs.
+        """
+        check_available(self.outputs, info, with_tools=bool(self.tools))
+        height, width = info.image_size_or(self.height, self.width)
+        check_image_size(height, width, limit=max_image_side)
+        _check_encoding(encoding, self.outputs)
+        if self.min_confidence is not None and not info.confidence:
+            raise InvalidArgument(
+                "min_confidence needs a scene that knows the confidence of its frames; this one was trained without",
+                field="min_confidence",
+            )
+        return Resolved(
+            probe=info.probe_or(self.probe),
+            beam=info.beam_or(self.slice_thickness_mm),
+            height=height,
+            width=width,
+            outputs=self.outputs,
+            encoding=encoding,
+            display=self.display or AS_RENDERED,
+            **self._additions(),
+        )
+
+    def _additions(self) -> dict[str, Any]:
+        """The additions that are asked for."""
+        given = {one.name: getattr(self, one.name, None) for one in fields(Additions)}
+        return {name: value for name, value in given.items() if value is not None}
+
+
+def registration_field() -> Any:
+    """The field that names a registration, of what poses come with."""
+    return described(
+        "Name of the registration by which the poses lead into the scene: they are then flange to base, or marker to "
+        "tracker. Default: they are probe to scene.",
+        None,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderSettings(FrameSettings):
+    """Settings with an encoding, for doors where neither an Accept header nor a file format decides it."""
+
+    encoding: Encoding = described("Form of the pixels.", Encoding.UINT8, choices=tuple(FRAME_ENCODINGS))
+    registration: str | None = registration_field()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.encoding.value not in FRAME_ENCODINGS:
+            raise InvalidArgument(
+                f"encoding must be one of {', '.join(FRAME_ENCODINGS)}, got {self.encoding.value!r}", field="encoding"
+            )
+
+
+@dataclass(frozen=True, kw_only=True)
+class Additions:
+    """What a frame has only where it was asked for, as it was used."""
+
+    # A setting of frames that has a default of its own is a field here, of the name that it has in `FrameSettings`:
+    # so it comes into `Resolved`, and to all that frames are told by.
+
+    min_confidence: float | None = described("Below it the frame was refused, or masked; null: any.", None)
+    below_min_confidence: Below = described(
+        "mask: where the frame's confidence is below min_confidence, pixels without support are 0.", Below.REFUSE
+    )
+    contact: Contact | None = described("As used; null: it was assumed.", None)
+    tools: tuple[Tool, ...] = described("As used.", ())
+    ghost: float = described("As used; 0: none.", 0.0)
+    registration: str | None = described("That led the pose into the scene; null: none, it was sent as it is.", None)
+
+
+@dataclass(frozen=True)
+class Resolved(Additions):
+    """Settings of a request for one scene, checked, with nothing left open."""
+
+    probe: Probe
+    height: int  # depth samples that are rendered
+    width: int  # scan lines
+    outputs: tuple[str, ...] = ("bmode",)
+    beam: ElevationBeam = PLANE
+    encoding: Encoding = Encoding.UINT8
+    display: Display = AS_RENDERED
+
+    @cached_property
+    def picture(self) -> Picture:
+        """Size and place of what the frames are shown as. Raises InvalidImageSize for a huge one."""
+        return self.display.picture(self.probe, self.height, self.width)
+
+    @cached_property
+    def view(self) -> tuple[Any, ...]:
+        """All that shows but outputs and encoding: frames that agree in this can be rendered together."""
+        return tuple(getattr(self, name) for name in _SHOWING)
+
+    @property
+    def pixels(self) -> int:
+        """The number of pixels rendered or shown for one pose, whichever is more, over all outputs."""
+        picture = self.picture
+        return max(self.height * self.width, picture.height * picture.width) * len(self.outputs)
+
+
+_SHOWING = tuple(one.name for one in fields(Resolved) if one.name not in ("outputs", "encoding", "registration"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SettingsUsed(Additions):
+    """The settings of a frame, as used: with its scene and its pose all that is needed to render it again."""
+
+    probe: Probe = described("As used.")
+    slice_thickness_mm: float = described("As used: at the focus of the scene's beam; 0: a plane.")
+    rendered_height: int = described("Depth samples, before the display settings were applied.")
+    rendered_width: int = described("Scan lines, likewise.")
+    display: Display = described("As used.", AS_RENDERED)
+    height: int = described("H.")
+    width: int = described("W.")
+    picture: Picture = described("Where the pixels lie.")
+    outputs: tuple[str, ...] = described("In the order of the data.", schema={"items": OUTPUT_SCHEMA})
+    encoding: Encoding = described("Of the pixels.")
+
+    # Every door tells all of them, by one of these two, or by the codec of messages.
+
+    def document(self) -> dict[str, Any]:
+        """The settings as JSON holds them, but for additions that were not asked for."""
+        plain = {one.name: one.default for one in fields(Additions)}
+        told = (one.name for one in fields(self) if plain.get(one.name, MISSING) != getattr(self, one.name))
+        return {name: to_dict(getattr(self, name)) for name in told}
+
+    def texts(self) -> dict[str, str]:
+        """The same with a text for each: words and numbers as they are, lists of words with commas, else JSON."""
+        return {name: _text(value) for name, value in self.document().items()}
+
+
+@lru_cache(maxsize=256)
+def settings_used(settings: Resolved) -> SettingsUsed:
+    """The settings of a request, as its frames tell them."""
+    picture = settings.picture
+    return SettingsUsed(
+        probe=settings.probe,
+        slice_thickness_mm=settings.beam.thickness_mm,
+        rendered_height=settings.height,
+        rendered_width=settings.width,
+        display=settings.display,
+        height=picture.height,
+        width=picture.width,
+        picture=picture,
+        outputs=settings.outputs,
+        encoding=settings.encoding,
+        **{one.name: getattr(settings, one.name) for one in fields(Additions)},
+    )
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, list) and value and all(isinstance(one, str) for one in value):
+        return ",".join(value)
+    return value if isinstance(value, str) else json.dumps(value)
+
+
+def _check_encoding(encoding: Encoding, outputs: tuple[str, ...]) -> None:
+    if encoding.is_image_file and len(outputs) != 1:
+        raise InvalidArgument(
+            f"encoding {encoding.value} holds exactly one output, got {len(outputs)}", field="encoding"
+        )
+    if encoding is Encoding.JPEG and OUTPUTS[outputs[0]].is_numbers:
+        raise InvalidArgument(f"encoding jpeg would change {outputs[0]}: ask for png, or raw pixels", field="encoding")

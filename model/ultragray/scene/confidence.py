@@ -1,0 +1,579 @@
+"""The extrapolation of a frame from what its scene was trained on, and the confidence in it."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, fields, replace
+from typing import Any, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from ultragray.contract import described
+from ultragray.errors import InvalidArgument, LowConfidence
+from ultragray.geometry.pose import check_poses
+from ultragray.geometry.probe import FloatArray, Probe
+
+# The place of a pose relative to the views that a scene was trained on. Needs no torch.
+
+
+POINTS_PER_SIDE = 6  # of the grid of image points at which distances are taken
+ANGLE_MM_PER_DEG = 0.02  # added to distances to choose the nearest view: of two about as near, the less turned one
+FAR_MM = 20.0  # a frame is expected to be no worse farther away: larger distances count as this
+MAX_VIEWS = 256  # around a pose that it is compared with: with more, this would take longer than rendering the frame
+SMALLEST_MM = 1e-6  # of a distance: nearer ones count as this
+POSES_AT_ONCE = 8  # so that their distances stay in the processor's cache
+NEIGHBOURHOOD_MM = 3.0  # of views whose hardness counts; where all are farther away, the nearest ones count
+
+
+@dataclass(frozen=True, eq=False)
+class ViewMeasures:
+    """Of K points of the images of C poses, row by row, and the weights of the P training views around each pose.
+
+    distance: to the nearest training image. interpolation: a·b/(a + b) of the distances a, b to the nearest images on
+    either side: half of either midway between two, all of it where there is one side only. Both count as at most
+    FAR_MM; `nearest_mm` is the distance without that limit. angle: the rotation to the view of the nearest image.
+    """
+
+    nearest_mm: FloatArray  # [C, K]
+    distance_mm: FloatArray  # [C, K]
+    interpolation_mm: FloatArray  # [C, K]
+    angle_deg: FloatArray  # [C, K]
+    weights: FloatArray  # [C, P], each row sums to 1
+
+    def averaged(self) -> ViewMeasures:
+        """The same with the mean over the points as the only one."""
+        return ViewMeasures(
+            nearest_mm=self.nearest_mm.mean(axis=1, keepdims=True),
+            distance_mm=self.distance_mm.mean(axis=1, keepdims=True),
+            interpolation_mm=self.interpolation_mm.mean(axis=1, keepdims=True),
+            angle_deg=self.angle_deg.mean(axis=1, keepdims=True),
+            weights=self.weights,
+        )
+
+
+class TrainingViews:
+    """The images of P training poses [P, 4, 4] (mm, probe→scene) of one probe, in space. P is at least 1."""
+
+    def __init__(self, poses: FloatArray, probe: Probe) -> None:
+        self._probe = probe
+        axes = np.ascontiguousarray(poses[:, :3, :3].transpose(2, 1, 0))  # [axis, xyz, P]
+        self._axes = axes.astype(np.float32)
+        self._offsets = np.einsum("axp,px->ap", axes, poses[:, :3, 3]).astype(np.float32)  # [axis, P]
+        self._rotations = poses[:, :3, :3].reshape(len(poses), 9)
+        self._middles = (
+            poses[:, :3, :3] @ _image_points(probe, POINTS_PER_SIDE).mean(axis=0) + poses[:, :3, 3]
+        )  # [P, 3] mm
+
+    def __len__(self) -> int:
+        return len(self._rotations)
+
+    def measure(self, poses: FloatArray, probe: Probe, points_per_side: int = POINTS_PER_SIDE) -> ViewMeasures:
+        """Measures poses [C, 4, 4] (mm) of a probe, which need not be the views' own. Raises InvalidPose."""
+        points = _image_points(probe, points_per_side)
+        count = len(poses)
+        measures = np.zeros((4, count, len(points)))
+        weights = np.zeros((count, len(self)))
+        checked = check_poses(poses) if count else poses
+        for first in range(0, count, POSES_AT_ONCE):
+            some = checked[first : first + POSES_AT_ONCE]
+            places = np.arange(first, first + len(some))
+            seen = points @ some[:, :3, :3].transpose(0, 2, 1) + some[:, None, :3, 3]
+            views = self._nearby(seen.mean(axis=1))
+            measures[:, places], weights[places[:, None], views] = self._measure(seen, some, views)
+        nearest, distance, interpolation, angle = measures
+        return ViewMeasures(nearest, distance, interpolation, angle, weights)
+
+    def mean_distances_mm(self, poses: FloatArray, probe: Probe) -> FloatArray:  # [C, P]
+        """Root of the mean square distance of the points of each image to each view."""
+        points = _image_points(probe, POINTS_PER_SIDE)
+        distances = np.zeros((len(poses), len(self)))
+        everyone = np.arange(len(self))[None]
+        for place, pose in enumerate(poses):
+            _, apart = self._offsets_mm((points @ pose[:3, :3].T + pose[:3, 3])[None], everyone)
+            distances[place] = _root_mean_square(apart)[0]
+        return distances
+
+    def _nearby(self, middles: FloatArray) -> npt.NDArray[np.intp]:  # [B, 3] mm -> [B, V] or [1, P]
+        """The views that can matter: all, or of very many those whose images have their middles nearest to a point."""
+        if len(self) <= MAX_VIEWS:
+            return np.arange(len(self))[None]
+        away = ((self._middles - middles[:, None]) ** 2).sum(axis=2)
+        return np.argpartition(away, MAX_VIEWS, axis=1)[:, :MAX_VIEWS]
+
+    def _offsets_mm(
+        self, points: FloatArray, views: npt.NDArray[np.intp]
+    ) -> tuple[FloatArray, FloatArray]:  # [B, K, 3] mm, [B, V] -> [B, K, V] both
+        """Distances of points off the planes of views along elevation, and from the images within the planes.
+
+        In float32, and squares are added up here: `np.hypot` of doubles takes ten times as long.
+        """
+        single = points.astype(np.float32)
+        x, elevation, z = (single @ self._axes[axis][:, views].transpose(1, 0, 2) for axis in range(3))
+        for coordinate, offsets in zip((x, elevation, z), self._offsets, strict=True):
+            coordinate -= offsets[views][:, None]
+        probe = self._probe
+        lateral, depth = probe.lines.beside(x, z)
+        depth -= 0.5 * (probe.near_mm + probe.far_mm)
+        axial = np.abs(depth, out=depth)
+        axial -= 0.5 * probe.scan_line_length_mm
+        squares = elevation * elevation
+        for beside in (lateral, axial):
+            np.maximum(beside, 0.0, out=beside)
+            beside *= beside
+            squares += beside
+        return elevation, np.sqrt(squares, out=squares)
+
+    def _measure(
+        self, points: FloatArray, poses: FloatArray, views: npt.NDArray[np.intp]
+    ) -> tuple[FloatArray, FloatArray]:  # [B, K, 3], [B, 4, 4], [B, V] -> [4, B, K], [B, V]
+        along, distances = self._offsets_mm(points, views)  # [B, K, V]
+        angles = np.take_along_axis(self._angles_deg(poses), views, axis=1)[:, None].astype(np.float32)
+        nearest = (distances + np.float32(ANGLE_MM_PER_DEG) * angles).argmin(axis=2)[..., None]
+        nearest_mm = np.take_along_axis(distances, nearest, axis=2)[..., 0]
+        facing = np.einsum("xbv,bx->bv", self._axes[1][:, views], poses[:, :3, 1])
+        along *= np.sign(facing)[:, None]  # −1: turned by more than 90°, front and back swap
+        largest = np.float32(1e3 * FAR_MM)  # of a side without a view
+        np.clip(distances, SMALLEST_MM, largest, out=distances)
+        nearness = np.copysign(1.0 / distances, along)  # the nearest view in front has the highest, behind the lowest
+        front, back = (1.0 / np.maximum(side, 1.0 / largest) for side in (nearness.max(axis=2), -nearness.min(axis=2)))
+        between = front * back / np.maximum(front + back, 1e-9)
+        capped = [np.minimum(value, FAR_MM) for value in (nearest_mm, between)]
+        around = _root_mean_square(distances)
+        least = around.min(axis=1, keepdims=True)
+        reach = np.maximum(NEIGHBOURHOOD_MM, 1.3 * least)
+        weights = np.exp((least / reach) ** 2 - (around / reach) ** 2)
+        turned = np.take_along_axis(np.broadcast_to(angles, distances.shape), nearest, axis=2)[..., 0]
+        return np.stack([nearest_mm, *capped, turned]), weights / weights.sum(axis=1, keepdims=True)
+
+    def _angles_deg(self, poses: FloatArray) -> FloatArray:  # [B, 4, 4] -> [B, P]
+        """Angle of the rotation from each pose to each view."""
+        cosine = 0.5 * (poses[:, :3, :3].reshape(-1, 9) @ self._rotations.T - 1.0)
+        return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
+
+
+def _image_points(probe: Probe, per_side: int) -> FloatArray:  # [K, 3] mm, probe frame
+    origins, directions = probe.scan_lines(per_side)
+    points = origins + probe.depths_mm(per_side)[:, None, None] * directions
+    return points.reshape(-1, 3)
+
+
+def _root_mean_square(values: FloatArray) -> FloatArray:  # [B, K, P] -> [B, P]
+    root: FloatArray = np.sqrt(np.einsum("bkp,bkp->bp", values, values) / values.shape[1]).astype(np.float64)
+    return root
+
+
+# The model behind the output `uncertainty`: the variances that add up to that of a pixel's error. Needs no torch.
+#
+# σ² = Σ cₖ·vₖ, cₖ ≥ 0
+#
+# The terms vₖ are those of `ultragray.rendering.confidence`. Those that grow with the distance to the training views
+# are shares of V = spread + (level − B̄)²: the mean squared error of a pixel that shows B̄ where the true grey value
+# may be any of those that the training images have at that depth.
+
+
+VARIANCE_TERMS = (
+    "floor",
+    "level",
+    "level²",
+    "texture",
+    "gap 0.3 mm",
+    "gap 1 mm",
+    "gap 3 mm",
+    "beyond",
+    "thin",
+    "shadow",
+)
+DEPTHS = 8  # bands of depth of the training images, each with its level and spread
+DIGITS = 6  # in a scene's metadata
+
+
+@dataclass(frozen=True)
+class DepthBands:
+    """Mean and variance of the training images' grey values, in [0, 1], in bands of depth.
+
+    Raises InvalidArgument for numbers that cannot be.
+    """
+
+    level: tuple[float, ...]  # [DEPTHS]
+    spread: tuple[float, ...]  # [DEPTHS]
+
+    def __post_init__(self) -> None:
+        for name in ("level", "spread"):
+            object.__setattr__(self, name, _amounts(name, getattr(self, name), DEPTHS))
+
+
+@dataclass(frozen=True)
+class Uncertainty:
+    """Fitted cₖ, and the depth bands of the training images.
+
+    Raises InvalidArgument for numbers that cannot be.
+    """
+
+    variances: tuple[float, ...]  # [TERMS]
+    bands: DepthBands
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "variances", _amounts("variances", self.variances, len(VARIANCE_TERMS)))
+
+    def to_dict(self) -> dict[str, Any]:
+        """A JSON object, as a scene's metadata holds it."""
+        numbers = {"variances": self.variances, "level": self.bands.level, "spread": self.bands.spread}
+        return {name: [round(value, DIGITS) for value in values] for name, values in numbers.items()}
+
+    @classmethod
+    def from_dict(cls, document: Any) -> Uncertainty:
+        """Inverse of `to_dict`, but for the digits. Raises InvalidArgument for keys or values that cannot be."""
+        expected = {"variances", "level", "spread"}
+        if not isinstance(document, Mapping) or set(document) != expected:
+            found = sorted(document) if isinstance(document, Mapping) else document
+            raise InvalidArgument(
+                f"uncertainty must be an object with the keys {sorted(expected)}, got {found!r}", field="uncertainty"
+            )
+        return cls(document["variances"], DepthBands(document["level"], document["spread"]))
+
+
+def _amounts(name: str, values: Any, count: int) -> tuple[float, ...]:
+    field = f"uncertainty.{name}"
+    try:
+        numbers = tuple(float(value) for value in values)
+    except (TypeError, ValueError, OverflowError):
+        raise InvalidArgument(f"{field} must be numbers, got {values!r}", field=field) from None
+    if len(numbers) != count or not all(math.isfinite(value) and value >= 0.0 for value in numbers):
+        raise InvalidArgument(f"{field} must be {count} numbers, at least 0, got {values!r}", field=field)
+    return numbers
+
+
+# The model behind the figure `confidence`: logistic curves over how points of a frame lie to the training views.
+#
+# c = b + (1 − b)·mean over points of σ(w₀ − w₁·log(1 + i/0.3 mm) − w₂·d/5 mm − w₃·φ/10° − w₄·h)
+#
+# d, i and φ are the distance, the interpolation distance and the angle of `ViewMeasures`; h is how hard the place is:
+# the `hardness` of the training views around the pose, by their weights. b is what a black frame reaches. w₁ … w₄ are
+# not negative, so that c never rises with d, i, φ or h. Beyond the farthest point that the weights were fitted on,
+# where no frame confirms the curve, the excess of d counts twice.
+#
+# Where Gaussians support only the share s of a frame's pixels, c ≤ b + (1 − b)·g·s; the gain g is fitted to frames
+# with little support. For a pose alone s is estimated as s₀·mean over points of exp(−d²/r²); of a rendered frame it
+# is known.
+#
+# Version 1, of older scenes, takes the curve of the means over the points, and has neither limit. Needs no torch.
+
+
+VERSION = 2
+NEAR_MM, DISTANCE_MM, ANGLE_DEG = 0.3, 5.0, 10.0  # units of the terms
+TERMS = 4  # beside the constant
+HARDNESS_DIGITS = 3
+
+
+@dataclass(frozen=True)
+class Support:
+    """The limit that the share of supported pixels sets, and what that share is expected to be at a pose.
+
+    Raises InvalidArgument for numbers that are not finite or not positive.
+    """
+
+    gain: float  # g
+    share: float  # s₀, at the views
+    reach_mm: float  # r
+
+    def __post_init__(self) -> None:
+        numbers = _numbers("support", (self.gain, self.share, self.reach_mm))
+        if min(numbers) <= 0.0:
+            raise InvalidArgument(f"support must be positive numbers, got {list(numbers)}", field="support")
+
+    def expected_shares(self, measures: ViewMeasures) -> FloatArray:  # [C]
+        """The share of supported pixels that frames at these poses are taken to have."""
+        return self.share * within(measures.distance_mm, self.reach_mm)
+
+
+@dataclass(frozen=True)
+class ConfidenceModel:
+    """Fitted weights w₀ … w₄, b, and the hardness of each training view; `fitted_on` and `error` describe the fit.
+
+    Raises InvalidArgument for numbers that are not finite or out of range.
+    """
+
+    weights: tuple[float, ...]  # w₀ … w₄
+    black_ms_ssim: float  # b
+    hardness: tuple[float, ...]  # [P]
+    fitted_on: int  # held-out views
+    error: float  # mean absolute error on those views
+    support: Support | None = None  # None: it sets no limit
+    fitted_to_mm: float | None = None  # the farthest point of those views; None: any
+    uncertainty: Uncertainty | None = None  # of pixels; None: not known
+    version: int = VERSION
+
+    def __post_init__(self) -> None:
+        weights = _numbers("weights", self.weights)
+        if len(weights) != 1 + TERMS or min(weights[1:]) < 0.0:
+            raise InvalidArgument(
+                f"weights must be {1 + TERMS} numbers, from the second on at least 0, got {list(weights)}",
+                field="weights",
+            )
+        black, error = _numbers("black_ms_ssim and error", (self.black_ms_ssim, self.error))
+        if not (0.0 <= black < 1.0 and 0.0 <= error <= 1.0):
+            raise InvalidArgument(
+                f"black_ms_ssim and error must be in [0, 1], got {black:g} and {error:g}", field="black_ms_ssim"
+            )
+        if type(self.fitted_on) is not int or self.fitted_on < 1:
+            raise InvalidArgument(f"fitted_on must be a positive integer, got {self.fitted_on!r}", field="fitted_on")
+        if self.fitted_to_mm is not None and _numbers("fitted_to_mm", [self.fitted_to_mm])[0] < 0.0:
+            raise InvalidArgument(f"fitted_to_mm must be at least 0, got {self.fitted_to_mm:g}", field="fitted_to_mm")
+        object.__setattr__(self, "weights", weights)
+        object.__setattr__(self, "hardness", _numbers("hardness", self.hardness))
+
+    def predict(self, measures: ViewMeasures) -> FloatArray:  # [C]
+        """The MS-SSIM expected at each pose, in [0, 1]."""
+        if self.version == 1:
+            measures = measures.averaged()
+        terms = terms_of(measures, np.array(self.hardness), self.fitted_to_mm)
+        expected = predicted(np.array(self.weights), terms, self.black_ms_ssim)
+        return expected if self.support is None else self.limited(expected, self.support.expected_shares(measures))
+
+    def limited(self, confidences: FloatArray, supported_shares: FloatArray) -> FloatArray:  # [C] both
+        """The confidences of poses, limited by the share of their pixels that has support."""
+        if self.support is None:
+            return confidences
+        shares = np.minimum(1.0, self.support.gain * supported_shares)
+        most: FloatArray = self.black_ms_ssim + (1.0 - self.black_ms_ssim) * shares
+        return np.minimum(confidences, most)
+
+    def to_dict(self) -> dict[str, Any]:
+        """A JSON object, as a scene's metadata holds it."""
+        document = {
+            **asdict(self),
+            "weights": list(self.weights),
+            "hardness": [round(value, HARDNESS_DIGITS) for value in self.hardness],
+            "uncertainty": None if self.uncertainty is None else self.uncertainty.to_dict(),
+        }
+        return {key: document[key] for key in _KEYS[self.version]}
+
+    @classmethod
+    def from_dict(cls, document: Mapping[str, Any]) -> ConfidenceModel:
+        """Inverse of `to_dict`, but for the digits of `hardness`.
+
+        Raises InvalidArgument for another version, a missing or a surplus key, and values that cannot be.
+        """
+        version = document.get("version") if isinstance(document, Mapping) else None
+        if type(version) is not int or version not in _KEYS:
+            known = " or ".join(map(str, _KEYS))
+            raise InvalidArgument(
+                f"confidence must be an object of version {known}, got {version!r}", field="confidence"
+            )
+        if set(document) != set(_KEYS[version]):
+            raise InvalidArgument(
+                f"confidence of version {version} must have the keys {sorted(_KEYS[version])}, got {sorted(document)}",
+                field="confidence",
+            )
+        support, uncertainty = document.get("support"), document.get("uncertainty")
+        parts = {
+            "support": None if support is None else _support_of(support),
+            "uncertainty": None if uncertainty is None else Uncertainty.from_dict(uncertainty),
+        }
+        return cls(**{**document, **parts})
+
+
+_KEYS_1 = ("version", "weights", "black_ms_ssim", "hardness", "fitted_on", "error")
+_KEYS = {1: _KEYS_1, 2: (*_KEYS_1, "support", "fitted_to_mm", "uncertainty")}
+
+
+def terms_of(
+    measures: ViewMeasures,
+    hardness: FloatArray,  # [P]
+    fitted_to_mm: float | None = None,
+) -> FloatArray:  # [C, K, 1 + TERMS]
+    """The factors of the weights at each point: 1 and the negative terms of the formula."""
+    distance_mm = measures.distance_mm
+    if fitted_to_mm is not None:
+        distance_mm = distance_mm + np.maximum(distance_mm - fitted_to_mm, 0.0)
+    columns = (
+        np.full_like(distance_mm, -1.0),
+        np.log1p(measures.interpolation_mm / NEAR_MM),
+        distance_mm / DISTANCE_MM,
+        measures.angle_deg / ANGLE_DEG,
+        np.broadcast_to((measures.weights @ hardness)[:, None], distance_mm.shape),
+    )
+    return -np.stack(columns, axis=-1)
+
+
+def predicted(weights: FloatArray, terms: FloatArray, black_ms_ssim: float) -> FloatArray:  # [C]
+    """c of each pose, by the formula."""
+    shares: FloatArray = logistic(terms @ weights).mean(axis=1)
+    return black_ms_ssim + (1.0 - black_ms_ssim) * shares
+
+
+def within(distance_mm: FloatArray, reach_mm: float) -> FloatArray:  # [C, K] -> [C]
+    """The mean over the points of exp(−d²/r²)."""
+    shares: FloatArray = np.exp(-np.square(distance_mm / reach_mm)).mean(axis=1)
+    return shares
+
+
+def logistic(values: FloatArray) -> FloatArray:
+    """σ of the formula."""
+    return 1.0 / (1.0 + np.exp(-np.clip(values, -500.0, 500.0)))
+
+
+def _support_of(document: Any) -> Support:
+    expected = set(Support.__dataclass_fields__)
+    if not isinstance(document, Mapping) or set(document) != expected:
+        found = sorted(document) if isinstance(document, Mapping) else document
+        raise InvalidArgument(
+            f"support must be an object with the keys {sorted(expected)}, got {found!r}", field="support"
+        )
+    return Support(**document)
+
+
+def _numbers(name: str, values: Any) -> tuple[float, ...]:
+    try:
+        numbers = tuple(float(value) for value in values)
+    except (TypeError, ValueError, OverflowError):
+        raise InvalidArgument(f"{name} must be numbers, got {values!r}", field=name) from None
+    if not all(map(math.isfinite, numbers)):
+        raise InvalidArgument(f"{name} must be finite, got {values!r}", field=name)
+    return numbers
+
+
+# The assessment of a frame: its extrapolation, and how much a real frame would look like it. Needs no torch.
+
+
+SUPPORT_COVERAGE = 0.3  # γ below which a pixel's error is more than twice that of the others
+
+
+@dataclass(frozen=True)
+class Extrapolation:
+    """Of one frame. None: the scene does not know its training views, has no model, or no coverage was given."""
+
+    distance_mm: float | None = described("Distance to the nearest training views, a mean over the image.")
+    angle_deg: float | None = described("Angle to them.")
+    confidence: float | None = described(
+        "The MS-SSIM that a real frame at this pose is expected to have with the rendered one, 0 to 1."
+    )
+    supported_share: float | None = described("Share of the pixels that Gaussians support: coverage of at least 0.3.")
+    contact_share: float | None = described(
+        "Share of the scan lines that have contact with the skin; none where contact is assumed.", None
+    )
+
+    def figures(self) -> dict[str, float | None]:
+        """FIGURES, and the share of contact where it was judged: what files hold of a frame."""
+        told = {name: getattr(self, name) for name in FIGURES}
+        return told if self.contact_share is None else told | {CONTACT_SHARE: self.contact_share}
+
+
+CONTACT_SHARE = "contact_share"
+FIGURES = tuple(figure.name for figure in fields(Extrapolation) if figure.name != CONTACT_SHARE)
+
+
+def figure_arrays(extrapolations: Sequence[Extrapolation]) -> dict[str, npt.NDArray[np.float32]]:
+    """Each of FIGURES, and the share of contact where it was judged, as [C]; NaN where one is not known."""
+    judged = any(one.contact_share is not None for one in extrapolations)
+    names = (*FIGURES, CONTACT_SHARE) if judged else FIGURES
+    return {name: np.array([getattr(one, name) for one in extrapolations], dtype=np.float32) for name in names}
+
+
+class Trained(Protocol):
+    """A description of a scene and of its training, such as `ultragray.SceneInfo`."""
+
+    @property
+    def probe(self) -> Probe | None: ...
+    @property
+    def confidence(self) -> dict[str, Any]: ...
+    def probe_or(self, asked: Probe | None) -> Probe: ...
+
+
+class Assessor:
+    """Computes the extrapolation of frames of one scene. Its distances and confidence need the pose alone."""
+
+    def __init__(self, info: Trained, training_poses: FloatArray) -> None:  # [P, 4, 4] mm
+        """Raises InvalidArgument where the scene's `confidence` is damaged or made for other training poses."""
+        known = info.probe is not None and len(training_poses) > 0
+        self._info = info
+        self._views = TrainingViews(training_poses, info.probe_or(None)) if known else None
+        self._model = read_model(info.confidence, len(training_poses)) if known else None
+
+    def assess(
+        self, poses: Any, probe: Probe | None = None, *, coverage: npt.NDArray[Any] | None = None
+    ) -> list[Extrapolation]:
+        """One for each pose [C, 4, 4] or [4, 4] (mm, probe→scene) of a probe (None: the scene's own).
+
+        `coverage` [C, H, W] is the renderer's γ at these poses; a small image suffices. Raises InvalidPose, and
+        InvalidProbe where no probe is known.
+        """
+        checked = check_poses(poses)
+        shares = [] if coverage is None else supported(coverage).mean(axis=(1, 2)).tolist()
+        if coverage is not None and len(shares) != len(checked):
+            raise InvalidArgument(
+                f"coverage must have one image for each of {len(checked)} poses, got {len(shares)}", field="coverage"
+            )
+        if self._views is None:
+            unknown = [Extrapolation(None, None, None, None)] * len(checked)
+            return unknown if coverage is None else self.with_support(unknown, shares)
+        measures = self._views.measure(checked, self._info.probe_or(probe))
+        confidences = [None] * len(checked) if self._model is None else self._model.predict(measures).tolist()
+        away = (measures.nearest_mm.mean(axis=1).tolist(), measures.angle_deg.mean(axis=1).tolist())
+        found = [Extrapolation(*values, None) for values in zip(*away, confidences, strict=True)]
+        return found if coverage is None else self.with_support(found, shares)
+
+    def with_support(self, extrapolations: Sequence[Extrapolation], shares: Sequence[float]) -> list[Extrapolation]:
+        """The extrapolations of rendered frames, completed with the share of each one's pixels that has support."""
+        confidences = [one.confidence for one in extrapolations]
+        if self._model is not None and None not in confidences:
+            confidences = self._model.limited(np.array(confidences), np.array(shares)).tolist()
+        return [
+            replace(one, confidence=confidence, supported_share=share)
+            for one, confidence, share in zip(extrapolations, confidences, shares, strict=True)
+        ]
+
+
+def supported(coverage: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:  # [C, H, W] -> [C, H, W]
+    """A mask of the pixels that Gaussians support: γ of at least SUPPORT_COVERAGE."""
+    return np.asarray(coverage) >= SUPPORT_COVERAGE
+
+
+def read_model(document: dict[str, Any], view_count: int) -> ConfidenceModel | None:
+    """The model in a scene's `confidence`, None where that is empty.
+
+    Raises InvalidArgument where it is damaged or does not have the hardness of `view_count` views.
+    """
+    if not document:
+        return None
+    model = ConfidenceModel.from_dict(document)
+    if len(model.hardness) != view_count:
+        raise InvalidArgument(
+            f"confidence.hardness must have one number for each of {view_count} training poses, got "
+            f"{len(model.hardness)}",
+            field="confidence",
+        )
+    return model
+
+
+# A least confidence that frames must have. Needs no torch.
+
+
+def is_confident(extrapolation: Extrapolation, min_confidence: float) -> bool:
+    """Whether a frame has the least confidence; one whose confidence is not known has none."""
+    return (extrapolation.confidence or 0.0) >= min_confidence
+
+
+def low_confidence(extrapolation: Extrapolation, min_confidence: float, field: str) -> LowConfidence:
+    """The error of a pose, named by its field, that does not have the least confidence."""
+    detail = f"{field} has a confidence of {extrapolation.confidence or 0.0:.2f}, {min_confidence:g} is asked for"
+    if extrapolation.distance_mm is not None and extrapolation.angle_deg is not None:
+        away = f"{extrapolation.distance_mm:.1f} mm and {extrapolation.angle_deg:.1f} degrees away"
+        detail = f"{detail}: the nearest training views are {away}"
+    return LowConfidence(detail, field=field)
+
+
+def require_confidence(
+    extrapolations: Sequence[Extrapolation], min_confidence: float | None, *, first: int = 0
+) -> None:
+    """Raises LowConfidence for the first of many poses that does not have the least confidence (None: any will do).
+
+    `first`: the number that they begin with.
+    """
+    if min_confidence is None:
+        return
+    for number, extrapolation in enumerate(extrapolations, first):
+        if not is_confident(extrapolation, min_confidence):
+            raise low_confidence(extrapolation, min_confidence, f"poses[{number}]")

@@ -1,0 +1,258 @@
+"""GaussianScene: the Gaussians of a trained scene and what they mean.
+
+Convention. Inside a scene lengths are in cm and the origin is the scene's centre; on every public surface they are in
+mm in the frame of the training sweep: p_cm = (p_mm − centre_mm) / 10.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+from torch import Tensor
+
+from ultragray.errors import InvalidArgument
+from ultragray.files import write_whole
+from ultragray.geometry.pose import check_poses
+from ultragray.geometry.probe import FloatArray
+from ultragray.scene.info import (
+    CORRECTIONS_TENSOR,
+    LABELS_TENSOR,
+    METADATA_KEY,
+    SceneInfo,
+    check_corrections,
+    check_header_size,
+    check_training_pose_count,
+    expected_shapes,
+    info_to_json,
+    read_header,
+    scene_file_invalid,
+    with_summary,
+)
+
+MAX_POSITION_CM = 1e6
+PARAMETERS = ("means", "scales", "quats", "transmittances", "sh0", "shN")
+
+
+Prepared = TypeVar("Prepared")
+
+
+class _Kept(NamedTuple):
+    """A preparation of a scene and its sources: holding the tensors keeps their identity from being reused."""
+
+    tensors: tuple[Tensor, ...]
+    versions: tuple[int, ...]
+    intensity: str
+    made: Any
+
+
+@dataclass(eq=False)
+class GaussianScene:
+    """Raw parameters (docs/physics.md §2), as a released checkpoint's `splats` holds them, and the scene's description.
+
+    The parameters share one floating dtype and one device. Where the Gaussians carry labels, `info.label_names` says
+    what they mean; 0 is no label. `GaussianScene.from_splats` checks them; use that.
+    """
+
+    means: Tensor  # [N, 3] cm
+    scales: Tensor  # [N, 3] log cm
+    quats: Tensor  # [N, 4] wxyz, any norm but 0
+    transmittances: Tensor  # [N] logit
+    sh0: Tensor  # [N, 1, 1]
+    shN: Tensor  # [N, K-1, 1]  # noqa: N815 (the released name)
+    info: SceneInfo = field(default_factory=SceneInfo)
+    training_poses: FloatArray = field(default_factory=lambda: np.zeros((0, 4, 4)))  # [P, 4, 4] mm
+    labels: Tensor | None = None  # [N] uint8
+    pose_corrections: FloatArray | None = None  # [P, 4, 4] mm: training poses = corrections · poses of the tracker
+    _prepared: dict[str, _Kept] = field(default_factory=dict, init=False, repr=False)
+
+    def __repr__(self) -> str:
+        name = "" if self.info.dataset_name is None else f"{self.info.dataset_name!r}, "
+        return f"GaussianScene({name}{len(self.means):,} Gaussians, {self.info.probe or 'no probe'})"
+
+    def __getstate__(self) -> dict[str, Any]:
+        """For copies and other processes, which prepare themselves anew."""
+        return {**vars(self), "_prepared": {}}
+
+    @classmethod
+    def from_splats(
+        cls,
+        splats: Mapping[str, Tensor],
+        *,
+        info: SceneInfo | None = None,
+        training_poses: Any = None,  # [P, 4, 4] mm
+        labels: Tensor | None = None,  # [N] uint8
+        pose_corrections: Any = None,  # [P, 4, 4] mm
+    ) -> GaussianScene:
+        """A scene of raw released parameters, lengths in cm; the graph of the tensors is kept.
+
+        Labels that `info.label_names` does not name are called after their number.
+        Raises InvalidArgument, naming the tensor, for a missing key, a wrong shape, mixed dtypes or devices, or
+        values that are not finite.
+        """
+        missing = [name for name in PARAMETERS if name not in splats and name != "shN"]
+        if missing:
+            raise InvalidArgument(
+                f"splats must hold {', '.join(PARAMETERS)}; missing {', '.join(missing)}", field="splats"
+            )
+        tensors: dict[str, Any] = {name: splats[name] for name in PARAMETERS if name in splats}
+        for name, tensor in tensors.items():
+            if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
+                raise InvalidArgument(
+                    f"splats[{name!r}] must be a floating tensor, got {type(tensor).__name__}", field=name
+                )
+        means = tensors["means"]
+        count = means.shape[0] if means.ndim else 0
+        if "shN" not in tensors:
+            tensors["shN"] = means.new_zeros((count, 0, 1))
+        shn = tensors["shN"]
+        degree = {0: 0, 3: 1, 8: 2, 15: 3}.get(shn.shape[1] if shn.ndim == 3 else -1)
+        if degree is None:
+            raise InvalidArgument(
+                f"splats['shN'] must be [N, K-1, 1] with K-1 in 0, 3, 8, 15, got {list(shn.shape)}",
+                field="shN",
+            )
+        for name, shape in expected_shapes(count, degree).items():
+            tensor = tensors[name]
+            if tuple(tensor.shape) != shape:
+                raise InvalidArgument(
+                    f"splats[{name!r}] must have shape {list(shape)}, got {list(tensor.shape)}", field=name
+                )
+            if tensor.dtype != means.dtype or tensor.device != means.device:
+                raise InvalidArgument(
+                    f"splats[{name!r}] must be {means.dtype} on {means.device} like means, got {tensor.dtype} on "
+                    f"{tensor.device}",
+                    field=name,
+                )
+            if not bool(torch.isfinite(tensor).all()):
+                raise InvalidArgument(f"splats[{name!r}] must be finite, got NaN or infinity", field=name)
+        if count and float(means.detach().abs().max()) > MAX_POSITION_CM:
+            raise InvalidArgument(f"splats['means'] must lie within {MAX_POSITION_CM:g} cm", field="means")
+        if count and bool((tensors["quats"].detach().norm(dim=-1) == 0).any()):
+            raise InvalidArgument("splats['quats'] must not be zero", field="quats")
+        poses = np.zeros((0, 4, 4)) if training_poses is None else check_poses(training_poses, field="training_poses")
+        check_training_pose_count(len(poses))
+        summary = with_summary(info or SceneInfo(), means.detach().cpu().double().numpy(), degree)
+        names = _names_of_labels(labels, means, summary.label_names)
+        corrections = None if pose_corrections is None else check_corrections(pose_corrections, len(poses))
+        return cls(
+            **tensors,
+            info=replace(summary, label_names=names),
+            training_poses=poses,
+            labels=labels,
+            pose_corrections=corrections,
+        )
+
+    @property
+    def gaussian_count(self) -> int:
+        return self.info.gaussian_count
+
+    @property
+    def sh_degree(self) -> int:
+        return self.info.sh_degree
+
+    @property
+    def splats(self) -> dict[str, Tensor]:
+        """The six raw parameter tensors by their released names."""
+        return {name: getattr(self, name) for name in PARAMETERS}
+
+    def to(self, target: torch.dtype | torch.device | str) -> GaussianScene:
+        """The same scene with its tensors in another dtype or on another device."""
+        moved: dict[str, Any] = {name: tensor.to(target) for name, tensor in self.splats.items()}
+        labels = None if self.labels is None else self.labels.to(moved["means"].device)
+        return GaussianScene(
+            **moved,
+            info=self.info,
+            training_poses=self.training_poses,
+            labels=labels,
+            pose_corrections=self.pose_corrections,
+        )
+
+    def prepared(self, name: str, make: Callable[[], Prepared]) -> Prepared:
+        """A backend's preparation of the scene, kept by name until one of the tensors, or the activation, changes.
+
+        A change that torch does not count (through `.data`) is not noticed.
+        """
+        tensors = (*self.splats.values(), *(() if self.labels is None else (self.labels,)))
+        if any(tensor.is_inference() for tensor in tensors):  # their changes are not counted
+            return make()
+        versions = tuple(tensor._version for tensor in tensors)
+        kept = self._prepared.get(name)
+        if (
+            kept is None
+            or kept.versions != versions
+            or kept.intensity != self.info.intensity
+            or any(a is not b for a, b in zip(kept.tensors, tensors, strict=True))
+        ):
+            kept = _Kept(tensors, versions, self.info.intensity, make())
+            self._prepared[name] = kept  # one assignment: threads may render the scene at the same time
+        made: Prepared = kept.made
+        return made
+
+    def poses_to_scene_cm(self, poses: FloatArray) -> FloatArray:  # [C, 4, 4] mm -> [C, 4, 4] cm
+        """Poses in the sweep's frame (mm) as poses in the scene's own (cm, about its centre)."""
+        inside: FloatArray = poses.copy()
+        inside[:, :3, 3] = (poses[:, :3, 3] - np.asarray(self.info.centre_mm)) / 10.0
+        return inside
+
+    def to_bytes(self) -> bytes:
+        """The scene file: deterministic, so that its SHA-256 names the scene.
+
+        Raises InvalidArgument where `info` is larger than the header of a scene file may be.
+        """
+        tensors = {name: t.detach().to("cpu", torch.float32).contiguous() for name, t in self.splats.items()}
+        if self.labels is not None:
+            tensors[LABELS_TENSOR] = self.labels.cpu().contiguous()
+        tensors["training_poses"] = torch.from_numpy(np.ascontiguousarray(self.training_poses))
+        if self.pose_corrections is not None:
+            tensors[CORRECTIONS_TENSOR] = torch.from_numpy(np.ascontiguousarray(self.pose_corrections))
+        data: bytes = save(tensors, metadata={METADATA_KEY: info_to_json(self.info)})
+        check_header_size(data)
+        return data
+
+    def save(self, path: str | Path) -> None:
+        """Writes the scene file whole or not at all. Raises OSError where it cannot be written."""
+        write_whole(path, self.to_bytes())
+
+    @classmethod
+    def load(cls, path: str | Path) -> GaussianScene:
+        """Reads a scene file. Never runs code; raises SceneFileInvalid, naming the file and the reason."""
+        header = read_header(path)
+        try:
+            with safe_open(path, framework="pt") as bundle:
+                splats = {name: bundle.get_tensor(name) for name in PARAMETERS}
+                labels = bundle.get_tensor(LABELS_TENSOR) if header.info.label_names else None
+            return cls.from_splats(
+                splats,
+                info=header.info,
+                training_poses=header.training_poses,
+                labels=labels,
+                pose_corrections=header.pose_corrections,
+            )
+        except (OSError, SafetensorError, ValueError) as error:
+            raise scene_file_invalid(path, error) from error
+
+
+def _names_of_labels(labels: Any, means: Tensor, known: Mapping[int, str]) -> dict[int, str]:
+    """A name for each label that occurs, and those known besides. Raises InvalidArgument."""
+    if labels is None:
+        if known:
+            raise InvalidArgument(
+                f"labels must be given where info.label_names names some: {', '.join(known.values())}", field="labels"
+            )
+        return {}
+    if not isinstance(labels, Tensor) or labels.dtype != torch.uint8 or labels.shape != means.shape[:1]:
+        got = f"{labels.dtype} {list(labels.shape)}" if isinstance(labels, Tensor) else type(labels).__name__
+        raise InvalidArgument(f"labels must be a uint8 tensor [{len(means)}], got {got}", field="labels")
+    if labels.device != means.device:
+        raise InvalidArgument(f"labels must be on {means.device} like means, got {labels.device}", field="labels")
+    found = {int(label): f"label {label}" for label in torch.unique(labels).tolist() if label > 0} | dict(known)
+    if not found:
+        raise InvalidArgument("labels must hold one above 0, or info.label_names name one", field="labels")
+    return found

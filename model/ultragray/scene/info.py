@@ -1,0 +1,251 @@
+"""A scene file's description of itself, readable without torch: the header of the safetensors bundle.
+
+The file is one safetensors bundle. Tensors: means [N, 3] cm, scales [N, 3] log cm, quats [N, 4] wxyz, transmittances
+[N] logit, sh0 [N, 1, 1], shN [N, K−1, 1], all float32, training_poses [P, 4, 4] float64 mm, and, where the Gaussians
+carry labels, labels [N] uint8. Its metadata holds one entry, `ultragray`, a JSON object with the fields of SceneInfo.
+All but the Gaussians is bounded, so that the description of any file is read in little memory and time.
+"""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from safetensors import SafetensorError, safe_open
+
+from ultragray.contract import Contract, described, from_dict, to_dict
+from ultragray.errors import InvalidArgument, InvalidProbe, SceneFileInvalid
+from ultragray.files import require_version
+from ultragray.geometry.image_size import DEFAULT_IMAGE_SIDE
+from ultragray.geometry.pose import check_poses
+from ultragray.geometry.probe import PLANE, ElevationBeam, FloatArray, Probe
+from ultragray.scene.confidence import read_model
+
+FORMAT_VERSION = 1
+METADATA_KEY = "ultragray"
+INTENSITIES = ("released", "sigmoid")
+MAX_SH_DEGREE = 3
+MAX_LABEL = 255
+MAX_HEADER_BYTES = 4 * 2**20  # of the bundle: names and shapes of tensors, and the metadata
+_NO_HEADER_BYTES = 1 << 40  # a number of bytes beyond is none: other files begin so
+MAX_TRAINING_POSES = 100_000
+MAX_METRICS = 1000
+LABELS_TENSOR = "labels"
+CORRECTIONS_TENSOR = "pose_corrections"
+_LENGTH_BYTES = 8  # a safetensors bundle starts with the length of its header, little endian
+
+Vector = tuple[float, float, float]
+
+
+@dataclass(frozen=True)
+class SceneInfo(Contract):
+    """A scene's own description. Positions are in mm; `bounds` and `centre` in the frame of the training sweep."""
+
+    centre_mm: Vector = (0.0, 0.0, 0.0)
+    probe: Probe | None = None
+    image_height: int | None = described("H of the training images.", None, low=1)
+    image_width: int | None = described("W of the training images.", None, low=1)
+    intensity: str = described("Activation of docs/physics.md §2.", "released", choices=INTENSITIES)
+    sh_degree: int = described("Of the Gaussians' spherical harmonics.", 0, low=0, high=MAX_SH_DEGREE)
+    gaussian_count: int = described("N.", 0, low=0)
+    bounds_min_mm: Vector = (0.0, 0.0, 0.0)  # of the Gaussians' means
+    bounds_max_mm: Vector = (0.0, 0.0, 0.0)
+    dataset_name: str | None = None
+    dataset_sha256: str | None = None
+    metrics: dict[str, float] = described("Of held-out frames.", factory=dict, most=MAX_METRICS)
+    training: dict[str, Any] = described("The configuration the scene was made with.", factory=dict)
+    confidence: dict[str, Any] = described("Of ultragray.scene.confidence.ConfidenceModel; empty: none.", factory=dict)
+    label_names: dict[int, str] = described("By label, 1 to 255; empty: the scene carries none.", factory=dict)
+    beam: ElevationBeam | None = described("Of the frames it was trained on; none: as thick as its Gaussians.", None)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "label_names", _label_names(self.label_names))
+        super().__post_init__()
+
+    def probe_or(self, asked: Probe | None) -> Probe:
+        """The probe asked for, else the one the scene was trained with.
+
+        Raises InvalidProbe where neither is known, and for what is no Probe.
+        """
+        if asked is not None and not isinstance(asked, Probe):
+            raise InvalidProbe(f"probe must be a Probe, such as LinearProbe(…), got {asked!r}", field="probe")
+        probe = asked or self.probe
+        if probe is None:
+            raise InvalidProbe(
+                "probe must be given: the scene does not know the one it was trained with", field="probe"
+            )
+        return probe
+
+    def beam_or(self, thickness_mm: float | None) -> ElevationBeam:
+        """The beam of the scene, as thick as asked for (None: as it is); where it has none, one without a focus."""
+        if self.beam is None:
+            return PLANE if thickness_mm is None else ElevationBeam(thickness_mm)
+        return self.beam if thickness_mm is None else self.beam.as_thick_as(thickness_mm)
+
+    def image_size_or(self, height: int | None, width: int | None) -> tuple[int, int]:
+        """Height and width as asked for, else those of the training images, else 512."""
+        return (
+            height if height is not None else self.image_height or DEFAULT_IMAGE_SIDE,
+            width if width is not None else self.image_width or DEFAULT_IMAGE_SIDE,
+        )
+
+
+def _label_names(names: Any) -> dict[int, str]:
+    """With numbers for keys, which JSON writes as text, in their order."""
+    try:
+        found = {int(label): name for label, name in names.items()}
+    except (AttributeError, TypeError, ValueError):
+        found = {0: ""}
+    if not all(1 <= label <= MAX_LABEL and isinstance(name, str) and name for label, name in found.items()):
+        raise InvalidArgument(
+            f"label_names must give labels from 1 to {MAX_LABEL} a name each, got {names!r}", field="label_names"
+        )
+    return dict(sorted(found.items()))
+
+
+def info_to_json(info: SceneInfo) -> str:
+    """The metadata entry of a scene file."""
+    document = {"format_version": FORMAT_VERSION, **to_dict(info)}
+    for name in ("label_names", "beam"):
+        if not document[name]:
+            del document[name]  # a scene without them keeps its bytes, and its hash
+    return json.dumps(document, allow_nan=False, sort_keys=True)
+
+
+def info_from_json(text: str) -> SceneInfo:
+    """Inverse of `info_to_json`. Raises ValueError (InvalidArgument among them), saying what is wrong."""
+    document = json.loads(text)
+    if not isinstance(document, dict):
+        raise ValueError("its metadata is not a JSON object")
+    require_version(document.pop("format_version", None), FORMAT_VERSION)
+    unknown = set(document) - set(SceneInfo.__dataclass_fields__)
+    if unknown:
+        raise ValueError(f"its metadata has unknown keys {sorted(unknown)}")
+    if document.get("probe") is not None:
+        document["probe"] = from_dict(Probe, document["probe"])
+    if document.get("beam") is not None:
+        document["beam"] = from_dict(ElevationBeam, document["beam"])
+    return SceneInfo(**document)
+
+
+def expected_shapes(count: int, sh_degree: int) -> dict[str, tuple[int, ...]]:
+    """Shapes of the six parameter tensors for N = `count` Gaussians."""
+    return {
+        "means": (count, 3),
+        "scales": (count, 3),
+        "quats": (count, 4),
+        "transmittances": (count,),
+        "sh0": (count, 1, 1),
+        "shN": (count, (sh_degree + 1) ** 2 - 1, 1),
+    }
+
+
+@dataclass(frozen=True)
+class SceneHeader:
+    """The description and the training poses of a scene file, without the Gaussians."""
+
+    info: SceneInfo
+    training_poses: FloatArray = field(repr=False)  # [P, 4, 4] mm, probe→scene
+    file_bytes: int
+    # [P, 4, 4] mm: training poses = corrections · poses of the tracker
+    pose_corrections: FloatArray | None = field(default=None, repr=False)
+
+
+def read_header(path: str | Path) -> SceneHeader:
+    """The description of a scene file, without loading its Gaussians and without torch.
+
+    Raises SceneFileInvalid, naming the file and the reason, for anything that is not a complete scene file.
+    """
+    path = Path(path)
+    try:
+        size = path.stat().st_size
+        with path.open("rb") as file:
+            check_header_size(file.read(_LENGTH_BYTES))
+        with safe_open(path, framework="numpy") as bundle:
+            metadata = bundle.metadata() or {}
+            if METADATA_KEY not in metadata:
+                raise ValueError("it is a safetensors file, but not one of ultragray's")
+            info = info_from_json(metadata[METADATA_KEY])
+            _check_tensors(bundle, info)
+            poses = check_poses(bundle.get_tensor("training_poses"), field="training_poses")
+            corrections = None
+            if CORRECTIONS_TENSOR in bundle.keys():  # noqa: SIM118
+                corrections = check_corrections(bundle.get_tensor(CORRECTIONS_TENSOR), len(poses))
+            read_model(info.confidence, len(poses))
+    except (OSError, SafetensorError, ValueError, TypeError, RecursionError) as error:
+        raise scene_file_invalid(path, error) from error
+    return SceneHeader(info=info, training_poses=poses, file_bytes=size, pose_corrections=corrections)
+
+
+def check_corrections(corrections: Any, count: int) -> FloatArray:  # [P, 4, 4] mm
+    """Rigid motions, one for each of `count` training poses. Raises InvalidPose and InvalidArgument."""
+    exact = check_poses(corrections, field=CORRECTIONS_TENSOR)
+    if len(exact) != count:
+        raise InvalidArgument(
+            f"{CORRECTIONS_TENSOR} must be {count}, one for each training pose, got {len(exact)}",
+            field=CORRECTIONS_TENSOR,
+        )
+    return exact
+
+
+def check_header_size(start: bytes) -> None:
+    """Raises InvalidArgument where a bundle that starts so has a larger header than that of a scene may be."""
+    size = int.from_bytes(start[:_LENGTH_BYTES], "little")
+    if size > _NO_HEADER_BYTES:
+        raise InvalidArgument("it does not begin as a scene file does: it is damaged, or a file of another kind")
+    if size > MAX_HEADER_BYTES:
+        raise InvalidArgument(f"the header of a scene file may have {MAX_HEADER_BYTES} bytes, it says {size}")
+
+
+def check_training_pose_count(count: int) -> None:
+    """Raises InvalidArgument for more than a scene may have."""
+    if count > MAX_TRAINING_POSES:
+        raise InvalidArgument(
+            f"training_poses must be at most {MAX_TRAINING_POSES}, got {count}", field="training_poses"
+        )
+
+
+def _check_tensors(bundle: Any, info: SceneInfo) -> None:
+    names = set(bundle.keys())
+    shapes = expected_shapes(info.gaussian_count, info.sh_degree)
+    if info.label_names:
+        shapes[LABELS_TENSOR] = (info.gaussian_count,)
+    if names - {CORRECTIONS_TENSOR} != {*shapes, "training_poses"}:
+        raise ValueError(f"its tensors are {sorted(names)}, expected {sorted([*shapes, 'training_poses'])}")
+    for name, shape in shapes.items():
+        part, dtype = bundle.get_slice(name), "U8" if name == LABELS_TENSOR else "F32"
+        if tuple(part.get_shape()) != shape or part.get_dtype() != dtype:
+            raise ValueError(
+                f"its tensor {name} is {part.get_dtype()} {list(part.get_shape())}, expected {dtype} {list(shape)}"
+            )
+    for name in sorted(names - set(shapes)):
+        poses = bundle.get_slice(name)
+        if poses.get_dtype() != "F64" or len(poses.get_shape()) != 3:
+            raise ValueError(
+                f"its tensor {name} is {poses.get_dtype()} {list(poses.get_shape())}, expected F64 [P, 4, 4]"
+            )
+        check_training_pose_count(poses.get_shape()[0])
+
+
+def scene_file_invalid(path: str | Path, error: Exception) -> SceneFileInvalid:
+    """The one sentence for a scene file that cannot be read."""
+    if isinstance(error, FileNotFoundError):
+        return SceneFileInvalid(f"{path}: no such file")
+    if isinstance(error, RecursionError):
+        return SceneFileInvalid(f"{path}: not a scene file: its metadata nests too deeply")
+    reason = error.strerror if isinstance(error, OSError) and error.strerror else error  # the whole would name the path
+    return SceneFileInvalid(f"{path}: not a scene file that can be read: {reason}")
+
+
+def with_summary(info: SceneInfo, means_cm: FloatArray, sh_degree: int) -> SceneInfo:  # means [N, 3]
+    """`info` with the count, degree and bounds of the Gaussians it goes with."""
+    centre = np.asarray(info.centre_mm)
+    if len(means_cm):
+        low, high = centre + 10.0 * means_cm.min(axis=0), centre + 10.0 * means_cm.max(axis=0)
+    else:
+        low = high = centre
+    bounds = {"bounds_min_mm": low.tolist(), "bounds_max_mm": high.tolist()}
+    return replace(info, gaussian_count=len(means_cm), sh_degree=sh_degree, **bounds)

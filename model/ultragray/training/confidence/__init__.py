@@ -1,1 +1,0 @@
-"""The fit of a trained scene's confidence and uncertainty, by a shorter training that holds frames out."""

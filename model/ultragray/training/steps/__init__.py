@@ -1,1 +1,0 @@
-"""One step: losses, the optimizer and its rates, Gaussians added and pruned."""

@@ -1,1 +1,0 @@
-"""Limits of each key: rates, streams, jobs, minutes of compute, bytes."""

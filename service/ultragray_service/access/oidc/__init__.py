@@ -1,1 +1,0 @@
-"""People and machines that an OpenID Connect issuer knows, by the tokens that it signs."""

@@ -1,0 +1,432 @@
+"""Commands of who looks after an installation: keys, audit, backup, restore, storage."""
+
+from __future__ import annotations
+
+import json as json_text
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict
+from datetime import datetime, timezone
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ultragray.errors import InvalidArgument
+from ultragray_service.access.principals import NAMES, Role, read_limits
+from ultragray_service.cli.options import FieldsOf, with_options
+from ultragray_service.cli.terminal import Json, command_group, examples, print_table, tell, to_json
+from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings, load_settings
+from ultragray_workers.errors import BackupInvalid
+
+if TYPE_CHECKING:
+    from ultragray_service.access.keys import Key, KeyStore
+    from ultragray_workers.backup.contents import Folders
+    from ultragray_workers.backup.manifest import Manifest
+    from ultragray_workers.jobs.queue.database import JobDatabase
+
+
+Where = Annotated[
+    dict[str, Any],
+    FieldsOf(Settings, "data_folder", "artifact_folder", "database_url", environment=ENVIRONMENT_PREFIX),
+]
+
+
+@contextmanager
+def opened_database(where: dict[str, Any]) -> Iterator[JobDatabase]:
+    """The database that the options name. Raises InvalidArgument where there is no such installation, StartupFailed."""
+    from ultragray_workers.jobs.places import shared_storage
+    from ultragray_workers.jobs.queue.database import JobDatabase
+
+    settings = load_settings(**where)
+    if settings.database_url is None and not settings.is_there:
+        raise InvalidArgument(
+            f"data_folder must be an existing folder, got {str(settings.data_folder)!r}: name that of the service with "
+            "--data-folder",
+            field="data_folder",
+        )
+    database = JobDatabase(settings.working_folder, settings.database_url, shared_storage(settings.artifacts))
+    try:
+        yield database
+    finally:
+        database.close()
+
+
+# `ultragray keys …`: the named API keys of a service, in the database of its jobs.
+
+
+keys_app = command_group("They live in the installation's database; changes count within two seconds.")
+
+_KEY_COLUMNS = ("id", "name", "role", "state", "created", "expires", "last used", "limits")
+
+
+@keys_app.command(
+    epilog=examples(
+        "ultragray keys create alice --role operator --expires-days 90",
+        "ultragray keys create console --role reader --limit frames_per_s=60",
+    )
+)
+@with_options
+def create(
+    name: Annotated[str, typer.Argument(help="Whose it is: a person, a machine or a program.", show_default=False)],
+    *,
+    role: Annotated[
+        Role,
+        typer.Option(
+            help="reader: sees, renders, streams; operator: and has jobs, datasets and scenes; admin: everything."
+        ),
+    ],
+    expires_days: Annotated[
+        float | None, typer.Option(min=0.0, max=36_500.0, help="Days that it counts.", show_default="for ever")
+    ] = None,
+    limit: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=NUMBER",
+            help=f"A limit of its own, NAME=none: no limit; may be repeated. Names: {', '.join(NAMES)}.",
+            show_default="the settings key_NAME of the service",
+        ),
+    ] = None,
+    json: Json = False,
+    where: Where,
+) -> None:
+    """Make a key, and print it: alone on standard output, and never again."""
+    limits = read_limits(limit or ())
+    settings = load_settings(**where)
+    default = Settings().data_folder
+    if settings.database_url is None and settings.data_folder == default and isinstance(default, Path):
+        default.mkdir(exist_ok=True)  # as `serve` makes it: keys may come first
+    with _key_store(where) as store:
+        others = [key for key in store.keys().values() if key.name == name and key.is_valid(time.time())]
+        key, secret = store.create(name, role, expires_days, limits)
+    typer.echo(f"key {key.id} of {key.name}, {_role(key)}, expires: {_time(key.expires_at_s, 'never')}", err=True)
+    for other in others:
+        typer.echo(f"{name} still has the key {other.id}, {_role(other)}, too", err=True)
+    typer.echo("Keep it now: it is shown only once.", err=True)
+    tell(secret, {**_document(key), "secret": secret}, as_json=json)
+
+
+@keys_app.command("list", epilog=examples("ultragray keys list", "ultragray keys list --json"))
+@with_options
+def list_keys(
+    *,
+    json: Json = False,
+    where: Where,
+) -> None:
+    """List the keys, oldest first, also those that count no more; no secrets."""
+    with _key_store(where) as store:
+        keys = list(store.keys().values())
+    if json:
+        typer.echo(to_json([_document(key) for key in keys]))
+        return
+    print_table(_KEY_COLUMNS, [_row(key) for key in keys])
+
+
+@keys_app.command(epilog=examples("ultragray keys revoke alice"))
+@with_options
+def revoke(
+    name: Annotated[str, typer.Argument(help="Name, or id of one key.", show_default=False)],
+    *,
+    json: Json = False,
+    where: Where,
+) -> None:
+    """Revoke all keys of a name, or the one of an id. What runs on them is cut within two seconds."""
+    with _key_store(where) as store:
+        revoked = store.revoke(name)
+    lines = [f"revoked {key.id} of {key.name}, {_role(key)}" for key in revoked]
+    if lines or json:
+        tell("\n".join(lines), [_document(key) for key in revoked], as_json=json)
+    if not revoked:
+        typer.echo(f"nothing changed: every key of {name} was revoked already, or has expired", err=True)
+
+
+@contextmanager
+def _key_store(where: dict[str, Any]) -> Iterator[KeyStore]:
+    from ultragray_service.access.keys import KeyStore
+
+    with opened_database(where) as database:
+        yield KeyStore(database.engine)
+
+
+def _document(key: Key) -> dict[str, Any]:
+    return {**asdict(key), "state": _state(key)}
+
+
+def _row(key: Key) -> tuple[str, ...]:
+    return (
+        key.id,
+        key.name,
+        _role(key),
+        _state(key),
+        _time(key.created_at_s, ""),
+        _time(key.expires_at_s, "never"),
+        _time(key.last_used_at_s, "never"),
+        " ".join(f"{name}={'none' if value is None else f'{value:g}'}" for name, value in key.limits.items()),
+    )
+
+
+def _role(key: Key) -> str:
+    return "unknown" if key.role is None else key.role.value
+
+
+def _state(key: Key) -> str:
+    if key.revoked_at_s is not None:
+        return "revoked"
+    return "valid" if key.is_valid(time.time()) else "expired"
+
+
+def _time(at_s: float | None, otherwise: str) -> str:
+    if at_s is None:
+        return otherwise
+    return datetime.fromtimestamp(at_s, timezone.utc).isoformat(sep=" ", timespec="minutes")
+
+
+# `ultragray audit`: who did what on a service, from the database of its jobs.
+
+
+_AUDIT_COLUMNS = ("time", "who", "address", "what", "target", "result", "facts")
+_HOUR_S = 3600.0
+
+
+audit_app = command_group()
+
+
+@audit_app.command(
+    epilog=examples("ultragray audit --since-hours 168 --who console", "ultragray audit --what scene.delete --json")
+)
+@with_options
+def audit(
+    *,
+    since_hours: Annotated[float, typer.Option(min=0.0, help="How far back.")] = 24.0,
+    who: Annotated[str | None, typer.Option(help="Only of this name.", show_default="all")] = None,
+    what: Annotated[
+        str | None, typer.Option(help="Only this operation, such as scene.delete, or scene.", show_default="all")
+    ] = None,
+    limit: Annotated[int, typer.Option(min=1, help="The last ones, at most.")] = 1000,
+    json: Json = False,
+    where: Where,
+) -> None:
+    """Oldest first. What is not given here comes from the settings (ULTRAGRAY_…)."""
+    from ultragray_service.access.audit import read_audit
+
+    since_s = time.time() - since_hours * _HOUR_S
+    with opened_database(where) as database:
+        entries = read_audit(database.engine, since_s=since_s, who=who, what=what, limit=limit)
+    if json:
+        typer.echo(to_json([{**asdict(entry), "time": _timestamp(entry.at_s)} for entry in entries]))
+        return
+    rows = [
+        (_timestamp(one.at_s), one.who, one.address, one.what, one.target, one.result, json_text.dumps(one.facts))
+        for one in entries
+    ]
+    print_table(_AUDIT_COLUMNS, rows)
+
+
+def _timestamp(at_s: float) -> str:
+    return datetime.fromtimestamp(at_s, timezone.utc).isoformat(timespec="milliseconds")
+
+
+# `ultragray backup`: a whole installation into a folder.
+
+
+BackupFolder = Annotated[
+    Path, typer.Argument(help="Folder of backups, on another disk than the data.", show_default=False)
+]
+_SHOWN = 3
+backup_app = command_group()
+
+
+@backup_app.command(
+    epilog=examples(
+        "ultragray backup /mnt/backups --keep 14", "ultragray backup /mnt/backups --verify  # reads every byte"
+    )
+)
+@with_options
+def backup(
+    folder: BackupFolder,
+    verify: Annotated[
+        bool, typer.Option("--verify", help="Make none: read all backups of the folder and check every hash.")
+    ] = False,
+    keep: Annotated[
+        int | None,
+        typer.Option(min=1, help="Remove all but so many of the newest backups of the folder.", show_default="all"),
+    ] = None,
+    json: Json = False,
+    *,
+    where: Where,
+) -> None:
+    """Service and workers go on meanwhile.
+
+    Again into the same folder it copies only what is new. Exit code 2: there is no new backup, or one is damaged.
+    """
+    if verify:
+        _verify(folder, as_json=json)
+        return
+    from ultragray_workers.backup.backing_up import back_up
+
+    settings = load_settings(**where)
+    report = back_up(folders_of(settings), settings.database_url, folder, keep=keep)
+    lines = [in_words(report.manifest), f"new: {report.new_files:,} files, {megabytes(report.new_bytes)}"]
+    if report.removed_backups:
+        lines.append(f"removed: {report.removed_backups} older backups, {megabytes(report.removed_bytes)}")
+    document = {
+        **document_of(report.manifest),
+        "new_files": report.new_files,
+        "new_bytes": report.new_bytes,
+        "removed_backups": report.removed_backups,
+        "removed_bytes": report.removed_bytes,
+    }
+    tell("\n".join(lines), document, as_json=json)
+
+
+def _verify(folder: Path, *, as_json: bool) -> None:
+    from ultragray_workers.backup.backing_up import verify
+
+    damaged: dict[str, list[str]] = {}
+    backups: list[dict[str, Any]] = []
+    for manifest, bad in verify(folder):
+        backups.append({**document_of(manifest), "damaged": bad})
+        if not as_json:
+            typer.echo(f"{in_words(manifest)}: {f'{len(bad)} contents missing or damaged' if bad else 'whole'}")
+        if bad:
+            damaged[manifest.name] = bad
+    if as_json:
+        typer.echo(to_json(backups))
+    if not backups:
+        raise BackupInvalid(f"{folder} holds no backup")
+    if damaged:
+        name, bad = next(iter(damaged.items()))
+        raise BackupInvalid(
+            f"{len(damaged)} of {len(backups)} backups are damaged; of {name}: {', '.join(bad[:_SHOWN])}"
+        )
+
+
+def folders_of(settings: Settings) -> Folders:
+    """The folders that a backup saves. Raises InvalidArgument where they are in a bucket."""
+    from ultragray_workers.backup.contents import Folders
+
+    data, artifacts = settings.data_folder, settings.artifacts
+    if not isinstance(data, Path) or not isinstance(artifacts, Path):
+        raise InvalidArgument(
+            "backups are of folders: what is in a bucket is kept by its versions and replication, and the database by "
+            "that of PostgreSQL",
+            field="artifact_folder" if isinstance(data, Path) else "data_folder",
+        )
+    return Folders(data, artifacts)
+
+
+def in_words(manifest: Manifest) -> str:
+    """A backup in one sentence."""
+    counts = ", ".join(f"{count:,} {what}" for what, count in manifest.counts.items())
+    return f"backup {manifest.name}: {counts}; {len(manifest.files):,} files, {megabytes(manifest.bytes)}"
+
+
+def document_of(manifest: Manifest) -> dict[str, Any]:
+    """The same for a program."""
+    return {"backup": manifest.name, **manifest.counts, "files": len(manifest.files), "bytes": manifest.bytes}
+
+
+def megabytes(size: int) -> str:
+    """A size for a person, in 10^6 bytes."""
+    return f"{size / 1e6:,.1f} MB"
+
+
+# `ultragray restore`: an installation as it was at a backup.
+
+
+restore_app = command_group()
+
+
+@restore_app.command(
+    epilog=examples(
+        "ultragray restore /mnt/backups --data-folder /srv/ultragray/data",
+        "ultragray restore /mnt/backups --backup 20261122T070301.123Z --force",
+    )
+)
+@with_options
+def restore(
+    folder: BackupFolder,
+    backup: Annotated[
+        str | None, typer.Option(help="Name of a backup of the folder.", show_default="the newest")
+    ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace all that the folders and the database hold now.")
+    ] = False,
+    json: Json = False,
+    *,
+    where: Where,
+) -> None:
+    """Service and workers must be stopped.
+
+    Every hash is checked before anything is changed. Interrupted, the same command goes on. Jobs that ran at the time
+    of the backup wait again, and go on from their checkpoints.
+    """
+    from ultragray_workers.backup.restoring import restore as restore_backup
+
+    settings = load_settings(**where)
+    manifest = restore_backup(
+        folder,
+        folders_of(settings),
+        settings.database_url,
+        name=backup,
+        overwrite=force,
+        say=lambda sentence: typer.echo(sentence, err=True),
+    )
+    tell(f"restored {in_words(manifest)}", document_of(manifest), as_json=json)
+
+
+# `ultragray storage …`: the places in which an installation keeps its scenes and datasets.
+
+
+storage_app = command_group("A place is a folder, or a bucket: s3://BUCKET/PREFIX, gs://, az://.")
+
+
+@storage_app.callback()
+def places() -> None:
+    """Makes it a group: of an app with one command typer makes that command."""
+
+
+@storage_app.command(
+    epilog=examples(
+        "ultragray storage copy /srv/ultragray/data s3://hospital/ultragray",
+        "ultragray storage copy /srv/ultragray/artifacts s3://hospital/ultragray/artifacts",
+    )
+)
+@with_options
+def copy(
+    source: Annotated[
+        str, typer.Argument(metavar="FROM", help="Data or artifact folder, or its URL.", show_default=False)
+    ],
+    target: Annotated[str, typer.Argument(metavar="TO", help="Where its scenes and datasets go.", show_default=False)],
+    *,
+    json: Json = False,
+) -> None:
+    """Copy the scenes of an installation, and check every hash; from a folder into a bucket its datasets, too.
+
+    Interrupted, the same command goes on. Nothing is changed in FROM, and nothing overwritten in TO.
+    """
+    from ultragray_workers.datasets.copying import CopiedDatasets, copy_datasets
+    from ultragray_workers.storage.copying import ARTIFACTS, copy_scenes
+    from ultragray_workers.storage.location import StorageUrl, parse_location
+    from ultragray_workers.storage.opening import open_storage
+
+    def say(sentence: str) -> None:
+        typer.echo(sentence, err=True)
+
+    here, there = parse_location(source, "FROM"), parse_location(target, "TO")
+    if isinstance(here, Path) and not here.is_dir():
+        raise InvalidArgument(f"FROM must be an existing folder or the URL of a bucket, got {source!r}", field="FROM")
+    done = copy_scenes(open_storage(here), open_storage(there), say)
+    datasets = CopiedDatasets()
+    if isinstance(here, Path) and isinstance(there, StorageUrl):
+        below = here / ARTIFACTS  # of a data folder
+        of_data = below.is_dir()
+        datasets = copy_datasets(
+            below if of_data else here, open_storage(there.below(ARTIFACTS) if of_data else there), say
+        )
+    line = (
+        f"scene files: {done.scenes:,} copied ({megabytes(done.bytes)}), {done.already_there:,} already there; "
+        f"datasets: {datasets.datasets:,} copied, {datasets.datasets_already_there:,} already there"
+    )
+    tell(line, {**asdict(done), **asdict(datasets)}, as_json=json)

@@ -1,1 +1,0 @@
-"""Commands of who looks after a service: keys, backups and the like."""

@@ -1,0 +1,188 @@
+"""`ultragray eval`: what a scene reaches on frames that were held out, as tables."""
+
+from __future__ import annotations
+
+import enum
+from collections.abc import Mapping
+from dataclasses import astuple
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ultragray.datasets.source import SourceOptions
+from ultragray.scene.info import read_header
+from ultragray_service.cli.options import with_options
+from ultragray_service.cli.sweeps import SweepArgument, check_scene_fits, check_source, read_dataset
+from ultragray_service.cli.terminal import (
+    Backend,
+    Force,
+    Json,
+    SceneFile,
+    check_folder,
+    command_group,
+    examples,
+    output_option,
+    to_json,
+    wide_console,
+    working,
+)
+
+if TYPE_CHECKING:
+    from ultragray.learn.evaluation.scoring import Evaluation, Reliability
+    from ultragray.learn.sweep import Sweep
+    from ultragray.scene.gaussians import GaussianScene
+
+
+command_app = command_group()
+
+
+class Split(str, enum.Enum):
+    """The frames of a dataset to measure on."""
+
+    VAL = "val"
+    TRAIN = "train"
+
+
+@command_app.command(
+    "eval",
+    epilog=examples(
+        "ultragray eval liver.ugr sweep/",
+        "ultragray eval liver.ugr sweep/ -o pictures/  # truth beside rendering, frame by frame",
+        "ultragray eval liver.ugr sweep/ --json | jq .mean",
+    ),
+)
+@with_options
+def evaluate(
+    scene: SceneFile,
+    sweep: SweepArgument,
+    output: Annotated[
+        Path | None,
+        output_option(
+            "New folder for one picture a frame: truth, rendering, difference, echo, transmittance; and one plot "
+            "of the uncertainty, one of the corrected poses.",
+            default="no pictures",
+        ),
+    ] = None,
+    force: Force = False,
+    json: Json = False,
+    split: Annotated[Split, typer.Option(help="Frames to measure on.")] = Split.VAL,
+    register: Annotated[
+        bool, typer.Option("--register", help="Also move each frame by one half of it, and score the other half.")
+    ] = False,
+    backend: Backend = "auto",
+    *,
+    source: SourceOptions,
+) -> None:
+    """The figures: PSNR, MS-SSIM, GMS, GMSD, speckle statistics, and how well the scene knows its own errors."""
+    if output is not None:
+        check_folder(output, force=force)
+    read_header(scene)
+    check_source(sweep)
+
+    from ultragray.learn.evaluation.scoring import evaluate as evaluate_scene
+    from ultragray.learn.evaluation.scoring import measure_reliability, require_frames
+    from ultragray.scene.gaussians import GaussianScene
+    from ultragray_workers.pool.scene_cache import render_device
+
+    loaded = GaussianScene.load(scene).to(render_device(backend))
+    read = read_dataset(sweep, source)
+    frames = read.val if split is Split.VAL else read.train
+    require_frames(frames)
+    check_scene_fits(loaded.info, read)
+    with working(f"measuring {len(frames)} frames …"):
+        evaluation = evaluate_scene(loaded, frames, backend=backend)
+        reliability = measure_reliability(loaded, frames, backend=backend)
+        poses = _pose_figures(loaded, frames if register else None, backend)
+    if json:
+        figures = evaluation.to_dict() | {"uncertainty": None if reliability is None else reliability.to_dict()}
+        figures |= {name: value.to_dict() for name, value in poses.items()}
+        typer.echo(to_json({"scene": str(scene), "dataset": read.name, "split": split.value, **figures}))
+    else:
+        print_metrics(f"{read.name}, {len(frames)} {split.value} frames", {scene.stem: evaluation})
+        print_speckle({scene.stem: evaluation})
+        if reliability is not None:
+            typer.echo(_in_words(reliability))
+        for value in poses.values():
+            typer.echo(str(value))
+    if output is not None:
+        from ultragray.files import write_whole
+        from ultragray.learn.evaluation.side_by_side import write_side_by_side
+        from ultragray.learn.report.plots import plot_corrections, plot_reliability
+
+        with working(f"drawing {len(frames)} pictures …"):
+            paths = write_side_by_side(loaded, frames, evaluation.frames, output, backend=backend)
+        if reliability is not None:
+            paths.append(output / "uncertainty.svg")
+            write_whole(paths[-1], plot_reliability(reliability))
+        if (corrections := poses.get("pose_corrections")) is not None:
+            paths.append(output / "pose_corrections.svg")
+            write_whole(paths[-1], plot_corrections(corrections.shift_mm, corrections.turn_deg))
+        typer.echo(f"wrote {len(paths)} pictures into {output}", err=json)
+
+
+def _pose_figures(scene: GaussianScene, registered: Sweep | None, backend: str) -> dict[str, Any]:
+    """How far a scene's training poses were corrected, and the scores of registered frames, by their key in JSON."""
+    from ultragray.learn.report.sizes import CorrectionSizes
+    from ultragray.learn.training.poses import score_halves
+
+    found: dict[str, Any] = {}
+    if scene.pose_corrections is not None:
+        found["pose_corrections"] = CorrectionSizes.of(scene.pose_corrections, scene.training_poses)
+    if registered is not None:
+        found["halves"] = score_halves(scene, registered, backend=backend)
+    return found
+
+
+def _in_words(reliability: Reliability) -> str:
+    return (
+        f"uncertainty: pixels are off by {reliability.expected:.3f} as expected, {reliability.actual:.3f} in truth; "
+        f"{reliability.within_1:.0%} of the errors are within 1, {reliability.within_2:.0%} within 2 deviations"
+    )
+
+
+# Tables of what was measured on held-out frames, one row a scene or a method.
+
+
+def print_metrics(title: str, evaluations: Mapping[str, Evaluation]) -> None:
+    """A table of mean ± standard deviation over the frames, one row a name."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    for place, head in enumerate(("", "PSNR, dB", "MS-SSIM", "GMS", "GMSD")):
+        table.add_column(head, justify="right" if place else "left", no_wrap=True)
+    for name, evaluation in evaluations.items():
+        mean, std = evaluation.mean, evaluation.std
+        table.add_row(
+            escape(name),
+            f"{mean.psnr_db:.2f} ± {std.psnr_db:.2f}",
+            *(f"{getattr(mean, key):.3f} ± {getattr(std, key):.3f}" for key in ("ms_ssim", "gms", "gmsd")),
+        )
+    console = Console()
+    console.print(title, highlight=False, markup=False, soft_wrap=True)
+    console.print(table)
+    scales = next(iter(evaluations.values())).ms_ssim_scales
+    if scales < 5:
+        console.print(f"MS-SSIM over {scales} of its 5 scales, which is what the image holds", style="dim")
+
+
+def print_speckle(evaluations: Mapping[str, Evaluation]) -> None:
+    """A table of the statistics of speckle, means over the frames: the true frames, then one row a name."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(box=None, pad_edge=False)
+    for place, head in enumerate(("speckle", "contrast", "axial, mm", "lateral, mm", "histogram distance")):
+        table.add_column(head, justify="right" if place else "left", no_wrap=True)
+    summaries = {name: evaluation.speckle for name, evaluation in evaluations.items()}
+    true = next(iter(summaries.values())).true
+    rows = {
+        "true frames": (true, ""),
+        **{n: (one.rendered, f"{one.histogram_distance:.4f}") for n, one in summaries.items()},
+    }
+    for name, (speckle, distance) in rows.items():
+        figures = ("–",) * 3 if speckle is None else [f"{value:.3f}" for value in astuple(speckle)]
+        table.add_row(escape(name), *figures, distance)
+    wide_console().print(table)

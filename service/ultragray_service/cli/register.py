@@ -1,0 +1,329 @@
+"""`ultragray localize` and `ultragray calibrate`.
+
+Where in a scene a real frame was taken, and how a robot or tracker lies to a scene.
+"""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ultragray.errors import InvalidArgument
+from ultragray.exchange.poses import load_poses
+from ultragray.learn.localization.pixels import read_frame
+from ultragray.scene.info import read_header
+from ultragray_service.cli.terminal import (
+    Backend,
+    Force,
+    Json,
+    SceneFile,
+    check_file,
+    command_group,
+    examples,
+    output_option,
+    tell,
+    working,
+)
+
+if TYPE_CHECKING:
+    from ultragray import Localization
+    from ultragray.geometry.probe import FloatArray
+    from ultragray.geometry.registration import Registration
+
+
+POSE_SUFFIXES = (".npy",)
+localize_app = command_group()
+
+
+@localize_app.command(
+    epilog=examples(
+        "ultragray localize liver.ugr frame.png --start pose.npy",
+        "ultragray localize liver.ugr frame.npy --start pose.json --within-mm 10 -o found.npy",
+    )
+)
+def localize(
+    scene: SceneFile,
+    image: Annotated[
+        Path,
+        typer.Argument(
+            help="The frame, .png or .npy: rows along depth, columns across scan lines, not scan-converted.",
+            show_default=False,
+        ),
+    ],
+    start: Annotated[
+        Path,
+        typer.Option(help="A pose that is about right: .npy or .json, 4x4 or 3x4, in mm; .mcap.", show_default=False),
+    ],
+    within_mm: Annotated[float, typer.Option(help="How far the start may be off.")] = 3.0,
+    within_deg: Annotated[float, typer.Option(help="By which angle.")] = 5.0,
+    output: Annotated[Path | None, output_option("The pose as .npy, [4, 4].", default="not written")] = None,
+    force: Force = False,
+    json: Json = False,
+    backend: Backend = "auto",
+) -> None:
+    """The probe is the one that the scene was trained with. Exit status 1: the frame was not found."""
+    if output is not None:
+        check_file(output, POSE_SUFFIXES, force=force)
+    read_header(scene)
+    poses = load_poses(start)
+    if len(poses) != 1:
+        raise InvalidArgument(f"{start} must hold one pose, got {len(poses)}", field="start")
+    pixels = read_frame(image)
+
+    from ultragray import GaussianScene
+    from ultragray import localize as search
+
+    with working("looking for the frame …"):
+        loaded = GaussianScene.load(scene)
+        found = search(loaded, pixels, poses[0], within_mm=within_mm, within_deg=within_deg, backend=backend)
+    if output is not None and found.is_found:
+        _write_pose(output, found)
+    document = asdict(found) | {"pose": found.pose.tolist()}
+    tell(_in_words(found, output), document, as_json=json)
+    if not found.is_found:
+        raise typer.Exit(1)
+
+
+def _write_pose(path: Path, found: Localization) -> None:
+    import io
+
+    import numpy as np
+
+    from ultragray.files import write_whole
+
+    data = io.BytesIO()
+    np.save(data, found.pose)
+    write_whole(path, data.getvalue())
+
+
+def _in_words(found: Localization, output: Path | None) -> str:
+    from ultragray.learn.localization.search import FOUND_SIMILARITY
+
+    if not found.is_found:
+        return (
+            f"not found: the place that looks most like it has a similarity of {found.similarity:.2f}, where "
+            f"{FOUND_SIMILARITY} is needed; a start that is closer, or a larger --within-mm, may help"
+        )
+    position = ", ".join(f"{one:.2g}" for one in found.position_std_mm)
+    angle = ", ".join(f"{one:.2g}" for one in found.angle_std_deg)
+    rows = "\n".join("  " + "  ".join(f"{value:10.4f}" for value in row) for row in found.pose)
+    where = "" if output is None else f"\nwrote {output}"
+    return (
+        f"found with a similarity of {found.similarity:.2f}, {found.shift_mm:.2f} mm and {found.turn_deg:.2f}° from "
+        f"the start; standard deviations along and about the probe's axes: {position} mm, {angle}°\n{rows}{where}"
+    )
+
+
+# `ultragray calibrate …`: the frame of a robot or tracker registered to a scene.
+
+
+SUFFIXES = (".json",)
+calibrate_app = command_group(
+    "What leads a robot's poses into a scene: probe→scene = base→scene · flange→base · probe→flange. For a tracked "
+    "probe the base is the tracker, and the flange the marker on the probe."
+)
+
+Output = Annotated[Path, output_option("The registration, .json.")]
+FlangePoses = Annotated[
+    Path, typer.Argument(metavar="FLANGE", help="Poses flange→base, mm: .npy or .json.", show_default=False)
+]
+Mounting = Annotated[
+    Path | None,
+    typer.Option(help="Pose probe→flange, mm: .npy or .json.", show_default="the frames are the same"),
+]
+
+
+@calibrate_app.command(epilog=examples("ultragray calibrate points in_base.npy in_scene.npy -o robot.json"))
+def points(
+    in_base: Annotated[Path, typer.Argument(help="Points in the base, [N, 3] mm: .npy, .csv.", show_default=False)],
+    in_scene: Annotated[Path, typer.Argument(help="The same ones in the scene.", show_default=False)],
+    output: Output,
+    probe_to_flange: Mounting = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """From three or more points that are known in both frames, not on a line."""
+    check_file(output, SUFFIXES, force=force)
+    mounting = _mounting(probe_to_flange)
+    import numpy as np
+
+    from ultragray.geometry.registration import Registration, register_points, rows
+
+    fit = register_points(_read_points(in_base), _read_points(in_scene))
+    registration = Registration(
+        base_to_scene=rows(fit.transform),
+        probe_to_flange=rows(np.eye(4) if mounting is None else mounting),
+        residual_mm=fit.rms_mm,
+        position_std_mm=fit.position_std_mm,
+        angle_std_deg=fit.angle_std_deg,
+    )
+    _write(output, registration, "points", fit.residuals_mm.tolist(), [], as_json=json)
+
+
+@calibrate_app.command(
+    epilog=examples(
+        "ultragray calibrate poses flange.npy probe.npy --probe-to-flange mounting.npy -o robot.json",
+        "ultragray calibrate poses flange.npy probe.npy --find-mounting -o robot.json",
+    )
+)
+def poses(
+    flange: FlangePoses,
+    probe: Annotated[
+        Path, typer.Argument(help="The poses probe→scene at the same times: .npy or .json.", show_default=False)
+    ],
+    output: Output,
+    probe_to_flange: Mounting = None,
+    find_mounting: Annotated[
+        bool, typer.Option("--find-mounting", help="Find probe→flange as well, from turns about two axes or more.")
+    ] = False,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """From poses of the flange and where the probe was in the scene: registration, and hand–eye calibration."""
+    check_file(output, SUFFIXES, force=force)
+    if find_mounting and probe_to_flange is not None:
+        raise InvalidArgument(
+            "--find-mounting finds what --probe-to-flange gives: name one of them", field="find_mounting"
+        )
+    in_base, in_scene, mounting = load_poses(flange), load_poses(probe), _mounting(probe_to_flange)
+    from ultragray.geometry.registration import register_poses, register_poses_and_mounting
+
+    if find_mounting:
+        fit = register_poses_and_mounting(in_base, in_scene)
+    else:
+        fit = register_poses(in_base, in_scene, mounting)
+    residuals = fit.residuals_mm.tolist(), fit.residuals_deg.tolist()
+    _write(output, _registration(fit), "poses", *residuals, as_json=json)
+
+
+@calibrate_app.command(
+    epilog=examples(
+        "ultragray calibrate frames liver.ugr flange.npy a.png b.png c.png --start about.npy -o robot.json",
+        "ultragray calibrate frames liver.ugr flange.npy frames.npy --start old.npy --within-mm 10 -o robot.json",
+    )
+)
+def frames(
+    scene: SceneFile,
+    flange: FlangePoses,
+    images: Annotated[
+        list[Path],
+        typer.Argument(
+            help="The real frames at these poses: .png each, or one .npy [N, H, W]; not scan-converted.",
+            show_default=False,
+        ),
+    ],
+    start: Annotated[Path, typer.Option(help="A pose base→scene that is about right: .npy or .json.")],
+    output: Output,
+    probe_to_flange: Mounting = None,
+    within_mm: Annotated[float, typer.Option(help="How far the start puts the frames off.")] = 3.0,
+    within_deg: Annotated[float, typer.Option(help="By which angle.")] = 5.0,
+    force: Force = False,
+    json: Json = False,
+    backend: Backend = "auto",
+) -> None:
+    """From real frames and the robot's poses at them, by what the images show. Frames that do not fit are left out."""
+    check_file(output, SUFFIXES, force=force)
+    in_base, mounting, about = load_poses(flange), _mounting(probe_to_flange), _one_pose(start, "start")
+    pixels = _read_frames(images)
+
+    from ultragray import GaussianScene
+    from ultragray.learn.registration import register_frames
+
+    with working("looking for the frames …"):
+        found = register_frames(
+            GaussianScene.load(scene),
+            pixels,
+            in_base,
+            about,
+            probe_to_flange=mounting,
+            within_mm=within_mm,
+            within_deg=within_deg,
+            backend=backend,
+        )
+    left_out = sorted({*range(len(pixels))} - {*found.agreeing})
+    residuals = found.fit.residuals_mm.tolist(), found.fit.residuals_deg.tolist()
+    _write(output, _registration(found.fit), "frames", *residuals, left_out=left_out, as_json=json)
+
+
+def _registration(fit: Any) -> Registration:
+    import numpy as np
+
+    from ultragray.geometry.registration import Registration, rows
+
+    return Registration(
+        base_to_scene=rows(fit.base_to_scene),
+        probe_to_flange=rows(fit.probe_to_flange),
+        residual_mm=float(np.sqrt(np.square(fit.residuals_mm).mean())),
+        residual_deg=float(np.sqrt(np.square(fit.residuals_deg).mean())),
+        position_std_mm=fit.position_std_mm,
+        angle_std_deg=fit.angle_std_deg,
+    )
+
+
+def _read_points(path: Path) -> Any:
+    import numpy as np
+
+    if path.suffix.lower() not in (".npy", ".csv"):
+        raise InvalidArgument(f"points must end in .npy or .csv, got {path.name!r}", field="points")
+    try:
+        return np.load(path, allow_pickle=False) if path.suffix.lower() == ".npy" else np.loadtxt(path, delimiter=",")
+    except (OSError, EOFError, ValueError) as error:
+        raise InvalidArgument(f"{path} cannot be read as points: {error}", field="points") from None
+
+
+def _read_frames(paths: list[Path]) -> list[Any]:
+    from ultragray.learn.localization.pixels import read_frame
+
+    read = [read_frame(path) for path in paths]
+    return list(read[0]) if len(read) == 1 and read[0].ndim == 3 else read
+
+
+def _mounting(path: Path | None) -> FloatArray | None:
+    return None if path is None else _one_pose(path, "probe_to_flange")
+
+
+def _one_pose(path: Path, field: str) -> FloatArray:
+    found = load_poses(path)
+    if len(found) != 1:
+        raise InvalidArgument(f"{path} must hold one pose, got {len(found)}", field=field)
+    pose: FloatArray = found[0]
+    return pose
+
+
+def _write(
+    path: Path,
+    registration: Registration,
+    what: str,
+    residuals_mm: list[float],
+    residuals_deg: list[float],
+    left_out: list[int] | None = None,
+    *,
+    as_json: bool,
+) -> None:
+    from ultragray.contract import to_dict
+    from ultragray.geometry.registration import save_registration
+
+    save_registration(path, registration)
+    document = to_dict(registration) | {"residuals_mm": residuals_mm, "residuals_deg": residuals_deg}
+    if left_out is not None:
+        document["left_out"] = left_out
+    sentences = [
+        f"wrote {path}, from {len(residuals_mm)} {what}",
+        f"residuals: {_range(residuals_mm)} mm" + (f", {_range(residuals_deg)}°" if residuals_deg else ""),
+    ]
+    if registration.position_std_mm is not None and registration.angle_std_deg is not None:
+        position, angle = (
+            ", ".join(f"{one:.2g}" for one in ones)
+            for ones in (registration.position_std_mm, registration.angle_std_deg)
+        )
+        sentences.append(f"standard deviations along and about the scene's axes: {position} mm, {angle}°")
+    if left_out:
+        sentences.append(f"left out, as they were not found or do not fit the others: {', '.join(map(str, left_out))}")
+    tell("\n".join(sentences), document, as_json=as_json)
+
+
+def _range(values: list[float]) -> str:
+    return f"{min(values):.2g} to {max(values):.2g}"

@@ -1,0 +1,335 @@
+"""`ultragray render`: poses into one file, a folder of PNGs, or shards of a cluster.
+
+Everything that can be wrong is found before torch is imported.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+
+from ultragray.errors import InvalidArgument, InvalidProbe
+from ultragray.exchange.batches import MANIFEST_FILE, SHARD_FRAMES, BatchPlan
+from ultragray.exchange.exports.formats import DTYPES, FORMATS, check_format, exporter_class, format_of
+from ultragray.exchange.poses import load_poses
+from ultragray.files import file_sha256
+from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.settings import Encoding, FrameSettings, Resolved
+from ultragray.samplers import Sampler, TrainingSampler, assessed_poses
+from ultragray.samplers.confident import require_drawn
+from ultragray.scene.confidence import CONTACT_SHARE, Assessor, Extrapolation, figure_arrays
+from ultragray.scene.info import read_header
+from ultragray_service.cli.options import poses_option, with_options
+from ultragray_service.cli.terminal import (
+    COMPUTE,
+    OR_A_FOLDER,
+    OUTPUT,
+    Backend,
+    Force,
+    Json,
+    SceneFile,
+    check_ending,
+    check_file,
+    check_folder,
+    command_group,
+    counted,
+    examples,
+    frames_in_words,
+    is_folder_name,
+    output_option,
+    tell,
+)
+
+SHARDS = "Shards"
+SUFFIXES = tuple(one.suffix for one in FORMATS.values())
+command_app = command_group()
+
+
+@command_app.command(
+    epilog=examples(
+        "ultragray render liver.ugr -o frames.npz  # the training poses",
+        "ultragray render liver.ugr -o pictures/ --poses path.npy  # a folder of PNGs",
+        "ultragray render liver.ugr -o augmented.tar --sampler around --count 500 --translation-mm 3",
+        "ultragray render liver.ugr -o labels.h5 --outputs bmode,labels --min-confidence 0.8",
+        "ultragray render liver.ugr -o s3://frames/liver --sampler around --count 10000000 --on ray://head:10001",
+    )
+)
+@with_options
+def render(
+    scene: SceneFile,
+    output: Annotated[
+        str,
+        output_option(
+            f"A file ({', '.join(SUFFIXES)}), or a folder for PNGs (frame_00000_bmode.png); with --on a folder or "
+            "s3://BUCKET/PREFIX for shards (frames-000000.tar)."
+        ),
+    ],
+    dtype: Annotated[
+        str | None,
+        typer.Option(
+            help=f"{' or '.join(DTYPES)}, of a file.", show_default="the format's own", rich_help_panel=OUTPUT
+        ),
+    ] = None,
+    force: Force = False,
+    json: Json = False,
+    poses: Annotated[Path | None, poses_option(default="the scene's training poses")] = None,
+    *,
+    sampler: Sampler | None,
+    settings: FrameSettings,
+    backend: Backend = "auto",
+    threads: Annotated[
+        int, typer.Option(min=0, help="Render threads; 0: all cores, of a shard one.", rich_help_panel=COMPUTE)
+    ] = 0,
+    on: Annotated[
+        str | None,
+        typer.Option(
+            metavar="ray|ray://HEAD:PORT",
+            help="Render in shards on a Ray cluster, or on one of this machine; what is there already is kept.",
+            show_default=False,
+            rich_help_panel=SHARDS,
+        ),
+    ] = None,
+    shard_frames: Annotated[
+        int | None,
+        typer.Option(min=1, help="Frames of a shard.", show_default=f"{SHARD_FRAMES:,}", rich_help_panel=SHARDS),
+    ] = None,
+) -> None:
+    """Each frame comes with its pose and with how far it can be trusted. Lengths are in mm, angles in degrees."""
+    if on is not None:
+        shards = Shards.prepared(scene, poses, sampler, settings, dtype=dtype, shard_frames=shard_frames)
+        told = render_shards(shards, output, on, backend=backend, threads=threads)
+        tell(told.in_words(), told.document(), as_json=json)
+        return
+    if shard_frames is not None:
+        raise InvalidArgument("--shard-frames is of shards: name an engine with --on", field="shard_frames")
+    path = Path(output)
+    format = checked_format(path, settings, dtype, force=force)
+    task = Task.prepared(scene, poses, sampler, settings)
+    found = render_frames(task, path, format, dtype=dtype, backend=backend, threads=threads)
+    tell(found.in_words(), found.document(), as_json=json)
+
+
+def checked_format(output: Path, settings: FrameSettings, dtype: str | None, *, force: bool) -> str | None:
+    """The format that the name of the output stands for; None for a folder of PNGs.
+
+    Raises InvalidArgument for an output that cannot or may not be written, ExtraMissing where the format's package is
+    not installed.
+    """
+    format = format_of(output.name)
+    if format is None and not is_folder_name(output):
+        check_ending(output, SUFFIXES, otherwise=OR_A_FOLDER)
+    if format is None:
+        if dtype is not None:
+            raise InvalidArgument("--dtype must be left out for PNGs: they hold uint8", field="dtype")
+        check_folder(output, force=force)
+        return None
+    check_file(output, force=force)
+    check_format(format, settings.outputs, dtype)
+    exporter_class(format)
+    return format
+
+
+# Rendering the poses of a file into one file or a folder of PNGs, in portions that fit in memory.
+
+
+@dataclass(frozen=True)
+class Task:
+    """Frames that are to be rendered, checked without a renderer."""
+
+    scene_file: Path
+    settings: Resolved
+    poses: FloatArray  # [C, 4, 4] mm
+    extrapolations: Sequence[Extrapolation]  # [C]
+
+    @classmethod
+    def prepared(cls, scene_file: Path, pose_file: Path | None, sampler: Sampler | None, asked: FrameSettings) -> Task:
+        """The task of a command line. Raises InvalidArgument and its kind, SceneFileInvalid."""
+        given_poses = None if pose_file is None else load_poses(pose_file)
+        header = read_header(scene_file)
+        try:
+            settings = asked.resolved(header.info, Encoding.FLOAT32)
+        except InvalidProbe as error:
+            raise InvalidProbe(f"--{error.detail}", field="probe") from None  # as the option is called here
+        base = header.training_poses if given_poses is None else given_poses
+        if not len(base):
+            raise InvalidArgument("--poses must be given: the scene holds no training poses", field="poses")
+        if sampler is None and given_poses is None:
+            sampler = TrainingSampler()
+        assess = partial(Assessor(header.info, header.training_poses).assess, probe=settings.probe)
+        return cls(scene_file, settings, *assessed_poses(sampler, base, settings.probe, assess, asked.least_confidence))
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """What a rendering wrote, how long it took, and how far it can be trusted."""
+
+    output: Path
+    settings: Resolved
+    extrapolations: Sequence[Extrapolation]
+    seconds: float
+
+    def in_words(self) -> str:
+        """One sentence."""
+        size = f"{self.settings.height}x{self.settings.width}"
+        what = f"{frames_in_words(len(self.extrapolations))} of {size}, {', '.join(self.settings.outputs)}"
+        return f"wrote {self.output}: {what}, in {self.seconds:.1f} s; {_trust(self.extrapolations)}"
+
+    def document(self) -> dict[str, Any]:
+        """The same for a program."""
+        figures = figure_arrays(self.extrapolations)
+        confidence = figures["confidence"]
+        known = bool(np.isfinite(confidence).all())
+        return {
+            "output": str(self.output),
+            "frames": len(self.extrapolations),
+            "height": self.settings.height,
+            "width": self.settings.width,
+            "outputs": list(self.settings.outputs),
+            "seconds": round(self.seconds, 3),
+            "confidence_min": float(confidence.min()) if known else None,
+            "confidence_max": float(confidence.max()) if known else None,
+            "supported_share": float(figures["supported_share"].mean()),
+            **({CONTACT_SHARE: float(figures[CONTACT_SHARE].mean())} if CONTACT_SHARE in figures else {}),
+        }
+
+
+def render_frames(
+    task: Task, output: Path, format: str | None, *, dtype: str | None, backend: str, threads: int
+) -> Rendered:
+    """Render and write; `format` None writes a folder of PNGs.
+
+    Raises InvalidArgument, SceneFileInvalid, BackendUnavailable, MemoryExceeded, OSError; a file is then not written.
+    """
+    import torch
+
+    from ultragray.exchange.rendering import render_to_file
+    from ultragray.scene.gaussians import GaussianScene
+    from ultragray_workers.pool.scene_cache import render_device
+
+    scene = GaussianScene.load(task.scene_file)
+    if threads:
+        torch.set_num_threads(threads)
+    started = time.perf_counter()
+    with counted("rendering", len(task.poses)) as report:
+        found = render_to_file(
+            output,
+            format,
+            scene.to(render_device(backend)),
+            task.settings,
+            task.poses,
+            task.extrapolations,
+            dtype=dtype,
+            scene_name=task.scene_file.stem,
+            scene_sha256=file_sha256(task.scene_file),
+            backend=backend,
+            before_portion=report,
+        )
+    return Rendered(output, task.settings, found, time.perf_counter() - started)
+
+
+def _trust(found: Sequence[Extrapolation]) -> str:
+    """A few words on the confidence, where it is known, and on how much of the frames has support."""
+    figures = figure_arrays(found)
+    confidence = figures["confidence"]
+    words = [f"Gaussians support {figures['supported_share'].mean():.0%} of the pixels"]
+    if CONTACT_SHARE in figures:
+        words.append(f"{figures[CONTACT_SHARE].mean():.0%} of the scan lines have contact")
+    if np.isfinite(confidence).all():
+        words.insert(0, f"confidence {confidence.min():.2f} to {confidence.max():.2f}")
+    return ", ".join(words)
+
+
+# Rendering the poses of a command line as shards on a cluster.
+
+
+@dataclass(frozen=True)
+class Shards:
+    """A batch that is to be rendered, checked without a renderer."""
+
+    scene_file: Path
+    plan: BatchPlan
+
+    @classmethod
+    def prepared(
+        cls,
+        scene_file: Path,
+        pose_file: Path | None,
+        sampler: Sampler | None,
+        settings: FrameSettings,
+        *,
+        dtype: str | None,
+        shard_frames: int | None,
+    ) -> Shards:
+        """The batch of a command line. Raises InvalidArgument and its kind, SceneFileInvalid."""
+        poses = None if pose_file is None else load_poses(pose_file)
+        header = read_header(scene_file)
+        if settings.least_confidence is not None and sampler is not None:
+            require_drawn(sampler)
+        try:
+            plan = BatchPlan.prepared(
+                header,
+                settings,
+                sampler=sampler,
+                poses=poses,
+                shard_frames=shard_frames,
+                scene=scene_file.stem,
+                scene_sha256=file_sha256(scene_file),
+                dtype=check_format("tar", settings.outputs, dtype),
+            )
+        except InvalidProbe as error:
+            raise InvalidProbe(f"--{error.detail}", field="probe") from None  # as the option is called here
+        return cls(scene_file, plan)
+
+
+@dataclass(frozen=True)
+class Sharded:
+    """What was rendered, where it is, and how long it took."""
+
+    plan: BatchPlan
+    output: str
+    seconds: float
+
+    def in_words(self) -> str:
+        """One sentence."""
+        files = f"{self.plan.file_names} and {MANIFEST_FILE}"
+        return f"wrote {self.output}: {frames_in_words(self.plan.frames)} in {files}, in {self.seconds:.1f} s"
+
+    def document(self) -> dict[str, Any]:
+        """The same for a program."""
+        return {
+            "output": self.output,
+            "frames": self.plan.frames,
+            "shards": self.plan.shard_count,
+            "files": self.plan.file_names,
+            "manifest": MANIFEST_FILE,
+            "plan": self.plan.identity,
+            "seconds": round(self.seconds, 3),
+        }
+
+
+def render_shards(shards: Shards, output: str, on: str, *, backend: str, threads: int) -> Sharded:
+    """Render what is missing of the batch, and write its manifest.
+
+    Raises InvalidArgument for an output that is no folder or holds something else, and what `RayBatch.render` raises.
+    """
+    from ultragray_workers.batches.on_ray import RayBatch, check_address
+    from ultragray_workers.storage.opening import open_storage
+
+    check_address(on)
+    storage = open_storage(output)
+    if storage.local is not None:
+        folder = storage.local.resolve()
+        if folder.exists() and not folder.is_dir():
+            raise InvalidArgument(f"--output must be a folder with --on, {output} is a file", field="output")
+        output = str(folder)  # the workers of a cluster have other working folders
+    started = time.perf_counter()
+    with counted("rendering", shards.plan.frames) as report:
+        RayBatch(shards.plan, shards.scene_file, output, backend, threads or 1).render(on, report)
+    return Sharded(shards.plan, output, time.perf_counter() - started)

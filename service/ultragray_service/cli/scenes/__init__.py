@@ -1,1 +1,0 @@
-"""Commands on scene files: rendering, looking, exchange with other programs."""

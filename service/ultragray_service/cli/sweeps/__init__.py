@@ -1,1 +1,0 @@
-"""Commands on tracked sweeps: checking, drawing, converting."""

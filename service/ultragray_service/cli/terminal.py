@@ -1,0 +1,229 @@
+"""What commands share: options such as --json, where they may write, what they print, progress, and stopping."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import math
+import os
+import signal
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from difflib import get_close_matches
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ultragray.errors import InvalidArgument
+
+if TYPE_CHECKING:
+    from rich.console import Console
+
+
+OUTPUT, COMPUTE = "Output", "Compute"
+
+Json = Annotated[
+    bool, typer.Option("--json", help="One JSON document on standard output, for scripts.", rich_help_panel=OUTPUT)
+]
+Force = Annotated[bool, typer.Option("--force", help="Replace what is there.", rich_help_panel=OUTPUT)]
+Threads = Annotated[int, typer.Option(min=0, help="Threads; 0: all cores.", rich_help_panel=COMPUTE)]
+Backend = Annotated[str, typer.Option(help="auto, cpu, cuda or reference.", rich_help_panel=COMPUTE)]
+SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.ugr).", show_default=False)]
+
+
+def command_group(help: str | None = None) -> typer.Typer:
+    """A typer app for one command, or for a group of commands."""
+    return typer.Typer(
+        add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode="rich", help=help
+    )
+
+
+def examples(*lines: str) -> str:
+    """The epilogue of a help: each line is a command that a shell takes as it stands, or a # comment."""
+    return "\n\n".join(("[bold]Examples[/bold]", *(line.replace("[", r"\[") for line in lines)))
+
+
+def output_option(help: str, *, default: str | None = None) -> Any:
+    """`--output FILE`, `-o FILE`; `default`: the words for what happens without it."""
+    shown: Any = False if default is None else default
+    return typer.Option("--output", "-o", help=help, show_default=shown, rich_help_panel=OUTPUT)
+
+
+def tell(sentence: str, document: Any, *, as_json: bool) -> None:
+    """Print what a command did, as one sentence for a person or as a JSON document for a program."""
+    typer.echo(to_json(document) if as_json else sentence)
+
+
+def to_json(document: Any) -> str:
+    """A JSON document as commands print it: paths and the like as text, numbers that JSON does not have as null."""
+    return json.dumps(_finite(document), indent=2, ensure_ascii=False, allow_nan=False, default=str)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, Mapping):
+        return {str(key): _finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def frames_in_words(count: int) -> str:
+    """Such as `1 frame` or `1,200 frames`."""
+    return f"{count:,} frame{'' if count == 1 else 's'}"
+
+
+def warn(text: str) -> None:
+    """A warning on stderr."""
+    typer.secho(f"warning: {text}", fg=typer.colors.YELLOW, err=True)
+
+
+# Where a command writes: checked before the work starts. What exists is replaced only with --force.
+
+
+SCENE_SUFFIX = ".ugr"  # the service lists no other files
+_PIPE_COLUMNS = 400  # where no terminal says how wide it is, nothing is cut
+OR_A_FOLDER = ", or be a folder for PNGs (a name without an ending)"
+_PICTURES = (".png", ".jpg", ".jpeg")
+_SIMILAR = {".hdf5": ".h5", ".hdf": ".h5", ".mha": ".igs.mha", ".zarr": ".zarr.zip", ".dicom": ".dcm", ".jpeg": ".jpg"}
+
+
+def check_file(path: Path, suffixes: Sequence[str] = (), *, force: bool) -> None:
+    """Raise InvalidArgument where a file cannot be written to `path`, or may not.
+
+    That is: the name ends in none of `suffixes` (none given: any will do), `path` is a folder or exists without
+    `force`, or its folder is not there or cannot be written to.
+    """
+    if path.is_dir():
+        raise InvalidArgument(f"output must be a file, {path} is a folder", field="output")
+    check_ending(path, suffixes)
+    folder = path.absolute().parent
+    if not folder.is_dir():
+        raise InvalidArgument(f"output must lie in a folder that exists, {path.parent} does not", field="output")
+    if not os.access(folder, os.W_OK):
+        raise InvalidArgument(f"output must lie in a folder that can be written to, {folder} cannot", field="output")
+    if path.exists() and not force:
+        raise InvalidArgument(f"{path} exists: --force replaces it", field="output")
+
+
+def check_folder(path: Path, *, force: bool) -> None:
+    """Raise InvalidArgument where `path` is a file, or without `force` a folder that holds something."""
+    if path.exists() and not path.is_dir():
+        raise InvalidArgument(f"output must be a folder, {path} is a file", field="output")
+    if path.is_dir() and not force and next(path.iterdir(), None) is not None:
+        raise InvalidArgument(
+            f"output must be a new or empty folder, {path} holds files: --force writes among them", field="output"
+        )
+
+
+def check_ending(path: Path, suffixes: Sequence[str], *, otherwise: str = "") -> None:
+    """Raise InvalidArgument where a name ends in none of `suffixes`, with the one that was perhaps meant.
+
+    `otherwise`: what the output may be instead, for the message.
+    """
+    if suffixes and not path.name.endswith(tuple(suffixes)):
+        given = path.suffix.lower()
+        similar = _SIMILAR.get(given)
+        near = [similar] if similar in suffixes else get_close_matches(given, suffixes, n=1, cutoff=0.7)
+        perhaps = f"; did you mean {near[0]}?" if near and len(suffixes) > 1 and given not in _PICTURES else ""
+        *others, last = suffixes
+        expected = f"{', '.join(others)} or {last}" if others else last
+        raise InvalidArgument(f"output must end in {expected}{otherwise}, got {path.name!r}{perhaps}", field="output")
+
+
+def is_folder_name(path: Path) -> bool:
+    """Whether a name that no format claims stands for a folder: it has no ending, or it is one already."""
+    return path.is_dir() or not path.suffix
+
+
+def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print rows under their columns; the first column is never cut."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    table = Table(*columns, box=None, pad_edge=False)
+    table.columns[0].no_wrap = True
+    for row in rows:
+        table.add_row(*map(escape, row))  # a reason or a name may hold brackets
+    wide_console().print(table)
+
+
+def wide_console() -> Console:
+    """Standard output; what is not a terminal is so wide that nothing is cut."""
+    from rich.console import Console
+
+    console = Console()
+    if not console.is_terminal:
+        console.width = _PIPE_COLUMNS
+    return console
+
+
+# Progress of a command on standard error: a bar on a terminal, elsewhere nothing or a line a step.
+
+
+@contextlib.contextmanager
+def counted(what: str, total: int) -> Iterator[Callable[[int], None]]:
+    """A function that is told how many of `total` are done: a bar on a terminal, nothing elsewhere."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task(what, total=total)
+        yield lambda done: progress.update(task, completed=done)
+
+
+@contextlib.contextmanager
+def transferred(what: str) -> Iterator[Callable[[int | None], Callable[[int], None]]]:
+    """A function that begins a transfer of so many bytes (None: nobody knows), and returns what is told of each block.
+
+    A bar with rate and time left on a terminal, nothing elsewhere.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}", markup=False),
+        BarColumn(),
+        DownloadColumn(),
+        TransferSpeedColumn(),
+        TimeRemainingColumn(),
+    )
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+
+        def begin(total: int | None) -> Callable[[int], None]:
+            task = progress.add_task(what, total=total)
+            return lambda count: progress.advance(task, count)
+
+        yield begin
+
+
+@contextlib.contextmanager
+def working(what: str) -> Iterator[None]:
+    """A line that moves while something of unknown length is done: on a terminal only."""
+    from rich.console import Console
+    from rich.markup import escape
+
+    console = Console(stderr=True)
+    if console.is_terminal:
+        with console.status(escape(what)):
+            yield
+    else:
+        yield
+
+
+# Commands that end with something to go on from when Ctrl-C or SIGTERM asks them to stop.
+
+
+@contextlib.contextmanager
+def stop_on_signal() -> Iterator[Callable[[], bool]]:
+    """A function that tells whether SIGINT or SIGTERM came; a process that is stopping ignores more of them."""
+    received: list[int] = []
+    numbers = (signal.SIGINT, signal.SIGTERM)
+    before = [signal.signal(number, lambda came, frame: received.append(came)) for number in numbers]
+    try:
+        yield lambda: bool(received)
+    finally:
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, signal.SIG_IGN if received else handler)

@@ -1,0 +1,347 @@
+"""`ultragray train`: a sweep becomes a scene file; the run can be stopped and resumed."""
+
+from __future__ import annotations
+
+import contextlib
+import json as json_text
+import sys
+import time
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from ultragray.datasets.source import SourceOptions
+from ultragray.errors import MemoryExceeded, TrainingDiverged, TrainingStateInvalid
+from ultragray.learn.training.config import PRESET_MEANINGS, TrainingConfig, read_config_file
+from ultragray_service.cli.app import INTERRUPTED
+from ultragray_service.cli.options import FieldsOf, parse_settings, with_options
+from ultragray_service.cli.sweeps import SweepArgument, check_source, read_dataset, warn_about_dataset
+from ultragray_service.cli.terminal import (
+    COMPUTE,
+    SCENE_SUFFIX,
+    Backend,
+    Force,
+    Json,
+    Threads,
+    check_file,
+    command_group,
+    examples,
+    output_option,
+    stop_on_signal,
+    tell,
+)
+
+if TYPE_CHECKING:
+    from ultragray.learn.training import Progress
+    from ultragray.scene.gaussians import GaussianScene
+
+
+RUN = "Run"
+MEASURING = "measuring what was reached"
+METRIC_NAMES = {"psnr_db": "PSNR, dB", "ms_ssim": "MS-SSIM", "gms": "GMS", "gmsd": "GMSD"}
+
+
+command_app = command_group()
+
+
+@command_app.command(
+    epilog=examples(
+        "ultragray train sweep/ -o liver.ugr",
+        "ultragray train sweep/ -o liver.ugr --preset best --threads 8",
+        "ultragray train scan.igs.mha --device-set plus.xml -o liver.ugr --set steps=4000 --set sh_degree=2",
+        "ultragray train sweep/ -o liver.ugr --resume  # after Ctrl-C",
+    )
+)
+@with_options
+def train(
+    sweep: SweepArgument,
+    output: Annotated[Path, output_option("Scene file to write (.ugr).")],
+    force: Force = False,
+    json: Json = False,
+    preset: Annotated[
+        str | None,
+        typer.Option(help=PRESET_MEANINGS, show_default="fast", rich_help_panel=RUN),
+    ] = None,
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            help="TOML file of settings: any field of TrainingConfig, and preset.",
+            show_default=False,
+            rich_help_panel=RUN,
+        ),
+    ] = None,
+    setting: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=VALUE",
+            help="Any field of TrainingConfig; repeat.",
+            show_default=False,
+            rich_help_panel=RUN,
+        ),
+    ] = None,
+    folder: Annotated[
+        Path | None,
+        typer.Option(
+            help="Folder of the run: checkpoint, metrics.jsonl, config.json.",
+            show_default="OUTPUT.run",
+            rich_help_panel=RUN,
+        ),
+    ] = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Go on from the checkpoint in the run's folder.", rich_help_panel=RUN)
+    ] = False,
+    checkpoint_every: Annotated[
+        float,
+        typer.Option(metavar="SECONDS", min=0.0, help="How often a checkpoint is written.", rich_help_panel=RUN),
+    ] = 30.0,
+    tensorboard: Annotated[
+        bool, typer.Option("--tensorboard", help="Also write TensorBoard events.", rich_help_panel=RUN)
+    ] = False,
+    device: Annotated[
+        str, typer.Option(help="cpu, or a GPU: cuda, or cuda:N for one of several.", rich_help_panel=COMPUTE)
+    ] = "cpu",
+    backend: Backend = "auto",
+    threads: Threads = 0,
+    *,
+    settings: Annotated[dict[str, Any], FieldsOf(TrainingConfig)],
+    source: SourceOptions,
+) -> None:
+    """Ctrl-C leaves a usable scene, and --resume goes on. Frames are held out to measure the scene with."""
+    given = {
+        **({} if config is None else read_config_file(config)),
+        **parse_settings(setting or []),
+        **settings,
+        **({} if preset is None else {"preset": preset}),
+    }
+    check_source(sweep)
+    run = RunOptions(
+        output=output,
+        folder=folder or output.with_name(f"{output.name}.run"),
+        resume=resume,
+        checkpoint_interval_s=checkpoint_every,
+        tensorboard=tensorboard,
+        device=device,
+        backend=backend,
+    )
+    if resume:
+        _check_resumable(run)
+    else:
+        _check_no_run(run, force=force)
+    check_file(output, [SCENE_SUFFIX], force=force or resume)
+    chosen = _config_of(run, given)
+
+    from ultragray.learn.training.memory import training_device
+
+    training_device(device, backend)  # refused before the sweep is read, which may take long
+    if threads:
+        import torch
+
+        torch.set_num_threads(threads)
+    read = read_dataset(sweep, source)
+    warn_about_dataset(read)
+    if not resume:
+        _forget_run(run)
+    _train(read, chosen, run, as_json=json)
+
+
+@dataclass(frozen=True)
+class RunOptions:
+    """The place and the means of a run; none of it changes the scene on one thread."""
+
+    output: Path
+    folder: Path
+    resume: bool
+    checkpoint_interval_s: float
+    tensorboard: bool
+    device: str
+    backend: str
+
+
+def _check_no_run(run: RunOptions, *, force: bool) -> None:
+    """Raise TrainingStateInvalid where the folder of the run holds one that was stopped, and is not to be replaced."""
+    if not run.folder.is_dir() or force:
+        return
+    from ultragray.learn.training.trainer import CHECKPOINT_FILE
+
+    if (run.folder / CHECKPOINT_FILE).exists():
+        raise TrainingStateInvalid(
+            f"{run.folder}: there is an unfinished run: --resume continues it, --force begins anew"
+        )
+
+
+def _forget_run(run: RunOptions) -> None:
+    """Remove the checkpoint of a run that is begun anew."""
+    from ultragray.learn.training.trainer import CHECKPOINT_FILE
+
+    (run.folder / CHECKPOINT_FILE).unlink(missing_ok=True)
+
+
+def _check_resumable(run: RunOptions) -> None:
+    """Raise TrainingStateInvalid, with the reason, where the folder of the run holds no checkpoint."""
+    if not run.folder.is_dir():
+        raise TrainingStateInvalid(f"{run.folder}: no such folder, so there is no checkpoint to resume from")
+    from ultragray.learn.training.trainer import CHECKPOINT_FILE, CONFIG_FILE, JOURNAL_FILE
+
+    if (run.folder / CHECKPOINT_FILE).exists():
+        return
+    steps = last_step = None
+    with contextlib.suppress(OSError, ValueError, LookupError, TypeError):  # whatever is there is no finished run
+        steps = json_text.loads((run.folder / CONFIG_FILE).read_text(encoding="utf-8"))["steps"]
+        last_line = (run.folder / JOURNAL_FILE).read_text(encoding="utf-8").splitlines()[-1]
+        last_step = json_text.loads(last_line)["step"]
+    if steps is not None and last_step == steps:
+        raise TrainingStateInvalid(f"{run.folder}: the run is finished, all {steps} steps are done; nothing to resume")
+    raise TrainingStateInvalid(f"{run.folder}: no checkpoint to resume from; leave out --resume to begin a run")
+
+
+def _config_of(run: RunOptions, given: Mapping[str, Any]) -> TrainingConfig:
+    """The preset with what was given; of a resumed run the one it was begun with, and what was given again."""
+    values = dict(given)
+    preset = values.pop("preset", None)
+    if run.resume and preset is None:
+        from ultragray.learn.training.checkpointing import read_checkpoint_header
+        from ultragray.learn.training.trainer import CHECKPOINT_FILE
+
+        stored = read_checkpoint_header(run.folder / CHECKPOINT_FILE).config
+        return TrainingConfig.from_dict({**stored.to_dict(), **values})
+    return TrainingConfig.preset(preset or "fast", **values)
+
+
+def _train(dataset: Any, config: TrainingConfig, run: RunOptions, *, as_json: bool) -> None:
+    from ultragray.learn.training import train as train_scene
+    from ultragray.learn.training.run import scene_of_checkpoint
+    from ultragray.learn.training.trainer import CHECKPOINT_FILE
+
+    started = time.monotonic()
+    last: Progress | None = None
+    with stop_on_signal() as should_stop:
+        try:
+            with _progress_bar() as show:
+
+                def report(state: Progress) -> None:
+                    nonlocal last
+                    last = state
+                    show(state)
+
+                scene = train_scene(
+                    dataset,
+                    config,
+                    folder=run.folder,
+                    resume=run.resume,
+                    report=report,
+                    should_stop=should_stop,
+                    device=run.device,
+                    backend=run.backend,
+                    checkpoint_interval_s=run.checkpoint_interval_s,
+                    tensorboard=run.tensorboard,
+                )
+        except (TrainingDiverged, MemoryExceeded) as error:
+            if not (run.folder / CHECKPOINT_FILE).exists():
+                raise
+            scene = scene_of_checkpoint(dataset, run.folder)
+            scene.save(run.output)
+            step = scene.info.training["step"]
+            raise type(error)(
+                f"{error.detail}; {run.output} is the scene after step {step}", field=error.field
+            ) from error
+        scene.save(run.output)
+    elapsed_s = time.monotonic() - started
+    done, steps = scene.info.training["step"], scene.info.training["steps"]
+    if not done:
+        typer.echo(
+            f"stopped before the first step, while the effort was chosen; wrote {run.output} as it starts; the same "
+            "command with --force goes on with the choice",
+            err=True,
+        )
+        raise typer.Exit(INTERRUPTED)
+    if done < steps:
+        typer.echo(
+            f"stopped after step {done:,} of {steps:,}; wrote {run.output} as it is; go on with the same "
+            "command and --resume",
+            err=True,
+        )
+        raise typer.Exit(INTERRUPTED)
+    (run.folder / CHECKPOINT_FILE).unlink()
+    if not as_json:
+        _print_metrics(scene)
+    cost = "" if last is None else f" ({_cost(last)})"
+    effort = f"chose effort {scene.info.training['effort']:g}, " if config.effort is None else ""
+    tell(
+        f"{effort}wrote {run.output}: {scene.gaussian_count:,} Gaussians, {done:,} steps, {elapsed_s:.0f} s{cost}",
+        {
+            "output": str(run.output),
+            "folder": str(run.folder),
+            "gaussian_count": scene.gaussian_count,
+            "steps": done,
+            "seconds": round(elapsed_s, 1),
+            "metrics": scene.info.metrics,
+            "training": scene.info.training,
+        },
+        as_json=as_json,
+    )
+
+
+def _cost(state: Progress) -> str:
+    """The time of a step at the end, and the most memory of a GPU that was in use."""
+    step = f"{1000.0 / state.steps_per_s:.1f} ms a step"
+    return step if state.peak_memory_mb is None else f"{step}, at most {state.peak_memory_mb:,.0f} MB of the GPU"
+
+
+@contextlib.contextmanager
+def _progress_bar() -> Iterator[Callable[[Any], None]]:
+    """A bar with rate, loss and time left on a terminal's stderr; elsewhere a line for every tenth of the run.
+
+    After the last step of a training what it reached is measured, which takes a while and has no steps.
+    """
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.fields[stage]}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[figures]}"),
+    )
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+        task = progress.add_task("", total=None, stage="training", figures="")
+
+        def report(state: Any) -> None:
+            stage, is_last = state.beside or "training", state.step == state.steps
+            if console.is_terminal:
+                progress.update(task, completed=state.step, total=state.steps, stage=stage, figures=_figures(state))
+                if is_last:
+                    progress.update(task, total=None, stage=f"{stage}: {MEASURING}", figures="")
+                return
+            if state.step * 10 // state.steps > (state.step - 1) * 10 // state.steps:
+                named = f"{state.beside}: " if state.beside else ""
+                sys.stderr.write(f"{named}step {state.step:,} of {state.steps:,}: {_figures(state)}\n")
+            if is_last:
+                sys.stderr.write(f"{stage}: {MEASURING} …\n")
+
+        yield report
+
+
+def _figures(state: Any) -> str:
+    held_out = "" if state.val_psnr_db is None else f" · held out {state.val_psnr_db:.2f} dB"
+    minutes, seconds = divmod(round(state.seconds_left), 60)
+    return (
+        f"loss {state.loss:.4f} · {state.gaussian_count:,} Gaussians · {state.steps_per_s:.1f} steps/s · "
+        f"{minutes}:{seconds:02d} left{held_out}"
+    )
+
+
+def _print_metrics(scene: GaussianScene) -> None:
+    from rich.console import Console
+    from rich.table import Table
+
+    metrics = scene.info.metrics
+    if not metrics:
+        return
+    table = Table("held out", *(METRIC_NAMES[name] for name in metrics))
+    table.add_row("mean", *(f"{value:.2f}" if name == "psnr_db" else f"{value:.3f}" for name, value in metrics.items()))
+    Console().print(table)

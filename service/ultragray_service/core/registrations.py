@@ -1,0 +1,325 @@
+"""Registrations of robots and trackers to scenes, kept by name in the database, copied in memory for frames."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import logging
+import re
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from typing import Any, Concatenate, ParamSpec, TypeVar
+
+import sqlalchemy as sa
+from sqlalchemy.dialects import postgresql, sqlite
+
+from ultragray.contract import described, from_dict, shown, to_dict
+from ultragray.errors import InvalidArgument, UltragrayError
+from ultragray.geometry.registration import Registration
+from ultragray_service.access.limits import Limits
+from ultragray_service.access.owners import Owners, may_change
+from ultragray_service.access.principals import Principal, Role, acting, iso_time
+from ultragray_service.core.jobs.database_threads import DatabaseThreads
+from ultragray_service.core.scenes import SceneCatalog, page_of_names
+from ultragray_service.errors import LimitReached, PermissionDenied
+from ultragray_workers.errors import RegistrationNotFound
+from ultragray_workers.jobs.queue.owners import Kind, Ownership, tell_change
+from ultragray_workers.jobs.queue.tables import REGISTRATIONS
+from ultragray_workers.scene_names import base_name
+
+
+@dataclass(frozen=True, kw_only=True)
+class NamedRegistration(Registration):
+    """A registration that the service keeps."""
+
+    name: str = described("Chosen by who put it.")
+    scene: str = described("That its poses lead into.")
+    owner: str | None = described("Who put it; null: nobody.", None)
+    changed_at: str = described("ISO 8601, UTC.")
+
+
+@dataclass(frozen=True)
+class RegistrationPage:
+    """One page of registrations by name."""
+
+    registrations: list[NamedRegistration]
+    next_page_token: str = described("Empty on the last page.")
+
+
+# The table of registrations. Its functions block; those that take an engine are one transaction each.
+
+
+_log = logging.getLogger("ultragray.service")
+_COLUMNS = REGISTRATIONS.c
+_KNOWN = {item.name for item in fields(Registration)}  # a later release may write more
+
+
+@dataclass(frozen=True)
+class Kept:
+    """A registration as its row has it."""
+
+    registration: NamedRegistration
+    private_to: str | None  # the owner of the scene, where that was private when the registration was put
+
+
+def read_registration(engine: sa.Engine, name: str) -> Kept | None:
+    """The registration of a name; None where there is none."""
+    with engine.connect() as connection:
+        row = connection.execute(sa.select(REGISTRATIONS).where(_COLUMNS.name == name)).one_or_none()
+    return None if row is None else _kept(*row)
+
+
+def read_registrations(connection: sa.Connection) -> dict[str, Kept]:
+    """All registrations that can be read, by name."""
+    found = {}
+    for row in connection.execute(sa.select(REGISTRATIONS)):
+        try:
+            found[row.name] = _kept(*row)
+        except (UltragrayError, ValueError) as error:
+            _log.warning(f"the registration {row.name!r} cannot be read, and is left out: {error}")
+    return found
+
+
+def write_registration(
+    engine: sa.Engine,
+    name: str,
+    scene: str,
+    private_to: str | None,
+    registration: Registration,
+    writer: Principal,
+    most: int | None,
+) -> Kept | None:
+    """The registration as it is kept from now on; None where it is another's than the writer's.
+
+    Its owner stays, unless an admin puts it for a private scene of somebody else's: then it is the admin's.
+    Raises LimitReached for a new one of a writer who has `most` already; None: any number.
+    """
+    values = {
+        "scene": scene,
+        "private_to": private_to,
+        "changed_at_s": time.time(),
+        "document": json.dumps(to_dict(registration), allow_nan=False),
+    }
+    owner = (
+        _COLUMNS.owner if private_to is None else sa.case((_COLUMNS.owner == private_to, private_to), else_=writer.name)
+    )
+    with engine.begin() as connection:
+        if most is not None:
+            _require_room(connection, name, writer, most)
+        insert = (sqlite if connection.dialect.name == "sqlite" else postgresql).insert(REGISTRATIONS)
+        kept = insert.values(name=name, owner=writer.name, **values).on_conflict_do_update(
+            index_elements=[_COLUMNS.name], set_={**values, "owner": owner}, where=_may_change(writer)
+        )
+        row = connection.execute(kept.returning(*_COLUMNS)).one_or_none()
+        if row is None:
+            return None
+        tell_change(connection)
+    return _kept(*row)
+
+
+def delete_registration(engine: sa.Engine, name: str, remover: Principal) -> bool:
+    """Whether it was there and the remover's to delete."""
+    with engine.begin() as connection:
+        gone = sa.delete(REGISTRATIONS).where(_COLUMNS.name == name, _may_change(remover))
+        if not connection.execute(gone).rowcount:
+            return False
+        tell_change(connection)
+    return True
+
+
+def _require_room(connection: sa.Connection, name: str, writer: Principal, most: int) -> None:
+    """Raises LimitReached where the writer has `most` registrations, and none is there of that name."""
+    if connection.execute(sa.select(_COLUMNS.name).where(_COLUMNS.name == name)).one_or_none() is not None:
+        return
+    owned = sa.select(sa.func.count()).select_from(REGISTRATIONS).where(_COLUMNS.owner == writer.name)
+    if connection.execute(owned).scalar_one() >= most:
+        raise LimitReached(f"this key may keep {most} registrations (registrations): delete one first")
+
+
+def _may_change(principal: Principal) -> sa.ColumnElement[bool]:
+    return sa.true() if principal.role is Role.ADMIN else _COLUMNS.owner == principal.name
+
+
+@lru_cache(maxsize=4096)  # they are read again whenever one of them, a key or an owner changes
+def _kept(name: str, scene: str, owner: str, changed_at_s: float, document: str, private_to: str | None) -> Kept:
+    """The registration of a row, by its columns. Raises InvalidArgument, InvalidPose, ValueError."""
+    content = {key: value for key, value in json.loads(document).items() if key in _KNOWN}
+    facts: dict[str, Any] = {"name": name, "scene": scene, "owner": owner, "changed_at": iso_time(changed_at_s)}
+    return Kept(NamedRegistration(**to_dict(from_dict(Registration, content)), **facts), private_to)
+
+
+# Registrations by name: kept, listed, deleted, and found for the requests that name one.
+
+
+NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
+
+P = ParamSpec("P")
+T = TypeVar("T")
+
+
+class Registrations:
+    """All registrations of the installation, and a copy of them in memory: no frame waits for the database.
+
+    One that was put while its scene was private is seen by that scene's owner and by admins alone, also when the scene
+    is gone and another has its name. Any other is seen by who put it, and by all who see its scene.
+    """
+
+    def __init__(self, catalog: SceneCatalog, owners: Owners, limits: Limits) -> None:
+        self._catalog, self._owners, self._limits = catalog, owners, limits
+        self._copy: dict[str, Kept] = {}  # by name
+        self._changes = 0  # of the copy by this service, so that no older copy follows a newer one
+        self._copying = threading.Lock()  # of the copy and the number of its changes
+        self._writing = threading.Lock()  # one change of the table at a time: the copy has them in the same order
+        self._engine: sa.Engine | None = None
+        self._threads: DatabaseThreads | None = None
+
+    def open(self, engine: sa.Engine, threads: DatabaseThreads) -> None:
+        """From now on they are read and written by `engine`, in `threads`."""
+        self._engine, self._threads = engine, threads
+
+    def read(self, connection: sa.Connection) -> None:
+        """Copies them again, waiting for no change that is under way. May be called from any thread."""
+        while True:
+            before, copy = self._changes, read_registrations(connection)
+            with self._copying:
+                if self._changes == before:
+                    self._copy = copy
+                    return
+
+    async def get(self, name: str) -> NamedRegistration:
+        """A registration as it is kept now. Raises RegistrationNotFound, DatabaseUnavailable."""
+        kept = await self._do(read_registration, name)
+        return await asyncio.to_thread(self._seen, name, kept)
+
+    async def ownership(self, name: str) -> Ownership:
+        """Whose a registration is. Raises RegistrationNotFound, DatabaseUnavailable."""
+        return Ownership((await self.get(name)).owner)
+
+    async def of_scene(self, name: str, scene: str) -> Registration:
+        """The registration that a request for a scene names, from the copy.
+
+        The database is asked where the copy lacks it, has it for another scene or hides it from the caller: another
+        service may have changed it just now. Raises RegistrationNotFound, DatabaseUnavailable, and InvalidArgument for
+        one of another scene.
+        """
+        kept = self._copy.get(name)
+        if (
+            kept is None
+            or kept.registration.scene != base_name(scene)
+            or not _is_seen(kept, lambda one: not self._owners.hides(Kind.SCENE, one))
+        ):
+            return _of_scene(await self.get(name), scene)
+        return kept.registration
+
+    def read_of_scene(self, name: str, scene: str) -> Registration:
+        """As `of_scene`, as it is kept now. Blocks; may be called from any thread."""
+        return _of_scene(self._seen(name, read_registration(self._opened, name)), scene)
+
+    async def page(self, page_size: int, page_token: str) -> RegistrationPage:
+        """One page by name. Raises InvalidArgument, DatabaseUnavailable."""
+        kept, there = await self._do(_read_all), set(await self._catalog.names())
+        seen = {name: one.registration for name, one in kept.items() if _is_seen(one, there.__contains__)}
+        names, next_page_token = page_of_names(sorted(seen), page_size, page_token)
+        return RegistrationPage([seen[name] for name in names], next_page_token)
+
+    async def put(self, name: str, scene: str, registration: Registration) -> NamedRegistration:
+        """Keeps a registration, in place of one of the name that is the caller's.
+
+        Raises InvalidArgument for a name, SceneNotFound, SceneFileInvalid, PermissionDenied, LimitReached,
+        DatabaseUnavailable.
+        """
+        if NAME.fullmatch(name) is None:
+            raise InvalidArgument(
+                "registration must be 1 to 128 letters, digits, '.', '_' and '-', the first a letter or digit, got "
+                f"{shown(name)}",
+                field="registration",
+            )
+        await self._catalog.header(scene)
+        most, whose = self._limits.mine.registrations, self._owners.known(Kind.SCENE, scene)
+        private_to = whose.owner if whose.private else None
+
+        def write(engine: sa.Engine) -> NamedRegistration:
+            with self._writing:
+                kept = write_registration(engine, name, base_name(scene), private_to, registration, acting(), most)
+                if kept is None:
+                    raise _not_own(name)
+                self._change_copy(name, kept)
+            return kept.registration
+
+        try:
+            return await self._do(write)
+        except LimitReached as error:
+            raise self._limits.refused("registrations", error) from None
+
+    async def delete(self, name: str) -> None:
+        """Forgets a registration. Raises RegistrationNotFound, PermissionDenied, DatabaseUnavailable."""
+
+        def forget(engine: sa.Engine) -> None:
+            with self._writing:
+                if not delete_registration(engine, name, acting()):
+                    raise _not_own(name)
+                self._change_copy(name, None)
+
+        await self.get(name)
+        await self._do(forget)
+
+    def _change_copy(self, name: str, kept: Kept | None) -> None:
+        with self._copying:
+            self._changes += 1
+            if kept is None:
+                self._copy.pop(name, None)
+            else:
+                self._copy[name] = kept
+
+    def _seen(self, name: str, kept: Kept | None) -> NamedRegistration:
+        """What was read of a name, where the caller may see it. Lists scenes: blocks. Raises RegistrationNotFound."""
+        if kept is None or not _is_seen(kept, lambda scene: scene in self._catalog.shown_names()):
+            raise RegistrationNotFound(f"there is no registration {shown(name)}", field="registration")
+        return kept.registration
+
+    @property
+    def _opened(self) -> sa.Engine:
+        assert self._engine is not None
+        return self._engine
+
+    async def _do(self, work: Callable[Concatenate[sa.Engine, P], T], *arguments: P.args, **options: P.kwargs) -> T:
+        assert self._threads is not None
+        return await self._threads.ask(work, self._opened, *arguments, **options)
+
+
+def _read_all(engine: sa.Engine) -> dict[str, Kept]:
+    with engine.connect() as connection:
+        return read_registrations(connection)
+
+
+def _is_seen(kept: Kept, sees_scene: Callable[[str], bool]) -> bool:
+    """Whether the caller sees a registration; `sees_scene`: whether the caller sees a scene, by its name."""
+    if kept.private_to is not None:
+        return _is_own(kept.private_to)
+    return _is_own(kept.registration.owner) or sees_scene(kept.registration.scene)
+
+
+def _is_own(owner: str | None) -> bool:
+    """Whether something is the caller's, or the caller an admin or the service itself."""
+    try:
+        return may_change(acting(), Ownership(owner))
+    except LookupError:
+        return True
+
+
+def _of_scene(found: NamedRegistration, scene: str) -> NamedRegistration:
+    if found.scene != base_name(scene):
+        raise InvalidArgument(
+            f"registration must be one of the scene {base_name(scene)!r}: {found.name!r} is of {found.scene!r}",
+            field="registration",
+        )
+    return found
+
+
+def _not_own(name: str) -> PermissionDenied:
+    return PermissionDenied(
+        f"the registration {name!r} is somebody else's: only its owner and admins change it", field="registration"
+    )

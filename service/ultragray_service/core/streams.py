@@ -1,0 +1,450 @@
+"""Poses of one client as they come, frames in their order: what every streaming front door shares."""
+
+from __future__ import annotations
+
+import asyncio
+import logging
+from collections import deque
+from collections.abc import Awaitable, Callable, Coroutine
+from dataclasses import dataclass, replace
+from enum import Enum
+from functools import partial
+from typing import Any, Protocol
+
+from ultragray.errors import InvalidArgument, UltragrayError
+from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.settings import RenderSettings
+from ultragray_service.core.open_streams import Answered, OpenStream
+from ultragray_service.core.rendering import Plan, Rendering
+from ultragray_workers.errors import Draining
+from ultragray_workers.pool.messages import Destination, RenderResult
+from ultragray_workers.pool.waiting import Turn
+
+MAX_FRAMES_IN_FLIGHT = 8  # of an ordered stream; then it stops reading
+MAX_BYTES_IN_FLIGHT = 32 * 2**20  # of their frames, if there is more than one
+MAX_WINDOW = 16  # answers of a latest stream that its client may have yet to acknowledge
+
+_log = logging.getLogger("ultragray.stream")
+
+
+class StreamMode(str, Enum):
+    """The fate of a pose that still waits when the next one comes."""
+
+    ORDERED = "ordered"  # every pose gets its frame
+    LATEST = "latest"  # the newer pose takes its place in the queue; it gets no frame, and is counted
+
+
+@dataclass(frozen=True, eq=False)
+class Asked:
+    """One pose of a client, checked."""
+
+    sequence: int
+    client_time: float | None  # any number (an int for gRPC): the client gets it back
+    plan: Plan  # the same object until the client sends other settings
+    pose: FloatArray  # [4, 4] mm, exact
+    deadline: float  # time.monotonic() in seconds
+
+
+Write = Callable[[Answered], Awaitable[None]]
+
+
+@dataclass(frozen=True, eq=False)
+class _Underway:
+    work: asyncio.Task[Answered]
+    sent: Callable[[], None]
+
+
+class _Room:
+    """For answers under way: a few, and of large frames fewer."""
+
+    def __init__(self) -> None:
+        self._count = self._bytes = 0
+        self._left = asyncio.Event()
+
+    async def enter(self, size: int) -> None:
+        """Waits until there is room for an answer of so many bytes; alone it may be of any size."""
+        while self._count and (self._count >= MAX_FRAMES_IN_FLIGHT or self._bytes + size > MAX_BYTES_IN_FLIGHT):
+            self._left.clear()
+            await self._left.wait()
+        self._count += 1
+        self._bytes += size
+
+    def leave(self, size: int) -> None:
+        """The answer is sent."""
+        self._count -= 1
+        self._bytes -= size
+        self._left.set()
+
+
+class _Window:
+    """The answers of a latest stream that are between the service and the hands of its client.
+
+    A pose is rendered only once there is room, so that it is the newest one then. A client that acknowledges has
+    opened a window of several answers, which leave it when they are acknowledged; of one that does not, one answer at
+    a time is on its way, until the transport has handed it over.
+    """
+
+    def __init__(self) -> None:
+        self._size: int | None = None  # None: the client acknowledges nothing
+        self._entered: deque[int] = deque()  # sequences, in the order of the answers
+
+    def open(self, size: int) -> None:
+        """The client acknowledges from now on."""
+        self._size = size
+
+    @property
+    def is_open(self) -> bool:
+        return self._size is not None
+
+    @property
+    def has_room(self) -> bool:
+        return len(self._entered) < (1 if self._size is None else self._size)
+
+    def enter(self, sequence: int) -> None:
+        """An answer is ready to be sent."""
+        self._entered.append(sequence)
+
+    def sent(self) -> None:
+        """The transport has done with the oldest answer."""
+        if self._size is None:
+            self._entered.popleft()
+
+    def acknowledge(self, sequence: int) -> None:
+        """The client has taken the answer of that sequence, and those before it are of no use any more."""
+        if self._size is not None and sequence in self._entered:
+            while self._entered.popleft() != sequence:
+                pass
+
+
+class PoseStream:
+    """One stream of one client."""
+
+    def __init__(self, rendering: Rendering, noted: OpenStream | None = None) -> None:
+        """`noted`: where others may see what is asked and answered."""
+        self.mode = StreamMode.ORDERED  # to be set before the first pose, likewise:
+        self.destination: Destination | None = None  # of its frames
+        self._rendering = rendering
+        self._noted = noted or OpenStream()
+        self._room = _Room()
+        self._answers: asyncio.Queue[_Underway | None] = asyncio.Queue()
+        self._started: set[asyncio.Task[Answered]] = set()
+        self._ended = False  # no more poses come
+        self._dropped = 0
+        # Of a latest stream: what is asked of the pool, its place in the queue, and what comes after it.
+        self._current: Asked | None = None
+        self._is_waiting = False  # for the limits of its key to allow it
+        self._turn = Turn()
+        self._next: Asked | None = None
+        self._window = _Window()
+
+    async def run(self, read: Callable[[], Awaitable[None]], send: Write, hand_over: Write) -> None:
+        """Until the client has sent its last pose and got its last frame.
+
+        `read` takes messages to `ask` and `refuse` until there are no more. `hand_over` sends the answers of a latest
+        stream whose client acknowledges none, `send` all others. Raises Draining when the service stops, after the
+        frames in flight, and what the three raise.
+        """
+        reader = asyncio.ensure_future(self._read(read))
+        writer = asyncio.ensure_future(self._write(send, hand_over))
+        stopping = asyncio.ensure_future(self._rendering.life.draining.wait())
+        stopping.add_done_callback(partial(_cancel, reader))
+        self._rendering.metrics.count_stream(+1)
+        try:
+            await asyncio.wait({reader, writer}, return_when=asyncio.FIRST_EXCEPTION)
+            if reader.done() and not reader.cancelled():
+                if isinstance(reader.exception(), UltragrayError):
+                    await asyncio.wait({writer})  # gRPC cannot end a call while an answer is being written
+                reader.result()
+            if writer.done() and not writer.cancelled():
+                writer.result()
+            if self._rendering.life.draining.is_set():
+                raise Draining("the service is stopping; the frames in flight have been answered")
+        finally:
+            self._rendering.metrics.count_stream(-1)
+            tasks = [reader, writer, stopping, *self._started]
+            for task in tasks:
+                task.cancel()
+            self._answers = asyncio.Queue()  # with the frames that nobody takes any more
+            await asyncio.gather(*tasks, return_exceptions=True)  # those that have failed already, too
+            tasks.clear()
+            del reader, writer  # what they raised holds on to this call, and that to frames that nobody takes any more
+
+    async def ask(self, asked: Asked) -> None:
+        """Takes a pose. An ordered stream waits while too many frames are in flight."""
+        self._noted.asked()
+        if self.mode is StreamMode.ORDERED:
+            settings = asked.plan.settings
+            size = settings.pixels * settings.encoding.pixel_type.itemsize
+            await self._room.enter(size)
+            self._start(self._answer(asked), sent=partial(self._room.leave, size))
+            return
+        if self._next is None and self._take_over(asked):
+            self._count_dropped()
+            return
+        if self._next is not None:
+            self._count_dropped()
+        self._next = asked
+        self._advance()
+
+    def open_window(self, size: int) -> None:
+        """The client of a latest stream acknowledges answers, and wants so many of them ahead."""
+        self._window.open(size)
+
+    def acknowledge(self, sequence: int) -> None:
+        """The client has taken the answer of that sequence."""
+        self._window.acknowledge(sequence)
+        self._advance()
+
+    async def refuse(self, sequence: int, client_time: float | None, error: UltragrayError) -> None:
+        """Takes a message that gets no frame. Waits while too many answers are under way."""
+
+        async def refusal() -> Answered:
+            return Answered(sequence, client_time, error)
+
+        self._rendering.metrics.count_frame_error(error)
+        await self._room.enter(0)
+        self._start(refusal(), sent=partial(self._room.leave, 0))
+
+    async def _read(self, read: Callable[[], Awaitable[None]]) -> None:
+        try:
+            await read()
+        finally:
+            self._ended = True
+            self._advance()
+
+    async def _write(self, send: Write, hand_over: Write) -> None:
+        while (underway := await self._answers.get()) is not None:
+            answered = await underway.work
+            dropped, self._dropped = self._dropped, 0
+            answered = replace(answered, dropped=dropped)
+            self._noted.answered(answered)
+            write = send if self.mode is StreamMode.ORDERED or self._window.is_open else hand_over
+            await write(answered)
+            underway.sent()
+
+    def _start(self, work: Coroutine[Any, Any, Answered], sent: Callable[[], None]) -> None:
+        task = asyncio.create_task(work)
+        self._started.add(task)
+        task.add_done_callback(self._started.discard)
+        self._answers.put_nowait(_Underway(task, sent))
+
+    async def _answer(self, asked: Asked) -> Answered:
+        return Answered(asked.sequence, asked.client_time, await self._outcome(self._rendered(asked)))
+
+    async def _rendered(self, asked: Asked) -> RenderResult:
+        await self._rendering.limits.frame_turn(asked.deadline)
+        return await self._render(asked, Turn())
+
+    async def _render(self, asked: Asked, turn: Turn) -> RenderResult:
+        return await self._rendering.render(
+            asked.plan, asked.pose[None], deadline=asked.deadline, turn=turn, destination=self.destination
+        )
+
+    async def _outcome(self, rendering: Awaitable[RenderResult]) -> RenderResult | UltragrayError:
+        try:
+            return await rendering
+        except UltragrayError as error:
+            outcome = error
+        except Exception as error:
+            outcome = unexpected(error)
+        self._rendering.metrics.count_frame_error(outcome)
+        return outcome
+
+    def _take_over(self, asked: Asked) -> bool:
+        """Puts a pose into the place of the one that is not begun: it waits for its key's limits, or in the pool."""
+        current = self._current
+        if self._is_waiting:
+            self._current = asked
+            return True
+        if current is None or current.plan is not asked.plan:
+            return False
+        if not self._turn.give_to(asked.pose[None], asked.deadline):
+            return False
+        self._current = asked
+        return True
+
+    def _advance(self) -> None:
+        """Asks the pool for what comes next, once it may; ends the answers after the last one."""
+        has_room = self._window.has_room or self._ended  # a client that has ended cannot acknowledge any more
+        if self._next is not None and self._current is None and has_room:
+            self._current, self._next, self._turn = self._next, None, Turn()
+            self._start(self._answer_latest(), sent=self._sent_latest)
+        if self._ended and self._next is None:
+            self._answers.put_nowait(None)
+
+    async def _answer_latest(self) -> Answered:
+        outcome = await self._outcome(self._rendered_latest())
+        assert self._current is not None
+        asked, self._current = self._current, None  # perhaps a later one than at the start
+        self._window.enter(asked.sequence)
+        self._advance()
+        return Answered(asked.sequence, asked.client_time, outcome)
+
+    async def _rendered_latest(self) -> RenderResult:
+        self._is_waiting = True
+        try:
+            await self._rendering.limits.frame_turn(None)  # meanwhile newer poses, with later deadlines, may come
+        finally:
+            self._is_waiting = False
+        assert self._current is not None
+        return await self._render(self._current, self._turn)
+
+    def _sent_latest(self) -> None:
+        self._window.sent()
+        self._advance()
+
+    def _count_dropped(self) -> None:
+        self._dropped += 1
+        self._rendering.metrics.count_dropped()
+
+
+def unexpected(error: Exception) -> UltragrayError:
+    """The refusal of a message that a fault of the service kept from its frame; the log has the fault."""
+    _log.error("unexpected error in a stream", exc_info=error)
+    return UltragrayError("an unexpected error, see the log")
+
+
+def _cancel(task: asyncio.Task[None], _: asyncio.Future[bool]) -> None:
+    task.cancel()
+
+
+# A stream of one client: its messages in their order, whatever they come through.
+
+
+MAX_TIMEOUT_MS = 3_600_000.0
+
+SceneSettings = tuple[str, RenderSettings]
+
+
+class Message(Protocol):
+    """A message of the client. What cannot be used is raised, as InvalidArgument, by the method that would give it."""
+
+    @property
+    def sequence(self) -> int: ...
+
+    @property
+    def client_time(self) -> float | None: ...
+
+    @property
+    def window(self) -> int | None:
+        """Answers of a latest stream that may wait to be acknowledged; of the first message. None: none ever is."""
+
+    @property
+    def acknowledged(self) -> int | None:
+        """The sequence of the newest answer that the client has taken; None: no news."""
+
+    def settings(self) -> SceneSettings | None:
+        """The scene and what to render of it from now on; None: as before."""
+
+    @property
+    def asks(self) -> bool:
+        """Whether it asks for a frame."""
+
+    def pose(self) -> FloatArray:  # [4, 4] mm, exact
+        """The pose to render, of a message that asks."""
+
+    def timeout_s(self) -> float | None:
+        """The time that the pose may wait; None: the default of the service."""
+
+
+class Transport(Protocol):
+    """The connection that messages come through."""
+
+    @property
+    def destination(self) -> Destination | None:
+        """Where frames are put, of a transport whose mode was asked for; None: into the answers."""
+
+    async def receive(self) -> Message | None:
+        """The next message; None after the last."""
+
+    def mode(self, message: Message) -> StreamMode | None:
+        """The mode that the first message asks for; None where it cannot be read: then the next one may."""
+
+    async def send(self, answered: Answered) -> None:
+        """Sends a frame, or why there is none."""
+
+    async def hand_over(self, answered: Answered) -> None:
+        """Sends, and waits until the client has taken the answer, as far as the transport can tell."""
+
+
+class FrameStream:
+    """Poses in, frames out. Refused settings change nothing: those before them stay, `unset` at the beginning.
+
+    A client whose first settings are refused gets no frames with settings that it did not ask for.
+    """
+
+    def __init__(
+        self,
+        rendering: Rendering,
+        transport: Transport,
+        unset: SceneSettings | None = None,
+        noted: OpenStream | None = None,
+    ) -> None:
+        self._rendering = rendering
+        self._transport = transport
+        self._unset = unset
+        self._plan: Plan | None = None
+        self._poses = PoseStream(rendering, noted)
+
+    async def run(self) -> None:
+        """Answers until the client has sent its last message and got its last frame.
+
+        Raises Draining when the service stops, and what the transport raises.
+        """
+        await self._poses.run(self._read, self._transport.send, self._transport.hand_over)
+
+    async def _read(self) -> None:
+        mode = None
+        while (message := await self._transport.receive()) is not None:
+            if mode is None and (mode := self._transport.mode(message)) is not None:
+                self._poses.mode, self._poses.destination = mode, self._transport.destination
+                if message.window is not None:
+                    self._poses.open_window(message.window)
+            if message.acknowledged is not None:
+                self._poses.acknowledge(message.acknowledged)
+            await self._take(message)
+
+    async def _take(self, message: Message) -> None:
+        try:
+            asked = await self._asked(message)
+        except UltragrayError as error:
+            await self._poses.refuse(message.sequence, message.client_time, error)
+        except Exception as error:
+            await self._poses.refuse(message.sequence, message.client_time, unexpected(error))
+        else:
+            if asked is not None:
+                await self._poses.ask(asked)
+
+    async def _asked(self, message: Message) -> Asked | None:
+        await self._change_settings(message)
+        if not message.asks:
+            return None
+        if self._plan is None:
+            if self._unset is None:
+                raise InvalidArgument("settings must be given, and accepted, before the first pose", field="settings")
+            self._plan = await self._resolve(self._unset)
+        pose, deadline = self._plan.placed(message.pose()), self._rendering.planner.deadline(message.timeout_s())
+        return Asked(message.sequence, message.client_time, self._plan, pose, deadline)
+
+    async def _change_settings(self, message: Message) -> None:
+        unset, self._unset = self._unset, None  # as long as the message's own are not known to be none
+        settings = message.settings()
+        if settings is None:
+            self._unset = unset
+        else:
+            self._plan = await self._resolve(settings)
+
+    async def _resolve(self, settings: SceneSettings) -> Plan:
+        scene, asked = settings
+        return await self._rendering.planner.plan(
+            scene, asked, asked.encoding, path="settings", registration=asked.registration
+        )
+
+
+def checked_s(name: str, milliseconds: float) -> float:
+    """The seconds of a time that a client gave as the field `name`. Raises InvalidArgument."""
+    if not 0.0 < milliseconds <= MAX_TIMEOUT_MS:
+        raise InvalidArgument(
+            f"{name} must be above 0 and at most {MAX_TIMEOUT_MS:g}, got {milliseconds:g}", field=name
+        )
+    return milliseconds / 1000.0

@@ -1,1 +1,0 @@
-"""Streams of poses for all front doors."""

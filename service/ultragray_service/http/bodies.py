@@ -1,0 +1,415 @@
+"""Bodies of requests, read as the classes of the contract: JSON small and large, and the files of a form."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import math
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import Field, dataclass, field, make_dataclass, replace
+from functools import cache
+from typing import Any, Literal, TypeVar, get_args
+
+import numpy as np
+from pydantic import TypeAdapter, ValidationError
+from python_multipart.exceptions import FormParserError
+from python_multipart.multipart import MultipartParser, parse_options_header
+from starlette.requests import Request
+
+from ultragray.contract import Contract, annotated_fields, described, error_under
+from ultragray.errors import InvalidArgument, InvalidImageSize, InvalidPose, UltragrayError
+from ultragray.geometry.image_size import MAX_IMAGE_SIDE
+from ultragray.geometry.probe import Probe
+from ultragray.geometry.registration import Registration
+from ultragray.learn.localization.settings import LocalizationSettings
+from ultragray.rendering.settings import FrameSettings, RenderSettings, registration_field
+from ultragray_service.core.poses import Pose, check_pose_count
+from ultragray_service.core.streams import MAX_TIMEOUT_MS, MAX_WINDOW, StreamMode
+from ultragray_service.errors import BodyTooLarge, UnsupportedMediaType
+from ultragray_service.http.problems import invalid_argument
+from ultragray_workers.jobs.job import MAX_PRIORITY
+from ultragray_workers.jobs.kinds import KINDS, Specification
+
+INLINE_BYTES = 64 * 1024  # of a body that is read at once: a few milliseconds
+MAX_VALUES = 100_000  # of a body that has no limit of its own: about ten milliseconds
+_MAX_DIGITS = 400  # of a number; one of a million takes long to read
+_SMALL_VALUES, _ELEMENT_VALUES = 4096, 64
+_DIGITS = bytes(b"0"[0] if chr(byte).isdecimal() and byte < 128 else b" "[0] for byte in range(256))
+
+_READER = ThreadPoolExecutor(1, "large-bodies")  # one at a time: they share one lock of the interpreter
+
+T = TypeVar("T")
+ReadSmall = Callable[[str, Any], Any]
+
+
+@dataclass(frozen=True)
+class Apart:
+    """The key of a body under which much may stand, and how that is read."""
+
+    key: str
+    kind: type[Any]  # list or dict
+    element: Any = None  # the class of a list's elements; None: taken as it is
+    error: type[InvalidArgument] = InvalidArgument
+    check_count: Callable[[int], None] = lambda count: None
+    max_bytes: float = math.inf  # of the whole body
+    max_values: float = MAX_VALUES
+
+
+async def read_large(body: bytes, cls: type[T], apart: Apart | None, read_small: ReadSmall) -> T:
+    """The body, checked as a small one would be. Raises BodyTooLarge, InvalidArgument and what the classes raise."""
+    if apart is not None and len(body) > apart.max_bytes:
+        raise BodyTooLarge(f"this body must be at most {apart.max_bytes} bytes, got {len(body)}", field="body")
+    return await asyncio.get_running_loop().run_in_executor(_READER, _read, body, cls, apart, read_small)
+
+
+def _read(body: bytes, cls: type[T], apart: Apart | None, read_small: ReadSmall) -> T:
+    document = _decoded(body, MAX_VALUES if apart is None else apart.max_values)
+    if apart is None or not isinstance(document, dict) or not isinstance(document.get(apart.key), apart.kind):
+        return _small(document, cls, read_small)
+    much = document[apart.key]
+    rest: Any = _small({**document, apart.key: apart.kind()}, cls, read_small)
+    if apart.element is not None:
+        apart.check_count(len(much))
+        much = [_element(apart, index, one, read_small) for index, one in enumerate(much)]
+    whole: T = replace(rest, **{apart.key: much})
+    return whole
+
+
+def _decoded(body: bytes, max_values: float) -> Any:
+    if body.count(b",") + body.count(b"[") + body.count(b"{") > max_values:
+        raise InvalidArgument(
+            f"a body must hold at most {max_values} values; many poses of a job are sent in base64, or over gRPC",
+            field="body",
+        )
+    if b"0" * _MAX_DIGITS in body.translate(_DIGITS):
+        raise InvalidArgument(f"a number must have less than {_MAX_DIGITS} digits", field="body")
+    try:
+        return json.loads(body)
+    except RecursionError:
+        raise InvalidArgument("this must be JSON: it nests too deeply") from None
+    except ValueError as error:
+        raise InvalidArgument(f"this must be JSON: {error}") from None
+
+
+def _small(value: Any, cls: type[T], read_small: ReadSmall) -> T:
+    if not _is_small(value, _SMALL_VALUES):
+        raise InvalidArgument(f"the body must hold at most {_SMALL_VALUES} values beside its poses", field="body")
+    read: T = read_small(json.dumps(value), cls)
+    return read
+
+
+def _element(apart: Apart, index: int, value: Any, read_small: ReadSmall) -> Any:
+    path = f"{apart.key}[{index}]"
+    if not _is_small(value, _ELEMENT_VALUES):
+        raise apart.error(f"{path} must hold at most {_ELEMENT_VALUES} values", field=path)
+    try:
+        return read_small(json.dumps(value), apart.element)
+    except UltragrayError as error:
+        raise error_under(path, error, apart.error) from None
+
+
+def _is_small(value: Any, most: int) -> bool:
+    """Whether a value holds at most `most` others, and no long text."""
+    waiting, values, characters = [value], 0, 0
+    while waiting and values <= most and characters <= INLINE_BYTES:
+        one = waiting.pop()
+        values += 1
+        if isinstance(one, str):
+            characters += len(one)
+        elif isinstance(one, dict):
+            waiting += (*one, *one.values())
+        elif isinstance(one, list):
+            waiting += one
+    return not waiting and values <= most and characters <= INLINE_BYTES
+
+
+# JSON bodies, read as the classes of the contract.
+
+
+@cache
+def adapter_of(cls: Any) -> TypeAdapter[Any]:
+    """The reader and writer of a class's JSON."""
+    return TypeAdapter(cls)
+
+
+def body_schema(cls: Any, examples: dict[str, Any] | None = None) -> dict[str, Any]:
+    """The part of the OpenAPI document about a body that a route reads by itself."""
+    content: dict[str, Any] = {"schema": {"$ref": f"#/components/schemas/{cls.__name__}"}}
+    if examples is not None:
+        content["examples"] = examples
+    return {"requestBody": {"required": True, "content": {"application/json": content}}}
+
+
+async def read_json_body(request: Request, cls: type[T], apart: Apart | None = None) -> T:
+    """The body, checked; `apart` says which part of it may be large.
+
+    Raises UnsupportedMediaType, BodyTooLarge, InvalidArgument and what the class raises.
+    """
+    content_type = request.headers.get("content-type", "application/json")
+    media_type = content_type.partition(";")[0].strip().lower()
+    if media_type != "application/json" and not media_type.endswith("+json"):
+        raise UnsupportedMediaType(f"Content-Type must be application/json, got {content_type!r}", field="Content-Type")
+    if request.headers.get("content-encoding", "identity").lower() != "identity":
+        raise UnsupportedMediaType("the body must not be compressed", field="Content-Encoding")
+    body = await request.body()
+    return read_json(body, cls) if len(body) <= INLINE_BYTES else await read_large(body, cls, apart, read_json)
+
+
+def read_json(text: str | bytes, cls: type[T]) -> T:
+    """The value of a JSON text. Raises InvalidArgument, and what the class raises."""
+    try:
+        kind: Any = cls
+        value: T = adapter_of(kind).validate_json(text)
+    except ValidationError as error:
+        raise invalid_argument(error.errors(include_url=False)[0], cls) from None
+    return value
+
+
+# Bodies of HTTP and messages over a WebSocket: the contract's settings, with poses and the times of a request.
+
+
+_POSE_BYTES = 1024  # with room for indentation
+
+
+def _many_poses(limit: int) -> Apart:
+    """The part of a body that may be large."""
+    return Apart(
+        "poses",
+        list,
+        Pose,
+        InvalidPose,
+        lambda count: check_pose_count(count, limit),
+        max_bytes=INLINE_BYTES + limit * _POSE_BYTES,
+        max_values=math.inf,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class AssessBody(Contract):
+    """The poses to assess."""
+
+    poses: list[Pose] = described("At least one.", factory=list, error=InvalidPose)
+    probe: Probe | None = described("Whose poses they are. Default: the scene's own.", None)
+    registration: str | None = registration_field()
+
+    many_poses = staticmethod(_many_poses)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LocalizeBody(LocalizationSettings):
+    """A real frame, and about where it was taken."""
+
+    image: str = described(
+        "The frame in base64, rows along depth, columns across scan lines, not scan-converted: a PNG file, or, with "
+        "image_height and image_width, grey pixels of 8 bits, row by row.",
+    )
+    image_height: int | None = described("Of grey pixels.", None, low=1, high=MAX_IMAGE_SIDE, error=InvalidImageSize)
+    image_width: int | None = described("Of grey pixels.", None, low=1, high=MAX_IMAGE_SIDE, error=InvalidImageSize)
+    start: Pose = described("A pose that is about right.", error=InvalidPose)
+    registration: str | None = registration_field()
+    timeout_ms: float | None = described(
+        "A search that has not ended by then is given up (504).", None, above=0, high=MAX_TIMEOUT_MS
+    )
+
+
+LARGE_IMAGE = Apart("image", str)
+
+
+@dataclass(frozen=True, kw_only=True)
+class RenderBody(FrameSettings):
+    """What to render. Exactly one of `pose` and `poses`; all else has a default from the scene."""
+
+    pose: Pose | None = described("One pose; rendered before frames of `poses` that wait.", None, error=InvalidPose)
+    poses: list[Pose] | None = described("Many poses, answered together, in order.", None, error=InvalidPose)
+    registration: str | None = registration_field()
+    dtype: Literal["uint8", "float32"] | None = described(
+        "Of application/octet-stream; a dtype in the Accept header goes first. Default: uint8.", None
+    )
+    timeout_ms: float | None = described(
+        "A frame that is not ready after this time is given up (504).", None, above=0, high=MAX_TIMEOUT_MS
+    )
+    max_queue_ms: float | None = described(
+        "A request that cannot begin within this time is refused at once (429, QUEUE_FULL); null: see "
+        "ULTRAGRAY_MAX_QUEUE_MS, which holds all the same.",
+        None,
+        above=0,
+        high=MAX_TIMEOUT_MS,
+    )
+
+    many_poses = staticmethod(_many_poses)
+
+    def poses_by_path(self, limit: int) -> Sequence[tuple[str, Pose]]:
+        """The poses, each with its path in the body. Raises InvalidArgument, TooManyPoses."""
+        if (self.pose is None) == (self.poses is None):
+            raise InvalidArgument("the body must hold exactly one of pose and poses", field="pose")
+        if self.pose is not None:
+            return [("pose", self.pose)]
+        poses = self.poses or []
+        check_pose_count(len(poses), limit)
+        return [(f"poses[{index}]", pose) for index, pose in enumerate(poses)]
+
+
+@dataclass(frozen=True, kw_only=True)
+class StreamMessage(Contract):
+    """One message of the client of a WebSocket."""
+
+    sequence: int = described("Any number; the answer to this message carries it.", 0, low=0, high=2**64 - 1)
+    settings: RenderSettings | None = described("Replaces all settings, from this pose on.", None)
+    pose: Pose | None = described("null: only the settings change.", None, error=InvalidPose)
+    mode: StreamMode | None = described("Of the stream; read from its first message. Default: ordered.", None)
+    timeout_ms: float | None = described("Later this pose is not rendered.", None, above=0, high=MAX_TIMEOUT_MS)
+    client_time_ms: float | None = described("Any number; the answer carries it.", None)
+    window: int | None = described(
+        "Of a latest stream, read from its first message: answers that may wait to be acknowledged. Default: the "
+        "client acknowledges none.",
+        None,
+        low=1,
+        high=MAX_WINDOW,
+    )
+    acknowledged: int | None = described(
+        "Sequence of the newest answer that the client has taken; it and those before it leave room for others.",
+        None,
+        low=0,
+        high=2**64 - 1,
+    )
+
+
+@dataclass(frozen=True, kw_only=True)
+class RegistrationBody(Registration):
+    """A registration, and the scene that its poses lead into."""
+
+    scene: str = described("Its name.")
+
+
+def _body_of(kind: str) -> type[Any]:
+    """The class of a specification's JSON, which `kind` stands beside: poses are lists."""
+    cls = Specification.member(kind)
+    given = [(item, annotation) for item, annotation in annotated_fields(cls) if item.name != "kind"]
+    described_fields: list[tuple[str, Any, Any]] = [
+        (item.name, _without_arrays(annotation), _again(item)) for item, annotation in given
+    ]
+    name = f"{kind.title()}Specification"
+    return make_dataclass(name, described_fields, namespace={"__doc__": cls.__doc__}, kw_only=True)
+
+
+def _again(item: Field[Any]) -> Any:
+    return field(default=item.default, default_factory=item.default_factory, metadata=item.metadata)
+
+
+def _without_arrays(annotation: Any) -> Any:
+    """An annotation without the arrays that it allows beside lists."""
+    kinds = [one for one in get_args(annotation) if getattr(one, "__origin__", None) is not np.ndarray]
+    if len(kinds) == len(get_args(annotation)):
+        return annotation
+    first, *others = kinds
+    for other in others:
+        first = first | other
+    return first
+
+
+SPECIFICATION = Apart("specification", dict)  # of a job: there may be many poses in it
+SPECIFICATIONS = tuple(map(_body_of, KINDS))
+
+
+@dataclass(frozen=True, kw_only=True)
+class JobBody(Contract):
+    """A job to be done in the background."""
+
+    kind: str = described("What is to be done.", choices=KINDS)
+    specification: dict[str, Any] = field(
+        metadata={
+            "description": f"{' or '.join(one.__name__ for one in SPECIFICATIONS)}, by kind. Poses may also be "
+            "one text: float64, row by row, the low byte first, in base64.",
+            "json_schema_extra": {
+                "anyOf": [{"$ref": f"#/components/schemas/{one.__name__}"} for one in SPECIFICATIONS]
+            },
+        }
+    )
+    request_id: str | None = described(
+        "Chosen by the client, 1 to 128 characters: sent again, it gives the same job.", None
+    )
+    priority: int = described("Higher ones go first.", 0, low=-MAX_PRIORITY, high=MAX_PRIORITY)
+    private: bool = described("Whether others may not see it, nor the scene that it makes.", False)
+
+
+# The files of a multipart/form-data body, as they come.
+
+
+class FileParts:
+    """Turns blocks of the body into the names and the bytes of its files."""
+
+    def __init__(self, content_type: str) -> None:
+        """Raises InvalidArgument for a Content-Type without a boundary."""
+        _, parameters = parse_options_header(content_type)
+        boundary = parameters.get(b"boundary", b"")
+        self._events: list[str | bytes] = []
+        self._header_name, self._header_value = bytearray(), bytearray()
+        self._disposition = b""
+        self._complete = False
+        try:
+            self._parser = MultipartParser(
+                boundary,
+                {
+                    "on_part_begin": self._begin_part,
+                    "on_header_field": self._take_header_name,
+                    "on_header_value": self._take_header_value,
+                    "on_header_end": self._end_header,
+                    "on_headers_finished": self._end_headers,
+                    "on_part_data": self._take_data,
+                    "on_end": self._end,
+                },
+            )
+        except FormParserError as error:
+            raise InvalidArgument(f"Content-Type has no boundary that can be used: {error}") from error
+        if not boundary:
+            raise InvalidArgument("Content-Type multipart/form-data must have a boundary", field="Content-Type")
+
+    def feed(self, block: bytes) -> list[str | bytes]:
+        """The content of the block, in order: the name of each file (str), then its bytes.
+
+        Raises InvalidArgument for a damaged body and for a part that is no file.
+        """
+        try:
+            self._parser.write(block)
+        except FormParserError as error:
+            raise InvalidArgument(f"the body is no multipart/form-data: {error}", field="body") from error
+        events, self._events = self._events, []
+        return events
+
+    def finish(self) -> None:
+        """Raises InvalidArgument where the body ended too early."""
+        if not self._complete:
+            raise InvalidArgument("the body is truncated: its last boundary is missing", field="body")
+
+    def _begin_part(self) -> None:
+        self._disposition = b""
+
+    def _take_header_name(self, data: bytes, start: int, end: int) -> None:
+        self._header_name += data[start:end]
+
+    def _take_header_value(self, data: bytes, start: int, end: int) -> None:
+        self._header_value += data[start:end]
+
+    def _end_header(self) -> None:
+        if self._header_name.lower() == b"content-disposition":
+            self._disposition = bytes(self._header_value)
+        self._header_name.clear()
+        self._header_value.clear()
+
+    def _end_headers(self) -> None:
+        _, parameters = parse_options_header(self._disposition)
+        name = parameters.get(b"filename")
+        if name is None:
+            field = parameters.get(b"name", b"").decode(errors="replace")[:80]
+            raise InvalidArgument(
+                f"each part must be a file with a filename, {field!r} is none (options are query parameters)",
+                field="body",
+            )
+        self._events.append(name.decode(errors="replace"))
+
+    def _take_data(self, data: bytes, start: int, end: int) -> None:
+        self._events.append(data[start:end])
+
+    def _end(self) -> None:
+        self._complete = True

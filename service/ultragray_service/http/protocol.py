@@ -1,0 +1,478 @@
+"""HTTP connections with bounds: on what is read before it is parsed, on time, and on requests that pile up."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import socket
+import ssl
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from functools import partial
+from typing import Any
+
+import uvicorn
+from starlette.types import ASGIApp
+from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
+from uvicorn.protocols.utils import ClientDisconnected
+from uvicorn.protocols.websockets.websockets_sansio_impl import WebSocketsSansIOProtocol
+from websockets.exceptions import InvalidHandshake, InvalidState
+from websockets.frames import Frame
+from websockets.http11 import Request
+
+from ultragray.errors import UltragrayError
+from ultragray_service.core.unread import hold_little
+from ultragray_service.errors import HeadersTooLarge, RequestMalformed, RequestTooSlow, TargetTooLong, statuses_of
+from ultragray_service.http.problems import problem_response
+from ultragray_service.listening import Acceptor, Connections, Patience, Place
+from ultragray_service.settings import Settings
+from ultragray_service.telemetry.logs import choose_request_id, request_id
+from ultragray_service.telemetry.metrics import Metrics
+from ultragray_service.tls.server import CertificateWatch
+
+HAND_OVER = "ultragray.hand_over"  # of an ASGI message with bytes: to return once the client has taken it
+_FRAGMENTS = 32  # of a message that is handed over
+_PINGS = 2
+_LOOK_EVERY_S = 0.25
+
+
+class PromptWebSocket(WebSocketsSansIOProtocol):
+    """A WebSocket that buffers next to nothing: whoever sends waits until the kernel has taken the whole message.
+
+    A message that is handed over waits longer, for pongs. Some libraries answer pings when the caller reads, which
+    suffices; others read ahead until so many fragments (Python's websockets: 16) wait for the caller, which every
+    message therefore has more than. Such a library may still read a ping that comes together with the message; it has
+    stopped when the next one comes.
+    """
+
+    _pong: asyncio.Future[None] | None = None
+    _ping = 0  # the number of the last one, which it carries
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(transport)
+        hold_little(transport)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        super().connection_lost(exc)
+        self._answered()
+
+    def handle_pong(self, event: Frame) -> None:
+        if bytes(event.data) == self._ping_payload:
+            self._answered()
+        else:
+            super().handle_pong(event)
+
+    async def send(self, message: Any) -> None:
+        is_handed_over = message.get(HAND_OVER, False)
+        try:
+            if not is_handed_over or "bytes" not in message:
+                await super().send(message)
+                await self.writable.wait()
+                return
+            self._send_fragments(message["bytes"])
+            await self.writable.wait()
+            for _ in range(_PINGS):
+                await self._be_answered()
+        except InvalidState:
+            raise ClientDisconnected from None
+
+    def _send_fragments(self, data: bytes) -> None:
+        step = -(-len(data) // _FRAGMENTS)
+        self.conn.send_binary(data[:step], fin=False)
+        for start in range(step, len(data), step):
+            self.conn.send_continuation(data[start : start + step], fin=start + step >= len(data))
+        self._write()
+
+    async def _be_answered(self) -> None:
+        """Waits for the pong of a new ping, or for the end of the connection.
+
+        Not while nobody reads on, such as a stream with too many refusals to send: the pong is behind what is unread.
+        """
+        self._pong = self.loop.create_future()
+        self._ping += 1
+        self.conn.send_ping(self._ping_payload)
+        self._write()
+        while not self._pong.done():
+            was_paused = self.read_paused
+            await asyncio.wait({self._pong}, timeout=_LOOK_EVERY_S)
+            if was_paused and self.read_paused:
+                return
+
+    @property
+    def _ping_payload(self) -> bytes:
+        return b"taken %d" % self._ping
+
+    def _answered(self) -> None:
+        if self._pong is not None and not self._pong.done():
+            self._pong.set_result(None)
+
+    def _write(self) -> None:
+        self.transport.write(b"".join(self.conn.data_to_send()))
+
+
+# HTTP connections with bounds: on what is read before it is parsed, on time, and on requests that pile up.
+
+
+MAX_PIPELINED = 32
+MAX_TARGET_BYTES = 16 * 1024
+_MAX_UNWANTED_BYTES = 2**20  # of a body whose request was answered already: a longer one costs the connection
+_LINGER_S = 1.0  # in which a client that still sends can read its answer
+
+
+@dataclass(frozen=True)
+class HttpLimits:
+    """The bounds of each connection. `on_refused` is told of each refusal."""
+
+    max_header_bytes: int
+    max_headers: int
+    header_timeout_s: float
+    min_bytes_per_s: float
+    transfer_patience_s: float
+    on_refused: Callable[[UltragrayError], None]
+
+
+class BoundedHttp(HttpToolsProtocol):
+    """One connection. `look` must be called every second or so.
+
+    A head is counted while it comes, and nothing beyond the limit reaches the parser. The same count bounds whatever
+    else brings neither a head to its end nor a body on. Trailers are bounded like a head, and thrown away.
+    """
+
+    def __init__(self, *arguments: Any, limits: HttpLimits, place: Place, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self.ws_protocol_class: Any = partial(_BoundedWebSocket, limits=limits, place=place)
+        self._limits = limits
+        self._place = place
+        self._in_head = True
+        self._head_since: float | None = self.loop.time()
+        self._looked_at = self.loop.time()
+        self._idle_bytes = 0  # since the request came on
+        self._body_bytes = 0  # since the last look
+        self._keep_alive = False  # once the body is whole
+        self._trailers = self._trailer_bytes = 0
+        self._refused_for: UltragrayError | None = None
+        self._is_over = False
+        self._receiving = Patience(limits.min_bytes_per_s, limits.transfer_patience_s)
+        self._sending = _Sending(limits)
+
+    def connection_made(self, transport: asyncio.BaseTransport) -> None:
+        super().connection_made(_Closing(transport, self._linger))  # type: ignore[arg-type]  # it has all that a transport has
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._place.leave()
+        super().connection_lost(exc)
+
+    def data_received(self, data: bytes) -> None:
+        if self._in_head:
+            if self._head_since is None:
+                self._head_since = self.loop.time()
+            room = self._limits.max_header_bytes - self._idle_bytes
+            if len(data) > room:
+                self._take(data[:room])
+                if self._in_head and not self._is_over:
+                    self._refuse(self._head_too_large())
+                data = data[room:]
+        self._take(data)
+
+    def _take(self, data: bytes) -> None:
+        if self._is_over or self.transport.is_closing():
+            return
+        self._idle_bytes += len(data)
+        super().data_received(data)
+        if self._idle_bytes > self._limits.max_header_bytes and not self._is_over:
+            self._refuse(self._head_too_large())
+
+    def on_message_begin(self) -> None:
+        if self._head_since is None:  # it came with the end of the request before
+            self._head_since = self.loop.time()
+        super().on_message_begin()
+
+    def on_url(self, url: bytes) -> None:
+        super().on_url(url)
+        if len(self.url) > MAX_TARGET_BYTES:
+            self._stop_parsing(TargetTooLong(f"the target of a request may have at most {MAX_TARGET_BYTES} bytes"))
+
+    def on_header(self, name: bytes, value: bytes) -> None:
+        if self._in_head:
+            super().on_header(name, value)
+            return
+        self._trailers += 1
+        self._trailer_bytes += len(name) + len(value)
+        if self._trailers > self._limits.max_headers or self._trailer_bytes > self._limits.max_header_bytes:
+            self._stop_parsing(self._head_too_large())
+
+    def on_headers_complete(self) -> None:
+        if len(self.headers) > self._limits.max_headers:
+            self._stop_parsing(self._head_too_large())
+        self._in_head = False
+        self._head_since = None
+        self._idle_bytes = self._trailers = self._trailer_bytes = 0
+        self._receiving.renew()
+        earlier = self.cycle
+        super().on_headers_complete()
+        if self.cycle is not earlier:  # no upgrade
+            self._keep_alive = self.cycle.keep_alive
+            self.cycle.keep_alive = self._keep_alive and not _may_be_long(self.headers)
+        if len(self.pipeline) > MAX_PIPELINED:
+            self._stop_parsing(RequestMalformed(f"at most {MAX_PIPELINED} requests may wait for their turn"))
+
+    def on_body(self, body: bytes) -> None:
+        self._idle_bytes = 0
+        self._body_bytes += len(body)
+        super().on_body(body)
+
+    def on_message_complete(self) -> None:
+        self._in_head = True
+        self._idle_bytes = 0
+        if self.cycle is not None:
+            self.cycle.keep_alive = self._keep_alive
+        super().on_message_complete()
+
+    def _stop_parsing(self, error: UltragrayError) -> None:
+        self._refused_for = error
+        raise ValueError  # the parser hands over to `send_400_response`
+
+    def send_400_response(self, msg: str) -> None:
+        """Answers where the parser stopped."""
+        self._refuse(self._refused_for or RequestMalformed("this is no HTTP request that can be read"))
+
+    def look(self, now: float) -> None:
+        """Cuts the connection where the client has been too slow."""
+        elapsed_s, self._looked_at = now - self._looked_at, now
+        body_bytes, self._body_bytes = self._body_bytes, 0
+        limits = self._limits
+        if self._sending.is_stalled(self.transport, elapsed_s):
+            self.transport.abort()
+        elif self._is_over:
+            pass
+        elif self._in_head:
+            if self._head_since is not None and now - self._head_since > limits.header_timeout_s:
+                self._refuse(RequestTooSlow(f"the head of a request must come within {limits.header_timeout_s:g} s"))
+        elif not self.flow.read_paused and self._receiving.is_over(body_bytes, elapsed_s):
+            self._refuse(RequestTooSlow(f"a body must come at {limits.min_bytes_per_s:g} bytes a second or faster"))
+
+    def _head_too_large(self) -> HeadersTooLarge:
+        limits = self._limits
+        return HeadersTooLarge(
+            f"the head of a request may have at most {limits.max_header_bytes} bytes and {limits.max_headers} headers"
+        )
+
+    def _refuse(self, error: UltragrayError) -> None:
+        """Says why, where no other answer is due, and closes. What still comes is thrown away."""
+        self._unset_keepalive_if_required()
+        cycle = self.cycle
+        is_due = cycle is not None and not cycle.response_complete
+        if self._in_head:
+            has_begun = self.scope is not None or self._idle_bytes > 0
+            can_answer = has_begun and not is_due
+        else:
+            can_answer = is_due and cycle.more_body and not cycle.response_started
+        if is_due:
+            cycle.disconnected = True
+            cycle.message_event.set()
+        self.pipeline.clear()
+        if can_answer:
+            self._limits.on_refused(error)
+            self.transport.write(refusal_bytes(error, self.server_state.default_headers))
+        self._end()
+
+    def _linger(self) -> bool:
+        """Whether the connection closes only after a moment: its client, still sending, may read the answer first."""
+        if self._in_head:
+            return False
+        if not self._is_over:
+            self._end()
+        return True
+
+    def _end(self) -> None:
+        """Says that nothing more is sent, throws away what still comes, and closes a moment later."""
+        self._is_over = True
+        self.flow.resume_reading()
+        if self.transport.can_write_eof() and not self.transport.is_closing():
+            self.transport.write_eof()
+        self.loop.call_later(_LINGER_S, self.transport.abort)
+
+
+class _Closing:
+    """A transport that drops what is written once it closes: the answers under way hear of that a moment later.
+
+    It closes later where `linger` says so.
+    """
+
+    def __init__(self, transport: Any, linger: Callable[[], bool]) -> None:
+        self._transport = transport
+        self._linger = linger
+        self._has_ended = False
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._transport, name)
+
+    def write(self, data: bytes) -> None:
+        if not self._has_ended and not self._transport.is_closing():
+            self._transport.write(data)
+
+    def is_closing(self) -> bool:
+        return self._has_ended or bool(self._transport.is_closing())
+
+    def close(self) -> None:
+        if not self._linger():
+            self._transport.close()
+
+    def write_eof(self) -> None:
+        self._has_ended = True
+        self._transport.write_eof()
+
+
+class _BoundedWebSocket(PromptWebSocket):
+    """What a connection becomes by an upgrade."""
+
+    def __init__(self, *arguments: Any, limits: HttpLimits, place: Place, **options: Any) -> None:
+        super().__init__(*arguments, **options)
+        self._place = place
+        self._limits = limits
+        self._looked_at = self.loop.time()
+        self._sending = _Sending(limits)
+
+    def connection_lost(self, exc: Exception | None) -> None:
+        self._place.leave()
+        super().connection_lost(exc)
+
+    def handle_connect(self, event: Request) -> None:
+        try:
+            self.conn.process_request(event)
+        except InvalidHandshake:
+            error = RequestMalformed("the headers are no handshake of a WebSocket of version 13 (RFC 6455)")
+            self.handshake_initiated = self.handshake_complete = self.close_sent = True
+            self._limits.on_refused(error)
+            self.transport.write(refusal_bytes(error, self.default_headers))
+            self.transport.close()
+        else:
+            super().handle_connect(event)
+
+    def look(self, now: float) -> None:
+        """Cuts the connection where the client does not take what is sent."""
+        elapsed_s, self._looked_at = now - self._looked_at, now
+        if self._sending.is_stalled(self.transport, elapsed_s):
+            self.transport.abort()
+
+
+class _Sending:
+    """Whether a client takes what is sent."""
+
+    def __init__(self, limits: HttpLimits) -> None:
+        self._patience = Patience(limits.min_bytes_per_s, limits.transfer_patience_s)
+        self._waiting_bytes = 0
+
+    def is_stalled(self, transport: asyncio.Transport, elapsed_s: float) -> bool:
+        """Whether it has been too slow, `elapsed_s` after the last question."""
+        before, self._waiting_bytes = self._waiting_bytes, transport.get_write_buffer_size()
+        if not before or not self._waiting_bytes or self._waiting_bytes > before:  # more comes when there is room only
+            self._patience.renew()
+            return False
+        return self._patience.is_over(before - self._waiting_bytes, elapsed_s)
+
+
+def _may_be_long(headers: list[tuple[bytes, bytes]]) -> bool:
+    """Whether the body after these headers may be longer than what is worth reading for its connection alone."""
+    return any(
+        name == b"transfer-encoding" or (name == b"content-length" and int(value) > _MAX_UNWANTED_BYTES)
+        for name, value in headers
+    )
+
+
+def refusal_bytes(error: UltragrayError, default_headers: list[tuple[bytes, bytes]]) -> bytes:
+    """The answer to a request that never reached the application."""
+    token = request_id.set(choose_request_id(None))
+    try:
+        response = problem_response(error, {"Connection": "close", "X-Request-Id": request_id.get()})
+    finally:
+        request_id.reset(token)
+    headers = [*default_headers, *response.raw_headers]
+    lines = [STATUS_LINE[response.status_code], *(b"%s: %s\r\n" % header for header in headers), b"\r\n"]
+    return b"".join([*lines, bytes(response.body)])
+
+
+# uvicorn, with connections of ours.
+
+
+MAX_STREAM_MESSAGE_BYTES = 2**16  # of a client, on a WebSocket
+_TICKS_PER_LOOK = 10  # of 0.1 s
+
+
+class HttpServer(uvicorn.Server):
+    """Serves an application. Has no signal handlers: one place decides when all servers stop."""
+
+    def __init__(
+        self, app: ASGIApp, settings: Settings, metrics: Metrics, certificates: CertificateWatch | None, flush_s: float
+    ) -> None:
+        """`flush_s`: how long the last answers may take after a stop."""
+        super().__init__(
+            uvicorn.Config(
+                app,
+                http=BoundedHttp,
+                ws=PromptWebSocket,
+                ws_max_size=MAX_STREAM_MESSAGE_BYTES,
+                ws_per_message_deflate=False,  # speckle does not shrink
+                lifespan="off",
+                log_config=None,
+                access_log=False,
+                server_header=False,
+                proxy_headers=False,  # anybody on this machine could write another's address there
+                timeout_keep_alive=int(settings.idle_timeout_s),
+                timeout_graceful_shutdown=int(flush_s),
+            )
+        )
+        self._settings = settings
+        self._metrics = metrics
+        self._certificates = certificates
+        self._limits = HttpLimits(
+            max_header_bytes=settings.max_header_bytes,
+            max_headers=settings.max_headers,
+            header_timeout_s=settings.header_timeout_s,
+            min_bytes_per_s=settings.min_bytes_per_s,
+            transfer_patience_s=settings.transfer_patience_s,
+            on_refused=self._count,
+        )
+
+    async def startup(self, sockets: list[socket.socket] | None = None) -> None:
+        """Begins to accept. uvicorn's own would not know whom it accepts."""
+        connections = Connections(self._settings.max_connections, self._settings.max_connections_per_address)
+        servers: list[Any] = [
+            Acceptor(
+                listener,
+                connections,
+                self._protocol,
+                refusal=self._refusal,
+                send_patience_s=self._settings.transfer_patience_s,
+                tls=self._tls,
+            )
+            for listener in sockets or ()
+        ]
+        self.servers = servers
+        self.started = True
+
+    async def on_tick(self, counter: int) -> bool:
+        """Every 0.1 s."""
+        if counter % _TICKS_PER_LOOK == 0:
+            now = asyncio.get_running_loop().time()
+            connections: set[Any] = self.server_state.connections
+            for connection in tuple(connections):
+                connection.look(now)
+        return await super().on_tick(counter)
+
+    @contextlib.contextmanager
+    def capture_signals(self) -> Iterator[None]:
+        yield
+
+    def _tls(self) -> ssl.SSLContext | None:
+        return None if self._certificates is None else self._certificates.current.http_context
+
+    def _protocol(self, place: Place) -> BoundedHttp:
+        return BoundedHttp(self.config, self.server_state, {}, limits=self._limits, place=place)
+
+    def _refusal(self, error: UltragrayError) -> bytes:
+        self._count(error)
+        return refusal_bytes(error, self.server_state.default_headers)
+
+    def _count(self, error: UltragrayError) -> None:
+        self._metrics.count_request("http", "refused", str(statuses_of(error).http), 0.0)

@@ -1,1 +1,0 @@
-"""Requests as HTTP brings them: accepted types, JSON bodies, uploads in parts."""

@@ -1,1 +1,0 @@
-"""Where probes see, and how robots lie to scenes."""

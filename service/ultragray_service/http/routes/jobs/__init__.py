@@ -1,1 +1,0 @@
-"""Jobs, trainings, and the workers that do them."""

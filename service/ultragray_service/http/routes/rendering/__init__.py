@@ -1,1 +1,0 @@
-"""Frames and slices of scenes, one by one."""

@@ -1,0 +1,472 @@
+"""Commands of PLUS over OpenIGTLink: a client sets its scanner and asks how it is set."""
+
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any
+from xml.etree import ElementTree
+
+from ultragray.contract import from_dict, shown, to_dict, under
+from ultragray.errors import InvalidArgument, InvalidProbe, UltragrayError
+from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.geometry.registration import Registration
+from ultragray.rendering.display import AS_RENDERED, FRAME_RANGE_DB
+from ultragray.rendering.settings import FrameSettings
+from ultragray.rendering.tools import MAX_TOOLS, Tool
+from ultragray_service.core.registrations import Registrations
+from ultragray_service.errors import IgtlMessageInvalid
+from ultragray_service.igtl.messages import DEVICE_NAME_BYTES, Message, pack_text, unpack_text
+from ultragray_service.igtl.routes import SceneChooser
+
+_NAME_BYTES = 128
+_COMMAND = struct.Struct(f">I{_NAME_BYTES}sHI")
+_STRING = struct.Struct(">HH")
+_UTF8 = 106  # the number of the character set at IANA; ASCII (3) is a part of it
+_MOST_STRING_BYTES = 0xFFFF
+
+
+@dataclass(frozen=True)
+class Command:
+    """A command or its reply. `name` may be empty where `text`, which is XML, has it."""
+
+    number: int
+    name: str
+    text: str
+
+
+def unpack_command(content: bytes) -> Command:
+    """The command of a COMMAND, the reply of an RTS_COMMAND. Raises IgtlMessageInvalid."""
+    if len(content) < _COMMAND.size:
+        raise IgtlMessageInvalid(f"COMMAND must hold {_COMMAND.size} bytes or more, got {len(content)}", field="body")
+    number, name, _, length = _COMMAND.unpack_from(content)
+    return Command(number, unpack_text(name), _text("COMMAND", content[_COMMAND.size :], length))
+
+
+def pack_command(command: Command) -> bytes:
+    """The content of a COMMAND or an RTS_COMMAND; the name is cut at 127 bytes."""
+    text = command.text.encode()
+    return _COMMAND.pack(command.number, pack_text(command.name, _NAME_BYTES - 1), _UTF8, len(text)) + text
+
+
+def unpack_string(content: bytes) -> str:
+    """The text of a STRING. Raises IgtlMessageInvalid."""
+    if len(content) < _STRING.size:
+        raise IgtlMessageInvalid(f"STRING must hold {_STRING.size} bytes or more, got {len(content)}", field="body")
+    _, length = _STRING.unpack_from(content)
+    return _text("STRING", content[_STRING.size :], length)
+
+
+def pack_string(text: str) -> bytes:
+    """The content of a STRING; the text is cut at 65,535 bytes."""
+    encoded = pack_text(text, _MOST_STRING_BYTES)
+    return _STRING.pack(_UTF8, len(encoded)) + encoded
+
+
+def _text(type_name: str, data: bytes, length: int) -> str:
+    if len(data) != length:
+        raise IgtlMessageInvalid(f"{type_name}: a text of {length} bytes must follow, got {len(data)}", field="body")
+    try:
+        return data.decode().rstrip("\0")
+    except UnicodeDecodeError:
+        raise IgtlMessageInvalid(f"{type_name}: its text must be ASCII or UTF-8", field="body") from None
+
+
+# The XML of commands and replies, as PLUS has it.
+#
+# <Command Name="SetUsParameter"><Parameter Name="DepthMm" Value="40"/></Command> <CommandReply Name="SetUsParameter"
+# Status="SUCCESS" Message="…"><Parameter Name="DepthMm" Success="true"/>…
+
+
+MAX_COMMAND_BYTES = 4096
+MAX_PARAMETERS = 32  # of one command
+
+
+@dataclass(frozen=True)
+class Request:
+    """A command: its name, and its parameters with the values that they are given."""
+
+    name: str
+    parameters: Mapping[str, str | None]
+
+
+@dataclass(frozen=True)
+class Outcome:
+    """The end of one parameter: an error, or else the value that was asked for."""
+
+    parameter: str
+    error: str = ""
+    value: str | None = None
+
+
+@dataclass(frozen=True)
+class Reply:
+    """The reply to a command. It failed where it has an error, or where a parameter has one."""
+
+    name: str
+    message: str = ""
+    error: str = ""
+    outcomes: tuple[Outcome, ...] = ()
+
+    @property
+    def errors(self) -> str:
+        """Every error, in one text; empty: success."""
+        return "; ".join(filter(None, [self.error, *(outcome.error for outcome in self.outcomes)]))
+
+    @property
+    def status(self) -> str:
+        return "FAIL" if self.errors else "SUCCESS"
+
+    @property
+    def xml(self) -> str:
+        root = ElementTree.Element("CommandReply", Name=_plain(self.name), Status=self.status)
+        root.set("Message", _plain(self.errors or self.message))
+        if self.errors:
+            root.set("Error", _plain(self.errors))
+        for outcome in self.outcomes:
+            found = ElementTree.SubElement(root, "Parameter", Name=outcome.parameter)
+            found.set("Success", "false" if outcome.error else "true")
+            if outcome.value is not None:
+                found.set("Value", _plain(outcome.value))
+        return ElementTree.tostring(root, encoding="unicode")
+
+    @property
+    def metadata(self) -> dict[str, str]:
+        """The reply as messages of version 2 carry it beside the XML."""
+        found = {one.parameter: "FAIL" if one.error else one.value or "SUCCESS" for one in self.outcomes}
+        return {**found, "Status": self.status, **({"Error": self.errors} if self.errors else {})}
+
+
+def read_request(name: str, text: str) -> Request:
+    """The command in an XML text. `name` is its name as the message has it; empty: the text has it.
+
+    Raises IgtlMessageInvalid for a text that is none. It may define no entities, which could grow without bounds.
+    """
+    root = _root(text)
+    own_name = root.get("Name", "")
+    if own_name and name and own_name.casefold() != name.casefold():
+        raise _invalid(f"the message calls the command {shown(name)}, its XML {shown(own_name)}")
+    if len(root) > MAX_PARAMETERS:
+        raise _invalid(f"a command may have at most {MAX_PARAMETERS} parameters, got {len(root)}")
+    parameters: dict[str, str | None] = {}
+    for element in root:
+        parameter = element.get("Name", "")
+        if element.tag != "Parameter" or not parameter:
+            raise _invalid(f'Command must hold elements <Parameter Name="…"/>, got {shown(element.tag)}')
+        if parameter in parameters:
+            raise _invalid(f"each parameter may be named once, got {shown(parameter)} twice")
+        parameters[parameter] = element.get("Value")
+    return Request(name or own_name, parameters)
+
+
+def _root(text: str) -> ElementTree.Element:
+    size = len(text.encode())
+    if size > MAX_COMMAND_BYTES:
+        raise _invalid(f"a command may have at most {MAX_COMMAND_BYTES} bytes, got {size}")
+    if "<!DOCTYPE" in text:
+        raise _invalid("a command has no DOCTYPE")
+    try:
+        root = ElementTree.fromstring(text)
+    except (ElementTree.ParseError, ValueError) as error:
+        raise _invalid(f'a command must be XML such as <Command Name="GetUsParameter">…</Command>: {error}') from None
+    if root.tag != "Command":
+        raise _invalid(f"the XML of a command must be an element Command, got {shown(root.tag)}")
+    return root
+
+
+def _invalid(detail: str) -> IgtlMessageInvalid:
+    return IgtlMessageInvalid(detail, field="body")
+
+
+def _plain(text: str) -> str:
+    """The text without characters that XML cannot hold."""
+    return "".join(one if one.isprintable() else "?" for one in text)
+
+
+# Tools in the frames of one connection: those that stay, and those that a device of the client moves.
+
+
+_DEVICE, _FRAME = "device", "frame"
+_EXAMPLE = '[{"kind": "needle", "tip_mm": [0, 0, 0], "hub_mm": [0, 0, -120], "device": "NeedleToReference"}]'
+
+
+@dataclass(frozen=True)
+class ClientTool:
+    """A tool as a client set it."""
+
+    tool: Tool
+    device: str | None  # that moves it, and whose frame its points are in; None: it stays
+
+
+@dataclass(frozen=True, eq=False)
+class ClientTools:
+    """The tools of a client, and the poses that its devices sent last."""
+
+    tools: tuple[ClientTool, ...] = ()
+    poses: Mapping[str, FloatArray] = field(default_factory=dict)  # [4, 4] mm, exact, by device
+
+    def are_moved_by(self, device: str) -> bool:
+        """Whether a device moves any of them."""
+        return any(one.device == device for one in self.tools)
+
+    def moved(self, device: str, pose: FloatArray) -> ClientTools:  # [4, 4] mm, exact
+        """The tools with a new pose of a device that moves some of them."""
+        return replace(self, poses={**self.poses, device: pose})
+
+    def placed(self, registration: Registration | None) -> tuple[Tool, ...]:
+        """The tools of a frame: those of a device in the scene, and none whose device has sent no pose yet.
+
+        `registration` leads from the frame that the poses of the devices lead to into the scene; None: it is the scene.
+        """
+        found = []
+        for one in self.tools:
+            if one.device is None:
+                found.append(one.tool)
+            elif (pose := self.poses.get(one.device)) is not None:
+                to_scene = pose if registration is None else registration.marker_to_scene(pose)
+                found.append(one.tool.moved(to_scene))
+        return tuple(found)
+
+
+def read_tools(text: str, before: ClientTools) -> ClientTools:
+    """The tools of a JSON text; devices that moved tools of `before` are where they were.
+
+    Raises InvalidArgument, naming the tool.
+    """
+    try:
+        documents = json.loads(text)
+    except (ValueError, RecursionError):
+        documents = None
+    if not isinstance(documents, list):
+        raise InvalidArgument(f"must be a list in JSON such as {_EXAMPLE}, got {shown(text)}")
+    if len(documents) > MAX_TOOLS:
+        raise InvalidArgument(f"must be at most {MAX_TOOLS} tools, got {len(documents)}")
+    tools = tuple(_read(number, one) for number, one in enumerate(documents))
+    devices = {one.device for one in tools}
+    return ClientTools(tools, {device: pose for device, pose in before.poses.items() if device in devices})
+
+
+def tools_text(tools: ClientTools) -> str:
+    """The tools as `read_tools` takes them."""
+    return json.dumps([_document(one) for one in tools.tools])
+
+
+def _read(number: int, document: Any) -> ClientTool:
+    with under(f"[{number}]"):
+        device = None
+        if isinstance(document, dict) and document.get(_DEVICE) is not None:
+            device = document[_DEVICE]
+            if not isinstance(device, str) or not 1 <= len(device.encode()) <= DEVICE_NAME_BYTES:
+                raise InvalidArgument(
+                    f"device must be the name of one, of 1 to {DEVICE_NAME_BYTES} bytes, got {shown(device)}",
+                    field=_DEVICE,
+                )
+            if _FRAME in document:
+                raise InvalidArgument("frame stands in place of device: the points are in the device's", field=_FRAME)
+            document = {name: value for name, value in document.items() if name != _DEVICE}
+        return ClientTool(from_dict(Tool, document), device)
+
+
+def _document(one: ClientTool) -> dict[str, Any]:
+    document: dict[str, Any] = to_dict(one.tool)
+    if one.device is None:
+        return document
+    return {**{name: value for name, value in document.items() if name != _FRAME}, _DEVICE: one.device}
+
+
+# The scanner of one connection: the settings of its frames under the names that PLUS has for them.
+
+
+_NO_GAIN_PERCENT = 50.0
+_DB_A_PERCENT = FRAME_RANGE_DB / 100.0
+_SCENE, _PROBE, _REGISTRATION, _TOOLS = "Scene", "Probe", "Registration", "Tools"
+
+
+@dataclass(frozen=True)
+class _DisplayParameter:
+    """A parameter that is a field of `Display`."""
+
+    field: str
+    read: Callable[[str], Any]
+    write: Callable[[Any], str]
+
+
+def _number(text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise InvalidArgument(f"must be a number, got {shown(text)}") from None
+
+
+def _gain_db(text: str) -> float:
+    percent = _number(text)
+    if not 0.0 <= percent <= 100.0:
+        raise InvalidArgument(f"must be a number from 0 to 100, got {shown(text)}")
+    return (percent - _NO_GAIN_PERCENT) * _DB_A_PERCENT
+
+
+def _number_text(number: float) -> str:
+    return f"{number:.10g}"
+
+
+_DISPLAY: Mapping[str, _DisplayParameter] = {
+    "DepthMm": _DisplayParameter("depth_mm", _number, _number_text),
+    "GainPercent": _DisplayParameter(
+        "gain_db", _gain_db, lambda db: _number_text(_NO_GAIN_PERCENT + db / _DB_A_PERCENT)
+    ),
+    "DynRangeDb": _DisplayParameter("dynamic_range_db", _number, _number_text),
+    "TimeGainCompensation": _DisplayParameter(
+        "tgc_db", lambda text: tuple(map(_number, text.split())), lambda gains: " ".join(map(_number_text, gains))
+    ),
+}
+PARAMETERS = (*_DISPLAY, _SCENE, _PROBE, _REGISTRATION, _TOOLS)
+
+
+@dataclass(frozen=True, eq=False)
+class Setup:
+    """All that the frames of a connection are rendered with; another object after each change."""
+
+    settings: FrameSettings
+    registration: str | None = None  # that leads the poses of devices into the scene
+    tools: ClientTools = field(default_factory=ClientTools)
+
+
+class Scanner:
+    """The setup of the frames of one connection, and the scene of its devices that name none."""
+
+    def __init__(self, scenes: SceneChooser, registrations: Registrations, setup: Setup) -> None:
+        self.setup = setup
+        self._scenes = scenes
+        self._registrations = registrations
+
+    def move(self, device: str, pose: FloatArray) -> None:  # [4, 4] mm, exact
+        """Takes the pose of a device that moves tools, for the frames to come."""
+        self.setup = replace(self.setup, tools=self.setup.tools.moved(device, pose))
+
+    async def set(self, parameter: str, value: str) -> None:
+        """Sets a parameter for the frames to come.
+
+        Raises InvalidArgument for an unknown parameter and for a value that cannot be, InvalidProbe, SceneNotFound,
+        RegistrationNotFound.
+        """
+        if parameter == _SCENE:
+            await self._scenes.prefer(value)
+        elif parameter == _REGISTRATION:
+            if value:
+                await self._scenes.prefer((await self._registrations.get(value)).scene)
+            self.setup = replace(self.setup, registration=value or None)
+        elif parameter == _TOOLS:
+            self.setup = replace(self.setup, tools=read_tools(value, self.setup.tools))
+        elif parameter == _PROBE:
+            self._set(probe=_probe(value))
+        else:
+            of_display = _of_display(parameter)
+            display = self.setup.settings.display or AS_RENDERED
+            self._set(display=replace(display, **{of_display.field: of_display.read(value)}))
+
+    def _set(self, **values: Any) -> None:
+        self.setup = replace(self.setup, settings=replace(self.setup.settings, **values))
+
+    async def get(self, parameter: str) -> str:
+        """The value of a parameter. Raises InvalidArgument for an unknown one and for one that is not set,
+        SceneNotFound where no scene is chosen."""
+        if parameter == _SCENE:
+            return await self._scenes.choose("")
+        if parameter == _REGISTRATION:
+            return self.setup.registration or ""
+        if parameter == _TOOLS:
+            return tools_text(self.setup.tools)
+        settings = self.setup.settings
+        write: Callable[[Any], str]
+        if parameter == _PROBE:
+            value, write = settings.probe, _probe_text
+        else:
+            of_display = _of_display(parameter)
+            value, write = getattr(settings.display or AS_RENDERED, of_display.field), of_display.write
+        if value is None:
+            raise InvalidArgument("is not set: frames have that of their scene")
+        return write(value)
+
+
+def _of_display(parameter: str) -> _DisplayParameter:
+    if parameter not in _DISPLAY:
+        raise InvalidArgument(f"must be one of {', '.join(PARAMETERS)}, got {shown(parameter)}")
+    return _DISPLAY[parameter]
+
+
+def _probe(text: str) -> Probe:
+    try:
+        document = json.loads(text)
+    except (ValueError, RecursionError):
+        raise InvalidProbe(f'must be JSON such as {{"kind": "linear", …}}, got {shown(text)}') from None
+    return from_dict(Probe, document)
+
+
+def _probe_text(probe: Probe) -> str:
+    return json.dumps(to_dict(probe, with_none=False))
+
+
+# Answers the commands of one connection.
+
+
+_ASKS, _ANSWERS = "CMD_", "ACK_"  # beginnings of the names of devices whose STRING is a command, and a reply
+_SET, _GET = "SetUsParameter", "GetUsParameter"
+
+
+async def answer(scanner: Scanner, message: Message) -> Message:
+    """The reply to a COMMAND, or to a STRING of a device CMD_…; it says what was wrong with the command, if so.
+
+    Raises IgtlMessageInvalid where the message holds no command.
+    """
+    if message.type_name == "COMMAND":
+        command = unpack_command(message.content)
+        reply = await _reply(scanner, command.name, command.text)
+        content = pack_command(Command(command.number, command.name or reply.name, reply.xml))
+        return _message("RTS_COMMAND", message, message.device_name, content, reply.metadata)
+    if not message.device_name.startswith(_ASKS):
+        raise IgtlMessageInvalid(
+            f"STRING is understood as a command, of a device called {_ASKS}1 or the like, got "
+            f"{shown(message.device_name)}",
+            field="header",
+        )
+    reply = await _reply(scanner, "", unpack_string(message.content))
+    device_name = _ANSWERS + message.device_name[len(_ASKS) :]
+    return _message("STRING", message, device_name, pack_string(reply.xml), reply.metadata)
+
+
+async def _reply(scanner: Scanner, name: str, text: str) -> Reply:
+    try:
+        request = read_request(name, text)
+        return await _obey(scanner, request)
+    except IgtlMessageInvalid as error:
+        return Reply(name, error=error.detail)
+
+
+async def _obey(scanner: Scanner, request: Request) -> Reply:
+    """Raises IgtlMessageInvalid for an unknown command and for one without parameters."""
+    known = {name.casefold(): name for name in (_SET, _GET)}
+    name = known.get(request.name.casefold())
+    if name is None:
+        raise IgtlMessageInvalid(f"the command must be {_SET} or {_GET}, got {shown(request.name)}", field="body")
+    if not request.parameters:
+        raise IgtlMessageInvalid(f'{name} must hold an element <Parameter Name="…"/> or more', field="body")
+    outcomes = []
+    for parameter, value in request.parameters.items():
+        try:
+            if name == _GET:
+                outcome = Outcome(parameter, value=await scanner.get(parameter))
+            elif value is None:
+                outcome = Outcome(parameter, f"{parameter}: a Value is required")
+            else:
+                await scanner.set(parameter, value)
+                outcome = Outcome(parameter)
+        except UltragrayError as error:
+            outcome = Outcome(parameter, f"{parameter}: {error.detail}")
+        outcomes.append(outcome)
+    return Reply(name, f"{name} completed", outcomes=tuple(outcomes))
+
+
+def _message(type_name: str, asked: Message, device_name: str, content: bytes, metadata: Mapping[str, str]) -> Message:
+    return Message(type_name, device_name, content, asked.timestamp, asked.version, asked.message_id, metadata)

@@ -1,0 +1,327 @@
+"""Sockets that listen: who may connect, how many, and how long each may take."""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import logging
+import os
+import resource
+import socket
+import ssl
+import stat
+import sys
+from collections import Counter
+from collections.abc import Callable
+from ipaddress import IPv6Address, ip_address
+
+from ultragray_service.errors import TooManyConnections
+from ultragray_service.settings import ENVIRONMENT_PREFIX
+from ultragray_service.tls.server import HANDSHAKE_TIMEOUT_S
+from ultragray_workers.errors import StartupFailed
+from ultragray_workers.rounds import Rounds
+
+_IPV6_NETWORK_BITS = 64  # what one subscriber has
+
+
+class Connections:
+    """The connections of one door. Each takes a place, and gives it back once."""
+
+    def __init__(self, total: int, per_address: int) -> None:
+        self._total = total
+        self._per_address = per_address
+        self._by_address: Counter[str] = Counter()
+        self._count = 0
+
+    def enter(self, host: str) -> Place:
+        """A place for a connection from `host`. Raises TooManyConnections."""
+        address = address_of(host)
+        if self._by_address[address] >= self._per_address:
+            raise TooManyConnections(f"at most {self._per_address} connections of one address may be open")
+        if self._count >= self._total:
+            raise TooManyConnections(f"at most {self._total} connections may be open")
+        self._count += 1
+        self._by_address[address] += 1
+        return Place(self, address)
+
+    def leave(self, address: str) -> None:
+        """Gives back a place; `Place.leave` calls it."""
+        self._count -= 1
+        self._by_address[address] -= 1
+        if not self._by_address[address]:
+            del self._by_address[address]
+
+
+class Place:
+    """The place of one connection."""
+
+    def __init__(self, connections: Connections, address: str) -> None:
+        self._connections = connections
+        self._address = address
+        self._is_taken = True
+
+    def leave(self) -> None:
+        """Gives the place back, if that was not done before."""
+        if self._is_taken:
+            self._is_taken = False
+            self._connections.leave(self._address)
+
+
+def address_of(host: str) -> str:
+    """What counts as one address: an IPv4 address, or the network of an IPv6 one."""
+    address = ip_address(host.partition("%")[0])
+    if not isinstance(address, IPv6Address):
+        return str(address)
+    if address.ipv4_mapped is not None:
+        return str(address.ipv4_mapped)
+    return str(int(address) >> (128 - _IPV6_NETWORK_BITS))
+
+
+# Accepting connections, each of which has a place before anything of it is read.
+
+
+_RETRY_S = 0.1  # where there is no file descriptor for another connection
+
+_log = logging.getLogger("ultragray.service")
+
+
+class Acceptor:
+    """Accepts from a socket that listens, until it is closed."""
+
+    def __init__(
+        self,
+        listener: socket.socket,
+        connections: Connections,
+        protocol: Callable[[Place], asyncio.Protocol],
+        *,
+        refusal: Callable[[TooManyConnections], bytes],
+        send_patience_s: float,
+        tls: Callable[[], ssl.SSLContext | None],
+    ) -> None:
+        """`protocol` serves a connection and gives its place back; `refusal` is sent to one that gets none.
+
+        `tls` is asked for each connection, so that new ones get a new certificate.
+        """
+        self._listener = listener
+        self._connections = connections
+        self._protocol = protocol
+        self._refusal = refusal
+        self._send_patience_s = send_patience_s
+        self._tls = tls
+        self._serving: set[asyncio.Task[None]] = set()
+        self._task = asyncio.ensure_future(self._accept())
+
+    def close(self) -> None:
+        """Accepts nothing more; what was accepted stays."""
+        self._task.cancel()
+
+    async def wait_closed(self) -> None:
+        """Returns when nothing is being accepted any more."""
+        await asyncio.wait({self._task})
+
+    async def _accept(self) -> None:
+        rounds = Rounds("accepting connections", _log)
+        while True:
+            with rounds.round():
+                await self._accept_one()
+
+    async def _accept_one(self) -> None:
+        try:
+            connection, peer = await asyncio.get_running_loop().sock_accept(self._listener)
+        except OSError as error:  # too many open files, or a peer that has gone already
+            _log.warning(f"a connection could not be accepted: {error.strerror}")
+            await asyncio.sleep(_RETRY_S)
+            return
+        try:
+            place = self._connections.enter(peer[0])
+        except TooManyConnections as error:
+            self._refuse(connection, error)
+            return
+        task = asyncio.ensure_future(self._serve(connection, place))
+        self._serving.add(task)
+        task.add_done_callback(self._serving.discard)
+
+    def _refuse(self, connection: socket.socket, error: TooManyConnections) -> None:
+        with connection, contextlib.suppress(OSError):  # before TLS no answer can be read
+            if self._tls() is None:
+                connection.send(self._refusal(error))
+                connection.shutdown(socket.SHUT_WR)
+
+    async def _serve(self, connection: socket.socket, place: Place) -> None:
+        tls = self._tls()
+        timeout_s = None if tls is None else HANDSHAKE_TIMEOUT_S
+        is_served = False
+        try:
+            give_up_on_silent_peers(connection, self._send_patience_s)
+            await asyncio.get_running_loop().connect_accepted_socket(
+                lambda: self._protocol(place), connection, ssl=tls, ssl_handshake_timeout=timeout_s
+            )
+            is_served = True
+        except OSError:
+            pass  # the peer has gone, or its TLS handshake failed
+        finally:
+            if not is_served:
+                place.leave()
+                connection.close()
+
+
+# A cap by address on connections that a library accepts by itself, as gRPC does.
+#
+# This process finds its own sockets among its open files, and shuts down those of an address that has too many: the
+# library sees them end as if the peer had hung up. Connections that are known stay; new ones go.
+
+
+INTERVAL_S = 0.25
+_OPEN_FILES = "/dev/fd"
+
+
+class OpenSockets:
+    """The connections to one port of this process."""
+
+    def __init__(self, port: int, connections: Connections) -> None:
+        self._port = port
+        self._connections = connections
+        self._others: set[int] = set()  # sockets that are no connections to the port, by inode
+        self._places: dict[int, Place] = {}  # the connections, by inode
+
+    async def run(self) -> None:
+        """Look again and again, until cancelled."""
+        rounds = Rounds(f"the watch over connections to port {self._port}", _log)
+        while True:
+            with rounds.round():
+                if refused := await asyncio.to_thread(self.look):
+                    _log.warning(f"closed {refused} connections to port {self._port}: too many of one address")
+            await asyncio.sleep(INTERVAL_S)
+
+    def look(self) -> int:
+        """Shuts down new connections beyond the cap; how many."""
+        inodes, refused = set(), 0
+        for name in os.listdir(_OPEN_FILES):
+            with contextlib.suppress(OSError):  # closed in the meantime
+                file = int(name)
+                status = os.fstat(file)
+                if not stat.S_ISSOCK(status.st_mode):
+                    continue
+                inodes.add(status.st_ino)
+                if status.st_ino not in self._others and status.st_ino not in self._places:
+                    refused += not self._let_in(file, status.st_ino)
+        self._others &= inodes
+        for inode in self._places.keys() - inodes:
+            self._places.pop(inode).leave()
+        return refused
+
+    def _let_in(self, file: int, inode: int) -> bool:
+        """Notes a socket that is new. Raises OSError where it has gone."""
+        with socket.socket(fileno=os.dup(file)) as found:
+            if os.fstat(found.fileno()).st_ino != inode:
+                return True  # another has its number by now, and is seen the next time
+            peer = self._peer(found)
+            if peer is None:
+                self._others.add(inode)
+                return True
+            try:
+                self._places[inode] = self._connections.enter(peer)
+            except TooManyConnections:
+                found.shutdown(socket.SHUT_RDWR)
+                return False
+        return True
+
+    def _peer(self, found: socket.socket) -> str | None:
+        """The host of the other end of a connection to the port; None for another socket."""
+        if found.family not in (socket.AF_INET, socket.AF_INET6) or found.getsockname()[1] != self._port:
+            return None
+        try:
+            return str(found.getpeername()[0])
+        except OSError:  # the one that listens
+            return None
+
+
+# Sockets as this service sets them up.
+
+
+_BACKLOG = 2048
+
+
+def listen(host: str, port: int, what: str, field: str) -> socket.socket:
+    """A socket that listens. Raises StartupFailed, naming the setting `field`, where the port cannot be had."""
+    listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
+    listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+    try:
+        listener.bind((host, port))
+    except OSError as error:
+        listener.close()
+        raise StartupFailed(
+            f"{what} cannot listen on {authority(host, port)}: {_remedy(error, field)}", field=field
+        ) from error
+    listener.listen(_BACKLOG)
+    listener.setblocking(False)
+    return listener
+
+
+def check_port_is_free(host: str, port: int, what: str, field: str) -> None:
+    """Raise StartupFailed as `listen` does, for a server that opens its socket itself and says less."""
+    if port:
+        listen(host, port, what, field).close()
+
+
+def _remedy(error: OSError, field: str) -> str:
+    """Why a port cannot be had, and what to give instead."""
+    if error.errno == errno.EADDRINUSE:
+        return f"the port is in use; give another one with {_named(field)}"
+    reason = (error.strerror or str(error)).lower()
+    return f"{reason}; give another address with {_named('host')}, or another port with {_named(field)}"
+
+
+def _named(field: str) -> str:
+    return f"--{field.replace('_', '-')} or {ENVIRONMENT_PREFIX}{field.upper()}"
+
+
+def authority(host: str, port: int) -> str:
+    """Host and port as a URL has them."""
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
+
+
+def give_up_on_silent_peers(connection: socket.socket, patience_s: float) -> None:
+    """Let the kernel end a connection whose peer takes nothing for so long, also after it was closed here."""
+    connection.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)  # to notice one that has vanished
+    if sys.platform == "linux":
+        connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, int(1000 * patience_s))
+
+
+def raise_open_files_limit(wanted: int) -> None:
+    """Raise the limit of open files to `wanted`, or as far as the hard limit allows, and warn where that is less."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    possible = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
+    if soft != resource.RLIM_INFINITY and soft < possible:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (possible, hard))
+    if possible < wanted:
+        _log.warning(
+            f"this process may open {hard} files, {wanted} are needed for all connections that the settings allow: "
+            "raise the hard limit (ulimit -n, LimitNOFILE of systemd)"
+        )
+
+
+# How long a transfer may lag behind the least rate.
+
+
+class Patience:
+    """An allowance of seconds: time uses it up, bytes refill it, up to where it began.
+
+    A peer that sends or takes at least `min_bytes_per_s` never runs out of it; one that stops does after `limit_s`.
+    """
+
+    def __init__(self, min_bytes_per_s: float, limit_s: float) -> None:
+        self._min_bytes_per_s = min_bytes_per_s
+        self._limit_s = limit_s
+        self._left_s = limit_s
+
+    def renew(self) -> None:
+        """Begin again: another transfer, or one that does not wait for the peer."""
+        self._left_s = self._limit_s
+
+    def is_over(self, moved_bytes: int, elapsed_s: float) -> bool:
+        """Whether the peer has been too slow, `elapsed_s` after the last question, with `moved_bytes` since."""
+        gained_s = moved_bytes / self._min_bytes_per_s
+        self._left_s = min(self._limit_s, self._left_s + gained_s - elapsed_s)
+        return self._left_s <= 0.0

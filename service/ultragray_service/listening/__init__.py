@@ -1,1 +1,0 @@
-"""Sockets that listen: who may connect, how many, and how long each may take."""

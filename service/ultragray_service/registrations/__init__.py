@@ -1,1 +1,0 @@
-"""Registrations of robots and trackers to scenes, kept by name in the installation's database."""

@@ -1,0 +1,282 @@
+"""RenderService: a frame, a batch of frames, a stream of poses, slices and searches."""
+
+from __future__ import annotations
+
+import asyncio
+import time
+from collections import deque
+from collections.abc import Awaitable, Callable
+from dataclasses import dataclass
+from typing import Any
+
+import grpc
+
+from ultragray.contract import under
+from ultragray.errors import FrameTooCostly, InvalidArgument, LowConfidence, UltragrayError
+from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.learn.localization.settings import LocalizationSettings
+from ultragray.rendering.volumes import SliceSettings
+from ultragray_proto.codec import to_message
+from ultragray_proto.v1 import rendering_pb2, scenes_pb2
+from ultragray_service.core.open_streams import Answered
+from ultragray_service.core.poses import check_pose_count, exact_poses
+from ultragray_service.core.rendering import Plan
+from ultragray_service.core.streams import MAX_WINDOW, FrameStream, SceneSettings, StreamMode, checked_s
+from ultragray_service.errors import Refusal
+from ultragray_service.rpc.messages import frame_message, read, read_pose, read_settings, read_word, slice_message
+from ultragray_service.rpc.shared_memory import SharedMemory
+from ultragray_service.service import Service
+from ultragray_service.views.localizing import locate, sought_frame
+from ultragray_workers.errors import QueueFull
+from ultragray_workers.pool.messages import Priority, RenderResult
+
+
+class _Message:
+    """A RenderStreamRequest."""
+
+    def __init__(self, message: rendering_pb2.RenderStreamRequest, left_s: float | None) -> None:
+        self.message = message
+        self.sequence: int = message.sequence
+        self.client_time: int | None = message.client_time_ns if message.HasField("client_time_ns") else None
+        self.acknowledged: int | None = message.acknowledged if message.HasField("acknowledged") else None
+        self._left_s = left_s  # until the deadline of the call
+
+    @property
+    def window(self) -> int | None:
+        """Raises InvalidArgument for one beyond the limit."""
+        if self.message.window > MAX_WINDOW:
+            raise InvalidArgument(
+                f"window must be at most {MAX_WINDOW}, 0 for none, got {self.message.window}", field="window"
+            )
+        return self.message.window or None
+
+    def settings(self) -> SceneSettings | None:
+        return read_settings(self.message) if self.message.HasField("settings") else None
+
+    @property
+    def asks(self) -> bool:
+        return self.message.HasField("pose") or not (self.message.HasField("settings") or self.acknowledged is not None)
+
+    def pose(self) -> FloatArray:  # [4, 4] mm
+        if not self.message.HasField("pose"):
+            raise InvalidArgument("pose or settings is required", field="pose")
+        return read_pose(self.message.pose, "pose")
+
+    def timeout_s(self) -> float | None:
+        if not self.message.HasField("timeout_ms"):
+            return self._left_s
+        timeout_s = checked_s("timeout_ms", self.message.timeout_ms)
+        return timeout_s if self._left_s is None else min(self._left_s, timeout_s)
+
+
+class _Unreadable:
+    """Bytes that are no RenderStreamRequest; they raise why where their contents are asked for."""
+
+    sequence = 0
+    client_time = window = acknowledged = None
+    asks = True
+
+    def __init__(self, error: InvalidArgument) -> None:
+        self._error = error
+
+    def settings(self) -> SceneSettings | None:
+        return None
+
+    def pose(self) -> FloatArray:
+        raise self._error
+
+    def timeout_s(self) -> float | None:
+        return None
+
+
+class CallTransport:
+    """One call of RenderStream; a context manager. Its mode is read from the first message that can be read."""
+
+    def __init__(self, context: grpc.aio.ServicerContext) -> None:
+        self._context = context
+        self.destination: SharedMemory | None = None
+
+    def __enter__(self) -> CallTransport:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        if self.destination is not None:
+            self.destination.close()
+
+    async def receive(self) -> _Message | _Unreadable | None:
+        try:
+            message = await self._context.read()
+        except InvalidArgument as error:
+            return _Unreadable(error)
+        return None if message is grpc.aio.EOF else _Message(message, self._context.time_remaining())
+
+    def mode(self, message: Any) -> StreamMode | None:
+        """Opens the memory that the client shares, too.
+
+        Raises InvalidArgument for a mode that does not exist, and for memory that is refused.
+        """
+        if isinstance(message, _Unreadable):
+            return None
+        mode = StreamMode(read_word(message.message, "mode") or StreamMode.ORDERED)
+        if message.message.HasField("shared_memory"):
+            self.destination = SharedMemory(message.message.shared_memory, self._context.peer())
+        return mode
+
+    async def send(self, answered: Answered) -> None:
+        about: dict[str, Any] = {"dropped": answered.dropped}
+        if answered.client_time is not None:
+            about["client_time_ns"] = int(answered.client_time)
+        if isinstance(answered.outcome, UltragrayError):
+            error = to_message(Refusal.of(answered.outcome), scenes_pb2.Error)
+            await self._context.write(rendering_pb2.Frame(sequence=answered.sequence, error=error, **about))
+        else:
+            await self._context.write(frame_message(answered.outcome, answered.sequence, **about))
+
+    hand_over = send  # flow control tells the client's library what was taken, not the service
+
+
+# RenderService: one frame, a batch of frames.
+
+
+_RETRY_S = 0.02
+_STREAM_NAME = "x-ultragray-stream-name"  # metadata
+
+
+@dataclass(frozen=True)
+class _OfProbe:
+    """The part of a request that says whose poses it has, and in which frame."""
+
+    probe: Probe | None = None
+    registration: str | None = None
+
+
+class RenderService:
+    """The methods of ultragray.v1.RenderService."""
+
+    def __init__(self, service: Service) -> None:
+        self._service = service
+
+    async def Render(  # noqa: N802
+        self, request: rendering_pb2.RenderRequest, context: grpc.aio.ServicerContext
+    ) -> rendering_pb2.Frame:
+        deadline = self._service.planner.deadline(context.time_remaining())
+        begin_by = None
+        if request.HasField("max_queue_ms"):
+            begin_by = self._service.planner.deadline(checked_s("max_queue_ms", request.max_queue_ms))
+        plan = await self._plan(request)
+        if not request.HasField("pose"):
+            raise InvalidArgument("pose is required", field="pose")
+        pose = plan.placed(read_pose(request.pose, "pose"))
+        await self._service.limits.take_frames(1, deadline)
+        result = await self._service.rendering.render(plan, pose[None], deadline=deadline, begin_by=begin_by)
+        return frame_message(result, 0)
+
+    async def RenderBatch(  # noqa: N802
+        self, request: rendering_pb2.RenderBatchRequest, context: grpc.aio.ServicerContext
+    ) -> None:
+        planner = self._service.planner
+        check_pose_count(len(request.poses), planner.max_poses)
+        plan = await self._plan(request)
+        sent = await exact_poses(len(request.poses), lambda index: read_pose(request.poses[index], f"poses[{index}]"))
+        poses = plan.placed(sent)
+        window = min(2 * self._service.settings.max_batch_poses, self._service.settings.queue_limit_frames)
+        in_flight: deque[asyncio.Task[RenderResult]] = deque()
+        started = 0
+        try:
+            for sequence in range(len(poses)):
+                while started < len(poses) and len(in_flight) < window:
+                    some = poses[started : started + 1]
+                    render = self._render if started == 0 else self._render_when_room
+                    in_flight.append(asyncio.ensure_future(self._in_turn(render, plan, some, context)))
+                    started += 1
+                try:
+                    result = await in_flight[0]
+                except (LowConfidence, FrameTooCostly) as error:
+                    field = f"poses[{sequence}]"
+                    raise type(error)(error.detail.replace("pose", field, 1), field=field) from None
+                in_flight.popleft()
+                await context.write(frame_message(result, sequence))
+        finally:
+            for task in in_flight:
+                task.cancel()
+            await asyncio.gather(*in_flight, return_exceptions=True)
+
+    async def RenderStream(  # noqa: N802
+        self, messages: object, context: grpc.aio.ServicerContext
+    ) -> None:
+        told = {key: value for key, value in context.invocation_metadata() or () if isinstance(value, str)}
+        name = told.get(_STREAM_NAME) or told.get("user-agent", "")
+        streams = self._service.streams
+        with self._service.limits.stream(), streams.opened("grpc", name) as noted, CallTransport(context) as transport:
+            await FrameStream(self._service.rendering, transport, noted=noted).run()
+
+    async def AssessPoses(  # noqa: N802
+        self, request: rendering_pb2.AssessPosesRequest, context: grpc.aio.ServicerContext
+    ) -> rendering_pb2.AssessPosesResponse:
+        check_pose_count(len(request.poses), self._service.planner.max_poses)
+        whose = read(request, _OfProbe)
+        poses = await exact_poses(len(request.poses), lambda index: read_pose(request.poses[index], f"poses[{index}]"))
+        found = await self._service.assessing.assess(request.scene, poses, whose.probe, whose.registration)
+        return to_message(found, rendering_pb2.AssessPosesResponse)
+
+    async def RenderSlice(  # noqa: N802
+        self, request: rendering_pb2.RenderSliceRequest, context: grpc.aio.ServicerContext
+    ) -> rendering_pb2.Slice:
+        deadline = self._service.planner.deadline(context.time_remaining())
+        if not request.HasField("slice"):
+            raise InvalidArgument("slice is required", field="slice")
+        with under("slice"):
+            asked = read(request.slice, SliceSettings)
+        plan = await self._service.planner.plan_slice(request.scene, asked, asked.numbers, path="slice")
+        await self._service.limits.take_frames(1, deadline)
+        result = await self._service.rendering.render(plan, asked.pose()[None], deadline=deadline)
+        return slice_message(result)
+
+    async def Localize(  # noqa: N802
+        self, request: rendering_pb2.LocalizeRequest, context: grpc.aio.ServicerContext
+    ) -> rendering_pb2.LocalizeResponse:
+        deadline = self._service.planner.deadline(context.time_remaining())
+        asked = read(request, LocalizationSettings)
+        height, width = (
+            getattr(request, side) if request.HasField(side) else None for side in ("image_height", "image_width")
+        )
+        if not request.HasField("start"):
+            raise InvalidArgument("start is required", field="start")
+        start = read_pose(request.start, "start")
+        sought = sought_frame(request.image, height, width, asked)
+        registration = request.registration if request.HasField("registration") else None
+        found = await locate(self._service.rendering, request.scene, sought, start, deadline, registration)
+        return to_message(found, rendering_pb2.LocalizeResponse)
+
+    async def _plan(self, request: rendering_pb2.RenderRequest | rendering_pb2.RenderBatchRequest) -> Plan:
+        """The plan of a request. Raises what RequestPlanner.plan raises; the field is a path."""
+        scene, asked = read_settings(request)
+        return await self._service.planner.plan(
+            scene, asked, asked.encoding, path="settings", registration=asked.registration
+        )
+
+    async def _in_turn(
+        self,
+        render: Callable[[Plan, FloatArray, float], Awaitable[RenderResult]],
+        plan: Plan,
+        pose: FloatArray,
+        context: grpc.aio.ServicerContext,
+    ) -> RenderResult:
+        """Renders a frame of a batch once the caller may have one more."""
+        left_s = context.time_remaining()
+        await self._service.limits.frame_turn(None if left_s is None else time.monotonic() + left_s)
+        return await render(plan, pose, self._service.planner.deadline(context.time_remaining()))
+
+    async def _render(self, plan: Plan, pose: FloatArray, deadline: float) -> RenderResult:
+        """Renders a frame of a batch."""
+        return await self._service.rendering.render(plan, pose, priority=Priority.BATCH, deadline=deadline)
+
+    async def _render_when_room(self, plan: Plan, pose: FloatArray, deadline: float) -> RenderResult:
+        """Renders a frame of a batch that was let in already: a full queue delays it."""
+        while True:
+            try:
+                return await self._render(plan, pose, deadline)
+            except QueueFull:
+                if time.monotonic() + _RETRY_S >= deadline:
+                    raise
+            await asyncio.sleep(_RETRY_S)

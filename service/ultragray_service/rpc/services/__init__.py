@@ -1,1 +1,0 @@
-"""The services of ultragray.v1, one module each."""

@@ -1,0 +1,113 @@
+"""MetaImage sequences, as PLUS writes them and as they arrive damaged."""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from ultragray.datasets.plus_files import read_meta_image
+from ultragray.errors import DatasetInvalid
+
+
+@pytest.mark.parametrize("deflate", [True, False])
+@pytest.mark.parametrize("data_file", ["LOCAL", "pixels.raw", "pixels.zraw"])
+def test_pixels_and_fields(tmp_path: Path, plus_files: SimpleNamespace, deflate: bool, data_file: str) -> None:
+    stored = plus_files.speckle(3, 5, 7)
+    fields = {"UltrasoundImageOrientation": "MFA", **plus_files.tracked_fields(4)}  # of one frame more than it has
+    path = plus_files.write_mha(tmp_path / "s.mhd", stored, fields, deflate=deflate, data_file=data_file)
+    sequence = read_meta_image(path)
+    np.testing.assert_array_equal(sequence.pixels, stored)
+    assert sequence.fields["UltrasoundImageOrientation"] == "MFA"
+    assert len(sequence.frame_fields) == 3
+    assert sequence.frame_fields[2]["ProbeToTrackerTransform"].split()[7] == "2.0"
+    assert sequence.frame_fields[2]["ProbeToTrackerTransformStatus"] == "OK"
+
+
+def test_colour_and_four_sizes(tmp_path: Path, plus_files: SimpleNamespace) -> None:
+    stored = plus_files.speckle(2, 5, 21).reshape(2, 5, 7, 3)
+    np.testing.assert_array_equal(read_meta_image(plus_files.write_mha(tmp_path / "c.mha", stored, {})).pixels, stored)
+    path = plus_files.write_mha(tmp_path / "v.mha", stored, {"DimSize": "7 5 1 2"})
+    np.testing.assert_array_equal(read_meta_image(path).pixels, stored)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"ElementType": "MET_FLOAT"}, "MET_UCHAR, MET_USHORT, MET_SHORT.*MET_FLOAT"),
+        ({"BinaryData": "False"}, "must be binary"),
+        ({"DimSize": "7 5"}, "columns x rows x frames, got 7 x 5"),
+        ({"DimSize": "7 5 4 3"}, "columns x rows x frames"),
+        ({"DimSize": "seven"}, "DimSize must be whole numbers"),
+        ({"DimSize": "-7 5 3"}, "DimSize must be whole numbers"),
+        ({"DimSize": "0 5 3"}, "0 bytes of pixels|limit"),
+        ({"DimSize": "99999 99999 99"}, "the limit is 4 GiB"),
+        ({"DimSize": "1 1 4000000000"}, "says 4000000000 frames, but has fields of 2 only"),
+        ({"DimSize": "7 5 4"}, "truncated: .* 105 of 140|truncated: 105 bytes .*140"),
+        ({"DimSize": "7 5 2"}, "more pixels than the 70 bytes"),
+        ({"ElementNumberOfChannels": "2"}, "1, 3 or 4 channels, got 2"),
+    ],
+)
+@pytest.mark.parametrize("deflate", [True, False])
+def test_headers_that_cannot_be_are_refused(
+    tmp_path: Path, plus_files: SimpleNamespace, changes: dict[str, str], message: str, deflate: bool
+) -> None:
+    fields = plus_files.tracked_fields(2) | changes
+    path = plus_files.write_mha(tmp_path / "s.mha", plus_files.speckle(3, 5, 7), fields, deflate=deflate)
+    with pytest.raises(DatasetInvalid, match=rf"s\.mha: .*({message})"):
+        read_meta_image(path)
+
+
+@pytest.mark.parametrize("data_file", ["../pixels.raw", "/etc/hosts", "missing.raw"])
+def test_pixels_lie_beside_the_header(tmp_path: Path, plus_files: SimpleNamespace, data_file: str) -> None:
+    path = plus_files.write_mha(tmp_path / "s.mhd", plus_files.speckle(3, 5, 7), {}, data_file="pixels.raw")
+    path.write_bytes(path.read_bytes().replace(b"pixels.raw", data_file.encode()))
+    with pytest.raises(DatasetInvalid, match=r"s\.mhd: .*beside it"):
+        read_meta_image(path)
+
+
+@pytest.mark.parametrize("keep", [0, 10, 200, -20, -1])
+def test_truncated_files_are_refused(tmp_path: Path, plus_files: SimpleNamespace, keep: int) -> None:
+    path = plus_files.write_mha(tmp_path / "s.mha", plus_files.speckle(3, 50, 70), {})
+    path.write_bytes(path.read_bytes()[:keep])
+    with pytest.raises(DatasetInvalid, match=r"s\.mha: (truncated|not a MetaImage file)"):
+        read_meta_image(path)
+
+
+def test_damaged_and_foreign_files_are_refused(tmp_path: Path, plus_files: SimpleNamespace) -> None:
+    path = plus_files.write_mha(tmp_path / "s.mha", plus_files.speckle(3, 50, 70), {})
+    data = bytearray(path.read_bytes())
+    data[-3000] ^= 0xFF
+    path.write_bytes(data)
+    with pytest.raises(DatasetInvalid, match=r"s\.mha: its compressed pixels are damaged"):
+        read_meta_image(path)
+    for content in (b"\x93NUMPY\0\0", b"hello\n" * 3, b"a" * (2 << 20)):
+        path.write_bytes(content)
+        with pytest.raises(DatasetInvalid, match=r"s\.mha: not a"):
+            read_meta_image(path)
+
+
+def test_a_bomb_is_not_inflated(tmp_path: Path, plus_files: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
+    path = plus_files.write_mha(tmp_path / "s.mha", np.zeros((3, 2000, 1000), np.uint8), {"DimSize": "7 5 3"})
+    inflated = []
+    make = zlib.decompressobj
+
+    class Watched:
+        def __init__(self, bits: int) -> None:
+            self.inner = make(bits)
+
+        def decompress(self, data: bytes, limit: int) -> bytes:
+            inflated.append(len(pixels := self.inner.decompress(data, limit)))
+            return pixels
+
+        @property
+        def eof(self) -> bool:
+            return self.inner.eof
+
+    monkeypatch.setattr(zlib, "decompressobj", Watched)
+    with pytest.raises(DatasetInvalid, match="more pixels than the 105 bytes"):
+        read_meta_image(path)
+    assert sum(inflated) <= 106

@@ -1,0 +1,184 @@
+"""PLUS sequences: poses as the toolkit defines them, and everything a recording may hold."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from ultragray import LinearProbe
+from ultragray.datasets.plus import read_plus_sweep
+from ultragray.datasets.source import SourceOptions, load_dataset
+from ultragray.errors import DatasetInvalid, InvalidArgument
+from ultragray.geometry.pose import rotation_angles_deg
+
+ROWS, COLUMNS = 30, 20
+TURN = np.array([[0.0, -1, 0, 3], [1, 0, 0, 4], [0, 0, 1, 5], [0, 0, 0, 1]])
+
+
+@pytest.mark.parametrize(
+    ("sequence", "xml", "name", "crop", "size", "train_frames", "pixels"),
+    [
+        (
+            *("SpinePhantomFreehand", "SpinePhantomFreehandReconstructionOnly", "spine_phantom"),
+            *("188:632,12:600", "192x256", None, 1.5),
+        ),
+        (
+            *("fCal_Test_Calibration_3NWires_fCal2.0", "fCal_Sim_VolumeReconstruction", "nwire_phantom"),
+            *("164:654,0:616", "176x216", ":189", 0.1),
+        ),
+    ],
+)
+def test_real_sequences_agree_with_the_sets_made_from_them(
+    data_folder: Path, sequence: str, xml: str, name: str, crop: str, size: str, train_frames: str | None, pixels: float
+) -> None:
+    folder = data_folder / "plus_original"
+    options = SourceOptions(
+        device_set=folder / f"PlusDeviceSet_{xml}.xml", crop=crop, image_size=size, train_frames=train_frames
+    )
+    ours, theirs = load_dataset(folder / f"{sequence}.igs.mha", options), load_dataset(data_folder / name)
+    pairs = [(ours.train, theirs.train)] if train_frames else [(ours.train, theirs.train), (ours.val, theirs.val)]
+    for got, expected in pairs:
+        expected = expected.select(range(len(got)))
+        assert len(got) == len(expected)
+        assert np.linalg.norm(got.poses[:, :3, 3] - expected.poses[:, :3, 3], axis=1).max() < 1e-3
+        assert np.diag(rotation_angles_deg(got.poses, expected.poses)).max() < 1e-3
+        assert got.probe.far_mm == pytest.approx(expected.probe.far_mm, abs=1e-3)
+        assert np.abs(got.images.astype(float) - expected.images).mean() < pixels
+    if not train_frames:
+        assert len(ours.train) + len(ours.val) == 21
+        assert ours.val.frame_numbers.tolist() == [2, 7, 12, 17]
+
+
+def test_a_sequence_with_its_device_set(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+    stored = plus_files.speckle(4, ROWS, COLUMNS)
+    path = plus_files.write_mha(tmp_path / "s.igs.mha", stored, plus_files.tracked_fields(4))
+    sweep, frame_count = read_plus_sweep(path, device_set=device_set, crop="2:12,3:23", frames="1:")
+    assert frame_count == 4
+    assert sweep.frame_numbers.tolist() == [1, 2, 3]
+    np.testing.assert_array_equal(sweep.images, stored[1:, 3:23, 2:12])
+    assert sweep.probe == LinearProbe(width_mm=2.0, near_mm=0.0, far_mm=2.0)
+    np.testing.assert_allclose(sweep.poses[:, :3, :3], np.tile(np.eye(3), (3, 1, 1)), atol=1e-12)
+    # the middle of columns 2 … 11 is 6.5, the upper edge of row 3 is 2.5
+    np.testing.assert_allclose(sweep.poses[0, :3, 3], (10 - 3 + 0.2 * 6.5, 1 + 1, 2 + 0.1 * 2.5))
+
+
+def test_the_reference_is_the_frame_of_the_poses_where_it_is_tracked(
+    tmp_path: Path, plus_files: SimpleNamespace, device_set: Path
+) -> None:
+    stored, fields = plus_files.speckle(3, ROWS, COLUMNS), plus_files.tracked_fields(3)
+    plain, _ = read_plus_sweep(plus_files.write_mha(tmp_path / "t.mha", stored, fields), device_set=device_set)
+    fields |= {f"Seq_Frame{f:04d}_ReferenceToTrackerTransform": plus_files.numbers(TURN) for f in range(3)}
+    turned, _ = read_plus_sweep(plus_files.write_mha(tmp_path / "r.mha", stored, fields), device_set=device_set)
+    np.testing.assert_allclose(turned.poses, np.linalg.inv(TURN) @ plain.poses, atol=1e-12)
+
+
+def test_the_calibration_may_be_in_the_sequence(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+    stored, fields = plus_files.speckle(2, ROWS, COLUMNS), plus_files.tracked_fields(2)
+    expected, _ = read_plus_sweep(plus_files.write_mha(tmp_path / "a.mha", stored, fields), device_set=device_set)
+    own = fields | {
+        f"Seq_Frame{f:04d}_ImageToProbeTransform": plus_files.numbers(plus_files.image_to_probe) for f in range(2)
+    }
+    sweep, _ = read_plus_sweep(plus_files.write_mha(tmp_path / "b.mha", stored, own))
+    np.testing.assert_allclose(sweep.poses, expected.poses)
+    direct = {
+        f"Seq_Frame{f:04d}_ImageToReferenceTransform": plus_files.numbers(
+            plus_files.translation(10, f, 0) @ plus_files.image_to_probe
+        )
+        for f in range(2)
+    }
+    sweep, _ = read_plus_sweep(plus_files.write_mha(tmp_path / "c.mha", stored, direct))
+    np.testing.assert_allclose(sweep.poses, expected.poses)
+
+
+@pytest.mark.parametrize("suffix", ["igs.mha", "seq.nrrd"])
+@pytest.mark.parametrize("orientation", ["MN", "FM", "NMA", "UF"])
+def test_stored_orientations_give_the_same_sweep(
+    tmp_path: Path, plus_files: SimpleNamespace, device_set: Path, orientation: str, suffix: str
+) -> None:
+    frames, fields = plus_files.speckle(3, ROWS, COLUMNS), plus_files.tracked_fields(3)
+    expected, _ = read_plus_sweep(
+        plus_files.write_mha(tmp_path / "mf.mha", frames, fields), device_set=device_set, crop="2:12,3:23"
+    )
+    stored = {
+        "MN": frames[:, ::-1],
+        "FM": frames.swapaxes(1, 2),
+        "NMA": frames.swapaxes(1, 2)[:, :, ::-1],
+        "UF": frames[:, :, ::-1],
+    }[orientation]
+    write, key = (
+        (plus_files.write_mha, "UltrasoundImageOrientation")
+        if suffix == "igs.mha"
+        else (plus_files.write_nrrd, "ultrasound image orientation")
+    )
+    path = write(tmp_path / f"s.{suffix}", np.ascontiguousarray(stored), {key: orientation, **fields})
+    sweep, _ = read_plus_sweep(path, device_set=device_set, crop="2:12,3:23")
+    np.testing.assert_array_equal(sweep.images, expected.images)
+    np.testing.assert_array_equal(sweep.poses, expected.poses)
+
+
+def test_invalid_frames_are_left_out_and_told(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+    fields = plus_files.tracked_fields(6)
+    fields["Seq_Frame0001_ProbeToTrackerTransform"] = plus_files.numbers(np.eye(4))
+    fields["Seq_Frame0001_ProbeToTrackerTransformStatus"] = "INVALID"
+    fields["Seq_Frame0003_ImageStatus"] = "INVALID"
+    del fields["Seq_Frame0005_ProbeToTrackerTransform"]
+    del fields["Seq_Frame0004_ProbeToTrackerTransformStatus"]  # none: taken to be valid
+    path = plus_files.write_mha(tmp_path / "s.mha", plus_files.speckle(6, ROWS, COLUMNS), fields)
+    sweep, frame_count = read_plus_sweep(path, device_set=device_set)
+    assert (sweep.frame_numbers.tolist(), frame_count) == ([0, 2, 4], 6)
+    assert sweep.notes[0] == "frames without a valid pose or image were left out: 1, 3, 5 (3 in all)"
+    assert "oriented" in sweep.notes[1]
+    assert "the whole image of 20 x 30 pixels" in sweep.notes[2]
+
+
+def test_an_invalid_reference_does_not_change_the_frame_of_the_poses(
+    tmp_path: Path, plus_files: SimpleNamespace, device_set: Path
+) -> None:
+    fields = plus_files.tracked_fields(3)
+    for frame, status in enumerate(("OK", "INVALID", "OK")):
+        fields[f"Seq_Frame{frame:04d}_ReferenceToTrackerTransform"] = plus_files.numbers(TURN)
+        fields[f"Seq_Frame{frame:04d}_ReferenceToTrackerTransformStatus"] = status
+    path = plus_files.write_mha(tmp_path / "s.mha", plus_files.speckle(3, ROWS, COLUMNS), fields)
+    assert read_plus_sweep(path, device_set=device_set)[0].frame_numbers.tolist() == [0, 2]
+
+
+def test_bad_recordings_are_one_clear_error(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+    stored, good = plus_files.speckle(3, ROWS, COLUMNS), plus_files.tracked_fields(3)
+    key = "Seq_Frame0002_ProbeToTrackerTransform"
+
+    def refused(message: str, changes: dict[str, str], frames: np.ndarray = stored) -> None:
+        path = plus_files.write_mha(tmp_path / "s.mha", frames, good | changes)
+        with pytest.raises(DatasetInvalid, match=rf"s\.mha: {message}"):
+            read_plus_sweep(path, device_set=device_set)
+
+    refused("frame 2: ProbeToTracker must .*mirrored", {key: plus_files.numbers(np.diag([1.0, 1, -1, 1]))})
+    refused("frame 2: ProbeToTracker must .*rotation", {key: plus_files.numbers(np.diag([2.0, 2, 2, 1]))})
+    refused("frame 2: ProbeToTracker must be sixteen finite", {key: "nan " * 16})
+    refused("frame 2: ProbeToTracker must be sixteen finite", {key: "1 0 0"})
+    refused("images must be B-mode .* RF_REAL", {"UltrasoundImageType": "RF_REAL"})
+    refused("UltrasoundImageOrientation must be", {"UltrasoundImageOrientation": "AMF"})
+    constant = stored.copy()
+    constant[1] = 3
+    refused("frame 1 is constant", {}, constant)
+    refused(
+        "none of its 3 frames has a valid ProbeToTracker",
+        {f"Seq_Frame{frame:04d}_ProbeToTrackerTransformStatus": "INVALID" for frame in range(3)},
+    )
+
+
+def test_what_is_missing_is_told(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+    stored = plus_files.speckle(3, ROWS, COLUMNS)
+    path = plus_files.write_mha(tmp_path / "s.mha", stored, plus_files.tracked_fields(3))
+    with pytest.raises(DatasetInvalid, match=r"no transforms lead .*there are ProbeToTracker .*give the device set"):
+        read_plus_sweep(path)
+    path = plus_files.write_mha(tmp_path / "s.mha", stored, {})
+    with pytest.raises(DatasetInvalid, match=r"there are ImageToProbe$"):
+        read_plus_sweep(path, device_set=device_set)
+    path = plus_files.write_mha(tmp_path / "s.mha", stored, plus_files.tracked_fields(3))
+    with pytest.raises(InvalidArgument, match=r"crop must lie within columns 0:20 and rows 0:30"):
+        read_plus_sweep(path, device_set=device_set, crop="0:21,0:30")
+    with pytest.raises(InvalidArgument, match=r"^frames.*only 3"):
+        read_plus_sweep(path, device_set=device_set, frames="0:9")

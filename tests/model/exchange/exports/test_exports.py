@@ -1,0 +1,385 @@
+from __future__ import annotations
+
+import io
+import json
+import subprocess
+import sys
+import tarfile
+import threading
+import time
+import zipfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import cv2
+import h5py
+import numpy as np
+import pydicom
+import pytest
+import zarr
+from zarr.storage import ZipStore
+
+from ultragray import LinearProbe
+from ultragray.contract import to_dict
+from ultragray.errors import ExtraMissing, InvalidArgument
+from ultragray.exchange.exports import FORMATS, ExportHeader, check_format, export_to
+from ultragray.exchange.exports.exporter import stored_pixels
+from ultragray.exchange.exports.npz import NpzExporter
+from ultragray.installation import install_advice
+from ultragray.rendering.settings import Contact, Resolved
+from ultragray.scene.confidence import FIGURES, Extrapolation, figure_arrays
+
+PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
+POSES = np.tile(np.eye(4), (5, 1, 1))
+POSES[:, 1, 3] = np.arange(5) / 3.0
+OUTPUTS = ("bmode", "echo", "labels")
+TOLD = [Extrapolation(0.5 * number, 2.0 * number, 0.9 - 0.1 * number, 0.75) for number in range(5)]
+UNKNOWN = Extrapolation(None, None, None, 0.25)
+
+
+def header(outputs: tuple[str, ...] = OUTPUTS, dtype: str = "float32") -> ExportHeader:
+    return ExportHeader(
+        settings=Resolved(PROBE, 6, 7, outputs),
+        dtype=dtype,
+        poses=POSES,
+        scene="one",
+        scene_sha256="0" * 64,
+        renderer="ultragray/0 cpu",
+    )
+
+
+def rendered(outputs: tuple[str, ...] = OUTPUTS) -> dict[str, Any]:
+    random = np.random.default_rng(1)
+    return {
+        name: random.integers(0, 5, (5, 6, 7), np.uint8) if name == "labels" else random.random((5, 6, 7), np.float32)
+        for name in outputs
+    }
+
+
+def export(path: Path, format: str, header: ExportHeader) -> dict[str, Any]:
+    """Writes five frames in portions of two; what the file must hold, by output."""
+    frames = rendered(header.settings.outputs)
+    with export_to(path, format, header) as add:
+        for first in (0, 2, 4):
+            add({name: values[first : first + 2] for name, values in frames.items()}, TOLD[first : first + 2])
+    assert [entry.name for entry in path.parent.iterdir()] == [path.name]
+    if header.dtype == "float32":
+        return frames
+    return {
+        name: values if name == "labels" else np.rint(values * 255).astype(np.uint8) for name, values in frames.items()
+    }
+
+
+@pytest.mark.parametrize("dtype", ["float32", "uint8"])
+def test_npz(tmp_path: Path, dtype: str) -> None:
+    expected = export(tmp_path / "frames.npz", "npz", header(dtype=dtype))
+    with np.load(tmp_path / "frames.npz") as archive:
+        assert set(archive) == {*OUTPUTS, "poses", *FIGURES, *header().origin()}
+        for name, figures in figure_arrays(TOLD).items():
+            assert archive[name].dtype == np.float32
+            np.testing.assert_array_equal(archive[name], figures)
+        for name, values in expected.items():
+            assert archive[name].dtype == values.dtype
+            np.testing.assert_array_equal(archive[name], values)
+        np.testing.assert_array_equal(archive["poses"], POSES)
+        assert (str(archive["scene"]), str(archive["renderer"])) == ("one", "ultragray/0 cpu")
+    with zipfile.ZipFile(tmp_path / "frames.npz") as archive:
+        assert {entry.compress_type for entry in archive.infolist()} == {zipfile.ZIP_STORED}
+
+
+def test_the_share_of_contact_is_there_where_it_was_asked_for(tmp_path: Path) -> None:
+    judged = replace(header(("bmode",)), settings=replace(header(("bmode",)).settings, contact=Contact.AIR))
+    told = [replace(one, contact_share=number / 4) for number, one in enumerate(TOLD)]
+    dtypes = {"npz": "float32", "hdf5": "float32", "tar": "uint8", "dicom": "uint8", "plus": "uint8"}
+    for format, dtype in dtypes.items():
+        asked = replace(judged, dtype=dtype)
+        path = tmp_path / f"frames{FORMATS[format].suffix}"
+        pixels = {"bmode": stored_pixels(rendered(("bmode",))["bmode"], np.dtype("u1" if dtype == "uint8" else "<f4"))}
+        with export_to(path, format, asked) as add:
+            add(pixels, told)
+    shares = [one.contact_share for one in told]
+    with np.load(tmp_path / "frames.npz") as archive:
+        assert archive["contact_share"].tolist() == shares
+        assert str(archive["contact"]) == "air"
+    with h5py.File(tmp_path / "frames.h5") as file:
+        assert file["contact_share"][:].tolist() == shares
+    with tarfile.open(tmp_path / "frames.tar") as tar:
+        file = tar.extractfile("000003.json")
+        assert file is not None
+        assert json.load(file)["contact_share"] == 0.75
+    data = pydicom.dcmread(tmp_path / "frames.dcm")
+    figures = np.frombuffer(data.private_block(0x0019, "ULTRAGRAY")[0x02].value, "<f4").reshape(5, -1)
+    assert figures[:, 4].tolist() == shares
+    sequence = (tmp_path / "frames.igs.mha").read_bytes()
+    assert b"UltraGRayContact = air" in sequence
+    assert b"Seq_Frame0002_UltraGRayContactShare = 5.000000e-01" in sequence
+
+
+def test_tar_loads_with_the_standard_library(tmp_path: Path) -> None:
+    expected = export(tmp_path / "frames.tar", "tar", header(dtype="uint8"))
+    with tarfile.open(tmp_path / "frames.tar") as tar:
+        parts = [*(f"{name}.png" for name in OUTPUTS), "json"]
+        assert tar.getnames() == [f"{number:06d}.{part}" for number in range(5) for part in parts]
+        for name, values in expected.items():
+            file = tar.extractfile(f"000004.{name}.png")
+            assert file is not None
+            pixels = cv2.imdecode(np.frombuffer(file.read(), np.uint8), cv2.IMREAD_UNCHANGED)
+            np.testing.assert_array_equal(pixels, values[4])
+        file = tar.extractfile("000002.json")
+        assert file is not None
+        told = json.load(file)
+    assert told["pose"] == POSES[2].tolist()
+    assert {name: told[name] for name in FIGURES} == TOLD[2].figures()
+    assert told["probe"] == to_dict(PROBE)
+
+
+def test_what_is_not_known(tmp_path: Path) -> None:
+    frames = {"bmode": rendered()["bmode"]}
+    for format in ("npz", "tar"):
+        with export_to(tmp_path / format, format, header(("bmode",))) as add:
+            add(frames, [UNKNOWN] * 5)
+    with np.load(tmp_path / "npz") as archive:
+        assert np.isnan([archive[name] for name in FIGURES[:3]]).all()
+        assert (archive["supported_share"] == 0.25).all()
+    with tarfile.open(tmp_path / "tar") as tar:
+        file = tar.extractfile("000004.json")
+        assert file is not None
+        told = json.load(file)
+    assert {name: told[name] for name in FIGURES} == UNKNOWN.figures()
+
+
+def test_tar_of_floats(tmp_path: Path) -> None:
+    expected = export(tmp_path / "frames.tar", "tar", header())
+    with tarfile.open(tmp_path / "frames.tar") as tar:
+        assert tar.getnames()[:4] == ["000000.bmode.npy", "000000.echo.npy", "000000.labels.png", "000000.json"]
+        file = tar.extractfile("000003.echo.npy")
+        assert file is not None
+        echo = np.load(io.BytesIO(file.read()))
+    np.testing.assert_array_equal(echo, expected["echo"][3])
+
+
+@pytest.mark.parametrize("dtype", ["float32", "uint8"])
+def test_zarr(tmp_path: Path, dtype: str) -> None:
+    path = tmp_path / "frames.zarr.zip"
+    expected = export(path, "zarr", header(dtype=dtype))
+    group = zarr.open_group(ZipStore(path, mode="r"), mode="r")
+    for name, values in expected.items():
+        array: Any = group[name]
+        assert (array.dtype, array.chunks) == (values.dtype, (1, 6, 7))
+        np.testing.assert_array_equal(array[:], values)
+    for name, figures in figure_arrays(TOLD).items():
+        stored: Any = group[name]
+        assert stored.dtype == np.float32
+        np.testing.assert_array_equal(stored[:], figures)
+    poses: Any = group["poses"]
+    np.testing.assert_array_equal(poses[:], POSES)
+    assert group.attrs["scene"] == "one"
+    assert group.attrs["probe"] == to_dict(PROBE)
+    group.store.close()
+
+
+@pytest.mark.parametrize("dtype", ["float32", "uint8"])
+def test_hdf5(tmp_path: Path, dtype: str) -> None:
+    expected = export(tmp_path / "frames.h5", "hdf5", header(dtype=dtype))
+    with h5py.File(tmp_path / "frames.h5") as file:
+        for name, values in expected.items():
+            assert (file[name].dtype, file[name].chunks) == (values.dtype, (1, 6, 7))
+            np.testing.assert_array_equal(file[name], values)
+        np.testing.assert_array_equal(file["poses"], POSES)
+        for name, figures in figure_arrays(TOLD).items():
+            assert file[name].dtype == np.float32
+            np.testing.assert_array_equal(file[name], figures)
+        assert file.attrs["scene_sha256"] == "0" * 64
+        assert json.loads(file.attrs["probe"]) == to_dict(PROBE)
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_whole_or_not_at_all(tmp_path: Path, format: str) -> None:
+    asked = header(("bmode",), FORMATS[format].dtypes[0])
+    path = tmp_path / f"frames{FORMATS[format].suffix}"
+    path.write_text("before")
+
+    def break_off() -> None:
+        with export_to(path, format, asked) as add:
+            add({"bmode": rendered()["bmode"][:3]}, TOLD[:3])
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        break_off()
+    assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
+    assert path.read_text() == "before"
+    assert not [thread for thread in threading.enumerate() if thread.name == "export"]
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_the_same_frames_make_the_same_file(tmp_path: Path, format: str) -> None:
+    asked = header(("bmode",), FORMATS[format].dtypes[0])
+    written = []
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        path = tmp_path / name / f"frames{FORMATS[format].suffix}"
+        export(path, format, asked)
+        written.append(path.read_bytes())
+    if format in ("npz", "zarr"):  # zip members carry the time
+        assert len(written[0]) == len(written[1])
+    else:
+        assert written[0] == written[1]
+
+
+def test_writes_beside_the_rendering_and_holds_few_portions(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written: list[int] = []
+    may_write = threading.Event()
+
+    def write(self: Any, frames: Any, count: int) -> None:
+        may_write.wait(10)
+        written.append(count)
+
+    monkeypatch.setattr(NpzExporter, "_write", write)
+    given: list[float] = []
+
+    def give(add: Any) -> None:
+        for _ in range(5):
+            add({"bmode": rendered()["bmode"][:1]}, TOLD[:1])
+            given.append(time.monotonic())
+
+    with export_to(tmp_path / "frames.npz", "npz", header(("bmode",))) as add:
+        giving = threading.Thread(target=give, args=(add,))
+        giving.start()
+        giving.join(0.3)
+        assert (len(given), written) == (3, [])  # one is being written, two wait
+        may_write.set()
+        giving.join(10)
+    assert written == [1] * 5
+
+
+def test_what_waits_is_dropped_where_the_rendering_fails(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    written: list[int] = []
+    failed = threading.Event()
+
+    def write(self: Any, frames: Any, count: int) -> None:
+        failed.wait(10)
+        time.sleep(0.1)
+        written.append(count)
+
+    monkeypatch.setattr(NpzExporter, "_write", write)
+
+    def render_on() -> None:
+        with export_to(tmp_path / "frames.npz", "npz", header(("bmode",))) as add:
+            for _ in range(3):
+                add({"bmode": rendered()["bmode"][:1]}, TOLD[:1])
+            failed.set()
+            raise ValueError("no")
+
+    with pytest.raises(ValueError, match="no"):
+        render_on()
+    assert written == [1]
+
+
+def test_an_error_of_the_writer_ends_the_rendering(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def write(self: Any, frames: Any, count: int) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(NpzExporter, "_write", write)
+    added = 0
+
+    def render_on() -> None:
+        nonlocal added
+        with export_to(tmp_path / "frames.npz", "npz", header(("bmode",))) as add:
+            while True:
+                add({"bmode": rendered()["bmode"][:1]}, TOLD[:1])
+                added += 1
+
+    with pytest.raises(OSError, match="No space"):
+        render_on()
+    assert added < 10_000
+    assert list(tmp_path.iterdir()) == []
+
+    with pytest.raises(OSError, match="No space"), export_to(tmp_path / "one.npz", "npz", header(("bmode",))) as add:
+        add({"bmode": rendered()["bmode"][:1]}, TOLD[:1])
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("format", FORMATS)
+def test_a_full_disk_is_told_as_such(tmp_path: Path, format: str) -> None:
+    program = (
+        f"import sys; sys.path[:] = {sys.path!r}\n"
+        "import errno, os, resource\n"
+        "import numpy as np\n"
+        "from ultragray import LinearProbe\n"
+        "from ultragray.scene.confidence import Extrapolation\n"
+        "from ultragray.exchange.exports import FORMATS, ExportHeader, export_to, exporter_class\n"
+        f"path, format = {str(tmp_path / 'frames')!r}, {format!r}\n"
+        "from ultragray.rendering.settings import Resolved\n"
+        "poses, settings = np.tile(np.eye(4), (40, 1, 1)), Resolved(LinearProbe(40.0, 0.0, 50.0), 300, 300)\n"
+        "header = ExportHeader(settings, FORMATS[format].dtypes[0], poses, 'one', '0' * 64, 'r')\n"
+        "exporter_class(format)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (1_000_000, resource.RLIM_INFINITY))\n"
+        "frames = np.random.default_rng(0).random((4, 300, 300), np.float32)\n"
+        "try:\n"
+        "    with export_to(path, format, header) as add:\n"
+        "        for _ in range(10): add({'bmode': frames}, [Extrapolation(1.0, 1.0, 0.5, 0.5)] * 4)\n"
+        "except OSError as error: print(errno.errorcode[error.errno])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert (done.stdout.strip(), done.returncode) == ("EFBIG", 0), done.stderr
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_pixels_are_rounded_and_held_below_256() -> None:
+    values = np.array([[[0.0, 0.5 / 255, 0.6 / 255, 1.0, 1.5]]], np.float32)
+    np.testing.assert_array_equal(stored_pixels(values, np.dtype("u1")), [[[0, 0, 1, 255, 255]]])
+    labels = np.arange(5, dtype=np.uint8).reshape(1, 1, 5)
+    np.testing.assert_array_equal(stored_pixels(labels, np.dtype("u1")), labels)
+
+
+@pytest.mark.parametrize(
+    ("format", "outputs", "dtype", "field", "told"),
+    [
+        ("zip", ("bmode",), None, "format", "one of npz, tar, zarr, hdf5, dicom, plus, mcap"),
+        (["npz"], ("bmode",), None, "format", "one of"),
+        ("npz", ("bmode",), "int8", "dtype", "float32, uint8"),
+        ("npz", ("bmode",), 8, "dtype", "float32, uint8"),
+        ("dicom", ("bmode",), "float32", "dtype", "uint8 in format dicom"),
+        ("plus", ("bmode", "echo"), None, "outputs", "bmode alone in format plus"),
+        ("dicom", ("labels",), None, "outputs", "bmode alone"),
+    ],
+)
+def test_what_a_format_cannot_hold(format: Any, outputs: Any, dtype: Any, field: str, told: str) -> None:
+    with pytest.raises(InvalidArgument, match=told) as caught:
+        check_format(format, outputs, dtype)
+    assert caught.value.field == field
+
+
+def test_default_types() -> None:
+    chosen = {name: check_format(name, ("bmode",), None) for name in FORMATS}
+    assert chosen == {
+        "npz": "float32",
+        "tar": "uint8",
+        "zarr": "float32",
+        "hdf5": "float32",
+        "dicom": "uint8",
+        "plus": "uint8",
+        "mcap": "uint8",
+    }
+    assert check_format("npz", OUTPUTS, "uint8") == "uint8"
+
+
+@pytest.mark.parametrize(
+    ("format", "package"), [("zarr", "zarr"), ("hdf5", "h5py"), ("dicom", "pydicom"), ("mcap", "mcap_ros2")]
+)
+def test_a_missing_package_is_named_with_its_extra(tmp_path: Path, format: str, package: str) -> None:
+    program = (
+        f"import sys; sys.path[:] = {sys.path!r}; sys.modules[{package!r}] = None\n"
+        "from ultragray.errors import ExtraMissing\n"
+        "from ultragray.exchange.exports import exporter_class\n"
+        f"try: exporter_class({format!r})\n"
+        "except ExtraMissing as error: print(error)\n"
+        "print('torch' in sys.modules)"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == [
+        f"format {format} needs {package}, which is not installed: {install_advice(format)}",
+        "False",
+    ]
+    assert ExtraMissing.reason == "EXTRA_MISSING"

@@ -1,0 +1,96 @@
+"""MCAP as its own reader reads it, by the definitions in the file."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from mcap.reader import make_reader
+from mcap_ros2.decoder import DecoderFactory
+
+from ultragray import LinearProbe
+from ultragray.contract import to_dict
+from ultragray.exchange.exports import ExportHeader, export_to
+from ultragray.exchange.poses import load_poses
+from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.settings import Resolved
+from ultragray.scene.confidence import FIGURES, Extrapolation
+
+PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
+FRAMES = 3
+
+
+def header(poses: FloatArray, dtype: str) -> ExportHeader:
+    settings = Resolved(PROBE, 6, 7, ("bmode", "labels"))
+    return ExportHeader(settings, dtype, poses, "one", "0" * 64, "ultragray/0 cpu")
+
+
+def written(path: Path, poses: FloatArray, dtype: str) -> dict[str, np.ndarray]:
+    random = np.random.default_rng(3)
+    frames: dict[str, Any] = {
+        "bmode": random.random((FRAMES, 6, 7), np.float32),
+        "labels": random.integers(0, 5, (FRAMES, 6, 7), np.uint8),
+    }
+    told = [Extrapolation(0.5, 2.0, 0.9 - 0.1 * number, 0.75) for number in range(FRAMES - 1)]
+    with export_to(path, "mcap", header(poses, dtype)) as add:
+        add(frames, [*told, Extrapolation(None, None, None, 0.25)])
+    return frames
+
+
+def messages(path: Path, topic: str) -> list[Any]:
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        return [found.decoded_message for found in reader.iter_decoded_messages(topics=[topic])]
+
+
+@pytest.mark.parametrize(("dtype", "encoding"), [("uint8", "mono8"), ("float32", "32FC1")])
+def test_images_come_back_with_the_stamps_of_their_poses(
+    tmp_path: Path, random_poses: Any, dtype: str, encoding: str
+) -> None:
+    path = tmp_path / "frames.mcap"
+    frames = written(path, random_poses(FRAMES), dtype)
+    images = messages(path, "/ultragray/bmode")
+    kind = np.dtype("u1" if dtype == "uint8" else "<f4")
+    got = np.stack([np.frombuffer(one.data, kind).reshape(one.height, one.width) for one in images])
+    expected = np.rint(255 * frames["bmode"]).astype("u1") if dtype == "uint8" else frames["bmode"]
+    np.testing.assert_array_equal(got, expected)
+    assert {(one.encoding, one.step, one.header.frame_id) for one in images} == {(encoding, 7 * kind.itemsize, "probe")}
+    labels = messages(path, "/ultragray/labels")
+    np.testing.assert_array_equal(np.frombuffer(labels[1].data, "u1").reshape(6, 7), frames["labels"][1])
+    stamps = [[(one.header.stamp.sec, one.header.stamp.nanosec) for one in images]]
+    stamps += [
+        [(one.header.stamp.sec, one.header.stamp.nanosec) for one in messages(path, topic)]
+        for topic in ("/ultragray/probe_pose", "/ultragray/confidence")
+    ]
+    assert stamps == [[(0, 0), (0, 40_000_000), (0, 80_000_000)]] * 3
+
+
+def test_poses_are_metres_in_the_file_and_come_back_as_they_were(tmp_path: Path, random_poses: Any) -> None:
+    path = tmp_path / "frames.mcap"
+    poses = random_poses(FRAMES, tilt_deg=170.0, shift_mm=200.0)
+    written(path, poses, "uint8")
+    first = messages(path, "/ultragray/probe_pose")[0]
+    place = first.pose.position
+    np.testing.assert_allclose([place.x, place.y, place.z], poses[0, :3, 3] / 1000.0)
+    assert first.header.frame_id == "scene"
+    np.testing.assert_allclose(load_poses(path), poses, atol=1e-9)
+
+
+def test_figures_and_origin_are_in_the_file(tmp_path: Path, random_poses: Any) -> None:
+    path = tmp_path / "frames.mcap"
+    written(path, random_poses(FRAMES), "uint8")
+    told = [one.status[0] for one in messages(path, "/ultragray/confidence")]
+    values = {one.key: float(one.value) for one in told[1].values}
+    assert values == {"distance_mm": 0.5, "angle_deg": 2.0, "confidence": 0.8, "supported_share": 0.75}
+    assert set(values) == set(FIGURES)
+    assert [one.level for one in told] == [0, 0, 1]
+    assert [one.key for one in told[2].values] == ["supported_share"], "what is not known is left out"
+    with path.open("rb") as file:
+        reader = make_reader(file, decoder_factories=[DecoderFactory()])
+        assert reader.get_header().profile == "ros2"
+        (metadata,) = reader.iter_metadata()
+    assert metadata.metadata["scene"] == "one"
+    assert json.loads(metadata.metadata["probe"]) == to_dict(PROBE)

@@ -1,0 +1,199 @@
+"""Compounding: exact where pixels meet voxels, sensible between frames, honest beyond them."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from ultragray import ConvexProbe, LinearProbe, Probe, RadialProbe, SteeredProbe
+from ultragray.datasets import Sweep
+from ultragray.datasets.source import load_dataset
+from ultragray.errors import InvalidArgument
+from ultragray.geometry.probe import FloatArray
+from ultragray.learn.evaluation import baselines as compounding
+from ultragray.learn.evaluation.baselines import (
+    affordable_voxel_mm,
+    compound,
+    evaluate_baselines,
+    mean_axes,
+    pixel_positions_mm,
+)
+
+HEIGHT, WIDTH = 12, 10
+PROBE = LinearProbe(width_mm=WIDTH * 0.5, near_mm=0.0, far_mm=HEIGHT * 0.5)  # a pixel is a voxel of 0.5 mm
+
+
+def sweep_of(images: np.ndarray, poses: FloatArray, probe: Probe = PROBE) -> Sweep:
+    return Sweep(images.astype(np.uint8), poses, probe, np.arange(len(images)), "made")
+
+
+def at(*elevations_mm: float) -> FloatArray:
+    poses = np.tile(np.eye(4), (len(elevations_mm), 1, 1))
+    poses[:, 1, 3] = elevations_mm
+    return poses
+
+
+@pytest.fixture
+def images() -> np.ndarray:  # [4, H, W]
+    return np.random.default_rng(0).integers(0, 256, (4, HEIGHT, WIDTH))
+
+
+@pytest.mark.parametrize(("method", "expected"), [("median", np.median), ("mean", np.mean), ("maximum", np.max)])
+def test_frames_of_one_plane_are_folded_pixel_by_pixel(
+    images: np.ndarray,
+    random_poses: Callable[..., FloatArray],
+    method: str,
+    expected: Callable[..., np.ndarray],
+) -> None:
+    pose = random_poses(1, seed=5)
+    volume = compound(sweep_of(images, np.repeat(pose, 4, axis=0)), method, 0.5)
+    plane = volume.reslice(PROBE, pose, HEIGHT, WIDTH)
+    np.testing.assert_allclose(plane[0], expected(images, axis=0) / 255.0, atol=2e-5)
+
+
+def test_the_median_of_an_even_number_lies_between_the_middle_two(images: np.ndarray) -> None:
+    images[:, 3, 3] = (10, 20, 40, 200)
+    plane = compound(sweep_of(images, at(0, 0, 0, 0)), "median", 0.5).reslice(PROBE, at(0), HEIGHT, WIDTH)
+    assert plane[0, 3, 3] == pytest.approx(30 / 255, abs=1e-5)
+
+
+def test_sorting_in_parts_gives_the_same_volume(images: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    sweep = sweep_of(images, at(0, 0.3, 0.6, 2.0))
+    whole = compound(sweep, "median", 0.5)
+    monkeypatch.setattr(compounding, "MAX_SAMPLES", 100)
+    assert compound(sweep, "median", 0.5).values.equal(whole.values)
+
+
+def test_filling_in_slabs_gives_the_same_volume(images: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    sweep = sweep_of(images, at(0, 1.5, 3.0, 5.5))
+    whole = compound(sweep, "mean", 0.5)
+    monkeypatch.setattr(compounding, "SLAB_VOXELS", 1)
+    assert compound(sweep, "mean", 0.5).values.equal(whole.values)
+
+
+def test_a_gap_between_two_frames_is_filled_with_what_lies_on_either_side() -> None:
+    ramp = np.linspace(20, 40, WIDTH).round()
+    images = np.stack([np.tile(ramp, (HEIGHT, 1)), np.tile(ramp + 100, (HEIGHT, 1))])
+    volume = compound(sweep_of(images, at(0.0, 2.0)), "median", 0.5)
+    plane = volume.reslice(PROBE, at(0.0, 1.0, 2.0), HEIGHT, WIDTH) * 255.0
+    np.testing.assert_allclose(plane[1], (images[0] + images[1]) / 2, atol=4.0)
+    np.testing.assert_allclose(plane[[0, 2]], images, atol=1e-2)
+
+
+def test_a_gap_wider_than_the_least_reach_is_closed_too() -> None:
+    images = np.random.default_rng(1).integers(50, 60, (3, HEIGHT, WIDTH))
+    volume = compound(sweep_of(images, at(0.0, 9.0, 18.0)), "median", 0.5)
+    assert (volume.reslice(PROBE, at(4.5), HEIGHT, WIDTH) > 0.19).all()
+
+
+def test_what_no_frame_comes_near_is_black(images: np.ndarray) -> None:
+    volume = compound(sweep_of(images, at(0, 0.5, 1.0, 1.5)), "median", 0.5)
+    away = at(0.0, 0.0)
+    away[:, 0, 3] = (WIDTH * 0.5 + 1.0, 50.0)
+    planes = volume.reslice(PROBE, away, HEIGHT, WIDTH)
+    assert not planes.any()
+    assert volume.reslice(PROBE, at(0.7), HEIGHT, WIDTH).any()
+    assert volume.reslice(PROBE, at(), HEIGHT, WIDTH).shape == (0, HEIGHT, WIDTH)
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_a_probe_that_was_held_still_is_not_seen_from_afar(images: np.ndarray, count: int) -> None:
+    volume = compound(sweep_of(images[:1].repeat(count, axis=0), at(*[0.0] * count)), "median", 0.5)
+    planes = volume.reslice(PROBE, at(-500.0, -1.0, 0.0, 1.0, 500.0), HEIGHT, WIDTH)
+    np.testing.assert_allclose(planes[2], images[0] / 255.0, atol=2e-5)
+    assert not planes[[0, 1, 3, 4]].any()
+
+
+def test_a_convex_sweep_keeps_its_geometry(random_poses: Callable[..., FloatArray]) -> None:
+    """A smooth field in space, seen by a fan that moves along elevation, comes back on a plane in between."""
+    probe = ConvexProbe(opening_angle_deg=70.0, near_mm=10.0, far_mm=30.0)
+    base = random_poses(1, seed=2, tilt_deg=40.0)[0]
+
+    def seen_from(elevation_mm: float) -> tuple[FloatArray, np.ndarray]:
+        pose = base.copy()
+        pose[:3, 3] += elevation_mm * base[:3, 1]
+        x, y, z = (pixel_positions_mm(probe, 48, 40) @ pose[:3, :3].T + pose[:3, 3]).T
+        return pose, (128 + 50 * np.sin(x / 6) + 40 * np.cos(z / 5) + 2 * y).reshape(48, 40)
+
+    poses, images = zip(*(seen_from(0.4 * step) for step in range(12)), strict=True)
+    volume = compound(sweep_of(np.stack(images).round(), np.stack(poses), probe), "median", 0.4)
+    pose, expected = seen_from(2.2)
+    plane = volume.reslice(probe, pose[None], 48, 40)[0] * 255.0
+    assert np.abs(plane - expected).mean() < 2.5
+    assert np.abs(plane[:, ::-1] - expected).mean() > 20.0
+
+
+def test_pixels_lie_on_their_scan_lines() -> None:
+    positions = pixel_positions_mm(PROBE, HEIGHT, WIDTH).reshape(HEIGHT, WIDTH, 3)
+    np.testing.assert_allclose(positions[0, 0], (-2.25, 0.0, 0.25))
+    np.testing.assert_allclose(positions[-1, 3], (-0.75, 0.0, 5.75))
+
+
+def test_voxels_too_small_are_refused_with_one_that_fits(images: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+    sweep = sweep_of(images, at(0, 1, 2, 3))
+    monkeypatch.setattr(compounding, "MAX_VOXELS", 1000)
+    fits_mm = affordable_voxel_mm(sweep, 0.1)
+    with pytest.raises(InvalidArgument, match=rf"voxel_mm must be at least {fits_mm:g} for made, .*, got 0\.1"):
+        compound(sweep, "median", 0.1)
+    assert compound(sweep, "median", fits_mm).values.numel() <= 1000
+    with pytest.raises(InvalidArgument, match="voxel_mm"):
+        compound(sweep, "median", fits_mm - 0.01)
+    assert affordable_voxel_mm(sweep, 2.0) == 2.0
+
+
+@pytest.mark.parametrize("voxel_mm", [0.0, -1.0, math.nan, math.inf])
+def test_a_voxel_is_a_positive_length(images: np.ndarray, voxel_mm: float) -> None:
+    with pytest.raises(InvalidArgument, match="voxel_mm must be a positive length"):
+        compound(sweep_of(images, at(0, 1, 2, 3)), "median", voxel_mm)
+
+
+def test_methods_are_named(images: np.ndarray) -> None:
+    with pytest.raises(InvalidArgument, match="median, mean, maximum, got 'mode'"):
+        compound(sweep_of(images, at(0, 1, 2, 3)), "mode")
+
+
+def test_the_mean_of_poses_is_a_rotation(random_poses: Callable[..., FloatArray]) -> None:
+    poses = random_poses(9, seed=1, tilt_deg=60.0)
+    axes = mean_axes(poses)
+    np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-12)
+    assert np.linalg.det(axes) == pytest.approx(1.0)
+    np.testing.assert_allclose(mean_axes(poses[:1]), poses[0, :3, :3], atol=1e-12)
+
+
+def test_a_real_sweep_is_predicted_as_well_as_by_an_independent_prototype(data_folder: Path) -> None:
+    mean = evaluate_baselines(load_dataset(data_folder / "spine_phantom"), ("median",))["median"].mean
+    assert mean.psnr_db == pytest.approx(22.30, abs=0.3)
+    assert mean.ms_ssim == pytest.approx(0.821, abs=0.005)
+    assert mean.gms == pytest.approx(0.898, abs=0.025)
+    assert mean.gmsd == pytest.approx(0.167, abs=0.025)
+
+
+@pytest.mark.parametrize(
+    "probe",
+    [
+        LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=20.0),
+        ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=30.0),
+        RadialProbe(near_mm=1.0, far_mm=10.0),
+        SteeredProbe(width_mm=20.0, steering_deg=25.0, near_mm=0.0, far_mm=20.0),
+    ],
+    ids=lambda probe: probe.kind,
+)
+def test_a_smooth_volume_comes_back_whatever_the_probe(probe: Probe) -> None:
+    size = (80, 100)
+    points = pixel_positions_mm(probe, *size)
+
+    def frames(poses: FloatArray) -> FloatArray:  # [C, H, W] in [0, 1]
+        places = np.einsum("cij,pj->cpi", poses[:, :3, :3], points) + poses[:, None, :3, 3]
+        return (0.5 + 0.15 * np.sin(places / (3.0, 4.0, 5.0)).sum(axis=2)).reshape(-1, *size)
+
+    poses, between = at(*np.arange(0.0, 6.0, 0.5)), at(1.25, 3.25)
+    images = np.rint(255 * frames(poses)).astype(np.uint8)
+    sweep = Sweep(images, poses, probe, np.arange(len(poses)), "made")
+    planes = compound(sweep, "mean").reslice(probe, between, *size)
+    inside = planes > 0.0
+    assert inside.mean() > 0.95
+    assert np.abs(planes - frames(between))[inside].mean() < 0.01

@@ -1,0 +1,194 @@
+"""A training that would not fit is refused before it starts."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ultragray.errors import MemoryExceeded
+from ultragray.learn.sweep import Dataset
+from ultragray.learn.training import TrainingConfig, memory, train
+from ultragray.learn.training import alignment as overlap
+from ultragray.learn.training.geometry import Geometry
+
+
+def test_names_what_to_lower(tiny_dataset: Callable[..., Dataset]) -> None:
+    config = TrainingConfig.preset("fast", max_gaussians=50_000_000, memory_gb=4.0)
+    with pytest.raises(MemoryExceeded, match=r"50,000,000 Gaussians .* memory_gb allows 4\.0 GiB: lower max_gaussians"):
+        train(tiny_dataset(), config)
+
+
+def test_uses_what_is_free(tiny_dataset: Callable[..., Dataset], monkeypatch: pytest.MonkeyPatch) -> None:
+    dataset, config = tiny_dataset(), TrainingConfig(max_gaussians=1000)
+    needed = memory.required_bytes(dataset, config)
+    monkeypatch.setattr(memory, "available_bytes", lambda: needed)
+    memory.check_memory(dataset, config, torch.device("cpu"))
+    monkeypatch.setattr(memory, "available_bytes", lambda: needed - 1)
+    with pytest.raises(MemoryExceeded, match="this machine has free"):
+        memory.check_memory(dataset, config, torch.device("cpu"))
+
+
+def test_a_gpu_is_asked_for_its_own_memory(
+    tiny_dataset: Callable[..., Dataset], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset, device = tiny_dataset(), torch.device("cuda", 1)
+    config = TrainingConfig(max_gaussians=1000)
+    needed = memory.required_device_bytes(dataset, config)
+    free = {device: needed}
+    monkeypatch.setattr(memory, "available_bytes", lambda: 0)
+    monkeypatch.setattr(torch.cuda, "mem_get_info", lambda asked: (free[asked], 1 << 40))
+    memory.check_memory(dataset, config, device)
+    free[device] = needed - 1
+    with pytest.raises(
+        MemoryExceeded, match=r"1,000 Gaussians .* cuda:1 has free 0\.3 GiB: lower max_gaussians or batch"
+    ):
+        memory.check_memory(dataset, config, device)
+    with pytest.raises(MemoryExceeded, match=r"cuda:1 has free"):  # a setting allows no more than there is
+        memory.check_memory(dataset, TrainingConfig(max_gaussians=1000, memory_gb=64.0), device)
+    with pytest.raises(MemoryExceeded, match=r"memory_gb allows 0\.1 GiB"):
+        memory.check_memory(dataset, TrainingConfig(max_gaussians=1000, memory_gb=0.1), device)
+
+
+def test_a_gpu_keeps_a_slice_of_each_gaussian_for_each_frame(tiny_dataset: Callable[..., Dataset]) -> None:
+    dataset = tiny_dataset(frames=90)
+
+    def needed(batch_size: int, gaussians: int) -> int:
+        return memory.required_device_bytes(dataset, TrainingConfig(max_gaussians=gaussians, batch_size=batch_size))
+
+    per_frame = (needed(64, 500_000) - needed(32, 500_000)) / 32
+    assert 500_000 * 4 * 21 < per_frame < 500_000 * 4 * 32
+    assert needed(8, 500_000) < 2 << 30  # the training of the paper fits every GPU that is in use
+
+
+def test_grows_with_gaussians_and_pixels(tiny_dataset: Callable[..., Dataset]) -> None:
+    def needed(dataset: Dataset, **settings: int) -> int:
+        return memory.required_bytes(dataset, TrainingConfig.preset("fast", **{"max_gaussians": 1000, **settings}))
+
+    small = tiny_dataset()
+    per_gaussian = (needed(small, max_gaussians=200_000) - needed(small, max_gaussians=100_000)) / 100_000
+    assert 4 * 15 * 5 < per_gaussian < 2_000  # parameters, gradients, moments and a copy at least
+    assert needed(tiny_dataset(height=200, width=200)) > needed(small)
+    assert needed(small, sh_degree=3) > needed(small)
+
+
+def test_batches_take_room_for_the_slices_of_all_gaussians(tiny_dataset: Callable[..., Dataset]) -> None:
+    dataset = tiny_dataset(frames=90)
+
+    def needed(batch_size: int) -> int:
+        return memory.required_bytes(dataset, TrainingConfig(max_gaussians=150_000, batch_size=batch_size))
+
+    per_frame = (needed(64) - needed(32)) / 32
+    assert 72 * 150_000 < per_frame < 72 * 150_000 * 1.2
+
+
+def test_held_out_frames_take_bounded_room(
+    tiny_dataset: Callable[..., Dataset], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset, config = tiny_dataset(frames=400), TrainingConfig(max_gaussians=1000, batch_size=1)
+    monkeypatch.setattr(memory, "CHUNK_PIXELS", 20 * 20 * 16)
+
+    def needed(held_out: int) -> int:
+        val = dataset.val.select(np.arange(held_out))
+        return memory.required_bytes(Dataset("some", dataset.train.select([0, 1]), val), config)
+
+    assert needed(20) - needed(10) > 10 * 20 * 16 * 200  # what measuring takes of each pixel
+    assert needed(80) - needed(20) == 60 * 20 * 16  # the frames themselves
+
+
+def test_frames_that_cannot_be_compared_are_refused_before_they_are(
+    tiny_dataset: Callable[..., Dataset], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    dataset, config = tiny_dataset(), TrainingConfig(max_gaussians=1000)
+    monkeypatch.setattr(memory, "available_bytes", lambda: memory.comparison_bytes(dataset, config) - 1)
+    monkeypatch.setattr(Geometry, "of", lambda dataset: pytest.fail("the frames were compared"))
+    with pytest.raises(MemoryExceeded, match=r"comparing its 8 frames needs up to 0\.0 GiB, this machine has free"):
+        train(dataset, config)
+
+
+def test_comparing_frames_grows_with_their_square(tiny_dataset: Callable[..., Dataset]) -> None:
+    datasets = [tiny_dataset(frames=frames) for frames in (40, 80, 120)]  # 30, 60 and 90 to train from
+    config = TrainingConfig(max_gaussians=1000)
+    first, second, third = (memory.comparison_bytes(dataset, config) for dataset in datasets)
+    assert (third - second) - (second - first) == 2 * 8 * 30**2
+    small, large = (memory.required_bytes(dataset, config) for dataset in datasets[:2])
+    assert large - small > second - first
+
+
+def test_the_registration_of_sweeps_takes_a_bounded_share(
+    tiny_dataset: Callable[..., Dataset], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    plain, refined = (TrainingConfig(max_gaussians=1000, refine_poses=mode) for mode in ("none", "sweeps"))
+    dataset = tiny_dataset(height=500, width=500, frames=8)  # 6 to train from
+    assert memory.comparison_bytes(dataset, refined) == memory.REGISTERED_BYTES * 6 * 500**2
+    assert memory.comparison_bytes(dataset, plain) < memory.comparison_bytes(dataset, refined)
+    monkeypatch.setattr(overlap, "FRAMES", 2)
+    assert memory.comparison_bytes(dataset, refined) == memory.REGISTERED_BYTES * 4 * 500**2
+
+
+@pytest.mark.parametrize(
+    ("folder", "limit", "used", "entry"),
+    [
+        (".", "memory.max", "memory.current", "inactive_file"),
+        ("memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
+    ],
+)
+def test_file_caches_of_a_control_group_are_free(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str, limit: str, used: str, entry: str
+) -> None:
+    group = tmp_path / folder
+    group.mkdir(exist_ok=True)
+    (group / limit).write_text("1000000\n")
+    (group / used).write_text("900000\n")
+    (group / "memory.stat").write_text(f"anon 12\n{entry} 600000\nother 7\n")
+    monkeypatch.setattr(memory, "CONTROL_GROUPS", tmp_path)
+    assert memory.available_bytes() == 700_000
+    (group / limit).write_text("max\n")
+    available = memory.available_bytes()
+    assert available is None or available > 1_000_000
+
+
+def test_finds_out_what_is_available() -> None:
+    available = memory.available_bytes()
+    assert available is None or available > 0
+
+
+PROGRAM = """
+import sys; sys.path[:0] = {path!r}
+import importlib.util, pathlib, re, torch
+spec = importlib.util.spec_from_file_location("tiny", {conftest!r})
+tiny = importlib.util.module_from_spec(spec); spec.loader.exec_module(tiny)
+from ultragray.learn.training import memory, train
+torch.set_num_threads(1)
+dataset = tiny.make_tiny_dataset(**{data!r})
+config = tiny.make_tiny_config(steps=3, refinements=1, **{settings!r})
+train(dataset, config, folder=pathlib.Path({folder!r}), checkpoint_interval_s=0.0)
+peak = re.search(r"VmHWM:\\s+(\\d+) kB", pathlib.Path("/proc/self/status").read_text())
+print(int(peak[1]) * 1024, memory.required_bytes(dataset, config))
+"""
+
+
+@pytest.mark.long
+@pytest.mark.skipif(sys.platform != "linux", reason="the peak is read from /proc")
+@pytest.mark.parametrize(
+    ("data", "settings"),
+    [
+        ({"height": 64, "width": 64}, {"max_gaussians": 200_000}),
+        ({"frames": 60, "spacing_mm": 0.005}, {"max_gaussians": 60_000, "batch_size": 64}),  # all are in all planes
+        ({"frames": 80, "height": 192, "width": 192}, {"max_gaussians": 1_000}),  # measuring takes the most
+    ],
+    ids=["gaussians", "slices", "held-out"],
+)
+def test_what_is_said_is_an_upper_bound(tmp_path: Path, data: dict[str, float], settings: dict[str, int]) -> None:
+    conftest = str(Path(__file__).with_name("conftest.py"))
+    program = PROGRAM.format(path=sys.path, conftest=conftest, folder=str(tmp_path), data=data, settings=settings)
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    found = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True, env=environment)
+    used, said = map(int, found.stdout.split())
+    assert 0.5 * said < used < said

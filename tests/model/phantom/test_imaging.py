@@ -1,0 +1,208 @@
+"""The phantom's image formation: speckle, specular interfaces, shadows; the same scatterers in every frame."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import cast
+
+import numpy as np
+import numpy.typing as npt
+import pytest
+
+from ultragray import ConvexProbe, LinearProbe
+from ultragray.errors import InvalidPose, InvalidProbe
+from ultragray.phantom import Tissue, anatomy, bone_attenuation_db, imaging, simulate, tissue_at, tissues
+from ultragray.phantom import anatomy as bone
+from ultragray.phantom.anatomy import ACOUSTICS, FREQUENCY_MHZ
+from ultragray.phantom.imaging import NOTHING, PER_MM3, ScattererField, Scatterers
+
+PROBE = LinearProbe(width_mm=24.0, near_mm=0.0, far_mm=50.0)
+HEIGHT, WIDTH = 214, 102  # about the phantom's own pixels
+SIZE = {"probe": PROBE, "height": HEIGHT, "width": WIDTH}
+
+Image = npt.NDArray[np.uint8]
+
+
+def at(x: float = 0.0, y: float = 0.0, tilt_deg: float = 0.0) -> npt.NDArray[np.float64]:
+    """A pose on the skin, tilted about the lateral axis."""
+    c, s = np.cos(np.radians(tilt_deg)), np.sin(np.radians(tilt_deg))
+    pose = np.eye(4)
+    pose[:3, :3] = [[1, 0, 0], [0, c, -s], [0, s, c]]
+    pose[:2, 3] = x, y
+    return pose
+
+
+SPINE, BESIDE, NEXT, FURTHER, TILTED = range(5)
+
+
+@pytest.fixture(scope="module")
+def frames() -> Image:  # [5, H, W]
+    poses = [at(), at(20.0), at(20.0, 0.3), at(20.0, 3.5), at(20.0, 0.0, 25.0)]
+    return simulate(np.stack(poses), **SIZE)
+
+
+def rows(low_mm: float, high_mm: float) -> slice:
+    return slice(round(low_mm * HEIGHT / 50.0), round(high_mm * HEIGHT / 50.0))
+
+
+def columns(low_mm: float, high_mm: float) -> slice:
+    return slice(round((low_mm + 12.0) * WIDTH / 24.0), round((high_mm + 12.0) * WIDTH / 24.0))
+
+
+def test_bone_is_the_brightest_and_its_shadow_black(frames: Image) -> None:
+    frame = frames[SPINE]
+    crest = frame[rows(12.5, 16.0), columns(-2.0, 2.0)].max(axis=0)
+    assert np.median(crest) > 200
+    lamina = frame[rows(27.0, 36.0), columns(5.0, 11.0)]
+    assert np.median(lamina.max(axis=0)) > 200
+    assert frame[rows(42.0, 50.0), columns(-10.0, 10.0)].max() <= 2
+
+
+def test_the_vessel_is_dark_within_muscle(frames: Image) -> None:
+    depth, lateral = np.meshgrid(PROBE.depths_mm(HEIGHT), PROBE.scan_lines(WIDTH)[0][:, 0], indexing="ij")
+    points = np.stack([lateral + 20.0, np.zeros_like(depth), depth], axis=-1).reshape(-1, 3)
+    labels = tissue_at(points).reshape(HEIGHT, WIDTH)
+    distance = anatomy.vessel_distance_mm(anatomy.straightened(points)).reshape(HEIGHT, WIDTH)
+    muscle = frames[BESIDE][labels == Tissue.MUSCLE].mean()
+    assert 50 < muscle < 120
+    assert frames[BESIDE][distance < -1.5].mean() < 0.1 * muscle
+
+
+def test_interfaces_fade_when_the_beam_leaves_their_normal(frames: Image) -> None:
+    straight, tilted = (
+        np.median(frames[which][rows(7.5, 11.5), columns(-8.0, 8.0)].max(axis=0)) for which in (BESIDE, TILTED)
+    )
+    assert straight > tilted + 40
+
+
+def test_speckle_is_shared_by_neighbours_and_lost_with_distance(frames: Image) -> None:
+    muscle = (rows(12.0, 19.0), columns(-10.0, 10.0))
+    here, near, far = (frames[which][muscle].ravel().astype(float) for which in (BESIDE, NEXT, FURTHER))
+    assert np.corrcoef(here, near)[0, 1] > 0.9
+    assert np.corrcoef(here, far)[0, 1] < 0.75
+
+
+def test_a_frame_does_not_depend_on_its_company(frames: Image) -> None:
+    np.testing.assert_array_equal(simulate(at(20.0, 3.5), **SIZE)[0], frames[FURTHER])
+
+
+def test_speckle_has_the_statistics_of_three_independent_looks(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Rayleigh envelopes: the mean of K independent powers has a standard deviation of 1/√K of its mean."""
+    rng = np.random.default_rng(0)
+    grid = imaging.Grid.of(PROBE, HEIGHT, WIDTH)
+    cells = grid.cell_mm[0] * grid.cell_mm[1]
+    thickness = np.sqrt(np.pi) * imaging.acoustics.elevation_sigma_mm(grid.depths_mm)[:, None]  # of a weight squared
+    looks = []
+    for _ in range(3):
+        noise = rng.normal(size=grid.shape) + 1j * rng.normal(size=grid.shape)
+        phasors = noise * np.sqrt(0.5 * PER_MM3 * cells * thickness)
+        looks.append(np.abs(imaging._blurred(phasors.astype(np.complex64), grid)) ** 2)
+    inside = np.mean(looks, axis=0)[40:-40, 20:-20]
+    assert inside.mean() == pytest.approx(1.0, abs=0.06)
+    assert inside.std() == pytest.approx(1.0 / np.sqrt(3.0), abs=0.06)
+    upper, lower = np.array_split(inside, 2)
+    assert upper.mean() == pytest.approx(lower.mean(), rel=0.15)
+
+
+def test_bone_attenuation_starts_at_the_bone_and_only_grows() -> None:
+    attenuation = bone_attenuation_db(at(), **SIZE)[0]
+    assert attenuation.shape == (HEIGHT, WIDTH)
+    assert (np.diff(attenuation, axis=0) >= -1e-3).all()
+    depth = PROBE.depths_mm(HEIGHT)
+    middle = attenuation[:, WIDTH // 2]
+    fine = np.arange(10.0, 20.0, 0.01)
+    points = np.stack([np.full_like(fine, 0.12), np.zeros_like(fine), fine], axis=1)
+    first = fine[np.argmax(bone.distance_mm(anatomy.straightened(points)) < 0.0)]
+    assert middle[depth < first - 0.3].max() == 0.0
+    per_mm = 0.2 * FREQUENCY_MHZ * ACOUSTICS[Tissue.BONE].attenuation
+    assert per_mm > 15.0
+    assert np.interp(first + 2.0, depth, middle) == pytest.approx(2.0 * per_mm, abs=0.15 * per_mm)
+    assert bone_attenuation_db(at(46.0), **SIZE).max() == 0.0
+
+
+def test_what_bone_hides_is_dark(frames: Image) -> None:
+    hidden = bone_attenuation_db(at(), **SIZE)[0] > 30.0
+    assert 0.2 < hidden.mean() < 0.8
+    assert frames[SPINE][hidden].mean() < 6
+    assert frames[SPINE][~hidden].mean() > 40
+
+
+def test_two_slices_hold_the_same_scatterers_where_they_cross() -> None:
+    field = ScattererField()
+    low, high = np.array([-4.0, -1.0, 20.0]), np.array([4.0, 1.0, 28.0])
+    one, other = (field.slice(pose, low, high) for pose in (at(20.0), at(20.0, 0.5)))
+    shared = {tuple(p) for p in one.points_mm.tolist()} & {tuple(p) for p in other.points_mm.tolist()}
+    assert len(shared) / len(one.points_mm) == pytest.approx(0.75, abs=0.03)
+    again = ScattererField().slice(at(20.0), low, high)
+    np.testing.assert_array_equal(again.points_mm, one.points_mm)
+    np.testing.assert_array_equal(again.amplitudes, one.amplitudes)
+
+
+def test_scatterers_lie_on_bone_with_outward_normals() -> None:
+    low, high = np.array([-8.0, -2.0, 24.0]), np.array([8.0, 2.0, 40.0])
+    slab = ScattererField().slice(at(), low, high)
+    bright = slab.specular > 0.2 * slab.specular.max()
+    points, normals = slab.surface_mm[bright], slab.normals[bright]
+    distance = bone.distance_mm(anatomy.straightened(points))
+    assert bright.sum() > 200
+    assert np.quantile(np.abs(distance), 0.95) < 0.2
+    outside = bone.distance_mm(anatomy.straightened(points + 0.5 * normals))
+    assert (outside > distance + 0.3).mean() > 0.95
+
+
+def test_a_probe_that_looks_away_sees_nothing_and_a_mirror_is_refused() -> None:
+    away = np.diag([1.0, -1.0, -1.0, 1.0])
+    away[2, 3] = -5.0
+    assert simulate(away, **SIZE).max() == 0
+    assert simulate(np.zeros((0, 4, 4)), **SIZE).shape == (0, HEIGHT, WIDTH)
+    for function in (simulate, bone_attenuation_db, tissues):
+        with pytest.raises(InvalidPose):
+            function(np.diag([-1.0, 1.0, 1.0, 1.0]), **SIZE)
+
+
+class OneScatterer:
+    """A field with a single scatterer before the image plane of the identity, in the focus."""
+
+    def __init__(self, elevation_mm: float) -> None:
+        self.place = np.array([[3.0, elevation_mm, 32.0]], dtype=np.float32)
+
+    def slice(self, *_: object) -> Scatterers:
+        return Scatterers.join([NOTHING, replace(NOTHING, points_mm=self.place, amplitudes=np.ones(1, np.float32))])
+
+
+def test_a_point_shows_the_beam_and_the_pulse() -> None:
+    grid = imaging.Grid.of(PROBE, HEIGHT, WIDTH)
+    power = imaging._power(cast(ScattererField, OneScatterer(0.0)), grid, np.eye(4))
+    row, column = np.unravel_index(power.argmax(), power.shape)
+    assert PROBE.depths_mm(HEIGHT)[row] == pytest.approx(32.0, abs=0.15)
+    assert PROBE.scan_lines(WIDTH)[0][column, 0] == pytest.approx(3.0, abs=0.15)
+    across, down = power[row].sum() / power.max(), power[:, column].sum() / power.max()
+    root_pi = np.sqrt(np.pi)  # ∫ exp(−x²/σ²) dx = √π σ
+    assert across * 24.0 / WIDTH == pytest.approx(root_pi * 0.34, rel=0.05)
+    assert down * 50.0 / HEIGHT == pytest.approx(root_pi * 0.17, rel=0.3)
+    beside = imaging._power(cast(ScattererField, OneScatterer(0.6)), grid, np.eye(4))
+    assert beside.max() / power.max() == pytest.approx(np.exp(-1.0), rel=0.01)
+
+
+def test_tissues_are_those_in_the_middle_of_each_pixel() -> None:
+    probe, height, width = LinearProbe(width_mm=24.0, near_mm=3.0, far_mm=50.0), 40, 21
+    poses = np.stack([at(), at(20.0, 7.0, 25.0)])
+    found = tissues(poses, probe=probe, height=height, width=width)
+    assert found.shape == (2, height, width)
+    z, x = np.meshgrid(
+        3.0 + (np.arange(height) + 0.5) / height * 47.0, ((np.arange(width) + 0.5) / width - 0.5) * 24.0, indexing="ij"
+    )
+    middles = np.stack([x, np.zeros_like(x), z, np.ones_like(x)], axis=-1).reshape(-1, 4)
+    for pose, labels in zip(poses, found, strict=True):
+        expected = tissue_at((middles @ pose.T)[:, :3]).reshape(height, width)
+        assert (labels != expected).mean() < 0.005  # rounding decides at a border
+    assert {Tissue.BONE, Tissue.MUSCLE, Tissue.FAT} <= {Tissue(value) for value in np.unique(found)}
+
+
+def test_tissues_of_scan_lines_that_are_not_upright_are_refused() -> None:
+    with pytest.raises(InvalidProbe, match="upright"):
+        tissues(at(), probe=ConvexProbe(opening_angle_deg=60.0, near_mm=40.0, far_mm=95.0), height=8, width=8)
+
+
+def test_frames_made_one_by_one_are_those_made_together(frames: Image) -> None:
+    np.testing.assert_array_equal(simulate(at(20.0, 0.3), **SIZE)[0], frames[NEXT])

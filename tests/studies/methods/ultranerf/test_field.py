@@ -1,0 +1,70 @@
+"""The field of Ultra-NeRF: its encoding, its size and its start."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from ultragray_studies.methods.parts import encode
+from ultragray_studies.methods.ultranerf import TissueField
+
+
+def field(seed: int = 0) -> TissueField:
+    return TissueField(torch.Generator().manual_seed(seed))
+
+
+def test_a_point_becomes_itself_and_ten_octaves_of_sines_and_cosines() -> None:
+    point = torch.tensor([math.pi / 2, 0.0, -math.pi / 4], dtype=torch.float64)
+    encoded = encode(point)
+    assert encoded.shape == (63,)
+    half = math.sqrt(0.5)
+    expected = [*point.tolist(), 1.0, 0.0, -half, 0.0, 1.0, half]  # p, then sin p and cos p
+    expected += [0.0, 0.0, -1.0, -1.0, 1.0, 0.0]  # sin 2p, cos 2p
+    torch.testing.assert_close(encoded[:15], torch.tensor(expected, dtype=torch.float64))
+    torch.testing.assert_close(encoded[-6:-3], torch.sin(512.0 * point))
+    torch.testing.assert_close(encoded[-3:], torch.cos(512.0 * point))
+
+
+def test_the_finest_period_in_metres_is_12_3_millimetres() -> None:
+    x_m = torch.tensor([0.0, 12.27e-3, 12.27e-3 / 2], dtype=torch.float64)
+    points = torch.stack([x_m, torch.zeros_like(x_m), torch.zeros_like(x_m)], dim=-1)
+    finest = encode(points)[:, -3]  # cos 512 x
+    torch.testing.assert_close(finest, torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64), atol=1e-3, rtol=0.0)
+
+
+def test_the_field_has_132485_parameters() -> None:
+    assert sum(one.numel() for one in field().parameters()) == 132_485
+
+
+def test_the_encoding_joins_again_before_the_sixth_layer() -> None:
+    module = field()
+    layers = [one for one in module.modules() if isinstance(one, torch.nn.Linear)]
+    assert [(one.in_features, one.out_features) for one in layers] == [
+        (63, 128), *[(128, 128)] * 4, (191, 128), *[(128, 128)] * 2, (128, 5)
+    ]  # fmt: skip
+    with torch.no_grad():
+        layers[4].weight.zero_()  # what came before the joint is gone
+        raw = module(torch.rand(8, 3, generator=torch.Generator().manual_seed(0)))
+    assert raw.shape == (8, 5)
+    assert raw.std(dim=0).min() > 0.0
+
+
+def test_weights_are_glorot_uniform_and_biases_zero() -> None:
+    for layer in field().modules():
+        if isinstance(layer, torch.nn.Linear):
+            bound = math.sqrt(6.0 / (layer.in_features + layer.out_features))
+            assert 0.95 * bound < layer.weight.abs().max() <= bound
+            assert float(layer.weight.detach().std()) == pytest.approx(bound / math.sqrt(3.0), rel=0.1)
+            assert not layer.bias.any()
+
+
+def test_the_start_comes_from_the_given_generator_alone() -> None:
+    torch.manual_seed(1)
+    before = torch.random.get_rng_state()
+    one = field(3)
+    assert torch.equal(torch.random.get_rng_state(), before)
+    torch.manual_seed(2)
+    assert all(torch.equal(a, b) for a, b in zip(one.parameters(), field(3).parameters(), strict=True))
+    assert not torch.equal(one.head.weight, field(4).head.weight)

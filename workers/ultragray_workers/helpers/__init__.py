@@ -1,1 +1,0 @@
-"""Short work in a process of its own, within a bound of memory."""
