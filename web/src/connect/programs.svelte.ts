@@ -1,12 +1,12 @@
 /** What other programs do with a scene: the streams that they have open, and the jobs that render a path for them. */
 
-import { explain, pauseAfter, untilAnswered } from "../api/client";
+import { explain, untilAnswered } from "../api/client";
 import { cancelJob, followJob, isFinal, type Job, startJob } from "../api/jobs";
 import { listStreams, PAGE, PAGE_NAME, type StreamSummary } from "../api/stream";
 import type { Pose } from "../geometry/pose";
 import { service } from "../page/service.svelte";
 import type { Session } from "../session/session.svelte";
-import { base64 } from "../shared/asking.svelte";
+import { base64, polled } from "../shared/asking.svelte";
 
 const EVERY_MS = 1000;
 
@@ -18,23 +18,10 @@ export class OpenStreams {
   constructor(scene: () => string, wanted: () => boolean) {
     $effect(() => {
       if (service.status !== "ready" || !wanted()) return;
-      const stopped = new AbortController();
-      void this.#follow(scene(), stopped.signal);
-      return () => stopped.abort();
+      const take = (all: StreamSummary[]): void => void (this.others = all.filter(({ name }) => name !== PAGE_NAME + PAGE));
+      const of = scene();
+      return polled((signal) => listStreams(of, signal), EVERY_MS, take, () => undefined);
     });
-  }
-
-  async #follow(scene: string, signal: AbortSignal): Promise<void> {
-    while (!signal.aborted) {
-      let pause_ms = EVERY_MS;
-      try {
-        const all = await listStreams(scene, signal);
-        this.others = all.filter(({ name }) => name !== PAGE_NAME + PAGE);
-      } catch (error) {
-        pause_ms = pauseAfter(error, EVERY_MS);
-      }
-      await new Promise((resolve) => setTimeout(resolve, pause_ms));
-    }
   }
 }
 

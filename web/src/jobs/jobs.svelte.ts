@@ -4,7 +4,7 @@ import { SvelteMap } from "svelte/reactivity";
 
 import { explain, pauseAfter, ServiceError, Unreachable } from "../api/client";
 import { type CurvePoint, followJob, isFinal, type Job, type JobState, listJobs, trainingCurve } from "../api/jobs";
-import { polled } from "../shared/asking.svelte";
+import { Listed } from "../shared/asking.svelte";
 
 const TONES: Record<JobState, string> = { queued: "", running: "warn", succeeded: "good", failed: "bad", cancelled: "" };
 
@@ -13,22 +13,17 @@ export function toneOf(state: JobState): string {
   return TONES[state];
 }
 
-const POLL_MS = 2000;
 const PAGE = 30;
 
-export class JobList {
+export class JobList extends Listed<Awaited<ReturnType<typeof listJobs>>[]> {
   /** null: not asked for yet. */
   jobs = $state.raw<Job[] | null>(null);
   kind = $state("");
   state = $state("");
   more = $state(false);
-  problem = $state<string | null>(null);
   /** Those under way, whatever is listed. */
   unfinished = $state.raw<Job[]>([]);
   #length = PAGE;
-  #asked = 0;
-  /** The newest request whose answer was taken: those to older ones come too late. */
-  #taken = 0;
 
   /** Shows others: none are known until they come. */
   filter(kind: string, state: string): void {
@@ -41,34 +36,15 @@ export class JobList {
     await this.refresh();
   }
 
-  async refresh(): Promise<void> {
-    await this.#ask().catch(() => undefined); // it is told as the problem
+  protected ask(): Promise<Awaited<ReturnType<typeof listJobs>>[]> {
+    const listed = listJobs(this.#length, { kind: this.kind, state: this.state });
+    return Promise.all(this.kind === "" && this.state === "" ? [listed] : [listed, listJobs(PAGE)]);
   }
 
-  /** Asks now and from now on; the answer ends it. */
-  poll(): () => void {
-    const nothing = (): void => undefined;
-    return polled(() => this.#ask(), POLL_MS, nothing, nothing);
-  }
-
-  async #ask(): Promise<void> {
-    const asked = ++this.#asked;
-    try {
-      const listed = listJobs(this.#length, { kind: this.kind, state: this.state });
-      const others = this.kind === "" && this.state === "" ? [] : [listJobs(PAGE, { kind: "", state: "" })];
-      const [{ jobs, more }, newest] = await Promise.all([listed, ...others]);
-      if (asked < this.#taken) return;
-      this.unfinished = (newest?.jobs ?? jobs).filter((job) => !isFinal(job));
-      this.#taken = asked;
-      this.jobs = jobs.map((job) => this.#known(job));
-      this.more = more;
-      this.problem = null;
-    } catch (error) {
-      if (asked < this.#taken) return;
-      this.#taken = asked;
-      this.problem = explain(error);
-      throw error;
-    }
+  protected take([listed, newest]: Awaited<ReturnType<typeof listJobs>>[]): void {
+    this.unfinished = (newest ?? listed)!.jobs.filter((job) => !isFinal(job));
+    this.jobs = listed!.jobs.map((job) => this.#known(job));
+    this.more = listed!.more;
   }
 
   /** The object that stands for the job already, where nothing of it changed: its row is left alone. */

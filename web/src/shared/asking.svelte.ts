@@ -94,6 +94,7 @@ export class Sending {
   }
 }
 
+const COPIED_MS = 1500;
 const KEPT_MS = 60_000;
 
 /** Gives a file to the person. */
@@ -112,4 +113,81 @@ export function base64(bytes: Uint8Array): string {
   const pieces: string[] = [];
   for (let start = 0; start < bytes.length; start += PIECE) pieces.push(String.fromCharCode(...bytes.subarray(start, start + PIECE)));
   return btoa(pieces.join(""));
+}
+
+/** Something that is tried at a press: whether it is under way, and why it came to nothing. */
+export class Attempt {
+  busy = $state(false);
+  problem = $state<string | null>(null);
+
+  /** Tries it; false where it came to nothing. */
+  async run(work: () => Promise<unknown>): Promise<boolean> {
+    this.busy = true;
+    this.problem = null;
+    try {
+      await work();
+      return true;
+    } catch (error) {
+      this.problem = explain(error);
+      return false;
+    } finally {
+      this.busy = false;
+    }
+  }
+}
+
+/** A list of the service that is asked for while somebody looks; answers that come too late are left. */
+export abstract class Listed<Answer> {
+  /** Why the newest answer is not there. */
+  problem = $state<string | null>(null);
+  #asked = 0;
+  #taken = 0;
+
+  protected abstract ask(): Promise<Answer>;
+  protected abstract take(answer: Answer): void;
+
+  /** Asks once; what goes wrong is told as the problem. */
+  async refresh(): Promise<void> {
+    await this.#answer().catch(() => undefined);
+  }
+
+  /** Asks now and from now on; the function that is returned ends it. */
+  poll(every_ms: number): () => void {
+    const nothing = (): void => undefined;
+    return polled(() => this.#answer(), every_ms, nothing, nothing);
+  }
+
+  async #answer(): Promise<void> {
+    const asked = ++this.#asked;
+    try {
+      const answer = await this.ask();
+      if (asked < this.#taken) return;
+      this.#taken = asked;
+      this.take(answer);
+      this.problem = null;
+    } catch (error) {
+      if (asked < this.#taken) return;
+      this.#taken = asked;
+      this.problem = explain(error);
+      throw error;
+    }
+  }
+}
+
+/** A text that a person copies. Browsers give the clipboard only to pages that they trust: not over plain HTTP from another machine. */
+export class Copying {
+  /** Whether the newest was copied a moment ago. */
+  done = $state(false);
+
+  /** Copies a text; false where the browser does not let the page. */
+  async copy(text: string): Promise<boolean> {
+    try {
+      await navigator.clipboard.writeText(text);
+    } catch {
+      return false;
+    }
+    this.done = true;
+    setTimeout(() => (this.done = false), COPIED_MS);
+    return true;
+  }
 }

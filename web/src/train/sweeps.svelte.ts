@@ -1,50 +1,25 @@
 /** The sweeps of the service, the one that is chosen and sent, and the crop that is drawn on it before. */
 
-import { explain } from "../api/client";
 import { type Dataset, type DatasetOptions, listDatasets, uploadDataset } from "../api/datasets";
-import { polled, Sending } from "../shared/asking.svelte";
+import { Listed, Sending } from "../shared/asking.svelte";
 import { nameOfFile } from "../shared/text";
 import { Sequence, type SequenceFrame, type Size } from "./sequence";
 
-const POLL_MS = 4000;
-
-class Datasets {
+class Datasets extends Listed<Dataset[]> {
   /** null: not asked for yet. */
   all = $state.raw<Dataset[] | null>(null);
   /** Name of the dataset that is looked at; empty: none. */
   chosen = $state("");
-  problem = $state<string | null>(null);
   readonly dataset = $derived(this.all?.find((one) => one.name === this.chosen) ?? null);
   readonly names = $derived((this.all ?? []).map(({ name }) => name));
-  #asked = 0;
-  /** The newest request whose answer was taken: those to older ones come too late. */
-  #taken = 0;
 
-  async refresh(): Promise<void> {
-    await this.#ask().catch(() => undefined); // it is told as the problem
+  protected ask(): Promise<Dataset[]> {
+    return listDatasets();
   }
 
-  /** Asks now and from now on; the answer ends it. */
-  poll(): () => void {
-    const nothing = (): void => undefined;
-    return polled(() => this.#ask(), POLL_MS, nothing, nothing);
-  }
-
-  async #ask(): Promise<void> {
-    const asked = ++this.#asked;
-    try {
-      const found = await listDatasets();
-      if (asked < this.#taken) return;
-      this.#taken = asked;
-      this.all = found.map((dataset) => this.#known(dataset));
-      if (this.dataset === null) this.chosen = this.all[0]?.name ?? "";
-      this.problem = null;
-    } catch (error) {
-      if (asked < this.#taken) return;
-      this.#taken = asked;
-      this.problem = explain(error);
-      throw error;
-    }
+  protected take(found: Dataset[]): void {
+    this.all = found.map((dataset) => this.#known(dataset));
+    if (this.dataset === null) this.chosen = this.all[0]?.name ?? "";
   }
 
   /** The object that stands for the dataset already: what is shown of it is not built anew at each answer. */

@@ -97,6 +97,7 @@ export const shared = {
     reset: (value: number, unit: string): string => `Double click: ${value}${unit && ` ${unit}`}`,
   },
   field: {
+    usual: "as usual",
     ofList: (label: string, place: number, count: number): string => `${label} ${place} of ${count}`,
     labels: {
       below_min_confidence: "Below that",

@@ -143,7 +143,6 @@ export const train = {
     } as Named,
     outputs: "Pictures of each frame",
     files: "Files",
-    usual: "as usual",
     more: "More",
     begin: "Start rendering",
     preview: "Poses that will be rendered",
