@@ -1,41 +1,29 @@
 /** Light or dark: as the system has it until the person says otherwise. */
 
+import { MediaQuery } from "svelte/reactivity";
+
 const STORAGE = "ultragray.theme";
 export const THEMES = ["system", "light", "dark"] as const;
 /** What a person chooses. */
-export type ThemeChoice = (typeof THEMES)[number];
-
-const systemDark = matchMedia("(prefers-color-scheme: dark)");
+type ThemeChoice = (typeof THEMES)[number];
 
 class ThemeState {
-  chosen = $state<ThemeChoice>(stored());
-  #system = $state<"light" | "dark">(systemDark.matches ? "dark" : "light");
+  chosen = $state<ThemeChoice>(THEMES.find((one) => one === localStorage.getItem(STORAGE)) ?? "system");
+  #systemDark = new MediaQuery("(prefers-color-scheme: dark)");
 
   constructor() {
-    systemDark.addEventListener("change", (event) => {
-      this.#system = event.matches ? "dark" : "light";
-      this.#apply();
+    $effect.root(() => {
+      $effect.pre(() => {
+        const system = this.#systemDark.current ? "dark" : "light";
+        document.documentElement.dataset.theme = this.chosen === "system" ? system : this.chosen;
+      });
     });
-    this.#apply();
-  }
-
-  get current(): "light" | "dark" {
-    return this.chosen === "system" ? this.#system : this.chosen;
   }
 
   choose(choice: ThemeChoice): void {
     this.chosen = choice;
     localStorage.setItem(STORAGE, choice);
-    this.#apply();
   }
-
-  #apply(): void {
-    document.documentElement.dataset.theme = this.current;
-  }
-}
-
-function stored(): ThemeChoice {
-  return THEMES.find((one) => one === localStorage.getItem(STORAGE)) ?? "system";
 }
 
 export const theme = new ThemeState();

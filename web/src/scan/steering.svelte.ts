@@ -51,13 +51,6 @@ class ScanSettings {
 
 export const scanSettings = new ScanSettings();
 
-export const COMMANDS = [
-  "freeze", "distance", "ellipse", "angle", "text", "leave", "store", "play", "previousFrame", "nextFrame",
-  "home", "snap", "undo", "redo", "slower", "faster", "large", "keys",
-] as const; // prettier-ignore
-export type Command = (typeof COMMANDS)[number];
-export type Commands = Readonly<Record<Command, () => void>>;
-
 interface Parts {
   scan: ScanState;
   store: Store;
@@ -65,54 +58,41 @@ interface Parts {
   openKeys: () => void;
 }
 
-export function commandsFor({ scan, store, steering, openKeys }: Parts): Commands {
-  const { session, cine, marks } = scan;
-  return {
-    freeze: () => scan.toggleFrozen(),
-    distance: () => scan.toggleTool("distance"),
-    ellipse: () => scan.toggleTool("ellipse"),
-    angle: () => scan.toggleTool("angle"),
-    text: () => scan.toggleTool("text"),
-    leave: () => marks.leave(),
-    store: () => void store.picture(),
-    play: () => (session.frozen ? cine.togglePlaying() : steering().togglePlaying()),
-    previousFrame: () => session.frozen && cine.step(-1),
-    nextFrame: () => session.frozen && cine.step(1),
-    home: () => session.goHome(),
-    snap: () => session.snap(),
-    undo: () => session.history.undo(),
-    redo: () => session.history.redo(),
-    slower: () => scanSettings.changeSpeed(-1),
-    faster: () => scanSettings.changeSpeed(1),
-    large: () => (scanSettings.large = !scanSettings.large),
-    keys: openKeys,
-  };
+/** What is done at a key. Keys are as `KeyboardEvent.key` has them, in lower case; Ctrl stands for Command, too. */
+interface KeyCommand {
+  keys: readonly string[];
+  /** Whether it goes on while its key is held. */
+  goesOn?: boolean;
+  run: (parts: Parts) => unknown;
 }
 
-/** Keys as `KeyboardEvent.key` has them, in lower case; Ctrl stands for Command, too. */
-export const KEYS: Readonly<Record<Command, readonly string[]>> = {
-  freeze: ["f"],
-  distance: ["m", "d"],
-  ellipse: ["e"],
-  angle: ["a"],
-  text: ["t"],
-  leave: ["escape"],
-  store: ["s"],
-  play: [" "],
-  previousFrame: [","],
-  nextFrame: ["."],
-  home: ["h"],
-  snap: ["n"],
-  undo: ["ctrl+z"],
-  redo: ["ctrl+shift+z", "ctrl+y"],
-  slower: ["-"],
-  faster: ["+"],
-  large: ["l"],
-  keys: ["?"],
-};
+const ALL = {
+  freeze: { keys: ["f"], run: ({ scan }) => scan.toggleFrozen() },
+  distance: { keys: ["m", "d"], run: ({ scan }) => scan.toggleTool("distance") },
+  ellipse: { keys: ["e"], run: ({ scan }) => scan.toggleTool("ellipse") },
+  angle: { keys: ["a"], run: ({ scan }) => scan.toggleTool("angle") },
+  text: { keys: ["t"], run: ({ scan }) => scan.toggleTool("text") },
+  leave: { keys: ["escape"], run: ({ scan }) => scan.marks.leave() },
+  store: { keys: ["s"], run: ({ store }) => store.picture() },
+  play: { keys: [" "], run: ({ scan, steering }) => (scan.session.frozen ? scan.cine.togglePlaying() : steering().togglePlaying()) },
+  previousFrame: { keys: [","], goesOn: true, run: ({ scan }) => scan.session.frozen && scan.cine.step(-1) },
+  nextFrame: { keys: ["."], goesOn: true, run: ({ scan }) => scan.session.frozen && scan.cine.step(1) },
+  home: { keys: ["h"], run: ({ scan }) => scan.session.goHome() },
+  snap: { keys: ["n"], run: ({ scan }) => scan.session.snap() },
+  undo: { keys: ["ctrl+z"], goesOn: true, run: ({ scan }) => scan.session.history.undo() },
+  redo: { keys: ["ctrl+shift+z", "ctrl+y"], goesOn: true, run: ({ scan }) => scan.session.history.redo() },
+  slower: { keys: ["-"], run: () => scanSettings.changeSpeed(-1) },
+  faster: { keys: ["+"], run: () => scanSettings.changeSpeed(1) },
+  large: { keys: ["l"], run: () => (scanSettings.large = !scanSettings.large) },
+  keys: { keys: ["?"], run: ({ openKeys }) => openKeys() },
+} satisfies Record<string, KeyCommand>;
+export type Command = keyof typeof ALL;
+export type Commands = Readonly<Record<Command, () => void>>;
+export const COMMANDS: readonly [Command, KeyCommand][] = Object.entries(ALL) as [Command, KeyCommand][];
 
-/** What goes on while its key is held. */
-const GOES_ON: readonly Command[] = ["previousFrame", "nextFrame", "undo", "redo"];
+export function commandsFor(parts: Parts): Commands {
+  return Object.fromEntries(COMMANDS.map(([name, { run }]) => [name, () => void run(parts)])) as Commands;
+}
 
 /** The command of a key that was pressed; undefined where it is none, or belongs to where the focus is. */
 export function commandOf(event: KeyboardEvent, singleKeys: boolean): Command | undefined {
@@ -123,8 +103,8 @@ export function commandOf(event: KeyboardEvent, singleKeys: boolean): Command | 
   if (!isControlled && !singleKeys && event.key !== "Escape") return undefined;
   const shift = isControlled && event.shiftKey ? "shift+" : ""; // the sign of a key alone has Shift in it
   const pressed = `${isControlled ? "ctrl+" : ""}${shift}${event.key.toLowerCase()}`;
-  const command = COMMANDS.find((one) => KEYS[one].includes(pressed));
-  return command === undefined || (event.repeat && !GOES_ON.includes(command)) ? undefined : command;
+  const [name, command] = COMMANDS.find(([, { keys }]) => keys.includes(pressed)) ?? [];
+  return event.repeat && !command?.goesOn ? undefined : name;
 }
 
 /** Whether what is typed there belongs there. */

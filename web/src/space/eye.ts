@@ -1,6 +1,6 @@
 /** The eye of the person: turned by dragging, put to viewpoints, and what cuts the scene open before it. */
 
-import { PerspectiveCamera, type Plane, Spherical, Vector3 } from "three";
+import { PerspectiveCamera, type Plane, Vector3 } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 
 import { apply, axis, IDENTITY, length, minus, type Pose } from "../geometry/pose";
@@ -65,33 +65,16 @@ export class Eye {
 
   /** Goes round by a key; true where it is one of those. */
   press(key: string): boolean {
-    const ways: Record<string, [number, number, number]> = {
-      ArrowLeft: [-KEY_STEP_RAD, 0, 1],
-      ArrowRight: [KEY_STEP_RAD, 0, 1],
-      ArrowUp: [0, -KEY_STEP_RAD, 1],
-      ArrowDown: [0, KEY_STEP_RAD, 1],
-      "+": [0, 0, 1 / KEY_ZOOM],
-      "-": [0, 0, KEY_ZOOM],
+    const ways: Record<string, () => void> = {
+      ArrowLeft: () => this.#orbit.rotateLeft(KEY_STEP_RAD),
+      ArrowRight: () => this.#orbit.rotateLeft(-KEY_STEP_RAD),
+      ArrowUp: () => this.#orbit.rotateUp(KEY_STEP_RAD),
+      ArrowDown: () => this.#orbit.rotateUp(-KEY_STEP_RAD),
+      "+": () => this.#orbit.dollyIn(1 / KEY_ZOOM),
+      "-": () => this.#orbit.dollyOut(1 / KEY_ZOOM),
     };
-    const way = ways[key];
-    if (way === undefined) return false;
-    const { position, target, up } = this.look;
-    const pole = new Vector3(0, 1, 0);
-    const from = new Vector3(...minus(position, target));
-    const turn = (vector: Vector3, a: Vector3, b: Vector3): Vector3 => {
-      const axis = new Vector3().crossVectors(a, b);
-      const angle = a.angleTo(b);
-      if (axis.lengthSq() < 1e-12) axis.set(1, 0, 0);
-      return vector.applyAxisAngle(axis.normalize(), angle);
-    };
-    const above = new Vector3(...up);
-    const place = new Spherical().setFromVector3(turn(from, above, pole));
-    place.theta += way[0];
-    place.phi = Math.max(0.02, Math.min(Math.PI - 0.02, place.phi + way[1]));
-    place.radius *= way[2];
-    const to = turn(new Vector3().setFromSpherical(place), pole, above);
-    this.look = { position: to.add(new Vector3(...target)).toArray(), target, up };
-    return true;
+    ways[key]?.();
+    return key in ways;
   }
 
   dispose(): void {
