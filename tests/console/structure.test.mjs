@@ -5,8 +5,8 @@ import { readdirSync, readFileSync } from "node:fs";
 import path from "node:path";
 import { describe, it } from "node:test";
 
-import { faults } from "../../web/storeys.mjs";
 import { ROOT } from "./harness.mjs";
+import { faults } from "./storeys.mjs";
 
 const SOURCES = path.join(ROOT, "web/src");
 

@@ -1,11 +1,9 @@
-/** The house of the console, checked: no import runs up, none runs to a neighbour, none in a circle. README.md names the storeys.
- *
- * `node storeys.mjs`, a part of `npm run check`.
- */
+/** The house of the console, as web/README.md draws it: no import runs up, none to a neighbour, none in a circle. */
 
 import { readdirSync, readFileSync } from "node:fs";
 import path from "node:path";
-import { fileURLToPath } from "node:url";
+
+import { ROOT } from "./harness.mjs";
 
 /** From the ground up: a folder of web/src knows those below its own storey, and none beside it. */
 const STOREYS = [
@@ -21,7 +19,7 @@ const STOREYS = [
   ["main.ts"],
 ];
 const MOST_LINES = 600; // what is read in one sitting
-const SOURCES = path.join(path.dirname(fileURLToPath(import.meta.url)), "src");
+const SOURCES = path.join(ROOT, "web/src");
 const IMPORT = /(?:^\s*(?:import|export)\s(?:[^"';]*?\sfrom\s+)?|\bimport\()"(\.[^"]+)"/gm;
 
 /** What is wrong with the house, one sentence each. */
@@ -63,10 +61,4 @@ function circles(imports) {
   };
   const found = [...imports.keys()].map((name) => from(name, [])).find((along) => along !== null);
   return found === undefined ? [] : [found];
-}
-
-if (process.argv[1] === fileURLToPath(import.meta.url)) {
-  const found = faults();
-  for (const fault of found) console.error(fault);
-  process.exitCode = found.length > 0 ? 1 : 0;
 }
