@@ -17,7 +17,7 @@ from ultragray.contract import to_dict
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.outputs import OUTPUTS
-from ultragray.rendering.pixels import PixelArray, to_uint8
+from ultragray.rendering.pixels import PixelArray, in_type
 from ultragray.rendering.settings import Resolved
 from ultragray.scene.confidence import Extrapolation, figure_arrays
 
@@ -130,4 +130,4 @@ class Exporter(ABC):
 
 def stored_pixels(frames: PixelArray, stored: np.dtype[Any]) -> PixelArray:  # [B, H, W] -> [B, H, W]
     """Rendered frames in [0, 1] (or labels, uint8) as they are stored, C order."""
-    return np.ascontiguousarray(to_uint8(frames) if stored == np.uint8 else frames, stored)
+    return in_type(frames, stored)
