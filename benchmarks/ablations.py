@@ -14,7 +14,7 @@ from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import TrainingConfig
 from ultragray.learn.training.config import TEXTURE
 from ultragray.phantom.imaging import BoneShadow
-from ultragray_studies.report.study import train_and_evaluate
+from ultragray_studies.report import train_and_evaluate
 
 SEEDS = (0, 1, 2)
 SHORTER = {"steps": 400, "max_gaussians": 40_000, "confidence": False}  # than `fast`, so that an hour is enough

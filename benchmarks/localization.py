@@ -23,7 +23,7 @@ from ultragray.learn.training import TrainingConfig
 from ultragray.phantom import PHANTOM_IMAGE_SIDE, PHANTOM_PROBE, freehand_poses, simulate
 from ultragray.phantom.demo import load_demo_scene
 from ultragray.scene.gaussians import GaussianScene
-from ultragray_studies.report.study import train_and_evaluate
+from ultragray_studies.report import train_and_evaluate
 
 PHANTOM = "phantom"
 SETS = (PHANTOM, "ultranerf_liver", "spine_phantom", "liver_convex")

@@ -20,7 +20,7 @@ from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import TrainingConfig
 from ultragray.phantom.imaging import BoneShadow
 from ultragray.scene.gaussians import GaussianScene
-from ultragray_studies.report.study import train_and_evaluate
+from ultragray_studies.report import train_and_evaluate
 
 THIRD, BAND_SPACINGS = 3, 10
 
@@ -84,8 +84,8 @@ def measure(name: str, data_folder: Path) -> Document:
         "settings": dict(run.settings),
         "steps": trained.scene.info.training["steps"],
         "gaussians": trained.scene.gaussian_count,
-        "step_ms": 1000.0 * trained.step_s,
-        "total_s": trained.seconds,
+        "step_ms": 1000.0 * trained.course.step_s,
+        "total_s": trained.course.seconds,
     }
     if run.source == PHANTOM:
         figures["shadow"] = measure_shadow(trained.scene, dataset, voxel_mm)

@@ -206,7 +206,7 @@ class FrameMaker:
 
         Raises SceneNotFound, RegistrationNotFound, and what RequestPlanner.plan and Service.render raise.
         """
-        self._service.require_serving()
+        self._service.life.require_serving()
         scene = await self._scenes.choose(underway.posed.message.device_name)
         ownership = self._service.owners.known(Kind.SCENE, scene)
         setup, found = self._scanner.setup, None
@@ -220,7 +220,7 @@ class FrameMaker:
 
         planner = self._service.planner
         plan = await planner.plan(scene, asked, Encoding.UINT8, complete=complete)
-        result = await self._service.render(
+        result = await self._service.rendering.render(
             plan, underway.pose[None], deadline=planner.deadline(None), turn=underway.turn
         )
         return Frame(underway.posed, result, image_of(result, found), ownership, found)

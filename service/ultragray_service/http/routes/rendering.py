@@ -120,7 +120,7 @@ async def render(request: Request) -> Response:
 
     async def rendered() -> RenderResult:
         await service.limits.take_frames(len(exact), deadline)
-        return await service.render(plan, exact, priority=priority, deadline=deadline, begin_by=begin_by)
+        return await service.rendering.render(plan, exact, priority=priority, deadline=deadline, begin_by=begin_by)
 
     result = await finish_or_abandon(rendered(), request.receive, deadline)
     data = await asyncio.to_thread(_dicom_of, result) if is_dicom else result.data
@@ -216,7 +216,7 @@ async def render_slice(request: Request, service: ServiceDep, scene: SceneName) 
 
     async def rendered() -> RenderResult[SliceView]:
         await service.limits.take_frames(1, deadline)
-        return await service.render(plan, asked.pose()[None], deadline=deadline)
+        return await service.rendering.render(plan, asked.pose()[None], deadline=deadline)
 
     result = await finish_or_abandon(rendered(), request.receive, deadline)
     data = _npy_of(result) if media_type == NPY else result.data

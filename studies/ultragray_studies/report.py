@@ -1,8 +1,10 @@
-"""The measurements of a report: a trained scene, the baselines, the ablations of the paper, and growing tilt."""
+"""Reports: a scene beside the baselines, the ablations of the paper and growing tilt, measured alike, on one HTML page.
+
+First what is measured, then the page. `ultragray report` makes both.
+"""
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -16,14 +18,21 @@ from ultragray.geometry.pose import rotation_angles_deg
 from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation.baselines import FOLDS as VOLUME_METHODS
 from ultragray.learn.evaluation.baselines import VOXEL_MM, evaluate_baselines, mean_axes, nearest_frames
+from ultragray.learn.evaluation.metrics import FrameMetrics
 from ultragray.learn.evaluation.scoring import Evaluation, evaluate, require_frames
+from ultragray.learn.report.page import Prediction, ScenePage, render_page
+from ultragray.learn.report.tables import Row, metric_rows
 from ultragray.learn.sweep import Dataset, IntArray, Sweep
 from ultragray.learn.training import Progress, TrainingConfig, train
+from ultragray.learn.training.progress import Course
 from ultragray.scene.gaussians import GaussianScene
-from ultragray_studies.comparison.result import Comparison
+from ultragray.scene.info import read_header
+from ultragray_studies.comparison.place import frames_of
+from ultragray_studies.comparison.plots import plot_counts, plot_distances, plot_tilt
+from ultragray_studies.comparison.result import Comparison, MethodResult
 from ultragray_studies.comparison.run import SCENE
 from ultragray_studies.methods.classical import Compounding, FromFrames
-from ultragray_studies.methods.gaussians import SceneMethod
+from ultragray_studies.methods.gaussians import SCENE_FILE, SceneMethod
 from ultragray_studies.methods.method import Method
 
 LEAST_TILT_DEG = 3.0  # a sweep that turns less cannot show what tilting costs
@@ -39,10 +48,7 @@ class Trained:
 
     scene: GaussianScene
     evaluation: Evaluation
-    seconds: float  # of the whole training
-    step_s: float  # of a step, the mean over the run
-    losses: list[float]  # of each step
-    val_psnr_db: dict[int, float]  # by step, over some held-out frames
+    course: Course
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,29 +94,8 @@ def train_and_evaluate(dataset: Dataset, config: TrainingConfig, *, report: Repo
 
     started = time.perf_counter()
     scene = train(dataset, replace(config, confidence=False), report=follow)
-    seconds = time.perf_counter() - started
-    return Trained(
-        scene=scene,
-        evaluation=evaluate(scene, dataset.val),
-        seconds=seconds,
-        step_s=seconds / len(losses),
-        losses=losses,
-        val_psnr_db=val_psnr_db,
-    )
-
-
-def trained_of_journal(scene: GaussianScene, evaluation: Evaluation, journal: Path) -> Trained:
-    """The same of a training that has finished: its scene, and the `metrics.jsonl` of its run. Raises OSError."""
-    lines = [json.loads(line) for line in journal.read_text(encoding="utf-8").splitlines()]
-    seconds = float(lines[-1]["elapsed_s"])
-    return Trained(
-        scene=scene,
-        evaluation=evaluation,
-        seconds=seconds,
-        step_s=seconds / len(lines),
-        losses=[line["loss"] for line in lines],
-        val_psnr_db={line["step"]: line["val_psnr_db"] for line in lines if "val_psnr_db" in line},
-    )
+    course = Course(time.perf_counter() - started, losses, val_psnr_db)
+    return Trained(scene, evaluate(scene, dataset.val), course)
 
 
 def ablations(config: TrainingConfig, gaussian_count: int) -> dict[str, TrainingConfig]:
@@ -201,3 +186,104 @@ def study_tilt(
         angles_deg=angles[np.arange(len(high)), nearest],
         evaluations={"scene": trained.evaluation, **evaluate_baselines(dataset, TILT_BASELINES, voxel_mm)},
     )
+
+
+NOT_PLOTTED = ("mean-", "maximum-")  # over the frames, where their lines would hide those of the median
+
+
+@dataclass(frozen=True, eq=False)
+class ReportContent:
+    """Contents of a report. `course` is None for a scene that was read from a file; a part that failed says why.
+
+    `comparison` holds the scene, under the name `scene`, the methods it is compared with, and the `ablations`; its
+    folder their frames.
+    """
+
+    dataset: Dataset
+    scene: GaussianScene
+    comparison: Comparison
+    folder: Path
+    course: Course | None = None
+    ablations: tuple[str, ...] = ()  # rows of the comparison
+    tilt: TiltStudy | Failed | None = None
+
+    @property
+    def compared(self) -> list[MethodResult]:
+        """The rows of the comparison that are no ablations."""
+        return [one for one in self.comparison.results if one.name not in self.ablations]
+
+    @property
+    def ablated(self) -> list[MethodResult]:
+        """The others."""
+        return [one for one in self.comparison.results if one.name in self.ablations]
+
+
+def render_report(content: ReportContent) -> str:
+    """The HTML text."""
+    compared = {one: one.evaluation for one in content.compared if one.evaluation is not None}
+    page = ScenePage(
+        content.dataset,
+        content.scene,
+        {
+            one.description.title: Prediction(evaluation, frames_of(content.folder, one.name))
+            for one, evaluation in compared.items()
+        },
+        content.comparison.machine,
+        course=content.course,
+        failures={one.description.title: one.failure for one in content.compared if one.failure is not None},
+        not_plotted=frozenset(one.description.title for one in compared if one.name.startswith(NOT_PLOTTED)),
+    )
+    evaluations = {one.description.title: evaluation for one, evaluation in compared.items()}
+    tilt = content.tilt if isinstance(content.tilt, TiltStudy) else None
+    return render_page(
+        page,
+        "report.html",
+        __package__,
+        distance_plot=plot_distances(evaluations, content.comparison.distances),
+        ablations=_ablation_rows(content),
+        counts_plot=_counts_plot(content),
+        tilt=tilt,
+        tilt_failure=content.tilt.reason if isinstance(content.tilt, Failed) else None,
+        tilt_plot=None if tilt is None else plot_tilt(tilt.angles_deg, tilt.evaluations),
+        tilt_rows=[] if tilt is None else metric_rows(tilt.evaluations),
+    )
+
+
+def _ablation_rows(content: ReportContent) -> list[Row]:
+    """The full model where it was trained, then each ablation in its order."""
+    if not content.ablated:
+        return []
+    evaluations: dict[str, Evaluation] = {}
+    notes: dict[str, list[str]] = {}
+    if content.course is not None:
+        evaluations["full model"] = content.comparison.measured[SCENE]
+        notes["full model"] = _training_notes(content.scene.gaussian_count, content.course.step_s)
+    for one in content.ablated:
+        if one.evaluation is not None:
+            evaluations[one.name] = one.evaluation
+            notes[one.name] = _training_notes(_gaussian_count(content, one.name), one.seconds / one.steps)
+    rows = {row.name: row for row in metric_rows(evaluations, notes)}
+    rows |= {one.name: Row(one.name, failure=one.failure) for one in content.ablated if one.failure is not None}
+    order = ["full model", *(one.name for one in content.ablated)]
+    return [rows[name] for name in order if name in rows]
+
+
+def _training_notes(gaussian_count: int, step_s: float) -> list[str]:
+    return [f"{gaussian_count:,}", f"{1000.0 * step_s:.0f}"]
+
+
+def _gaussian_count(content: ReportContent, name: str) -> int:
+    return read_header(content.folder / name / SCENE_FILE).info.gaussian_count
+
+
+def _counts_plot(content: ReportContent) -> str | None:
+    """Over the runs that differ in their number of Gaussians only."""
+    measured = content.comparison.measured
+    points: dict[int, FrameMetrics] = {
+        _gaussian_count(content, name): measured[name].mean
+        for name in GAUSSIAN_SHARES
+        if name in content.ablations and name in measured
+    }
+    if content.course is not None:
+        points[content.scene.gaussian_count] = measured[SCENE].mean
+    return plot_counts(points) if len(points) > 1 else None

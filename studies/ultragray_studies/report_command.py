@@ -85,7 +85,7 @@ def report(
 ) -> None:
     """The page is one self-contained HTML file: a scene, the baselines and the paper's ablations, measured alike."""
     check_file(output, [".html"], force=force)
-    import ultragray_studies.report.page  # noqa: F401  # where its packages are missing, that is told before all the work
+    import ultragray_studies.report  # noqa: F401  # where its packages are missing, that is told before all the work
 
     config = TrainingConfig.preset(preset, **settings)
     if scene is not None:
@@ -116,12 +116,13 @@ def _write_report(dataset: Dataset, config: TrainingConfig, output: Path, option
     from ultragray.scene.gaussians import GaussianScene
     from ultragray_studies.comparison.run import SCENE, ComparisonProgress, compare_methods
     from ultragray_studies.methods.gaussians import GivenScene
-    from ultragray_studies.report.page import ReportContent, render_page
-    from ultragray_studies.report.study import (
+    from ultragray_studies.report import (
         Failed,
+        ReportContent,
         ablation_methods,
         attempt,
         baselines,
+        render_report,
         scene_evaluation,
         study_tilt,
         train_and_evaluate,
@@ -144,7 +145,7 @@ def _write_report(dataset: Dataset, config: TrainingConfig, output: Path, option
         comparison = compare_methods(
             dataset,
             {
-                SCENE: GivenScene(scene, 0.0 if trained is None else trained.seconds),
+                SCENE: GivenScene(scene, 0.0 if trained is None else trained.course.seconds),
                 **baselines(options.voxel_mm),
                 **ablated,
             },
@@ -158,9 +159,15 @@ def _write_report(dataset: Dataset, config: TrainingConfig, output: Path, option
         if options.ablations:
             tilt = attempt(partial(study_tilt, dataset.train, config, voxel_mm=options.voxel_mm, report=follow(TILT)))
         content = ReportContent(
-            dataset, scene, comparison, Path(folder), trained=trained, ablations=tuple(ablated), tilt=tilt
+            dataset,
+            scene,
+            comparison,
+            Path(folder),
+            course=None if trained is None else trained.course,
+            ablations=tuple(ablated),
+            tilt=tilt,
         )
-        write_whole(output, render_page(content))
+        write_whole(output, render_report(content))
     return {**comparison.failures, **({TILT: tilt.reason} if isinstance(tilt, Failed) else {})}
 
 

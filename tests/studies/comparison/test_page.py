@@ -13,9 +13,9 @@ from ultragray.datasets import Dataset
 from ultragray.learn.evaluation.methods import ComparisonSettings
 from ultragray.learn.evaluation.metrics import FrameMetrics
 from ultragray.learn.evaluation.scoring import Evaluation
-from ultragray.learn.report.pictures import telling_places
-from ultragray.learn.report.plots import DISTANCE_BINS, binned_medians
+from ultragray.learn.report.page import telling_places
 from ultragray_studies.comparison.page import write_comparison
+from ultragray_studies.comparison.plots import DISTANCE_BINS, binned_medians
 from ultragray_studies.comparison.result import Comparison
 from ultragray_studies.comparison.run import compare_methods
 from ultragray_studies.methods.method import Method, Paces

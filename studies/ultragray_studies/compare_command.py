@@ -16,7 +16,7 @@ from ultragray.datasets.source import SourceOptions
 from ultragray.errors import TrainingStateInvalid
 from ultragray.learn.evaluation.methods import ComparisonSettings
 from ultragray_service.cli.app import INTERRUPTED
-from ultragray_service.cli.evaluate import print_comparison, print_speckle
+from ultragray_service.cli.evaluate import print_speckle
 from ultragray_service.cli.options import with_options
 from ultragray_service.cli.sweeps import SweepArgument, check_source, read_dataset, warn_about_dataset
 from ultragray_service.cli.terminal import (
@@ -152,11 +152,46 @@ def _compare(
 
 
 def _print(comparison: Comparison, written: list[Path]) -> None:
-    print_comparison(comparison)
+    _print_table(comparison)
     if comparison.measured:
         print_speckle({one.title: one.evaluation for one in comparison.results if one.evaluation is not None})
     for path in written:
         typer.echo(f"wrote {path}")
+
+
+def _print_table(comparison: Comparison) -> None:
+    """A table of the means of each method, its costs and its mean rank, and why a method has none."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    from ultragray.learn.report.tables import METRICS, rank, shown_value
+    from ultragray_service.cli.terminal import wide_console
+    from ultragray_studies.comparison.tables import budget_text, steps_text
+
+    table = Table(box=None, pad_edge=False)
+    heads = ("", *(metric.label for metric in METRICS), "steps", "training, s", "frame, ms", "MB", "mean rank")
+    for place, head in enumerate(heads):
+        table.add_column(head, justify="right" if place else "left", no_wrap=True)
+    ranks = rank(comparison.measured)
+    for one in comparison.results:
+        if one.evaluation is not None:
+            means = one.evaluation.mean.to_dict()
+            table.add_row(
+                escape(one.title),
+                *(shown_value(metric.name, means[metric.name]) for metric in METRICS),
+                steps_text(one),
+                f"{one.seconds:,.1f}",
+                f"{one.frame_ms:,.1f}",
+                f"{one.model_bytes / 1e6:,.2f}",
+                f"{ranks[one.name].mean:.2f}",
+            )
+    console, facts = wide_console(), comparison.dataset
+    head = f"{facts.name}, {facts.val_frames} val frames, {comparison.machine}; budget: {budget_text(comparison)}"
+    console.print(head, highlight=False, markup=False, soft_wrap=True)
+    console.print(table)
+    for one in comparison.results:
+        if one.failure is not None:
+            console.print(f"{one.title} failed: {one.failure}", highlight=False, markup=False, soft_wrap=True)
 
 
 def _write(comparison: Comparison, dataset: Dataset, run: Path, output: Path) -> list[Path]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,11 +11,10 @@ import pytest
 from ultragray.datasets import Dataset
 from ultragray.errors import DatasetInvalid, TrainingDiverged
 from ultragray.learn.evaluation.scoring import evaluate
-from ultragray.learn.training import Progress, TrainingConfig, train
-from ultragray.learn.training.trainer import JOURNAL_FILE
+from ultragray.learn.training import Progress, TrainingConfig
 from ultragray.scene.gaussians import GaussianScene
-from ultragray_studies.report import study
-from ultragray_studies.report.study import (
+from ultragray_studies import report as study
+from ultragray_studies.report import (
     Failed,
     ablations,
     attempt,
@@ -24,32 +22,17 @@ from ultragray_studies.report.study import (
     split_by_tilt,
     study_tilt,
     train_and_evaluate,
-    trained_of_journal,
 )
 
 
 def test_a_training_is_followed_and_measured(turning_dataset: Dataset, small_config: TrainingConfig) -> None:
     seen: list[Progress] = []
     trained = train_and_evaluate(turning_dataset, small_config, report=seen.append)
-    assert trained.losses == [progress.loss for progress in seen]
-    assert len(trained.losses) == 6
-    assert list(trained.val_psnr_db) == [1, 2, 3, 4, 5, 6]
+    assert trained.course.losses == [progress.loss for progress in seen]
+    assert len(trained.course.losses) == 6
+    assert list(trained.course.val_psnr_db) == [1, 2, 3, 4, 5, 6]
     assert trained.evaluation.frames == evaluate(trained.scene, turning_dataset.val).frames
-    assert trained.seconds >= 6 * trained.step_s > 0
-
-
-def test_a_finished_run_is_read_from_its_journal(
-    turning_dataset: Dataset, small_config: TrainingConfig, tmp_path: Path
-) -> None:
-    seen: list[Progress] = []
-    scene = train(turning_dataset, replace(small_config, confidence=False), folder=tmp_path, report=seen.append)
-    evaluation = evaluate(scene, turning_dataset.val)
-    trained = trained_of_journal(scene, evaluation, tmp_path / JOURNAL_FILE)
-    assert trained.losses == [progress.loss for progress in seen]
-    assert trained.val_psnr_db == {step + 1: progress.val_psnr_db for step, progress in enumerate(seen)}
-    assert trained.seconds == pytest.approx(6 * trained.step_s)
-    assert trained.seconds > 0
-    assert trained.evaluation is evaluation
+    assert trained.course.seconds == pytest.approx(6 * trained.course.step_s)
 
 
 def test_each_validation_is_a_point_even_where_nothing_changed(
@@ -64,7 +47,7 @@ def test_each_validation_is_a_point_even_where_nothing_changed(
         return random_scene(7)
 
     monkeypatch.setattr(study, "train", train)
-    assert train_and_evaluate(turning_dataset, small_config).val_psnr_db == {2: 20.0, 4: 20.0}
+    assert train_and_evaluate(turning_dataset, small_config).course.val_psnr_db == {2: 20.0, 4: 20.0}
 
 
 def test_a_study_that_fails_gives_its_reason() -> None:
