@@ -1,4 +1,8 @@
-"""From what a caller asked for to what the pool renders: every check, once, for all front doors."""
+"""From what a caller asks for to what the pool renders: every check, once, for all front doors.
+
+A door reads a request into settings and poses; `RequestPlanner` resolves the settings for the scene as it is now, in a
+`Plan`; `Rendering` gives plan and poses to the pool, again where the scene changed in between.
+"""
 
 from __future__ import annotations
 
@@ -10,15 +14,25 @@ from functools import lru_cache
 from typing import Generic
 
 from ultragray.contract import join, under
-from ultragray.errors import InvalidImageSize, TooManyPoses
+from ultragray.errors import InvalidImageSize, RenderFailed, TooManyPoses
 from ultragray.geometry.probe import FloatArray
 from ultragray.geometry.registration import Registration
 from ultragray.rendering.settings import Encoding, FrameSettings, Resolved
 from ultragray.rendering.volumes import SliceSettings, SliceView, check_field
-from ultragray.scene.info import SceneInfo
-from ultragray_service.core.catalog import SceneCatalog
+from ultragray.scene.info import SceneHeader, SceneInfo
+from ultragray_service.access.audit import account
+from ultragray_service.access.limits import Limits
+from ultragray_service.access.owners import Owners
+from ultragray_service.access.principals import caller
+from ultragray_service.core.life import Life
+from ultragray_service.core.scenes import SceneCatalog, scene_to_blame
 from ultragray_service.settings import Settings
-from ultragray_workers.pool.messages import S
+from ultragray_service.telemetry.metrics import Metrics
+from ultragray_workers.errors import NotReady, SceneNotFound
+from ultragray_workers.jobs.queue.owners import Kind
+from ultragray_workers.pool.messages import Destination, Priority, RenderRequest, RenderResult, S, SceneChangedError
+from ultragray_workers.pool.pool import MAX_SCENE_CHANGES, RenderPool
+from ultragray_workers.pool.waiting import Turn
 from ultragray_workers.scene_names import base_name
 from ultragray_workers.storage.local import FileVersion
 
@@ -33,6 +47,7 @@ class Plan(Generic[S]):
 
     settings: S
     version: FileVersion
+    header: SceneHeader
     registration: Registration | None  # that leads the poses into the scene
 
     def __init__(
@@ -59,7 +74,7 @@ class Plan(Generic[S]):
         """Resolves the settings for the scene as it is now. Raises what RequestPlanner.plan raises."""
         with under(self._path) if self._path else nullcontext():
             version, header = await self._catalog.versioned_header(self._asked)
-            self.settings, self.version = self._resolve(header.info), version
+            self.settings, self.version, self.header = self._resolve(header.info), version, header
 
 
 def as_resolved(settings: Resolved) -> Resolved:
@@ -172,6 +187,57 @@ class RequestPlanner:
     def deadline(self, timeout_s: float | None) -> float:
         """The time.monotonic() seconds after a time; None: after the default timeout."""
         return time.monotonic() + (self._settings.default_timeout_s if timeout_s is None else timeout_s)
+
+
+class Rendering:
+    """Frames for plans, from the pool: what every door asks for, whether once or in a stream."""
+
+    def __init__(
+        self, pool: RenderPool, planner: RequestPlanner, life: Life, owners: Owners, limits: Limits, metrics: Metrics
+    ) -> None:
+        self.pool, self.planner, self.life, self.limits, self.metrics = pool, planner, life, limits, metrics
+        self._owners = owners
+
+    def require_frames(self) -> None:
+        """Raises NotReady or Draining, saying why no frame would be rendered now."""
+        self.life.require_serving()
+        if not self.pool.ready:
+            raise NotReady("no render process is alive and gets on with its work at the moment")
+
+    async def render(
+        self,
+        plan: Plan[S],
+        poses: FloatArray,  # [C, 4, 4] mm, exact
+        *,
+        deadline: float | None,  # time.monotonic() in seconds
+        priority: Priority = Priority.INTERACTIVE,
+        turn: Turn | None = None,
+        begin_by: float | None = None,  # time.monotonic() in seconds; else it is refused
+        destination: Destination | None = None,
+    ) -> RenderResult[S]:
+        """Renders, with the settings as they are for the scene that is there when it is rendered.
+
+        Raises what RenderPool.render and Plan.renew raise; cancelling drops a request that still waits.
+        """
+        self.life.require_serving()
+        mine = account()
+        mine.target = plan.scene
+        mine.frames += len(poses)
+        if self._owners.hides(Kind.SCENE, plan.scene):  # since a stream began, for example
+            raise SceneNotFound(f"there is no scene {plan.scene!r} any more", field="scene")
+        turn = turn or Turn()
+        for _ in range(MAX_SCENE_CHANGES):
+            request = RenderRequest(
+                plan.scene, plan.settings, poses, priority, deadline, plan.version, caller(), begin_by, destination
+            )
+            try:
+                with scene_to_blame():
+                    return await self.pool.render(request, turn)
+            except SceneChangedError:
+                if turn.ticket is not None:  # perhaps with newer poses
+                    poses, deadline = turn.ticket.request.poses, turn.ticket.request.deadline
+                await plan.renew()
+        raise RenderFailed(f"scene {plan.scene!r} kept changing while it was being rendered", field="scene")
 
 
 @lru_cache(maxsize=256)
