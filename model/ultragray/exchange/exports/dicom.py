@@ -141,4 +141,3 @@ def _words(text: str) -> str:
     return line.encode()[:MAX_WORDS_BYTES].decode(errors="ignore")
 
 
-EXPORTER = DicomExporter

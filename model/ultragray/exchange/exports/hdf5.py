@@ -75,4 +75,3 @@ class _Sink(io.FileIO):
             return size or 0
 
 
-EXPORTER = Hdf5Exporter

@@ -31,4 +31,3 @@ class McapExporter(Exporter):
         self._recording.finish()
 
 
-EXPORTER = McapExporter

@@ -53,4 +53,3 @@ class NpzExporter(Exporter):
                 np.lib.format.write_array(member, np.asarray(value), allow_pickle=False)
 
 
-EXPORTER = NpzExporter

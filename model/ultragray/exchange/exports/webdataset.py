@@ -44,4 +44,3 @@ def _npy(frame: PixelArray) -> bytes:
     return file.getvalue()
 
 
-EXPORTER = TarExporter

@@ -49,4 +49,3 @@ class ZarrExporter(Exporter):
         )[:] = values
 
 
-EXPORTER = ZarrExporter
