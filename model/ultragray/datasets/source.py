@@ -9,8 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from fnmatch import fnmatchcase
-from importlib import import_module
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path, PurePath
 from typing import TYPE_CHECKING, Any
 
@@ -105,9 +104,8 @@ class DatasetFormat:
             self._function(self.upload_check)(source, folder)
 
     def _function(self, place: str) -> Any:
-        module, _, name = place.partition(":")
         try:
-            return getattr(import_module(module), name)
+            return EntryPoint(self.name, place, "").load()
         except ImportError as error:
             raise missing_extra(error, f"the {self.noun}") from error
 
