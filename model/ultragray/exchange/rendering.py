@@ -11,7 +11,7 @@ from typing import Any
 import torch
 
 from ultragray.exchange.exports import FORMATS, ExportHeader, check_format, export_to
-from ultragray.exchange.exports.png_folder import export_pngs
+from ultragray.exchange.exports.archives import export_pngs
 from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation.scoring import frames_at_once
 from ultragray.rendering.backends.registry import renderer_name
