@@ -1,4 +1,4 @@
-"""The architecture as the source tree has it: no import circles, no probe kinds in the open."""
+"""The architecture as the source tree has it: who may import whom, no circles, no probe kinds in the open."""
 
 from __future__ import annotations
 
@@ -10,6 +10,23 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parent.parent
 SOURCE_ROOTS = [ROOT / name for name in ("model", "workers", "service", "client", "proto", "ros", "studies")]
 PROBE_PACKAGE = "ultragray.geometry.probe"
+
+BENEATH = {"ultragray", "ultragray.errors", "ultragray.contract", "ultragray.files", "ultragray.installation"}
+BENEATH |= {"ultragray._cpu"}
+STOREYS = [f"ultragray.{name}" for name in ("geometry", "scene", "rendering", "learn")]  # each imports those before it
+PLUGINS = {f"ultragray.{name}" for name in ("datasets", "exchange", "samplers", "phantom")}
+MAY_IMPORT = {
+    **dict.fromkeys(BENEATH, BENEATH),
+    "ultragray": BENEATH | set(STOREYS),  # its public names, on first use
+    **{storey: BENEATH | set(STOREYS[:place]) for place, storey in enumerate(STOREYS)},
+    **dict.fromkeys(PLUGINS, BENEATH | set(STOREYS) | PLUGINS),
+    "ultragray_proto": set(),
+    "ultragray_client": {"ultragray_proto"},
+    "ultragray_ros": {"ultragray_client"},
+    "ultragray_workers": {"ultragray"},
+    "ultragray_service": {"ultragray", "ultragray_client", "ultragray_proto", "ultragray_workers"},
+    "ultragray_studies": {"ultragray", "ultragray_client", "ultragray_proto", "ultragray_workers", "ultragray_service"},
+}  # by the first names of both: a whole package, or a room of the library
 
 
 @cache
@@ -70,6 +87,37 @@ def circles() -> Iterator[list[str]]:
     for name in graph:
         if name not in order:
             yield from visit(name)
+
+
+def room(name: str) -> str:
+    """The room of a module of the library, the package of any other."""
+    package, *inner = name.split(".")
+    return f"{package}.{inner[0]}" if package == "ultragray" and inner else package
+
+
+def test_each_room_imports_only_what_stands_before_it() -> None:
+    wrong = [
+        f"{name} imports {other}"
+        for name in modules()
+        for other in imports_of(name)
+        if room(other) != room(name) and not {room(other), other.partition(".")[0]} & allowed(name)
+    ]
+    assert sorted(wrong) == []
+
+
+def allowed(name: str) -> set[str]:
+    """The rooms and packages that a module may import; within the library a room has to be named."""
+    return MAY_IMPORT[room(name)] - ({"ultragray"} if name.startswith("ultragray.") else set())
+
+
+def test_every_module_says_what_it_is_for() -> None:
+    generated = ("_pb2", "_pb2_grpc")
+    silent = [
+        name
+        for name, path in modules().items()
+        if path.suffix == ".py" and not name.endswith(generated) and not ast.get_docstring(tree(name))
+    ]
+    assert sorted(silent) == []
 
 
 def test_no_module_imports_itself_by_way_of_others() -> None:
