@@ -15,8 +15,8 @@ from ultragray import LinearProbe, errors
 from ultragray.contract import annotated_fields, limits_in_words, range_of, to_dict
 from ultragray.exchange.exports import FORMATS
 from ultragray.geometry import image_size, pose, probe
-from ultragray.geometry import probe as fan
 from ultragray.learn.training.config import PRESETS, TrainingConfig
+from ultragray.rendering import pixels
 from ultragray.rendering.outputs import OUTPUTS
 from ultragray.rendering.settings import Resolved
 from ultragray.rendering.tools import MAX_TOOLS
@@ -47,7 +47,6 @@ from ultragray_workers.jobs.job import JobState
 from ultragray_workers.jobs.matching.demand import AUTO
 from ultragray_workers.jobs.overview import JobsOverview
 from ultragray_workers.jobs.queue.attendance import WorkerState
-from ultragray_workers.pool import pixels as encoding
 from ultragray_workers.pool.messages import RenderResult
 
 from .interfaces import temporary_service
@@ -164,7 +163,7 @@ def fixed_limits() -> str:
         ("Coordinate of a pose", f"{pose.MAX_POSITION_MM:,.0f} mm"),
         ("Length of a probe", f"{probe.MAX_LENGTH_MM:,.0f} mm"),
         ("Tools of a frame", f"{MAX_TOOLS}"),
-        ("Opening angle of a fan", f"{fan.LARGEST_OPENING_DEG:g}°"),
+        ("Opening angle of a fan", f"{probe.LARGEST_OPENING_DEG:g}°"),
         ("Height and width of a frame (library)", f"{image_size.MAX_IMAGE_SIDE:,}"),
         ("Height and width if the scene does not know them", f"{image_size.DEFAULT_IMAGE_SIDE:,}"),
         ("Training poses of a scene", f"{scene_info.MAX_TRAINING_POSES:,}"),
@@ -183,7 +182,7 @@ def fixed_limits() -> str:
         ("gRPC message, if `ULTRAGRAY_MAX_BODY_BYTES` is less", _bytes(grpc_server.LEAST_MAX_MESSAGE_BYTES)),
         ("Time between keepalive pings of a gRPC client, at least", f"{grpc_server.LEAST_PING_INTERVAL_MS:,} ms"),
         ("TLS handshake", f"{HANDSHAKE_TIMEOUT_S:g} s"),
-        ("Quality of a JPEG", f"{encoding.JPEG_QUALITY}"),
+        ("Quality of a JPEG", f"{pixels.JPEG_QUALITY}"),
         ("`Retry-After` of a full queue", f"{STATUSES['QUEUE_FULL'].retry_after_s:g} s"),
         ("Length of an API key, at least", f"{LEAST_KEY_LENGTH} characters"),
     ]
