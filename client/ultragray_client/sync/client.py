@@ -15,8 +15,8 @@ from ultragray_client.records import AuditEntry, Me
 from ultragray_proto.codec import from_message
 from ultragray_proto.v1 import access_pb2, access_pb2_grpc, rendering_pb2, rendering_pb2_grpc
 
-from ..contract import Probe, RenderSettings, SliceSettings
-from ..frames import Extrapolation, Frame, Slice, frame_from_message, settings_message, slice_from_message
+from ..contract import Extrapolation, Probe, RenderSettings, SliceSettings
+from ..frames import Frame, Slice, frame_from_message, settings_message, slice_from_message
 from ..geometry import PoseLike, pose_message, pose_messages
 from ..messages import message_of
 from .connection import Connection

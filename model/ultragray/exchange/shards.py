@@ -163,7 +163,7 @@ class ShardRenderer:
 
             def write(frames: dict[str, PixelArray], figures: list[Extrapolation]) -> None:
                 nonlocal done
-                stored = {name: stored_pixels(pixels, header.pixel_type(name)) for name, pixels in frames.items()}
+                stored = {name: stored_pixels(name, pixels, header.pixel_type(name)) for name, pixels in frames.items()}
                 places = slice(done, done + len(figures))
                 tar.add([plan.key(number) for number in numbers[places]], poses[places], figures, stored)
                 done += len(figures)

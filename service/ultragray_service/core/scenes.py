@@ -21,12 +21,11 @@ from prometheus_client.registry import Collector
 from ultragray.contract import described
 from ultragray.errors import InvalidArgument, SceneFileInvalid, UltragrayError
 from ultragray.geometry.probe import ElevationBeam, Probe
-from ultragray.rendering.outputs import OUTPUTS
+from ultragray.rendering.outputs import OUTPUT_SCHEMA, OUTPUTS
 from ultragray.scene.confidence import read_model
 from ultragray.scene.info import SceneHeader
 from ultragray_service.access.owners import Owners
 from ultragray_service.access.principals import iso_time
-from ultragray_service.core.frames import OutputName
 from ultragray_service.core.life import Life
 from ultragray_service.core.poses import PoseInBothForms, Position
 from ultragray_service.core.scene_points import point_message
@@ -358,7 +357,7 @@ class Scene:
     metrics: dict[str, float]
     dataset_name: str | None
     dataset_sha256: str | None
-    outputs: list[OutputName] = described("What can be rendered of it.")
+    outputs: list[str] = described("What can be rendered of it.", schema={"items": OUTPUT_SCHEMA})
     label_names: dict[int, str] = described("What the values of the output labels mean; empty: it has none.")
     beam: ElevationBeam | None = described("Of the frames it was trained on; null: they are taken for planes.")
     confidence: ConfidenceFit | None = described("null: the scene cannot tell the confidence of its frames.")

@@ -68,7 +68,8 @@ class _OnHost:
         self._frames = {name: _on_host(frames[name]) for name in wanted}
 
     def take(self, name: str, pixel_type: np.dtype[Any], first: int, stop: int) -> Pixels:
-        return self._frames[name][first:stop]
+        frames = self._frames[name][first:stop]
+        return OUTPUTS[name].shares(frames) if pixel_type == np.uint8 else frames
 
 
 def _on_host(frames: Tensor) -> Pixels:
@@ -91,7 +92,9 @@ class _FromGpu:
         for first in range(0, len(poses), CHUNK_POSES):
             frames = render(poses[first : first + CHUNK_POSES])
             ready = {
-                (name, pixel_type): round_to_uint8(frames[name]) if pixel_type == np.uint8 else frames[name].float()
+                (name, pixel_type): round_to_uint8(OUTPUTS[name].shares(frames[name]))
+                if pixel_type == np.uint8
+                else frames[name].float()
                 for name, pixel_types in wanted.items()
                 for pixel_type in pixel_types
             }

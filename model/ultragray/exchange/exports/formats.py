@@ -182,7 +182,7 @@ def _beside(exporter: Exporter, header: ExportHeader) -> Iterator[Add]:
             frames, extrapolations = portion
             try:
                 stored = {
-                    name: stored_pixels(frames[name], header.pixel_type(name)) for name in header.settings.outputs
+                    name: stored_pixels(name, frames[name], header.pixel_type(name)) for name in header.settings.outputs
                 }
                 exporter.add(stored, extrapolations)
             except BaseException as error:
@@ -223,7 +223,7 @@ def export_bytes(
         exporter = make(path, header)
         try:
             exporter.add(
-                {name: stored_pixels(frames[name], header.pixel_type(name)) for name in frames}, extrapolations
+                {name: stored_pixels(name, frames[name], header.pixel_type(name)) for name in frames}, extrapolations
             )
         except BaseException:
             exporter.abandon()

@@ -11,6 +11,7 @@ from typing import Any
 from ultragray.exchange.exports.exporter import ExportHeader
 from ultragray.exchange.exports.formats import Add
 from ultragray.files import atomic_path
+from ultragray.rendering.outputs import OUTPUTS
 from ultragray.rendering.pixels import PixelArray, image_file
 from ultragray.scene.confidence import Extrapolation
 
@@ -27,7 +28,7 @@ def export_pngs(folder: Path, header: ExportHeader) -> Iterator[Add]:
         for place, extrapolation in enumerate(extrapolations):
             number = len(documents)
             for name in header.settings.outputs:
-                data = image_file(frames[name][place], ".png")
+                data = image_file(OUTPUTS[name].shares(frames[name][place]), ".png")
                 (folder / f"frame_{number:05d}_{name}.png").write_bytes(data.tobytes())
             documents.append({"frame": number, "pose": header.poses[number].tolist(), **extrapolation.figures()})
 

@@ -15,9 +15,9 @@ from pydantic import Field, FiniteFloat, TypeAdapter
 from ultragray.contract import described
 from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray.geometry.probe import FloatArray
-from ultragray.rendering.settings import RenderSettings
+from ultragray.rendering.settings import RenderSettings, settings_used
 from ultragray_service.access.credentials import STREAM_PROTOCOL
-from ultragray_service.core.frames import FrameHeader, settings_used
+from ultragray_service.core.frames import FrameHeader
 from ultragray_service.core.open_streams import Answered, StreamSummary, Watcher
 from ultragray_service.core.streams import FrameStream, Message, SceneSettings, StreamMode
 from ultragray_service.errors import Refusal, statuses_of
