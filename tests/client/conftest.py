@@ -77,7 +77,7 @@ class Blocking:
     def _as_ordinary(self, value: Any) -> Any:
         if inspect.iscoroutine(value):
             return self._as_ordinary(self._run(value))
-        own = type(value).__module__.startswith("ultragray_client.aio") or inspect.isasyncgen(value)
+        own = type(value).__name__.startswith("Async") or inspect.isasyncgen(value)
         return Blocking(value, self._loop) if own or inspect.ismethod(value) else value
 
 
