@@ -13,8 +13,8 @@ from ultragray_client.connection import Tls
 from ultragray_client.contract import *  # noqa: F403
 from ultragray_client.errors import ClientError
 from ultragray_client.exchange import StreamMode
-from ultragray_client.frames import Extrapolation, Frame, Localization, Picture, Slice, Timings
-from ultragray_client.geometry import Placement, PoseLike, Quaternion
+from ultragray_client.frames import Frame, Localization, Slice, Timings
+from ultragray_client.geometry import Picture, Placement, PoseLike, Quaternion
 from ultragray_client.recording.recording import Recording
 from ultragray_client.records import (
     AuditEntry,
@@ -42,7 +42,6 @@ __all__ = [
     "Client",
     "ClientError",
     "ConfidenceFit",
-    "Extrapolation",
     "Frame",
     "FrameStream",
     "Job",

@@ -16,12 +16,19 @@ import numpy as np
 import numpy.typing as npt
 
 from ultragray_client.connection import Metadata, Retries, Terms
-from ultragray_client.contract import Dataset, DatasetOptions, Probe, RenderSettings, SliceSettings, Specification
+from ultragray_client.contract import (
+    Dataset,
+    DatasetOptions,
+    Extrapolation,
+    Probe,
+    RenderSettings,
+    SliceSettings,
+    Specification,
+)
 from ultragray_client.conversations import Batch, Conversation, LastJob, Upload, Watch, downloaded
 from ultragray_client.errors import ClientError, InvalidPose, NotFound
 from ultragray_client.exchange import PoseExchange, StreamMode
 from ultragray_client.frames import (
-    Extrapolation,
     Frame,
     Localization,
     Slice,

@@ -116,9 +116,8 @@ def test_a_deletion_takes_the_name_first_and_leaves_nothing(
         asked.append(on_host("three").names())
         return "a job" if len(asked) == 2 else None
 
-    two.in_use = in_use
     with pytest.raises(DatasetInUse):  # a job came in between
-        two.delete("tiny")
+        two.delete("tiny", in_use)
     assert asked == [["tiny"], []]
     assert one.load("tiny").sha256 == tiny_dataset().sha256
     two.delete("tiny")
