@@ -28,8 +28,8 @@ KEY = "0123456789abcdef-client"
 MAX_POSES = 40
 SETTINGS: dict[str, Any] = {"max_poses_per_request": MAX_POSES, "max_image_side": 600, "api_keys": KEY}
 
-# Of uploads and jobs, `make test` has those of the client for threads, which is made from the one for asyncio.
-UPLOADS_AND_JOBS = {"test_client_confidence.py", "test_client_recording.py", "test_client_resources.py"}
+# Of uploads and jobs, `make test` has those of the client for threads: both carry out the same descriptions.
+UPLOADS_AND_JOBS = {"test_client_recording.py", "test_client_resources.py"}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
