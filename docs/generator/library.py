@@ -18,10 +18,7 @@ from .markdown import code, codes, in_line, summary, table
 
 
 def outputs() -> str:
-    rows = (
-        (code(one.name), in_line(one.meaning), "whole numbers" if one.is_numbers else "0 to 1")
-        for one in OUTPUTS.values()
-    )
+    rows = ((code(one.name), in_line(one.meaning), one.range_in_words) for one in OUTPUTS.values())
     return table(("Output", "Meaning", "Pixels"), rows)
 
 
