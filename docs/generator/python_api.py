@@ -61,9 +61,9 @@ LIBRARY_MODULES = (
     "ultragray.learn.registration",
 )
 CLIENT_GROUPS = (
-    *("ultragray_client.sync.scenes.Scenes", "ultragray_client.sync.datasets.Datasets"),
-    *("ultragray_client.sync.jobs.Jobs", "ultragray_client.sync.workers.Workers"),
-    "ultragray_client.sync.registrations.Registrations",
+    *("ultragray_client.client.Scenes", "ultragray_client.client.Datasets"),
+    *("ultragray_client.client.Jobs", "ultragray_client.client.Workers"),
+    "ultragray_client.client.Registrations",
 )
 _ONLY = {"ultragray.contract": ("from_dict", "to_dict")}
 _OWN = ("ultragray", "ultragray_client")
