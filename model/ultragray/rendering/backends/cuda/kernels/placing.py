@@ -10,8 +10,8 @@ is in the axes of the probe (x lateral, y elevation, z axial; sheared for steere
 
 The equations, forwards (`slicing`; §3). μ is the mean, and Σ = a aᵀ + b bᵀ + c cᵀ, where the spokes a, b, c are the
 columns of the rotation R, each times its standard deviation s_k. A beam adds its variance to Σ_yy at first, and
-ln(1 + variance·eᵀΣ⁻¹e) to m² (`spread_along_elevation`). The plane y = 0 then cuts out, with the tilts t_x = Σ_xy/Σ_yy and
-t_z = Σ_yz/Σ_yy and the rise r = μ_y/Σ_yy,
+ln(1 + variance·eᵀΣ⁻¹e) to m² (`spread_along_elevation`). The plane y = 0 then cuts out, with the tilts t_x = Σ_xy/Σ_yy
+and t_z = Σ_yz/Σ_yy and the rise r = μ_y/Σ_yy,
 
     mean (μ_x − t_x·μ_y, μ_z − t_z·μ_y)      m² = r·μ_y
     covariance (Σ_xx − t_x·Σ_xy, Σ_xz − t_x·Σ_yz, Σ_zz − t_z·Σ_yz)
@@ -19,9 +19,9 @@ t_z = Σ_yz/Σ_yy and the rise r = μ_y/Σ_yy,
 Backwards, in the order of the code: turn the gradient from the axes of a fan's scan line into the probe's; add to the
 covariance's what the determinant says; undo the cut (the six entries of Σ and the three of μ); undo the beam, whose
 variance depends on the depth of μ, and whose moments are those that `Moments` of `backends.inputs` takes; from Σ to the
-spokes (∂L/∂a = (G + Gᵀ)·a), and from these to log s_k (a·∂L/∂a) and to R, of which follows the unit quaternion, less the
-part along it; to μ and, by way of the direction of view, to the harmonics; and last to a shift and a turn of the whole
-view, which move all Gaussians the other way (§4).
+spokes (∂L/∂a = (G + Gᵀ)·a), from these to log s_k (a·∂L/∂a) and to R, and on to the unit quaternion, less the part along
+it; to μ and, by way of the direction of view, to the harmonics; and last to a shift and a turn of the whole view, which
+move all Gaussians the other way (§4).
 """
 
 import triton
@@ -188,7 +188,7 @@ def place_gradients(
             sum_s1 += tl.where(cut, gb[0] * b[0] + gb[1] * b[1] + gb[2] * b[2], 0.0).to(tl.float32)
             sum_s2 += tl.where(cut, gc[0] * c[0] + gc[1] * c[1] + gc[2] * c[2], 0.0).to(tl.float32)
 
-            # From the spokes to the rotation and its quaternion: of r01 the first index is the scene's axis, the second the Gaussian's own.
+            # From the spokes to the rotation, and its quaternion. Of r01: the scene's axis, and the Gaussian's own.
             r00 = s[0] * towards_scene(view, ga[0], ga[1], ga[2], 0)
             r10 = s[0] * towards_scene(view, ga[0], ga[1], ga[2], 1)
             r20 = s[0] * towards_scene(view, ga[0], ga[1], ga[2], 2)
