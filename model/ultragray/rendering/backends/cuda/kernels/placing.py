@@ -19,7 +19,7 @@ and t_z = Σ_yz/Σ_yy and the rise r = μ_y/Σ_yy,
 Backwards, in the order of the code: turn the gradient from the axes of a fan's scan line into the probe's; add to the
 covariance's what the determinant says; undo the cut (the six entries of Σ and the three of μ); undo the beam, whose
 variance depends on the depth of μ, and whose moments are those that `Moments` of `backends.inputs` takes; from Σ to the
-spokes (∂L/∂a = (G + Gᵀ)·a), from these to log s_k (a·∂L/∂a) and to R, and on to the unit quaternion, less the part along
+spokes (∂L/∂a = (G + Gᵀ)·a), from these to log s_k (a·∂L/∂a) and R, and on to the unit quaternion, less the part along
 it; to μ and, by way of the direction of view, to the harmonics; and last to a shift and a turn of the whole view, which
 move all Gaussians the other way (§4).
 """
