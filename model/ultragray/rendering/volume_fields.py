@@ -19,7 +19,7 @@ from ultragray.errors import InvalidArgument
 from ultragray.files import atomic_path, write_whole
 from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.backends.reference import MAX_WEIGHT, MIN_WEIGHT, intensity, inverse_root_covariance
-from ultragray.rendering.labels import MIN_WEIGHT_SUM
+from ultragray.rendering.derived import MIN_WEIGHT_SUM
 from ultragray.rendering.limits import UNLIMITED, Limits
 from ultragray.rendering.pixels import image_file
 from ultragray.rendering.volumes import SLICE_SUFFIXES, VOLUME_SUFFIXES, VolumeGrid, check_field
@@ -169,7 +169,7 @@ class _Slab:
 
 # Slices as pictures; volumes as NIfTI-1 (.nii, .nii.gz) and NRRD (.nrrd), written slab by slab.
 #
-# The same volume is the same bytes.
+# The same volume is the same bytes. nibabel and pynrrd would want the whole volume in memory, so the headers are ours.
 #
 # Both formats say that their axes are right, anterior and superior (RAS+), which programs for patients expect. A
 # scene knows no patient: its frame's x, y and z are written as these three, with unchanged numbers, as 3D Slicer

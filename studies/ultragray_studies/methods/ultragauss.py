@@ -12,17 +12,18 @@ from torch import Tensor, nn
 
 from ultragray.errors import DatasetInvalid
 from ultragray.geometry.probe import FloatArray, ParallelLines, Probe
+from ultragray.learn.evaluation.methods import BudgetKind
 from ultragray.learn.sweep import Dataset
 from ultragray.learn.training.config import TrainingConfig
 from ultragray.learn.training.geometry import Geometry
 from ultragray.learn.training.losses import SSIM_WINDOW, image_loss
 from ultragray.learn.training.optimizer import PullStatistics, refine
 from ultragray.rendering.backends.inputs import scene_poses, spatial_order
-from ultragray.rendering.backends.weighted import WeightedSums, weighted_sums
+from ultragray.rendering.backends.registry import WeightedSums, weighted_sums
 from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.info import SceneInfo
 from ultragray_studies.methods.learner import LearnedMethod, Learner
-from ultragray_studies.methods.method import Budget, BudgetKind, Description
+from ultragray_studies.methods.method import Budget, Description
 from ultragray_studies.methods.parts import Box, frame_of_step
 
 
@@ -54,7 +55,7 @@ START_DENSITY = 1.0  # 1/cm; a fit sets it by what its first image weighs
 
 
 class Field(nn.Module):
-    """Raw parameters; `transmittances` holds the logits of the weights (`ultragray.rendering.backends.weighted`)."""
+    """Raw parameters; `transmittances` holds the logits of the weights (`ultragray.rendering.backends.registry`)."""
 
     def __init__(self, gaussians: Mapping[str, Tensor], *, casts_shadow: bool) -> None:
         super().__init__()
