@@ -6,7 +6,7 @@ import { deflateSync, gzipSync } from "node:zlib";
 
 import { built } from "./sources.mjs";
 
-const { between, moved, readCrop, whole, writeCrop, Sequence, rangeOf, ticks, tickText, readCalibration } = await built("train/sweeps.svelte", "train/sequence", "shared/chart");
+const { between, moved, readCrop, whole, writeCrop, Sequence, rangeOf, ticks, tickText, readCalibration } = await built("train/sweeps.svelte", "shared/chart");
 
 const SIZE = { width: 640, height: 480 };
 

@@ -5,7 +5,7 @@ import { describe, it } from "node:test";
 
 import { built } from "./sources.mjs";
 
-const space = await built("geometry/pose", "geometry/skin", "space/viewpoints", "space/volume", "api/gaussians");
+const space = await built("geometry/pose", "geometry/skin", "space/volume", "space/appearance", "api/gaussians");
 const { apply, axis, cross, dot, fromPositionQuaternion, length, minus, position, rotated, scaled, translated, unit } = space;
 
 const near = (a, b, most, what) => assert.ok(Math.abs(a - b) <= most, `${what}: ${a} is not ${b}`);

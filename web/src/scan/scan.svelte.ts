@@ -1,10 +1,19 @@
-/** What is kept of Scan: the frozen frames of the cine loop, what a person set on them, and what that measures. */
+/** What a person does in Scan: freezes, looks back, measures, tells poses, and finds it all again by the address. */
+
+import { untrack } from "svelte";
 
 import type { Frame } from "../api/stream";
 import {
   angleAt_deg, area_mm2, type Box, carried, circumference_mm, distanceBetween_mm, ellipseOf, type EllipsePoints,
   middleOf, placeLabels, type PlanePoint, squareTo,
 } from "../geometry/plane";
+import {
+  flangePose, fromPositionQuaternion, type Place, placeIn, type Pose, position, probePose, quaternion,
+  type Reference, type Registered, withPlaceIn, withPosition,
+} from "../geometry/pose";
+import type { PoseForm } from "../geometry/pose_files";
+import { router } from "../page/router.svelte";
+import { followLink, isAsLinked, isLink, linkOf } from "../session/link";
 import { besideSession, type History, type Session } from "../session/session.svelte";
 import { fixed } from "../shared/text";
 import { words } from "../words/words.svelte";
@@ -372,3 +381,144 @@ export class ScanState {
 
 /** What is kept of a scene; a session that was forgotten begins anew. */
 export const scanOf = besideSession((session) => new ScanState(session));
+
+export const MOST_MM = 10_000; // beyond, a typed position is a slip
+
+export class PoseTelling {
+  reference = $state<Reference>("absolute");
+  form = $state<PoseForm>("json");
+  /** Tells poses as a robot or a tracker does; null: of the probe, in the scene. */
+  registered = $state.raw<Registered | null>(null);
+  /** Whether relative poses are told against the mark; else against Home. */
+  fromMark = $state(false);
+  mark = $state.raw<Pose | null>(null);
+  readonly other = $derived.by(() => (this.fromMark && this.mark ? this.mark : this.session.held(this.session.scene.home)));
+
+  constructor(private readonly session: Session) {}
+
+  setMark(pose: Pose): void {
+    this.mark = pose;
+    this.fromMark = true;
+    if (this.reference === "absolute") this.reference = "relativeProbe";
+  }
+
+  /** A pose of the probe as it is shown: in the scene, or by the registration. */
+  told(pose: Pose): Pose {
+    return this.registered === null ? pose : flangePose(this.registered, pose);
+  }
+
+  /** Its inverse. */
+  meant(told: Pose): Pose {
+    return this.registered === null ? told : probePose(this.registered, told);
+  }
+
+  place(pose: Pose): Place {
+    return placeIn(this.told(pose), this.reference, this.told(this.other));
+  }
+
+  /** Moves the probe along one axis of what is told. */
+  setPosition(index: number, value_mm: number): void {
+    const place = this.place(this.session.pose);
+    const moved = this.#meantBy({ ...place, position_mm: replaced(place.position_mm, index, value_mm) });
+    const turn = fromPositionQuaternion([0, 0, 0], quaternion(this.session.pose)); // its digits stay as they are
+    this.session.pose = withPosition(turn, position(moved));
+  }
+
+  /** Turns the probe about its face. */
+  setAngle(index: number, value_deg: number): void {
+    const place = this.place(this.session.pose);
+    const turned = this.#meantBy({ ...place, angles_deg: replaced(place.angles_deg, index, value_deg) });
+    this.session.turnTo(quaternion(turned));
+  }
+
+  #meantBy(place: Place): Pose {
+    return this.meant(withPlaceIn(place, this.reference, this.told(this.other)));
+  }
+}
+
+function replaced(vector: Place["position_mm"], index: number, value: number): Place["position_mm"] {
+  return vector.map((before, i) => (i === index ? value : before)) as unknown as Place["position_mm"];
+}
+
+/** That of a session; the same for every view. */
+export const tellingOf = besideSession((session) => new PoseTelling(session));
+
+const WRITTEN_EVERY_MS = 250;
+
+type Values = Record<string, string | null>;
+
+export class Address {
+  /** What of the address that was opened cannot be used. */
+  refused = $state.raw<readonly string[]>([]);
+  /** Whether the session is what the address told when the view was opened. */
+  #taken = $state(false);
+  #arrivals: number | null = null;
+  #jumps = 0;
+  #latest: Values = {};
+  #timer: ReturnType<typeof setTimeout> | undefined;
+
+  /** Must be made while a component is being made; ends with it. */
+  constructor(private readonly scan: ScanState) {
+    const { session } = scan;
+    $effect(() => {
+      if (!session.scene.known) return;
+      const { arrivals } = router;
+      untrack(() => void this.#take(arrivals));
+    });
+    $effect(() => {
+      if (!session.scene.known || !this.#taken) return;
+      const [values, jumps] = [linkOf(session), session.jumps];
+      untrack(() => this.#note(values, jumps));
+    });
+    $effect(() => () => clearTimeout(this.#timer));
+  }
+
+  /** The whole address of what is shown. */
+  link(): string {
+    this.#write();
+    return new URL(router.link, location.href).href;
+  }
+
+  async #take(arrivals: number): Promise<void> {
+    const opened = this.#arrivals === null;
+    this.#arrivals = arrivals;
+    if (!this.#isHere) return;
+    const { session } = this.scan;
+    const { kept } = router;
+    // An address that tells nothing is the way back from another view, unless one came to it within this one.
+    const follows = opened ? isLink(kept) : true;
+    if (follows && !isAsLinked(session, kept)) {
+      this.#taken = false;
+      this.scan.unfreeze();
+      this.refused = await followLink(session, kept);
+    }
+    this.#jumps = session.jumps;
+    this.#latest = linkOf(session);
+    this.#taken = true;
+  }
+
+  #note(values: Values, jumps: number): void {
+    const isJump = jumps !== this.#jumps;
+    this.#jumps = jumps;
+    if (isJump && JSON.stringify(values) !== JSON.stringify(this.#latest)) {
+      this.#write();
+      this.#latest = values;
+      if (this.#isHere) router.keep(values, { entry: true });
+      return;
+    }
+    this.#latest = values;
+    this.#timer ??= setTimeout(() => this.#write(), WRITTEN_EVERY_MS);
+  }
+
+  #write(): void {
+    clearTimeout(this.#timer);
+    this.#timer = undefined;
+    if (this.#isHere) router.keep(this.#latest);
+  }
+
+  /** Whether the address is still that of this view: it changes before the view goes. */
+  get #isHere(): boolean {
+    const { view, name } = router.route;
+    return view === "scan" && name === this.scan.session.name;
+  }
+}

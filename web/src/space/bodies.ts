@@ -12,8 +12,8 @@ import { areAllAround, boxOf, type Line, pixelAt, type Placed, shortened } from 
 import type { Pose } from "../geometry/pose";
 import type { Skin } from "../geometry/skin";
 import { isRod, lengthOf, poseOfBox } from "../geometry/tool_place";
+import { type Box, corners } from "./appearance";
 import { OCCLUDERS } from "./cloud";
-import { type Box, corners } from "./viewpoints";
 
 /** The pose as a matrix of three.js. */
 export function matrixOf(pose: Pose): Matrix4 {

@@ -5,9 +5,8 @@ import { type SceneDescription, sceneGaussians } from "../api/scenes";
 import { apply, axis, type Pose, translated, type Vector, withPosition } from "../geometry/pose";
 import { keptOn, putOn } from "../geometry/skin";
 import { besideSession, type Session } from "../session/session.svelte";
-import { type Appearance, type ColourBy, type Cut, middleOf, USUAL } from "./appearance";
+import { type Appearance, type ColourBy, type Cut, type Look, middleOf, USUAL, type Viewpoint } from "./appearance";
 import type { Gizmo } from "./probe_handle";
-import type { Look, Viewpoint } from "./viewpoints";
 import { brightestOf, type Volume } from "./volume";
 import type { VolumeDelivery, VolumeOrder } from "./volume.worker";
 
