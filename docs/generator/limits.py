@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ultragray.geometry import image_size, pose, probe
-from ultragray.geometry import probe as fan
+from ultragray.rendering import pixels
 from ultragray.rendering.tools import MAX_TOOLS
 from ultragray.scene import info as scene_info
 from ultragray_service.core import scenes as catalog
@@ -20,7 +20,6 @@ from ultragray_service.tls.server import HANDSHAKE_TIMEOUT_S
 from ultragray_workers import scene_names
 from ultragray_workers.datasets import store as dataset_store
 from ultragray_workers.datasets import unpack as dataset_unpack
-from ultragray_workers.pool import pixels as encoding
 
 from .markdown import code, table
 
@@ -35,7 +34,7 @@ def fixed() -> str:
         ("Coordinate of a pose", f"{pose.MAX_POSITION_MM:,.0f} mm"),
         ("Length of a probe", f"{probe.MAX_LENGTH_MM:,.0f} mm"),
         ("Tools of a frame", f"{MAX_TOOLS}"),
-        ("Opening angle of a fan", f"{fan.LARGEST_OPENING_DEG:g}°"),
+        ("Opening angle of a fan", f"{probe.LARGEST_OPENING_DEG:g}°"),
         ("Height and width of a frame (library)", f"{image_size.MAX_IMAGE_SIDE:,}"),
         ("Height and width if the scene does not know them", f"{image_size.DEFAULT_IMAGE_SIDE:,}"),
         ("Training poses of a scene", f"{scene_info.MAX_TRAINING_POSES:,}"),
@@ -54,7 +53,7 @@ def fixed() -> str:
         ("gRPC message, if `ULTRAGRAY_MAX_BODY_BYTES` is less", _bytes(grpc_server.LEAST_MAX_MESSAGE_BYTES)),
         ("Time between keepalive pings of a gRPC client, at least", f"{grpc_server.LEAST_PING_INTERVAL_MS:,} ms"),
         ("TLS handshake", f"{HANDSHAKE_TIMEOUT_S:g} s"),
-        ("Quality of a JPEG", f"{encoding.JPEG_QUALITY}"),
+        ("Quality of a JPEG", f"{pixels.JPEG_QUALITY}"),
         ("`Retry-After` of a full queue", f"{STATUSES['QUEUE_FULL'].retry_after_s:g} s"),
         ("Length of an API key, at least", f"{LEAST_KEY_LENGTH} characters"),
     ]

@@ -47,7 +47,7 @@ LIBRARY_MODULES = (
     "ultragray.geometry.scan_conversion",
     "ultragray.exchange.rendering",
     "ultragray.exchange.exports",
-    "ultragray.exchange.exports.png_folder",
+    "ultragray.exchange.exports.archives",
     "ultragray.exchange.ply",
     "ultragray.exchange.checkpoint",
     "ultragray.exchange.poses",

@@ -5,9 +5,8 @@ from __future__ import annotations
 import cv2
 import numpy as np
 
-from ultragray.rendering.pixels import to_uint8
+from ultragray.rendering.pixels import encoded_image, in_type, to_uint8
 from ultragray.rendering.settings import Encoding
-from ultragray_workers.pool.pixels import encode_image, encode_pixels
 
 
 def test_uint8_saturates_and_rounds():
@@ -19,20 +18,20 @@ def test_uint8_saturates_and_rounds():
 
 def test_pixels_are_little_endian_and_contiguous():
     frames = np.arange(12, dtype=np.float32).reshape(2, 2, 3)[:, :, ::2]
-    assert encode_pixels(frames, Encoding.FLOAT32).data.cast("B")[4:8].tobytes() == np.float32(2).tobytes()
-    assert encode_pixels(frames, Encoding.UINT8).tolist() == [[[0, 255], [255, 255]], [[255, 255], [255, 255]]]
+    assert in_type(frames, Encoding.FLOAT32.pixel_type).data.cast("B")[4:8].tobytes() == np.float32(2).tobytes()
+    assert in_type(frames, Encoding.UINT8.pixel_type).tolist() == [[[0, 255], [255, 255]], [[255, 255], [255, 255]]]
 
 
 def test_bytes_are_taken_as_they_are():
     """A GPU has rounded them already, or they are labels."""
     frame = np.array([[0, 1], [254, 255]], np.uint8)
-    assert encode_pixels(frame[None], Encoding.UINT8).tolist() == [frame.tolist()]
-    floats = encode_pixels(frame[None], Encoding.FLOAT32)
+    assert in_type(frame[None], Encoding.UINT8.pixel_type).tolist() == [frame.tolist()]
+    floats = in_type(frame[None], Encoding.FLOAT32.pixel_type)
     assert (floats.dtype.str, floats.tolist()) == ("<f4", [frame.tolist()])
-    assert cv2.imdecode(encode_image(frame, Encoding.PNG), cv2.IMREAD_UNCHANGED).tolist() == frame.tolist()
+    assert cv2.imdecode(encoded_image(frame, Encoding.PNG), cv2.IMREAD_UNCHANGED).tolist() == frame.tolist()
 
 
 def test_one_by_one_images():
     frame = np.full((1, 1), 0.5, np.float32)
-    assert encode_image(frame, Encoding.PNG).tobytes().startswith(b"\x89PNG")
-    assert encode_image(frame, Encoding.JPEG).tobytes().startswith(b"\xff\xd8")
+    assert encoded_image(frame, Encoding.PNG).tobytes().startswith(b"\x89PNG")
+    assert encoded_image(frame, Encoding.JPEG).tobytes().startswith(b"\xff\xd8")
