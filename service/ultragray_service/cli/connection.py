@@ -1,21 +1,33 @@
-"""The connection to a running service: requests, pages, downloads and uploads over HTTP."""
+"""The connection of commands to a running service: the options that find it, and requests over HTTP.
+
+The commands ask over HTTP, not over gRPC as the Python client does: what users have is the URL of the service, often of
+a proxy that lets nothing else through; scene files, pictures and the documents that `--json` prints are HTTP's alone;
+and these commands are of the core, which needs no gRPC. The standard library is enough for them.
+"""
 
 from __future__ import annotations
 
 import contextlib
 import http.client
+import inspect
 import json
 import ssl
 import urllib.error
 import urllib.request
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from functools import wraps
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Annotated, Any, get_type_hints
 from urllib.parse import quote, urlencode, urlsplit
+
+import typer
 
 from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray.files import atomic_path
-from ultragray_service.tls.client import cut_off_hint, tls_problem
+from ultragray_service.cli.options import keyword, with_parameters
+from ultragray_service.cli.terminal import warn
+from ultragray_service.environment import ADDRESS, API_KEY, CA, CLIENT_CERTIFICATE, CLIENT_KEY
+from ultragray_service.tls.client import client_context, cut_off_hint, exposes_key, tls_problem
 from ultragray_workers.errors import NotReady
 
 JSON = "application/json"
@@ -51,12 +63,13 @@ class Connection:
 
     def json(self, method: str, route: str, body: Mapping[str, Any] | None = None) -> Any:
         """The JSON of an answer; None where it has none."""
-        return self.answered(method, route, body)[0]
-
-    def answered(self, method: str, route: str, body: Mapping[str, Any] | None = None) -> tuple[Any, int]:
-        """The JSON of an answer, None where it has none, and its status."""
         with self.open(method, route, body) as answer:
-            return self._document(self.whole(answer)), answer.status
+            return self._document(self.whole(answer))
+
+    def text(self, route: str) -> str:
+        """An answer that is text."""
+        with self.open("GET", route, accept="*/*") as answer:
+            return self.whole(answer).decode("utf-8", "replace")
 
     def whole(self, answer: http.client.HTTPResponse) -> bytes:
         """All that is left of an answer. Raises NotReady where it breaks off."""
@@ -95,6 +108,18 @@ class Connection:
         except (OSError, http.client.HTTPException) as error:
             raise self._unreachable(error.reason if isinstance(error, urllib.error.URLError) else error) from error
         return answer
+
+    def events(self, route: str, name: str) -> Iterator[Any]:
+        """The JSON of the events of that name; ends with the stream, or where the service goes away."""
+        with self.open("GET", route, accept="text/event-stream") as answer:
+            event = ""
+            with contextlib.suppress(OSError, http.client.HTTPException):
+                for line in answer:
+                    key, _, value = line.decode("utf-8", "replace").rstrip("\r\n").partition(": ")
+                    if key == "event":
+                        event = value
+                    elif key == "data" and event == name:
+                        yield json.loads(value)
 
     def download(self, route: str, path: Path, progress: Callable[[int | None], Count]) -> int:
         """Write an answer to `path`, whole or not at all, and return its size in bytes.
@@ -208,3 +233,68 @@ def _in_words(reason: object) -> str:
     if isinstance(reason, OSError) and reason.strerror:
         return reason.strerror.lower()
     return str(reason) or type(reason).__name__
+
+
+CONNECTION, TLS = "Connection", "TLS"
+
+
+def _option(help: str, envvar: str, panel: str, show_default: str | bool) -> Any:
+    return typer.Option(help=help, envvar=envvar, rich_help_panel=panel, show_default=show_default)
+
+
+_OPTIONS = [
+    keyword(
+        "address",
+        Annotated[str, _option("URL of the service.", ADDRESS, CONNECTION, True)],
+        "http://127.0.0.1:8000",
+    ),
+    keyword(
+        "api_key", Annotated[str | None, _option("Where the service asks for one.", API_KEY, CONNECTION, False)], None
+    ),
+    keyword(
+        "ca",
+        Annotated[
+            Path | None,
+            _option("Authorities (PEM) that sign the service's certificate.", CA, TLS, "the system's"),
+        ],
+        None,
+    ),
+    keyword(
+        "client_certificate",
+        Annotated[
+            Path | None,
+            _option("Certificate (PEM) of the client, where the service asks for one.", CLIENT_CERTIFICATE, TLS, False),
+        ],
+        None,
+    ),
+    keyword(
+        "client_key", Annotated[Path | None, _option("Its key (PEM), not encrypted.", CLIENT_KEY, TLS, False)], None
+    ),
+]
+
+
+def with_connection(command: Callable[..., None]) -> Callable[..., None]:
+    """Make a command of a function that takes a `connection` first: with the options of the connection."""
+    hints = get_type_hints(command, include_extras=True)
+    own = [
+        parameter.replace(annotation=hints[name], kind=parameter.KEYWORD_ONLY)
+        for name, parameter in inspect.signature(command).parameters.items()
+        if name != "connection"
+    ]
+
+    @wraps(command)
+    def run(
+        *,
+        address: str,
+        api_key: str | None,
+        ca: Path | None,
+        client_certificate: Path | None,
+        client_key: Path | None,
+        **given: Any,
+    ) -> None:
+        connection = Connection(address, api_key, client_context(ca, client_certificate, client_key))
+        if api_key is not None and exposes_key(address):
+            warn(f"the API key travels unencrypted to {address}, and whoever is on the way can read it")
+        command(connection, **given)
+
+    return with_parameters(run, [*own, *_OPTIONS])
