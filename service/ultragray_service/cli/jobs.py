@@ -29,7 +29,7 @@ from ultragray_service.cli.terminal import (
     output_option,
     print_facts,
     print_table,
-    progress,
+    progress_bars,
     tell,
     to_json,
     transferred,
@@ -320,7 +320,7 @@ def _watched(connection: Connection, job_id: str, show: Callable[[dict[str, Any]
 def _display(job_id: str) -> Iterator[Callable[[dict[str, Any]], None]]:
     """A bar on a terminal's stderr; elsewhere a line for every change of state and every tenth of the work."""
     last: tuple[str, int] | None = None
-    with progress("{task.description}", "bar", "of", "{task.fields[figures]}") as bar:
+    with progress_bars("{task.description}", "bar", "of", "{task.fields[figures]}") as bar:
         task = bar.add_task(f"{job_id}", total=None, figures="")
 
         def show(job: dict[str, Any]) -> None:

@@ -18,6 +18,7 @@ from ultragray.errors import InvalidArgument
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.progress import Progress
 
 
 OUTPUT, COMPUTE = "Output", "Compute"
@@ -191,7 +192,7 @@ def wide_console() -> Console:
 
 
 @contextlib.contextmanager
-def progress(*columns: str) -> Iterator[Progress]:
+def progress_bars(*columns: str) -> Iterator[Progress]:
     """Bars on standard error, between texts such as "{task.description}"; disabled elsewhere than on a terminal.
 
     A column may be named as well: "bar", "of" (how many of how many), "bytes", "rate" of these, "left" (time).
@@ -215,7 +216,7 @@ def progress(*columns: str) -> Iterator[Progress]:
 @contextlib.contextmanager
 def counted(what: str, total: int) -> Iterator[Callable[[int], None]]:
     """A function that is told how many of `total` are done: a bar on a terminal, nothing elsewhere."""
-    with progress("{task.description}", "bar", "of", "left") as bars:
+    with progress_bars("{task.description}", "bar", "of", "left") as bars:
         task = bars.add_task(what, total=total)
         yield lambda done: bars.update(task, completed=done)
 
@@ -226,7 +227,7 @@ def transferred(what: str) -> Iterator[Callable[[int | None], Callable[[int], No
 
     A bar with rate and time left on a terminal, nothing elsewhere.
     """
-    with progress("{task.description}", "bar", "bytes", "rate", "left") as bars:
+    with progress_bars("{task.description}", "bar", "bytes", "rate", "left") as bars:
 
         def begin(total: int | None) -> Callable[[int], None]:
             task = bars.add_task(what, total=total)

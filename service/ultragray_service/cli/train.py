@@ -30,7 +30,7 @@ from ultragray_service.cli.terminal import (
     command_group,
     examples,
     output_option,
-    progress,
+    progress_bars,
     stop_on_signal,
     tell,
 )
@@ -298,7 +298,7 @@ def _progress_bar() -> Iterator[Callable[[Any], None]]:
 
     After the last step of a training what it reached is measured, which takes a while and has no steps.
     """
-    with progress("{task.fields[stage]}", "bar", "of", "{task.fields[figures]}") as bar:
+    with progress_bars("{task.fields[stage]}", "bar", "of", "{task.fields[figures]}") as bar:
         task = bar.add_task("", total=None, stage="training", figures="")
 
         def report(state: Any) -> None:
