@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import grpc
 
@@ -30,7 +30,7 @@ from ultragray_service.views.localizing import locate, sought_frame
 from ultragray_workers.errors import QueueFull
 from ultragray_workers.pool.messages import Priority, RenderResult
 
-Context = grpc.aio.ServicerContext
+Context: TypeAlias = grpc.aio.ServicerContext
 
 
 class _Message:

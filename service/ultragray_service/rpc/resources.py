@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import replace
+from typing import TypeAlias
 
 import grpc
 import numpy as np
@@ -35,7 +36,7 @@ from ultragray_workers.jobs.queue.wishes import Wanted
 from ultragray_workers.jobs.shared.reading import opened
 from ultragray_workers.jobs.store import JobStore
 
-Context = grpc.aio.ServicerContext
+Context: TypeAlias = grpc.aio.ServicerContext
 
 
 class SceneService:
