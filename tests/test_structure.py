@@ -21,6 +21,16 @@ MAY_IMPORT = {
     "ultragray_workers": {"ultragray"},
     "ultragray_service": {"ultragray", "ultragray_workers", "ultragray_proto", "ultragray_client"},
 }
+# The library: each storey imports those before it and what lies beneath all; plug-ins stand beside.
+STOREYS = ("geometry", "scene", "rendering", "learn")
+BENEATH = {"", "errors", "contract", "files", "installation", "_cpu"}
+PLUGINS = ("datasets", "exchange", "phantom", "samplers")
+ROOMS = {
+    "": {*BENEATH, *STOREYS},  # public names, on first use
+    **{room: BENEATH for room in BENEATH if room},
+    **{storey: {*BENEATH, *STOREYS[:place]} for place, storey in enumerate(STOREYS)},
+    **{plugin: {*BENEATH, *STOREYS, *PLUGINS} for plugin in PLUGINS},
+}
 
 
 @cache
@@ -73,6 +83,22 @@ def test_distributions_import_only_those_below_them(package: str) -> None:
         if other.partition(".")[0] not in {package, *MAY_IMPORT[package]}
     }
     assert wrong == set()
+
+
+def test_rooms_of_the_library_import_only_those_below_them() -> None:
+    inside = {name: (*name.split("."), "")[1] for name in modules() if name.partition(".")[0] == "ultragray"}
+    wrong = {
+        (name, other)
+        for name, room in inside.items()
+        for other in imports_of(name) & inside.keys()
+        if inside[other] not in {room, *ROOMS[room]}
+    }
+    assert wrong == set()
+
+
+def test_every_module_says_what_it_is_for() -> None:
+    written = {name for name, path in modules().items() if path.suffix == ".py" and "_pb2" not in name}
+    assert {name for name in written if not ast.get_docstring(tree(name))} == set()
 
 
 def test_nobody_outside_its_module_asks_for_the_kind_of_a_probe() -> None:
