@@ -6,10 +6,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import Enum
 
 from ultragray.contract import Contract, described
 from ultragray.errors import InvalidArgument
-from ultragray_studies.methods.method import BudgetKind
 
 ALL = "all"
 NAMES = (
@@ -41,6 +41,13 @@ def chosen_names(names: Sequence[str]) -> tuple[str, ...]:
 
 
 EVERY_METHOD = (ALL,)
+
+
+class BudgetKind(str, Enum):
+    """The closed set of budgets."""
+
+    EQUAL = "equal"
+    AUTHOR = "author"
 
 
 @dataclass(frozen=True)

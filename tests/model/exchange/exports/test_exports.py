@@ -95,7 +95,8 @@ def test_the_share_of_contact_is_there_where_it_was_asked_for(tmp_path: Path) ->
     for format, dtype in dtypes.items():
         asked = replace(judged, dtype=dtype)
         path = tmp_path / f"frames{FORMATS[format].suffix}"
-        pixels = {"bmode": stored_pixels("bmode", rendered(("bmode",))["bmode"], np.dtype("u1" if dtype == "uint8" else "<f4"))}
+        stored = np.dtype("u1" if dtype == "uint8" else "<f4")
+        pixels = {"bmode": stored_pixels("bmode", rendered(("bmode",))["bmode"], stored)}
         with export_to(path, format, asked) as add:
             add(pixels, told)
     shares = [one.contact_share for one in told]
