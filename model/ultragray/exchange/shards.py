@@ -19,7 +19,7 @@ from ultragray.exchange.exports.exporter import stored_pixels
 from ultragray.exchange.rendering import render_portions, written_behind
 from ultragray.files import file_sha256
 from ultragray.geometry.probe import FloatArray
-from ultragray.rendering.frames import renderer_name
+from ultragray.rendering.backends.registry import renderer_name
 from ultragray.rendering.limits import UNLIMITED, Limits
 from ultragray.rendering.pixels import PixelArray
 from ultragray.samplers import Assess

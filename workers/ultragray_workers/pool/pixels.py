@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, BinaryIO, Protocol
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -16,8 +15,7 @@ from torch import Tensor
 
 from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.outputs import OUTPUTS
-from ultragray.rendering.pixels import ByteArray, PixelArray, image_file, to_uint8
-from ultragray.rendering.settings import Encoding
+from ultragray.rendering.pixels import PixelArray
 from ultragray.scene.confidence import Extrapolation, figure_arrays
 
 CHUNK_POSES = 8  # rendered in one launch; while they are copied and written, the next ones are rendered
@@ -127,26 +125,6 @@ def _copy_stream(device: torch.device) -> torch.cuda.Stream:
     return _copy_streams[device]
 
 
-# Frames as bytes: the pixel work, done in the worker processes.
-
-
-JPEG_QUALITY = 90
-
-
-def encode_pixels(frames: PixelArray, encoding: Encoding) -> npt.NDArray[np.generic]:  # [C, H, W] -> [C, H, W]
-    """Frames in the pixel type of an encoding, C order, little endian; labels keep their values."""
-    pixel_type = encoding.pixel_type
-    pixels: npt.NDArray[Any] = to_uint8(frames) if pixel_type == np.uint8 else frames
-    return np.ascontiguousarray(pixels, dtype=pixel_type)
-
-
-def encode_image(frame: PixelArray, encoding: Encoding) -> ByteArray:  # [H, W] -> [bytes]
-    """A frame as the bytes of a grey PNG (at OpenCV's default settings) or JPEG file."""
-    if encoding is Encoding.PNG:
-        return image_file(frame, ".png")
-    return image_file(frame, ".jpg", cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY)
-
-
 def write_npz(
     file: BinaryIO,
     frames: Mapping[str, PixelArray],  # each [C, H, W]
@@ -157,7 +135,7 @@ def write_npz(
     scene_sha256: str,
     renderer: str,
 ) -> int:
-    """Writes an .npz archive, labels as uint8, at the start of `file` and returns its size in bytes."""
+    """Writes an .npz archive, labels as uint8, at the start of `file`; its size in bytes."""
     file.seek(0)
     arrays: dict[str, Any] = {
         **{name: np.asarray(pixels, OUTPUTS[name].dtype) for name, pixels in frames.items()},

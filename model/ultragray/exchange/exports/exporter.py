@@ -16,7 +16,7 @@ import numpy.typing as npt
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.outputs import OUTPUTS
-from ultragray.rendering.pixels import PixelArray, to_uint8
+from ultragray.rendering.pixels import PixelArray, in_type
 from ultragray.rendering.settings import Encoding, Resolved, SettingsUsed, settings_used
 from ultragray.scene.confidence import Extrapolation, figure_arrays
 
@@ -118,5 +118,4 @@ class Exporter(ABC):
 
 def stored_pixels(output: str, frames: PixelArray, stored: np.dtype[Any]) -> PixelArray:  # [B, H, W] -> [B, H, W]
     """Rendered frames of an output as they are stored, C order."""
-    pixels = to_uint8(OUTPUTS[output].shares(frames)) if stored == np.uint8 else frames
-    return np.ascontiguousarray(pixels, stored)
+    return in_type(OUTPUTS[output].shares(frames) if stored == np.uint8 else frames, stored)

@@ -11,6 +11,14 @@ from enum import Enum
 from ultragray.contract import Contract, described
 from ultragray.errors import InvalidArgument
 
+
+class BudgetKind(str, Enum):
+    """The closed set of budgets."""
+
+    EQUAL = "equal"
+    AUTHOR = "author"
+
+
 ALL = "all"
 NAMES = (
     "scene",
@@ -41,13 +49,6 @@ def chosen_names(names: Sequence[str]) -> tuple[str, ...]:
 
 
 EVERY_METHOD = (ALL,)
-
-
-class BudgetKind(str, Enum):
-    """The closed set of budgets."""
-
-    EQUAL = "equal"
-    AUTHOR = "author"
 
 
 @dataclass(frozen=True)
