@@ -8,16 +8,12 @@ import time
 from collections.abc import Callable
 from typing import Any
 
-import grpc
 import httpx
 import numpy as np
 import pytest
 
-from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
-
 from ..waiting import at_this_load
 from .conftest import RunningService, StartService
-from .rpc.test_grpc_render import error_info
 
 POSES = 26_000  # 3.8 MB as JSON
 MOST_S = 0.2  # for a small request beside a large one; where the loop of the service reads it, half a second
@@ -73,20 +69,3 @@ def test_json(ample: RunningService) -> None:
         assert (answer.status_code, answer.json()["reason"]) == (422, "INVALID_ARGUMENT"), answer.text
 
     assert longest_wait_s(ample, submit) < at_this_load(MOST_S)
-
-
-@pytest.mark.long
-def test_grpc(ample: RunningService) -> None:
-    request = rendering_pb2.RenderBatchRequest(
-        settings=rendering_pb2.RenderSettings(scene="demo", height=8, width=8),
-        poses=[geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=pose.ravel())) for pose in poses()],
-    )
-    with ample.channel() as channel:
-        stub = rendering_pb2_grpc.RenderServiceStub(channel)
-
-        def render() -> None:
-            with pytest.raises(grpc.RpcError) as refused:
-                next(stub.RenderBatch(request, timeout=60))
-            assert error_info(refused.value)[0].reason == "INVALID_POSE", refused.value
-
-        assert longest_wait_s(ample, render) < at_this_load(MOST_S)

@@ -9,7 +9,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import grpc
 import httpx
 import numpy as np
 import pytest
@@ -19,7 +18,6 @@ from ultragray.geometry.probe import FloatArray
 from ultragray.phantom.demo import DEMO_FILE, demo_poses, load_demo_scene
 from ultragray.rendering.pixels import image_file, to_uint8
 from ultragray_client import Client
-from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 
 from ..waiting import Deadline
 from .conftest import RunningService, StartService
@@ -79,18 +77,6 @@ def test_a_png_file_is_found_over_http(http: httpx.Client, png: bytes) -> None:
     assert found["shift_mm"] == pytest.approx(np.linalg.norm((1.5, -1.0, 1.0)), abs=0.3)
     assert found["scene"] == "spine"
     assert found["search_ms"] > 0.0
-
-
-def test_grey_pixels_are_found_over_grpc(phantom: RunningService, pixels: Any) -> None:
-    asked = rendering_pb2.LocalizeRequest(
-        scene="spine", image=pixels.tobytes(), image_height=SIDE, image_width=SIDE, within_mm=2.5
-    )
-    asked.start.matrix.values.extend(start().ravel().tolist())
-    with grpc.insecure_channel(phantom.grpc) as channel:
-        found = rendering_pb2_grpc.RenderServiceStub(channel).Localize(asked, timeout=120.0)
-    assert found.is_found
-    np.testing.assert_allclose(np.reshape(found.pose.values, (4, 4)), POSE, atol=0.2)
-    assert 0.0 < found.angle_std_deg.axial < 1.0
 
 
 def test_arrays_and_files_are_found_by_the_client(phantom: RunningService, pixels: Any, png: bytes) -> None:
@@ -171,13 +157,6 @@ def test_a_picture_that_says_it_is_huge_takes_no_memory(http: httpx.Client, png:
 
 def test_a_scene_that_is_not_there_is_not_found(http: httpx.Client, png: bytes) -> None:
     assert http.post("/v1/scenes/nowhere:localize", json=body(png)).status_code == 404
-
-
-def test_a_large_body_is_read_as_a_small_one(http: httpx.Client) -> None:
-    scene = load_demo_scene()
-    frame = render(scene, None, POSE, height=384, width=384, outputs=("bmode",))["bmode"][0]
-    asked = body(to_uint8(frame.detach().numpy()).tobytes(), image_height=384, image_width=384)
-    assert http.post("/v1/scenes/spine:localize", json=asked).json()["is_found"]
 
 
 def test_a_search_ends_at_its_deadline_and_with_its_caller(http: httpx.Client, png: bytes) -> None:
