@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import shutil
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -180,21 +179,3 @@ def test_a_search_counts_as_many_frames_of_the_key(
         assert answer.status_code == 422, answer.text
         assert "frames_per_s" in answer.json()["detail"]
         assert httpx.post(f"{service.http}/v1/scenes/spine:localize", json=body(png), timeout=60).status_code == 401
-
-
-def test_frames_are_rendered_between_searches(phantom: RunningService, png: bytes) -> None:
-    """One process serves both: a frame waits for at most one search."""
-    asked = body(png)
-
-    def search() -> None:
-        httpx.post(f"{phantom.http}/v1/scenes/spine:localize", json=asked, timeout=120.0)
-
-    searches = [threading.Thread(target=search) for _ in range(4)]
-    for thread in searches:
-        thread.start()
-    with Client(phantom.grpc, timeout_s=120.0) as client:
-        client.render("spine", POSE)
-    waiting = sum(thread.is_alive() for thread in searches)
-    for thread in searches:
-        thread.join()
-    assert waiting >= 1
