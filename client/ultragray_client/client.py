@@ -1,7 +1,7 @@
 """The clients, for threads and for asyncio side by side: thin transports of the calls that `calls.py` describes.
 
-A method of a client is such a description carried out: `render = answer_method(ClientCalls.render)` has the parameters and
-the docstring of the description, and gives what the call answers.
+A method of a client is such a description carried out: `render = answer_method(ClientCalls.render)` has the parameters
+and the docstring of the description, and gives what the call answers.
 """
 
 from __future__ import annotations
