@@ -13,7 +13,6 @@ import pyigtl
 import pytest
 
 from ultragray.geometry.pose import check_poses
-from ultragray.geometry.scan_conversion import scan_convert
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 from ultragray_service.igtl.contents import (
     Instrument,
@@ -29,7 +28,7 @@ from ultragray_service.igtl.contents import (
 from ...freshness import check_fresh
 from ..conftest import DEMO_PROBE, HEIGHT, WIDTH, RunningService, StartService
 from ..rpc.test_grpc_render import matrix_pose
-from .conftest import FAN, Connect, Peer, address_of, moved, pyigtl_client, random_pose
+from .conftest import Connect, Peer, address_of, moved, pyigtl_client, random_pose
 
 SLOW = {"backend": "reference", "max_batch_poses": 1}
 
@@ -89,14 +88,6 @@ def test_tools_named_like_scenes_get_a_frame_each(peer: Peer, igtl_service: Runn
         assert np.array_equal(unpack_image(answer.content).pixels, over_grpc(igtl_service, name, pose))
 
 
-def test_a_fan_is_sent_as_a_picture(peer: Peer, igtl_service: RunningService) -> None:
-    peer.send_pose(np.eye(4), "ProbeTofan")
-    image = peer.image()
-    expected = scan_convert(over_grpc(igtl_service, "fan", np.eye(4)), FAN, FAN.scan_line_length_mm / HEIGHT)
-    assert np.abs(image.pixels - expected).max() <= 8
-    assert expected.max() > 50
-
-
 def test_an_answer_repeats_what_identifies_its_question(peer: Peer) -> None:
     peer.send_pose(np.eye(4), "demo", timestamp=77, version=2, message_id=5)
     answer = peer.receive()
@@ -126,20 +117,6 @@ def test_a_newer_pose_replaces_one_that_waits(start_service: StartService, igtl_
     assert replaced > 20
     assert service.metric("ultragray_stream_dropped_poses_total") == replaced
     assert service.metric('ultragray_requests_total{door="igtl",route="TRANSFORM",status="OK"}') == frames
-
-
-def test_clients_do_not_disturb_each_other(connect: Connect, igtl_service: RunningService) -> None:
-    peers = [connect() for _ in range(8)]
-    for step in range(5):
-        for number, peer in enumerate(peers):
-            peer.send_pose(moved(number), "second" if number % 2 else "demo", timestamp=step)
-    for number, peer in enumerate(peers):
-        expected = over_grpc(igtl_service, "second" if number % 2 else "demo", moved(number))
-        while True:
-            answer = peer.receive()
-            assert np.array_equal(unpack_image(answer.content).pixels, expected)
-            if answer.timestamp == 4:
-                break
 
 
 # Queries and streams
@@ -207,22 +184,12 @@ def test_a_viewer_is_sent_what_the_robot_sees(connect: Connect) -> None:
         assert client.ask("GET_STATUS").type_name == "STATUS"
 
 
-def test_the_robot_is_told_its_own_poses_as_often_as_it_asks(peer: Peer) -> None:
-    interval_ms = 300
-    assert peer.ask("STT_QTDATA", "", struct.pack(">I32s", interval_ms, b"")).content == b"\0"
-    images, told = 0, []
-    started = time.monotonic()
-    while time.monotonic() - started < 1.0:
-        peer.send_pose(moved(images / 10))
-        while (answer := peer.receive()).type_name == "QTDATA":
-            told.append(time.monotonic())
-        images += 1
-    assert images > 10
-    assert 3 <= len(told) <= 4
-    assert min(np.diff(told)) > 0.9 * interval_ms / 1000
+def test_the_robot_is_told_its_own_poses(peer: Peer) -> None:
+    assert peer.ask("STT_QTDATA", "", struct.pack(">I32s", 0, b"")).content == b"\0"
+    peer.send_pose(moved(1))
+    assert {peer.receive().type_name, peer.receive().type_name} == {"IMAGE", "QTDATA"}
     peer.send("STP_QTDATA")
-    while (answer := peer.receive()).type_name != "RTS_QTDATA":
-        assert answer.type_name == "QTDATA"
+    assert peer.receive().type_name == "RTS_QTDATA"
 
 
 def test_streams_that_we_cannot_give_are_refused(peer: Peer) -> None:
@@ -244,8 +211,7 @@ def test_a_stop_answers_what_was_asked_and_is_told(
         busy.image()
     for name in ("demo", "second", "fan"):
         busy.send_pose(np.eye(4), name)
-    answers = [busy.receive()]
-    time.sleep(0.05)  # the second is being rendered, or has been
+    answers = [busy.receive(), busy.receive()]
     assert service.terminate() == 0
     while answers[-1].device_name:
         answers.append(busy.receive())
