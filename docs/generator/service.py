@@ -18,10 +18,10 @@ from ultragray_service.service import Service
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings
 from ultragray_workers import errors as workers_errors
 from ultragray_workers.errors import QueueFull
-from ultragray_workers.jobs.job import JobState
-from ultragray_workers.jobs.matching.demand import AUTO
-from ultragray_workers.jobs.overview import JobsOverview
-from ultragray_workers.jobs.queue.attendance import WorkerState
+from ultragray_workers.jobs.demand import AUTO
+from ultragray_workers.jobs.record import JobState
+from ultragray_workers.jobs.store import JobsOverview
+from ultragray_workers.jobs.workers import WorkerState
 from ultragray_workers.pool.messages import RenderResult
 
 from .http_api import temporary_service

@@ -36,13 +36,13 @@ from ultragray_service.views.assessments import Assessing
 from ultragray_service.views.prepared import Comparisons, DatasetViews, TrainingViews, simulated_sha256
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import Draining, NotReady, SceneNotFound, StartupFailed
-from ultragray_workers.jobs.places import shared_storage
-from ultragray_workers.jobs.queue.owners import Kind
+from ultragray_workers.jobs.owners import Kind
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.pool.messages import Destination, Priority, RenderRequest, RenderResult, S, SceneChangedError
 from ultragray_workers.pool.pool import MAX_SCENE_CHANGES, PoolConfig, RenderPool
 from ultragray_workers.pool.waiting import Turn
 from ultragray_workers.scenes import SceneStore
+from ultragray_workers.storage.location import open_storage
 
 
 class Phase(Enum):
@@ -91,7 +91,7 @@ class Service:
             ),
         )
         self.datasets = DatasetStore(
-            settings.working_folder, shared_storage(settings.artifacts), settings.max_cache_bytes
+            settings.working_folder, open_storage(settings.artifacts), settings.max_cache_bytes
         )
         self.jobs = Jobs(
             settings, store, self.datasets, lambda name, scene: self.registrations.read_of_scene(name, scene)

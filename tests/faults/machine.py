@@ -27,7 +27,7 @@ if "ultragray_workers.jobs.worker.run_job" in line:
     from ultragray_workers.jobs.kinds import train_run
     train_run.CHECKPOINT_INTERVAL_S = {CHECKPOINT_INTERVAL_S}
 elif "worker" in line:
-    from ultragray_workers.jobs.queue import heartbeat
+    from ultragray_workers.jobs import queue as heartbeat
     heartbeat.DEAD_AFTER_S = {DEAD_AFTER_S}
 """
 _SERVE = [sys.executable, "-m", "ultragray_service"]

@@ -22,7 +22,7 @@ import pytest
 
 from ultragray_service.bench.measured import measured
 from ultragray_workers.storage.copying import copy_scenes
-from ultragray_workers.storage.opening import open_storage
+from ultragray_workers.storage.location import open_storage
 
 from ..docker.envoy import Envoy, program, script
 from ..postgres import PostgresServer

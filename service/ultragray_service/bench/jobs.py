@@ -29,7 +29,7 @@ from ultragray_service.bench.report import Report, percentiles
 from ultragray_service.bench.served import pose_message, running_server
 from ultragray_service.remote.jobs import Jobs
 from ultragray_workers.errors import NotReady
-from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.database import JobDatabase
 
 SCENE = "demo"
 SIDE = 512

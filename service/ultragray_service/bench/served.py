@@ -27,7 +27,7 @@ from ultragray_service.bench.shared_file import SharedFile
 from ultragray_service.remote.connection import Connection
 from ultragray_service.remote.jobs import Jobs
 from ultragray_workers.errors import NotReady
-from ultragray_workers.jobs.worker.processes import account_of
+from ultragray_workers.jobs.worker.process import account_of
 
 SCENE = "bench"
 IN_FLIGHT = 8

@@ -12,7 +12,7 @@ from ultragray_service.core.catalog import page_of_names
 from ultragray_service.service import Service
 from ultragray_workers.datasets.store import DatasetRecord, DatasetStore
 from ultragray_workers.errors import DatasetNotFound
-from ultragray_workers.jobs.queue.owners import Kind
+from ultragray_workers.jobs.owners import Kind
 
 
 @dataclass(frozen=True)
@@ -52,11 +52,4 @@ async def dataset_page(service: Service, page_size: int, page_token: str) -> Dat
 
 async def contact_sheet(store: DatasetStore, name: str) -> bytes:
     """The PNG of a dataset. Raises DatasetNotFound."""
-
-    def read() -> bytes:
-        try:
-            return store.contact_sheet(name).read_bytes()
-        except FileNotFoundError:  # deleted a moment ago
-            raise DatasetNotFound(f"there is no dataset {name!r} any more", field="dataset") from None
-
-    return await asyncio.to_thread(read)
+    return await asyncio.to_thread(store.contact_sheet, name)

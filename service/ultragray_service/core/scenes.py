@@ -15,7 +15,7 @@ from ultragray_service.core.frames import OutputName
 from ultragray_service.core.poses import PoseInBothForms, Position
 from ultragray_service.errors import Refusal
 from ultragray_service.service import Service
-from ultragray_workers.jobs.queue.owners import Kind, Ownership
+from ultragray_workers.jobs.owners import Kind, Ownership
 from ultragray_workers.scene_names import base_name
 
 

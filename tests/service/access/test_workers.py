@@ -11,8 +11,8 @@ import pytest
 import sqlalchemy as sa
 
 from ultragray_proto.v1 import workers_pb2, workers_pb2_grpc
-from ultragray_workers.jobs.queue.database import JobDatabase
-from ultragray_workers.jobs.queue.tables import WORKERS
+from ultragray_workers.jobs.database import JobDatabase
+from ultragray_workers.jobs.tables import WORKERS
 
 from ...waiting import wait_until
 from ..rpc.test_grpc_render import error_info

@@ -12,10 +12,10 @@ from starlette.applications import Starlette
 from starlette.requests import Request
 from starlette.responses import FileResponse, Response
 from starlette.routing import Route
+from ultragray_workers.jobs.shared.record import StoredFile
 
 from ultragray_service.http.routes.jobs import SHOWN, shared_file_response
-from ultragray_workers.jobs.shared.reading import SharedFile
-from ultragray_workers.jobs.shared.record import StoredFile
+from ultragray_workers.jobs.files import SharedFile
 from ultragray_workers.storage.local import LocalStorage
 
 CONTENT = bytes(range(256)) * 10_000

@@ -9,6 +9,7 @@ from typing import Any
 
 import pytest
 import sqlalchemy as sa
+from ultragray_workers.jobs.queue.internals import WORKFLOWS
 
 from ultragray.samplers import AroundSampler
 from ultragray_workers.backup import backing_up, manifest
@@ -18,10 +19,9 @@ from ultragray_workers.backup.database_copy import Database
 from ultragray_workers.backup.objects import Objects
 from ultragray_workers.backup.restoring import restore
 from ultragray_workers.errors import BackupInvalid, RestoreRefused
+from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.folder import JobFolder, Outcome
 from ultragray_workers.jobs.kinds import RenderJob
-from ultragray_workers.jobs.queue.database import JobDatabase
-from ultragray_workers.jobs.queue.internals import WORKFLOWS
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 from ultragray_workers.scenes import SceneStore
 

@@ -16,8 +16,8 @@ from ultragray_workers.backup.backing_up import back_up
 from ultragray_workers.backup.contents import Folders
 from ultragray_workers.backup.restoring import restore
 from ultragray_workers.errors import BackupInvalid, RestoreRefused, StartupFailed
+from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.queue import tables
-from ultragray_workers.jobs.queue.database import JobDatabase
 from ultragray_workers.jobs.store import JobStore
 
 from ...postgres import NewDatabase

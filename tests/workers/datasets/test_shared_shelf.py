@@ -10,15 +10,15 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from ultragray_workers.datasets.shared_shelf import FILES, SharedShelf
 
 from ultragray.errors import DatasetInvalid
 from ultragray_workers import shared_claims
 from ultragray_workers.datasets import shared_shelf
-from ultragray_workers.datasets.copies import LocalCopies
 from ultragray_workers.datasets.incoming import IncomingDataset
-from ultragray_workers.datasets.shared_shelf import FILES, SharedShelf
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import DatasetExists, DatasetInUse, DatasetNotFound
+from ultragray_workers.storage.copies import LocalCopies
 from ultragray_workers.storage.local import LocalStorage
 from ultragray_workers.storage.storage import Storage
 

@@ -21,8 +21,8 @@ from ultragray import LinearProbe
 from ultragray.datasets.released import write_released
 from ultragray.learn.sweep import Dataset, Sweep
 from ultragray_workers.datasets.store import FILES_NAME, DatasetRecord, write_manifest
+from ultragray_workers.jobs.database import SQLITE_FILE, JobDatabase
 from ultragray_workers.jobs.kinds import TrainJob
-from ultragray_workers.jobs.queue.database import SQLITE_FILE, JobDatabase
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 
 from ...waiting import Deadline
@@ -32,7 +32,7 @@ PROBE = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=25.0)
 PROGRAM = """
 import json, os, signal, socket, sys, threading
 from pathlib import Path
-from ultragray_workers.jobs.queue import heartbeat
+from ultragray_workers.jobs import queue as heartbeat
 from ultragray_workers.jobs.shards import desk
 from ultragray_workers.jobs.worker.worker import work
 heartbeat.DEAD_AFTER_S = 3.0

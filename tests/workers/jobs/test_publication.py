@@ -6,12 +6,12 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from ultragray_workers.jobs.publication import give_name_back, publish_scene
 
 from ultragray_workers.errors import SceneExists
+from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.folder import JobFolder
-from ultragray_workers.jobs.publication import give_name_back, publish_scene
-from ultragray_workers.jobs.queue.database import JobDatabase
-from ultragray_workers.jobs.queue.owners import Kind, read_owner
+from ultragray_workers.jobs.owners import Kind, read_owner
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.storage.local import LocalStorage
 

@@ -12,13 +12,13 @@ from typing import Any
 
 import pytest
 import sqlalchemy as sa
+from ultragray_workers.jobs.queue.internals import SCHEMA
 
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import DatasetInUse, DatasetNotFound, JobInUse, JobNotFound
 from ultragray_workers.jobs import removal
+from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.folder import JobFolder
-from ultragray_workers.jobs.queue.database import JobDatabase
-from ultragray_workers.jobs.queue.internals import SCHEMA
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 from ultragray_workers.jobs.worker import housekeeping
 from ultragray_workers.jobs.worker.housekeeping import DAY_S, Housekeeper

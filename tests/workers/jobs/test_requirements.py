@@ -18,9 +18,9 @@ from ultragray.samplers import AroundSampler, SplineSampler, TrainingSampler
 from ultragray.scene.confidence import ConfidenceModel
 from ultragray_workers.errors import DatabaseUnavailable, SceneNotFound, StorageFull
 from ultragray_workers.jobs import requirements
+from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.kinds import RenderJob, render
 from ultragray_workers.jobs.kinds.base import Surroundings
-from ultragray_workers.jobs.queue.database import JobDatabase
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.scenes import SceneStore
 

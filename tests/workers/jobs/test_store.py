@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
+from ultragray_workers.jobs.queue.internals import WORKFLOWS
 
 from ultragray.errors import InvalidArgument
 from ultragray.samplers import TrainingSampler
@@ -25,9 +26,8 @@ from ultragray_workers.errors import (
     SceneNotFound,
     StartupFailed,
 )
+from ultragray_workers.jobs.database import checked_url
 from ultragray_workers.jobs.kinds import RenderJob
-from ultragray_workers.jobs.queue.database import checked_url
-from ultragray_workers.jobs.queue.internals import WORKFLOWS
 from ultragray_workers.jobs.store import JobState, JobStore
 from ultragray_workers.scenes import SceneStore
 

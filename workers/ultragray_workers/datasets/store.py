@@ -1,4 +1,8 @@
-"""The datasets of an artifact folder, or of a storage that hosts share: each appears and goes whole. Free of torch."""
+"""The datasets of an installation: what a dataset says of itself, and which there are. Free of torch.
+
+An upload arrives in `datasets.incoming`, is checked by `datasets.intake`, and becomes a dataset here; where its files
+lie is known to `datasets.shelf`.
+"""
 
 from __future__ import annotations
 
@@ -6,7 +10,7 @@ import contextlib
 import json
 import re
 from collections.abc import Callable
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,17 +21,17 @@ from ultragray.files import require_version, write_whole
 from ultragray.geometry.probe import Probe
 from ultragray.learn.sweep import ImageRegion
 from ultragray_workers.datasets.contents import find_source
-from ultragray_workers.datasets.copies import DEFAULT_MAX_BYTES
-from ultragray_workers.datasets.shared_shelf import SharedShelf
-from ultragray_workers.datasets.shelf import FILES_NAME as FILES_NAME
-from ultragray_workers.datasets.shelf import MANIFEST_NAME, FolderShelf, Shelf
+from ultragray_workers.datasets.shelf import MANIFEST_NAME, DatasetShelf
 from ultragray_workers.errors import DatasetExists, DatasetInUse, DatasetNotFound, known_names
+from ultragray_workers.storage.copies import DEFAULT_MAX_BYTES
+from ultragray_workers.storage.local import LocalStorage
+from ultragray_workers.storage.location import open_storage
 from ultragray_workers.storage.storage import Storage
 
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset
 
-FOLDER = "datasets"
+UPLOADS = "uploads"  # of the artifact folder
 FORMAT_VERSION = 1  # of the manifest
 _NOT_KEPT = ("owner", "private")  # in the manifest: they are the database's
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
@@ -56,35 +60,29 @@ class DatasetRecord(Contract):
         "Of a sequence: where its frames lie in the stored images, and its calibration; null where that is not known.",
         None,
     )
-    owner: str | None = described("Who uploaded it; null: from before there were owners.", None)
+    owner: str | None = described("Who uploaded it; null: nobody who is known.", None)
     private: bool = described("Whether others may not see it.", False)
 
     @classmethod
     def from_json(cls, text: str) -> DatasetRecord:
         """The record of a manifest. Raises ValueError, KeyError or TypeError for anything else."""
         document: dict[str, Any] = json.loads(text)
-        require_version(document.get("format_version", FORMAT_VERSION), FORMAT_VERSION)  # early ones have none
-        kept = [one for one in fields(cls) if one.name not in _NOT_KEPT]
-        later = {one.name for one in kept if one.default is not MISSING}  # than the first manifests
-        return from_dict(
-            cls, {one.name: document[one.name] for one in kept if one.name in document or one.name not in later}
-        )
+        require_version(document["format_version"], FORMAT_VERSION)
+        return from_dict(cls, {one.name: document[one.name] for one in fields(cls) if one.name not in _NOT_KEPT})
 
 
 class DatasetStore:
     """The datasets that several services and workers share."""
 
     def __init__(
-        self, artifact_folder: Path, shared: Storage | None = None, max_copies_bytes: int = DEFAULT_MAX_BYTES
+        self, artifact_folder: Path, storage: Storage | None = None, max_copies_bytes: int = DEFAULT_MAX_BYTES
     ) -> None:
-        """`shared`: where the datasets of several hosts lie; None: in the artifact folder, for all who see that.
+        """`storage`: where the datasets lie; None: in the artifact folder.
 
-        `max_copies_bytes`: of this host's copies of shared ones, beside those in use.
+        `max_copies_bytes`: of this host's copies, where the storage is elsewhere, beside those in use.
         """
-        self.folder = Path(artifact_folder) / FOLDER  # in which uploads to this host arrive
-        self.shelf: Shelf = FolderShelf(self.folder)
-        if shared is not None:
-            self.shelf = SharedShelf(shared, self.folder, max_copies_bytes)
+        self.folder = Path(artifact_folder) / UPLOADS  # in which uploads to this host arrive
+        self.shelf = DatasetShelf(storage or LocalStorage(Path(artifact_folder)), self.folder, max_copies_bytes)
         self.hides: Callable[[str], bool] = lambda name: False  # from whoever asks: what is hidden is not found
         self.in_use: Callable[[str], str | None] = lambda name: None  # who needs a dataset, in words
 
@@ -126,7 +124,7 @@ class DatasetStore:
         with self.shelf.files(name) as files:
             return replace(find_source(files).load(record.options), name=name)
 
-    def contact_sheet(self, name: str) -> Path:
+    def contact_sheet(self, name: str) -> bytes:
         """The PNG. Raises DatasetNotFound."""
         self._require_existing(name)
         return self.shelf.contact_sheet(name)
@@ -137,8 +135,9 @@ class DatasetStore:
         Where there is one already, it stays: with the same content and options it is the answer, else
         DatasetExists is raised.
         """
-        record = DatasetRecord.from_json((folder / MANIFEST_NAME).read_text(encoding="utf-8"))
-        if self.shelf.put(folder, name):
+        manifest = (folder / MANIFEST_NAME).read_text(encoding="utf-8")
+        record = DatasetRecord.from_json(manifest)
+        if self.shelf.put(folder, manifest, name):
             return record, True
         return self.present(folder, name), False
 
@@ -202,3 +201,10 @@ def write_manifest(record: DatasetRecord, folder: Path) -> None:
     kept = {name: value for name, value in to_dict(record).items() if name not in _NOT_KEPT}
     document = {"format_version": FORMAT_VERSION, **kept}
     write_whole(folder / MANIFEST_NAME, json.dumps(document, indent=1) + "\n")
+
+
+def open_datasets(
+    artifact_folder: str | Path, storage: str | None, max_copies_bytes: int = DEFAULT_MAX_BYTES
+) -> DatasetStore:
+    """The datasets at a location that a process is told in words; None: in the artifact folder."""
+    return DatasetStore(Path(artifact_folder), None if storage is None else open_storage(storage), max_copies_bytes)

@@ -8,7 +8,7 @@ import typer
 
 from ultragray_service.cli.remote.connection import with_connection
 from ultragray_service.cli.terminal import Json, command_group, examples, print_table, tell, to_json
-from ultragray_workers.jobs.matching.demand import GB
+from ultragray_workers.jobs.demand import GB
 
 if TYPE_CHECKING:
     from ultragray_service.remote.connection import Connection

@@ -50,7 +50,7 @@ async def estimate(service: Service, specification: Specification, *, field: str
         plan = await service.planner.plan(specification.scene, specification, Encoding.UINT8)
         if specification.registration is not None:
             found = await service.registrations.of_scene(specification.registration, specification.scene)
-            specification = specification.led(found)
+            specification = specification.registered(found)
         _, header = await service.catalog.versioned_header(specification.scene)
         settings = plan.settings
         frames, poses = await asyncio.to_thread(specification.outlook, header, settings, MAX_POSES)

@@ -48,7 +48,7 @@ from ultragray_service.views.scene_points import (
     even_selection,
 )
 from ultragray_workers.errors import UploadTooLarge
-from ultragray_workers.jobs.queue.owners import Kind
+from ultragray_workers.jobs.owners import Kind
 from ultragray_workers.scene_names import SUFFIX, base_name
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])

@@ -6,11 +6,11 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+from ultragray_workers.jobs.queue.folder_identity import FILE
 
 from ultragray_workers.errors import ArtifactFolderUnavailable, StartupFailed, StorageUnavailable
+from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.queue import folder_identity
-from ultragray_workers.jobs.queue.database import JobDatabase
-from ultragray_workers.jobs.queue.folder_identity import FILE
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 from ultragray_workers.storage.local import LocalStorage
 

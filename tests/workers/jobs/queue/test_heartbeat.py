@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterator
 
 import pytest
 import sqlalchemy as sa
-
-from ultragray_workers.jobs.queue import heartbeat as heartbeat_module
-from ultragray_workers.jobs.queue.database import JobDatabase
-from ultragray_workers.jobs.queue.heartbeat import Heartbeat
 from ultragray_workers.jobs.queue.internals import WORKFLOWS
+
+from ultragray_workers.jobs import queue as heartbeat_module
+from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.store import JobState, JobStore
+from ultragray_workers.jobs.workers import Heartbeat
 
 from ....postgres import NewDatabase
 from ..conftest import train_job

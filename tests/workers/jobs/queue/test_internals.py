@@ -9,9 +9,9 @@ from typing import Any
 import pytest
 import sqlalchemy as sa
 from dbos import DBOSClient
-
-from ultragray_workers.jobs.queue.database import QUEUE, SERIALIZER, JobDatabase
 from ultragray_workers.jobs.queue.internals import SQLITE_ISOLATION, SQLITE_SETTINGS, WORKFLOWS, put_back
+
+from ultragray_workers.jobs.database import QUEUE, SERIALIZER, JobDatabase
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 
 from ....postgres import NewDatabase

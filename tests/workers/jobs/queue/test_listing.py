@@ -3,9 +3,9 @@ from __future__ import annotations
 import base64
 
 import pytest
+from ultragray_workers.jobs.queue.listing import read_token, write_token
 
 from ultragray.errors import InvalidArgument
-from ultragray_workers.jobs.queue.listing import read_token, write_token
 
 
 def test_there_and_back() -> None:

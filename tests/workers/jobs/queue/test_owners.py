@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import pytest
 
-from ultragray_workers.jobs.queue.database import JobDatabase
-from ultragray_workers.jobs.queue.owners import (
+from ultragray_workers.jobs.database import JobDatabase
+from ultragray_workers.jobs.owners import (
     NOBODYS,
     Kind,
     Ownership,

@@ -19,7 +19,7 @@ from ultragray.datasets.source import load_dataset
 from ultragray.learn.training import TrainingConfig, train
 from ultragray.scene.gaussians import GaussianScene
 from ultragray_workers.errors import DatabaseUnavailable, StartupFailed
-from ultragray_workers.jobs.queue.database import JobDatabase, checked_url
+from ultragray_workers.jobs.database import JobDatabase, checked_url
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 
 from ....postgres import PASSWORD, PostgresServer
@@ -31,7 +31,7 @@ Until = Callable[..., Job]
 
 # `ultragray worker`, less patient with the dead.
 HOST = """
-from ultragray_workers.jobs.queue import heartbeat
+from ultragray_workers.jobs import queue as heartbeat
 from ultragray_service.cli.app import app
 heartbeat.DEAD_AFTER_S = 3.0
 app()

@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 import sqlalchemy as sa
+from ultragray_workers.jobs.queue.internals import QUEUE_VERSION, SCHEMA, latest_queue_version
 
 from ultragray_workers.errors import StartupFailed
+from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.queue import tables
-from ultragray_workers.jobs.queue.database import JobDatabase
-from ultragray_workers.jobs.queue.internals import QUEUE_VERSION, SCHEMA, latest_queue_version
 
 from ....postgres import NewDatabase
 
@@ -20,7 +20,7 @@ STARTS = 4
 OPEN = """
 import sys
 from pathlib import Path
-from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.queue.internals import SCHEMA
 sys.stdin.readline()
 JobDatabase(Path(sys.argv[1]), sys.argv[2] or None).close()

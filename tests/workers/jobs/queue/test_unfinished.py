@@ -8,11 +8,11 @@ from typing import Any
 
 import pytest
 import sqlalchemy as sa
-
-from ultragray_workers.jobs.matching.demand import Demand
-from ultragray_workers.jobs.queue import database, unfinished
-from ultragray_workers.jobs.queue.database import JobDatabase
 from ultragray_workers.jobs.queue.internals import WORKFLOWS
+
+from ultragray_workers.jobs.database import JobDatabase
+from ultragray_workers.jobs.demand import Demand
+from ultragray_workers.jobs.queue import database, unfinished
 from ultragray_workers.jobs.store import JobStore
 
 from ....postgres import NewDatabase

@@ -12,6 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import sqlalchemy as sa
+from ultragray_workers.jobs.queue.internals import WORKFLOWS
 
 from ultragray import render
 from ultragray.phantom.demo import copy_demo_scene
@@ -19,9 +20,8 @@ from ultragray.samplers import AroundSampler
 from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.info import read_header
 from ultragray_workers.jobs.kinds import RenderJob
-from ultragray_workers.jobs.queue.internals import WORKFLOWS
-from ultragray_workers.jobs.queue.tables import SHARDS
 from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.tables import SHARDS
 
 from ..conftest import RunningWorker, train_job
 

@@ -6,8 +6,6 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-
-from ultragray_workers.jobs.folder import Outcome, Progress
 from ultragray_workers.jobs.shared.record import (
     JobRecord,
     LogPiece,
@@ -18,6 +16,8 @@ from ultragray_workers.jobs.shared.record import (
     read_record,
     record_key,
 )
+
+from ultragray_workers.jobs.folder import Outcome, Progress
 from ultragray_workers.storage.local import LocalStorage
 from ultragray_workers.storage.storage import Storage
 

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ultragray_workers.jobs.files import CHECKPOINT_NAME, JOURNAL_NAME
 from ultragray_workers.jobs.shared.run_files import copy_of, files_in, version_of
+
+from ultragray_workers.jobs.files import CHECKPOINT_NAME, JOURNAL_NAME
 
 
 def write_run(run: Path) -> None:

@@ -7,12 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from ultragray_workers.jobs.queue.unfinished import demands_waiting
 
 from ultragray.installation import memory_bytes
-from ultragray_workers.jobs.matching.demand import Demand
-from ultragray_workers.jobs.matching.offer import WorkerDevice
-from ultragray_workers.jobs.queue.database import JobDatabase
-from ultragray_workers.jobs.queue.unfinished import demands_waiting
+from ultragray_workers.jobs.database import JobDatabase
+from ultragray_workers.jobs.demand import Demand, WorkerDevice
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 from ultragray_workers.jobs.worker.device import DeviceLock, HostDevice
 from ultragray_workers.jobs.worker.gate import Gate

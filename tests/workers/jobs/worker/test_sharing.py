@@ -7,15 +7,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from ultragray_workers.jobs.shared.files import SharedFiles
+from ultragray_workers.jobs.shared.record import Superseded, read_record, record_key
+from ultragray_workers.jobs.worker.sharing import ThroughStorage
 
 from ultragray_workers.errors import StorageUnavailable
-from ultragray_workers.jobs.files import CHECKPOINT_NAME, CONFIG_NAME, JOURNAL_NAME
+from ultragray_workers.jobs.files import CHECKPOINT_NAME, CONFIG_NAME, JOURNAL_NAME, SharedLog, opened
 from ultragray_workers.jobs.folder import JobFolder, Outcome, Progress
-from ultragray_workers.jobs.shared.files import SharedFiles
-from ultragray_workers.jobs.shared.reading import SharedLog, opened
-from ultragray_workers.jobs.shared.record import Superseded, read_record, record_key
 from ultragray_workers.jobs.worker import sharing
-from ultragray_workers.jobs.worker.sharing import ThroughStorage
 from ultragray_workers.storage.local import LocalStorage
 
 from ....waiting import wait_until

@@ -9,15 +9,15 @@ from typing import Any
 import numpy as np
 import pytest
 import sqlalchemy as sa
+from ultragray_workers.jobs.queue.internals import WORKFLOWS
 
 from ultragray.phantom.demo import copy_demo_scene
 from ultragray_workers.errors import JobFinished
 from ultragray_workers.jobs import publication
+from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.folder import JobFolder, Outcome, Progress
 from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.queue import database, runs
-from ultragray_workers.jobs.queue.database import JobDatabase
-from ultragray_workers.jobs.queue.internals import WORKFLOWS
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 from ultragray_workers.jobs.worker import supervision
 from ultragray_workers.jobs.worker.device import DeviceLock, devices_of

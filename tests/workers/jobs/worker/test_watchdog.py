@@ -17,8 +17,7 @@ import pytest
 from ultragray_workers.jobs.queue import runs
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 from ultragray_workers.jobs.worker import watchdog
-from ultragray_workers.jobs.worker.processes import kill_group
-from ultragray_workers.jobs.worker.watchdog import Watchdog
+from ultragray_workers.jobs.worker.process import Watchdog, kill_group
 
 from ....waiting import wait_until
 from ..conftest import RunningWorker, train_job

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from typing_extensions import Self
 
 from ultragray.contract import Family, described
 from ultragray.scene.info import SceneHeader
-from ultragray_workers.jobs.matching.demand import AUTO, MAX_MEMORY_GB, check_device, check_labels
+from ultragray_workers.jobs.demand import AUTO, MAX_MEMORY_GB, check_device, check_labels
 from ultragray_workers.scene_names import check_scene_name, check_scene_reference
 
 MAX_RUN_S = 31_536_000.0
@@ -20,7 +19,7 @@ TOPIC = "Worker"
 
 if TYPE_CHECKING:
     from ultragray.geometry.registration import Registration
-    from ultragray_workers.jobs.folder import Outcome
+    from ultragray_workers.jobs.record import Outcome
     from ultragray_workers.jobs.worker.job_run import JobRun
 
 
@@ -29,7 +28,7 @@ class Surroundings:
     """The surroundings of a job at its submission."""
 
     scene: SceneHeader | None  # the one that `needs_scene` names
-    artifact_folder: Path | None  # None: what jobs make is not written on this host
+    free_bytes: int | None  # room for what the job makes; None: not known
     max_image_side: int  # pixels
 
 
@@ -65,7 +64,7 @@ class Specification(Family):
     worker_labels: dict[str, str] = described(
         'Labels that the worker must have, such as {"site": "lab1"}.', factory=dict, topic=TOPIC, kw_only=True
     )
-    run_module: ClassVar[str]  # below this folder: its `run(job_run, specification)` does the work
+    run_module: ClassVar[str]  # its `run(job_run, specification)` does the work
     needs_dataset: ClassVar[str | None] = None  # field: the dataset stays while the job waits or runs
     needs_scene: ClassVar[str | None] = None  # field: the scene is kept for the job as it is at the submission
     needs_registration: ClassVar[str | None] = None  # field: it leads the poses of the job as it is at the submission
@@ -84,8 +83,8 @@ class Specification(Family):
     def check(self, surroundings: Surroundings) -> None:
         """Raises what the job would fail with, as far as its submission can know."""
 
-    def led(self, registration: Registration) -> Self:
-        """The job with its poses led into its scene, which names no registration any more."""
+    def registered(self, registration: Registration) -> Self:
+        """The job with its poses brought into its scene, which names no registration any more."""
         raise NotImplementedError
 
     @classmethod
@@ -95,6 +94,6 @@ class Specification(Family):
 
     def run(self, job_run: JobRun) -> Outcome:
         """Does the work; in the job's own process, for it imports torch."""
-        module: Any = import_module(f".{self.run_module}", __package__)
+        module: Any = import_module(self.run_module)
         outcome: Outcome = module.run(job_run, self)
         return outcome

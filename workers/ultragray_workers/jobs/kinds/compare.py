@@ -21,6 +21,6 @@ class CompareJob(ComparisonSettings, Specification):
     dataset: str = described("Name of an uploaded dataset, with held-out frames.", kw_only=True)
     kind: Literal["compare"] = kind_field("compare")
 
-    run_module = "compare_run"
+    run_module = "ultragray_workers.jobs.kinds.compare_run"
     has_checkpoints = True
     needs_dataset = "dataset"

@@ -24,14 +24,13 @@ from ultragray_studies.methods.gaussians import GivenScene
 from ultragray_studies.report.page import ReportContent, render_page
 from ultragray_studies.report.study import scene_evaluation, trained_of_journal
 from ultragray_workers.jobs.files import BASELINES_NAME
-from ultragray_workers.jobs.folder import Outcome, Progress
 from ultragray_workers.jobs.kinds.curve import draw_training_curve
-from ultragray_workers.jobs.kinds.earlier_run import take_over_run
 from ultragray_workers.jobs.kinds.train import TrainJob
 from ultragray_workers.jobs.kinds.training.baselines import write_baselines
 from ultragray_workers.jobs.kinds.training.remaining import PICTURES, REPORT_FRAMES, Finishing
+from ultragray_workers.jobs.record import Outcome, Progress
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
-from ultragray_workers.scenes import SUFFIX
+from ultragray_workers.scene_names import SUFFIX
 
 CHECKPOINT_INTERVAL_S = 10.0
 _LINES = 20  # of the log in a run
@@ -45,7 +44,6 @@ def run(job_run: JobRun, job: TrainJob) -> Outcome:
     device = job_run.request.device
     config = TrainingConfig.preset(job.preset, **job.settings)
     dataset = job_run.load_dataset(job.dataset)
-    take_over_run(job_run, CHECKPOINT_FILE)
     checkpoint = job_run.folder.run / CHECKPOINT_FILE
     resume = checkpoint.exists()
     sys.stderr.write(

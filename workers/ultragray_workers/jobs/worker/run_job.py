@@ -22,7 +22,8 @@ from pathlib import Path
 
 from ultragray.errors import InvalidArgument, MemoryExceeded, UltragrayError
 from ultragray_workers.claims import is_no_room, storage_full
-from ultragray_workers.jobs.folder import JobFolder, Outcome
+from ultragray_workers.jobs.folder import JobFolder
+from ultragray_workers.jobs.record import Outcome
 from ultragray_workers.jobs.shards.channel import Channel
 from ultragray_workers.jobs.specification import from_dict
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
@@ -55,6 +56,8 @@ def main(folder_path: str, worker_pid: str, *descriptors: str) -> int:
         if folder.outcome() is not None:
             return 0
         request = folder.request()
+        if request is None:  # it was taken away
+            return FOLDER_LOST
         let_frames_go_first(request.nice)
         Path("/proc/self/oom_score_adj").write_text(_OOM_SCORE_ADJ, encoding="ascii")
         channel = Channel(*map(int, descriptors)) if descriptors else None

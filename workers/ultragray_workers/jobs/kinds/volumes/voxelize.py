@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import shutil
 from dataclasses import dataclass
 from typing import Literal
 
@@ -42,7 +41,7 @@ class VoxelizeJob(Specification):
     format: str = described("Of the file.", _FORMATS[0], choices=_FORMATS)
     kind: Literal["voxelize"] = kind_field("voxelize")
 
-    run_module = "volumes.voxelize_run"
+    run_module = "ultragray_workers.jobs.kinds.volumes.voxelize_run"
     needs_scene = "scene"
 
     def __post_init__(self) -> None:
@@ -62,11 +61,11 @@ class VoxelizeJob(Specification):
     def check(self, surroundings: Surroundings) -> None:
         """Raises InvalidArgument for labels of a scene without them and for too many voxels; StorageFull for more than
         the disk has room for."""
-        scene, folder = surroundings.scene, surroundings.artifact_folder
+        scene, free = surroundings.scene, surroundings.free_bytes
         assert scene is not None
         check_field(self.field, has_labels=bool(scene.info.label_names))
         needed = math.prod(self.grid(scene.info).shape) * voxel_bytes(self.field)
-        if folder is not None and needed > (free := shutil.disk_usage(folder).free):
+        if free is not None and needed > free:
             raise StorageFull(
                 f"the volume takes up to {needed / _MB:,.0f} MB, the artifact folder has {free / _MB:,.0f} MB left",
                 field="spacing_mm",

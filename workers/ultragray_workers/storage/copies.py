@@ -1,4 +1,4 @@
-"""Copies of shared datasets on this host: made whole, kept while they are used, the oldest removed for room.
+"""Folders of objects of a bucket, copied to this host: made whole, kept while they are used, the oldest removed.
 
 NAME/content/   what was fetched
 NAME/lock       locked together by those who use the copy, alone by who removes it

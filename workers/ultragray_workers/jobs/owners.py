@@ -8,7 +8,7 @@ from enum import Enum
 import sqlalchemy as sa
 from sqlalchemy.dialects import postgresql, sqlite
 
-from ultragray_workers.jobs.queue.tables import CHANGES, OWNERS
+from ultragray_workers.jobs.tables import CHANGES, OWNERS
 
 
 class Kind(str, Enum):

@@ -1,4 +1,4 @@
-"""Which shards of a batch are done, and who is at the others: a table of our own beside DBOS's rows."""
+"""The table of shards: which of a batch are done, and who is at the others. Free of torch."""
 
 from __future__ import annotations
 
@@ -8,9 +8,8 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from ultragray_workers.jobs.queue import database
-from ultragray_workers.jobs.queue.internals import WORKFLOWS
-from ultragray_workers.jobs.queue.tables import SHARDS
+from ultragray_workers.jobs.record import JobState
+from ultragray_workers.jobs.tables import JOBS, SHARDS
 
 MOST_TRIES = 20  # of one shard: after so many deaths of those who were at it, it is to blame
 _ROWS = SHARDS.c
@@ -38,11 +37,11 @@ class Failed:
 def lay_out(engine: sa.Engine, batch: str, frames: int, shard_frames: int, done: Collection[int]) -> None:
     """Makes the rows of a batch, those that are `done` already included; nothing where they are there."""
     with engine.begin() as connection:
-        if connection.execute(sa.select(_ROWS.number).where(_ROWS.job_id == batch).limit(1)).first() is not None:
+        if connection.execute(sa.select(_ROWS.number).where(_ROWS.job == batch).limit(1)).first() is not None:
             return
         rows = [
             {
-                "job_id": batch,
+                "job": batch,
                 "number": number,
                 "frames": min(shard_frames, frames - number * shard_frames),
                 "done": number in done,
@@ -58,7 +57,7 @@ def take(engine: sa.Engine, batch: str, share: str) -> int | None:
     others = SHARDS.alias()
     free = (
         sa.select(others.c.number)
-        .where(others.c.job_id == batch, *_is_free(others.c))
+        .where(others.c.job == batch, *_is_free(others.c))
         .order_by(others.c.number)
         .limit(1)
         .with_for_update(skip_locked=True)
@@ -66,7 +65,7 @@ def take(engine: sa.Engine, batch: str, share: str) -> int | None:
     # One statement: a SQLite file is locked from a change on, not from the question before it.
     taking = (
         sa.update(SHARDS)
-        .where(_ROWS.job_id == batch, _ROWS.number == free.scalar_subquery(), _ROWS.share.is_(None))
+        .where(_ROWS.job == batch, _ROWS.number == free.scalar_subquery(), _ROWS.share.is_(None))
         .values(share=share, tries=_ROWS.tries + 1)
         .returning(_ROWS.number)
     )
@@ -92,7 +91,7 @@ def failed(engine: sa.Engine, batch: str) -> Failed | None:
     is_lost = sa.and_(_ROWS.share.is_(None), _ROWS.tries >= MOST_TRIES)
     found = (
         sa.select(_ROWS.number, _ROWS.error, _ROWS.reason)
-        .where(_ROWS.job_id == batch, _ROWS.done.is_(False), sa.or_(_ROWS.error.is_not(None), is_lost))
+        .where(_ROWS.job == batch, _ROWS.done.is_(False), sa.or_(_ROWS.error.is_not(None), is_lost))
         .order_by(_ROWS.number)
         .limit(1)
     )
@@ -107,15 +106,14 @@ def failed(engine: sa.Engine, batch: str) -> Failed | None:
 def release(engine: sa.Engine, batch: str, share: str) -> None:
     """Frees the shards of a share whose process has ended."""
     with engine.begin() as connection:
-        mine = sa.and_(_ROWS.job_id == batch, _ROWS.share == share)
+        mine = sa.and_(_ROWS.job == batch, _ROWS.share == share)
         connection.execute(sa.update(SHARDS).where(mine).values(share=None))
 
 
 def release_lost(engine: sa.Engine, batch: str) -> None:
     """Frees the shards of shares that nobody runs any more."""
-    rows = WORKFLOWS.c
-    running = sa.select(rows.workflow_uuid).where(rows.workflow_uuid == _ROWS.share, rows.status.in_(database.RUNNING))
-    lost = sa.and_(_ROWS.job_id == batch, _ROWS.share.is_not(None), ~running.exists())
+    running = sa.select(JOBS.c.id).where(JOBS.c.id == _ROWS.share, JOBS.c.state == JobState.RUNNING.value)
+    lost = sa.and_(_ROWS.job == batch, _ROWS.share.is_not(None), ~running.exists())
     with engine.begin() as connection:
         connection.execute(sa.update(SHARDS).where(lost).values(share=None))
 
@@ -129,14 +127,9 @@ def tally(engine: sa.Engine, batch: str) -> Tally:
         sa.func.coalesce(sa.func.sum(free), 0),
         sa.func.coalesce(sa.func.sum(done), 0),
         sa.func.coalesce(sa.func.sum(done * _ROWS.frames), 0),
-    ).where(_ROWS.job_id == batch)
+    ).where(_ROWS.job == batch)
     with engine.connect() as connection:
         return Tally(*(int(value) for value in connection.execute(counted).one()))
-
-
-def forget(connection: sa.Connection, batch: str) -> None:
-    """Removes the rows of a batch."""
-    connection.execute(sa.delete(SHARDS).where(_ROWS.job_id == batch))
 
 
 def _is_free(row: Any) -> tuple[sa.ColumnElement[bool], ...]:
@@ -144,4 +137,4 @@ def _is_free(row: Any) -> tuple[sa.ColumnElement[bool], ...]:
 
 
 def _of(batch: str, number: int) -> sa.Update:
-    return sa.update(SHARDS).where(_ROWS.job_id == batch, _ROWS.number == number)
+    return sa.update(SHARDS).where(_ROWS.job == batch, _ROWS.number == number)
