@@ -89,7 +89,8 @@ class Supervisor:
     """Does the jobs of a worker, one at a time."""
 
     def __init__(self, config: WorkerConfig, jobs: JobDatabase, gate: Gate) -> None:
-        self._config, self._engine, self._identity, self._gate = config, jobs.engine, jobs.identity, gate
+        self._config, self._jobs, self._gate = config, jobs, gate
+        self._engine, self._identity = jobs.engine, jobs.identity
         self._stop = threading.Event()
         self._idle = threading.Event()
         self._idle.set()
@@ -217,7 +218,7 @@ class _JobAtHand:
         self._config, self._engine = supervisor._config, supervisor._engine
         self._folder = JobFolder(self._config.artifact_folder, row.id, row.attempt)
         self._telling = Telling(
-            self._engine, self._config.storage, self._folder, row, lambda: supervisor.look_after(row)
+            supervisor._jobs, self._config.storage, self._folder, row, lambda: supervisor.look_after(row)
         )
         self._limit_s = min(
             filter(None, [row.summary.get("max_run_s") or 0.0, self._config.max_run_s]), default=float("inf")
@@ -230,15 +231,15 @@ class _JobAtHand:
         try:
             try:
                 outcome = self._outcome() if self._is_needed() else Outcome()
+                if outcome.error is not None:
+                    self._supervisor.require_storage(self._row)
                 files = self._telling.end(outcome)
                 if outcome.error is None and self._made is not None:
                     outcome = self._publish(outcome, files)
             finally:
                 self._save_run_time()
-            if outcome.error is not None:
-                self._supervisor.require_storage(self._row)
-                if self._desk is not None:
-                    self._ask(lambda: self._desk is not None and self._desk.fail(outcome))
+            if outcome.error is not None and (desk := self._desk) is not None:
+                self._ask(lambda: desk.fail(outcome))
             if not self._ask(lambda: queue.finish(self._engine, self._row, outcome, files)):
                 raise Superseded
             if is_in_shards(self._row.summary) and self._row.batch is None:

@@ -18,12 +18,11 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TypeVar
 
-import sqlalchemy as sa
-
 from ultragray.errors import TrainingStateInvalid
 from ultragray.files import TEMPORARY_SUFFIX, file_sha256
-from ultragray_workers.errors import DatabaseUnavailable, StorageFull, StorageUnavailable
+from ultragray_workers.errors import ArtifactFolderUnavailable, DatabaseUnavailable, StorageFull, StorageUnavailable
 from ultragray_workers.jobs import queue
+from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.files import (
     BASELINES_NAME,
     CONFIG_NAME,
@@ -48,7 +47,7 @@ _LOOK_S = 0.25
 # Beside a checkpoint: they say nothing without it, and a journal grows all the time.
 _BESIDE = (JOURNAL_NAME, CONFIG_NAME, BASELINES_NAME)
 _PICTURE = ".png"  # of a validation: likewise
-_AWAY = (StorageUnavailable, DatabaseUnavailable, StorageFull, OSError)
+_AWAY = (StorageUnavailable, ArtifactFolderUnavailable, DatabaseUnavailable, StorageFull, OSError)
 
 _log = logging.getLogger("ultragray.jobs")
 _T = TypeVar("_T")
@@ -63,15 +62,16 @@ class Telling:
     """What others know of the job at hand."""
 
     def __init__(
-        self, engine: sa.Engine, storage: Storage, folder: JobFolder, row: Row, watch: Callable[[], None]
+        self, jobs: JobDatabase, storage: Storage, folder: JobFolder, row: Row, watch: Callable[[], None]
     ) -> None:
         """`watch`: called while something takes long; what it raises ends that."""
-        self._engine, self._storage, self._folder, self._row, self._watch = engine, storage, folder, row, watch
+        self._engine, self._storage, self._folder, self._row, self._watch = jobs.engine, storage, folder, row, watch
+        self._require_storage = jobs.identity.check  # before it is written to: a share may have gone
         self._prefix = f"{FOLDER}/{row.id}/{row.number}-{row.attempt}"
         self._files = row.files
         self._progress = row.progress
-        self._log = _GrowingFile(storage, folder.log, f"{self._prefix}/log")
-        self._journal = _GrowingFile(storage, folder.run / JOURNAL_NAME, f"{self._prefix}/journal")
+        self._log = _GrowingFile(self._write, folder.log, f"{self._prefix}/log")
+        self._journal = _GrowingFile(self._write, folder.run / JOURNAL_NAME, f"{self._prefix}/journal")
         self._telling = threading.Lock()
         self._ended = threading.Event()
         self._is_begun = self._is_away = False
@@ -293,8 +293,13 @@ class Telling:
 
     def _upload(self, path: Path, name: str) -> StoredFile:
         stored = StoredFile(f"{self._prefix}/{name}", path.stat().st_size, file_sha256(path))
+        self._require_storage()
         self._storage.upload(path, stored.key)
         return stored
+
+    def _write(self, key: str, data: bytes) -> None:
+        self._require_storage()
+        self._storage.write(key, data)
 
     def _end(self, outcome: Outcome) -> Files:
         with self._telling:
@@ -324,8 +329,8 @@ class Telling:
 class _GrowingFile:
     """A file to whose end a process writes, as pieces in the storage."""
 
-    def __init__(self, storage: Storage, path: Path, key: str) -> None:
-        self._storage, self._path, self._key = storage, path, key
+    def __init__(self, write: Callable[[str, bytes], object], path: Path, key: str) -> None:
+        self._write, self._path, self._key = write, path, key
         self._own: list[Piece] = []
 
     def told(self, before: tuple[Piece, ...], *, everything: bool) -> tuple[Piece, ...]:
@@ -344,7 +349,7 @@ class _GrowingFile:
                     break
                 number = len(self._own) if is_full else len(self._own) - 1
                 piece = Piece(f"{self._key}-{number:05d}", len(data))
-                self._storage.write(piece.key, data)
+                self._write(piece.key, data)
                 self._own[number:] = [piece]
                 left -= begin + len(data) - told
                 told = begin + len(data)

@@ -15,7 +15,7 @@ from ultragray_workers.jobs.owners import (
     read_owners,
 )
 
-from ....postgres import NewDatabase
+from ...postgres import NewDatabase
 
 
 @pytest.fixture

@@ -22,18 +22,18 @@ from ultragray_workers.errors import DatabaseUnavailable, StartupFailed
 from ultragray_workers.jobs.database import JobDatabase, checked_url
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 
-from ....postgres import PASSWORD, PostgresServer
-from ....waiting import Deadline, at_this_load
-from ..conftest import RunningWorker, train_job
+from ...postgres import PASSWORD, PostgresServer
+from ...waiting import Deadline, at_this_load
+from .conftest import RunningWorker, files_of, train_job
 
 StartWorker = Callable[..., RunningWorker]
 Until = Callable[..., Job]
 
 # `ultragray worker`, less patient with the dead.
 HOST = """
-from ultragray_workers.jobs import queue as heartbeat
+from ultragray_workers.jobs import queue
 from ultragray_service.cli.app import app
-heartbeat.DEAD_AFTER_S = 3.0
+queue.DEAD_AFTER_S = 3.0
 app()
 """
 
@@ -100,7 +100,7 @@ def test_hosts_share_one_queue_and_one_takes_over_from_the_other(
     assert {first, job.worker} == set(hosts)
     torch.set_num_threads(1)
     undisturbed = train(
-        load_dataset(artifact_folder / "datasets" / "tiny" / "files"), TrainingConfig.preset("fast", **asked.settings)
+        load_dataset(files_of(artifact_folder, "tiny")), TrainingConfig.preset("fast", **asked.settings)
     )
     served = GaussianScene.load(artifact_folder / "scenes" / "long.ugr")
     for name, tensor in undisturbed.splats.items():

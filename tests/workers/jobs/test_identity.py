@@ -6,17 +6,16 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from ultragray_workers.jobs.queue.folder_identity import FILE
 
 from ultragray_workers.errors import ArtifactFolderUnavailable, StartupFailed, StorageUnavailable
 from ultragray_workers.jobs.database import JobDatabase
-from ultragray_workers.jobs.queue import folder_identity
+from ultragray_workers.jobs.identity import KEY as FILE
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 from ultragray_workers.storage.local import LocalStorage
 
-from ....postgres import PostgresServer
-from ....waiting import wait_until
-from ..conftest import RunningWorker, train_job
+from ...postgres import PostgresServer
+from ...waiting import wait_until
+from .conftest import RunningWorker, train_job
 
 
 @pytest.fixture
@@ -92,7 +91,7 @@ def test_a_storage_that_belongs_to_another_database_is_refused(
 ) -> None:
     first, storage = postgres.create_database(), LocalStorage(tmp_path / "bucket")
     jobs = JobDatabase(artifact_folder, first, storage)
-    jobs.folder.check_writable()
+    jobs.identity.check_writable()
     assert [entry.key for entry in storage.entries()] == [FILE]
     jobs.close()
     JobDatabase(tmp_path / "another-host", first, storage).close()
@@ -103,17 +102,16 @@ def test_a_storage_that_belongs_to_another_database_is_refused(
 def test_a_storage_that_is_another_now_or_away_is_not_worked_in(
     artifact_folder: Path, database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(folder_identity, "_ASKED_EVERY_S", 0.0)
     storage = LocalStorage(tmp_path / "bucket")
     jobs = JobDatabase(artifact_folder, database_url, storage)
     storage.write(FILE, b"another")
     with pytest.raises(ArtifactFolderUnavailable, match="another bucket or prefix"):
-        jobs.folder.check()
+        jobs.identity.check()
 
-    def away(key: str) -> bytes:
+    def away(key: str, **_: object) -> bytes:
         raise StorageUnavailable("it does not answer")
 
     monkeypatch.setattr(storage, "read", away)
     with pytest.raises(ArtifactFolderUnavailable, match="does not answer"):
-        jobs.folder.check()
+        jobs.identity.check()
     jobs.close()

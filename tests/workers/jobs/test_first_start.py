@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ....postgres import PostgresServer
+from ...postgres import PostgresServer
 
 WORKERS, ROUNDS = 4, 10
 # Everything is imported once; of each round, all workers begin when the last of them is ready.
