@@ -6,7 +6,7 @@ from ultragray.geometry import image_size, pose, probe
 from ultragray.geometry import probe as fan
 from ultragray.rendering.tools import MAX_TOOLS
 from ultragray.scene import info as scene_info
-from ultragray_service.core import catalog
+from ultragray_service.core import scenes as catalog
 from ultragray_service.core import streams as pose_stream
 from ultragray_service.core import uploads as dataset_uploads
 from ultragray_service.errors import STATUSES

@@ -20,12 +20,12 @@ from ultragray_service.access.origins import Origins
 from ultragray_service.access.owners import Owners, require
 from ultragray_service.access.principals import Principal, act_as, caller, is_loopback
 from ultragray_service.access.rules import Operation
-from ultragray_service.core.catalog import SceneCatalog, ScenePlaces, scene_to_blame
+from ultragray_service.core.scenes import SceneCatalog, ScenePlaces, scene_to_blame
 from ultragray_service.core.jobs.jobs import Jobs
 from ultragray_service.core.open_streams import OpenStreams
 from ultragray_service.core.readiness import Readiness
 from ultragray_service.core.registrations import Registrations
-from ultragray_service.core.requests import Plan, RequestPlanner
+from ultragray_service.core.rendering import Plan, RequestPlanner
 from ultragray_service.core.threads import HelperProcesses
 from ultragray_service.core.uploads import DatasetUploads, Holdings, SceneImports
 from ultragray_service.doors import Doors

@@ -13,7 +13,7 @@ import pytest
 
 from ultragray import GaussianScene
 from ultragray_service.access.principals import LOCAL, act_as
-from ultragray_service.core import catalog
+from ultragray_service.core import scenes as catalog
 from ultragray_service.core import uploads as scene_imports
 from ultragray_service.core.threads import HelperProcesses
 from ultragray_service.service import Service

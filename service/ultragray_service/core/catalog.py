@@ -19,7 +19,7 @@ from ultragray.errors import InvalidArgument, SceneFileInvalid, UltragrayError
 from ultragray.scene.info import SceneHeader
 from ultragray_service.core.threads import in_own_thread
 from ultragray_service.settings import Settings
-from ultragray_service.views.scene_points import point_message
+from ultragray_service.core.scene_points import point_message
 from ultragray_workers.errors import SceneNotFound, SceneTooLarge, StartupFailed, StorageUnavailable
 from ultragray_workers.scenes import SceneStore
 from ultragray_workers.shelves.bucket import BucketShelf

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 
 from ultragray.contract import described
 from ultragray.errors import DatasetInvalid
-from ultragray_service.core.catalog import page_of_names
+from ultragray_service.core.scenes import page_of_names
 from ultragray_service.service import Service
 from ultragray_workers.datasets.store import DatasetRecord, DatasetStore
 from ultragray_workers.errors import DatasetNotFound

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 from ultragray.contract import described
 from ultragray.errors import UltragrayError
-from ultragray_service.core.catalog import ScenePlaces
+from ultragray_service.core.scenes import ScenePlaces
 from ultragray_service.core.threads import in_own_thread
 from ultragray_workers.errors import ArtifactFolderUnavailable, DatabaseUnavailable, NotReady
 from ultragray_workers.jobs.database import JobDatabase

@@ -16,7 +16,7 @@ from ultragray.geometry.registration import Registration
 from ultragray.rendering.settings import Encoding, FrameSettings, Resolved
 from ultragray.rendering.volumes import SliceSettings, SliceView, check_field
 from ultragray.scene.info import SceneInfo
-from ultragray_service.core.catalog import SceneCatalog
+from ultragray_service.core.scenes import SceneCatalog
 from ultragray_service.settings import Settings
 from ultragray_workers.pool.messages import S
 from ultragray_workers.scene_names import base_name

@@ -10,7 +10,7 @@ from ultragray.rendering.outputs import OUTPUTS
 from ultragray.scene.confidence import read_model
 from ultragray.scene.info import SceneHeader
 from ultragray_service.access.principals import iso_time
-from ultragray_service.core.catalog import CatalogEntry, finite_metrics
+from ultragray_service.core.scenes import CatalogEntry, finite_metrics
 from ultragray_service.core.frames import OutputName
 from ultragray_service.core.poses import PoseInBothForms, Position
 from ultragray_service.errors import Refusal

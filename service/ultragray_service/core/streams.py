@@ -15,7 +15,7 @@ from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.settings import RenderSettings
 from ultragray_service.core.open_streams import Answered, OpenStream
-from ultragray_service.core.requests import Plan
+from ultragray_service.core.rendering import Plan
 from ultragray_service.service import Service
 from ultragray_workers.errors import Draining
 from ultragray_workers.pool.messages import Destination, RenderResult

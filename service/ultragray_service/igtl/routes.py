@@ -6,7 +6,7 @@ import re
 import time
 
 from ultragray.contract import shown
-from ultragray_service.core.catalog import SceneCatalog
+from ultragray_service.core.scenes import SceneCatalog
 from ultragray_service.igtl.messages import DEVICE_NAME_BYTES, pack_text
 from ultragray_workers.errors import SceneNotFound
 

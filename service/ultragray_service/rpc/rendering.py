@@ -20,7 +20,7 @@ from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import rendering_pb2, scenes_pb2
 from ultragray_service.core.open_streams import Answered
 from ultragray_service.core.poses import check_pose_count, exact_poses
-from ultragray_service.core.requests import Plan
+from ultragray_service.core.rendering import Plan
 from ultragray_service.core.streams import MAX_WINDOW, FrameStream, SceneSettings, StreamMode, checked_s
 from ultragray_service.errors import Refusal
 from ultragray_service.rpc.messages import frame_message, read, read_pose, read_settings, read_word, slice_message

@@ -24,7 +24,7 @@ from ultragray_proto.v1 import (
 )
 from ultragray_service.access.principals import me
 from ultragray_service.core import scenes
-from ultragray_service.core.catalog import DEFAULT_PAGE_SIZE
+from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE
 from ultragray_service.core.datasets import contact_sheet, dataset, dataset_page, with_owner
 from ultragray_service.core.jobs.estimates import estimate
 from ultragray_service.core.jobs.log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES

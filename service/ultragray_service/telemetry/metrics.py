@@ -20,7 +20,7 @@ from prometheus_client.registry import Collector
 from ultragray.contract import described
 from ultragray.errors import UltragrayError
 from ultragray_service.access.principals import acting
-from ultragray_service.core.catalog import ScenePlaces
+from ultragray_service.core.scenes import ScenePlaces
 from ultragray_service.errors import statuses_of
 from ultragray_workers.jobs.store import JobsOverview
 from ultragray_workers.pool.messages import LocalizeResult, RenderResult

@@ -9,7 +9,7 @@ from ultragray.contract import described
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.scene.confidence import Assessor, Extrapolation
 from ultragray.scene.info import SceneHeader
-from ultragray_service.core.catalog import SceneCatalog
+from ultragray_service.core.scenes import SceneCatalog
 from ultragray_service.core.registrations import Registrations
 
 

@@ -11,9 +11,9 @@ from ultragray.learn.localization.settings import LocalizationSettings
 from ultragray.rendering.settings import Encoding, FrameSettings
 from ultragray_service.access.audit import account
 from ultragray_service.access.principals import caller
-from ultragray_service.core.catalog import scene_to_blame
+from ultragray_service.core.scenes import scene_to_blame
 from ultragray_service.core.poses import MatrixRows
-from ultragray_service.core.requests import Plan
+from ultragray_service.core.rendering import Plan
 from ultragray_service.service import Service
 from ultragray_workers.pool.messages import LocalizeResult, Priority, RenderRequest, SceneChangedError, Sought
 from ultragray_workers.pool.pool import MAX_SCENE_CHANGES

@@ -20,7 +20,7 @@ from safetensors.numpy import save
 
 from ultragray import GaussianScene, SceneInfo
 from ultragray.scene.info import MAX_TRAINING_POSES, expected_shapes, info_to_json
-from ultragray_service.views.scene_points import even_selection
+from ultragray_service.core.scene_points import even_selection
 
 from ...waiting import wait_until
 from ..conftest import DEMO_PROBE, RunningService, StartService, make_scene

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from ultragray_service.core.catalog import SceneCatalog
+from ultragray_service.core.scenes import SceneCatalog
 from ultragray_service.igtl import routes
 from ultragray_service.igtl.routes import SceneChooser, device_of, frame_of, image_name
 from ultragray_workers.errors import SceneNotFound

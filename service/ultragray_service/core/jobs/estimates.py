@@ -9,7 +9,7 @@ from ultragray.contract import described, under
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.settings import Encoding
-from ultragray_service.core.requests import Plan
+from ultragray_service.core.rendering import Plan
 from ultragray_service.service import Service
 from ultragray_workers.errors import DeadlineExceeded, QueueFull
 from ultragray_workers.jobs.kinds import RenderJob, Specification

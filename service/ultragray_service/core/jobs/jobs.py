@@ -18,7 +18,7 @@ from ultragray.geometry.registration import Registration
 from ultragray_service.access.audit import account
 from ultragray_service.access.owners import may_see
 from ultragray_service.access.principals import acting
-from ultragray_service.core.catalog import MAX_PAGE_SIZE, scene_to_blame
+from ultragray_service.core.scenes import MAX_PAGE_SIZE, scene_to_blame
 from ultragray_service.core.jobs.database_threads import PATIENCE_S, DatabaseThreads
 from ultragray_service.core.jobs.hub import JobHub
 from ultragray_service.settings import Settings

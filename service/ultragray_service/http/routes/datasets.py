@@ -13,7 +13,7 @@ from starlette.responses import Response
 
 from ultragray.datasets.source import UPLOAD_OPTIONS, UPLOADED_FORMATS
 from ultragray_service.core import datasets
-from ultragray_service.core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
+from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
 from ultragray_service.core.datasets import DatasetPage, contact_sheet, dataset_page, with_owner
 from ultragray_service.core.threads import PATIENCE_S
 from ultragray_service.core.uploads import DatasetUpload

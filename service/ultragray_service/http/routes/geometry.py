@@ -12,7 +12,7 @@ from starlette.requests import Request
 from ultragray.contract import described, from_dict, to_dict
 from ultragray.geometry.probe import Probe
 from ultragray.geometry.registration import Registration
-from ultragray_service.core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
+from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
 from ultragray_service.core.registrations import NamedRegistration, RegistrationPage
 from ultragray_service.http.bodies import RegistrationBody, body_schema, read_json_body
 from ultragray_service.http.dependencies import ServiceDep, problems

@@ -19,7 +19,7 @@ from starlette.types import Receive, Scope, Send
 
 from ultragray.contract import under
 from ultragray.errors import InvalidArgument
-from ultragray_service.core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
+from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
 from ultragray_service.core.jobs.estimates import JobEstimate, estimate
 from ultragray_service.core.jobs.hub import JobChange, JobWatch
 from ultragray_service.core.jobs.jobs import JobPage, WorkerList

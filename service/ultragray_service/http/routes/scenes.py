@@ -20,7 +20,7 @@ from ultragray.learn.localization.settings import LocalizationSettings
 from ultragray.learn.report.sizes import CorrectionSizes
 from ultragray.scene.info import SceneHeader
 from ultragray_service.core import scenes
-from ultragray_service.core.catalog import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
+from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
 from ultragray_service.core.poses import check_pose_count, exact_poses
 from ultragray_service.core.scenes import Scene, SceneLoaded, ScenePage
 from ultragray_service.core.threads import PATIENCE_S
@@ -39,14 +39,7 @@ from ultragray_service.http.dependencies import (
 from ultragray_service.http.routes.datasets import Private
 from ultragray_service.views.assessments import Assessments
 from ultragray_service.views.localizing import Located, locate, sought_frame
-from ultragray_service.views.scene_points import (
-    ALL_FIELDS,
-    DEFAULT_POINTS,
-    FIELDS,
-    MAX_POINTS,
-    MAX_POSES,
-    even_selection,
-)
+from ultragray_service.core.scene_points import ALL_FIELDS, DEFAULT_POINTS, FIELDS, MAX_POINTS, MAX_POSES, even_selection
 from ultragray_workers.errors import UploadTooLarge
 from ultragray_workers.jobs.owners import Kind
 from ultragray_workers.scene_names import SUFFIX, base_name
