@@ -7,11 +7,11 @@ BIN := $(VENV)/bin
 # As nice as the helpers of a service, for which they wait: those would get what is left over.
 PYTEST := nice -n 10 $(BIN)/pytest --numprocesses 4 --dist loadfile --no-loadscope-reorder
 KERNEL_SOURCES := $(wildcard model/kernels/*) CMakeLists.txt
-PACKAGES := . proto client ros
+PACKAGES := . proto client ros studies
 PACKAGE_SOURCES := $(KERNEL_SOURCES) $(PACKAGES:%=%/pyproject.toml) $(wildcard distribution/*.py)
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
 GENERATED_TESTS := tests/proto tests/client/test_client_generated.py tests/documents/test_measured_tables.py tests/documents/test_snapshots.py tests/benchmarks/test_registry.py
-PYTHON_SOURCES := model service workers proto client ros distribution tests benchmarks docs examples
+PYTHON_SOURCES := model service workers proto client ros studies distribution tests benchmarks docs examples
 NPM := $(shell command -v npm)
 CONSOLE := service/ultragray_service/console/index.html
 CONSOLE_SOURCES := $(shell find web -type f -not -path 'web/node_modules/*' -not -path 'web/src/api/generated/*')
@@ -238,7 +238,7 @@ generate: $(VENV)/installed-dev  ## rewrite all that is generated: gRPC contract
 	$(BIN)/python -m docs.generator.snapshots
 	@[ ! -d web/node_modules ] || npm --prefix web run --silent generate
 
-packages: $(VENV)/installed-dev $(CONSOLE)  ## build the four packages into dist: sdists, and wheels for this Python
+packages: $(VENV)/installed-dev $(CONSOLE)  ## build the five packages into dist: sdists, and wheels for this Python
 	for package in $(PACKAGES); do $(BIN)/python -m build --outdir dist $$package || exit 1; done
 
 clean:  ## remove what was built
@@ -256,13 +256,13 @@ $(VENV)/python:
 
 # An editable install knows each module by its file: one that moved is found again after another install.
 $(VENV)/modules: ALWAYS | $(VENV)/python
-	@find model workers service proto client ros -name '*.py' | sort > $@.new
+	@find model workers service proto client ros studies -name '*.py' | sort > $@.new
 	@cmp --quiet $@.new $@ && rm $@.new || mv $@.new $@
 
 $(VENV)/installed: $(VENV)/python $(VENV)/modules $(PACKAGE_SOURCES)
 	@$(BIN)/python distribution/prerequisites.py
 	@echo "Installing the libraries and compiling the kernel (a minute or two the first time) ..."
-	@$(PIP_INSTALL) --editable ./proto --editable '.[all]' --editable ./client --editable ./ros || \
+	@$(PIP_INSTALL) --editable ./proto --editable '.[all]' --editable ./client --editable ./ros --editable ./studies || \
 		{ echo "error: pip said above why it failed; if it found no cmake or ninja: sudo apt-get install cmake ninja-build"; exit 1; }
 	@touch $@
 

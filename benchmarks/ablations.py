@@ -27,8 +27,8 @@ from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import TrainingConfig
 from ultragray.learn.training.config import TEXTURE
 from ultragray.phantom.imaging import BoneShadow
-from ultragray_service.bench.measured import DIRTY, measured
-from ultragray_studies.report.study import train_and_evaluate
+from ultragray_studies.bench.report import DIRTY, measured
+from ultragray_studies.report import train_and_evaluate
 
 OUTPUT = FIGURES["ablations"].staged
 SEEDS = (0, 1, 2)

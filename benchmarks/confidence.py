@@ -34,7 +34,7 @@ from ultragray.learn.evaluation.scoring import compare_deviations, render_sweep
 from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import TrainingConfig, train
 from ultragray.scene.confidence import Assessor
-from ultragray_service.bench.measured import measured
+from ultragray_studies.bench.report import measured
 
 OUTPUT = FIGURES["confidence"].staged
 IMAGES = ROOT / "docs" / "images"

@@ -21,7 +21,7 @@ from registry import FIGURES
 from ultragray.files import write_whole
 from ultragray.phantom.demo import DEMO_FILE
 from ultragray.scene.gaussians import GaussianScene
-from ultragray_service.bench.measured import measured
+from ultragray_studies.bench.report import measured
 from ultragray_studies.gym import STANDARD_PLANE
 
 OUTPUT = FIGURES["environment"].staged

@@ -38,7 +38,7 @@ from ultragray.learn.training.geometry import Shadows
 from ultragray.phantom.imaging import BoneShadow, simulate
 from ultragray.phantom.sweeps import PHANTOM_IMAGE_SIDE, PHANTOM_PROBE, freehand_poses
 from ultragray.rendering.pixels import to_uint8
-from ultragray_service.bench.measured import measured
+from ultragray_studies.bench.report import measured
 
 OUTPUT = FIGURES["libraries"].staged
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=50.0, far_mm=150.0)

@@ -29,8 +29,8 @@ from ultragray.learn.training import TrainingConfig
 from ultragray.phantom import PHANTOM_IMAGE_SIDE, PHANTOM_PROBE, freehand_poses, simulate
 from ultragray.phantom.demo import load_demo_scene
 from ultragray.scene.gaussians import GaussianScene
-from ultragray_service.bench.measured import measured
-from ultragray_studies.report.study import train_and_evaluate
+from ultragray_studies.bench.report import measured
+from ultragray_studies.report import train_and_evaluate
 
 OUTPUT = FIGURES["localization"].staged
 PHANTOM = "phantom"

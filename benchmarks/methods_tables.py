@@ -24,7 +24,7 @@ from ultragray.datasets.source import PHANTOM, load_dataset
 from ultragray.files import write_whole
 from ultragray.learn.evaluation.methods import ComparisonSettings
 from ultragray.learn.report.tables import METRICS, by_mean_rank, rank, shown_value
-from ultragray_service.bench.measured import measured
+from ultragray_studies.bench.report import measured
 from ultragray_studies.comparison.result import Comparison
 from ultragray_studies.comparison.run import ComparisonProgress, compare
 from ultragray_studies.comparison.tables import COST_HEADINGS, cost_texts

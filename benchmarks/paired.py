@@ -20,8 +20,8 @@ from rich.console import Console
 from rich.table import Table
 
 from ultragray.installation import processor_name
-from ultragray_service.bench.kernel import BenchScene, bench_poses
-from ultragray_service.bench.served import DOORS, SCENE, WARM_UP, running_server
+from ultragray_studies.bench.kernel import BenchScene, bench_poses
+from ultragray_studies.bench.served import DOORS, SCENE, WARM_UP, running_server
 
 MEASURED = ("gRPC stream", "HTTP raw")
 

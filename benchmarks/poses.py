@@ -28,8 +28,8 @@ from ultragray.geometry.rotations import about_axes, random_directions
 from ultragray.learn.sweep import Dataset, Sweep
 from ultragray.learn.training import TrainingConfig
 from ultragray.learn.training.alignment import sweep_ranges
-from ultragray_service.bench.measured import measured
-from ultragray_studies.report.study import train_and_evaluate
+from ultragray_studies.bench.report import measured
+from ultragray_studies.report import train_and_evaluate
 
 OUTPUT = FIGURES["poses"].staged
 SHAKEN, MOVED, RECORDED = "each frame by 1 mm and 1°", "the second sweep by 8 mm and 4°", "poses as recorded"
@@ -81,7 +81,7 @@ def measure(dataset: Dataset, error: str, seed: int) -> dict[str, Any]:
         config = TrainingConfig.preset("fast", refine_poses=mode, confidence=False, seed=seed)
         trained = train_and_evaluate(replace(dataset, train=given), config)
         mean = trained.evaluation.mean
-        scores[mode] = {"psnr_db": mean.psnr_db, "ms_ssim": mean.ms_ssim, "seconds": round(trained.seconds)}
+        scores[mode] = {"psnr_db": mean.psnr_db, "ms_ssim": mean.ms_ssim, "seconds": round(trained.course.seconds)}
         refined = trained.scene.training_poses
     return {
         **{f"{key}_{mode}": value for mode, score in scores.items() for key, value in score.items()},

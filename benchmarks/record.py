@@ -18,7 +18,7 @@ import documents
 import simulation
 from registry import FIGURES, Document, Figures
 from ultragray.files import write_whole
-from ultragray_service.bench.measured import changed_sources, commit
+from ultragray_studies.bench.report import changed_sources, commit
 
 SHOWN = 3  # names of changed files
 

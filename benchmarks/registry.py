@@ -35,7 +35,7 @@ class Figures:
         return STAGE / self.kept.name
 
 
-_BENCH = "service/ultragray_service/bench"
+_BENCH = "studies/ultragray_studies/bench"
 _KERNEL = (
     "CMakeLists.txt",
     "model/kernels",
@@ -59,14 +59,14 @@ _TRAINED = (
     "model/ultragray/learn/training",
 )
 _JOBS = ("workers/ultragray_workers/jobs", "workers/ultragray_workers/claims.py")
-_GPU = ("model/ultragray/rendering/backends/cuda", "model/ultragray/rendering/frames.py", f"{_BENCH}/cuda")
+_GPU = ("model/ultragray/rendering/backends/cuda", "model/ultragray/rendering/frames.py", f"{_BENCH}/cuda.py")
 _PRODUCT = ("model", "workers", "service", "proto", "client", "ros")
 
 _FILES = (
-    Figures("benchmarks/results.json", "bench", (*_SERVED, f"{_BENCH}/frames.py")),
-    Figures("benchmarks/kernel.json", "bench", (*_KERNEL, f"{_BENCH}/kernel_details.py")),
-    Figures("benchmarks/training.json", "bench", (*_KERNEL, "model/ultragray/learn/training", f"{_BENCH}/train.py")),
-    Figures("benchmarks/jobs.json", "bench", (*_SERVED, *_JOBS, f"{_BENCH}/jobs.py")),
+    Figures("benchmarks/results.json", "bench", (*_SERVED, f"{_BENCH}/served.py")),
+    Figures("benchmarks/kernel.json", "bench", (*_KERNEL, f"{_BENCH}/parts.py")),
+    Figures("benchmarks/training.json", "bench", (*_KERNEL, "model/ultragray/learn/training", f"{_BENCH}/parts.py")),
+    Figures("benchmarks/jobs.json", "bench", (*_SERVED, *_JOBS, f"{_BENCH}/clients.py")),
     Figures(
         "benchmarks/clients.json",
         "bench",

@@ -31,8 +31,8 @@ from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import Progress, TrainingConfig
 from ultragray.phantom.imaging import SHADOW_DB, BoneShadow
 from ultragray.scene.gaussians import GaussianScene
-from ultragray_service.bench.measured import measured
-from ultragray_studies.report.study import train_and_evaluate
+from ultragray_studies.bench.report import measured
+from ultragray_studies.report import train_and_evaluate
 
 SECONDS_PER_LINE = 15.0
 THIRD, BAND_SPACINGS = 3, 10
@@ -139,7 +139,7 @@ def measure(run: Run, data_folder: Path) -> dict[str, Any]:
     baselines = evaluate_baselines(dataset, BASELINES, voxel_mm)
     config = TrainingConfig.preset(run.preset, **run.settings)
     trained = train_and_evaluate(dataset, config, report=_teller(run.name))
-    log.info("%s: %.2f dB in %.0f s", run.name, trained.evaluation.mean.psnr_db, trained.seconds)
+    log.info("%s: %.2f dB in %.0f s", run.name, trained.evaluation.mean.psnr_db, trained.course.seconds)
     evaluations = {"scene": trained.evaluation, **baselines}
     figures = {
         "train_frames": len(dataset.train),
@@ -156,8 +156,8 @@ def measure(run: Run, data_folder: Path) -> dict[str, Any]:
         "settings": dict(run.settings),
         "steps": trained.scene.info.training["steps"],
         "gaussians": trained.scene.gaussian_count,
-        "step_ms": 1000.0 * trained.step_s,
-        "total_s": trained.seconds,
+        "step_ms": 1000.0 * trained.course.step_s,
+        "total_s": trained.course.seconds,
         "measured": head,
     }
     if run.source == PHANTOM:

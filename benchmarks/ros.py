@@ -27,8 +27,8 @@ from registry import FIGURES
 from ultragray.files import write_whole
 from ultragray.phantom.demo import copy_demo_scene, demo_poses
 from ultragray_client import Client, RenderSettings
-from ultragray_service.bench.measured import measured
-from ultragray_service.bench.served import running_server
+from ultragray_studies.bench.report import measured
+from ultragray_studies.bench.served import running_server
 
 OUTPUT = FIGURES["ros"].staged
 SCENE = "demo"

@@ -25,7 +25,7 @@ from scaling.outcome import Outcome, mean_with_confidence, with_confidence
 from scaling.study import Case, Policy, run
 from scaling.workload import Workload
 from ultragray.files import write_whole
-from ultragray_service.bench.measured import measured
+from ultragray_studies.bench.report import measured
 
 OUTPUT = FIGURES["simulation"].staged
 PICTURE = ROOT / "docs" / "images" / "scaling.png"

@@ -27,8 +27,9 @@ from ultragray.errors import error_classes
 from ultragray.exchange import ros_messages, ros_recording
 from ultragray.geometry.pose import quaternion_from_pose
 from ultragray.geometry.probe import ElevationBeam
-from ultragray.rendering.settings import RenderSettings
+from ultragray.rendering.settings import RenderSettings, SettingsUsed
 from ultragray.rendering.volumes import SliceSettings
+from ultragray.scene.confidence import Extrapolation
 from ultragray_service.errors import STATUSES
 from ultragray_workers.datasets.store import DatasetRecord
 from ultragray_workers.jobs.kinds import Specification
@@ -39,6 +40,8 @@ MODULES = ("client", "connection", "datasets", "jobs", "registrations", "scenes"
 # The classes that callers fill in or get, each with all that it is made of, and the names that the client gives them.
 ROOTS = {
     "RenderSettings": RenderSettings,
+    "SettingsUsed": SettingsUsed,
+    "Extrapolation": Extrapolation,
     "SliceSettings": SliceSettings,
     "ElevationBeam": ElevationBeam,
     "DatasetOptions": SourceOptions,
@@ -100,7 +103,7 @@ from dataclasses import field as field_of
 from enum import Enum
 from typing import Any, Literal, TypeAlias
 
-from .geometry import PoseLike
+from .geometry import Picture, PoseLike
 '''
 _RECORDING_HEADER = "# Generated from {module} by client/generate.py; change that.\n"
 _RAISES = re.compile(r"\s*\bRaises\s.*?(?=\n\n|\Z)", flags=re.DOTALL)
@@ -260,16 +263,22 @@ def _field_source(item: Field[Any], *, kw_only: bool) -> str:
         return f"    kind: Literal[{item.default!r}] = field_of(default={item.default!r}, repr=False, kw_only=True)"
     default = ""
     if item.default is not MISSING:
-        default = f" = {item.default if isinstance(item.default, Enum) else repr(item.default)}"
+        default = f" = {_default_source(item.default)}"
     elif item.default_factory is not MISSING:
         default = f" = field_of(default_factory={item.default_factory.__name__})"
     if kw_only:
-        given = f"default={item.default!r}"
+        given = f"default={_default_source(item.default)}"
         if item.default_factory is not MISSING:
             given = f"default_factory={item.default_factory.__name__}"
         default = f" = field_of({given}, kw_only=True)"
     annotation = re.sub(r"\w+", lambda word: OWN_TYPES.get(word[0], word[0]), str(item.type))
     return f"    {item.name}: {annotation}{default}\n    {_quoted(_wrapped(item.metadata['description']))}"
+
+
+def _default_source(default: Any) -> str:
+    if isinstance(default, Contract):  # a class whose own defaults it has
+        return f"{type(default).__name__}()"
+    return str(default) if isinstance(default, Enum) else repr(default)
 
 
 def _docstring(cls: Any) -> str:

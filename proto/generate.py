@@ -79,6 +79,7 @@ class Lock:
 
     def __init__(self, lines: Iterable[str]) -> None:
         self.lines = list(lines)
+        self.messages: dict[type, str] = {}  # and enums, of classes that have another name than theirs
         self.fields: dict[str, dict[str, tuple[int, str | None]]] = {}  # by message or enum, by name
         for line in self.lines:
             if (found := _LOCKED.fullmatch(line)) is not None:
@@ -183,7 +184,7 @@ def _field_lines(cls: Any, owner: str, declared: set[str], lock: Lock) -> list[s
             continue
         form = lock.form(owner, item.name)
         if form is None:
-            form = _form(owner, item, annotation)
+            form = _form(owner, item, annotation, lock)
         else:
             _check_form(owner, item, annotation, form)
         number = lock.number(owner, item.name)
@@ -211,26 +212,26 @@ def _fields_of(cls: Any) -> Iterator[tuple[Field[Any], Any]]:
                 yield item, hints[item.name]
 
 
-def _form(owner: str, item: Field[Any], annotation: Any) -> str:
+def _form(owner: str, item: Field[Any], annotation: Any, lock: Lock) -> str:
     """The form of a new field by its annotation. Raises ContractError for one that has none."""
     kind, is_optional = optional_of(annotation)
     if get_origin(kind) in (tuple, list):
-        return f"repeated {_wire_type(owner, item, get_args(kind)[0])}"
+        return f"repeated {_wire_type(owner, item, get_args(kind)[0], lock)}"
     if get_origin(kind) is dict:
-        return "map<{}, {}>".format(*(_wire_type(owner, item, one) for one in get_args(kind)))
-    wire = _wire_type(owner, item, kind)
+        return "map<{}, {}>".format(*(_wire_type(owner, item, one, lock) for one in get_args(kind)))
+    wire = _wire_type(owner, item, kind, lock)
     is_message = is_dataclass(kind) or (isinstance(kind, type) and issubclass(kind, (Family, Enum)))
     has_presence = is_optional or (item.default is not MISSING and bool(item.default))
     return f"optional {wire}" if has_presence and not is_message else wire
 
 
-def _wire_type(owner: str, item: Field[Any], kind: Any) -> str:
+def _wire_type(owner: str, item: Field[Any], kind: Any, lock: Lock) -> str:
     if kind is int and item.metadata.get("low", -math.inf) >= -_INT32 and item.metadata.get("high", math.inf) < _INT32:
         return "int32"
     if kind in _WIRE:
         return _WIRE[kind][0]
     if isinstance(kind, type) and (is_dataclass(kind) or issubclass(kind, (Enum, Family))):
-        return kind.__name__
+        return lock.messages.get(kind, kind.__name__)
     raise ContractError(
         f"{owner}.{item.name} has no form on the wire: write it into the template, {kind} says too little"
     )
@@ -283,10 +284,15 @@ def generate(target: Path = ROOT) -> list[Path]:
     """
     lock = Lock((ROOT / LOCK).read_text(encoding="utf-8").splitlines())
     protos, stubs = target / PROTOS.relative_to(ROOT), target / STUBS.relative_to(ROOT)
+    templates = {path.name: path.read_text(encoding="utf-8") for path in sorted(TEMPLATES.glob("*.proto"))}
+    for template in templates.values():
+        for _, name, body in _BLOCK.findall(template):
+            named = (_named(pragma) for pragma in _PRAGMA.finditer(body))
+            lock.messages |= {one: name for one in named if isinstance(one, type)}
     written = []
-    for template in sorted(TEMPLATES.glob("*.proto")):
-        text = f"// Written by proto/generate.py from proto/templates/{template.name}; change that.\n"
-        written.append(_write(protos / template.name, text + proto_text(template.read_text(encoding="utf-8"), lock)))
+    for name, template in templates.items():
+        text = f"// Written by proto/generate.py from proto/templates/{name}; change that.\n"
+        written.append(_write(protos / name, text + proto_text(template, lock)))
     with tempfile.TemporaryDirectory() as temporary:
         descriptors = Path(temporary, "descriptors")
         outputs = [f"--{name}_out={temporary}" for name in ("python", "pyi", "grpc_python")]

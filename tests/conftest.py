@@ -24,7 +24,7 @@ from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.backends import cuda
 from ultragray.rendering.outputs import PLANES
 from ultragray.scene.gaussians import PARAMETERS
-from ultragray_service.bench.measured import measured
+from ultragray_studies.bench.report import measured
 
 from .object_storage import new_bucket, object_proxy, object_server
 from .postgres import new_database, postgres

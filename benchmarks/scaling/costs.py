@@ -17,7 +17,7 @@ import torch
 
 from registry import FIGURES
 from ultragray import render
-from ultragray_service.bench.kernel import BenchScene, bench_poses, bench_scenes
+from ultragray_studies.bench.kernel import BenchScene, bench_poses, bench_scenes
 from ultragray_workers.pool.scene_cache import SceneCache
 from ultragray_workers.scenes import resident_bytes
 

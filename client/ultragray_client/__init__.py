@@ -33,8 +33,8 @@ from .aio.client import AsyncClient
 from .aio.stream import AsyncFrameStream
 from .contract import *  # noqa: F403
 from .errors import ClientError
-from .frames import Extrapolation, Frame, Picture, Slice, Timings
-from .geometry import Placement, PoseLike, Quaternion
+from .frames import Frame, Slice, Timings
+from .geometry import Picture, Placement, PoseLike, Quaternion
 from .recording.recording import Recording
 from .sync.client import Client
 from .sync.stream import FrameStream
@@ -46,7 +46,6 @@ __all__ = [
     "Client",
     "ClientError",
     "ConfidenceFit",
-    "Extrapolation",
     "Frame",
     "FrameStream",
     "Job",

@@ -9,9 +9,10 @@ from dataclasses import field as field_of
 from enum import Enum
 from typing import Any, Literal, TypeAlias
 
-from .geometry import PoseLike
+from .geometry import Picture, PoseLike
 
 __all__ = [
+    "Additions",
     "AroundSampler",
     "Below",
     "Box",
@@ -27,6 +28,7 @@ __all__ = [
     "ElevationBeam",
     "Encoding",
     "EvaluateJob",
+    "Extrapolation",
     "FanSampler",
     "FrameSettings",
     "ImageRegion",
@@ -38,6 +40,7 @@ __all__ = [
     "RenderJob",
     "RenderSettings",
     "Sampler",
+    "SettingsUsed",
     "Shaft",
     "SliceSettings",
     "Specification",
@@ -282,6 +285,66 @@ class RenderSettings(FrameSettings):
     """Name of the registration by which the poses lead into the scene: they are then flange to base, or marker to
     tracker. Default: they are probe to scene.
     """
+
+
+@dataclass(frozen=True, kw_only=True)
+class Additions:
+    """What a frame has only where it was asked for, as it was used."""
+
+    min_confidence: float | None = None
+    """Below it the frame was refused, or masked; null: any."""
+    below_min_confidence: Below = Below.REFUSE
+    """mask: where the frame's confidence is below min_confidence, pixels without support are 0."""
+    contact: Contact | None = None
+    """As used; null: it was assumed."""
+    tools: tuple[Tool, ...] = ()
+    """As used."""
+    ghost: float = 0.0
+    """As used; 0: none."""
+    registration: str | None = None
+    """That led the pose into the scene; null: none, it was sent as it is."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class SettingsUsed(Additions):
+    """The settings of a frame, as used: with its scene and its pose all that is needed to render it again."""
+
+    probe: Probe
+    """As used."""
+    slice_thickness_mm: float
+    """As used: at the focus of the scene's beam; 0: a plane."""
+    rendered_height: int
+    """Depth samples, before the display settings were applied."""
+    rendered_width: int
+    """Scan lines, likewise."""
+    display: Display = Display()
+    """As used."""
+    height: int
+    """H."""
+    width: int
+    """W."""
+    picture: Picture
+    """Where the pixels lie."""
+    outputs: tuple[str, ...]
+    """In the order of the data."""
+    encoding: Encoding
+    """Of the pixels."""
+
+
+@dataclass(frozen=True)
+class Extrapolation:
+    """Of one frame. None: the scene does not know its training views, has no model, or no coverage was given."""
+
+    distance_mm: float | None
+    """Distance to the nearest training views, a mean over the image."""
+    angle_deg: float | None
+    """Angle to them."""
+    confidence: float | None
+    """The MS-SSIM that a real frame at this pose is expected to have with the rendered one, 0 to 1."""
+    supported_share: float | None
+    """Share of the pixels that Gaussians support: coverage of at least 0.3."""
+    contact_share: float | None = None
+    """Share of the scan lines that have contact with the skin; none where contact is assumed."""
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from dataclasses import field as field_of
+from enum import Enum
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ultragray_client.contract import Contact, Display, Encoding, Probe, RenderSettings, Tool
+from ultragray_client.contract import Additions, Encoding, Extrapolation, Probe, RenderSettings, SettingsUsed
 from ultragray_client.errors import InvalidArgument
 from ultragray_client.geometry import FloatArray, PoseLike, pose_message
 from ultragray_client.messages import message_of
@@ -36,74 +37,18 @@ class Timings:
     encode_ms: float
 
 
-@dataclass(frozen=True)
-class Extrapolation:
-    """Distance of a frame from what its scene was trained on; None: the scene cannot tell."""
-
-    distance_mm: float | None  # to the nearest training views, a mean over the image
-    angle_deg: float | None  # likewise
-    confidence: float | None  # the MS-SSIM, 0 to 1, that a real frame is expected to have with this one
-    supported_share: float | None  # of the pixels, by Gaussians
-    contact_share: float | None = None  # of the scan lines, with the skin; None: `contact` was not asked for
-
-
-@dataclass(frozen=True)
-class Picture:
-    """The places of pixels in the image plane of the probe.
-
-    Columns are mm along x (`column_unit` "mm"), or scan lines of a fan at degrees from its axis ("deg"); rows are mm
-    along z, or mm of range. The first values are those of the centre of pixel (0, 0), the steps lead to the next one.
-    """
-
-    column_unit: str
-    first_column: float
-    first_row_mm: float
-    column_step: float  # negative where left and right are exchanged
-    row_step_mm: float
-
-    def pixel_to_probe(self) -> FloatArray:  # [4, 4]
-        """Takes (column, row, k, 1) to mm in the probe's frame, k in mm against the elevation y.
-
-        Pixels are counted from 0 at their centres. Raises InvalidArgument where columns are angles.
-        """
-        if self.column_unit != "mm":
-            raise InvalidArgument(
-                f"no matrix takes pixels whose columns are in {self.column_unit} to mm; "
-                "ask for square ones: display=Display(pixel_mm=...)",
-                field="display.pixel_mm",
-            )
-        return np.array(
-            [
-                [self.column_step, 0.0, 0.0, self.first_column],
-                [0.0, 0.0, -1.0, 0.0],
-                [0.0, self.row_step_mm, 0.0, self.first_row_mm],
-                [0.0, 0.0, 0.0, 1.0],
-            ]
-        )
-
-
-@dataclass(frozen=True, eq=False)
-class Frame:
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Frame(SettingsUsed):
     """A frame, and all that is needed to render it again. `frame["bmode"]` is one of its arrays."""
 
     arrays: Mapping[str, npt.NDArray[Any]]  # by output, each [H, W], read-only: uint8 of 0 to 255, or float32 of 0 to 1
     pose: FloatArray  # [4, 4] mm, as used
-    probe: Probe
     scene: str
     scene_sha256: str  # of the scene file
     renderer: str  # name, version and backend
     sequence: int  # in a batch from 0; in a stream that of its pose, from 1
     timings: Timings
     extrapolation: Extrapolation
-    picture: Picture  # where the pixels lie
-    rendered_height: int  # depth samples, before `display` was applied
-    rendered_width: int  # scan lines, likewise
-    slice_thickness_mm: float = 0.0  # as used, at the focus of the scene's beam; 0: a plane
-    contact: Contact | None = None  # as used; None: it was assumed
-    tools: tuple[Tool, ...] = ()  # as used
-    ghost: float = 0.0  # as used; 0: none
-    registration: str | None = None  # that led the pose into the scene; None: none, it was sent as it is
-    display: Display | None = None  # as used; None: none was asked for
     dropped: int = 0  # in a stream: poses that newer ones replaced since the frame before
     latency_ms: float | None = None  # in a stream: from `measured_ns` of the pose to the arrival of the frame here
 
@@ -123,6 +68,34 @@ class Frame:
         with `Display(pixel_mm=...)`.
         """
         return self.pose @ self.picture.pixel_to_probe()
+
+
+def origin_of(frame: Frame) -> dict[str, Any]:
+    """The origin of a frame and its settings as used, as JSON holds them; as the files of jobs have it."""
+    found: dict[str, Any] = {name: getattr(frame, name) for name in ("scene", "scene_sha256", "renderer")}
+    plain = {one.name: one.default for one in fields(Additions)}  # as they are where they were not asked for
+    for one in fields(SettingsUsed):
+        value = getattr(frame, one.name)
+        if one.name not in plain or value != plain[one.name]:
+            found[one.name] = _plain(value)
+    picture = frame.picture
+    found["picture"] = {
+        "height": frame.height,
+        "width": frame.width,
+        "column_unit": picture.column_unit,
+        "first": (picture.first_column, picture.first_row_mm),
+        "step": (picture.column_step, picture.row_step_mm),
+    }
+    return found
+
+
+def _plain(value: Any) -> Any:
+    """A value of the contract as JSON holds it."""
+    if isinstance(value, Enum):
+        return value.value
+    if isinstance(value, tuple):
+        return [_plain(one) for one in value]
+    return {one.name: _plain(getattr(value, one.name)) for one in fields(value)} if is_dataclass(value) else value
 
 
 @dataclass(frozen=True, eq=False)

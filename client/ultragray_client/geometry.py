@@ -1,4 +1,4 @@
-"""Poses, as a caller writes them.
+"""Poses, as a caller writes them, and the places of pixels.
 
 Convention. Lengths are millimetres, angles degrees. A pose takes the probe's frame (x lateral, y elevation, z axial) to
 the scene's: p_scene = R p_probe + t. Worked value: `Placement((0, 0, 10), Quaternion(w=1, x=0, y=0, z=0))` is the
@@ -14,7 +14,7 @@ from typing import TypeAlias
 import numpy as np
 import numpy.typing as npt
 
-from ultragray_client.errors import InvalidPose
+from ultragray_client.errors import InvalidArgument, InvalidPose
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import geometry_pb2
 
@@ -60,3 +60,38 @@ def pose_message(pose: PoseLike, *, field: str = "pose") -> geometry_pb2.Pose:
 def pose_messages(poses: Iterable[PoseLike]) -> Iterator[geometry_pb2.Pose]:
     """The messages of many poses. Raises InvalidPose, naming the place of the pose."""
     return (pose_message(pose, field=f"poses[{index}]") for index, pose in enumerate(poses))
+
+
+@dataclass(frozen=True)
+class Picture:
+    """The places of pixels in the image plane of the probe.
+
+    Columns are mm along x (`column_unit` "mm"), or scan lines of a fan at degrees from its axis ("deg"); rows are mm
+    along z, or mm of range. The first values are those of the centre of pixel (0, 0), the steps lead to the next one.
+    """
+
+    column_unit: str
+    first_column: float
+    first_row_mm: float
+    column_step: float  # negative where left and right are exchanged
+    row_step_mm: float
+
+    def pixel_to_probe(self) -> FloatArray:  # [4, 4]
+        """Takes (column, row, k, 1) to mm in the probe's frame, k in mm against the elevation y.
+
+        Pixels are counted from 0 at their centres. Raises InvalidArgument where columns are angles.
+        """
+        if self.column_unit != "mm":
+            raise InvalidArgument(
+                f"no matrix takes pixels whose columns are in {self.column_unit} to mm; "
+                "ask for square ones: display=Display(pixel_mm=...)",
+                field="display.pixel_mm",
+            )
+        return np.array(
+            [
+                [self.column_step, 0.0, 0.0, self.first_column],
+                [0.0, 0.0, -1.0, 0.0],
+                [0.0, self.row_step_mm, 0.0, self.first_row_mm],
+                [0.0, 0.0, 0.0, 1.0],
+            ]
+        )

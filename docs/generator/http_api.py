@@ -12,6 +12,7 @@ from typing import Any
 from ultragray_service.http.app import create_app
 from ultragray_service.service import Service
 from ultragray_service.settings import Settings
+from ultragray_service.wiring import make_service
 
 from .markdown import code, codes, in_line, prose, sections, table
 
@@ -20,7 +21,7 @@ from .markdown import code, codes, in_line, prose, sections, table
 def temporary_service() -> Iterator[Service]:
     """A service that is never started, with an empty data folder."""
     with tempfile.TemporaryDirectory() as folder:
-        yield Service(Settings(data_folder=Path(folder)))
+        yield make_service(Settings(data_folder=Path(folder)))
 
 
 @cache

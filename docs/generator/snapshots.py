@@ -1,5 +1,4 @@
-"""What the code says of itself, kept under version control so that each change of it is read: `make generate` writes
-it.
+"""What the code says of itself, under version control so that each change of it is read: `make generate` writes it.
 
 web/openapi.json                    the HTTP interface, of which the console's types and forms are made
 tests/documents/public_names.txt    the public names of the Python packages, with their signatures

@@ -45,6 +45,7 @@ def described(
     error: type[InvalidArgument] | None = None,
     example: Any = None,
     topic: str | None = None,
+    schema: Mapping[str, Any] | None = None,
     **options: Any,
 ) -> Any:
     """A dataclass field that says what it means.
@@ -52,17 +53,18 @@ def described(
     A number must lie from `low` (or above `above`) to `high`; a word must be one of `choices`, a list may have `most`
     elements, each within the limits. `error`: what is raised instead of the error of the class. `example`: a value of a
     usual member of a family. `topic`: the heading under which a help lists it, where that is not the class's.
-    `options` are those of `dataclasses.field`.
+    `schema`: what else its JSON Schema says. `options` are those of `dataclasses.field`.
     """
     metadata: dict[str, Any] = {"description": meaning}
     limits = {"low": low, "high": high, "above": above, "choices": choices, "most": most, "error": error}
     metadata |= {
         name: fact for name, fact in {**limits, "example": example, "topic": topic}.items() if fact is not None
     }
-    if schema := _schema(**limits):
-        if choices is not None and default is None:
-            schema["enum"] = [*choices, None]
-        metadata["json_schema_extra"] = schema  # the key that pydantic reads
+    words = _schema(**limits) | dict(schema or {})
+    if choices is not None and default is None:
+        words["enum"] = [*choices, None]
+    if words:
+        metadata["json_schema_extra"] = words  # the key that pydantic reads
     return field(default=default, default_factory=factory, metadata=metadata, **options)
 
 

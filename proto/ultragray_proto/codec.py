@@ -79,7 +79,7 @@ def from_message(message: Any, cls: type[_M], **others: Any) -> _M:
     Raises MessageInvalid.
     """
     annotation: Any = cls
-    value: _M = _reader(message.DESCRIPTOR, annotation)(message, **others)
+    value: _M = _reader(message.DESCRIPTOR, annotation, frozenset(others))(message, **others)
     return value
 
 
@@ -182,8 +182,8 @@ def _struct_of(values: Mapping[str, Any]) -> Struct:
 
 
 @cache
-def _reader(descriptor: Descriptor, annotation: Any) -> Callable[..., Any]:
-    """Reads a message as what an annotation says; keyword arguments are attributes that are known otherwise."""
+def _reader(descriptor: Descriptor, annotation: Any, known: frozenset[str] = frozenset()) -> Callable[..., Any]:
+    """Reads a message as what an annotation says; attributes that are `known` otherwise are its keyword arguments."""
     kind, _ = _optional_of(annotation)
     if descriptor.full_name == _STRUCT:
         return _dict_of
@@ -192,24 +192,24 @@ def _reader(descriptor: Descriptor, annotation: Any) -> Callable[..., Any]:
     if (members := _members(kind)) is not None:
         if kinds := _only_oneof(descriptor):
             return partial(_read_member, descriptor.oneofs[0].name, kinds, members)
-        return partial(_read_flat_member, members)
+        return partial(_read_flat_member, members, known)
     if get_origin(kind) is dict:
         return lambda message: {field.name: value for field, value in message.ListFields()}
     if get_origin(kind) is tuple:
         names = [one.name for one in descriptor.fields]
         return lambda message: tuple([getattr(message, name) for name in names])
-    return _dataclass_reader(descriptor, kind)
+    return _dataclass_reader(descriptor, kind, known)
 
 
 @cache
-def _dataclass_reader(descriptor: Descriptor, cls: Any) -> Callable[..., Any]:
+def _dataclass_reader(descriptor: Descriptor, cls: Any, known: frozenset[str]) -> Callable[..., Any]:
     hints, oneofs, steps = get_type_hints(cls), _oneofs(descriptor), []
     for one in fields(cls):
         kind, is_optional = _optional_of(hints[one.name])
         has_default = one.default is not MISSING or one.default_factory is not MISSING
         left_out = _LEFT_OUT if has_default else None
         is_required = not has_default and not is_optional
-        if not one.init:
+        if not one.init or one.name in known:
             continue
         if (field := descriptor.fields_by_name.get(one.name)) is not None:
             steps.append((one.name, _field_reader(field, kind, left_out, is_required)))
@@ -218,7 +218,7 @@ def _dataclass_reader(descriptor: Descriptor, cls: Any) -> Callable[..., Any]:
 
     def read(message: Any, **values: Any) -> Any:
         for name, step in steps:
-            if name not in values and (value := step(message)) is not _LEFT_OUT:
+            if (value := step(message)) is not _LEFT_OUT:
                 values[name] = value
         try:
             return cls(**values)
@@ -291,10 +291,11 @@ def _read_member(
     kind = message.WhichOneof(name)
     if kind not in members:
         raise MessageInvalid(f"must be one of {', '.join(members)}, got {kind or 'none'}", field=name)
-    return _at(kind, partial(_reader(kinds[kind], members[kind]), **others), getattr(message, kind))
+    read = _reader(kinds[kind], members[kind], frozenset(others))
+    return _at(kind, partial(read, **others), getattr(message, kind))
 
 
-def _read_flat_member(members: Mapping[str, Any], message: Any, **others: Any) -> Any:
+def _read_flat_member(members: Mapping[str, Any], known: frozenset[str], message: Any, **others: Any) -> Any:
     """The member of a family that a message tells which has the fields of all of them."""
     if message.kind not in members:
         raise MessageInvalid(f"must be one of {', '.join(members)}, got {message.kind!r}", field="kind")
@@ -303,7 +304,7 @@ def _read_flat_member(members: Mapping[str, Any], message: Any, **others: Any) -
     for field, _ in message.ListFields():
         if field.name not in takes:
             raise MessageInvalid(f"must be left out: kind {message.kind} does not take it", field=field.name)
-    return _dataclass_reader(message.DESCRIPTOR, member)(message, **others)
+    return _dataclass_reader(message.DESCRIPTOR, member, known)(message, **others)
 
 
 def _dict_of(struct: Struct) -> dict[str, Any]:

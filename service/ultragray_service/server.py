@@ -39,6 +39,7 @@ from ultragray_service.service import Service
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings
 from ultragray_service.telemetry.logs import configure_logging, is_for_people
 from ultragray_service.tls.server import CertificateWatch
+from ultragray_service.wiring import make_service
 from ultragray_workers.errors import StartupFailed
 from ultragray_workers.rounds import Rounds
 
@@ -190,7 +191,7 @@ async def serve(settings: Settings) -> None:
     signals = _StopSignals()
     manager = ServiceManager()
     certificates = CertificateWatch.of(settings)
-    service = Service(settings)
+    service = make_service(settings)
     if certificates is not None:
         service.metrics.tell_certificate_expiry(lambda: certificates.current.not_after)
     await service.open()
@@ -223,7 +224,7 @@ async def serve(settings: Settings) -> None:
                 await signals.stop.wait()
             manager.tell(STOPPING)
             if settings.drain_delay_s:
-                service.begin_leaving()
+                service.life.begin_leaving()
                 _log.info(f"not ready any more; stopping in {settings.drain_delay_s:g} s")
                 await signals.unless_forced(asyncio.sleep(settings.drain_delay_s))
             _log.info("stopping: frames that wait are answered first; Ctrl-C again stops at once")

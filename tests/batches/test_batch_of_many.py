@@ -32,7 +32,7 @@ from ultragray.rendering.settings import FrameSettings
 from ultragray.samplers import AroundSampler
 from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.info import read_header
-from ultragray_service.bench.measured import measured
+from ultragray_studies.bench.report import measured
 from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 

@@ -55,7 +55,7 @@ def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Repository:
 
 def adopt(monkeypatch: pytest.MonkeyPatch, root: Path) -> None:
     """Let the scripts take a folder for the root of their checkout."""
-    from ultragray_service.bench import measured
+    from ultragray_studies.bench import report as measured
 
     for module in (benchmark("registry"), benchmark("age"), measured):
         monkeypatch.setattr(module, "ROOT", root)

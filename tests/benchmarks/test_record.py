@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from ultragray_service.bench import measured
+from ultragray_studies.bench import report as measured
 
 from ..scripts import benchmark
 from .conftest import Repository, adopt

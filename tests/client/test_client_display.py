@@ -56,8 +56,7 @@ def test_every_way_takes_them(client: Any) -> None:
 
 def test_defaults_are_those_of_the_service(client: Any) -> None:
     assert vars(Display()) == vars(AS_RENDERED)
-    assert client.render("demo", np.eye(4)).display is None
-    assert client.render("demo", np.eye(4), RenderSettings(display=Display())).display is None
+    assert client.render("demo", np.eye(4)).display == Display()
     assert client.render("demo", np.eye(4), RenderSettings(display=Display(flip=True))).display == Display(flip=True)
 
 

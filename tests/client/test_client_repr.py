@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ultragray_client import Extrapolation, Frame, LinearProbe, Picture, Timings
+from ultragray_client import Encoding, Extrapolation, Frame, LinearProbe, Picture, Timings
 
 
 def test_a_frame() -> None:
@@ -23,5 +23,10 @@ def test_a_frame() -> None:
         picture=Picture("mm", 0.0, 0.0, 1.0, 1.0),
         rendered_height=512,
         rendered_width=256,
+        slice_thickness_mm=0.0,
+        height=512,
+        width=256,
+        outputs=("bmode", "echo"),
+        encoding=Encoding.UINT8,
     )
     assert repr(frame) == "Frame('demo', bmode 512x256, echo 512x256, at (1, -2.25, 30) mm)"

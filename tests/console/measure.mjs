@@ -88,7 +88,7 @@ try {
   const rounded = (value) => Math.round(value * 10) / 10;
   const heaps_mib = heaps.map((bytes) => rounded(bytes / MEBIBYTE));
   const figures = {
-    measured: JSON.parse(execFileSync(PYTHON, ["-m", "ultragray_service.bench.measured"])),
+    measured: JSON.parse(execFileSync(PYTHON, ["-m", "ultragray_studies.bench.report"])),
     seconds,
     frames_per_s: { median: rounded(sorted[sorted.length >> 1]), least: rounded(sorted[0]), most: rounded(sorted.at(-1)) },
     heap_mib: { first: heaps_mib[0], last: heaps_mib.at(-1), most: Math.max(...heaps_mib) },

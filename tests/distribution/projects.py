@@ -1,4 +1,4 @@
-"""The four projects of this repository, as their pyproject.toml say."""
+"""The five projects of this repository, as their pyproject.toml say."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ FOLDERS = {
     "ultragray-client": ROOT / "client",
     "ultragray-proto": ROOT / "proto",
     "ultragray-ros": ROOT / "ros",
+    "ultragray-studies": ROOT / "studies",
 }
 
 

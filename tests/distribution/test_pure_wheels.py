@@ -1,4 +1,4 @@
-"""The wheels and sdists of client, messages and node: each holds its own package, and what ROS looks for."""
+"""The wheels and sdists of client, messages, node and studies: each holds its own package, and what ROS looks for."""
 
 from __future__ import annotations
 
@@ -13,7 +13,12 @@ import pytest
 from ..surroundings import ROOT
 from .projects import unpacked
 
-PACKAGES = {"client": "ultragray_client", "proto": "ultragray_proto", "ros": "ultragray_ros"}
+PACKAGES = {
+    "client": "ultragray_client",
+    "proto": "ultragray_proto",
+    "ros": "ultragray_ros",
+    "studies": "ultragray_studies",
+}
 FOR_ROS = {
     "share/ament_index/resource_index/packages/ultragray_ros",
     "share/ultragray_ros/launch/ultragray.launch.xml",

@@ -15,7 +15,7 @@ from typing import Any
 import pytest
 
 from ultragray import GaussianScene
-from ultragray_service.bench.measured import measured
+from ultragray_studies.bench.report import measured
 
 from ..service.conftest import DEMO_PROBE, RunningService, StartService, make_scene, service_starter
 from ..surroundings import ROOT

@@ -20,7 +20,7 @@ from typing import Any
 
 import pytest
 
-from ultragray_service.bench.measured import measured
+from ultragray_studies.bench.report import measured
 from ultragray_workers.storage.copying import copy_scenes
 from ultragray_workers.storage.location import open_storage
 

@@ -18,6 +18,7 @@ from ultragray_service.core import uploads as scene_imports
 from ultragray_service.core.threads import HelperProcesses
 from ultragray_service.service import Service
 from ultragray_service.settings import load_settings
+from ultragray_service.wiring import make_service
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.shelves import folder
 
@@ -76,7 +77,7 @@ def test_long_work_leaves_the_threads_of_the_loop(
 
     async def main() -> None:
         act_as(LOCAL, address="127.0.0.1", connection="test")
-        service = Service(load_settings(data_folder=tmp_path))
+        service = make_service(load_settings(data_folder=tmp_path))
         await service.jobs.open()
         service.owners.open(service.jobs.database.engine, service.jobs.threads.executor)
         asyncio.get_running_loop().set_default_executor(ThreadPoolExecutor(1))

@@ -23,9 +23,9 @@ import pytest
 from ultragray.datasets import Dataset
 from ultragray.datasets.released import write_released
 from ultragray.files import file_sha256
-from ultragray_service.bench.measured import measured
+from ultragray_studies.bench.report import measured
 
-from ..model.training.conftest import make_tiny_dataset
+from ..model.learn.training.conftest import make_tiny_dataset
 from ..processes import Growth, Taken, by_role, family
 from ..service.conftest import RunningService, service_starter
 from ..service.igtl.conftest import address_of

@@ -39,9 +39,10 @@ class SceneStore:
     What blocks raises StorageUnavailable where a bucket does not answer.
     """
 
-    def __init__(self, *places: Path | Shelf) -> None:
+    def __init__(self, *places: Path | Shelf, hides: Callable[[str], bool] = lambda name: False) -> None:
+        """`hides`: whether a scene is hidden from whoever asks, who does not find it then."""
         self.shelves = tuple(FolderShelf(place) if isinstance(place, Path) else place for place in places)
-        self.hides: Callable[[str], bool] = lambda name: False  # from whoever asks: what is hidden is not found
+        self.hides = hides
         self._headers: KeptHeaders[FileVersion] = KeptHeaders()
         self._hashes: dict[str, tuple[FileVersion, str]] = {}
         self._hashing = threading.Lock()

@@ -108,7 +108,7 @@ def figures_message(
 
 
 def geometry_document(origin: Mapping[str, Any], frame_id: str) -> dict[str, Any]:
-    """Where the pixels lie in the frame of the probe, and what was rendered, from the origin of frames.
+    """Where the pixels lie in the frame of the probe, and all of what was rendered, from the origin of frames.
 
     `pixel_to_probe_m` [4, 4] takes (column, row, k, 1) to metres, k metres against the elevation y; None where columns
     are scan lines of a fan. `picture` describes the pixels in either case, in mm and degrees.
@@ -120,6 +120,7 @@ def geometry_document(origin: Mapping[str, Any], frame_id: str) -> dict[str, Any
         across, down = [column_step / MM_PER_M, 0.0, 0.0, column / MM_PER_M], [0.0, row_step / MM_PER_M, 0.0]
         matrix = [across, [0.0, 0.0, -1.0, 0.0], [*down, row / MM_PER_M], [0.0, 0.0, 0.0, 1.0]]
     return {
+        **origin,
         "frame_id": frame_id,
         "height": picture["height"],
         "width": picture["width"],
@@ -131,8 +132,6 @@ def geometry_document(origin: Mapping[str, Any], frame_id: str) -> dict[str, Any
             "column_step": column_step,
             "row_step_mm": row_step,
         },
-        "probe": origin["probe"],
-        **{key: origin[key] for key in ("slice_thickness_mm", "scene", "scene_sha256", "renderer")},
     }
 
 

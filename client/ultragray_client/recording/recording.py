@@ -9,11 +9,9 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
 
-from ..contract import Display
 from ..errors import ExtraMissing, InvalidArgument
-from ..frames import Frame
+from ..frames import Frame, origin_of
 
 FRAME_TIME_NS = 40_000_000  # between frames without a time of their own, as in the files of jobs
 MAX_TIME_NS = 2**31 * 1_000_000_000  # the seconds of a stamp have 31 bits
@@ -103,27 +101,3 @@ class Recording:
                 self._file.close()
             self._temporary.unlink(missing_ok=True)
             raise
-
-
-def origin_of(frame: Frame) -> dict[str, Any]:
-    """The origin of a frame and its display, as the files of jobs have it."""
-    height, width = next(iter(frame.arrays.values())).shape
-    picture = frame.picture
-    return {
-        "scene": frame.scene,
-        "scene_sha256": frame.scene_sha256,
-        "renderer": frame.renderer,
-        "probe": asdict(frame.probe),
-        "slice_thickness_mm": frame.slice_thickness_mm,
-        "display": asdict(frame.display or Display()),
-        "picture": {
-            "height": height,
-            "width": width,
-            "column_unit": picture.column_unit,
-            "first": (picture.first_column, picture.first_row_mm),
-            "step": (picture.column_step, picture.row_step_mm),
-        },
-        **({} if frame.contact is None else {"contact": frame.contact.value}),
-        **({"tools": [asdict(tool) for tool in frame.tools]} if frame.tools else {}),
-        **({"ghost": frame.ghost} if frame.ghost else {}),
-    }

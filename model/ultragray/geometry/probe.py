@@ -204,11 +204,28 @@ class Picture:
     picture is flipped.
     """
 
-    height: int
-    width: int
-    column_unit: str
-    first: tuple[float, float]
-    step: tuple[float, float]
+    height: int = described("H.")
+    width: int = described("W.")
+    column_unit: str = described("mm or deg.", choices=("mm", "deg"))
+    first: tuple[float, float] = described("Column and row of the centre of pixel (0, 0).")
+    step: tuple[float, float] = described("To the next column and row.")
+
+    @property
+    def first_column(self) -> float:
+        """Centre of the first pixel, in the unit of the columns."""
+        return self.first[0]
+
+    @property
+    def first_row_mm(self) -> float:
+        return self.first[1]
+
+    @property
+    def column_step(self) -> float:
+        return self.step[0]
+
+    @property
+    def row_step_mm(self) -> float:
+        return self.step[1]
 
     @classmethod
     def over(cls, box: Box, pixel_mm: float) -> Picture:

@@ -150,6 +150,15 @@ UNCERTAINTY = _register(
 )
 
 
+OUTPUT_SCHEMA: dict[str, Any] = {  # JSON Schema of the name of an output
+    "type": "string",
+    "oneOf": [
+        {"const": output.name, "description": output.meaning, "x-numbers": output.is_numbers}
+        for output in OUTPUTS.values()
+    ],
+}
+
+
 def check_outputs(outputs: Sequence[str], *, field: str = "outputs") -> tuple[str, ...]:
     """`outputs` without repetitions, in the given order. Raises UnknownOutput for an unknown name or an empty list."""
     names = (outputs,) if isinstance(outputs, str) else tuple(outputs)

@@ -5,19 +5,20 @@ A request's settings are checked and completed once, by `resolved`; what comes a
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from dataclasses import MISSING, dataclass, fields
 from enum import Enum
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 import numpy as np
 
-from ultragray.contract import Contract, described
+from ultragray.contract import Contract, described, to_dict
 from ultragray.errors import InvalidArgument, InvalidImageSize, InvalidProbe, UnknownOutput
 from ultragray.geometry.image_size import MAX_IMAGE_SIDE, check_image_size
 from ultragray.geometry.probe import MAX_THICKNESS_MM, PLANE, ElevationBeam, Picture, Probe
 from ultragray.rendering.display import AS_RENDERED, Display
-from ultragray.rendering.outputs import OUTPUTS, check_available, check_outputs
+from ultragray.rendering.outputs import OUTPUT_SCHEMA, OUTPUTS, check_available, check_outputs
 from ultragray.rendering.tools import MAX_TOOLS, Tool
 from ultragray.scene.info import SceneInfo
 
@@ -138,12 +139,13 @@ class FrameSettings(Contract):
             outputs=self.outputs,
             encoding=encoding,
             display=self.display or AS_RENDERED,
-            min_confidence=self.min_confidence,
-            below_min_confidence=self.below_min_confidence,
-            contact=self.contact,
-            tools=self.tools or (),
-            ghost=self.ghost or 0.0,
+            **self._additions(),
         )
+
+    def _additions(self) -> dict[str, Any]:
+        """The additions that are asked for."""
+        given = {one.name: getattr(self, one.name, None) for one in fields(Additions)}
+        return {name: value for name, value in given.items() if value is not None}
 
 
 def registration_field() -> Any:
@@ -170,8 +172,25 @@ class RenderSettings(FrameSettings):
             )
 
 
+@dataclass(frozen=True, kw_only=True)
+class Additions:
+    """What a frame has only where it was asked for, as it was used."""
+
+    # A setting of frames that has a default of its own is a field here, of the name that it has in `FrameSettings`:
+    # so it comes into `Resolved`, and to all that frames are told by.
+
+    min_confidence: float | None = described("Below it the frame was refused, or masked; null: any.", None)
+    below_min_confidence: Below = described(
+        "mask: where the frame's confidence is below min_confidence, pixels without support are 0.", Below.REFUSE
+    )
+    contact: Contact | None = described("As used; null: it was assumed.", None)
+    tools: tuple[Tool, ...] = described("As used.", ())
+    ghost: float = described("As used; 0: none.", 0.0)
+    registration: str | None = described("That led the pose into the scene; null: none, it was sent as it is.", None)
+
+
 @dataclass(frozen=True)
-class Resolved:
+class Resolved(Additions):
     """Settings of a request for one scene, checked, with nothing left open."""
 
     probe: Probe
@@ -181,12 +200,6 @@ class Resolved:
     beam: ElevationBeam = PLANE
     encoding: Encoding = Encoding.UINT8
     display: Display = AS_RENDERED
-    min_confidence: float | None = None
-    below_min_confidence: Below = Below.REFUSE
-    contact: Contact | None = None
-    tools: tuple[Tool, ...] = ()
-    ghost: float = 0.0
-    registration: str | None = None  # that led the poses into the scene
 
     @cached_property
     def picture(self) -> Picture:
@@ -196,14 +209,69 @@ class Resolved:
     @cached_property
     def view(self) -> tuple[Any, ...]:
         """All that shows but outputs and encoding: frames that agree in this can be rendered together."""
-        asked = (self.display, self.min_confidence, self.below_min_confidence, self.contact)
-        return (self.probe, self.beam, self.height, self.width, *asked, self.tools, self.ghost)
+        return tuple(getattr(self, name) for name in _SHOWING)
 
     @property
     def pixels(self) -> int:
         """The number of pixels rendered or shown for one pose, whichever is more, over all outputs."""
         picture = self.picture
         return max(self.height * self.width, picture.height * picture.width) * len(self.outputs)
+
+
+_SHOWING = tuple(one.name for one in fields(Resolved) if one.name not in ("outputs", "encoding", "registration"))
+
+
+@dataclass(frozen=True, kw_only=True)
+class SettingsUsed(Additions):
+    """The settings of a frame, as used: with its scene and its pose all that is needed to render it again."""
+
+    probe: Probe = described("As used.")
+    slice_thickness_mm: float = described("As used: at the focus of the scene's beam; 0: a plane.")
+    rendered_height: int = described("Depth samples, before the display settings were applied.")
+    rendered_width: int = described("Scan lines, likewise.")
+    display: Display = described("As used.", AS_RENDERED)
+    height: int = described("H.")
+    width: int = described("W.")
+    picture: Picture = described("Where the pixels lie.")
+    outputs: tuple[str, ...] = described("In the order of the data.", schema={"items": OUTPUT_SCHEMA})
+    encoding: Encoding = described("Of the pixels.")
+
+    # Every door tells all of them, by one of these two, or by the codec of messages.
+
+    def document(self) -> dict[str, Any]:
+        """The settings as JSON holds them, but for additions that were not asked for."""
+        plain = {one.name: one.default for one in fields(Additions)}
+        told = (one.name for one in fields(self) if plain.get(one.name, MISSING) != getattr(self, one.name))
+        return {name: to_dict(getattr(self, name)) for name in told}
+
+    def texts(self) -> dict[str, str]:
+        """The same with a text for each: words and numbers as they are, lists of words with commas, else JSON."""
+        return {name: _text(value) for name, value in self.document().items()}
+
+
+@lru_cache(maxsize=256)
+def settings_used(settings: Resolved) -> SettingsUsed:
+    """The settings of a request, as its frames tell them."""
+    picture = settings.picture
+    return SettingsUsed(
+        probe=settings.probe,
+        slice_thickness_mm=settings.beam.thickness_mm,
+        rendered_height=settings.height,
+        rendered_width=settings.width,
+        display=settings.display,
+        height=picture.height,
+        width=picture.width,
+        picture=picture,
+        outputs=settings.outputs,
+        encoding=settings.encoding,
+        **{one.name: getattr(settings, one.name) for one in fields(Additions)},
+    )
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, list) and value and all(isinstance(one, str) for one in value):
+        return ",".join(value)
+    return value if isinstance(value, str) else json.dumps(value)
 
 
 def _check_encoding(encoding: Encoding, outputs: tuple[str, ...]) -> None:

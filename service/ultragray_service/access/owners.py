@@ -36,18 +36,8 @@ T = TypeVar("T")
 class Owners:
     """Knows whose datasets and scenes are without asking the database; those of other things stand with their rows."""
 
-    def __init__(
-        self,
-        kept_with_rows: Mapping[Kind, Callable[[str], Awaitable[Ownership]]],
-        find: Mapping[Kind, Callable[[str], object]],
-    ) -> None:
-        """`kept_with_rows`: reads the owner of a job or registration. Raises JobNotFound, RegistrationNotFound.
-
-        `find`: raises DatasetNotFound or SceneNotFound where there is no such thing; it blocks.
-        """
+    def __init__(self) -> None:
         self._known: dict[tuple[Kind, str], Ownership] = {}
-        self._kept_with_rows = kept_with_rows
-        self._find = find
         self._changing = threading.Lock()  # of the table and its copy, so that no older copy follows a newer one
         self._engine: sa.Engine | None = None
         self._threads: Executor | None = None
@@ -69,16 +59,6 @@ class Owners:
         """The datasets or scenes of an owner. May be called from any thread."""
         with self._changing:
             return [name for (one, name), whose in self._known.items() if one is kind and whose.owner == owner]
-
-    async def of(self, kind: Kind, name: str) -> Ownership:
-        """Whose something is. Raises JobNotFound, RegistrationNotFound."""
-        read = self._kept_with_rows.get(kind)
-        return self.known(kind, name) if read is None else await read(name)
-
-    async def require_existing(self, kind: Kind, name: str) -> None:
-        """Raises DatasetNotFound or SceneNotFound, also for what is hidden."""
-        if kind in self._find:
-            await asyncio.to_thread(self._find[kind], name)
 
     def hides(self, kind: Kind, name: str) -> bool:
         """Whether a dataset or scene is private to somebody else than who the running code works for."""
@@ -123,11 +103,7 @@ class Owners:
 
     @asynccontextmanager
     async def removing(self, kind: Kind, name: str) -> AsyncIterator[None]:
-        """Forgets whose the dataset or scene was that the body removes.
-
-        Raises DatasetNotFound, SceneNotFound, and DatabaseUnavailable.
-        """
-        await self.require_existing(kind, name)
+        """Forgets whose the dataset or scene was that the body removes. Raises DatabaseUnavailable."""
         ownership = await self._write(lambda connection: read_owner(connection, kind, name))
         yield
         await self.forget(kind, name, ownership)
@@ -189,9 +165,6 @@ def may_change(principal: Principal, ownership: Ownership) -> bool:
     return principal.role is Role.ADMIN or principal.name == ownership.owner
 
 
-# Whether a principal may do an operation on something.
-
-
 def require_role(principal: Principal, operation: Operation) -> None:
     """Raises PermissionDenied, which names the role."""
     if operation.role is not None and not principal.role.includes(operation.role):
@@ -200,20 +173,38 @@ def require_role(principal: Principal, operation: Operation) -> None:
         )
 
 
-async def require(principal: Principal, operation: Operation, name: str, owners: Owners) -> None:
-    """Raises PermissionDenied; JobNotFound for a job that is private to somebody else.
+class Permissions:
+    """Whether a principal may do an operation on something."""
 
-    Scenes and datasets that are private to somebody else are found by nobody else, see `Owners.hides`.
-    """
-    require_role(principal, operation)
-    if operation.about is None or principal.role is Role.ADMIN or not (operation.owned or operation.about is Kind.JOB):
-        return
-    ownership = await owners.of(operation.about, name)
-    if operation.about is Kind.JOB and not may_see(principal, ownership):
-        raise job_not_found(name)
-    if operation.owned and not may_change(principal, ownership):
-        await owners.require_existing(operation.about, name)
-        raise _not_own(operation, name, ownership.owner)
+    def __init__(
+        self,
+        owners: Owners,
+        kept_with_rows: Mapping[Kind, Callable[[str], Awaitable[Ownership]]],
+        find: Mapping[Kind, Callable[[str], object]],
+    ) -> None:
+        """`kept_with_rows`: reads the owner of a job or registration. Raises JobNotFound, RegistrationNotFound.
+
+        `find`: raises DatasetNotFound or SceneNotFound where there is no such thing; it blocks.
+        """
+        self._owners, self._kept_with_rows, self._find = owners, kept_with_rows, find
+
+    async def require(self, principal: Principal, operation: Operation, name: str) -> None:
+        """Raises PermissionDenied; JobNotFound for a job that is private to somebody else.
+
+        Scenes and datasets that are private to somebody else are found by nobody else, see `Owners.hides`.
+        """
+        require_role(principal, operation)
+        about = operation.about
+        if about is None or principal.role is Role.ADMIN or not (operation.owned or about is Kind.JOB):
+            return
+        read = self._kept_with_rows.get(about)
+        ownership = self._owners.known(about, name) if read is None else await read(name)
+        if about is Kind.JOB and not may_see(principal, ownership):
+            raise job_not_found(name)
+        if operation.owned and not may_change(principal, ownership):
+            if about in self._find:  # something that is not there, or hidden, is nobody's
+                await asyncio.to_thread(self._find[about], name)
+            raise _not_own(operation, name, ownership.owner)
 
 
 def _not_own(operation: Operation, name: str, owner: str | None) -> UltragrayError:

@@ -226,9 +226,6 @@ class _Commands(LazyGroup):
         Entry("convert", ".sweeps:convert_app", _SWEEPS, "Write a sweep in the layout of the released trainer."),
         Entry("train", ".train:command_app", _SWEEPS, "Train a scene from a tracked sweep."),
         Entry("eval", ".evaluate:command_app", _SWEEPS, "Measure a scene on the held-out frames of a sweep."),
-        Entry("compare", ".studies.compare:command_app", _SWEEPS, "Compare this and other methods on the same frames."),
-        Entry("report", ".studies.report:command_app", _SWEEPS, "Train, measure and compare; write one HTML page."),
-        Entry("bench", ".studies.bench:command_app", _SWEEPS, "Measure the kernel and the service on this machine."),
         Entry("scenes", ".remote.scenes:command_app", _REMOTE, "List, upload, download, delete and render scenes."),
         Entry(
             "datasets",

@@ -32,7 +32,6 @@ if TYPE_CHECKING:
     from ultragray.learn.evaluation.scoring import Evaluation, Reliability
     from ultragray.learn.sweep import Sweep
     from ultragray.scene.gaussians import GaussianScene
-    from ultragray_studies.comparison.result import Comparison
 
 
 command_app = command_group()
@@ -109,7 +108,7 @@ def evaluate(
     if output is not None:
         from ultragray.files import write_whole
         from ultragray.learn.evaluation.side_by_side import write_side_by_side
-        from ultragray.learn.report.plots import plot_reliability
+        from ultragray.learn.report.plots import plot_corrections, plot_reliability
 
         with working(f"drawing {len(frames)} pictures …"):
             paths = write_side_by_side(loaded, frames, evaluation.frames, output, backend=backend)
@@ -118,7 +117,7 @@ def evaluate(
             write_whole(paths[-1], plot_reliability(reliability))
         if (corrections := poses.get("pose_corrections")) is not None:
             paths.append(output / "pose_corrections.svg")
-            corrections.write_plot(paths[-1])
+            write_whole(paths[-1], plot_corrections(corrections.shift_mm, corrections.turn_deg))
         typer.echo(f"wrote {len(paths)} pictures into {output}", err=json)
 
 
@@ -167,40 +166,6 @@ def print_metrics(title: str, evaluations: Mapping[str, Evaluation]) -> None:
     scales = next(iter(evaluations.values())).ms_ssim_scales
     if scales < 5:
         console.print(f"MS-SSIM over {scales} of its 5 scales, which is what the image holds", style="dim")
-
-
-def print_comparison(comparison: Comparison) -> None:
-    """A table of the means of each method, its costs and its mean rank, and why a method has none."""
-    from rich.markup import escape
-    from rich.table import Table
-
-    from ultragray.learn.report.tables import METRICS, rank, shown_value
-    from ultragray_studies.comparison.tables import budget_text, steps_text
-
-    table = Table(box=None, pad_edge=False)
-    heads = ("", *(metric.label for metric in METRICS), "steps", "training, s", "frame, ms", "MB", "mean rank")
-    for place, head in enumerate(heads):
-        table.add_column(head, justify="right" if place else "left", no_wrap=True)
-    ranks = rank(comparison.measured)
-    for one in comparison.results:
-        if one.evaluation is not None:
-            means = one.evaluation.mean.to_dict()
-            table.add_row(
-                escape(one.title),
-                *(shown_value(metric.name, means[metric.name]) for metric in METRICS),
-                steps_text(one),
-                f"{one.seconds:,.1f}",
-                f"{one.frame_ms:,.1f}",
-                f"{one.model_bytes / 1e6:,.2f}",
-                f"{ranks[one.name].mean:.2f}",
-            )
-    console, facts = wide_console(), comparison.dataset
-    head = f"{facts.name}, {facts.val_frames} val frames, {comparison.machine}; budget: {budget_text(comparison)}"
-    console.print(head, highlight=False, markup=False, soft_wrap=True)
-    console.print(table)
-    for one in comparison.results:
-        if one.failure is not None:
-            console.print(f"{one.title} failed: {one.failure}", highlight=False, markup=False, soft_wrap=True)
 
 
 def print_speckle(evaluations: Mapping[str, Evaluation]) -> None:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import asyncio
+from collections.abc import Callable, Set
 from contextlib import suppress
 from dataclasses import dataclass, replace
 
 from ultragray.contract import described
 from ultragray.errors import DatasetInvalid
+from ultragray_service.access.owners import Owners
 from ultragray_service.core.scenes import page_of_names
-from ultragray_service.service import Service
 from ultragray_workers.datasets.store import DatasetRecord, DatasetStore
 from ultragray_workers.errors import DatasetNotFound
 from ultragray_workers.jobs.owners import Kind
@@ -23,33 +24,55 @@ class DatasetPage:
     next_page_token: str = described("Empty on the last page.")
 
 
-def with_owner(service: Service, record: DatasetRecord) -> DatasetRecord:
-    """A dataset, told with whose it is."""
-    ownership = service.owners.known(Kind.DATASET, record.name)
-    return replace(record, owner=ownership.owner, private=ownership.private)
+class Datasets:
+    """The datasets of the service, with whose they are."""
 
+    def __init__(self, store: DatasetStore, owners: Owners) -> None:
+        self._store, self._owners = store, owners
 
-async def dataset(service: Service, name: str) -> DatasetRecord:
-    """One dataset. Raises DatasetNotFound, DatasetInvalid."""
-    return with_owner(service, await asyncio.to_thread(service.datasets.get, name))
+    def with_owner(self, record: DatasetRecord) -> DatasetRecord:
+        """A dataset with whose it is."""
+        ownership = self._owners.known(Kind.DATASET, record.name)
+        return replace(record, owner=ownership.owner, private=ownership.private)
 
+    async def get(self, name: str) -> DatasetRecord:
+        """One dataset. Raises DatasetNotFound, DatasetInvalid."""
+        return self.with_owner(await asyncio.to_thread(self._store.get, name))
 
-async def dataset_page(service: Service, page_size: int, page_token: str) -> DatasetPage:
-    """The datasets of one page; those whose manifest is damaged are left out. Raises InvalidArgument."""
+    async def page(self, page_size: int, page_token: str) -> DatasetPage:
+        """The datasets of one page; those whose manifest is damaged are left out. Raises InvalidArgument."""
 
-    store = service.datasets
+        def read() -> DatasetPage:
+            names, next_page_token = page_of_names(self._store.shown_names(), page_size, page_token)
+            records = []
+            for name in names:
+                with suppress(DatasetNotFound, DatasetInvalid):
+                    records.append(self.with_owner(self._store.get(name)))
+            return DatasetPage(records, next_page_token)
 
-    def read() -> DatasetPage:
-        names, next_page_token = page_of_names(store.shown_names(), page_size, page_token)
-        records = []
-        for name in names:
-            with suppress(DatasetNotFound, DatasetInvalid):
-                records.append(with_owner(service, store.get(name)))
-        return DatasetPage(records, next_page_token)
+        return await asyncio.to_thread(read)
 
-    return await asyncio.to_thread(read)
+    async def contact_sheet(self, name: str) -> bytes:
+        """The PNG of a dataset. Raises DatasetNotFound."""
 
+        def read() -> bytes:
+            try:
+                return self._store.contact_sheet(name)
+            except FileNotFoundError:  # deleted a moment ago
+                raise DatasetNotFound(f"there is no dataset {name!r} any more", field="dataset") from None
 
-async def contact_sheet(store: DatasetStore, name: str) -> bytes:
-    """The PNG of a dataset. Raises DatasetNotFound."""
-    return await asyncio.to_thread(store.contact_sheet, name)
+        return await asyncio.to_thread(read)
+
+    async def delete(self, name: str, in_use: Callable[[str], str | None]) -> str | None:
+        """Deletes a dataset; its SHA-256, if no other one has the same content.
+
+        Raises DatasetNotFound, and DatasetInUse where `in_use` names in words who needs it.
+        """
+        deleted = (await asyncio.to_thread(self._store.get, name)).sha256
+        async with self._owners.removing(Kind.DATASET, name):
+            await asyncio.to_thread(self._store.delete, name, in_use)
+        return None if deleted in await self.contents() else deleted
+
+    async def contents(self) -> Set[str]:
+        """The SHA-256 of all that there are."""
+        return (await asyncio.to_thread(self._store.names_by_content)).keys()

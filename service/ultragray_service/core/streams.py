@@ -15,8 +15,7 @@ from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.settings import RenderSettings
 from ultragray_service.core.open_streams import Answered, OpenStream
-from ultragray_service.core.rendering import Plan
-from ultragray_service.service import Service
+from ultragray_service.core.rendering import Plan, Rendering
 from ultragray_workers.errors import Draining
 from ultragray_workers.pool.messages import Destination, RenderResult
 from ultragray_workers.pool.waiting import Turn
@@ -120,11 +119,11 @@ class _Window:
 class PoseStream:
     """One stream of one client."""
 
-    def __init__(self, service: Service, noted: OpenStream | None = None) -> None:
+    def __init__(self, rendering: Rendering, noted: OpenStream | None = None) -> None:
         """`noted`: where others may see what is asked and answered."""
         self.mode = StreamMode.ORDERED  # to be set before the first pose, likewise:
         self.destination: Destination | None = None  # of its frames
-        self._service = service
+        self._rendering = rendering
         self._noted = noted or OpenStream()
         self._room = _Room()
         self._answers: asyncio.Queue[_Underway | None] = asyncio.Queue()
@@ -147,9 +146,9 @@ class PoseStream:
         """
         reader = asyncio.ensure_future(self._read(read))
         writer = asyncio.ensure_future(self._write(send, hand_over))
-        stopping = asyncio.ensure_future(self._service.draining.wait())
+        stopping = asyncio.ensure_future(self._rendering.life.draining.wait())
         stopping.add_done_callback(partial(_cancel, reader))
-        self._service.metrics.count_stream(+1)
+        self._rendering.metrics.count_stream(+1)
         try:
             await asyncio.wait({reader, writer}, return_when=asyncio.FIRST_EXCEPTION)
             if reader.done() and not reader.cancelled():
@@ -158,10 +157,10 @@ class PoseStream:
                 reader.result()
             if writer.done() and not writer.cancelled():
                 writer.result()
-            if self._service.draining.is_set():
+            if self._rendering.life.draining.is_set():
                 raise Draining("the service is stopping; the frames in flight have been answered")
         finally:
-            self._service.metrics.count_stream(-1)
+            self._rendering.metrics.count_stream(-1)
             tasks = [reader, writer, stopping, *self._started]
             for task in tasks:
                 task.cancel()
@@ -202,7 +201,7 @@ class PoseStream:
         async def refusal() -> Answered:
             return Answered(sequence, client_time, error)
 
-        self._service.metrics.count_frame_error(error)
+        self._rendering.metrics.count_frame_error(error)
         await self._room.enter(0)
         self._start(refusal(), sent=partial(self._room.leave, 0))
 
@@ -233,11 +232,11 @@ class PoseStream:
         return Answered(asked.sequence, asked.client_time, await self._outcome(self._rendered(asked)))
 
     async def _rendered(self, asked: Asked) -> RenderResult:
-        await self._service.limits.frame_turn(asked.deadline)
+        await self._rendering.limits.frame_turn(asked.deadline)
         return await self._render(asked, Turn())
 
     async def _render(self, asked: Asked, turn: Turn) -> RenderResult:
-        return await self._service.render(
+        return await self._rendering.render(
             asked.plan, asked.pose[None], deadline=asked.deadline, turn=turn, destination=self.destination
         )
 
@@ -248,7 +247,7 @@ class PoseStream:
             outcome = error
         except Exception as error:
             outcome = unexpected(error)
-        self._service.metrics.count_frame_error(outcome)
+        self._rendering.metrics.count_frame_error(outcome)
         return outcome
 
     def _take_over(self, asked: Asked) -> bool:
@@ -284,7 +283,7 @@ class PoseStream:
     async def _rendered_latest(self) -> RenderResult:
         self._is_waiting = True
         try:
-            await self._service.limits.frame_turn(None)  # meanwhile newer poses, with later deadlines, may come
+            await self._rendering.limits.frame_turn(None)  # meanwhile newer poses, with later deadlines, may come
         finally:
             self._is_waiting = False
         assert self._current is not None
@@ -296,7 +295,7 @@ class PoseStream:
 
     def _count_dropped(self) -> None:
         self._dropped += 1
-        self._service.metrics.count_dropped()
+        self._rendering.metrics.count_dropped()
 
 
 def unexpected(error: Exception) -> UltragrayError:
@@ -376,16 +375,16 @@ class FrameStream:
 
     def __init__(
         self,
-        service: Service,
+        rendering: Rendering,
         transport: Transport,
         unset: SceneSettings | None = None,
         noted: OpenStream | None = None,
     ) -> None:
-        self._service = service
+        self._rendering = rendering
         self._transport = transport
         self._unset = unset
         self._plan: Plan | None = None
-        self._poses = PoseStream(service, noted)
+        self._poses = PoseStream(rendering, noted)
 
     async def run(self) -> None:
         """Answers until the client has sent its last message and got its last frame.
@@ -424,7 +423,7 @@ class FrameStream:
             if self._unset is None:
                 raise InvalidArgument("settings must be given, and accepted, before the first pose", field="settings")
             self._plan = await self._resolve(self._unset)
-        pose, deadline = self._plan.placed(message.pose()), self._service.planner.deadline(message.timeout_s())
+        pose, deadline = self._plan.placed(message.pose()), self._rendering.planner.deadline(message.timeout_s())
         return Asked(message.sequence, message.client_time, self._plan, pose, deadline)
 
     async def _change_settings(self, message: Message) -> None:
@@ -437,7 +436,7 @@ class FrameStream:
 
     async def _resolve(self, settings: SceneSettings) -> Plan:
         scene, asked = settings
-        return await self._service.planner.plan(
+        return await self._rendering.planner.plan(
             scene, asked, asked.encoding, path="settings", registration=asked.registration
         )
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
 from contextvars import copy_context
 from datetime import datetime, time, timedelta, timezone
@@ -85,9 +85,9 @@ class Room:
 class Holdings:
     """What whoever the running code works for has, and whether there may be more."""
 
-    def __init__(self, limits: Limits, owners: Owners, datasets: DatasetStore, scenes: SceneStore, jobs: Jobs) -> None:
+    def __init__(self, limits: Limits, owners: Owners, datasets: DatasetStore, scenes: SceneStore) -> None:
         self._limits, self._owners = limits, owners
-        self._datasets, self._scenes, self._jobs = datasets, scenes, jobs
+        self._datasets, self._scenes = datasets, scenes
 
     def admit_job(self, jobs: JobStore) -> int | None:
         """How many jobs may run at once; None: any number. Blocks. Raises LimitReached where there may be no more."""
@@ -114,11 +114,11 @@ class Holdings:
         self._left_bytes(jobs)
         return mine.running_jobs
 
-    async def room(self) -> Room:
+    async def room(self, jobs: Jobs) -> Room:
         """The room for an upload. Raises LimitReached where there is none."""
         if self._limits.mine.stored_gb is None:
             return Room(self._limits, None)
-        return Room(self._limits, await self._jobs.do(self._left_bytes))
+        return Room(self._limits, await jobs.do(self._left_bytes))
 
     def _left_bytes(self, jobs: JobStore) -> int | None:
         """The bytes that there may still be; None: any number. Raises LimitReached where there may be none."""
@@ -169,11 +169,13 @@ class DatasetUploads:
         self,
         store: DatasetStore,
         settings: Settings,
+        jobs: Jobs,
         draining: asyncio.Event,
         checks: HelperProcesses,
         owners: Owners,
         holdings: Holdings,
     ) -> None:
+        self._jobs = jobs
         self._store = store
         self._holdings = holdings
         self._owners = owners
@@ -196,7 +198,7 @@ class DatasetUploads:
         with self._slots.one():
             stopping: asyncio.Future[Any] = asyncio.ensure_future(self._draining.wait())
             try:
-                room, most = await self._holdings.room(), self._settings.max_dataset_bytes
+                room, most = await self._holdings.room(self._jobs), self._settings.max_dataset_bytes
                 incoming = await asyncio.to_thread(IncomingDataset, self._store, room.at_most(most))
                 claim = Claim(self._owners, Kind.DATASET, name, incoming.folder.name, private=private)
                 upload = DatasetUpload(
@@ -330,15 +332,15 @@ class SceneImports:
         store: SceneStore,
         shelf: Shelf,
         settings: Settings,
-        maker_of: Callable[[str], Awaitable[str | None]],
+        jobs: Jobs,
         checks: HelperProcesses,
         owners: Owners,
         holdings: Holdings,
     ) -> None:
-        """`shelf`: of the store, for what is imported; `maker_of`: the job that makes a scene, in words; or None."""
+        """`shelf`: of the store, for what is imported."""
         self._store = store
         self._settings = settings
-        self._maker_of = maker_of
+        self._jobs = jobs
         self._checks = checks
         self._owners = owners
         self._holdings = holdings
@@ -357,7 +359,7 @@ class SceneImports:
         with self._slots.one():
             claim = contextlib.ExitStack()
             try:
-                room, most = await self._holdings.room(), self._settings.max_dataset_bytes
+                room, most = await self._holdings.room(self._jobs), self._settings.max_dataset_bytes
                 with storage_full("the scene"), room.to_blame(most):
                     folder = await to_its_end(lambda: claim.enter_context(self._shelf.making()))
                     received = folder / f"{name}{SUFFIX}"
@@ -393,12 +395,9 @@ class SceneImports:
 
     async def delete(self, name: str) -> None:
         """Removes the file of a scene. Raises SceneNotFound, and SceneReadOnly for one of the data folder."""
+        await asyncio.to_thread(self._store.require, name)
         async with self._owners.removing(Kind.SCENE, name):
             await asyncio.to_thread(self._delete, name)
-
-    async def removable(self) -> set[str]:
-        """The names of the scenes that `delete` removes."""
-        return await asyncio.to_thread(self._store.names_of, self._shelf)
 
     async def remove_stale(self) -> None:
         """Removes what services that died during an import left."""
@@ -427,14 +426,14 @@ class SceneImports:
         """Whether the scene of a claim is there, or is being made: in this order it is not missed."""
         if claim is not None and await asyncio.to_thread(self._shelf.is_making, claim):
             return True
-        if await self._maker_of(name) is not None:
+        if await self._jobs.makes_scene(name) is not None:
             return True
         return await asyncio.to_thread(self._store.shelf_of, name) is not None
 
     async def _require_free(self, name: str) -> None:
         if await asyncio.to_thread(self._store.shelf_of, name) is not None:
             raise await asyncio.to_thread(self._exists, name)
-        if (maker := await self._maker_of(name)) is not None:
+        if (maker := await self._jobs.makes_scene(name)) is not None:
             raise SceneExists(f"{maker} makes a scene {name!r}: choose another name", field="scene")
 
     def _exists(self, name: str) -> SceneExists:

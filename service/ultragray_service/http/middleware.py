@@ -153,7 +153,9 @@ class Authorize:
             credential = offered_credential(headers.getlist("authorization"), keys)
             principal = service.guard.authenticate(credential)
         connection = f"{address}:{port}"
-        async with service.permitted(principal, credential, operation, target, address=address, connection=connection):
+        async with service.admission.permitted(
+            principal, credential, operation, target, address=address, connection=connection
+        ):
             await self._app(scope, receive, send)
 
 

@@ -175,7 +175,7 @@ class Connection:
         elif message.type_name == "GET_CAPABIL":
             await self._send(_reply("CAPABILITY", message, pack_capability(CAPABILITY)))
         elif message.type_name == "GET_STATUS":
-            self._service.require_frames()
+            self._service.rendering.require_frames()
             await self._send(_reply("STATUS", message, pack_status(Status(OK, 0, "OK", "ready"))))
         elif prefix == "GET_":
             await self._send(self._newest_frame(KINDS[suffix], message))

@@ -6,19 +6,17 @@ import asyncio
 import contextlib
 import json
 import time
-from collections.abc import Awaitable, Callable
+from collections.abc import Awaitable, Callable, Mapping
 from contextlib import AbstractAsyncContextManager
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
 
 import numpy as np
 
-from ultragray.contract import to_dict
 from ultragray.geometry.probe import FloatArray
 from ultragray.geometry.registration import Registration
-from ultragray.rendering.display import Display, true_to_scale
-from ultragray.rendering.settings import Encoding, Resolved
-from ultragray.rendering.tools import Tool
+from ultragray.rendering.display import true_to_scale
+from ultragray.rendering.settings import Encoding, Resolved, settings_used
 from ultragray_service.igtl.commands import Scanner, Setup
 from ultragray_service.igtl.contents import (
     Image,
@@ -172,8 +170,7 @@ class Frame:
             "scene": result.scene,
             "scene_sha256": result.scene_sha256,
             "renderer": result.renderer,
-            "slice_thickness_mm": repr(result.settings.beam.thickness_mm),
-            "display": _text(result.settings.display),
+            **_settings_texts(result.settings),
             **self._placing(),
             "replaced_poses": str(self.posed.replaced),
             **{name: f"{value:.3f}" for name, value in asdict(result.extrapolations[0]).items() if value is not None},
@@ -182,14 +179,15 @@ class Frame:
         }
 
     def _placing(self) -> dict[str, str]:
-        """What the frame can be rendered again with, beside its pose, where there is any."""
-        settings, found = self.result.settings, {}
-        if settings.registration is not None:
-            found["registration"] = settings.registration
-            found["probe_to_scene"] = json.dumps(self.result.poses[0].tolist(), separators=(",", ":"))
-        if settings.tools:
-            found["tools"] = f"[{','.join(map(_text, settings.tools))}]"
-        return found
+        """The pose in the scene, where a registration led there."""
+        is_led = self.result.settings.registration is not None
+        return {"probe_to_scene": json.dumps(self.result.poses[0].tolist(), separators=(",", ":"))} if is_led else {}
+
+
+@lru_cache(maxsize=256)
+def _settings_texts(settings: Resolved) -> Mapping[str, str]:
+    """The part of the metadata that is the same for all frames of a device, until the scanner is set anew."""
+    return settings_used(settings).texts()
 
 
 class FrameMaker:
@@ -206,7 +204,7 @@ class FrameMaker:
 
         Raises SceneNotFound, RegistrationNotFound, and what RequestPlanner.plan and Service.render raise.
         """
-        self._service.require_serving()
+        self._service.life.require_serving()
         scene = await self._scenes.choose(underway.posed.message.device_name)
         ownership = self._service.owners.known(Kind.SCENE, scene)
         setup, found = self._scanner.setup, None
@@ -220,7 +218,7 @@ class FrameMaker:
 
         planner = self._service.planner
         plan = await planner.plan(scene, asked, Encoding.UINT8, complete=complete)
-        result = await self._service.render(
+        result = await self._service.rendering.render(
             plan, underway.pose[None], deadline=planner.deadline(None), turn=underway.turn
         )
         return Frame(underway.posed, result, image_of(result, found), ownership, found)
@@ -229,12 +227,6 @@ class FrameMaker:
         side = self._service.settings.max_image_side
         pixel_mm = true_to_scale(settings.probe, settings.height, side).pixel_mm
         return replace(settings, display=replace(settings.display, pixel_mm=pixel_mm))
-
-
-@lru_cache(maxsize=256)
-def _text(part: Display | Tool) -> str:
-    """A part of the settings as JSON."""
-    return json.dumps(to_dict(part, with_none=False), separators=(",", ":"))
 
 
 def image_of(result: RenderResult, registration: Registration | None = None) -> Image:

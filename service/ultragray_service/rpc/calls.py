@@ -175,7 +175,7 @@ class CallContext(grpc.aio.ServerInterceptor):  # type: ignore[misc]
 
         async def call(request: Any, context: Any) -> Any:
             peer, target = context.peer(), name_in(request, operation)
-            async with service.permitted(
+            async with service.admission.permitted(
                 principal, credential, operation, target, address=address_of(peer), connection=peer
             ):
                 return await method(request, context)

@@ -168,7 +168,7 @@ class RenderService:
             raise InvalidArgument("pose is required", field="pose")
         pose = plan.placed(read_pose(request.pose, "pose"))
         await self._service.limits.take_frames(1, deadline)
-        result = await self._service.render(plan, pose[None], deadline=deadline, begin_by=begin_by)
+        result = await self._service.rendering.render(plan, pose[None], deadline=deadline, begin_by=begin_by)
         return frame_message(result, 0)
 
     async def RenderBatch(  # noqa: N802
@@ -208,7 +208,7 @@ class RenderService:
         name = told.get(_STREAM_NAME) or told.get("user-agent", "")
         streams = self._service.streams
         with self._service.limits.stream(), streams.opened("grpc", name) as noted, CallTransport(context) as transport:
-            await FrameStream(self._service, transport, noted=noted).run()
+            await FrameStream(self._service.rendering, transport, noted=noted).run()
 
     async def AssessPoses(  # noqa: N802
         self, request: rendering_pb2.AssessPosesRequest, context: grpc.aio.ServicerContext
@@ -229,7 +229,7 @@ class RenderService:
             asked = read(request.slice, SliceSettings)
         plan = await self._service.planner.plan_slice(request.scene, asked, asked.numbers, path="slice")
         await self._service.limits.take_frames(1, deadline)
-        result = await self._service.render(plan, asked.pose()[None], deadline=deadline)
+        result = await self._service.rendering.render(plan, asked.pose()[None], deadline=deadline)
         return slice_message(result)
 
     async def Localize(  # noqa: N802
@@ -245,7 +245,7 @@ class RenderService:
         start = read_pose(request.start, "start")
         sought = sought_frame(request.image, height, width, asked)
         registration = request.registration if request.HasField("registration") else None
-        found = await locate(self._service, request.scene, sought, start, deadline, registration)
+        found = await locate(self._service.rendering, request.scene, sought, start, deadline, registration)
         return to_message(found, rendering_pb2.LocalizeResponse)
 
     async def _plan(self, request: rendering_pb2.RenderRequest | rendering_pb2.RenderBatchRequest) -> Plan:
@@ -269,7 +269,7 @@ class RenderService:
 
     async def _render(self, plan: Plan, pose: FloatArray, deadline: float) -> RenderResult:
         """Renders a frame of a batch."""
-        return await self._service.render(plan, pose, priority=Priority.BATCH, deadline=deadline)
+        return await self._service.rendering.render(plan, pose, priority=Priority.BATCH, deadline=deadline)
 
     async def _render_when_room(self, plan: Plan, pose: FloatArray, deadline: float) -> RenderResult:
         """Renders a frame of a batch that was let in already: a full queue delays it."""

@@ -23,12 +23,9 @@ from ultragray_proto.v1 import (
     workers_pb2,
 )
 from ultragray_service.access.principals import me
-from ultragray_service.core import scenes
-from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE
-from ultragray_service.core.datasets import contact_sheet, dataset, dataset_page, with_owner
 from ultragray_service.core.jobs.estimates import estimate
 from ultragray_service.core.jobs.log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
-from ultragray_service.core.scenes import SceneLoaded
+from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE
 from ultragray_service.core.uploads import DatasetUpload
 from ultragray_service.rpc.messages import job_message, read, read_specification, read_word
 from ultragray_service.service import Service
@@ -47,24 +44,24 @@ class SceneService:
     async def ListScenes(  # noqa: N802
         self, request: scenes_pb2.ListScenesRequest, context: grpc.aio.ServicerContext
     ) -> scenes_pb2.ListScenesResponse:
-        page = await scenes.scene_page(self._service, request.page_size or DEFAULT_PAGE_SIZE, request.page_token)
+        page = await self._service.scenes.page(request.page_size or DEFAULT_PAGE_SIZE, request.page_token)
         return to_message(page, scenes_pb2.ListScenesResponse)
 
     async def GetScene(  # noqa: N802
         self, request: scenes_pb2.GetSceneRequest, context: grpc.aio.ServicerContext
     ) -> scenes_pb2.Scene:
-        return to_message(await scenes.scene(self._service, request.scene), scenes_pb2.Scene)
+        return to_message(await self._service.scenes.get(request.scene), scenes_pb2.Scene)
 
     async def LoadScene(  # noqa: N802
         self, request: scenes_pb2.LoadSceneRequest, context: grpc.aio.ServicerContext
     ) -> scenes_pb2.LoadSceneResponse:
-        loaded = SceneLoaded.of(request.scene, await self._service.load(request.scene))
+        loaded = await self._service.scenes.load(request.scene)
         return to_message(loaded, scenes_pb2.LoadSceneResponse)
 
     async def UnloadScene(  # noqa: N802
         self, request: scenes_pb2.UnloadSceneRequest, context: grpc.aio.ServicerContext
     ) -> scenes_pb2.UnloadSceneResponse:
-        loaded = SceneLoaded.of(request.scene, await self._service.unload(request.scene))
+        loaded = await self._service.scenes.unload(request.scene)
         return to_message(loaded, scenes_pb2.UnloadSceneResponse)
 
 
@@ -80,7 +77,7 @@ class DatasetService:
     async def UploadDataset(  # noqa: N802
         self, requests: object, context: grpc.aio.ServicerContext
     ) -> datasets_pb2.UploadDatasetResponse:
-        self._service.require_serving()
+        self._service.life.require_serving()
         first = await context.read()
         if first is grpc.aio.EOF or first.WhichOneof("part") != "header":
             raise InvalidArgument("the first message must hold the header", field="header")
@@ -91,25 +88,25 @@ class DatasetService:
                 await upload.begin_archive()
             await _receive(context, upload, archive=header.archive)
             record, is_new = await upload.finish()
-        told = to_message(with_owner(self._service, record), datasets_pb2.Dataset)
+        told = to_message(self._service.datasets.with_owner(record), datasets_pb2.Dataset)
         return datasets_pb2.UploadDatasetResponse(dataset=told, created=is_new)
 
     async def ListDatasets(  # noqa: N802
         self, request: datasets_pb2.ListDatasetsRequest, context: grpc.aio.ServicerContext
     ) -> datasets_pb2.ListDatasetsResponse:
         page_size = request.page_size or DEFAULT_PAGE_SIZE
-        page = await dataset_page(self._service, page_size, request.page_token)
+        page = await self._service.datasets.page(page_size, request.page_token)
         return to_message(page, datasets_pb2.ListDatasetsResponse)
 
     async def GetDataset(  # noqa: N802
         self, request: datasets_pb2.GetDatasetRequest, context: grpc.aio.ServicerContext
     ) -> datasets_pb2.Dataset:
-        return to_message(await dataset(self._service, request.dataset), datasets_pb2.Dataset)
+        return to_message(await self._service.datasets.get(request.dataset), datasets_pb2.Dataset)
 
     async def GetContactSheet(  # noqa: N802
         self, request: datasets_pb2.GetContactSheetRequest, context: grpc.aio.ServicerContext
     ) -> datasets_pb2.GetContactSheetResponse:
-        return datasets_pb2.GetContactSheetResponse(png=await contact_sheet(self._service.datasets, request.dataset))
+        return datasets_pb2.GetContactSheetResponse(png=await self._service.datasets.contact_sheet(request.dataset))
 
     async def DeleteDataset(  # noqa: N802
         self, request: datasets_pb2.DeleteDatasetRequest, context: grpc.aio.ServicerContext
@@ -146,7 +143,7 @@ class JobService:
     async def SubmitJob(  # noqa: N802
         self, request: jobs_pb2.SubmitJobRequest, context: grpc.aio.ServicerContext
     ) -> jobs_pb2.SubmitJobResponse:
-        self._service.require_serving()
+        self._service.life.require_serving()
         specification, field = await asyncio.to_thread(read_specification, request)  # of many poses
         job, is_new = await self._service.jobs.submit(
             specification,
@@ -160,9 +157,9 @@ class JobService:
     async def EstimateJob(  # noqa: N802
         self, request: jobs_pb2.SubmitJobRequest, context: grpc.aio.ServicerContext
     ) -> jobs_pb2.JobEstimate:
-        self._service.require_serving()
+        self._service.life.require_serving()
         specification, field = await asyncio.to_thread(read_specification, request)
-        found = await estimate(self._service, specification, field=field)
+        found = await estimate(self._service.rendering, specification, field=field)
         poses = [geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=pose)) for pose in found.poses]
         return to_message(replace(found, poses=[]), jobs_pb2.JobEstimate, poses=poses)
 
@@ -191,7 +188,7 @@ class JobService:
     async def RetryJob(  # noqa: N802
         self, request: jobs_pb2.RetryJobRequest, context: grpc.aio.ServicerContext
     ) -> jobs_pb2.Job:
-        self._service.require_serving()
+        self._service.life.require_serving()
         job, _ = await self._service.jobs.retry(request.job)
         return job_message(job)
 
@@ -226,7 +223,7 @@ class JobService:
     async def WatchJob(  # noqa: N802
         self, request: jobs_pb2.WatchJobRequest, context: grpc.aio.ServicerContext
     ) -> None:
-        self._service.require_serving()
+        self._service.life.require_serving()
         watch = await self._service.jobs.hub.watch(request.job)
         try:
             while (change := await watch.next(_LOOK_AROUND_S)) is not None:

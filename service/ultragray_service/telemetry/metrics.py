@@ -20,7 +20,6 @@ from prometheus_client.registry import Collector
 from ultragray.contract import described
 from ultragray.errors import UltragrayError
 from ultragray_service.access.principals import acting
-from ultragray_service.core.scenes import ScenePlaces
 from ultragray_service.errors import statuses_of
 from ultragray_workers.jobs.store import JobsOverview
 from ultragray_workers.pool.messages import LocalizeResult, RenderResult
@@ -230,27 +229,6 @@ class _JobsCollector(Collector):
         yield GaugeMetricFamily("ultragray_unfit_jobs", unfit, now.unfit)
 
 
-class _ScenesCollector(Collector):
-    """The cache of scenes, and the buckets that they come from; nothing where all are in folders."""
-
-    def __init__(self, places: ScenePlaces) -> None:
-        self._places = places
-
-    def collect(self) -> Iterator[Metric]:
-        buckets, counts = self._places.buckets, self._places.cache.counts
-        counter, gauge = CounterMetricFamily, GaugeMetricFamily
-        yield counter("ultragray_scene_cache_hits", "Requests whose scene was cached.", counts.hits)
-        yield counter("ultragray_scene_cache_misses", "Scenes that were fetched from a bucket.", counts.misses)
-        yield counter("ultragray_scene_cache_fetched_bytes", "Bytes of those.", counts.fetched_bytes)
-        yield counter("ultragray_scene_cache_fetch_seconds", "Time that their fetches took in all.", counts.fetch_s)
-        held = self._places.cache.held_bytes() if buckets else 0
-        yield gauge("ultragray_scene_cache_bytes", "Bytes that the cache of this host holds.", held)
-        errors = sum(one.index.unavailable_total for one in buckets)
-        yield counter("ultragray_scene_list_errors", "Times that a bucket did not tell its scenes.", errors)
-        age = max((one.index.age_s for one in buckets), default=0.0)
-        yield gauge("ultragray_scene_list_age_seconds", "Age of the oldest list of the scenes of a bucket.", age)
-
-
 def _role() -> str:
     """The role of who asks."""
     try:
@@ -260,9 +238,9 @@ def _role() -> str:
 
 
 class Metrics:
-    """One registry per service. `jobs`: the jobs in numbers, as they were counted last."""
+    """One registry per service."""
 
-    def __init__(self, pool: RenderPool, jobs: Callable[[], JobsOverview], scenes: ScenePlaces) -> None:
+    def __init__(self) -> None:
         self.registry = CollectorRegistry()
         self.statistics = Statistics()
         counter = partial(Counter, registry=self.registry)
@@ -302,10 +280,12 @@ class Metrics:
             "ultragray_searches", "Frames looked for in a scene, and whether they were found.", ["scene", "found"]
         )
         self._search = seconds("ultragray_search_seconds", "Time that looking for a frame took, without its wait.")
-        self.registry.register(_PoolCollector(pool))
-        self.registry.register(_JobsCollector(jobs))
-        self.registry.register(_ScenesCollector(scenes))
         ProcessCollector(registry=self.registry)
+
+    def read(self, pool: RenderPool, jobs: Callable[[], JobsOverview], scenes: Collector) -> None:
+        """From now on each scrape reads these, too. `jobs`: in numbers, as they were counted last."""
+        for collector in (_PoolCollector(pool), _JobsCollector(jobs), scenes):
+            self.registry.register(collector)
 
     def tell_certificate_expiry(self, not_after: Callable[[], datetime]) -> None:
         """The end of the certificate in use, which is asked for at each scrape."""

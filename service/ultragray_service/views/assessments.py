@@ -9,8 +9,8 @@ from ultragray.contract import described
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.scene.confidence import Assessor, Extrapolation
 from ultragray.scene.info import SceneHeader
-from ultragray_service.core.scenes import SceneCatalog
 from ultragray_service.core.registrations import Registrations
+from ultragray_service.core.scenes import SceneCatalog
 
 
 @dataclass(frozen=True)

@@ -11,10 +11,9 @@ from ultragray.learn.localization.settings import LocalizationSettings
 from ultragray.rendering.settings import Encoding, FrameSettings
 from ultragray_service.access.audit import account
 from ultragray_service.access.principals import caller
-from ultragray_service.core.scenes import scene_to_blame
 from ultragray_service.core.poses import MatrixRows
-from ultragray_service.core.rendering import Plan
-from ultragray_service.service import Service
+from ultragray_service.core.rendering import Plan, Rendering
+from ultragray_service.core.scenes import scene_to_blame
 from ultragray_workers.pool.messages import LocalizeResult, Priority, RenderRequest, SceneChangedError, Sought
 from ultragray_workers.pool.pool import MAX_SCENE_CHANGES
 
@@ -78,7 +77,7 @@ def sought_frame(image: bytes, height: int | None, width: int | None, settings: 
 
 
 async def locate(
-    service: Service,
+    rendering: Rendering,
     scene: str,
     sought: Sought,
     start: FloatArray,  # [4, 4] mm, exact
@@ -92,12 +91,12 @@ async def locate(
     It waits behind frames of interactive callers. Cancelling ends it. Raises what RenderPool.localize and
     RequestPlanner.plan raise, and RateLimited.
     """
-    service.require_serving()
+    rendering.life.require_serving()
     account().target = scene
-    plan = await service.planner.plan(
+    plan = await rendering.planner.plan(
         scene, FrameSettings(probe=sought.settings.probe), Encoding.UINT8, registration=registration
     )
-    await service.limits.take_frames(FRAMES_OF_A_SEARCH, deadline)
+    await rendering.limits.take_frames(FRAMES_OF_A_SEARCH, deadline)
     for _ in range(MAX_SCENE_CHANGES):
         asked = RenderRequest(
             plan.scene,
@@ -111,10 +110,10 @@ async def locate(
         )
         try:
             with scene_to_blame():
-                result = await service.pool.localize(asked)
+                result = await rendering.pool.localize(asked)
         except SceneChangedError:
             await plan.renew()
         else:
-            service.metrics.observe_search(result)
+            rendering.metrics.observe_search(result)
             return Located.of(result, plan)
     raise RenderFailed(f"scene {plan.scene!r} kept changing while the frame was looked for", field="scene")

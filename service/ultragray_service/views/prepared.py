@@ -28,9 +28,9 @@ from ultragray.files import sync
 from ultragray.phantom.demo import DEMO_FILE
 from ultragray.rendering.settings import Encoding
 from ultragray.scene.info import read_header
-from ultragray_service.core.scenes import SceneCatalog
 from ultragray_service.core.jobs.jobs import Jobs
 from ultragray_service.core.poses import MatrixRows
+from ultragray_service.core.scenes import SceneCatalog
 from ultragray_service.core.threads import HelperProcesses, in_own_thread, to_its_end
 from ultragray_service.settings import Settings
 from ultragray_workers.claims import claimed_folder, remove_abandoned, remove_whole, storage_full

@@ -8,26 +8,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from jinja2 import ChoiceLoader, Environment, PackageLoader, StrictUndefined
 
 from ultragray.files import write_whole
-from ultragray.installation import __version__
 from ultragray.learn.evaluation.scoring import Evaluation
-from ultragray.learn.evaluation.side_by_side import DIFFERENCE_GAIN
-from ultragray.learn.report.pictures import FrameOfPage, Shown, frames_of_page, telling_places
-from ultragray.learn.report.plots import plot_distances
-from ultragray.learn.report.tables import METRICS, by_mean_rank, rank
+from ultragray.learn.report.page import FrameOfPage, Shown, environment, frames_of_page, telling_places
+from ultragray.learn.report.tables import Row, by_mean_rank, metric_rows, rank, rank_rows, speckle_rows
 from ultragray.learn.sweep import Dataset
 from ultragray_studies.comparison.place import frames_of
+from ultragray_studies.comparison.plots import plot_distances
 from ultragray_studies.comparison.result import RESULT_FILE, Comparison, MethodResult
 from ultragray_studies.comparison.tables import (
-    Row,
     budget_text,
     cost_texts,
     latex_table,
-    metric_rows,
-    rank_rows,
-    speckle_rows,
     steps_text,
 )
 from ultragray_studies.methods.gaussians import SceneMethod
@@ -51,7 +44,7 @@ def render_comparison(comparison: Comparison, dataset: Dataset, folder: Path) ->
     by_title = {titles[one.name]: one for one in comparison.results}
     evaluations = {titles[name]: comparison.measured[name] for name in by_mean_rank(comparison.measured)}
     return (
-        environment()
+        environment("ultragray_studies")
         .get_template("comparison.html")
         .render(
             comparison=comparison,
@@ -71,18 +64,6 @@ def render_comparison(comparison: Comparison, dataset: Dataset, folder: Path) ->
             scales=min((found.ms_ssim_scales for found in evaluations.values()), default=5),
         )
     )
-
-
-def environment(*packages: str) -> Environment:
-    """The templates of these packages, and those of comparisons; with what all of them use."""
-    loaders = [PackageLoader(package) for package in (*packages, __package__, "ultragray.learn.report")]
-    made = Environment(loader=ChoiceLoader(loaders), autoescape=True, undefined=StrictUndefined, trim_blocks=True)
-    made.globals |= {
-        "version": __version__,
-        "gain": DIFFERENCE_GAIN,
-        "headings": [metric.heading for metric in METRICS],
-    }
-    return made
 
 
 def _titles(comparison: Comparison) -> dict[str, str]:
@@ -140,9 +121,7 @@ def _facts(comparison: Comparison) -> dict[str, str]:
             f"{facts.val_frames}, {np.median(away.mm):.2f} mm and {np.median(away.deg):.2f}° from the nearest training "
             f"frame (median; at most {away.mm.max():.2f} mm, {away.deg.max():.2f}°)"
         ),
-        "Image": f"{facts.height} rows x {facts.width} scan lines",
-        "Pixel": f"{facts.axial_mm:.2f} mm axial, {facts.lateral_mm:.2f} mm lateral in the middle",
-        "Probe": facts.probe,
+        **facts.image_words,
         "Dataset": f"SHA-256 {facts.sha256[:16]}…",
         "Seed": f"{comparison.seed}",
     }

@@ -16,6 +16,7 @@ from ultragray.learn.evaluation.baselines import nearest_frames
 from ultragray.learn.evaluation.metrics import FrameMetrics
 from ultragray.learn.evaluation.scoring import Evaluation
 from ultragray.learn.evaluation.speckle import FrameSpeckle, Speckle
+from ultragray.learn.report.tables import DatasetFacts
 from ultragray.learn.sweep import Dataset, IntArray
 from ultragray_studies.methods.method import Cost, Description
 
@@ -81,27 +82,6 @@ class MethodResult:
 
 
 _PLAIN = ("machine", "steps", "of_steps", "seconds", "frame_ms", "model_bytes", "failure")
-
-
-@dataclass(frozen=True)
-class DatasetFacts:
-    """The dataset of a comparison."""
-
-    name: str
-    sha256: str
-    probe: str
-    train_frames: int
-    val_frames: int
-    height: int
-    width: int
-    axial_mm: float  # of a pixel in the middle of the image
-    lateral_mm: float
-
-    @classmethod
-    def of(cls, dataset: Dataset) -> DatasetFacts:
-        train = dataset.train
-        counts = (len(train), len(dataset.val), train.height, train.width)
-        return cls(dataset.name, dataset.sha256, str(dataset.probe), *counts, *train.pixel_mm)
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,11 +12,11 @@ import numpy as np
 import torch
 
 from ultragray.errors import TrainingDiverged, UltragrayError
-from ultragray.installation import __version__, processor_name
+from ultragray.installation import __version__
 from ultragray.learn.evaluation.methods import ComparisonSettings
 from ultragray.learn.evaluation.scoring import evaluate_frames, require_frames
 from ultragray.learn.sweep import Dataset, Sweep, spread_places
-from ultragray.learn.training.memory import training_device
+from ultragray.learn.training.memory import machine_in_words, training_device
 from ultragray_studies.comparison.place import Place
 from ultragray_studies.comparison.result import Comparison, DatasetFacts, Distances, MethodResult
 from ultragray_studies.methods.gaussians import SceneMethod
@@ -137,14 +137,6 @@ def default_paces(dataset: Dataset, device: str = "cpu") -> Paces:
         "dataset": dataset.sha256,
     }
     return Paces(cache / "ultragray" / "paces.json", surroundings)
-
-
-def machine_in_words(device: str = "cpu") -> str:
-    """The processor, the threads, and the GPU where one is used."""
-    threads = torch.get_num_threads()
-    words = f"{processor_name()}, {threads} thread{'' if threads == 1 else 's'}"
-    on = training_device(device, "auto")
-    return words if on.type == "cpu" else f"{words}, {torch.cuda.get_device_name(on)}"
 
 
 def _learns_within_a_time(method: Method) -> bool:

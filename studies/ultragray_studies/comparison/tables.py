@@ -2,58 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import astuple, dataclass, field
-
-from ultragray.learn.evaluation.scoring import Evaluation
-from ultragray.learn.evaluation.speckle import Speckle
-from ultragray.learn.report.tables import METRICS, by_mean_rank, rank, shown_value
+from ultragray.learn.report.tables import METRICS, Row, by_mean_rank, metric_rows, rank
 from ultragray_studies.comparison.result import Comparison, MethodResult
 from ultragray_studies.methods.method import BudgetKind
 
 COST_HEADINGS = ("steps", "training", "ms a frame", "MB")
-
-
-@dataclass(frozen=True)
-class Row:
-    """A line of a table of metrics. `cells` pairs each text with whether it is the best of its column.
-
-    A line with a `failure` has that in their place.
-    """
-
-    name: str
-    cells: list[tuple[str, bool]] = field(default_factory=list)
-    notes: list[str] = field(default_factory=list)
-    failure: str | None = None
-    anchor: str = ""  # of what the page says of the method
-
-
-def metric_rows(evaluations: Mapping[str, Evaluation], notes: Mapping[str, list[str]] | None = None) -> list[Row]:
-    """One row a method with mean ± standard deviation, the best mean of each column marked."""
-    ranks = rank(evaluations)
-    rows = []
-    for name, evaluation in evaluations.items():
-        mean, std = evaluation.mean.to_dict(), evaluation.std.to_dict()
-        cells = [
-            (
-                f"{shown_value(metric.name, mean[metric.name])} ± {shown_value(metric.name, std[metric.name])}",
-                len(evaluations) > 1 and ranks[name].by_metric[metric.name] == 1,
-            )
-            for metric in METRICS
-        ]
-        rows.append(Row(name, cells, (notes or {}).get(name, [])))
-    return rows
-
-
-def rank_rows(evaluations: Mapping[str, Evaluation]) -> list[Row]:
-    """One row a method with its place by each metric, and the mean of them; the first of each column marked."""
-    ranks = rank(evaluations)
-    means = {name: f"{found.mean:.2f}" for name, found in ranks.items()}
-    best = min(means.values(), key=float, default="")
-    return [
-        Row(name, [*((str(place), place == 1) for place in places.by_metric.values()), (mean, mean == best)])
-        for (name, places), mean in zip(ranks.items(), means.values(), strict=True)
-    ]
 
 
 def cost_texts(result: MethodResult) -> list[str]:
@@ -90,22 +43,6 @@ def budget_text(comparison: Comparison) -> str:
         return "none: no method here learns within an equal time"
     times = "" if comparison.times == 1.0 else f", {comparison.times:g} times that of the scene's preset fast"
     return f"equal time, {duration_text(comparison.budget_s * comparison.times)}{times}"
-
-
-def speckle_rows(evaluations: Mapping[str, Evaluation]) -> list[tuple[str, list[str]]]:
-    """The statistics of speckle: the true frames, then one row a method, as texts."""
-    summaries = {name: evaluation.speckle for name, evaluation in evaluations.items()}
-    if not summaries:
-        return []
-    true = next(iter(summaries.values())).true
-    return [
-        ("true frames", [*_speckle_texts(true), ""]),
-        *((name, [*_speckle_texts(one.rendered), f"{one.histogram_distance:.4f}"]) for name, one in summaries.items()),
-    ]
-
-
-def _speckle_texts(speckle: Speckle | None) -> list[str]:
-    return ["–"] * 3 if speckle is None else [f"{value:.3f}" for value in astuple(speckle)]
 
 
 # The table of a comparison as LaTeX, for the package booktabs.

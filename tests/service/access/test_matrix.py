@@ -28,8 +28,8 @@ from ultragray_service.access.principals import Role
 from ultragray_service.access.rules import GRPC_OPERATIONS, WEBSOCKET, HttpRules, Operation, require_all_methods
 from ultragray_service.http import app as http_app
 from ultragray_service.http.app import OWNED, ROLE, create_app
-from ultragray_service.service import Service
 from ultragray_service.settings import Settings
+from ultragray_service.wiring import make_service
 
 from ..rpc.test_grpc_render import error_info
 from .conftest import ROLES, Keyed
@@ -147,12 +147,12 @@ def test_unauthenticated_answers_say_how_to_authenticate(keyed: Keyed) -> None:
 
 
 def test_rules_and_routes_are_the_same(tmp_path: Path) -> None:
-    create_app(Service(Settings(data_folder=tmp_path)))  # which has a rule for each of its routes
+    create_app(make_service(Settings(data_folder=tmp_path)))  # which has a rule for each of its routes
     assert set(METHODS) == set(GRPC_OPERATIONS)
 
 
 def test_the_openapi_document_tells_the_rules(tmp_path: Path) -> None:
-    paths = create_app(Service(Settings(data_folder=tmp_path))).openapi()["paths"]
+    paths = create_app(make_service(Settings(data_folder=tmp_path))).openapi()["paths"]
     told = {
         (path, method.upper()): (operation.get(ROLE), operation.get(OWNED))
         for path, operations in paths.items()
@@ -171,7 +171,7 @@ def test_a_route_without_a_rule_stops_the_start(tmp_path: Path, monkeypatch: pyt
     kept = [Operation(one.name, one.role, (f"{method} {path}",)) for method, path, one in known if path != "/v1/jobs"]
     monkeypatch.setattr(http_app, "HttpRules", lambda: HttpRules(kept))
     with pytest.raises(LookupError, match=r"who may ask for \[\('GET', '/v1/jobs'\), \('POST', '/v1/jobs'"):
-        create_app(Service(Settings(data_folder=tmp_path)))
+        create_app(make_service(Settings(data_folder=tmp_path)))
     with pytest.raises(LookupError, match="does not say who may call"):
         require_all_methods([*METHODS, "/ultragray.v1.SceneService/Paint"])
 

@@ -22,8 +22,8 @@ from ultragray_service.access import oidc as issuer_module
 from ultragray_service.access.oidc import LEEWAY_S, MAX_TOKEN_BYTES, OidcTokens, claim_at, parse_roles
 from ultragray_service.access.principals import Role
 from ultragray_service.errors import IssuerUnavailable
-from ultragray_service.service import oidc_tokens
 from ultragray_service.settings import load_settings
+from ultragray_service.wiring import oidc_tokens
 
 from ...waiting import Deadline
 from .identity_provider import IdentityProvider

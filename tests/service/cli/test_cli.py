@@ -101,7 +101,7 @@ def test_completion_knows_commands_and_options() -> None:
         program = "from ultragray_service.cli.app import app; app(prog_name='ultragray')"
         return subprocess.run(python(program), env=environment, capture_output=True, text=True, check=False).stdout
 
-    assert completed("ultragray re").split() == ["render", "report", "registrations", "restore"]
+    assert completed("ultragray re").split() == ["render", "registrations", "restore", "report"]
     assert completed("ultragray scenes do").split() == ["download"]
     assert "--outputs" in completed("ultragray render --out").split()
 

@@ -14,12 +14,13 @@ from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray_service.core.streams import Answered, FrameStream, PoseStream, StreamMode
 from ultragray_service.service import Service
 from ultragray_service.settings import Settings
+from ultragray_service.wiring import make_service
 
 
 @pytest.fixture
 def service(tmp_path: Path) -> Service:
     """A service that has not been started."""
-    return Service(Settings(data_folder=tmp_path))
+    return make_service(Settings(data_folder=tmp_path))
 
 
 def test_a_connection_that_breaks_fails_reading_and_writing_at_once_and_neither_failure_is_forgotten(
@@ -30,7 +31,7 @@ def test_a_connection_that_breaks_fails_reading_and_writing_at_once_and_neither_
     async def main() -> None:
         asyncio.get_running_loop().set_exception_handler(lambda _, context: forgotten.append(context))
         broken = asyncio.Event()
-        stream = PoseStream(service)
+        stream = PoseStream(service.rendering)
 
         async def read() -> None:
             await stream.refuse(1, None, UltragrayError("so that there is something to write"))
@@ -55,7 +56,7 @@ def test_a_stream_that_is_refused_as_a_whole_is_not_ended_in_the_middle_of_an_an
     written: list[Answered] = []
 
     async def main() -> None:
-        stream, writing = PoseStream(service), asyncio.Event()
+        stream, writing = PoseStream(service.rendering), asyncio.Event()
 
         async def read() -> None:
             await stream.refuse(1, None, UltragrayError("so that there is something to write"))
@@ -107,7 +108,7 @@ class FaultyTransport:
 
 def test_a_fault_at_one_message_is_told_and_the_stream_goes_on(service: Service) -> None:
     transport = FaultyTransport()
-    asyncio.run(FrameStream(service, transport).run())
+    asyncio.run(FrameStream(service.rendering, transport).run())
     (answer,) = transport.answers
     assert (answer.sequence, answer.client_time) == (7, 1.5)
     assert isinstance(answer.outcome, UltragrayError)

@@ -3,7 +3,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ultragray_service.bench.igtl import PingPong
+from ultragray_studies.bench.clients import PingPong
 from ultragray_workers.errors import NotReady
 
 from ..conftest import HEIGHT, WIDTH, RunningService

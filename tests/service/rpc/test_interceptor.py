@@ -12,8 +12,8 @@ import pytest
 from google.protobuf.empty_pb2 import Empty
 
 from ultragray_service.rpc.calls import CallContext, abort
-from ultragray_service.service import Service
 from ultragray_service.settings import load_settings
+from ultragray_service.wiring import make_service
 from ultragray_workers.errors import DeadlineExceeded
 
 METHOD = "/ultragray.v1.JobService/WatchJob"
@@ -38,7 +38,7 @@ class Streaming(grpc.GenericRpcHandler):  # type: ignore[misc]
 
 
 async def vanish(folder: Path) -> None:
-    server = grpc.aio.server(interceptors=[CallContext(Service(load_settings(data_folder=folder)))])
+    server = grpc.aio.server(interceptors=[CallContext(make_service(load_settings(data_folder=folder)))])
     streaming = Streaming()
     server.add_generic_rpc_handlers([streaming])
     port = server.add_insecure_port("127.0.0.1:0")

@@ -7,9 +7,9 @@ import httpx
 import pytest
 from websockets.sync.client import connect
 
-from ultragray_service.service import Service
 from ultragray_service.settings import load_settings
 from ultragray_service.telemetry.metrics import STEP_S, STEPS, StageTimes, Statistics
+from ultragray_service.wiring import make_service
 from ultragray_workers.errors import DeadlineExceeded
 
 from ..conftest import StartService
@@ -102,7 +102,7 @@ def test_only_what_the_service_could_not_do_is_an_error(start_service: StartServ
 
 
 def test_a_refused_message_is_one_error(tmp_path: Path) -> None:
-    metrics = Service(load_settings(data_folder=tmp_path)).metrics
+    metrics = make_service(load_settings(data_folder=tmp_path)).metrics
     metrics.count_frame_error(DeadlineExceeded("too late"))  # OpenIGTLink counts a message as an answer as well
     metrics.count_request("igtl", "TRANSFORM", "DEADLINE_EXCEEDED", 0.1)
     assert sum(step.errors for step in metrics.statistics.summaries()) == 1

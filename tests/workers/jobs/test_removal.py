@@ -160,18 +160,17 @@ def test_a_deletion_and_a_submission_at_once_never_both_succeed(
     store: JobStore, artifact_folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     datasets = DatasetStore(artifact_folder)
-    datasets.in_use = store.uses_dataset
 
     def submit_in_between(name: str) -> str | None:
         """The first look finds nobody; then a job comes, before the dataset is out of sight."""
-        datasets.in_use = store.uses_dataset
+        if submitted:
+            return store.uses_dataset(name)
         submitted.append(store.submit(train_job("one"))[0])
         return None
 
     submitted: list[Job] = []
-    datasets.in_use = submit_in_between
     with pytest.raises(DatasetInUse, match="needed by the job"):
-        datasets.delete("tiny")
+        datasets.delete("tiny", submit_in_between)
     assert datasets.get("tiny").name == "tiny"
     assert [path.name for path in datasets.folder.iterdir()] == ["tiny"]
     assert store.get(submitted[0].id).state is JobState.QUEUED

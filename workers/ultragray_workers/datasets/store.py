@@ -75,16 +75,21 @@ class DatasetStore:
     """The datasets that several services and workers share."""
 
     def __init__(
-        self, artifact_folder: Path, storage: Storage | None = None, max_copies_bytes: int = DEFAULT_MAX_BYTES
+        self,
+        artifact_folder: Path,
+        storage: Storage | None = None,
+        max_copies_bytes: int = DEFAULT_MAX_BYTES,
+        *,
+        hides: Callable[[str], bool] = lambda name: False,
     ) -> None:
         """`storage`: where the datasets lie; None: in the artifact folder.
 
-        `max_copies_bytes`: of this host's copies, where the storage is elsewhere, beside those in use.
+        `max_copies_bytes`: of this host's copies, where the storage is elsewhere, beside those in use. `hides`: whether
+        a dataset is hidden from whoever asks, who does not find it then.
         """
         self.folder = Path(artifact_folder) / UPLOADS  # in which uploads to this host arrive
         self.shelf = DatasetShelf(storage or LocalStorage(Path(artifact_folder)), self.folder, max_copies_bytes)
-        self.hides: Callable[[str], bool] = lambda name: False  # from whoever asks: what is hidden is not found
-        self.in_use: Callable[[str], str | None] = lambda name: None  # who needs a dataset, in words
+        self.hides = hides
 
     def names(self) -> list[str]:
         """The names of all datasets, sorted."""
@@ -153,22 +158,18 @@ class DatasetStore:
             field="dataset",
         )
 
-    def delete(self, name: str) -> None:
-        """Raises DatasetNotFound, and DatasetInUse where `in_use` names who needs it.
+    def delete(self, name: str, in_use: Callable[[str], str | None] = lambda name: None) -> None:
+        """Raises DatasetNotFound, and DatasetInUse where `in_use` names in words who needs it.
 
         `in_use` is asked again when nobody finds the dataset any more: who came in between gets it back, unless
         another one has taken its name.
         """
         self._require_existing(name)
-        self._require_unused(name)
+        _require_unused(name, in_use)
         with self.shelf.without(name) as found:
             if not found:
                 raise self._not_found(name)
-            self._require_unused(name)
-
-    def _require_unused(self, name: str) -> None:
-        if (user := self.in_use(name)) is not None:
-            raise DatasetInUse(f"the dataset {name!r} is needed by {user}", field="dataset")
+            _require_unused(name, in_use)
 
     def _require_existing(self, name: str) -> None:
         if not (self._is_shown(name) and self.is_taken(name)):
@@ -201,6 +202,11 @@ def write_manifest(record: DatasetRecord, folder: Path) -> None:
     kept = {name: value for name, value in to_dict(record).items() if name not in _NOT_KEPT}
     document = {"format_version": FORMAT_VERSION, **kept}
     write_whole(folder / MANIFEST_NAME, json.dumps(document, indent=1) + "\n")
+
+
+def _require_unused(name: str, in_use: Callable[[str], str | None]) -> None:
+    if (user := in_use(name)) is not None:
+        raise DatasetInUse(f"the dataset {name!r} is needed by {user}", field="dataset")
 
 
 def open_datasets(

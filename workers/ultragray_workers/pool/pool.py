@@ -102,8 +102,13 @@ class PoolStatistics:
 class RenderPool:
     """Worker processes and the queue before them. All its methods belong to one event loop."""
 
-    def __init__(self, store: SceneStore, config: PoolConfig) -> None:
-        self.on_rendered: Callable[[RenderResult[Any]], None] | None = None
+    def __init__(
+        self,
+        store: SceneStore,
+        config: PoolConfig,
+        on_rendered: Callable[[RenderResult[Any]], None] = lambda result: None,
+    ) -> None:
+        self.on_rendered = on_rendered
         self._store = store
         self._waiting = WaitingQueue(
             config.queue_limit_frames,
@@ -159,8 +164,7 @@ class RenderPool:
         MemoryExceeded, RenderFailed; SceneChangedError where the request is for another version of the scene's file.
         """
         result = await self._answered(request, turn or Turn(), _frames)
-        if self.on_rendered is not None:
-            self.on_rendered(result)
+        self.on_rendered(result)
         return result
 
     async def localize(self, request: RenderRequest) -> LocalizeResult:

@@ -6,19 +6,18 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ultragray.contract import to_dict
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.outputs import OUTPUTS
 from ultragray.rendering.pixels import PixelArray, to_uint8
-from ultragray.rendering.settings import Resolved
+from ultragray.rendering.settings import Encoding, Resolved, SettingsUsed, settings_used
 from ultragray.scene.confidence import Extrapolation, figure_arrays
 
 FRAME_TIME_MS = 40.0  # rendered frames have no time of their own: formats that need one show 25 a second
@@ -44,26 +43,15 @@ class ExportHeader:
         """The type that the pixels of an output are stored in."""
         return np.dtype("<u1" if OUTPUTS[output].is_numbers or self.dtype == "uint8" else "<f4")
 
-    def origin(self) -> dict[str, Any]:
-        """The origin of the frames and their display, as JSON holds it.
+    @property
+    def settings_used(self) -> SettingsUsed:
+        """The settings as used."""
+        return settings_used(replace(self.settings, encoding=Encoding(self.dtype)))
 
-        `picture` has the fields of `ultragray.geometry.probe.Picture`; `contact` is there where it was judged, `tools`
-        and
-        `ghost` where there were any.
-        """
-        contact, tools, ghost = self.settings.contact, self.settings.tools, self.settings.ghost
-        return {
-            "scene": self.scene,
-            "scene_sha256": self.scene_sha256,
-            "renderer": self.renderer,
-            "probe": to_dict(self.settings.probe),
-            "slice_thickness_mm": self.settings.beam.thickness_mm,
-            "display": to_dict(self.settings.display),
-            "picture": to_dict(self.settings.picture),
-            **({} if contact is None else {"contact": contact.value}),
-            **({"tools": to_dict(tools)} if tools else {}),
-            **({"ghost": ghost} if ghost else {}),
-        }
+    def origin(self) -> dict[str, Any]:
+        """The origin of the frames and their settings as used, as JSON holds them."""
+        made_of = {"scene": self.scene, "scene_sha256": self.scene_sha256, "renderer": self.renderer}
+        return {**made_of, **self.settings_used.document()}
 
 
 class Exporter(ABC):

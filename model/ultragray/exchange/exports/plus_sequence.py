@@ -9,7 +9,6 @@ moved by `near_mm` along the axial axis.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 
 import numpy as np
@@ -54,7 +53,7 @@ class PlusExporter(Exporter):
         self._line("ElementDataFile", "LOCAL")
 
     def _fields(self) -> dict[str, str]:
-        header, picture, origin = self._header, self._header.settings.picture, self._header.origin()
+        header, picture = self._header, self._header.settings.picture
         return {
             "ObjectType": "Image",
             "NDims": "3",
@@ -73,12 +72,9 @@ class PlusExporter(Exporter):
             "UltraGRayScene": " ".join(header.scene.split()),
             "UltraGRaySceneSha256": header.scene_sha256,
             "UltraGRayRenderer": header.renderer,
-            "UltraGRayProbe": json.dumps(origin["probe"]),
-            "UltraGRaySliceThicknessMm": json.dumps(origin["slice_thickness_mm"]),
-            "UltraGRayDisplay": json.dumps(origin["display"]),
-            **({"UltraGRayContact": origin["contact"]} if "contact" in origin else {}),
-            **({"UltraGRayTools": json.dumps(origin["tools"])} if "tools" in origin else {}),
-            **({"UltraGRayGhost": json.dumps(origin["ghost"])} if "ghost" in origin else {}),
+            **{
+                f"UltraGRay{name.title().replace('_', '')}": text for name, text in header.settings_used.texts().items()
+            },
         }
 
     def _line(self, key: str, value: str) -> None:
@@ -99,6 +95,11 @@ class PlusExporter(Exporter):
     def _finish(self) -> None:
         self._file.seek(0)
         self._write_header()
+
+
+def _key(name: str) -> str:
+    """The key of a setting: `UltraGRayGhost` of ghost."""
+    return f"UltraGRay{name.title().replace('_', '')}"
 
 
 def _row_by_row(matrix: FloatArray) -> str:

@@ -1,15 +1,13 @@
-"""How far corrections moved the frames of a scene: numbers, and a plot over the frames. Free of torch."""
+"""How far corrections moved the frames of a scene. Free of torch."""
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ultragray.files import write_whole
 from ultragray.geometry.probe import FloatArray
 
 
@@ -38,9 +36,3 @@ class CorrectionSizes:
             f"poses of {len(shift)} training frames were corrected by {shift.mean():.2f} mm (at most {shift.max():.2f})"
             f" and {turn.mean():.2f}° (at most {turn.max():.2f}) on average"
         )
-
-    def write_plot(self, path: Path) -> None:
-        """Both over the frames, as SVG."""
-        from ultragray.learn.report.plots import plot_corrections
-
-        write_whole(path, plot_corrections(self.shift_mm, self.turn_deg))

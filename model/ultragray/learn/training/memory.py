@@ -9,6 +9,7 @@ from pathlib import Path
 import torch
 
 from ultragray.errors import BackendUnavailable, MemoryExceeded
+from ultragray.installation import processor_name
 from ultragray.learn.evaluation.scoring import CHUNK_PIXELS, frames_at_once
 from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import alignment as overlap
@@ -41,6 +42,14 @@ def training_device(name: str, backend: str) -> torch.device:
             field="backend",
         )
     return device
+
+
+def machine_in_words(device: str = "cpu") -> str:
+    """The processor, the threads, and the GPU where one is used."""
+    threads = torch.get_num_threads()
+    words = f"{processor_name()}, {threads} thread{'' if threads == 1 else 's'}"
+    on = training_device(device, "auto")
+    return words if on.type == "cpu" else f"{words}, {torch.cuda.get_device_name(on)}"
 
 
 def forget_peak_memory(device: torch.device) -> None:

@@ -35,6 +35,30 @@ class Progress:
     beside: str | None = None
 
 
+@dataclass(frozen=True)
+class Course:
+    """The way of a training that has ended."""
+
+    seconds: float  # of all steps
+    losses: list[float]  # of each step
+    val_psnr_db: dict[int, float]  # by step, over some held-out frames
+
+    @classmethod
+    def of_journal(cls, journal: Path) -> Course:
+        """As the `metrics.jsonl` of a run tells it. Raises OSError."""
+        lines = [json.loads(line) for line in journal.read_text(encoding="utf-8").splitlines()]
+        return cls(
+            seconds=float(lines[-1]["elapsed_s"]),
+            losses=[line["loss"] for line in lines],
+            val_psnr_db={line["step"]: line["val_psnr_db"] for line in lines if "val_psnr_db" in line},
+        )
+
+    @property
+    def step_s(self) -> float:
+        """The mean over the steps."""
+        return self.seconds / len(self.losses)
+
+
 class StepTimer:
     """The time that steps take, smoothed."""
 

@@ -9,8 +9,7 @@ from ultragray.contract import described, under
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.settings import Encoding
-from ultragray_service.core.rendering import Plan
-from ultragray_service.service import Service
+from ultragray_service.core.rendering import Plan, Rendering
 from ultragray_workers.errors import DeadlineExceeded, QueueFull
 from ultragray_workers.jobs.kinds import RenderJob, Specification
 from ultragray_workers.pool.messages import Priority
@@ -37,7 +36,7 @@ class JobEstimate:
     )
 
 
-async def estimate(service: Service, specification: Specification, *, field: str) -> JobEstimate:
+async def estimate(rendering: Rendering, specification: Specification, *, field: str) -> JobEstimate:
     """The estimate of a job. `field` is where the caller wrote the specification.
 
     Raises InvalidArgument for a job of another kind, and what its submission would raise for what it asks of the scene.
@@ -47,15 +46,15 @@ async def estimate(service: Service, specification: Specification, *, field: str
             f"only render jobs can be estimated, this is of the kind {specification.kind}", field="kind"
         )
     with under(field):
-        plan = await service.planner.plan(specification.scene, specification, Encoding.UINT8)
-        if specification.registration is not None:
-            found = await service.registrations.of_scene(specification.registration, specification.scene)
-            specification = specification.registered(found)
-        _, header = await service.catalog.versioned_header(specification.scene)
+        plan = await rendering.planner.plan(
+            specification.scene, specification, Encoding.UINT8, registration=specification.registration
+        )
+        if plan.registration is not None:
+            specification = specification.registered(plan.registration)
         settings = plan.settings
-        frames, poses = await asyncio.to_thread(specification.outlook, header, settings, MAX_POSES)
+        frames, poses = await asyncio.to_thread(specification.outlook, plan.header, settings, MAX_POSES)
         picture = specification.file_format.shown(settings).picture
-    frame_s = await _frame_s(service, plan, poses[:1])
+    frame_s = await _frame_s(rendering, plan, poses[:1])
     return JobEstimate(
         frames=frames,
         files=specification.file_count(frames),
@@ -67,13 +66,13 @@ async def estimate(service: Service, specification: Specification, *, field: str
     )
 
 
-async def _frame_s(service: Service, plan: Plan, poses: FloatArray) -> float | None:
+async def _frame_s(rendering: Rendering, plan: Plan, poses: FloatArray) -> float | None:
     """The seconds that one frame takes; None where there is no room for it now."""
-    deadline, took_ms = service.planner.deadline(None), 0.0
+    deadline, took_ms = rendering.planner.deadline(None), 0.0
     try:
         for _ in range(_TIMED_FRAMES):
-            await service.limits.take_frames(len(poses), deadline)
-            took_ms = (await service.render(plan, poses, priority=Priority.BATCH, deadline=deadline)).render_ms
+            await rendering.limits.take_frames(len(poses), deadline)
+            took_ms = (await rendering.render(plan, poses, priority=Priority.BATCH, deadline=deadline)).render_ms
     except (DeadlineExceeded, QueueFull):
         return None
     return took_ms / 1000.0

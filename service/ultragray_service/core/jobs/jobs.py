@@ -18,9 +18,9 @@ from ultragray.geometry.registration import Registration
 from ultragray_service.access.audit import account
 from ultragray_service.access.owners import may_see
 from ultragray_service.access.principals import acting
-from ultragray_service.core.scenes import MAX_PAGE_SIZE, scene_to_blame
 from ultragray_service.core.jobs.database_threads import PATIENCE_S, DatabaseThreads
 from ultragray_service.core.jobs.hub import JobHub
+from ultragray_service.core.scenes import MAX_PAGE_SIZE, scene_to_blame
 from ultragray_service.settings import Settings
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import (
@@ -72,8 +72,9 @@ class Jobs:
         scenes: SceneStore,
         datasets: DatasetStore,
         registration: Callable[[str, str], Registration],
+        admit: Admit,
     ) -> None:
-        """`registration`: finds that of a name, for a scene; it blocks."""
+        """`registration`: finds that of a name, for a scene; it blocks, as `admit` does, which each new job passes."""
         self._settings = settings
         self._scenes = scenes
         self._datasets = datasets
@@ -83,7 +84,7 @@ class Jobs:
         self.hub = JobHub(
             lambda job_id: self._store.get(job_id), lambda job_id: self.files.log(job_id), self.threads.executor
         )
-        self.admit: Admit = lambda jobs: None
+        self._admit = admit
         self.overview = JobsOverview()  # as it was up to COUNT_INTERVAL_S ago
         self._counting: asyncio.Task[None] | None = None
 
@@ -145,14 +146,14 @@ class Jobs:
                 priority=priority,
                 owner=acting().name,
                 private=private,
-                admit=self.admit,
+                admit=self._admit,
             )
         account().target = job.id
         return job, is_new
 
     async def retry(self, job_id: str) -> tuple[Job, bool]:
         """As JobStore.retry. Raises LimitReached."""
-        return await self.do(JobStore.retry, job_id, by=acting().name, admit=self.admit)
+        return await self.do(JobStore.retry, job_id, by=acting().name, admit=self._admit)
 
     async def page(self, *, state: str, kind: str, page_size: int, page_token: str) -> JobPage:
         """One page of jobs; empty filters pass all.

@@ -12,9 +12,8 @@ from starlette.requests import ClientDisconnect, Request
 from starlette.responses import Response
 
 from ultragray.datasets.source import UPLOAD_OPTIONS, UPLOADED_FORMATS
-from ultragray_service.core import datasets
+from ultragray_service.core.datasets import DatasetPage
 from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
-from ultragray_service.core.datasets import DatasetPage, contact_sheet, dataset_page, with_owner
 from ultragray_service.core.threads import PATIENCE_S
 from ultragray_service.core.uploads import DatasetUpload
 from ultragray_service.errors import UnsupportedMediaType
@@ -102,7 +101,7 @@ async def put_dataset(
     private: Private = False,
 ) -> DatasetRecord:
     """Uploads a dataset, checks it as `ultragray check` does, and keeps it. Empty options: as it is stored."""
-    service.require_serving()
+    service.life.require_serving()
     media_type = _media_type(request)
     announced = request.headers.get("content-length", "")
     if announced.isdigit() and int(announced) > service.settings.max_dataset_bytes:
@@ -118,7 +117,7 @@ async def put_dataset(
         deadline = time.monotonic() + PATIENCE_S
         record, is_new = await finish_or_abandon(upload.finish(), request.receive, deadline)
     response.status_code = 201 if is_new else 200
-    return with_owner(service, record)
+    return service.datasets.with_owner(record)
 
 
 @router.get("", responses=problems(401, 422, 503))
@@ -126,13 +125,13 @@ async def list_datasets(
     service: ServiceDep, page_size: PageSize = DEFAULT_PAGE_SIZE, page_token: PageToken = ""
 ) -> DatasetPage:
     """The datasets by name."""
-    return await dataset_page(service, page_size, page_token)
+    return await service.datasets.page(page_size, page_token)
 
 
 @router.get("/{dataset}", responses=problems(401, 404, 422, 503))
 async def get_dataset(service: ServiceDep, dataset: DatasetName) -> DatasetRecord:
     """Size, probe, split, and what the check warned of."""
-    return await datasets.dataset(service, dataset)
+    return await service.datasets.get(dataset)
 
 
 @router.get(
@@ -142,7 +141,7 @@ async def get_dataset(service: ServiceDep, dataset: DatasetName) -> DatasetRecor
 )
 async def get_contact_sheet(service: ServiceDep, dataset: DatasetName) -> Response:
     """A picture of the dataset, PNG."""
-    return Response(await contact_sheet(service.datasets, dataset), media_type=PNG)
+    return Response(await service.datasets.contact_sheet(dataset), media_type=PNG)
 
 
 @router.delete("/{dataset}", status_code=204, responses=problems(401, 403, 404, 409, 422, 503))
@@ -212,7 +211,7 @@ _POSES: _Answers2 = {200: {"model": DatasetPoses}, 304: {"description": NOT_MODI
 @comparison_router.get("/scenes/{scene}/comparison", responses=problems(401, 404, 422, 503))
 async def get_comparison(service: ServiceDep, scene: SceneName) -> Comparison:
     """Metrics on the held-out frames of the scene's dataset. The first request begins to compute them."""
-    service.require_serving()
+    service.life.require_serving()
     return await service.comparisons.get(scene)
 
 
@@ -244,7 +243,7 @@ async def get_compared_picture(
 )
 async def get_dataset_poses(request: Request, service: ServiceDep, dataset: DatasetName) -> Response:
     """Probe to scene, of the training frames and the held-out ones."""
-    service.require_serving()
+    service.life.require_serving()
 
     async def poses() -> Response:
         return Response(await service.dataset_views.poses_json(dataset), media_type="application/json")
@@ -261,7 +260,7 @@ async def get_dataset_frame(
     request: Request, service: ServiceDep, dataset: DatasetName, part: Literal["train", "val"], index: FrameIndex
 ) -> Response:
     """A frame of a dataset; those of convex and phased probes as fans."""
-    service.require_serving()
+    service.life.require_serving()
 
     async def frame() -> Response:
         return Response(await service.dataset_views.frame_png(dataset, part, index), media_type=PNG)

@@ -12,8 +12,8 @@ from starlette.requests import Request
 from ultragray.contract import described, from_dict, to_dict
 from ultragray.geometry.probe import Probe
 from ultragray.geometry.registration import Registration
-from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
 from ultragray_service.core.registrations import NamedRegistration, RegistrationPage
+from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
 from ultragray_service.http.bodies import RegistrationBody, body_schema, read_json_body
 from ultragray_service.http.dependencies import ServiceDep, problems
 
@@ -81,7 +81,7 @@ async def get_registration(service: ServiceDep, registration: Name) -> NamedRegi
 )
 async def put_registration(request: Request, service: ServiceDep, registration: Name) -> NamedRegistration:
     """Keeps a registration, in place of one of that name which is the key's own."""
-    service.require_serving()
+    service.life.require_serving()
     body = await read_json_body(request, RegistrationBody)
     content = {name: value for name, value in to_dict(body).items() if name != "scene"}
     return await service.registrations.put(registration, body.scene, from_dict(Registration, content))
@@ -90,5 +90,5 @@ async def put_registration(request: Request, service: ServiceDep, registration: 
 @registrations_router.delete("/{registration}", status_code=204, responses=problems(401, 403, 404, 422, 503))
 async def delete_registration(service: ServiceDep, registration: Name) -> None:
     """Forgets a registration."""
-    service.require_serving()
+    service.life.require_serving()
     await service.registrations.delete(registration)

@@ -19,11 +19,11 @@ from starlette.types import Receive, Scope, Send
 
 from ultragray.contract import under
 from ultragray.errors import InvalidArgument
-from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
 from ultragray_service.core.jobs.estimates import JobEstimate, estimate
 from ultragray_service.core.jobs.hub import JobChange, JobWatch
 from ultragray_service.core.jobs.jobs import JobPage, WorkerList
 from ultragray_service.core.jobs.log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
+from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
 from ultragray_service.http.accept import NPZ, PNG
 from ultragray_service.http.bodies import SPECIFICATION, JobBody, adapter_of, body_schema, read_json_body
 from ultragray_service.http.dependencies import JOB_EXAMPLES, ServiceDep, problems
@@ -167,7 +167,7 @@ _EVENTS: _Answers = {
 )
 async def submit_job(request: Request, response: Response, service: ServiceDep) -> Job:
     """Puts a job into the queue. The same request_id with the same body gives the same job, whatever its state."""
-    service.require_serving()
+    service.life.require_serving()
     body = await read_json_body(request, JobBody, SPECIFICATION)
     job, is_new = await service.jobs.submit(
         await _specification(body),
@@ -188,9 +188,9 @@ async def submit_job(request: Request, response: Response, service: ServiceDep) 
 )
 async def estimate_job(request: Request, service: ServiceDep) -> JobEstimate:
     """What a render job would make, and how long that may take: a frame of it is rendered. Nothing is submitted."""
-    service.require_serving()
+    service.life.require_serving()
     body = await read_json_body(request, JobBody, SPECIFICATION)
-    return await estimate(service, await _specification(body), field=SPECIFICATION.key)
+    return await estimate(service.rendering, await _specification(body), field=SPECIFICATION.key)
 
 
 @router.get("", responses=problems(401, 422, 503))
@@ -233,7 +233,7 @@ async def cancel_job(service: ServiceDep, job: JobId) -> Job:
 )
 async def retry_job(response: Response, service: ServiceDep, job: JobId) -> Job:
     """A new job in place of a failed or cancelled one; a training goes on from its last checkpoint."""
-    service.require_serving()
+    service.life.require_serving()
     successor, is_new = await service.jobs.retry(job)
     response.status_code = 201 if is_new else 200
     return successor
@@ -281,7 +281,7 @@ async def get_artifact(
 )
 async def watch_job(service: ServiceDep, job: JobId, last_event_id: LastEventId = "") -> JobEvents:
     """Follows a job. A stream that ends before the final state goes on where it ended: say the id of its last event."""
-    service.require_serving()
+    service.life.require_serving()
     last = LastEvent.read(last_event_id)
     return JobEvents(await service.jobs.hub.watch(job, last.log_offset), last)
 
@@ -371,7 +371,7 @@ async def get_curve(service: ServiceDep, job: JobId) -> TrainingCurve:
 )
 async def get_preview(service: ServiceDep, job: JobId) -> Response:
     """A held-out frame, rendered from the last checkpoint of a running training: a new one comes every ten seconds."""
-    service.require_serving()
+    service.life.require_serving()
     return Response(await service.training_views.preview_png(job), media_type=PNG)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import io
 import json
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from functools import lru_cache
 from typing import Any
 
@@ -14,13 +14,12 @@ from fastapi import APIRouter
 from starlette.requests import Request
 from starlette.responses import Response
 
-from ultragray.contract import to_dict
 from ultragray.exchange.exports.exporter import ExportHeader
 from ultragray.exchange.exports.formats import FORMATS, check_format, export_bytes, exporter_class
 from ultragray.rendering.outputs import OUTPUTS
-from ultragray.rendering.settings import Encoding, Resolved
+from ultragray.rendering.settings import Encoding, Resolved, SettingsUsed, settings_used
 from ultragray.rendering.volumes import SliceSettings, SliceView
-from ultragray_service.core.frames import SliceFacts, settings_used
+from ultragray_service.core.frames import SliceFacts
 from ultragray_service.core.poses import exact_poses
 from ultragray_service.http.accept import DICOM, JPEG, NPY, NPZ, PNG, RAW, choose, choose_of_slice
 from ultragray_service.http.bodies import RenderBody, body_schema, read_json_body
@@ -39,24 +38,23 @@ from ultragray_workers.pool.messages import Priority, RenderResult
 
 router = APIRouter(prefix="/v1/scenes", tags=["render"])
 
+
+def _header_of(setting: str) -> str:
+    """The header of a setting as used: a text as it is, numbers, lists with commas, else JSON."""
+    return f"X-Ultragray-{setting.replace('_', '-').title()}"
+
+
 RENDER_HEADERS = {
     "X-Ultragray-Scene": "Name of the scene.",
     "X-Ultragray-Scene-Sha256": "SHA-256 of the scene file.",
     "X-Ultragray-Renderer": "Name, version and backend of the renderer.",
     "X-Ultragray-Shape": "Outputs, poses, height, width: 1,1,512,512.",
     "X-Ultragray-Dtype": "uint8 or float32 (little endian).",
-    "X-Ultragray-Outputs": "Outputs in the order of the data, with commas.",
     "X-Ultragray-Pose": "One pose only: the 4x4 matrix that was used, JSON. Of many, npz holds `poses`.",
-    "X-Ultragray-Probe": "The probe that was used, JSON.",
-    "X-Ultragray-Slice-Thickness-Mm": "As used: at the focus of the scene's beam; 0: a plane.",
-    "X-Ultragray-Contact": "As used, air or pressure; absent where contact was assumed.",
-    "X-Ultragray-Tools": "As used, JSON; absent where there were none.",
-    "X-Ultragray-Ghost": "As used; absent where there was none.",
-    "X-Ultragray-Registration": "That led the poses into the scene; absent where they were sent as they are.",
     "X-Ultragray-Confidence": "Of each pose, with commas; empty where the scene cannot tell.",
     "X-Ultragray-Extrapolation": "One pose only: distance_mm, angle_deg, confidence, supported_share, contact_share, "
     "JSON. Of many, npz holds them.",
-    "X-Ultragray-Picture": "Where the pixels lie in the image plane, JSON: column_unit, first, step.",
+    **{_header_of(one.name): one.metadata["description"] for one in fields(SettingsUsed)},
     "X-Ultragray-Queue-Ms": "Waiting time.",
     "X-Ultragray-Render-Ms": "Render time of the batch that the poses were in.",
     "X-Ultragray-Encode-Ms": "Encoding time.",
@@ -120,7 +118,7 @@ async def render(request: Request) -> Response:
 
     async def rendered() -> RenderResult:
         await service.limits.take_frames(len(exact), deadline)
-        return await service.render(plan, exact, priority=priority, deadline=deadline, begin_by=begin_by)
+        return await service.rendering.render(plan, exact, priority=priority, deadline=deadline, begin_by=begin_by)
 
     result = await finish_or_abandon(rendered(), request.receive, deadline)
     data = await asyncio.to_thread(_dicom_of, result) if is_dicom else result.data
@@ -158,21 +156,8 @@ def render_headers(result: RenderResult) -> dict[str, str]:
 @lru_cache(maxsize=256)
 def _settings_headers(settings: Resolved) -> dict[str, str]:
     """The headers that settings alone decide."""
-    used = settings_used(settings)
-    asked = {} if used.contact is None else {"X-Ultragray-Contact": used.contact.value}
-    if used.tools:
-        asked["X-Ultragray-Tools"] = json.dumps(to_dict(used.tools))
-    if used.ghost:
-        asked["X-Ultragray-Ghost"] = repr(used.ghost)
-    if used.registration is not None:
-        asked["X-Ultragray-Registration"] = used.registration
-    return asked | {
-        "X-Ultragray-Dtype": settings.encoding.pixel_type.name,
-        "X-Ultragray-Outputs": ",".join(settings.outputs),
-        "X-Ultragray-Probe": json.dumps(to_dict(used.probe)),
-        "X-Ultragray-Slice-Thickness-Mm": repr(used.slice_thickness_mm),
-        "X-Ultragray-Picture": json.dumps(to_dict(used.picture)),
-    }
+    texts = {"dtype": settings.encoding.pixel_type.name, **settings_used(settings).texts()}
+    return {_header_of(name): text for name, text in texts.items()}
 
 
 # Slices of a scene on any plane. The Accept header chooses the form.
@@ -216,7 +201,7 @@ async def render_slice(request: Request, service: ServiceDep, scene: SceneName) 
 
     async def rendered() -> RenderResult[SliceView]:
         await service.limits.take_frames(1, deadline)
-        return await service.render(plan, asked.pose()[None], deadline=deadline)
+        return await service.rendering.render(plan, asked.pose()[None], deadline=deadline)
 
     result = await finish_or_abandon(rendered(), request.receive, deadline)
     data = _npy_of(result) if media_type == NPY else result.data

@@ -19,10 +19,16 @@ from ultragray.errors import InvalidArgument
 from ultragray.learn.localization.settings import LocalizationSettings
 from ultragray.learn.report.sizes import CorrectionSizes
 from ultragray.scene.info import SceneHeader
-from ultragray_service.core import scenes
-from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
 from ultragray_service.core.poses import check_pose_count, exact_poses
-from ultragray_service.core.scenes import Scene, SceneLoaded, ScenePage
+from ultragray_service.core.scene_points import (
+    ALL_FIELDS,
+    DEFAULT_POINTS,
+    FIELDS,
+    MAX_POINTS,
+    MAX_POSES,
+    even_selection,
+)
+from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE, Scene, SceneLoaded, ScenePage
 from ultragray_service.core.threads import PATIENCE_S
 from ultragray_service.core.uploads import arrival
 from ultragray_service.errors import UnsupportedMediaType
@@ -39,7 +45,6 @@ from ultragray_service.http.dependencies import (
 from ultragray_service.http.routes.datasets import Private
 from ultragray_service.views.assessments import Assessments
 from ultragray_service.views.localizing import Located, locate, sought_frame
-from ultragray_service.core.scene_points import ALL_FIELDS, DEFAULT_POINTS, FIELDS, MAX_POINTS, MAX_POSES, even_selection
 from ultragray_workers.errors import UploadTooLarge
 from ultragray_workers.jobs.owners import Kind
 from ultragray_workers.scene_names import SUFFIX, base_name
@@ -55,13 +60,13 @@ async def list_scenes(
     service: ServiceDep, page_size: PageSize = DEFAULT_PAGE_SIZE, page_token: PageToken = ""
 ) -> ScenePage:
     """The scenes by name. New files appear without a restart; one that cannot be read has an `error`."""
-    return await scenes.scene_page(service, page_size, page_token)
+    return await service.scenes.page(page_size, page_token)
 
 
 @router.get("/{scene}", responses=problems(401, 404, 422))
 async def get_scene(service: ServiceDep, scene: SceneName) -> Scene:
     """Probe, bounds, centre, training poses and metrics; mm, in the frame of the training sweep."""
-    return await scenes.scene(service, scene)
+    return await service.scenes.get(scene)
 
 
 @router.post("/{scene}:assess", openapi_extra=body_schema(AssessBody), responses=problems(401, 404, 413, 415, 422))
@@ -86,7 +91,7 @@ async def localize(request: Request, service: ServiceDep, scene: SceneName) -> L
     asked = LocalizationSettings(probe=body.probe, within_mm=body.within_mm, within_deg=body.within_deg)
     image = await asyncio.to_thread(_bytes_of, body.image)
     sought = sought_frame(image, body.image_height, body.image_width, asked)
-    work = locate(service, scene, sought, body.start.exact("start"), deadline, body.registration)
+    work = locate(service.rendering, scene, sought, body.start.exact("start"), deadline, body.registration)
     return await finish_or_abandon(work, request.receive, deadline)
 
 
@@ -100,13 +105,13 @@ def _bytes_of(text: str) -> bytes:
 @router.post("/{scene}:load", responses=problems(401, 403, 404, 422, 503, 507))
 async def load_scene(service: ServiceDep, scene: SceneName) -> SceneLoaded:
     """Loads the scene into every worker ahead of its first frame (rendering also loads on demand)."""
-    return SceneLoaded.of(scene, await service.load(scene))
+    return await service.scenes.load(scene)
 
 
 @router.post("/{scene}:unload", responses=problems(401, 403, 404, 422, 503))
 async def unload_scene(service: ServiceDep, scene: SceneName) -> SceneLoaded:
     """Frees the scene's memory; no error where it is not loaded."""
-    return SceneLoaded.of(scene, await service.unload(scene))
+    return await service.scenes.unload(scene)
 
 
 # Scene files: downloaded, imported, deleted, and looked into.
@@ -180,7 +185,7 @@ async def get_training_poses(request: Request, service: ServiceDep, scene: Scene
 async def download_scene(service: ServiceDep, scene: SceneName) -> FileResponse:
     """Downloads the scene file. Ranges are answered, so that a download can go on."""
     await service.catalog.header(scene)
-    path = await asyncio.to_thread(service.scenes.path, scene)
+    path = await asyncio.to_thread(service.scene_store.path, scene)
     return FileResponse(path, media_type=RAW, filename=f"{base_name(scene)}{SUFFIX}")
 
 
@@ -192,7 +197,7 @@ async def download_scene(service: ServiceDep, scene: SceneName) -> FileResponse:
 )
 async def import_scene(request: Request, service: ServiceDep, scene: SceneName, private: Private = False) -> Scene:
     """Takes a scene file in and serves it. It is checked first, and appears whole or not at all."""
-    service.require_serving()
+    service.life.require_serving()
     if request.headers.get("content-encoding", "identity").lower() != "identity":
         raise UnsupportedMediaType("the body must not be compressed", field="Content-Encoding")
     limit = service.settings.max_dataset_bytes
@@ -210,7 +215,7 @@ async def import_scene(request: Request, service: ServiceDep, scene: SceneName, 
 @files_router.delete("/{scene}", status_code=204, responses=problems(401, 403, 404, 422, 503))
 async def delete_scene(service: ServiceDep, scene: SceneName) -> None:
     """Deletes a scene that was imported or that a job made, and frees its memory. Others are not the service's."""
-    service.require_serving()
+    service.life.require_serving()
     await service.imports.delete(scene)
     await service.pool.forget(scene)
 
@@ -226,7 +231,7 @@ def _poses_json(header: SceneHeader) -> bytes:
 
 async def _blocks(request: Request, service: ServiceDep) -> AsyncIterator[bytes]:
     """The body as it comes. Raises ClientDisconnect, and as `arrival`."""
-    stopping: asyncio.Future[Any] = asyncio.ensure_future(service.draining.wait())
+    stopping: asyncio.Future[Any] = asyncio.ensure_future(service.life.draining.wait())
     more = True
     try:
         while more:

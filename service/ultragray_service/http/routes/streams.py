@@ -15,9 +15,9 @@ from pydantic import Field, FiniteFloat, TypeAdapter
 from ultragray.contract import described
 from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray.geometry.probe import FloatArray
-from ultragray.rendering.settings import RenderSettings
+from ultragray.rendering.settings import RenderSettings, settings_used
 from ultragray_service.access.credentials import STREAM_PROTOCOL
-from ultragray_service.core.frames import FrameHeader, settings_used
+from ultragray_service.core.frames import FrameHeader
 from ultragray_service.core.open_streams import Answered, StreamSummary, Watcher
 from ultragray_service.core.streams import FrameStream, Message, SceneSettings, StreamMode
 from ultragray_service.errors import Refusal, statuses_of
@@ -103,7 +103,7 @@ async def stream(websocket: WebSocket, scene: SceneName, name: StreamName = "") 
     place = ExitStack()
     try:
         check_subprotocols(websocket.scope["subprotocols"])
-        service.require_serving()
+        service.life.require_serving()
         await service.catalog.header(scene)
         place.enter_context(service.limits.stream())
         noted = place.enter_context(
@@ -117,7 +117,9 @@ async def stream(websocket: WebSocket, scene: SceneName, name: StreamName = "") 
     try:
         with place:
             await websocket.accept(STREAM_PROTOCOL if STREAM_PROTOCOL in websocket.scope["subprotocols"] else None)
-            await FrameStream(service, _WebSocketTransport(websocket, scene), (scene, RenderSettings()), noted).run()
+            await FrameStream(
+                service.rendering, _WebSocketTransport(websocket, scene), (scene, RenderSettings()), noted
+            ).run()
     except WebSocketDisconnect:
         pass
     except Draining as error:
@@ -273,7 +275,7 @@ async def watch(websocket: WebSocket, stream: str) -> None:
     try:
         offered = websocket.scope["subprotocols"]
         check_subprotocols(offered)
-        service.require_serving()
+        service.life.require_serving()
         place.enter_context(service.limits.stream())
         watcher = place.enter_context(service.streams.get(stream).watched())
     except UltragrayError as error:
@@ -298,7 +300,7 @@ async def _show(service: Service, websocket: WebSocket, watcher: Watcher) -> str
     """Until the stream ends, the watcher goes, or the service stops; how it ended."""
     showing = asyncio.ensure_future(_pass_on(websocket, watcher))
     gone = asyncio.ensure_future(_until_gone(websocket))
-    stopping = asyncio.ensure_future(service.draining.wait())
+    stopping = asyncio.ensure_future(service.life.draining.wait())
     tasks = {showing, gone, stopping}
     try:
         await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)

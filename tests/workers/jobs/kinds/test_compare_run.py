@@ -15,11 +15,12 @@ import torch
 
 from ultragray.errors import InvalidArgument, MemoryExceeded, TrainingDiverged
 from ultragray.learn.evaluation.baselines import evaluate_baselines
+from ultragray_studies import compare_run
 from ultragray_studies.methods.classical import Compounding, FromFrames
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import DatasetNotFound
 from ultragray_workers.jobs.folder import JobFolder, Outcome, Request
-from ultragray_workers.jobs.kinds import CompareJob, compare_run
+from ultragray_workers.jobs.kinds import CompareJob
 from ultragray_workers.jobs.specification import from_dict, to_dict
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped

@@ -5,17 +5,20 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
+from importlib.metadata import EntryPoint, entry_points
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from typing_extensions import Self
 
 from ultragray.contract import Family, described
+from ultragray.errors import ExtraMissing
 from ultragray.scene.info import SceneHeader
 from ultragray_workers.jobs.demand import AUTO, MAX_MEMORY_GB, check_device, check_labels
 from ultragray_workers.scene_names import check_scene_name, check_scene_reference
 
 MAX_RUN_S = 31_536_000.0
 TOPIC = "Worker"
+PLUGINS = "ultragray.job_kinds"  # entry points: the work of kinds that other distributions bring
 
 if TYPE_CHECKING:
     from ultragray.geometry.registration import Registration
@@ -64,7 +67,8 @@ class Specification(Family):
     worker_labels: dict[str, str] = described(
         'Labels that the worker must have, such as {"site": "lab1"}.', factory=dict, topic=TOPIC, kw_only=True
     )
-    run_module: ClassVar[str]  # its `run(job_run, specification)` does the work
+    # Its `run(job_run, specification)` does the work; None: that of an entry point of PLUGINS does.
+    run_module: ClassVar[str | None] = None
     needs_dataset: ClassVar[str | None] = None  # field: the dataset stays while the job waits or runs
     needs_scene: ClassVar[str | None] = None  # field: the scene is kept for the job as it is at the submission
     needs_registration: ClassVar[str | None] = None  # field: it leads the poses of the job as it is at the submission
@@ -94,6 +98,16 @@ class Specification(Family):
 
     def run(self, job_run: JobRun) -> Outcome:
         """Does the work; in the job's own process, for it imports torch."""
-        module: Any = import_module(self.run_module)
+        module: Any = self.plugin().load() if self.run_module is None else import_module(self.run_module)
         outcome: Outcome = module.run(job_run, self)
         return outcome
+
+    def plugin(self) -> EntryPoint:
+        """The module that does the work of a kind that another distribution brings. Raises ExtraMissing."""
+        for point in entry_points(group=PLUGINS, name=self.kind):
+            return point
+        raise ExtraMissing(
+            f"jobs of the kind {self.kind} are done by the distribution ultragray-studies, which is not installed: "
+            "pip install ultragray-studies",
+            field="kind",
+        )

@@ -7,7 +7,7 @@ from typing import Literal
 
 from ultragray.contract import described, kind_field
 from ultragray.learn.evaluation.methods import ComparisonSettings
-from ultragray_workers.jobs.kinds.base import Specification
+from ultragray_workers.jobs.kinds.base import Specification, Surroundings
 
 
 @dataclass(frozen=True)
@@ -21,6 +21,9 @@ class CompareJob(ComparisonSettings, Specification):
     dataset: str = described("Name of an uploaded dataset, with held-out frames.", kw_only=True)
     kind: Literal["compare"] = kind_field("compare")
 
-    run_module = "ultragray_workers.jobs.kinds.compare_run"
     has_checkpoints = True
     needs_dataset = "dataset"
+
+    def check(self, surroundings: Surroundings) -> None:
+        """Raises ExtraMissing where the methods are not installed."""
+        self.plugin()

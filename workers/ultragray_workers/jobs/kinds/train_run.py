@@ -9,22 +9,20 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 
-from ultragray.learn.evaluation.methods import ComparisonSettings
 from ultragray.learn.evaluation.side_by_side import write_spread
+from ultragray.learn.report.page import THIS_SCENE, Prediction, ScenePage, render_page
+from ultragray.learn.report.plots import write_training_curve
 from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import Progress as TrainingProgress
 from ultragray.learn.training import TrainingConfig
 from ultragray.learn.training import train as train_scene
+from ultragray.learn.training.memory import machine_in_words
 from ultragray.learn.training.pictures import pictures_in
+from ultragray.learn.training.progress import Course
 from ultragray.learn.training.run import FITTING
 from ultragray.learn.training.trainer import CHECKPOINT_FILE, JOURNAL_FILE
 from ultragray.scene.gaussians import GaussianScene
-from ultragray_studies.comparison.run import SCENE, compare_methods
-from ultragray_studies.methods.gaussians import GivenScene
-from ultragray_studies.report.page import ReportContent, render_page
-from ultragray_studies.report.study import scene_evaluation, trained_of_journal
 from ultragray_workers.jobs.files import BASELINES_NAME
-from ultragray_workers.jobs.kinds.curve import draw_training_curve
 from ultragray_workers.jobs.kinds.train import TrainJob
 from ultragray_workers.jobs.kinds.training.baselines import write_baselines
 from ultragray_workers.jobs.kinds.training.remaining import PICTURES, REPORT_FRAMES, Finishing
@@ -119,7 +117,7 @@ def _finish(
         beside = (job_run.folder.run / BASELINES_NAME, *pictures_in(job_run.folder.run))
         for path in (journal, *(one for one in beside if one.exists())):
             shutil.copyfile(path, folder / path.name)
-        draw_training_curve(journal, folder / "training_curve.png")
+        write_training_curve(Course.of_journal(journal), folder / "training_curve.png")
         document = {
             "scene": job.scene,
             "dataset": job.dataset,
@@ -129,28 +127,22 @@ def _finish(
         }
         (folder / "metrics.json").write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
         if len(dataset.val):
-            scene = scene.to(device)
-            _write_report(job_run, job, dataset, scene, folder)
+            _write_report(job, dataset, scene.to(device), folder, machine_in_words(device))
     job_run.progress = replace(job_run.progress, phase=None, seconds_left=0.0)
     return Outcome(artifacts=job_run.folder.artifact_names(), metrics=metrics)
 
 
-def _write_report(job_run: JobRun, job: TrainJob, dataset: Dataset, scene: GaussianScene, artifacts: Path) -> None:
-    """Pictures of some held-out frames, and the page of the scene alone: a comparison of one method."""
-    device = job_run.request.device
-    with job_run.folder.scratch() as folder:
-        methods = {SCENE: GivenScene(scene)}
-        comparison = compare_methods(dataset, methods, ComparisonSettings(), folder=folder, device=device)
-        assert comparison is not None  # nothing tells it to stop
-        evaluation = scene_evaluation(comparison)
-        write_spread(scene, dataset.val, evaluation, artifacts, PICTURES)
-        content = ReportContent(
-            dataset,
-            scene,
-            comparison,
-            folder,
-            scene_name=job.scene,
-            spread=REPORT_FRAMES,
-            trained=trained_of_journal(scene, evaluation, artifacts / JOURNAL_FILE),
-        )
-        (artifacts / "report.html").write_text(render_page(content), encoding="utf-8")
+def _write_report(job: TrainJob, dataset: Dataset, scene: GaussianScene, artifacts: Path, machine: str) -> None:
+    """Pictures of some held-out frames, and the page of the scene."""
+    prediction = Prediction.of_scene(scene, dataset.val)
+    write_spread(scene, dataset.val, prediction.evaluation, artifacts, PICTURES)
+    page = ScenePage(
+        dataset,
+        scene,
+        {THIS_SCENE: prediction},
+        machine,
+        scene_name=job.scene,
+        spread=REPORT_FRAMES,
+        course=Course.of_journal(artifacts / JOURNAL_FILE),
+    )
+    (artifacts / "report.html").write_text(render_page(page), encoding="utf-8")

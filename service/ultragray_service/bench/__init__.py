@@ -1,1 +1,0 @@
-"""`ultragray bench`: what the kernel, the service and the clients reach on this machine."""

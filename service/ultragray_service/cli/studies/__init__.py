@@ -1,1 +1,0 @@
-"""Commands that train and measure: train, eval, compare, report, bench."""

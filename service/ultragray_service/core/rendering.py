@@ -1,0 +1,246 @@
+"""From what a caller asks for to what the pool renders: every check, once, for all front doors.
+
+A door reads a request into settings and poses; `RequestPlanner` resolves the settings for the scene as it is now, in a
+`Plan`; `Rendering` gives plan and poses to the pool, again where the scene changed in between.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Awaitable, Callable
+from contextlib import nullcontext
+from dataclasses import replace
+from functools import lru_cache
+from typing import Generic
+
+from ultragray.contract import join, under
+from ultragray.errors import InvalidImageSize, RenderFailed, TooManyPoses
+from ultragray.geometry.probe import FloatArray
+from ultragray.geometry.registration import Registration
+from ultragray.rendering.settings import Encoding, FrameSettings, Resolved
+from ultragray.rendering.volumes import SliceSettings, SliceView, check_field
+from ultragray.scene.info import SceneHeader, SceneInfo
+from ultragray_service.access.audit import account
+from ultragray_service.access.limits import Limits
+from ultragray_service.access.owners import Owners
+from ultragray_service.access.principals import caller
+from ultragray_service.core.life import Life
+from ultragray_service.core.scenes import SceneCatalog, scene_to_blame
+from ultragray_service.settings import Settings
+from ultragray_service.telemetry.metrics import Metrics
+from ultragray_workers.errors import NotReady, SceneNotFound
+from ultragray_workers.jobs.owners import Kind
+from ultragray_workers.pool.messages import Destination, Priority, RenderRequest, RenderResult, S, SceneChangedError
+from ultragray_workers.pool.pool import MAX_SCENE_CHANGES, RenderPool
+from ultragray_workers.pool.waiting import Turn
+from ultragray_workers.scene_names import base_name
+from ultragray_workers.storage.local import FileVersion
+
+
+class Plan(Generic[S]):
+    """What a client wants of a scene: its settings, with nothing left open as the scene is now.
+
+    A frame is rendered for the version of the scene's file that they are for. Where the file has another by then, they
+    are resolved anew: what they left open is as the new scene has it. A scene that is asked for with a pin must have
+    that content.
+    """
+
+    settings: S
+    version: FileVersion
+    header: SceneHeader
+    registration: Registration | None  # that leads the poses into the scene
+
+    def __init__(
+        self,
+        catalog: SceneCatalog,
+        scene: str,
+        resolve: Callable[[SceneInfo], S],
+        path: str,
+        registration: Registration | None = None,
+    ) -> None:
+        """`path`: the place of the settings in the client's message, for errors. To be renewed before it is used."""
+        self.scene = base_name(scene)
+        self._asked = scene
+        self._catalog = catalog
+        self._resolve = resolve
+        self._path = path
+        self.registration = registration
+
+    def placed(self, poses: FloatArray) -> FloatArray:  # [..., 4, 4] mm, exact, both
+        """The poses probe→scene of those that the client sent."""
+        return poses if self.registration is None else self.registration.probe_to_scene(poses)
+
+    async def renew(self) -> None:
+        """Resolves the settings for the scene as it is now. Raises what RequestPlanner.plan raises."""
+        with under(self._path) if self._path else nullcontext():
+            version, header = await self._catalog.versioned_header(self._asked)
+            self.settings, self.version, self.header = self._resolve(header.info), version, header
+
+
+def as_resolved(settings: Resolved) -> Resolved:
+    """The settings as they are."""
+    return settings
+
+
+class RequestPlanner:
+    """Checks requests against the scenes and the limits of the service."""
+
+    def __init__(
+        self,
+        settings: Settings,
+        catalog: SceneCatalog,
+        registration: Callable[[str, str], Awaitable[Registration]],
+    ) -> None:
+        """`registration`: finds that of a name, for a scene."""
+        self._settings = settings
+        self._catalog = catalog
+        self._registration = registration
+
+    @property
+    def max_poses(self) -> int:
+        """Poses that one call may carry."""
+        return self._settings.max_poses_per_request
+
+    @property
+    def max_poses_at_once(self) -> int:
+        """Poses that one answer may carry: they all wait in the queue at the same time."""
+        return min(self._settings.max_poses_per_request, self._settings.queue_limit_frames)
+
+    async def plan(
+        self,
+        scene: str,
+        asked: FrameSettings,
+        encoding: Encoding,
+        *,
+        path: str = "",
+        registration: str | None = None,
+        complete: Callable[[Resolved], Resolved] = as_resolved,
+    ) -> Plan:
+        """The settings for a scene, with nothing left open; `complete` checks or adds what only the door knows.
+
+        Raises SceneNotFound, SceneFileInvalid, InvalidProbe, InvalidImageSize, UnknownOutput, InvalidArgument,
+        RegistrationNotFound, and what `complete` raises; `path` is the place of the settings in the client's message.
+        """
+        found = None
+        if registration is not None:
+            with under(path) if path else nullcontext():
+                await self._catalog.header(scene)
+                found = await self._registration(registration, scene)
+
+        def resolved(info: SceneInfo) -> Resolved:
+            return complete(self._resolved(info, asked, encoding, registration))
+
+        plan = Plan(self._catalog, scene, resolved, path, found)
+        await plan.renew()
+        return plan
+
+    async def plan_slice(
+        self, scene: str, asked: SliceSettings, encoding: Encoding, *, path: str = ""
+    ) -> Plan[SliceView]:
+        """The settings of a slice for a scene; `path` is their place in the client's message.
+
+        Raises SceneNotFound, SceneFileInvalid; InvalidArgument for labels of a scene without them, InvalidImageSize.
+        """
+        view = asked.view(encoding)
+        side, pixels = max(view.height, view.width), view.height * view.width
+        if side > self._settings.max_image_side or pixels > self._settings.max_request_pixels:
+            raise InvalidImageSize(
+                f"a slice may have at most {self._settings.max_image_side} pixels on a side and "
+                f"{self._settings.max_request_pixels} in all, size_mm and spacing_mm give {view.height}x{view.width}",
+                field=join(path, "spacing_mm"),
+            )
+
+        def resolve(info: SceneInfo) -> SliceView:
+            with under(path) if path else nullcontext():
+                check_field(asked.field, has_labels=bool(info.label_names))
+            return view
+
+        plan = Plan(self._catalog, scene, resolve, "")
+        await plan.renew()
+        return plan
+
+    def _resolved(
+        self, info: SceneInfo, asked: FrameSettings, encoding: Encoding, registration: str | None
+    ) -> Resolved:
+        resolved = asked.resolved(info, encoding, max_image_side=self._settings.max_image_side)
+        settings = _the_same(resolved if registration is None else replace(resolved, registration=registration))
+        with under("display"):
+            pixels = settings.pixels
+        if pixels > self._settings.max_request_pixels:
+            raise InvalidImageSize(
+                f"height x width x outputs must be at most {self._settings.max_request_pixels} pixels, got {pixels}",
+                field="height",
+            )
+        return settings
+
+    def check_pixels(self, settings: Resolved, poses: int) -> Resolved:
+        """The settings. Raises TooManyPoses for an answer of more pixels than one may have."""
+        pixels = poses * settings.pixels
+        if pixels > self._settings.max_request_pixels:
+            raise TooManyPoses(
+                f"poses x height x width x outputs must be at most {self._settings.max_request_pixels} "
+                f"pixels, got {pixels}; send the poses in several requests",
+                field="poses",
+            )
+        return settings
+
+    def deadline(self, timeout_s: float | None) -> float:
+        """The time.monotonic() seconds after a time; None: after the default timeout."""
+        return time.monotonic() + (self._settings.default_timeout_s if timeout_s is None else timeout_s)
+
+
+class Rendering:
+    """Frames for plans, from the pool: what every door asks for, whether once or in a stream."""
+
+    def __init__(
+        self, pool: RenderPool, planner: RequestPlanner, life: Life, owners: Owners, limits: Limits, metrics: Metrics
+    ) -> None:
+        self.pool, self.planner, self.life, self.limits, self.metrics = pool, planner, life, limits, metrics
+        self._owners = owners
+
+    def require_frames(self) -> None:
+        """Raises NotReady or Draining, saying why no frame would be rendered now."""
+        self.life.require_serving()
+        if not self.pool.ready:
+            raise NotReady("no render process is alive and gets on with its work at the moment")
+
+    async def render(
+        self,
+        plan: Plan[S],
+        poses: FloatArray,  # [C, 4, 4] mm, exact
+        *,
+        deadline: float | None,  # time.monotonic() in seconds
+        priority: Priority = Priority.INTERACTIVE,
+        turn: Turn | None = None,
+        begin_by: float | None = None,  # time.monotonic() in seconds; else it is refused
+        destination: Destination | None = None,
+    ) -> RenderResult[S]:
+        """Renders, with the settings as they are for the scene that is there when it is rendered.
+
+        Raises what RenderPool.render and Plan.renew raise; cancelling drops a request that still waits.
+        """
+        self.life.require_serving()
+        mine = account()
+        mine.target = plan.scene
+        mine.frames += len(poses)
+        if self._owners.hides(Kind.SCENE, plan.scene):  # since a stream began, for example
+            raise SceneNotFound(f"there is no scene {plan.scene!r} any more", field="scene")
+        turn = turn or Turn()
+        for _ in range(MAX_SCENE_CHANGES):
+            request = RenderRequest(
+                plan.scene, plan.settings, poses, priority, deadline, plan.version, caller(), begin_by, destination
+            )
+            try:
+                with scene_to_blame():
+                    return await self.pool.render(request, turn)
+            except SceneChangedError:
+                if turn.ticket is not None:  # perhaps with newer poses
+                    poses, deadline = turn.ticket.request.poses, turn.ticket.request.deadline
+                await plan.renew()
+        raise RenderFailed(f"scene {plan.scene!r} kept changing while it was being rendered", field="scene")
+
+
+@lru_cache(maxsize=256)
+def _the_same(settings: Resolved) -> Resolved:
+    """One object for equal settings, so that their picture is worked out once."""
+    return settings

@@ -1,0 +1,153 @@
+"""The one place where the parts of the service are made and given to each other, each after those that it needs."""
+
+from __future__ import annotations
+
+from functools import partial
+from typing import Any
+
+from ultragray_service.access.admission import Admission
+from ultragray_service.access.audit import AuditLog
+from ultragray_service.access.credentials import EnvironmentKeys, Guard, Sessions
+from ultragray_service.access.keys import KnownKeys
+from ultragray_service.access.limits import Limits
+from ultragray_service.access.oidc import Issuer, OidcTokens, parse_roles
+from ultragray_service.access.origins import Origins
+from ultragray_service.access.owners import Owners, Permissions
+from ultragray_service.core.datasets import Datasets
+from ultragray_service.core.jobs.jobs import Jobs
+from ultragray_service.core.life import Life
+from ultragray_service.core.open_streams import OpenStreams
+from ultragray_service.core.readiness import Readiness
+from ultragray_service.core.registrations import Registrations
+from ultragray_service.core.rendering import Rendering, RequestPlanner
+from ultragray_service.core.scenes import SceneCatalog, ScenePlaces, Scenes
+from ultragray_service.core.threads import HelperProcesses
+from ultragray_service.core.uploads import DatasetUploads, Holdings, SceneImports
+from ultragray_service.doors import Doors
+from ultragray_service.service import Service
+from ultragray_service.settings import Settings
+from ultragray_service.telemetry.logs import Tracing, start_tracing
+from ultragray_service.telemetry.metrics import Metrics
+from ultragray_service.views.assessments import Assessing
+from ultragray_service.views.prepared import Comparisons, DatasetViews, TrainingViews
+from ultragray_workers.datasets.store import DatasetStore
+from ultragray_workers.jobs.owners import Kind
+from ultragray_workers.jobs.store import JobStore
+from ultragray_workers.pool.messages import RenderResult
+from ultragray_workers.pool.pool import PoolConfig, RenderPool
+from ultragray_workers.scenes import SceneStore
+from ultragray_workers.storage.location import open_storage
+
+
+def make_service(settings: Settings) -> Service:
+    """A service that is not open yet. Raises StartupFailed for a data folder that does not exist, InvalidArgument."""
+    life, metrics, tracing = Life(), Metrics(), start_tracing("service")
+
+    keys, tokens = KnownKeys(), oidc_tokens(settings)
+    guard = Guard([keys, EnvironmentKeys(settings.api_keys), *([] if tokens is None else [tokens])])
+    sessions, audit, owners = Sessions(guard), AuditLog(), Owners()
+    limits = Limits(settings.allowance, metrics.count_limited)
+
+    places = ScenePlaces(settings)
+    scenes = SceneStore(places.data, places.made, hides=partial(owners.hides, Kind.SCENE))
+    datasets = DatasetStore(
+        settings.working_folder,
+        open_storage(settings.artifacts),
+        settings.max_cache_bytes,
+        hides=partial(owners.hides, Kind.DATASET),
+    )
+    catalog = SceneCatalog(scenes)
+    registrations = Registrations(catalog, owners, limits)
+    holdings = Holdings(limits, owners, datasets, scenes)
+    jobs = Jobs(settings, scenes, datasets, registrations.read_of_scene, holdings.admit_job)
+
+    pool = _pool(settings, places, metrics, tracing)
+    planner = RequestPlanner(settings, catalog, registrations.of_scene)
+    rendering = Rendering(pool, planner, life, owners, limits, metrics)
+    metrics.read(pool, lambda: jobs.overview, places)
+
+    permissions = Permissions(
+        owners,
+        {Kind.JOB: lambda job: jobs.do(JobStore.ownership, job), Kind.REGISTRATION: registrations.ownership},
+        {Kind.SCENE: scenes.require, Kind.DATASET: datasets.get},
+    )
+    # Each process may take all the memory that settings allow to one: one checks at a time, and one makes pictures.
+    checks, pictures = (HelperProcesses(settings.dataset_memory_mb << 20) for _ in range(2))
+    return Service(
+        settings=settings,
+        life=life,
+        doors=Doors.of(settings, settings.http_port, settings.grpc_port, None),
+        keys=keys,
+        tokens=tokens,
+        guard=guard,
+        sessions=sessions,
+        origins=Origins(settings.host, names=settings.allowed_hosts, pages=settings.cors_origins),
+        owners=owners,
+        limits=limits,
+        audit=audit,
+        admission=Admission(audit, limits, sessions, permissions),
+        places=places,
+        scene_store=scenes,
+        catalog=catalog,
+        scenes=Scenes(catalog, places, scenes, pool, owners, life),
+        datasets=Datasets(datasets, owners),
+        registrations=registrations,
+        jobs=jobs,
+        uploads=DatasetUploads(datasets, settings, jobs, life.draining, checks, owners, holdings),
+        imports=SceneImports(scenes, places.made, settings, jobs, checks, owners, holdings),
+        pool=pool,
+        planner=planner,
+        rendering=rendering,
+        streams=OpenStreams(),
+        assessing=Assessing(catalog, registrations),
+        dataset_views=DatasetViews(datasets, settings, pictures),
+        comparisons=Comparisons(scenes, catalog, datasets, settings, pictures),
+        training_views=TrainingViews(jobs, datasets, settings, pictures),
+        readiness=Readiness(
+            lambda: jobs.database,
+            require_serving=life.require_staying,
+            require_frames=rendering.require_frames,
+            scenes=places,
+            without_jobs=settings.ready_without_jobs,
+        ),
+        metrics=metrics,
+        tracing=tracing,
+    )
+
+
+def _pool(settings: Settings, places: ScenePlaces, metrics: Metrics, tracing: Tracing | None) -> RenderPool:
+    """The render processes; each result is counted and traced."""
+    config = PoolConfig(
+        processes=settings.processes,
+        threads_per_process=settings.threads_per_process,
+        queue_limit_frames=settings.queue_limit_frames,
+        client_limit_frames=settings.client_limit_frames,
+        max_queue_ms=settings.max_queue_ms,
+        max_batch_poses=settings.max_batch_poses,
+        memory_budget_bytes=settings.memory_budget_mb * 2**20,
+        max_footprint_pixels=settings.max_footprint_pixels,
+        worker_grace_s=settings.worker_grace_s,
+        worker_timeout_s=settings.worker_timeout_s,
+        backend=settings.backend,
+    )
+
+    def observe(result: RenderResult[Any]) -> None:
+        metrics.observe_result(result)
+        if tracing is not None:
+            tracing.observe_result(result)
+
+    # Scenes of its own: nothing is hidden from the pool, which works for everybody at once.
+    return RenderPool(SceneStore(places.data, places.made), config, observe)
+
+
+def oidc_tokens(settings: Settings) -> OidcTokens | None:
+    """The tokens of the settings; None: they name no issuer."""
+    if settings.oidc_issuer is None:
+        return None
+    return OidcTokens(
+        Issuer(settings.oidc_issuer, settings.oidc_ca),
+        audience=settings.oidc_audience,
+        role_claim=settings.oidc_role_claim,
+        name_claim=settings.oidc_name_claim,
+        roles=parse_roles(settings.oidc_roles),
+    )

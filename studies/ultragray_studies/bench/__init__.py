@@ -1,0 +1,1 @@
+"""What the kernel, the service and its clients reach on this machine: `ultragray bench`."""

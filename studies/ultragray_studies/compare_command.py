@@ -1,0 +1,236 @@
+"""`ultragray compare`: methods side by side on the same held-out frames, each within the same budget."""
+
+from __future__ import annotations
+
+import shutil
+import sys
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from ultragray.datasets.source import SourceOptions
+from ultragray.errors import TrainingStateInvalid
+from ultragray.learn.evaluation.methods import ComparisonSettings
+from ultragray_service.cli.app import INTERRUPTED
+from ultragray_service.cli.evaluate import print_speckle
+from ultragray_service.cli.options import with_options
+from ultragray_service.cli.sweeps import SweepArgument, check_source, read_dataset, warn_about_dataset
+from ultragray_service.cli.terminal import (
+    COMPUTE,
+    Json,
+    Threads,
+    check_file,
+    command_group,
+    examples,
+    output_option,
+    stop_on_signal,
+    to_json,
+)
+
+if TYPE_CHECKING:
+    from ultragray.datasets import Dataset
+    from ultragray_studies.comparison.result import Comparison
+    from ultragray_studies.comparison.run import ComparisonProgress
+
+PAGE_SUFFIX, BESIDE_IT = ".html", (".json", ".tex")
+
+command_app = command_group()
+
+
+@command_app.command(
+    epilog=examples(
+        "ultragray compare sweep/ --methods median,mean,linear,nearest  # seconds",
+        "ultragray compare sweep/ -o comparison.html  # every method, as long as a scene takes",
+        "ultragray compare sweep/ --methods scene,median --json | jq '.results[].name'",
+    )
+)
+@with_options
+def compare(
+    sweep: SweepArgument,
+    output: Annotated[
+        Path | None,
+        output_option(
+            "Page to write (.html), with .json and .tex beside it. What each method learned is kept in OUTPUT.run: the "
+            "same command goes on from there, also with more methods.",
+            default="none, only the table",
+        ),
+    ] = None,
+    force: Annotated[
+        bool, typer.Option("--force", help="Replace what is there, and begin anew.", rich_help_panel="Output")
+    ] = False,
+    json: Json = False,
+    device: Annotated[
+        str, typer.Option(help="cpu, or a GPU: cuda, or cuda:N for one of several.", rich_help_panel=COMPUTE)
+    ] = "cpu",
+    threads: Threads = 0,
+    *,
+    settings: ComparisonSettings,
+    source: SourceOptions,
+) -> None:
+    """The figures are those of `ultragray eval`. Ctrl-C stops; with --output, the same command goes on."""
+    check_source(sweep)
+    if output is not None:
+        _check_output(output, force=force)
+        import ultragray_studies.comparison.page  # noqa: F401  # packages that it lacks are told before all the work
+
+    from ultragray.learn.evaluation.scoring import require_frames
+    from ultragray.learn.training.memory import training_device
+    from ultragray_studies.methods.registry import chosen_methods
+
+    training_device(device, "auto")  # refused before the sweep is read, which may take long
+    if threads:
+        import torch
+
+        torch.set_num_threads(threads)
+    read = read_dataset(sweep, source)
+    require_frames(read.val)
+    warn_about_dataset(read)
+    if output is not None:
+        if force:
+            shutil.rmtree(run_folder(output), ignore_errors=True)
+        _compare(read, settings, device, run_folder(output), output, as_json=json)
+        return
+    if any(method.describe().published_steps is not None for method in chosen_methods(settings.methods).values()):
+        typer.echo("what the methods learn is not kept; with --output PAGE.html it is, and a page is written", err=True)
+    with tempfile.TemporaryDirectory(prefix="ultragray-compare-") as folder:
+        _compare(read, settings, device, Path(folder), None, as_json=json)
+
+
+def run_folder(output: Path) -> Path:
+    """The folder of what each method of a comparison learned."""
+    return output.with_name(f"{output.name}.run")
+
+
+def _check_output(output: Path, *, force: bool) -> None:
+    """Raise InvalidArgument where the page or a file beside it cannot be written, or is not this comparison's to write.
+
+    TrainingStateInvalid where the folder of the run is another thing's: --force would remove it.
+    """
+    from ultragray_studies.comparison.place import RUN_FILE
+
+    run = run_folder(output)
+    is_a_run = (run / RUN_FILE).is_file()
+    if run.exists() and not is_a_run and not (run.is_dir() and next(run.iterdir(), None) is None):
+        raise TrainingStateInvalid(f"{run}: it is there, and holds no comparison: give another --output, or move it")
+    check_file(output, [PAGE_SUFFIX], force=force or is_a_run)
+    for suffix in BESIDE_IT:
+        check_file(output.with_suffix(suffix), force=force or is_a_run)
+
+
+def _compare(
+    dataset: Dataset, settings: ComparisonSettings, device: str, run: Path, output: Path | None, *, as_json: bool
+) -> None:
+    from ultragray_studies.comparison.run import compare as compare_methods
+
+    last: ComparisonProgress | None = None
+    with stop_on_signal() as should_stop, _progress_bar() as show:
+
+        def report(state: ComparisonProgress) -> None:
+            nonlocal last
+            last = state
+            show(state)
+
+        comparison = compare_methods(
+            dataset, settings, folder=run, device=device, report=report, should_stop=should_stop
+        )
+        written = [] if comparison is None or output is None else _write(comparison, dataset, run, output)
+    if comparison is None:
+        typer.echo(
+            f"{_where(last)}; {'nothing is kept' if output is None else 'go on with the same command'}", err=True
+        )
+        raise typer.Exit(INTERRUPTED)
+    if as_json:
+        typer.echo(to_json(comparison.to_dict() | {"written": [str(path) for path in written]}))
+    else:
+        _print(comparison, written)
+    if not comparison.measured:
+        raise typer.Exit(1)
+
+
+def _print(comparison: Comparison, written: list[Path]) -> None:
+    _print_table(comparison)
+    if comparison.measured:
+        print_speckle({one.title: one.evaluation for one in comparison.results if one.evaluation is not None})
+    for path in written:
+        typer.echo(f"wrote {path}")
+
+
+def _print_table(comparison: Comparison) -> None:
+    """A table of the means of each method, its costs and its mean rank, and why a method has none."""
+    from rich.markup import escape
+    from rich.table import Table
+
+    from ultragray.learn.report.tables import METRICS, rank, shown_value
+    from ultragray_service.cli.terminal import wide_console
+    from ultragray_studies.comparison.tables import budget_text, steps_text
+
+    table = Table(box=None, pad_edge=False)
+    heads = ("", *(metric.label for metric in METRICS), "steps", "training, s", "frame, ms", "MB", "mean rank")
+    for place, head in enumerate(heads):
+        table.add_column(head, justify="right" if place else "left", no_wrap=True)
+    ranks = rank(comparison.measured)
+    for one in comparison.results:
+        if one.evaluation is not None:
+            means = one.evaluation.mean.to_dict()
+            table.add_row(
+                escape(one.title),
+                *(shown_value(metric.name, means[metric.name]) for metric in METRICS),
+                steps_text(one),
+                f"{one.seconds:,.1f}",
+                f"{one.frame_ms:,.1f}",
+                f"{one.model_bytes / 1e6:,.2f}",
+                f"{ranks[one.name].mean:.2f}",
+            )
+    console, facts = wide_console(), comparison.dataset
+    head = f"{facts.name}, {facts.val_frames} val frames, {comparison.machine}; budget: {budget_text(comparison)}"
+    console.print(head, highlight=False, markup=False, soft_wrap=True)
+    console.print(table)
+    for one in comparison.results:
+        if one.failure is not None:
+            console.print(f"{one.title} failed: {one.failure}", highlight=False, markup=False, soft_wrap=True)
+
+
+def _write(comparison: Comparison, dataset: Dataset, run: Path, output: Path) -> list[Path]:
+    """The page and what stands beside it, of the names that the output gives them."""
+    from ultragray.files import write_whole
+    from ultragray_studies.comparison.page import write_comparison
+
+    written = []
+    for made in write_comparison(comparison, dataset, run):
+        written.append(output.with_suffix(made.suffix))
+        write_whole(written[-1], made.read_bytes())
+    return written
+
+
+def _where(state: ComparisonProgress | None) -> str:
+    """Where a comparison was stopped."""
+    if state is None:
+        return "stopped before the first method"
+    at = f"stopped at {state.method}, method {state.number} of {state.of}"
+    return at if state.fit is None else f"{at}, after step {state.fit.step:,} of {state.fit.steps:,}"
+
+
+@contextmanager
+def _progress_bar() -> Iterator[Callable[[ComparisonProgress], None]]:
+    """A bar a method on a terminal's stderr; elsewhere a line for each tenth of a fit."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+    console = Console(stderr=True)
+    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bars:
+        task = bars.add_task("", total=None)
+
+        def show(state: ComparisonProgress) -> None:
+            named, fit = f"{state.method} ({state.number} of {state.of})", state.fit
+            if console.is_terminal:
+                done, of = (None, None) if fit is None else (fit.step, fit.steps)
+                bars.update(task, description=named, completed=done, total=of)
+            elif fit is not None and fit.step * 10 // fit.steps > (fit.step - 1) * 10 // fit.steps:
+                sys.stderr.write(f"{named}: step {fit.step:,} of {fit.steps:,}: loss {fit.loss:.4f}\n")
+
+        yield show

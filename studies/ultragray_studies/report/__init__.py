@@ -1,1 +1,0 @@
-"""A scene, its baselines and its ablations on one page."""

@@ -1,0 +1,83 @@
+"""The page of a trained scene: complete, self-contained, and safe with any name."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from dataclasses import replace
+from html.parser import HTMLParser
+from pathlib import Path
+
+import pytest
+
+from ultragray.datasets import Dataset
+from ultragray.learn.evaluation.scoring import evaluate
+from ultragray.learn.report.page import THIS_SCENE, Prediction, ScenePage, render_page
+from ultragray.learn.report.plots import write_training_curve
+from ultragray.learn.training import Progress, TrainingConfig, train
+from ultragray.learn.training.progress import Course
+from ultragray.learn.training.trainer import JOURNAL_FILE
+
+VOID = {"meta", "img", "link", "br"}
+
+
+class Checked(HTMLParser):
+    """Tags that are closed in order, and every address that the page refers to."""
+
+    def __init__(self, text: str) -> None:
+        super().__init__()
+        self.open_tags: list[str] = []
+        self.addresses: list[str] = []
+        self.feed(text)
+
+    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.addresses += [value or "" for name, value in attrs if name in ("src", "href", "xlink:href")]
+        if tag not in VOID:
+            self.open_tags.append(tag)
+
+    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+        self.handle_starttag(tag, attrs)
+        if tag not in VOID:
+            self.open_tags.pop()
+
+    def handle_endtag(self, tag: str) -> None:
+        assert self.open_tags.pop() == tag
+
+
+@pytest.fixture
+def page(tiny_dataset: Callable[..., Dataset], tiny_config: Callable[..., TrainingConfig], tmp_path: Path) -> ScenePage:
+    """The page of a training, whose course is that of the journal of its run."""
+    dataset = replace(tiny_dataset(), name="tiny <sweep>")
+    seen: list[Progress] = []
+    scene = train(dataset, tiny_config(steps=6, confidence=False), folder=tmp_path, report=seen.append)
+    course = Course.of_journal(tmp_path / JOURNAL_FILE)
+    assert course.losses == [progress.loss for progress in seen]
+    assert course.val_psnr_db == {one.val_step: one.val_psnr_db for one in seen if one.val_step is not None}
+    assert course.seconds == pytest.approx(6 * course.step_s)
+    assert course.seconds > 0.0
+    predictions = {THIS_SCENE: Prediction.of_scene(scene, dataset.val)}
+    return ScenePage(dataset, scene, predictions, "a machine", scene_name="ball & <noise>", spread=2, course=course)
+
+
+def test_the_page_of_a_scene_alone_with_frames_from_end_to_end(page: ScenePage, tmp_path: Path) -> None:
+    text = render_page(page)
+    checked = Checked(text)
+    assert checked.open_tags == []
+    assert all(address.startswith(("data:image/png;base64,", "#")) for address in checked.addresses)
+    assert "<script" not in text
+    assert "url(http" not in text
+    assert "tiny &lt;sweep&gt;" in text
+    assert re.findall(r"<h2>(.*?)</h2>", text) == ["Held-out frames", "Pictures", "Training"]
+    assert "<dt>Scene</dt><dd>ball &amp; &lt;noise&gt;</dd>" in text
+    assert re.findall(r'<th scope="row">(.*?)</th>', text) == [THIS_SCENE, "true frames", THIS_SCENE]
+    mean = evaluate(page.scene, page.dataset.val).mean
+    assert f"{mean.psnr_db:.2f} ±" in text
+    first, last = page.dataset.val.frame_numbers[[0, -1]]
+    assert re.findall(r"<figcaption>Frame (\d+)</figcaption>", text) == [str(first), str(last)]
+    assert text.count("<img ") == 2 * 5  # truth, the scene and how far it is off, what it is made of
+    assert render_page(replace(page, spread=24)).count("<img ") == len(page.dataset.val) * 5
+    read_from_a_file = render_page(replace(page, course=None))
+    assert re.findall(r"<h2>(.*?)</h2>", read_from_a_file) == ["Held-out frames", "Pictures"]
+    assert page.course is not None
+    write_training_curve(page.course, tmp_path / "curve.png")
+    assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")

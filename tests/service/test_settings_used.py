@@ -1,0 +1,165 @@
+"""Every door tells every setting of a frame as it was used: none of them has a list of its own."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import fields
+from enum import Enum
+from pathlib import Path
+from typing import Any, get_args, get_type_hints
+
+import numpy as np
+import pytest
+
+from ultragray import LinearProbe
+from ultragray.contract import to_dict
+from ultragray.exchange.exports.exporter import ExportHeader
+from ultragray.exchange.exports.plus_sequence import PlusExporter
+from ultragray.exchange.ros_messages import geometry_document
+from ultragray.geometry.probe import ElevationBeam
+from ultragray.rendering.display import Display
+from ultragray.rendering.settings import Additions, Resolved, SettingsUsed, settings_used
+from ultragray.rendering.tools import Needle
+from ultragray.scene.confidence import Extrapolation
+from ultragray_client.frames import frame_from_message, origin_of
+from ultragray_service.core.open_streams import Answered
+from ultragray_service.http.routes.rendering import render_headers
+from ultragray_service.http.routes.streams import frame_bytes
+from ultragray_service.igtl.frames import Frame, PoseMessage, image_of
+from ultragray_service.igtl.messages import Message
+from ultragray_service.rpc.messages import frame_message
+from ultragray_workers.pool.messages import RenderResult
+
+HEIGHT, WIDTH = 12, 10
+EXAMPLES: dict[Any, Any] = {
+    float: 0.25,
+    int: 3,
+    bool: True,
+    str: "arm",
+    Needle: Needle(tip_mm=(0.0, 0.0, 9.0), hub_mm=(5.0, 0.0, 1.0)),
+}
+
+
+def example(annotation: Any, default: Any) -> Any:
+    """A value of an annotation that is not the default."""
+    if isinstance(annotation, type) and issubclass(annotation, Enum):
+        return next(one for one in annotation if one is not default)
+    if annotation in EXAMPLES:
+        return EXAMPLES[annotation]
+    if "members" in vars(annotation) if isinstance(annotation, type) else False:
+        return next(value for value in EXAMPLES.values() if isinstance(value, annotation))
+    inner = example(get_args(annotation)[0], default)
+    return (inner,) if isinstance(default, tuple) else inner
+
+
+HINTS = get_type_hints(Additions)
+SETTINGS = Resolved(
+    LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=24.0),
+    HEIGHT,
+    WIDTH,
+    beam=ElevationBeam(1.5),
+    display=Display(flip=True, depth_mm=18.0),
+    **{one.name: example(HINTS[one.name], one.default) for one in fields(Additions)},
+)
+PLAIN = Resolved(LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=24.0), HEIGHT, WIDTH)
+
+
+def result(settings: Resolved) -> RenderResult:
+    height, width = settings.picture.height, settings.picture.width
+    return RenderResult(
+        scene="demo",
+        scene_sha256="0" * 64,
+        renderer="ultragray/0 cpu",
+        settings=settings,
+        poses=np.eye(4)[None],
+        data=bytes(height * width),
+        queue_ms=1.0,
+        render_ms=2.0,
+        encode_ms=0.0,
+        extrapolations=(Extrapolation(1.0, 2.0, 0.5, 0.9),),
+        batch_size=1,
+    )
+
+
+def parsed(texts: dict[str, str], key: Callable[[str], str]) -> dict[str, Any]:
+    """The settings that texts tell under the keys of their names."""
+    found: dict[str, Any] = {}
+    for one in fields(SettingsUsed):
+        if (text := texts.get(key(one.name))) is not None:
+            found[one.name] = text.split(",") if one.name == "outputs" else text
+            if text[0] in "[{0123456789":
+                found[one.name] = json.loads(text)
+    return found
+
+
+def http(settings: Resolved) -> dict[str, Any]:
+    return parsed(render_headers(result(settings)), lambda name: f"X-Ultragray-{name.replace('_', '-').title()}")
+
+
+def websocket(settings: Resolved) -> dict[str, Any]:
+    message = frame_bytes(Answered(1, None, result(settings)))
+    told: dict[str, Any] = json.loads(message[4 : 4 + int.from_bytes(message[:4], "little")])
+    return told
+
+
+def grpc(settings: Resolved) -> dict[str, Any]:
+    message = frame_message(result(settings), 1)
+    return origin_of(frame_from_message(type(message).FromString(message.SerializeToString())))
+
+
+def igtl(settings: Resolved) -> dict[str, Any]:
+    rendered = result(settings)
+    posed = PoseMessage(Message("TRANSFORM", "demo", b""), np.eye(4), 0.0)
+    frame = Frame(posed, rendered, image_of(rendered), None, None)  # type: ignore[arg-type]
+    return parsed(frame.message("IMAGE", 2).metadata, lambda name: name)  # type: ignore[arg-type]
+
+
+def header(settings: Resolved) -> ExportHeader:
+    return ExportHeader(settings, "uint8", np.eye(4)[None], "demo", "0" * 64, "ultragray/0 cpu")
+
+
+def export(settings: Resolved) -> dict[str, Any]:
+    return header(settings).origin()
+
+
+def plus(settings: Resolved) -> dict[str, Any]:
+    exporter = PlusExporter(Path("/dev/null"), header(settings))
+    try:
+        return parsed(exporter._fields(), lambda name: f"UltraGRay{name.title().replace('_', '')}")
+    finally:
+        exporter.abandon()
+
+
+def ros(settings: Resolved) -> dict[str, Any]:
+    """The geometry of a topic, of a recording and of a file of a job."""
+    document = geometry_document(grpc(settings), "probe")
+    own = geometry_document(export(settings), "probe")
+    assert json.loads(json.dumps(document)) == json.loads(json.dumps(own))
+    return {**document, "picture": export(settings)["picture"]}  # which has names of its own there
+
+
+DOORS = [http, websocket, grpc, igtl, export, plus, ros]
+
+
+@pytest.mark.parametrize("door", DOORS, ids=lambda door: door.__name__)
+def test_every_door_tells_every_setting_as_used(door: Callable[[Resolved], dict[str, Any]]) -> None:
+    expected = json.loads(json.dumps(to_dict(settings_used(SETTINGS))))
+    told = json.loads(json.dumps(door(SETTINGS)))
+    assert {name: told.get(name) for name in expected} == expected
+
+
+@pytest.mark.parametrize("door", DOORS, ids=lambda door: door.__name__)
+def test_what_was_not_asked_for_may_be_left_out(door: Callable[[Resolved], dict[str, Any]]) -> None:
+    expected = json.loads(json.dumps(to_dict(settings_used(PLAIN))))
+    told = json.loads(json.dumps(door(PLAIN)))
+    left_out = expected.keys() - told.keys()
+    assert left_out <= {one.name for one in fields(Additions)}
+    assert {name: told[name] for name in expected.keys() - left_out} == {
+        name: expected[name] for name in expected.keys() - left_out
+    }
+
+
+def test_every_setting_has_a_value_of_its_own_here() -> None:
+    assert all(getattr(SETTINGS, one.name) != one.default for one in fields(Additions))
+    assert settings_used(SETTINGS).display != settings_used(PLAIN).display

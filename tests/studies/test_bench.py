@@ -1,0 +1,191 @@
+"""`ultragray bench` writes what it prints: parts that add up, and counts that one knows by heart."""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+from collections.abc import Iterator
+from datetime import datetime
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from ultragray import GaussianScene, LinearProbe, SceneInfo
+from ultragray.datasets import Dataset, Sweep
+from ultragray.phantom import PHANTOM_PROBE, freehand_poses, simulate
+from ultragray.rendering.backends import cpu
+from ultragray_studies.bench import clients, parts, report
+from ultragray_studies.bench.clients import ClientsExtent, JobsExtent, bench_clients, bench_jobs
+from ultragray_studies.bench.kernel import BenchScene
+from ultragray_studies.bench.parts import LANES, PARTS, View, bench_kernel_details, bench_training, measure_training
+
+PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=40.0)
+
+
+def one_gaussian(sigma_mm: float) -> GaussianScene:
+    """A round one in the middle of the image, that does not absorb."""
+    splats = {
+        "means": torch.tensor([[0.0, 0.0, 2.0]]),
+        "scales": torch.full((1, 3), math.log(sigma_mm / 10.0)),
+        "quats": torch.tensor([[1.0, 0.0, 0.0, 0.0]]),
+        "transmittances": torch.tensor([20.0]),
+        "sh0": torch.zeros(1, 1, 1),
+        "shN": torch.zeros(1, 0, 1),
+    }
+    return GaussianScene.from_splats(splats, info=SceneInfo(probe=PROBE, image_height=80, image_width=80))
+
+
+@pytest.mark.parametrize("instruction_set", cpu.INSTRUCTION_SETS)
+def test_the_work_of_a_gaussian_is_its_footprint(instruction_set: str) -> None:
+    scene = one_gaussian(sigma_mm=1.0)
+    strips = cpu.drawing_work(scene, PROBE, np.eye(4)[None], 80, 80, instruction_set=instruction_set)
+    assert strips["slices"].shape == (1, 2)
+    assert strips["slices"].tolist() == [[1, 0]]  # its last scan line is the 47th
+    work = {name: counts.sum() for name, counts in strips.items()}
+    across = 2 * math.ceil(3.33 / 0.5)  # scan lines within its reach on either side, half a millimetre apart
+    assert work["slices"] == 1
+    assert across / LANES[instruction_set] <= work["groups"] <= across / LANES[instruction_set] + 2
+    assert math.pi * 3.33**2 / 0.25 <= work["lanes"]  # the pixels of the ellipse
+    assert work["lanes"] <= work["rows"] * LANES[instruction_set]
+
+
+def test_nothing_to_draw_is_no_work() -> None:
+    away = np.eye(4)[None].copy()
+    away[0, 1, 3] = 5.0
+    assert not any(counts.any() for counts in cpu.drawing_work(one_gaussian(1.0), PROBE, away, 80, 80).values())
+
+
+def test_bench_of_the_kernels_parts(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    def tiny(quick: bool) -> Iterator[View]:
+        yield View("one", one_gaussian(1.0), PROBE, np.eye(4)[None].repeat(4, 0), 80, 80)
+
+    monkeypatch.setattr(parts, "views", tiny)
+    monkeypatch.setattr(report, "time_yard_ms", lambda: 4.0)
+    bench_kernel_details(tmp_path / "kernel.json", quick=True)
+    rows = json.loads((tmp_path / "kernel.json").read_text())["rows"]
+    assert [row["instruction_set"] for row in rows] == list(cpu.INSTRUCTION_SETS)
+    for row in rows:
+        assert row["slicing_ms"] + row["drawing_ms"] + row["finishing_ms"] == pytest.approx(row["frame_ms"])
+        assert 0.0 < row["lanes_used"] <= 1.0
+        assert row["modelled_speedups"]["2"] < 2.0  # all of it lies in one of two strips
+        assert row["modelled_speedups"]["16"] >= row["modelled_speedups"]["2"]
+    printed = capsys.readouterr().out
+    assert all(f"{row['groups']:,.0f}" in printed for row in rows)
+
+
+TINY = BenchScene(300, 0.1, height=24, width=20)
+
+
+def test_parts_make_up_the_step() -> None:
+    timing = measure_training(TINY, threads=1, repeats=3)
+    assert list(timing.part_ms) == list(PARTS)
+    assert len(timing.step_ms) == 3
+    assert np.sum(list(timing.part_ms.values()), axis=0).tolist() == pytest.approx(timing.step_ms)
+    assert min(min(times) for times in timing.part_ms.values()) > 0.0
+    assert all(0.0 < timing.share(part) < 1.0 for part in PARTS)
+
+
+def test_leaves_the_scene_and_the_threads_as_they_were() -> None:
+    before = {name: tensor.clone() for name, tensor in TINY.scene.splats.items()}
+    threads = torch.get_num_threads()
+    measure_training(TINY, threads=threads + 1, repeats=1)
+    assert torch.get_num_threads() == threads
+    assert all(torch.equal(before[name], tensor) for name, tensor in TINY.scene.splats.items())
+
+
+@pytest.mark.parametrize(("quick", "gaussians"), [(True, [300]), (False, [400, 300])])
+def test_training_bench(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    quick: bool,
+    gaussians: list[int],
+) -> None:
+    large, small = BenchScene(400, 0.1, height=24, width=20), BenchScene(300, 0.1, height=24, width=20)
+    monkeypatch.setattr(parts, "training_scenes", lambda: [large, small])
+    monkeypatch.setattr(report, "time_yard_ms", lambda: 4.0)
+    bench_training(tmp_path / "bench.json", quick)
+    document = json.loads((tmp_path / "bench.json").read_text())
+    assert [row["gaussians"] for row in document["rows"]] == gaussians
+    assert document["yard_ms"] == 4.0
+    assert document.get("quick", False) == quick
+    for row in document["rows"]:
+        assert row["images"] == "8 of 24x20"
+        assert row["step_yards"] == pytest.approx(row["step_ms"] / 4.0)
+        assert list(row["shares"]) == list(PARTS)
+        assert all(0.0 <= share <= 1.0 for share in row["shares"].values())
+    printed = capsys.readouterr().out
+    assert "yard 4.0 ms" in printed
+    assert f"{document['rows'][-1]['step_ms']:.0f}" in printed
+
+
+def small_phantom() -> Dataset:
+    poses = freehand_poses(8)
+    images = simulate(poses, probe=PHANTOM_PROBE, height=32, width=24)
+    sweep = Sweep(images, poses, PHANTOM_PROBE, np.arange(8), "phantom")
+    return Dataset("phantom", sweep.select([0, 1, 2, 4, 5, 6]), sweep.select([3, 7]))
+
+
+@pytest.mark.long
+def test_bench_of_jobs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    monkeypatch.setattr(clients, "load_phantom", small_phantom)
+    monkeypatch.setattr(clients, "STEPS", 100_000)
+    monkeypatch.setattr(report, "time_yard_ms", lambda: 4.0)
+    monkeypatch.setattr(clients, "JobsExtent", lambda **less: JobsExtent(150, 3, 1, 0.3, 32))
+    bench_jobs(tmp_path / "jobs.json", quick=True)
+    document = json.loads((tmp_path / "jobs.json").read_text())
+    assert document["extent"] == {"jobs": 150, "pages": 3, "rounds": 1, "seconds": 0.3, "side": 32}
+    assert list(document["latency_ms"]) == [
+        "page of 50, newest",
+        "page of 50, in the middle",
+        "frame, alone",
+        "frame, beside a training",
+    ]
+    assert all(0.0 < times["p50"] <= times["p99"] for times in document["latency_ms"].values())
+    frames = [document["latency_ms"][what]["p99"] for what in ("frame, alone", "frame, beside a training")]
+    assert document["p99_ratio"] == pytest.approx(frames[1] / frames[0])
+    assert "ready with 150 jobs after " in capsys.readouterr().out
+
+
+@pytest.mark.long
+def test_bench_of_clients(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    tiny = ClientsExtent(loop_s=1.0, stream_s=0.3, ping_pongs=5, frames=12, gaussians=500, kernel_repeats=3, side=32)
+    monkeypatch.setattr(report, "time_yard_ms", lambda: 4.0)
+    monkeypatch.setattr(clients, "ClientsExtent", lambda **less: tiny)
+    bench_clients(tmp_path / "clients.json", quick=True)
+    found = json.loads((tmp_path / "clients.json").read_text())["clients"]
+    assert list(found) == [
+        "control loop",
+        "WebSocket, 1 client(s)",
+        "WebSocket, 8 client(s)",
+        "OpenIGTLink",
+        "augmentation",
+    ]
+    loop, augmentation = found["control loop"], found["augmentation"]
+    assert 0 < loop["p50_ms"] <= loop["p99_ms"] <= loop["p99.9_ms"]
+    assert loop["frames_per_s"] == pytest.approx(60, rel=0.5)
+    assert augmentation["share_of_kernel"] == pytest.approx(
+        augmentation["frames_per_s"] / augmentation["kernel_frames_per_s"]
+    )
+
+
+def test_the_head_says_commit_date_and_machine(capsys: pytest.CaptureFixture[str]) -> None:
+    report.main()
+    head = json.loads(capsys.readouterr().out)
+    assert list(head) == ["commit", "date", "machine"]
+    assert datetime.fromisoformat(head["date"]).tzinfo is not None
+    machine = head["machine"]
+    assert (machine["threads"], machine["cores"]) == (os.cpu_count(), os.cpu_count())
+    assert machine["instruction_set"] == cpu.INSTRUCTION_SETS[0]
+    assert machine["memory_gib"] > 0.1
+    assert report.measured(1)["machine"] == {**machine, "threads": 1}
+
+
+def test_an_installed_package_has_no_commit(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(report, "ROOT", tmp_path)
+    assert report.commit() is None
