@@ -24,6 +24,8 @@ from ultragray.learn.sweep import Dataset, Sweep
 from ultragray_workers.datasets.shelf import FILES_NAME
 from ultragray_workers.datasets.store import DatasetRecord, DatasetStore, write_manifest
 from ultragray_workers.jobs.database import SQLITE_FILE, JobDatabase
+from ultragray_workers.jobs.files import Artifact
+from ultragray_workers.jobs.folder import Request
 from ultragray_workers.jobs.kinds import TrainJob
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 
@@ -97,6 +99,18 @@ def files_of(artifact_folder: Path, name: str) -> Path:
     """The files of a dataset in an artifact folder, as they were sent."""
     with DatasetStore(artifact_folder).shelf.files(name) as files:
         return files
+
+
+def request_of(specification: dict[str, Any], artifact_folder: Path, submitted: int = 1, **options: Any) -> Request:
+    """The instructions of a worker without anything special, on the processor."""
+    folder = str(artifact_folder)
+    return Request(specification, submitted, None, None, "cpu", 1, 0, folder, folder, **options)
+
+
+def path_of(artifact: Artifact) -> Path:
+    """The file that an artifact is, of a folder."""
+    assert artifact.storage.local is not None
+    return artifact.storage.local / artifact.stored.key
 
 
 def train_job(

@@ -211,10 +211,12 @@ def row_of(engine: sa.Engine, job_id: str) -> Row | None:
     return None if row is None else Row.of(row)
 
 
-def specification_of(engine: sa.Engine, job_id: str) -> str:
-    """The whole specification of a job that is there, as JSON."""
+def specification_of(engine: sa.Engine, job_id: str) -> dict[str, Any]:
+    """The whole specification of a job that is there, in JSON."""
     with engine.connect() as connection:
-        return connection.execute(sa.select(JOBS.c.specification).where(JOBS.c.id == job_id)).scalar_one()
+        text = connection.execute(sa.select(JOBS.c.specification).where(JOBS.c.id == job_id)).scalar_one()
+    specification: dict[str, Any] = json.loads(text)
+    return specification
 
 
 def page(

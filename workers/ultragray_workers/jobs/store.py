@@ -336,7 +336,7 @@ class JobStore:
             raise JobNotFinished(
                 f"only a failed or cancelled job can be retried, the job {job_id} is {row.state.value}", field="job"
             )
-        specification = from_dict(json.loads(queue.specification_of(self._engine, job_id)))
+        specification = from_dict(queue.specification_of(self._engine, job_id))
         again = _Submission(
             id=_id_of(f"retry {job_id}", row.owner),
             specification=specification,

@@ -7,11 +7,11 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
-from ultragray_workers.jobs.queue.unfinished import demands_waiting
 
 from ultragray.installation import memory_bytes
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.demand import Demand, WorkerDevice
+from ultragray_workers.jobs.queue import demands_waiting
 from ultragray_workers.jobs.store import Job, JobState, JobStore
 from ultragray_workers.jobs.worker.device import DeviceLock, HostDevice
 from ultragray_workers.jobs.worker.gate import Gate
@@ -114,7 +114,7 @@ def workstation(jobs: JobDatabase, artifact_folder: Path) -> Callable[[str], Gat
         names = ("cuda:0", "cuda:1", "cpu")
         devices = [WorkerDevice(name=one, model="a model", memory_bytes=8 * 10**9) for one in names]
         locks = [DeviceLock(artifact_folder, HostDevice(one, one.name), name) for one in devices]
-        return Gate(jobs.folder, locks, (), lambda: demands_waiting(jobs))
+        return Gate(jobs.identity, locks, (), lambda: demands_waiting(jobs.engine))
 
     return make
 

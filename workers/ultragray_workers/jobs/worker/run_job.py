@@ -44,7 +44,8 @@ def main(folder_path: str, worker_pid: str, *descriptors: str) -> int:
     signal.signal(signal.SIGTERM, lambda number, frame: received.append(number))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     path = Path(folder_path)
-    folder = JobFolder(path.parent.parent, path.name)
+    job_id, _, attempt = path.name.rpartition(".")
+    folder = JobFolder(path.parent.parent, job_id, int(attempt))
     with folder.lock.open("a") as lock:
         while not _is_locked(lock.fileno()):  # another worker's process may still be at it, or have finished
             if received:
