@@ -34,7 +34,8 @@ SECTIONS: Mapping[str, tuple[str, ...]] = {
         ),
     ),
     "Concepts": (
-        *("concepts/frame.md", "physics.md", "concepts/training.md", "confidence.md", "concepts/limits.md", "poses.md"),
+        *("concepts/frame.md", "physics.md", "concepts/training.md", "concepts/jobs.md", "confidence.md"),
+        *("concepts/limits.md", "poses.md"),
         "concepts/methods.md",
         "concepts/*.md",
     ),

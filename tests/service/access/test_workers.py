@@ -33,7 +33,7 @@ def let_work(database: JobDatabase, name: str, job: str | None) -> None:
     """A worker that goes on living, at work on a job, as its heartbeat would write it."""
     with database.engine.begin() as connection:
         facts = {"seen_at_s": time.time() + 3600.0, "host": "bench", "pid": 7, "device": "cpu", "version": "1"}
-        connection.execute(sa.insert(WORKERS).values(executor=name, job_id=job, **facts))
+        connection.execute(sa.insert(WORKERS).values(name=name, job=job, **facts))
 
 
 def told_http(keyed: Keyed, who: str) -> dict[str, tuple[str, str | None]]:

@@ -113,7 +113,7 @@ def plus_files() -> dict[str, bytes]:
 
 
 def uploads_under_way(folder: Path) -> list[str]:
-    return [path.name for path in folder.glob("datasets/.*")]
+    return [path.name for path in folder.glob("uploads/.*")]
 
 
 def helper_process(service: RunningService, work: str) -> int | None:
@@ -329,11 +329,9 @@ def test_an_upload_needs_a_key(service: RunningService, files: dict[str, bytes])
 def test_pages_join_to_the_whole_list(http: httpx.Client, artifacts: Path, files: dict[str, bytes]) -> None:
     names = ["a", "b", "c"]
     put(http, "a", zipped(files))
-    manifest = json.loads((artifacts / "datasets" / "a" / "dataset.json").read_text())
+    manifest = json.loads((artifacts / "datasets" / "a.json").read_text())
     for name in names[1:]:
-        (artifacts / "datasets" / name).mkdir()
-        (artifacts / "datasets" / name / "dataset.json").write_text(json.dumps({**manifest, "name": name}))
-    (artifacts / "datasets" / "no-manifest").mkdir()
+        (artifacts / "datasets" / f"{name}.json").write_text(json.dumps({**manifest, "name": name}))
     found, token = [], ""
     while True:
         page = http.get("/v1/datasets", params={"page_size": 2, "page_token": token}).json()
@@ -392,7 +390,7 @@ def test_a_check_that_is_killed(http: httpx.Client, service: RunningService, fil
 def test_a_service_that_dies_or_stops_leaves_nothing(start_service: StartService, tmp_path: Path) -> None:
     first = start_service(artifact_folder=tmp_path, api_keys=KEY)
     upload = HalfUpload(first, "half")
-    wait_until(lambda: list(tmp_path.glob(f"datasets/.*/{LOCK_NAME}")))
+    wait_until(lambda: list(tmp_path.glob(f"uploads/.*/{LOCK_NAME}")))
     first.process.kill()
     first.process.wait()
     upload.close()
