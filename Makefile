@@ -10,7 +10,7 @@ KERNEL_SOURCES := $(wildcard model/kernels/*) CMakeLists.txt
 PACKAGES := . proto client ros studies
 PACKAGE_SOURCES := $(KERNEL_SOURCES) $(PACKAGES:%=%/pyproject.toml) $(wildcard distribution/*.py)
 PIP_INSTALL := $(BIN)/python -m pip install --quiet --disable-pip-version-check
-GENERATED_TESTS := tests/proto tests/client/test_client_generated.py tests/documents/test_measured_tables.py tests/documents/test_snapshots.py tests/benchmarks/test_registry.py
+GENERATED_TESTS := tests/proto tests/client/test_client_generated.py tests/documents/test_snapshots.py
 PYTHON_SOURCES := model service workers proto client ros studies distribution tests benchmarks docs examples
 NPM := $(shell command -v npm)
 CONSOLE := service/ultragray_service/console/index.html
@@ -22,8 +22,8 @@ ARGS ?=
 # control, and the documents are rewritten: only from a committed checkout, so that the figures can name their commit.
 RECORD ?=
 FIGURES := build/bench
-READY = @$(if $(RECORD),$(BIN)/python benchmarks/record.py --ready &&) mkdir -p $(FIGURES)
-KEEP = @$(if $(RECORD),$(BIN)/python benchmarks/record.py,:)
+READY = @$(if $(RECORD),$(BIN)/python benchmarks/figures.py ready &&) mkdir -p $(FIGURES)
+KEEP = @$(if $(RECORD),$(BIN)/python benchmarks/figures.py record,:)
 MINUTES ?= 30
 FRAMES ?= 100000
 # Hundreds of processes of the tests import the sources: the first one's bytecode is kept for the others.
@@ -121,12 +121,11 @@ check-web:
 	@$(CONSOLE_IF_POSSIBLE)
 	@[ ! -d web/node_modules ] || npm --prefix web run --silent check
 
-# Warns, no more: figures are taken anew when there is time for it.
 check-figures:
-	@$(BIN)/python benchmarks/age.py --changed
+	@$(BIN)/python benchmarks/figures.py check
 
-figures: $(VENV)/python  ## list the measured figures: commit, date, machine, and whether their code has changed since
-	@$(BIN)/python benchmarks/age.py
+figures: $(VENV)/installed  ## list the measured figures: commit, date, machine, and how many commits of the product came since
+	@$(BIN)/python benchmarks/figures.py list
 
 format: $(VENV)/installed-dev  ## rewrite the sources in the project's format
 	$(BIN)/python docs/notebooks.py
@@ -168,62 +167,62 @@ bench-cuda: $(VENV)/installed  ## the same on a GPU, with the distance to what i
 results: $(VENV)/installed-dev  ## train on every data set of DATA, then methods; prints the tables of docs/results.md (ARGS="--only liver_convex" for one training)
 	$(READY)
 	$(BIN)/python benchmarks/results_tables.py $(DATA) $(ARGS)
-	@$(BIN)/python benchmarks/documents.py --show results
+	@$(BIN)/python benchmarks/figures.py show results
 	$(KEEP) results_tables
 	$(if $(ARGS),,@$(MAKE) --no-print-directory methods)
 
 methods: $(VENV)/installed-dev  ## compare all methods on every data set of DATA at equal time; a killed run goes on; takes two hours (ARGS="--only liver_convex" for one)
 	$(READY)
 	$(BIN)/python benchmarks/methods_tables.py $(DATA) $(ARGS)
-	@$(BIN)/python benchmarks/documents.py --show methods
+	@$(BIN)/python benchmarks/figures.py show methods
 	$(KEEP) methods_tables
 
 ablations: $(VENV)/installed-dev  ## train without each part of the training, three seeds each; takes an hour
 	$(READY)
 	$(BIN)/python benchmarks/ablations.py $(DATA) $(ARGS)
-	@$(BIN)/python benchmarks/documents.py --show ablations
+	@$(BIN)/python benchmarks/figures.py show ablations
 	$(KEEP) ablations
 
 poses: $(VENV)/installed-dev  ## train with errors added to poses, with and without refinement; takes half an hour
 	$(READY)
 	$(BIN)/python benchmarks/poses.py $(DATA) $(ARGS)
-	@$(BIN)/python benchmarks/documents.py --show poses
+	@$(BIN)/python benchmarks/figures.py show poses
 	$(KEEP) poses
 
 localization: $(VENV)/installed-dev  ## find held-out frames again from 3 mm and 5° away; trains first, half an hour
 	$(READY)
 	$(BIN)/python benchmarks/localization.py $(DATA) $(ARGS)
-	@$(BIN)/python benchmarks/documents.py --show localization
+	@$(BIN)/python benchmarks/figures.py show localization
 	$(KEEP) localization
 
 confidence: $(VENV)/installed-dev  ## how true confidence and uncertainty are, scene by scene; takes an hour
 	$(READY)
-	$(BIN)/python benchmarks/confidence.py --data $(DATA) $(ARGS)
-	@$(BIN)/python benchmarks/documents.py --show confidence
+	$(BIN)/python benchmarks/confidence.py $(DATA) $(ARGS)
+	@$(BIN)/python benchmarks/figures.py show confidence
 	$(KEEP) confidence
 
 libraries: $(VENV)/installed-dev  ## the image processing here beside scikit-image's: time and difference
 	$(READY)
 	$(BIN)/python benchmarks/libraries.py
-	@$(BIN)/python benchmarks/documents.py --show libraries
+	@$(BIN)/python benchmarks/figures.py show libraries
 	$(KEEP) libraries
 
 environment: $(VENV)/installed-dev  ## steps a second of the gymnasium environment with a random policy
 	$(READY)
 	$(BIN)/python benchmarks/environment.py
-	@$(BIN)/python benchmarks/documents.py --show environment
+	@$(BIN)/python benchmarks/figures.py show environment
 	$(KEEP) environment
 
 ros: $(VENV)/installed-dev  ## the time from a pose published in ROS 2 to its image, through the node (wants make test-ros before)
 	$(READY)
 	$(BIN)/python benchmarks/ros.py
-	@$(BIN)/python benchmarks/documents.py --show ros
+	@$(BIN)/python benchmarks/figures.py show ros
 	$(KEEP) ros
 
 simulation: $(VENV)/installed-dev  ## simulate 1,000 replicas behind Envoy, for docs/scaling.md; takes some minutes (ARGS="--only load" for one study)
 	$(READY)
 	$(BIN)/python benchmarks/simulation.py $(ARGS)
-	@$(BIN)/python benchmarks/documents.py --show simulation
+	@$(BIN)/python benchmarks/figures.py show simulation
 	$(KEEP) simulation
 
 demo-scene: $(VENV)/installed  ## simulate the phantom, train the demo scene from it and put it in its place

@@ -7,8 +7,6 @@
 
 from __future__ import annotations
 
-import argparse
-import json
 import time
 from itertools import product
 from typing import Any
@@ -17,14 +15,12 @@ import gymnasium
 import numpy as np
 import torch
 
-from registry import FIGURES
-from ultragray.files import write_whole
+from figures import write
 from ultragray.phantom.demo import DEMO_FILE
 from ultragray.scene.gaussians import GaussianScene
 from ultragray_studies.bench.report import measured
 from ultragray_studies.gym import STANDARD_PLANE
 
-OUTPUT = FIGURES["environment"].staged
 SIDES = (64, 128, 256)
 CONTACTS = (None, "air")
 THREADS = 1
@@ -34,7 +30,6 @@ Row = dict[str, Any]
 
 
 def main() -> None:
-    argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0]).parse_args()
     scene = GaussianScene.load(DEMO_FILE)
     torch.set_num_threads(THREADS)
     cases = list(product(SIDES, CONTACTS))
@@ -48,8 +43,7 @@ def main() -> None:
         "rounds": ROUNDS,
         "rows": [row(*case, rounds) for case, rounds in took_ms.items()],
     }
-    OUTPUT.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(OUTPUT, json.dumps(document, indent=1, allow_nan=False) + "\n")
+    write("environment", document)
 
 
 def steps_of_random_policy(scene: GaussianScene, side: int, contact: str | None) -> list[float]:

@@ -7,8 +7,6 @@ On one thread, on frames of the built-in phantom and on noise. docs/libraries.md
 
 from __future__ import annotations
 
-import argparse
-import json
 import statistics
 import subprocess
 import sys
@@ -27,10 +25,9 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from skimage.transform import resize_local_mean, warp
 from skimage.util import img_as_ubyte
 
-from registry import FIGURES
+from figures import write
 from ultragray import ConvexProbe
 from ultragray.datasets.images import resize_frames
-from ultragray.files import write_whole
 from ultragray.geometry.scan_conversion import interpolated, samples
 from ultragray.learn.evaluation.metrics import frame_metrics, ms_ssim_scales
 from ultragray.learn.sweep import Sweep
@@ -40,7 +37,6 @@ from ultragray.phantom.sweeps import PHANTOM_IMAGE_SIDE, PHANTOM_PROBE, freehand
 from ultragray.rendering.pixels import to_uint8
 from ultragray_studies.bench.report import measured
 
-OUTPUT = FIGURES["libraries"].staged
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=50.0, far_mm=150.0)
 PIXEL_MM = 0.2
 SIDE = 512
@@ -62,7 +58,6 @@ Row = dict[str, Any]
 
 
 def main() -> None:
-    argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0]).parse_args()
     torch.set_num_threads(1)
     cv2.setNumThreads(1)
     poses = freehand_poses(FRAMES, tilt_deg=6.0)
@@ -76,8 +71,7 @@ def main() -> None:
         "rows": [*of_metrics(images), *of_images()],
         "shadows": of_shadows(sweep),
     }
-    OUTPUT.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(OUTPUT, json.dumps(document, indent=1, allow_nan=False) + "\n")
+    write("libraries", document)
 
 
 def installed_mb(name: str) -> float:

@@ -1,38 +1,30 @@
-"""Held-out frames found again in trained scenes, from poses that are 3 mm and 5° off.
+"""Held-out frames found again in trained scenes, from poses that are 3 mm and 5° off: `make localization`.
 
-    python benchmarks/localization.py [DATA_FOLDER] [--only NAME ...]
-
-Of the built-in phantom the demo scene is used, and the held-out sweep is simulated; the sets of DATA_FOLDER are trained
-by `fast` first, without their held-out frames. Each frame is moved in a direction, and turned about an axis, at random.
-The figures of a set go into build/bench/localization.json as soon as they are there.
+Of the built-in phantom the demo scene is used, and the held-out sweep is simulated; the other sets are trained by
+`fast` first, without their held-out frames. Each frame is moved in a direction, and turned about an axis, at random.
 """
 
 from __future__ import annotations
 
-import argparse
-import json
 import math
 import time
-from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from registry import FIGURES, Document
+from figures import Document, measure_runs
 from ultragray.datasets.source import load_dataset
-from ultragray.files import write_whole
 from ultragray.geometry.probe import FloatArray
 from ultragray.learn.localization.search import Motions, localize
 from ultragray.learn.training import TrainingConfig
 from ultragray.phantom import PHANTOM_IMAGE_SIDE, PHANTOM_PROBE, freehand_poses, simulate
 from ultragray.phantom.demo import load_demo_scene
 from ultragray.scene.gaussians import GaussianScene
-from ultragray_studies.bench.report import measured
 from ultragray_studies.report import train_and_evaluate
 
-OUTPUT = FIGURES["localization"].staged
 PHANTOM = "phantom"
 SETS = (PHANTOM, "ultranerf_liver", "spine_phantom", "liver_convex")
 OFF_MM, OFF_DEG = 3.0, 5.0
@@ -41,23 +33,10 @@ SAME_MM = 0.3  # that two searches for a frame may end apart
 MOST_FRAMES = 24  # of a set, evenly taken
 THREADS = 2
 
-Row = dict[str, Any]
 
-
-def main() -> None:
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
-    parser.add_argument("data_folder", type=Path, nargs="?", help="folder of the data sets; without: the phantom alone")
-    parser.add_argument("--only", nargs="+", choices=SETS, metavar="NAME", help=", ".join(SETS))
-    given = parser.parse_args()
-    torch.set_num_threads(THREADS)
-    for name in given.only or SETS:
-        if name == PHANTOM or given.data_folder is not None:
-            head = measured(THREADS)
-            scene, images, poses = held_out(name, given.data_folder)
-            found = {**row(scene, images, poses), "measured": head}
-            figures = json.loads(OUTPUT.read_text()) if OUTPUT.exists() else {}
-            OUTPUT.parent.mkdir(parents=True, exist_ok=True)
-            write_whole(OUTPUT, json.dumps({**figures, name: found}, indent=1, allow_nan=False) + "\n")
+def measure(name: str, data_folder: Path) -> Document:
+    """What became of the held-out frames of a set."""
+    return row(*held_out(name, data_folder))
 
 
 def held_out(name: str, data_folder: Path) -> tuple[GaussianScene, Any, FloatArray]:
@@ -72,7 +51,7 @@ def held_out(name: str, data_folder: Path) -> tuple[GaussianScene, Any, FloatArr
     return scene, dataset.val.images[chosen], dataset.val.poses[chosen]
 
 
-def row(scene: GaussianScene, images: Any, poses: FloatArray) -> Row:
+def row(scene: GaussianScene, images: Any, poses: FloatArray) -> Document:
     """What became of the frames: errors and time of each, from a pose that is off and from the recorded one."""
     motions, random = Motions.of(scene.info.probe_or(None)), np.random.default_rng(0)
     errors, at_recorded, apart_mm, took_s, is_found = [], [], [], [], []
@@ -114,19 +93,5 @@ def between(motions: Motions, one: FloatArray, other: FloatArray) -> tuple[float
     return motions.step_between(torch.from_numpy(one), torch.from_numpy(other))
 
 
-def table(figures: Document) -> Iterator[str]:
-    """The Markdown of what was measured."""
-    yield (
-        f"| set | held-out frames | within {FOUND_MM:g} mm and {FOUND_DEG:g}° | from the recorded pose | "
-        "both end in one place | median error | time, median and 90 of 100 |"
-    )
-    yield "|---|---|---|---|---|---|---|"
-    for name in SETS:
-        if (one := figures.get(name)) is not None:
-            shares = " | ".join(f"{one[key]:.0%}" for key in ("within", "within_from_recorded", "same_place"))
-            error = f"{one['median_mm']:.2f} mm, {one['median_deg']:.2f}°"
-            yield f"| {name} | {one['frames']} | {shares} | {error} | {one['p50_s']:.2f} s, {one['p90_s']:.2f} s |"
-
-
 if __name__ == "__main__":
-    main()
+    measure_runs("localization", __doc__, {name: partial(measure, name) for name in SETS}, threads=THREADS)

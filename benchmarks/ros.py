@@ -8,8 +8,6 @@ rclpy, which `make test-ros` installs.
 
 from __future__ import annotations
 
-import argparse
-import json
 import os
 import subprocess
 import sys
@@ -23,14 +21,12 @@ from typing import Any
 
 import numpy as np
 
-from registry import FIGURES
-from ultragray.files import write_whole
+from figures import write
 from ultragray.phantom.demo import copy_demo_scene, demo_poses
 from ultragray_client import Client, RenderSettings
 from ultragray_studies.bench.report import measured
 from ultragray_studies.bench.served import running_server
 
-OUTPUT = FIGURES["ros"].staged
 SCENE = "demo"
 SIDES = (256, 512)
 FRAMES, UNCOUNTED, ROUNDS = 200, 20, 3
@@ -42,7 +38,6 @@ Ask = Callable[[int], None]  # of a frame by the number of its pose, until it is
 
 
 def main() -> None:
-    argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0]).parse_args()
     os.environ.update(SURROUNDINGS)
     threads = os.cpu_count() or 1
     rows: list[Row] = []
@@ -58,8 +53,7 @@ def main() -> None:
                         took_ms[way] += times_ms(ways[way])
                 rows += [row(side, way, times) for way, times in took_ms.items()]
     document = {"measured": measured(threads), "frames": FRAMES, "rounds": ROUNDS, "rows": rows}
-    OUTPUT.parent.mkdir(parents=True, exist_ok=True)
-    write_whole(OUTPUT, json.dumps(document, indent=1, allow_nan=False) + "\n")
+    write("ros", document)
 
 
 def times_ms(ask: Ask) -> list[float]:

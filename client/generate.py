@@ -1,6 +1,5 @@
 """Generates what the client does not write by hand: `python client/generate.py`.
 
-`sync/` is `aio/` without its asyncio, by unasync; `transport.py` and `__init__.py` are written by hand in both.
 `contract.py` are the service's dataclasses that callers fill in or get, without its checks, and `errors.py` the errors
 that calls may end with, so that the client needs neither `ultragray` nor torch.
 """
@@ -11,15 +10,12 @@ import inspect
 import re
 import subprocess
 import sys
-import tempfile
 import textwrap
 from collections.abc import Iterable, Iterator
 from dataclasses import MISSING, Field, is_dataclass
 from enum import Enum
 from pathlib import Path
 from typing import Any, get_args, get_type_hints
-
-import unasync
 
 from ultragray.contract import Contract, Family, annotated_fields
 from ultragray.datasets.source import SourceOptions
@@ -35,7 +31,6 @@ from ultragray_workers.datasets.store import DatasetRecord
 from ultragray_workers.jobs.kinds import Specification
 
 PACKAGE = Path(__file__).resolve().parent / "ultragray_client"
-MODULES = ("client", "connection", "datasets", "jobs", "registrations", "scenes", "stream", "workers")
 
 # The classes that callers fill in or get, each with all that it is made of, and the names that the client gives them.
 ROOTS = {
@@ -107,29 +102,6 @@ from .geometry import Picture, PoseLike
 '''
 _RECORDING_HEADER = "# Generated from {module} by client/generate.py; change that.\n"
 _RAISES = re.compile(r"\s*\bRaises\s.*?(?=\n\n|\Z)", flags=re.DOTALL)
-_HEADER = "# Generated from aio/{name}.py by client/generate.py; change that file.\n"
-_REPLACEMENTS = {"asyncio": "time", "aclosing": "closing"}  # of asyncio, `sleep` alone is used
-_KEYWORD = re.compile(r"\b(?:async|await) ")
-
-
-def generate_sync(output_folder: Path) -> list[Path]:
-    """Writes the modules for threads, and returns their paths."""
-    texts = {name: (PACKAGE / "aio" / f"{name}.py").read_text() for name in MODULES}
-    classes = {f"Async{found}": found for text in texts.values() for found in re.findall(r"class Async(\w+)", text)}
-    with tempfile.TemporaryDirectory() as temporary:
-        source = Path(temporary, "aio")
-        source.mkdir()
-        for name, text in texts.items():
-            (source / f"{name}.py").write_text(text)
-        rule = unasync.Rule("/aio/", "/sync/", additional_replacements={**_REPLACEMENTS, **classes})
-        unasync.unasync_files([str(source / f"{name}.py") for name in MODULES], [rule])
-        written = []
-        for name in MODULES:
-            target = output_folder / f"{name}.py"
-            text = Path(temporary, "sync", target.name).read_text()
-            target.write_text(_HEADER.format(name=name) + _KEYWORD.sub("", text))  # those left are in docstrings
-            written.append(target)
-    return formatted(written)
 
 
 def generate_errors(output_folder: Path) -> Path:
@@ -307,4 +279,3 @@ if __name__ == "__main__":
     generate_errors(PACKAGE)
     generate_contract(PACKAGE)
     generate_recording(PACKAGE / "recording")
-    generate_sync(PACKAGE / "sync")

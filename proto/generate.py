@@ -168,7 +168,7 @@ def _values(pragma: re.Match[str], owner: str, declared: set[str], lock: Lock) -
     found = {}
     for word in named:
         name = f"{prefix}_{word.upper()}"
-        meaning = getattr(named[word], "meaning", "") if isinstance(named, Mapping) else ""
+        meaning = getattr(named[word], "about", "") if isinstance(named, Mapping) else ""
         found[lock.number(owner, name)] = _comment(meaning, indent) + f"{indent}{name} = "
     return "".join(f"{line}{number};\n" for number, line in sorted(found.items()))
 

@@ -7,9 +7,15 @@ is told as one of `ultragray_client.errors`.
 
 from __future__ import annotations
 
+from ultragray_client import contract, errors
+from ultragray_client.client import AsyncClient, Client
 from ultragray_client.connection import Tls
+from ultragray_client.contract import *  # noqa: F403
+from ultragray_client.errors import ClientError
 from ultragray_client.exchange import StreamMode
-from ultragray_client.frames import Localization
+from ultragray_client.frames import Frame, Localization, Slice, Timings
+from ultragray_client.geometry import Picture, Placement, PoseLike, Quaternion
+from ultragray_client.recording.recording import Recording
 from ultragray_client.records import (
     AuditEntry,
     ConfidenceFit,
@@ -27,17 +33,7 @@ from ultragray_client.records import (
     WorkerDevice,
     WorkerState,
 )
-
-from . import contract, errors
-from .aio.client import AsyncClient
-from .aio.stream import AsyncFrameStream
-from .contract import *  # noqa: F403
-from .errors import ClientError
-from .frames import Frame, Slice, Timings
-from .geometry import Picture, Placement, PoseLike, Quaternion
-from .recording.recording import Recording
-from .sync.client import Client
-from .sync.stream import FrameStream
+from ultragray_client.stream import AsyncFrameStream, FrameStream
 
 __all__ = [
     "AsyncClient",

@@ -8,12 +8,11 @@ import re
 import ssl
 import time
 import warnings
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Generic, TypeAlias, TypeVar
+from typing import Any, TypeAlias
 from urllib.parse import quote
 
 import grpc
@@ -93,15 +92,11 @@ class Retries:
 
 
 # Options of a connection, and calls that go on where they broke off.
-
-
-T = TypeVar("T")
 ApiKey: TypeAlias = str | Callable[[], str]  # of which the function gives one that is valid when it is called
 
 DEFAULT_ADDRESS = "localhost:50051"
 DEFAULT_TIMEOUT_S = 30.0
 LONGEST_PAUSE_OF_STREAMS_S = 1.0  # between attempts to go on: a control loop waits
-PAGE_SIZE = 1000  # the most that the service gives at once
 CHANNEL_OPTIONS: tuple[tuple[str, str | int], ...] = (
     ("grpc.max_receive_message_length", -1),  # a frame of float32 outputs may be larger than the usual 4 MiB
     ("grpc.keepalive_time_ms", 30_000),  # only while calls are under way; a peer that vanished is noticed
@@ -126,24 +121,39 @@ def metadata_of(request: Any, api_key: ApiKey | None) -> Metadata:
     return (*metadata, ("x-api-key", api_key if isinstance(api_key, str) else api_key()))
 
 
-class Conversation(ABC, Generic[T]):
-    """Calls whose answers are streams: where one breaks off, the next asks for what is missing."""
+class Terms:
+    """What goes with every call of a client: address, key, and how long it may take. Raises InvalidArgument."""
 
-    @abstractmethod
-    def request(self) -> Any:
-        """The request of the next call; None when all is there."""
+    def __init__(self, address: str, api_key: ApiKey | None, tls: Tls | None, timeout_s: float) -> None:
+        self.address = check_address(address)
+        self._api_key, self._timeout_s = api_key, check_timeout(timeout_s)
+        if api_key is not None and tls is None:
+            warn_of_open_key(address)
 
-    @abstractmethod
-    def take(self, message: Any) -> T:
-        """The meaning of a message."""
+    def metadata(self, request: Any) -> Metadata:
+        """The metadata of a call; `request` as in `metadata_of`."""
+        return metadata_of(request, self._api_key)
 
-    @abstractmethod
-    def end_of_call(self) -> None:
-        """Notes that the service ended a call without an error. Raises ClientError where it should have gone on."""
+    def retries(self, timeout_s: float | None, *, is_short: bool = False) -> Retries:
+        """The attempts within `timeout_s`.
 
-    def pause_s(self, error: ClientError, retries: Retries) -> float:
-        """The seconds to wait before the next call. Raises the error where no other call can succeed."""
-        return retries.pause_s(error)
+        None: as the client has it for a short call; of others as long as they take, with so much patience.
+        """
+        if timeout_s is None and not is_short:
+            return Retries(None, self._timeout_s)
+        return Retries(check_timeout(self._timeout_s if timeout_s is None else timeout_s), None)
+
+    def stream_retries(self, timeout_s: float | None, reconnect_s: float | None) -> Retries:
+        """The calls of a stream of poses, one after another.
+
+        They end after `timeout_s` (None: they may last), or when no other call has brought anything for `reconnect_s`
+        after one that broke (None: the client's timeout_s).
+        """
+        return Retries(
+            None if timeout_s is None else check_timeout(timeout_s),
+            self._timeout_s if reconnect_s is None else check_reconnect(reconnect_s),
+            longest_pause_s=LONGEST_PAUSE_OF_STREAMS_S,
+        )
 
 
 def check_timeout(timeout_s: float) -> float:
@@ -161,8 +171,6 @@ def check_reconnect(reconnect_s: float) -> float:
 
 
 # From a failed gRPC call to an error of the client.
-
-
 _DETAILS_KEY = "grpc-status-details-bin"
 _TLS_FAILURES = {  # by a part of what grpc says
     "WRONG_VERSION_NUMBER": "does not speak TLS: leave out tls",
@@ -241,8 +249,6 @@ def _text(message: bytes, number: int) -> str:
 
 
 # Encrypted channels: the certificates of both sides, and a warning where a key would travel in the open.
-
-
 _URL = re.compile(r"(?:https?|grpcs?)://")
 _TARGET = re.compile(r"(?:dns:(?://[^/]*/)?|ipv[46]:)?(\[[^]]*\]|[^:]*)")  # of gRPC: the host
 _LOCAL_SCHEMES = ("unix:", "unix-abstract:")
@@ -313,7 +319,7 @@ def warn_of_open_key(address: str) -> None:
         warnings.warn(
             f"the API key travels unencrypted to {address}, and whoever is on the way can read it: give tls=Tls(...)",
             UserWarning,
-            stacklevel=4,  # where the client is made
+            stacklevel=5,  # where the client is made
         )
 
 

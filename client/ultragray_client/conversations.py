@@ -6,20 +6,44 @@ import contextlib
 import os
 import re
 import secrets
+from abc import ABC, abstractmethod
 from collections import deque
 from collections.abc import Iterable, Iterator
 from itertools import islice
 from pathlib import Path
+from typing import Any, Generic, TypeVar
 
-from ultragray_client.connection import Conversation, Retries
+from ultragray_client.connection import Retries
 from ultragray_client.contract import DatasetOptions
 from ultragray_client.errors import ClientError, InvalidArgument, TooManyPoses, Unreachable
 from ultragray_client.frames import Frame, frame_from_message
 from ultragray_client.geometry import PoseLike, pose_messages
 from ultragray_client.messages import message_of
+from ultragray_client.records import Job, JobEvent, job_from_message
 from ultragray_proto.v1 import datasets_pb2, geometry_pb2, jobs_pb2, rendering_pb2
 
+T = TypeVar("T")
 _POSES_PER_CALL = 256  # halved where the service takes fewer
+
+
+class Conversation(ABC, Generic[T]):
+    """Calls whose answers are streams: where one breaks off, the next asks for what is missing."""
+
+    @abstractmethod
+    def request(self) -> Any:
+        """The request of the next call; None when all is there."""
+
+    @abstractmethod
+    def take(self, message: Any) -> T:
+        """The meaning of a message."""
+
+    @abstractmethod
+    def end_of_call(self) -> None:
+        """Notes that the service ended a call without an error. Raises ClientError where it should have gone on."""
+
+    def pause_s(self, error: ClientError, retries: Retries) -> float:
+        """The seconds to wait before the next call. Raises the error where no other call can succeed."""
+        return retries.pause_s(error)
 
 
 class Batch(Conversation[Frame]):
@@ -71,9 +95,6 @@ class Batch(Conversation[Frame]):
         return type(error)(detail, reason=error.reason, field=field, retry_after_s=error.retry_after_s)
 
 
-# The messages of an upload.
-
-
 _CHUNK_BYTES = 2**20
 _ARCHIVE_SUFFIXES = (".zip", ".tar", ".tar.gz", ".tgz")
 
@@ -105,17 +126,65 @@ class Upload:
                     yield request(chunk=chunk)
 
 
-# A file that comes in chunks: whole under its name, or not at all.
+class Watch(Conversation[JobEvent]):
+    """The news of a job until its final state; each call begins with the last lines of the log."""
+
+    def __init__(self, job_id: str) -> None:
+        self._job_id = job_id
+        self._over = False
+        self._seen = ""  # the end of the log so far
+        self._again = False  # the next lines may be seen ones
+
+    def request(self) -> jobs_pb2.WatchJobRequest | None:
+        return None if self._over else jobs_pb2.WatchJobRequest(job=self._job_id)
+
+    def take(self, message: jobs_pb2.JobEvent) -> JobEvent:
+        job = job_from_message(message.job) if message.HasField("job") else None
+        return JobEvent(job, self._new(message.log))
+
+    def end_of_call(self) -> None:
+        self._over = True
+
+    def pause_s(self, error: ClientError, retries: Retries) -> float:
+        self._again = True
+        return retries.pause_s(error)
+
+    def _new(self, log: str) -> str:
+        if self._again and log:
+            self._again = False
+            place = log.rfind(self._seen) if self._seen else -1
+            log = log if place < 0 else log[place + len(self._seen) :]
+        self._seen = (self._seen + log)[-1000:]
+        return log
+
+
+class LastJob(Watch):
+    """A watch that keeps the last that was told of the job itself."""
+
+    def __init__(self, job_id: str) -> None:
+        super().__init__(job_id)
+        self._job: Job | None = None
+
+    @property
+    def result(self) -> Job:
+        """The job in its final state, once the watch is over."""
+        assert self._job is not None  # the first event has it
+        return self._job
+
+    def keep(self, event: JobEvent) -> None:
+        """Takes an event."""
+        self._job = event.job or self._job
 
 
 class Download(Conversation[jobs_pb2.ArtifactChunk]):
-    """The part of a file that is there; each chunk goes to `write` before the next one is asked for."""
+    """The part of a file that is there; each chunk goes to `keep` before the next one is asked for."""
 
     def __init__(self, job_id: str, name: str, descriptor: int) -> None:
         self._job_id, self._name = job_id, name
         self._descriptor = descriptor
         self._received = 0
         self._expected: int | None = None
+        self.result = None  # the file itself is
 
     def request(self) -> jobs_pb2.DownloadArtifactRequest | None:
         """The request for the part that is missing."""
@@ -131,8 +200,8 @@ class Download(Conversation[jobs_pb2.ArtifactChunk]):
         if self._received != self._expected:
             raise Unreachable(f"{self._name} of job {self._job_id} broke off after {self._received} bytes")
 
-    def write(self, chunk: jobs_pb2.ArtifactChunk) -> None:
-        """Raises OSError."""
+    def keep(self, chunk: jobs_pb2.ArtifactChunk) -> None:
+        """Writes a chunk to the disk. Raises OSError."""
         self._expected = chunk.file_bytes
         rest = memoryview(chunk.data)
         while rest:

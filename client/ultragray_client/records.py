@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import uuid
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import Enum
@@ -10,13 +9,10 @@ from typing import Any, get_args
 
 import numpy as np
 
-from ultragray_client.connection import Conversation, Retries
 from ultragray_client.contract import ElevationBeam, Probe, Specification
-from ultragray_client.errors import ClientError
-from ultragray_client.geometry import FloatArray, pose_messages
-from ultragray_client.messages import message_of
+from ultragray_client.geometry import FloatArray
 from ultragray_proto.codec import from_message
-from ultragray_proto.v1 import jobs_pb2, scenes_pb2, workers_pb2
+from ultragray_proto.v1 import jobs_pb2, scenes_pb2
 
 Point = tuple[float, float, float]  # x, y, z in the scene's frame, mm
 
@@ -105,9 +101,6 @@ class _TrainingPoses:
     last: FloatArray
 
 
-# Jobs, as the service tells them, and what watches them.
-
-
 _KINDS: dict[str, Any] = {cls.kind: cls for cls in get_args(Specification)}
 
 
@@ -184,63 +177,6 @@ class JobEvent:
     log: str  # new lines
 
 
-@dataclass(frozen=True)
-class JobFilter:
-    """The jobs to list; None: all."""
-
-    state: JobState | str | None
-    kind: str | None
-
-
-class Watch(Conversation[JobEvent]):
-    """The news of a job until its final state; each call begins with the last lines of the log."""
-
-    def __init__(self, job_id: str) -> None:
-        self._job_id = job_id
-        self._over = False
-        self._seen = ""  # the end of the log so far
-        self._again = False  # the next lines may be seen ones
-
-    def request(self) -> jobs_pb2.WatchJobRequest | None:
-        return None if self._over else jobs_pb2.WatchJobRequest(job=self._job_id)
-
-    def take(self, message: jobs_pb2.JobEvent) -> JobEvent:
-        job = job_from_message(message.job) if message.HasField("job") else None
-        return JobEvent(job, self._new(message.log))
-
-    def end_of_call(self) -> None:
-        self._over = True
-
-    def pause_s(self, error: ClientError, retries: Retries) -> float:
-        self._again = True
-        return retries.pause_s(error)
-
-    def _new(self, log: str) -> str:
-        if self._again and log:
-            self._again = False
-            place = log.rfind(self._seen) if self._seen else -1
-            log = log if place < 0 else log[place + len(self._seen) :]
-        self._seen = (self._seen + log)[-1000:]
-        return log
-
-
-def submission(
-    specification: Specification, request_id: str | None, priority: int, private: bool
-) -> jobs_pb2.SubmitJobRequest:
-    """The request for a job. With an id of its own a submission that is sent again gives the same job.
-
-    Raises InvalidPose, and InvalidArgument for a word that is none; the service checks the rest.
-    """
-    request_id = uuid.uuid4().hex if request_id is None else request_id
-    request = jobs_pb2.SubmitJobRequest(request_id=request_id, priority=priority, private=private)
-    job = getattr(request, specification.kind)
-    poses = getattr(specification, "poses", None)
-    others = {} if poses is None else {"poses": pose_messages(poses)}
-    job.MergeFrom(message_of(specification, type(job), **others))
-    job.SetInParent()
-    return request
-
-
 def job_from_message(message: jobs_pb2.Job) -> Job:
     """A job as the service tells it."""
     kind = message.WhichOneof("specification")
@@ -248,9 +184,6 @@ def job_from_message(message: jobs_pb2.Job) -> Job:
     others = {"poses": None} if hasattr(cls, "poses") else {}
     specification = from_message(getattr(message, kind), cls, **others)
     return from_message(message, Job, specification=specification, pose_count=message.render.pose_count)
-
-
-# Workers, as the service tells them.
 
 
 class WorkerState(str, Enum):
@@ -292,14 +225,6 @@ class Worker:
     labels: Mapping[str, str]  # those that jobs can ask for
 
 
-def worker_from_message(message: workers_pb2.Worker) -> Worker:
-    """A worker as the service tells it."""
-    return from_message(message, Worker)
-
-
-# Registrations of robots and trackers, as the service keeps them.
-
-
 @dataclass(frozen=True, eq=False, kw_only=True)
 class Registration:
     """How a robot lies to a scene: probe→scene = base_to_scene · flange→base · probe_to_flange.
@@ -317,9 +242,6 @@ class Registration:
     angle_std_deg: tuple[float, float, float] | None  # about the axes of the scene
     owner: str | None  # who put it
     changed_at: str  # ISO 8601, UTC
-
-
-# The caller, as the service tells them.
 
 
 class Role(str, Enum):

@@ -5,8 +5,7 @@ from __future__ import annotations
 import subprocess
 import sys
 
-from .pages import SiteInvalid
-from .site import build
+from .site import SiteInvalid, build
 
 try:
     site = build()

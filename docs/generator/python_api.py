@@ -1,18 +1,23 @@
-"""Parts about Python: public names with their signatures and docstrings."""
+"""Parts about Python and the command line: public names with their docstrings, commands as typer tells them."""
 
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Iterator
 from dataclasses import is_dataclass
 from enum import Enum
 from importlib import import_module
-from types import ModuleType, UnionType
-from typing import Any, Union, get_args, get_origin
+from types import ModuleType
+from typing import Any
+
+import typer
+from typer.cli import get_docs_for_click
 
 from ultragray.contract import Contract
+from ultragray_service.cli.app import app
 
-from . import library
+from . import product
 from .markdown import prose, sections
 
 # Public modules beside the packages' own names. A module without __all__ makes public what it defines.
@@ -47,7 +52,7 @@ LIBRARY_MODULES = (
     "ultragray.geometry.scan_conversion",
     "ultragray.exchange.rendering",
     "ultragray.exchange.exports",
-    "ultragray.exchange.exports.png_folder",
+    "ultragray.exchange.exports.archives",
     "ultragray.exchange.ply",
     "ultragray.exchange.checkpoint",
     "ultragray.exchange.poses",
@@ -56,12 +61,14 @@ LIBRARY_MODULES = (
     "ultragray.learn.registration",
 )
 CLIENT_GROUPS = (
-    *("ultragray_client.sync.scenes.Scenes", "ultragray_client.sync.datasets.Datasets"),
-    *("ultragray_client.sync.jobs.Jobs", "ultragray_client.sync.workers.Workers"),
-    "ultragray_client.sync.registrations.Registrations",
+    *("ultragray_client.client.Scenes", "ultragray_client.client.Datasets"),
+    *("ultragray_client.client.Jobs", "ultragray_client.client.Workers"),
+    "ultragray_client.client.Registrations",
 )
 _ONLY = {"ultragray.contract": ("from_dict", "to_dict")}
 _OWN = ("ultragray", "ultragray_client")
+
+_HEADING = re.compile(r"\[bold\]")
 
 
 def package(name: str) -> str:
@@ -98,52 +105,12 @@ def exported(module: ModuleType) -> list[str]:
     if hasattr(module, "__all__"):
         return sorted(module.__all__)
     above = set(getattr(import_module(module.__name__.partition(".")[0]), "__all__", ()))
-    return sorted(
+    defined = {
         name
         for name, value in vars(module).items()
-        if not name.startswith("_")
-        and name not in above
-        and (inspect.isfunction(value) or inspect.isclass(value))
-        and value.__module__ == module.__name__
-    )
-
-
-def snapshot() -> str:
-    """Every public name with its signature, a line each."""
-    lines: list[str] = []
-    for name in ("ultragray", *LIBRARY_MODULES, "ultragray_client"):
-        module = import_module(name)
-        for short in exported(module):
-            lines += _lines(f"{name}.{short}", getattr(module, short))
-    for path in CLIENT_GROUPS:
-        module_name, _, short = path.rpartition(".")
-        lines += _lines(path, getattr(import_module(module_name), short))
-    return "\n".join(lines) + "\n"
-
-
-def _lines(name: str, value: Any) -> Iterator[str]:
-    yield f"{name}{signature(value)}"
-    if inspect.isclass(value) and not issubclass(value, Enum):
-        for member, inner in members(value):
-            yield f"{name}.{member}{signature(inner)}"
-
-
-def signature(value: Any) -> str:
-    """`(parameters) -> answer` of what can be called; what else a name is, after a colon."""
-    if inspect.ismodule(value):
-        return ": a module"
-    if inspect.isclass(value) and issubclass(value, Enum):
-        return f": {', '.join(f'{one.name} = {one.value!r}' for one in value)}"
-    if isinstance(value, property):
-        told = inspect.signature(value.fget).return_annotation if value.fget else inspect.Signature.empty
-        return "" if told is inspect.Signature.empty else f": {told}"
-    if get_origin(value) in (Union, UnionType) and all(map(_is_own, get_args(value))):
-        return f": any of {', '.join(one.__name__ for one in get_args(value))}"
-    if isinstance(value, (int, float, str, Contract)):
-        return f" = {value!r}"
-    if not (inspect.isroutine(value) or inspect.isclass(value)):
-        return ""
-    return str(_readable(inspect.signature(value), is_class=inspect.isclass(value)))
+        if not name.startswith("_") and getattr(value, "__module__", None) == module.__name__ and callable(value)
+    }
+    return sorted(defined - above)
 
 
 class _Word:
@@ -156,65 +123,73 @@ class _Word:
         return self.text
 
 
-def _readable(found: inspect.Signature, *, is_class: bool) -> inspect.Signature:
-    """Without `self` and the `kind` that tells the members of a family apart; annotations as they are written."""
-    kept = []
-    for one in found.parameters.values():
-        if one.name == "self" or (one.name == "kind" and "Literal" in str(one.annotation)):
-            continue
-        default = one.default
-        if isinstance(default, Enum):
-            default = _Word(f"{type(default).__name__}.{default.name}")
-        elif repr(default) == "<factory>" or inspect.isroutine(default):
-            default = _Word("…")
-        kept.append(one.replace(annotation=_written(one.annotation), default=default))
-    told = inspect.Signature.empty if is_class else _written(found.return_annotation)
-    return inspect.Signature(kept, return_annotation=told)
+def signature(value: Any) -> str:
+    """`(parameters) -> answer` of what can be called; the members of an enum, the type of a property; else nothing."""
+    if isinstance(value, type) and issubclass(value, Enum):
+        return f": {', '.join(f'{one.name} = {one.value!r}' for one in value)}"
+    if isinstance(value, property):
+        return f": {inspect.signature(value.fget).return_annotation}" if value.fget else ""
+    if not (inspect.isroutine(value) or inspect.isclass(value)):
+        return ""
 
+    def written(annotation: Any) -> Any:
+        return _Word(annotation) if isinstance(annotation, str) else annotation
 
-def _written(annotation: Any) -> Any:
-    return _Word(annotation) if isinstance(annotation, str) else annotation
+    found = inspect.signature(value)
+    kept = [one for name, one in found.parameters.items() if name not in ("self", "kind")]
+    answer = found.empty if inspect.isclass(value) else written(found.return_annotation)
+    return str(
+        inspect.Signature([one.replace(annotation=written(one.annotation)) for one in kept], return_annotation=answer)
+    )
 
 
 def members(cls: type[Any]) -> Iterator[tuple[str, Any]]:
-    """Public methods and properties that our own code defines, by name; those of a public base are told there."""
-    found: dict[str, Any] = {}
-    public = [Contract, *(base for base in cls.__mro__[1:] if _is_public(base))]
-    for base in reversed(cls.__mro__):
-        if _is_own(base) and not any(base in one.__mro__ for one in public):
-            for name, value in vars(base).items():
-                if name.startswith("_") or inspect.isclass(value):
-                    continue
-                if isinstance(value, (staticmethod, classmethod)):
-                    found[name] = getattr(cls, name)
-                elif inspect.isfunction(value) or isinstance(value, property):
-                    found[name] = value
-    return iter(sorted(found.items()))
-
-
-def _is_own(cls: Any) -> bool:
-    return inspect.isclass(cls) and cls.__module__.partition(".")[0] in _OWN
-
-
-def _is_public(cls: type[Any]) -> bool:
-    module = import_module(cls.__module__.partition(".")[0])
-    return getattr(module, cls.__name__, None) is cls
+    """The public methods and properties that a class defines itself, by name."""
+    for name, value in sorted(vars(cls).items()):
+        if not name.startswith("_"):
+            if isinstance(value, (staticmethod, classmethod)):
+                yield name, getattr(cls, name)
+            elif inspect.isfunction(value) or isinstance(value, property):
+                yield name, value
 
 
 def _documented(value: Any) -> str:
     name = value.__name__ if inspect.isclass(value) or inspect.isroutine(value) else ""
-    told = f"{name}{signature(value)}".removeprefix(": ").removeprefix(" = ")
+    told = f"{name}{signature(value)}".removeprefix(": ")
     parts = [f"```text\n{told}\n```"] if told else []
     if name or inspect.ismodule(value):
         parts.append(prose(inspect.getdoc(value) or ""))
     if isinstance(value, type) and not issubclass(value, Enum):
         if is_dataclass(value) and issubclass(value, Contract):
-            parts.append(library.keys(value, "Field"))
-        parts += (f"`{name}{signature(inner)}`{_indented(inner)}" for name, inner in members(value))
+            parts.append(product.keys(value, "Field"))
+        for short, inner in members(value):
+            words = prose(inspect.getdoc(inner) or "").replace("\n", "\n    ")
+            parts.append(f"`{name}.{short}{signature(inner)}`" + (f"\n: {words}" if words else ""))
     return "\n\n".join(part for part in parts if part)
 
 
-def _indented(value: Any) -> str:
-    """The docstring of a member as the definition of its name."""
-    words = prose(inspect.getdoc(value) or "").replace("\n", "\n    ")
-    return f"\n: {words}" if words else ""
+def commands() -> str:
+    """Each command that does something itself, by the panels of `--help`."""
+    panels: dict[str, list[str]] = {}
+    for panel, name, command in _commands(typer.main.get_command(app)):
+        lines = [
+            line.replace("\\[", "[")
+            for line in (command.epilog or "").splitlines()
+            if line.strip() and not _HEADING.search(line)
+        ]
+        command.epilog = None  # examples are a block of their own
+        context = typer.Context(command, info_name=name)
+        text = get_docs_for_click(obj=command, ctx=context, indent=2, name=name, call_prefix="ultragray")
+        examples = "\n".join(("```bash", *lines, "```")) if lines else ""
+        panels.setdefault(panel, []).append(f"{text}\n{examples}\n")
+    return sections(2, ((panel, "\n".join(those)) for panel, those in panels.items()))
+
+
+def _commands(group: Any, panel: str = "", prefix: str = "") -> Iterator[tuple[str, str, Any]]:
+    """Every command that does something itself, by its panel and its words, in the order of `--help`."""
+    for word, command in group.commands.items():
+        inside = panel or getattr(command, "rich_help_panel", None) or "Commands"
+        if hasattr(command, "commands"):
+            yield from _commands(command, inside, f"{prefix}{word} ")
+        elif not command.hidden:
+            yield inside, f"{prefix}{word}", command

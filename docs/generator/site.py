@@ -1,119 +1,161 @@
-"""The site: its order, its configuration, and its build with Zensical."""
+"""The site: the documents of the repository with their generated parts, and links that hold there, built by Zensical.
+
+`<!-- generated: NAME -->` in a document asks for a part; PARTS says which there are.
+"""
 
 from __future__ import annotations
 
-import json
+import os
+import re
 import shutil
 import subprocess
 import sys
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 
-from .pages import SiteInvalid, pages_of, write_pages
-from .parts import PARTS
+from ultragray.rendering.display import Display
+from ultragray.rendering.settings import RenderSettings
+from ultragray.rendering.volumes import SliceSettings
+from ultragray.scene.confidence import Extrapolation
+from ultragray.scene.info import SceneInfo
+from ultragray_service.http.bodies import RenderBody, StreamMessage
+from ultragray_service.http.routes.streams import FrameMessage
+from ultragray_studies.gym.standard_plane import StandardPlaneSettings
+
+from . import interfaces, product, python_api
 
 ROOT = Path(__file__).resolve().parents[2]
 FOLDER = ROOT / "build"
-
-# The pages of each section, in their order; a pattern stands for those that are not named.
-SECTIONS: Mapping[str, tuple[str, ...]] = {
-    "Home": ("index.md",),
-    "Tutorial": ("tutorial.md",),
-    "How-to": (
-        *("howto/robotics.md", "howto/ros.md", "howto/simulator.md", "howto/data-science.md", "howto/sonographer.md"),
-        *(
-            "howto/recording.md",
-            "howto/mcap.md",
-            "howto/compare.md",
-            "howto/contact.md",
-            "howto/tools.md",
-            "howto/gymnasium.md",
-            "howto/notebooks.md",
-            "howto/operator.md",
-            "howto/*.md",
-        ),
-    ),
-    "Concepts": (
-        *("concepts/frame.md", "physics.md", "concepts/training.md", "concepts/jobs.md", "confidence.md"),
-        *("concepts/limits.md", "poses.md"),
-        "concepts/methods.md",
-        "concepts/*.md",
-    ),
-    "Operation": ("operation.md", "scaling.md", "access.md", "tls.md", "backup.md"),
-    "Results": ("results.md", "performance.md"),
-    "Reference": (
-        *("reference/index.md", "reference/command-line.md", "reference/http.md", "reference/stream.md"),
-        *("reference/grpc.md", "reference/openigtlink.md", "reference/client.md", "reference/python.md"),
-        *("reference/frames.md", "reference/export-formats.md", "reference/samplers.md", "reference/datasets.md"),
-        *("reference/scene-file.md", "reference/training.md", "reference/jobs.md", "reference/settings.md"),
-        *("reference/metrics.md", "reference/errors.md"),
-    ),
-    "Contributing": ("contributing.md", "extending.md", "libraries.md", "security.md", "changelog.md"),
+CONFIGURATION = Path(__file__).with_name("zensical.toml")
+PARTS: dict[str, Callable[[], str]] = {
+    "outputs": product.outputs,
+    "formats": product.formats,
+    "npz": product.npz,
+    "samplers": product.samplers,
+    "methods": product.methods,
+    "training settings": product.training_settings,
+    "scene metadata": partial(product.keys, SceneInfo),
+    "display": partial(product.keys, Display, "Setting"),
+    "standard plane": partial(product.keys, StandardPlaneSettings, "Argument"),
+    "confidence": partial(product.told, Extrapolation, "Figure"),
+    "render body": partial(product.keys, RenderBody),
+    "slice body": partial(product.keys, SliceSettings),
+    "stream messages": partial(product.keys, StreamMessage),
+    "stream settings": partial(product.keys, RenderSettings),
+    "stream frames": partial(product.told, FrameMessage),
+    "settings": product.settings,
+    "errors": product.error_reasons,
+    "client errors": product.client_error_reasons,
+    "metrics": product.metrics,
+    "limits": product.fixed_limits,
+    "OpenIGTLink limits": product.igtl_limits,
+    "routes": interfaces.routes,
+    "render headers": interfaces.render_headers,
+    "objects": interfaces.objects,
+    "services": interfaces.services,
+    "messages": interfaces.messages,
+    "enums": interfaces.enums,
+    "commands": python_api.commands,
+    "library": partial(python_api.package, "ultragray"),
+    "library modules": python_api.modules,
+    "client": partial(python_api.package, "ultragray_client"),
+    "client groups": python_api.client_groups,
 }
-_CONFIGURATION = """
-[project]
-site_name = "UltraG-Ray"
-site_description = "Ultrasound simulation from trained 3D Gaussian scenes"
-docs_dir = "pages"
-site_dir = "site"
-use_directory_urls = false
-extra_css = ["site.css"]
-nav = [
-{nav}
-]
-
-[project.theme]
-variant = "modern"
-font = false
-language = "en"
-features = [
-    "navigation.tabs", "navigation.indexes", "navigation.top", "navigation.footer",
-    "content.code.copy", "search.highlight", "toc.follow",
-]
-
-[[project.theme.palette]]
-media = "(prefers-color-scheme: light)"
-scheme = "default"
-toggle.icon = "lucide/sun"
-toggle.name = "Dark"
-
-[[project.theme.palette]]
-media = "(prefers-color-scheme: dark)"
-scheme = "slate"
-toggle.icon = "lucide/moon"
-toggle.name = "Light"
-
-[project.extra]
-generator = false
-"""
+# Documents outside docs/, by their place in the site.
+ADOPTED = {
+    "README.md": "index.md",
+    "CONTRIBUTING.md": "contributing.md",
+    "SECURITY.md": "security.md",
+    "CHANGELOG.md": "changelog.md",
+}
+MARKER = re.compile(r"^<!-- generated: ([\w -]+) -->$", flags=re.MULTILINE)
+_LINK = re.compile(r"(!?)\[((?:[^\[\]]|\[[^\]]*\])*)\]\(([^)\s]+)\)")
+_SOURCE = re.compile(r"(<img [^>]*src=\")([^\"]+)(\")")
 
 
-def order(pages: set[str]) -> dict[str, list[str]]:
-    """The pages of each section. Raises SiteInvalid for a page that is in none."""
-    left = set(pages)
-    found: dict[str, list[str]] = {}
-    for section, patterns in SECTIONS.items():
-        for pattern in patterns:
-            those = sorted(page for page in left if Path(page).match(pattern) and page.count("/") == pattern.count("/"))
-            found.setdefault(section, []).extend(those)
-            left -= set(those)
-    if left:
-        raise SiteInvalid(f"{', '.join(sorted(left))}: in no section of docs/generator/site.py")
-    return {section: those for section, those in found.items() if those}
+class SiteInvalid(Exception):
+    """A document that cannot become a page."""
+
+
+def pages_of(root: Path) -> dict[Path, Path]:
+    """Where each document of the repository lies in the site; both paths are relative."""
+    docs = {path.relative_to(root): path.relative_to(root / "docs") for path in (root / "docs").rglob("*.md")}
+    return docs | {Path(name): Path(place) for name, place in ADOPTED.items() if (root / name).exists()}
+
+
+def write_pages(root: Path, folder: Path, parts: Mapping[str, Callable[[], str]]) -> None:
+    """Writes all pages into a folder, with the pictures that they show. Raises SiteInvalid for an unknown part."""
+    places = pages_of(root)
+    for document, place in places.items():
+        text = with_parts((root / document).read_text(encoding="utf-8"), parts, document)
+        target = folder / place
+        target.parent.mkdir(parents=True, exist_ok=True)
+        target.write_text(_with_links(text, document, place, root, places), encoding="utf-8")
+    for picture in (root / "docs").rglob("*.*"):
+        if picture.suffix in {".png", ".svg", ".jpg", ".css"}:
+            target = folder / picture.relative_to(root / "docs")
+            target.parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(picture, target)
+
+
+def with_parts(text: str, parts: Mapping[str, Callable[[], str]], document: Path) -> str:
+    """The text with what its markers ask for."""
+
+    def made(match: re.Match[str]) -> str:
+        if match[1] not in parts:
+            raise SiteInvalid(f"{document}: there is no part {match[1]!r}; known are {', '.join(sorted(parts))}")
+        return parts[match[1]]()
+
+    return MARKER.sub(made, text)
+
+
+def _with_links(text: str, document: Path, place: Path, root: Path, places: Mapping[Path, Path]) -> str:
+    """Links lead to pages and pictures of the site; of those to other files of the repository the words stay."""
+
+    def moved(target: str) -> str | None:
+        path, _, anchor = target.partition("#")
+        if "://" in target or target.startswith("mailto:") or not path:
+            return target
+        wanted = Path(os.path.normpath(document.parent / path))
+        if wanted in places:
+            found = places[wanted]
+        elif wanted.parts[0] == "docs" and (root / wanted).is_file():
+            found = wanted.relative_to("docs")
+        elif (root / wanted).exists():
+            return None
+        else:
+            return target  # for the strict build to refuse
+        return os.path.relpath(found, place.parent) + (f"#{anchor}" if anchor else "")
+
+    def link(match: re.Match[str]) -> str:
+        inner = _LINK.sub(link, match[2])  # a picture in a link
+        target = moved(match[3])
+        return inner if target is None else f"{match[1]}[{inner}]({target})"
+
+    def source(match: re.Match[str]) -> str:
+        return f"{match[1]}{moved(match[2]) or match[2]}{match[3]}"
+
+    # Code in backticks within a link's words is part of the link: only fences and code outside of links are left alone.
+    pieces = re.split(r"(^```.*?^```)", text, flags=re.MULTILINE | re.DOTALL)
+    return "".join(
+        piece if piece.startswith("```") else _SOURCE.sub(source, _LINK.sub(link, piece)) for piece in pieces
+    )
 
 
 def build(folder: Path = FOLDER) -> Path:
-    """The site in `folder`/site, made of `folder`/pages. Raises CalledProcessError where a link leads nowhere."""
+    """The site in `folder`/site, made of `folder`/pages.
+
+    Raises SiteInvalid for a page that is in no section, CalledProcessError where a link leads nowhere.
+    """
     pages, site = folder / "pages", folder / "site"
     for old in (pages, site):
         shutil.rmtree(old, ignore_errors=True)
     write_pages(ROOT, pages, PARTS)
     shutil.copyfile(Path(__file__).with_name("site.css"), pages / "site.css")
-    sections = order({place.as_posix() for place in pages_of(ROOT).values()})
-    nav = ",\n".join(
-        f"    {{ {json.dumps(section)} = {json.dumps(those[0] if len(those) == 1 else those)} }}"
-        for section, those in sections.items()
-    )
-    (folder / "zensical.toml").write_text(_CONFIGURATION.format(nav=nav), encoding="utf-8")
+    configuration = CONFIGURATION.read_text(encoding="utf-8")
+    if lost := [place for place in map(Path.as_posix, pages_of(ROOT).values()) if f'"{place}"' not in configuration]:
+        raise SiteInvalid(f"{', '.join(sorted(lost))}: in no section of {CONFIGURATION.name}")
+    (folder / CONFIGURATION.name).write_text(configuration, encoding="utf-8")
     subprocess.run([sys.executable, "-m", "zensical", "build", "--strict"], cwd=folder, check=True)
     return site

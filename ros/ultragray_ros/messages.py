@@ -20,8 +20,8 @@ from sensor_msgs.msg import CompressedImage, Image
 from std_msgs.msg import Header, String
 
 from ultragray_client import Frame, Placement, Quaternion
+from ultragray_client.frames import origin_of
 from ultragray_client.recording.messages import geometry_document
-from ultragray_client.recording.recording import origin_of
 
 MM_PER_M = 1000.0
 JPEG_QUALITY = 95

@@ -1,4 +1,4 @@
-"""A repository of its own for what asks git, and a folder of data for what trains."""
+"""A checkout of their own for the scripts that measure, and a folder of data."""
 
 from __future__ import annotations
 
@@ -13,6 +13,7 @@ import pytest
 from ultragray import LinearProbe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
+from ultragray_studies.bench import report
 
 from ..scripts import benchmark
 
@@ -21,7 +22,7 @@ COMMITTER = ("-c", "user.name=tests", "-c", "user.email=tests@example.org", "-c"
 
 @dataclass(frozen=True)
 class Repository:
-    """A checkout with a first commit, which holds `model/code.py` and `README.md`."""
+    """A checkout with a first commit, which holds `model/code.py` and `.gitignore`."""
 
     path: Path
 
@@ -29,14 +30,16 @@ class Repository:
         command = ["git", *COMMITTER, "-C", str(self.path), *words]
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
-    def commit(self, name: str, text: str) -> str:
-        """Commits a file; returns the commit's name as the figures have it."""
-        file = self.path / name
-        file.parent.mkdir(parents=True, exist_ok=True)
-        file.write_text(text)
-        self.git("add", "--all")
-        self.git("commit", "--quiet", "--message", f"{name}: {text}")
+    @property
+    def commit(self) -> str:
         return self.git("rev-parse", "--short=12", "HEAD")
+
+
+def adopt(monkeypatch: pytest.MonkeyPatch, root: Path) -> None:
+    """Let the scripts take a folder for the root of their checkout."""
+    for module in (benchmark("figures"), report):
+        monkeypatch.setattr(module, "ROOT", root)
+    monkeypatch.setattr(benchmark("figures"), "STAGE", root / "build" / "bench")
 
 
 @pytest.fixture
@@ -45,21 +48,14 @@ def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Repository:
     if shutil.which("git") is None:
         pytest.skip("git is not installed")
     made = Repository(tmp_path / "checkout")
-    made.path.mkdir()
+    (made.path / "model").mkdir(parents=True)
+    (made.path / "model/code.py").write_text("first")
+    (made.path / ".gitignore").write_text("build")
     made.git("init", "--quiet")
-    made.commit("README.md", "a table")
-    made.commit("model/code.py", "first")
+    made.git("add", "--all")
+    made.git("commit", "--quiet", "--message", "first")
     adopt(monkeypatch, made.path)
     return made
-
-
-def adopt(monkeypatch: pytest.MonkeyPatch, root: Path) -> None:
-    """Let the scripts take a folder for the root of their checkout."""
-    from ultragray_studies.bench import report as measured
-
-    for module in (benchmark("registry"), benchmark("age"), measured):
-        monkeypatch.setattr(module, "ROOT", root)
-    monkeypatch.setattr(benchmark("registry"), "STAGE", root / "build" / "bench")
 
 
 @pytest.fixture

@@ -28,8 +28,8 @@ KEY = "0123456789abcdef-client"
 MAX_POSES = 40
 SETTINGS: dict[str, Any] = {"max_poses_per_request": MAX_POSES, "max_image_side": 600, "api_keys": KEY}
 
-# Of uploads and jobs, `make test` has those of the client for threads, which is made from the one for asyncio.
-UPLOADS_AND_JOBS = {"test_client_confidence.py", "test_client_recording.py", "test_client_resources.py"}
+# Of uploads and jobs, `make test` has those of the client for threads: both carry out the same descriptions.
+UPLOADS_AND_JOBS = {"test_client_recording.py", "test_client_resources.py"}
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
@@ -77,7 +77,7 @@ class Blocking:
     def _as_ordinary(self, value: Any) -> Any:
         if inspect.iscoroutine(value):
             return self._as_ordinary(self._run(value))
-        own = type(value).__module__.startswith("ultragray_client.aio") or inspect.isasyncgen(value)
+        own = type(value).__name__.startswith("Async") or inspect.isasyncgen(value)
         return Blocking(value, self._loop) if own or inspect.ismethod(value) else value
 
 

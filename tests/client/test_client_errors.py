@@ -5,15 +5,18 @@ from __future__ import annotations
 from typing import Any
 
 import grpc
+import numpy as np
 import pytest
 from google.protobuf.any_pb2 import Any as AnyMessage
 from google.rpc.status_pb2 import Status
 
 from ultragray import errors as library_errors
 from ultragray.errors import UltragrayError, error_classes
-from ultragray_client import errors
-from ultragray_client.connection import error_of_call, error_of_frame
-from ultragray_proto.v1 import scenes_pb2
+from ultragray_client import RenderSettings, conversations, errors
+from ultragray_client.connection import Retries, error_of_call, error_of_frame
+from ultragray_client.conversations import Batch
+from ultragray_client.frames import settings_message
+from ultragray_proto.v1 import rendering_pb2, scenes_pb2
 from ultragray_service import errors as service_errors
 from ultragray_service.errors import STATUSES
 from ultragray_service.rpc.calls import status_of
@@ -78,3 +81,18 @@ def test_errors_in_place_of_frames() -> None:
     error = error_of_frame(scenes_pb2.Error(reason="INVALID_POSE", field="pose", detail="no"), 7)
     assert (type(error), error.field, error.sequence) == (errors.InvalidPose, "pose", 7)
     assert error_of_frame(scenes_pb2.Error(reason="NEW", detail="no"), 1).reason == "NEW"
+
+
+def test_a_refused_pose_of_a_batch_is_named_by_its_place_in_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Also one that is told as a single pose: frames come in their order."""
+    monkeypatch.setattr(conversations, "frame_from_message", lambda *_, **__: None)
+    for field, place in (("poses[2].matrix", 258), ("pose", 257)):
+        batch = Batch(settings_message("demo", RenderSettings()), np.tile(np.eye(4), (300, 1, 1)))
+        for number in range(257):
+            if number % 256 == 0:
+                assert batch.request() is not None
+            batch.take(rendering_pb2.Frame())
+        with pytest.raises(errors.InvalidPose) as caught:
+            batch.pause_s(errors.InvalidPose(f"{field} is no pose", field=field), Retries(60.0, None))
+        assert caught.value.field == field.replace(field.partition(".")[0], f"poses[{place}]")
+        assert caught.value.detail == f"{caught.value.field} is no pose"

@@ -16,18 +16,11 @@ from ultragray_service.errors import STATUSES
 from ..scripts import loaded
 
 CLIENT = Path(__file__).resolve().parents[2] / "client"
-BY_HAND = {"__init__.py", "transport.py"}
 
 
 @pytest.fixture(scope="module")
 def generator() -> ModuleType:
     return loaded(CLIENT / "generate.py")
-
-
-def test_the_client_for_threads_is_current(generator: ModuleType, tmp_path: Path) -> None:
-    generated = {path.name: path.read_text() for path in generator.generate_sync(tmp_path)}
-    committed = {path.name: path.read_text() for path in (CLIENT / "ultragray_client" / "sync").glob("*.py")}
-    assert {name: text for name, text in committed.items() if name not in BY_HAND} == generated
 
 
 def test_the_contract_is_current(generator: ModuleType, tmp_path: Path) -> None:
@@ -50,9 +43,3 @@ def test_the_writer_of_recordings_is_current(generator: ModuleType, tmp_path: Pa
 def test_the_contract_has_the_defaults_of_the_library() -> None:
     for own, library in ((RenderSettings(), settings.RenderSettings()), (Display(), AS_RENDERED)):
         assert asdict(own) == asdict(library)
-
-
-def test_nothing_of_asyncio_is_left_in_it(generator: ModuleType, tmp_path: Path) -> None:
-    for path in generator.generate_sync(tmp_path):
-        for word in ("asyncio", "async ", "await ", "aiter", "anext"):
-            assert word not in path.read_text(), f"{word!r} in {path.name}"

@@ -82,7 +82,7 @@ def test_npz(generator: Generator) -> None:
     file.seek(0)
     with np.load(file) as archive:
         found = set(archive)
-    table = generator("library").npz()
+    table = generator("product").npz()
     assert {code(line)[0] for line in table.splitlines()[2:]} == found
 
 

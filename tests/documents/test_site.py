@@ -17,29 +17,29 @@ LEADING = {"canonical", "prev", "next", "alternate"}  # links in a page's head t
 
 
 def test_every_part_is_made(generator: Generator) -> None:
-    for name, make in generator("parts").PARTS.items():
+    for name, make in generator("site").PARTS.items():
         assert make().strip(), f"the part {name!r} is empty"
 
 
 def test_every_part_has_its_page(generator: Generator) -> None:
-    pages = generator("pages")
-    used = [
-        name for path in (ROOT / "docs").rglob("*.md") for name in pages.markers_of(path.read_text(encoding="utf-8"))
-    ]
-    assert sorted(used) == sorted(generator("parts").PARTS)
+    site = generator("site")
+    used = [name for path in (ROOT / "docs").rglob("*.md") for name in site.MARKER.findall(path.read_text("utf-8"))]
+    assert sorted(used) == sorted(site.PARTS)
 
 
 def test_an_unknown_part_is_refused(generator: Generator) -> None:
-    pages = generator("pages")
-    with pytest.raises(pages.SiteInvalid, match=r"a\.md: there is no part 'x'"):
-        pages.with_parts("<!-- generated: x -->\n", {}, Path("a.md"))
+    site = generator("site")
+    with pytest.raises(site.SiteInvalid, match=r"a\.md: there is no part 'x'"):
+        site.with_parts("<!-- generated: x -->\n", {}, Path("a.md"))
 
 
-def test_a_page_in_no_section_is_refused(generator: Generator) -> None:
-    site, pages = generator("site"), generator("pages")
-    assert site.order({"index.md", "howto/new.md"}) == {"Home": ["index.md"], "How-to": ["howto/new.md"]}
-    with pytest.raises(pages.SiteInvalid, match=r"lost\.md"):
-        site.order({"lost.md"})
+def test_a_page_in_no_section_is_refused(generator: Generator, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    site = generator("site")
+    (tmp_path / "docs").mkdir()
+    (tmp_path / "docs" / "lost.md").touch()
+    monkeypatch.setattr(site, "ROOT", tmp_path)
+    with pytest.raises(site.SiteInvalid, match=r"lost\.md: in no section"):
+        site.build(tmp_path / "build")
 
 
 def test_links_hold_in_the_site(generator: Generator, tmp_path: Path) -> None:
@@ -53,7 +53,7 @@ def test_links_hold_in_the_site(generator: Generator, tmp_path: Path) -> None:
     (root / "docs" / "howto" / "one.md").write_text(
         "[home](../../README.md) [lost](lost.md) [out](https://a.example)\n"
     )
-    generator("pages").write_pages(root, site, {})
+    generator("site").write_pages(root, site, {})
     assert (site / "index.md").read_text() == ("[one](howto/one.md#x) [![p](a.png)](howto/one.md) `run`\n")
     assert (site / "howto" / "one.md").read_text() == "[home](../index.md) [lost](lost.md) [out](https://a.example)\n"
     assert (site / "a.png").exists()
@@ -92,7 +92,7 @@ def test_the_site_builds_and_loads_nothing_from_elsewhere(generator: Generator, 
     pytest.importorskip("zensical", reason="zensical is not installed: pip install '.[docs]'")
     site = generator("site").build(tmp_path)
     pages = list(site.rglob("*.html"))
-    assert len(pages) > len(generator("pages").pages_of(ROOT))  # and the page that is shown for lost ones
+    assert len(pages) > len(generator("site").pages_of(ROOT))  # and the page that is shown for lost ones
     foreign = re.compile(r"^['\"]?(https?:)?//")
     for page in pages:
         loaded = Loaded()

@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
+import numpy as np
 import pytest
+import torch
 
 from ultragray import SceneInfo
 from ultragray.errors import UnknownOutput
-from ultragray.rendering.outputs import OUTPUTS, check_available, check_outputs
+from ultragray.exchange.exports.exporter import stored_pixels
+from ultragray.rendering.outputs import OUTPUTS, Output, check_available, check_outputs
+from ultragray.rendering.pixels import to_uint8
+from ultragray_workers.pool.pixels import render_to_host, round_to_uint8
 
 
 def test_outputs_keep_their_order_without_repetitions() -> None:
@@ -30,3 +36,27 @@ def test_labels_need_a_scene_that_has_them() -> None:
     with pytest.raises(UnknownOutput, match="only for a scene whose Gaussians carry labels") as caught:
         check_available(("bmode", "labels"), SceneInfo())
     assert caught.value.field == "outputs"
+
+
+def test_eight_bits_hold_the_shares_of_a_scale(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    level = Output(
+        "level", "echo in dB", ("echo",), lambda drawing: drawing.plane("echo"), unit="dB", scale=(-60.0, 0.0)
+    )
+    monkeypatch.setitem(OUTPUTS, "level", level)
+    values = np.array([[-80.0, -60.0, -30.0], [-1.0, 0.0, 3.0]], np.float32)[None]
+    expected = np.array([[0, 0, 128], [251, 255, 255]], np.uint8)[None]
+    np.testing.assert_array_equal(stored_pixels("level", values, np.dtype("u1")), expected)
+    np.testing.assert_array_equal(stored_pixels("level", values, np.dtype("<f4")), values)
+    np.testing.assert_array_equal(round_to_uint8(level.shares(torch.from_numpy(values))), expected)
+    on_host = render_to_host(
+        lambda poses: {"level": torch.from_numpy(values)},
+        np.eye(4)[None],
+        {"level": {np.dtype("u1"), np.dtype("<f4")}},
+        torch.device("cpu"),
+    )
+    np.testing.assert_array_equal(to_uint8(on_host.take("level", np.dtype("u1"), 0, 1)), expected)
+    np.testing.assert_array_equal(on_host.take("level", np.dtype("<f4"), 0, 1), values)
+    assert (level.about, level.range_in_words) == ("echo in dB; -60 to 0 dB", "-60 to 0 dB")
+    shares = np.ones((1, 1, 2), np.float32)
+    assert OUTPUTS["bmode"].shares(shares) is shares
+    assert OUTPUTS["labels"].range_in_words == "whole numbers"

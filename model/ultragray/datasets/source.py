@@ -1,6 +1,7 @@
 """load_dataset: every format of tracked sweeps behind one call, and the registry of the formats.
 
-Readers are imported when they are needed, so that help texts and uploads can list the formats without them.
+Readers are imported when they are needed, so that help texts and uploads can list the formats without them. Another
+package adds a format of its own by an entry point of the group `ultragray.dataset_formats`, which is a `DatasetFormat`.
 """
 
 from __future__ import annotations
@@ -8,15 +9,16 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field, fields, replace
 from fnmatch import fnmatchcase
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path, PurePath
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from ultragray.contract import Contract, described
 from ultragray.errors import DatasetInvalid, InvalidArgument
 from ultragray.installation import missing_extra
 
 if TYPE_CHECKING:
-    from ultragray.learn.sweep import Dataset, Sweep
+    from ultragray.learn.sweep import Dataset
 
 
 MAX_OPTION_LENGTH = 1000
@@ -66,20 +68,46 @@ class SourceOptions(Contract):
 class DatasetFormat:
     """A format of tracked sweeps.
 
-    `load` gives the dataset of a source with the options applied, all but `image_size`; it raises DatasetInvalid and
-    InvalidArgument. An upload in this format holds one file whose name, in lower case, matches one of `files`.
+    `reader` is imported when a source is read, and is given the source's path (a built-in format: nothing) and the
+    `options`, by their names. It returns a `Dataset` whose parts are split already, or a `Sweep` and the number of
+    frames in its file, and raises DatasetInvalid and InvalidArgument. An upload in this format holds one file whose
+    name, in lower case, matches one of `files`.
     """
 
     name: str
     noun: str  # what a source in this format is, as messages say it
     meaning: str  # the same with its files, for help texts
     is_source: Callable[[str], bool]  # whether a user who writes this means the format
-    load: Callable[[str, SourceOptions], Dataset]
+    reader: str  # "module:function"
     files: tuple[str, ...] = ()  # none: built in, never a file
     options: tuple[str, ...] = ()  # fields of SourceOptions that it takes, beside EVERY_FORMAT_TAKES
     beside: tuple[str, ...] = ()  # endings of the files that lie beside such a file, with its stem, and belong to it
     companions: Mapping[str, str] = field(default_factory=dict)  # pattern of the file of an upload that is an option
-    check_upload: Callable[[Path, Path], None] = lambda source, folder: None  # raises where it needs files elsewhere
+    upload_check: str | None = None  # "module:function" of (source, folder): raises where it needs files elsewhere
+
+    def load(self, source: str, options: SourceOptions) -> Dataset:
+        """The dataset of a source with all options but `image_size` applied. Raises as the reader, ExtraMissing."""
+        from ultragray.learn.sweep import Dataset, split_parts, split_sequence
+
+        path = Path(source)
+        given = {name: getattr(options, name) for name in self.options}
+        found = self._function(self.reader)(*([path] if self.files else []), **given)
+        wanted = options.train_frames, options.val_frames
+        if isinstance(found, Dataset):
+            train, val = split_parts(found.train, found.val, *wanted)
+            return replace(found, train=train, val=val)
+        return Dataset(path.name.split(".")[0], *split_sequence(*found, *wanted))
+
+    def check_upload(self, source: Path, folder: Path) -> None:
+        """Raises DatasetInvalid where an upload in this format names files outside of its folder."""
+        if self.upload_check is not None:
+            self._function(self.upload_check)(source, folder)
+
+    def _function(self, place: str) -> Any:
+        try:
+            return EntryPoint(self.name, place, "").load()
+        except ImportError as error:
+            raise missing_extra(error, f"the {self.noun}") from error
 
     @property
     def upload_meaning(self) -> str:
@@ -132,79 +160,6 @@ def format_of(source: str | Path) -> DatasetFormat:
     raise DatasetInvalid(f"{path}: a dataset is {', '.join(meanings)} or {last}")
 
 
-def _load_released(source: str, options: SourceOptions) -> Dataset:
-    from ultragray.datasets.released import read_released
-
-    return _split(read_released(source), options)
-
-
-def _load_phantom(source: str, options: SourceOptions) -> Dataset:
-    from ultragray.phantom import load_phantom
-
-    return _split(load_phantom(), options)
-
-
-def _split(dataset: Dataset, options: SourceOptions) -> Dataset:
-    from ultragray.learn.sweep import split_parts
-
-    train, val = split_parts(dataset.train, dataset.val, options.train_frames, options.val_frames)
-    return replace(dataset, train=train, val=val)
-
-
-def _split_sequence(path: Path, options: SourceOptions, sweep: Sweep, frame_count: int) -> Dataset:
-    from ultragray.learn.sweep import Dataset, split_sequence
-
-    parts = split_sequence(sweep, frame_count, options.train_frames, options.val_frames)
-    return Dataset(path.name.split(".")[0], *parts)
-
-
-def _load_plus(source: str, options: SourceOptions) -> Dataset:
-    from ultragray.datasets.plus import read_plus_sweep
-
-    path = Path(source)
-    read = read_plus_sweep(
-        path,
-        device_set=options.device_set,
-        frames=options.frames,
-        crop=options.crop,
-        fan=options.fan,
-        transform=options.transform,
-    )
-    return _split_sequence(path, options, *read)
-
-
-def _check_released_upload(source: Path, folder: Path) -> None:
-    from ultragray.datasets.released import require_files_below
-
-    require_files_below(source, folder)
-
-
-def _load_dicom(source: str, options: SourceOptions) -> Dataset:
-    from ultragray.datasets.dicom import read_dicom_sweep
-
-    path = Path(source)
-    read = read_dicom_sweep(path, frames=options.frames, crop=options.crop, fan=options.fan)
-    return _split_sequence(path, options, *read)
-
-
-def _load_mcap(source: str, options: SourceOptions) -> Dataset:
-    try:
-        from ultragray.datasets.mcap import read_mcap_sweep
-    except ImportError as error:
-        raise missing_extra(error, "an MCAP recording") from error
-
-    path = Path(source)
-    read = read_mcap_sweep(
-        path,
-        frames=options.frames,
-        crop=options.crop,
-        transform=options.transform,
-        image_topic=options.image_topic,
-        pose_topic=options.pose_topic,
-    )
-    return _split_sequence(path, options, *read)
-
-
 PLUS_SUFFIXES = (".mha", ".mhd", ".nrrd", ".nhdr")
 FORMATS: Mapping[str, DatasetFormat] = {
     one.name: one
@@ -214,16 +169,16 @@ FORMATS: Mapping[str, DatasetFormat] = {
             noun="folder of the released layout",
             meaning="a folder with conf.json and .npy files (or its conf.json)",
             is_source=lambda source: Path(source).is_dir() or source.lower().endswith(".json"),
-            load=_load_released,
+            reader="ultragray.datasets.released:read_released",
             files=("conf.json",),
-            check_upload=_check_released_upload,
+            upload_check="ultragray.datasets.released:require_files_below",
         ),
         DatasetFormat(
             name="plus",
             noun="PLUS sequence",
             meaning=f"a PLUS sequence ({', '.join(PLUS_SUFFIXES)})",
             is_source=lambda source: source.lower().endswith(PLUS_SUFFIXES),
-            load=_load_plus,
+            reader="ultragray.datasets.plus:read_plus_sweep",
             files=tuple(f"*{suffix}" for suffix in PLUS_SUFFIXES),
             options=("frames", "device_set", "crop", "fan", "transform"),
             beside=(".raw", ".zraw", ".raw.gz"),
@@ -234,7 +189,7 @@ FORMATS: Mapping[str, DatasetFormat] = {
             noun="DICOM cine loop",
             meaning="a DICOM cine loop (.dcm) with its poses beside it (.poses.npy or .poses.json)",
             is_source=lambda source: source.lower().endswith(".dcm"),
-            load=_load_dicom,
+            reader="ultragray.datasets.dicom:read_dicom_sweep",
             files=("*.dcm",),
             options=("frames", "crop", "fan"),
             beside=(".poses.npy", ".poses.json"),
@@ -245,7 +200,7 @@ FORMATS: Mapping[str, DatasetFormat] = {
             meaning="an MCAP recording of ROS 2 (.mcap) with images and poses, its geometry in it or beside it "
             "(.geometry.json)",
             is_source=lambda source: source.lower().endswith(".mcap"),
-            load=_load_mcap,
+            reader="ultragray.datasets.mcap:read_mcap_sweep",
             files=("*.mcap",),
             options=("frames", "crop", "transform", "image_topic", "pose_topic"),
             beside=(".geometry.json",),
@@ -255,8 +210,9 @@ FORMATS: Mapping[str, DatasetFormat] = {
             noun="built-in phantom",
             meaning=f"the word {PHANTOM}",
             is_source=lambda source: source == PHANTOM,
-            load=_load_phantom,
+            reader="ultragray.phantom:load_phantom",
         ),
+        *(point.load() for point in entry_points(group="ultragray.dataset_formats")),
     )
 }
 UPLOADED_FORMATS = tuple(one for one in FORMATS.values() if one.files)

@@ -11,15 +11,16 @@ from typing import Any
 import torch
 
 from ultragray.exchange.exports import FORMATS, ExportHeader, check_format, export_to
-from ultragray.exchange.exports.png_folder import export_pngs
+from ultragray.exchange.exports.archives import export_pngs
 from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation.scoring import frames_at_once
+from ultragray.rendering.backends.registry import renderer_name
 from ultragray.rendering.confidence import SupportWatch
-from ultragray.rendering.frames import render, renderer_name, show
+from ultragray.rendering.frames import render_shown
 from ultragray.rendering.limits import UNLIMITED, Limits
 from ultragray.rendering.pixels import PixelArray
-from ultragray.rendering.settings import Below, Resolved
-from ultragray.scene.confidence import Assessor, Extrapolation, is_confident
+from ultragray.rendering.settings import Resolved
+from ultragray.scene.confidence import Assessor, Extrapolation
 from ultragray.scene.gaussians import GaussianScene
 
 __all__ = ["render_portions", "render_to_file"]
@@ -85,36 +86,15 @@ def render_portions(
     `before_portion` is told how many frames are done, at last all of them; to stop, it raises. `assessor`: the scene's,
     where the caller has one. Raises what `render` raises.
     """
-    limit = settings.min_confidence if settings.below_min_confidence is Below.MASK else None
-    masked = [limit is not None and not is_confident(one, limit) for one in extrapolations]
-    wanted = tuple(dict.fromkeys((*settings.outputs, "coverage")))
+    support = SupportWatch(assessor or Assessor(scene.info, scene.training_poses), extrapolations, settings)
     portion = frames_at_once(settings.height, settings.width)
-    assessor = assessor or Assessor(scene.info, scene.training_poses)
     for first in range(0, len(poses), portion):
         if before_portion is not None:
             before_portion(first)
-        places = slice(first, first + portion)
+        some = poses[first : first + portion]
         with torch.no_grad():
-            frames = render(
-                scene,
-                settings.probe,
-                poses[places],
-                height=settings.height,
-                width=settings.width,
-                outputs=wanted,
-                backend=backend,
-                limits=limits.after(first),
-                beam=settings.beam,
-                contact=settings.contact,
-                tools=settings.tools,
-                ghost=settings.ghost,
-            )
-            assert frames.coverage is not None
-            watch = SupportWatch(masked[places])
-            blackened = watch.look(frames.coverage, frames.touch)
-            asked = {name: getattr(frames, name) for name in settings.outputs}
-            shown = show(asked, settings.probe, settings.display, blackened)
-            figures = watch.completed(assessor, extrapolations[places], 0)
+            shown = render_shown(scene, settings, some, backend=backend, limits=limits.after(first), support=support)
+        figures = support.completed(first, first + len(some))
         yield {name: pixels.cpu().numpy() for name, pixels in shown.items()}, figures
     if before_portion is not None:
         before_portion(len(poses))

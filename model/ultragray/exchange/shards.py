@@ -19,7 +19,7 @@ from ultragray.exchange.exports.exporter import stored_pixels
 from ultragray.exchange.rendering import render_portions, written_behind
 from ultragray.files import file_sha256
 from ultragray.geometry.probe import FloatArray
-from ultragray.rendering.frames import renderer_name
+from ultragray.rendering.backends.registry import renderer_name
 from ultragray.rendering.limits import UNLIMITED, Limits
 from ultragray.rendering.pixels import PixelArray
 from ultragray.samplers import Assess
@@ -163,7 +163,7 @@ class ShardRenderer:
 
             def write(frames: dict[str, PixelArray], figures: list[Extrapolation]) -> None:
                 nonlocal done
-                stored = {name: stored_pixels(pixels, header.pixel_type(name)) for name, pixels in frames.items()}
+                stored = {name: stored_pixels(name, pixels, header.pixel_type(name)) for name, pixels in frames.items()}
                 places = slice(done, done + len(figures))
                 tar.add([plan.key(number) for number in numbers[places]], poses[places], figures, stored)
                 done += len(figures)

@@ -12,16 +12,29 @@ from torch.nn import functional
 
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.rendering.contact import Touch
-from ultragray.scene.confidence import SUPPORT_COVERAGE, Assessor, DepthBands, Extrapolation, TrainingViews, read_model
+from ultragray.rendering.settings import Below, Resolved
+from ultragray.scene.confidence import (
+    SUPPORT_COVERAGE,
+    Assessor,
+    DepthBands,
+    Extrapolation,
+    TrainingViews,
+    is_confident,
+    read_model,
+)
 from ultragray.scene.gaussians import GaussianScene
 
 
 class SupportWatch:
-    """Records the support and the contact of frames as they are rendered, in the order of their poses."""
+    """The confidence in frames while they are rendered, in the order of their poses: their support and their contact
+    with the skin, and the pixels that are masked for want of support.
+    """
 
-    def __init__(self, masked: Sequence[bool]) -> None:
-        """`masked`: for each pose, whether pixels without support are to be black."""
-        self._masked = masked
+    def __init__(self, assessor: Assessor, extrapolations: Sequence[Extrapolation], settings: Resolved) -> None:
+        """`extrapolations`: of all poses, from the poses alone."""
+        limit = settings.min_confidence if settings.below_min_confidence is Below.MASK else None
+        self._masked = [limit is not None and not is_confident(one, limit) for one in extrapolations]
+        self._assessor, self._extrapolations = assessor, extrapolations
         self._shares: list[Tensor] = []
         self._contacts: list[FloatArray] = []
         self._count = 0
@@ -37,20 +50,14 @@ class SupportWatch:
             return None
         return torch.tensor(masked, device=coverage.device)[:, None, None] & (coverage < SUPPORT_COVERAGE)
 
-    def shares(self, first: int, count: int) -> list[float]:
-        """The share of each of `count` frames that has support, from `first` on; waits for a GPU to have rendered."""
-        shares: list[float] = torch.cat(self._shares)[first : first + count].tolist()
-        return shares
-
-    def completed(
-        self, assessor: Assessor, extrapolations: Sequence[Extrapolation], first: int
-    ) -> list[Extrapolation]:  # [B]
-        """The extrapolations of the frames from `first` on, with what was seen of their support and contact."""
-        found = assessor.with_support(extrapolations, self.shares(first, len(extrapolations)))
+    def completed(self, first: int, stop: int) -> list[Extrapolation]:
+        """The extrapolations of some frames with what was seen of them; waits for a GPU to have rendered."""
+        shares = torch.cat(self._shares)[first:stop].tolist()
+        found = self._assessor.with_support(self._extrapolations[first:stop], shares)
         if not self._contacts:
             return found
-        contacts = np.concatenate(self._contacts)[first:].tolist()
-        return [replace(one, contact_share=contact) for one, contact in zip(found, contacts, strict=False)]
+        contacts = np.concatenate(self._contacts)[first:stop].tolist()
+        return [replace(one, contact_share=contact) for one, contact in zip(found, contacts, strict=True)]
 
 
 def _supported_shares(coverage: Tensor) -> Tensor:  # [C, H, W] -> [C]
@@ -66,8 +73,9 @@ def _supported_shares(coverage: Tensor) -> Tensor:  # [C, H, W] -> [C]
 # d are `interpolation_mm` and `distance_mm` of `ViewMeasures`, on a grid of POINTS_PER_SIDE² points, interpolated
 # too, and reach(x, r) = 1 − exp(−x/r). The terms vₖ:
 #
-# floor 0.001 level B̄/10 level² B̄² texture mean of B² less B̄² gap r reach(i, r)·V beyond reach(d, 5 mm)·V thin (1 −
-# γ)·V shadow (1 − T)·B̄/10
+#     floor      0.001                 level      B̄/10           level²   B̄²       texture   mean of B² less B̄²
+#     gap r      reach(i, r)·V         beyond     reach(d, 5 mm)·V
+#     thin       (1 − γ)·V             shadow     (1 − T)·B̄/10
 
 
 CELLS = 32  # a side; no more than pixels

@@ -1,4 +1,9 @@
-"""render(): poses in, frames out, on the backend that fits."""
+"""Poses in, frames out: `render` draws the outputs of a scene by the backend that fits, `show` turns them into what a
+display shows, and `render_shown` does both as the settings of a request want it.
+
+From scene and settings to pixels: `_views` (where the probe is, pressed or not) → `Drawing` (the backend's planes; air,
+tools and ghosts put into them) → outputs (`ultragray.rendering.outputs`) → `show`.
+"""
 
 from __future__ import annotations
 
@@ -11,33 +16,32 @@ import torch
 from torch import Tensor
 from torch.nn.functional import avg_pool2d, grid_sample, pad
 
-from ultragray.errors import BackendUnavailable, InvalidArgument
+from ultragray.errors import InvalidArgument
 from ultragray.geometry.image_size import check_image_size
 from ultragray.geometry.probe import BoolArray, ElevationBeam, FloatArray, Probe
 from ultragray.geometry.scan_conversion import samples
-from ultragray.installation import __version__
-from ultragray.rendering.backends import cpu, cuda, reference
+from ultragray.rendering.backends import cpu
 from ultragray.rendering.backends.inputs import ScenePoses, as_array, beam_cm, scene_poses
+from ultragray.rendering.backends.registry import BACKENDS, choose_backend
+from ultragray.rendering.confidence import SupportWatch
 from ultragray.rendering.contact import Skin, Touch, at_rest
-from ultragray.rendering.display import FRAME_RANGE_DB, Display
+from ultragray.rendering.display import AS_RENDERED, FRAME_RANGE_DB, Display
 from ultragray.rendering.limits import UNLIMITED, Limits
 from ultragray.rendering.outputs import OUTPUTS, PLANES, check_available, check_outputs
 from ultragray.rendering.overlays import GHOST_PLANES, ToolsInView, add_ghosts
-from ultragray.rendering.settings import Contact
+from ultragray.rendering.settings import Contact, Resolved
 from ultragray.rendering.tools import ScanView, Tool
 from ultragray.scene.gaussians import GaussianScene
 
-Backend = Callable[
-    [GaussianScene, Probe, ScenePoses, int, int, Sequence[str], Limits, Tensor | None], dict[str, Tensor]
-]
+_CACHED_PICTURES = 8  # at 9 bytes a pixel
+_LARGEST_CACHED_PICTURE = 2**20  # pixels
 
 
 class Frames(Mapping[str, Tensor]):
     """Rendered frames by output, each [C, H, W]: `frames["bmode"]`, or `frames.bmode`, None where it was not asked for.
 
     `ultragray.rendering.outputs` says what each means. Amounts lie in [0, 1]; labels are uint8, of which
-    `scene.info.label_names`
-    tells the meaning, 0 where there is none.
+    `scene.info.label_names` tells the meaning, 0 where there is none.
     """
 
     def __init__(self, outputs: Mapping[str, Tensor], touch: Touch | None = None) -> None:
@@ -73,7 +77,7 @@ class Drawing:
 
     def __init__(
         self,
-        draw: Backend,
+        draw: Callable[..., dict[str, Tensor]],
         scene: GaussianScene,
         view: View,
         limits: Limits,
@@ -159,16 +163,12 @@ def render(
     `beam` is how thick a slice the frames show, instead of the scene's own (None); a thickness of 0 mm is an infinitely
     thin one. A tensor [3] of its thickness, focus and depth of field in mm is differentiable too.
     `contact` makes scan lines off the skin dark, and compresses tissue under pressure (`ultragray.rendering.contact`);
-    the
-    result's `touch` tells where. It follows from the poses alone, has no gradient, and is the same on every backend.
+    the result's `touch` tells where. It follows from the poses alone, and has no gradient.
     `tools`, such as needles, are drawn into the frames (`ultragray.rendering.tools`); labels then are there for every
-    scene.
-    `ghost`, 0 to 1, is the share that a mirror image has of what is heard beyond the first strong interface
+    scene. `ghost`, 0 to 1, is the share that a mirror image has of what is heard beyond the first strong interface
     (`ultragray.rendering.overlays`). Both are the same on every backend, have no gradient, and let that of the planes
-    pass.
-    `limits` bound the cost of each frame and can end the rendering (`ultragray.rendering.limits`), but for frames with
-    gradients:
-    FrameTooCostly, GivenUp.
+    pass. `limits` bound the cost of each frame and can end the rendering (`ultragray.rendering.limits`), but for frames
+    with gradients: FrameTooCostly, GivenUp.
     Raises InvalidPose, InvalidProbe, InvalidImageSize, UnknownOutput (also for labels of a scene that carries none),
     BackendUnavailable, MemoryExceeded where the GPU's memory does not suffice, and InvalidArgument for a contact that
     is none, and where contact is asked for and the scene knows no skin.
@@ -182,7 +182,7 @@ def render(
         int(height),
         int(width),
     )
-    draw = _BACKENDS[choose_backend(backend, scene)]
+    draw = BACKENDS[choose_backend(backend, scene)].draw
     contact = _checked_contact(contact)
     planes = list(dict.fromkeys(plane for name in chosen for plane in OUTPUTS[name].planes))
     touch = touch_of(scene, view[0], poses, view[3]) if contact is not None else None
@@ -277,50 +277,41 @@ def footprint_pixels(
     return cpu.footprint_pixels(scene, *view, limits, beam_cm(beam or scene.info.beam, view[0]))
 
 
-_BACKENDS: dict[str, Backend] = {
-    "reference": reference.render_outputs,
-    "cpu": cpu.render_outputs,
-    "cuda": cuda.render_outputs,
-}
+def render_shown(
+    scene: GaussianScene,
+    settings: Resolved,
+    poses: FloatArray,  # [C, 4, 4] mm
+    *,
+    outputs: Sequence[str] | None = None,
+    backend: str = "auto",
+    limits: Limits = UNLIMITED,
+    support: SupportWatch | None = None,
+) -> dict[str, Tensor]:  # [C, H', W'] by output
+    """Frames as settings have them shown: the one way from the settings of a request to pixels, of pool and files.
 
-
-def choose_backend(name: str, scene: GaussianScene) -> str:
-    """The backend that `name` (auto: the best) means for a scene.
-
-    Raises BackendUnavailable for an unknown name and for one that cannot render the scene here.
+    `outputs`: instead of those of the settings. With `support` it sees the coverage of each frame, and pixels are black
+    where it masks them. Raises what `render` raises.
     """
-    if name == "auto":
-        if scene.means.is_cuda and cuda.supports(scene):
-            return "cuda"
-        return "cpu" if cpu.supports(scene) else "reference"
-    if name not in _BACKENDS:
-        raise BackendUnavailable(f"backend must be one of auto, {', '.join(_BACKENDS)}, got {name!r}", field="backend")
-    if name == "cuda":
-        cuda.require()
-    if name != "reference" and not (cpu if name == "cpu" else cuda).supports(scene):
-        place = "on the CPU" if name == "cpu" else f"on the device {cuda.device()}"
-        raise BackendUnavailable(
-            f"backend {name} renders float32 scenes {place}, got {scene.means.dtype} on {scene.means.device}",
-            field="backend",
-        )
-    return name
-
-
-def renderer_name(backend: str, scene: GaussianScene) -> str:
-    """The name of a scene's renderer, as in every frame: `ultragray/0.1.0 cpu-avx512`, `ultragray/0.1.0 cuda-sm90`."""
-    chosen = choose_backend(backend, scene)
-    if chosen == "cpu":
-        by = f"cpu-{cpu.INSTRUCTION_SETS[0]}"
-    else:
-        by = cuda.renderer(scene.means.device) if chosen == "cuda" else chosen
-    return f"ultragray/{__version__} {by}"
-
-
-# Rendered frames as a sonographer has set the display: the pixel work, where the frames are.
-
-
-_CACHED_PICTURES = 8  # at 9 bytes a pixel
-_LARGEST_CACHED_PICTURE = 2**20  # pixels
+    names = settings.outputs if outputs is None else tuple(outputs)
+    frames = render(
+        scene,
+        settings.probe,
+        poses,
+        height=settings.height,
+        width=settings.width,
+        outputs=names if support is None else (*names, "coverage"),
+        backend=backend,
+        limits=limits,
+        beam=settings.beam,
+        contact=settings.contact,
+        tools=settings.tools,
+        ghost=settings.ghost,
+    )
+    blackened = None if support is None else support.look(frames["coverage"], frames.touch)
+    rendered = {name: frames[name] for name in names}
+    if settings.display == AS_RENDERED and blackened is None:
+        return rendered
+    return show(rendered, settings.probe, settings.display, blackened)
 
 
 def show(

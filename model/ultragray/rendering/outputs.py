@@ -1,16 +1,17 @@
 """The outputs of a renderer: what can be asked for at each pixel, and how each follows from what the backends draw.
 
-To add an output, register it here; its number on the wire goes into `proto/ultragray/v1/rendering.proto`. Free of
-torch.
+An output is known by being registered here: to every door, to the contract of gRPC (`make generate`), to files and to
+the console. Its values have a unit and a scale. Free of torch.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol, TypeVar
 
 import numpy as np
+import numpy.typing as npt
 
 from ultragray.errors import UnknownOutput
 
@@ -26,6 +27,7 @@ PLANES = ("bmode", "echo", "transmittance", "coverage")  # what a backend draws,
 WEIGHT_SUM, INTENSITY_SUM = "weight_sum", "intensity_sum"  # S and ΣI·w of docs/physics.md §3
 SUMS = (WEIGHT_SUM, INTENSITY_SUM)  # which backends draw too, with gradients
 SPENT_BEAM = 1e-4  # a transmittance below it is noise: nothing can be said of what is taken from it
+_Values = TypeVar("_Values", "npt.NDArray[Any]", "Tensor")
 _AMOUNTS, _NUMBERS = np.dtype("<f4"), np.dtype("u1")
 
 
@@ -65,7 +67,11 @@ class Output:
     derive: Callable[[Drawing], Tensor]
     """The output [C, H, W] of a drawing."""
     dtype: np.dtype[Any] = _AMOUNTS
-    """float32: amounts in [0, 1]. uint8: numbers that stand for something, which nothing may interpolate or scale."""
+    """float32: amounts. uint8: numbers that stand for something, which nothing may interpolate or scale."""
+    unit: str = "1"
+    """Of its values, such as dB/cm; 1: a share."""
+    scale: tuple[float, float] = (0.0, 1.0)
+    """The values that 8 bits hold as 0 and as 255; those beyond are held as these. float32 holds the values."""
     is_toned: bool = False
     """Whether gain, dynamic range and time-gain compensation change it."""
     shows_tools_alone: bool = False
@@ -79,6 +85,27 @@ class Output:
     def is_numbers(self) -> bool:
         """Whether its pixels are numbers, not amounts."""
         return self.dtype == _NUMBERS
+
+    @property
+    def range_in_words(self) -> str:
+        """Its values, such as "0 to 1" or "-60 to 0 dB"."""
+        if self.is_numbers:
+            return "whole numbers"
+        low, high = self.scale
+        return f"{low:g} to {high:g}" + ("" if self.unit == "1" else f" {self.unit}")
+
+    @property
+    def about(self) -> str:
+        """Its meaning, with its values where these are not shares."""
+        return self.meaning if self.is_numbers or self.unit == "1" else f"{self.meaning}; {self.range_in_words}"
+
+    def shares(self, values: _Values) -> _Values:
+        """The shares of its scale that amounts are, which 8 bits hold times 255; labels as they are."""
+        low, high = self.scale
+        if self.is_numbers or (low, high) == (0.0, 1.0):
+            return values
+        found: _Values = (values.clip(low, high) - low) / (high - low)
+        return found
 
 
 OUTPUTS: dict[str, Output] = {}
@@ -153,7 +180,13 @@ UNCERTAINTY = _register(
 OUTPUT_SCHEMA: dict[str, Any] = {  # JSON Schema of the name of an output
     "type": "string",
     "oneOf": [
-        {"const": output.name, "description": output.meaning, "x-numbers": output.is_numbers}
+        {
+            "const": output.name,
+            "description": output.about,
+            "x-numbers": output.is_numbers,
+            "x-unit": output.unit,
+            "x-scale": list(output.scale),
+        }
         for output in OUTPUTS.values()
     ],
 }

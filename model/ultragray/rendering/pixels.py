@@ -7,8 +7,16 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from ultragray.rendering.settings import Encoding
+
 ByteArray = npt.NDArray[np.uint8]
 PixelArray = npt.NDArray[Any]  # float32 as rendered, or uint8: labels, and what is rounded already
+
+JPEG_QUALITY = 90
+_IMAGE_FILES: dict[Encoding, tuple[Any, ...]] = {  # suffix, and options in the words of OpenCV
+    Encoding.PNG: (".png",),
+    Encoding.JPEG: (".jpg", 1, JPEG_QUALITY),  # cv2.IMWRITE_JPEG_QUALITY
+}
 
 
 def to_uint8(frames: PixelArray) -> ByteArray:
@@ -19,6 +27,17 @@ def to_uint8(frames: PixelArray) -> ByteArray:
 
     rows = frames.reshape(-1, frames.shape[-1])
     return cv2.convertScaleAbs(rows, alpha=255.0).astype(np.uint8, copy=False).reshape(frames.shape)
+
+
+def in_type(frames: PixelArray, dtype: npt.DTypeLike) -> npt.NDArray[Any]:
+    """Frames in a type of pixels, C order, little endian: uint8 as `to_uint8` rounds, labels as they are."""
+    wanted = np.dtype(dtype)
+    return np.ascontiguousarray(to_uint8(frames) if wanted == np.uint8 else frames, wanted.newbyteorder("<"))
+
+
+def encoded_image(frame: PixelArray, encoding: Encoding) -> ByteArray:  # [H, W] -> [bytes]
+    """A frame as the bytes of a grey image file. Raises KeyError for an encoding that is no image file."""
+    return image_file(frame, *_IMAGE_FILES[encoding])
 
 
 def image_file(frame: PixelArray, suffix: str, *options: int) -> ByteArray:  # [H, W] -> [bytes]

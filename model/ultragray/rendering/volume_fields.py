@@ -169,7 +169,7 @@ class _Slab:
 
 # Slices as pictures; volumes as NIfTI-1 (.nii, .nii.gz) and NRRD (.nrrd), written slab by slab.
 #
-# The same volume is the same bytes.
+# The same volume is the same bytes. nibabel and pynrrd would want the whole volume in memory, so the headers are ours.
 #
 # Both formats say that their axes are right, anterior and superior (RAS+), which programs for patients expect. A
 # scene knows no patient: its frame's x, y and z are written as these three, with unchanged numbers, as 3D Slicer

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from typing import Any, Protocol
 
@@ -556,7 +556,7 @@ def is_confident(extrapolation: Extrapolation, min_confidence: float) -> bool:
     return (extrapolation.confidence or 0.0) >= min_confidence
 
 
-def low_confidence(extrapolation: Extrapolation, min_confidence: float, field: str) -> LowConfidence:
+def _low_confidence(extrapolation: Extrapolation, min_confidence: float, field: str) -> LowConfidence:
     """The error of a pose, named by its field, that does not have the least confidence."""
     detail = f"{field} has a confidence of {extrapolation.confidence or 0.0:.2f}, {min_confidence:g} is asked for"
     if extrapolation.distance_mm is not None and extrapolation.angle_deg is not None:
@@ -566,14 +566,18 @@ def low_confidence(extrapolation: Extrapolation, min_confidence: float, field: s
 
 
 def require_confidence(
-    extrapolations: Sequence[Extrapolation], min_confidence: float | None, *, first: int = 0
+    extrapolations: Sequence[Extrapolation],
+    min_confidence: float | None,
+    *,
+    first: int = 0,
+    name_pose: Callable[[int], str] = "poses[{}]".format,
 ) -> None:
     """Raises LowConfidence for the first of many poses that does not have the least confidence (None: any will do).
 
-    `first`: the number that they begin with.
+    `first`: the number that they begin with; `name_pose`: how the caller names the pose of a number.
     """
     if min_confidence is None:
         return
     for number, extrapolation in enumerate(extrapolations, first):
         if not is_confident(extrapolation, min_confidence):
-            raise low_confidence(extrapolation, min_confidence, f"poses[{number}]")
+            raise _low_confidence(extrapolation, min_confidence, name_pose(number))

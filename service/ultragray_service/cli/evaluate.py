@@ -82,8 +82,8 @@ def evaluate(
 
     from ultragray.learn.evaluation.scoring import evaluate as evaluate_scene
     from ultragray.learn.evaluation.scoring import measure_reliability, require_frames
+    from ultragray.rendering.backends.registry import render_device
     from ultragray.scene.gaussians import GaussianScene
-    from ultragray_workers.pool.scene_cache import render_device
 
     loaded = GaussianScene.load(scene).to(render_device(backend))
     read = read_dataset(sweep, source)

@@ -210,8 +210,8 @@ def render_frames(
     import torch
 
     from ultragray.exchange.rendering import render_to_file
+    from ultragray.rendering.backends.registry import render_device
     from ultragray.scene.gaussians import GaussianScene
-    from ultragray_workers.pool.scene_cache import render_device
 
     scene = GaussianScene.load(task.scene_file)
     if threads:

@@ -135,6 +135,36 @@ def is_folder_name(path: Path) -> bool:
     return path.is_dir() or not path.suffix
 
 
+def print_facts(document: dict[str, Any]) -> None:
+    """A table of names and values for a person; what is unknown is left out."""
+    from rich.console import Console
+    from rich.markup import escape
+    from rich.table import Table
+
+    facts = {key: _text(value) for key, value in document.items() if value not in (None, {}, [])}
+    console = Console()
+    if not console.is_terminal:  # no padding for other programs, and nothing is cut
+        width = max(map(len, facts), default=0)
+        typer.echo("\n".join(f"{key:<{width}}  {text}" for key, text in facts.items()))
+        return
+    table = Table(show_header=False, box=None, pad_edge=False)
+    table.add_column(style="bold", no_wrap=True)
+    table.add_column(overflow="fold")
+    for key, text in facts.items():
+        table.add_row(key, escape(text))  # a scene's own strings must not be read as markup
+    console.print(table)
+
+
+def _text(value: Any) -> str:
+    if isinstance(value, dict):
+        return "  ".join(f"{key}={_text(item)}" for key, item in value.items())
+    if isinstance(value, (list, tuple)):
+        return "(" + ", ".join(_text(item) for item in value) + ")"
+    if isinstance(value, float):
+        return f"{value:.6g}"
+    return f"{value:,}" if isinstance(value, int) and not isinstance(value, bool) else str(value)
+
+
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Print rows under their columns; the first column is never cut."""
     from rich.markup import escape

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import lru_cache
 
 from ultragray.rendering.settings import Encoding
 from ultragray_service.errors import NotAcceptable
@@ -82,7 +83,7 @@ def choose(accept: str, *, frames: int, outputs: int, dtype: str | None, lossles
         able = tuple(media_type for media_type in able if media_type != JPEG)
     if dtype is not None:  # only raw pixels have one
         able = (RAW, *(media_type for media_type in able if media_type != RAW))
-    media_type, chosen = _best(accept, able, f"{frames} frame(s) of {outputs} output(s)")
+    media_type, chosen = _best(accept, tuple(able), f"{frames} frame(s) of {outputs} output(s)")
     if media_type == RAW:
         return Choice(RAW, RAW_ENCODINGS[chosen.dtype or dtype or "uint8"])
     return Choice(media_type, _ENCODINGS[media_type])
@@ -93,22 +94,26 @@ def choose_of_slice(accept: str) -> str:
     return _best(accept, SLICE_TYPES, "a slice")[0]
 
 
-def _best(accept: str, able: Sequence[str], what: str) -> tuple[str, MediaRange]:
+def _best(accept: str, able: tuple[str, ...], what: str) -> tuple[str, MediaRange]:
     """The media type that an Accept header likes best, the first of those alike, and the range that names it."""
-    ranges = parse_accept(accept) if accept.strip() else [MediaRange("*", "*", None, 1.0)]
-    best: tuple[float, str, MediaRange] | None = None
-    for media_type in able:
-        matches = [(r.specificity(media_type), r) for r in ranges if r.specificity(media_type) >= 0]
-        if not matches:
-            continue
-        closest = max(level for level, _ in matches)
-        chosen = max((r for level, r in matches if level == closest), key=lambda r: r.quality)
-        if chosen.quality > 0 and (best is None or chosen.quality > best[0]):
-            best = (chosen.quality, media_type, chosen)
+    best = _liked(accept, able)
     if best is None:
         raise NotAcceptable(
             f"Accept must allow a type that can hold {what}: {', '.join(able)}; got {accept!r}",
             field="Accept",
         )
-    _, media_type, chosen = best
-    return media_type, chosen
+    return best
+
+
+@lru_cache(maxsize=64)  # a client sends the same header with every request
+def _liked(accept: str, able: tuple[str, ...]) -> tuple[str, MediaRange] | None:
+    ranges = parse_accept(accept) if accept.strip() else [MediaRange("*", "*", None, 1.0)]
+    best: tuple[str, MediaRange] | None = None
+    for media_type in able:
+        matches = [(level, one) for one in ranges if (level := one.specificity(media_type)) >= 0]
+        if not matches:
+            continue
+        _, chosen = max(matches, key=lambda match: (match[0], match[1].quality))
+        if chosen.quality > 0 and (best is None or chosen.quality > best[1].quality):
+            best = media_type, chosen
+    return best

@@ -100,13 +100,12 @@ async def locate(
     for _ in range(MAX_SCENE_CHANGES):
         asked = RenderRequest(
             plan.scene,
-            plan.settings,
+            sought,
             plan.placed(start)[None],
             Priority.BATCH,
             deadline,
             plan.version,
             caller(),
-            sought=sought,
         )
         try:
             with scene_to_blame():

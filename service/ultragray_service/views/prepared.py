@@ -26,6 +26,7 @@ from ultragray.datasets.source import PHANTOM
 from ultragray.errors import DatasetInvalid, TrainingStateInvalid, UltragrayError
 from ultragray.files import sync
 from ultragray.phantom.demo import DEMO_FILE
+from ultragray.rendering.pixels import encoded_image
 from ultragray.rendering.settings import Encoding
 from ultragray.scene.info import read_header
 from ultragray_service.core.jobs.jobs import Jobs
@@ -38,7 +39,6 @@ from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import ArtifactNotFound, DatasetNotFound, Draining
 from ultragray_workers.helpers import PROGRESS_NAME, read_picture
 from ultragray_workers.jobs.store import Job, JobStore
-from ultragray_workers.pool.pixels import encode_image
 from ultragray_workers.scenes import SceneStore
 from ultragray_workers.views import FRAMES_NAME, POSES_NAME, PREVIEW_PICTURES, compare, draw_preview, lay_out
 
@@ -122,7 +122,7 @@ class Prepared:
             found = [picture for picture in pictures if picture is not None]
             if len(found) < len(names):
                 return None
-            return encode_image(np.concatenate(found, axis=1), Encoding.PNG).tobytes()
+            return encoded_image(np.concatenate(found, axis=1), Encoding.PNG).tobytes()
 
         return await asyncio.to_thread(read)
 

@@ -30,9 +30,9 @@ from ultragray.geometry.probe import FloatArray
 from ultragray.phantom import load_phantom
 from ultragray.phantom.demo import copy_demo_scene, demo_poses
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
+from ultragray_service.cli.connection import Connection, route
 from ultragray_service.igtl.contents import Image, pack_transform, unpack_image, unpack_status
 from ultragray_service.igtl.messages import HEADER_BYTES, Message, pack_message, unpack_header, unpack_message
-from ultragray_service.remote.jobs import Jobs
 from ultragray_studies.bench.kernel import BenchScene, bench_poses, measure_kernel, time_ms
 from ultragray_studies.bench.report import Report, percentiles
 from ultragray_studies.bench.served import pose_message, running_server
@@ -111,7 +111,7 @@ def measure_clients(extent: ClientsExtent, tell: Callable[[str], None]) -> dict[
             tell("OpenIGTLink, one pose after another ...")
             measured["OpenIGTLink"] = _ping_pong(server.igtl_port, extent.ping_pongs)
             tell(f"{extent.frames:,} frames to an archive ...")
-            frames_per_s = _augment(server.jobs(), extent)
+            frames_per_s = _augment(server.connection(), extent)
         tell("the kernel by itself ...")
         timings = measure_kernel(bench, [threads], extent.kernel_repeats)
         kernel_frames_per_s = max(1000.0 / float(np.median(timing.frame_ms)) for timing in timings)
@@ -213,7 +213,7 @@ def _ping_pong(port: int, repeats: int) -> dict[str, float]:
         return _percentiles([time_ms(client.render, poses[number % len(poses)]) for number in range(repeats)])
 
 
-def _augment(client: Jobs, extent: ClientsExtent) -> float:
+def _augment(client: Connection, extent: ClientsExtent) -> float:
     """Frames per second of a rendering job, from its start to the whole archive."""
     specification = {
         "scene": AUGMENTED,
@@ -224,13 +224,13 @@ def _augment(client: Jobs, extent: ClientsExtent) -> float:
         "dtype": "uint8",
         "format": "npz",
     }
-    job: dict[str, Any] = client.submit({"kind": "render", "specification": specification})[0]
+    job: dict[str, Any] = client.json("POST", "/v1/jobs", {"kind": "render", "specification": specification})
     end = time.monotonic() + _WAIT_S
     while job["finished_at"] is None:
         if time.monotonic() > end:
             raise NotReady(f"the benchmark's rendering took more than {_WAIT_S:g} s")
         time.sleep(_POLL_S)
-        job = client.get(job["id"])
+        job = client.json("GET", route("jobs", job["id"]))
     if job["state"] != "succeeded":
         raise NotReady(f"the benchmark's rendering {job['state']}: {job['reason']}")
     started, finished = (datetime.fromisoformat(job[name]) for name in ("started_at", "finished_at"))
@@ -267,12 +267,12 @@ def measure_jobs(extent: JobsExtent, tell: Callable[[str], None]) -> dict[str, A
         copy_demo_scene(folder / f"{SCENE}.ugr")
         tell("one job, which is then copied ...")
         with running_server(folder, "cpu", SCENE) as server:
-            _finish_one(server.jobs())
+            _finish_one(server.connection())
         _copy_jobs(folder / "artifacts", extent.jobs)
         tell(f"start with {extent.jobs:,} jobs, and pages of them ...")
         with running_server(folder, "cpu", SCENE) as server:
             start_s = server.ready_s
-            port, client = server.http_port, server.jobs()
+            port, client = server.http_port, server.connection()
             pages = {
                 f"page of {PAGE}, newest": _pages(port, extent.pages, f"/v1/jobs?page_size={PAGE}"),
                 f"page of {PAGE}, in the middle": _pages(port, extent.pages, _middle(port, extent.jobs)),
@@ -309,15 +309,15 @@ def bench_jobs(output: Path | None, quick: bool) -> None:
     )
 
 
-def _finish_one(client: Jobs) -> None:
+def _finish_one(client: Connection) -> None:
     specification = {"scene": SCENE, "sampler": {"kind": "training"}, "height": 8, "width": 8}
-    job, _ = client.submit({"kind": "render", "specification": specification})
+    job = client.json("POST", "/v1/jobs", {"kind": "render", "specification": specification})
     _until(client, job["id"], lambda job: job["state"] == "succeeded")
 
 
-def _until(client: Jobs, job_id: str, reached: Callable[[dict[str, Any]], bool]) -> None:
+def _until(client: Connection, job_id: str, reached: Callable[[dict[str, Any]], bool]) -> None:
     end = time.monotonic() + WAIT_S
-    while not reached(job := client.get(job_id)):
+    while not reached(job := client.json("GET", route("jobs", job_id))):
         if time.monotonic() > end or job["state"] == "failed":
             raise NotReady(f"the job of the benchmark is {job['state']}: {job['reason']}")
         time.sleep(0.1)
@@ -369,7 +369,7 @@ def _middle(port: int, jobs: int) -> str:
 
 
 def _frames_beside_training(
-    client: Jobs, http_port: int, grpc_port: int, extent: JobsExtent
+    client: Connection, http_port: int, grpc_port: int, extent: JobsExtent
 ) -> dict[str, list[list[float]]]:
     """Latencies of gRPC unary frames, one after another; a list for each round."""
     _upload(http_port, load_phantom())
@@ -380,10 +380,10 @@ def _frames_beside_training(
             frames["frame, alone"].append(_render_for(stub, extent))
             settings = {"steps": STEPS}
             specification = {"dataset": "phantom", "scene": f"beside-{number}", "settings": settings}
-            job, _ = client.submit({"kind": "train", "specification": specification})
+            job = client.json("POST", "/v1/jobs", {"kind": "train", "specification": specification})
             _until(client, job["id"], lambda job: bool(job["progress"]["step"]))
             frames["frame, beside a training"].append(_render_for(stub, extent))
-            client.cancel(job["id"])
+            client.json("POST", route("jobs", job["id"], suffix=":cancel"))
             time.sleep(REST_S)
     return frames
 

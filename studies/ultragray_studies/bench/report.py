@@ -37,7 +37,6 @@ _WRITTEN_BY_RECORDING = (
     "README.md",
     "docs/*.md",
     "docs/images/*_reliability.png",
-    "docs/images/scaling.png",
 )
 
 

@@ -29,8 +29,7 @@ import torch
 
 from ultragray.geometry.probe import FloatArray
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
-from ultragray_service.remote.connection import Connection
-from ultragray_service.remote.jobs import Jobs
+from ultragray_service.cli.connection import Connection
 from ultragray_service.rpc.shared_memory import FOLDER, FREE, HEADER_BYTES, TOKEN_BYTES
 from ultragray_studies.bench.kernel import BenchScene, bench_poses, bench_scenes, measure_kernel, time_ms
 from ultragray_studies.bench.report import Report, percentiles
@@ -109,9 +108,9 @@ class RunningServer:
     pid: int
     ready_s: float  # from its start until it was ready
 
-    def jobs(self) -> Jobs:
-        """A client of its jobs."""
-        return Jobs(Connection(f"http://127.0.0.1:{self.http_port}"))
+    def connection(self) -> Connection:
+        """A connection over HTTP."""
+        return Connection(f"http://127.0.0.1:{self.http_port}")
 
 
 @contextmanager

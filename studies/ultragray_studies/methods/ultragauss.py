@@ -18,7 +18,7 @@ from ultragray.learn.training.geometry import Geometry
 from ultragray.learn.training.losses import SSIM_WINDOW, image_loss
 from ultragray.learn.training.optimizer import PullStatistics, refine
 from ultragray.rendering.backends.inputs import scene_poses, spatial_order
-from ultragray.rendering.backends.weighted import WeightedSums, weighted_sums
+from ultragray.rendering.backends.registry import WeightedSums, weighted_sums
 from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.info import SceneInfo
 from ultragray_studies.methods.learner import LearnedMethod, Learner
@@ -54,7 +54,7 @@ START_DENSITY = 1.0  # 1/cm; a fit sets it by what its first image weighs
 
 
 class Field(nn.Module):
-    """Raw parameters; `transmittances` holds the logits of the weights (`ultragray.rendering.backends.weighted`)."""
+    """Raw parameters; `transmittances` holds the logits of the weights (`ultragray.rendering.backends.registry`)."""
 
     def __init__(self, gaussians: Mapping[str, Tensor], *, casts_shadow: bool) -> None:
         super().__init__()

@@ -16,7 +16,7 @@ import torch
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, render
 from ultragray.errors import BackendUnavailable, MemoryExceeded
 from ultragray.rendering.backends import cuda
-from ultragray.rendering.frames import renderer_name
+from ultragray.rendering.backends.registry import renderer_name
 from ultragray.rendering.outputs import PLANES
 
 pytest.importorskip("triton", reason="the package triton is not installed, which runs these kernels")

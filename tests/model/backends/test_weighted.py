@@ -14,7 +14,7 @@ from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, RadialProb
 from ultragray.errors import BackendUnavailable
 from ultragray.rendering.backends import cpu, cuda
 from ultragray.rendering.backends.inputs import scene_poses
-from ultragray.rendering.backends.weighted import WeightedSums, weighted_sums
+from ultragray.rendering.backends.registry import WeightedSums, weighted_sums
 from ultragray.rendering.outputs import SUMS
 
 HEIGHT, WIDTH = 37, 53

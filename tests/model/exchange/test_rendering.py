@@ -14,7 +14,7 @@ import pytest
 from ultragray import ConvexProbe, GaussianScene, render
 from ultragray.contract import to_dict
 from ultragray.exchange import rendering
-from ultragray.exchange.exports.npz import NpzExporter
+from ultragray.exchange.exports.archives import NpzExporter
 from ultragray.exchange.rendering import render_to_file
 from ultragray.rendering.display import Display
 from ultragray.rendering.pixels import PixelArray

@@ -25,7 +25,7 @@ from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
 from ultragray.files import file_sha256
 from ultragray_service.cli.app import app
-from ultragray_service.cli.remote.watch import JOB_CANCELLED, JOB_FAILED, results
+from ultragray_service.cli.jobs import JOB_CANCELLED, JOB_FAILED, results
 
 from ..conftest import ROOT, SOURCE_FOLDERS, RunningService, StartService
 

@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 
 from ultragray.errors import DatasetInvalid
 from ultragray_service.cli.app import app
-from ultragray_service.remote.datasets import archive_of
+from ultragray_service.cli.remote import archive_of
 
 KEY = "0123456789abcdef-strangers"
 

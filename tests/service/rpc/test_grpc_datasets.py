@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-import time
+import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,7 @@ from ultragray_proto.v1 import datasets_pb2, datasets_pb2_grpc
 
 from ...waiting import wait_until
 from ..conftest import RunningService, StartService
-from ..http.test_http_datasets import KEY, LIMIT_BYTES, poisoned_files, released_files, uploads_under_way, zipped
+from ..http.test_http_datasets import KEY, LIMIT_BYTES, poisoned_files, released_files, uploads_under_way
 from .test_grpc_render import error_info
 
 IDLE_TIMEOUT_S = 2.0
@@ -73,34 +73,6 @@ def refusal(call: Any, *arguments: Any, **keywords: Any) -> tuple[grpc.StatusCod
     return caught.value.code(), error_info(caught.value)[0].reason, caught.value.details()
 
 
-@pytest.mark.long
-def test_the_life_of_a_dataset(datasets: datasets_pb2_grpc.DatasetServiceStub, files: dict[str, bytes]) -> None:
-    first = upload(datasets, header("liver", train_frames="0:6"), *parts(files))
-    assert first.created
-    dataset = first.dataset
-    assert (dataset.name, dataset.kind, dataset.train_frames, dataset.val_frames) == ("liver", "released", 6, 3)
-    assert (dataset.height, dataset.width, dataset.probe.linear.width_mm) == (20, 16, 40.0)
-    assert dataset.options == datasets_pb2.DatasetOptions(train_frames="0:6")
-
-    archive = Message(chunk=zipped(files))
-    again = upload(datasets, header("liver", archive=True, train_frames="0:6"), archive)
-    assert (again.created, again.dataset) == (False, dataset)
-
-    assert datasets.GetDataset(datasets_pb2.GetDatasetRequest(dataset="liver"), metadata=METADATA) == dataset
-    page = datasets.ListDatasets(datasets_pb2.ListDatasetsRequest(), metadata=METADATA)
-    assert (list(page.datasets), page.next_page_token) == ([dataset], "")
-    sheet = datasets.GetContactSheet(datasets_pb2.GetContactSheetRequest(dataset="liver"), metadata=METADATA)
-    assert sheet.png.startswith(b"\x89PNG")
-    datasets.DeleteDataset(datasets_pb2.DeleteDatasetRequest(dataset="liver"), metadata=METADATA)
-    for method, request in (
-        (datasets.GetDataset, datasets_pb2.GetDatasetRequest(dataset="liver")),
-        (datasets.GetContactSheet, datasets_pb2.GetContactSheetRequest(dataset="liver")),
-        (datasets.DeleteDataset, datasets_pb2.DeleteDatasetRequest(dataset="liver")),
-    ):
-        code, reason, _ = refusal(method, request, metadata=METADATA)
-        assert (code, reason) == (grpc.StatusCode.NOT_FOUND, "DATASET_NOT_FOUND")
-
-
 def test_what_is_refused(datasets: datasets_pb2_grpc.DatasetServiceStub, files: dict[str, bytes]) -> None:
     invalid = grpc.StatusCode.INVALID_ARGUMENT
     large = [Message(chunk=b"\0" * 100_000)] * 3
@@ -125,24 +97,35 @@ def test_an_upload_needs_a_key(datasets: datasets_pb2_grpc.DatasetServiceStub) -
     assert (code, reason) == (grpc.StatusCode.UNAUTHENTICATED, "UNAUTHENTICATED")
 
 
-def begun(seconds: float) -> Iterator[Message]:
-    yield header("half")
-    yield Message(file="conf.json")
-    time.sleep(seconds)
+@pytest.fixture
+def begun() -> Iterator[Iterator[Message]]:
+    """The messages of an upload that comes to a halt until the test is over."""
+    is_over = threading.Event()
+
+    def messages() -> Iterator[Message]:
+        yield header("half")
+        yield Message(file="conf.json")
+        is_over.wait()
+
+    yield messages()
+    is_over.set()
 
 
-def test_an_upload_that_comes_to_a_halt(datasets: datasets_pb2_grpc.DatasetServiceStub) -> None:
-    code, reason, _ = refusal(datasets.UploadDataset, begun(IDLE_TIMEOUT_S + 1.0), metadata=METADATA, timeout=60)
+def test_an_upload_that_comes_to_a_halt(
+    datasets: datasets_pb2_grpc.DatasetServiceStub, begun: Iterator[Message]
+) -> None:
+    code, reason, _ = refusal(datasets.UploadDataset, begun, metadata=METADATA, timeout=60)
     assert (code, reason) == (grpc.StatusCode.DEADLINE_EXCEEDED, "DEADLINE_EXCEEDED")
 
 
-def test_a_client_that_goes_away(datasets: datasets_pb2_grpc.DatasetServiceStub, artifacts: Path) -> None:
-    call = datasets.UploadDataset.future(begun(IDLE_TIMEOUT_S), metadata=METADATA)
+def test_a_client_that_goes_away(
+    datasets: datasets_pb2_grpc.DatasetServiceStub, service: RunningService, artifacts: Path, begun: Iterator[Message]
+) -> None:
+    call = datasets.UploadDataset.future(begun, metadata=METADATA)
     wait_until(lambda: uploads_under_way(artifacts))
-    started = time.monotonic()
     call.cancel()
     wait_until(lambda: not uploads_under_way(artifacts))
-    assert time.monotonic() - started < IDLE_TIMEOUT_S - 0.1
+    wait_until(lambda: "CANCELLED" in [one.get("status") for one in service.log()])  # it did not wait for its patience
 
 
 def test_the_message_has_the_options_of_an_upload() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 import threading
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -16,7 +15,7 @@ from google.rpc.status_pb2 import Status
 
 from ultragray_proto.v1 import geometry_pb2, jobs_pb2, jobs_pb2_grpc, rendering_pb2
 from ultragray_service.rpc.messages import read_specification
-from ultragray_workers.jobs.kinds import CompareJob, TrainJob
+from ultragray_workers.jobs.kinds import TrainJob
 
 from ..conftest import RunningService, StartService
 
@@ -92,12 +91,6 @@ def test_what_a_job_asks_of_its_worker_is_read_from_the_messages_of_all_kinds(ki
     assert specification.worker_labels == {"site": "lab1", "rack": "4"}
 
 
-def test_what_a_comparison_leaves_out_is_every_method_at_equal_time() -> None:
-    specification, _ = read_specification(jobs_pb2.SubmitJobRequest(compare=jobs_pb2.CompareJob(dataset="liver")))
-    assert specification == CompareJob(dataset="liver")
-    assert (specification.methods, specification.budget, specification.times) == (("all",), "equal", 1.0)
-
-
 def test_a_render_job_is_estimated_and_not_submitted(jobs: jobs_pb2_grpc.JobServiceStub) -> None:
     before = len(jobs.ListJobs(jobs_pb2.ListJobsRequest()).jobs)
     asked = training_poses()
@@ -109,27 +102,6 @@ def test_a_render_job_is_estimated_and_not_submitted(jobs: jobs_pb2_grpc.JobServ
     assert found.seconds > 0.0
     assert len(found.poses[0].matrix.values) == 16
     assert len(jobs.ListJobs(jobs_pb2.ListJobsRequest()).jobs) == before
-
-
-def test_a_demand_comes_back_with_what_the_job_waits_for(jobs: jobs_pb2_grpc.JobServiceStub) -> None:
-    request = training_poses()
-    request.render.MergeFrom(jobs_pb2.RenderJob(device="cpu", min_memory_gb=8, worker_labels={"site": "lab1"}))
-    job = jobs.SubmitJob(request).job
-    assert (job.render.device, job.render.min_memory_gb) == ("cpu", 8)
-    assert dict(job.render.worker_labels) == {"site": "lab1"}
-    assert job.progress.waits_for.startswith("a worker with the device cpu of at least 8 GB and the label site=lab1")
-
-
-def test_the_same_request_id_gives_the_same_job(jobs: jobs_pb2_grpc.JobServiceStub) -> None:
-    sampler = jobs_pb2.PoseSampler(kind="around", count=3, translation_mm=1.5, seed=7)
-    request = jobs_pb2.SubmitJobRequest(render=jobs_pb2.RenderJob(scene="demo", sampler=sampler), request_id="one")
-    first, again = jobs.SubmitJob(request), jobs.SubmitJob(request)
-    assert (first.created, again.created) == (True, False)
-    assert first.job == again.job
-    told = MessageToDict(first.job.render.sampler, preserving_proto_field_name=True)
-    assert told == {"kind": "around", "count": 3, "translation_mm": 1.5, "rotation_deg": 5.0, "seed": "7"}
-    conflict = training_poses(request_id="one")
-    assert refusal(lambda: jobs.SubmitJob(conflict)) == ("ALREADY_EXISTS", "REQUEST_ID_CONFLICT", "request_id")
 
 
 @pytest.mark.parametrize(
@@ -145,18 +117,6 @@ def test_the_same_request_id_gives_the_same_job(jobs: jobs_pb2_grpc.JobServiceSt
             ("NOT_FOUND", "DATASET_NOT_FOUND", "train.dataset"),
         ),
         (
-            jobs_pb2.SubmitJobRequest(evaluate=jobs_pb2.EvaluateJob(dataset="gone", scene="demo", baselines=True)),
-            ("NOT_FOUND", "DATASET_NOT_FOUND", "evaluate.dataset"),
-        ),
-        (
-            jobs_pb2.SubmitJobRequest(compare=jobs_pb2.CompareJob(dataset="gone")),
-            ("NOT_FOUND", "DATASET_NOT_FOUND", "compare.dataset"),
-        ),
-        (
-            jobs_pb2.SubmitJobRequest(compare=jobs_pb2.CompareJob(dataset="gone", methods=["newest"])),
-            ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "compare.methods"),
-        ),
-        (
             jobs_pb2.SubmitJobRequest(render=jobs_pb2.RenderJob(scene="demo")),
             ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "render.poses"),
         ),
@@ -167,12 +127,6 @@ def test_the_same_request_id_gives_the_same_job(jobs: jobs_pb2_grpc.JobServiceSt
         (
             jobs_pb2.SubmitJobRequest(render=jobs_pb2.RenderJob(scene="demo", outputs=[9])),
             ("INVALID_ARGUMENT", "UNKNOWN_OUTPUT", "render.outputs"),
-        ),
-        (
-            jobs_pb2.SubmitJobRequest(
-                render=jobs_pb2.RenderJob(scene="gone", sampler=jobs_pb2.PoseSampler(kind="training"))
-            ),
-            ("NOT_FOUND", "SCENE_NOT_FOUND", "render.scene"),
         ),
         (training_poses(priority=-1001), ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "priority")),
     ],
@@ -196,16 +150,6 @@ def test_pages_and_filters(jobs: jobs_pb2_grpc.JobServiceStub) -> None:
     assert not jobs.ListJobs(jobs_pb2.ListJobsRequest(kind=jobs_pb2.JOB_KIND_TRAIN)).jobs
     refused = refusal(lambda: jobs.ListJobs(jobs_pb2.ListJobsRequest(state=99)))
     assert refused == ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "state")
-
-
-def test_cancel_and_retry(jobs: jobs_pb2_grpc.JobServiceStub) -> None:
-    job = jobs.SubmitJob(training_poses()).job
-    refused = refusal(lambda: jobs.RetryJob(jobs_pb2.RetryJobRequest(job=job.id)))
-    assert refused == ("FAILED_PRECONDITION", "JOB_NOT_FINISHED", "job")
-    assert jobs.CancelJob(jobs_pb2.CancelJobRequest(job=job.id)).state == jobs_pb2.JOB_STATE_CANCELLED
-    retried = jobs.RetryJob(jobs_pb2.RetryJobRequest(job=job.id))
-    assert (retried.state, retried.retry_of) == (jobs_pb2.JOB_STATE_QUEUED, job.id)
-    assert jobs.RetryJob(jobs_pb2.RetryJobRequest(job=job.id)) == retried
 
 
 def test_a_finished_job_is_deleted(jobs: jobs_pb2_grpc.JobServiceStub) -> None:
@@ -286,11 +230,6 @@ def test_settings_that_no_training_takes_are_refused(jobs: jobs_pb2_grpc.JobServ
         train.settings.update(settings)
         refused = refusal(lambda: jobs.SubmitJob(jobs_pb2.SubmitJobRequest(train=train)))  # noqa: B023 (called here)
         assert refused == ("INVALID_ARGUMENT", "INVALID_ARGUMENT", f"train.settings.{field}")
-    for number in (math.nan, math.inf):
-        train = jobs_pb2.TrainJob(dataset="gone", scene="new")
-        train.settings.update({"means_rate": number})
-        refused = refusal(lambda: jobs.SubmitJob(jobs_pb2.SubmitJobRequest(train=train)))  # noqa: B023
-        assert refused == ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "train.settings.means_rate")
 
 
 def test_whole_numbers_of_settings_are_integers() -> None:

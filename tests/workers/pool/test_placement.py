@@ -7,7 +7,7 @@ import torch
 
 from ultragray.errors import BackendUnavailable
 from ultragray.rendering.backends import cuda
-from ultragray_workers.pool.scene_cache import render_device
+from ultragray.rendering.backends.registry import render_device
 
 CPU = torch.device("cpu")
 

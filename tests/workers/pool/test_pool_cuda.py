@@ -86,7 +86,7 @@ def patch_workers(cold_templates, tmp_path, monkeypatch):
     def patch(code):
         folder = tmp_path / "patches"
         folder.mkdir()
-        imports = "import torch\nfrom ultragray_workers.pool.process import worker"
+        imports = "import torch\nfrom ultragray_workers.pool import worker\nfrom ultragray.rendering import frames"
         (folder / "sitecustomize.py").write_text(f"{imports}\n{code}")
         monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(folder), *filter(None, sys.path)]))
 
@@ -123,14 +123,14 @@ def test_each_gpu_gets_a_process_where_no_number_is_given(run, open_pool, patch_
 
 
 OUT_OF_MEMORY = """
-render = worker.render
+render = frames.render
 
 def render_few(scene, probe, poses, **options):
     if len(poses) * options["height"] > 60:
         raise torch.OutOfMemoryError("CUDA out of memory")
     return render(scene, probe, poses, **options)
 
-worker.render = render_few
+frames.render = render_few
 """
 
 
@@ -161,14 +161,14 @@ def test_out_of_memory_fails_the_request_and_no_more(run, open_pool, random_pose
 
 
 FULL_GPU = """
-render = worker.render
+render = frames.render
 
 def render_in_little(scene, probe, poses, **options):
     torch.cuda.empty_cache()
     torch.cuda.set_per_process_memory_fraction(0.0 if options["height"] > 60 else 1.0)
     return render(scene, probe, poses, **options)
 
-worker.render = render_in_little
+frames.render = render_in_little
 """
 
 
@@ -191,7 +191,7 @@ def test_a_full_gpu_fails_the_request_and_no_more(run, open_pool, random_poses, 
 
 LOST_GPU = """
 import pathlib
-render = worker.render
+render = frames.render
 
 def lose(*_):
     raise RuntimeError("CUDA error: an illegal memory access was encountered")
@@ -203,7 +203,7 @@ def lose_once(scene, *arguments, **options):
         lose()
     return render(scene, *arguments, **options)
 
-worker.render = lose_once
+frames.render = lose_once
 """
 
 

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from ultragray.rendering.pixels import in_type, to_uint8
 from ultragray.rendering.settings import Encoding
-from ultragray_workers.pool import pixels as encoding
 from ultragray_workers.pool.pixels import CHUNK_POSES, render_to_host, round_to_uint8
 
 UINT8, FLOAT32 = np.dtype("u1"), np.dtype("<f4")
@@ -51,9 +51,9 @@ def expect_all(frames, poses):
                 pixels = frames.take(name, pixel_type, first, stop)
                 if name == "labels":
                     encoded = Encoding(pixel_type.name)
-                    np.testing.assert_array_equal(encoding.encode_pixels(pixels, encoded), expected[first:stop])
+                    np.testing.assert_array_equal(in_type(pixels, encoded.pixel_type), expected[first:stop])
                 elif pixel_type == UINT8:
-                    np.testing.assert_array_equal(encoding.to_uint8(pixels), encoding.to_uint8(expected[first:stop]))
+                    np.testing.assert_array_equal(to_uint8(pixels), to_uint8(expected[first:stop]))
                 else:
                     np.testing.assert_array_equal(pixels, expected[first:stop])
 
@@ -71,7 +71,7 @@ def test_rounding_equals_the_encoders():
     values = [*(np.arange(511) / 510), 1.0, 1.0 + 1e-6, 3.0, *np.random.default_rng(0).random(1000)]
     frames = np.array(values, np.float32).reshape(1, 2, -1)
     before = frames.copy()
-    np.testing.assert_array_equal(round_to_uint8(torch.from_numpy(frames)).numpy(), encoding.to_uint8(frames))
+    np.testing.assert_array_equal(round_to_uint8(torch.from_numpy(frames)).numpy(), to_uint8(frames))
     np.testing.assert_array_equal(frames, before)
 
 

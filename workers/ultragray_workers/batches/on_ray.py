@@ -160,7 +160,7 @@ def _make_shard(
 def _renderer(plan: BatchPlan, scene: bytes, backend: str) -> ShardRenderer:
     global _held
     from ultragray.exchange.shards import ShardRenderer
-    from ultragray_workers.pool.scene_cache import render_device
+    from ultragray.rendering.backends.registry import render_device
 
     wanted = f"{plan.identity} {backend}"
     if _held is None or _held[0] != wanted:

@@ -11,6 +11,7 @@ from dataclasses import replace
 from typing import Any
 
 from ultragray.errors import RenderFailed, UltragrayError
+from ultragray.rendering.settings import Encoding, Resolved
 from ultragray.rendering.volumes import SliceView
 from ultragray.scene.confidence import Extrapolation
 from ultragray_workers.pool.channel import MemoryPool, write_at
@@ -18,19 +19,16 @@ from ultragray_workers.pool.messages import (
     Answer,
     ForkWorker,
     LoadTask,
-    LocalizeTask,
-    Outdated,
     PackTask,
     Rendered,
-    RenderPart,
-    RenderTask,
     SceneChangedError,
-    SliceTask,
     Sought,
+    Task,
+    TaskPart,
     UnloadTask,
 )
 from ultragray_workers.pool.processes import Assignment, Command, Launcher, Patience, Slot
-from ultragray_workers.pool.waiting import Packing, Part, Step, Ticket, WaitingQueue
+from ultragray_workers.pool.waiting import Part, Ticket, WaitingQueue
 from ultragray_workers.rounds import Rounds
 
 _MAX_DEATHS = 5
@@ -125,25 +123,32 @@ class Dispatcher:
             idle.remove(slot)
             self._assign(slot, batch)
 
-    def _assign(self, slot: Slot, batch: list[Step]) -> None:
-        parts = [step for step in batch if isinstance(step, Part)]
-        for step in batch:
-            step.ticket.in_flight += 1
-            step.ticket.batch_size = max(step.ticket.batch_size, sum(part.frames for part in parts))
-            if step.ticket.memory is None:
-                step.ticket.memory = self._memories.acquire()
-                if (sought := step.ticket.request.sought) is not None:
-                    write_at(step.ticket.memory, memoryview(sought.image), 0)
+    def _assign(self, slot: Slot, batch: list[Part]) -> None:
+        frames = sum(part.frames for part in batch)
+        for part in batch:
+            part.ticket.in_flight += 1
+            part.ticket.batch_size = max(part.ticket.batch_size, frames)
         assignment = Assignment(steps=dict(enumerate(batch)), batch=tuple(batch))
-        ticket = batch[0].ticket
-        if parts and ticket.request.sought is not None:
-            slot.assign(_localize_task(ticket, ticket.request.sought), assignment, _descriptors([ticket.memory]))
-        elif parts:
-            slot.assign(_task(ticket, parts), assignment, _descriptors(part.ticket.memory for part in parts))
+        first = batch[0]
+        if first.packs:
+            slot.assign(_pack_task(first.ticket), assignment, [self._memory(first.ticket), self._archive(first.ticket)])
         else:
-            if ticket.archive is None:
-                ticket.archive = self._memories.acquire()
-            slot.assign(_pack_task(ticket), assignment, _descriptors((ticket.memory, ticket.archive)))
+            slot.assign(_task(first.ticket, batch), assignment, [self._memory(part.ticket) for part in batch])
+
+    def _memory(self, ticket: Ticket) -> int:
+        """The file that the frames of a ticket are written to; with it a ticket counts as begun."""
+        if ticket.memory is None:
+            ticket.memory = self._memories.acquire()
+            if isinstance(ticket.request.settings, Sought):
+                os.ftruncate(ticket.memory, 0)
+                write_at(ticket.memory, memoryview(ticket.request.settings.image), 0)
+        return ticket.memory
+
+    def _archive(self, ticket: Ticket) -> int:
+        """The file that the .npz of a ticket is written to."""
+        if ticket.archive is None:
+            ticket.archive = self._memories.acquire()
+        return ticket.archive
 
     def on_idle(self) -> None:
         """Gives the worker of a slot that has just become idle something to do."""
@@ -168,8 +173,6 @@ class Dispatcher:
             return
         if isinstance(outcome, Rendered):
             self._advance(ticket, step, outcome)
-        elif isinstance(outcome, Outdated):
-            self._fail_ticket(ticket, SceneChangedError())
         else:
             self._fail_ticket(ticket, outcome or RenderFailed("a worker answered nothing"))
 
@@ -193,9 +196,9 @@ class Dispatcher:
                 self._waiting.put_first(again)
         self._dispatch()
 
-    def _advance(self, ticket: Ticket, step: Step, outcome: Rendered) -> None:
+    def _advance(self, ticket: Ticket, step: Part, outcome: Rendered) -> None:
         """Takes a step of a ticket as done; completes it after its last."""
-        if isinstance(step, Packing):
+        if step.packs:
             ticket.done.set_result(_summary([*ticket.rendered, outcome]))
             return
         ticket.rendered.append(outcome)
@@ -204,8 +207,8 @@ class Dispatcher:
             return
         if len({rendered.scene_sha256 for rendered in ticket.rendered}) > 1:
             self._fail_ticket(ticket, SceneChangedError())
-        elif ticket.needs_packing:
-            self._waiting.put_first(Packing(ticket))
+        elif _is_archive(ticket):
+            self._waiting.put_first(Part(ticket, 0, 0))
             self._dispatch()
         else:
             ticket.done.set_result(_summary(ticket.rendered))
@@ -250,10 +253,16 @@ def _extrapolations(steps: Iterable[Rendered]) -> tuple[Extrapolation, ...]:
     return tuple(one for step in sorted(steps, key=lambda step: step.first) for one in step.extrapolations)
 
 
-def _task(ticket: Ticket, parts: list[Part]) -> RenderTask | SliceTask:
-    found: tuple[RenderPart[Any], ...] = tuple(
-        RenderPart(
-            settings=part.ticket.request.settings,
+def _is_archive(ticket: Ticket) -> bool:
+    """Whether its frames, once rendered, are not yet the file that was asked for."""
+    settings = ticket.request.settings
+    return isinstance(settings, Resolved) and settings.encoding is Encoding.NPZ
+
+
+def _task(ticket: Ticket, parts: list[Part]) -> Task[Any]:
+    found: tuple[TaskPart[Any], ...] = tuple(
+        TaskPart(
+            settings=_sent(part.ticket.request.settings),
             poses=part.ticket.request.poses[part.first : part.stop],
             first=part.first,
             total=len(part.ticket.request.poses),
@@ -261,22 +270,12 @@ def _task(ticket: Ticket, parts: list[Part]) -> RenderTask | SliceTask:
         )
         for part in parts
     )
-    request = ticket.request
-    task = SliceTask if isinstance(request.settings, SliceView) else RenderTask
-    return task(scene=request.scene, path=ticket.path, version=request.version, parts=found)
+    return Task(scene=ticket.request.scene, path=ticket.path, version=ticket.request.version, parts=found)
 
 
-def _localize_task(ticket: Ticket, sought: Sought) -> LocalizeTask:
-    request = ticket.request
-    return LocalizeTask(
-        scene=request.scene,
-        path=ticket.path,
-        version=request.version,
-        start=request.poses[0],
-        image_bytes=len(sought.image),
-        size=sought.size,
-        settings=sought.settings,
-    )
+def _sent(settings: Resolved | SliceView | Sought) -> Resolved | SliceView | Sought:
+    """Settings as a message takes them: what is sought lies in the memory."""
+    return replace(settings, image=b"") if isinstance(settings, Sought) else settings
 
 
 def _pack_task(ticket: Ticket) -> PackTask:
@@ -288,7 +287,3 @@ def _pack_task(ticket: Ticket) -> PackTask:
         poses=ticket.request.poses,
         extrapolations=_extrapolations(ticket.rendered),
     )
-
-
-def _descriptors(memories: Iterable[int | None]) -> list[int]:
-    return [memory for memory in memories if memory is not None]

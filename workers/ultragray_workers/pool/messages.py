@@ -1,12 +1,14 @@
-"""What passes between the pool's callers, the pool and its worker processes: requests, tasks and reports. Free of
-torch.
+"""What passes between the pool's callers, the pool, and its worker processes. Free of torch.
+
+A frame's way: `RenderRequest` (settings resolved, poses checked) → `Task` (to a worker, with requests that share its
+view) → planes, in the worker → `Rendered` (its report; the pixels lie in shared memory) → `RenderResult`.
 """
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from enum import IntEnum
-from typing import Generic, Protocol
+from typing import Any, Generic, Protocol
 
 from typing_extensions import TypeVar
 
@@ -19,7 +21,22 @@ from ultragray.scene.confidence import Extrapolation
 from ultragray_workers.pool.turns import UNKNOWN_CALLER, Caller
 from ultragray_workers.storage.local import FileVersion
 
+
+@dataclass(frozen=True, eq=False)
+class Sought:
+    """A real frame that is looked for in a scene. Its pixels are read, and checked, where it is looked for."""
+
+    image: bytes  # a PNG file, or uint8 row by row where there is a size
+    size: tuple[int, int] | None  # height and width
+    settings: LocalizationSettings
+
+    @property
+    def view(self) -> tuple[Any, ...]:
+        return (self.settings,)
+
+
 S = TypeVar("S", bound=Resolved | SliceView, default=Resolved)  # settings of a frame, or of a slice
+W = TypeVar("W", bound=Resolved | SliceView | Sought, default=Resolved)  # what is to be done at each pose
 
 
 class Priority(IntEnum):
@@ -45,23 +62,14 @@ class Destination(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Sought:
-    """A real frame that is looked for in a scene. Its pixels are read, and checked, where it is looked for."""
-
-    image: bytes  # a PNG file, or uint8 row by row where there is a size
-    size: tuple[int, int] | None  # height and width
-    settings: LocalizationSettings
-
-
-@dataclass(frozen=True, eq=False)
-class RenderRequest(Generic[S]):
+class RenderRequest(Generic[W]):
     """Frames, or slices, of one scene for some poses; everything but the scene has been checked by the caller.
 
-    With `sought` nothing is rendered for the one pose: it is where the search for that frame starts.
+    For what is `Sought` nothing is rendered at the one pose: it is where the search for that frame starts.
     """
 
     scene: str
-    settings: S
+    settings: W
     poses: FloatArray  # [C, 4, 4] mm, probe→scene, exact (check_poses was applied)
     priority: Priority = Priority.INTERACTIVE
     deadline: float | None = None  # time.monotonic() in seconds; past it the request is given up
@@ -69,11 +77,10 @@ class RenderRequest(Generic[S]):
     caller: Caller = UNKNOWN_CALLER
     begin_by: float | None = None  # time.monotonic() in seconds; it is given up where none of it has begun by then
     destination: Destination | None = None  # of the reply; None: RenderResult.data
-    sought: Sought | None = None
 
 
 class SceneChangedError(Exception):
-    """The file of a scene is not of the version that the settings of a request are for."""
+    """The file of a scene is not of the version that the settings of a request are for: it was not rendered."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,10 +159,10 @@ class Hello:
 
 
 @dataclass(frozen=True, eq=False)
-class RenderPart(Generic[S]):
+class TaskPart(Generic[W]):
     """Some poses of one request, of `total`, starting with its pose number `first`."""
 
-    settings: S
+    settings: W
     poses: FloatArray  # [C, 4, 4] mm
     first: int
     total: int
@@ -167,43 +174,21 @@ class RenderPart(Generic[S]):
 
 
 @dataclass(frozen=True, eq=False)
-class RenderTask:
-    """Render parts together, which share a view. One memory descriptor per part goes along; one Answer per part comes
-    back.
+class Task(Generic[W]):
+    """Parts of requests to be done together: they share a view, and so the kind of their settings.
+
+    The memory of each part's request goes along, and an Answer comes back for each.
     """
 
     scene: str
     path: str
     version: FileVersion | None  # that the scene's file must have; None: any
-    parts: tuple[RenderPart, ...]
+    parts: tuple[TaskPart[W], ...]
 
     @property
-    def view(self) -> Resolved:
+    def view(self) -> W:
         """Settings whose outputs and encoding are those of the first part only, and all else that of every part."""
         return self.parts[0].settings
-
-
-@dataclass(frozen=True, eq=False)
-class SliceTask:
-    """Sample parts of slices. As of a RenderTask, a memory descriptor goes along and an Answer comes back for each."""
-
-    scene: str
-    path: str
-    version: FileVersion | None
-    parts: tuple[RenderPart[SliceView], ...]
-
-
-@dataclass(frozen=True, eq=False)
-class LocalizeTask:
-    """Look for a real frame. The memory that holds it goes along."""
-
-    scene: str
-    path: str
-    version: FileVersion | None  # that the scene's file must have; None: any
-    start: FloatArray  # [4, 4] mm
-    image_bytes: int
-    size: tuple[int, int] | None  # height and width of grey pixels; None: it is a PNG file
-    settings: LocalizationSettings
 
 
 @dataclass(frozen=True, eq=False)
@@ -220,16 +205,20 @@ class PackTask:
 
 @dataclass(frozen=True)
 class LoadTask:
+    """Load a scene, and render a frame of it."""
+
     scene: str
     path: str
 
 
 @dataclass(frozen=True)
 class UnloadTask:
+    """Drop a scene."""
+
     scene: str
 
 
-Task = RenderTask | SliceTask | LocalizeTask | PackTask | LoadTask | UnloadTask
+AnyTask = Task[Any] | PackTask | LoadTask | UnloadTask
 
 
 @dataclass(frozen=True)
@@ -254,9 +243,7 @@ class Loading:
     begins: bool
 
 
-@dataclass(frozen=True)
-class Outdated:
-    """A worker's report that it did not render: the scene's file is of another version."""
+Outcome = Rendered | UltragrayError | SceneChangedError | None
 
 
 @dataclass(frozen=True)
@@ -264,6 +251,6 @@ class Answer:
     """The outcome of part `part` of a task (0 where it has none); after the `last` one the worker is idle."""
 
     part: int
-    outcome: Rendered | Outdated | UltragrayError | None
+    outcome: Outcome
     last: bool
     resident: tuple[str, ...]  # scenes the worker holds now

@@ -8,7 +8,6 @@ import time
 from collections.abc import Callable, Collection, Mapping, Sequence
 from typing import Any, BinaryIO, Protocol
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import torch
@@ -16,8 +15,7 @@ from torch import Tensor
 
 from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.outputs import OUTPUTS
-from ultragray.rendering.pixels import ByteArray, PixelArray, image_file, to_uint8
-from ultragray.rendering.settings import Encoding
+from ultragray.rendering.pixels import PixelArray
 from ultragray.scene.confidence import Extrapolation, figure_arrays
 
 CHUNK_POSES = 8  # rendered in one launch; while they are copied and written, the next ones are rendered
@@ -68,7 +66,8 @@ class _OnHost:
         self._frames = {name: _on_host(frames[name]) for name in wanted}
 
     def take(self, name: str, pixel_type: np.dtype[Any], first: int, stop: int) -> Pixels:
-        return self._frames[name][first:stop]
+        frames = self._frames[name][first:stop]
+        return OUTPUTS[name].shares(frames) if pixel_type == np.uint8 else frames
 
 
 def _on_host(frames: Tensor) -> Pixels:
@@ -91,7 +90,9 @@ class _FromGpu:
         for first in range(0, len(poses), CHUNK_POSES):
             frames = render(poses[first : first + CHUNK_POSES])
             ready = {
-                (name, pixel_type): round_to_uint8(frames[name]) if pixel_type == np.uint8 else frames[name].float()
+                (name, pixel_type): round_to_uint8(OUTPUTS[name].shares(frames[name]))
+                if pixel_type == np.uint8
+                else frames[name].float()
                 for name, pixel_types in wanted.items()
                 for pixel_type in pixel_types
             }
@@ -124,26 +125,6 @@ def _copy_stream(device: torch.device) -> torch.cuda.Stream:
     return _copy_streams[device]
 
 
-# Frames as bytes: the pixel work, done in the worker processes.
-
-
-JPEG_QUALITY = 90
-
-
-def encode_pixels(frames: PixelArray, encoding: Encoding) -> npt.NDArray[np.generic]:  # [C, H, W] -> [C, H, W]
-    """Frames in the pixel type of an encoding, C order, little endian; labels keep their values."""
-    pixel_type = encoding.pixel_type
-    pixels: npt.NDArray[Any] = to_uint8(frames) if pixel_type == np.uint8 else frames
-    return np.ascontiguousarray(pixels, dtype=pixel_type)
-
-
-def encode_image(frame: PixelArray, encoding: Encoding) -> ByteArray:  # [H, W] -> [bytes]
-    """A frame as the bytes of a grey PNG (at OpenCV's default settings) or JPEG file."""
-    if encoding is Encoding.PNG:
-        return image_file(frame, ".png")
-    return image_file(frame, ".jpg", cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY)
-
-
 def write_npz(
     file: BinaryIO,
     frames: Mapping[str, PixelArray],  # each [C, H, W]
@@ -154,7 +135,7 @@ def write_npz(
     scene_sha256: str,
     renderer: str,
 ) -> int:
-    """Writes an .npz archive, labels as uint8, at the start of `file` and returns its size in bytes."""
+    """Writes an .npz archive, labels as uint8, at the start of `file`; its size in bytes."""
     file.seek(0)
     arrays: dict[str, Any] = {
         **{name: np.asarray(pixels, OUTPUTS[name].dtype) for name, pixels in frames.items()},

@@ -18,6 +18,8 @@ from typing import Any, TypeVar
 
 from ultragray.contract import Contract, described
 from ultragray.errors import InvalidArgument, RenderFailed
+from ultragray.rendering.settings import Resolved
+from ultragray.rendering.volumes import SliceView
 from ultragray_workers.errors import Draining, NotReady
 from ultragray_workers.pool.channel import MAX_DESCRIPTORS, read_start
 from ultragray_workers.pool.dispatcher import Dispatcher
@@ -30,6 +32,7 @@ from ultragray_workers.pool.messages import (
     RenderResult,
     S,
     SceneChangedError,
+    Sought,
     UnloadTask,
 )
 from ultragray_workers.pool.processes import Launcher, Patience
@@ -167,15 +170,15 @@ class RenderPool:
         self.on_rendered(result)
         return result
 
-    async def localize(self, request: RenderRequest) -> LocalizeResult:
-        """Looks for the frame that the request has `sought`; its turn comes, and it ends, as that of a rendering does.
+    async def localize(self, request: RenderRequest[Sought]) -> LocalizeResult:
+        """Looks for a real frame about the pose of the request; its turn comes, and ends, as that of a rendering.
 
         Raises what `render` raises; InvalidArgument and InvalidImageSize also for pixels that are no frame.
         """
         return await self._answered(request, Turn(), _place_found)
 
     async def _answered(
-        self, request: RenderRequest[S], turn: Turn, read: Callable[[Ticket, Rendered], Awaitable[R]]
+        self, request: RenderRequest[Any], turn: Turn, read: Callable[[Ticket, Rendered], Awaitable[R]]
     ) -> R:
         """What `read` makes of the answer to a request, while the memory of the answer is there."""
         self._check_accepting()
@@ -264,7 +267,7 @@ class RenderPool:
             raise NotReady("the service is starting; try again in a few seconds")
 
     async def _answer(
-        self, request: RenderRequest[S], turn: Turn, read: Callable[[Ticket, Rendered], Awaitable[R]]
+        self, request: RenderRequest[Any], turn: Turn, read: Callable[[Ticket, Rendered], Awaitable[R]]
     ) -> R:
         with self._store.hold(request.scene) as path:
             if path is not None:
@@ -273,7 +276,7 @@ class RenderPool:
         raise SceneChangedError
 
     async def _answer_of_file(
-        self, request: RenderRequest[S], turn: Turn, path: Path, read: Callable[[Ticket, Rendered], Awaitable[R]]
+        self, request: RenderRequest[Any], turn: Turn, path: Path, read: Callable[[Ticket, Rendered], Awaitable[R]]
     ) -> R:
         turn.ticket = ticket = self._ticket(request, path)
         turn.expiry = Expiry(ticket, self._waiting)
@@ -288,27 +291,32 @@ class RenderPool:
             self._open.discard(ticket)
             self._dispatcher.discard(ticket)
 
-    def _ticket(self, request: RenderRequest[S], path: Path) -> Ticket:
+    def _ticket(self, request: RenderRequest[Any], path: Path) -> Ticket:
         """Raises InvalidArgument for a request that no reply can hold."""
-        settings, poses = request.settings, len(request.poses)
-        if poses == 0:
+        if not len(request.poses):
             raise InvalidArgument("poses must hold at least one pose, got none", field="poses")
-        if settings.encoding.is_image_file and poses != 1:
-            raise InvalidArgument(
-                f"encoding {settings.encoding.value} holds the frame of one pose, got {poses} poses", field="encoding"
-            )
-        pixels = poses * len(settings.outputs) * settings.picture.height * settings.picture.width
-        reply_bytes = pixels * settings.encoding.pixel_type.itemsize
-        if reply_bytes > MAX_REPLY_BYTES:
-            raise InvalidArgument(
-                f"poses times pixels must fit a reply of {MAX_REPLY_BYTES} bytes, got {reply_bytes}",
-                field="poses",
-            )
+        if not isinstance(request.settings, Sought):
+            _check_reply(request.settings, len(request.poses))
         return Ticket(
             request=request,
             path=str(path),
             done=asyncio.get_running_loop().create_future(),
             submitted=time.monotonic(),
+        )
+
+
+def _check_reply(settings: Resolved | SliceView, poses: int) -> None:
+    """Raises InvalidArgument for what no reply can hold."""
+    if settings.encoding.is_image_file and poses != 1:
+        raise InvalidArgument(
+            f"encoding {settings.encoding.value} holds the frame of one pose, got {poses} poses", field="encoding"
+        )
+    pixels = poses * len(settings.outputs) * settings.picture.height * settings.picture.width
+    reply_bytes = pixels * settings.encoding.pixel_type.itemsize
+    if reply_bytes > MAX_REPLY_BYTES:
+        raise InvalidArgument(
+            f"poses times pixels must fit a reply of {MAX_REPLY_BYTES} bytes, got {reply_bytes}",
+            field="poses",
         )
 
 

@@ -21,8 +21,17 @@ from typing import Any, Protocol
 from ultragray.errors import RenderFailed, UltragrayError
 from ultragray_workers.errors import Draining
 from ultragray_workers.pool.channel import Board, Channel
-from ultragray_workers.pool.messages import Answer, ForkTemplate, ForkWorker, Hello, Loading, LoadTask, Task, UnloadTask
-from ultragray_workers.pool.waiting import Step
+from ultragray_workers.pool.messages import (
+    Answer,
+    AnyTask,
+    ForkTemplate,
+    ForkWorker,
+    Hello,
+    Loading,
+    LoadTask,
+    UnloadTask,
+)
+from ultragray_workers.pool.waiting import Part
 
 _STOP_TIMEOUT_S = 2.0
 _POLL_INTERVAL_S = 0.002
@@ -294,9 +303,9 @@ class Command:
 class Assignment:
     """The steps of a batch that a worker has not answered yet, or its command."""
 
-    steps: dict[int, Step] = field(default_factory=dict)
+    steps: dict[int, Part] = field(default_factory=dict)
     command: Command | None = None
-    batch: tuple[Step, ...] = ()  # all of its steps
+    batch: tuple[Part, ...] = ()  # all of its steps
     begun: float = field(default_factory=time.monotonic)  # in seconds
     loaded: bool = False  # a scene, which took longer than frames do
     given_up: bool = False
@@ -381,7 +390,7 @@ class Slot:
         self._peer = self._launcher.launch(self._settings, self._on_message, self._on_gone, [memory])
         os.close(memory)
 
-    def assign(self, task: Task, assignment: Assignment, descriptors: Sequence[int] = ()) -> None:
+    def assign(self, task: AnyTask, assignment: Assignment, descriptors: Sequence[int] = ()) -> None:
         """Gives the idle worker a task."""
         assert self._peer is not None
         self._assignment = assignment

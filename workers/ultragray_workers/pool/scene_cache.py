@@ -12,28 +12,12 @@ import torch
 
 from ultragray.errors import MemoryExceeded, SceneFileInvalid, UltragrayError
 from ultragray.files import file_sha256
-from ultragray.rendering.backends import cuda
 from ultragray.scene.confidence import Assessor
 from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.info import read_header, scene_file_invalid
 from ultragray_workers.errors import SceneTooLarge
 from ultragray_workers.scenes import resident_bytes
 from ultragray_workers.storage.local import FileVersion
-
-
-def render_device(backend: str, number: int = 0) -> torch.device:
-    """GPU `number`, counted round and round, for `cuda` and where there is one for `auto`; else the CPU.
-
-    Raises BackendUnavailable for `cuda` where there is none.
-    """
-    if backend == "cuda" or (backend == "auto" and cuda.available()):
-        return cuda.device(number % max(1, cuda.device_count()))
-    return torch.device("cpu")
-
-
-# The scenes a worker process holds where it renders them: loaded on demand, the least recently used evicted within a
-# memory budget.
-
 
 MAX_SCENES = 256
 _READ_ATTEMPTS = 3

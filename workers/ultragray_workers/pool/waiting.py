@@ -11,10 +11,10 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from ultragray.geometry.probe import FloatArray
-from ultragray.rendering.settings import Encoding, Resolved
+from ultragray.rendering.settings import Resolved
 from ultragray.rendering.volumes import SliceView
 from ultragray_workers.errors import DeadlineExceeded, QueueFull
-from ultragray_workers.pool.messages import Priority, Rendered, RenderRequest
+from ultragray_workers.pool.messages import Priority, Rendered, RenderRequest, Sought
 from ultragray_workers.pool.turns import Forecast, Turns
 
 _FULL_BATCH_PIXELS_PER_POSE = 512 * 512
@@ -33,20 +33,18 @@ class Ticket:
     path: str  # of the scene's file
     done: asyncio.Future[Rendered]
     submitted: float  # time.monotonic() in seconds
-    waiting: deque[Step] = field(default_factory=deque)
+    waiting: deque[Part] = field(default_factory=deque)
     in_flight: int = 0  # parts that workers have
     rendered: list[Rendered] = field(default_factory=list)
     rendered_poses: int = 0
     batch_size: int = 0
     memory: int | None = None  # descriptor of the file that its frames are written to, once it is begun
-    archive: int | None = None  # and of the .npz, where that is made of several parts
+    archive: int | None = None  # and of the .npz that is made of them, where that is asked for
 
     @property
     def batch_key(self) -> tuple[Any, ...]:
         """Requests that agree in this can be rendered together."""
-        sought = self.request.sought
-        view = self.request.settings.view if sought is None else (sought.settings,)
-        return (self.request.scene, self.request.version, *view)
+        return (self.request.scene, self.request.version, *self.request.settings.view)
 
     @property
     def give_up_at(self) -> float:
@@ -62,11 +60,6 @@ class Ticket:
     def untouched(self) -> bool:
         """Whether all of it still waits to be rendered."""
         return bool(self.waiting) and self.memory is None and not self.done.done()
-
-    @property
-    def needs_packing(self) -> bool:
-        """Whether its rendered frames are not yet the file that was asked for."""
-        return self.request.settings.encoding is Encoding.NPZ and len(self.rendered) > 1
 
     @property
     def reply_memory(self) -> int:
@@ -102,7 +95,7 @@ class Turn:
 
 @dataclass(eq=False)
 class Part:
-    """Poses `first` to `stop` of a ticket, rendered in one go."""
+    """Poses `first` to `stop` of a ticket, rendered in one go; none of them: the last step, which packs its .npz."""
 
     ticket: Ticket
     first: int
@@ -120,29 +113,16 @@ class Part:
         """Whether it may be what kills the workers: it goes alone."""
         return self.attempts >= _ATTEMPTS_IN_COMPANY or self.kills > 0
 
-    def for_retry(self, *, hung: bool) -> list[Step]:
+    @property
+    def packs(self) -> bool:
+        """Whether it makes the .npz of what was rendered."""
+        return self.first == self.stop
+
+    def for_retry(self, *, hung: bool) -> list[Part]:
         """Itself in halves, so that even slow frames get done between one death and the next."""
         middle = (self.first + self.stop + 1) // 2
-        bounds = [(self.first, middle), (middle, self.stop)]
-        counts = self.attempts + 1, self.kills + hung
-        return [Part(self.ticket, first, stop, *counts) for first, stop in bounds if first < stop]
-
-
-@dataclass(eq=False)
-class Packing:
-    """The last step of an .npz whose frames were rendered in several parts."""
-
-    ticket: Ticket
-    attempts: int = 0
-    kills: int = 0
-    frames: int = 0
-    work_s: float = 0.0
-
-    def for_retry(self, *, hung: bool) -> list[Step]:
-        return [Packing(self.ticket, self.attempts + 1, self.kills + hung)]
-
-
-Step = Part | Packing
+        bounds = {(self.first, middle), (middle, self.stop)} if self.frames > 1 else {(self.first, self.stop)}
+        return [Part(self.ticket, *one, self.attempts + 1, self.kills + hung) for one in sorted(bounds)]
 
 
 class WaitingQueue:
@@ -197,7 +177,7 @@ class WaitingQueue:
             ticket.waiting.append(Part(ticket, first, stop, work_s=(stop - first) * frame_s))
         turns.enter(request.caller, ticket, count, count * frame_s)
 
-    def put_first(self, step: Step) -> None:
+    def put_first(self, step: Part) -> None:
         """Puts a step that was begun and lost ahead of all that waits."""
         ticket = step.ticket
         self._leave(ticket)
@@ -211,7 +191,7 @@ class WaitingQueue:
         self._leave(ticket)
         ticket.waiting.clear()
 
-    def take_batch(self) -> list[Step]:
+    def take_batch(self) -> list[Part]:
         """The steps to be done next, together; empty when nothing waits. Drops tickets past their deadline."""
         priorities = list(Priority)
         patient_s = time.monotonic() - self._last_batch_turn
@@ -223,14 +203,12 @@ class WaitingQueue:
                     self.expire(ticket)
                     continue
                 step = self._take(ticket)
-                batch: list[Step] = [step]
-                if isinstance(step, Part):
-                    batch += self._take_company(step)
+                batch = [step, *self._take_company(step)]
                 self._shed_overtaken()
                 return batch
         return []
 
-    def settle(self, steps: Sequence[Step], seconds: float, *, typical: bool) -> None:
+    def settle(self, steps: Sequence[Part], seconds: float, *, typical: bool) -> None:
         """Takes note of what a worker took for steps together; `typical`: such frames will take as long again."""
         frames = sum(step.frames for step in steps)
         kind = steps[0].ticket.batch_key
@@ -323,7 +301,7 @@ class WaitingQueue:
             self._turns[request.priority].leave(request.caller, ticket, frames, work_s)
 
     def _take_company(self, first: Part) -> list[Part]:
-        if first.suspect or first.ticket.request.sought is not None:
+        if first.suspect or first.packs or isinstance(first.ticket.request.settings, Sought):
             return []
         room = self._poses_together(first.ticket) - first.frames
         company: list[Part] = []
@@ -332,7 +310,7 @@ class WaitingQueue:
                 continue
             while ticket.waiting and room > 0:
                 step = ticket.waiting[0]
-                if not isinstance(step, Part) or step.frames > room or step.suspect:
+                if step.packs or step.frames > room or step.suspect:
                     break
                 self._take(ticket)
                 company.append(step)
@@ -341,7 +319,7 @@ class WaitingQueue:
                 break
         return company
 
-    def _take(self, ticket: Ticket) -> Step:
+    def _take(self, ticket: Ticket) -> Part:
         request = ticket.request
         self._last_priority = request.priority
         if request.priority is Priority.BATCH:
@@ -358,7 +336,9 @@ class WaitingQueue:
     def _poses_together(self, ticket: Ticket) -> int:
         """The number of poses in a full batch: fewer for images of more than 512x512 pixels, and for slow ones."""
         share = _BATCH_PRIORITY_SHARE if ticket.request.priority is Priority.BATCH else 1
-        settings: Resolved | SliceView = ticket.request.settings
+        settings: Resolved | SliceView | Sought = ticket.request.settings
+        if isinstance(settings, Sought):
+            return 1
         pixels = settings.height * settings.width * len(settings.outputs)
         fitting = self._max_batch_poses * _FULL_BATCH_PIXELS_PER_POSE // pixels
         if (frame_s := self._forecast.frame_s(ticket.batch_key)) > 0.0:
@@ -366,7 +346,7 @@ class WaitingQueue:
         return max(1, min(self._max_batch_poses, fitting) // share)
 
 
-def _sum_of(steps: Iterable[Step]) -> tuple[int, float]:
+def _sum_of(steps: Iterable[Part]) -> tuple[int, float]:
     """Their frames, and the work of these."""
     steps = list(steps)
     return sum(step.frames for step in steps), sum(step.work_s for step in steps)

@@ -1,4 +1,8 @@
-"""The worker process: takes tasks from its channel one at a time, renders, encodes, answers. Imports torch."""
+"""The worker process: takes tasks from its channel one at a time, renders, encodes, answers. Imports torch.
+
+`_Worker.do` finds the work of a task by the kind of its settings (`_WORK`): frames, slices, a frame that is looked for.
+Each part of a task has an answer of its own, as soon as its pixels lie in the memory of its request.
+"""
 
 from __future__ import annotations
 
@@ -12,55 +16,47 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import partial
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ultragray.errors import LowConfidence, MemoryExceeded, RenderFailed, UltragrayError
+from ultragray.errors import MemoryExceeded, RenderFailed, UltragrayError
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.localization.pixels import read_grey, read_png
 from ultragray.learn.localization.search import localize
 from ultragray.rendering.backends import cuda
+from ultragray.rendering.backends.registry import render_device, renderer_name
 from ultragray.rendering.confidence import SupportWatch
-from ultragray.rendering.display import AS_RENDERED
-from ultragray.rendering.frames import render, renderer_name, show
+from ultragray.rendering.frames import render_shown
 from ultragray.rendering.limits import UNLIMITED, GivenUp, Limits
-from ultragray.rendering.pixels import ByteArray, to_uint8
+from ultragray.rendering.pixels import encoded_image, in_type
 from ultragray.rendering.settings import Below, Encoding, Resolved
 from ultragray.rendering.volume_fields import as_grey, sample_slice
 from ultragray.rendering.volumes import SliceView
-from ultragray.scene.confidence import Assessor, Extrapolation, is_confident, low_confidence
+from ultragray.scene.confidence import require_confidence
 from ultragray.scene.gaussians import GaussianScene
 from ultragray_workers.errors import DeadlineExceeded
 from ultragray_workers.pool.channel import Board, Channel, read_start, write_at
 from ultragray_workers.pool.messages import (
     Answer,
+    AnyTask,
     ForkWorker,
     Hello,
     Loading,
     LoadTask,
-    LocalizeTask,
-    Outdated,
+    Outcome,
     PackTask,
     Rendered,
-    RenderPart,
-    RenderTask,
-    SliceTask,
+    SceneChangedError,
+    Sought,
     Task,
+    TaskPart,
     UnloadTask,
 )
-from ultragray_workers.pool.pixels import (
-    CHUNK_POSES,
-    Arriving,
-    Wanted,
-    encode_image,
-    encode_pixels,
-    render_to_host,
-    write_npz,
-)
-from ultragray_workers.pool.scene_cache import LoadedScene, SceneCache, render_device
+from ultragray_workers.pool.pixels import CHUNK_POSES, Arriving, Wanted, render_to_host, write_npz
+from ultragray_workers.pool.scene_cache import LoadedScene, SceneCache
 
 MAX_DETAIL_LENGTH = 2000
 
@@ -116,76 +112,42 @@ class _Worker:
         """Renders and encodes small frames, so that the first request does not pay for first uses."""
         shapes = {"means": (1, 3), "scales": (1, 3), "transmittances": (1,), "sh0": (1, 1, 1)}
         splats = {name: torch.zeros(shape) for name, shape in shapes.items()} | {"quats": torch.ones(1, 4)}
-        scene = GaussianScene.from_splats(splats).to(self._device)
-        for frame in self._render_small(scene):
-            encode_image(frame, Encoding.PNG)
+        self._render_small(GaussianScene.from_splats(splats).to(self._device))
 
-    def do(self, task: Task, descriptors: list[int]) -> None:
-        """Does one task and answers it, whatever happens."""
+    def _render_small(self, scene: GaussianScene) -> None:
+        """Renders and encodes a frame for each bundle of scan lines, as kernels differ by it."""
+        pixel_type = Encoding.PNG.pixel_type
+        for probe in example_probes():
+            frames = self._render(scene, Resolved(probe, 16, 16), np.eye(4)[None], {"bmode": {pixel_type}})
+            encoded_image(frames.take("bmode", pixel_type, 0, 1)[0], Encoding.PNG)
+
+    def do(self, task: AnyTask, memories: list[int]) -> None:
+        """Does one task and answers each of its parts, whatever happens."""
         self._tasks += 1
         self._board.taken[0] = self._tasks
         try:
-            if isinstance(task, RenderTask):
-                self._answer_all(self._render_parts(task, descriptors), len(task.parts))
-            elif isinstance(task, SliceTask):
-                self._answer_all(self._slice_parts(task, descriptors), len(task.parts))
+            if isinstance(task, Task):
+                work = self._WORK[type(task.view)](self, task, memories)
+                for part, outcome in enumerate(work):
+                    self._answer(part, outcome, last=part == len(task.parts) - 1)
             else:
-                self._answer(0, self._do_other(task, descriptors), last=True)
+                self._answer(0, _outcome(lambda: self._do_other(task, memories)), last=True)
         finally:
-            for descriptor in descriptors:
-                os.close(descriptor)
+            for memory in memories:
+                os.close(memory)
 
-    def _answer_all(self, outcomes: Iterator[Rendered | Outdated | UltragrayError], parts: int) -> None:
-        for part, outcome in enumerate(outcomes):
-            self._answer(part, outcome, last=part == parts - 1)
-
-    def _answer(self, part: int, outcome: Rendered | Outdated | UltragrayError | None, *, last: bool) -> None:
+    def _answer(self, part: int, outcome: Outcome, *, last: bool) -> None:
         self._channel.send(Answer(part=part, outcome=outcome, last=last, resident=self._scenes.names()))
 
-    def _do_other(
-        self, task: LocalizeTask | PackTask | LoadTask | UnloadTask, descriptors: list[int]
-    ) -> Rendered | Outdated | UltragrayError | None:
-        try:
-            if isinstance(task, LocalizeTask):
-                return self._localize(task, *descriptors)
-            if isinstance(task, PackTask):
-                return _pack(task, *descriptors)
-            if isinstance(task, LoadTask):
+    def _do_other(self, task: PackTask | LoadTask | UnloadTask, memories: list[int]) -> Rendered | None:
+        match task:
+            case PackTask():
+                return _pack(task, *memories)
+            case LoadTask():
                 self._loaded(task.scene, task.path)
-            else:
+            case UnloadTask():
                 self._scenes.drop(task.scene)
-        except GivenUp:
-            return _given_up()
-        except Exception as error:
-            return _as_reported(error)
         return None
-
-    def _localize(self, task: LocalizeTask, memory: int) -> Rendered | Outdated:
-        """Looks for the frame in the memory. Raises what reading it and localize() raise, and GivenUp."""
-        loaded = self._loaded(task.scene, task.path)
-        if task.version not in (None, loaded.version):
-            return Outdated()
-        started, asked = time.monotonic(), task.settings
-        data = read_start(memory, task.image_bytes)
-        found = localize(
-            loaded.scene,
-            read_png(data) if task.size is None else read_grey(data, *task.size),
-            task.start,
-            probe=asked.probe,
-            within_mm=asked.within_mm,
-            within_deg=asked.within_deg,
-            backend=self._backend,
-            limits=Limits(self._max_footprint_pixels, self._board.given_up, self._tasks, lambda _: "start"),
-        )
-        return Rendered(
-            size=0,
-            scene_sha256=loaded.sha256,
-            renderer=renderer_name(self._backend, loaded.scene),
-            started=started,
-            render_ms=_since_ms(started),
-            encode_ms=0.0,
-            found=found,
-        )
 
     def _loaded(self, name: str, path: str) -> LoadedScene:
         """A scene, ready for its first frame. Raises SceneFileInvalid, SceneTooLarge, MemoryExceeded."""
@@ -199,89 +161,68 @@ class _Worker:
             self._channel.send(Loading(begins=False))
         return loaded
 
-    def _render_parts(
-        self, task: RenderTask, memories: Sequence[int]
-    ) -> Iterator[Rendered | Outdated | UltragrayError]:
-        """One outcome per part, each as soon as its frames are written."""
-        try:
-            loaded = self._loaded(task.scene, task.path)
-            if task.version not in (None, loaded.version):
-                yield from [Outdated()] * len(task.parts)
-                return
-            poses = np.concatenate([part.poses for part in task.parts])  # [C, 4, 4]
-            extrapolations = loaded.assessor.assess(poses, task.view.probe)
-        except Exception as error:
-            yield from [_as_reported(error)] * len(task.parts)
-            return
-        refused = refusal(task, extrapolations)
-        if refused is not None and len(task.parts) == 1:
-            yield refused
-            return
+    def _scene_of(self, task: Task[Any]) -> LoadedScene:
+        """The scene of a task. Raises what `_loaded` raises, and SceneChangedError for one of another version."""
+        loaded = self._loaded(task.scene, task.path)
+        if task.version not in (None, loaded.version):
+            raise SceneChangedError
+        return loaded
+
+    def _limits(self, name_pose: Callable[[int], str]) -> Limits:
+        """Those of the task at hand, which the service may have given up meanwhile."""
+        return Limits(self._max_footprint_pixels, self._board.given_up, self._tasks, name_pose)
+
+    def _rendered(self, loaded: LoadedScene, started: float, **more: Any) -> Rendered:
+        """The report on what was rendered, or looked for, since `started`."""
+        return Rendered(
+            **{"size": 0, "encode_ms": 0.0, **more},
+            scene_sha256=loaded.sha256,
+            renderer=renderer_name(self._backend, loaded.scene),
+            started=started,
+            render_ms=_since_ms(started),
+        )
+
+    def _render_parts(self, task: Task[Resolved], memories: Sequence[int]) -> Iterator[Outcome]:
+        """Frames: all parts are rendered together, where that fails each alone, as it may be one that fails."""
+        first = task.parts[0]
+        poses = np.concatenate([part.poses for part in task.parts])  # [C, 4, 4]
         wanted: dict[str, set[np.dtype[Any]]] = {}
         for part in task.parts:
             for name in part.settings.outputs:
                 wanted.setdefault(name, set()).add(part.settings.encoding.pixel_type)
-        started = time.monotonic()
-        support = SupportWatch(below_limit(task, extrapolations))
-        limits = Limits(self._max_footprint_pixels, self._board.given_up, self._tasks, task.parts[0].name_pose)
+        try:
+            loaded = self._scene_of(task)
+            extrapolations = loaded.assessor.assess(poses, task.view.probe)
+        except SceneChangedError as error:
+            yield from [error] * len(task.parts)
+            return
+        except Exception as error:
+            yield from [_as_reported(error)] * len(task.parts)
+            return
         frames = None
         try:
-            if refused is None:
-                frames = self._render(loaded.scene, task.view, poses, wanted, support, limits)
+            if task.view.below_min_confidence is Below.REFUSE:
+                require_confidence(extrapolations, task.view.min_confidence, name_pose=first.name_pose)
+            support = SupportWatch(loaded.assessor, extrapolations, task.view)
+            started = time.monotonic()
+            frames = self._render(loaded.scene, task.view, poses, wanted, support, self._limits(first.name_pose))
+            rendered = self._rendered(loaded, started)
         except GivenUp:
-            yield from [_given_up()] * len(task.parts)
+            yield from [_GIVEN_UP] * len(task.parts)
             return
         except Exception as error:
             if len(task.parts) == 1:
                 yield _as_reported(error)
                 return
         if frames is None:  # out of the handler: the error holds on to memory of the GPU
-            for part, memory in zip(task.parts, memories, strict=True):  # alone: it may be one that fails
+            for part, memory in zip(task.parts, memories, strict=True):
                 yield from self._render_parts(replace(task, parts=(part,)), [memory])
             return
-        rendered = Rendered(
-            size=0,
-            scene_sha256=loaded.sha256,
-            renderer=renderer_name(self._backend, loaded.scene),
-            started=started,
-            render_ms=_since_ms(started),
-            encode_ms=0.0,
-        )
         begin = 0
         for part, memory in zip(task.parts, memories, strict=True):
             end = begin + len(part.poses)
-            assessed = partial(_supported, loaded.assessor, extrapolations[begin:end], support, begin)
-            if part.deadline is not None and time.monotonic() >= part.deadline:
-                yield DeadlineExceeded("the deadline passed before the frames were written")
-            else:
-                yield _write_part(task.scene, part, frames, begin, memory, rendered, assessed)
+            yield _outcome(partial(_write_part, part, frames, begin, memory, rendered, support))
             begin = end
-
-    def _slice_parts(self, task: SliceTask, memories: Sequence[int]) -> Iterator[Rendered | Outdated | UltragrayError]:
-        """One outcome per part, each as soon as its slices are written."""
-        for part, memory in zip(task.parts, memories, strict=True):
-            try:
-                loaded = self._loaded(task.scene, task.path)
-                if task.version not in (None, loaded.version):
-                    yield Outdated()
-                    continue
-                started = time.monotonic()
-                limits = Limits(self._max_footprint_pixels, self._board.given_up, self._tasks, lambda _: "spacing_mm")
-                size = write_slices(loaded.scene, part, memory, limits)
-            except GivenUp:
-                yield RenderFailed("the service gave up this slice: nobody waited for it any more")
-            except Exception as error:
-                yield _as_reported(error)
-            else:
-                yield Rendered(
-                    size=size,
-                    scene_sha256=loaded.sha256,
-                    renderer=renderer_name(self._backend, loaded.scene),
-                    started=started,
-                    render_ms=_since_ms(started),
-                    encode_ms=0.0,
-                    first=part.first,
-                )
 
     def _render(
         self,
@@ -289,55 +230,76 @@ class _Worker:
         view: Resolved,
         poses: FloatArray,  # [C, 4, 4] mm
         wanted: Wanted,
-        support: SupportWatch,
-        limits: Limits,
+        support: SupportWatch | None = None,
+        limits: Limits = UNLIMITED,
     ) -> Arriving:
-        shot = 0
-
-        def shoot(some: FloatArray) -> dict[str, Tensor]:  # [C, 4, 4] -> each [C, H, W] of the picture
-            nonlocal shot
-            frames = render(
-                scene,
-                view.probe,
-                some,
-                height=view.height,
-                width=view.width,
-                outputs=needed,
-                backend=self._backend,
-                limits=limits.after(shot),
-                beam=view.beam,
-                contact=view.contact,
-                tools=view.tools,
-                ghost=view.ghost,
-            )
-            shot += len(some)
-            assert frames.coverage is not None
-            blackened = support.look(frames.coverage, frames.touch)
-            rendered = {name: frames[name] for name in outputs}
-            if view.display == AS_RENDERED and blackened is None:
-                return rendered
-            return show(rendered, view.probe, view.display, blackened)
-
         outputs = tuple(wanted)
-        needed = tuple(dict.fromkeys((*outputs, "coverage")))
+        done = 0
+
+        def shown(some: FloatArray) -> dict[str, Tensor]:  # [C, 4, 4] -> each [C, H, W] of the picture
+            nonlocal done
+            done += len(some)
+            return render_shown(
+                scene,
+                view,
+                some,
+                outputs=outputs,
+                backend=self._backend,
+                limits=limits.after(done - len(some)),
+                support=support,
+            )
+
         try:
-            return render_to_host(shoot, poses, wanted, self._device)
+            return render_to_host(shown, poses, wanted, self._device)
         except torch.OutOfMemoryError as error:
             raise MemoryExceeded(
                 f"{len(poses)} frames of {view.height}x{view.width} pixels ({', '.join(outputs)}) do not fit into the "
                 f"free memory of {self._device}; ask for fewer or smaller ones"
             ) from error
 
-    def _render_small(self, scene: GaussianScene) -> list[ByteArray]:  # each [16, 16]
-        """A frame for each bundle of scan lines, as kernels differ by it."""
-        pixel_type, small = Encoding.UINT8.pixel_type, []
-        for probe in example_probes():
-            view = Resolved(probe, 16, 16)
-            frames = self._render(
-                scene, view, np.eye(4)[None], {"bmode": {pixel_type}}, SupportWatch([False]), UNLIMITED
-            )
-            small.append(to_uint8(frames.take("bmode", pixel_type, 0, 1)[0]))
-        return small
+    def _sample_parts(self, task: Task[SliceView], memories: Sequence[int]) -> Iterator[Outcome]:
+        """Slices, part by part."""
+        for part, memory in zip(task.parts, memories, strict=True):
+            yield _outcome(partial(self._sample, task, part, memory))
+
+    def _sample(self, task: Task[SliceView], part: TaskPart[SliceView], memory: int) -> Rendered:
+        loaded, view = self._scene_of(task), part.settings
+        started, size = time.monotonic(), 0
+        for number, pose in enumerate(part.poses, part.first):
+            pixels = sample_slice(loaded.scene, view.field, view.grid(pose), self._limits(lambda _: "spacing_mm"))
+            if view.encoding is Encoding.PNG:
+                pixels = encoded_image(as_grey(pixels, view.field), Encoding.PNG)
+            data = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("<"))
+            write_at(memory, data.data.cast("B"), number * data.nbytes)
+            size = part.total * data.nbytes
+        return self._rendered(loaded, started, size=size, first=part.first)
+
+    def _search_parts(self, task: Task[Sought], memories: Sequence[int]) -> Iterator[Outcome]:
+        """A real frame, which lies in the memory, and is looked for about the one pose."""
+        for part, memory in zip(task.parts, memories, strict=True):
+            yield _outcome(partial(self._search, task, part, memory))
+
+    def _search(self, task: Task[Sought], part: TaskPart[Sought], memory: int) -> Rendered:
+        loaded, asked = self._scene_of(task), part.settings.settings
+        started, size = time.monotonic(), part.settings.size
+        data = read_start(memory, os.fstat(memory).st_size)
+        found = localize(
+            loaded.scene,
+            read_png(data) if size is None else read_grey(data, *size),
+            part.poses[0],
+            probe=asked.probe,
+            within_mm=asked.within_mm,
+            within_deg=asked.within_deg,
+            backend=self._backend,
+            limits=self._limits(lambda _: "start"),
+        )
+        return self._rendered(loaded, started, found=found)
+
+    _WORK: ClassVar[dict[type, Callable[..., Iterator[Outcome]]]] = {  # by the kind of settings
+        Resolved: _render_parts,
+        SliceView: _sample_parts,
+        Sought: _search_parts,
+    }
 
 
 def example_probes() -> tuple[Probe, ...]:
@@ -346,60 +308,40 @@ def example_probes() -> tuple[Probe, ...]:
     return tuple({type(probe.lines): probe for probe in examples}.values())
 
 
-def _supported(
-    assessor: Assessor, extrapolations: Sequence[Extrapolation], support: SupportWatch, first: int
-) -> tuple[Extrapolation, ...]:
-    """The extrapolations of the frames from `first` on, with what was seen of their support."""
-    return tuple(support.completed(assessor, extrapolations, first))
-
-
 def _write_part(
-    scene: str,
-    part: RenderPart,
+    part: TaskPart,
     frames: Arriving,  # of a batch that holds the part from its pose `begin` on
     begin: int,
     memory: int,
-    rendered: Rendered,
-    assessed: Callable[[], tuple[Extrapolation, ...]],
-) -> Rendered | UltragrayError:
-    """Encodes a part into its request's memory: a whole file, or its share of the pixels."""
+    rendered: Rendered,  # the batch
+    support: SupportWatch,
+) -> Rendered:
+    """Encodes a part into its request's memory: an image file, or its share of the pixels, output after output.
+
+    An .npz is made of these when all parts are there (`_pack`). Raises DeadlineExceeded where nobody waits any more.
+    """
+    if part.deadline is not None and time.monotonic() >= part.deadline:
+        raise DeadlineExceeded("the deadline passed before the frames were written")
     started, waited_ms = time.monotonic(), frames.waited_ms
     outputs, encoding, end = part.settings.outputs, part.settings.encoding, begin + len(part.poses)
     pixel_type = encoding.pixel_type
-    try:
-        if encoding.is_image_file:
-            image = encode_image(frames.take(outputs[0], pixel_type, begin, end)[0], encoding)
-            write_at(memory, image.data, 0)
-            size = image.nbytes
-        elif encoding is Encoding.NPZ and len(part.poses) == part.total:
-            with os.fdopen(os.dup(memory), "wb") as file:
-                size = write_npz(
-                    file,
-                    {name: frames.take(name, pixel_type, begin, end) for name in outputs},
-                    part.poses,
-                    assessed(),
-                    scene=scene,
-                    scene_sha256=rendered.scene_sha256,
-                    renderer=rendered.renderer,
-                )
-        else:
-            for first in range(begin, end, CHUNK_POSES):  # each is written while the next one arrives
-                for number, name in enumerate(outputs):
-                    pixels = encode_pixels(
-                        frames.take(name, pixel_type, first, min(first + CHUNK_POSES, end)), encoding
-                    )
-                    place = number * part.total + part.first + first - begin
-                    write_at(memory, pixels.data.cast("B"), place * pixels[0].nbytes)
-            size = len(outputs) * part.total * pixels[0].nbytes
-        extrapolations = assessed()
-    except Exception as error:
-        return _as_reported(error)
-    waiting_ms = frames.waited_ms - waited_ms
+    if encoding.is_image_file:
+        image = encoded_image(frames.take(outputs[0], pixel_type, begin, end)[0], encoding)
+        write_at(memory, image.data, 0)
+        size = image.nbytes
+    else:
+        for first in range(begin, end, CHUNK_POSES):  # each is written while the next one arrives
+            for number, name in enumerate(outputs):
+                pixels = in_type(frames.take(name, pixel_type, first, min(first + CHUNK_POSES, end)), pixel_type)
+                place = number * part.total + part.first + first - begin
+                write_at(memory, pixels.data.cast("B"), place * pixels[0].nbytes)
+        size = len(outputs) * part.total * pixels[0].nbytes
+    extrapolations = tuple(support.completed(begin, end))
     return replace(
         rendered,
         size=size,
         render_ms=rendered.render_ms + frames.waited_ms,
-        encode_ms=_since_ms(started) - waiting_ms,
+        encode_ms=_since_ms(started) - (frames.waited_ms - waited_ms),
         first=part.first,
         extrapolations=extrapolations,
     )
@@ -435,8 +377,19 @@ def _pack(task: PackTask, pixels_memory: int, archive_memory: int) -> Rendered:
     )
 
 
-def _given_up() -> RenderFailed:
-    return RenderFailed("the service gave up this rendering: nobody waited for it any more")
+_GIVEN_UP = RenderFailed("the service gave up this rendering: nobody waited for it any more")
+
+
+def _outcome(work: Callable[[], Rendered | None]) -> Outcome:
+    """What work comes to, whatever it raises."""
+    try:
+        return work()
+    except GivenUp:
+        return _GIVEN_UP
+    except SceneChangedError as error:
+        return error
+    except Exception as error:
+        return _as_reported(error)
 
 
 def _as_reported(error: Exception) -> UltragrayError:
@@ -456,42 +409,3 @@ def _as_reported(error: Exception) -> UltragrayError:
 
 def _since_ms(started: float) -> float:
     return (time.monotonic() - started) * 1000.0
-
-
-# Slices of a scene, sampled and written into their requests' memory.
-
-
-def write_slices(scene: GaussianScene, part: RenderPart[SliceView], memory: int, limits: Limits) -> int:
-    """Samples the slices of a part and writes them in the place of their request's; the bytes of the whole reply.
-
-    Raises GivenUp, FrameTooCostly, and InvalidArgument for labels of a scene without them.
-    """
-    view, size = part.settings, 0
-    for number, pose in enumerate(part.poses, part.first):
-        pixels = sample_slice(scene, view.field, view.grid(pose), limits)
-        if view.encoding is Encoding.PNG:
-            pixels = encode_image(as_grey(pixels, view.field), Encoding.PNG)
-        data = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("<"))
-        write_at(memory, data.data.cast("B"), number * data.nbytes)
-        size = part.total * data.nbytes
-    return size
-
-
-# Poses whose confidence is below the limit of a render job.
-
-
-def below_limit(task: RenderTask, extrapolations: Sequence[Extrapolation]) -> list[bool]:
-    """For each pose, whether it has less confidence than the task wants; a scene without a model has none."""
-    limit = task.view.min_confidence
-    return [limit is not None and not is_confident(one, limit) for one in extrapolations]
-
-
-def refusal(task: RenderTask, extrapolations: Sequence[Extrapolation]) -> LowConfidence | None:
-    """The reason not to render a task of one part; None where it is rendered."""
-    limit = task.view.min_confidence
-    if limit is None or task.view.below_min_confidence is not Below.REFUSE:
-        return None
-    for index, one in enumerate(extrapolations):
-        if not is_confident(one, limit):
-            return low_confidence(one, limit, task.parts[0].name_pose(index))
-    return None

@@ -139,6 +139,3 @@ def _words(text: str) -> str:
     """A value of VR LO: one line without backslashes, cut to its greatest length."""
     line = " ".join(text.replace("\\", "/").split())
     return line.encode()[:MAX_WORDS_BYTES].decode(errors="ignore")
-
-
-EXPORTER = DicomExporter

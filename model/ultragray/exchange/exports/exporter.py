@@ -16,7 +16,7 @@ import numpy.typing as npt
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.outputs import OUTPUTS
-from ultragray.rendering.pixels import PixelArray, to_uint8
+from ultragray.rendering.pixels import PixelArray, in_type
 from ultragray.rendering.settings import Encoding, Resolved, SettingsUsed, settings_used
 from ultragray.scene.confidence import Extrapolation, figure_arrays
 
@@ -28,7 +28,7 @@ class ExportHeader:
     """The facts that the frames of an export share, and all it takes to render them again."""
 
     settings: Resolved
-    dtype: str  # "uint8": round(255·x), or "float32"; labels are uint8 as they are
+    dtype: str  # "uint8": round(255·share of the scale), or "float32"; labels are uint8 as they are
     poses: FloatArray  # [C, 4, 4] mm
     scene: str
     scene_sha256: str
@@ -116,6 +116,6 @@ class Exporter(ABC):
         return
 
 
-def stored_pixels(frames: PixelArray, stored: np.dtype[Any]) -> PixelArray:  # [B, H, W] -> [B, H, W]
-    """Rendered frames in [0, 1] (or labels, uint8) as they are stored, C order."""
-    return np.ascontiguousarray(to_uint8(frames) if stored == np.uint8 else frames, stored)
+def stored_pixels(output: str, frames: PixelArray, stored: np.dtype[Any]) -> PixelArray:  # [B, H, W] -> [B, H, W]
+    """Rendered frames of an output as they are stored, C order."""
+    return in_type(OUTPUTS[output].shares(frames) if stored == np.uint8 else frames, stored)

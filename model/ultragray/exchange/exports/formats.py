@@ -1,14 +1,17 @@
-"""The formats of rendered frames by name, and files of them: whole or not at all, or as bytes."""
+"""The formats of rendered frames by name, and files of them: whole or not at all, or as bytes.
+
+Another package adds a format by an entry point of the group `ultragray.exporters`, which is a `Format`.
+"""
 
 from __future__ import annotations
 
-import importlib
 import queue
 import tempfile
 import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TypeAlias
 
@@ -31,7 +34,7 @@ class Format:
     name: str
     suffix: str  # of its files
     meaning: str
-    module: str
+    exporter: str  # "module:class", imported when it writes
     dtypes: tuple[str, ...] = DTYPES
     bmode_only: bool = False
     in_mm: bool = False  # whether a pixel has one size in mm: fans are scan-converted
@@ -50,35 +53,41 @@ class Format:
         return replace(settings, display=replace(settings.display, pixel_mm=pixel_mm))
 
 
-_ALL = (
-    Format("npz", ".npz", "NumPy arrays, the npz keys, not compressed; objects of the origin as JSON", "npz"),
+_HERE = __package__
+_ALL: tuple[Format, ...] = (
+    Format(
+        "npz",
+        ".npz",
+        "NumPy arrays, the npz keys, not compressed; objects of the origin as JSON",
+        f"{_HERE}.archives:NpzExporter",
+    ),
     Format(
         "tar",
         ".tar",
         "WebDataset, for any reader of tar: 000000.bmode.png (float32: .npy) of each output and 000000.json with pose, "
         "figures and origin; then 000001 and so on",
-        "webdataset",
+        f"{_HERE}.archives:TarExporter",
         dtypes=("uint8", "float32"),
     ),
     Format(
         "zarr",
         ".zarr.zip",
         "A Zarr 3 group in a zip: an array of each output in chunks of a frame, poses, figures; origin as attributes",
-        "zarr_zip",
+        f"{_HERE}.zarr_zip:ZarrExporter",
         package="zarr",
     ),
     Format(
         "hdf5",
         ".h5",
         "HDF5: a data set of each output in chunks of a frame, poses, figures; origin as attributes, objects as JSON",
-        "hdf5",
+        f"{_HERE}.hdf5:Hdf5Exporter",
         package="h5py",
     ),
     Format(
         "dicom",
         ".dcm",
         "A DICOM ultrasound multi-frame image: bmode alone, true to scale",
-        "dicom",
+        f"{_HERE}.dicom:DicomExporter",
         dtypes=("uint8",),
         bmode_only=True,
         in_mm=True,
@@ -88,7 +97,7 @@ _ALL = (
         "plus",
         ".igs.mha",
         "A PLUS sequence: bmode alone, true to scale",
-        "plus_sequence",
+        f"{_HERE}.plus_sequence:PlusExporter",
         dtypes=("uint8",),
         bmode_only=True,
         in_mm=True,
@@ -97,10 +106,11 @@ _ALL = (
         "mcap",
         ".mcap",
         "MCAP, messages of ROS 2: a topic of images for each output, poses in metres, figures; origin as metadata",
-        "mcap_file",
+        f"{_HERE}.mcap_file:McapExporter",
         dtypes=("uint8", "float32"),
         package="mcap_ros2",
     ),
+    *(point.load() for point in entry_points(group="ultragray.exporters")),
 )
 FORMATS: dict[str, Format] = {format.name: format for format in _ALL}
 
@@ -132,10 +142,9 @@ def exporter_class(name: str) -> type[Exporter]:
     """The exporter of a format. Raises ExtraMissing where a package that it needs is not installed."""
     chosen = FORMATS[name]
     try:
-        module = importlib.import_module(f".{chosen.module}", __package__)
+        found: type[Exporter] = EntryPoint(name, chosen.exporter, "").load()
     except ImportError as error:
         raise missing_extra(error, f"format {name}", field="format") from error
-    found: type[Exporter] = module.EXPORTER
     return found
 
 
@@ -182,7 +191,7 @@ def _beside(exporter: Exporter, header: ExportHeader) -> Iterator[Add]:
             frames, extrapolations = portion
             try:
                 stored = {
-                    name: stored_pixels(frames[name], header.pixel_type(name)) for name in header.settings.outputs
+                    name: stored_pixels(name, frames[name], header.pixel_type(name)) for name in header.settings.outputs
                 }
                 exporter.add(stored, extrapolations)
             except BaseException as error:
@@ -223,7 +232,7 @@ def export_bytes(
         exporter = make(path, header)
         try:
             exporter.add(
-                {name: stored_pixels(frames[name], header.pixel_type(name)) for name in frames}, extrapolations
+                {name: stored_pixels(name, frames[name], header.pixel_type(name)) for name in frames}, extrapolations
             )
         except BaseException:
             exporter.abandon()

@@ -73,6 +73,3 @@ class _Sink(io.FileIO):
         except OSError as error:
             self.error = self.error or error
             return size or 0
-
-
-EXPORTER = Hdf5Exporter

@@ -29,6 +29,3 @@ class McapExporter(Exporter):
 
     def _finish(self) -> None:
         self._recording.finish()
-
-
-EXPORTER = McapExporter

@@ -104,6 +104,3 @@ def _key(name: str) -> str:
 
 def _row_by_row(matrix: FloatArray) -> str:
     return " ".join(repr(float(number)) for number in matrix.reshape(-1))
-
-
-EXPORTER = PlusExporter

@@ -47,6 +47,3 @@ class ZarrExporter(Exporter):
         self._group.create_array(
             name, shape=values.shape, chunks=values.shape, dtype=values.dtype.newbyteorder("<"), compressors=None
         )[:] = values
-
-
-EXPORTER = ZarrExporter

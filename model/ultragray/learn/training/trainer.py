@@ -46,7 +46,8 @@ from ultragray.learn.training.pictures import write_picture
 from ultragray.learn.training.poses import PoseRefinement
 from ultragray.learn.training.progress import Board, Journal, Progress, StepTimer
 from ultragray.rendering.backends import cuda
-from ultragray.rendering.frames import Frames, choose_backend, render
+from ultragray.rendering.backends.registry import choose_backend
+from ultragray.rendering.frames import Frames, render
 from ultragray.scene.gaussians import PARAMETERS, GaussianScene
 from ultragray.scene.info import SceneInfo, check_training_pose_count
 

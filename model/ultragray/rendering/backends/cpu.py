@@ -48,7 +48,7 @@ def render_outputs(
     limits: Limits = UNLIMITED,
     beam: Tensor | None = None,  # [3] cm, see `beam.beam_cm`
     *,
-    weighted: bool = False,  # see `weighted.weighted_sums`
+    weighted: bool = False,  # see `registry.weighted_sums`
     instruction_set: str = "auto",
 ) -> dict[str, Tensor]:
     """The outputs by name, each [C, H, W] float32; differentiable once by every parameter, by poses and by the beam.

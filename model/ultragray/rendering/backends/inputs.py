@@ -27,7 +27,7 @@ class Kind(NamedTuple):
     """How intensities are activated, and whether Gaussians have weights instead of transmittances."""
 
     intensity: str  # of scene_info.INTENSITIES
-    weighted: bool = False  # see `weighted.weighted_sums`
+    weighted: bool = False  # see `registry.weighted_sums`
 
     def place(self, backend: str) -> str:
         """The name under which a scene keeps what a backend prepared of it."""

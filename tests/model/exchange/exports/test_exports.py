@@ -24,8 +24,8 @@ from ultragray import LinearProbe
 from ultragray.contract import to_dict
 from ultragray.errors import ExtraMissing, InvalidArgument
 from ultragray.exchange.exports import FORMATS, ExportHeader, check_format, export_to
+from ultragray.exchange.exports.archives import NpzExporter
 from ultragray.exchange.exports.exporter import stored_pixels
-from ultragray.exchange.exports.npz import NpzExporter
 from ultragray.installation import install_advice
 from ultragray.rendering.settings import Contact, Resolved
 from ultragray.scene.confidence import FIGURES, Extrapolation, figure_arrays

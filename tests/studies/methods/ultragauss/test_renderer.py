@@ -9,7 +9,7 @@ import torch
 
 from ultragray import LinearProbe
 from ultragray.rendering.backends import cpu
-from ultragray.rendering.backends.weighted import WeightedSums, weighted_sums
+from ultragray.rendering.backends.registry import WeightedSums, weighted_sums
 from ultragray_studies.methods.ultragauss import Field, average, shadow
 
 # One pixel, whose middle lies at the depth of 1 cm on the axis of the probe.

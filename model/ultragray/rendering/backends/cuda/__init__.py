@@ -47,7 +47,7 @@ def render_outputs(
     limits: Limits = UNLIMITED,
     beam: Tensor | None = None,  # [3] cm, see `beam.beam_cm`
     *,
-    weighted: bool = False,  # see `weighted.weighted_sums`
+    weighted: bool = False,  # see `registry.weighted_sums`
 ) -> dict[str, Tensor]:
     """The outputs by name, each [C, H, W] float32 on the scene's device; differentiable once by every parameter and
     by poses and the beam.

@@ -1,1 +1,0 @@
-"""The client for asyncio, with the same methods."""

@@ -1,0 +1,591 @@
+"""What a client asks of the service, without a transport: each operation once, as the message that it sends, the answer
+that it reads, and the attempts that it makes. `client.py` carries them out, for threads and for asyncio.
+"""
+
+from __future__ import annotations
+
+import uuid
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, Generic, NamedTuple, TypeAlias, TypeVar
+
+import numpy as np
+import numpy.typing as npt
+
+from ultragray_client.connection import Metadata, Retries, Terms
+from ultragray_client.contract import (
+    Dataset,
+    DatasetOptions,
+    Extrapolation,
+    Probe,
+    RenderSettings,
+    SliceSettings,
+    Specification,
+)
+from ultragray_client.conversations import Batch, Conversation, LastJob, Upload, Watch, downloaded
+from ultragray_client.errors import ClientError, InvalidPose, NotFound
+from ultragray_client.exchange import PoseExchange, StreamMode
+from ultragray_client.frames import (
+    Frame,
+    Localization,
+    Slice,
+    frame_from_message,
+    localize_message,
+    settings_message,
+    slice_from_message,
+)
+from ultragray_client.geometry import PoseLike, pose_message, pose_messages
+from ultragray_client.messages import message_of
+from ultragray_client.records import (
+    AuditEntry,
+    Job,
+    JobEvent,
+    JobState,
+    Me,
+    Registration,
+    Scene,
+    SceneEntry,
+    Worker,
+    entry_from_message,
+    job_from_message,
+    scene_from_message,
+)
+from ultragray_proto.codec import from_message
+from ultragray_proto.v1 import (
+    access_pb2,
+    datasets_pb2,
+    geometry_pb2,
+    jobs_pb2,
+    registrations_pb2,
+    rendering_pb2,
+    scenes_pb2,
+    workers_pb2,
+)
+
+T = TypeVar("T")
+PAGE_SIZE = 1000  # the most that the service gives at once
+_QUALITY = ("residual_mm", "residual_deg", "position_std_mm", "angle_std_deg")
+
+
+class Attempt(NamedTuple):
+    """One call of a method, such as "SceneService.GetScene"; `content`: a message, or an iterator of messages."""
+
+    method: str
+    content: Any
+    timeout_s: float | None
+    metadata: Metadata
+
+
+class Pause(NamedTuple):
+    """A rest before the next attempt."""
+
+    seconds: float
+
+
+# What a transport does for a call: it carries out each attempt or pause, and sends the answer back, or throws the
+# ClientError that the attempt ended with. The value that the generator returns is what the caller gets.
+Steps: TypeAlias = Generator[Attempt | Pause, Any, T]
+
+
+class Call(Generic[T]):
+    """A question with one answer. `timeout_s` is for all attempts together; None: the client's."""
+
+    def __init__(self, method: str, request: Any, read: Callable[[Any], T], timeout_s: float | None) -> None:
+        self._method, self._request, self._read, self._timeout_s = method, request, read, timeout_s
+
+    def steps(self, terms: Terms) -> Steps[T]:
+        """The steps to the answer, by the terms of a client."""
+        return self._read((yield from self._attempts(terms, terms.retries(self._timeout_s, is_short=True))))
+
+    def _attempts(self, terms: Terms, retries: Retries) -> Steps[Any]:
+        while True:
+            metadata = terms.metadata(self._request)
+            try:
+                return (yield Attempt(self._method, self._content(), retries.remaining_s(), metadata))
+            except ClientError as error:
+                pause = Pause(retries.pause_s(error))
+            yield pause
+
+    def _content(self) -> Any:
+        return self._request
+
+
+class Deletion(Call[None]):
+    """A deletion. What is not found any more where an attempt broke off was deleted by that."""
+
+    def __init__(self, method: str, request: Any, timeout_s: float | None) -> None:
+        super().__init__(method, request, lambda _: None, timeout_s)
+
+    def steps(self, terms: Terms) -> Steps[None]:
+        retries = terms.retries(self._timeout_s, is_short=True)
+        try:
+            yield from self._attempts(terms, retries)
+        except NotFound:
+            if not retries.was_unavailable:
+                raise
+
+
+class Sending(Call[T]):
+    """Messages that each attempt sends from the first one on, and their answer. No timeout: as long as it takes."""
+
+    def __init__(
+        self, method: str, messages: Callable[[], Iterator[Any]], read: Callable[[Any], T], timeout_s: float | None
+    ) -> None:
+        super().__init__(method, None, read, timeout_s)
+        self._messages = messages
+
+    def steps(self, terms: Terms) -> Steps[T]:
+        return self._read((yield from self._attempts(terms, terms.retries(self._timeout_s))))
+
+    def _content(self) -> Any:
+        return self._messages()
+
+
+class Listing(Call[tuple[T, ...]]):
+    """A list that comes in pages, at most `limit` of its items. Each page has the timeout for itself."""
+
+    def __init__(
+        self,
+        method: str,
+        request: Any,
+        items: str,
+        read_item: Callable[[Any], T],
+        timeout_s: float | None,
+        limit: int | None = None,
+    ) -> None:
+        super().__init__(method, request, lambda page: tuple(map(read_item, getattr(page, items))), timeout_s)
+        self._limit = limit
+
+    def steps(self, terms: Terms) -> Steps[tuple[T, ...]]:
+        found: tuple[T, ...] = ()
+        while self._limit is None or len(found) < self._limit:
+            self._request.page_size = PAGE_SIZE if self._limit is None else min(PAGE_SIZE, self._limit - len(found))
+            page = yield from self._attempts(terms, terms.retries(self._timeout_s, is_short=True))
+            found += self._read(page)
+            self._request.page_token = page.next_page_token
+            if not page.next_page_token:
+                break
+        return found
+
+
+@dataclass(frozen=True)
+class Talk(Generic[T]):
+    """A conversation over calls of a method whose answers are streams. No timeout: as long as it takes."""
+
+    method: str
+    conversation: Conversation[T]
+    timeout_s: float | None
+
+
+@dataclass(frozen=True)
+class Collection(Generic[T]):
+    """A conversation that keeps its results, and makes one answer of them.
+
+    `keeper` begins it, in a context that holds what is made. Beside what a conversation has, it has `keep`, which takes
+    a result and may wait for the disk, and `result`.
+    """
+
+    method: str
+    keeper: Callable[[], AbstractContextManager[Any]]
+    timeout_s: float | None
+
+
+@dataclass(frozen=True)
+class PoseStream:
+    """A stream of poses, which lasts at most `timeout_s`, and goes on after a failure for at most `reconnect_s`."""
+
+    method: str
+    exchange: PoseExchange
+    timeout_s: float | None
+    reconnect_s: float | None
+
+
+class ClientCalls:
+    """The operations of a client itself."""
+
+    @staticmethod
+    def render(
+        scene: str, pose: PoseLike, settings: RenderSettings | None = None, *, timeout_s: float | None = None
+    ) -> Call[Frame]:
+        """One frame of `pose`, [4, 4] mm or a Placement; `settings` None: B-mode in uint8, as the scene was trained.
+
+        Raises SceneNotFound, InvalidArgument and its kinds, QueueFull, DeadlineExceeded, Unavailable.
+        """
+        request = rendering_pb2.RenderRequest(settings=settings_message(scene, settings), pose=pose_message(pose))
+        return Call("RenderService.Render", request, frame_from_message, timeout_s)
+
+    @staticmethod
+    def render_batch(
+        scene: str,
+        poses: Iterable[PoseLike],
+        settings: RenderSettings | None = None,
+        *,
+        timeout_s: float | None = None,
+    ) -> Talk[Frame]:
+        """The frames of any number of poses ([C, 4, 4] mm, or as they come from an iterator), in order, as they are
+        ready; behind the frames of interactive callers.
+
+        Goes on from the first missing frame where the service is restarted. Without `timeout_s` it takes as long as it
+        takes. Otherwise as `render`; a refused pose is named `poses[index]`, and one below `min_confidence` only after
+        the frames before it.
+        """
+        return Talk("RenderService.RenderBatch", Batch(settings_message(scene, settings), poses), timeout_s)
+
+    @staticmethod
+    def stream(
+        scene: str,
+        settings: RenderSettings | None = None,
+        *,
+        mode: StreamMode | str = "ordered",
+        timeout_s: float | None = None,
+        shared_memory: bool = False,
+        reconnect_s: float | None = None,
+    ) -> PoseStream:
+        """A stream of poses: `with client.stream("demo", mode="latest") as stream: stream.send(pose)`.
+
+        `timeout_s` is the deadline of the whole stream; None: it has none. Otherwise as `render`.
+
+        Where the connection is lost, or the service stops, the stream goes on over another connection, with the same
+        sequences: it sends the poses without an answer again, a latest one the newest of them alone, and the others
+        count as dropped. `reconnect_s`: for so long it tries, before `receive` raises why it cannot (0: at once; None:
+        the client's `timeout_s`). `stream.reconnections` tells how often it went on.
+
+        `shared_memory`: pixels come through memory that is shared with the service instead of the connection, which
+        takes a Linux host that both run on, as the same user, and a loopback `address`; else InvalidArgument. The
+        arrays of a frame are views of that memory, and stay as they are for as long as anything refers to one of
+        them. While 16 frames are held, others come through the connection, as do those of more than 16 MiB.
+        """
+        exchange = PoseExchange(settings_message(scene, settings), mode, shared_memory=shared_memory)
+        return PoseStream("RenderService.RenderStream", exchange, timeout_s, reconnect_s)
+
+    @staticmethod
+    def render_slice(scene: str, plane: SliceSettings, *, timeout_s: float | None = None) -> Call[Slice]:
+        """A field of a scene on any plane, without a probe. It waits and counts as a frame does.
+
+        Raises SceneNotFound, InvalidArgument and its kinds, QueueFull, DeadlineExceeded, Unavailable.
+        """
+        request = rendering_pb2.RenderSliceRequest(scene=scene, slice=message_of(plane, rendering_pb2.SliceSettings))
+        return Call("RenderService.RenderSlice", request, slice_from_message, timeout_s)
+
+    @staticmethod
+    def assess_poses(
+        scene: str,
+        poses: Iterable[PoseLike],
+        probe: Probe | None = None,
+        *,
+        registration: str | None = None,
+        timeout_s: float | None = None,
+    ) -> Call[tuple[Extrapolation, ...]]:
+        """How far frames at these poses of a probe (None: the scene's own) would extrapolate, without rendering any.
+
+        With a `registration` they are poses of the flange in its base.
+
+        `supported_share` is None: only a rendered frame tells it. Raises SceneNotFound, InvalidPose, InvalidProbe,
+        TooManyPoses.
+        """
+        request = message_of(
+            {"probe": probe, "registration": registration},
+            rendering_pb2.AssessPosesRequest,
+            scene=scene,
+            poses=list(pose_messages(poses)),
+        )
+        return Call("RenderService.AssessPoses", request, _each("extrapolations", Extrapolation), timeout_s)
+
+    @staticmethod
+    def localize(
+        scene: str,
+        image: npt.ArrayLike | bytes,
+        start: PoseLike,
+        *,
+        probe: Probe | None = None,
+        registration: str | None = None,
+        within_mm: float = 3.0,
+        within_deg: float = 5.0,
+        timeout_s: float | None = None,
+    ) -> Call[Localization]:
+        """Where in a scene a real frame was taken, looked for about `start`, which may be off by the two `within`.
+
+        `image`: grey values [H, W], uint8 or in [0, 1], or the bytes of a PNG file; rows along depth, columns across
+        scan lines, not scan-converted. `probe` took it (None: the scene's own). `is_found` of the answer says whether
+        its pose can be used. With a `registration` the start is a pose of the flange in its base, and the answer has
+        such a pose as well. Raises SceneNotFound, InvalidArgument and its kinds, QueueFull, DeadlineExceeded.
+        """
+        request = localize_message(scene, image, start, probe, registration, within_mm, within_deg)
+        return Call("RenderService.Localize", request, _one(Localization), timeout_s)
+
+    @staticmethod
+    def who_am_i(*, timeout_s: float | None = None) -> Call[Me]:
+        """The name and the role that the key stands for."""
+        return Call("AccessService.WhoAmI", access_pb2.WhoAmIRequest(), _one(Me), timeout_s)
+
+    @staticmethod
+    def audit(
+        *,
+        since_hours: float = 24.0,
+        who: str | None = None,
+        what: str | None = None,
+        limit: int = 1000,
+        timeout_s: float | None = None,
+    ) -> Call[tuple[AuditEntry, ...]]:
+        """The last entries of the audit log, oldest first; `what`: an operation such as scene.delete, or scene.
+
+        For admins alone. Raises PermissionDenied, InvalidArgument.
+        """
+        request = access_pb2.ListAuditEntriesRequest(since_hours=since_hours, who=who, what=what, limit=limit)
+        return Call("AccessService.ListAuditEntries", request, _each("entries", AuditEntry), timeout_s)
+
+
+class SceneCalls:
+    """The operations of `client.scenes`."""
+
+    @staticmethod
+    def list(*, timeout_s: float | None = None) -> Listing[SceneEntry]:
+        """All scenes by name."""
+        request = scenes_pb2.ListScenesRequest()
+        return Listing("SceneService.ListScenes", request, "scenes", entry_from_message, timeout_s)
+
+    @staticmethod
+    def get(name: str, *, timeout_s: float | None = None) -> Call[Scene]:
+        """All that a scene says about itself."""
+        return Call("SceneService.GetScene", scenes_pb2.GetSceneRequest(scene=name), scene_from_message, timeout_s)
+
+    @staticmethod
+    def load(name: str, *, timeout_s: float | None = None) -> Call[int]:
+        """Loads a scene ahead of its first frame; the number of render processes that hold it."""
+        return Call("SceneService.LoadScene", scenes_pb2.LoadSceneRequest(scene=name), _loaded, timeout_s)
+
+    @staticmethod
+    def unload(name: str, *, timeout_s: float | None = None) -> Call[int]:
+        """Frees a scene's memory; the number of render processes that still hold it."""
+        return Call("SceneService.UnloadScene", scenes_pb2.UnloadSceneRequest(scene=name), _loaded, timeout_s)
+
+
+class DatasetCalls:
+    """The operations of `client.datasets`."""
+
+    @staticmethod
+    def upload(
+        name: str,
+        path: str | Path,
+        *,
+        options: DatasetOptions | None = None,
+        private: bool = False,
+        timeout_s: float | None = None,
+    ) -> Sending[Dataset]:
+        """Uploads a folder with all below it, or an archive (.zip, .tar, .tar.gz, .tgz), and waits until it is checked.
+
+        Others do not see a `private` one. The same content and options again give the dataset that is there. Without
+        `timeout_s` it takes as long as it takes. Raises DatasetInvalid with the file and the frame, DatasetExists,
+        UploadTooLarge, StorageFull.
+        """
+        upload = Upload(name, path, options or DatasetOptions(), private)
+        return Sending(
+            "DatasetService.UploadDataset",
+            upload.messages,
+            lambda answer: from_message(answer.dataset, Dataset),
+            timeout_s,
+        )
+
+    @staticmethod
+    def list(*, timeout_s: float | None = None) -> Listing[Dataset]:
+        """All datasets by name."""
+        request = datasets_pb2.ListDatasetsRequest()
+        return Listing("DatasetService.ListDatasets", request, "datasets", _one(Dataset), timeout_s)
+
+    @staticmethod
+    def get(name: str, *, timeout_s: float | None = None) -> Call[Dataset]:
+        """One dataset."""
+        return Call("DatasetService.GetDataset", datasets_pb2.GetDatasetRequest(dataset=name), _one(Dataset), timeout_s)
+
+    @staticmethod
+    def contact_sheet(name: str, *, timeout_s: float | None = None) -> Call[bytes]:
+        """A PNG of the image planes in space and of some frames."""
+        request = datasets_pb2.GetContactSheetRequest(dataset=name)
+        return Call("DatasetService.GetContactSheet", request, lambda answer: bytes(answer.png), timeout_s)
+
+    @staticmethod
+    def delete(name: str, *, timeout_s: float | None = None) -> Call[None]:
+        """Raises DatasetInUse where a job needs it."""
+        return Deletion("DatasetService.DeleteDataset", datasets_pb2.DeleteDatasetRequest(dataset=name), timeout_s)
+
+
+class JobCalls:
+    """The operations of `client.jobs`."""
+
+    @staticmethod
+    def submit(
+        specification: Specification,
+        *,
+        request_id: str | None = None,
+        priority: int = 0,
+        private: bool = False,
+        timeout_s: float | None = None,
+    ) -> Call[Job]:
+        """Puts a job into the queue: `TrainJob(dataset="liver", scene="liver")` makes a scene that is served,
+        `RenderJob(scene="demo", sampler=FanSampler(tilt_deg=10, step_deg=2))` an archive of frames.
+
+        Raises DatasetNotFound, SceneNotFound, RegistrationNotFound, SceneExists, JobQueueFull, ExtraMissing,
+        StorageFull, LowConfidence and other kinds of InvalidArgument.
+        """
+        # With an id of its own a submission that is sent again gives the same job.
+        request_id = uuid.uuid4().hex if request_id is None else request_id
+        request = jobs_pb2.SubmitJobRequest(request_id=request_id, priority=priority, private=private)
+        job = getattr(request, specification.kind)
+        poses = getattr(specification, "poses", None)
+        others = {} if poses is None else {"poses": pose_messages(poses)}
+        job.MergeFrom(message_of(specification, type(job), **others))
+        job.SetInParent()
+        return Call("JobService.SubmitJob", request, lambda answer: job_from_message(answer.job), timeout_s)
+
+    @staticmethod
+    def list(
+        *,
+        state: JobState | str | None = None,
+        kind: str | None = None,
+        limit: int | None = None,
+        timeout_s: float | None = None,
+    ) -> Listing[Job]:
+        """The newest jobs first, at most `limit`; None: all that the service keeps."""
+        request = message_of({"state": state, "kind": kind}, jobs_pb2.ListJobsRequest)
+        return Listing("JobService.ListJobs", request, "jobs", job_from_message, timeout_s, limit)
+
+    @staticmethod
+    def get(job_id: str, *, timeout_s: float | None = None) -> Call[Job]:
+        """One job."""
+        return Call("JobService.GetJob", jobs_pb2.GetJobRequest(job=job_id), job_from_message, timeout_s)
+
+    @staticmethod
+    def watch(job_id: str, *, timeout_s: float | None = None) -> Talk[JobEvent]:
+        """The job at first and whenever it changed, and new lines of its log, until it is in its final state.
+
+        Goes on where the service was restarted in the meantime. Without `timeout_s` it takes as long as the job.
+        """
+        return Talk("JobService.WatchJob", Watch(job_id), timeout_s)
+
+    @staticmethod
+    def wait(job_id: str, *, timeout_s: float | None = None) -> Collection[Job]:
+        """The job in its final state, whichever that is."""
+        return Collection("JobService.WatchJob", lambda: nullcontext(LastJob(job_id)), timeout_s)
+
+    @staticmethod
+    def cancel(job_id: str, *, timeout_s: float | None = None) -> Call[Job]:
+        """Stops a job within a second. Raises JobFinished for one that succeeded or failed."""
+        return Call("JobService.CancelJob", jobs_pb2.CancelJobRequest(job=job_id), job_from_message, timeout_s)
+
+    @staticmethod
+    def retry(job_id: str, *, timeout_s: float | None = None) -> Call[Job]:
+        """A new job in place of a failed or cancelled one; asked again, the same one. Raises JobNotFinished."""
+        return Call("JobService.RetryJob", jobs_pb2.RetryJobRequest(job=job_id), job_from_message, timeout_s)
+
+    @staticmethod
+    def delete(job_id: str, *, timeout_s: float | None = None) -> Call[None]:
+        """Removes a finished job and its files; a scene that it trained stays. Raises JobInUse."""
+        return Deletion("JobService.DeleteJob", jobs_pb2.DeleteJobRequest(job=job_id), timeout_s)
+
+    @staticmethod
+    def log(job_id: str, *, max_bytes: int = 65536, timeout_s: float | None = None) -> Call[str]:
+        """The end of what the job's process said."""
+        request = jobs_pb2.GetJobLogRequest(job=job_id, max_bytes=max_bytes)
+        return Call("JobService.GetJobLog", request, lambda answer: str(answer.log), timeout_s)
+
+    @staticmethod
+    def download(job_id: str, artifact: str, path: str | Path, *, timeout_s: float | None = None) -> Collection[None]:
+        """Writes an artifact to the file `path`, whole or not at all; goes on where the connection broke.
+
+        Raises ArtifactNotFound, and OSError where the file cannot be written.
+        """
+        return Collection("JobService.DownloadArtifact", partial(downloaded, job_id, artifact, Path(path)), timeout_s)
+
+
+class WorkerCalls:
+    """The operations of `client.workers`."""
+
+    @staticmethod
+    def list(*, timeout_s: float | None = None) -> Call[tuple[Worker, ...]]:
+        """The workers by name, also those that were lost within a day."""
+        return Call("WorkerService.ListWorkers", workers_pb2.ListWorkersRequest(), _each("workers", Worker), timeout_s)
+
+    @staticmethod
+    def pause(name: str, *, timeout_s: float | None = None) -> Call[Worker]:
+        """Lets a worker take no more jobs; it ends the one at hand."""
+        return Call("WorkerService.PauseWorker", workers_pb2.PauseWorkerRequest(worker=name), _one(Worker), timeout_s)
+
+    @staticmethod
+    def drain(name: str, *, timeout_s: float | None = None) -> Call[Worker]:
+        """As `pause`, but a training at hand goes back into the queue at once, and on elsewhere from its checkpoint."""
+        return Call("WorkerService.DrainWorker", workers_pb2.DrainWorkerRequest(worker=name), _one(Worker), timeout_s)
+
+    @staticmethod
+    def resume(name: str, *, timeout_s: float | None = None) -> Call[Worker]:
+        """Lets a worker take jobs again."""
+        return Call("WorkerService.ResumeWorker", workers_pb2.ResumeWorkerRequest(worker=name), _one(Worker), timeout_s)
+
+
+class RegistrationCalls:
+    """The operations of `client.registrations`."""
+
+    @staticmethod
+    def list(*, timeout_s: float | None = None) -> Listing[Registration]:
+        """All registrations that the key may see, by name."""
+        request = registrations_pb2.ListRegistrationsRequest()
+        return Listing("RegistrationService.ListRegistrations", request, "registrations", _one(Registration), timeout_s)
+
+    @staticmethod
+    def get(name: str, *, timeout_s: float | None = None) -> Call[Registration]:
+        """One registration."""
+        request = registrations_pb2.GetRegistrationRequest(registration=name)
+        return Call("RegistrationService.GetRegistration", request, _one(Registration), timeout_s)
+
+    @staticmethod
+    def put(
+        name: str,
+        scene: str,
+        base_to_scene: npt.ArrayLike,
+        probe_to_flange: npt.ArrayLike | None = None,
+        *,
+        quality: Mapping[str, Any] | None = None,
+        timeout_s: float | None = None,
+    ) -> Call[Registration]:
+        """Keeps a registration of a scene, in place of one of that name which is the key's own.
+
+        Both links are [4, 4], mm; without `probe_to_flange` the probe's frame is the flange's. `quality` may hold
+        residual_mm, residual_deg, position_std_mm and angle_std_deg, as the file of `ultragray calibrate` does.
+        Raises InvalidPose, SceneNotFound, PermissionDenied, LimitReached.
+        """
+        links = {"base_to_scene": base_to_scene, "probe_to_flange": probe_to_flange}
+        matrices = {link: _matrix(pose, link) for link, pose in links.items() if pose is not None}
+        known = {key: value for key, value in (quality or {}).items() if key in _QUALITY}
+        content = message_of(known, registrations_pb2.Registration, scene=scene, **matrices)
+        request = registrations_pb2.PutRegistrationRequest(registration=name, content=content)
+        return Call("RegistrationService.PutRegistration", request, _one(Registration), timeout_s)
+
+    @staticmethod
+    def delete(name: str, *, timeout_s: float | None = None) -> Call[None]:
+        """Forgets a registration."""
+        request = registrations_pb2.DeleteRegistrationRequest(registration=name)
+        return Call("RegistrationService.DeleteRegistration", request, lambda _: None, timeout_s)
+
+
+def _one(cls: type[T]) -> Callable[[Any], T]:
+    return lambda message: from_message(message, cls)
+
+
+def _each(items: str, cls: type[T]) -> Callable[[Any], tuple[T, ...]]:
+    return lambda answer: tuple(from_message(one, cls) for one in getattr(answer, items))
+
+
+def _loaded(answer: Any) -> int:
+    return int(answer.loaded_processes)
+
+
+def _matrix(pose: npt.ArrayLike, field: str) -> geometry_pb2.Matrix:
+    try:
+        matrix = np.asarray(pose, np.float64)
+    except (TypeError, ValueError):
+        raise InvalidPose(f"{field} must be numbers [4, 4], got {type(pose).__name__}", field=field) from None
+    if matrix.shape != (4, 4):
+        raise InvalidPose(f"{field} must be [4, 4], got {list(matrix.shape)}", field=field)
+    return geometry_pb2.Matrix(values=matrix.ravel().tolist())

@@ -1,0 +1,120 @@
+"""Archives that numpy, any reader of tar and the eye need nothing else for: .npz, WebDataset, a folder of PNGs."""
+
+from __future__ import annotations
+
+import io
+import json
+import shutil
+import tarfile
+import tempfile
+import zipfile
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+
+from ultragray.exchange.exports.exporter import Exporter, ExportHeader
+from ultragray.exchange.exports.formats import Add
+from ultragray.files import atomic_path
+from ultragray.rendering.outputs import OUTPUTS
+from ultragray.rendering.pixels import PixelArray, image_file
+from ultragray.scene.confidence import Extrapolation
+
+
+class NpzExporter(Exporter):
+    """A writer of the first output into the archive as it comes; the others wait in files without a name beside it."""
+
+    def _open(self) -> None:
+        header = self._header
+        self._archive = self._held.enter_context(zipfile.ZipFile(self._path, "w"))
+        first, *others = header.settings.outputs
+        self._waiting = {name: self._held.enter_context(self._nameless()) for name in others}
+        self._first = self._held.enter_context(self._member(first))
+        self._files: dict[str, IO[bytes]] = {first: self._first, **self._waiting}
+        for name, file in self._files.items():
+            described = {"descr": header.pixel_type(name).str, "fortran_order": False, "shape": header.shape}
+            np.lib.format.write_array_header_1_0(file, described)
+
+    def _nameless(self) -> IO[bytes]:
+        return tempfile.TemporaryFile(dir=self._path.parent)
+
+    def _member(self, name: str) -> IO[bytes]:
+        return self._archive.open(f"{name}.npy", "w", force_zip64=True)
+
+    def _write(self, frames: Mapping[str, PixelArray], count: int) -> None:
+        for name, file in self._files.items():
+            file.write(frames[name].data)
+
+    def _finish(self) -> None:
+        self._first.close()
+        for name, file in self._waiting.items():
+            file.seek(0)
+            with self._member(name) as member:
+                shutil.copyfileobj(file, member, 1 << 20)
+        header = self._header
+        origin = {name: one if isinstance(one, str) else json.dumps(one) for name, one in header.origin().items()}
+        described = {"poses": np.asarray(header.poses, np.float64), **self._figures(), **origin}
+        for name, value in described.items():
+            with self._member(name) as member:
+                np.lib.format.write_array(member, np.asarray(value), allow_pickle=False)
+
+
+# WebDataset: a tar with some files of one name for each frame.
+
+
+class TarExporter(Exporter):
+    """A writer of 000012.OUTPUT.png (float32: .npy) for each output and 000012.json (pose, figures, origin)."""
+
+    def _open(self) -> None:
+        self._tar = self._held.enter_context(tarfile.TarFile(self._path, "w"))
+
+    def _write(self, frames: Mapping[str, PixelArray], count: int) -> None:
+        for place in range(count):
+            number = self._done + place
+            for name in self._header.settings.outputs:
+                frame = frames[name][place]
+                suffix, data = (
+                    ("png", image_file(frame, ".png").tobytes()) if frame.dtype == np.uint8 else ("npy", _npy(frame))
+                )
+                self._member(f"{number:06d}.{name}.{suffix}", data)
+            figures = self._extrapolations[number].figures()
+            document = {"pose": self._header.poses[number].tolist(), **figures, **self._header.origin()}
+            self._member(f"{number:06d}.json", json.dumps(document).encode())
+
+    def _member(self, name: str, data: bytes) -> None:
+        member = tarfile.TarInfo(name)
+        member.size = len(data)
+        self._tar.addfile(member, io.BytesIO(data))
+
+
+def _npy(frame: PixelArray) -> bytes:
+    file = io.BytesIO()
+    np.lib.format.write_array(file, frame, allow_pickle=False)
+    return file.getvalue()
+
+
+# A folder of grey PNGs, one a frame and output, a pixel of labels holding the label; FRAMES_FILE describes each.
+
+
+FRAMES_FILE = "frames.json"
+
+
+@contextmanager
+def export_pngs(folder: Path, header: ExportHeader) -> Iterator[Add]:
+    """A function that takes the rendered frames in order, and writes frame_00012_bmode.png and so on."""
+    documents: list[dict[str, Any]] = []
+
+    def add(frames: Mapping[str, PixelArray], extrapolations: Sequence[Extrapolation]) -> None:
+        folder.mkdir(parents=True, exist_ok=True)  # only now: a mistake that the rendering finds leaves no folder
+        for place, extrapolation in enumerate(extrapolations):
+            number = len(documents)
+            for name in header.settings.outputs:
+                data = image_file(OUTPUTS[name].shares(frames[name][place]), ".png")
+                (folder / f"frame_{number:05d}_{name}.png").write_bytes(data.tobytes())
+            documents.append({"frame": number, "pose": header.poses[number].tolist(), **extrapolation.figures()})
+
+    yield add
+    with atomic_path(folder / FRAMES_FILE) as temporary:
+        temporary.write_text(json.dumps(documents), encoding="utf-8")

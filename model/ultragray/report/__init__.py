@@ -1,1 +1,0 @@
-"""Reports: a scene against its baselines and ablations, as numbers and as one HTML page."""

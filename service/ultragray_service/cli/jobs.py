@@ -1,0 +1,390 @@
+"""`ultragray jobs …`: training, batch rendering and the other kinds of jobs on a running service."""
+
+from __future__ import annotations
+
+import contextlib
+import inspect
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Annotated, Any, get_type_hints
+
+import numpy as np
+import typer
+
+from ultragray.contract import to_dict
+from ultragray.exchange.batches import names_in
+from ultragray.samplers import TrainingSampler
+from ultragray_service.cli.app import INTERRUPTED
+from ultragray_service.cli.connection import Connection, route, with_connection
+from ultragray_service.cli.options import parameters_of, values_of, with_parameters
+from ultragray_service.cli.terminal import (
+    Force,
+    Json,
+    check_file,
+    command_group,
+    counted,
+    examples,
+    output_option,
+    print_facts,
+    print_table,
+    tell,
+    to_json,
+    transferred,
+    warn,
+)
+from ultragray_workers.errors import NotReady
+from ultragray_workers.jobs.kinds import KINDS, Specification
+
+command_app = command_group("Work in the background, on a running service: it goes on when this command ends.")
+submit_app = command_group("Put a job into the queue; its id is printed.")
+command_app.add_typer(submit_app, name="submit")
+
+JobArgument = Annotated[str, typer.Argument(help="Id of the job.", show_default=False)]
+QUEUE = "Queue"
+_SUBMITS = {
+    "train": (
+        "ultragray jobs submit train liver --scene liver --preset best --wait",
+        "ultragray jobs submit train liver --scene liver --device cuda --min-memory-gb 16 --require site=lab1",
+    ),
+    "compare": ("ultragray jobs submit compare liver --methods scene,median,linear --wait",),
+    "evaluate": ("ultragray jobs submit evaluate liver --scene liver --wait",),
+    "render": (
+        "ultragray jobs submit render liver --format hdf5 --sampler around --count 5000 --translation-mm 3",
+        "ultragray jobs submit render liver --sampler around --count 10000000 --height 64 --width 64 --wait",
+    ),
+    "voxelize": ("ultragray jobs submit voxelize liver --field labels --format nrrd --spacing-mm 0.5 --wait",),
+}
+JOB_FAILED = 3  # the exit code of a command that watched a job fail
+JOB_CANCELLED = 4
+_FINAL_STATES = ("succeeded", "failed", "cancelled")
+_METRICS_IN_A_LINE = 6
+_RETRY_S = 1.0
+_HELD_S = 5.0  # a connection that lasted so long was one to a service that works
+_GONE_S = 60.0  # a service that comes back within this time is asked again
+_COLUMNS = ("id", "kind", "state", "scene or dataset", "progress", "created", "reason")
+
+
+@command_app.command(
+    "list", epilog=examples("ultragray jobs list", "ultragray jobs list --state failed --json | jq -r '.[].id'")
+)
+@with_connection
+def list_jobs(
+    connection: Connection,
+    state: Annotated[
+        str, typer.Option(help="Only queued, running, succeeded, failed or cancelled ones.", show_default="all")
+    ] = "",
+    kind: Annotated[str, typer.Option(help=f"Only {' or '.join(KINDS)} ones.", show_default="all")] = "",
+    limit: Annotated[int, typer.Option(min=1, help="How many at most.")] = 20,
+    json: Json = False,
+) -> None:
+    """List the jobs, newest first."""
+
+    jobs = connection.listed("/v1/jobs", "jobs", limit, state=state, kind=kind)
+    if json:
+        typer.echo(to_json(jobs))
+    else:
+        _print_jobs(jobs)
+
+
+@command_app.command(epilog=examples("ultragray jobs show 7f3c2a", "ultragray jobs show 7f3c2a --json | jq .metrics"))
+@with_connection
+def show(connection: Connection, job: JobArgument, json: Json = False) -> None:
+    """Print all that is known about a job."""
+
+    found = connection.json("GET", route("jobs", job))
+    if json:
+        typer.echo(to_json(found))
+    else:
+        print_facts(found)
+
+
+@command_app.command(epilog=examples("ultragray jobs watch 7f3c2a"))
+@with_connection
+def watch(connection: Connection, job: JobArgument, json: Json = False) -> None:
+    """Follow a job to its end. Exit code 0: it succeeded, 3: it failed, 4: it was cancelled."""
+
+    follow(connection, job, as_json=json)
+
+
+@command_app.command(epilog=examples("ultragray jobs cancel 7f3c2a"))
+@with_connection
+def cancel(connection: Connection, job: JobArgument, json: Json = False) -> None:
+    """Stop a job."""
+
+    cancelled = connection.json("POST", route("jobs", job, suffix=":cancel"))
+    tell(f"{cancelled['id']} {cancelled['state']}", cancelled, as_json=json)
+
+
+@command_app.command(epilog=examples("ultragray jobs retry 7f3c2a"))
+@with_connection
+def retry(connection: Connection, job: JobArgument, json: Json = False) -> None:
+    """Put a new job in place of a failed or cancelled one; it goes on from the last checkpoint."""
+
+    again = connection.json("POST", route("jobs", job, suffix=":retry"))
+    tell(again["id"], again, as_json=json)
+
+
+@command_app.command(epilog=examples("ultragray jobs delete 7f3c2a"))
+@with_connection
+def delete(connection: Connection, job: JobArgument, json: Json = False) -> None:
+    """Remove a finished job and its files; the scene that it trained stays."""
+
+    connection.json("DELETE", route("jobs", job))
+    tell(f"{job} deleted", {"deleted": job}, as_json=json)
+
+
+@command_app.command(epilog=examples("ultragray jobs logs 7f3c2a --bytes 4096"))
+@with_connection
+def logs(
+    connection: Connection,
+    job: JobArgument,
+    max_bytes: Annotated[int, typer.Option("--bytes", min=1, max=2**20, help="How much of its end.")] = 65536,
+    json: Json = False,
+) -> None:
+    """Print the end of a job's log."""
+
+    log = connection.text(route("jobs", job, suffix=f"/log?max_bytes={max_bytes}"))
+    if json:
+        typer.echo(to_json({"job": job, "log": log}))
+    else:
+        typer.echo(log, nl=False)
+
+
+@command_app.command(
+    epilog=examples(
+        "ultragray jobs download 7f3c2a frames.npz -o frames.npz",
+        "ultragray jobs download 7f3c2a 'frames-{000000..000199}.tar' -o frames/  # those that are not there yet",
+    )
+)
+@with_connection
+def download(
+    connection: Connection,
+    job: JobArgument,
+    name: Annotated[str, typer.Argument(help="One of the job's artifacts, or a range of them.", show_default=False)],
+    output: Annotated[Path | None, output_option("File to write; of a range the folder.", default="NAME, here")] = None,
+    force: Force = False,
+    json: Json = False,
+) -> None:
+    """Download a file that a job made."""
+
+    if len(names := list(names_in(name))) > 1:
+        _download_all(connection, job, names, Path() if output is None else output, as_json=json, force=force)
+        return
+    path = Path(Path(name).name) if output is None else output
+    check_file(path, force=force)
+    with transferred(f"downloading {name}") as begin:
+        size = connection.download(route("jobs", job, "artifacts", name), path, begin)
+    tell(f"wrote {path}: {size:,} bytes", {"output": str(path), "bytes": size}, as_json=json)
+
+
+def _download_all(
+    connection: Connection, job: str, names: list[str], folder: Path, *, as_json: bool, force: bool
+) -> None:
+    """Downloads the files that are not in the folder yet, whole each."""
+    folder.mkdir(parents=True, exist_ok=True)
+    missing = [name for name in names if force or not (folder / Path(name).name).exists()]
+    size = 0
+    with counted(f"downloading {len(missing):,} files", len(missing)) as report:
+        for number, name in enumerate(missing, 1):
+            to = folder / Path(name).name
+            size += connection.download(route("jobs", job, "artifacts", name), to, lambda total: lambda count: None)
+            report(number)
+    document = {"output": str(folder), "files": len(missing), "there_before": len(names) - len(missing), "bytes": size}
+    tell(f"wrote {len(missing):,} files to {folder}: {size:,} bytes", document, as_json=as_json)
+
+
+def _submit(
+    connection: Connection,
+    kind: str,
+    specification: dict[str, Any],
+    *,
+    request_id: Annotated[
+        str | None,
+        typer.Option(
+            help="A name of your own: given again, it gives the same job.", show_default=False, rich_help_panel=QUEUE
+        ),
+    ] = None,
+    priority: Annotated[
+        int, typer.Option(min=-1000, max=1000, help="Higher ones go first.", rich_help_panel=QUEUE)
+    ] = 0,
+    private: Annotated[
+        bool,
+        typer.Option(
+            "--private", help="Others see neither the job nor the scene that it makes.", rich_help_panel=QUEUE
+        ),
+    ] = False,
+    wait: Annotated[
+        bool, typer.Option("--wait", help="Follow the job to its end, as `jobs watch` does.", rich_help_panel=QUEUE)
+    ] = False,
+    json: Json = False,
+) -> None:
+    beside = {"request_id": request_id, "priority": priority, "private": private}
+    job = connection.json("POST", "/v1/jobs", {"kind": kind, "specification": specification, **beside})
+    if wait and json:
+        follow(connection, job["id"], as_json=True)
+        return
+    if job["progress"]["waits_for"] is not None:
+        warn(f"{job['id']} waits for {job['progress']['waits_for']}")
+    tell(job["id"], job, as_json=json)
+    if wait:
+        follow(connection, job["id"], as_json=False)
+
+
+def _add_submit_command(kind: str, cls: type[Specification]) -> None:
+    """`jobs submit KIND`, with an option for each field of the specification."""
+    hints = get_type_hints(_submit, include_extras=True)
+    common = [
+        parameter.replace(annotation=hints[parameter.name])
+        for parameter in inspect.signature(_submit).parameters.values()
+        if parameter.kind is parameter.KEYWORD_ONLY
+    ]
+
+    def submit(connection: Connection, **given: Any) -> None:
+        values = values_of(cls, given)
+        if {"sampler", "poses"} <= given.keys() and not {"sampler", "poses"} & values.keys():
+            values["sampler"] = TrainingSampler()
+        document = {name: _as_json(value) for name, value in values.items()}
+        _submit(connection, kind, document, **{parameter.name: given[parameter.name] for parameter in common})
+
+    summary = inspect.getdoc(cls) or ""
+    command = with_connection(with_parameters(submit, [*parameters_of(cls), *common]))
+    submit_app.command(kind, help=summary.split("\n\n")[0], epilog=examples(*_SUBMITS.get(kind, ())))(command)
+
+
+def _as_json(value: Any) -> Any:
+    return value.tolist() if isinstance(value, np.ndarray) else to_dict(value, with_none=False)
+
+
+for _kind, _class in Specification.members.items():
+    _add_submit_command(_kind, _class)
+
+
+def _print_jobs(jobs: list[dict[str, Any]]) -> None:
+
+    print_table(_COLUMNS, [_row(job, amount(job)) for job in jobs])
+
+
+def _row(job: dict[str, Any], progress: str) -> tuple[str, ...]:
+    created = str(job["created_at"])[:19].replace("T", " ")
+    about = str(job["specification"].get("scene", job["specification"].get("dataset", "")))
+    return (job["id"], job["kind"], job["state"], about, progress, created, job["reason"] or "")
+
+
+def follow(connection: Connection, job_id: str, *, as_json: bool = False) -> None:
+    """Return when the job has succeeded; exit with 3 where it failed, 4 where it was cancelled, 130 at Ctrl-C.
+
+    Raises UltragrayError: no such job, or a service that stays away.
+    """
+    try:
+        with _display(job_id) as show:
+            job = _watched(connection, job_id, show)
+    except KeyboardInterrupt:
+        typer.echo(f"job {job_id} goes on; `ultragray jobs cancel {job_id}` stops it", err=True)
+        raise typer.Exit(INTERRUPTED) from None
+    if job["state"] == "succeeded":
+        tell(f"{job_id} succeeded{results(job)}", job, as_json=as_json)
+        return
+    if as_json:
+        tell("", job, as_json=True)
+    if job["state"] == "failed":
+        typer.secho(f"error: {job_id} failed: {job['reason']}", fg=typer.colors.RED, err=True)
+        raise typer.Exit(JOB_FAILED)
+    typer.echo(f"{job_id} was cancelled", err=True)
+    raise typer.Exit(JOB_CANCELLED)
+
+
+def _watched(connection: Connection, job_id: str, show: Callable[[dict[str, Any]], None]) -> dict[str, Any]:
+    """The job in its final state; a service that was restarted in the meantime is asked again."""
+    connection.json("GET", route("jobs", job_id))  # nobody there, or no such job: said at once
+    seen = time.monotonic()
+    while True:
+        asked, gone = time.monotonic(), NotReady(f"nothing is heard of the job {job_id}")
+        try:
+            for job in connection.events(route("jobs", job_id, "events"), "progress"):
+                show(job)
+                if job["state"] in _FINAL_STATES:
+                    return job
+        except NotReady as error:
+            gone = error
+        if (now := time.monotonic()) - asked > _HELD_S:
+            seen = now  # the service was there until now, though perhaps nothing changed
+        elif now - seen > _GONE_S:
+            raise gone
+        time.sleep(_RETRY_S)
+
+
+@contextlib.contextmanager
+def _display(job_id: str) -> Iterator[Callable[[dict[str, Any]], None]]:
+    """A bar on a terminal's stderr; elsewhere a line for every change of state and every tenth of the work."""
+    from rich.console import Console
+    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+    console = Console(stderr=True)
+    columns = (
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TextColumn("{task.fields[figures]}"),
+    )
+    last: tuple[str, int] | None = None
+    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+        task = bar.add_task(f"{job_id}", total=None, figures="")
+
+        def show(job: dict[str, Any]) -> None:
+            nonlocal last
+            done, of, _ = work_done(job)
+            if console.is_terminal:
+                bar.update(task, description=f"{job_id} {job['state']}", completed=done, total=of, figures=figures(job))
+                return
+            current = (job["state"], done * 10 // of if of else 0)
+            if current != last:
+                last = current
+                sys.stderr.write(" ".join(filter(None, (job_id, job["state"], amount(job), figures(job)))) + "\n")
+
+        yield show
+
+
+def work_done(job: dict[str, Any]) -> tuple[int, int | None, str]:
+    """Steps or frames that are done, how many there are (None: not known yet), and which of the two."""
+    progress = job["progress"]
+    done, of = ("frames_done", "frames") if progress["steps"] is None else ("step", "steps")
+    return progress[done] or 0, progress[of], of
+
+
+def amount(job: dict[str, Any]) -> str:
+    """Such as "120 of 500 steps"; empty where it is not known yet."""
+    done, of, unit = work_done(job)
+    return "" if of is None else f"{done:,} of {of:,} {unit}"
+
+
+def figures(job: dict[str, Any]) -> str:
+    """The figures of the progress that are known, in short."""
+    progress = job["progress"]
+    parts = []
+    if progress["waits_for"] is not None:
+        parts.append(f"waits for {progress['waits_for']}")
+    if progress["method"] is not None:
+        parts.append(f"{progress['method']}, method {progress['method_number']} of {progress['methods']}")
+    if progress["loss"] is not None:
+        parts.append(f"loss {progress['loss']:.4f}")
+    if progress["gaussians"] is not None:
+        parts.append(f"{progress['gaussians']:,} Gaussians")
+    if progress["rate_per_s"] is not None:
+        parts.append(f"{progress['rate_per_s']:.1f}/s")
+    if progress["seconds_left"] is not None:
+        minutes, seconds = divmod(round(progress["seconds_left"]), 60)
+        parts.append(f"{minutes}:{seconds:02d} left")
+    if progress["val_psnr_db"] is not None:
+        parts.append(f"held out {progress['val_psnr_db']:.2f} dB")
+    return " · ".join(parts)
+
+
+def results(job: dict[str, Any]) -> str:
+    """Metrics and artifacts, for the end of a line; more metrics than one reads in a line stand below it."""
+    metrics = [f"{name} {value:.4g}" for name, value in job["metrics"].items()]
+    artifacts = f"; artifacts: {', '.join(job['artifacts'])}" if job["artifacts"] else ""
+    if len(metrics) > _METRICS_IN_A_LINE:
+        return "".join((artifacts, *(f"\n  {metric}" for metric in metrics)))
+    return f"; {', '.join(metrics)}{artifacts}" if metrics else artifacts

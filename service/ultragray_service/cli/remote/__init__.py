@@ -1,1 +1,0 @@
-"""Commands that ask a running service over HTTP: scenes, datasets, registrations, jobs."""

@@ -1,0 +1,158 @@
+"""Frames that a running service renders, into a picture, an archive or a folder of PNGs."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ultragray.contract import from_dict, to_dict
+from ultragray.errors import InvalidArgument
+from ultragray.exchange.poses import load_poses
+from ultragray.files import write_whole
+from ultragray.geometry.pose import check_poses
+from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.rendering.settings import FrameSettings
+from ultragray.samplers import Sampler
+from ultragray_service.cli.connection import Connection, route
+from ultragray_service.cli.terminal import OR_A_FOLDER, check_ending, check_file, check_folder, counted, is_folder_name
+
+MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".npz": "application/x-npz"}
+SUFFIXES = tuple(MEDIA_TYPES)
+FRAMES_FILE = "frames.json"
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What a command line asks for. Raises InvalidArgument for a registration that has no poses to lead."""
+
+    scene: str
+    output: Path
+    suffix: str | None  # of SUFFIXES; None: a folder of PNGs
+    pose_file: Path | None
+    sampler: Sampler | None
+    registration: str | None  # that leads the poses of the file into the scene
+    settings: FrameSettings
+
+    def __post_init__(self) -> None:
+        if self.registration is not None and (self.pose_file is None or self.sampler is not None):
+            raise InvalidArgument(
+                "a registration leads the poses of a file, which must be given with --poses and without --sampler; "
+                "ultragray jobs submit render samples about such poses",
+                field="registration",
+            )
+
+
+def checked_kind(output: Path, settings: FrameSettings, *, force: bool) -> str | None:
+    """The ending of the output, of SUFFIXES; None for a folder.
+
+    Raises InvalidArgument for an output that cannot or may not be written, and for a picture of several outputs.
+    """
+    if is_folder_name(output):
+        check_folder(output, force=force)
+        return None
+    check_ending(output, SUFFIXES, otherwise=OR_A_FOLDER)
+    check_file(output, force=force)
+    if output.suffix != ".npz" and len(settings.outputs) != 1:
+        raise InvalidArgument(
+            f"a picture holds one output, got {', '.join(settings.outputs)}: write a .npz file or a folder",
+            field="outputs",
+        )
+    return output.suffix
+
+
+def render_remotely(connection: Connection, wanted: Wanted) -> dict[str, Any]:
+    """Write the frames; what they are, for a program. Raises InvalidArgument and what the connection raises."""
+    given = None if wanted.pose_file is None else load_poses(wanted.pose_file)
+    poses = _poses(connection, wanted, given)
+    settings = to_dict(wanted.settings, with_none=False)
+    if wanted.registration is not None:
+        settings["registration"] = wanted.registration
+    if wanted.suffix is None:
+        shape = _write_folder(connection, wanted, settings, poses)
+    else:
+        if wanted.suffix != ".npz" and len(poses) != 1:
+            raise InvalidArgument(
+                f"a picture holds one frame, there are {len(poses)} poses: write a .npz file or a folder",
+                field="output",
+            )
+        body = {**settings, **({"pose": _pose(poses[0])} if len(poses) == 1 else {"poses": list(map(_pose, poses))})}
+        answer = _rendered(connection, wanted.scene, body, MEDIA_TYPES[wanted.suffix])
+        write_whole(wanted.output, answer.data)
+        shape = answer.headers["x-ultragray-shape"]
+    _, _, height, width = map(int, shape.split(","))
+    return {
+        "output": str(wanted.output),
+        "scene": wanted.scene,
+        "frames": len(poses),
+        "height": height,
+        "width": width,
+        "outputs": list(wanted.settings.outputs),
+    }
+
+
+def _poses(connection: Connection, wanted: Wanted, given: FloatArray | None) -> FloatArray:  # [C, 4, 4] mm
+    """The poses of a file, or those that a sampler makes; without either the middle training pose."""
+    if wanted.sampler is None and given is not None:
+        return given
+    base = _training_poses(connection, wanted.scene) if given is None else given
+    if not len(base):
+        raise InvalidArgument("--poses must be given: the scene holds no training poses", field="poses")
+    if wanted.sampler is None:
+        middle: FloatArray = base[len(base) // 2][None]
+        return middle
+    probe = wanted.settings.probe
+    if probe is None:
+        document = connection.json("GET", route("scenes", wanted.scene))["probe"]
+        if document is None:
+            raise InvalidArgument("--probe must be given: the scene does not know its own", field="probe")
+        probe = from_dict(Probe, document)
+    return wanted.sampler.poses(base, probe)
+
+
+def _write_folder(connection: Connection, wanted: Wanted, settings: dict[str, Any], poses: FloatArray) -> str:
+    """A PNG for each pose and output, and a file that describes the frames; their shape as a header tells it."""
+    shape, documents = "", []
+    with counted("rendering", len(poses)) as report:
+        for number, pose in enumerate(poses):
+            for output in wanted.settings.outputs:
+                body = {**settings, "outputs": [output], "pose": _pose(pose)}
+                answer = _rendered(connection, wanted.scene, body, MEDIA_TYPES[".png"])
+                wanted.output.mkdir(parents=True, exist_ok=True)  # only now: a refusal leaves no folder
+                write_whole(wanted.output / f"frame_{number:05d}_{output}.png", answer.data)
+                shape = answer.headers["x-ultragray-shape"]
+            documents.append({"frame": number, "pose": answer.fact("pose"), **(answer.fact("extrapolation") or {})})
+            report(number + 1)
+    write_whole(wanted.output / FRAMES_FILE, json.dumps(documents))
+    return shape
+
+
+@dataclass(frozen=True)
+class _Answer:
+    """Rendered frames as the service encoded them, and what its headers say about them."""
+
+    data: bytes
+    headers: dict[str, str]
+
+    def fact(self, name: str) -> Any:
+        """A header that holds JSON, by the end of its name; None where it is not there."""
+        text = self.headers.get(f"x-ultragray-{name}")
+        return None if text is None else json.loads(text)
+
+
+def _rendered(connection: Connection, scene: str, body: dict[str, Any], media_type: str) -> _Answer:
+    with connection.open("POST", route("scenes", scene, "render"), body, accept=media_type) as answer:
+        return _Answer(connection.whole(answer), {key.lower(): value for key, value in answer.headers.items()})
+
+
+def _training_poses(connection: Connection, scene: str) -> FloatArray:  # [P, 4, 4] mm
+    """The poses that a scene was trained from, at most 10,000 of them."""
+    found = connection.json("GET", route("scenes", scene, "training-poses"))
+    return check_poses(np.array(found["poses"], np.float64).reshape(-1, 4, 4))
+
+
+def _pose(pose: FloatArray) -> dict[str, Any]:  # [4, 4] mm
+    return {"matrix": pose.tolist()}

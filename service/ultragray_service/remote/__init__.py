@@ -1,1 +1,0 @@
-"""A running service, asked over HTTP with nothing but the standard library: scenes, datasets, jobs, workers."""
