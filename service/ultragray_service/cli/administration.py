@@ -407,8 +407,7 @@ def copy(
 
     Interrupted, the same command goes on. Nothing is changed in FROM, and nothing overwritten in TO.
     """
-    from ultragray_workers.datasets.copying import CopiedDatasets, copy_datasets
-    from ultragray_workers.storage.copying import ARTIFACTS, copy_scenes
+    from ultragray_workers.backup.copying import ARTIFACTS, CopiedDatasets, copy_datasets, copy_scenes
     from ultragray_workers.storage.location import below, open_storage, parse_location
 
     def say(sentence: str) -> None:

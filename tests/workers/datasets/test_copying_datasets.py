@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ultragray_workers.datasets.copying import CopiedDatasets, copy_datasets
+from ultragray_workers.backup.copying import CopiedDatasets, copy_datasets
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import RestoreRefused
 from ultragray_workers.storage.local import LocalStorage

@@ -41,7 +41,7 @@ class VoxelizeJob(Specification):
     format: str = described("Of the file.", _FORMATS[0], choices=_FORMATS)
     kind: Literal["voxelize"] = kind_field("voxelize")
 
-    run_module = "ultragray_workers.jobs.kinds.volumes.voxelize_run"
+    run_module = "ultragray_workers.jobs.kinds.voxelize_run"
     needs_scene = "scene"
 
     def __post_init__(self) -> None:
