@@ -261,7 +261,7 @@ $(VENV)/modules: ALWAYS | $(VENV)/python
 $(VENV)/installed: $(VENV)/python $(VENV)/modules $(PACKAGE_SOURCES)
 	@$(BIN)/python distribution/prerequisites.py
 	@echo "Installing the libraries and compiling the kernel (a minute or two the first time) ..."
-	@$(PIP_INSTALL) --editable ./proto --editable '.[all]' --editable ./client --editable ./ros --editable ./studies || \
+	@$(PIP_INSTALL) --editable ./proto --editable '.[all]' --editable ./client --editable ./ros --editable './studies[gym]' || \
 		{ echo "error: pip said above why it failed; if it found no cmake or ninja: sudo apt-get install cmake ninja-build"; exit 1; }
 	@touch $@
 

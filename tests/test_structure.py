@@ -1,15 +1,36 @@
-"""The architecture as the source tree has it: no import circles, no probe kinds in the open."""
+"""The architecture as the source tree has it: no import circles, storeys, no probe kinds in the open."""
 
 from __future__ import annotations
 
 import ast
-from collections.abc import Iterator
 from functools import cache
+from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
+
+import pytest
 
 ROOT = Path(__file__).resolve().parent.parent
 SOURCE_ROOTS = [ROOT / name for name in ("model", "workers", "service", "client", "proto", "ros", "studies")]
-PROBE_PACKAGE = "ultragray.geometry.probe"
+PROBE_MODULE = "ultragray.geometry.probe"
+# What each distribution may import of the others; the product never imports its studies.
+MAY_IMPORT = {
+    "ultragray": set(),
+    "ultragray_proto": set(),
+    "ultragray_client": {"ultragray_proto"},
+    "ultragray_ros": {"ultragray_client"},
+    "ultragray_workers": {"ultragray"},
+    "ultragray_service": {"ultragray", "ultragray_workers", "ultragray_proto", "ultragray_client"},
+}
+# The library: each storey imports those before it and what lies beneath all; plug-ins stand beside.
+STOREYS = ("geometry", "scene", "rendering", "learn")
+BENEATH = {"", "errors", "contract", "files", "installation", "_cpu"}
+PLUGINS = ("datasets", "exchange", "phantom", "samplers")
+ROOMS = {
+    "": {*BENEATH, *STOREYS},  # public names, on first use
+    **{room: BENEATH for room in BENEATH if room},
+    **{storey: {*BENEATH, *STOREYS[:place]} for place, storey in enumerate(STOREYS)},
+    **{plugin: {*BENEATH, *STOREYS, *PLUGINS} for plugin in PLUGINS},
+}
 
 
 @cache
@@ -29,6 +50,7 @@ def tree(name: str) -> ast.Module:
     return ast.parse(modules()[name].read_text(encoding="utf-8"))
 
 
+@cache
 def imports_of(name: str) -> set[str]:
     """The product's modules that a module names in imports, wherever they stand: in functions and for types too."""
     is_package = modules()[name].stem == "__init__"
@@ -44,47 +66,51 @@ def imports_of(name: str) -> set[str]:
     return (found & modules().keys()) - {name}
 
 
-def circles() -> Iterator[list[str]]:
-    """Sets of modules that all lead to each other (Tarjan's algorithm)."""
-    graph = {name: imports_of(name) for name in modules()}
-    order: dict[str, int] = {}
-    lowest: dict[str, int] = {}
-    waiting: list[str] = []
-
-    def visit(name: str) -> Iterator[list[str]]:
-        order[name] = lowest[name] = len(order)
-        waiting.append(name)
-        for other in graph[name]:
-            if other not in order:
-                yield from visit(other)
-                lowest[name] = min(lowest[name], lowest[other])
-            elif other in waiting:
-                lowest[name] = min(lowest[name], order[other])
-        if lowest[name] == order[name]:
-            place = waiting.index(name)
-            together = waiting[place:]
-            del waiting[place:]
-            if len(together) > 1:
-                yield sorted(together)
-
-    for name in graph:
-        if name not in order:
-            yield from visit(name)
-
-
 def test_no_module_imports_itself_by_way_of_others() -> None:
-    assert list(circles()) == []
+    try:
+        TopologicalSorter({name: imports_of(name) for name in modules()}).prepare()
+    except CycleError as error:
+        pytest.fail(" → ".join(error.args[1]))
 
 
-def test_nobody_outside_its_package_asks_for_the_kind_of_a_probe() -> None:
+@pytest.mark.parametrize("package", MAY_IMPORT)
+def test_distributions_import_only_those_below_them(package: str) -> None:
+    wrong = {
+        (name, other)
+        for name in modules()
+        if name.partition(".")[0] == package
+        for other in imports_of(name)
+        if other.partition(".")[0] not in {package, *MAY_IMPORT[package]}
+    }
+    assert wrong == set()
+
+
+def test_rooms_of_the_library_import_only_those_below_them() -> None:
+    inside = {name: (*name.split("."), "")[1] for name in modules() if name.partition(".")[0] == "ultragray"}
+    wrong = {
+        (name, other)
+        for name, room in inside.items()
+        for other in imports_of(name) & inside.keys()
+        if inside[other] not in {room, *ROOMS[room]}
+    }
+    assert wrong == set()
+
+
+def test_every_module_says_what_it_is_for() -> None:
+    written = {name for name, path in modules().items() if path.suffix == ".py" and "_pb2" not in name}
+    assert {name for name in written if not ast.get_docstring(tree(name))} == set()
+
+
+def test_nobody_outside_its_module_asks_for_the_kind_of_a_probe() -> None:
     found = [
         f"{name}:{node.lineno}"
         for name in modules()
-        if not name.startswith(PROBE_PACKAGE)
+        if name != PROBE_MODULE
         for node in ast.walk(tree(name))
         if isinstance(node, (ast.Call, ast.Compare)) and asks_for_a_kind(node)
     ]
     assert found == []
+    assert {"LinearProbe", "RadialProbe"} <= kinds_of_probes()
 
 
 def asks_for_a_kind(node: ast.Call | ast.Compare) -> bool:
@@ -98,17 +124,11 @@ def asks_for_a_kind(node: ast.Call | ast.Compare) -> bool:
 
 @cache
 def kinds_of_probes() -> set[str]:
-    """The classes of the probe package that define a `kind` of their own."""
+    """The classes of the probe module that define a `kind` of their own."""
     return {
         node.name
-        for name in modules()
-        if name.startswith(PROBE_PACKAGE)
-        for node in tree(name).body
+        for node in tree(PROBE_MODULE).body
         if isinstance(node, ast.ClassDef)
         for item in node.body
         if isinstance(item, ast.AnnAssign) and ast.unparse(item.target) == "kind" and item.value
     }
-
-
-def test_the_kinds_of_probes_are_found() -> None:
-    assert {"LinearProbe", "RadialProbe"} <= kinds_of_probes()

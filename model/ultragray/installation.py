@@ -23,7 +23,6 @@ MODULES_OF_EXTRAS = {
     ),
     "train": ("jinja2", "matplotlib"),
     "dicom": ("pydicom",),
-    "gym": ("gymnasium",),
     "hdf5": ("h5py",),
     "mcap": ("mcap", "mcap_ros2"),
     "ray": ("ray",),

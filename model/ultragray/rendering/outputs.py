@@ -119,7 +119,7 @@ def _register(name: str, meaning: str, **properties: Any) -> Output:
 
 
 def _labels(drawing: Drawing) -> Tensor:
-    from ultragray.rendering.labels import render_labels  # needs torch
+    from ultragray.rendering.derived import render_labels  # needs torch
 
     labels = render_labels(drawing.scene, drawing.shape, lambda part: drawing.plane_of(part, WEIGHT_SUM))
     drawing.mark_tools(labels)
@@ -134,7 +134,7 @@ def _attenuation(drawing: Drawing) -> Tensor:
 
 
 def _uncertainty(drawing: Drawing) -> Tensor:
-    from ultragray.rendering.confidence import deviations  # needs torch
+    from ultragray.rendering.derived import deviations  # needs torch
 
     planes = tuple(drawing.plane(name) for name in UNCERTAINTY.planes)
     return deviations(drawing.scene, planes, drawing.poses_mm, drawing.probe)

@@ -19,7 +19,7 @@ from ultragray.errors import InvalidArgument
 from ultragray.files import atomic_path, write_whole
 from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.backends.reference import MAX_WEIGHT, MIN_WEIGHT, intensity, inverse_root_covariance
-from ultragray.rendering.labels import MIN_WEIGHT_SUM
+from ultragray.rendering.derived import MIN_WEIGHT_SUM
 from ultragray.rendering.limits import UNLIMITED, Limits
 from ultragray.rendering.pixels import image_file
 from ultragray.rendering.volumes import SLICE_SUFFIXES, VOLUME_SUFFIXES, VolumeGrid, check_field

@@ -168,7 +168,7 @@ def _root_mean_square(values: FloatArray) -> FloatArray:  # [B, K, P] -> [B, P]
 #
 # σ² = Σ cₖ·vₖ, cₖ ≥ 0
 #
-# The terms vₖ are those of `ultragray.rendering.confidence`. Those that grow with the distance to the training views
+# The terms vₖ are those of `ultragray.rendering.derived`. Those that grow with the distance to the training views
 # are shares of V = spread + (level − B̄)²: the mean squared error of a pixel that shows B̄ where the true grey value
 # may be any of those that the training images have at that depth.
 

@@ -13,7 +13,7 @@ import torch
 
 from ultragray.errors import TrainingDiverged, UltragrayError
 from ultragray.installation import __version__
-from ultragray.learn.evaluation.methods import ComparisonSettings
+from ultragray.learn.evaluation.methods import BudgetKind, ComparisonSettings
 from ultragray.learn.evaluation.scoring import evaluate_frames, require_frames
 from ultragray.learn.sweep import Dataset, Sweep, spread_places
 from ultragray.learn.training.memory import machine_in_words, training_device
@@ -22,7 +22,6 @@ from ultragray_studies.comparison.result import Comparison, DatasetFacts, Distan
 from ultragray_studies.methods.gaussians import SceneMethod
 from ultragray_studies.methods.method import (
     Budget,
-    BudgetKind,
     FitProgress,
     FitRun,
     Fitted,

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+from ultragray.learn.evaluation.methods import BudgetKind
 from ultragray.learn.report.tables import METRICS, Row, by_mean_rank, metric_rows, rank
 from ultragray_studies.comparison.result import Comparison, MethodResult
-from ultragray_studies.methods.method import BudgetKind
 
 COST_HEADINGS = ("steps", "training", "ms a frame", "MB")
 

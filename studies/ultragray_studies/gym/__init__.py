@@ -8,14 +8,15 @@ env = gymnasium.make("ultragray/StandardPlane-v0", scene="scene.ugr")
 
 from __future__ import annotations
 
-from ultragray.installation import missing_extra
-from ultragray_studies.gym.standard_plane import StandardPlaneEnv, StandardPlaneSettings
+from ultragray.errors import ExtraMissing
 
 try:
     import gymnasium
-except ImportError as error:
-    raise missing_extra(error, "ultragray_studies.gym") from None
+except ImportError:
+    advice = "pip install 'ultragray-studies[gym]'"
+    raise ExtraMissing(f"ultragray_studies.gym needs gymnasium, which is not installed: {advice}") from None
 
+from ultragray_studies.gym.standard_plane import StandardPlaneEnv, StandardPlaneSettings
 
 __all__ = ["STANDARD_PLANE", "StandardPlaneEnv", "StandardPlaneSettings"]
 

@@ -11,6 +11,7 @@ import torch
 
 from ultragray.files import write_whole
 from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.learn.evaluation.methods import BudgetKind
 from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import Progress, TrainingConfig, train
 from ultragray.learn.training.checkpointing import read_checkpoint_header
@@ -20,7 +21,6 @@ from ultragray.rendering.frames import render
 from ultragray.scene.gaussians import GaussianScene
 from ultragray_studies.methods.method import (
     Budget,
-    BudgetKind,
     Cost,
     Description,
     FitProgress,

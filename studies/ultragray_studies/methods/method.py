@@ -7,7 +7,6 @@ import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import astuple, dataclass, field, replace
-from enum import Enum
 from pathlib import Path
 from typing import Any
 
@@ -17,16 +16,10 @@ import numpy.typing as npt
 from ultragray.errors import InvalidArgument
 from ultragray.files import write_whole
 from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.learn.evaluation.methods import BudgetKind
 from ultragray.learn.sweep import Dataset
 
 USED_SHARE = 0.8  # of an equal time: a fit that took less was promised too few steps
-
-
-class BudgetKind(str, Enum):
-    """The closed set of budgets."""
-
-    EQUAL = "equal"
-    AUTHOR = "author"
 
 
 @dataclass(frozen=True)

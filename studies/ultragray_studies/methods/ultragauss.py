@@ -12,6 +12,7 @@ from torch import Tensor, nn
 
 from ultragray.errors import DatasetInvalid
 from ultragray.geometry.probe import FloatArray, ParallelLines, Probe
+from ultragray.learn.evaluation.methods import BudgetKind
 from ultragray.learn.sweep import Dataset
 from ultragray.learn.training.config import TrainingConfig
 from ultragray.learn.training.geometry import Geometry
@@ -22,7 +23,7 @@ from ultragray.rendering.backends.registry import WeightedSums, weighted_sums
 from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.info import SceneInfo
 from ultragray_studies.methods.learner import LearnedMethod, Learner
-from ultragray_studies.methods.method import Budget, BudgetKind, Description
+from ultragray_studies.methods.method import Budget, Description
 from ultragray_studies.methods.parts import Box, frame_of_step
 
 

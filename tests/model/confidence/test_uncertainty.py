@@ -14,7 +14,7 @@ import torch
 from ultragray import GaussianScene, LinearProbe, SceneInfo, render
 from ultragray.errors import InvalidArgument, UnknownOutput
 from ultragray.geometry.probe import FloatArray
-from ultragray.rendering.confidence import CELLS, variance_terms
+from ultragray.rendering.derived import CELLS, variance_terms
 from ultragray.scene.confidence import DEPTHS, VARIANCE_TERMS, ConfidenceModel, DepthBands, Uncertainty
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)

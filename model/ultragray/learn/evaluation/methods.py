@@ -6,10 +6,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from enum import Enum
 
 from ultragray.contract import Contract, described
 from ultragray.errors import InvalidArgument
-from ultragray_studies.methods.method import BudgetKind
+
+
+class BudgetKind(str, Enum):
+    """The closed set of budgets."""
+
+    EQUAL = "equal"
+    AUTHOR = "author"
+
 
 ALL = "all"
 NAMES = (

@@ -22,8 +22,8 @@ from ultragray.learn.evaluation.metrics import frame_metrics
 from ultragray.learn.evaluation.scoring import evaluate, evaluate_frames, frames_at_once, render_sweep
 from ultragray.learn.sweep import ByteArray, Dataset, IntArray, Sweep, spread_places
 from ultragray.learn.training.config import TrainingConfig
-from ultragray.rendering.confidence import CELLS, in_cells, variance_terms, view_distances
-from ultragray.rendering.confidence import POINTS_PER_SIDE as DEVIATION_POINTS
+from ultragray.rendering.derived import CELLS, in_cells, variance_terms, view_distances
+from ultragray.rendering.derived import POINTS_PER_SIDE as DEVIATION_POINTS
 from ultragray.rendering.frames import render
 from ultragray.scene.confidence import (
     DEPTHS,

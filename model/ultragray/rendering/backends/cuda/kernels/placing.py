@@ -1,6 +1,27 @@
 """The last step of the backward pass: from slices to the raw parameters of their Gaussians, over all poses.
 
 One program owns BLOCK Gaussians and adds up what each pose says of them, pose after pose.
+
+What is derived. `gathering` leaves the gradient of the loss L by each slice, the 2D Gaussian that a Gaussian leaves in
+the image plane: by its mean and covariance along and across the slice's own scan line, by m², by the determinant of its
+covariance, by intensity and absorption. Here this becomes the gradient by the raw parameters (docs/physics.md §2). All
+is in the axes of the probe (x lateral, y elevation, z axial; sheared for steered lines) about its origin, in cm, until
+`towards_scene` turns vectors into the scene's axes. on_x stands for ∂L/∂x, and so on.
+
+The equations, forwards (`slicing`; §3). μ is the mean, and Σ = a aᵀ + b bᵀ + c cᵀ, where the spokes a, b, c are the
+columns of the rotation R, each times its standard deviation s_k. A beam adds its variance to Σ_yy at first, and
+ln(1 + variance·eᵀΣ⁻¹e) to m² (`spread_along_elevation`). The plane y = 0 then cuts out, with the tilts t_x = Σ_xy/Σ_yy
+and t_z = Σ_yz/Σ_yy and the rise r = μ_y/Σ_yy,
+
+    mean (μ_x − t_x·μ_y, μ_z − t_z·μ_y)      m² = r·μ_y
+    covariance (Σ_xx − t_x·Σ_xy, Σ_xz − t_x·Σ_yz, Σ_zz − t_z·Σ_yz)
+
+Backwards, in the order of the code: turn the gradient from the axes of a fan's scan line into the probe's; add to the
+covariance's what the determinant says; undo the cut (the six entries of Σ and the three of μ); undo the beam, whose
+variance depends on the depth of μ, and whose moments are those that `Moments` of `backends.inputs` takes; from Σ to the
+spokes (∂L/∂a = (G + Gᵀ)·a), from these to log s_k (a·∂L/∂a) and R, and on to the unit quaternion, less the part along
+it; to μ and, by way of the direction of view, to the harmonics; and last to a shift and a turn of the whole view, which
+move all Gaussians the other way (§4).
 """
 
 import triton
@@ -97,7 +118,8 @@ def place_gradients(
             on_t, on_r = tl.load(g, cut, 0.0).to(tl.float64), tl.load(g + 1, cut, 0.0).to(tl.float64)
             on_tt, on_tr = tl.load(g + 2, cut, 0.0).to(tl.float64), tl.load(g + 3, cut, 0.0).to(tl.float64)
             on_rr, on_m2 = tl.load(g + 4, cut, 0.0).to(tl.float64), tl.load(g + 5, cut, 0.0).to(tl.float64)
-            if FANNED:  # from the axes of the slice's scan line to those of the probe
+            # The gradient by the slice, turned from the axes of its scan line to those of the probe.
+            if FANNED:
                 start, pitch = tl.load(view + 15), tl.load(view + 16) / width
                 column = tl.load(rectangles + slot * RECTANGLE + 4, cut, 0)
                 theta = start + (column.to(tl.float64) + 0.5) * pitch
@@ -119,7 +141,7 @@ def place_gradients(
             if THICK:
                 depth_offset, variance, precision, ratio = spread_along_elevation(view, mean, a, b, c, s, FANNED)
                 yy += variance
-            # The conditioning on the plane, backwards.
+            # The cut by the plane, backwards, after what the determinant of the slice's covariance says.
             inverse = 1.0 / yy
             rise, tilt_x, tilt_z = mean[1] * inverse, xy * inverse, yz * inverse
             on_det = tl.load(g + 8, cut, 0.0).to(tl.float64)
@@ -132,6 +154,7 @@ def place_gradients(
             on_yy = tilt_x * tilt_x * on_xx + tilt_x * tilt_z * on_xz + tilt_z * tilt_z * on_zz
             on_yy += rise * (tilt_x * on_x + tilt_z * on_z) - rise * rise * on_m2
 
+            # The beam, backwards: m² and Σ_yy hold its variance, which depends on the depth of the mean.
             on_px, on_pz = on_x, on_z
             if THICK:
                 on_variance = tl.where(cut, on_yy + on_m2 * precision / ratio, 0.0)
@@ -146,6 +169,7 @@ def place_gradients(
                 else:
                     on_pz += on_depth
 
+            # From Σ to the spokes, and from these to the logs of the standard deviations.
             ga = spoke_gradient(a, on_xx, on_xy, on_xz, on_yy, on_yz, on_zz)
             gb = spoke_gradient(b, on_xx, on_xy, on_xz, on_yy, on_yz, on_zz)
             gc = spoke_gradient(c, on_xx, on_xy, on_xz, on_yy, on_yz, on_zz)
@@ -164,7 +188,7 @@ def place_gradients(
             sum_s1 += tl.where(cut, gb[0] * b[0] + gb[1] * b[1] + gb[2] * b[2], 0.0).to(tl.float32)
             sum_s2 += tl.where(cut, gc[0] * c[0] + gc[1] * c[1] + gc[2] * c[2], 0.0).to(tl.float32)
 
-            # By the entries of the rotation: the first index is the scene's axis, the second the Gaussian's own.
+            # From the spokes to the rotation, and its quaternion. Of r01: the scene's axis, and the Gaussian's own.
             r00 = s[0] * towards_scene(view, ga[0], ga[1], ga[2], 0)
             r10 = s[0] * towards_scene(view, ga[0], ga[1], ga[2], 1)
             r20 = s[0] * towards_scene(view, ga[0], ga[1], ga[2], 2)
@@ -185,6 +209,7 @@ def place_gradients(
             sum_qy += tl.where(cut, (gy - y * radial) / norm, 0.0).to(tl.float32)
             sum_qz += tl.where(cut, (gz - z * radial) / norm, 0.0).to(tl.float32)
 
+            # The intensity, by the direction of view; then the mean, the absorption, and the view as a whole.
             vx, vy, vz = offset[0].to(tl.float32), offset[1].to(tl.float32), offset[2].to(tl.float32)
             on_intensity = tl.load(g + 6, cut, 0.0)
             hx, hy, hz, on_sh = harmonics_gradient(

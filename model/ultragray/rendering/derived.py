@@ -1,0 +1,143 @@
+"""Outputs that follow from more than one plane at a pixel: labels, and the expected error of B-mode.
+
+`ultragray.rendering.outputs` says what they are and which planes they take; here is how, in torch.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.nn import functional
+
+from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.scene.confidence import DepthBands, TrainingViews, read_model
+from ultragray.scene.gaussians import GaussianScene
+
+MIN_WEIGHT_SUM = 1.0 / 255.0  # a label with less is not seen
+
+WeightSum = Callable[[GaussianScene], Tensor]  # S of each pixel of a scene, [C, H, W]
+
+
+def render_labels(scene: GaussianScene, shape: tuple[int, int, int], weight_sum: WeightSum) -> Tensor:
+    """argmax over l of S_l, the sum of w over the Gaussians of label l, [C, H, W] uint8; 0 where no S_l reaches 1/255.
+
+    Gaussians without a label are those of label 0. Of labels that weigh the same, the smallest is taken.
+    """
+    found = torch.zeros(shape, dtype=torch.uint8, device=scene.means.device)
+    heaviest = scene.means.new_zeros(shape)
+    with torch.no_grad():
+        for label, part in scene.prepared("labels", lambda: _parts(scene)):
+            _keep_heavier(found, heaviest, label, weight_sum(part))
+    return found
+
+
+def _keep_heavier(found: Tensor, heaviest: Tensor, label: int, weight: Tensor) -> None:  # [C, H, W] each
+    """Puts a label where it weighs more than those before it, and what it weighs there."""
+    if found.is_cuda:
+        heavier = (weight > heaviest) & (weight >= MIN_WEIGHT_SUM)
+        found.masked_fill_(heavier, label)
+        heaviest.copy_(torch.where(heavier, weight, heaviest))
+    else:  # by numpy: on a busy machine the threads of torch wait for each other longer than a frame takes
+        most, own = heaviest.numpy(), weight.numpy()
+        more = (own > most) & (own >= MIN_WEIGHT_SUM)
+        np.copyto(found.numpy(), np.uint8(label), where=more)
+        np.copyto(most, own, where=more)
+
+
+def _parts(scene: GaussianScene) -> list[tuple[int, GaussianScene]]:
+    """The Gaussians of each label that occurs, as scenes of their own; their intensities do not matter."""
+    if scene.labels is None:
+        return []
+    parts = []
+    for label in torch.unique(scene.labels).tolist():
+        chosen = scene.labels == label
+        splats: dict[str, Any] = {name: raw.detach()[chosen] for name, raw in scene.splats.items() if name != "shN"}
+        splats["shN"] = splats["sh0"][:, :0]
+        info = replace(scene.info, sh_degree=0, gaussian_count=len(splats["means"]), label_names={})
+        parts.append((label, GaussianScene(**splats, info=info)))
+    return parts
+
+
+# The expected standard deviation of a pixel's error, from the planes rendered around it and the distances of views.
+#
+# All terms are computed in CELLS² cells of the image, over which B̄, γ and T are means, and then interpolated. i and
+# d are `interpolation_mm` and `distance_mm` of `ViewMeasures`, on a grid of POINTS_PER_SIDE² points, interpolated
+# too, and reach(x, r) = 1 − exp(−x/r). The terms vₖ:
+#
+#     floor      0.001                 level      B̄/10           level²   B̄²       texture   mean of B² less B̄²
+#     gap r      reach(i, r)·V         beyond     reach(d, 5 mm)·V
+#     thin       (1 − γ)·V             shadow     (1 − T)·B̄/10
+
+
+CELLS = 32  # a side; no more than pixels
+POINTS_PER_SIDE = 12
+GAPS_MM = (0.3, 1.0, 3.0)
+BEYOND_MM = 5.0
+
+
+def deviations(
+    scene: GaussianScene,
+    planes: tuple[Tensor, ...],  # bmode, coverage, transmittance, each [C, H, W]
+    poses: FloatArray,  # [C, 4, 4] mm
+    probe: Probe,
+) -> Tensor:  # [C, H, W]
+    """The output `uncertainty` of frames of a scene that has its model."""
+    model = read_model(scene.info.confidence, len(scene.training_poses))
+    assert model is not None
+    assert model.uncertainty is not None
+    views = TrainingViews(scene.training_poses, scene.info.probe_or(None))
+    terms = variance_terms(planes, view_distances(views, poses, probe), model.uncertainty.bands)
+    weighted = [weight * term for weight, term in zip(model.uncertainty.variances, terms, strict=True)]
+    deviation = torch.stack(weighted).sum(dim=0).clamp(0.0, 1.0).sqrt()
+    return _interpolated(deviation, planes[0].shape[1:])
+
+
+def view_distances(
+    views: TrainingViews, poses: FloatArray, probe: Probe
+) -> tuple[FloatArray, FloatArray]:  # [C, 4, 4] mm -> two of [C, POINTS_PER_SIDE, POINTS_PER_SIDE]
+    """Interpolation distance and distance to the views, mm, on a grid over each image."""
+    measures = views.measure(poses, probe, POINTS_PER_SIDE)
+    grid = (len(poses), POINTS_PER_SIDE, POINTS_PER_SIDE)
+    return measures.interpolation_mm.reshape(grid), measures.distance_mm.reshape(grid)
+
+
+def variance_terms(
+    planes: tuple[Tensor, ...],  # bmode, coverage, transmittance, each [C, H, W]
+    distances_mm: tuple[FloatArray, FloatArray],  # of `view_distances`
+    bands: DepthBands,  # of the training images
+) -> Iterator[Tensor]:  # each [C, h, w]
+    """The vₖ in each cell, in the order of `uncertainty.TERMS`."""
+    mean, coverage, transmittance = map(in_cells, planes)
+    cells = mean.shape[1:]
+    interpolation, distance = (
+        _interpolated(torch.as_tensor(values, dtype=mean.dtype, device=mean.device), cells) for values in distances_mm
+    )
+    level, spread = (
+        _interpolated(torch.tensor(values, dtype=mean.dtype, device=mean.device)[None, :, None], (cells[0], 1))
+        for values in (bands.level, bands.spread)
+    )
+    unknown = spread + (level - mean).square()
+    yield torch.full_like(mean, 1e-3)
+    yield 0.1 * mean
+    yield mean.square()
+    yield (in_cells(planes[0].square()) - mean.square()).clamp_min(0.0)
+    for reach in GAPS_MM:
+        yield -torch.expm1(-interpolation / reach) * unknown
+    yield -torch.expm1(-distance / BEYOND_MM) * unknown
+    yield (1.0 - coverage) * unknown
+    yield 0.1 * (1.0 - transmittance) * mean
+
+
+def in_cells(frames: Tensor) -> Tensor:  # [C, H, W] -> [C, h, w]
+    """Means over the cells."""
+    height, width = frames.shape[1:]
+    return functional.adaptive_avg_pool2d(frames, (min(CELLS, height), min(CELLS, width)))
+
+
+def _interpolated(maps: Tensor, size: Sequence[int]) -> Tensor:  # [C, h, w] -> [C, *size]
+    return functional.interpolate(maps[:, None], tuple(size), mode="bilinear", align_corners=False)[:, 0]
