@@ -11,7 +11,7 @@ from ultragray.errors import TrainingDiverged
 from ultragray_studies.comparison.page import write_comparison
 from ultragray_studies.comparison.run import ComparisonProgress, compare
 from ultragray_workers.jobs.kinds.compare import CompareJob
-from ultragray_workers.jobs.record import Outcome, Progress
+from ultragray_workers.jobs.progress import Outcome, Progress
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 
 _LINES = 10  # of the log in a fit

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from ultragray.files import remove_stale_temporaries, sync, write_whole
-from ultragray_workers.jobs.record import Outcome, Progress
+from ultragray_workers.jobs.progress import Outcome, Progress
 from ultragray_workers.storage.copies import DEFAULT_MAX_BYTES
 
 WORK = "work"  # of the artifact folder

@@ -22,7 +22,7 @@ PLUGINS = "ultragray.job_kinds"  # entry points: the work of kinds that other di
 
 if TYPE_CHECKING:
     from ultragray.geometry.registration import Registration
-    from ultragray_workers.jobs.record import Outcome
+    from ultragray_workers.jobs.progress import Outcome
     from ultragray_workers.jobs.worker.job_run import JobRun
 
 

@@ -25,7 +25,7 @@ from ultragray.learn.sweep import Sweep
 from ultragray.learn.training.memory import training_device
 from ultragray.scene.gaussians import GaussianScene
 from ultragray_workers.jobs.kinds.evaluate import EvaluateJob
-from ultragray_workers.jobs.record import Outcome, Progress
+from ultragray_workers.jobs.progress import Outcome, Progress
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 from ultragray_workers.scene_names import SUFFIX
 

@@ -18,7 +18,7 @@ from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.info import SceneHeader, read_header
 from ultragray_workers.jobs.kinds import shards_run
 from ultragray_workers.jobs.kinds.render import RenderJob
-from ultragray_workers.jobs.record import Outcome, Progress
+from ultragray_workers.jobs.progress import Outcome, Progress
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 from ultragray_workers.scene_names import SUFFIX
 

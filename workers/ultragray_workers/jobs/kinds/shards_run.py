@@ -21,7 +21,7 @@ from ultragray_workers.batches.place import ShardPlace
 from ultragray_workers.errors import StorageUnavailable
 from ultragray_workers.jobs.files import batch_prefix
 from ultragray_workers.jobs.kinds.render import RenderJob
-from ultragray_workers.jobs.record import Outcome, Progress
+from ultragray_workers.jobs.progress import Outcome, Progress
 from ultragray_workers.jobs.shards.channel import BatchFailed, ShardQueue
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 from ultragray_workers.scene_names import SUFFIX

@@ -32,7 +32,7 @@ from ultragray.learn.training.trainer import CHECKPOINT_FILE, JOURNAL_FILE, VALI
 from ultragray.scene.gaussians import GaussianScene
 from ultragray_workers.jobs.files import BASELINES_NAME
 from ultragray_workers.jobs.kinds.train import TrainJob
-from ultragray_workers.jobs.record import Outcome, Progress
+from ultragray_workers.jobs.progress import Outcome, Progress
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 from ultragray_workers.scene_names import SUFFIX
 

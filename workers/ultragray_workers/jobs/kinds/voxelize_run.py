@@ -10,7 +10,7 @@ from ultragray.files import file_sha256
 from ultragray.rendering.volume_fields import volume_facts, write_volume
 from ultragray.scene.gaussians import GaussianScene
 from ultragray_workers.jobs.kinds.voxelize import VoxelizeJob
-from ultragray_workers.jobs.record import Outcome, Progress
+from ultragray_workers.jobs.progress import Outcome, Progress
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 from ultragray_workers.scene_names import SUFFIX
 

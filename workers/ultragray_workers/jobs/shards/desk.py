@@ -12,7 +12,8 @@ import sqlalchemy as sa
 
 from ultragray_workers.errors import DatabaseUnavailable, StorageFull
 from ultragray_workers.jobs import queue
-from ultragray_workers.jobs.record import Outcome, Row
+from ultragray_workers.jobs.progress import Outcome
+from ultragray_workers.jobs.record import Row
 from ultragray_workers.jobs.shards import table
 from ultragray_workers.jobs.shards.channel import channel
 from ultragray_workers.jobs.shards.table import Failed

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 from ultragray_workers.datasets.store import open_datasets
 from ultragray_workers.errors import StorageUnavailable
 from ultragray_workers.jobs.folder import JobFolder, Request
-from ultragray_workers.jobs.record import Progress
+from ultragray_workers.jobs.progress import Progress
 from ultragray_workers.jobs.shards.channel import Channel
 
 if TYPE_CHECKING:

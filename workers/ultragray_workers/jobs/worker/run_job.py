@@ -23,7 +23,7 @@ from pathlib import Path
 from ultragray.errors import InvalidArgument, MemoryExceeded, UltragrayError
 from ultragray_workers.claims import is_no_room, storage_full
 from ultragray_workers.jobs.folder import JobFolder
-from ultragray_workers.jobs.record import Outcome
+from ultragray_workers.jobs.progress import Outcome
 from ultragray_workers.jobs.shards.channel import Channel
 from ultragray_workers.jobs.specification import from_dict
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped

@@ -33,7 +33,8 @@ from ultragray_workers.jobs import queue
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.demand import demand_of_key
 from ultragray_workers.jobs.folder import JobFolder, Request
-from ultragray_workers.jobs.record import Files, Outcome, Row
+from ultragray_workers.jobs.progress import Outcome
+from ultragray_workers.jobs.record import Files, Row
 from ultragray_workers.jobs.shards.desk import BatchOver, ShardDesk
 from ultragray_workers.jobs.specification import has_checkpoints, is_in_shards
 from ultragray_workers.jobs.worker.device import DeviceLock
