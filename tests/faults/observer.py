@@ -15,7 +15,9 @@ import httpx
 import numpy as np
 
 from ultragray.scene.gaussians import GaussianScene
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.storage.local import FileVersion
 
 from ..workers.jobs.conftest import path_of

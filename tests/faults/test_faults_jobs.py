@@ -28,7 +28,9 @@ from ultragray.datasets.source import load_dataset
 from ultragray.learn.training import TrainingConfig, train
 from ultragray.phantom.demo import copy_demo_scene
 from ultragray_proto.v1 import jobs_pb2, jobs_pb2_grpc
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
 
 from ..workers.jobs.conftest import files_of, store_dataset
 from .machine import Machine

@@ -38,7 +38,8 @@ from ultragray_workers.claims import claimed_folder, remove_abandoned, remove_wh
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import ArtifactNotFound, DatasetNotFound, Draining
 from ultragray_workers.helpers import PROGRESS_NAME, read_picture
-from ultragray_workers.jobs.store import Job, JobStore
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.scenes import SceneStore
 from ultragray_workers.views import FRAMES_NAME, POSES_NAME, PREVIEW_PICTURES, compare, draw_preview, lay_out
 

@@ -12,8 +12,8 @@ from ultragray_service.core.jobs import hub as job_hub
 from ultragray_service.core.jobs.hub import JobChange, JobHub, JobWatch
 from ultragray_service.core.jobs.log import TAIL_BYTES, GrowingLog
 from ultragray_workers.errors import JobNotFound
-from ultragray_workers.jobs.progress import Progress
-from ultragray_workers.jobs.record import Job, JobState
+from ultragray_workers.jobs.progress import JobState, Progress
+from ultragray_workers.jobs.record import Job
 
 INTERVAL_S = 0.02
 WAIT_S = 60.0

@@ -21,8 +21,9 @@ from ultragray_workers.errors import BackupInvalid, RestoreRefused
 from ultragray_workers.jobs import queue
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.kinds import RenderJob
-from ultragray_workers.jobs.record import Files, StoredFile
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Files, Job, StoredFile
+from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.tables import JOBS
 from ultragray_workers.scenes import SceneStore
 from ultragray_workers.storage.local import LocalStorage

@@ -27,7 +27,9 @@ from ultragray_workers.jobs.database import SQLITE_FILE, JobDatabase
 from ultragray_workers.jobs.files import Artifact
 from ultragray_workers.jobs.folder import Request
 from ultragray_workers.jobs.kinds import TrainJob
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
 
 from ...waiting import Deadline
 

@@ -10,7 +10,9 @@ import pytest
 from ultragray_workers.errors import ArtifactFolderUnavailable, StartupFailed, StorageUnavailable
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.identity import KEY as FILE
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.storage.local import LocalStorage
 
 from ...postgres import PostgresServer

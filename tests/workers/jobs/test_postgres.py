@@ -20,7 +20,9 @@ from ultragray.learn.training import TrainingConfig, train
 from ultragray.scene.gaussians import GaussianScene
 from ultragray_workers.errors import DatabaseUnavailable, StartupFailed
 from ultragray_workers.jobs.database import JobDatabase, checked_url
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
 
 from ...postgres import PASSWORD, PostgresServer
 from ...waiting import Deadline, at_this_load

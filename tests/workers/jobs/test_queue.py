@@ -16,8 +16,8 @@ from ultragray_workers.errors import StartupFailed
 from ultragray_workers.jobs import queue, tables, workers
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.demand import Demand
-from ultragray_workers.jobs.progress import Outcome, Progress
-from ultragray_workers.jobs.record import Files, JobState, Piece, Row, StoredFile
+from ultragray_workers.jobs.progress import JobState, Outcome, Progress
+from ultragray_workers.jobs.record import Files, Piece, Row, StoredFile
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.tables import SCHEMA_VERSION
 from ultragray_workers.jobs.workers import Heartbeat

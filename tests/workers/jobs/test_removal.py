@@ -16,7 +16,9 @@ from ultragray_workers.errors import DatasetInUse, DatasetNotFound, JobInUse, Jo
 from ultragray_workers.jobs import queue
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.folder import WORK
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.tables import JOBS
 from ultragray_workers.jobs.worker import housekeeping
 from ultragray_workers.jobs.worker.housekeeping import DAY_S, Housekeeper

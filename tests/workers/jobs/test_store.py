@@ -27,7 +27,8 @@ from ultragray_workers.errors import (
 )
 from ultragray_workers.jobs.database import checked_url
 from ultragray_workers.jobs.kinds import RenderJob
-from ultragray_workers.jobs.store import JobState, JobStore
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.scenes import SceneStore
 
 from ...postgres import NewDatabase

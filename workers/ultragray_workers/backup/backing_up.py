@@ -25,7 +25,7 @@ from ultragray_workers.backup.database_copy import Database
 from ultragray_workers.backup.manifest import FileEntry, Manifest
 from ultragray_workers.backup.objects import Objects
 from ultragray_workers.errors import BackupInvalid, RestoreRefused
-from ultragray_workers.jobs.record import JobState
+from ultragray_workers.jobs.progress import JobState
 
 _SETTLE_S = 5.0  # a job that is just being deleted has lost its folder, and soon its row
 _SETTLE_POLL_S = 0.1

@@ -23,7 +23,7 @@ from ultragray_workers.backup.objects import Objects
 from ultragray_workers.errors import BackupInvalid, RestoreRefused
 from ultragray_workers.jobs import queue, tables
 from ultragray_workers.jobs.database import checked_url
-from ultragray_workers.jobs.record import JobState
+from ultragray_workers.jobs.progress import JobState
 from ultragray_workers.jobs.tables import JOBS, SCHEMA, SCHEMA_VERSION, TABLES, WORKERS
 
 _SQLITE_WAIT_S = 60.0

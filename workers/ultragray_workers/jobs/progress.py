@@ -1,15 +1,31 @@
-"""How far a job is, and how its work ended: what its process says, and its row keeps. Free of torch."""
+"""The state of a job, how far it is, and how its work ended: what its process says, and its row keeps. Free of torch."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field, fields
+from enum import Enum
 from typing import Any, ClassVar
 
 from ultragray.contract import described
 
 PHASES = ("baselines", "effort", "training", "evaluation", "confidence", "report")
+
+
+class JobState(str, Enum):
+    """The state of a job in its life."""
+
+    QUEUED = "queued"
+    RUNNING = "running"
+    SUCCEEDED = "succeeded"
+    FAILED = "failed"
+    CANCELLED = "cancelled"
+
+    @property
+    def is_final(self) -> bool:
+        """Whether the job neither waits nor runs."""
+        return self not in (JobState.QUEUED, JobState.RUNNING)
 
 
 @dataclass(frozen=True)

@@ -27,8 +27,8 @@ from sqlalchemy.exc import IntegrityError
 from ultragray.errors import InvalidArgument
 from ultragray_workers.jobs.demand import Demand, demand_of_key
 from ultragray_workers.jobs.owners import Kind, Ownership, claim_of_job, forget_owner
-from ultragray_workers.jobs.progress import Outcome, Progress
-from ultragray_workers.jobs.record import COLUMNS, Files, JobState, Row
+from ultragray_workers.jobs.progress import JobState, Outcome, Progress
+from ultragray_workers.jobs.record import COLUMNS, Files, Row
 from ultragray_workers.jobs.tables import JOBS, SHARDS, USAGE, WORKERS
 
 SHARE = "share"  # the kind of a share of a batch

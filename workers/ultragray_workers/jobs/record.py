@@ -10,7 +10,6 @@ import json
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, field, fields, replace
 from datetime import datetime, timezone
-from enum import Enum
 from typing import Any
 
 import sqlalchemy as sa
@@ -19,25 +18,10 @@ from ultragray.contract import described
 from ultragray_workers.jobs.demand import LivingWorker, demand_of_key, waits_for
 from ultragray_workers.jobs.kinds import KINDS
 from ultragray_workers.jobs.owners import Ownership
-from ultragray_workers.jobs.progress import Outcome, Progress
+from ultragray_workers.jobs.progress import JobState, Outcome, Progress
 from ultragray_workers.jobs.tables import JOBS
 
 MAX_PRIORITY = 1000
-
-
-class JobState(str, Enum):
-    """The state of a job in its life."""
-
-    QUEUED = "queued"
-    RUNNING = "running"
-    SUCCEEDED = "succeeded"
-    FAILED = "failed"
-    CANCELLED = "cancelled"
-
-    @property
-    def is_final(self) -> bool:
-        """Whether the job neither waits nor runs."""
-        return self not in (JobState.QUEUED, JobState.RUNNING)
 
 
 @dataclass(frozen=True)

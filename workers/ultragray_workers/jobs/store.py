@@ -54,7 +54,8 @@ from ultragray_workers.jobs.owners import (
     forget_owner,
     read_owner,
 )
-from ultragray_workers.jobs.record import MAX_PRIORITY, Job, JobState, Row, job_of
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import MAX_PRIORITY, Job, Row, job_of
 from ultragray_workers.jobs.requirements import Requirements
 from ultragray_workers.jobs.specification import from_dict, in_short, to_dict, value_in
 from ultragray_workers.jobs.workers import Wanted, Worker, WorkerState

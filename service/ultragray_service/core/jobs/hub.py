@@ -11,7 +11,7 @@ from functools import partial
 from ultragray_service.core.jobs.log import GrowingLog
 from ultragray_workers.errors import DatabaseUnavailable, StorageUnavailable
 from ultragray_workers.jobs.files import Log
-from ultragray_workers.jobs.store import Job
+from ultragray_workers.jobs.record import Job
 
 READ_INTERVAL_S = 0.5
 

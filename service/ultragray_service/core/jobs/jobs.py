@@ -33,7 +33,9 @@ from ultragray_workers.errors import (
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.files import JobFiles
 from ultragray_workers.jobs.kinds import Specification
-from ultragray_workers.jobs.store import Admit, Job, JobsOverview, JobState, JobStore
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import Admit, JobsOverview, JobStore
 from ultragray_workers.jobs.workers import Worker
 from ultragray_workers.rounds import Rounds
 from ultragray_workers.scenes import SceneStore

@@ -30,7 +30,8 @@ from ultragray_service.http.dependencies import JOB_EXAMPLES, ServiceDep, proble
 from ultragray_service.views.prepared import TrainingCurve
 from ultragray_workers.jobs.files import Artifact
 from ultragray_workers.jobs.kinds import KINDS, Specification
-from ultragray_workers.jobs.record import Job, JobState
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
 from ultragray_workers.jobs.specification import from_dict
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.workers import Wanted, Worker

@@ -22,9 +22,10 @@ from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import DatasetNotFound
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.kinds import CompareJob
-from ultragray_workers.jobs.progress import Outcome
+from ultragray_workers.jobs.progress import JobState, Outcome
+from ultragray_workers.jobs.record import Job
 from ultragray_workers.jobs.specification import from_dict, to_dict
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 
 from ..conftest import RunningWorker, request_of

@@ -19,8 +19,10 @@ from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import DatasetNotFound, SceneNotFound
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.kinds import EvaluateJob, evaluate_run
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
 from ultragray_workers.jobs.specification import from_dict, to_dict
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 from ultragray_workers.scenes import SceneStore
 

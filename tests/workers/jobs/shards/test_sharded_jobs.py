@@ -19,7 +19,9 @@ from ultragray.samplers import AroundSampler
 from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.info import read_header
 from ultragray_workers.jobs.kinds import RenderJob
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.tables import JOBS, SHARDS
 
 from ..conftest import RunningWorker, path_of, train_job

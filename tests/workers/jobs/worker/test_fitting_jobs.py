@@ -11,8 +11,10 @@ import pytest
 from ultragray.installation import memory_bytes
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.demand import Demand, WorkerDevice
+from ultragray_workers.jobs.progress import JobState
 from ultragray_workers.jobs.queue import demands_waiting
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.worker.device import DeviceLock, HostDevice
 from ultragray_workers.jobs.worker.gate import Gate
 

@@ -15,9 +15,9 @@ from ultragray_workers.jobs import queue
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.kinds import RenderJob
-from ultragray_workers.jobs.progress import Outcome, Progress
-from ultragray_workers.jobs.record import Row
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.progress import JobState, Outcome, Progress
+from ultragray_workers.jobs.record import Job, Row
+from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.worker import supervision
 from ultragray_workers.jobs.worker.device import DeviceLock, devices_of
 from ultragray_workers.jobs.worker.gate import Gate

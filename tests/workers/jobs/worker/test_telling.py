@@ -14,8 +14,8 @@ from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.files import CHECKPOINT_NAME, CONFIG_NAME, JOURNAL_NAME, JobFiles
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.progress import Outcome, Progress
-from ultragray_workers.jobs.record import Row
-from ultragray_workers.jobs.store import Job, JobStore
+from ultragray_workers.jobs.record import Job, Row
+from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.worker import telling
 from ultragray_workers.jobs.worker.telling import Telling
 from ultragray_workers.storage.local import LocalStorage

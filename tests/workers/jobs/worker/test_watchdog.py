@@ -15,7 +15,9 @@ from pathlib import Path
 import pytest
 
 from ultragray_workers.jobs import queue
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.worker import process as watchdog
 from ultragray_workers.jobs.worker.process import Watchdog, kill_group
 

@@ -21,7 +21,9 @@ from ultragray.scene.gaussians import GaussianScene
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import JobFinished, JobNotFinished, StartupFailed
 from ultragray_workers.jobs.kinds import RenderJob
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.worker.worker import claim_name
 
 from ....waiting import at_this_load

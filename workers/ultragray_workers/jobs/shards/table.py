@@ -8,7 +8,7 @@ from typing import Any
 
 import sqlalchemy as sa
 
-from ultragray_workers.jobs.record import JobState
+from ultragray_workers.jobs.progress import JobState
 from ultragray_workers.jobs.tables import JOBS, SHARDS
 
 MOST_TRIES = 20  # of one shard: after so many deaths of those who were at it, it is to blame
