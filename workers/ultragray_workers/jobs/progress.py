@@ -1,4 +1,4 @@
-"""The state of a job, how far it is, and how its work ended: what its process says, and its row keeps. Free of torch."""
+"""The state of a job, how far it is, and how its work ended: what its process says, and its row keeps."""
 
 from __future__ import annotations
 
