@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import io
-import json
 import os
 import signal
 import socket
@@ -252,24 +251,6 @@ def test_an_upload_needs_a_key(service: RunningService, files: dict[str, bytes])
         f"{service.http}/v1/datasets/a", content=zipped(files), headers={"Content-Type": ZIP}, timeout=60
     )
     assert_problem(answer, 401, "UNAUTHENTICATED")
-
-
-def test_pages_join_to_the_whole_list(http: httpx.Client, artifacts: Path, files: dict[str, bytes]) -> None:
-    names = ["a", "b", "c"]
-    put(http, "a", zipped(files))
-    manifest = json.loads((artifacts / "datasets" / "a.json").read_text())
-    for name in names[1:]:
-        (artifacts / "datasets" / f"{name}.json").write_text(json.dumps({**manifest, "name": name}))
-    found, token = [], ""
-    while True:
-        page = http.get("/v1/datasets", params={"page_size": 2, "page_token": token}).json()
-        found += [dataset["name"] for dataset in page["datasets"]]
-        if not (token := page["next_page_token"]):
-            break
-    assert found == names
-    assert_problem(http.get("/v1/datasets", params={"page_token": "*"}), 422, "INVALID_ARGUMENT")
-    for name in names:
-        assert http.delete(f"/v1/datasets/{name}").status_code == 204
 
 
 def test_an_upload_that_comes_to_a_halt(service: RunningService, artifacts: Path) -> None:

@@ -10,7 +10,7 @@ import httpx
 import pytest
 import sqlalchemy as sa
 
-from ultragray_proto.v1 import datasets_pb2, datasets_pb2_grpc, jobs_pb2, jobs_pb2_grpc
+from ultragray_proto.v1 import jobs_pb2, jobs_pb2_grpc
 from ultragray_workers.jobs.tables import USAGE
 
 from ...rpc.test_grpc_render import moved
@@ -106,15 +106,3 @@ def test_a_key_keeps_only_so_many_registrations(limited: Limited) -> None:
     assert limited.http("registrations", "DELETE", "/v1/registrations/one").status_code == 204
     assert put("registrations", "four").status_code == 200
     assert limited.refusals("registrations") == 1
-
-
-def test_uploads_over_grpc_count_likewise(limited: Limited, dataset_bytes: bytes) -> None:
-    stub = datasets_pb2_grpc.DatasetServiceStub(limited.channel)
-    message = datasets_pb2.UploadDatasetRequest
-    parts = [
-        message(header=datasets_pb2.UploadHeader(dataset="rpc", archive=True)),
-        message(chunk=dataset_bytes),
-    ]
-    with pytest.raises(grpc.RpcError) as caught:
-        stub.UploadDataset(iter(parts), metadata=limited.metadata("bytes"), timeout=60)
-    assert retry_after_s(caught.value, "LIMIT_REACHED") is None
