@@ -18,7 +18,7 @@ from ultragray.geometry.probe import FloatArray
 from ultragray_client import AroundSampler, Client, JobState, RenderJob, RenderSettings, errors
 from ultragray_service.access.keys import KeyStore
 from ultragray_service.access.principals import Role
-from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.database import JobDatabase
 
 from .conftest import RunningService, StartService
 

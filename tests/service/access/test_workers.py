@@ -10,8 +10,8 @@ import pytest
 import sqlalchemy as sa
 
 from ultragray_proto.v1 import workers_pb2, workers_pb2_grpc
-from ultragray_workers.jobs.queue.database import JobDatabase
-from ultragray_workers.jobs.queue.tables import WORKERS
+from ultragray_workers.jobs.database import JobDatabase
+from ultragray_workers.jobs.tables import WORKERS
 
 from ...waiting import wait_until
 from .conftest import Keyed
@@ -31,7 +31,7 @@ def let_work(database: JobDatabase, name: str, job: str | None) -> None:
     """A worker that goes on living, at work on a job, as its heartbeat would write it."""
     with database.engine.begin() as connection:
         facts = {"seen_at_s": time.time() + 3600.0, "host": "bench", "pid": 7, "device": "cpu", "version": "1"}
-        connection.execute(sa.insert(WORKERS).values(executor=name, job_id=job, **facts))
+        connection.execute(sa.insert(WORKERS).values(name=name, job=job, **facts))
 
 
 def told_http(keyed: Keyed, who: str) -> dict[str, tuple[str, str | None]]:

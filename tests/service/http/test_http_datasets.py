@@ -74,7 +74,7 @@ def tarred(files: dict[str, bytes]) -> bytes:
 
 
 def uploads_under_way(folder: Path) -> list[str]:
-    return [path.name for path in folder.glob("datasets/.*")]
+    return [path.name for path in folder.glob("uploads/.*")]
 
 
 def helper_process(service: RunningService, work: str) -> int | None:
@@ -299,7 +299,7 @@ def test_a_check_that_is_killed(http: httpx.Client, service: RunningService, fil
 def test_a_service_that_dies_or_stops_leaves_nothing(start_service: StartService, tmp_path: Path) -> None:
     first = start_service(artifact_folder=tmp_path, api_keys=KEY)
     upload = HalfUpload(first, "half")
-    wait_until(lambda: list(tmp_path.glob(f"datasets/.*/{LOCK_NAME}")))
+    wait_until(lambda: list(tmp_path.glob(f"uploads/.*/{LOCK_NAME}")))
     first.process.kill()
     first.process.wait()
     upload.close()

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from datetime import datetime, timezone
 from typing import Any
 
 import grpc
 import httpx
 import pytest
+import sqlalchemy as sa
 
 from ultragray_proto.v1 import jobs_pb2, jobs_pb2_grpc
-from ultragray_workers.jobs.queue import runs
+from ultragray_workers.jobs.tables import USAGE
 
 from ...rpc.test_grpc_render import moved
 from ..conftest import MATRIX
@@ -25,6 +27,13 @@ def submit(limited: Limited, who: str, **more: Any) -> httpx.Response:
 
 def is_limit(answer: httpx.Response, name: str) -> bool:
     return (answer.status_code, answer.json()["reason"]) == (429, "LIMIT_REACHED") and name in answer.json()["detail"]
+
+
+def ran(limited: Limited, device: str) -> None:
+    """Half a minute on a device, of a job that has been deleted."""
+    with limited.database.engine.begin() as connection:
+        values = {"owner": "minutes", "device": device, "day": datetime.now(timezone.utc).date(), "run_s": 30.0}
+        connection.execute(sa.insert(USAGE).values(values))
 
 
 def test_only_so_many_jobs_of_a_key_wait_or_run(limited: Limited) -> None:
@@ -58,9 +67,9 @@ def test_jobs_of_grpc_count_likewise(limited: Limited) -> None:
 
 
 def test_the_minutes_of_a_day_end_at_midnight(limited: Limited) -> None:
-    runs.add_run(limited.database.engine, "earlier", "minutes", "cpu", 30.0)
+    ran(limited, "cpu")
     assert submit(limited, "minutes").status_code == 201
-    runs.add_run(limited.database.engine, "earlier", "minutes", "cuda", 30.0)
+    ran(limited, "gpu")
     refused = submit(limited, "minutes")
     assert is_limit(refused, "compute_minutes_per_day")
     assert 0 < int(refused.headers["Retry-After"]) <= DAY_S + 2
