@@ -4,7 +4,7 @@ import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
 import { describe, it } from "node:test";
 
-import { picture, seriousFindings, until } from "./harness.mjs";
+import { BACKGROUND_TIMEOUT_MS, picture, seriousFindings, until } from "./harness.mjs";
 import { enterPose, openScan, poseOf } from "./scan_page.mjs";
 import { tested } from "./tested.mjs";
 
@@ -129,7 +129,7 @@ describe("the path of the probe", () => {
 
     await page.getByRole("button", { name: "Render as a data set" }).click();
     const job = page.getByTestId("path-job");
-    await until(() => job.textContent(), (text) => text.includes("Done"), "the job is not done");
+    await until(() => job.textContent(), (text) => text.includes("Done"), "the job is not done", BACKGROUND_TIMEOUT_MS);
     await page.getByRole("link", { name: /^Download .*npz/ }).waitFor();
     assert.deepEqual(page.faults, []);
   });
