@@ -24,7 +24,7 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
-SOURCE_FOLDERS = ("model", "proto", "workers", "service")
+SOURCE_FOLDERS = ("model", "proto", "workers", "service", "client", "studies")
 _MAX_REQUEST_BYTES = 2**17
 _STANDARD_FILES = 3
 _START_TIMEOUT_S = 120.0

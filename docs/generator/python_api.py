@@ -136,7 +136,8 @@ def signature(value: Any) -> str:
         return _Word(annotation) if isinstance(annotation, str) else annotation
 
     found = inspect.signature(value)
-    kept = [one for name, one in found.parameters.items() if name not in ("self", "kind")]
+    dropped = ("self", "kind") if inspect.isclass(value) else ("self",)  # `kind` tells members of a family apart
+    kept = [one for name, one in found.parameters.items() if name not in dropped]
     answer = found.empty if inspect.isclass(value) else written(found.return_annotation)
     return str(
         inspect.Signature([one.replace(annotation=written(one.annotation)) for one in kept], return_annotation=answer)
@@ -144,8 +145,9 @@ def signature(value: Any) -> str:
 
 
 def members(cls: type[Any]) -> Iterator[tuple[str, Any]]:
-    """The public methods and properties that a class defines itself, by name."""
-    for name, value in sorted(vars(cls).items()):
+    """The public methods and properties that a class defines itself or has of private bases, by name."""
+    own = [base for base in reversed(cls.__mro__) if base is cls or base.__name__.startswith("_")]
+    for name, value in sorted({name: value for base in own for name, value in vars(base).items()}.items()):
         if not name.startswith("_"):
             if isinstance(value, (staticmethod, classmethod)):
                 yield name, getattr(cls, name)

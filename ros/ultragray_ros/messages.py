@@ -68,14 +68,14 @@ def confidence(frame: Frame, header: Header, *, least: float | None, replaced: i
     The values are the confidence figures of the frame, its latency in ms, and the poses that it replaced; those that
     are not known are missing.
     """
-    told = frame.extrapolation
-    known = told.confidence is not None
-    is_fine = told.confidence is not None and (least is None or told.confidence >= least)
-    values = {**asdict(told), "latency_ms": frame.latency_ms, "replaced_poses": replaced}
+    extrapolation = frame.extrapolation
+    known = extrapolation.confidence is not None
+    is_fine = extrapolation.confidence is not None and (least is None or extrapolation.confidence >= least)
+    values = {**asdict(extrapolation), "latency_ms": frame.latency_ms, "replaced_poses": replaced}
     status = DiagnosticStatus(
         level=DiagnosticStatus.OK if is_fine else DiagnosticStatus.WARN,
         name=f"ultragray: {frame.scene}",
-        message=f"confidence {told.confidence:.2f}" if known else "the scene cannot tell its confidence",
+        message=f"confidence {extrapolation.confidence:.2f}" if known else "the scene cannot tell its confidence",
         hardware_id=frame.scene_sha256,
         values=[KeyValue(key=key, value=f"{value:g}") for key, value in values.items() if value is not None],
     )

@@ -15,7 +15,7 @@ Tag = TypeVar("Tag")
 
 
 @dataclass(frozen=True)
-class _Asked(Generic[Tag]):
+class _Request(Generic[Tag]):
     pose: PoseLike
     tag: Tag
     arrived_ns: int  # of time.monotonic_ns()
@@ -43,7 +43,7 @@ class NewestFrames(Generic[Tag]):
         self._client, self._timeout_s, self._take, self._tell = client, timeout_s, take, tell
         self._wanted = (scene, settings)
         self._changed = threading.Condition()
-        self._waiting: _Asked[Tag] | None = None
+        self._waiting: _Request[Tag] | None = None
         self._closed = False
         self._stream: FrameStream | None = None
         self._streamed: tuple[str, RenderSettings] | None = None  # what the stream was opened for
@@ -54,7 +54,7 @@ class NewestFrames(Generic[Tag]):
         """Ask for the frame of a pose."""
         with self._changed:
             replaced = 0 if self._waiting is None else self._waiting.replaced + 1
-            self._waiting = _Asked(pose, tag, time.monotonic_ns(), replaced)
+            self._waiting = _Request(pose, tag, time.monotonic_ns(), replaced)
             self._changed.notify()
 
     def change(self, scene: str, settings: RenderSettings) -> None:
@@ -73,38 +73,38 @@ class NewestFrames(Generic[Tag]):
         self._thread.join()
 
     def _run(self) -> None:
-        while (asked := self._next()) is not None:
+        while (request := self._next()) is not None:
             try:
-                frame = self._frame(asked)
+                frame = self._frame(request)
             except ClientError as error:
                 if not self._closed:
                     self._tell(error)
             else:
-                self._take(frame, asked.tag, asked.replaced)
+                self._take(frame, request.tag, request.replaced)
         self._end_stream()
 
-    def _next(self) -> _Asked[Tag] | None:
+    def _next(self) -> _Request[Tag] | None:
         with self._changed:
             self._changed.wait_for(lambda: self._waiting is not None or self._closed)
-            asked, self._waiting = self._waiting, None
-            return None if self._closed else asked
+            request, self._waiting = self._waiting, None
+            return None if self._closed else request
 
-    def _frame(self, asked: _Asked[Tag]) -> Frame:
-        left_s = self._left_s(asked)
+    def _frame(self, request: _Request[Tag]) -> Frame:
+        left_s = self._left_s(request)
         stream = self._open_stream()
         try:
-            stream.send(asked.pose, timeout_s=left_s, measured_ns=asked.arrived_ns)
+            stream.send(request.pose, timeout_s=left_s, measured_ns=request.arrived_ns)
             frame = stream.receive()
         except ClientError as error:
             if not error.sequence:  # it is about the stream, not about this pose
                 self._end_stream()
             raise
-        self._left_s(asked)
+        self._left_s(request)
         return frame
 
-    def _left_s(self, asked: _Asked[Tag]) -> float:
+    def _left_s(self, request: _Request[Tag]) -> float:
         """What is left of the time of a pose. Raises DeadlineExceeded where there is none."""
-        age_s = (time.monotonic_ns() - asked.arrived_ns) / 1e9
+        age_s = (time.monotonic_ns() - request.arrived_ns) / 1e9
         if age_s >= self._timeout_s:
             raise DeadlineExceeded(f"the frame is {age_s:.2f} s behind its pose, more than {self._timeout_s:g} s")
         return self._timeout_s - age_s

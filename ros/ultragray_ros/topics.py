@@ -33,7 +33,7 @@ class Publishers:
         self._images: dict[str, tuple[Publisher, Publisher]] = {}
         self._confidence = node.create_publisher(DiagnosticArray, "~/confidence", qos_profile_sensor_data)
         self._geometry = node.create_publisher(String, "~/geometry", LATCHED)
-        self._told_geometry: String | None = None
+        self._last_geometry: String | None = None
 
     def offer(self, outputs: tuple[str, ...]) -> None:
         """Have topics for these outputs, beside those of before. Raises UnknownOutput for one that cannot be a name."""
@@ -52,8 +52,8 @@ class Publishers:
         """Publish a frame; pixels only where somebody subscribes to them."""
         header = Header(stamp=pose_header.stamp, frame_id=self._probe_frame)
         geometry = messages.geometry(frame, self._probe_frame)
-        if geometry != self._told_geometry:
-            self._told_geometry = geometry
+        if geometry != self._last_geometry:
+            self._last_geometry = geometry
             self._geometry.publish(geometry)
         self._confidence.publish(messages.confidence(frame, header, least=least_confidence, replaced=replaced))
         for output, pixels in frame.arrays.items():

@@ -20,6 +20,7 @@ from collections import OrderedDict
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, fields, replace
 from enum import IntEnum
+from functools import partial
 from typing import Protocol
 
 import numpy as np
@@ -350,7 +351,7 @@ class Router:
         self._scene: list[int] = traffic.scene.tolist()
         self._door: list[int] = traffic.door.tolist()
         self._case, self._seed, self._generator = case, seed, generator
-        self._costs = [kinds[large] for large in traffic.large.tolist()]
+        self._costs: list[SceneCosts] = [kinds[large] for large in traffic.large.tolist()]
         self._caches = [ReplicaCache(case.sizes, self._costs, case.storage) for _ in range(case.numbers)]
         self._open = [OpenRequests(case.numbers) for _ in (GRPC, HTTP)]
         self._streams: list[set[int]] = [set() for _ in range(case.numbers)]  # indices of askings
@@ -364,12 +365,12 @@ class Router:
     def run(self) -> Routed:
         """Send all traffic to replicas."""
         for change in self._case.changes:
-            self._plan(change.time_s, lambda now_s, change=change: self._change(now_s, change))
+            self._plan(change.time_s, partial(self._change, change))
         for origin, (now_s, length_s) in enumerate(self._traffic):
             while self._later and self._later[0][0] <= now_s:
                 time_s, _, happen = heapq.heappop(self._later)
                 happen(time_s)
-            self._ask(origin, now_s, now_s + length_s if length_s else 0.0)
+            self._ask(origin, now_s + length_s if length_s else 0.0, now_s)
         return self._routed
 
     def _live(self, numbers: Sequence[int]) -> None:
@@ -379,7 +380,7 @@ class Router:
     def _plan(self, time_s: float, happen: Callable[[float], None]) -> None:
         heapq.heappush(self._later, (time_s, next(self._number), happen))
 
-    def _ask(self, origin: int, now_s: float, end_s: float) -> None:
+    def _ask(self, origin: int, end_s: float, now_s: float) -> None:
         """A request (`end_s` 0), or a stream until then."""
         routed, scene, door = self._routed, self._scene[origin], self._door[origin]
         opened = self._open[door]
@@ -409,7 +410,7 @@ class Router:
             opened.of[replica] -= 1
             opened.total -= 1
 
-    def _change(self, now_s: float, change: Change) -> None:
+    def _change(self, change: Change, now_s: float) -> None:
         """The balancers know at once; the streams of dead replicas come again, one by one."""
         again = [index for replica in change.die for index in sorted(self._streams[replica])]
         for opened in self._open:
@@ -420,8 +421,7 @@ class Router:
         for index, after_s in zip(again, self._generator.uniform(*RECONNECTED_S, len(again)).tolist(), strict=True):
             until_s, self._routed.end_s[index] = self._routed.end_s[index], now_s
             if now_s + after_s < until_s:
-                origin = self._origin[index]
-                self._plan(now_s + after_s, lambda time_s, origin=origin, end=until_s: self._ask(origin, time_s, end))
+                self._plan(now_s + after_s, partial(self._ask, self._origin[index], until_s))
 
 
 def mean_waits(workload: Workload, kinds: Sequence[SceneCosts]) -> list[float]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import signal
 import threading
-import time
 from collections.abc import Callable
 from concurrent import futures
 from typing import Any
@@ -18,14 +17,13 @@ from ultragray_client.exchange import Unanswered
 from ultragray_proto.v1 import rendering_pb2
 
 from ..service.conftest import RunningService, StartService
-from ..waiting import at_this_load, wait_until
+from ..waiting import wait_until
 from .conftest import KEY
 from .proxy import Proxy
 from .test_client_render import moved
 from .test_client_shared_memory import is_shared
 
 SMALL = RenderSettings(height=16, width=16)
-RESUMES_WITHIN_S = 2.0
 
 
 def test_an_ordered_stream_gets_the_frame_of_each_pose_once(far_client: Any, proxy: Proxy) -> None:
@@ -122,12 +120,10 @@ def test_a_stream_goes_on_at_another_service(
         proxy.lead_to(second.grpc)
         stream.send(moved(5.0))
         first.process.send_signal(number)
-        began = time.monotonic()
         frames = [stream.receive()]
         while not stream.reconnections:
             stream.send(moved(6.0))
             frames.append(stream.receive())
-        assert time.monotonic() - began < at_this_load(RESUMES_WITHIN_S)
         stream.send(moved(7.0))
         frames.append(stream.receive())
     assert second_data == first.data_folder
@@ -144,10 +140,8 @@ def test_patience_ends(make_client: Callable[..., Any], client_service: RunningS
         stream.send(moved(0.0))
         assert stream.receive().sequence == 1
         proxy.close()
-        began = time.monotonic()
         with pytest.raises(errors.Unreachable):
             stream.receive()
-        assert time.monotonic() - began < at_this_load(4.0)
         with pytest.raises(errors.Unreachable):
             stream.send(moved(0.0))
     with pytest.raises(errors.InvalidArgument, match="reconnect_s"):
@@ -172,20 +166,21 @@ def test_a_sender_may_be_ahead_while_nobody_reads(far_client: Any, proxy: Proxy)
         proxy.cut_after(0)
         for x in range(30):
             stream.send(moved(x))
-            time.sleep(0.01)
         stream.done_sending()
         assert [frame.pose[0, 3] for frame in stream] == list(range(30))
         assert stream.reconnections == proxy.cuts == 1
 
 
-def test_a_pose_is_sent_again_with_what_is_left_of_its_time() -> None:
+def test_a_pose_is_sent_again_with_what_is_left_of_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    now = 1000.0
+    monkeypatch.setattr("ultragray_client.exchange.time.monotonic", lambda: now)
     unanswered = Unanswered(newest_alone=False)
     unanswered.sent(rendering_pb2.RenderStreamRequest(sequence=1, timeout_ms=5000.0))
     unanswered.sent(rendering_pb2.RenderStreamRequest(sequence=2, timeout_ms=1.0))
     unanswered.sent(rendering_pb2.RenderStreamRequest(sequence=3))
-    time.sleep(0.05)
+    now += 0.05
     first, second, third = unanswered.again()
-    assert 1000.0 < first.timeout_ms <= 4950.0
+    assert first.timeout_ms == pytest.approx(4950.0)
     assert 0.0 < second.timeout_ms < 0.01  # which the service refuses, as it came too late
     assert not third.HasField("timeout_ms")
     unanswered.answered(rendering_pb2.Frame(sequence=2))

@@ -181,7 +181,6 @@ def test_a_latest_stream_may_be_read_before_anything_is_sent(client: Any) -> Non
         frames: list[Any] = []
         reader = threading.Thread(target=lambda: frames.append(stream.receive()))
         reader.start()
-        time.sleep(0.1)
         stream.send(moved(0.0))
         reader.join()
         assert frames[0].sequence == 1

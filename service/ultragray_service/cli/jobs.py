@@ -29,6 +29,7 @@ from ultragray_service.cli.terminal import (
     output_option,
     print_facts,
     print_table,
+    progress_bars,
     tell,
     to_json,
     transferred,
@@ -302,6 +303,7 @@ def _watched(connection: Connection, job_id: str, show: Callable[[dict[str, Any]
     while True:
         asked, gone = time.monotonic(), NotReady(f"nothing is heard of the job {job_id}")
         try:
+            job: dict[str, Any]
             for job in connection.events(route("jobs", job_id, "events"), "progress"):
                 show(job)
                 if job["state"] in _FINAL_STATES:
@@ -318,24 +320,14 @@ def _watched(connection: Connection, job_id: str, show: Callable[[dict[str, Any]
 @contextlib.contextmanager
 def _display(job_id: str) -> Iterator[Callable[[dict[str, Any]], None]]:
     """A bar on a terminal's stderr; elsewhere a line for every change of state and every tenth of the work."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-
-    console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[figures]}"),
-    )
     last: tuple[str, int] | None = None
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bar:
+    with progress_bars("{task.description}", "bar", "of", "{task.fields[figures]}") as bar:
         task = bar.add_task(f"{job_id}", total=None, figures="")
 
         def show(job: dict[str, Any]) -> None:
             nonlocal last
             done, of, _ = work_done(job)
-            if console.is_terminal:
+            if not bar.disable:
                 bar.update(task, description=f"{job_id} {job['state']}", completed=done, total=of, figures=figures(job))
                 return
             current = (job["state"], done * 10 // of if of else 0)

@@ -5,8 +5,9 @@ Everything that can be wrong is found before torch is imported.
 
 from __future__ import annotations
 
+import contextlib
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -103,17 +104,26 @@ def render(
 ) -> None:
     """Each frame comes with its pose and with how far it can be trusted. Lengths are in mm, angles in degrees."""
     if on is not None:
-        shards = Shards.prepared(scene, poses, sampler, settings, dtype=dtype, shard_frames=shard_frames)
-        told = render_shards(shards, output, on, backend=backend, threads=threads)
-        tell(told.in_words(), told.document(), as_json=json)
+        plan = plan_of_shards(scene, poses, sampler, settings, dtype=dtype, shard_frames=shard_frames)
+        sentence, document = render_shards(plan, scene, output, on, backend=backend, threads=threads)
+        tell(sentence, document, as_json=json)
         return
     if shard_frames is not None:
         raise InvalidArgument("--shard-frames is of shards: name an engine with --on", field="shard_frames")
     path = Path(output)
     format = checked_format(path, settings, dtype, force=force)
     task = Task.prepared(scene, poses, sampler, settings)
-    found = render_frames(task, path, format, dtype=dtype, backend=backend, threads=threads)
-    tell(found.in_words(), found.document(), as_json=json)
+    sentence, document = render_frames(task, path, format, dtype=dtype, backend=backend, threads=threads)
+    tell(sentence, document, as_json=json)
+
+
+@contextlib.contextmanager
+def _probe_as_an_option() -> Iterator[None]:
+    """Tells of a probe as the command line calls it."""
+    try:
+        yield
+    except InvalidProbe as error:
+        raise InvalidProbe(f"--{error.detail}", field="probe") from None
 
 
 def checked_format(output: Path, settings: FrameSettings, dtype: str | None, *, force: bool) -> str | None:
@@ -136,9 +146,6 @@ def checked_format(output: Path, settings: FrameSettings, dtype: str | None, *, 
     return format
 
 
-# Rendering the poses of a file into one file or a folder of PNGs, in portions that fit in memory.
-
-
 @dataclass(frozen=True)
 class Task:
     """Frames that are to be rendered, checked without a renderer."""
@@ -153,10 +160,8 @@ class Task:
         """The task of a command line. Raises InvalidArgument and its kind, SceneFileInvalid."""
         given_poses = None if pose_file is None else load_poses(pose_file)
         header = read_header(scene_file)
-        try:
+        with _probe_as_an_option():
             settings = asked.resolved(header.info, Encoding.FLOAT32)
-        except InvalidProbe as error:
-            raise InvalidProbe(f"--{error.detail}", field="probe") from None  # as the option is called here
         base = header.training_poses if given_poses is None else given_poses
         if not len(base):
             raise InvalidArgument("--poses must be given: the scene holds no training poses", field="poses")
@@ -166,44 +171,10 @@ class Task:
         return cls(scene_file, settings, *assessed_poses(sampler, base, settings.probe, assess, asked.least_confidence))
 
 
-@dataclass(frozen=True)
-class Rendered:
-    """What a rendering wrote, how long it took, and how far it can be trusted."""
-
-    output: Path
-    settings: Resolved
-    extrapolations: Sequence[Extrapolation]
-    seconds: float
-
-    def in_words(self) -> str:
-        """One sentence."""
-        size = f"{self.settings.height}x{self.settings.width}"
-        what = f"{frames_in_words(len(self.extrapolations))} of {size}, {', '.join(self.settings.outputs)}"
-        return f"wrote {self.output}: {what}, in {self.seconds:.1f} s; {_trust(self.extrapolations)}"
-
-    def document(self) -> dict[str, Any]:
-        """The same for a program."""
-        figures = figure_arrays(self.extrapolations)
-        confidence = figures["confidence"]
-        known = bool(np.isfinite(confidence).all())
-        return {
-            "output": str(self.output),
-            "frames": len(self.extrapolations),
-            "height": self.settings.height,
-            "width": self.settings.width,
-            "outputs": list(self.settings.outputs),
-            "seconds": round(self.seconds, 3),
-            "confidence_min": float(confidence.min()) if known else None,
-            "confidence_max": float(confidence.max()) if known else None,
-            "supported_share": float(figures["supported_share"].mean()),
-            **({CONTACT_SHARE: float(figures[CONTACT_SHARE].mean())} if CONTACT_SHARE in figures else {}),
-        }
-
-
 def render_frames(
     task: Task, output: Path, format: str | None, *, dtype: str | None, backend: str, threads: int
-) -> Rendered:
-    """Render and write; `format` None writes a folder of PNGs.
+) -> tuple[str, dict[str, Any]]:
+    """Render and write; `format` None writes a folder of PNGs. What was written: a sentence, and a document.
 
     Raises InvalidArgument, SceneFileInvalid, BackendUnavailable, MemoryExceeded, OSError; a file is then not written.
     """
@@ -231,91 +202,63 @@ def render_frames(
             backend=backend,
             before_portion=report,
         )
-    return Rendered(output, task.settings, found, time.perf_counter() - started)
-
-
-def _trust(found: Sequence[Extrapolation]) -> str:
-    """A few words on the confidence, where it is known, and on how much of the frames has support."""
+    seconds = time.perf_counter() - started
     figures = figure_arrays(found)
-    confidence = figures["confidence"]
-    words = [f"Gaussians support {figures['supported_share'].mean():.0%} of the pixels"]
+    confidence, supported = figures["confidence"], float(figures["supported_share"].mean())
+    trust = [f"Gaussians support {supported:.0%} of the pixels"]
+    document = {
+        "output": str(output),
+        "frames": len(found),
+        "height": task.settings.height,
+        "width": task.settings.width,
+        "outputs": list(task.settings.outputs),
+        "seconds": round(seconds, 3),
+        "confidence_min": None,  # of a scene that does not know it
+        "confidence_max": None,
+        "supported_share": supported,
+    }
     if CONTACT_SHARE in figures:
-        words.append(f"{figures[CONTACT_SHARE].mean():.0%} of the scan lines have contact")
+        document[CONTACT_SHARE] = float(figures[CONTACT_SHARE].mean())
+        trust.append(f"{document[CONTACT_SHARE]:.0%} of the scan lines have contact")
     if np.isfinite(confidence).all():
-        words.insert(0, f"confidence {confidence.min():.2f} to {confidence.max():.2f}")
-    return ", ".join(words)
+        document |= {"confidence_min": float(confidence.min()), "confidence_max": float(confidence.max())}
+        trust.insert(0, f"confidence {confidence.min():.2f} to {confidence.max():.2f}")
+    size = f"{task.settings.height}x{task.settings.width}"
+    what = f"{frames_in_words(len(found))} of {size}, {', '.join(task.settings.outputs)}"
+    return f"wrote {output}: {what}, in {seconds:.1f} s; {', '.join(trust)}", document
 
 
-# Rendering the poses of a command line as shards on a cluster.
+def plan_of_shards(
+    scene_file: Path,
+    pose_file: Path | None,
+    sampler: Sampler | None,
+    settings: FrameSettings,
+    *,
+    dtype: str | None,
+    shard_frames: int | None,
+) -> BatchPlan:
+    """The batch of a command line. Raises InvalidArgument and its kind, SceneFileInvalid."""
+    poses = None if pose_file is None else load_poses(pose_file)
+    header = read_header(scene_file)
+    if settings.least_confidence is not None and sampler is not None:
+        require_drawn(sampler)
+    with _probe_as_an_option():
+        return BatchPlan.prepared(
+            header,
+            settings,
+            sampler=sampler,
+            poses=poses,
+            shard_frames=shard_frames,
+            scene=scene_file.stem,
+            scene_sha256=file_sha256(scene_file),
+            dtype=check_format("tar", settings.outputs, dtype),
+        )
 
 
-@dataclass(frozen=True)
-class Shards:
-    """A batch that is to be rendered, checked without a renderer."""
-
-    scene_file: Path
-    plan: BatchPlan
-
-    @classmethod
-    def prepared(
-        cls,
-        scene_file: Path,
-        pose_file: Path | None,
-        sampler: Sampler | None,
-        settings: FrameSettings,
-        *,
-        dtype: str | None,
-        shard_frames: int | None,
-    ) -> Shards:
-        """The batch of a command line. Raises InvalidArgument and its kind, SceneFileInvalid."""
-        poses = None if pose_file is None else load_poses(pose_file)
-        header = read_header(scene_file)
-        if settings.least_confidence is not None and sampler is not None:
-            require_drawn(sampler)
-        try:
-            plan = BatchPlan.prepared(
-                header,
-                settings,
-                sampler=sampler,
-                poses=poses,
-                shard_frames=shard_frames,
-                scene=scene_file.stem,
-                scene_sha256=file_sha256(scene_file),
-                dtype=check_format("tar", settings.outputs, dtype),
-            )
-        except InvalidProbe as error:
-            raise InvalidProbe(f"--{error.detail}", field="probe") from None  # as the option is called here
-        return cls(scene_file, plan)
-
-
-@dataclass(frozen=True)
-class Sharded:
-    """What was rendered, where it is, and how long it took."""
-
-    plan: BatchPlan
-    output: str
-    seconds: float
-
-    def in_words(self) -> str:
-        """One sentence."""
-        files = f"{self.plan.file_names} and {MANIFEST_FILE}"
-        return f"wrote {self.output}: {frames_in_words(self.plan.frames)} in {files}, in {self.seconds:.1f} s"
-
-    def document(self) -> dict[str, Any]:
-        """The same for a program."""
-        return {
-            "output": self.output,
-            "frames": self.plan.frames,
-            "shards": self.plan.shard_count,
-            "files": self.plan.file_names,
-            "manifest": MANIFEST_FILE,
-            "plan": self.plan.identity,
-            "seconds": round(self.seconds, 3),
-        }
-
-
-def render_shards(shards: Shards, output: str, on: str, *, backend: str, threads: int) -> Sharded:
-    """Render what is missing of the batch, and write its manifest.
+def render_shards(
+    plan: BatchPlan, scene_file: Path, output: str, on: str, *, backend: str, threads: int
+) -> tuple[str, dict[str, Any]]:
+    """Render what is missing of a batch on a cluster, and write its manifest. A sentence and a document tell of it.
 
     Raises InvalidArgument for an output that is no folder or holds something else, and what `RayBatch.render` raises.
     """
@@ -330,6 +273,17 @@ def render_shards(shards: Shards, output: str, on: str, *, backend: str, threads
             raise InvalidArgument(f"--output must be a folder with --on, {output} is a file", field="output")
         output = str(folder)  # the workers of a cluster have other working folders
     started = time.perf_counter()
-    with counted("rendering", shards.plan.frames) as report:
-        RayBatch(shards.plan, shards.scene_file, output, backend, threads or 1).render(on, report)
-    return Sharded(shards.plan, output, time.perf_counter() - started)
+    with counted("rendering", plan.frames) as report:
+        RayBatch(plan, scene_file, output, backend, threads or 1).render(on, report)
+    seconds = time.perf_counter() - started
+    document = {
+        "output": output,
+        "frames": plan.frames,
+        "shards": plan.shard_count,
+        "files": plan.file_names,
+        "manifest": MANIFEST_FILE,
+        "plan": plan.identity,
+        "seconds": round(seconds, 3),
+    }
+    files = f"{plan.file_names} and {MANIFEST_FILE}"
+    return f"wrote {output}: {frames_in_words(plan.frames)} in {files}, in {seconds:.1f} s", document

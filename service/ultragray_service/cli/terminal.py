@@ -18,6 +18,7 @@ from ultragray.errors import InvalidArgument
 
 if TYPE_CHECKING:
     from rich.console import Console
+    from rich.progress import Progress
 
 
 OUTPUT, COMPUTE = "Output", "Compute"
@@ -191,16 +192,33 @@ def wide_console() -> Console:
 
 
 @contextlib.contextmanager
+def progress_bars(*columns: str) -> Iterator[Progress]:
+    """Bars on standard error, between texts such as "{task.description}"; disabled elsewhere than on a terminal.
+
+    A column may be named as well: "bar", "of" (how many of how many), "bytes", "rate" of these, "left" (time).
+    """
+    from rich import progress as rich_progress
+    from rich.console import Console
+
+    kinds = {
+        "bar": rich_progress.BarColumn,
+        "of": rich_progress.MofNCompleteColumn,
+        "bytes": rich_progress.DownloadColumn,
+        "rate": rich_progress.TransferSpeedColumn,
+        "left": rich_progress.TimeRemainingColumn,
+    }
+    console = Console(stderr=True)
+    made = (kinds[one]() if one in kinds else rich_progress.TextColumn(one, markup=False) for one in columns)
+    with rich_progress.Progress(*made, console=console, transient=True, disable=not console.is_terminal) as bars:
+        yield bars
+
+
+@contextlib.contextmanager
 def counted(what: str, total: int) -> Iterator[Callable[[int], None]]:
     """A function that is told how many of `total` are done: a bar on a terminal, nothing elsewhere."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task(what, total=total)
-        yield lambda done: progress.update(task, completed=done)
+    with progress_bars("{task.description}", "bar", "of", "left") as bars:
+        task = bars.add_task(what, total=total)
+        yield lambda done: bars.update(task, completed=done)
 
 
 @contextlib.contextmanager
@@ -209,22 +227,11 @@ def transferred(what: str) -> Iterator[Callable[[int | None], Callable[[int], No
 
     A bar with rate and time left on a terminal, nothing elsewhere.
     """
-    from rich.console import Console
-    from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
-
-    console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.description}", markup=False),
-        BarColumn(),
-        DownloadColumn(),
-        TransferSpeedColumn(),
-        TimeRemainingColumn(),
-    )
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
+    with progress_bars("{task.description}", "bar", "bytes", "rate", "left") as bars:
 
         def begin(total: int | None) -> Callable[[int], None]:
-            task = progress.add_task(what, total=total)
-            return lambda count: progress.advance(task, count)
+            task = bars.add_task(what, total=total)
+            return lambda count: bars.advance(task, count)
 
         yield begin
 

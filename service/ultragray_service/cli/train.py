@@ -30,6 +30,7 @@ from ultragray_service.cli.terminal import (
     command_group,
     examples,
     output_option,
+    progress_bars,
     stop_on_signal,
     tell,
 )
@@ -297,25 +298,15 @@ def _progress_bar() -> Iterator[Callable[[Any], None]]:
 
     After the last step of a training what it reached is measured, which takes a while and has no steps.
     """
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
-
-    console = Console(stderr=True)
-    columns = (
-        TextColumn("{task.fields[stage]}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TextColumn("{task.fields[figures]}"),
-    )
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as progress:
-        task = progress.add_task("", total=None, stage="training", figures="")
+    with progress_bars("{task.fields[stage]}", "bar", "of", "{task.fields[figures]}") as bar:
+        task = bar.add_task("", total=None, stage="training", figures="")
 
         def report(state: Any) -> None:
             stage, is_last = state.beside or "training", state.step == state.steps
-            if console.is_terminal:
-                progress.update(task, completed=state.step, total=state.steps, stage=stage, figures=_figures(state))
+            if not bar.disable:
+                bar.update(task, completed=state.step, total=state.steps, stage=stage, figures=_figures(state))
                 if is_last:
-                    progress.update(task, total=None, stage=f"{stage}: {MEASURING}", figures="")
+                    bar.update(task, total=None, stage=f"{stage}: {MEASURING}", figures="")
                 return
             if state.step * 10 // state.steps > (state.step - 1) * 10 // state.steps:
                 named = f"{state.beside}: " if state.beside else ""

@@ -7,7 +7,7 @@ import time
 from collections import deque
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import grpc
 
@@ -29,6 +29,8 @@ from ultragray_service.service import Service
 from ultragray_service.views.localizing import locate, sought_frame
 from ultragray_workers.errors import QueueFull
 from ultragray_workers.pool.messages import Priority, RenderResult
+
+Context: TypeAlias = grpc.aio.ServicerContext
 
 
 class _Message:
@@ -92,7 +94,7 @@ class _Unreadable:
 class CallTransport:
     """One call of RenderStream; a context manager. Its mode is read from the first message that can be read."""
 
-    def __init__(self, context: grpc.aio.ServicerContext) -> None:
+    def __init__(self, context: Context) -> None:
         self._context = context
         self.destination: SharedMemory | None = None
 
@@ -156,9 +158,7 @@ class RenderService:
     def __init__(self, service: Service) -> None:
         self._service = service
 
-    async def Render(  # noqa: N802
-        self, request: rendering_pb2.RenderRequest, context: grpc.aio.ServicerContext
-    ) -> rendering_pb2.Frame:
+    async def Render(self, request: rendering_pb2.RenderRequest, context: Context) -> rendering_pb2.Frame:
         deadline = self._service.planner.deadline(context.time_remaining())
         begin_by = None
         if request.HasField("max_queue_ms"):
@@ -171,9 +171,7 @@ class RenderService:
         result = await self._service.rendering.render(plan, pose[None], deadline=deadline, begin_by=begin_by)
         return frame_message(result, 0)
 
-    async def RenderBatch(  # noqa: N802
-        self, request: rendering_pb2.RenderBatchRequest, context: grpc.aio.ServicerContext
-    ) -> None:
+    async def RenderBatch(self, request: rendering_pb2.RenderBatchRequest, context: Context) -> None:
         planner = self._service.planner
         check_pose_count(len(request.poses), planner.max_poses)
         plan = await self._plan(request)
@@ -201,17 +199,15 @@ class RenderService:
                 task.cancel()
             await asyncio.gather(*in_flight, return_exceptions=True)
 
-    async def RenderStream(  # noqa: N802
-        self, messages: object, context: grpc.aio.ServicerContext
-    ) -> None:
+    async def RenderStream(self, messages: object, context: Context) -> None:
         told = {key: value for key, value in context.invocation_metadata() or () if isinstance(value, str)}
         name = told.get(_STREAM_NAME) or told.get("user-agent", "")
         streams = self._service.streams
         with self._service.limits.stream(), streams.opened("grpc", name) as noted, CallTransport(context) as transport:
             await FrameStream(self._service.rendering, transport, noted=noted).run()
 
-    async def AssessPoses(  # noqa: N802
-        self, request: rendering_pb2.AssessPosesRequest, context: grpc.aio.ServicerContext
+    async def AssessPoses(
+        self, request: rendering_pb2.AssessPosesRequest, context: Context
     ) -> rendering_pb2.AssessPosesResponse:
         check_pose_count(len(request.poses), self._service.planner.max_poses)
         whose = read(request, _OfProbe)
@@ -219,9 +215,7 @@ class RenderService:
         found = await self._service.assessing.assess(request.scene, poses, whose.probe, whose.registration)
         return to_message(found, rendering_pb2.AssessPosesResponse)
 
-    async def RenderSlice(  # noqa: N802
-        self, request: rendering_pb2.RenderSliceRequest, context: grpc.aio.ServicerContext
-    ) -> rendering_pb2.Slice:
+    async def RenderSlice(self, request: rendering_pb2.RenderSliceRequest, context: Context) -> rendering_pb2.Slice:
         deadline = self._service.planner.deadline(context.time_remaining())
         if not request.HasField("slice"):
             raise InvalidArgument("slice is required", field="slice")
@@ -232,8 +226,8 @@ class RenderService:
         result = await self._service.rendering.render(plan, asked.pose()[None], deadline=deadline)
         return slice_message(result)
 
-    async def Localize(  # noqa: N802
-        self, request: rendering_pb2.LocalizeRequest, context: grpc.aio.ServicerContext
+    async def Localize(
+        self, request: rendering_pb2.LocalizeRequest, context: Context
     ) -> rendering_pb2.LocalizeResponse:
         deadline = self._service.planner.deadline(context.time_remaining())
         asked = read(request, LocalizationSettings)
@@ -260,7 +254,7 @@ class RenderService:
         render: Callable[[Plan, FloatArray, float], Awaitable[RenderResult]],
         plan: Plan,
         pose: FloatArray,
-        context: grpc.aio.ServicerContext,
+        context: Context,
     ) -> RenderResult:
         """Renders a frame of a batch once the caller may have one more."""
         left_s = context.time_remaining()

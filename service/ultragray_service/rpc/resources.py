@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 from dataclasses import replace
+from typing import TypeAlias
 
 import grpc
 import numpy as np
@@ -35,6 +36,8 @@ from ultragray_workers.jobs.queue.wishes import Wanted
 from ultragray_workers.jobs.shared.reading import opened
 from ultragray_workers.jobs.store import JobStore
 
+Context: TypeAlias = grpc.aio.ServicerContext
+
 
 class SceneService:
     """The methods of ultragray.v1.SceneService."""
@@ -42,25 +45,21 @@ class SceneService:
     def __init__(self, service: Service) -> None:
         self._service = service
 
-    async def ListScenes(  # noqa: N802
-        self, request: scenes_pb2.ListScenesRequest, context: grpc.aio.ServicerContext
+    async def ListScenes(
+        self, request: scenes_pb2.ListScenesRequest, context: Context
     ) -> scenes_pb2.ListScenesResponse:
         page = await self._service.scenes.page(request.page_size or DEFAULT_PAGE_SIZE, request.page_token)
         return to_message(page, scenes_pb2.ListScenesResponse)
 
-    async def GetScene(  # noqa: N802
-        self, request: scenes_pb2.GetSceneRequest, context: grpc.aio.ServicerContext
-    ) -> scenes_pb2.Scene:
+    async def GetScene(self, request: scenes_pb2.GetSceneRequest, context: Context) -> scenes_pb2.Scene:
         return to_message(await self._service.scenes.get(request.scene), scenes_pb2.Scene)
 
-    async def LoadScene(  # noqa: N802
-        self, request: scenes_pb2.LoadSceneRequest, context: grpc.aio.ServicerContext
-    ) -> scenes_pb2.LoadSceneResponse:
+    async def LoadScene(self, request: scenes_pb2.LoadSceneRequest, context: Context) -> scenes_pb2.LoadSceneResponse:
         loaded = await self._service.scenes.load(request.scene)
         return to_message(loaded, scenes_pb2.LoadSceneResponse)
 
-    async def UnloadScene(  # noqa: N802
-        self, request: scenes_pb2.UnloadSceneRequest, context: grpc.aio.ServicerContext
+    async def UnloadScene(
+        self, request: scenes_pb2.UnloadSceneRequest, context: Context
     ) -> scenes_pb2.UnloadSceneResponse:
         loaded = await self._service.scenes.unload(request.scene)
         return to_message(loaded, scenes_pb2.UnloadSceneResponse)
@@ -75,9 +74,7 @@ class DatasetService:
     def __init__(self, service: Service) -> None:
         self._service = service
 
-    async def UploadDataset(  # noqa: N802
-        self, requests: object, context: grpc.aio.ServicerContext
-    ) -> datasets_pb2.UploadDatasetResponse:
+    async def UploadDataset(self, requests: object, context: Context) -> datasets_pb2.UploadDatasetResponse:
         self._service.life.require_serving()
         first = await context.read()
         if first is grpc.aio.EOF or first.WhichOneof("part") != "header":
@@ -92,31 +89,29 @@ class DatasetService:
         told = to_message(self._service.datasets.with_owner(record), datasets_pb2.Dataset)
         return datasets_pb2.UploadDatasetResponse(dataset=told, created=is_new)
 
-    async def ListDatasets(  # noqa: N802
-        self, request: datasets_pb2.ListDatasetsRequest, context: grpc.aio.ServicerContext
+    async def ListDatasets(
+        self, request: datasets_pb2.ListDatasetsRequest, context: Context
     ) -> datasets_pb2.ListDatasetsResponse:
         page_size = request.page_size or DEFAULT_PAGE_SIZE
         page = await self._service.datasets.page(page_size, request.page_token)
         return to_message(page, datasets_pb2.ListDatasetsResponse)
 
-    async def GetDataset(  # noqa: N802
-        self, request: datasets_pb2.GetDatasetRequest, context: grpc.aio.ServicerContext
-    ) -> datasets_pb2.Dataset:
+    async def GetDataset(self, request: datasets_pb2.GetDatasetRequest, context: Context) -> datasets_pb2.Dataset:
         return to_message(await self._service.datasets.get(request.dataset), datasets_pb2.Dataset)
 
-    async def GetContactSheet(  # noqa: N802
-        self, request: datasets_pb2.GetContactSheetRequest, context: grpc.aio.ServicerContext
+    async def GetContactSheet(
+        self, request: datasets_pb2.GetContactSheetRequest, context: Context
     ) -> datasets_pb2.GetContactSheetResponse:
         return datasets_pb2.GetContactSheetResponse(png=await self._service.datasets.contact_sheet(request.dataset))
 
-    async def DeleteDataset(  # noqa: N802
-        self, request: datasets_pb2.DeleteDatasetRequest, context: grpc.aio.ServicerContext
+    async def DeleteDataset(
+        self, request: datasets_pb2.DeleteDatasetRequest, context: Context
     ) -> datasets_pb2.DeleteDatasetResponse:
         await self._service.delete_dataset(request.dataset)
         return datasets_pb2.DeleteDatasetResponse(dataset=request.dataset)
 
 
-async def _receive(context: grpc.aio.ServicerContext, upload: DatasetUpload, *, archive: bool) -> None:
+async def _receive(context: Context, upload: DatasetUpload, *, archive: bool) -> None:
     while (message := await upload.next(context.read())) is not grpc.aio.EOF:
         part = message.WhichOneof("part")
         if part == "chunk":
@@ -141,9 +136,7 @@ class JobService:
     def __init__(self, service: Service) -> None:
         self._service = service
 
-    async def SubmitJob(  # noqa: N802
-        self, request: jobs_pb2.SubmitJobRequest, context: grpc.aio.ServicerContext
-    ) -> jobs_pb2.SubmitJobResponse:
+    async def SubmitJob(self, request: jobs_pb2.SubmitJobRequest, context: Context) -> jobs_pb2.SubmitJobResponse:
         self._service.life.require_serving()
         specification, field = await asyncio.to_thread(read_specification, request)  # of many poses
         job, is_new = await self._service.jobs.submit(
@@ -155,18 +148,14 @@ class JobService:
         )
         return jobs_pb2.SubmitJobResponse(job=job_message(job), created=is_new)
 
-    async def EstimateJob(  # noqa: N802
-        self, request: jobs_pb2.SubmitJobRequest, context: grpc.aio.ServicerContext
-    ) -> jobs_pb2.JobEstimate:
+    async def EstimateJob(self, request: jobs_pb2.SubmitJobRequest, context: Context) -> jobs_pb2.JobEstimate:
         self._service.life.require_serving()
         specification, field = await asyncio.to_thread(read_specification, request)
         found = await estimate(self._service.rendering, specification, field=field)
         poses = [geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=pose)) for pose in found.poses]
         return to_message(replace(found, poses=[]), jobs_pb2.JobEstimate, poses=poses)
 
-    async def ListJobs(  # noqa: N802
-        self, request: jobs_pb2.ListJobsRequest, context: grpc.aio.ServicerContext
-    ) -> jobs_pb2.ListJobsResponse:
+    async def ListJobs(self, request: jobs_pb2.ListJobsRequest, context: Context) -> jobs_pb2.ListJobsResponse:
         page = await self._service.jobs.page(
             state=read_word(request, "state"),
             kind=read_word(request, "kind"),
@@ -176,40 +165,28 @@ class JobService:
         jobs = [job_message(job) for job in page.jobs]
         return jobs_pb2.ListJobsResponse(jobs=jobs, next_page_token=page.next_page_token)
 
-    async def GetJob(  # noqa: N802
-        self, request: jobs_pb2.GetJobRequest, context: grpc.aio.ServicerContext
-    ) -> jobs_pb2.Job:
+    async def GetJob(self, request: jobs_pb2.GetJobRequest, context: Context) -> jobs_pb2.Job:
         return job_message(await self._service.jobs.do(JobStore.get, request.job))
 
-    async def CancelJob(  # noqa: N802
-        self, request: jobs_pb2.CancelJobRequest, context: grpc.aio.ServicerContext
-    ) -> jobs_pb2.Job:
+    async def CancelJob(self, request: jobs_pb2.CancelJobRequest, context: Context) -> jobs_pb2.Job:
         return job_message(await self._service.jobs.do(JobStore.cancel, request.job))
 
-    async def RetryJob(  # noqa: N802
-        self, request: jobs_pb2.RetryJobRequest, context: grpc.aio.ServicerContext
-    ) -> jobs_pb2.Job:
+    async def RetryJob(self, request: jobs_pb2.RetryJobRequest, context: Context) -> jobs_pb2.Job:
         self._service.life.require_serving()
         job, _ = await self._service.jobs.retry(request.job)
         return job_message(job)
 
-    async def DeleteJob(  # noqa: N802
-        self, request: jobs_pb2.DeleteJobRequest, context: grpc.aio.ServicerContext
-    ) -> jobs_pb2.DeleteJobResponse:
+    async def DeleteJob(self, request: jobs_pb2.DeleteJobRequest, context: Context) -> jobs_pb2.DeleteJobResponse:
         await self._service.delete_job(request.job)
         return jobs_pb2.DeleteJobResponse(job=request.job)
 
-    async def GetJobLog(  # noqa: N802
-        self, request: jobs_pb2.GetJobLogRequest, context: grpc.aio.ServicerContext
-    ) -> jobs_pb2.GetJobLogResponse:
+    async def GetJobLog(self, request: jobs_pb2.GetJobLogRequest, context: Context) -> jobs_pb2.GetJobLogResponse:
         max_bytes = request.max_bytes or DEFAULT_LOG_BYTES
         if not 1 <= max_bytes <= MAX_LOG_BYTES:
             raise InvalidArgument(f"max_bytes must be from 1 to {MAX_LOG_BYTES}, got {max_bytes}", field="max_bytes")
         return jobs_pb2.GetJobLogResponse(log=await self._service.jobs.do(JobStore.log_tail, request.job, max_bytes))
 
-    async def DownloadArtifact(  # noqa: N802
-        self, request: jobs_pb2.DownloadArtifactRequest, context: grpc.aio.ServicerContext
-    ) -> None:
+    async def DownloadArtifact(self, request: jobs_pb2.DownloadArtifactRequest, context: Context) -> None:
         found = await self._service.jobs.do(JobStore.artifact, request.job, request.name)
         with opened(found) as file:
             if not 0 <= request.offset <= file.length:
@@ -222,9 +199,7 @@ class JobService:
                 if not data or offset >= file.length:
                     return
 
-    async def WatchJob(  # noqa: N802
-        self, request: jobs_pb2.WatchJobRequest, context: grpc.aio.ServicerContext
-    ) -> None:
+    async def WatchJob(self, request: jobs_pb2.WatchJobRequest, context: Context) -> None:
         self._service.life.require_serving()
         watch = await self._service.jobs.hub.watch(request.job)
         try:
@@ -248,24 +223,18 @@ class WorkerService:
     def __init__(self, service: Service) -> None:
         self._service = service
 
-    async def ListWorkers(  # noqa: N802
-        self, request: workers_pb2.ListWorkersRequest, context: grpc.aio.ServicerContext
+    async def ListWorkers(
+        self, request: workers_pb2.ListWorkersRequest, context: Context
     ) -> workers_pb2.ListWorkersResponse:
         return to_message(await self._service.jobs.workers(), workers_pb2.ListWorkersResponse)
 
-    async def PauseWorker(  # noqa: N802
-        self, request: workers_pb2.PauseWorkerRequest, context: grpc.aio.ServicerContext
-    ) -> workers_pb2.Worker:
+    async def PauseWorker(self, request: workers_pb2.PauseWorkerRequest, context: Context) -> workers_pb2.Worker:
         return await self._want(request.worker, Wanted.PAUSE)
 
-    async def DrainWorker(  # noqa: N802
-        self, request: workers_pb2.DrainWorkerRequest, context: grpc.aio.ServicerContext
-    ) -> workers_pb2.Worker:
+    async def DrainWorker(self, request: workers_pb2.DrainWorkerRequest, context: Context) -> workers_pb2.Worker:
         return await self._want(request.worker, Wanted.DRAIN)
 
-    async def ResumeWorker(  # noqa: N802
-        self, request: workers_pb2.ResumeWorkerRequest, context: grpc.aio.ServicerContext
-    ) -> workers_pb2.Worker:
+    async def ResumeWorker(self, request: workers_pb2.ResumeWorkerRequest, context: Context) -> workers_pb2.Worker:
         return await self._want(request.worker, Wanted.WORK)
 
     async def _want(self, worker: str, wanted: Wanted) -> workers_pb2.Worker:
@@ -284,20 +253,20 @@ class RegistrationService:
     def __init__(self, service: Service) -> None:
         self._service = service
 
-    async def ListRegistrations(  # noqa: N802
-        self, request: registrations_pb2.ListRegistrationsRequest, context: grpc.aio.ServicerContext
+    async def ListRegistrations(
+        self, request: registrations_pb2.ListRegistrationsRequest, context: Context
     ) -> registrations_pb2.ListRegistrationsResponse:
         page_size = request.page_size or DEFAULT_PAGE_SIZE
         page = await self._service.registrations.page(page_size, request.page_token)
         return to_message(page, registrations_pb2.ListRegistrationsResponse)
 
-    async def GetRegistration(  # noqa: N802
-        self, request: registrations_pb2.GetRegistrationRequest, context: grpc.aio.ServicerContext
+    async def GetRegistration(
+        self, request: registrations_pb2.GetRegistrationRequest, context: Context
     ) -> registrations_pb2.Registration:
         return to_message(await self._service.registrations.get(request.registration), registrations_pb2.Registration)
 
-    async def PutRegistration(  # noqa: N802
-        self, request: registrations_pb2.PutRegistrationRequest, context: grpc.aio.ServicerContext
+    async def PutRegistration(
+        self, request: registrations_pb2.PutRegistrationRequest, context: Context
     ) -> registrations_pb2.Registration:
         content = request.content
         with under("content"):
@@ -308,8 +277,8 @@ class RegistrationService:
         kept = await self._service.registrations.put(request.registration, content.scene, registration)
         return to_message(kept, registrations_pb2.Registration)
 
-    async def DeleteRegistration(  # noqa: N802
-        self, request: registrations_pb2.DeleteRegistrationRequest, context: grpc.aio.ServicerContext
+    async def DeleteRegistration(
+        self, request: registrations_pb2.DeleteRegistrationRequest, context: Context
     ) -> registrations_pb2.DeleteRegistrationResponse:
         await self._service.registrations.delete(request.registration)
         return registrations_pb2.DeleteRegistrationResponse()
@@ -330,13 +299,11 @@ class AccessService:
     def __init__(self, service: Service) -> None:
         self._service = service
 
-    async def WhoAmI(  # noqa: N802
-        self, request: access_pb2.WhoAmIRequest, context: grpc.aio.ServicerContext
-    ) -> access_pb2.WhoAmIResponse:
+    async def WhoAmI(self, request: access_pb2.WhoAmIRequest, context: Context) -> access_pb2.WhoAmIResponse:
         return to_message(me(self._service.guard.asks), access_pb2.WhoAmIResponse)
 
-    async def ListAuditEntries(  # noqa: N802
-        self, request: access_pb2.ListAuditEntriesRequest, context: grpc.aio.ServicerContext
+    async def ListAuditEntries(
+        self, request: access_pb2.ListAuditEntriesRequest, context: Context
     ) -> access_pb2.ListAuditEntriesResponse:
         entries = await audit_entries(
             self._service.jobs.database.engine,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Any
 
 import grpc
@@ -46,21 +46,23 @@ LEAST_PING_INTERVAL_MS = 10_000
 MAX_CALLS_PER_CONNECTION = 1024
 _UNLIMITED = -1
 
-_SCENES = scenes_pb2.DESCRIPTOR.services_by_name["SceneService"].full_name
-_RENDERING = rendering_pb2.DESCRIPTOR.services_by_name["RenderService"].full_name
-_DATASETS = datasets_pb2.DESCRIPTOR.services_by_name["DatasetService"].full_name
-_JOBS = jobs_pb2.DESCRIPTOR.services_by_name["JobService"].full_name
-_ACCESS = access_pb2.DESCRIPTOR.services_by_name["AccessService"].full_name
-_WORKERS = workers_pb2.DESCRIPTOR.services_by_name["WorkerService"].full_name
-_REGISTRATIONS = registrations_pb2.DESCRIPTOR.services_by_name["RegistrationService"].full_name
-SERVICE_NAMES = (_SCENES, _RENDERING, _DATASETS, _JOBS, _ACCESS, _WORKERS, _REGISTRATIONS)
+_SERVICERS: tuple[tuple[Any, Callable[[Service], Any], Callable[[Any, Any], None]], ...] = (
+    (scenes_pb2, SceneService, scenes_pb2_grpc.add_SceneServiceServicer_to_server),
+    (rendering_pb2, RenderService, rendering_pb2_grpc.add_RenderServiceServicer_to_server),
+    (datasets_pb2, DatasetService, datasets_pb2_grpc.add_DatasetServiceServicer_to_server),
+    (jobs_pb2, JobService, jobs_pb2_grpc.add_JobServiceServicer_to_server),
+    (access_pb2, AccessService, access_pb2_grpc.add_AccessServiceServicer_to_server),
+    (workers_pb2, WorkerService, workers_pb2_grpc.add_WorkerServiceServicer_to_server),
+    (registrations_pb2, RegistrationService, registrations_pb2_grpc.add_RegistrationServiceServicer_to_server),
+)
+_DESCRIPTORS = {name: one for file, *_ in _SERVICERS for name, one in file.DESCRIPTOR.services_by_name.items()}
+SERVICE_NAMES = tuple(one.full_name for one in _DESCRIPTORS.values())
 
 
 def _methods() -> Iterator[str]:
     """Every method of our services, as calls name them."""
-    for file in (scenes_pb2, rendering_pb2, datasets_pb2, jobs_pb2, access_pb2, workers_pb2, registrations_pb2):
-        for service in file.DESCRIPTOR.services_by_name.values():
-            yield from (f"/{service.full_name}/{method.name}" for method in service.methods)
+    for service in _DESCRIPTORS.values():
+        yield from (f"/{service.full_name}/{method.name}" for method in service.methods)
 
 
 class GrpcServer:
@@ -86,13 +88,8 @@ class GrpcServer:
         )
         self._health = Health()
         self._told = dict.fromkeys(("", *SERVICE_NAMES), False)
-        rendering_pb2_grpc.add_RenderServiceServicer_to_server(RenderService(service), self._server)
-        scenes_pb2_grpc.add_SceneServiceServicer_to_server(SceneService(service), self._server)
-        datasets_pb2_grpc.add_DatasetServiceServicer_to_server(DatasetService(service), self._server)
-        jobs_pb2_grpc.add_JobServiceServicer_to_server(JobService(service), self._server)
-        access_pb2_grpc.add_AccessServiceServicer_to_server(AccessService(service), self._server)
-        workers_pb2_grpc.add_WorkerServiceServicer_to_server(WorkerService(service), self._server)
-        registrations_pb2_grpc.add_RegistrationServiceServicer_to_server(RegistrationService(service), self._server)
+        for _, servicer, add in _SERVICERS:
+            add(servicer(service), self._server)
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
         reflection.enable_server_reflection(
             (*SERVICE_NAMES, health.SERVICE_NAME, reflection.SERVICE_NAME), self._server
@@ -115,16 +112,16 @@ class GrpcServer:
         """Sets the answers of grpc.health.v1 from now on: that of the server as a whole, and of each service."""
         parts = readiness.components
         serving = {
-            "": readiness.problem is None,
-            _RENDERING: parts.frames.ready,
-            _SCENES: parts.frames.ready,
-            _DATASETS: parts.artifacts.ready,
-            _JOBS: parts.jobs.ready and parts.artifacts.ready,
-            _WORKERS: parts.jobs.ready,
-            _ACCESS: True,
-            _REGISTRATIONS: parts.jobs.ready,
+            "RenderService": parts.frames.ready,
+            "SceneService": parts.frames.ready,
+            "DatasetService": parts.artifacts.ready,
+            "JobService": parts.jobs.ready and parts.artifacts.ready,
+            "WorkerService": parts.jobs.ready,
+            "AccessService": True,
+            "RegistrationService": parts.jobs.ready,
         }
-        for name, is_serving in serving.items():
+        told = {_DESCRIPTORS[name].full_name: is_serving for name, is_serving in serving.items()}
+        for name, is_serving in {"": readiness.problem is None, **told}.items():
             if self._told[name] is not is_serving:
                 self._told[name] = is_serving
                 code = health_pb2.HealthCheckResponse
@@ -184,7 +181,7 @@ class Health(health.aio.HealthServicer):  # type: ignore[misc]
         self._statuses[service] = status
         await super().set(service, status)
 
-    async def List(self, request: Any, context: Any) -> Any:  # noqa: N802  # the name of the method
+    async def List(self, request: Any, context: Any) -> Any:  # the name of the method
         """The health of all services."""
         statuses = {name: health_pb2.HealthCheckResponse(status=status) for name, status in self._statuses.items()}
         return health_pb2.HealthListResponse(statuses=statuses)

@@ -18,8 +18,8 @@ from ultragray.datasets.released import read_released, write_released
 from ultragray.errors import MemoryExceeded, TrainingDiverged
 from ultragray.learn.evaluation.scoring import evaluate, measure_reliability
 from ultragray.learn.training import TrainingConfig, train
+from ultragray_studies import report
 from ultragray_studies.methods import gaussians
-from ultragray_studies.report import study
 
 from .command_line import refused, run
 
@@ -122,9 +122,9 @@ def test_a_study_that_fails_does_not_take_the_report_with_it(
     def study_tilt(*arguments: Any, **options: Any) -> None:
         raise TrainingDiverged("the loss is nan")
 
-    monkeypatch.setattr(study, "train", train_or_fail)
+    monkeypatch.setattr(report, "train", train_or_fail)
     monkeypatch.setattr(gaussians, "train", train_or_fail)
-    monkeypatch.setattr(study, "study_tilt", study_tilt)
+    monkeypatch.setattr(report, "study_tilt", study_tilt)
     page = tmp_path / "page.html"
     result = run("report", dataset, "-o", page, "--steps", 2, "--max-gaussians", 40, "--threads", 1)
     assert result.exit_code == 0, result.output

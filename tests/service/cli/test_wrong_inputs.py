@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import socket
 import subprocess
-import sys
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -235,9 +234,3 @@ def test_a_misspelt_variable_is_told(variable: str, meant: str, place: Path, mon
     result = run("show", place / "scene.ugr", "--json")
     assert result.exit_code == 0
     assert f"the environment variable {variable} is not known and is ignored{meant}\n" in result.stderr
-
-
-def test_there_are_at_least_sixty_rows() -> None:
-    assert len(WRONG) >= 60
-    assert set(AS_PROCESSES) <= set(WRONG)
-    assert sys.executable

@@ -207,22 +207,12 @@ def test_a_viewer_is_sent_what_the_robot_sees(connect: Connect) -> None:
         assert client.ask("GET_STATUS").type_name == "STATUS"
 
 
-def test_the_robot_is_told_its_own_poses_as_often_as_it_asks(peer: Peer) -> None:
-    interval_ms = 300
-    assert peer.ask("STT_QTDATA", "", struct.pack(">I32s", interval_ms, b"")).content == b"\0"
-    images, told = 0, []
-    started = time.monotonic()
-    while time.monotonic() - started < 1.0:
-        peer.send_pose(moved(images / 10))
-        while (answer := peer.receive()).type_name == "QTDATA":
-            told.append(time.monotonic())
-        images += 1
-    assert images > 10
-    assert 3 <= len(told) <= 4
-    assert min(np.diff(told)) > 0.9 * interval_ms / 1000
+def test_the_robot_is_told_its_own_poses(peer: Peer) -> None:
+    assert peer.ask("STT_QTDATA", "", struct.pack(">I32s", 0, b"")).content == b"\0"
+    peer.send_pose(moved(1))
+    assert {peer.receive().type_name, peer.receive().type_name} == {"IMAGE", "QTDATA"}
     peer.send("STP_QTDATA")
-    while (answer := peer.receive()).type_name != "RTS_QTDATA":
-        assert answer.type_name == "QTDATA"
+    assert peer.receive().type_name == "RTS_QTDATA"
 
 
 def test_streams_that_we_cannot_give_are_refused(peer: Peer) -> None:
@@ -244,8 +234,7 @@ def test_a_stop_answers_what_was_asked_and_is_told(
         busy.image()
     for name in ("demo", "second", "fan"):
         busy.send_pose(np.eye(4), name)
-    answers = [busy.receive()]
-    time.sleep(0.05)  # the second is being rendered, or has been
+    answers = [busy.receive(), busy.receive()]
     assert service.terminate() == 0
     while answers[-1].device_name:
         answers.append(busy.receive())

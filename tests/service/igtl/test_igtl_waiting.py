@@ -1,6 +1,9 @@
+"""Poses that wait, and subscriptions, without a service and without a clock."""
+
 from __future__ import annotations
 
 import asyncio
+import contextlib
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
 from typing import Any
@@ -11,7 +14,7 @@ import pytest
 from ultragray.geometry.registration import Registration, rows
 from ultragray.rendering.settings import FrameSettings
 from ultragray_service.igtl.commands import Setup
-from ultragray_service.igtl.frames import MAX_WAITING_DEVICES, PoseMessage, Underway, WaitingPoses
+from ultragray_service.igtl.frames import MAX_WAITING_DEVICES, Feed, PoseMessage, Underway, WaitingPoses
 from ultragray_service.igtl.messages import Message
 from ultragray_workers.errors import QueueFull
 
@@ -139,3 +142,51 @@ def test_settled_is_when_nothing_waits_and_nothing_is_under_way() -> None:
         more.cancel()
 
     run(work)
+
+
+class _FrameOf:
+    """A frame that goes by any name."""
+
+    def goes_by(self, name: str) -> bool:
+        return True
+
+    def message(self, kind: str, version: int) -> Message:
+        return Message(kind, "robot", version=version)
+
+
+class _SkippingLoop(asyncio.SelectorEventLoop):
+    """An event loop whose time goes on to the next thing that is due whenever there is nothing to do."""
+
+    now = 1000.0
+
+    def time(self) -> float:
+        return self.now
+
+    def _run_once(self) -> None:
+        if not self._ready and self._scheduled:  # type: ignore[attr-defined]
+            self.now = max(self.now, self._scheduled[0].when())  # type: ignore[attr-defined]
+        super()._run_once()  # type: ignore[misc]
+
+
+def test_a_subscriber_is_told_at_most_as_often_as_it_asks(monkeypatch: pytest.MonkeyPatch) -> None:
+    loop = _SkippingLoop()
+    monkeypatch.setattr("ultragray_service.igtl.frames.time.monotonic", loop.time)
+    told: list[float] = []
+
+    async def send(message: Message) -> None:
+        told.append(loop.time())
+
+    async def work() -> None:
+        feed = Feed(contextlib.nullcontext, send)
+        feed.start("QTDATA", "", 0.3, 1)
+        running = asyncio.ensure_future(feed.run())
+        for _ in range(100):
+            feed.offer(_FrameOf(), is_own=True)  # type: ignore[arg-type]
+            await asyncio.sleep(0.01)
+        feed.stop("QTDATA")
+        await asyncio.sleep(1.0)
+        running.cancel()
+
+    loop.run_until_complete(work())
+    loop.close()
+    assert told == pytest.approx([1000.0, 1000.3, 1000.6, 1000.9], abs=0.02)

@@ -95,7 +95,8 @@ def test_the_share_of_contact_is_there_where_it_was_asked_for(tmp_path: Path) ->
     for format, dtype in dtypes.items():
         asked = replace(judged, dtype=dtype)
         path = tmp_path / f"frames{FORMATS[format].suffix}"
-        pixels = {"bmode": stored_pixels(rendered(("bmode",))["bmode"], np.dtype("u1" if dtype == "uint8" else "<f4"))}
+        stored = np.dtype("u1" if dtype == "uint8" else "<f4")
+        pixels = {"bmode": stored_pixels("bmode", rendered(("bmode",))["bmode"], stored)}
         with export_to(path, format, asked) as add:
             add(pixels, told)
     shares = [one.contact_share for one in told]
@@ -328,9 +329,9 @@ def test_a_full_disk_is_told_as_such(tmp_path: Path, format: str) -> None:
 
 def test_pixels_are_rounded_and_held_below_256() -> None:
     values = np.array([[[0.0, 0.5 / 255, 0.6 / 255, 1.0, 1.5]]], np.float32)
-    np.testing.assert_array_equal(stored_pixels(values, np.dtype("u1")), [[[0, 0, 1, 255, 255]]])
+    np.testing.assert_array_equal(stored_pixels("bmode", values, np.dtype("u1")), [[[0, 0, 1, 255, 255]]])
     labels = np.arange(5, dtype=np.uint8).reshape(1, 1, 5)
-    np.testing.assert_array_equal(stored_pixels(labels, np.dtype("u1")), labels)
+    np.testing.assert_array_equal(stored_pixels("labels", labels, np.dtype("u1")), labels)
 
 
 @pytest.mark.parametrize(

@@ -35,7 +35,7 @@ from ultragray.learn.training.geometry import Geometry
 from ultragray.learn.training.run import scene_of_checkpoint
 from ultragray.scene import info as scene_info
 
-from ...waiting import Deadline
+from ....waiting import Deadline
 
 Datasets = Callable[..., Dataset]
 Configs = Callable[..., TrainingConfig]
