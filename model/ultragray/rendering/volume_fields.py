@@ -1,4 +1,7 @@
-"""The fields of a scene on the grids of volumes and slices, and the files that these are written to."""
+"""The fields of a scene on the grids of volumes and slices (`ultragray.rendering.volumes`), and files of them.
+
+Fields are sums over Gaussians as `reference` has them, without a probe: nothing is rendered on the way.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,9 @@
-"""The extrapolation of a frame from what its scene was trained on, and the confidence in it."""
+"""How far a frame extrapolates from what its scene was trained on, and how much to trust it: what the pose alone tells.
+
+In reading order: measures of poses to the training views; the model of pixels' errors and that of whole frames, fitted
+by `ultragray.learn.training.confidence` and kept in the scene's file; `Assessor`, which gives each pose its
+`Extrapolation`; a least confidence. What only a rendered frame tells is in `ultragray.rendering.confidence`. No torch.
+"""
 
 from __future__ import annotations
 
@@ -445,8 +450,8 @@ class Extrapolation:
 
     def figures(self) -> dict[str, float | None]:
         """FIGURES, and the share of contact where it was judged: what files hold of a frame."""
-        told = {name: getattr(self, name) for name in FIGURES}
-        return told if self.contact_share is None else told | {CONTACT_SHARE: self.contact_share}
+        figures = {name: getattr(self, name) for name in FIGURES}
+        return figures if self.contact_share is None else figures | {CONTACT_SHARE: self.contact_share}
 
 
 CONTACT_SHARE = "contact_share"
