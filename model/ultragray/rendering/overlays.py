@@ -1,4 +1,4 @@
-"""What is put into the planes of frames when the backend has drawn them, before outputs are derived: tools, and then the
+"""What is put into the planes of frames after the backend has drawn them, before outputs are derived: tools, then the
 second echo. Both are the same on every backend; gradients pass to the planes.
 """
 
