@@ -31,6 +31,11 @@ ROOMS = {
     **{storey: {*BENEATH, *STOREYS[:place]} for place, storey in enumerate(STOREYS)},
     **{plugin: {*BENEATH, *STOREYS, *PLUGINS} for plugin in PLUGINS},
 }
+# The storeys of `ultragray`, each of which imports those before it; plug-ins stand beside them and import storeys.
+SERVICE_ROOMS = (  # each may import those before it
+    *("", "errors", "environment", "access", "settings", "misspelt", "tls", "telemetry", "listening", "core", "views"),
+    *("doors", "service", "wiring", "http", "rpc", "igtl", "server", "healthcheck", "cli", "__main__"),
+)
 
 
 @cache
@@ -92,6 +97,21 @@ def test_rooms_of_the_library_import_only_those_below_them() -> None:
         for name, room in inside.items()
         for other in imports_of(name) & inside.keys()
         if inside[other] not in {room, *ROOMS[room]}
+    }
+    assert wrong == set()
+
+
+def test_rooms_of_the_service_import_only_those_before_them() -> None:
+    places = {
+        name: SERVICE_ROOMS.index((*name.split("."), "")[1])
+        for name in modules()
+        if name.partition(".")[0] == "ultragray_service"
+    }
+    wrong = {
+        (name, other)
+        for name, place in places.items()
+        for other in imports_of(name) & places.keys()
+        if places[other] > place
     }
     assert wrong == set()
 

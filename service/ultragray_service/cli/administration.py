@@ -16,7 +16,7 @@ import typer
 from ultragray.errors import InvalidArgument
 from ultragray_service.access.principals import NAMES, Role, read_limits
 from ultragray_service.cli.options import FieldsOf, with_options
-from ultragray_service.cli.terminal import Json, command_group, examples, print_table, tell, to_json
+from ultragray_service.cli.terminal import Json, argument, command_group, examples, option, print_table, tell, to_json
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from ultragray_workers.errors import BackupInvalid
 
@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ultragray_service.access.keys import Key, KeyStore
     from ultragray_workers.backup.contents import Folders
     from ultragray_workers.backup.manifest import Manifest
-    from ultragray_workers.jobs.queue.database import JobDatabase
+    from ultragray_workers.jobs.database import JobDatabase
 
 
 Where = Annotated[
@@ -36,8 +36,9 @@ Where = Annotated[
 @contextmanager
 def opened_database(where: dict[str, Any]) -> Iterator[JobDatabase]:
     """The database that the options name. Raises InvalidArgument where there is no such installation, StartupFailed."""
-    from ultragray_workers.jobs.places import shared_storage
-    from ultragray_workers.jobs.queue.database import JobDatabase
+
+    from ultragray_workers.jobs.database import JobDatabase
+    from ultragray_workers.storage.location import open_storage
 
     settings = load_settings(**where)
     if settings.database_url is None and not settings.is_there:
@@ -46,7 +47,7 @@ def opened_database(where: dict[str, Any]) -> Iterator[JobDatabase]:
             "--data-folder",
             field="data_folder",
         )
-    database = JobDatabase(settings.working_folder, settings.database_url, shared_storage(settings.artifacts))
+    database = JobDatabase(settings.working_folder, settings.database_url, open_storage(settings.artifacts))
     try:
         yield database
     finally:
@@ -69,23 +70,20 @@ _KEY_COLUMNS = ("id", "name", "role", "state", "created", "expires", "last used"
 )
 @with_options
 def create(
-    name: Annotated[str, typer.Argument(help="Whose it is: a person, a machine or a program.", show_default=False)],
+    name: Annotated[str, argument("Whose it is: a person, a machine or a program.", shown=False)],
     *,
     role: Annotated[
-        Role,
-        typer.Option(
-            help="reader: sees, renders, streams; operator: and has jobs, datasets and scenes; admin: everything."
-        ),
+        Role, option("reader: sees, renders, streams; operator: and has jobs, datasets and scenes; admin: everything.")
     ],
     expires_days: Annotated[
-        float | None, typer.Option(min=0.0, max=36_500.0, help="Days that it counts.", show_default="for ever")
+        float | None, option("Days that it counts.", min=0.0, max=36500.0, shown="for ever")
     ] = None,
     limit: Annotated[
         list[str] | None,
-        typer.Option(
+        option(
+            f"A limit of its own, NAME=none: no limit; may be repeated. Names: {', '.join(NAMES)}.",
             metavar="NAME=NUMBER",
-            help=f"A limit of its own, NAME=none: no limit; may be repeated. Names: {', '.join(NAMES)}.",
-            show_default="the settings key_NAME of the service",
+            shown="the settings key_NAME of the service",
         ),
     ] = None,
     json: Json = False,
@@ -100,9 +98,9 @@ def create(
     with _key_store(where) as store:
         others = [key for key in store.keys().values() if key.name == name and key.is_valid(time.time())]
         key, secret = store.create(name, role, expires_days, limits)
-    typer.echo(f"key {key.id} of {key.name}, {_role(key)}, expires: {_time(key.expires_at_s, 'never')}", err=True)
+    typer.echo(f"key {key.id} of {key.name}, {key.role.value}, expires: {_time(key.expires_at_s, 'never')}", err=True)
     for other in others:
-        typer.echo(f"{name} still has the key {other.id}, {_role(other)}, too", err=True)
+        typer.echo(f"{name} still has the key {other.id}, {other.role.value}, too", err=True)
     typer.echo("Keep it now: it is shown only once.", err=True)
     tell(secret, {**_document(key), "secret": secret}, as_json=json)
 
@@ -126,7 +124,7 @@ def list_keys(
 @keys_app.command(epilog=examples("ultragray keys revoke alice"))
 @with_options
 def revoke(
-    name: Annotated[str, typer.Argument(help="Name, or id of one key.", show_default=False)],
+    name: Annotated[str, argument("Name, or id of one key.", shown=False)],
     *,
     json: Json = False,
     where: Where,
@@ -134,7 +132,7 @@ def revoke(
     """Revoke all keys of a name, or the one of an id. What runs on them is cut within two seconds."""
     with _key_store(where) as store:
         revoked = store.revoke(name)
-    lines = [f"revoked {key.id} of {key.name}, {_role(key)}" for key in revoked]
+    lines = [f"revoked {key.id} of {key.name}, {key.role.value}" for key in revoked]
     if lines or json:
         tell("\n".join(lines), [_document(key) for key in revoked], as_json=json)
     if not revoked:
@@ -157,17 +155,13 @@ def _row(key: Key) -> tuple[str, ...]:
     return (
         key.id,
         key.name,
-        _role(key),
+        key.role.value,
         _state(key),
         _time(key.created_at_s, ""),
         _time(key.expires_at_s, "never"),
         _time(key.last_used_at_s, "never"),
         " ".join(f"{name}={'none' if value is None else f'{value:g}'}" for name, value in key.limits.items()),
     )
-
-
-def _role(key: Key) -> str:
-    return "unknown" if key.role is None else key.role.value
 
 
 def _state(key: Key) -> str:
@@ -198,12 +192,10 @@ audit_app = command_group()
 @with_options
 def audit(
     *,
-    since_hours: Annotated[float, typer.Option(min=0.0, help="How far back.")] = 24.0,
-    who: Annotated[str | None, typer.Option(help="Only of this name.", show_default="all")] = None,
-    what: Annotated[
-        str | None, typer.Option(help="Only this operation, such as scene.delete, or scene.", show_default="all")
-    ] = None,
-    limit: Annotated[int, typer.Option(min=1, help="The last ones, at most.")] = 1000,
+    since_hours: Annotated[float, option("How far back.", min=0.0)] = 24.0,
+    who: Annotated[str | None, option("Only of this name.", shown="all")] = None,
+    what: Annotated[str | None, option("Only this operation, such as scene.delete, or scene.", shown="all")] = None,
+    limit: Annotated[int, option("The last ones, at most.", min=1)] = 1000,
     json: Json = False,
     where: Where,
 ) -> None:
@@ -230,9 +222,7 @@ def _timestamp(at_s: float) -> str:
 # `ultragray backup`: a whole installation into a folder.
 
 
-BackupFolder = Annotated[
-    Path, typer.Argument(help="Folder of backups, on another disk than the data.", show_default=False)
-]
+BackupFolder = Annotated[Path, argument("Folder of backups, on another disk than the data.", shown=False)]
 _SHOWN = 3
 backup_app = command_group()
 
@@ -246,11 +236,10 @@ backup_app = command_group()
 def backup(
     folder: BackupFolder,
     verify: Annotated[
-        bool, typer.Option("--verify", help="Make none: read all backups of the folder and check every hash.")
+        bool, option("Make none: read all backups of the folder and check every hash.", "--verify")
     ] = False,
     keep: Annotated[
-        int | None,
-        typer.Option(min=1, help="Remove all but so many of the newest backups of the folder.", show_default="all"),
+        int | None, option("Remove all but so many of the newest backups of the folder.", min=1, shown="all")
     ] = None,
     json: Json = False,
     *,
@@ -347,12 +336,8 @@ restore_app = command_group()
 @with_options
 def restore(
     folder: BackupFolder,
-    backup: Annotated[
-        str | None, typer.Option(help="Name of a backup of the folder.", show_default="the newest")
-    ] = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Replace all that the folders and the database hold now.")
-    ] = False,
+    backup: Annotated[str | None, option("Name of a backup of the folder.", shown="the newest")] = None,
+    force: Annotated[bool, option("Replace all that the folders and the database hold now.", "--force")] = False,
     json: Json = False,
     *,
     where: Where,
@@ -395,21 +380,17 @@ def places() -> None:
 )
 @with_options
 def copy(
-    source: Annotated[
-        str, typer.Argument(metavar="FROM", help="Data or artifact folder, or its URL.", show_default=False)
-    ],
-    target: Annotated[str, typer.Argument(metavar="TO", help="Where its scenes and datasets go.", show_default=False)],
+    source: Annotated[str, argument("Data or artifact folder, or its URL.", metavar="FROM", shown=False)],
+    target: Annotated[str, argument("Where its scenes and datasets go.", metavar="TO", shown=False)],
     *,
     json: Json = False,
 ) -> None:
-    """Copy the scenes of an installation, and check every hash; from a folder into a bucket its datasets, too.
+    """Copy the scenes of an installation, and check every hash; likewise its datasets.
 
     Interrupted, the same command goes on. Nothing is changed in FROM, and nothing overwritten in TO.
     """
-    from ultragray_workers.datasets.copying import CopiedDatasets, copy_datasets
-    from ultragray_workers.storage.copying import ARTIFACTS, copy_scenes
-    from ultragray_workers.storage.location import StorageUrl, parse_location
-    from ultragray_workers.storage.opening import open_storage
+    from ultragray_workers.backup.copying import ARTIFACTS, CopiedDatasets, copy_datasets, copy_scenes
+    from ultragray_workers.storage.location import below, open_storage, parse_location
 
     def say(sentence: str) -> None:
         typer.echo(sentence, err=True)
@@ -418,13 +399,12 @@ def copy(
     if isinstance(here, Path) and not here.is_dir():
         raise InvalidArgument(f"FROM must be an existing folder or the URL of a bucket, got {source!r}", field="FROM")
     done = copy_scenes(open_storage(here), open_storage(there), say)
-    datasets = CopiedDatasets()
-    if isinstance(here, Path) and isinstance(there, StorageUrl):
-        below = here / ARTIFACTS  # of a data folder
-        of_data = below.is_dir()
-        datasets = copy_datasets(
-            below if of_data else here, open_storage(there.below(ARTIFACTS) if of_data else there), say
-        )
+    datasets = copy_datasets(open_storage(here), open_storage(there), say)
+    below_data = copy_datasets(open_storage(below(here, ARTIFACTS)), open_storage(below(there, ARTIFACTS)), say)
+    datasets = CopiedDatasets(
+        datasets.datasets + below_data.datasets,
+        datasets.datasets_already_there + below_data.datasets_already_there,
+    )
     line = (
         f"scene files: {done.scenes:,} copied ({megabytes(done.bytes)}), {done.already_there:,} already there; "
         f"datasets: {datasets.datasets:,} copied, {datasets.datasets_already_there:,} already there"

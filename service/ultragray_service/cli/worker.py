@@ -10,11 +10,9 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Annotated, Any
 
-import typer
-
 from ultragray.errors import UltragrayError
 from ultragray_service.cli.options import FieldsOf, pairs_of, with_options
-from ultragray_service.cli.terminal import command_group, examples
+from ultragray_service.cli.terminal import command_group, examples, option
 from ultragray_service.server import ALIVE, READY, ServiceManager
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from ultragray_workers.errors import StartupFailed
@@ -31,15 +29,12 @@ command_app = command_group()
 )
 @with_options
 def worker(
-    name: Annotated[
-        str | None, typer.Option(help="Name of this worker, its alone.", show_default="of the host, numbered")
-    ] = None,
+    name: Annotated[str | None, option("Name of this worker, its alone.", shown="of the host, numbered")] = None,
     device: Annotated[
-        str, typer.Option(help="auto: every GPU of the host, and its processor; cpu; cuda: every GPU; or cuda:N.")
+        str, option("auto: every GPU of the host, and its processor; cpu; cuda: every GPU; or cuda:N.")
     ] = "auto",
     label: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=VALUE", help="A label that jobs can ask for; may be given several times."),
+        list[str] | None, option("A label that jobs can ask for; may be given several times.", metavar="NAME=VALUE")
     ] = None,
     *,
     options: Annotated[
@@ -72,8 +67,8 @@ def run_worker(
     from opentelemetry import trace
 
     from ultragray_service.telemetry.logs import configure_logging, start_tracing
-    from ultragray_workers.jobs.places import shared_storage
     from ultragray_workers.jobs.worker.worker import work
+    from ultragray_workers.storage.location import open_storage
 
     settings = load_settings(**overrides)
     configure_logging(settings.log_level, settings.log_format)
@@ -92,7 +87,7 @@ def run_worker(
         settings.working_folder,
         settings.database_url,
         stop,
-        shared=shared_storage(settings.artifacts),
+        storage=open_storage(settings.artifacts),
         max_copies_bytes=settings.max_cache_bytes,
         hurry=hurry,
         name=name,
@@ -112,7 +107,7 @@ def run_worker(
     if tracing is not None:
         tracing.stop()
     sys.stderr.flush()
-    os._exit(0)  # threads of the queue would be waited for
+    os._exit(0)  # work that a storage which is away keeps would be waited for
 
 
 def main(service_pid: str) -> int:

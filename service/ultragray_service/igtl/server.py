@@ -20,7 +20,7 @@ from ultragray_service.igtl.routes import SceneChooser
 from ultragray_service.listening import Connections
 from ultragray_service.service import Service
 from ultragray_workers.errors import Draining
-from ultragray_workers.jobs.queue.owners import Kind
+from ultragray_workers.jobs.owners import Kind
 
 _log = logging.getLogger("ultragray.igtl")
 
@@ -98,7 +98,7 @@ class IgtlServer:
                 self._service.limits.take_request()
                 places.callback(self._places.enter(host).leave)
                 places.enter_context(self._service.limits.stream())
-                connection.noted = places.enter_context(self._service.streams.opened("openigtlink", ""))
+                connection.record = places.enter_context(self._service.streams.opened("openigtlink", ""))
             except (TooManyConnections, RateLimited, LimitReached) as error:
                 self._service.audit.count(Entry(principal.name, host, IGTL.name, "", error.reason))
                 connection.dismiss(error)

@@ -15,10 +15,11 @@ from ultragray.errors import TrainingDiverged, UltragrayError
 from ultragray.installation import __version__
 from ultragray.learn.evaluation.methods import BudgetKind, ComparisonSettings
 from ultragray.learn.evaluation.scoring import evaluate_frames, require_frames
+from ultragray.learn.report.tables import DatasetFacts
 from ultragray.learn.sweep import Dataset, Sweep, spread_places
 from ultragray.learn.training.memory import machine_in_words, training_device
 from ultragray_studies.comparison.place import Place
-from ultragray_studies.comparison.result import Comparison, DatasetFacts, Distances, MethodResult
+from ultragray_studies.comparison.result import Comparison, Distances, MethodResult
 from ultragray_studies.methods.gaussians import SceneMethod
 from ultragray_studies.methods.method import (
     Budget,

@@ -27,7 +27,7 @@ from ultragray.phantom.demo import DEMO_FILE
 from ultragray_service.cli.app import app
 from ultragray_service.cli.serve import ensure_scenes, link_scenes
 from ultragray_service.settings import Settings
-from ultragray_workers.jobs.store import SCENES_FOLDER
+from ultragray_workers.shelves.opening import SCENES_FOLDER
 
 from .command_line import python, refused, run
 
@@ -90,6 +90,16 @@ def test_lists_of_commands_load_none_of_them() -> None:
     )
     answer = subprocess.run(python(program, "--help"), capture_output=True, text=True, check=True)
     assert answer.stdout.splitlines()[-1] == "[]"
+
+
+def test_no_help_needs_torch() -> None:
+    program = (
+        "from typer.testing import CliRunner; from ultragray_service.cli.app import app\n"
+        f"for line in {list(COMMANDS)!r}:\n"
+        "    CliRunner().invoke(app, [*line.split(), '--help']); assert 'torch' not in sys.modules, line"
+    )
+    done = subprocess.run(python(program), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 def test_completion_knows_commands_and_options() -> None:
