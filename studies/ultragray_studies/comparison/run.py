@@ -30,7 +30,6 @@ from ultragray_studies.methods.method import (
     Pace,
     Paces,
 )
-from ultragray_studies.methods.registry import chosen_methods
 
 SCENE = SceneMethod.name
 EQUAL_TIME = "equal time"  # among the paces: the seconds of the scene
@@ -47,27 +46,6 @@ class ComparisonProgress:
     fit: FitProgress | None
 
 
-def compare(
-    dataset: Dataset,
-    settings: ComparisonSettings,
-    *,
-    folder: Path,
-    device: str = "cpu",
-    paces: Paces | None = None,
-    report: Callable[[ComparisonProgress], None] | None = None,
-    should_stop: Callable[[], bool] | None = None,
-) -> Comparison | None:
-    """Compares the chosen methods; None where it was told to stop. The same call on the same folder goes on.
-
-    `paces` are `default_paces` unless given. Raises DatasetInvalid where no frames are held out, BackendUnavailable,
-    and TrainingStateInvalid for a folder of another comparison.
-    """
-    methods = chosen_methods(settings.methods)
-    return compare_methods(
-        dataset, methods, settings, folder=folder, device=device, paces=paces, report=report, should_stop=should_stop
-    )
-
-
 def compare_methods(
     dataset: Dataset,
     methods: Mapping[str, Method],
@@ -79,7 +57,11 @@ def compare_methods(
     report: Callable[[ComparisonProgress], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> Comparison | None:
-    """As `compare`, of any methods by name."""
+    """Compares methods by name; None where it was told to stop. The same call on the same folder goes on.
+
+    `paces` are `default_paces` unless given. Raises DatasetInvalid where no frames are held out, BackendUnavailable,
+    and TrainingStateInvalid for a folder of another comparison.
+    """
     require_frames(dataset.val)
     training_device(device, "auto")
     paces = default_paces(dataset, device) if paces is None else paces

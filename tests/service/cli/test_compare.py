@@ -100,7 +100,9 @@ def test_a_comparison_of_which_nothing_could_be_measured_ends_with_an_error(tmp_
 
 
 def test_what_is_learned_without_an_output_is_told_to_be_lost(sweep: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("ultragray_studies.comparison.run.compare", lambda *_, **__: None)  # as if stopped at once
+    monkeypatch.setattr(
+        "ultragray_studies.comparison.run.compare_methods", lambda *_, **__: None
+    )  # as if stopped at once
     result = run("compare", sweep, "--methods", "median,rapidvol")
     assert "with --output PAGE.html" in result.stderr
     assert "nothing is kept" in result.stderr
