@@ -110,7 +110,7 @@ def _check_output(output: Path, *, force: bool) -> None:
 
     TrainingStateInvalid where the folder of the run is another thing's: --force would remove it.
     """
-    from ultragray_studies.comparison.place import RUN_FILE
+    from ultragray_studies.comparison.run import RUN_FILE
 
     run = run_folder(output)
     is_a_run = (run / RUN_FILE).is_file()

@@ -9,8 +9,7 @@ from dataclasses import replace
 
 from ultragray.errors import TrainingDiverged
 from ultragray_studies.comparison.page import write_comparison
-from ultragray_studies.comparison.place import RUN_FILE
-from ultragray_studies.comparison.run import ComparisonProgress, compare_methods
+from ultragray_studies.comparison.run import RUN_FILE, ComparisonProgress, compare_methods
 from ultragray_studies.methods.registry import chosen_methods
 from ultragray_workers.jobs.folder import Outcome, Progress
 from ultragray_workers.jobs.kinds.compare import CompareJob

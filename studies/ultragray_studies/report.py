@@ -27,10 +27,9 @@ from ultragray.learn.training import Progress, TrainingConfig, train
 from ultragray.learn.training.progress import Course
 from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.info import read_header
-from ultragray_studies.comparison.place import frames_of
-from ultragray_studies.comparison.plots import plot_counts, plot_distances, plot_tilt
+from ultragray_studies.comparison.page import plot_counts, plot_distances, plot_tilt
 from ultragray_studies.comparison.result import Comparison, MethodResult
-from ultragray_studies.comparison.run import SCENE
+from ultragray_studies.comparison.run import SCENE, frames_of
 from ultragray_studies.methods.classical import Compounding, FromFrames
 from ultragray_studies.methods.gaussians import SCENE_FILE, SceneMethod
 from ultragray_studies.methods.method import Method

@@ -14,9 +14,8 @@ from ultragray.datasets import Dataset
 from ultragray.errors import DatasetInvalid, InvalidArgument, TrainingStateInvalid
 from ultragray.learn.evaluation.methods import ComparisonSettings
 from ultragray.learn.evaluation.scoring import evaluate_frames
-from ultragray_studies.comparison.place import frames_of
 from ultragray_studies.comparison.result import Comparison
-from ultragray_studies.comparison.run import EQUAL_TIME, ComparisonProgress, compare_methods, default_paces
+from ultragray_studies.comparison.run import EQUAL_TIME, ComparisonProgress, compare_methods, default_paces, frames_of
 from ultragray_studies.methods.classical import FromFrames
 from ultragray_studies.methods.method import Method, Pace, Paces
 from ultragray_studies.methods.registry import chosen_methods
