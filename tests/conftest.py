@@ -176,6 +176,17 @@ def random_poses() -> Callable[..., FloatArray]:
     return make
 
 
+# Folders all of whose tests are `long`, or want an image: importing them takes each test process seconds.
+_LONG_FOLDERS = {
+    ROOT / "tests" / name for name in ("batches", "faults", "fuzz", "hosts", "overload", "replicas", "soak")
+}
+
+
+def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+    """Leaves out what `-m "not long"` would import and then deselect."""
+    return True if collection_path in _LONG_FOLDERS and "not long" in config.option.markexpr else None
+
+
 # Fixtures that start processes: tests that use them are `slow`.
 _STARTING = {
     "benched",

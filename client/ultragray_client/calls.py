@@ -25,7 +25,7 @@ from ultragray_client.contract import (
     SliceSettings,
     Specification,
 )
-from ultragray_client.conversations import Batch, Conversation, LastJob, Upload, Watch, downloaded
+from ultragray_client.conversations import Batch, Conversation, LastJob, Upload, Watch, download_into
 from ultragray_client.errors import ClientError, InvalidPose, NotFound
 from ultragray_client.exchange import PoseExchange, StreamMode
 from ultragray_client.frames import (
@@ -497,7 +497,9 @@ class JobCalls:
 
         Raises ArtifactNotFound, and OSError where the file cannot be written.
         """
-        return Collection("JobService.DownloadArtifact", partial(downloaded, job_id, artifact, Path(path)), timeout_s)
+        return Collection(
+            "JobService.DownloadArtifact", partial(download_into, job_id, artifact, Path(path)), timeout_s
+        )
 
 
 class WorkerCalls:

@@ -1,7 +1,7 @@
 """The clients, for threads and for asyncio side by side: thin transports of the calls that `calls.py` describes.
 
-A method of a client is such a description carried out: `render = answered(ClientCalls.render)` has the parameters and
-the docstring of the description, and gives what the call answers.
+A method of a client is such a description carried out: `render = answer_method(ClientCalls.render)` has the parameters
+and the docstring of the description, and gives what the call answers.
 """
 
 from __future__ import annotations
@@ -251,33 +251,35 @@ def _method(describe: Callable[..., Any], verb: str, answer: str, *, is_awaited:
     return method
 
 
-def answered(describe: Callable[P, Call[T] | Collection[T]]) -> Callable[Concatenate[Any, P], T]:
+def answer_method(describe: Callable[P, Call[T] | Collection[T]]) -> Callable[Concatenate[Any, P], T]:
     """The method that waits for the answer to a call."""
     return _method(describe, "answer", "{}")  # type: ignore[no-any-return]
 
 
-def iterated(describe: Callable[P, Talk[T]]) -> Callable[Concatenate[Any, P], Iterator[T]]:
+def iterator_method(describe: Callable[P, Talk[T]]) -> Callable[Concatenate[Any, P], Iterator[T]]:
     """The method that gives the results of a conversation as they come."""
     return _method(describe, "iterate", "Iterator[{}]")  # type: ignore[no-any-return]
 
 
-def opened(describe: Callable[P, PoseStream]) -> Callable[Concatenate[Any, P], FrameStream]:
+def stream_method(describe: Callable[P, PoseStream]) -> Callable[Concatenate[Any, P], FrameStream]:
     """The method that opens a stream of poses."""
     return _method(describe, "open", "FrameStream")  # type: ignore[no-any-return]
 
 
-def awaited(describe: Callable[P, Call[T] | Collection[T]]) -> Callable[Concatenate[Any, P], Coroutine[Any, Any, T]]:
-    """As `answered`, for asyncio."""
+def coroutine_method(
+    describe: Callable[P, Call[T] | Collection[T]],
+) -> Callable[Concatenate[Any, P], Coroutine[Any, Any, T]]:
+    """As `answer_method`, for asyncio."""
     return _method(describe, "answer", "{}", is_awaited=True)  # type: ignore[no-any-return]
 
 
-def async_iterated(describe: Callable[P, Talk[T]]) -> Callable[Concatenate[Any, P], AsyncIterator[T]]:
-    """As `iterated`, for asyncio."""
+def async_iterator_method(describe: Callable[P, Talk[T]]) -> Callable[Concatenate[Any, P], AsyncIterator[T]]:
+    """As `iterator_method`, for asyncio."""
     return _method(describe, "iterate", "AsyncIterator[{}]")  # type: ignore[no-any-return]
 
 
-def async_opened(describe: Callable[P, PoseStream]) -> Callable[Concatenate[Any, P], AsyncFrameStream]:
-    """As `opened`, for asyncio."""
+def async_stream_method(describe: Callable[P, PoseStream]) -> Callable[Concatenate[Any, P], AsyncFrameStream]:
+    """As `stream_method`, for asyncio."""
     return _method(describe, "open", "AsyncFrameStream")  # type: ignore[no-any-return]
 
 
@@ -291,20 +293,20 @@ class _Group:
 class Scenes(_Group):
     """`client.scenes`. All raise ClientError; a name that does not exist is SceneNotFound."""
 
-    list = answered(SceneCalls.list)
-    get = answered(SceneCalls.get)
-    load = answered(SceneCalls.load)
-    unload = answered(SceneCalls.unload)
+    list = answer_method(SceneCalls.list)
+    get = answer_method(SceneCalls.get)
+    load = answer_method(SceneCalls.load)
+    unload = answer_method(SceneCalls.unload)
 
 
 class Datasets(_Group):
     """`client.datasets`. All raise ClientError; a name that does not exist is DatasetNotFound."""
 
-    upload = answered(DatasetCalls.upload)
-    list = answered(DatasetCalls.list)
-    get = answered(DatasetCalls.get)
-    contact_sheet = answered(DatasetCalls.contact_sheet)
-    delete = answered(DatasetCalls.delete)
+    upload = answer_method(DatasetCalls.upload)
+    list = answer_method(DatasetCalls.list)
+    get = answer_method(DatasetCalls.get)
+    contact_sheet = answer_method(DatasetCalls.contact_sheet)
+    delete = answer_method(DatasetCalls.delete)
 
 
 class Jobs(_Group):
@@ -315,16 +317,16 @@ class Jobs(_Group):
     see neither a `private` job nor the scene that it makes.
     """
 
-    submit = answered(JobCalls.submit)
-    list = answered(JobCalls.list)
-    get = answered(JobCalls.get)
-    watch = iterated(JobCalls.watch)
-    wait = answered(JobCalls.wait)
-    cancel = answered(JobCalls.cancel)
-    retry = answered(JobCalls.retry)
-    delete = answered(JobCalls.delete)
-    log = answered(JobCalls.log)
-    download = answered(JobCalls.download)
+    submit = answer_method(JobCalls.submit)
+    list = answer_method(JobCalls.list)
+    get = answer_method(JobCalls.get)
+    watch = iterator_method(JobCalls.watch)
+    wait = answer_method(JobCalls.wait)
+    cancel = answer_method(JobCalls.cancel)
+    retry = answer_method(JobCalls.retry)
+    delete = answer_method(JobCalls.delete)
+    log = answer_method(JobCalls.log)
+    download = answer_method(JobCalls.download)
 
 
 class Workers(_Group):
@@ -334,19 +336,19 @@ class Workers(_Group):
     included.
     """
 
-    list = answered(WorkerCalls.list)
-    pause = answered(WorkerCalls.pause)
-    drain = answered(WorkerCalls.drain)
-    resume = answered(WorkerCalls.resume)
+    list = answer_method(WorkerCalls.list)
+    pause = answer_method(WorkerCalls.pause)
+    drain = answer_method(WorkerCalls.drain)
+    resume = answer_method(WorkerCalls.resume)
 
 
 class Registrations(_Group):
     """`client.registrations`. All raise ClientError; a name that does not exist is RegistrationNotFound."""
 
-    list = answered(RegistrationCalls.list)
-    get = answered(RegistrationCalls.get)
-    put = answered(RegistrationCalls.put)
-    delete = answered(RegistrationCalls.delete)
+    list = answer_method(RegistrationCalls.list)
+    get = answer_method(RegistrationCalls.get)
+    put = answer_method(RegistrationCalls.put)
+    delete = answer_method(RegistrationCalls.delete)
 
 
 class Client:
@@ -379,14 +381,14 @@ class Client:
         self.workers = Workers(self._connection)
         self.registrations = Registrations(self._connection)
 
-    render = answered(ClientCalls.render)
-    render_batch = iterated(ClientCalls.render_batch)
-    stream = opened(ClientCalls.stream)
-    render_slice = answered(ClientCalls.render_slice)
-    assess_poses = answered(ClientCalls.assess_poses)
-    localize = answered(ClientCalls.localize)
-    who_am_i = answered(ClientCalls.who_am_i)
-    audit = answered(ClientCalls.audit)
+    render = answer_method(ClientCalls.render)
+    render_batch = iterator_method(ClientCalls.render_batch)
+    stream = stream_method(ClientCalls.stream)
+    render_slice = answer_method(ClientCalls.render_slice)
+    assess_poses = answer_method(ClientCalls.assess_poses)
+    localize = answer_method(ClientCalls.localize)
+    who_am_i = answer_method(ClientCalls.who_am_i)
+    audit = answer_method(ClientCalls.audit)
 
     def close(self) -> None:
         """Ends all that is under way."""
@@ -402,53 +404,53 @@ class Client:
 class AsyncScenes(_Group):
     """`Scenes` for asyncio."""
 
-    list = awaited(SceneCalls.list)
-    get = awaited(SceneCalls.get)
-    load = awaited(SceneCalls.load)
-    unload = awaited(SceneCalls.unload)
+    list = coroutine_method(SceneCalls.list)
+    get = coroutine_method(SceneCalls.get)
+    load = coroutine_method(SceneCalls.load)
+    unload = coroutine_method(SceneCalls.unload)
 
 
 class AsyncDatasets(_Group):
     """`Datasets` for asyncio."""
 
-    upload = awaited(DatasetCalls.upload)
-    list = awaited(DatasetCalls.list)
-    get = awaited(DatasetCalls.get)
-    contact_sheet = awaited(DatasetCalls.contact_sheet)
-    delete = awaited(DatasetCalls.delete)
+    upload = coroutine_method(DatasetCalls.upload)
+    list = coroutine_method(DatasetCalls.list)
+    get = coroutine_method(DatasetCalls.get)
+    contact_sheet = coroutine_method(DatasetCalls.contact_sheet)
+    delete = coroutine_method(DatasetCalls.delete)
 
 
 class AsyncJobs(_Group):
     """`Jobs` for asyncio."""
 
-    submit = awaited(JobCalls.submit)
-    list = awaited(JobCalls.list)
-    get = awaited(JobCalls.get)
-    watch = async_iterated(JobCalls.watch)
-    wait = awaited(JobCalls.wait)
-    cancel = awaited(JobCalls.cancel)
-    retry = awaited(JobCalls.retry)
-    delete = awaited(JobCalls.delete)
-    log = awaited(JobCalls.log)
-    download = awaited(JobCalls.download)
+    submit = coroutine_method(JobCalls.submit)
+    list = coroutine_method(JobCalls.list)
+    get = coroutine_method(JobCalls.get)
+    watch = async_iterator_method(JobCalls.watch)
+    wait = coroutine_method(JobCalls.wait)
+    cancel = coroutine_method(JobCalls.cancel)
+    retry = coroutine_method(JobCalls.retry)
+    delete = coroutine_method(JobCalls.delete)
+    log = coroutine_method(JobCalls.log)
+    download = coroutine_method(JobCalls.download)
 
 
 class AsyncWorkers(_Group):
     """`Workers` for asyncio."""
 
-    list = awaited(WorkerCalls.list)
-    pause = awaited(WorkerCalls.pause)
-    drain = awaited(WorkerCalls.drain)
-    resume = awaited(WorkerCalls.resume)
+    list = coroutine_method(WorkerCalls.list)
+    pause = coroutine_method(WorkerCalls.pause)
+    drain = coroutine_method(WorkerCalls.drain)
+    resume = coroutine_method(WorkerCalls.resume)
 
 
 class AsyncRegistrations(_Group):
     """`Registrations` for asyncio."""
 
-    list = awaited(RegistrationCalls.list)
-    get = awaited(RegistrationCalls.get)
-    put = awaited(RegistrationCalls.put)
-    delete = awaited(RegistrationCalls.delete)
+    list = coroutine_method(RegistrationCalls.list)
+    get = coroutine_method(RegistrationCalls.get)
+    put = coroutine_method(RegistrationCalls.put)
+    delete = coroutine_method(RegistrationCalls.delete)
 
 
 class AsyncClient:
@@ -472,14 +474,14 @@ class AsyncClient:
         self.workers = AsyncWorkers(self._connection)
         self.registrations = AsyncRegistrations(self._connection)
 
-    render = awaited(ClientCalls.render)
-    render_batch = async_iterated(ClientCalls.render_batch)
-    stream = async_opened(ClientCalls.stream)
-    render_slice = awaited(ClientCalls.render_slice)
-    assess_poses = awaited(ClientCalls.assess_poses)
-    localize = awaited(ClientCalls.localize)
-    who_am_i = awaited(ClientCalls.who_am_i)
-    audit = awaited(ClientCalls.audit)
+    render = coroutine_method(ClientCalls.render)
+    render_batch = async_iterator_method(ClientCalls.render_batch)
+    stream = async_stream_method(ClientCalls.stream)
+    render_slice = coroutine_method(ClientCalls.render_slice)
+    assess_poses = coroutine_method(ClientCalls.assess_poses)
+    localize = coroutine_method(ClientCalls.localize)
+    who_am_i = coroutine_method(ClientCalls.who_am_i)
+    audit = coroutine_method(ClientCalls.audit)
 
     async def close(self) -> None:
         """Ends all that is under way."""

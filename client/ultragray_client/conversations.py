@@ -211,7 +211,7 @@ class Download(Conversation[jobs_pb2.ArtifactChunk]):
 
 
 @contextlib.contextmanager
-def downloaded(job_id: str, name: str, path: Path) -> Iterator[Download]:
+def download_into(job_id: str, name: str, path: Path) -> Iterator[Download]:
     """A download into a temporary file beside `path`, which takes that name when the body is done. Raises OSError."""
     temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}.tmp")
     descriptor = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o666)

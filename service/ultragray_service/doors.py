@@ -79,8 +79,8 @@ class Doors:
             "API key": self._about_keys(asks_for_keys),
             "stop": "Ctrl-C",
         }
-        told = (f"  {name:<{_LABEL_WIDTH}}{value}\n" for name, value in lines.items() if value is not None)
-        return f"\nUltraG-Ray {__version__} is ready\n{''.join(told)}\n"
+        rows = (f"  {name:<{_LABEL_WIDTH}}{value}\n" for name, value in lines.items() if value is not None)
+        return f"\nUltraG-Ray {__version__} is ready\n{''.join(rows)}\n"
 
     def _about_keys(self, asks_for_keys: bool) -> str:
         if asks_for_keys:

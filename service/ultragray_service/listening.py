@@ -1,4 +1,8 @@
-"""Sockets that listen: who may connect, how many, and how long each may take."""
+"""Sockets that listen: who may connect, how many, and how long each may take.
+
+Neither uvicorn nor gRPC counts connections by address. HTTP and OpenIGTLink are accepted here, a place for each; gRPC
+accepts by itself, and is watched.
+"""
 
 from __future__ import annotations
 

@@ -22,7 +22,7 @@ from ultragray_service.core.registrations import Registrations
 from ultragray_service.core.rendering import Rendering, RequestPlanner
 from ultragray_service.core.scenes import SceneCatalog, ScenePlaces, Scenes
 from ultragray_service.core.threads import HelperProcesses
-from ultragray_service.core.uploads import DatasetUploads, Holdings, SceneImports
+from ultragray_service.core.uploads import DatasetUploads, Quotas, SceneImports
 from ultragray_service.doors import Doors
 from ultragray_service.service import Service
 from ultragray_service.settings import Settings
@@ -58,8 +58,8 @@ def make_service(settings: Settings) -> Service:
     )
     catalog = SceneCatalog(scenes)
     registrations = Registrations(catalog, owners, limits)
-    holdings = Holdings(limits, owners, datasets, scenes)
-    jobs = Jobs(settings, scenes, datasets, registrations.read_of_scene, holdings.admit_job)
+    quotas = Quotas(limits, owners, datasets, scenes)
+    jobs = Jobs(settings, scenes, datasets, registrations.read_of_scene, quotas.admit_job)
 
     pool = _pool(settings, places, metrics, tracing)
     planner = RequestPlanner(settings, catalog, registrations.of_scene)
@@ -93,8 +93,8 @@ def make_service(settings: Settings) -> Service:
         datasets=Datasets(datasets, owners),
         registrations=registrations,
         jobs=jobs,
-        uploads=DatasetUploads(datasets, settings, jobs, life.draining, checks, owners, holdings),
-        imports=SceneImports(scenes, places.made, settings, jobs, checks, owners, holdings),
+        uploads=DatasetUploads(datasets, settings, jobs, life.draining, checks, owners, quotas),
+        imports=SceneImports(scenes, places.made, settings, jobs, checks, owners, quotas),
         pool=pool,
         planner=planner,
         rendering=rendering,

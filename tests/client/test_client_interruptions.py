@@ -15,7 +15,7 @@ import pytest
 from ultragray_client import JobState, RenderJob, RenderSettings, errors
 from ultragray_client.calls import Deletion, Pause
 from ultragray_client.connection import Retries, Terms
-from ultragray_client.conversations import Watch, downloaded
+from ultragray_client.conversations import Watch, download_into
 from ultragray_proto.v1 import jobs_pb2
 
 from ..service.conftest import RunningService
@@ -68,7 +68,7 @@ def test_a_watch_goes_on(far_client: Any, client: Any, proxy: Proxy) -> None:
 
 def test_a_file_that_does_not_come_leaves_nothing(tmp_path: Path) -> None:
     def half() -> None:
-        with downloaded("job", "file", tmp_path / "file") as download:
+        with download_into("job", "file", tmp_path / "file") as download:
             download.keep(jobs_pb2.ArtifactChunk(data=b"half", file_bytes=8))
             request = download.request()
             assert request is not None
@@ -81,7 +81,7 @@ def test_a_file_that_does_not_come_leaves_nothing(tmp_path: Path) -> None:
 
 
 def test_an_empty_file_is_a_file(tmp_path: Path) -> None:
-    with downloaded("job", "file", tmp_path / "file") as download:
+    with download_into("job", "file", tmp_path / "file") as download:
         download.keep(jobs_pb2.ArtifactChunk(data=b"", file_bytes=0))
         download.end_of_call()
         assert download.request() is None

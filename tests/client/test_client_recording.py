@@ -11,10 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from mcap.exceptions import EndOfFile
 from mcap.reader import make_reader
-from mcap.records import Message
-from mcap.stream_reader import StreamReader
 from mcap_ros2.decoder import DecoderFactory
 
 from ultragray_client import (
@@ -150,34 +147,6 @@ def test_times_that_no_stamp_can_hold_are_refused(client: Any, tmp_path: Path) -
             with pytest.raises(errors.InvalidArgument, match="time_ns must be a whole number of nanoseconds"):
                 recording.add(frame, time_ns=time_ns)
     assert not decoded(tmp_path / "times.mcap", "/ultragray/bmode")
-
-
-KILLED = """
-import os, signal, sys
-import numpy as np
-from ultragray_client import Client, Recording, RenderSettings
-address, key, path = sys.argv[1:]
-with Client(address, api_key=key) as client, Recording(path) as recording:
-    for place in range(3):
-        for frame in client.render_batch("demo", np.tile(np.eye(4), (10, 1, 1)), RenderSettings(height=300, width=300)):
-            recording.add(frame)
-    os.kill(os.getpid(), signal.SIGKILL)
-"""
-
-
-@pytest.mark.slow
-def test_a_client_that_is_killed_leaves_no_file_of_that_name_and_what_it_wrote_can_be_read(
-    client_service: RunningService, tmp_path: Path
-) -> None:
-    path = tmp_path / "killed.mcap"
-    done = subprocess.run([sys.executable, "-c", KILLED, client_service.grpc, KEY, str(path)], timeout=120)
-    assert done.returncode == -signal.SIGKILL
-    (left,) = tmp_path.iterdir()
-    assert left.name.startswith(".killed.mcap.")
-    found: list[Any] = []
-    with left.open("rb") as file, pytest.raises(EndOfFile):  # its end is missing
-        found.extend(StreamReader(file).records)
-    assert sum(isinstance(one, Message) for one in found) > 60  # three of each frame but those of the last megabyte
 
 
 def test_a_file_that_cannot_grow_is_one_error_and_leaves_nothing(client: Any, tmp_path: Path) -> None:

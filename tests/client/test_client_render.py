@@ -120,16 +120,6 @@ def test_a_batch_takes_poses_as_it_goes(client: Any) -> None:
     assert not list(client.render_batch("demo", []))
 
 
-def test_a_bad_pose_is_named_by_its_place_in_the_whole_batch(client: Any) -> None:
-    poses = np.tile(np.eye(4), (MAX_POSES * 2 + 5, 1, 1))
-    poses[-1] *= 2
-    frames = client.render_batch("demo", poses, RenderSettings(height=8, width=8))
-    assert next(frames).sequence == 0
-    with pytest.raises(errors.InvalidPose, match=r"poses\[84\]") as caught:
-        list(frames)
-    assert caught.value.field == "poses[84].matrix"
-
-
 def test_both_clients_have_the_same_methods(client_service: RunningService) -> None:
     def signatures(cls: type) -> dict[str, list[tuple[str, Any]]]:
         public = inspect.getmembers(cls, lambda value: inspect.isfunction(value))

@@ -16,18 +16,13 @@ from ultragray_client import (
     AroundSampler,
     Box,
     ConvexProbe,
-    CoveredSampler,
     DatasetOptions,
     Display,
-    FanSampler,
     JobState,
     LinearProbe,
     Needle,
     RenderJob,
-    Sampler,
-    SplineSampler,
     ToolFrame,
-    TrainingSampler,
     TrainJob,
     WorkerState,
     errors,
@@ -178,23 +173,6 @@ def test_a_batch_of_frames_as_a_job(client: Any, tmp_path: Path) -> None:
         client.jobs.submit(RenderJob(scene="demo", poses=[np.eye(4), np.eye(3)]))
     with pytest.raises(errors.InvalidArgument, match="state must be one of queued"):
         client.jobs.list(state="lost")
-
-
-@pytest.mark.parametrize(
-    ("sampler", "format", "dtype"),
-    [
-        (TrainingSampler(), "tar", "float32"),
-        (AroundSampler(count=2, translation_mm=1.5, rotation_deg=3.0, seed=1), "npz", "uint8"),
-        (SplineSampler(spacing_mm=2.0), "zarr", "float32"),
-        (FanSampler(tilt_deg=4.0, step_deg=2.0), "hdf5", "uint8"),
-        (CoveredSampler(count=2, seed=5), "plus", "uint8"),
-        (CoveredSampler(count=2, seed=6), "mcap", "float32"),
-    ],
-)
-def test_every_sampler_is_taken(client: Any, sampler: Sampler, format: str, dtype: str) -> None:
-    specification = RenderJob(scene="demo", sampler=sampler, height=8, width=8, format=format, dtype=dtype)
-    told = client.jobs.submit(specification, priority=-1000).specification
-    assert (told.sampler, told.format, told.dtype) == (sampler, format, dtype)
 
 
 def test_cancel_and_retry(client: Any) -> None:

@@ -15,7 +15,6 @@ from PIL import Image as Picture
 
 from ultragray_client import Client, Display, RenderSettings
 
-from ..client.proxy import Proxy
 from ..service.conftest import RunningService
 from ..surroundings import ROOT
 from ..waiting import wait_until
@@ -135,64 +134,6 @@ def test_what_cannot_be_rendered_is_logged_and_the_node_goes_on(
     peer.frame(images, 4)
     assert {image.header.stamp.sec for image in images} == {1, 4}
     assert node.log().count("INVALID_POSE") == 1, "the log is throttled"
-
-
-def test_a_scene_that_does_not_exist_is_logged_until_another_is_named(
-    start_node: Start, peer: Peer, ros_service: RunningService
-) -> None:
-    from sensor_msgs.msg import Image
-
-    node = start_node(address=ros_service.grpc, scene="absent")
-    images = peer.listen(Image, "bmode")
-    peer.pose_until(lambda: "SCENE_NOT_FOUND" in node.log(), 1)
-    assert peer.set("scene", "demo") is None
-    peer.frame(images, 2)
-    assert {image.header.stamp.sec for image in images} == {2}
-
-
-def test_a_service_that_is_away_is_logged_and_found_again(
-    start_node: Start, peer: Peer, ros_service: RunningService
-) -> None:
-    from sensor_msgs.msg import Image
-
-    proxy = Proxy("127.0.0.1:1")
-    node = start_node(address=proxy.address)
-    images = peer.listen(Image, "bmode")
-    peer.pose_until(lambda: "UNREACHABLE" in node.log(), 1)
-    proxy.lead_to(ros_service.grpc)
-    peer.frame(images, 2)
-    proxy.cut_after(100)
-    peer.frame(images, 3)
-    peer.frame(images, 4)
-    assert proxy.cuts == 1
-    proxy.close()
-
-
-def test_of_poses_that_come_too_fast_the_newest_gets_the_image(
-    start_node: Start, peer: Peer, ros_service: RunningService
-) -> None:
-    from diagnostic_msgs.msg import DiagnosticArray
-
-    start_node(address=ros_service.grpc, height="1024", width="1024", timeout_s="60.0")
-    told = peer.listen(DiagnosticArray, "confidence")
-    peer.frame(told, 1)
-    for stamp in range(100, 400):
-        peer.pose(stamp)
-    wait_until(lambda: told[-1].header.stamp.sec == 399)
-    stamps = [one.header.stamp.sec for one in told]
-    assert stamps == sorted(stamps)
-    assert len(stamps) < 250
-
-
-def test_a_frame_that_is_too_far_behind_its_pose_is_not_published(
-    start_node: Start, peer: Peer, ros_service: RunningService
-) -> None:
-    from sensor_msgs.msg import Image
-
-    node = start_node(address=ros_service.grpc, timeout_s="0.000001")
-    images = peer.listen(Image, "bmode")
-    peer.pose_until(lambda: "DEADLINE_EXCEEDED" in node.log(), 1)
-    assert images == []
 
 
 def test_the_node_is_a_lifecycle_node(start_node: Start, peer: Peer, ros_service: RunningService) -> None:

@@ -15,13 +15,11 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
-from websockets.sync.client import ClientConnection, connect
 
 from ultragray.contract import Contract, Family, annotated_fields, optional_of
 from ultragray.rendering.settings import RenderSettings
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2
 
-from .conftest import RunningService
 from .rpc.test_grpc_render import error_info
 
 TIMEOUT_S = 60.0
@@ -117,24 +115,6 @@ def test_http(http: httpx.Client, asked: dict[str, Any], pose: dict[str, Any]) -
     assert answer.status_code == 200 or answer.json()["field"], answer.text
 
 
-@pytest.fixture(scope="module")
-def websocket(service: RunningService) -> Iterator[ClientConnection]:
-    address = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/demo/stream"
-    with connect(address, compression=None, max_size=None, close_timeout=0.2) as connection:
-        yield connection
-
-
-@EXTREME
-@example(asked=DEEP, pose=POSE)
-@MANY
-def test_websocket(websocket: ClientConnection, asked: dict[str, Any], pose: dict[str, Any]) -> None:
-    websocket.send(json.dumps({"settings": asked, "pose": pose}))
-    answer = websocket.recv(timeout=TIMEOUT_S)
-    if isinstance(answer, str):
-        error = json.loads(answer)["error"]
-        assert error["field"], error
-
-
 class Stream:
     """A stream that must outlive all that is asked of it."""
 
@@ -181,24 +161,6 @@ def pose_message(pose: dict[str, Any]) -> geometry_pb2.Pose:
     if "matrix" in pose:
         return geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=np.ravel(pose["matrix"])))
     return geometry_pb2.Pose(placement=geometry_pb2.Placement(**pose))
-
-
-FEWER = settings(MANY, max_examples=60)
-
-
-@EXTREME
-@example(asked=DEEP, pose=POSE)
-@FEWER
-def test_grpc_calls(renders: Any, asked: dict[str, Any], pose: dict[str, Any]) -> None:
-    try:
-        settings, placed = settings_message(asked), pose_message(pose)
-    except (ValueError, OverflowError):  # an integer that the message has no room for
-        return
-    check_refusal(
-        lambda: renders.Render(rendering_pb2.RenderRequest(settings=settings, pose=placed), timeout=TIMEOUT_S)
-    )
-    batch = rendering_pb2.RenderBatchRequest(settings=settings, poses=[placed])
-    check_refusal(lambda: list(renders.RenderBatch(batch, timeout=TIMEOUT_S)))
 
 
 def check_refusal(call: Callable[[], Any]) -> None:

@@ -28,6 +28,11 @@ WAITING = "ultragray_waiting_frames "
 SLOW = {"backend": "reference", "max_batch_poses": 1}  # so that frames still wait when a test looks
 
 
+@pytest.fixture(scope="module")
+def slow(start_service: StartService) -> RunningService:
+    return start_service(**SLOW)
+
+
 def render(service: RunningService, client: httpx.Client, **body: Any) -> httpx.Response:
     return client.post(f"{service.http}/v1/scenes/demo/render", json={"pose": IDENTITY, **body}, timeout=120)
 
@@ -159,10 +164,9 @@ def test_a_full_queue_is_told_with_a_time_to_retry(start_service: StartService) 
         assert render(service, client).status_code == 200
 
 
-def test_frames_of_a_client_that_has_gone_are_dropped(start_service: StartService) -> None:
-    service = start_service(**SLOW)
+def test_frames_of_a_client_that_has_gone_are_dropped(slow: RunningService) -> None:
     with httpx.Client(timeout=60) as client:
-        host, port = service.http.removeprefix("http://").split(":")
+        host, port = slow.http.removeprefix("http://").split(":")
         body = (
             b'{"height": 80, "width": 80, "poses": ['
             + b", ".join(
@@ -176,22 +180,21 @@ def test_frames_of_a_client_that_has_gone_are_dropped(start_service: StartServic
         )
         with socket.create_connection((host, int(port))) as connection:
             connection.sendall(head.encode() + body)
-            wait_until(lambda: service.metric(WAITING))
-        wait_until(lambda: service.metric(WAITING) == 0, within_s=at_this_load(3))
-        assert render(service, client).status_code == 200
+            wait_until(lambda: slow.metric(WAITING))
+        wait_until(lambda: slow.metric(WAITING) == 0, within_s=at_this_load(3))
+        assert render(slow, client).status_code == 200
 
 
-def test_interactive_frames_go_before_a_batch(start_service: StartService) -> None:
-    service = start_service(**SLOW)
-    with service.channel() as channel, httpx.Client(timeout=60) as client:
+def test_interactive_frames_go_before_a_batch(slow: RunningService) -> None:
+    with slow.channel() as channel, httpx.Client(timeout=60) as client:
         stub = rendering_pb2_grpc.RenderServiceStub(channel)
         settings = rendering_pb2.RenderSettings(scene="demo", **SMALL)
         batch = rendering_pb2.RenderBatchRequest(settings=settings, poses=[moved(0)] * 12)
         received: list[int] = []
         reader = threading.Thread(target=lambda: received.extend(f.sequence for f in stub.RenderBatch(batch)))
         reader.start()
-        wait_until(lambda: service.metric(WAITING))
-        assert render(service, client, **SMALL).status_code == 200
+        wait_until(lambda: slow.metric(WAITING))
+        assert render(slow, client, **SMALL).status_code == 200
         done_before = len(received)
         reader.join()
         assert done_before <= 4

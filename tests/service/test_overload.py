@@ -5,13 +5,11 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections import Counter
 from pathlib import Path
 from typing import Any
 
 import grpc
 import httpx
-import numpy as np
 import pytest
 import torch
 
@@ -24,8 +22,6 @@ from .rpc.test_grpc_render import error_info, moved
 
 IDENTITY = {"position_mm": {"x": 0, "y": 0, "z": 0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}
 LARGE = {"height": 512, "width": 512}
-GREEDY = 40
-OVERLOAD_S = 6.0
 
 
 @pytest.fixture(scope="module")
@@ -121,51 +117,3 @@ def test_a_request_names_how_long_it_waits_to_begin(start_service: StartService,
         assert error_info(caught.value)[0].metadata["field"] == "max_queue_ms"
         request.max_queue_ms = 60_000
         assert rendering_pb2_grpc.RenderServiceStub(channel).Render(request, timeout=60).data
-
-
-def test_overload_is_refused_early_and_whoever_asks_little_is_served(slow: RunningService) -> None:
-    body = {"height": 80, "width": 80}
-    statuses: Counter[int] = Counter()
-    accepted_s: list[float] = []
-    retry_after_s: list[int] = []
-    stop = threading.Event()
-    lock = threading.Lock()
-
-    def hammer() -> None:
-        with httpx.Client(base_url=slow.http, timeout=60) as client:
-            while not stop.is_set():
-                began = time.monotonic()
-                answer = render(client, "demo", **body)
-                with lock:
-                    statuses[answer.status_code] += 1
-                    if answer.status_code == 200:
-                        accepted_s.append(time.monotonic() - began)
-                    else:
-                        assert answer.json()["reason"] == "QUEUE_FULL"
-                        retry_after_s.append(int(answer.headers["Retry-After"]))
-                if answer.status_code == 429:
-                    time.sleep(0.05)  # far sooner than it was told
-
-    with httpx.Client(base_url=slow.http, timeout=60) as client:
-        alone_s = []
-        for _ in range(10):
-            began = time.monotonic()
-            assert render(client, "demo", **body).status_code == 200
-            alone_s.append(time.monotonic() - began)
-        threads = [threading.Thread(target=hammer) for _ in range(GREEDY)]
-        for thread in threads:
-            thread.start()
-        time.sleep(OVERLOAD_S)
-        stop.set()
-        for thread in threads:
-            thread.join(60)
-        began = time.monotonic()
-        assert render(client, "demo", **body).status_code == 200  # recovered
-        recovery_s = time.monotonic() - began
-    frame_s = float(np.median(alone_s))
-    assert set(statuses) == {200, 429}, statuses
-    assert statuses[429] > 0
-    assert min(retry_after_s) >= 1
-    assert np.percentile(accepted_s, 99) < at_this_load(2.0)
-    assert recovery_s < at_this_load(2.0)
-    assert statuses[200] > 0.3 * OVERLOAD_S / frame_s  # goodput, with the clients on the same cores

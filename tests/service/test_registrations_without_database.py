@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import time
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +11,6 @@ import numpy as np
 import pytest
 import sqlalchemy as sa
 
-from ultragray_service.access.keys import INTERVAL_S
 from ultragray_workers.jobs.queue.database import JobDatabase
 from ultragray_workers.jobs.queue.owners import tell_change
 from ultragray_workers.jobs.queue.tables import REGISTRATIONS
@@ -67,7 +65,7 @@ def test_frames_go_on_by_a_registration_that_was_read_while_the_database_is_away
         put(http, 3.0)
         assert_shifted(render(elsewhere, pose_body, "robot"), 3.0)
         put(http, 4.0)
-        time.sleep(at_this_load(2 * INTERVAL_S))
+        wait_until(lambda: shift_mm(render(elsewhere, pose_body, "robot")) == 4.0)
         take_away()
         try:
             for _ in range(2):

@@ -10,7 +10,6 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
 
 import httpx
 import numpy as np
@@ -18,14 +17,11 @@ import pytest
 from websockets.sync.client import connect
 
 from ultragray import LinearProbe
-from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
 from ultragray_service.igtl.contents import unpack_image
 
 from .conftest import RunningService, StartService, make_scene
 from .igtl.conftest import Peer, address_of
 
-IDENTITY = geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=np.eye(4).ravel().tolist()))
-SETTINGS = rendering_pb2.RenderSettings(scene="changing")
 SWAPS = 8
 BETWEEN_SWAPS_S = 0.25
 
@@ -90,11 +86,6 @@ def check(changing: Changing, ask: Ask) -> None:
         swapping.join()
 
 
-def of_frame(frame: rendering_pb2.Frame) -> Seen:
-    assert not frame.HasField("error"), frame.error
-    return frame.scene_sha256, frame.probe.linear.far_mm
-
-
 def test_http(service: RunningService, changing: Changing) -> None:
     body = {"poses": [{"matrix": np.eye(4).tolist()}] * 3, "dtype": "uint8"}
 
@@ -106,44 +97,6 @@ def test_http(service: RunningService, changing: Changing) -> None:
 
     with httpx.Client(base_url=service.http, timeout=60) as client:
         check(changing, ask)
-
-
-def test_grpc(service: RunningService, changing: Changing) -> None:
-    with service.channel() as channel:
-        renders = rendering_pb2_grpc.RenderServiceStub(channel)
-        one = rendering_pb2.RenderRequest(settings=SETTINGS, pose=IDENTITY)
-        many = rendering_pb2.RenderBatchRequest(settings=SETTINGS, poses=[IDENTITY] * 20)
-
-        def ask() -> Iterator[Seen]:
-            yield of_frame(renders.Render(one, timeout=60))
-            yield from map(of_frame, renders.RenderBatch(many, timeout=60))
-
-        check(changing, ask)
-
-
-@pytest.mark.parametrize("mode", [rendering_pb2.STREAM_MODE_ORDERED, rendering_pb2.STREAM_MODE_LATEST])
-def test_grpc_stream(service: RunningService, changing: Changing, mode: Any) -> None:
-    poses = threading.Semaphore(0)
-    over = threading.Event()
-
-    def messages() -> Iterator[rendering_pb2.RenderStreamRequest]:
-        yield rendering_pb2.RenderStreamRequest(settings=SETTINGS, mode=mode)
-        while poses.acquire() and not over.is_set():
-            yield rendering_pb2.RenderStreamRequest(pose=IDENTITY)
-
-    with service.channel() as channel:
-        frames = rendering_pb2_grpc.RenderServiceStub(channel).RenderStream(messages())
-        poses.release(3)
-
-        def ask() -> Iterator[Seen]:
-            poses.release()
-            yield of_frame(next(frames))
-            if mode == rendering_pb2.STREAM_MODE_LATEST:
-                poses.release()  # some get no frame
-
-        check(changing, ask)
-        over.set()
-        poses.release()
 
 
 def test_websocket(service: RunningService, changing: Changing) -> None:

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import base64
 import shutil
-import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-import grpc
 import httpx
 import numpy as np
 import pytest
@@ -19,7 +17,6 @@ from ultragray.geometry.probe import FloatArray
 from ultragray.phantom.demo import DEMO_FILE, demo_poses, load_demo_scene
 from ultragray.rendering.pixels import image_file, to_uint8
 from ultragray_client import Client
-from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 
 from ..waiting import Deadline
 from .conftest import RunningService, StartService
@@ -79,18 +76,6 @@ def test_a_png_file_is_found_over_http(http: httpx.Client, png: bytes) -> None:
     assert found["shift_mm"] == pytest.approx(np.linalg.norm((1.5, -1.0, 1.0)), abs=0.3)
     assert found["scene"] == "spine"
     assert found["search_ms"] > 0.0
-
-
-def test_grey_pixels_are_found_over_grpc(phantom: RunningService, pixels: Any) -> None:
-    asked = rendering_pb2.LocalizeRequest(
-        scene="spine", image=pixels.tobytes(), image_height=SIDE, image_width=SIDE, within_mm=2.5
-    )
-    asked.start.matrix.values.extend(start().ravel().tolist())
-    with grpc.insecure_channel(phantom.grpc) as channel:
-        found = rendering_pb2_grpc.RenderServiceStub(channel).Localize(asked, timeout=120.0)
-    assert found.is_found
-    np.testing.assert_allclose(np.reshape(found.pose.values, (4, 4)), POSE, atol=0.2)
-    assert 0.0 < found.angle_std_deg.axial < 1.0
 
 
 def test_arrays_and_files_are_found_by_the_client(phantom: RunningService, pixels: Any, png: bytes) -> None:
@@ -173,13 +158,6 @@ def test_a_scene_that_is_not_there_is_not_found(http: httpx.Client, png: bytes) 
     assert http.post("/v1/scenes/nowhere:localize", json=body(png)).status_code == 404
 
 
-def test_a_large_body_is_read_as_a_small_one(http: httpx.Client) -> None:
-    scene = load_demo_scene()
-    frame = render(scene, None, POSE, height=384, width=384, outputs=("bmode",))["bmode"][0]
-    asked = body(to_uint8(frame.detach().numpy()).tobytes(), image_height=384, image_width=384)
-    assert http.post("/v1/scenes/spine:localize", json=asked).json()["is_found"]
-
-
 def test_a_search_ends_at_its_deadline_and_with_its_caller(http: httpx.Client, png: bytes) -> None:
     late = http.post("/v1/scenes/spine:localize", json=body(png, timeout_ms=1))
     assert late.status_code == 504
@@ -201,21 +179,3 @@ def test_a_search_counts_as_many_frames_of_the_key(
         assert answer.status_code == 422, answer.text
         assert "frames_per_s" in answer.json()["detail"]
         assert httpx.post(f"{service.http}/v1/scenes/spine:localize", json=body(png), timeout=60).status_code == 401
-
-
-def test_frames_are_rendered_between_searches(phantom: RunningService, png: bytes) -> None:
-    """One process serves both: a frame waits for at most one search."""
-    asked = body(png)
-
-    def search() -> None:
-        httpx.post(f"{phantom.http}/v1/scenes/spine:localize", json=asked, timeout=120.0)
-
-    searches = [threading.Thread(target=search) for _ in range(4)]
-    for thread in searches:
-        thread.start()
-    with Client(phantom.grpc, timeout_s=120.0) as client:
-        client.render("spine", POSE)
-    waiting = sum(thread.is_alive() for thread in searches)
-    for thread in searches:
-        thread.join()
-    assert waiting >= 1

@@ -205,7 +205,7 @@ FORMATS: Mapping[str, DatasetFormat] = {
             options=("frames", "crop", "transform", "image_topic", "pose_topic"),
             beside=(".geometry.json",),
         ),
-        DatasetFormat(
+        DatasetFormat(  # the last: a word, no file
             name=PHANTOM,
             noun="built-in phantom",
             meaning=f"the word {PHANTOM}",

@@ -75,7 +75,7 @@ def write_ply(scene: GaussianScene, path: str | Path) -> None:
     tables = {"vertex": vertices, "training_pose": poses}
     for name, table in tables.items():
         lines.append(f"element {name} {len(table)}")
-        lines += [f"property {_KINDS[kind]} {column}" for column, kind in table.dtype.descr]
+        lines += [f"property {_KINDS[kind]} {column}" for column, kind, *_ in table.dtype.descr]
     with atomic_path(path) as temporary, temporary.open("wb") as file:
         file.write("\n".join([*lines, "end_header\n"]).encode("ascii"))
         for table in tables.values():
@@ -148,7 +148,8 @@ def _record(name: str, columns: list[tuple[str, str]]) -> np.dtype[np.void]:
     given = dict(columns)
     rest = sum(column.startswith("f_rest_") for column in given)
     degree = next((d for d in range(MAX_SH_DEGREE + 1) if (d + 1) ** 2 - 1 == rest), 0)
-    wanted = dict((_vertex(degree, LABEL in given) if name == "vertex" else _POSE).descr)
+    kind_of = _vertex(degree, LABEL in given) if name == "vertex" else _POSE
+    wanted = {column: kind for column, kind, *_ in kind_of.descr}
     if missing := sorted(wanted.keys() - given.keys()):
         raise ValueError(f"its {name} lacks {', '.join(missing)}")
     if surplus := sorted(given.keys() - wanted.keys()):

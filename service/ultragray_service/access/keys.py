@@ -19,7 +19,7 @@ from ultragray.contract import described
 from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray_service.access.credentials import digest_of
 from ultragray_service.access.principals import Number, Principal, Role
-from ultragray_service.errors import PermissionDenied, Unauthenticated
+from ultragray_service.errors import Unauthenticated
 from ultragray_workers.jobs.queue.owners import tell_change
 from ultragray_workers.jobs.queue.tables import CHANGES, KEYS
 from ultragray_workers.rounds import Rounds
@@ -38,7 +38,7 @@ class Key:
 
     id: str
     name: str = described("Whose it is.")
-    role: Role | None = described("null: one of another release, which is none here.")
+    role: Role
     created_at_s: float
     expires_at_s: float | None = None
     revoked_at_s: float | None = None
@@ -133,7 +133,7 @@ def read_keys(connection: sa.Connection) -> dict[bytes, Key]:
         bytes.fromhex(row.digest): Key(
             id=row.id,
             name=row.name,
-            role=_role(row.role),
+            role=Role(row.role),
             created_at_s=row.created_at_s,
             expires_at_s=row.expires_at_s,
             revoked_at_s=row.revoked_at_s,
@@ -142,11 +142,6 @@ def read_keys(connection: sa.Connection) -> dict[bytes, Key]:
         )
         for row in rows
     }
-
-
-def _role(name: str) -> Role | None:
-    """A role by its name; None for one that this release does not know."""
-    return Role(name) if name in {role.value for role in Role} else None
 
 
 class KnownKeys:
@@ -166,7 +161,7 @@ class KnownKeys:
         self._principals = {
             digest: Principal(key.name, key.role, key.id, key.expires_at_s, tuple(key.limits.items()))
             for digest, key in keys.items()
-            if key.revoked_at_s is None and key.role is not None
+            if key.revoked_at_s is None
         }
         self._keys = keys
 
@@ -175,10 +170,8 @@ class KnownKeys:
         principal = self._principals.get(digest)
         if principal is not None:
             self._used_at_s[principal.source] = time.time()
-        elif (key := self._keys.get(digest)) is not None:
-            if key.revoked_at_s is not None:
-                raise Unauthenticated("the API key was revoked", field="Authorization")
-            raise PermissionDenied("the API key has a role that this service does not know", field="Authorization")
+        elif digest in self._keys:
+            raise Unauthenticated("the API key was revoked", field="Authorization")
         return principal
 
     def take_uses(self) -> dict[str, float]:

@@ -1,4 +1,7 @@
-"""Limits of whoever the running code works for: what goes beyond them is refused, or waits for its turn."""
+"""Limits of whoever the running code works for: what goes beyond them is refused, or waits for its turn.
+
+The package `limits` counts in moving windows. What it does not know is how to wait in turn, and what is under way.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Tokens of an OpenID Connect issuer: its keys, fetched in the background; its claims, mapped to a role."""
+"""Tokens of an OpenID Connect issuer: its keys, fetched in the background; its claims, mapped to a role.
+
+PyJWT verifies. Its PyJWKClient does not fetch here: it does so where a token is checked, which is the event loop, and
+takes an answer of any length.
+"""
 
 from __future__ import annotations
 

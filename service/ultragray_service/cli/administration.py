@@ -100,9 +100,9 @@ def create(
     with _key_store(where) as store:
         others = [key for key in store.keys().values() if key.name == name and key.is_valid(time.time())]
         key, secret = store.create(name, role, expires_days, limits)
-    typer.echo(f"key {key.id} of {key.name}, {_role(key)}, expires: {_time(key.expires_at_s, 'never')}", err=True)
+    typer.echo(f"key {key.id} of {key.name}, {key.role.value}, expires: {_time(key.expires_at_s, 'never')}", err=True)
     for other in others:
-        typer.echo(f"{name} still has the key {other.id}, {_role(other)}, too", err=True)
+        typer.echo(f"{name} still has the key {other.id}, {other.role.value}, too", err=True)
     typer.echo("Keep it now: it is shown only once.", err=True)
     tell(secret, {**_document(key), "secret": secret}, as_json=json)
 
@@ -134,7 +134,7 @@ def revoke(
     """Revoke all keys of a name, or the one of an id. What runs on them is cut within two seconds."""
     with _key_store(where) as store:
         revoked = store.revoke(name)
-    lines = [f"revoked {key.id} of {key.name}, {_role(key)}" for key in revoked]
+    lines = [f"revoked {key.id} of {key.name}, {key.role.value}" for key in revoked]
     if lines or json:
         tell("\n".join(lines), [_document(key) for key in revoked], as_json=json)
     if not revoked:
@@ -157,17 +157,13 @@ def _row(key: Key) -> tuple[str, ...]:
     return (
         key.id,
         key.name,
-        _role(key),
+        key.role.value,
         _state(key),
         _time(key.created_at_s, ""),
         _time(key.expires_at_s, "never"),
         _time(key.last_used_at_s, "never"),
         " ".join(f"{name}={'none' if value is None else f'{value:g}'}" for name, value in key.limits.items()),
     )
-
-
-def _role(key: Key) -> str:
-    return "unknown" if key.role is None else key.role.value
 
 
 def _state(key: Key) -> str:

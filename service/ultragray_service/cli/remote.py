@@ -24,7 +24,7 @@ from ultragray.samplers import Sampler
 from ultragray.scene.info import read_header
 from ultragray_service.cli.connection import Connection, route, with_connection
 from ultragray_service.cli.options import FieldsOf, poses_option, with_options
-from ultragray_service.cli.remote_frames import SUFFIXES, Wanted, checked_kind
+from ultragray_service.cli.remote_frames import SUFFIXES, RenderRequest, checked_kind
 from ultragray_service.cli.sweeps import SWEEP_MEANING
 from ultragray_service.cli.terminal import (
     SCENE_SUFFIX,
@@ -201,8 +201,8 @@ def render_scene(
     from ultragray_service.cli.remote_frames import render_remotely
 
     suffix = checked_kind(output, settings, force=force)
-    wanted = Wanted(name, output, suffix, poses, sampler, of_poses.get("registration"), settings)
-    document = render_remotely(connection, wanted)
+    request = RenderRequest(name, output, suffix, poses, sampler, of_poses.get("registration"), settings)
+    document = render_remotely(connection, request)
     size = f"{document['height']}x{document['width']}"
     tell(
         f"wrote {output}: {frames_in_words(document['frames'])} of {size}, {', '.join(settings.outputs)}",

@@ -26,7 +26,7 @@ FRAMES_FILE = "frames.json"
 
 
 @dataclass(frozen=True)
-class Wanted:
+class RenderRequest:
     """What a command line asks for. Raises InvalidArgument for a registration that has no poses to lead."""
 
     scene: str
@@ -64,69 +64,69 @@ def checked_kind(output: Path, settings: FrameSettings, *, force: bool) -> str |
     return output.suffix
 
 
-def render_remotely(connection: Connection, wanted: Wanted) -> dict[str, Any]:
+def render_remotely(connection: Connection, request: RenderRequest) -> dict[str, Any]:
     """Write the frames; what they are, for a program. Raises InvalidArgument and what the connection raises."""
-    given = None if wanted.pose_file is None else load_poses(wanted.pose_file)
-    poses = _poses(connection, wanted, given)
-    settings = to_dict(wanted.settings, with_none=False)
-    if wanted.registration is not None:
-        settings["registration"] = wanted.registration
-    if wanted.suffix is None:
-        shape = _write_folder(connection, wanted, settings, poses)
+    given = None if request.pose_file is None else load_poses(request.pose_file)
+    poses = _poses(connection, request, given)
+    settings = to_dict(request.settings, with_none=False)
+    if request.registration is not None:
+        settings["registration"] = request.registration
+    if request.suffix is None:
+        shape = _write_folder(connection, request, settings, poses)
     else:
-        if wanted.suffix != ".npz" and len(poses) != 1:
+        if request.suffix != ".npz" and len(poses) != 1:
             raise InvalidArgument(
                 f"a picture holds one frame, there are {len(poses)} poses: write a .npz file or a folder",
                 field="output",
             )
         body = {**settings, **({"pose": _pose(poses[0])} if len(poses) == 1 else {"poses": list(map(_pose, poses))})}
-        answer = _rendered(connection, wanted.scene, body, MEDIA_TYPES[wanted.suffix])
-        write_whole(wanted.output, answer.data)
+        answer = _rendered(connection, request.scene, body, MEDIA_TYPES[request.suffix])
+        write_whole(request.output, answer.data)
         shape = answer.headers["x-ultragray-shape"]
     _, _, height, width = map(int, shape.split(","))
     return {
-        "output": str(wanted.output),
-        "scene": wanted.scene,
+        "output": str(request.output),
+        "scene": request.scene,
         "frames": len(poses),
         "height": height,
         "width": width,
-        "outputs": list(wanted.settings.outputs),
+        "outputs": list(request.settings.outputs),
     }
 
 
-def _poses(connection: Connection, wanted: Wanted, given: FloatArray | None) -> FloatArray:  # [C, 4, 4] mm
+def _poses(connection: Connection, request: RenderRequest, given: FloatArray | None) -> FloatArray:  # [C, 4, 4] mm
     """The poses of a file, or those that a sampler makes; without either the middle training pose."""
-    if wanted.sampler is None and given is not None:
+    if request.sampler is None and given is not None:
         return given
-    base = _training_poses(connection, wanted.scene) if given is None else given
+    base = _training_poses(connection, request.scene) if given is None else given
     if not len(base):
         raise InvalidArgument("--poses must be given: the scene holds no training poses", field="poses")
-    if wanted.sampler is None:
+    if request.sampler is None:
         middle: FloatArray = base[len(base) // 2][None]
         return middle
-    probe = wanted.settings.probe
+    probe = request.settings.probe
     if probe is None:
-        document = connection.json("GET", route("scenes", wanted.scene))["probe"]
+        document = connection.json("GET", route("scenes", request.scene))["probe"]
         if document is None:
             raise InvalidArgument("--probe must be given: the scene does not know its own", field="probe")
         probe = from_dict(Probe, document)
-    return wanted.sampler.poses(base, probe)
+    return request.sampler.poses(base, probe)
 
 
-def _write_folder(connection: Connection, wanted: Wanted, settings: dict[str, Any], poses: FloatArray) -> str:
+def _write_folder(connection: Connection, request: RenderRequest, settings: dict[str, Any], poses: FloatArray) -> str:
     """A PNG for each pose and output, and a file that describes the frames; their shape as a header tells it."""
     shape, documents = "", []
     with counted("rendering", len(poses)) as report:
         for number, pose in enumerate(poses):
-            for output in wanted.settings.outputs:
+            for output in request.settings.outputs:
                 body = {**settings, "outputs": [output], "pose": _pose(pose)}
-                answer = _rendered(connection, wanted.scene, body, MEDIA_TYPES[".png"])
-                wanted.output.mkdir(parents=True, exist_ok=True)  # only now: a refusal leaves no folder
-                write_whole(wanted.output / f"frame_{number:05d}_{output}.png", answer.data)
+                answer = _rendered(connection, request.scene, body, MEDIA_TYPES[".png"])
+                request.output.mkdir(parents=True, exist_ok=True)  # only now: a refusal leaves no folder
+                write_whole(request.output / f"frame_{number:05d}_{output}.png", answer.data)
                 shape = answer.headers["x-ultragray-shape"]
             documents.append({"frame": number, "pose": answer.fact("pose"), **(answer.fact("extrapolation") or {})})
             report(number + 1)
-    write_whole(wanted.output / FRAMES_FILE, json.dumps(documents))
+    write_whole(request.output / FRAMES_FILE, json.dumps(documents))
     return shape
 
 

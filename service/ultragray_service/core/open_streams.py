@@ -21,7 +21,7 @@ from ultragray_workers.pool.messages import RenderResult
 
 
 @dataclass(frozen=True, eq=False)
-class Answered:
+class StreamAnswer:
     """A frame, or why there is none."""
 
     sequence: int
@@ -90,13 +90,13 @@ class Watcher:
     """Takes the answers of one stream, as far as it gets on."""
 
     def __init__(self) -> None:
-        self._newest: Answered | None = None
+        self._newest: StreamAnswer | None = None
         self._ended = False
         self._changed = asyncio.Event()
 
-    def offer(self, answered: Answered) -> None:
+    def offer(self, answer: StreamAnswer) -> None:
         """An answer of the stream, which takes the place of one that was not taken."""
-        self._newest = answered
+        self._newest = answer
         self._changed.set()
 
     def end(self) -> None:
@@ -104,14 +104,14 @@ class Watcher:
         self._ended = True
         self._changed.set()
 
-    async def next(self) -> Answered | None:
+    async def next(self) -> StreamAnswer | None:
         """The newest answer, once there is one that was not taken; None after the last."""
         await self._changed.wait()
         self._changed.clear()
-        answered, self._newest = self._newest, None
+        answer, self._newest = self._newest, None
         if self._ended:
             self._changed.set()
-        return answered
+        return answer
 
 
 class OpenStream:
@@ -130,23 +130,23 @@ class OpenStream:
         self._newest: RenderResult | None = None
         self._watchers: set[Watcher] = set()
 
-    def asked(self) -> None:
+    def count_pose(self) -> None:
         """A pose has come."""
         self._poses += 1
         self._asked_at = time.monotonic()
         self._pose_rate.count()
 
-    def answered(self, answered: Answered) -> None:
+    def note(self, answer: StreamAnswer) -> None:
         """An answer is about to be sent."""
-        self._dropped += answered.dropped
-        if isinstance(answered.outcome, UltragrayError):
+        self._dropped += answer.dropped
+        if isinstance(answer.outcome, UltragrayError):
             self._refused += 1
         else:
             self._frames += 1
             self._frame_rate.count()
-            self._newest = answered.outcome
+            self._newest = answer.outcome
         for watcher in self._watchers:
-            watcher.offer(answered)
+            watcher.offer(answer)
 
     def summary(self) -> StreamSummary:
         """The stream as it is now."""

@@ -9,7 +9,7 @@ import re
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
@@ -54,7 +54,6 @@ class RegistrationPage:
 
 _log = logging.getLogger("ultragray.service")
 _COLUMNS = REGISTRATIONS.c
-_KNOWN = {item.name for item in fields(Registration)}  # a later release may write more
 
 
 @dataclass(frozen=True)
@@ -146,9 +145,8 @@ def _may_change(principal: Principal) -> sa.ColumnElement[bool]:
 @lru_cache(maxsize=4096)  # they are read again whenever one of them, a key or an owner changes
 def _kept(name: str, scene: str, owner: str, changed_at_s: float, document: str, private_to: str | None) -> Kept:
     """The registration of a row, by its columns. Raises InvalidArgument, InvalidPose, ValueError."""
-    content = {key: value for key, value in json.loads(document).items() if key in _KNOWN}
     facts: dict[str, Any] = {"name": name, "scene": scene, "owner": owner, "changed_at": iso_time(changed_at_s)}
-    return Kept(NamedRegistration(**to_dict(from_dict(Registration, content)), **facts), private_to)
+    return Kept(NamedRegistration(**to_dict(from_dict(Registration, json.loads(document))), **facts), private_to)
 
 
 # Registrations by name: kept, listed, deleted, and found for the requests that name one.

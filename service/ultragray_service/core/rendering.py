@@ -60,7 +60,7 @@ class Plan(Generic[S]):
     ) -> None:
         """`path`: the place of the settings in the client's message, for errors. To be renewed before it is used."""
         self.scene = base_name(scene)
-        self._asked = scene
+        self._reference = scene
         self._catalog = catalog
         self._resolve = resolve
         self._path = path
@@ -73,7 +73,7 @@ class Plan(Generic[S]):
     async def renew(self) -> None:
         """Resolves the settings for the scene as it is now. Raises what RequestPlanner.plan raises."""
         with under(self._path) if self._path else nullcontext():
-            version, header = await self._catalog.versioned_header(self._asked)
+            version, header = await self._catalog.versioned_header(self._reference)
             self.settings, self.version, self.header = self._resolve(header.info), version, header
 
 
@@ -109,7 +109,7 @@ class RequestPlanner:
     async def plan(
         self,
         scene: str,
-        asked: FrameSettings,
+        request: FrameSettings,
         encoding: Encoding,
         *,
         path: str = "",
@@ -128,20 +128,20 @@ class RequestPlanner:
                 found = await self._registration(registration, scene)
 
         def resolved(info: SceneInfo) -> Resolved:
-            return complete(self._resolved(info, asked, encoding, registration))
+            return complete(self._resolved(info, request, encoding, registration))
 
         plan = Plan(self._catalog, scene, resolved, path, found)
         await plan.renew()
         return plan
 
     async def plan_slice(
-        self, scene: str, asked: SliceSettings, encoding: Encoding, *, path: str = ""
+        self, scene: str, request: SliceSettings, encoding: Encoding, *, path: str = ""
     ) -> Plan[SliceView]:
         """The settings of a slice for a scene; `path` is their place in the client's message.
 
         Raises SceneNotFound, SceneFileInvalid; InvalidArgument for labels of a scene without them, InvalidImageSize.
         """
-        view = asked.view(encoding)
+        view = request.view(encoding)
         side, pixels = max(view.height, view.width), view.height * view.width
         if side > self._settings.max_image_side or pixels > self._settings.max_request_pixels:
             raise InvalidImageSize(
@@ -152,7 +152,7 @@ class RequestPlanner:
 
         def resolve(info: SceneInfo) -> SliceView:
             with under(path) if path else nullcontext():
-                check_field(asked.field, has_labels=bool(info.label_names))
+                check_field(request.field, has_labels=bool(info.label_names))
             return view
 
         plan = Plan(self._catalog, scene, resolve, "")
@@ -160,9 +160,9 @@ class RequestPlanner:
         return plan
 
     def _resolved(
-        self, info: SceneInfo, asked: FrameSettings, encoding: Encoding, registration: str | None
+        self, info: SceneInfo, request: FrameSettings, encoding: Encoding, registration: str | None
     ) -> Resolved:
-        resolved = asked.resolved(info, encoding, max_image_side=self._settings.max_image_side)
+        resolved = request.resolved(info, encoding, max_image_side=self._settings.max_image_side)
         settings = _the_same(resolved if registration is None else replace(resolved, registration=registration))
         with under("display"):
             pixels = settings.pixels

@@ -440,11 +440,11 @@ class Scenes:
         """One page of scenes by name. Raises InvalidArgument."""
         entries, next_page_token = await self._catalog.page(page_size, page_token)
         loaded, removable = self._pool.loaded(), await asyncio.to_thread(self._store.names_of, self._places.made)
-        told = [
+        rows = [
             _entry(one, one.name in loaded, one.name in removable, self._owners.known(Kind.SCENE, one.name))
             for one in entries
         ]
-        return ScenePage(told, next_page_token)
+        return ScenePage(rows, next_page_token)
 
     async def load(self, scene: str) -> SceneLoaded:
         """Loads a scene into every process. Raises SceneNotFound, SceneFileInvalid, SceneTooLarge."""

@@ -14,7 +14,7 @@ from typing import Any, Protocol
 from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.settings import RenderSettings
-from ultragray_service.core.open_streams import Answered, OpenStream
+from ultragray_service.core.open_streams import OpenStream, StreamAnswer
 from ultragray_service.core.rendering import Plan, Rendering
 from ultragray_workers.errors import Draining
 from ultragray_workers.pool.messages import Destination, RenderResult
@@ -35,7 +35,7 @@ class StreamMode(str, Enum):
 
 
 @dataclass(frozen=True, eq=False)
-class Asked:
+class PoseRequest:
     """One pose of a client, checked."""
 
     sequence: int
@@ -45,12 +45,12 @@ class Asked:
     deadline: float  # time.monotonic() in seconds
 
 
-Write = Callable[[Answered], Awaitable[None]]
+Write = Callable[[StreamAnswer], Awaitable[None]]
 
 
 @dataclass(frozen=True, eq=False)
 class _Underway:
-    work: asyncio.Task[Answered]
+    work: asyncio.Task[StreamAnswer]
     sent: Callable[[], None]
 
 
@@ -119,22 +119,22 @@ class _Window:
 class PoseStream:
     """One stream of one client."""
 
-    def __init__(self, rendering: Rendering, noted: OpenStream | None = None) -> None:
-        """`noted`: where others may see what is asked and answered."""
+    def __init__(self, rendering: Rendering, record: OpenStream | None = None) -> None:
+        """`record`: where others may see what is asked and answered."""
         self.mode = StreamMode.ORDERED  # to be set before the first pose, likewise:
         self.destination: Destination | None = None  # of its frames
         self._rendering = rendering
-        self._noted = noted or OpenStream()
+        self._record = record or OpenStream()
         self._room = _Room()
         self._answers: asyncio.Queue[_Underway | None] = asyncio.Queue()
-        self._started: set[asyncio.Task[Answered]] = set()
+        self._started: set[asyncio.Task[StreamAnswer]] = set()
         self._ended = False  # no more poses come
         self._dropped = 0
         # Of a latest stream: what is asked of the pool, its place in the queue, and what comes after it.
-        self._current: Asked | None = None
+        self._current: PoseRequest | None = None
         self._is_waiting = False  # for the limits of its key to allow it
         self._turn = Turn()
-        self._next: Asked | None = None
+        self._next: PoseRequest | None = None
         self._window = _Window()
 
     async def run(self, read: Callable[[], Awaitable[None]], send: Write, hand_over: Write) -> None:
@@ -169,21 +169,21 @@ class PoseStream:
             tasks.clear()
             del reader, writer  # what they raised holds on to this call, and that to frames that nobody takes any more
 
-    async def ask(self, asked: Asked) -> None:
+    async def ask(self, request: PoseRequest) -> None:
         """Takes a pose. An ordered stream waits while too many frames are in flight."""
-        self._noted.asked()
+        self._record.count_pose()
         if self.mode is StreamMode.ORDERED:
-            settings = asked.plan.settings
+            settings = request.plan.settings
             size = settings.pixels * settings.encoding.pixel_type.itemsize
             await self._room.enter(size)
-            self._start(self._answer(asked), sent=partial(self._room.leave, size))
+            self._start(self._answer(request), sent=partial(self._room.leave, size))
             return
-        if self._next is None and self._take_over(asked):
+        if self._next is None and self._take_over(request):
             self._count_dropped()
             return
         if self._next is not None:
             self._count_dropped()
-        self._next = asked
+        self._next = request
         self._advance()
 
     def open_window(self, size: int) -> None:
@@ -198,8 +198,8 @@ class PoseStream:
     async def refuse(self, sequence: int, client_time: float | None, error: UltragrayError) -> None:
         """Takes a message that gets no frame. Waits while too many answers are under way."""
 
-        async def refusal() -> Answered:
-            return Answered(sequence, client_time, error)
+        async def refusal() -> StreamAnswer:
+            return StreamAnswer(sequence, client_time, error)
 
         self._rendering.metrics.count_frame_error(error)
         await self._room.enter(0)
@@ -214,30 +214,30 @@ class PoseStream:
 
     async def _write(self, send: Write, hand_over: Write) -> None:
         while (underway := await self._answers.get()) is not None:
-            answered = await underway.work
+            answer = await underway.work
             dropped, self._dropped = self._dropped, 0
-            answered = replace(answered, dropped=dropped)
-            self._noted.answered(answered)
+            answer = replace(answer, dropped=dropped)
+            self._record.note(answer)
             write = send if self.mode is StreamMode.ORDERED or self._window.is_open else hand_over
-            await write(answered)
+            await write(answer)
             underway.sent()
 
-    def _start(self, work: Coroutine[Any, Any, Answered], sent: Callable[[], None]) -> None:
+    def _start(self, work: Coroutine[Any, Any, StreamAnswer], sent: Callable[[], None]) -> None:
         task = asyncio.create_task(work)
         self._started.add(task)
         task.add_done_callback(self._started.discard)
         self._answers.put_nowait(_Underway(task, sent))
 
-    async def _answer(self, asked: Asked) -> Answered:
-        return Answered(asked.sequence, asked.client_time, await self._outcome(self._rendered(asked)))
+    async def _answer(self, request: PoseRequest) -> StreamAnswer:
+        return StreamAnswer(request.sequence, request.client_time, await self._outcome(self._rendered(request)))
 
-    async def _rendered(self, asked: Asked) -> RenderResult:
-        await self._rendering.limits.frame_turn(asked.deadline)
-        return await self._render(asked, Turn())
+    async def _rendered(self, request: PoseRequest) -> RenderResult:
+        await self._rendering.limits.frame_turn(request.deadline)
+        return await self._render(request, Turn())
 
-    async def _render(self, asked: Asked, turn: Turn) -> RenderResult:
+    async def _render(self, request: PoseRequest, turn: Turn) -> RenderResult:
         return await self._rendering.render(
-            asked.plan, asked.pose[None], deadline=asked.deadline, turn=turn, destination=self.destination
+            request.plan, request.pose[None], deadline=request.deadline, turn=turn, destination=self.destination
         )
 
     async def _outcome(self, rendering: Awaitable[RenderResult]) -> RenderResult | UltragrayError:
@@ -250,17 +250,17 @@ class PoseStream:
         self._rendering.metrics.count_frame_error(outcome)
         return outcome
 
-    def _take_over(self, asked: Asked) -> bool:
+    def _take_over(self, request: PoseRequest) -> bool:
         """Puts a pose into the place of the one that is not begun: it waits for its key's limits, or in the pool."""
         current = self._current
         if self._is_waiting:
-            self._current = asked
+            self._current = request
             return True
-        if current is None or current.plan is not asked.plan:
+        if current is None or current.plan is not request.plan:
             return False
-        if not self._turn.give_to(asked.pose[None], asked.deadline):
+        if not self._turn.give_to(request.pose[None], request.deadline):
             return False
-        self._current = asked
+        self._current = request
         return True
 
     def _advance(self) -> None:
@@ -272,13 +272,13 @@ class PoseStream:
         if self._ended and self._next is None:
             self._answers.put_nowait(None)
 
-    async def _answer_latest(self) -> Answered:
+    async def _answer_latest(self) -> StreamAnswer:
         outcome = await self._outcome(self._rendered_latest())
         assert self._current is not None
-        asked, self._current = self._current, None  # perhaps a later one than at the start
-        self._window.enter(asked.sequence)
+        request, self._current = self._current, None  # perhaps a later one than at the start
+        self._window.enter(request.sequence)
         self._advance()
-        return Answered(asked.sequence, asked.client_time, outcome)
+        return StreamAnswer(request.sequence, request.client_time, outcome)
 
     async def _rendered_latest(self) -> RenderResult:
         self._is_waiting = True
@@ -360,10 +360,10 @@ class Transport(Protocol):
     def mode(self, message: Message) -> StreamMode | None:
         """The mode that the first message asks for; None where it cannot be read: then the next one may."""
 
-    async def send(self, answered: Answered) -> None:
+    async def send(self, answer: StreamAnswer) -> None:
         """Sends a frame, or why there is none."""
 
-    async def hand_over(self, answered: Answered) -> None:
+    async def hand_over(self, answer: StreamAnswer) -> None:
         """Sends, and waits until the client has taken the answer, as far as the transport can tell."""
 
 
@@ -378,13 +378,13 @@ class FrameStream:
         rendering: Rendering,
         transport: Transport,
         unset: SceneSettings | None = None,
-        noted: OpenStream | None = None,
+        record: OpenStream | None = None,
     ) -> None:
         self._rendering = rendering
         self._transport = transport
         self._unset = unset
         self._plan: Plan | None = None
-        self._poses = PoseStream(rendering, noted)
+        self._poses = PoseStream(rendering, record)
 
     async def run(self) -> None:
         """Answers until the client has sent its last message and got its last frame.
@@ -406,16 +406,16 @@ class FrameStream:
 
     async def _take(self, message: Message) -> None:
         try:
-            asked = await self._asked(message)
+            request = await self._asked(message)
         except UltragrayError as error:
             await self._poses.refuse(message.sequence, message.client_time, error)
         except Exception as error:
             await self._poses.refuse(message.sequence, message.client_time, unexpected(error))
         else:
-            if asked is not None:
-                await self._poses.ask(asked)
+            if request is not None:
+                await self._poses.ask(request)
 
-    async def _asked(self, message: Message) -> Asked | None:
+    async def _asked(self, message: Message) -> PoseRequest | None:
         await self._change_settings(message)
         if not message.asks:
             return None
@@ -424,7 +424,7 @@ class FrameStream:
                 raise InvalidArgument("settings must be given, and accepted, before the first pose", field="settings")
             self._plan = await self._resolve(self._unset)
         pose, deadline = self._plan.placed(message.pose()), self._rendering.planner.deadline(message.timeout_s())
-        return Asked(message.sequence, message.client_time, self._plan, pose, deadline)
+        return PoseRequest(message.sequence, message.client_time, self._plan, pose, deadline)
 
     async def _change_settings(self, message: Message) -> None:
         unset, self._unset = self._unset, None  # as long as the message's own are not known to be none
@@ -435,9 +435,9 @@ class FrameStream:
             self._plan = await self._resolve(settings)
 
     async def _resolve(self, settings: SceneSettings) -> Plan:
-        scene, asked = settings
+        scene, request = settings
         return await self._rendering.planner.plan(
-            scene, asked, asked.encoding, path="settings", registration=asked.registration
+            scene, request, request.encoding, path="settings", registration=request.registration
         )
 
 

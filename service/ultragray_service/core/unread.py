@@ -110,10 +110,10 @@ class Unread:
         """None where the system does not tell."""
         if sys.platform != "linux" or self._socket is None or self._socket.fileno() < 0:
             return None
-        told = self._socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO_BYTES)
-        if len(told) < _TCP_INFO_BYTES:
+        info = self._socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_INFO, _TCP_INFO_BYTES)
+        if len(info) < _TCP_INFO_BYTES:
             return None
         unacknowledged = struct.unpack("i", fcntl.ioctl(self._socket.fileno(), _SIOCOUTQ, bytes(4)))[0]
-        window = struct.unpack_from("I", told, _SEND_WINDOW_OFFSET)[0]
-        quiet_ms = struct.unpack_from("I", told, _LAST_DATA_RECEIVED_OFFSET)[0]
+        window = struct.unpack_from("I", info, _SEND_WINDOW_OFFSET)[0]
+        quiet_ms = struct.unpack_from("I", info, _LAST_DATA_RECEIVED_OFFSET)[0]
         return _State(unacknowledged, window, quiet_ms / 1000)

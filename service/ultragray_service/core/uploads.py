@@ -85,7 +85,7 @@ class Room:
             raise self._limits.refused("stored_gb", _too_many_bytes(self._limits.mine.stored_gb)) from None
 
 
-class Holdings:
+class Quotas:
     """What whoever the running code works for has, and whether there may be more."""
 
     def __init__(self, limits: Limits, owners: Owners, datasets: DatasetStore, scenes: SceneStore) -> None:
@@ -189,11 +189,11 @@ class DatasetUploads:
         draining: asyncio.Event,
         checks: HelperProcesses,
         owners: Owners,
-        holdings: Holdings,
+        quotas: Quotas,
     ) -> None:
         self._jobs = jobs
         self._store = store
-        self._holdings = holdings
+        self._quotas = quotas
         self._owners = owners
         self._settings = settings
         self._draining = draining
@@ -214,7 +214,7 @@ class DatasetUploads:
         with self._slots.one():
             stopping: asyncio.Future[Any] = asyncio.ensure_future(self._draining.wait())
             try:
-                room, most = await self._holdings.room(self._jobs), self._settings.max_dataset_bytes
+                room, most = await self._quotas.room(self._jobs), self._settings.max_dataset_bytes
                 incoming = await asyncio.to_thread(IncomingDataset, self._store, room.at_most(most))
                 claim = Claim(self._owners, Kind.DATASET, name, incoming.folder.name, private=private)
                 upload = DatasetUpload(
@@ -351,7 +351,7 @@ class SceneImports:
         jobs: Jobs,
         checks: HelperProcesses,
         owners: Owners,
-        holdings: Holdings,
+        quotas: Quotas,
     ) -> None:
         """`shelf`: of the store, for what is imported."""
         self._store = store
@@ -359,7 +359,7 @@ class SceneImports:
         self._jobs = jobs
         self._checks = checks
         self._owners = owners
-        self._holdings = holdings
+        self._quotas = quotas
         self._shelf = shelf
         self._slots = Slots(MAX_IMPORTS, "imports of scenes")
 
@@ -375,7 +375,7 @@ class SceneImports:
         with self._slots.one():
             claim = contextlib.ExitStack()
             try:
-                room, most = await self._holdings.room(self._jobs), self._settings.max_dataset_bytes
+                room, most = await self._quotas.room(self._jobs), self._settings.max_dataset_bytes
                 with storage_full("the scene"), room.to_blame(most):
                     folder = await to_its_end(lambda: claim.enter_context(self._shelf.making()))
                     received = folder / f"{name}{SUFFIX}"

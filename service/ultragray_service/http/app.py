@@ -314,10 +314,10 @@ class _Application(FastAPI):
             schemas.update(extra["$defs"])
             schemas[TrainingConfig.__name__][PRESETS_SET] = PRESETS
             for method, path, operation in HttpRules().routes():
-                told = document["paths"].get(path, {}).get(method.lower())
-                if told is not None and operation.role is not None:
-                    told[ROLE] = operation.role.value
-                    told[OWNED] = operation.owned
+                entry = document["paths"].get(path, {}).get(method.lower())
+                if entry is not None and operation.role is not None:
+                    entry[ROLE] = operation.role.value
+                    entry[OWNED] = operation.owned
             for unused in ("HTTPValidationError", "ValidationError"):
                 schemas.pop(unused, None)
             if self.state.service.guard.asks:

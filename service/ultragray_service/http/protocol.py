@@ -1,4 +1,8 @@
-"""HTTP connections with bounds: on what is read before it is parsed, on time, and on requests that pile up."""
+"""HTTP connections with bounds: on what is read before it is parsed, on time, and on requests that pile up.
+
+uvicorn bounds none of these by itself: a head of any length, a body that never ends and any number of pipelined
+requests reach its parser. The bounds are a subclass of its protocol, and parsing stays its own.
+"""
 
 from __future__ import annotations
 

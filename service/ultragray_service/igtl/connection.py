@@ -12,7 +12,7 @@ from typing import Protocol
 
 from ultragray.errors import UltragrayError
 from ultragray.rendering.settings import FrameSettings
-from ultragray_service.core.open_streams import Answered, OpenStream
+from ultragray_service.core.open_streams import OpenStream, StreamAnswer
 from ultragray_service.core.unread import Unread, hold_little
 from ultragray_service.errors import IgtlMessageInvalid
 from ultragray_service.igtl.commands import Scanner, Setup, answer
@@ -73,7 +73,7 @@ class Connection:
         writer: asyncio.StreamWriter,
     ) -> None:
         self.feed = Feed(self._turn, self._send)
-        self.noted = OpenStream("openigtlink")
+        self.record = OpenStream("openigtlink")
         self._answers = 0
         self._service = service
         self._scenes = scenes
@@ -213,7 +213,7 @@ class Connection:
         for device_name, pose in of_tools:
             self._scanner.move(device_name, pose)
         for device_name, pose in of_probes:
-            self.noted.asked()
+            self.record.count_pose()
             self._newest = PoseMessage(replace(message, device_name=device_name), pose, arrived)
             if self._poses.put(self._newest, self._service.planner.deadline(None), self._scanner.setup):
                 self._service.metrics.count_dropped()
@@ -255,9 +255,9 @@ class Connection:
 
     def _note(self, posed: PoseMessage, outcome: RenderResult | UltragrayError) -> None:
         """Shows an answer to those who watch."""
-        self.noted.name = posed.message.device_name
+        self.record.name = posed.message.device_name
         self._answers += 1
-        self.noted.answered(Answered(self._answers, None, outcome, posed.replaced))
+        self.record.note(StreamAnswer(self._answers, None, outcome, posed.replaced))
 
     async def _refuse(self, about: Message, error: UltragrayError, arrived: float) -> None:
         self._service.metrics.count_frame_error(error)

@@ -98,7 +98,7 @@ class IgtlServer:
                 self._service.limits.take_request()
                 places.callback(self._places.enter(host).leave)
                 places.enter_context(self._service.limits.stream())
-                connection.noted = places.enter_context(self._service.streams.opened("openigtlink", ""))
+                connection.record = places.enter_context(self._service.streams.opened("openigtlink", ""))
             except (TooManyConnections, RateLimited, LimitReached) as error:
                 self._service.audit.count(Entry(principal.name, host, IGTL.name, "", error.reason))
                 connection.dismiss(error)

@@ -18,7 +18,7 @@ from ultragray.learn.localization.settings import LocalizationSettings
 from ultragray.rendering.volumes import SliceSettings
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import rendering_pb2, scenes_pb2
-from ultragray_service.core.open_streams import Answered
+from ultragray_service.core.open_streams import StreamAnswer
 from ultragray_service.core.poses import check_pose_count, exact_poses
 from ultragray_service.core.rendering import Plan
 from ultragray_service.core.streams import MAX_WINDOW, FrameStream, SceneSettings, StreamMode, checked_s
@@ -124,15 +124,15 @@ class CallTransport:
             self.destination = SharedMemory(message.message.shared_memory, self._context.peer())
         return mode
 
-    async def send(self, answered: Answered) -> None:
-        about: dict[str, Any] = {"dropped": answered.dropped}
-        if answered.client_time is not None:
-            about["client_time_ns"] = int(answered.client_time)
-        if isinstance(answered.outcome, UltragrayError):
-            error = to_message(Refusal.of(answered.outcome), scenes_pb2.Error)
-            await self._context.write(rendering_pb2.Frame(sequence=answered.sequence, error=error, **about))
+    async def send(self, answer: StreamAnswer) -> None:
+        about: dict[str, Any] = {"dropped": answer.dropped}
+        if answer.client_time is not None:
+            about["client_time_ns"] = int(answer.client_time)
+        if isinstance(answer.outcome, UltragrayError):
+            error = to_message(Refusal.of(answer.outcome), scenes_pb2.Error)
+            await self._context.write(rendering_pb2.Frame(sequence=answer.sequence, error=error, **about))
         else:
-            await self._context.write(frame_message(answered.outcome, answered.sequence, **about))
+            await self._context.write(frame_message(answer.outcome, answer.sequence, **about))
 
     hand_over = send  # flow control tells the client's library what was taken, not the service
 
@@ -204,7 +204,7 @@ class RenderService:
         name = told.get(_STREAM_NAME) or told.get("user-agent", "")
         streams = self._service.streams
         with self._service.limits.stream(), streams.opened("grpc", name) as noted, CallTransport(context) as transport:
-            await FrameStream(self._service.rendering, transport, noted=noted).run()
+            await FrameStream(self._service.rendering, transport, record=noted).run()
 
     async def AssessPoses(
         self, request: rendering_pb2.AssessPosesRequest, context: Context

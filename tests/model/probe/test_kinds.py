@@ -5,23 +5,18 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
+from ultragray import LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
 from ultragray.contract import from_dict, to_dict
 from ultragray.geometry.scan_conversion import scan_convert
 
 PROBES = [
+    *(member(**member.example()) for member in Probe.members.values()),
     LinearProbe(width_mm=40.0, near_mm=10.0, far_mm=50.0),
-    ConvexProbe(opening_angle_deg=60.0, near_mm=50.0, far_mm=150.0),
     PhasedProbe(opening_angle_deg=90.0, far_mm=120.0),
-    RadialProbe(near_mm=1.0, far_mm=12.0),
     SteeredProbe(width_mm=40.0, steering_deg=25.0, near_mm=5.0, far_mm=50.0),
     SteeredProbe(width_mm=40.0, steering_deg=-45.0, near_mm=0.0, far_mm=30.0),
 ]
 each_probe = pytest.mark.parametrize("probe", PROBES, ids=str)
-
-
-def test_every_kind_is_here() -> None:
-    assert {probe.kind for probe in PROBES} == set(Probe.members)
 
 
 @each_probe
@@ -91,7 +86,7 @@ def test_scan_conversion_shows_each_pixel_where_it_lies(probe: Probe) -> None:
 def test_json_and_repr_give_the_probe_back(probe: Probe) -> None:
     assert from_dict(Probe, to_dict(probe)) == probe
     assert to_dict(probe)["kind"] == probe.kind
-    assert eval(repr(probe)) == probe
+    assert eval(repr(probe), {one.__name__: one for one in Probe.members.values()}) == probe
 
 
 def test_a_radial_picture_is_a_disc_with_a_hole() -> None:

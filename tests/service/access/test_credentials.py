@@ -30,6 +30,9 @@ def guarded(start_service: StartService) -> RunningService:
     [
         ([("x-api-key", KEY)], True),
         ([("authorization", f"Bearer {KEY}")], True),
+        ([("authorization", f"bearer {OTHER}")], True),
+        ([("authorization", f"Basic {KEY}")], False),
+        ([("x-api-key", KEY[:-1])], False),
         ([("x-api-key", KEY), ("authorization", "Basic of-a-proxy")], True),
         ([("x-api-key", KEY), ("x-api-key", KEY)], False),
         ([("x-api-key", KEY), ("x-api-key", "unknown")], False),
@@ -91,3 +94,15 @@ def test_health_lists_every_service_without_a_key(guarded: RunningService) -> No
             check(b"\xff\xff", timeout=60)
     assert caught.value.code() is grpc.StatusCode.INVALID_ARGUMENT
     assert "Traceback" not in guarded.log_path.read_text()
+
+
+def test_refusals_say_how_to_authenticate_and_health_and_documentation_stay_open(guarded: RunningService) -> None:
+    for path in ("/v1/scenes", "/metrics", "/v1/nothing"):
+        answer = httpx.get(f"{guarded.http}{path}", timeout=60)
+        assert (answer.status_code, answer.json()["reason"]) == (401, "UNAUTHENTICATED")
+        assert answer.headers["www-authenticate"] == "Bearer"
+    for path in ("/v1/health/live", "/v1/health/ready", "/docs"):
+        assert httpx.get(f"{guarded.http}{path}", timeout=60).status_code == 200
+    document = httpx.get(f"{guarded.http}/openapi.json", timeout=60).json()
+    assert set(document["components"]["securitySchemes"]) == {"Bearer", "ApiKey"}
+    assert KEY not in guarded.log_path.read_text()

@@ -3,13 +3,19 @@
 from __future__ import annotations
 
 import socket
+from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import grpc
 import httpx
 import pytest
+from starlette.testclient import TestClient
 
 from ultragray_proto.v1 import scenes_pb2, scenes_pb2_grpc
+from ultragray_service.http.app import create_app
+from ultragray_service.settings import load_settings
+from ultragray_service.wiring import make_service
 
 from ..conftest import RunningService, StartService
 from ..rpc.test_grpc_render import error_info
@@ -96,13 +102,33 @@ def test_a_page_behind_a_proxy_of_grpc_web_is_refused(service: RunningService) -
     assert error_info(caught.value)[0].reason == "ORIGIN_REFUSED"
 
 
-def test_names_and_origins_can_be_allowed(start_service: StartService, tmp_path: Path) -> None:
-    service = start_service(artifact_folder=tmp_path, allowed_hosts="simulator.lab", cors_origins="http://app.lab")
-    hosts = {"Host": "simulator.lab:8000", "Origin": "http://simulator.lab:8000"}
-    assert httpx.get(f"{service.http}/v1/scenes", headers=hosts, timeout=60).status_code == 200
-    answer = httpx.get(f"{service.http}/v1/scenes", headers={"Origin": "http://app.lab"}, timeout=60)
-    assert answer.headers["access-control-allow-origin"] == "http://app.lab"
-    assert httpx.get(f"{service.http}/v1/scenes", headers={"Origin": ELSEWHERE}, timeout=60).status_code == 403
+@pytest.fixture
+def status_of(tmp_path: Path) -> Callable[..., int]:
+    """The answer of a service of its own, which is not started, to a request with headers."""
+
+    def ask(path: str, headers: dict[str, str], **settings: Any) -> int:
+        app = create_app(make_service(load_settings(data_folder=tmp_path, **settings)))
+        return int(TestClient(app, base_url="http://127.0.0.1").get(path, headers=headers).status_code)
+
+    return ask
+
+
+def test_names_and_origins_can_be_allowed(status_of: Callable[..., int]) -> None:
+    allowed = {"allowed_hosts": "simulator.lab", "cors_origins": "http://app.lab"}
+    own = {"Host": "simulator.lab:8000", "Origin": "http://simulator.lab:8000"}
+    for headers, status in ((own, 200), ({"Origin": "http://app.lab"}, 200), ({"Origin": ELSEWHERE}, 403)):
+        assert status_of("/v1/health/live", headers, **allowed) == status, headers
+
+
+def test_insecure_opens_a_public_address_to_addresses_but_not_to_names(status_of: Callable[..., int]) -> None:
+    for host, status in {"192.168.0.9:8000": 200, "[fe80::1]:8000": 200, "elsewhere.example": 403}.items():
+        assert status_of("/v1/me", {"Host": host}, host="0.0.0.0", insecure=True) == status, host
+
+
+def test_with_keys_any_name_will_do_and_pages_need_a_key(status_of: Callable[..., int]) -> None:
+    key, foreign = "0123456789abcdef", {"Host": "simulator.lab", "Origin": ELSEWHERE}
+    assert status_of("/v1/me", foreign, host="0.0.0.0", api_keys=key) == 401
+    assert status_of("/v1/me", {**foreign, "X-API-Key": key}, host="0.0.0.0", api_keys=key) == 200
 
 
 def test_a_public_address_without_keys_is_refused(start_service: StartService, tmp_path: Path) -> None:
@@ -111,21 +137,3 @@ def test_a_public_address_without_keys_is_refused(start_service: StartService, t
     text = service.log_path.read_text()
     for words in ("0.0.0.0", "ultragray keys create", "ULTRAGRAY_API_KEYS", "ULTRAGRAY_INSECURE"):
         assert words in text
-
-
-def test_insecure_opens_a_public_address_to_addresses_but_not_to_names(
-    start_service: StartService, tmp_path: Path
-) -> None:
-    service = start_service(artifact_folder=tmp_path, host="0.0.0.0", insecure=True)
-    url = service.http.replace("0.0.0.0", "127.0.0.1")
-    for host, status in {"192.168.0.9:8000": 200, "[fe80::1]:8000": 200, "elsewhere.example": 403}.items():
-        assert httpx.get(f"{url}/v1/scenes", headers={"Host": host}, timeout=60).status_code == status, host
-
-
-def test_with_keys_any_name_will_do_and_pages_need_a_key(start_service: StartService, tmp_path: Path) -> None:
-    key = "0123456789abcdef"
-    service = start_service(artifact_folder=tmp_path, host="0.0.0.0", api_keys=key)
-    url = f"{service.http.replace('0.0.0.0', '127.0.0.1')}/v1/scenes"
-    foreign = {"Host": "simulator.lab", "Origin": ELSEWHERE}
-    assert httpx.get(url, headers=foreign, timeout=60).status_code == 401
-    assert httpx.get(url, headers={**foreign, "X-API-Key": key}, timeout=60).status_code == 200

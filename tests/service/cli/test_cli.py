@@ -92,6 +92,16 @@ def test_lists_of_commands_load_none_of_them() -> None:
     assert answer.stdout.splitlines()[-1] == "[]"
 
 
+def test_no_help_needs_torch() -> None:
+    program = (
+        "from typer.testing import CliRunner; from ultragray_service.cli.app import app\n"
+        f"for line in {list(COMMANDS)!r}:\n"
+        "    CliRunner().invoke(app, [*line.split(), '--help']); assert 'torch' not in sys.modules, line"
+    )
+    done = subprocess.run(python(program), capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
 def test_completion_knows_commands_and_options() -> None:
     def completed(words: str) -> str:
         environment = {**os.environ, "_ULTRAGRAY_COMPLETE": "complete_bash", "COMP_WORDS": words}

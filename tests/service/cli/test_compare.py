@@ -56,13 +56,6 @@ def test_the_table_has_what_the_library_measures(sweep: Path, tmp_path: Path, mo
     assert list(tmp_path.iterdir()) == []
 
 
-def test_json_has_every_frame_of_every_method(sweep: Path) -> None:
-    document = json.loads(run("compare", sweep, *CLASSICAL, "--json").stdout)
-    assert [one["name"] for one in document["results"]] == ["median", "linear", "nearest"]
-    expected = evaluate_baselines(read_released(sweep), ("linear",))["linear"].to_dict()
-    assert document["results"][1]["evaluation"]["frames"] == expected["frames"]
-
-
 def test_a_page_with_its_table_as_json_and_latex(sweep: Path, tmp_path: Path) -> None:
     page = tmp_path / "ball.html"
     result = run("compare", sweep, *CLASSICAL, "-o", page)
@@ -71,19 +64,6 @@ def test_a_page_with_its_table_as_json_and_latex(sweep: Path, tmp_path: Path) ->
     assert len(json.loads((tmp_path / "ball.json").read_text())["results"]) == 3
     assert r"\toprule" in (tmp_path / "ball.tex").read_text()
     assert f"wrote {page}\n" in result.stdout
-
-
-def test_more_methods_are_added_and_those_that_are_there_are_kept(sweep: Path, tmp_path: Path) -> None:
-    page = tmp_path / "ball.html"
-    assert run("compare", sweep, "--methods", "median", "-o", page).exit_code == 0
-    kept = tmp_path / "ball.html.run" / "median" / "result.json"
-    before = kept.stat().st_mtime_ns
-    assert run("compare", sweep, "--methods", "median,nearest", "-o", page).exit_code == 0
-    assert kept.stat().st_mtime_ns == before
-    assert "nearest training frame" in page.read_text()
-    assert run("compare", sweep, "--methods", "median", "-o", page, "--force").exit_code == 0
-    assert kept.stat().st_mtime_ns != before
-    assert not (tmp_path / "ball.html.run" / "nearest").exists()
 
 
 def test_a_comparison_of_which_nothing_could_be_measured_ends_with_an_error(tmp_path: Path) -> None:
@@ -99,16 +79,6 @@ def test_a_comparison_of_which_nothing_could_be_measured_ends_with_an_error(tmp_
     assert run("compare", tmp_path / "wide", "--methods", "median-0.25mm,nearest").exit_code == 0
 
 
-def test_what_is_learned_without_an_output_is_told_to_be_lost(sweep: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(
-        "ultragray_studies.comparison.run.compare_methods", lambda *_, **__: None
-    )  # as if stopped at once
-    result = run("compare", sweep, "--methods", "median,rapidvol")
-    assert "with --output PAGE.html" in result.stderr
-    assert "nothing is kept" in result.stderr
-    assert "--output" not in run("compare", sweep, *CLASSICAL).stderr
-
-
 def test_what_is_not_a_comparisons_is_not_replaced(sweep: Path, tmp_path: Path) -> None:
     page = tmp_path / "ball.html"
     (tmp_path / "ball.tex").write_text("a paper")
@@ -119,12 +89,6 @@ def test_what_is_not_a_comparisons_is_not_replaced(sweep: Path, tmp_path: Path) 
     assert "holds no comparison" in refused("compare", sweep, *CLASSICAL, "-o", page, "--force")
     assert (tmp_path / "ball.html.run" / "thesis.txt").exists()
     assert "output must end in .html" in refused("compare", sweep, *CLASSICAL, "-o", tmp_path / "ball.pdf")
-
-
-def test_the_folder_of_another_comparison_is_refused(sweep: Path, tmp_path: Path) -> None:
-    page = tmp_path / "ball.html"
-    assert run("compare", sweep, "--methods", "nearest", "-o", page).exit_code == 0
-    assert "seed" in refused("compare", sweep, "--methods", "nearest", "-o", page, "--seed", 1)
 
 
 @pytest.mark.parametrize(
@@ -138,13 +102,6 @@ def test_the_folder_of_another_comparison_is_refused(sweep: Path, tmp_path: Path
 )
 def test_mistakes_give_one_line(sweep: Path, arguments: tuple[Any, ...], sentence: str) -> None:
     assert sentence in refused("compare", sweep, *arguments)
-
-
-def test_help_needs_no_torch() -> None:
-    program = "from ultragray_service.cli.app import app; app(standalone_mode=False); print('torch' in sys.modules)"
-    answer = subprocess.run(python(program, "compare", "--help"), capture_output=True, text=True, check=True)
-    assert "--budget" in answer.stdout
-    assert answer.stdout.endswith("False\n")
 
 
 @pytest.mark.long

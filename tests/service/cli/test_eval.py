@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
-import shutil
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -15,11 +13,8 @@ import pytest
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import read_released, write_released
-from ultragray.errors import MemoryExceeded, TrainingDiverged
 from ultragray.learn.evaluation.scoring import evaluate, measure_reliability
 from ultragray.learn.training import TrainingConfig, train
-from ultragray_studies import report
-from ultragray_studies.methods import gaussians
 
 from .command_line import refused, run
 
@@ -94,58 +89,6 @@ def test_report_of_a_scene(dataset: Path, scene: Path, tmp_path: Path) -> None:
     assert "Ablations" not in page.read_text()
 
 
-def test_report_trains_and_studies(dataset: Path, tmp_path: Path) -> None:
-    page = tmp_path / "page.html"
-    result = run("report", dataset, "-o", page, "--steps", 3, "--max-gaussians", 40, "--threads", 1)
-    assert result.exit_code == 0, result.output
-    assert result.stderr.splitlines() == [
-        "training: scene",
-        "training: no transmittance",
-        "training: spherical harmonics of degree 0",
-        "training: no out-of-plane sampling",
-        "training: a quarter of the Gaussians",
-        "training: half of the Gaussians",
-        "training: twice the Gaussians",
-    ]
-    assert "max_gaussians = 40" in page.read_text()
-    assert "hardly turns" in page.read_text()
-
-
-def test_a_study_that_fails_does_not_take_the_report_with_it(
-    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def train_or_fail(read: Dataset, config: TrainingConfig, **options: Any) -> GaussianScene:
-        if not config.transmittance:
-            raise MemoryExceeded("it needs 9 GB")
-        return train(read, config, **options)
-
-    def study_tilt(*arguments: Any, **options: Any) -> None:
-        raise TrainingDiverged("the loss is nan")
-
-    monkeypatch.setattr(report, "train", train_or_fail)
-    monkeypatch.setattr(gaussians, "train", train_or_fail)
-    monkeypatch.setattr(report, "study_tilt", study_tilt)
-    page = tmp_path / "page.html"
-    result = run("report", dataset, "-o", page, "--steps", 2, "--max-gaussians", 40, "--threads", 1)
-    assert result.exit_code == 0, result.output
-    assert result.stderr.splitlines()[-2:] == [
-        "failed: no transmittance: it needs 9 GB",
-        "failed: growing tilt: the loss is nan",
-    ]
-    text = page.read_text()
-    assert re.search(r">no transmittance</th><td [^>]*>it needs 9 GB<", text)
-    assert "could not be finished: the loss is nan" in text
-    assert text.index("no transmittance") < text.index("twice the Gaussians")
-
-
-def test_a_folder_that_cannot_be_written_to_is_told_before_the_work(
-    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("os.access", lambda path, mode: Path(path) != tmp_path)  # a superuser may write anywhere
-    message = refused("report", tmp_path / "no dataset", "-o", tmp_path / "page.html")
-    assert f"output must lie in a folder that can be written to, {tmp_path} cannot" in message
-
-
 def test_mistakes(dataset: Path, scene: Path, tmp_path: Path) -> None:
     (tmp_path / "file").touch()
     assert "file is a file" in refused("eval", scene, dataset, "-o", tmp_path / "file")
@@ -177,18 +120,6 @@ def test_a_scene_of_another_probe_or_of_other_data(dataset: Path, scene: Path, t
         result = run(*arguments)
         assert result.exit_code == 2
         assert "error: convex: its probe is convex, the scene was trained with a linear one" in result.stderr
-
-
-def test_report_warns_of_what_looks_wrong(dataset: Path, scene: Path, tmp_path: Path) -> None:
-    page = tmp_path / "page.html"
-    arguments = ("-o", page, "--scene", scene, "--no-ablations", "--threads", 1, "--train-frames", "0:4")
-    copied = tmp_path / "ball"
-    shutil.copytree(dataset, copied)
-    np.save(copied / "images_val.npy", np.load(copied / "images_train.npy")[:2])
-    np.save(copied / "poses_val.npy", np.load(copied / "poses_train.npy")[:2])
-    result = run("report", copied, *arguments)
-    assert result.exit_code == 0, result.output
-    assert "warning: held-out frames 0, 1 are also training frames" in result.stderr
 
 
 def test_a_dataset_without_held_out_frames_is_refused(dataset: Path, scene: Path, tmp_path: Path) -> None:

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -70,12 +68,3 @@ def test_mistakes_are_told_in_one_line(make_file: Callable[..., Path], tmp_path:
     (tmp_path / "conf.json").write_text("{}")
     assert "folder of its own" in refused("export", scene, "-o", tmp_path / "ckpt.pt")
     assert sorted(path.name for path in tmp_path.iterdir()) == ["conf.json", "scene.ugr"]
-
-
-def test_help_imports_nothing_heavy() -> None:
-    program = (
-        f"import sys; sys.path[:0] = {sys.path!r}; from ultragray_service.cli.scenes import export, importing; "
-        "print(sorted({'torch', 'numpy.testing', 'cv2', 'safetensors.torch'} & set(sys.modules)))"
-    )
-    answer = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert answer.stdout.strip() == "[]"

@@ -11,10 +11,8 @@ import tarfile
 import zipfile
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import httpx
-import nibabel
 import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
@@ -130,41 +128,6 @@ def test_a_scene_is_trained_watched_and_served(server: RunningService, client: h
     assert json.loads(events.rpartition("\ndata: ")[2])["state"] == "succeeded"
 
 
-@pytest.mark.long
-def test_methods_are_compared_and_their_page_is_shown_without_scripts(
-    server: RunningService, client: httpx.Client
-) -> None:
-    result = run(server, "submit", "compare", "tiny", "--methods", "median,nearest", "--device", "cpu", "--wait")
-    assert result.exit_code == 0, result.output
-    job = result.stdout.split()[0]
-    told = client.get(f"/v1/jobs/{job}").json()
-    assert told["specification"]["methods"] == ["median", "nearest"]
-    assert told["artifacts"] == ["comparison.html", "comparison.json", "comparison.tex"]
-    assert {"median_psnr_db", "nearest_gmsd"} < set(told["metrics"])
-    assert told["progress"]["method_number"] == told["progress"]["methods"] == 2
-    kept = client.get(f"/v1/jobs/{job}/artifacts/comparison.html")
-    shown = client.get(f"/v1/jobs/{job}/artifacts/comparison.html?show=true")
-    assert kept.headers["content-disposition"].startswith("attachment")
-    assert shown.headers["content-disposition"].startswith("inline")
-    assert "nearest training frame" in shown.text
-    for answer in (kept, shown):
-        assert answer.headers["content-type"] == "text/html; charset=utf-8"
-        assert answer.headers["content-security-policy"].startswith("sandbox; default-src 'none'")
-        assert answer.headers["x-content-type-options"] == "nosniff"
-
-
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [(("--methods", "median,newest"), "got 'newest'"), (("--budget", "half"), "budget must be one of equal, author")],
-)
-def test_a_comparison_that_cannot_be_is_refused(
-    server: RunningService, client: httpx.Client, arguments: tuple[str, ...], sentence: str
-) -> None:
-    result = run(server, "submit", "compare", "tiny", *arguments)
-    assert result.exit_code == 2
-    assert sentence in " ".join(result.stderr.split())
-
-
 def test_poses_of_a_file_become_an_archive(server: RunningService, client: httpx.Client, tmp_path: Path) -> None:
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, 1, 3] = (0.5, 1.5, 2.5)
@@ -180,16 +143,6 @@ def test_poses_of_a_file_become_an_archive(server: RunningService, client: httpx
     listed = json.loads(done(server, "list", "--kind", "render", "--json"))
     assert job in {entry["id"] for entry in listed}
     assert job in done(server, "list", "--state", "succeeded")
-
-
-def test_a_field_of_a_scene_becomes_a_volume(server: RunningService, client: httpx.Client, tmp_path: Path) -> None:
-    options = ("--field", "coverage", "--spacing-mm", 2, "--box-mm=-10:10,-2:2,10:30", "--format", "nii", "--wait")
-    job = done(server, "submit", "voxelize", "demo", *options).splitlines()[0]
-    assert client.get(f"/v1/jobs/{job}").json()["artifacts"] == ["coverage.nii", "volume.json"]
-    done(server, "download", job, "coverage.nii", "-o", tmp_path / "coverage.nii")
-    image: Any = nibabel.load(tmp_path / "coverage.nii")
-    assert image.shape == (10, 2, 10)
-    assert np.asarray(image.dataobj).max() > 0.5
 
 
 def test_shards_are_downloaded_by_one_name_those_that_are_missing(
@@ -209,12 +162,6 @@ def test_shards_are_downloaded_by_one_name_those_that_are_missing(
         assert file_sha256(tmp_path / "frames" / shard["file"]) == shard["sha256"]
     assert client.get(f"/v1/jobs/{job}/artifacts/frames-000003.tar").status_code == 404
     assert client.get(f"/v1/jobs/{job}/artifacts/{files}").status_code == 404
-
-
-def test_a_job_is_private_where_that_is_said(server: RunningService, client: httpx.Client) -> None:
-    for options, private in (((), False), (("--private",), True)):
-        job = done(server, "submit", "render", "demo", "--height", "24", "--width", "16", *options).strip()
-        assert client.get(f"/v1/jobs/{job}").json()["private"] is private
 
 
 def test_a_job_that_fails_says_why_by_its_exit_code(server: RunningService, client: httpx.Client) -> None:
@@ -257,18 +204,6 @@ def test_mistakes_give_one_line(server: RunningService, arguments: tuple[str, ..
     assert result.stderr.startswith("error: ")
     assert told in result.stderr
     assert result.stderr.count("\n") == 1
-
-
-def test_submitting_needs_no_torch() -> None:
-    program = (
-        "import sys; from typer.testing import CliRunner; from ultragray_service.cli.app import app\n"
-        "arguments = 'jobs submit train tiny --scene new --set steps=3 --address http://127.0.0.1:9'\n"
-        "print(CliRunner().invoke(app, arguments.split()).exit_code, 'torch' in sys.modules)"
-    )
-    path = os.pathsep.join(str(ROOT / folder) for folder in SOURCE_FOLDERS)
-    environment = {**os.environ, "PYTHONPATH": path}
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True, env=environment)
-    assert done.stdout.split() == ["2", "False"]
 
 
 def test_a_watch_outlives_a_restart_of_the_service(start_service: StartService, tmp_path: Path) -> None:

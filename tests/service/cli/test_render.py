@@ -6,7 +6,6 @@ import json
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import cv2
 import h5py
@@ -15,14 +14,12 @@ import pytest
 import torch
 
 import ultragray
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, SceneInfo, render
+from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, render
 from ultragray.contract import to_dict
 from ultragray.datasets.plus import read_plus_sweep
-from ultragray.exchange import rendering
 from ultragray.files import file_sha256
-from ultragray.geometry.scan_conversion import scan_convert, scan_convert_labels
+from ultragray.geometry.scan_conversion import scan_convert
 from ultragray.rendering.backends import cpu
-from ultragray.rendering.settings import Contact
 from ultragray.rendering.tools import Needle, ToolFrame
 from ultragray.samplers import FanSampler
 from ultragray.scene.confidence import FIGURES, Assessor, ConfidenceModel, figure_arrays
@@ -61,26 +58,6 @@ def test_shards_need_an_engine_that_exists(scene_file: Path, tmp_path: Path) -> 
     assert "--shard-frames is of shards: name an engine with --on" in refused(*made, "--shard-frames", 5)
     assert "on must be ray or ray://HEAD:PORT, got 'spark'" in refused(*made, "--on", "spark")
     assert "count 100,001 is more than the 100,000 poses" in refused(*made[:-1], 100_001)
-
-
-def test_chunks_do_not_show(scene_file: Path, pose_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    whole, chunked = tmp_path / "whole.npz", tmp_path / "chunked.npz"
-    arguments = ("render", scene_file, "--poses", pose_file, "--outputs", "bmode,echo,coverage", "-o")
-    assert run(*arguments, whole).exit_code == 0
-    sizes: list[int] = []
-
-    def counting(scene: Any, probe: Any, poses: Any, **options: Any) -> Any:
-        sizes.append(len(poses))
-        return render(scene, probe, poses, **options)
-
-    monkeypatch.setattr(rendering, "render", counting)
-    monkeypatch.setattr(rendering, "frames_at_once", lambda height, width: 3)
-    assert run(*arguments, chunked).exit_code == 0
-    assert sizes == [3, 3, 1]
-    with np.load(whole) as first, np.load(chunked) as second:
-        for name in first:
-            np.testing.assert_array_equal(first[name], second[name])
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["chunked.npz", "poses.npy", "scene.ugr", "whole.npz"]
 
 
 def test_without_poses_the_training_views_are_rendered_as_trained(scene_file: Path, tmp_path: Path) -> None:
@@ -136,25 +113,6 @@ def test_render_tells_and_stores_how_far_frames_extrapolate(
         np.testing.assert_allclose(frames["supported_share"], figures["supported_share"])
         np.testing.assert_allclose(frames["angle_deg"], figures["angle_deg"], rtol=1e-6)
         assert np.isnan(frames["confidence"]).all()
-
-
-def test_render_tells_how_much_of_the_probe_touches_the_skin(scene_file: Path, tmp_path: Path) -> None:
-    scene = GaussianScene.load(scene_file)
-    lifted = scene.training_poses.copy()
-    lifted[0, :3, 3] -= 5.0 * lifted[0, :3, 2]
-    np.save(tmp_path / "poses.npy", lifted[:2])
-    arguments = ("render", scene_file, "--poses", tmp_path / "poses.npy", "-o", tmp_path / "f.npz")
-    expected = render(scene, None, lifted[:2], height=24, width=20, outputs=("bmode",), contact=Contact.AIR)
-    assert expected.touch is not None
-    off, on = expected.touch.shares
-    assert off < 0.5 < on
-    words = f", {expected.touch.shares.astype(np.float32).mean():.0%} of the scan lines have contact\n"
-    assert run(*arguments, "--contact", "air").output.endswith(words)
-    with np.load(tmp_path / "f.npz") as frames:
-        np.testing.assert_allclose(frames["contact_share"], expected.touch.shares)
-        np.testing.assert_allclose(frames["bmode"], expected["bmode"].numpy(), atol=1e-6)
-        assert str(frames["contact"]) == "air"
-    assert run(*arguments, "--force", "--contact", "gel").exit_code == 2
 
 
 def test_render_draws_the_tools_of_a_file(scene_file: Path, tmp_path: Path) -> None:
@@ -233,42 +191,6 @@ def test_render_with_another_probe_as_a_fan(scene_file: Path, tmp_path: Path) ->
     frame = render(scene, CONVEX, scene.training_poses[:1], height=24, width=20).bmode
     assert frame is not None
     np.testing.assert_array_equal(picture, np.rint(scan_convert(frame[0].numpy(), CONVEX, 0.5) * 255))
-
-
-@pytest.fixture
-def labelled_file(tmp_path: Path, random_scene: Callable[..., GaussianScene]) -> Path:
-    labels = torch.arange(60, dtype=torch.uint8) % 3
-    info = SceneInfo(probe=PHASED, image_height=24, image_width=20, label_names={1: "bone", 2: "fat"})
-    GaussianScene.from_splats(random_scene(60).splats, info=info, labels=labels, training_poses=np.eye(4)[None]).save(
-        tmp_path / "labelled.ugr"
-    )
-    return tmp_path / "labelled.ugr"
-
-
-def test_labels_are_written_as_they_are(labelled_file: Path, tmp_path: Path) -> None:
-    arguments = ("render", labelled_file, "--outputs", "labels,bmode", "-o")
-    for more in ((tmp_path / "f.npz",), (tmp_path / "flat",), (tmp_path / "fan", "--scan-convert", 0.5)):
-        result = run(*arguments, *more)
-        assert result.exit_code == 0, result.output
-    scene = GaussianScene.load(labelled_file)
-    truth = render(scene, None, scene.training_poses, height=24, width=20, outputs=("labels",)).labels
-    assert truth is not None
-    assert {*truth.unique().tolist()} == {0, 1, 2}
-    with np.load(tmp_path / "f.npz") as frames:
-        assert (frames["labels"].dtype, frames["bmode"].dtype) == (np.uint8, np.float32)
-        np.testing.assert_array_equal(frames["labels"], truth)
-    flat, fan = (
-        cv2.imread(str(tmp_path / name / "frame_00000_labels.png"), cv2.IMREAD_UNCHANGED) for name in ("flat", "fan")
-    )
-    np.testing.assert_array_equal(flat, truth[0])
-    np.testing.assert_array_equal(fan, scan_convert_labels(truth[0].numpy(), PHASED, 0.5))
-
-
-def test_info_tells_of_labels_and_a_phased_probe(labelled_file: Path) -> None:
-    document = json.loads(run("show", labelled_file, "--json").output)
-    assert document["label_names"] == {"1": "bone", "2": "fat"}
-    assert document["probe"] == {"kind": "phased", "opening_angle_deg": 90.0, "far_mm": 50.0}
-    assert "1=bone" in run("show", labelled_file).output
 
 
 def test_threads_and_backend_are_used(scene_file: Path, tmp_path: Path) -> None:

@@ -24,7 +24,6 @@ from ultragray.learn.training import TrainingConfig, trainer
 from ultragray.learn.training.geometry import Geometry
 from ultragray_service.cli.app import app
 
-from ...mcap_files import PROBE, recorded
 from ...waiting import Deadline
 
 SMALL = ("--steps", 24, "--max-gaussians", 60, "--threads", 1)
@@ -82,16 +81,6 @@ def test_trains_a_scene(dataset: Path, tmp_path: Path) -> None:
     assert pictures[-2:] == ["validation_00000024.png", "validation_truth.png"]
     assert len((folder / "metrics.jsonl").read_text().splitlines()) == 24
     assert "the run is finished, all 24 steps are done" in refused(dataset, "-o", output, "--resume")
-
-
-def test_trains_a_scene_from_an_mcap_recording(tmp_path: Path) -> None:
-    sweep, output = recorded(tmp_path / "sweep.mcap"), tmp_path / "scene.ugr"
-    result = run(sweep, "-o", output, *SMALL)
-    assert result.exit_code == 0, result.output
-    scene = GaussianScene.load(output)
-    assert scene.info.probe == PROBE
-    assert len(scene.training_poses) == 10
-    assert scene.info.training["step"] == 24
 
 
 def test_settings_come_from_file_set_and_options(dataset: Path, tmp_path: Path) -> None:
@@ -211,55 +200,8 @@ def test_further_signals_do_not_stop_the_scene_from_being_written(dataset: Path,
     assert GaussianScene.load(output).info.training["step"] < 3000
 
 
-def test_the_best_effort_is_tried_out_first(dataset: Path, tmp_path: Path) -> None:
-    output = tmp_path / "best.ugr"
-    result = run(dataset, "-o", output, "--preset", "best", "--steps", 6, "--batch-size", 3, "--threads", 1)
-    assert result.exit_code == 0, result.output
-    assert result.stderr.splitlines()[0].startswith("trying effort 1 on a part of the frames: step 1 of 6")
-    assert any(line.startswith("step 6 of 6") for line in result.stderr.splitlines())
-    assert result.stderr.splitlines()[-2].startswith("fitting the confidence: step 6 of 6")
-    assert result.stderr.splitlines()[-1] == "fitting the confidence: measuring what was reached …"
-    effort = GaussianScene.load(output).info.training["effort"]
-    assert f"chose effort {effort:g}, wrote {output}" in result.output
-
-
-def test_warns_of_what_looks_wrong_before_it_trains(dataset: Path, tmp_path: Path) -> None:
-    poses = np.load(dataset / "poses_train.npy")
-    poses[4, 0, 3] = 30.0
-    np.save(dataset / "poses_train.npy", poses)
-    result = run(dataset, "-o", tmp_path / "scene.ugr", *SMALL)
-    assert result.exit_code == 0, result.output
-    lines = result.stderr.splitlines()
-    assert lines[0].startswith("warning: train: frame 4 lies 30.0 mm off")
-    assert any(line.startswith("step 24 of 24") for line in lines)
-
-
-def test_divergence_leaves_the_last_good_scene(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    true_loss, calls = trainer.image_loss, 0
-
-    def loss_that_breaks(rendered: torch.Tensor, truth: torch.Tensor, texture: float) -> Any:
-        nonlocal calls
-        calls += 1
-        return true_loss(rendered, truth, texture) * (float("nan") if calls == 6 else 1.0)
-
-    monkeypatch.setattr(trainer, "image_loss", loss_that_breaks)
-    output = tmp_path / "scene.ugr"
-    told = refused(dataset, "-o", output, *SMALL, "--checkpoint-every", 0)
-    assert "diverged in step 6: the loss is nan" in told
-    assert f"{output} is the scene after step 5" in told
-    assert GaussianScene.load(output).info.training["step"] == 5
-
-
 def test_tensorboard_that_is_missing_is_said(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
     told = refused(dataset, "-o", tmp_path / "scene.ugr", *SMALL, "--tensorboard")
     assert f"TensorBoard is not installed: {install_advice('tensorboard')}" in told
     assert not (tmp_path / "scene.ugr.run").exists()
-
-
-def test_help_needs_no_torch() -> None:
-    program = (
-        f"import sys; sys.path[:0] = {sys.path!r}; import ultragray_service.cli.app; print('torch' in sys.modules)"
-    )
-    found = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True)
-    assert found.stdout == "False\n"

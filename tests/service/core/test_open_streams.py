@@ -9,15 +9,15 @@ import pytest
 
 from ultragray.errors import UltragrayError
 from ultragray_service.access.principals import Principal, Role, act_as
-from ultragray_service.core.open_streams import MAX_NAME, Answered, OpenStream, OpenStreams
+from ultragray_service.core.open_streams import MAX_NAME, OpenStream, OpenStreams, StreamAnswer
 from ultragray_service.errors import StreamNotFound
 
 ALICE, BOB = (Principal(name, Role.READER, "key") for name in ("alice", "bob"))
 ADMIN = Principal("root", Role.ADMIN, "key")
 
 
-def refusal(sequence: int, **others: Any) -> Answered:
-    return Answered(sequence, None, UltragrayError("not this one"), **others)
+def refusal(sequence: int, **others: Any) -> StreamAnswer:
+    return StreamAnswer(sequence, None, UltragrayError("not this one"), **others)
 
 
 def act(principal: Principal) -> None:
@@ -29,7 +29,7 @@ def test_a_slow_watcher_gets_the_newest_answer_alone_and_then_the_end() -> None:
         stream, taken = OpenStream(), []
         with stream.watched() as watcher:
             for sequence in range(5):
-                stream.answered(refusal(sequence))
+                stream.note(refusal(sequence))
             stream.end()
             while (answered := await watcher.next()) is not None:
                 taken.append(answered.sequence)
@@ -43,7 +43,7 @@ def test_a_watcher_that_has_gone_is_told_nothing() -> None:
         stream = OpenStream()
         with stream.watched():
             assert stream.summary().watchers == 1
-        stream.answered(refusal(1))
+        stream.note(refusal(1))
         assert stream.summary().watchers == 0
 
     asyncio.run(main())
@@ -52,8 +52,8 @@ def test_a_watcher_that_has_gone_is_told_nothing() -> None:
 def test_a_summary_counts_what_came_and_what_was_answered() -> None:
     stream = OpenStream(name="UR5 \n" + "x" * 200)
     for sequence in range(3):
-        stream.asked()
-        stream.answered(refusal(sequence, dropped=2))
+        stream.count_pose()
+        stream.note(refusal(sequence, dropped=2))
     told = stream.summary()
     assert (told.poses, told.frames, told.refused, told.dropped) == (3, 0, 3, 6)
     assert (told.scene, told.pose) == (None, None)

@@ -11,7 +11,7 @@ from typing import Any
 import pytest
 
 from ultragray.errors import InvalidArgument, UltragrayError
-from ultragray_service.core.streams import Answered, FrameStream, PoseStream, StreamMode
+from ultragray_service.core.streams import FrameStream, PoseStream, StreamAnswer, StreamMode
 from ultragray_service.service import Service
 from ultragray_service.settings import Settings
 from ultragray_service.wiring import make_service
@@ -38,7 +38,7 @@ def test_a_connection_that_breaks_fails_reading_and_writing_at_once_and_neither_
             await broken.wait()
             raise ConnectionResetError("read")
 
-        async def write(answered: Answered) -> None:
+        async def write(answered: StreamAnswer) -> None:
             await broken.wait()
             raise ConnectionResetError("write")
 
@@ -53,7 +53,7 @@ def test_a_connection_that_breaks_fails_reading_and_writing_at_once_and_neither_
 
 
 def test_a_stream_that_is_refused_as_a_whole_is_not_ended_in_the_middle_of_an_answer(service: Service) -> None:
-    written: list[Answered] = []
+    written: list[StreamAnswer] = []
 
     async def main() -> None:
         stream, writing = PoseStream(service.rendering), asyncio.Event()
@@ -63,7 +63,7 @@ def test_a_stream_that_is_refused_as_a_whole_is_not_ended_in_the_middle_of_an_an
             await writing.wait()
             raise InvalidArgument("no such mode", field="mode")
 
-        async def write(answered: Answered) -> None:
+        async def write(answered: StreamAnswer) -> None:
             writing.set()
             await asyncio.sleep(0.05)
             written.append(answered)
@@ -92,7 +92,7 @@ class FaultyTransport:
 
     def __init__(self) -> None:
         self.messages: Iterator[Faulty] = iter([Faulty()])
-        self.answers: list[Answered] = []
+        self.answers: list[StreamAnswer] = []
 
     async def receive(self) -> Any:
         return next(self.messages, None)
@@ -100,7 +100,7 @@ class FaultyTransport:
     def mode(self, message: Any) -> StreamMode:
         return StreamMode.ORDERED
 
-    async def send(self, answered: Answered) -> None:
+    async def send(self, answered: StreamAnswer) -> None:
         self.answers.append(answered)
 
     hand_over = send

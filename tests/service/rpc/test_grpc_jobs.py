@@ -9,11 +9,10 @@ from typing import Any
 
 import grpc
 import pytest
-from google.protobuf.json_format import MessageToDict
 from google.rpc.error_details_pb2 import ErrorInfo
 from google.rpc.status_pb2 import Status
 
-from ultragray_proto.v1 import geometry_pb2, jobs_pb2, jobs_pb2_grpc, rendering_pb2
+from ultragray_proto.v1 import geometry_pb2, jobs_pb2, jobs_pb2_grpc
 from ultragray_service.rpc.messages import read_specification
 from ultragray_workers.jobs.kinds import TrainJob
 
@@ -47,48 +46,6 @@ def refusal(call: Callable[[], Any]) -> tuple[str, str, str]:
     info = ErrorInfo()
     details[0].Unpack(info)
     return error.code().name, info.reason, info.metadata["field"]
-
-
-def test_a_render_job_comes_back_as_it_was_asked_for(jobs: jobs_pb2_grpc.JobServiceStub) -> None:
-    pose = geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=[1, 0, 0, 0, 0, 1, 0, 2.5, 0, 0, 1, 0, 0, 0, 0, 1]))
-    render = jobs_pb2.RenderJob(
-        scene="demo",
-        poses=[pose, pose],
-        height=16,
-        outputs=[rendering_pb2.OUTPUT_ECHO, rendering_pb2.OUTPUT_BMODE],
-        format="tar",
-        dtype="float32",
-        sampler=jobs_pb2.PoseSampler(kind="fan", tilt_deg=5, step_deg=2.5),
-    )
-    answer = jobs.SubmitJob(jobs_pb2.SubmitJobRequest(render=render, priority=2))
-    job = answer.job
-    assert answer.created
-    assert (job.kind, job.state, job.priority) == (jobs_pb2.JOB_KIND_RENDER, jobs_pb2.JOB_STATE_QUEUED, 2)
-    assert (job.render.scene, job.render.pose_count, len(job.render.poses)) == ("demo", 2, 0)
-    assert (job.render.height, job.render.HasField("width")) == (16, False)
-    assert (job.render.format, job.render.dtype, job.render.sampler) == ("tar", "float32", render.sampler)
-    assert list(job.render.outputs) == [rendering_pb2.OUTPUT_ECHO, rendering_pb2.OUTPUT_BMODE]
-    assert not job.HasField("error")
-    assert MessageToDict(job.progress) == {"waitsFor": "a worker: none is running"}
-    assert jobs.GetJob(jobs_pb2.GetJobRequest(job=job.id)) == job
-
-
-@pytest.mark.parametrize(
-    ("kind", "named"),
-    [
-        ("train", jobs_pb2.TrainJob(dataset="liver", scene="liver")),
-        ("render", jobs_pb2.RenderJob(scene="liver", sampler=jobs_pb2.PoseSampler(kind="training"))),
-        ("evaluate", jobs_pb2.EvaluateJob(dataset="liver", scene="liver")),
-        ("compare", jobs_pb2.CompareJob(dataset="liver", methods=["median", "linear"])),
-        ("voxelize", jobs_pb2.VoxelizeJob(scene="liver", field="labels", spacing_mm=1.0)),
-    ],
-)
-def test_what_a_job_asks_of_its_worker_is_read_from_the_messages_of_all_kinds(kind: str, named: Any) -> None:
-    named.MergeFrom(type(named)(device="cuda:1", min_memory_gb=16, worker_labels={"site": "lab1", "rack": "4"}))
-    specification, field = read_specification(jobs_pb2.SubmitJobRequest(**{kind: named}))
-    assert field == kind
-    assert (specification.device, specification.min_memory_gb) == ("cuda:1", 16)
-    assert specification.worker_labels == {"site": "lab1", "rack": "4"}
 
 
 def test_a_render_job_is_estimated_and_not_submitted(jobs: jobs_pb2_grpc.JobServiceStub) -> None:
@@ -150,15 +107,6 @@ def test_pages_and_filters(jobs: jobs_pb2_grpc.JobServiceStub) -> None:
     assert not jobs.ListJobs(jobs_pb2.ListJobsRequest(kind=jobs_pb2.JOB_KIND_TRAIN)).jobs
     refused = refusal(lambda: jobs.ListJobs(jobs_pb2.ListJobsRequest(state=99)))
     assert refused == ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "state")
-
-
-def test_a_finished_job_is_deleted(jobs: jobs_pb2_grpc.JobServiceStub) -> None:
-    job = jobs.SubmitJob(training_poses()).job
-    request = jobs_pb2.DeleteJobRequest(job=job.id)
-    assert refusal(lambda: jobs.DeleteJob(request)) == ("FAILED_PRECONDITION", "JOB_IN_USE", "job")
-    jobs.CancelJob(jobs_pb2.CancelJobRequest(job=job.id))
-    assert jobs.DeleteJob(request).job == job.id
-    assert refusal(lambda: jobs.DeleteJob(request)) == ("NOT_FOUND", "JOB_NOT_FOUND", "job")
 
 
 def test_log_and_artifacts_of_a_job(start_service: StartService, tmp_path: Path) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import queue
-import threading
 from collections.abc import Callable, Iterator
 from typing import Any
 
@@ -60,41 +59,6 @@ def expected(scene: GaussianScene, x_mm: float) -> Any:
 
 def pixels(frame: rendering_pb2.Frame) -> Any:
     return np.frombuffer(frame.data, np.uint8).reshape(frame.height, frame.width) / 255
-
-
-def test_one_frame_carries_all_that_renders_it_again(
-    renders: Stub, demo_scene: GaussianScene, settings_message: Any, pose_message: Any
-) -> None:
-    request = rendering_pb2.RenderRequest(settings=settings_message, pose=pose_message)
-    frame = renders.Render(request, timeout=TIMEOUT_S)
-    assert np.abs(pixels(frame) - expected(demo_scene, 1.0)).max() <= 1.001 / 255
-    assert (frame.scene, len(frame.scene_sha256), frame.height, frame.width) == ("demo", 64, HEIGHT, WIDTH)
-    assert frame.renderer.startswith("ultragray/")
-    assert list(frame.outputs) == [rendering_pb2.OUTPUT_BMODE]
-    assert frame.encoding == rendering_pb2.ENCODING_UINT8
-    assert frame.probe.linear.far_mm == 40.0
-    assert frame.pose.values[3] == 1.0
-    assert frame.timings.render_ms > 0
-    again = rendering_pb2.RenderSettings(
-        scene=frame.scene,
-        height=frame.height,
-        width=frame.width,
-        outputs=frame.outputs,
-        encoding=frame.encoding,
-        probe=frame.probe,
-    )
-    pose = geometry_pb2.Pose(matrix=frame.pose)
-    repeated = renders.Render(rendering_pb2.RenderRequest(settings=again, pose=pose), timeout=TIMEOUT_S)
-    assert repeated.data == frame.data
-
-
-def test_a_batch_comes_in_order(renders: Stub, demo_scene: GaussianScene, settings_message: Any) -> None:
-    shifts = np.linspace(-4, 4, 40)
-    request = rendering_pb2.RenderBatchRequest(settings=settings_message, poses=[moved(x) for x in shifts])
-    frames = list(renders.RenderBatch(request, timeout=TIMEOUT_S))
-    assert [frame.sequence for frame in frames] == list(range(40))
-    assert [frame.pose.values[3] for frame in frames] == shifts.tolist()
-    assert np.abs(pixels(frames[7]) - expected(demo_scene, shifts[7])).max() <= 1.001 / 255
 
 
 class Conversation:
@@ -234,24 +198,6 @@ def test_a_client_that_leaves_frees_the_service(renders: Stub, settings_message:
         conversation.call.cancel()
     request = rendering_pb2.RenderRequest(settings=settings_message, pose=moved(0))
     assert renders.Render(request, timeout=TIMEOUT_S).data
-
-
-def test_streams_run_side_by_side(renders: Stub, settings_message: Any) -> None:
-    answers: dict[int, list[int]] = {}
-
-    def run(number: int) -> None:
-        conversation = Conversation(renders)
-        conversation.send(settings=settings_message)
-        for k in range(20):
-            conversation.send(100 * number + k, pose=moved(k))
-        answers[number] = [frame.sequence for frame in conversation.finish()]
-
-    threads = [threading.Thread(target=run, args=(number,)) for number in range(4)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert answers == {number: [100 * number + k for k in range(20)] for number in range(4)}
 
 
 def bad(**fields: Any) -> Callable[[], rendering_pb2.RenderRequest]:

@@ -10,7 +10,7 @@ from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 from ultragray_proto.v1 import scenes_pb2, scenes_pb2_grpc
 
 from ...waiting import wait_until
-from ..conftest import HEIGHT, RunningService
+from ..conftest import RunningService
 from .test_grpc_render import error_info
 
 Stub = scenes_pb2_grpc.SceneServiceStub
@@ -25,23 +25,6 @@ def test_list_pages_and_tells_bad_files(scenes: Stub) -> None:
     assert not first.scenes[0].HasField("error")
     assert first.scenes[1].error.reason == "SCENE_FILE_INVALID"
     assert rest.next_page_token == ""
-
-
-def test_a_scene_says_all_about_itself(scenes: Stub) -> None:
-    scene = scenes.GetScene(scenes_pb2.GetSceneRequest(scene="demo"))
-    assert scene.probe.linear.width_mm == 40.0
-    assert scene.centre_mm.z == 20.0
-    assert scene.image_height == HEIGHT
-    assert dict(scene.metrics) == {"psnr": 20.5}
-    assert scene.training_poses.count == 5
-    assert scene.training_poses.position_max_mm.y == 4.0
-    assert scene.training_poses.last.values[7] == 4.0
-
-
-def test_load_and_unload(scenes: Stub) -> None:
-    assert scenes.LoadScene(scenes_pb2.LoadSceneRequest(scene="second")).loaded_processes == 1
-    assert scenes.GetScene(scenes_pb2.GetSceneRequest(scene="second")).loaded
-    assert scenes.UnloadScene(scenes_pb2.UnloadSceneRequest(scene="second")).loaded_processes == 0
 
 
 @pytest.mark.parametrize(

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import os
 import secrets
-import signal
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -16,15 +13,14 @@ import numpy as np
 import pytest
 
 from ultragray.errors import InvalidArgument
-from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
+from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 from ultragray_service.rpc.calls import address_of
 from ultragray_service.rpc.shared_memory import FOLDER, SharedMemory
 from ultragray_workers.pool.messages import Place
 
 from ...file_sizes import files_of_at_most
-from ...waiting import wait_until
 from ..access.test_addresses import own_address
-from ..conftest import ROOT, RunningService, StartService
+from ..conftest import RunningService, StartService
 from .test_grpc_render import Conversation, Stub, error_info, moved
 
 SLOT_BYTES = 2**20
@@ -80,35 +76,6 @@ def opened(renders: Stub, memory: ClientMemory, **settings: Any) -> Conversation
     return conversation
 
 
-ENCODINGS: dict[str, dict[str, Any]] = {
-    "uint8": {"encoding": rendering_pb2.ENCODING_UINT8},
-    "float32": {"encoding": rendering_pb2.ENCODING_FLOAT32, "outputs": [1, 2, 3, 4, 6]},
-    "png": {"encoding": rendering_pb2.ENCODING_PNG},
-    "jpeg": {"encoding": rendering_pb2.ENCODING_JPEG},
-}
-
-
-@pytest.mark.parametrize("settings", ENCODINGS.values(), ids=ENCODINGS)
-def test_frames_are_those_of_messages_byte_for_byte(
-    renders: Stub, memory: ClientMemory, settings: dict[str, Any]
-) -> None:
-    ordinary = Conversation(renders)
-    ordinary.send(settings=rendering_pb2.RenderSettings(scene="demo", **settings))
-    shared = opened(renders, memory, **settings)
-    for sequence in range(5):
-        one, other = ordinary.ask(sequence, pose=moved(sequence)), shared.ask(sequence, pose=moved(sequence))
-        assert memory.pixels(other) == one.data
-        memory.free(other.shared_data.slot)
-        for frame in (one, other):
-            frame.ClearField("data")
-            frame.ClearField("shared_data")
-            frame.ClearField("timings")
-        assert one == other
-    assert not memory.path.exists()  # the service has taken the name away
-    ordinary.finish()
-    shared.finish()
-
-
 def test_a_slot_is_written_again_only_once_it_is_free(renders: Stub, memory: ClientMemory) -> None:
     conversation = opened(renders, memory)
     frames = [conversation.ask(k, pose=moved(k)) for k in range(3)]
@@ -130,30 +97,6 @@ def test_a_frame_larger_than_a_slot_comes_in_its_message(renders: Stub, memory: 
     assert len(conversation.ask(1, pose=moved(0)).data) == 600 * 600 * 4
     assert memory.flags == b"\1\1\1"
     conversation.finish()
-
-
-def test_errors_and_new_settings_are_as_without(renders: Stub, memory: ClientMemory, settings_message: Any) -> None:
-    conversation = opened(renders, memory, scene="nowhere")
-    assert next(conversation.call).error.reason == "SCENE_NOT_FOUND"
-    assert len(memory.pixels(conversation.ask(1, settings=settings_message, pose=moved(0)))) == 64 * 48
-    assert conversation.ask(2, pose=geometry_pb2.Pose()).error.reason == "INVALID_POSE"
-    assert conversation.ask(3, pose=moved(0), timeout_ms=1e-6).error.reason == "DEADLINE_EXCEEDED"
-    small = rendering_pb2.RenderSettings(scene="second", height=10, width=12)
-    assert len(memory.pixels(conversation.ask(4, settings=small, pose=moved(0)))) == 10 * 12
-    assert memory.flags == b"\0\0\1"
-    conversation.finish()
-
-
-def test_a_latest_stream_takes_slots_only_for_frames_that_it_sends(renders: Stub, memory: ClientMemory) -> None:
-    conversation = Conversation(renders)
-    settings = rendering_pb2.RenderSettings(scene="demo", height=400, width=400)
-    conversation.send(settings=settings, mode=rendering_pb2.STREAM_MODE_LATEST, shared_memory=memory.message)
-    for sequence in range(200):
-        conversation.send(sequence, pose=moved(0))
-    frames = conversation.finish()
-    assert sum(1 + frame.dropped for frame in frames) == 200
-    slots = [frame.shared_data.slot for frame in frames if frame.HasField("shared_data")]
-    assert slots == list(range(min(3, len(frames))))
 
 
 def test_a_file_that_is_cut_off_or_scribbled_on_harms_its_client_alone(
@@ -311,38 +254,3 @@ def test_a_slot_that_cannot_be_written_is_not_taken(memory: ClientMemory, tmp_pa
     shared.close()
     assert shared.put(source.fileno(), 8192) is None
     source.close()
-
-
-def shared_files(service: RunningService) -> list[str]:
-    """The shared memory that the service has open."""
-    links = (os.readlink(link) for link in Path(f"/proc/{service.process.pid}/fd").iterdir() if link.is_symlink())
-    return [link for link in links if "shm/ultragray-" in link]
-
-
-DYING_CLIENT = """
-import sys, numpy as np
-from ultragray_client import Client
-stream = Client(sys.argv[1]).stream("demo", shared_memory=True)
-held = []
-for _ in range(3):
-    stream.send(np.eye(4))
-    held.append(stream.receive())
-print("streams", flush=True)
-sys.stdin.read()
-"""
-
-
-def test_a_client_that_dies_leaves_nothing(service: RunningService, renders: Stub) -> None:
-    before = set(Path(FOLDER).glob("ultragray-*"))
-    assert shared_files(service) == []
-    command = [sys.executable, "-c", DYING_CLIENT, service.grpc]
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(str(ROOT / name) for name in ("client", "proto"))}
-    with subprocess.Popen(command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, env=environment, text=True) as client:
-        assert client.stdout is not None
-        assert client.stdout.readline() == "streams\n"
-        assert len(shared_files(service)) == 1
-        client.send_signal(signal.SIGKILL)
-    wait_until(lambda: shared_files(service) == [])
-    wait_until(lambda: set(Path(FOLDER).glob("ultragray-*")) <= before)  # other tests may make some, for a moment
-    settings = rendering_pb2.RenderSettings(scene="demo")
-    assert renders.Render(rendering_pb2.RenderRequest(settings=settings, pose=moved(0)), timeout=60).data

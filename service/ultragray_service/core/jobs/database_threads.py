@@ -25,14 +25,16 @@ class DatabaseThreads:
     def __init__(self) -> None:
         self.executor = ThreadPoolExecutor(_THREADS, "database")
 
-    async def ask(self, question: Callable[Concatenate[D, P], T], asked: D, *details: P.args, **options: P.kwargs) -> T:
-        """Calls `question(asked, *details, **options)` in a thread, in the caller's context.
+    async def ask(
+        self, question: Callable[Concatenate[D, P], T], target: D, *details: P.args, **options: P.kwargs
+    ) -> T:
+        """Calls `question(target, *details, **options)` in a thread, in the caller's context.
 
         What is hidden from the caller is not found.
 
         Raises what it raises, and DatabaseUnavailable where there is no answer within PATIENCE_S.
         """
-        call = partial(copy_context().run, question, asked, *details, **options)
+        call = partial(copy_context().run, question, target, *details, **options)
         answer = asyncio.get_running_loop().run_in_executor(self.executor, call)
         try:
             return await asyncio.wait_for(answer, PATIENCE_S)

@@ -18,7 +18,7 @@ from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.settings import RenderSettings, settings_used
 from ultragray_service.access.credentials import STREAM_PROTOCOL
 from ultragray_service.core.frames import FrameHeader
-from ultragray_service.core.open_streams import Answered, StreamSummary, Watcher
+from ultragray_service.core.open_streams import StreamAnswer, StreamSummary, Watcher
 from ultragray_service.core.streams import FrameStream, Message, SceneSettings, StreamMode
 from ultragray_service.errors import Refusal, statuses_of
 from ultragray_service.http.bodies import StreamMessage, adapter_of, read_json
@@ -52,33 +52,33 @@ class RefusalMessage(Answer):
     error: Refusal
 
 
-def frame_bytes(answered: Answered) -> bytes:
+def frame_bytes(answer: StreamAnswer) -> bytes:
     """A frame as one binary message: the length of the JSON that follows (uint32, little endian), the JSON, the data.
 
     Spaces at the end of the JSON let the data begin at a multiple of 8 bytes.
     """
-    assert not isinstance(answered.outcome, UltragrayError)
+    assert not isinstance(answer.outcome, UltragrayError)
     header: bytes = adapter_of(FrameMessage).dump_json(
         FrameMessage.of(
-            answered.outcome,
-            **vars(settings_used(answered.outcome.settings)),
-            sequence=answered.sequence,
-            client_time_ms=answered.client_time,
-            dropped=answered.dropped,
+            answer.outcome,
+            **vars(settings_used(answer.outcome.settings)),
+            sequence=answer.sequence,
+            client_time_ms=answer.client_time,
+            dropped=answer.dropped,
         )
     )
     header += b" " * (-(4 + len(header)) % _ALIGNMENT)
-    return len(header).to_bytes(4, "little") + header + answered.outcome.data
+    return len(header).to_bytes(4, "little") + header + answer.outcome.data
 
 
-def refusal_text(answered: Answered) -> str:
+def refusal_text(answer: StreamAnswer) -> str:
     """The text message in place of a frame."""
-    assert isinstance(answered.outcome, UltragrayError)
+    assert isinstance(answer.outcome, UltragrayError)
     message = RefusalMessage(
-        sequence=answered.sequence,
-        client_time_ms=answered.client_time,
-        dropped=answered.dropped,
-        error=Refusal.of(answered.outcome),
+        sequence=answer.sequence,
+        client_time_ms=answer.client_time,
+        dropped=answer.dropped,
+        error=Refusal.of(answer.outcome),
     )
     text: bytes = adapter_of(RefusalMessage).dump_json(message)
     return text.decode()
@@ -225,17 +225,17 @@ class _WebSocketTransport:
     def mode(self, message: Message) -> StreamMode | None:
         return (message.mode or StreamMode.ORDERED) if isinstance(message, _Message) else None
 
-    async def send(self, answered: Answered) -> None:
-        await self._websocket.send({"type": "websocket.send", **_contents(answered)})
+    async def send(self, answer: StreamAnswer) -> None:
+        await self._websocket.send({"type": "websocket.send", **_contents(answer)})
 
-    async def hand_over(self, answered: Answered) -> None:
-        await self._websocket.send({"type": "websocket.send", HAND_OVER: True, **_contents(answered)})
+    async def hand_over(self, answer: StreamAnswer) -> None:
+        await self._websocket.send({"type": "websocket.send", HAND_OVER: True, **_contents(answer)})
 
 
-def _contents(answered: Answered) -> dict[str, Any]:
-    if isinstance(answered.outcome, UltragrayError):
-        return {"text": refusal_text(answered)}
-    return {"bytes": frame_bytes(answered)}
+def _contents(answer: StreamAnswer) -> dict[str, Any]:
+    if isinstance(answer.outcome, UltragrayError):
+        return {"text": refusal_text(answer)}
+    return {"bytes": frame_bytes(answer)}
 
 
 # The open streams, and the WebSocket that shows what one of them asks for and gets.
@@ -320,11 +320,11 @@ async def _show(service: Service, websocket: WebSocket, watcher: Watcher) -> str
 
 async def _pass_on(websocket: WebSocket, watcher: Watcher) -> None:
     """Sends answers as the stream's own client gets them, as many as the watcher takes."""
-    while (answered := await watcher.next()) is not None:
-        if isinstance(answered.outcome, UltragrayError):
-            await websocket.send({"type": "websocket.send", "text": refusal_text(answered)})
+    while (answer := await watcher.next()) is not None:
+        if isinstance(answer.outcome, UltragrayError):
+            await websocket.send({"type": "websocket.send", "text": refusal_text(answer)})
         else:
-            await websocket.send({"type": "websocket.send", HAND_OVER: True, "bytes": frame_bytes(answered)})
+            await websocket.send({"type": "websocket.send", HAND_OVER: True, "bytes": frame_bytes(answer)})
 
 
 async def _until_gone(websocket: WebSocket) -> None:

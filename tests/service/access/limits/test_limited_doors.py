@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import queue
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -145,23 +144,6 @@ def test_a_latest_stream_renders_the_newest_pose_whenever_it_may(limited: Limite
     assert not any("error" in answer for answer in answers)
     assert len(answers) < 10
     assert len(answers) + sum(answer["dropped"] for answer in answers) == 31
-
-
-def test_a_stream_of_grpc_is_paced_likewise(limited: Limited) -> None:
-    messages: queue.Queue[rendering_pb2.RenderStreamRequest | None] = queue.Queue()
-    settings = render_settings()
-    for sequence in range(30):
-        mode = rendering_pb2.STREAM_MODE_LATEST
-        asked = rendering_pb2.RenderStreamRequest(sequence=sequence, settings=settings, pose=moved(0), mode=mode)
-        messages.put(asked)
-    messages.put(None)
-    call = limited.renders().RenderStream(
-        iter(messages.get, None), metadata=limited.metadata("rpc-latest"), timeout=120
-    )
-    answers = list(call)
-    assert answers[-1].sequence == 29
-    assert not any(answer.HasField("error") for answer in answers)
-    assert len(answers) + sum(answer.dropped for answer in answers) == 30
 
 
 def test_streams_at_once_are_limited_over_all_doors(limited: Limited) -> None:
