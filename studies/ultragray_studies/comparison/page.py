@@ -17,8 +17,8 @@ from ultragray.learn.evaluation.scoring import Evaluation
 from ultragray.learn.report.page import FrameOfPage, Shown, environment, frames_of_page, telling_places
 from ultragray.learn.report.plots import COLOURS, SCENE_COLOUR, line_style, make_figure, svg
 from ultragray.learn.report.tables import LABELS, Row, by_mean_rank, metric_rows, rank, rank_rows, speckle_rows
-from ultragray.learn.sweep import Dataset
-from ultragray_studies.comparison.result import RESULT_FILE, Comparison, Distances, MethodResult
+from ultragray.learn.sweep import Dataset, Distances
+from ultragray_studies.comparison.result import RESULT_FILE, Comparison, MethodResult
 from ultragray_studies.comparison.run import frames_of
 from ultragray_studies.comparison.tables import budget_text, cost_texts, latex_table, steps_text
 from ultragray_studies.methods.gaussians import SceneMethod

@@ -28,10 +28,10 @@ from ultragray.installation import __version__
 from ultragray.learn.evaluation.methods import BudgetKind, ComparisonSettings
 from ultragray.learn.evaluation.scoring import evaluate_frames, require_frames
 from ultragray.learn.report.tables import DatasetFacts
-from ultragray.learn.sweep import ByteArray, Dataset, Sweep, spread_places
+from ultragray.learn.sweep import ByteArray, Dataset, Distances, Sweep, spread_places
 from ultragray.learn.training.memory import machine_in_words, training_device
 from ultragray.rendering.pixels import to_uint8
-from ultragray_studies.comparison.result import FORMAT_VERSION, Comparison, Distances, MethodResult
+from ultragray_studies.comparison.result import FORMAT_VERSION, Comparison, MethodResult
 from ultragray_studies.methods.gaussians import SceneMethod
 from ultragray_studies.methods.method import Budget, FitProgress, FitRun, Fitted, FrameArray, Method, Pace, Paces
 

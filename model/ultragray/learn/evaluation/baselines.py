@@ -24,7 +24,16 @@ from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.geometry.scan_conversion import interpolated, pixel_places
 from ultragray.learn.evaluation.scoring import Evaluation, evaluate_frames, require_frames
-from ultragray.learn.sweep import ByteArray, Dataset, IntArray, Sweep, corner_distances_mm
+from ultragray.learn.sweep import (
+    ByteArray,
+    Dataset,
+    IntArray,
+    Sweep,
+    corner_distances_mm,
+    mean_axes,
+    nearest_frames,
+    pixel_positions_mm,
+)
 
 FOLDS = ("median", "mean", "maximum")
 VOXEL_MM = 0.5
@@ -101,20 +110,6 @@ def affordable_voxel_mm(sweep: Sweep, wanted_mm: float = VOXEL_MM) -> float:
     while math.prod(_counts(high - low, hundredths / 100.0)) > MAX_VOXELS:
         hundredths += 1
     return hundredths / 100.0
-
-
-def mean_axes(poses: FloatArray) -> FloatArray:  # [F, 4, 4] -> [3, 3]
-    """The rotation nearest to the mean of the poses' rotations."""
-    left, _, right = np.linalg.svd(poses[:, :3, :3].mean(axis=0))
-    mean: FloatArray = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-    return mean
-
-
-def pixel_positions_mm(probe: Probe, height: int, width: int) -> FloatArray:  # [H·W, 3], row by row
-    """The place of each pixel in the probe frame, mm."""
-    origins, directions = probe.scan_lines(width)
-    positions: FloatArray = origins + probe.depths_mm(height)[:, None, None] * directions
-    return positions.reshape(-1, 3)
 
 
 def _on_grid(
@@ -255,12 +250,6 @@ def evaluate_baselines(
         method: evaluate_frames(predict(dataset.train, dataset.val.poses, method, voxel_mm=voxel_mm), dataset.val)
         for method in methods
     }
-
-
-def nearest_frames(sweep: Sweep, poses: FloatArray) -> IntArray:  # [C]
-    """The place of the sweep's frame whose corners lie nearest on average, for each pose [C, 4, 4] (mm)."""
-    nearest: IntArray = _distances_to_frames_mm(sweep, poses).argmin(axis=1)
-    return nearest
 
 
 def interpolate_planes(sweep: Sweep, poses: FloatArray) -> FrameArray:  # [C, H, W] in [0, 1]

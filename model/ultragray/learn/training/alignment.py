@@ -25,8 +25,7 @@ import numpy.typing as npt
 from ultragray.geometry.probe import FloatArray
 from ultragray.geometry.rotations import rotations_of, turns_of
 from ultragray.geometry.scan_conversion import FloatImage, interpolated_frames, pixel_places
-from ultragray.learn.evaluation.baselines import mean_axes
-from ultragray.learn.sweep import IntArray, Sweep, corner_distances_mm, spread_places
+from ultragray.learn.sweep import IntArray, Sweep, corner_distances_mm, mean_axes, spread_places
 
 
 def likelihood_terms(bends: FloatArray, ratios: FloatArray) -> tuple[FloatArray, FloatArray]:
