@@ -15,7 +15,6 @@ _SWITCHES_OF_TESTS = tuple(
 )
 _FOREIGN_PREFIXES = (
     "ULTRAGRAY_",
-    "DBOS_",
     "OTEL_",
     "PG",
     "XDG_",

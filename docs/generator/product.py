@@ -43,10 +43,10 @@ from ultragray_workers import scene_names
 from ultragray_workers.datasets import store as dataset_store
 from ultragray_workers.datasets import unpack as dataset_unpack
 from ultragray_workers.errors import QueueFull
-from ultragray_workers.jobs.job import JobState
-from ultragray_workers.jobs.matching.demand import AUTO
-from ultragray_workers.jobs.overview import JobsOverview
-from ultragray_workers.jobs.queue.attendance import WorkerState
+from ultragray_workers.jobs.demand import AUTO
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.store import JobsOverview
+from ultragray_workers.jobs.workers import WorkerState
 from ultragray_workers.pool.messages import RenderResult
 
 from .interfaces import temporary_service

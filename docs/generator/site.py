@@ -15,7 +15,7 @@ from functools import partial
 from pathlib import Path
 
 from ultragray.rendering.display import Display
-from ultragray.rendering.settings import RenderSettings
+from ultragray.rendering.settings import RenderSettings, SettingsUsed
 from ultragray.rendering.volumes import SliceSettings
 from ultragray.scene.confidence import Extrapolation
 from ultragray.scene.info import SceneInfo
@@ -39,6 +39,7 @@ PARTS: dict[str, Callable[[], str]] = {
     "display": partial(product.keys, Display, "Setting"),
     "standard plane": partial(product.keys, StandardPlaneSettings, "Argument"),
     "confidence": partial(product.told, Extrapolation, "Figure"),
+    "settings used": partial(product.told, SettingsUsed, "Setting"),
     "render body": partial(product.keys, RenderBody),
     "slice body": partial(product.keys, SliceSettings),
     "stream messages": partial(product.keys, StreamMessage),

@@ -17,7 +17,7 @@ __version__ = "0.1.0"
 # The modules that are imported although the core's dependencies do not bring them, by the extra that does.
 MODULES_OF_EXTRAS = {
     "serve": (
-        *("cryptography", "dbos", "fastapi", "fastapi_offline", "google", "grpc", "grpc_health", "grpc_reflection"),
+        *("cryptography", "fastapi", "fastapi_offline", "google", "grpc", "grpc_health", "grpc_reflection"),
         *("jwt", "limits", "opentelemetry", "prometheus_client", "psycopg", "python_multipart", "sqlalchemy"),
         *("fastcrc", "starlette", "ultragray_proto", "uvicorn", "uvloop", "websockets"),
     ),

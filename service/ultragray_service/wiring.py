@@ -31,12 +31,12 @@ from ultragray_service.telemetry.metrics import Metrics
 from ultragray_service.views.assessments import Assessing
 from ultragray_service.views.prepared import Comparisons, DatasetViews, TrainingViews
 from ultragray_workers.datasets.store import DatasetStore
-from ultragray_workers.jobs.places import shared_storage
-from ultragray_workers.jobs.queue.owners import Kind
+from ultragray_workers.jobs.owners import Kind
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.pool.messages import RenderResult
 from ultragray_workers.pool.pool import PoolConfig, RenderPool
 from ultragray_workers.scenes import SceneStore
+from ultragray_workers.storage.location import open_storage
 
 
 def make_service(settings: Settings) -> Service:
@@ -52,7 +52,7 @@ def make_service(settings: Settings) -> Service:
     scenes = SceneStore(places.data, places.made, hides=partial(owners.hides, Kind.SCENE))
     datasets = DatasetStore(
         settings.working_folder,
-        shared_storage(settings.artifacts),
+        open_storage(settings.artifacts),
         settings.max_cache_bytes,
         hides=partial(owners.hides, Kind.DATASET),
     )

@@ -9,11 +9,10 @@ from dataclasses import replace
 
 from ultragray.errors import TrainingDiverged
 from ultragray_studies.comparison.page import write_comparison
-from ultragray_studies.comparison.run import RUN_FILE, ComparisonProgress, compare_methods
+from ultragray_studies.comparison.run import ComparisonProgress, compare_methods
 from ultragray_studies.methods.registry import chosen_methods
-from ultragray_workers.jobs.folder import Outcome, Progress
 from ultragray_workers.jobs.kinds.compare import CompareJob
-from ultragray_workers.jobs.kinds.earlier_run import take_over_run
+from ultragray_workers.jobs.progress import Outcome, Progress
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 
 _LINES = 10  # of the log in a fit
@@ -27,7 +26,6 @@ def run(job_run: JobRun, job: CompareJob) -> Outcome:
     """
     device = job_run.request.device
     dataset = job_run.load_dataset(job.dataset)
-    take_over_run(job_run, RUN_FILE)
     sys.stderr.write(
         f"comparing {', '.join(job.methods)} on {job.dataset} on {device}, {job_run.request.threads} threads\n"
     )

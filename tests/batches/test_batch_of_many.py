@@ -34,7 +34,9 @@ from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.info import read_header
 from ultragray_studies.bench.report import measured
 from ultragray_workers.jobs.kinds import RenderJob
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
 
 from ..surroundings import ROOT
 from ..waiting import Deadline

@@ -22,7 +22,6 @@ from .projects import names_of, packages, project, pyproject
 
 BESIDE_TORCH = {"triton"}  # comes with torch's CUDA build, and is asked for by find_spec
 BROUGHT_BY = {  # modules that are used with, and come with, what is required
-    "psycopg": "dbos",
     "starlette": "fastapi",
     "typing_extensions": "pydantic",
     "uvloop": "uvicorn",

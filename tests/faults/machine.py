@@ -27,8 +27,8 @@ if "ultragray_workers.jobs.worker.run_job" in line:
     from ultragray_workers.jobs.kinds import train_run
     train_run.CHECKPOINT_INTERVAL_S = {CHECKPOINT_INTERVAL_S}
 elif "worker" in line:
-    from ultragray_workers.jobs.queue import heartbeat
-    heartbeat.DEAD_AFTER_S = {DEAD_AFTER_S}
+    from ultragray_workers.jobs import queue
+    queue.DEAD_AFTER_S = {DEAD_AFTER_S}
 """
 _SERVE = [sys.executable, "-m", "ultragray_service"]
 WORK = [sys.executable, "-c", "from ultragray_service.cli.app import app; app()", "worker", "--device", "cpu"]

@@ -15,9 +15,12 @@ import httpx
 import numpy as np
 
 from ultragray.scene.gaussians import GaussianScene
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.storage.local import FileVersion
 
+from ..workers.jobs.conftest import path_of
 from .machine import Machine
 
 _LOOK_EVERY_S = 0.1
@@ -36,7 +39,7 @@ class Observer:
         self.looks = self.answers = 0
         self._states: dict[str, str] = {}
         self._scenes: dict[Path, FileVersion] = {}
-        self._steps: dict[Path, int] = {}
+        self._steps: dict[str, int] = {}
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
@@ -115,7 +118,7 @@ class Observer:
     def _check_finished(self, job: Job) -> None:
         """What a job that succeeded has made is there, whole, and its scene is served."""
         for name in job.artifacts:
-            check_whole(self._store.artifact(job.id, name))
+            check_whole(path_of(self._store.artifact(job.id, name)))
         scene = self._machine.artifacts / "scenes" / f"{job.specification['scene']}.ugr"
         if job.kind == "train" and not scene.is_file():
             self._wrong(f"{job.id} succeeded, its scene is not served")
@@ -134,13 +137,14 @@ class Observer:
 
     def _look_at_journals(self) -> None:
         """A journal that has become shorter tells how far back a training has gone."""
-        for journal in (self._machine.artifacts / "jobs").glob("*/run/metrics.jsonl"):
+        for journal in (self._machine.artifacts / "work").glob("*/run/metrics.jsonl"):
             try:
                 steps = journal.read_bytes().count(b"\n")
             except FileNotFoundError:  # it has finished
                 continue
-            self.steps_lost += max(0, self._steps.get(journal, 0) - steps)
-            self._steps[journal] = steps
+            job_id = journal.parents[1].stem  # one folder for each attempt
+            self.steps_lost += max(0, self._steps.get(job_id, 0) - steps)
+            self._steps[job_id] = steps
 
 
 def _scene_files(folders: Iterable[Path]) -> list[Path]:

@@ -20,11 +20,10 @@ import pytest
 
 from ultragray.phantom.demo import copy_demo_scene
 from ultragray_workers.backup.contents import Folders
-from ultragray_workers.jobs.folder import JobFolder
 
 from ..postgres import NewDatabase
 from ..waiting import wait_until
-from ..workers.jobs.conftest import store_dataset
+from ..workers.jobs.conftest import files_of, store_dataset
 from .machine import Machine
 
 WAIT_S = 400.0
@@ -175,13 +174,13 @@ def test_service_that_was_lost_at_work_goes_on_elsewhere(
         finished = [submit(train("made", 20)), submit(render("demo", 3))]
         wait_until(lambda: all(map(is_done, finished)), within_s=WAIT_S, every_s=0.2)
         interrupted = submit(train("long", STEPS))
-        run = JobFolder(folders.artifacts, interrupted).run
-        wait_until(lambda: any(run.glob("checkpoint*")), within_s=WAIT_S, every_s=0.1)
+        told = folders.artifacts / "jobs" / interrupted
+        wait_until(lambda: any(told.glob("*/run-*/checkpoint*")), within_s=WAIT_S, every_s=0.1)
         machine.halt_jobs()  # it is at work however long the backup takes
         waiting = [submit(train("next", 30)), submit(render("made", 4))]
         told = jobs_of(client)
         frames = {scene: frame_of(client, scene) for scene in ("demo", "made")}
-        scene, dataset = (folders.data / "demo.ugr").read_bytes(), zipped(folders.artifacts / "datasets/tiny/files")
+        scene, dataset = (folders.data / "demo.ugr").read_bytes(), zipped(files_of(folders.artifacts, "tiny"))
         with Load(machine.http, scene, dataset) as load:
             wait_until(lambda: load.rounds > 4, within_s=WAIT_S)
             ultragray("backup", str(backups), *options(folders, url))

@@ -28,9 +28,11 @@ from ultragray.datasets.source import load_dataset
 from ultragray.learn.training import TrainingConfig, train
 from ultragray.phantom.demo import copy_demo_scene
 from ultragray_proto.v1 import jobs_pb2, jobs_pb2_grpc
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
 
-from ..workers.jobs.conftest import store_dataset
+from ..workers.jobs.conftest import files_of, store_dataset
 from .machine import Machine
 from .observer import Observer
 
@@ -135,7 +137,7 @@ class Killer:
 
     def _is_finishing(self) -> bool:
         """Whether a job has begun to write its artifacts and has not said how it ended."""
-        folders = (self._machine.artifacts / "jobs").glob("*/artifacts*")
+        folders = (self._machine.artifacts / "work").glob("*/artifacts*")
         return any(not (folder.parent / "outcome.json").exists() for folder in folders)
 
 
@@ -223,28 +225,32 @@ def test_every_job_ends_as_if_nothing_had_been_killed(machine: Machine) -> None:
     )
 
 
+def artifact_of(machine: Machine, job: Job, name: str) -> Path:
+    (path,) = (machine.artifacts / "jobs" / job.id).glob(f"*/artifacts/{name}")
+    return path
+
+
 def check_artifacts_are_told(machine: Machine, jobs: dict[str, Job]) -> None:
     """Over HTTP, each artifact is the file of the store."""
     for job in jobs.values():
         for name in job.artifacts:
             answer = httpx.get(f"{machine.http}/v1/jobs/{job.id}/artifacts/{name}", timeout=60)
             assert answer.status_code == 200, answer.text
-            assert answer.content == (machine.artifacts / "jobs" / job.id / "artifacts" / name).read_bytes()
+            assert answer.content == artifact_of(machine, job, name).read_bytes()
 
 
 def check_training(machine: Machine, job: Job, scene: str, seed: int, steps: int) -> None:
     """The scene is that of an undisturbed run, byte for byte, and every step was taken once."""
     settings = training(scene, 0, seed, steps - STEPS)["specification"]["settings"]
-    dataset = replace(load_dataset(machine.artifacts / "datasets" / "tiny" / "files"), name="tiny")
+    dataset = replace(load_dataset(files_of(machine.artifacts, "tiny")), name="tiny")
     undisturbed = train(dataset, TrainingConfig.preset("fast", **settings))
     served = machine.artifacts / "scenes" / f"{scene}.ugr"
     made = GaussianScene.load(served)
     assert made.info.training["step"] == made.info.training["steps"] == steps
     assert (job.progress.step, job.progress.steps) == (steps, steps)
     assert served.read_bytes() == undisturbed.to_bytes()
-    artifacts = machine.artifacts / "jobs" / job.id / "artifacts"
-    assert (artifacts / f"{scene}.ugr").read_bytes() == served.read_bytes()
-    journal = (artifacts / "metrics.jsonl").read_text(encoding="utf-8").splitlines()
+    assert artifact_of(machine, job, f"{scene}.ugr").read_bytes() == served.read_bytes()
+    journal = artifact_of(machine, job, "metrics.jsonl").read_text(encoding="utf-8").splitlines()
     assert [json.loads(line)["step"] for line in journal] == list(range(1, steps + 1))
 
 
@@ -253,10 +259,10 @@ def check_renderings(machine: Machine, npz: Job, tar: Job) -> None:
     scene = GaussianScene.load(machine.data / "demo.ugr")
     direct = render(scene, None, POSES, height=HEIGHT, width=WIDTH, outputs=("bmode",))
     assert direct.bmode is not None
-    with np.load(machine.artifacts / "jobs" / npz.id / "artifacts" / "frames.npz") as archive:
+    with np.load(artifact_of(machine, npz, "frames.npz")) as archive:
         np.testing.assert_array_equal(archive["poses"], POSES)
         np.testing.assert_array_equal(archive["bmode"], direct.bmode.numpy())
-    with tarfile.open(machine.artifacts / "jobs" / tar.id / "artifacts" / "frames.tar") as archive_of_files:
+    with tarfile.open(artifact_of(machine, tar, "frames.tar")) as archive_of_files:
         parts = ("bmode.png", "json")
         assert archive_of_files.getnames() == [f"{frame:06d}.{part}" for frame in range(FRAMES) for part in parts]
     assert (npz.progress.frames_done, tar.progress.frames_done) == (FRAMES, FRAMES)
@@ -264,9 +270,10 @@ def check_renderings(machine: Machine, npz: Job, tar: Job) -> None:
 
 def check_nothing_is_left(machine: Machine) -> None:
     """No checkpoint and no half-written file outlives its job."""
-    kept = {"job.json", "lock", "log.txt", "progress.json", "outcome.json", "artifacts", "demo.ugr"}
-    for folder in (machine.artifacts / "jobs").iterdir():
-        assert {path.name for path in folder.iterdir()} <= kept, folder
+    assert list((machine.artifacts / "work").iterdir()) == []
+    for path in (machine.artifacts / "jobs").rglob("*"):
+        is_log = path.name.startswith(("log-", "journal-"))
+        assert path.is_dir() or is_log or path.parent.name == "artifacts" or path.name == "demo.ugr", path
     assert sorted(path.name for path in (machine.artifacts / "scenes").iterdir()) == [
         f"{scene}.ugr" for scene, *_ in TRAININGS
     ]

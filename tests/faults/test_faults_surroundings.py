@@ -16,7 +16,9 @@ import pytest
 
 from ultragray.phantom.demo import copy_demo_scene
 from ultragray_workers.errors import DatabaseUnavailable
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
 
 from ..postgres import PostgresServer
 from ..workers.jobs.conftest import store_dataset

@@ -25,7 +25,7 @@ from ultragray.exchange.ply import read_ply
 from ultragray.exchange.poses import load_poses
 from ultragray.learn.training.checkpointing import check_tensors, read_checkpoint
 from ultragray.scene.info import read_header
-from ultragray_workers.datasets.contents import find_source
+from ultragray_workers.datasets.store import find_source
 from ultragray_workers.datasets.unpack import unpack
 
 ADDRESS_SPACE_BYTES = 8 << 30

@@ -22,8 +22,8 @@ if "ultragray_workers.jobs.worker.run_job" in line:
     from ultragray_workers.jobs.kinds import train_run
     train_run.CHECKPOINT_INTERVAL_S = 0.3
 elif "worker" in line:
-    from ultragray_workers.jobs.queue import heartbeat
-    heartbeat.DEAD_AFTER_S = 3.0
+    from ultragray_workers.jobs import queue
+    queue.DEAD_AFTER_S = 3.0
 """
 _SERVE = [sys.executable, "-m", "ultragray_service"]
 _WORK = [sys.executable, "-c", "from ultragray_service.cli.app import app; app()", "worker", "--device", "cpu"]

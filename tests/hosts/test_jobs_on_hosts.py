@@ -22,7 +22,7 @@ from ultragray.datasets.released import write_released
 from ultragray.datasets.source import load_dataset
 from ultragray.learn.training import TrainingConfig, train
 from ultragray_proto.v1 import jobs_pb2, jobs_pb2_grpc
-from ultragray_workers.storage.opening import open_storage
+from ultragray_workers.storage.location import open_storage
 
 from ..object_storage import AWAY_S, FaultyProxy
 from ..waiting import wait_until

@@ -22,9 +22,9 @@ from ultragray_service.core import scenes
 from ultragray_service.core.frames import FrameHeader
 from ultragray_service.errors import Refusal
 from ultragray_workers.datasets.store import DatasetRecord
-from ultragray_workers.jobs.folder import Progress
-from ultragray_workers.jobs.job import Job
 from ultragray_workers.jobs.kinds import RenderJob, Specification, TrainJob
+from ultragray_workers.jobs.progress import Progress
+from ultragray_workers.jobs.record import Job
 
 # A dataclass and its message, and the fields that stand on one side only, for a reason.
 PAIRS: list[tuple[type[Any], type[Any], set[str]]] = [

@@ -21,8 +21,8 @@ from typing import Any
 import pytest
 
 from ultragray_studies.bench.report import measured
-from ultragray_workers.storage.copying import copy_scenes
-from ultragray_workers.storage.opening import open_storage
+from ultragray_workers.backup.copying import copy_scenes
+from ultragray_workers.storage.location import open_storage
 
 from ..docker.envoy import Envoy, program, script
 from ..postgres import PostgresServer

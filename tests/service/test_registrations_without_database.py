@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 import sqlalchemy as sa
 
-from ultragray_workers.jobs.queue.database import JobDatabase
-from ultragray_workers.jobs.queue.owners import tell_change
-from ultragray_workers.jobs.queue.tables import REGISTRATIONS
+from ultragray_workers.jobs.database import JobDatabase
+from ultragray_workers.jobs.owners import tell_change
+from ultragray_workers.jobs.tables import REGISTRATIONS
 
 from ..postgres import PostgresServer
 from ..waiting import at_this_load, wait_until

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
-from ultragray_workers.storage.opening import open_storage
+from ultragray_workers.storage.location import open_storage
 
 from ..object_storage import AWAY_S, FaultyProxy, ObjectServer, credentials
 from ..postgres import PostgresServer

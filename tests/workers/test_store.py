@@ -1,4 +1,4 @@
-"""The artifact folder: older ones get a version, newer ones are refused, and a restore is alone in it."""
+"""The artifact folder: it gets a version, and one of another is refused, and a restore is alone in it."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def test_folder_without_a_version_gets_one(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "told"),
     [
-        ('{"format_version": 2}', "has version 2 .* a newer release has used it; start that one, or restore a backup"),
+        ('{"format_version": 2}', "has version 2 .* another release has used it; start that one, or restore a backup"),
         ("{", "is damaged: restore the folder from a backup"),
         ('{"format_version": "one"}', "is damaged"),
     ],

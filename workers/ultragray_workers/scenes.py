@@ -12,7 +12,6 @@ from ultragray.files import file_sha256
 from ultragray.scene.info import SceneHeader, SceneInfo, read_header, scene_file_invalid
 from ultragray_workers.errors import SceneNotFound, known_names
 from ultragray_workers.scene_names import SUFFIX, SceneReference, base_name, check_scene_name
-from ultragray_workers.shelves.bucket import BucketShelf
 from ultragray_workers.shelves.folder import FolderShelf
 from ultragray_workers.shelves.headers import KeptHeaders, floats_per_gaussian
 from ultragray_workers.shelves.shelf import Shelf
@@ -142,14 +141,14 @@ class SceneStore:
         known = shelf.sha256(reference.name)
         return self._hash_of_file(reference.name, self.path(text))[1] if known is None else known
 
-    def file(self, name: str) -> Path | None:
-        """The path of a scene's file in the first folder that has it; None where no folder does."""
-        folders = [shelf for shelf in self.shelves if isinstance(shelf, FolderShelf)]
-        return next((path for shelf in folders if (path := shelf.here(name)) is not None), None)
-
-    def bytes_in_buckets(self, name: str) -> int:
-        """Of the files that the buckets have of a scene."""
-        return sum(shelf.bytes_of(name) for shelf in self.shelves if isinstance(shelf, BucketShelf))
+    def stored(self, name: str) -> tuple[str, int] | None:
+        """A word that tells the content of a scene from others, and the bytes of its file; None where there is none."""
+        if (shelf := self.shelf_of(name)) is None:
+            return None
+        known = shelf.sha256(name)
+        if known is None and (path := shelf.here(name)) is not None:
+            known = self._hash_of_file(name, path)[1]
+        return known or name, shelf.bytes_of(name)
 
     def forget(self, name: str) -> None:
         """Drops what is kept of a scene that was deleted."""

@@ -18,7 +18,7 @@ from typing import IO
 from ultragray.files import sync, write_whole
 from ultragray_workers.errors import RestoreRefused, StartupFailed
 
-FORMAT_VERSION = 1  # 0: folders of releases that wrote no version, which are laid out as those of version 1
+FORMAT_VERSION = 1
 _VERSION_FILE, _LOCK_FILE, MARKER = "store.json", "store.lock", "restoring.json"
 PRIVATE_FOLDER, PRIVATE_FILE = 0o700, 0o600  # modes of what is made here: keys' hashes, and what people own
 _READ_ONLY = (errno.EACCES, errno.EPERM, errno.EROFS)
@@ -43,7 +43,7 @@ class OpenStore:
         try:
             if restore_under_way(folder) is not None:
                 raise _being_restored(folder)
-            _migrate(folder)
+            _require_version(folder)
         except BaseException:
             self.close()
             raise
@@ -96,8 +96,8 @@ def _being_restored(folder: Path) -> StartupFailed:
     )
 
 
-def _migrate(folder: Path) -> None:
-    """Writes the version where there is none. Raises StartupFailed for a newer one, and a damaged file."""
+def _require_version(folder: Path) -> None:
+    """Writes the version where there is none. Raises StartupFailed for another one, and a damaged file."""
     path = folder / _VERSION_FILE
     try:
         version = int(json.loads(path.read_text(encoding="utf-8"))["format_version"])
@@ -107,10 +107,9 @@ def _migrate(folder: Path) -> None:
         return
     except (ValueError, KeyError, TypeError) as error:
         raise StartupFailed(f"{path} is damaged: restore the folder from a backup", field="artifact_folder") from error
-    if version > FORMAT_VERSION:
+    if version != FORMAT_VERSION:
         raise StartupFailed(
-            f"{folder} has version {version} of the layout of artifact folders, and this release knows them up to "
-            f"version {FORMAT_VERSION}: a newer release has used it; start that one, or restore a backup made "
-            "before it",
+            f"{folder} has version {version} of the layout of artifact folders, and this release knows version "
+            f"{FORMAT_VERSION}: another release has used it; start that one, or restore a backup that this one made",
             field="artifact_folder",
         )

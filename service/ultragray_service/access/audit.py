@@ -25,7 +25,7 @@ from sqlalchemy.exc import SQLAlchemyError
 from ultragray.errors import UltragrayError
 from ultragray_service.access.rules import Operation
 from ultragray_service.errors import LimitReached, PermissionDenied, RateLimited, Unauthenticated
-from ultragray_workers.jobs.queue.tables import AUDIT
+from ultragray_workers.jobs.tables import AUDIT
 from ultragray_workers.rounds import Rounds
 
 OK = "OK"

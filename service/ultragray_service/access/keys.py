@@ -20,8 +20,8 @@ from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray_service.access.credentials import digest_of
 from ultragray_service.access.principals import Number, Principal, Role
 from ultragray_service.errors import Unauthenticated
-from ultragray_workers.jobs.queue.owners import tell_change
-from ultragray_workers.jobs.queue.tables import CHANGES, KEYS
+from ultragray_workers.jobs.owners import tell_change
+from ultragray_workers.jobs.tables import CHANGES, KEYS
 from ultragray_workers.rounds import Rounds
 
 _PREFIX = "ultragray_"  # so that people, and those who search files for secrets, know one when they see it

@@ -17,7 +17,7 @@ from ultragray_service.access.principals import Principal, Role, acting
 from ultragray_service.access.rules import Operation
 from ultragray_service.errors import PermissionDenied
 from ultragray_workers.errors import job_not_found
-from ultragray_workers.jobs.queue.owners import (
+from ultragray_workers.jobs.owners import (
     NOBODYS,
     Kind,
     Ownership,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from starlette.routing import compile_path
 
 from ultragray_service.access.principals import Role
-from ultragray_workers.jobs.queue.owners import Kind
+from ultragray_workers.jobs.owners import Kind
 
 STREAM = "stream"  # the operation of poses in, frames out
 WATCH = "stream.watch"  # of somebody's stream

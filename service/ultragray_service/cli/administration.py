@@ -24,7 +24,7 @@ if TYPE_CHECKING:
     from ultragray_service.access.keys import Key, KeyStore
     from ultragray_workers.backup.contents import Folders
     from ultragray_workers.backup.manifest import Manifest
-    from ultragray_workers.jobs.queue.database import JobDatabase
+    from ultragray_workers.jobs.database import JobDatabase
 
 
 Where = Annotated[
@@ -36,8 +36,9 @@ Where = Annotated[
 @contextmanager
 def opened_database(where: dict[str, Any]) -> Iterator[JobDatabase]:
     """The database that the options name. Raises InvalidArgument where there is no such installation, StartupFailed."""
-    from ultragray_workers.jobs.places import shared_storage
-    from ultragray_workers.jobs.queue.database import JobDatabase
+
+    from ultragray_workers.jobs.database import JobDatabase
+    from ultragray_workers.storage.location import open_storage
 
     settings = load_settings(**where)
     if settings.database_url is None and not settings.is_there:
@@ -46,7 +47,7 @@ def opened_database(where: dict[str, Any]) -> Iterator[JobDatabase]:
             "--data-folder",
             field="data_folder",
         )
-    database = JobDatabase(settings.working_folder, settings.database_url, shared_storage(settings.artifacts))
+    database = JobDatabase(settings.working_folder, settings.database_url, open_storage(settings.artifacts))
     try:
         yield database
     finally:
@@ -398,14 +399,12 @@ def copy(
     *,
     json: Json = False,
 ) -> None:
-    """Copy the scenes of an installation, and check every hash; from a folder into a bucket its datasets, too.
+    """Copy the scenes of an installation, and check every hash; likewise its datasets.
 
     Interrupted, the same command goes on. Nothing is changed in FROM, and nothing overwritten in TO.
     """
-    from ultragray_workers.datasets.copying import CopiedDatasets, copy_datasets
-    from ultragray_workers.storage.copying import ARTIFACTS, copy_scenes
-    from ultragray_workers.storage.location import StorageUrl, parse_location
-    from ultragray_workers.storage.opening import open_storage
+    from ultragray_workers.backup.copying import ARTIFACTS, CopiedDatasets, copy_datasets, copy_scenes
+    from ultragray_workers.storage.location import below, open_storage, parse_location
 
     def say(sentence: str) -> None:
         typer.echo(sentence, err=True)
@@ -414,13 +413,12 @@ def copy(
     if isinstance(here, Path) and not here.is_dir():
         raise InvalidArgument(f"FROM must be an existing folder or the URL of a bucket, got {source!r}", field="FROM")
     done = copy_scenes(open_storage(here), open_storage(there), say)
-    datasets = CopiedDatasets()
-    if isinstance(here, Path) and isinstance(there, StorageUrl):
-        below = here / ARTIFACTS  # of a data folder
-        of_data = below.is_dir()
-        datasets = copy_datasets(
-            below if of_data else here, open_storage(there.below(ARTIFACTS) if of_data else there), say
-        )
+    datasets = copy_datasets(open_storage(here), open_storage(there), say)
+    below_data = copy_datasets(open_storage(below(here, ARTIFACTS)), open_storage(below(there, ARTIFACTS)), say)
+    datasets = CopiedDatasets(
+        datasets.datasets + below_data.datasets,
+        datasets.datasets_already_there + below_data.datasets_already_there,
+    )
     line = (
         f"scene files: {done.scenes:,} copied ({megabytes(done.bytes)}), {done.already_there:,} already there; "
         f"datasets: {datasets.datasets:,} copied, {datasets.datasets_already_there:,} already there"

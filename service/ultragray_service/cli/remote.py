@@ -42,7 +42,7 @@ from ultragray_service.cli.terminal import (
     transferred,
     warn,
 )
-from ultragray_workers.jobs.matching.demand import GB
+from ultragray_workers.jobs.demand import GB
 
 ARCHIVE_SUFFIXES = (".zip", ".tar", ".tar.gz", ".tgz")
 

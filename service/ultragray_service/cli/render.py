@@ -263,7 +263,7 @@ def render_shards(
     Raises InvalidArgument for an output that is no folder or holds something else, and what `RayBatch.render` raises.
     """
     from ultragray_workers.batches.on_ray import RayBatch, check_address
-    from ultragray_workers.storage.opening import open_storage
+    from ultragray_workers.storage.location import open_storage
 
     check_address(on)
     storage = open_storage(output)

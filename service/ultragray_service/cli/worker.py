@@ -72,8 +72,8 @@ def run_worker(
     from opentelemetry import trace
 
     from ultragray_service.telemetry.logs import configure_logging, start_tracing
-    from ultragray_workers.jobs.places import shared_storage
     from ultragray_workers.jobs.worker.worker import work
+    from ultragray_workers.storage.location import open_storage
 
     settings = load_settings(**overrides)
     configure_logging(settings.log_level, settings.log_format)
@@ -92,7 +92,7 @@ def run_worker(
         settings.working_folder,
         settings.database_url,
         stop,
-        shared=shared_storage(settings.artifacts),
+        storage=open_storage(settings.artifacts),
         max_copies_bytes=settings.max_cache_bytes,
         hurry=hurry,
         name=name,
@@ -112,7 +112,7 @@ def run_worker(
     if tracing is not None:
         tracing.stop()
     sys.stderr.flush()
-    os._exit(0)  # threads of the queue would be waited for
+    os._exit(0)  # work that a storage which is away keeps would be waited for
 
 
 def main(service_pid: str) -> int:

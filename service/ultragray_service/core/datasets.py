@@ -13,7 +13,7 @@ from ultragray_service.access.owners import Owners
 from ultragray_service.core.scenes import page_of_names
 from ultragray_workers.datasets.store import DatasetRecord, DatasetStore
 from ultragray_workers.errors import DatasetNotFound
-from ultragray_workers.jobs.queue.owners import Kind
+from ultragray_workers.jobs.owners import Kind
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class Datasets:
 
         def read() -> bytes:
             try:
-                return self._store.contact_sheet(name).read_bytes()
+                return self._store.contact_sheet(name)
             except FileNotFoundError:  # deleted a moment ago
                 raise DatasetNotFound(f"there is no dataset {name!r} any more", field="dataset") from None
 

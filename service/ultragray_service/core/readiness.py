@@ -12,7 +12,7 @@ from ultragray.errors import UltragrayError
 from ultragray_service.core.scenes import ScenePlaces
 from ultragray_service.core.threads import in_own_thread
 from ultragray_workers.errors import ArtifactFolderUnavailable, DatabaseUnavailable, NotReady
-from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.rounds import Rounds
 
 CHECK_INTERVAL_S = 5.0
@@ -112,7 +112,7 @@ class Readiness:
         self._without_jobs = without_jobs
         self._jobs = WatchedPart("the database of the jobs", lambda: database().check(), DatabaseUnavailable)
         self._artifacts = WatchedPart(
-            "the artifact folder", lambda: database().folder.check_writable(), ArtifactFolderUnavailable
+            "the artifact folder", lambda: database().identity.check_writable(), ArtifactFolderUnavailable
         )
         self._tasks: list[asyncio.Task[None]] = []
 

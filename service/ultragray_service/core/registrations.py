@@ -26,8 +26,8 @@ from ultragray_service.core.jobs.database_threads import DatabaseThreads
 from ultragray_service.core.scenes import SceneCatalog, page_of_names
 from ultragray_service.errors import LimitReached, PermissionDenied
 from ultragray_workers.errors import RegistrationNotFound
-from ultragray_workers.jobs.queue.owners import Kind, Ownership, tell_change
-from ultragray_workers.jobs.queue.tables import REGISTRATIONS
+from ultragray_workers.jobs.owners import Kind, Ownership, tell_change
+from ultragray_workers.jobs.tables import REGISTRATIONS
 from ultragray_workers.scene_names import base_name
 
 

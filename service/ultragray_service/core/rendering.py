@@ -29,7 +29,7 @@ from ultragray_service.core.scenes import SceneCatalog, scene_to_blame
 from ultragray_service.settings import Settings
 from ultragray_service.telemetry.metrics import Metrics
 from ultragray_workers.errors import NotReady, SceneNotFound
-from ultragray_workers.jobs.queue.owners import Kind
+from ultragray_workers.jobs.owners import Kind
 from ultragray_workers.pool.messages import Destination, Priority, RenderRequest, RenderResult, S, SceneChangedError
 from ultragray_workers.pool.pool import MAX_SCENE_CHANGES, RenderPool
 from ultragray_workers.pool.waiting import Turn

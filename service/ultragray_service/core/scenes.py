@@ -33,19 +33,18 @@ from ultragray_service.core.threads import in_own_thread
 from ultragray_service.errors import Refusal
 from ultragray_service.settings import Settings
 from ultragray_workers.errors import SceneNotFound, SceneTooLarge, StartupFailed, StorageUnavailable
-from ultragray_workers.jobs.publication import SCENES_FOLDER
-from ultragray_workers.jobs.queue.owners import Kind, Ownership
+from ultragray_workers.jobs.owners import Kind, Ownership
 from ultragray_workers.pool.pool import RenderPool
 from ultragray_workers.scene_names import base_name
 from ultragray_workers.scenes import SceneStore
 from ultragray_workers.shelves.bucket import BucketShelf
 from ultragray_workers.shelves.folder import FolderShelf
 from ultragray_workers.shelves.index import SceneIndex
+from ultragray_workers.shelves.opening import SCENES_FOLDER
 from ultragray_workers.shelves.shelf import Shelf
 from ultragray_workers.storage.cache import Cache
 from ultragray_workers.storage.local import FileVersion
-from ultragray_workers.storage.location import Location
-from ultragray_workers.storage.opening import open_storage
+from ultragray_workers.storage.location import Location, open_storage
 
 PATIENCE_S = 10.0  # of frames that wait for a scene
 
@@ -108,7 +107,7 @@ class ScenePlaces(Collector):
 
     def _shelf(self, location: Location, folder: str) -> Shelf:
         if isinstance(location, Path):
-            return FolderShelf(location / folder)
+            return FolderShelf(location / folder, open_storage(location))
         storage = open_storage(location, patience_s=PATIENCE_S)
         index = SceneIndex(storage, folder, self._settings.scene_list_max_age_s)
         return BucketShelf(index, self.cache, self._settings.working_folder / SCENES_FOLDER)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-import os
-from collections.abc import AsyncIterator, Awaitable, Iterable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
 from contextvars import copy_context
 from datetime import datetime, time, timedelta, timezone
@@ -32,9 +31,7 @@ from ultragray_workers.datasets.incoming import IncomingDataset, remove_stale
 from ultragray_workers.datasets.intake import take_in
 from ultragray_workers.datasets.store import DatasetRecord, DatasetStore, check_dataset_name
 from ultragray_workers.errors import DeadlineExceeded, Draining, SceneExists, SceneNotFound, UploadTooLarge
-from ultragray_workers.jobs.files import Artifact
-from ultragray_workers.jobs.queue.owners import Kind
-from ultragray_workers.jobs.shared.reading import SharedFile
+from ultragray_workers.jobs.owners import Kind
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.scene_names import SUFFIX, check_scene_name
 from ultragray_workers.scenes import SceneStore, check_scene_file
@@ -138,23 +135,10 @@ class Quotas:
         for name in self._owners.owned(Kind.DATASET, owner):
             with suppress(UltragrayError):  # a damaged one, or one that has just gone
                 dataset_bytes += self._datasets.get(name).bytes
-        names = self._owners.owned(Kind.SCENE, owner)
-        scenes = [path for name in names if (path := self._scenes.file(name)) is not None]
-        dataset_bytes += sum(self._scenes.bytes_in_buckets(name) for name in names)
-        return dataset_bytes + _bytes_of([*scenes, *jobs.artifact_files_of(owner)])
-
-
-def _bytes_of(files: Iterable[Artifact]) -> int:
-    """Of the files that are there; one of several names counts once, such as a scene and the artifact that it was."""
-    sizes: dict[object, int] = {}
-    for file in files:
-        if isinstance(file, SharedFile):
-            sizes[file.stored.key] = file.stored.bytes
-            continue
-        with suppress(OSError):
-            status = os.stat(file)
-            sizes[status.st_dev, status.st_ino] = status.st_size
-    return sum(sizes.values())
+        scenes = [self._scenes.stored(name) for name in self._owners.owned(Kind.SCENE, owner)]
+        sizes = dict(filter(None, scenes))  # a scene and the artifact that it was are one content
+        sizes |= {file.stored.sha256: file.stored.bytes for file in jobs.artifact_files_of(owner)}
+        return dataset_bytes + sum(sizes.values())
 
 
 def _too_many_bytes(limit_gb: float | None) -> LimitReached:

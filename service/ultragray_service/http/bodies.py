@@ -28,8 +28,8 @@ from ultragray_service.core.poses import Pose, check_pose_count
 from ultragray_service.core.streams import MAX_TIMEOUT_MS, MAX_WINDOW, StreamMode
 from ultragray_service.errors import BodyTooLarge, UnsupportedMediaType
 from ultragray_service.http.problems import invalid_argument
-from ultragray_workers.jobs.job import MAX_PRIORITY
 from ultragray_workers.jobs.kinds import KINDS, Specification
+from ultragray_workers.jobs.record import MAX_PRIORITY
 
 INLINE_BYTES = 64 * 1024  # of a body that is read at once: a few milliseconds
 MAX_VALUES = 100_000  # of a body that has no limit of its own: about ten milliseconds

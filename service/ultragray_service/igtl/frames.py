@@ -30,7 +30,7 @@ from ultragray_service.igtl.messages import Message
 from ultragray_service.igtl.routes import SceneChooser, image_name
 from ultragray_service.service import Service
 from ultragray_workers.errors import QueueFull
-from ultragray_workers.jobs.queue.owners import Kind, Ownership
+from ultragray_workers.jobs.owners import Kind, Ownership
 from ultragray_workers.pool.messages import RenderResult
 from ultragray_workers.pool.waiting import Turn
 

@@ -20,7 +20,7 @@ from ultragray_service.igtl.routes import SceneChooser
 from ultragray_service.listening import Connections
 from ultragray_service.service import Service
 from ultragray_workers.errors import Draining
-from ultragray_workers.jobs.queue.owners import Kind
+from ultragray_workers.jobs.owners import Kind
 
 _log = logging.getLogger("ultragray.igtl")
 

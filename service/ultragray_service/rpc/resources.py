@@ -32,9 +32,8 @@ from ultragray_service.rpc.messages import job_message, read, read_specification
 from ultragray_service.service import Service
 from ultragray_service.views.audited import DEFAULT_ENTRIES, DEFAULT_HOURS, audit_entries
 from ultragray_workers.errors import Draining
-from ultragray_workers.jobs.queue.wishes import Wanted
-from ultragray_workers.jobs.shared.reading import opened
 from ultragray_workers.jobs.store import JobStore
+from ultragray_workers.jobs.workers import Wanted
 
 Context: TypeAlias = grpc.aio.ServicerContext
 
@@ -188,16 +187,15 @@ class JobService:
 
     async def DownloadArtifact(self, request: jobs_pb2.DownloadArtifactRequest, context: Context) -> None:
         found = await self._service.jobs.do(JobStore.artifact, request.job, request.name)
-        with opened(found) as file:
-            if not 0 <= request.offset <= file.length:
-                raise InvalidArgument(f"offset must be from 0 to {file.length}, got {request.offset}", field="offset")
-            offset = request.offset
-            while True:
-                data = await asyncio.to_thread(file.read, offset, _CHUNK_BYTES)
-                await context.write(jobs_pb2.ArtifactChunk(data=data, file_bytes=file.length))
-                offset += len(data)
-                if not data or offset >= file.length:
-                    return
+        length, offset = found.stored.bytes, request.offset
+        if not 0 <= offset <= length:
+            raise InvalidArgument(f"offset must be from 0 to {length}, got {offset}", field="offset")
+        while True:
+            data = await asyncio.to_thread(found.read, offset, _CHUNK_BYTES)
+            await context.write(jobs_pb2.ArtifactChunk(data=data, file_bytes=length))
+            offset += len(data)
+            if not data or offset >= length:
+                return
 
     async def WatchJob(self, request: jobs_pb2.WatchJobRequest, context: Context) -> None:
         self._service.life.require_serving()

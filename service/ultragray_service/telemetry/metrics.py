@@ -21,7 +21,7 @@ from ultragray.contract import described
 from ultragray.errors import UltragrayError
 from ultragray_service.access.principals import acting
 from ultragray_service.errors import statuses_of
-from ultragray_workers.jobs.overview import JobsOverview
+from ultragray_workers.jobs.store import JobsOverview
 from ultragray_workers.pool.messages import LocalizeResult, RenderResult
 from ultragray_workers.pool.pool import RenderPool
 

@@ -38,8 +38,8 @@ from ultragray_workers.claims import claimed_folder, remove_abandoned, remove_wh
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import ArtifactNotFound, DatasetNotFound, Draining
 from ultragray_workers.helpers import PROGRESS_NAME, read_picture
-from ultragray_workers.jobs.files import BASELINES_NAME, JOURNAL_NAME
-from ultragray_workers.jobs.store import Job, JobStore
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.scenes import SceneStore
 from ultragray_workers.views import FRAMES_NAME, POSES_NAME, PREVIEW_PICTURES, compare, draw_preview, lay_out
 
@@ -382,9 +382,9 @@ class TrainingViews(Prepared):
         return ArtifactNotFound(f"the job {job.id} has no checkpoint to render (any more)", field="job")
 
 
-def _texts(jobs: JobStore, job_id: str) -> tuple[str | None, str | None]:
+def _texts(jobs: JobStore, job_id: str) -> tuple[str, str]:
     known = jobs.get(job_id).id
-    return jobs.files.text_of_run(known, JOURNAL_NAME), jobs.files.text_of_run(known, BASELINES_NAME)
+    return jobs.files.journal(known), jobs.files.baselines(known)
 
 
 def _curve_of(journal: str | None) -> list[CurvePoint]:

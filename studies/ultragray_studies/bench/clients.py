@@ -37,7 +37,8 @@ from ultragray_studies.bench.kernel import BenchScene, bench_poses, measure_kern
 from ultragray_studies.bench.report import Report, percentiles
 from ultragray_studies.bench.served import pose_message, running_server
 from ultragray_workers.errors import NotReady
-from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.database import JobDatabase
+from ultragray_workers.jobs.tables import JOBS
 
 _TIMEOUT_S = 60.0
 
@@ -327,23 +328,18 @@ def _copy_jobs(artifact_folder: Path, count: int) -> None:
     """Insert copies of the finished job, a second apart before it; they have no folders, which lists do not read."""
     jobs = JobDatabase(artifact_folder, None)
     try:
-        tables = sa.MetaData()
-        tables.reflect(jobs.engine, only=("workflow_status", "workflow_input", "workflow_output"))
         with jobs.engine.begin() as connection:
-            for table in tables.sorted_tables:
-                original = connection.execute(sa.select(table)).mappings().first()
-                copies = [] if original is None else [_copy(dict(original), number) for number in range(1, count)]
-                for first in range(0, len(copies), _COPIED_AT_ONCE):
-                    connection.execute(sa.insert(table), copies[first : first + _COPIED_AT_ONCE])
+            original = connection.execute(sa.select(JOBS)).mappings().one()
+            copies = [_copy(dict(original), number) for number in range(1, count)]
+            for first in range(0, len(copies), _COPIED_AT_ONCE):
+                connection.execute(sa.insert(JOBS), copies[first : first + _COPIED_AT_ONCE])
     finally:
         jobs.close()
 
 
 def _copy(row: dict[str, Any], number: int) -> dict[str, Any]:
-    earlier = {
-        name: row[name] - 1000 * number for name in ("created_at", "updated_at", "completed_at") if row.get(name)
-    }
-    return {**row, **earlier, "workflow_uuid": f"{number:024x}"}
+    earlier = {name: row[name] - 1000 * number for name in ("created_ms", "started_ms", "finished_ms")}
+    return {**row, **earlier, "number": -number, "id": f"{number:024x}"}
 
 
 def _pages(port: int, repeats: int, route: str) -> list[float]:

@@ -34,7 +34,7 @@ from ultragray_service.rpc.shared_memory import FOLDER, FREE, HEADER_BYTES, TOKE
 from ultragray_studies.bench.kernel import BenchScene, bench_poses, bench_scenes, measure_kernel, time_ms
 from ultragray_studies.bench.report import Report, percentiles
 from ultragray_workers.errors import NotReady
-from ultragray_workers.jobs.worker.processes import account_of
+from ultragray_workers.jobs.worker.process import account_of
 
 _SLOT_BYTES = 4 * 2**20
 

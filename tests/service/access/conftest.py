@@ -15,8 +15,8 @@ import sqlalchemy as sa
 
 from ultragray_service.access.keys import KeyStore
 from ultragray_service.access.principals import Role
-from ultragray_workers.jobs.queue.database import JobDatabase
-from ultragray_workers.jobs.queue.tables import KEYS
+from ultragray_workers.jobs.database import JobDatabase
+from ultragray_workers.jobs.tables import KEYS
 
 from ..conftest import DEMO_PROBE, RunningService, StartService, make_scene
 from ..http.test_http_datasets import released_files, zipped

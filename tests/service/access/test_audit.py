@@ -20,7 +20,7 @@ from ultragray_service.access import audit
 from ultragray_service.access.audit import MAX_WAITING, AuditLog, Entry, read_audit
 from ultragray_service.access.keys import KeyStore
 from ultragray_service.access.principals import Role
-from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.database import JobDatabase
 
 from ...postgres import PostgresServer
 from ...waiting import wait_until

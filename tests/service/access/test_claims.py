@@ -12,8 +12,8 @@ import httpx
 import pytest
 import sqlalchemy as sa
 
-from ultragray_workers.jobs.queue.database import JobDatabase
-from ultragray_workers.jobs.queue.tables import OWNERS
+from ultragray_workers.jobs.database import JobDatabase
+from ultragray_workers.jobs.tables import OWNERS
 
 from ...postgres import PostgresServer
 from ...waiting import wait_until

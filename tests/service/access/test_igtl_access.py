@@ -12,7 +12,7 @@ import pytest
 from ultragray_service.access.keys import KeyStore
 from ultragray_service.access.principals import Role
 from ultragray_service.igtl.contents import unpack_status
-from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.database import JobDatabase
 
 from ..conftest import RunningService, StartService
 from ..igtl.conftest import Peer, address_of, moved

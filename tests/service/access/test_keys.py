@@ -17,8 +17,8 @@ from ultragray_service.access.keys import KeyStore, KnownKeys, Snapshot
 from ultragray_service.access.principals import Principal, Role
 from ultragray_service.errors import Unauthenticated
 from ultragray_workers.errors import DatabaseUnavailable
-from ultragray_workers.jobs.queue import tables
-from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs import tables
+from ultragray_workers.jobs.database import JobDatabase
 
 from ...postgres import NewDatabase, PostgresServer
 from ...waiting import wait_until

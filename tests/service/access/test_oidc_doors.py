@@ -14,7 +14,7 @@ from ultragray_client import Client
 from ultragray_proto.v1 import scenes_pb2, scenes_pb2_grpc
 from ultragray_service.access.keys import KeyStore
 from ultragray_service.access.principals import Role
-from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.database import JobDatabase
 
 from ...waiting import wait_until
 from ..conftest import RunningService, StartService

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import socket
 from collections.abc import Callable
 from pathlib import Path
@@ -10,7 +11,6 @@ from typing import Any
 import grpc
 import httpx
 import pytest
-from starlette.testclient import TestClient
 
 from ultragray_proto.v1 import scenes_pb2, scenes_pb2_grpc
 from ultragray_service.http.app import create_app
@@ -108,7 +108,12 @@ def status_of(tmp_path: Path) -> Callable[..., int]:
 
     def ask(path: str, headers: dict[str, str], **settings: Any) -> int:
         app = create_app(make_service(load_settings(data_folder=tmp_path, **settings)))
-        return int(TestClient(app, base_url="http://127.0.0.1").get(path, headers=headers).status_code)
+
+        async def answer() -> int:
+            async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://127.0.0.1") as client:
+                return (await client.get(path, headers=headers)).status_code
+
+        return asyncio.run(answer())
 
     return ask
 

@@ -6,16 +6,14 @@ import time
 from collections.abc import Iterator
 from typing import Any
 
-import grpc
 import pytest
 import sqlalchemy as sa
 
 from ultragray_proto.v1 import workers_pb2, workers_pb2_grpc
-from ultragray_workers.jobs.queue.database import JobDatabase
-from ultragray_workers.jobs.queue.tables import WORKERS
+from ultragray_workers.jobs.database import JobDatabase
+from ultragray_workers.jobs.tables import WORKERS
 
 from ...waiting import wait_until
-from ..rpc.test_grpc_render import error_info
 from .conftest import Keyed
 from .test_audit import entries
 
@@ -33,7 +31,7 @@ def let_work(database: JobDatabase, name: str, job: str | None) -> None:
     """A worker that goes on living, at work on a job, as its heartbeat would write it."""
     with database.engine.begin() as connection:
         facts = {"seen_at_s": time.time() + 3600.0, "host": "bench", "pid": 7, "device": "cpu", "version": "1"}
-        connection.execute(sa.insert(WORKERS).values(executor=name, job_id=job, **facts))
+        connection.execute(sa.insert(WORKERS).values(name=name, job=job, **facts))
 
 
 def told_http(keyed: Keyed, who: str) -> dict[str, tuple[str, str | None]]:
@@ -90,27 +88,3 @@ def test_admins_pause_drain_and_resume_over_http(keyed: Keyed, database: JobData
             ("admin", f"worker.{wish}", "absent", "WORKER_NOT_FOUND"),
         }
         wait_until(lambda expected=expected: expected <= audited())
-
-
-def test_admins_pause_drain_and_resume_over_grpc(keyed: Keyed, database: JobDatabase) -> None:
-    let_work(database, "one", None)
-    admin, alice = (tuple(keyed.headers(who).items()) for who in ("admin", "alice"))
-    with keyed.service.channel() as channel:
-        stub = workers_pb2_grpc.WorkerServiceStub(channel)
-        for call, request, state in (
-            (stub.PauseWorker, workers_pb2.PauseWorkerRequest, workers_pb2.WORKER_STATE_PAUSED),
-            (stub.DrainWorker, workers_pb2.DrainWorkerRequest, workers_pb2.WORKER_STATE_DRAINED),
-            (stub.ResumeWorker, workers_pb2.ResumeWorkerRequest, workers_pb2.WORKER_STATE_IDLE),
-        ):
-            worker = call(request(worker="one"), metadata=admin)
-            assert (worker.name, worker.state, worker.host, worker.pid, worker.device) == (
-                "one",
-                state,
-                "bench",
-                7,
-                "cpu",
-            )
-            for metadata, name, reason in ((alice, "one", "PERMISSION_DENIED"), (admin, "absent", "WORKER_NOT_FOUND")):
-                with pytest.raises(grpc.RpcError) as caught:
-                    call(request(worker=name), metadata=metadata)
-                assert error_info(caught.value)[0].reason == reason

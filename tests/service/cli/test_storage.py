@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from ultragray.phantom.demo import copy_demo_scene
-from ultragray_workers.storage.opening import open_storage
+from ultragray_workers.storage.location import open_storage
 
 from ...workers.jobs.conftest import store_dataset
 from .command_line import refused, run

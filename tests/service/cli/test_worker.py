@@ -18,7 +18,9 @@ import pytest
 from ultragray.phantom.demo import copy_demo_scene
 from ultragray.samplers import AroundSampler
 from ultragray_workers.jobs.kinds import RenderJob
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.scenes import SceneStore
 
 from ...waiting import Deadline, wait_until

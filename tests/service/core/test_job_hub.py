@@ -12,7 +12,8 @@ from ultragray_service.core.jobs import hub as job_hub
 from ultragray_service.core.jobs.hub import JobChange, JobHub, JobWatch
 from ultragray_service.core.jobs.log import TAIL_BYTES, GrowingLog
 from ultragray_workers.errors import JobNotFound
-from ultragray_workers.jobs.store import Job, JobState, Progress
+from ultragray_workers.jobs.progress import JobState, Progress
+from ultragray_workers.jobs.record import Job
 
 INTERVAL_S = 0.02
 WAIT_S = 60.0
@@ -21,6 +22,19 @@ WAIT_S = 60.0
 @pytest.fixture(autouse=True)
 def _short_interval(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(job_hub, "READ_INTERVAL_S", INTERVAL_S)
+
+
+class FileLog:
+    """A log that is a file."""
+
+    def __init__(self, path: Path) -> None:
+        self._path = path
+
+    def size(self) -> int:
+        return self._path.stat().st_size if self._path.exists() else 0
+
+    def read(self, start: int, length: int) -> bytes:
+        return self._path.read_bytes()[start : start + length] if self._path.exists() else b""
 
 
 class OneJob:
@@ -51,7 +65,7 @@ class OneJob:
             owner=None,
             private=False,
         )
-        self.hub = JobHub(self.get, lambda job_id: self.log_path)
+        self.hub = JobHub(self.get, lambda job_id: FileLog(self.log_path))
 
     def get(self, job_id: str) -> Job:
         self.reads += 1
@@ -188,7 +202,7 @@ def test_a_closed_hub_ends_every_watch(one: OneJob) -> None:
 
 def test_a_log_is_told_in_whole_lines(tmp_path: Path) -> None:
     path = tmp_path / "log.txt"
-    log = GrowingLog(path)
+    log = GrowingLog(FileLog(path))
     assert log.read() == ""
     with path.open("a") as file:
         for text, expected in (("one\ntw", "one\n"), ("o", ""), ("\nthree\n", "two\nthree\n"), ("", "")):
@@ -203,7 +217,7 @@ def test_a_long_log_is_told_from_its_end_and_then_whole(tmp_path: Path) -> None:
     path = tmp_path / "log.txt"
     lines = [f"line {number:06d}" for number in range(20_000)]
     path.write_text("\n".join(lines) + "\n")
-    log = GrowingLog(path)
+    log = GrowingLog(FileLog(path))
     told = log.read()
     assert 0 < len(told) <= TAIL_BYTES
     assert told.splitlines() == lines[-len(told.splitlines()) :]
@@ -217,7 +231,7 @@ def test_a_long_log_is_told_from_its_end_and_then_whole(tmp_path: Path) -> None:
 def test_a_log_is_told_from_a_given_byte_and_a_line_without_end_in_pieces(tmp_path: Path) -> None:
     path = tmp_path / "log.txt"
     path.write_text("told before\n" + "x" * 200_000 + "\nafter\n")
-    log = GrowingLog(path, len("told before\n"))
+    log = GrowingLog(FileLog(path), len("told before\n"))
     assert read_whole(log) == "x" * 200_000 + "\nafter\n"
 
 

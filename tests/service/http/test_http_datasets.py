@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import io
-import json
 import os
 import signal
 import socket
@@ -75,7 +74,7 @@ def tarred(files: dict[str, bytes]) -> bytes:
 
 
 def uploads_under_way(folder: Path) -> list[str]:
-    return [path.name for path in folder.glob("datasets/.*")]
+    return [path.name for path in folder.glob("uploads/.*")]
 
 
 def helper_process(service: RunningService, work: str) -> int | None:
@@ -254,26 +253,6 @@ def test_an_upload_needs_a_key(service: RunningService, files: dict[str, bytes])
     assert_problem(answer, 401, "UNAUTHENTICATED")
 
 
-def test_pages_join_to_the_whole_list(http: httpx.Client, artifacts: Path, files: dict[str, bytes]) -> None:
-    names = ["a", "b", "c"]
-    put(http, "a", zipped(files))
-    manifest = json.loads((artifacts / "datasets" / "a" / "dataset.json").read_text())
-    for name in names[1:]:
-        (artifacts / "datasets" / name).mkdir()
-        (artifacts / "datasets" / name / "dataset.json").write_text(json.dumps({**manifest, "name": name}))
-    (artifacts / "datasets" / "no-manifest").mkdir()
-    found, token = [], ""
-    while True:
-        page = http.get("/v1/datasets", params={"page_size": 2, "page_token": token}).json()
-        found += [dataset["name"] for dataset in page["datasets"]]
-        if not (token := page["next_page_token"]):
-            break
-    assert found == names
-    assert_problem(http.get("/v1/datasets", params={"page_token": "*"}), 422, "INVALID_ARGUMENT")
-    for name in names:
-        assert http.delete(f"/v1/datasets/{name}").status_code == 204
-
-
 def test_an_upload_that_comes_to_a_halt(service: RunningService, artifacts: Path) -> None:
     upload = HalfUpload(service, "halted")
     wait_until(lambda: uploads_under_way(artifacts))
@@ -320,7 +299,7 @@ def test_a_check_that_is_killed(http: httpx.Client, service: RunningService, fil
 def test_a_service_that_dies_or_stops_leaves_nothing(start_service: StartService, tmp_path: Path) -> None:
     first = start_service(artifact_folder=tmp_path, api_keys=KEY)
     upload = HalfUpload(first, "half")
-    wait_until(lambda: list(tmp_path.glob(f"datasets/.*/{LOCK_NAME}")))
+    wait_until(lambda: list(tmp_path.glob(f"uploads/.*/{LOCK_NAME}")))
     first.process.kill()
     first.process.wait()
     upload.close()

@@ -10,7 +10,7 @@ import httpx
 import numpy as np
 import pytest
 
-from ultragray import GaussianScene, LinearProbe, render
+from ultragray import GaussianScene, render
 from ultragray.scene.confidence import FIGURES
 
 from ..conftest import HEIGHT, WIDTH, RunningService
@@ -112,20 +112,6 @@ def test_headers_let_the_frame_be_rendered_again(http: httpx.Client, pose_body: 
     assert headers["server-timing"].count("dur=") == 3
     again = post(http, {"pose": {"matrix": pose.tolist()}})
     assert again.content == answer.content
-
-
-def test_probe_and_size_override_those_of_the_scene(
-    http: httpx.Client, demo_scene: GaussianScene, pose_body: Any, pose_matrix: Any
-) -> None:
-    probe = {"kind": "linear", "width_mm": 20.0, "near_mm": 5.0, "far_mm": 30.0}
-    body = {"pose": pose_body, "probe": probe, "height": 31, "width": 17}
-    answer = post(http, body, "application/octet-stream;dtype=float32")
-    assert answer.headers["x-ultragray-shape"] == "1,1,31,17"
-    assert json.loads(answer.headers["x-ultragray-probe"]) == probe
-    ours = LinearProbe(width_mm=20.0, near_mm=5.0, far_mm=30.0)
-    truth = render(demo_scene, ours, pose_matrix, height=31, width=17, outputs=("bmode",)).bmode
-    assert truth is not None
-    np.testing.assert_allclose(np.frombuffer(answer.content, "<f4").reshape(31, 17), truth[0].numpy(), atol=1e-5)
 
 
 def test_a_scene_without_a_probe_renders_when_one_is_given(http: httpx.Client, pose_body: Any) -> None:

@@ -1,4 +1,4 @@
-"""Artifacts that lie in a storage are answered in ranges, as those that lie in a folder."""
+"""Artifacts are answered in ranges, as a web server answers files."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from starlette.requests import Request
 from starlette.responses import FileResponse, Response
 from starlette.routing import Route
 
-from ultragray_service.http.routes.jobs import SHOWN, shared_file_response
-from ultragray_workers.jobs.shared.reading import SharedFile
-from ultragray_workers.jobs.shared.record import StoredFile
+from ultragray_service.http.routes.jobs import SHOWN, artifact_response
+from ultragray_workers.jobs.files import Artifact
+from ultragray_workers.jobs.record import StoredFile
 from ultragray_workers.storage.local import LocalStorage
 
 CONTENT = bytes(range(256)) * 10_000
@@ -29,10 +29,10 @@ def get(tmp_path: Path) -> Get:
     """Answers the same file from a storage and from a folder."""
     storage = LocalStorage(tmp_path)
     storage.write("jobs/one/frames.npz", CONTENT)
-    file = SharedFile(storage, "frames.npz", StoredFile("jobs/one/frames.npz", len(CONTENT), "ab" * 32))
+    file = Artifact(storage, "frames.npz", StoredFile("jobs/one/frames.npz", len(CONTENT), "ab" * 32))
 
     async def shared(request: Request) -> Response:
-        return shared_file_response(file, request.headers, "application/x-npz", SHOWN, "attachment")
+        return artifact_response(file, request.headers, "application/x-npz", SHOWN, "attachment")
 
     async def local(request: Request) -> Response:
         path = tmp_path / "jobs" / "one" / "frames.npz"

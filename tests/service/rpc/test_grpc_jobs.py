@@ -118,11 +118,13 @@ def test_log_and_artifacts_of_a_job(start_service: StartService, tmp_path: Path)
         job = jobs.SubmitJob(jobs_pb2.SubmitJobRequest(render=render)).job
         *_, last = jobs.WatchJob(jobs_pb2.WatchJobRequest(job=job.id), timeout=60)
         assert last.job.state == jobs_pb2.JOB_STATE_SUCCEEDED, last
-        log = (tmp_path / "jobs" / job.id / "log.txt").read_text()
+        (told,) = (tmp_path / "jobs" / job.id).glob("*/log-00000")
+        log = told.read_text()
         assert jobs.GetJobLog(jobs_pb2.GetJobLogRequest(job=job.id)).log == log
         assert jobs.GetJobLog(jobs_pb2.GetJobLogRequest(job=job.id, max_bytes=7)).log == log[-7:]
 
-        content = (tmp_path / "jobs" / job.id / "artifacts" / "frames.npz").read_bytes()
+        (file,) = (tmp_path / "jobs" / job.id).glob("*/artifacts/frames.npz")
+        content = file.read_bytes()
         chunks = list(jobs.DownloadArtifact(jobs_pb2.DownloadArtifactRequest(job=job.id, name="frames.npz")))
         assert b"".join(chunk.data for chunk in chunks) == content
         assert len(chunks) == 2

@@ -40,6 +40,7 @@ def wanted(tmp_path: Path) -> Wanted:
     (folder / "files").mkdir(parents=True)
     write_released(DATASET, folder / "files")
     write_manifest(check_files(folder / "files", "tiny", {}, folder / "contact_sheet.png"), folder)
+    DatasetStore(tmp_path).add(folder, "tiny")
     return {"dataset": "tiny"}
 
 
@@ -261,7 +262,7 @@ def test_one_helper_process_at_a_time(tmp_path: Path, wanted: Wanted, monkeypatc
 
 @pytest.mark.long
 def test_memory_beyond_the_limit_is_one_clear_error(tmp_path: Path, wanted: Wanted) -> None:
-    images = tmp_path / "datasets" / "tiny" / "files" / "images_train.npy"
+    (images,) = tmp_path.glob("dataset-files/*/files/images_train.npy")
     with images.open("wb") as file:
         shape = (2000, 512, 512)
         np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": shape})

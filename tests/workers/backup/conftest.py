@@ -9,7 +9,7 @@ import pytest
 
 from ultragray.phantom.demo import copy_demo_scene
 from ultragray_workers.backup.contents import Folders
-from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.scenes import SceneStore
 

@@ -18,12 +18,15 @@ from ultragray_workers.backup.database_copy import Database
 from ultragray_workers.backup.objects import Objects
 from ultragray_workers.backup.restoring import restore
 from ultragray_workers.errors import BackupInvalid, RestoreRefused
-from ultragray_workers.jobs.folder import JobFolder, Outcome
+from ultragray_workers.jobs import queue
+from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.kinds import RenderJob
-from ultragray_workers.jobs.queue.database import JobDatabase
-from ultragray_workers.jobs.queue.internals import WORKFLOWS
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Files, Job, StoredFile
+from ultragray_workers.jobs.store import JobStore
+from ultragray_workers.jobs.tables import JOBS
 from ultragray_workers.scenes import SceneStore
+from ultragray_workers.storage.local import LocalStorage
 
 from ...postgres import NewDatabase
 
@@ -36,10 +39,8 @@ def submit(store: JobStore, name: str) -> Job:
 
 def set_row(database: JobDatabase, job: Job, **values: Any) -> None:
     """As the queue would."""
-    rows = sa.Table(WORKFLOWS.name, sa.MetaData(), *[sa.Column(name) for name in ("workflow_uuid", *values)])
-    rows.schema = WORKFLOWS.schema
     with database.engine.begin() as connection:
-        connection.execute(sa.update(rows).where(rows.c.workflow_uuid == job.id).values(**values))
+        connection.execute(sa.update(JOBS).where(JOBS.c.id == job.id).values(**values))
 
 
 def restored(backups: Path, elsewhere: Folders, url: str | None) -> JobStore:
@@ -61,17 +62,13 @@ def test_everything_comes_back_and_what_ran_waits_again(
     new_database: NewDatabase,
 ) -> None:
     waiting, running, done, odd = (submit(store, name) for name in ("waiting", "running", "done", ODD))
-    set_row(database, running, status="PENDING", executor_id="gone", recovery_attempts=1)
-    set_row(database, done, status="CANCELLED")
-    folder = JobFolder(folders.artifacts, running.id)
-    folder.run.mkdir(parents=True)
-    (folder.run / "checkpoint.safetensors").write_bytes(b"far")
-    (folder.run / "metrics.jsonl").write_text("{}\n")
-    folder.lock.touch()
-    folder.reserve.write_bytes(bytes(100))
-    for name in ("artifacts.partial", "scratch.partial"):
-        (folder.path / name).mkdir()
-        (folder.path / name / "half").write_text("half")
+    checkpoint = StoredFile(f"jobs/{running.id}/2-1/run-1/checkpoint.safetensors", 3, "")
+    LocalStorage(folders.artifacts).write(checkpoint.key, b"far")
+    files = Files(run={"checkpoint.safetensors": checkpoint})
+    set_row(database, running, state="running", worker="gone", attempt=1, files=files.to_json())
+    set_row(database, done, state="cancelled")
+    (folders.artifacts / "work" / f"{running.id}.1").mkdir(parents=True)
+    (folders.artifacts / "work" / f"{running.id}.1" / "reserve").write_bytes(bytes(100))
     before, _ = store.list()
 
     report = back_up(folders, database_url, backups)
@@ -88,14 +85,14 @@ def test_everything_comes_back_and_what_ran_waits_again(
     }
     assert [job for job in after if job.id != running.id] == [job for job in before if job.id != running.id]
     assert next(job for job in after if job.id == odd.id).request_id == ODD
-    assert contents(elsewhere.artifacts / "datasets") == contents(folders.artifacts / "datasets")
+    for folder in ("datasets", "dataset-files", "jobs"):
+        assert contents(elsewhere.artifacts / folder) == contents(folders.artifacts / folder)
+    assert contents(elsewhere.artifacts / "jobs" / running.id)["2-1/run-1/checkpoint.safetensors"] == b"far"
+    assert not (elsewhere.artifacts / "work").exists()
     assert (elsewhere.data / "demo.ugr").read_bytes() == (folders.data / "demo.ugr").read_bytes()
-    there = contents(JobFolder(elsewhere.artifacts, running.id).path)
-    assert there == {
-        "demo.ugr": (folders.data / "demo.ugr").read_bytes(),
-        "run/checkpoint.safetensors": b"far",
-        "run/metrics.jsonl": b"{}\n",
-    }
+    again = queue.row_of(other.database.engine, running.id)
+    assert again is not None
+    assert again.files == files
     newer = submit(other, "newer")
     assert other.list()[0][0].id == newer.id
     other.close()
@@ -165,9 +162,7 @@ def test_jobs_that_go_while_files_are_copied_are_gone_after_the_restore(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     stays, goes, ends = (submit(store, name) for name in ("stays", "goes", "ends"))
-    set_row(database, goes, status="SUCCESS")
-    folder = JobFolder(folders.artifacts, goes.id)
-    folder.write_outcome(Outcome())
+    set_row(database, goes, state="succeeded")
     late: list[Job] = []
     snapshot = Database.snapshot
 
@@ -185,12 +180,12 @@ def test_jobs_that_go_while_files_are_copied_are_gone_after_the_restore(
     other = restored(backups, elsewhere, new_database())
     states = {job.id: job.state for job in other.list()[0]}
     assert states == {stays.id: JobState.QUEUED, ends.id: JobState.CANCELLED}
-    assert not JobFolder(elsewhere.artifacts, late[0].id).path.exists()
-    assert not JobFolder(elsewhere.artifacts, goes.id).path.exists()
+    assert not (elsewhere.artifacts / "jobs" / late[0].id).exists()
+    assert not (elsewhere.artifacts / "jobs" / goes.id).exists()
     other.close()
 
 
-def test_backup_of_a_newer_release_is_refused(
+def test_backup_of_another_release_is_refused(
     store: JobStore, folders: Folders, backups: Path, elsewhere: Folders, database_url: str | None
 ) -> None:
     submit(store, "one")
@@ -199,8 +194,7 @@ def test_backup_of_a_newer_release_is_refused(
     document = json.loads((backups / "manifests" / f"{made.name}.json").read_text())
     for change, told in (
         ({"format_version": 2}, "has version 2 of the format of backups.*restore it with release"),
-        ({"database": {**document["database"], "tables_version": 99}}, "holds version 99 of our own tables"),
-        ({"database": {**document["database"], "queue_version": 999}}, "holds version 999 of the queue's tables"),
+        ({"database": {**document["database"], "tables_version": 99}}, "holds tables of version 99"),
     ):
         changed = {name: value for name, value in (document | change).items() if name != "sha256"}
         changed["sha256"] = manifest._sha256(changed)

@@ -16,8 +16,8 @@ from ultragray_workers.backup.backing_up import back_up
 from ultragray_workers.backup.contents import Folders
 from ultragray_workers.backup.restoring import restore
 from ultragray_workers.errors import BackupInvalid, RestoreRefused, StartupFailed
-from ultragray_workers.jobs.queue import tables
-from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs import tables
+from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.store import JobStore
 
 from ...postgres import NewDatabase
@@ -34,7 +34,7 @@ def test_nothing_is_overwritten_unasked(
     with pytest.raises(RestoreRefused, match="a service or a worker is at work"):
         restore(backups, folders, database_url, overwrite=True)
     store.close()
-    with pytest.raises(RestoreRefused, match=r"holds something already, such as datasets/tiny/.*--force"):
+    with pytest.raises(RestoreRefused, match=r"holds something already, such as dataset.*--force"):
         restore(backups, folders, database_url)
     restore(backups, folders, database_url, overwrite=True)
     again = JobStore(folders.artifacts, database_url)
@@ -145,32 +145,8 @@ def test_interrupted_restore_goes_on_and_is_seen_by_nobody_before(
     assert {job.id for job in again.list()[0]} == jobs
     again.close()
     assert (elsewhere.data / "demo.ugr").stat().st_ino == written
-    assert contents(elsewhere.artifacts / "datasets") == contents(folders.artifacts / "datasets")
-
-
-def test_backup_with_older_tables_is_migrated(
-    store: JobStore,
-    database: JobDatabase,
-    folders: Folders,
-    backups: Path,
-    elsewhere: Folders,
-    database_url: str | None,
-    new_database: NewDatabase,
-) -> None:
-    job = submit(store, "one")
-    with database.engine.begin() as connection:  # as a release before the first version left them
-        for table in reversed(tables.TABLES.sorted_tables):
-            connection.execute(sa.schema.DropTable(table))
-    made = back_up(folders, database_url, backups).manifest
-    assert made.database is not None
-    assert made.database.tables_version == 0
-    url = new_database()
-    restore(backups, elsewhere, url)
-    opened = JobDatabase(elsewhere.artifacts, url)
-    with opened.engine.begin() as connection:
-        assert tables.version(connection) == tables.VERSION
-    assert opened.workflow(job.id) is not None
-    opened.close()
+    for folder in ("datasets", "dataset-files"):
+        assert contents(elsewhere.artifacts / folder) == contents(folders.artifacts / folder)
 
 
 def test_restore_of_an_older_backup_brings_back_a_database_of_a_newer_release(
@@ -182,7 +158,7 @@ def test_restore_of_an_older_backup_brings_back_a_database_of_a_newer_release(
         connection.execute(sa.update(tables.SCHEMA_VERSION).values(version=99))
     store.close()
     database.close()
-    with pytest.raises(StartupFailed, match="restore a backup made before it"):
+    with pytest.raises(StartupFailed, match="restore a backup that this one made"):
         JobStore(folders.artifacts, database_url)
     restore(backups, folders, database_url, overwrite=True)
     again = JobStore(folders.artifacts, database_url)

@@ -12,7 +12,7 @@ from ultragray.files import file_sha256
 from ultragray.rendering.settings import FrameSettings
 from ultragray.samplers import AroundSampler
 from ultragray.scene.info import read_header
-from ultragray_workers.storage.opening import open_storage
+from ultragray_workers.storage.location import open_storage
 from ultragray_workers.storage.storage import Storage
 
 PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)

@@ -12,7 +12,7 @@ from ultragray.errors import InvalidArgument
 from ultragray.exchange.batches import BatchPlan
 from ultragray.exchange.shards import ShardRenderer
 from ultragray_workers.batches.place import ShardPlace
-from ultragray_workers.storage.opening import open_storage
+from ultragray_workers.storage.location import open_storage
 from ultragray_workers.storage.storage import Storage
 
 from .conftest import plan_of

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import sqlite3
 import subprocess
@@ -20,10 +21,15 @@ import pytest
 from ultragray import LinearProbe
 from ultragray.datasets.released import write_released
 from ultragray.learn.sweep import Dataset, Sweep
-from ultragray_workers.datasets.store import FILES_NAME, DatasetRecord, write_manifest
+from ultragray_workers.datasets.shelf import FILES_NAME
+from ultragray_workers.datasets.store import DatasetRecord, DatasetStore, write_manifest
+from ultragray_workers.jobs.database import SQLITE_FILE, JobDatabase
+from ultragray_workers.jobs.files import Artifact
+from ultragray_workers.jobs.folder import Request
 from ultragray_workers.jobs.kinds import TrainJob
-from ultragray_workers.jobs.queue.database import SQLITE_FILE, JobDatabase
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
 
 from ...waiting import Deadline
 
@@ -32,10 +38,10 @@ PROBE = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=25.0)
 PROGRAM = """
 import json, os, signal, socket, sys, threading
 from pathlib import Path
-from ultragray_workers.jobs.queue import heartbeat
+from ultragray_workers.jobs import queue
 from ultragray_workers.jobs.shards import desk
 from ultragray_workers.jobs.worker.worker import work
-heartbeat.DEAD_AFTER_S = 3.0
+queue.DEAD_AFTER_S = 3.0
 stop = threading.Event()
 signal.signal(signal.SIGTERM, lambda number, frame: stop.set())
 options = json.loads(sys.argv[3])
@@ -65,9 +71,10 @@ def tiny_dataset(frames: int = 8, side: int = 16) -> Dataset:
 
 
 def store_dataset(artifact_folder: Path, name: str) -> Path:
-    """A dataset as an upload leaves it; its folder."""
+    """A dataset as an upload leaves it; its files."""
     dataset = tiny_dataset()
-    folder = artifact_folder / "datasets" / name
+    store = DatasetStore(artifact_folder)
+    folder = store.folder / f"made-{name}"
     folder.mkdir(parents=True)
     write_released(dataset, folder / FILES_NAME)
     record = DatasetRecord(
@@ -85,7 +92,27 @@ def store_dataset(artifact_folder: Path, name: str) -> Path:
         options={},
     )
     write_manifest(record, folder)
-    return folder
+    store.add(folder, name)
+    shutil.rmtree(folder)
+    return files_of(artifact_folder, name)
+
+
+def files_of(artifact_folder: Path, name: str) -> Path:
+    """The files of a dataset in an artifact folder, as they were sent."""
+    with DatasetStore(artifact_folder).shelf.files(name) as files:
+        return files
+
+
+def request_of(specification: dict[str, Any], artifact_folder: Path, submitted: int = 1, **options: Any) -> Request:
+    """The instructions of a worker without anything special, on the processor."""
+    folder = str(artifact_folder)
+    return Request(specification, submitted, None, None, "cpu", 1, 0, folder, folder, **options)
+
+
+def path_of(artifact: Artifact) -> Path:
+    """The file that an artifact is, of a folder."""
+    assert artifact.storage.local is not None
+    return artifact.storage.local / artifact.stored.key
 
 
 def train_job(

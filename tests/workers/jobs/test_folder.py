@@ -6,7 +6,8 @@ import os
 from multiprocessing import get_context
 from pathlib import Path
 
-from ultragray_workers.jobs.folder import JobFolder, Progress
+from ultragray_workers.jobs.folder import JobFolder
+from ultragray_workers.jobs.progress import Progress
 
 
 def die_amid_the_work(path: Path) -> None:

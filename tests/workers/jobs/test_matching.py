@@ -5,9 +5,16 @@ from __future__ import annotations
 import pytest
 
 from ultragray.errors import InvalidArgument
+from ultragray_workers.jobs.demand import (
+    Demand,
+    LivingWorker,
+    Offer,
+    WorkerDevice,
+    demand_of_key,
+    offer_of_json,
+    waits_for,
+)
 from ultragray_workers.jobs.kinds import EvaluateJob, RenderJob, TrainJob
-from ultragray_workers.jobs.matching.demand import Demand, demand_of_key
-from ultragray_workers.jobs.matching.offer import LivingWorker, Offer, WorkerDevice, offer_of_json, waits_for
 from ultragray_workers.jobs.specification import to_dict
 
 PROCESSOR = WorkerDevice(name="cpu", model="a processor", memory_bytes=64 * 10**9, cores=8)

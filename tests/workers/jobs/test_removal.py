@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
-import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -15,13 +13,16 @@ import sqlalchemy as sa
 
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import DatasetInUse, DatasetNotFound, JobInUse, JobNotFound
-from ultragray_workers.jobs import removal
-from ultragray_workers.jobs.folder import JobFolder
-from ultragray_workers.jobs.queue.database import JobDatabase
-from ultragray_workers.jobs.queue.internals import SCHEMA
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs import queue
+from ultragray_workers.jobs.database import JobDatabase
+from ultragray_workers.jobs.folder import WORK
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
+from ultragray_workers.jobs.tables import JOBS
 from ultragray_workers.jobs.worker import housekeeping
 from ultragray_workers.jobs.worker.housekeeping import DAY_S, Housekeeper
+from ultragray_workers.storage.local import LocalStorage
 
 from ...postgres import NewDatabase
 from .conftest import train_job
@@ -34,32 +35,29 @@ def database_url(new_database: NewDatabase) -> str | None:
 
 @pytest.fixture
 def finished(store: JobStore, jobs: JobDatabase, artifact_folder: Path) -> Callable[..., tuple[Job, Path]]:
-    """Makes a cancelled job that ended so many days ago, with a folder as its process would have left it."""
-    columns = (sa.Column("workflow_uuid"), sa.Column("completed_at"))
-    rows = sa.Table("workflow_status", sa.MetaData(), *columns, schema=SCHEMA)
+    """Makes a cancelled job that ended so many days ago, with files as its worker would have left them."""
 
     def make(scene: str, days_ago: float = 0.0) -> tuple[Job, Path]:
         job = store.cancel(store.submit(train_job(scene))[0].id)
         ended_ms = int((time.time() - days_ago * DAY_S) * 1000)
         with jobs.engine.begin() as connection:
-            connection.execute(sa.update(rows).where(rows.c.workflow_uuid == job.id).values(completed_at=ended_ms))
-        folder = make_folder(artifact_folder, job.id, days_ago)
-        (folder / "job.json").write_text("{}")
-        return job, folder
+            connection.execute(sa.update(JOBS).where(JOBS.c.id == job.id).values(finished_ms=ended_ms))
+        return job, make_files(artifact_folder, job.id, days_ago)
 
     return make
 
 
-def make_folder(artifact_folder: Path, job_id: str, days_ago: float) -> Path:
-    folder = JobFolder(artifact_folder, job_id).path
-    (folder / "artifacts").mkdir(parents=True)
-    (folder / "artifacts" / "metrics.json").write_text("{}")
-    os.utime(folder, (time.time() - days_ago * DAY_S,) * 2)
-    return folder
+def make_files(artifact_folder: Path, job_id: str, days_ago: float, folder: str = "jobs") -> Path:
+    made = artifact_folder / folder / job_id
+    (made / "artifacts").mkdir(parents=True)
+    (made / "artifacts" / "metrics.json").write_text("{}")
+    for path in (made / "artifacts" / "metrics.json", made):
+        os.utime(path, (time.time() - days_ago * DAY_S,) * 2)
+    return made
 
 
-def left(artifact_folder: Path) -> set[str]:
-    return {path.name for path in (artifact_folder / "jobs").iterdir()}
+def left(artifact_folder: Path, folder: str = "jobs") -> set[str]:
+    return {path.name for path in (artifact_folder / folder).iterdir()}
 
 
 Finished = Callable[..., tuple[Job, Path]]
@@ -96,27 +94,6 @@ def test_what_another_job_goes_on_from_stays(store: JobStore, finished: Finished
     assert not folder.exists()
 
 
-def test_a_job_whose_process_still_ends_stays_whole(
-    store: JobStore, finished: Finished, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    job, folder = finished("one")
-    program = (
-        f"import fcntl, sys; lock = open({str(folder / 'lock')!r}, 'a'); fcntl.lockf(lock, fcntl.LOCK_EX); "
-        "print('locked', flush=True); sys.stdin.read()"
-    )
-    monkeypatch.setattr(removal, "_LOCK_WAIT_S", 0.2)
-    with subprocess.Popen([sys.executable, "-c", program], stdin=subprocess.PIPE, stdout=subprocess.PIPE) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline() == b"locked\n"
-        with pytest.raises(JobInUse, match="still being stopped"):
-            store.delete(job.id)
-        assert store.get(job.id).state is JobState.CANCELLED
-        assert (folder / "artifacts" / "metrics.json").exists()
-        process.communicate(b"")
-    store.delete(job.id)
-    assert not folder.exists()
-
-
 def test_jobs_are_counted_by_state(store: JobStore, finished: Finished) -> None:
     finished("one")
     finished("two")
@@ -139,20 +116,22 @@ def test_old_jobs_go_and_what_is_needed_stays(
     young, _ = finished("young", 29)
     source, _ = finished("source", 40)
     successor, _ = store.retry(source.id)
-    make_folder(artifact_folder, "0" * 24, 1.1)  # of a submission that failed
-    make_folder(artifact_folder, "1" * 24, 0.9)
-    worked = make_folder(artifact_folder, "2" * 24, 29)  # of a job that another database may know
-    (worked / "job.json").write_text("{}")
-    os.utime(worked, (time.time() - 29 * DAY_S,) * 2)
-    make_folder(artifact_folder, ".deleted-x", 0)
-    make_folder(artifact_folder, "not-a-job", 99)
+    make_files(artifact_folder, "0" * 24, 1.1)  # of a submission that failed
+    make_files(artifact_folder, "1" * 24, 0.9)
+    make_files(artifact_folder, "not-a-job", 99)
+    make_files(artifact_folder, f"{'2' * 24}.1", 1.1, WORK)  # of a worker that died
+    make_files(artifact_folder, f"{young.id}.1", 1.1, WORK)
 
-    assert Housekeeper(jobs, artifact_folder, 30).keep_house() == len(old) + 1
+    def keep_house() -> int:
+        return Housekeeper(jobs, artifact_folder, LocalStorage(artifact_folder), 30).keep_house()
+
+    assert keep_house() == len(old) + 2
     kept = {young.id, source.id}
-    assert left(artifact_folder) == kept | {"1" * 24, "2" * 24, "not-a-job"}
+    assert left(artifact_folder) == kept | {"1" * 24, "not-a-job"}
+    assert left(artifact_folder, WORK) == {f"{young.id}.1"}
     assert {job.id for job in store.list()[0]} == kept | {successor.id}
     store.cancel(successor.id)
-    assert Housekeeper(jobs, artifact_folder, 30).keep_house() == 1
+    assert keep_house() == 1
     assert source.id not in left(artifact_folder)
 
 
@@ -172,18 +151,18 @@ def test_a_deletion_and_a_submission_at_once_never_both_succeed(
     with pytest.raises(DatasetInUse, match="needed by the job"):
         datasets.delete("tiny", submit_in_between)
     assert datasets.get("tiny").name == "tiny"
-    assert [path.name for path in datasets.folder.iterdir()] == ["tiny"]
+    assert datasets.names() == ["tiny"]
     assert store.get(submitted[0].id).state is JobState.QUEUED
     store.cancel(submitted[0].id)
 
-    enqueue = JobDatabase.enqueue
+    submit = queue.submit
 
-    def delete_in_between(self: JobDatabase, *arguments: Any, **options: Any) -> None:
+    def delete_in_between(*arguments: Any) -> bool:
         """The dataset was there when it was looked for, and is gone before a deletion could see the job."""
         datasets.delete("tiny")
-        enqueue(self, *arguments, **options)
+        return submit(*arguments)
 
-    monkeypatch.setattr(JobDatabase, "enqueue", delete_in_between)
+    monkeypatch.setattr(queue, "submit", delete_in_between)
     with pytest.raises(DatasetNotFound):
         store.submit(train_job("two"), request_id="mine")
     assert store.overview().counts[JobState.QUEUED] == 0

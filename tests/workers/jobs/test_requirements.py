@@ -3,9 +3,7 @@
 from __future__ import annotations
 
 import errno
-import shutil
 from collections.abc import Callable
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,21 +15,16 @@ from ultragray.errors import InvalidArgument, InvalidImageSize, InvalidProbe, Lo
 from ultragray.samplers import AroundSampler, SplineSampler, TrainingSampler
 from ultragray.scene.confidence import ConfidenceModel
 from ultragray_workers.errors import DatabaseUnavailable, SceneNotFound, StorageFull
-from ultragray_workers.jobs import requirements
+from ultragray_workers.jobs import queue
 from ultragray_workers.jobs.kinds import RenderJob, render
 from ultragray_workers.jobs.kinds.base import Surroundings
-from ultragray_workers.jobs.queue.database import JobDatabase
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.scenes import SceneStore
+from ultragray_workers.storage import local
 
 INFO = {"probe": LinearProbe(30.0, 0.0, 40.0), "image_height": 24, "image_width": 20}
 POSES = np.tile(np.eye(4), (3, 1, 1))
 MODEL = ConfidenceModel((3.5, 1.2, 0.8, 0.1, 0.6), 0.06, (0.0,) * 3, 20, 0.04).to_dict()
-
-
-@dataclass
-class Disk:
-    free: int
 
 
 @pytest.fixture
@@ -98,22 +91,19 @@ def test_room_for_all_pixels(
     needed_bytes: int,
     save: Callable[..., bytes],
     scenes: SceneStore,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     save("one")
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: Disk(needed_bytes))
-    job.check(Surroundings(scenes.header("one"), tmp_path, 64))
-    monkeypatch.setattr(shutil, "disk_usage", lambda path: Disk(needed_bytes - 1))
+    job.check(Surroundings(scenes.header("one"), needed_bytes, 64))
+    job.check(Surroundings(scenes.header("one"), None, 64))
     with pytest.raises(StorageFull, match=r"frames of .* take up to .* left"):
-        job.check(Surroundings(scenes.header("one"), tmp_path, 64))
+        job.check(Surroundings(scenes.header("one"), needed_bytes - 1, 64))
 
 
 def test_given_poses_are_assessed_where_that_is_quick(
-    save: Callable[..., bytes], scenes: SceneStore, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    save: Callable[..., bytes], scenes: SceneStore, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def check(job: RenderJob) -> None:
-        job.check(Surroundings(scenes.header(job.scene), tmp_path, 64))
+        job.check(Surroundings(scenes.header(job.scene), None, 64))
 
     save("one", confidence=MODEL)
     save("plain")
@@ -137,7 +127,7 @@ def test_submission_sent_again_after_a_failure_takes_the_scene_of_now(
 
     save("one", seed=1)
     with monkeypatch.context() as context:
-        context.setattr(JobDatabase, "enqueue", away)
+        context.setattr(queue, "submit", away)
         with pytest.raises(DatabaseUnavailable):
             rendering_store.submit(RenderJob(scene="one", poses=POSES), request_id="mine")
     now = save("one", seed=2)
@@ -177,10 +167,10 @@ def test_scene_that_goes_meanwhile_and_a_disk_that_is_full(
     def full(source: Path, target: Path) -> None:
         raise OSError(errno.ENOSPC, "full")
 
-    monkeypatch.setattr(requirements, "link_or_copy", full)
+    monkeypatch.setattr(local, "link_or_copy", full)
     with pytest.raises(StorageFull, match="no room for the scene"):
         rendering_store.submit(RenderJob(scene="one", poses=POSES))
-    monkeypatch.setattr(requirements, "link_or_copy", gone)
+    monkeypatch.setattr(local, "link_or_copy", gone)
     with pytest.raises(SceneNotFound):
         rendering_store.submit(RenderJob(scene="one", poses=POSES))
     assert not (tmp_path / "one.ugr").exists()

@@ -21,7 +21,7 @@ from ultragray_workers.shelves import index as index_module
 from ultragray_workers.shelves.bucket import BucketShelf
 from ultragray_workers.shelves.index import SceneIndex
 from ultragray_workers.storage.cache import Cache
-from ultragray_workers.storage.opening import open_storage
+from ultragray_workers.storage.location import open_storage
 from ultragray_workers.storage.storage import Storage
 
 from ...object_storage import FaultyProxy

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from ultragray_workers.storage.opening import open_storage
+from ultragray_workers.storage.location import open_storage
 from ultragray_workers.storage.storage import Storage
 
 

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
+from ultragray_workers.backup.copying import Copied, copy_scenes
 from ultragray_workers.errors import RestoreRefused
-from ultragray_workers.storage.copying import Copied, copy_scenes
 from ultragray_workers.storage.local import LocalStorage
 from ultragray_workers.storage.storage import Storage
 

@@ -12,7 +12,7 @@ import pytest
 from ultragray.errors import ExtraMissing
 from ultragray_workers.errors import StorageUnavailable
 from ultragray_workers.storage import remote
-from ultragray_workers.storage.opening import open_storage
+from ultragray_workers.storage.location import open_storage
 from ultragray_workers.storage.storage import NotThere, Storage
 
 from ...object_storage import Fault, FaultyProxy

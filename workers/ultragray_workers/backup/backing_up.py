@@ -25,11 +25,12 @@ from ultragray_workers.backup.database_copy import Database
 from ultragray_workers.backup.manifest import FileEntry, Manifest
 from ultragray_workers.backup.objects import Objects
 from ultragray_workers.errors import BackupInvalid, RestoreRefused
-from ultragray_workers.jobs.queue.database import CANCELLED, QUEUED, RUNNING, SUCCEEDED
+from ultragray_workers.jobs.progress import JobState
 
 _SETTLE_S = 5.0  # a job that is just being deleted has lost its folder, and soon its row
 _SETTLE_POLL_S = 0.1
 _Known = dict[tuple[str, str], FileEntry]
+_States = Mapping[str, JobState]
 
 
 @dataclass(frozen=True)
@@ -100,30 +101,32 @@ class _Backup:
         self._copy_files()
         with tempfile.TemporaryDirectory(dir=backup_folder, prefix=".work-") as work:
             snapshot = self._database.snapshot(self._objects, Path(work))
-        taken = {} if snapshot is None else dict(snapshot.statuses)
+        taken = {} if snapshot is None else dict(snapshot.states)
         entries = self._copy_files()
         now, entries = self._settled(taken, entries)
         deleted = taken.keys() - now.keys()
         kept = taken.keys() - deleted
         files = tuple(entry for entry in entries if (job := job_id_of(entry.root, entry.path)) is None or job in kept)
-        waiting = {job for job in kept if taken[job] in (*QUEUED, *RUNNING)}
+        waiting = {job for job in kept if not taken[job].is_final}
         return Manifest(
             name=name,
             release=ultragray.__version__,
             files=files,
             database=None if snapshot is None else snapshot.entry,
             deleted_jobs=tuple(sorted(deleted)),
-            cancelled_jobs=tuple(sorted(job for job in waiting if now[job] in CANCELLED)),
+            cancelled_jobs=tuple(sorted(job for job in waiting if now[job] is JobState.CANCELLED)),
             counts=_counts(files, kept, waiting),
         )
 
-    def _settled(self, taken: Mapping[str, str], entries: list[FileEntry]) -> tuple[Mapping[str, str], list[FileEntry]]:
+    def _settled(
+        self, taken: Mapping[str, JobState], entries: list[FileEntry]
+    ) -> tuple[Mapping[str, JobState], list[FileEntry]]:
         """The jobs as they are after the files were copied, and the files, when no job is half deleted."""
         end = time.monotonic() + _SETTLE_S
         while True:
-            now = self._database.statuses()
+            now = self._database.states()
             found = {job_id_of(entry.root, entry.path) for entry in entries}
-            lost = [job for job in now if taken.get(job) in SUCCEEDED and job not in found]
+            lost = [job for job in now if taken.get(job) is JobState.SUCCEEDED and job not in found]
             if not lost or time.monotonic() > end:  # its folder was lost otherwise, which a backup does not mend
                 return now, entries
             time.sleep(_SETTLE_POLL_S)
@@ -176,9 +179,7 @@ def _remove_unused(backup_folder: Path, objects: Objects) -> int:
 
 def _counts(files: Iterable[FileEntry], jobs: Iterable[str], waiting: Iterable[str]) -> dict[str, int]:
     kinds = Counter("scenes" if entry.root == DATA else entry.path.partition("/")[0] for entry in files)
-    datasets = {
-        entry.path.split("/")[1] for entry in files if entry.root != DATA and entry.path.startswith("datasets/")
-    }
+    datasets = {entry.path for entry in files if entry.root != DATA and entry.path.startswith("datasets/")}
     return {
         "scenes": kinds["scenes"],
         "datasets": len(datasets),

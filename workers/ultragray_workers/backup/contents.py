@@ -7,19 +7,15 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from ultragray_workers.datasets.store import FOLDER as DATASETS
-from ultragray_workers.datasets.store import DatasetStore
-from ultragray_workers.jobs.folder import FOLDER as JOBS
-from ultragray_workers.jobs.folder import JobFolder
-from ultragray_workers.jobs.publication import SCENES_FOLDER
+from ultragray_workers.datasets.shelf import FILES, MANIFESTS
+from ultragray_workers.jobs.files import FOLDER as JOBS
 from ultragray_workers.scenes import SUFFIX, SceneStore
+from ultragray_workers.shelves.opening import SCENES_FOLDER
 from ultragray_workers.storage.local import FileVersion
 from ultragray_workers.store import MARKER
 
 DATA, ARTIFACTS = "data", "artifacts"
-_GROWING = (".txt", ".jsonl", ".log")
-_OF_A_PROCESS = (".lock", ".partial", ".tmp", ".new")
-_OF_A_JOBS_PROCESS = {path.name for path in (JobFolder(Path(), "").lock, JobFolder(Path(), "").reserve)}
+_OF_A_PROCESS = (".lock", ".tmp", ".new")
 
 
 @dataclass(frozen=True)
@@ -32,8 +28,8 @@ class StoredFile:
 
     @property
     def grows(self) -> bool:
-        """Whether somebody may be writing lines at its end."""
-        return self.root == ARTIFACTS and self.path.parts[0] == JOBS and self.path.suffix in _GROWING
+        """Whether somebody may be writing at its end."""
+        return self.path.suffix == ".log"
 
     def version(self) -> FileVersion:
         """Tells one content from the next, without reading it. Raises OSError."""
@@ -74,12 +70,9 @@ def _files(folders: Folders, database: Path | None) -> Iterator[StoredFile]:
     for name in SceneStore(artifacts / SCENES_FOLDER).names():
         path = PurePosixPath(SCENES_FOLDER, f"{name}{SUFFIX}")
         yield StoredFile(ARTIFACTS, path, artifacts / path)
-    for name in DatasetStore(artifacts).names():
-        yield from _below(artifacts, PurePosixPath(DATASETS, name))
-    for entry in _entries(artifacts / JOBS):
-        if not entry.name.startswith("."):
-            kept = _below(artifacts, PurePosixPath(JOBS, entry.name))
-            yield from (file for file in kept if not any(map(_is_of_a_process, file.path.parts[2:])))
+    for folder in (FILES, MANIFESTS, JOBS):  # a dataset's files are there before its manifest
+        kept = _below(artifacts, PurePosixPath(folder))
+        yield from (file for file in kept if not any(map(_is_of_a_process, file.path.parts[1:])))
     for entry in _entries(artifacts):  # facts about the folder itself
         is_database = database is not None and entry.name.startswith(database.name)
         if entry.is_file() and not is_database and not _is_of_a_process(entry.name) and entry.name != MARKER:
@@ -103,4 +96,4 @@ def _entries(folder: Path) -> list[os.DirEntry[str]]:
 
 
 def _is_of_a_process(name: str) -> bool:
-    return name.startswith(".") or name.endswith(_OF_A_PROCESS) or name in _OF_A_JOBS_PROCESS
+    return name.startswith(".") or name.endswith(_OF_A_PROCESS)

@@ -16,21 +16,18 @@ from urllib.parse import quote
 
 import psycopg
 import sqlalchemy as sa
-from dbos import DBOS
 from psycopg import sql
 
 from ultragray_workers.backup.manifest import DatabaseEntry, TableEntry
 from ultragray_workers.backup.objects import Objects
 from ultragray_workers.errors import BackupInvalid, RestoreRefused
-from ultragray_workers.jobs.kinds import KINDS
-from ultragray_workers.jobs.queue import tables
-from ultragray_workers.jobs.queue.database import checked_url
-from ultragray_workers.jobs.queue.heartbeat import DEAD_AFTER_S
-from ultragray_workers.jobs.queue.internals import QUEUE_VERSION, SCHEMA, WORKFLOWS, latest_queue_version
-from ultragray_workers.jobs.queue.tables import SCHEMA_VERSION, WORKERS
+from ultragray_workers.jobs import queue, tables
+from ultragray_workers.jobs.database import checked_url
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.tables import JOBS, SCHEMA, SCHEMA_VERSION, TABLES, WORKERS
 
 _SQLITE_WAIT_S = 60.0
-_NOT_COPIED = {QUEUE_VERSION.name, SCHEMA_VERSION.name, WORKERS.name}
+_COPIED = [table for table in TABLES.sorted_tables if table not in (SCHEMA_VERSION, WORKERS)]
 _BLOCK_BYTES = 2**20
 
 
@@ -39,11 +36,11 @@ class Snapshot:
     """A database at one moment."""
 
     entry: DatabaseEntry
-    statuses: Mapping[str, str]  # of all jobs
+    states: Mapping[str, JobState]  # of all jobs
 
 
 class Database:
-    """The database of an installation, opened neither to make nor to migrate its tables."""
+    """The database of an installation, whose tables are not made by opening it."""
 
     def __init__(self, artifact_folder: Path, database_url: str | None) -> None:
         """Raises StartupFailed for a URL that names no database."""
@@ -72,40 +69,41 @@ class Database:
             source.backup(target)  # in one step, so that nobody writes in between
         stored = objects.add(copy)
         with _connected(sa.URL.create("sqlite", database=str(copy))) as connection:
-            statuses = _statuses(connection)
+            states = _states(connection)
             entry = DatabaseEntry(
-                **_versions(connection), jobs=_counted(statuses), sha256=stored.sha256, bytes=stored.version.size
+                "sqlite", tables.version(connection) or 0, _counted(states), stored.sha256, stored.version.size
             )
-        return Snapshot(entry, statuses)
+        return Snapshot(entry, states)
 
-    def statuses(self) -> Mapping[str, str]:
-        """The status of every job as it is now."""
+    def states(self) -> Mapping[str, JobState]:
+        """The state of every job as it is now."""
         if self.sqlite is not None and not self.sqlite.is_file():
             return {}
         with _connected(self.url) as connection:
-            return _statuses(connection)
+            return _states(connection)
 
     def _postgresql_snapshot(self, objects: Objects, work_folder: Path) -> Snapshot | None:
         with _connected(self.url, is_patient=True, at_one_moment=True) as connection:
-            if not sa.inspect(connection).has_table(WORKFLOWS.name, schema=SCHEMA):
+            if not sa.inspect(connection).has_table(JOBS.name, schema=SCHEMA):
                 return None
             entries = []
-            for table in _tables_of(connection):
+            for table in _COPIED:
                 columns = tuple(column.name for column in table.columns)
                 copy = work_folder / "table"
                 rows = _copy_out(connection, table, columns, copy)
                 stored = objects.add(copy)
                 entries.append(TableEntry(table.name, columns, rows, stored.sha256, stored.version.size))
-            statuses = _statuses(connection)
-            entry = DatabaseEntry(**_versions(connection), jobs=_counted(statuses), tables=tuple(entries))
-        return Snapshot(entry, statuses)
+            states = _states(connection)
+            version = tables.version(connection) or 0
+            entry = DatabaseEntry("postgresql", version, _counted(states), tables=tuple(entries))
+        return Snapshot(entry, states)
 
     def holds_jobs(self) -> bool:
         """Whether a restore would replace something."""
         if self.sqlite is not None:
             return self.sqlite.exists()
         with _connected(self.url) as connection:
-            return sa.inspect(connection).has_table(WORKFLOWS.name, schema=SCHEMA) and bool(_statuses(connection))
+            return sa.inspect(connection).has_table(JOBS.name, schema=SCHEMA) and bool(_states(connection))
 
     def workers_at_work(self) -> list[str]:
         """The workers that have told a moment ago that they are alive."""
@@ -114,26 +112,22 @@ class Database:
         with _connected(self.url) as connection:
             if not sa.inspect(connection).has_table(WORKERS.name, schema=SCHEMA):
                 return []
-            age_s = sa.func.extract("epoch", sa.func.clock_timestamp()) - WORKERS.c.seen_at_s
-            return list(connection.execute(sa.select(WORKERS.c.executor).where(age_s < DEAD_AFTER_S)).scalars())
+            age_s = queue.now_s(connection.engine) - WORKERS.c.seen_at_s
+            return list(connection.execute(sa.select(WORKERS.c.name).where(age_s < queue.DEAD_AFTER_S)).scalars())
 
     def check_loadable(self, entry: DatabaseEntry) -> None:
-        """Raises RestoreRefused for a copy of another kind of database, BackupInvalid for one of a newer release."""
+        """Raises RestoreRefused for a copy of another kind of database, BackupInvalid for one of another release."""
         if entry.kind != self.kind:
             raise RestoreRefused(
                 f"the backup holds a database of the kind {entry.kind}, and the settings name one of the kind "
                 f"{self.kind} (ULTRAGRAY_DATABASE_URL)",
                 field="database_url",
             )
-        for what, found, known in (
-            ("our own tables", entry.tables_version, tables.VERSION),
-            ("the queue's tables", entry.queue_version, latest_queue_version(self.kind)),
-        ):
-            if found > known:
-                raise BackupInvalid(
-                    f"the backup holds version {found} of {what}, and this release knows them up to version {known}: "
-                    "restore it with the release that made it, or a newer one"
-                )
+        if entry.tables_version != tables.VERSION:
+            raise BackupInvalid(
+                f"the backup holds tables of version {entry.tables_version}, and this release knows version "
+                f"{tables.VERSION}: restore it with the release that made it"
+            )
 
     def load(self, entry: DatabaseEntry, objects: Objects) -> None:
         """Makes the tables of a PostgreSQL database anew, whatever they held, with the rows of a copy.
@@ -143,20 +137,15 @@ class Database:
         with tables.one_at_a_time(self.url):
             with _connected(self.url) as connection:
                 connection.execute(sa.schema.DropSchema(SCHEMA, cascade=True, if_exists=True))
-            DBOS.migrate(self.url.render_as_string(hide_password=False))
+            engine = sa.create_engine(self.url, poolclass=sa.NullPool)
+            tables.make_tables(engine)
             with _connected(self.url, is_patient=True) as connection:
-                tables.migrate_to(connection, entry.tables_version)  # which has the columns of the copy
                 copied = {one.name: one for one in entry.tables}
-                made = _tables_of(connection)
-                for table in reversed(made):  # of what the migrations write
-                    if table.name in copied:
-                        connection.execute(sa.delete(table))
-                for table in made:  # those that others refer to come first
-                    if (one := copied.pop(table.name, None)) is not None:
-                        _copy_in(connection, one, objects.path(one.sha256))
-                        _count_on(connection, table)
-                if copied:
-                    raise BackupInvalid(f"the backup holds tables that this release does not know: {', '.join(copied)}")
+                for table in _COPIED:
+                    connection.execute(sa.delete(table))  # of what is there from the start
+                    one = copied[table.name]
+                    _copy_in(connection, one, objects.path(one.sha256))
+                    _count_on(connection, table)
 
 
 @contextmanager
@@ -174,30 +163,13 @@ def _connected(url: sa.URL, *, is_patient: bool = False, at_one_moment: bool = F
         yield connection
 
 
-def _statuses(connection: sa.Connection) -> dict[str, str]:
-    rows = WORKFLOWS.c
-    found = connection.execute(sa.select(rows.workflow_uuid, rows.status).where(rows.name.in_(KINDS)))
-    return {row[0]: row[1] for row in found}
+def _states(connection: sa.Connection) -> dict[str, JobState]:
+    found = connection.execute(sa.select(JOBS.c.id, JOBS.c.state).where(JOBS.c.batch.is_(None)))
+    return {job_id: JobState(state) for job_id, state in found}
 
 
-def _counted(statuses: Mapping[str, str]) -> dict[str, int]:
-    return {status: sum(one == status for one in statuses.values()) for status in sorted(set(statuses.values()))}
-
-
-def _versions(connection: sa.Connection) -> dict[str, Any]:
-    """The first fields of an entry."""
-    return {
-        "kind": connection.dialect.name,
-        "tables_version": tables.version(connection),
-        "queue_version": connection.execute(sa.select(QUEUE_VERSION.c.version)).scalar() or 0,
-    }
-
-
-def _tables_of(connection: sa.Connection) -> list[sa.Table]:
-    """The tables of a PostgreSQL database whose rows belong to a backup; those that others refer to come first."""
-    found = sa.MetaData()
-    found.reflect(connection, schema=SCHEMA, only=lambda name, _: name not in _NOT_COPIED)
-    return found.sorted_tables
+def _counted(states: Mapping[str, JobState]) -> dict[str, int]:
+    return {state.value: sum(one is state for one in states.values()) for state in sorted(set(states.values()))}
 
 
 def _copy_out(connection: sa.Connection, table: sa.Table, columns: Iterable[str], target: Path) -> int:

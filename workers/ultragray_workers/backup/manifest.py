@@ -50,9 +50,8 @@ class DatabaseEntry:
     """The database at one moment: a SQLite file, or the rows of PostgreSQL's tables."""
 
     kind: str  # sqlite or postgresql
-    tables_version: int  # of our own tables
-    queue_version: int  # of those of DBOS
-    jobs: dict[str, int]  # how many, by their status in the queue
+    tables_version: int
+    jobs: dict[str, int]  # how many, by their state
     sha256: str | None = None  # of the SQLite file
     bytes: int = 0
     tables: tuple[TableEntry, ...] = ()
@@ -116,10 +115,10 @@ def read(backup_folder: Path, name: str | None) -> Manifest:
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
         told, version = document.pop("sha256"), document["format_version"]
-        if version > FORMAT_VERSION:
+        if version != FORMAT_VERSION:
             raise BackupInvalid(
-                f"{path} has version {version} of the format of backups, and this release reads them up to version "
-                f"{FORMAT_VERSION}: restore it with release {document['release']} or a newer one"
+                f"{path} has version {version} of the format of backups, and this release reads version "
+                f"{FORMAT_VERSION}: restore it with release {document['release']}"
             )
         if told != _sha256(document):
             raise ValueError("it does not have its own hash")

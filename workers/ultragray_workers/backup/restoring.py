@@ -22,9 +22,9 @@ from ultragray_workers.backup.database_copy import Database
 from ultragray_workers.backup.manifest import FileEntry, Manifest
 from ultragray_workers.backup.objects import Objects
 from ultragray_workers.errors import BackupInvalid, RestoreRefused
-from ultragray_workers.jobs.queue import unfinished
-from ultragray_workers.jobs.queue.database import JobDatabase
-from ultragray_workers.jobs.queue.tables import WORKERS
+from ultragray_workers.jobs import queue
+from ultragray_workers.jobs.database import JobDatabase
+from ultragray_workers.jobs.tables import WORKERS
 from ultragray_workers.scenes import SUFFIX
 from ultragray_workers.store import (
     PRIVATE_FILE,
@@ -167,16 +167,15 @@ def _load_database(manifest: Manifest, database: Database, objects: Objects) -> 
 
 
 def _let_jobs_go_on(manifest: Manifest, artifact_folder: Path, database_url: str | None) -> None:
-    """Brings the tables to this release's version; what ran waits again, and what was taken away goes."""
+    """Lets what ran wait again, and takes away what was taken away while the backup was made."""
     jobs = JobDatabase(artifact_folder, database_url)
     try:
         with jobs.engine.begin() as connection:
             connection.execute(sa.delete(WORKERS))  # of the processes of then
-        if manifest.cancelled_jobs:
-            jobs.client.cancel_workflows(list(manifest.cancelled_jobs))
-        if manifest.deleted_jobs:
-            jobs.client.delete_workflows(list(manifest.deleted_jobs))
-        for job_id, executor in unfinished.running(jobs):
-            jobs.put_back(job_id, executor)
+        for job_id in manifest.cancelled_jobs:
+            queue.cancel(jobs.engine, job_id)
+        for job_id in manifest.deleted_jobs:
+            queue.forget(jobs.engine, job_id)
+        queue.put_back_of(jobs.engine)
     finally:
         jobs.close()

@@ -20,7 +20,7 @@ from ultragray.exchange.batches import BatchPlan
 from ultragray.installation import missing_extra
 from ultragray_workers.batches.place import ShardPlace
 from ultragray_workers.errors import StorageUnavailable
-from ultragray_workers.storage.opening import open_storage
+from ultragray_workers.storage.location import open_storage
 
 if TYPE_CHECKING:
     from ultragray.exchange.shards import ShardRenderer

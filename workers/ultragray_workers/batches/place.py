@@ -17,7 +17,8 @@ from dataclasses import asdict
 from pathlib import Path
 
 from ultragray.errors import InvalidArgument
-from ultragray.exchange.batches import MANIFEST_FILE, BatchPlan, ShardEntry, manifest
+from ultragray.exchange import batches as manifest
+from ultragray.exchange.batches import MANIFEST_FILE, BatchPlan, ShardEntry
 from ultragray.files import sync
 from ultragray_workers.storage.storage import NotThere, Storage
 

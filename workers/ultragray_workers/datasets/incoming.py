@@ -10,7 +10,7 @@ from typing import IO
 
 from ultragray.errors import DatasetInvalid
 from ultragray.files import sync
-from ultragray_workers.claims import DELETED_PREFIX, claimed_folder, remove_abandoned, storage_full
+from ultragray_workers.claims import claimed_folder, remove_abandoned, storage_full
 from ultragray_workers.datasets.shelf import FILES_NAME
 from ultragray_workers.datasets.store import DatasetRecord, DatasetStore
 from ultragray_workers.datasets.unpack import FileBudget, create_below
@@ -35,7 +35,7 @@ class IncomingDataset:
         self._discarded = False
         with storage_full("the dataset"), contextlib.ExitStack() as stack:
             self.folder = stack.enter_context(claimed_folder(store.folder, PREFIX))
-            stack.enter_context(store.shelf.claimed(self.folder.name))
+            stack.enter_context(store.shelf.storage.claimed(self.folder.name))
             (self.folder / DATASET_NAME / FILES_NAME).mkdir(parents=True)
             self._claim = stack.pop_all()
 
@@ -76,7 +76,7 @@ class IncomingDataset:
 
         In the other order a dataset that appears in between would be missed.
         """
-        return (claim is not None and self._store.shelf.is_claimed(claim)) or self._store.is_taken(name)
+        return (claim is not None and self._store.shelf.storage.is_claimed(claim)) or self._store.is_taken(name)
 
     def present(self, name: str) -> DatasetRecord:
         """As `DatasetStore.present`."""
@@ -113,5 +113,5 @@ class IncomingDataset:
 
 
 def remove_stale(store: DatasetStore) -> int:
-    """Remove what dead services left of uploads and deletions; how many. Uploads of live ones, anywhere, stay."""
-    return sum(remove_abandoned(store.folder, prefix) for prefix in (PREFIX, DELETED_PREFIX))
+    """Remove what dead services left of uploads; how many. Uploads of live ones, anywhere, stay."""
+    return remove_abandoned(store.folder, PREFIX)

@@ -12,10 +12,9 @@ from pathlib import Path
 from ultragray.errors import UltragrayError
 from ultragray.files import sync
 from ultragray_workers.claims import storage_full
-from ultragray_workers.datasets.contents import find_source
 from ultragray_workers.datasets.incoming import ARCHIVE_NAME, DATASET_NAME
 from ultragray_workers.datasets.shelf import CONTACT_SHEET_NAME, FILES_NAME
-from ultragray_workers.datasets.store import DatasetRecord, write_manifest
+from ultragray_workers.datasets.store import DatasetRecord, find_source, write_manifest
 from ultragray_workers.datasets.unpack import unpack
 
 

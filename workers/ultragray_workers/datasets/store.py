@@ -1,4 +1,4 @@
-"""The datasets of an artifact folder, or of a storage that hosts share: each appears and goes whole. Free of torch."""
+"""The datasets of an installation: the one in a folder of files, what a dataset says of itself, and which there are."""
 
 from __future__ import annotations
 
@@ -6,28 +6,78 @@ import contextlib
 import json
 import re
 from collections.abc import Callable
-from dataclasses import MISSING, dataclass, fields, replace
+from dataclasses import dataclass, fields, replace
+from fnmatch import fnmatchcase
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from ultragray.contract import Contract, described, from_dict, to_dict
-from ultragray.datasets.source import UPLOADED_FORMATS
+from ultragray.datasets.source import UPLOADED_FORMATS, DatasetFormat, SourceOptions, load_dataset
 from ultragray.errors import DatasetInvalid, InvalidArgument, UltragrayError
 from ultragray.files import require_version, write_whole
 from ultragray.geometry.probe import Probe
 from ultragray.learn.sweep import ImageRegion
-from ultragray_workers.datasets.contents import find_source
-from ultragray_workers.datasets.copies import DEFAULT_MAX_BYTES
-from ultragray_workers.datasets.shared_shelf import SharedShelf
-from ultragray_workers.datasets.shelf import FILES_NAME as FILES_NAME
-from ultragray_workers.datasets.shelf import MANIFEST_NAME, FolderShelf, Shelf
+from ultragray_workers.datasets.shelf import MANIFEST_NAME, DatasetShelf
 from ultragray_workers.errors import DatasetExists, DatasetInUse, DatasetNotFound, known_names
+from ultragray_workers.storage.copies import DEFAULT_MAX_BYTES
+from ultragray_workers.storage.local import LocalStorage
+from ultragray_workers.storage.location import open_storage
 from ultragray_workers.storage.storage import Storage
 
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset
 
-FOLDER = "datasets"
+
+_NAMES_IN_MESSAGE = 5
+
+
+@dataclass(frozen=True)
+class UploadedSource:
+    """The file by which the dataset is known, and the files that are options of it."""
+
+    format: DatasetFormat
+    path: Path
+    companions: dict[str, Path]  # by the name of the option
+
+    def load(self, options: dict[str, str]) -> Dataset:
+        """Read the dataset. Raises as `load_dataset`."""
+        given: dict[str, Any] = {**options, **self.companions}
+        return load_dataset(self.path, SourceOptions(**given))
+
+
+def find_source(files: Path) -> UploadedSource:
+    """The dataset below a folder. Raises DatasetInvalid, naming files from that folder, where there is not one."""
+    relative = sorted(path.relative_to(files) for path in files.rglob("*") if path.is_file())
+    plain = [path for path in relative if not any(part.startswith((".", "__MACOSX")) for part in path.parts)]
+    sources = [(one, path) for one in UPLOADED_FORMATS for path in plain if one.is_file(path)]
+    if not sources:
+        expected = " or ".join(one.upload_meaning for one in UPLOADED_FORMATS)
+        raise DatasetInvalid(f"the upload must hold {expected}, it holds {_listed(plain) or 'no files'}")
+    if len(sources) > 1:
+        raise DatasetInvalid(f"the upload must hold one dataset, it holds {_listed([path for _, path in sources])}")
+    ((found, source),) = sources
+    companions = {}
+    for option, pattern in found.companions.items():
+        matching = [path for path in plain if fnmatchcase(path.name.lower(), pattern)]
+        if len(matching) > 1:
+            raise DatasetInvalid(f"the upload must hold at most one {option} ({pattern}), it holds {_listed(matching)}")
+        if matching:
+            companions[option] = files / matching[0]
+    return UploadedSource(found, files / source, companions)
+
+
+def _listed(paths: list[Path]) -> str:
+    shown = ", ".join(map(str, paths[:_NAMES_IN_MESSAGE]))
+    return shown + (f" and {len(paths) - _NAMES_IN_MESSAGE} more" if len(paths) > _NAMES_IN_MESSAGE else "")
+
+
+# The datasets of an installation: what a dataset says of itself, and which there are. Free of torch.
+#
+# An upload arrives in `datasets.incoming`, is checked by `datasets.intake`, and becomes a dataset here; where its
+# files lie is known to `datasets.shelf`.
+
+
+UPLOADS = "uploads"  # of the artifact folder
 FORMAT_VERSION = 1  # of the manifest
 _NOT_KEPT = ("owner", "private")  # in the manifest: they are the database's
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
@@ -56,19 +106,15 @@ class DatasetRecord(Contract):
         "Of a sequence: where its frames lie in the stored images, and its calibration; null where that is not known.",
         None,
     )
-    owner: str | None = described("Who uploaded it; null: from before there were owners.", None)
+    owner: str | None = described("Who uploaded it; null: nobody who is known.", None)
     private: bool = described("Whether others may not see it.", False)
 
     @classmethod
     def from_json(cls, text: str) -> DatasetRecord:
         """The record of a manifest. Raises ValueError, KeyError or TypeError for anything else."""
         document: dict[str, Any] = json.loads(text)
-        require_version(document.get("format_version", FORMAT_VERSION), FORMAT_VERSION)  # early ones have none
-        kept = [one for one in fields(cls) if one.name not in _NOT_KEPT]
-        later = {one.name for one in kept if one.default is not MISSING}  # than the first manifests
-        return from_dict(
-            cls, {one.name: document[one.name] for one in kept if one.name in document or one.name not in later}
-        )
+        require_version(document["format_version"], FORMAT_VERSION)
+        return from_dict(cls, {one.name: document[one.name] for one in fields(cls) if one.name not in _NOT_KEPT})
 
 
 class DatasetStore:
@@ -77,20 +123,18 @@ class DatasetStore:
     def __init__(
         self,
         artifact_folder: Path,
-        shared: Storage | None = None,
+        storage: Storage | None = None,
         max_copies_bytes: int = DEFAULT_MAX_BYTES,
         *,
         hides: Callable[[str], bool] = lambda name: False,
     ) -> None:
-        """`shared`: where the datasets of several hosts lie; None: in the artifact folder, for all who see that.
+        """`storage`: where the datasets lie; None: in the artifact folder.
 
-        `max_copies_bytes`: of this host's copies of shared ones, beside those in use. `hides`: whether a dataset is
-        hidden from whoever asks, who does not find it then.
+        `max_copies_bytes`: of this host's copies, where the storage is elsewhere, beside those in use. `hides`: whether
+        a dataset is hidden from whoever asks, who does not find it then.
         """
-        self.folder = Path(artifact_folder) / FOLDER  # in which uploads to this host arrive
-        self.shelf: Shelf = FolderShelf(self.folder)
-        if shared is not None:
-            self.shelf = SharedShelf(shared, self.folder, max_copies_bytes)
+        self.folder = Path(artifact_folder) / UPLOADS  # in which uploads to this host arrive
+        self.shelf = DatasetShelf(storage or LocalStorage(Path(artifact_folder)), self.folder, max_copies_bytes)
         self.hides = hides
 
     def names(self) -> list[str]:
@@ -131,7 +175,7 @@ class DatasetStore:
         with self.shelf.files(name) as files:
             return replace(find_source(files).load(record.options), name=name)
 
-    def contact_sheet(self, name: str) -> Path:
+    def contact_sheet(self, name: str) -> bytes:
         """The PNG. Raises DatasetNotFound."""
         self._require_existing(name)
         return self.shelf.contact_sheet(name)
@@ -142,8 +186,9 @@ class DatasetStore:
         Where there is one already, it stays: with the same content and options it is the answer, else
         DatasetExists is raised.
         """
-        record = DatasetRecord.from_json((folder / MANIFEST_NAME).read_text(encoding="utf-8"))
-        if self.shelf.put(folder, name):
+        manifest = (folder / MANIFEST_NAME).read_text(encoding="utf-8")
+        record = DatasetRecord.from_json(manifest)
+        if self.shelf.put(folder, manifest, name):
             return record, True
         return self.present(folder, name), False
 
@@ -208,3 +253,10 @@ def write_manifest(record: DatasetRecord, folder: Path) -> None:
 def _require_unused(name: str, in_use: Callable[[str], str | None]) -> None:
     if (user := in_use(name)) is not None:
         raise DatasetInUse(f"the dataset {name!r} is needed by {user}", field="dataset")
+
+
+def open_datasets(
+    artifact_folder: str | Path, storage: str | None, max_copies_bytes: int = DEFAULT_MAX_BYTES
+) -> DatasetStore:
+    """The datasets at a location that a process is told in words; None: in the artifact folder."""
+    return DatasetStore(Path(artifact_folder), None if storage is None else open_storage(storage), max_copies_bytes)

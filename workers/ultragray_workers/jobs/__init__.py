@@ -1,5 +1,5 @@
 """Training and batch rendering as durable jobs: what is asked for, the store, and the workers. Free of torch.
 
-Only what `run_job` imports in its own process loads torch. The queue is DBOS: a SQLite file in the artifact folder, or
-PostgreSQL. `store` and `supervision` are the two ends: one submits, the other runs.
+`store` submits and tells, `worker.supervision` runs; between them are the table `jobs` (`queue`, `record`) and the
+storage of the files (`files`). Only what `worker.run_job` imports in its own process loads torch.
 """

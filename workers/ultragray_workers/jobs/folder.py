@@ -1,16 +1,17 @@
-"""The folder of one job, which its worker and its training process write and the service reads.
+"""The working folder of an attempt at a job on the host of its worker, in which the worker and the job's process meet.
 
 job.json        what is asked for: written by the worker before its process starts
 lock            held by the one process that works in the folder, whose number it says
-NAME.ugr        the scene that the job needs, as it was when the job was submitted
+NAME.ugr        the scene that the job needs
 run/            the trainer's folder: checkpoint, journal, configuration; of a comparison one for each method within
 progress.json   how far it is
 log.txt         what the process said
 reserve         room on the disk, given back when the process has ended
 artifacts/      what can be downloaded; appears whole
-batch/          of a job in shards: what can be downloaded instead, see `batches.place`; other hosts write to it, too
 outcome.json    how it ended: the last thing that the process writes
 scratch.partial files of a step that are not kept: see `JobFolder.scratch`
+
+The worker puts into the storage what others are to have (`worker.telling`), and removes the folder with its work.
 """
 
 from __future__ import annotations
@@ -19,76 +20,15 @@ import contextlib
 import json
 import shutil
 from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any
 
-from ultragray.contract import described
 from ultragray.files import remove_stale_temporaries, sync, write_whole
-from ultragray_workers.datasets.copies import DEFAULT_MAX_BYTES
+from ultragray_workers.jobs.progress import Outcome, Progress
+from ultragray_workers.storage.copies import DEFAULT_MAX_BYTES
 
-FOLDER, BATCH = "jobs", "batch"
-PHASES = ("baselines", "effort", "training", "evaluation", "confidence", "report")
-
-
-@dataclass(frozen=True)
-class Progress:
-    """The progress of a job; null for what does not apply, or not yet."""
-
-    __pydantic_config__: ClassVar[dict[str, Any]] = {"json_schema_serialization_defaults_required": True}
-
-    step: int | None = described("Steps that are done of a training, or of the method at hand of a comparison.", None)
-    steps: int | None = None
-    loss: float | None = None
-    val_psnr_db: float | None = described("On the held-out frames, the last time it was measured.", None)
-    gaussians: int | None = None
-    frames_done: int | None = described(
-        "Frames that are done, such as those of a render job in its archive; of a volume: layers of voxels.", None
-    )
-    frames: int | None = None
-    rate_per_s: float | None = described("Steps or frames.", None)
-    seconds_left: float | None = described("Until the end of the job, of all that is still to be done; about.", None)
-    waits_for: str | None = described(
-        "Of a job that waits: what else it needs than its turn, such as a worker that offers what it asks for.", None
-    )
-    method: str | None = described("Of a comparison: the method at hand.", None)
-    method_number: int | None = described("Its number among the methods of the comparison, from 1.", None)
-    methods: int | None = None
-    phase: str | None = described(
-        "Of a training that runs: classical methods are measured, the effort is chosen, it trains, it is measured on "
-        "the held-out frames, its confidence is fitted, or its report is written.",
-        None,
-        choices=PHASES,
-    )
-
-    @classmethod
-    def from_dict(cls, document: Mapping[str, Any]) -> Progress:
-        """Inverse of `asdict`; unknown keys, of a later release, are left out."""
-        return cls(**{item.name: document.get(item.name) for item in fields(cls)})
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """The end of a job's work: artifacts, or a reason."""
-
-    error: str | None = None  # stable reason, such as DATASET_INVALID; None: it succeeded
-    reason: str | None = None  # one sentence
-    artifacts: tuple[str, ...] = ()
-    metrics: dict[str, float] = field(default_factory=dict)
-    progress: Progress = Progress()
-    attempts: int = 1  # how often a process was started for it
-
-    def to_dict(self) -> dict[str, Any]:
-        """The outcome as JSON holds it."""
-        return {**asdict(self), "artifacts": list(self.artifacts)}
-
-    @classmethod
-    def from_dict(cls, document: Mapping[str, Any]) -> Outcome:
-        """Inverse of `to_dict`."""
-        values = {item.name: document[item.name] for item in fields(cls) if item.name in document}
-        values["artifacts"] = tuple(values.get("artifacts", ()))
-        values["progress"] = Progress.from_dict(values.get("progress", {}))
-        return cls(**values)
+WORK = "work"  # of the artifact folder
 
 
 @dataclass(frozen=True)
@@ -96,64 +36,65 @@ class Request:
     """The instructions of a worker to the process of a job."""
 
     specification: dict[str, Any]
+    submitted: int  # number of the job: tells it from an earlier one of its id, whose database is lost
+    batch: str | None  # of a share
     retry_of: str | None
-    submission: str | None  # tells this submission of a request_id from an earlier one, whose database is lost
     device: str  # cpu, cuda or cuda:N
     threads: int
     nice: int
+    artifact_folder: str
+    storage: str  # location of the datasets and of the files of jobs
     max_footprint_pixels: int | None = None  # of a frame, see ultragray.rendering.limits; None: no limit
-    storage: str | None = None  # that several hosts share; None: all is in the artifact folder
-    max_copies_bytes: int = DEFAULT_MAX_BYTES  # of shared datasets on this host
+    max_copies_bytes: int = DEFAULT_MAX_BYTES  # of copies of datasets on this host
 
 
 class JobFolder:
-    """The paths of one job, and its small files."""
+    """The paths of one attempt at a job, and its small files."""
 
-    def __init__(self, artifact_folder: Path, job_id: str) -> None:
+    def __init__(self, artifact_folder: Path, job_id: str, attempt: int = 1) -> None:
         self.artifact_folder, self.job_id = Path(artifact_folder), job_id
-        self.path = self.artifact_folder / FOLDER / job_id
+        self.path = self.artifact_folder / WORK / f"{job_id}.{attempt}"
         self.lock = self.path / "lock"
         self.run = self.path / "run"
         self.log = self.path / "log.txt"
         self.reserve = self.path / "reserve"
         self.artifacts = self.path / "artifacts"
-        self.batch = self.path / BATCH
         self._partial = self.path / "artifacts.partial"
         self._scratch = self.path / "scratch.partial"
         self._request = self.path / "job.json"
         self._progress = self.path / "progress.json"
         self._outcome = self.path / "outcome.json"
 
-    def request(self) -> Request:
-        """The worker's instructions. Raises OSError, ValueError."""
-        return Request(**json.loads(self._request.read_text(encoding="utf-8")))
+    def request(self) -> Request | None:
+        """The worker's instructions; None where there are none."""
+        document = _read(self._request)
+        with contextlib.suppress(TypeError):
+            return None if document is None else Request(**document)
+        return None
 
-    def begin(self, submission: str | None, needed: str | None) -> None:
-        """Makes the folder; empties that of another submission, but for the file that this one needs.
+    @property
+    def attempt(self) -> int:
+        """The number of the attempt."""
+        return int(self.path.name.rpartition(".")[2])
 
-        A job's id follows from its request_id: after its database was lost, another job of that id may have been here.
-        Raises OSError.
-        """
-        self.path.mkdir(parents=True, exist_ok=True)
-        before = _read(self._request)
-        if before is None or before.get("submission") == submission:
-            return
-        for path in self.path.iterdir():
-            if path == self._request or path.name in (self.lock.name, needed):
-                continue
-            if path.is_dir():
-                shutil.rmtree(path)
-            else:
-                path.unlink()
-        self._request.unlink()  # last: until then the folder is the other one's
+    def others(self) -> list[JobFolder]:
+        """The folders of other attempts at the job, on this host."""
+        found = self.path.parent.glob(f"{self.job_id}.*")
+        attempts = [int(path.suffix[1:]) for path in found if path.suffix[1:].isdigit() and path != self.path]
+        return [JobFolder(self.artifact_folder, self.job_id, attempt) for attempt in attempts]
 
-    def was_begun(self) -> bool:
-        """True where a worker has started a process in the folder."""
-        return self._request.exists()
+    def make(self) -> None:
+        """Makes the folder, empty. Raises OSError."""
+        shutil.rmtree(self.path, ignore_errors=True)
+        self.path.mkdir(parents=True)
+
+    def remove(self) -> None:
+        """Removes the folder."""
+        shutil.rmtree(self.path, ignore_errors=True)
 
     def write_request(self, request: Request) -> None:
         """Replaces the file whole. Raises OSError."""
-        _write(self._request, asdict(request))
+        _write(self._request, json.dumps(asdict(request)))
 
     def progress(self) -> Progress:
         """The progress of the job, as far as its folder says."""
@@ -162,16 +103,18 @@ class JobFolder:
 
     def write_progress(self, progress: Progress) -> None:
         """Replaces the file whole. Raises OSError."""
-        _write(self._progress, asdict(progress))
+        _write(self._progress, json.dumps(asdict(progress)))
 
     def outcome(self) -> Outcome | None:
         """The end of the work; None where it goes on."""
-        document = _read(self._outcome)
-        return None if document is None else Outcome.from_dict(document)
+        try:
+            return Outcome.from_json(self._outcome.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            return None
 
     def write_outcome(self, outcome: Outcome) -> None:
         """Replaces the file whole. Raises OSError."""
-        _write(self._outcome, outcome.to_dict())
+        _write(self._outcome, outcome.to_json())
 
     @contextlib.contextmanager
     def new_artifacts(self) -> Iterator[Path]:
@@ -212,12 +155,8 @@ class JobFolder:
         """The files to download, sorted."""
         return tuple(sorted(path.name for path in self.artifacts.iterdir()))
 
-    def remove_checkpoints(self) -> None:
-        """Removes what only an unfinished job needs."""
-        shutil.rmtree(self.run, ignore_errors=True)
 
-
-def _read(path: Path) -> dict[str, Any] | None:
+def _read(path: Path) -> Mapping[str, Any] | None:
     try:
         document = json.loads(path.read_text(encoding="utf-8"))
     except (OSError, ValueError):
@@ -225,5 +164,5 @@ def _read(path: Path) -> dict[str, Any] | None:
     return document if isinstance(document, dict) else None
 
 
-def _write(path: Path, document: Mapping[str, Any]) -> None:
-    write_whole(path, json.dumps(document) + "\n")
+def _write(path: Path, text: str) -> None:
+    write_whole(path, text + "\n")

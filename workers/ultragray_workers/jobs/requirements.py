@@ -6,23 +6,19 @@ from collections.abc import Callable
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
-from ultragray.files import link_or_copy, sync
 from ultragray.geometry.registration import Registration
 from ultragray.scene.info import SceneHeader, read_header
 from ultragray_workers.claims import storage_full
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import SceneExists
-from ultragray_workers.jobs.folder import JobFolder
+from ultragray_workers.jobs.files import JobFiles
 from ultragray_workers.jobs.kinds import Specification
 from ultragray_workers.jobs.kinds.base import Surroundings
-from ultragray_workers.jobs.queue.owners import Kind
-from ultragray_workers.scene_names import SUFFIX, base_name
+from ultragray_workers.jobs.owners import Kind
+from ultragray_workers.scene_names import base_name
 from ultragray_workers.scenes import SceneStore
-
-if TYPE_CHECKING:
-    from ultragray_workers.jobs.files import JobFiles
 
 
 @dataclass(frozen=True)
@@ -33,7 +29,7 @@ class Requirements:
     scenes: SceneStore
     registration: Callable[[str, str], Registration]  # finds that of a name, for a scene
     files: JobFiles
-    artifact_folder: Path | None  # in which jobs work; None: in folders of other hosts
+    free_bytes: Callable[[], int | None]  # of the storage of the files; None: not known
     max_image_side: int
 
     def provide(self, specification: Specification, job_id: str, before: str | None) -> None:
@@ -66,8 +62,8 @@ class Requirements:
                     self.scenes.path(name)  # raises SceneNotFound where the scene has just gone
                     raise
 
-    def led(self, specification: Specification) -> Specification:
-        """The job with its poses led into its scene by the registration that it names, as that is now.
+    def placed(self, specification: Specification) -> Specification:
+        """The job with its poses brought into its scene by the registration that it names, as that is now.
 
         Raises SceneNotFound, RegistrationNotFound, and InvalidArgument for one of another scene.
         """
@@ -76,7 +72,7 @@ class Requirements:
             return specification
         scene = _named(specification, specification.needs_scene)
         self.scenes.path(scene)
-        return specification.led(self.registration(name, scene))
+        return specification.registered(self.registration(name, scene))
 
     def taken(self, specification: Specification, before: str | None) -> list[tuple[Kind, str]]:
         """The dataset and the scene that `provide` takes; not a scene that the job replaced has kept."""
@@ -95,24 +91,11 @@ class Requirements:
             self.datasets.get(dataset)
 
     def _surroundings(self, scene: SceneHeader | None) -> Surroundings:
-        return Surroundings(scene, self.artifact_folder, self.max_image_side)
+        return Surroundings(scene, self.free_bytes(), self.max_image_side)
 
     def _kept(self, scene: str, before: str | None) -> AbstractContextManager[Path | None]:
         """The scene that was kept for the job that is replaced; None where it is not there."""
         return nullcontext() if before is None else self.files.kept_scene(before, scene)
-
-
-def keep_in_folder(path: Path, scene: str, folder: JobFolder) -> None:
-    """Puts a scene, as it is now, into the folder of a job. Raises OSError."""
-    folder.path.mkdir(parents=True, exist_ok=True)
-    sync(folder.path.parent)
-    kept = folder.path / f"{scene}{SUFFIX}"
-    new = kept.with_name(f".{kept.name}")
-    new.unlink(missing_ok=True)
-    link_or_copy(path, new)
-    new.replace(kept)  # a submission that failed may have left another scene
-    new.unlink(missing_ok=True)  # or the same: renaming one link of a file to another does nothing
-    sync(folder.path)
 
 
 def _named(specification: Specification, field: str | None) -> Any:

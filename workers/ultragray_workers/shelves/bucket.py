@@ -15,7 +15,6 @@ from ultragray_workers.claims import claimed_folder, remove_abandoned
 from ultragray_workers.errors import StorageUnavailable
 from ultragray_workers.rounds import Rounds
 from ultragray_workers.scene_names import SUFFIX
-from ultragray_workers.shared_claims import SharedClaims
 from ultragray_workers.shelves.folder import MAKING_PREFIX
 from ultragray_workers.shelves.headers import KeptHeaders, fetch_header
 from ultragray_workers.shelves.index import FRESH_S, Placed, SceneIndex
@@ -44,7 +43,6 @@ class BucketShelf:
         """`working_folder`: of this host, for scenes that are being made."""
         self.index, self.cache = index, cache
         self._working_folder = working_folder
-        self._claims = SharedClaims(index.storage)
         self._headers: KeptHeaders[str] = KeptHeaders()
         self._held: dict[str, _Held] = {}  # by the name in the cache
         self._holding = threading.Lock()
@@ -154,11 +152,11 @@ class BucketShelf:
 
     @contextlib.contextmanager
     def making(self) -> Iterator[Path]:
-        with claimed_folder(self._working_folder, MAKING_PREFIX) as folder, self._claims.claimed(folder.name):
+        with claimed_folder(self._working_folder, MAKING_PREFIX) as folder, self.index.storage.claimed(folder.name):
             yield folder
 
     def is_making(self, token: str) -> bool:
-        return self._claims.is_claimed(token)
+        return self.index.storage.is_claimed(token)
 
     def remove_abandoned(self) -> None:
         remove_abandoned(self._working_folder, MAKING_PREFIX)

@@ -8,9 +8,11 @@ from pathlib import Path
 
 from ultragray.files import file_sha256, link_or_copy, sync
 from ultragray.scene.info import SceneHeader, read_header
-from ultragray_workers.claims import claimed_folder, is_claimed, remove_abandoned
+from ultragray_workers.claims import claimed_folder, remove_abandoned
 from ultragray_workers.errors import SceneExists
 from ultragray_workers.scene_names import SUFFIX, is_scene_name
+from ultragray_workers.storage.local import LocalStorage
+from ultragray_workers.storage.storage import Storage
 
 MAKING_PREFIX = ".importing-"
 
@@ -18,8 +20,10 @@ MAKING_PREFIX = ".importing-"
 class FolderShelf:
     """The scenes of a folder, which need not exist yet."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder: Path, storage: Storage | None = None) -> None:
+        """`storage`: by which services claim what they make; None: the folder."""
         self.folder = Path(folder)
+        self._storage = storage or LocalStorage(self.folder)
 
     def names(self) -> set[str]:
         try:
@@ -50,6 +54,12 @@ class FolderShelf:
     def header(self, name: str) -> SceneHeader:
         return read_header(self.fetch(name))
 
+    def bytes_of(self, name: str) -> int:
+        try:
+            return self.path(name).stat().st_size
+        except FileNotFoundError:
+            return 0
+
     def sha256(self, name: str) -> str | None:
         return None
 
@@ -68,11 +78,13 @@ class FolderShelf:
         sync(self.folder)
         return True
 
-    def making(self) -> contextlib.AbstractContextManager[Path]:
-        return claimed_folder(self.folder, MAKING_PREFIX)
+    @contextlib.contextmanager
+    def making(self) -> Iterator[Path]:
+        with claimed_folder(self.folder, MAKING_PREFIX) as folder, self._storage.claimed(folder.name):
+            yield folder
 
     def is_making(self, token: str) -> bool:
-        return is_claimed(self.folder / token)
+        return self._storage.is_claimed(token)
 
     def remove_abandoned(self) -> None:
         remove_abandoned(self.folder, MAKING_PREFIX)

@@ -36,6 +36,9 @@ class Shelf(Protocol):
     def header(self, name: str) -> SceneHeader:
         """The description of the scene; its Gaussians are not fetched. Raises FileNotFoundError, SceneFileInvalid."""
 
+    def bytes_of(self, name: str) -> int:
+        """Of the file of a scene; 0 where there is none."""
+
     def sha256(self, name: str) -> str | None:
         """The hash of the file, where it is known without reading it."""
 

@@ -7,13 +7,15 @@ import fcntl
 import os
 import secrets
 import shutil
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from ultragray.files import TEMPORARY_SUFFIX, atomic_path, link_or_copy, sync
+from ultragray.files import TEMPORARY_SUFFIX, link_or_copy, sync
+from ultragray_workers.claims import remove_whole
 from ultragray_workers.storage.storage import Entry, NotThere, check_key
 
+_CLAIMS = "claims"  # prefix of keys; a claim is locked as long as its process lives
 _LOCK = ".storage.lock"  # held while an object is compared and replaced
 _CHUNK_BYTES = 2**20
 
@@ -116,9 +118,9 @@ class LocalStorage:
         return True
 
     def download(self, key: str, path: Path, *, version: str | None = None) -> Entry:
-        with self._open(key, version) as descriptor, atomic_path(path) as temporary:
-            with open(descriptor, "rb", closefd=False) as file, temporary.open("wb") as copy:
-                shutil.copyfileobj(file, copy, _CHUNK_BYTES)
+        with self._open(key, version) as descriptor, self._whole(path) as made:
+            link_or_copy(self._path(key), made)
+            made.replace(path)
             return self._entry(key, os.stat(descriptor))
 
     def chunks(self, key: str, *, version: str | None = None) -> Iterator[bytes]:
@@ -131,6 +133,42 @@ class LocalStorage:
         with contextlib.suppress(FileNotFoundError, NotADirectoryError):
             path.unlink()
             sync(path.parent)
+
+    def delete_all(self, prefix: str) -> None:
+        remove_whole(self._folder(prefix))
+
+    @contextlib.contextmanager
+    def held(self, prefix: str, sha256: Mapping[str, str], folder: Path, max_bytes: int) -> Iterator[Path]:
+        place = self._folder(prefix)
+        if not place.is_dir():
+            raise NotThere(f"there is no {prefix} in {self.location}")
+        yield place
+
+    @contextlib.contextmanager
+    def claimed(self, token: str) -> Iterator[None]:
+        path = self._path(f"{_CLAIMS}/{token}")
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with self._whole(path) as made, made.open("wb") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            made.rename(path)  # nobody finds it unlocked
+            try:
+                yield
+            finally:
+                path.unlink(missing_ok=True)
+
+    def is_claimed(self, token: str) -> bool:
+        try:
+            with self._path(f"{_CLAIMS}/{token}").open("rb+") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return True
+        except (FileNotFoundError, NotADirectoryError):
+            return False
+        self.delete(f"{_CLAIMS}/{token}")  # of a process that died
+        return False
+
+    def free_bytes(self) -> int | None:
+        return shutil.disk_usage(self.folder).free
 
     def _folder(self, prefix: str) -> Path:
         return self.folder / check_key(prefix) if prefix else self.folder

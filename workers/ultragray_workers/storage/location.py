@@ -1,37 +1,21 @@
-"""The place of a storage as settings and commands name it: a path, or the URL of a bucket."""
+"""The place of a storage as settings and commands name it, a path or the URL of a bucket, and the storage there."""
 
 from __future__ import annotations
 
 import re
-from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import unquote, urlsplit
 
 from ultragray.errors import InvalidArgument
+from ultragray_workers.storage.local import LocalStorage
+from ultragray_workers.storage.storage import Storage
+from ultragray_workers.storage.storage import StorageUrl as StorageUrl
 
+PATIENCE_S = 20.0
 _SCHEMES = ("s3", "gs", "az")
 _KNOWN = "a path, file:///FOLDER, s3://BUCKET/PREFIX, gs://BUCKET/PREFIX or az://CONTAINER/PREFIX"
 _BUCKET = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*")
 _PREFIX = re.compile(r"[A-Za-z0-9._~=/-]*")
-
-
-@dataclass(frozen=True)
-class StorageUrl:
-    """A bucket (of Azure, a container) of an object storage, and what the keys in it begin with; without credentials.
-
-    `scheme` is s3, gs or az; `prefix` neither begins nor ends with a slash, and may be empty.
-    """
-
-    scheme: str
-    bucket: str
-    prefix: str = ""
-
-    def __str__(self) -> str:
-        return f"{self.scheme}://{self.bucket}/{self.prefix}".rstrip("/")
-
-    def below(self, key: str) -> StorageUrl:
-        """The place of the objects whose keys begin with `key` and a slash."""
-        return StorageUrl(self.scheme, self.bucket, f"{self.prefix}/{key}".strip("/"))
 
 
 Location = Path | StorageUrl
@@ -78,3 +62,22 @@ def parse_location(given: str | Path | StorageUrl, field: str) -> Location:
             field=field,
         )
     return StorageUrl(scheme, parts.netloc, prefix)
+
+
+def open_storage(location: str | Path | StorageUrl, *, patience_s: float = PATIENCE_S) -> Storage:
+    """The storage of a folder (a path, or file://), or of a bucket (s3://, gs://, az://). Nothing is asked of it yet.
+
+    `patience_s`: how long a request to a bucket is repeated before StorageUnavailable.
+    Raises InvalidArgument for another URL, ExtraMissing where obstore is not installed.
+    """
+    found = parse_location(location, "location")
+    if isinstance(found, Path):
+        return LocalStorage(found)
+    from ultragray_workers.storage.remote import RemoteStorage
+
+    return RemoteStorage(found, patience_s=patience_s)
+
+
+def below(location: Location, key: str) -> Location:
+    """The place of the objects of a location whose keys begin with `key` and a slash."""
+    return location / key if isinstance(location, Path) else location.below(key)

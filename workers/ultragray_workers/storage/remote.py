@@ -9,20 +9,20 @@ from __future__ import annotations
 import contextlib
 import os
 import re
-from collections.abc import Iterator
+import secrets
+import threading
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from ultragray.errors import InvalidArgument
-from ultragray.files import atomic_path
+from ultragray.files import atomic_path, file_sha256
 from ultragray.installation import missing_extra
 from ultragray_workers.errors import StorageUnavailable
-from ultragray_workers.storage.location import StorageUrl
-from ultragray_workers.storage.storage import Entry, NotThere, check_key
-
-if TYPE_CHECKING:
-    pass
+from ultragray_workers.storage.copies import LocalCopies
+from ultragray_workers.storage.storage import Damaged, Entry, NotThere, StorageUrl, check_key
 
 _ENVIRONMENT = {"s3": "AWS", "gs": "GOOGLE", "az": "AZURE"}
 _CONNECT_TIMEOUT_S, _SILENCE_TIMEOUT_S = 5, 30  # a request that hears nothing so long is repeated
@@ -30,6 +30,9 @@ _REQUEST_TIMEOUT_S = 3600  # of a whole request: the largest object over the slo
 _LONGEST_PAUSE_S = 5
 _SINGLE_REQUEST_BYTES = 16 * 2**20  # larger files are uploaded in parts
 _PART_BYTES, _MOST_PARTS, _PARTS_AT_ONCE = 8 * 2**20, 9000, 4  # S3 takes 10,000 parts
+_AT_ONCE = 8  # objects of a folder
+_CLAIMS = "claims"  # prefix of keys: who claims a token says so again and again; the clock is the bucket's
+REFRESH_S, DEAD_AFTER_S = 10.0, 60.0
 _STATUS = re.compile(r"Server returned non-2xx status code: (\d{3}[ A-Za-z]*)")
 _REFUSED = re.compile(r"NoSuchBucket|ContainerNotFound|specified bucket does not exist")
 
@@ -154,6 +157,62 @@ class RemoteStorage:
     def delete(self, key: str) -> None:
         with contextlib.suppress(NotThere), self._asking(key):
             self._obstore.delete(self._store, check_key(key))
+
+    def delete_all(self, prefix: str) -> None:
+        for entry in list(self.entries(prefix)):
+            self.delete(entry.key)
+
+    @contextlib.contextmanager
+    def held(self, prefix: str, sha256: Mapping[str, str], folder: Path, max_bytes: int) -> Iterator[Path]:
+        def fetch_all(target: Path) -> None:
+            def fetch(path: str) -> None:
+                copy = target / path
+                copy.parent.mkdir(parents=True, exist_ok=True)
+                self.download(f"{prefix}/{path}", copy)
+                if file_sha256(copy) != sha256[path]:
+                    raise Damaged(path)
+
+            with ThreadPoolExecutor(_AT_ONCE, "fetch") as threads:
+                list(threads.map(fetch, sha256))
+
+        with LocalCopies(folder, max_bytes).held(prefix.replace("/", "-"), fetch_all) as copy:
+            yield copy
+
+    @contextlib.contextmanager
+    def claimed(self, token: str) -> Iterator[None]:
+        key = f"{_CLAIMS}/{token}"
+        self.write(key, secrets.token_bytes(8))
+        ended = threading.Event()
+
+        def refresh() -> None:
+            while not ended.wait(REFRESH_S):
+                with contextlib.suppress(StorageUnavailable):  # others ask the same storage
+                    self.write(key, secrets.token_bytes(8))
+
+        thread = threading.Thread(target=refresh, name="claim", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            ended.set()
+            thread.join()
+            with contextlib.suppress(StorageUnavailable):
+                self.delete(key)
+
+    def is_claimed(self, token: str) -> bool:
+        claim = self.entry(f"{_CLAIMS}/{token}")
+        if claim is None:
+            return False
+        probe = f"{_CLAIMS}/now-{secrets.token_hex(8)}"
+        self.write(probe, b"")
+        try:
+            now = self.entry(probe)
+        finally:
+            self.delete(probe)
+        return now is None or now.modified - claim.modified < DEAD_AFTER_S
+
+    def free_bytes(self) -> int | None:
+        return None
 
     def _get(self, key: str, version: str | None) -> tuple[Entry, Iterator[bytes]]:
         options = {} if version is None else {"if_match": version}

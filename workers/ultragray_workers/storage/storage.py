@@ -1,11 +1,15 @@
 """Objects by key, wherever they are: the methods that a folder and a bucket have in common.
 
+Scenes, datasets and the files of jobs are objects; nothing above knows where they lie. `local` and `remote` are the two
+implementations, `location` opens the one that a path or a URL names.
+
 A key is a relative POSIX path such as `jobs/0c5f/outcome.json`. All methods block; call them in a thread.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
@@ -19,6 +23,10 @@ class NotThere(LookupError):
     """There is no object of that key, or not the version that was asked for."""
 
 
+class Damaged(Exception):
+    """An object does not have the hash that it should have; the text is its path."""
+
+
 @dataclass(frozen=True)
 class Entry:
     """An object without its content."""
@@ -27,6 +35,25 @@ class Entry:
     bytes: int
     version: str  # tells one content from the next: of a bucket the ETag, of a folder that of the file
     modified: float  # seconds since 1970
+
+
+@dataclass(frozen=True)
+class StorageUrl:
+    """A bucket (of Azure, a container) of an object storage, and what the keys in it begin with; without credentials.
+
+    `scheme` is s3, gs or az; `prefix` neither begins nor ends with a slash, and may be empty.
+    """
+
+    scheme: str
+    bucket: str
+    prefix: str = ""
+
+    def __str__(self) -> str:
+        return f"{self.scheme}://{self.bucket}/{self.prefix}".rstrip("/")
+
+    def below(self, key: str) -> StorageUrl:
+        """The place of the objects whose keys begin with `key` and a slash."""
+        return StorageUrl(self.scheme, self.bucket, f"{self.prefix}/{key}".strip("/"))
 
 
 class Storage(Protocol):
@@ -75,13 +102,40 @@ class Storage(Protocol):
         """
 
     def download(self, key: str, path: Path, *, version: str | None = None) -> Entry:
-        """Writes an object to a file, which appears whole or not at all. Raises NotThere, OSError of the file."""
+        """Writes an object to a file, which appears whole or not at all, and must not change: it may be a link.
+
+        Raises NotThere, OSError of the file.
+        """
 
     def chunks(self, key: str, *, version: str | None = None) -> Iterator[bytes]:
         """The content piece by piece, of one version throughout. Raises NotThere before the first piece."""
 
     def delete(self, key: str) -> None:
         """Removes an object; nothing where it is absent."""
+
+    def delete_all(self, prefix: str) -> None:
+        """Removes the objects below `prefix`."""
+
+    def held(
+        self, prefix: str, sha256: Mapping[str, str], folder: Path, max_bytes: int
+    ) -> AbstractContextManager[Path]:
+        """A folder of this host with objects below `prefix`, which never change, during the body: in place, or a copy.
+
+        `sha256`: of each, by its path below the prefix. `folder`: for copies, which take at most `max_bytes` beside
+        those in use. Raises NotThere where one is gone, Damaged for one of another hash.
+        """
+
+    def claimed(self, token: str) -> AbstractContextManager[None]:
+        """Lets all who have the storage find the token claimed during the body, as long as this process lives.
+
+        Enter and leave it in any threads.
+        """
+
+    def is_claimed(self, token: str) -> bool:
+        """Whether a process that lives, on any host, has claimed the token."""
+
+    def free_bytes(self) -> int | None:
+        """The room that is left; None where nobody knows."""
 
 
 def check_key(key: str) -> str:

@@ -50,7 +50,7 @@ async def estimate(rendering: Rendering, specification: Specification, *, field:
             specification.scene, specification, Encoding.UINT8, registration=specification.registration
         )
         if plan.registration is not None:
-            specification = specification.led(plan.registration)
+            specification = specification.registered(plan.registration)
         settings = plan.settings
         frames, poses = await asyncio.to_thread(specification.outlook, plan.header, settings, MAX_POSES)
         picture = specification.file_format.shown(settings).picture

@@ -10,8 +10,8 @@ from functools import partial
 
 from ultragray_service.core.jobs.log import GrowingLog
 from ultragray_workers.errors import DatabaseUnavailable, StorageUnavailable
-from ultragray_workers.jobs.files import Log, size_of_log
-from ultragray_workers.jobs.store import Job
+from ultragray_workers.jobs.files import Log
+from ultragray_workers.jobs.record import Job
 
 READ_INTERVAL_S = 0.5
 
@@ -132,7 +132,7 @@ class _Reader:
 
     def _look(self) -> tuple[Job, int]:
         job = self._read()  # first, so that the log of a finished job is whole
-        return job, size_of_log(self._log)
+        return job, self._log.size()
 
 
 class JobHub:

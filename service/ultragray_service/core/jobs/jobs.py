@@ -30,15 +30,16 @@ from ultragray_workers.errors import (
     SceneExists,
     SceneNotFound,
 )
+from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.files import JobFiles
 from ultragray_workers.jobs.kinds import Specification
-from ultragray_workers.jobs.overview import JobsOverview
-from ultragray_workers.jobs.places import shared_storage
-from ultragray_workers.jobs.queue.attendance import Worker
-from ultragray_workers.jobs.queue.database import JobDatabase
-from ultragray_workers.jobs.store import Admit, Job, JobState, JobStore
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import Admit, JobsOverview, JobStore
+from ultragray_workers.jobs.workers import Worker
 from ultragray_workers.rounds import Rounds
 from ultragray_workers.scenes import SceneStore
+from ultragray_workers.storage.location import open_storage
 
 COUNT_INTERVAL_S = 10.0
 _BESIDE_SPECIFICATION = ("request_id", "priority")
@@ -106,7 +107,7 @@ class Jobs:
             scenes=self._scenes,
             datasets=self._datasets,
             registration=self._registration,
-            shared=shared_storage(settings.artifacts, patience_s=PATIENCE_S / 2),
+            storage=open_storage(settings.artifacts, patience_s=PATIENCE_S / 2),
             max_image_side=settings.max_image_side,
         )
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ultragray_workers.jobs.files import Log, read_log, size_of_log
+from ultragray_workers.jobs.files import Log
 
 DEFAULT_LOG_BYTES, MAX_LOG_BYTES = 65536, 2**20  # of the log's end, given at once
 TAIL_BYTES = 8192  # of the log, for a watcher who names no place
@@ -29,7 +29,7 @@ class GrowingLog:
         A log that became shorter was begun again, and is read from its start. Raises StorageUnavailable.
         """
         self._offset = self._begin()
-        added = read_log(self._log, self._offset, _STEP_BYTES)
+        added = self._log.read(self._offset, _STEP_BYTES)
         self.has_more = len(added) == _STEP_BYTES
         end = added.rfind(b"\n") + 1
         if not end and self.has_more:
@@ -38,8 +38,8 @@ class GrowingLog:
         return added[:end].decode("utf-8", "replace")
 
     def _begin(self) -> int:
-        size = size_of_log(self._log)
+        size = self._log.size()
         if self._offset is not None:
             return self._offset if self._offset <= size else 0
         begin = max(0, size - TAIL_BYTES)
-        return begin and begin + read_log(self._log, begin, TAIL_BYTES).find(b"\n") + 1
+        return begin and begin + self._log.read(begin, TAIL_BYTES).find(b"\n") + 1

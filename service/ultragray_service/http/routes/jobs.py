@@ -28,13 +28,13 @@ from ultragray_service.http.accept import NPZ, PNG
 from ultragray_service.http.bodies import SPECIFICATION, JobBody, adapter_of, body_schema, read_json_body
 from ultragray_service.http.dependencies import JOB_EXAMPLES, ServiceDep, problems
 from ultragray_service.views.prepared import TrainingCurve
-from ultragray_workers.jobs.job import Job, JobState
+from ultragray_workers.jobs.files import Artifact
 from ultragray_workers.jobs.kinds import KINDS, Specification
-from ultragray_workers.jobs.queue.attendance import Worker
-from ultragray_workers.jobs.queue.wishes import Wanted
-from ultragray_workers.jobs.shared.reading import OpenFile, SharedFile, opened
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
 from ultragray_workers.jobs.specification import from_dict
 from ultragray_workers.jobs.store import JobStore
+from ultragray_workers.jobs.workers import Wanted, Worker
 
 EVENTS_TYPE = "text/event-stream"
 KEEP_ALIVE_S = 15.0
@@ -272,11 +272,7 @@ async def get_artifact(
     found = await service.jobs.do(JobStore.artifact, job, name)
     media_type = MEDIA_TYPES.get(PurePosixPath(name).suffix, _ANY_FILE)
     disposition = "inline" if show else "attachment"
-    if isinstance(found, SharedFile):
-        return shared_file_response(found, request.headers, media_type, SHOWN, disposition)
-    return FileResponse(
-        found, media_type=media_type, filename=name, headers=SHOWN, content_disposition_type=disposition
-    )
+    return artifact_response(found, request.headers, media_type, SHOWN, disposition)
 
 
 @router.get(
@@ -291,7 +287,7 @@ async def watch_job(service: ServiceDep, job: JobId, last_event_id: LastEventId 
     return JobEvents(await service.jobs.hub.watch(job, last.log_offset), last)
 
 
-# A file of an object storage as an answer of HTTP: whole, or the range that was asked for.
+# A file of a job as an answer of HTTP: whole, or the range that was asked for.
 
 
 # A page that a job made is shown without scripts, in an origin of its own, and fetches nothing.
@@ -304,8 +300,8 @@ _CHUNK_BYTES = 2**20
 _RANGE = re.compile(r"bytes=(\d*)-(\d*)")
 
 
-def shared_file_response(
-    file: SharedFile, asked: Headers, media_type: str, beside: Mapping[str, str], disposition: str
+def artifact_response(
+    file: Artifact, asked: Headers, media_type: str, beside: Mapping[str, str], disposition: str
 ) -> Response:
     """The answer to a GET with these headers. Of several ranges none is answered, but the whole file.
 
@@ -336,16 +332,15 @@ def shared_file_response(
     return StreamingResponse(_bytes(file, start, end), status_code=status, headers=headers, media_type=media_type)
 
 
-async def _bytes(file: SharedFile, start: int, end: int) -> AsyncIterator[bytes]:
-    with opened(file) as source:
-        while start < end:
-            chunk = await asyncio.to_thread(_read, source, start, min(_CHUNK_BYTES, end - start))
-            start += len(chunk)
-            yield chunk
+async def _bytes(file: Artifact, start: int, end: int) -> AsyncIterator[bytes]:
+    while start < end:
+        chunk = await asyncio.to_thread(_read, file, start, min(_CHUNK_BYTES, end - start))
+        start += len(chunk)
+        yield chunk
 
 
-def _read(source: OpenFile, start: int, length: int) -> bytes:
-    if not (chunk := source.read(start, length)):
+def _read(file: Artifact, start: int, length: int) -> bytes:
+    if not (chunk := file.read(start, length)):
         raise OSError("the file is shorter than its record says")  # ends the connection: the client sees that
     return chunk
 

@@ -46,7 +46,7 @@ from ultragray_service.http.routes.datasets import Private
 from ultragray_service.views.assessments import Assessments
 from ultragray_service.views.localizing import Located, locate, sought_frame
 from ultragray_workers.errors import UploadTooLarge
-from ultragray_workers.jobs.queue.owners import Kind
+from ultragray_workers.jobs.owners import Kind
 from ultragray_workers.scene_names import SUFFIX, base_name
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])

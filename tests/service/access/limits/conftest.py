@@ -15,7 +15,7 @@ from google.rpc.status_pb2 import Status
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 from ultragray_service.access.keys import KeyStore
 from ultragray_service.access.principals import Role, read_limits
-from ultragray_workers.jobs.queue.database import JobDatabase
+from ultragray_workers.jobs.database import JobDatabase
 
 from ...conftest import RunningService, StartService
 from ...rpc.test_grpc_render import error_info, moved

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from datetime import datetime, timezone
 from typing import Any
 
 import grpc
 import httpx
 import pytest
+import sqlalchemy as sa
 
-from ultragray_proto.v1 import datasets_pb2, datasets_pb2_grpc, jobs_pb2, jobs_pb2_grpc
-from ultragray_workers.jobs.queue import runs
+from ultragray_proto.v1 import jobs_pb2, jobs_pb2_grpc
+from ultragray_workers.jobs.tables import USAGE
 
 from ...rpc.test_grpc_render import moved
 from ..conftest import MATRIX
@@ -25,6 +27,13 @@ def submit(limited: Limited, who: str, **more: Any) -> httpx.Response:
 
 def is_limit(answer: httpx.Response, name: str) -> bool:
     return (answer.status_code, answer.json()["reason"]) == (429, "LIMIT_REACHED") and name in answer.json()["detail"]
+
+
+def ran(limited: Limited, device: str) -> None:
+    """Half a minute on a device, of a job that has been deleted."""
+    with limited.database.engine.begin() as connection:
+        values = {"owner": "minutes", "device": device, "day": datetime.now(timezone.utc).date(), "run_s": 30.0}
+        connection.execute(sa.insert(USAGE).values(values))
 
 
 def test_only_so_many_jobs_of_a_key_wait_or_run(limited: Limited) -> None:
@@ -58,9 +67,9 @@ def test_jobs_of_grpc_count_likewise(limited: Limited) -> None:
 
 
 def test_the_minutes_of_a_day_end_at_midnight(limited: Limited) -> None:
-    runs.add_run(limited.database.engine, "earlier", "minutes", "cpu", 30.0)
+    ran(limited, "cpu")
     assert submit(limited, "minutes").status_code == 201
-    runs.add_run(limited.database.engine, "earlier", "minutes", "cuda", 30.0)
+    ran(limited, "gpu")
     refused = submit(limited, "minutes")
     assert is_limit(refused, "compute_minutes_per_day")
     assert 0 < int(refused.headers["Retry-After"]) <= DAY_S + 2
@@ -97,15 +106,3 @@ def test_a_key_keeps_only_so_many_registrations(limited: Limited) -> None:
     assert limited.http("registrations", "DELETE", "/v1/registrations/one").status_code == 204
     assert put("registrations", "four").status_code == 200
     assert limited.refusals("registrations") == 1
-
-
-def test_uploads_over_grpc_count_likewise(limited: Limited, dataset_bytes: bytes) -> None:
-    stub = datasets_pb2_grpc.DatasetServiceStub(limited.channel)
-    message = datasets_pb2.UploadDatasetRequest
-    parts = [
-        message(header=datasets_pb2.UploadHeader(dataset="rpc", archive=True)),
-        message(chunk=dataset_bytes),
-    ]
-    with pytest.raises(grpc.RpcError) as caught:
-        stub.UploadDataset(iter(parts), metadata=limited.metadata("bytes"), timeout=60)
-    assert retry_after_s(caught.value, "LIMIT_REACHED") is None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import shutil
 import signal
 import subprocess
 import sys
@@ -19,13 +20,15 @@ from ultragray_studies import compare_run
 from ultragray_studies.methods.classical import Compounding, FromFrames
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import DatasetNotFound
-from ultragray_workers.jobs.folder import JobFolder, Outcome, Request
+from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.kinds import CompareJob, base
+from ultragray_workers.jobs.progress import JobState, Outcome
+from ultragray_workers.jobs.record import Job
 from ultragray_workers.jobs.specification import from_dict, to_dict
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 
-from ..conftest import RunningWorker
+from ..conftest import RunningWorker, request_of
 
 JOB = CompareJob(dataset="tiny", methods=("median", "nearest"))
 
@@ -35,12 +38,10 @@ def job_run(artifact_folder: Path) -> Callable[..., JobRun]:
     """The run of a job."""
     torch.set_num_threads(1)
 
-    def make(
-        job_id: str = "job", retry_of: str | None = None, should_stop: Callable[[], bool] = lambda: False
-    ) -> JobRun:
+    def make(job_id: str = "job", should_stop: Callable[[], bool] = lambda: False) -> JobRun:
         folder = JobFolder(artifact_folder, job_id)
         folder.path.mkdir(parents=True, exist_ok=True)
-        return JobRun(folder, Request(to_dict(JOB), retry_of, None, "cpu", 1, 0), should_stop)
+        return JobRun(folder, request_of(to_dict(JOB), artifact_folder), should_stop)
 
     return make
 
@@ -69,7 +70,8 @@ def test_a_job_that_is_to_stop_goes_on_in_its_retry(job_run: Callable[..., JobRu
         compare_run.run(first, JOB)
     assert not first.folder.artifacts.exists()
     kept = (first.folder.run / "median" / "result.json").read_bytes()
-    again = job_run("again", retry_of="job")
+    again = job_run("again")
+    shutil.copytree(first.folder.run, again.folder.run)  # as the worker fetches it
     compare_run.run(again, JOB)
     assert (again.folder.run / "median" / "result.json").read_bytes() == kept
 

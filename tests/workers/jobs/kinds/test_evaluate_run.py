@@ -17,14 +17,16 @@ from ultragray.learn.evaluation.baselines import BASELINES
 from ultragray.learn.evaluation.scoring import evaluate
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import DatasetNotFound, SceneNotFound
-from ultragray_workers.jobs.folder import JobFolder, Request
+from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.kinds import EvaluateJob, evaluate_run
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
 from ultragray_workers.jobs.specification import from_dict, to_dict
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 from ultragray_workers.scenes import SceneStore
 
-from ..conftest import PROBE, RunningWorker, tiny_dataset
+from ..conftest import PROBE, RunningWorker, request_of, tiny_dataset
 
 JOB = EvaluateJob("tiny", "one")
 
@@ -38,7 +40,7 @@ def job_run(artifact_folder: Path, random_scene: Callable[..., GaussianScene]) -
         folder = JobFolder(artifact_folder, "job")
         folder.path.mkdir(parents=True)
         random_scene(60, info={"probe": probe}).save(folder.path / "one.ugr")
-        return JobRun(folder, Request(to_dict(job), None, None, "cpu", 1, 0), should_stop)
+        return JobRun(folder, request_of(to_dict(job), artifact_folder), should_stop)
 
     return make
 

@@ -24,10 +24,12 @@ from ultragray.rendering.settings import Below
 from ultragray.rendering.tools import Cylinder, Needle, ToolFrame
 from ultragray.samplers import AroundSampler, CoveredSampler, FanSampler, SplineSampler, TrainingSampler
 from ultragray.scene.confidence import Assessor, ConfidenceModel, figure_arrays
-from ultragray_workers.jobs.folder import JobFolder, Request
+from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.kinds import RenderJob, render_run
 from ultragray_workers.jobs.specification import from_dict, to_dict
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
+
+from ..conftest import request_of
 
 PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 TRAINING = np.tile(np.eye(4), (6, 1, 1))
@@ -57,7 +59,9 @@ def work(tmp_path: Path, random_scene: Callable[..., GaussianScene]) -> Callable
         made = random_scene(60, info=info | changes)
         scene = GaussianScene.from_splats(made.splats, info=made.info, training_poses=TRAINING)
         scene.save(folder.path / f"{job.scene}.ugr")
-        return JobRun(folder, Request(to_dict(job), None, None, "cpu", 1, 0, max_footprint_pixels), should_stop)
+        return JobRun(
+            folder, request_of(to_dict(job), tmp_path, max_footprint_pixels=max_footprint_pixels), should_stop
+        )
 
     return make
 

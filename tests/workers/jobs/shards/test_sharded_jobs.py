@@ -19,11 +19,12 @@ from ultragray.samplers import AroundSampler
 from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.info import read_header
 from ultragray_workers.jobs.kinds import RenderJob
-from ultragray_workers.jobs.queue.internals import WORKFLOWS
-from ultragray_workers.jobs.queue.tables import SHARDS
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
+from ultragray_workers.jobs.tables import JOBS, SHARDS
 
-from ..conftest import RunningWorker, train_job
+from ..conftest import RunningWorker, path_of, train_job
 
 StartWorker = Callable[..., RunningWorker]
 Until = Callable[..., Job]
@@ -45,10 +46,10 @@ def batch(count: int, shard_frames: int | None, **settings: object) -> RenderJob
 
 def pixels_of(store: JobStore, job: Job) -> dict[str, bytes]:
     """The pixels of each frame by its key, of all shards; each key once."""
-    manifest = json.loads(store.artifact(job.id, "manifest.json").read_text())
+    manifest = json.loads(path_of(store.artifact(job.id, "manifest.json")).read_text())
     found: dict[str, bytes] = {}
     for shard in manifest["shards"]:
-        path = store.artifact(job.id, shard["file"])
+        path = path_of(store.artifact(job.id, shard["file"]))
         assert path.stat().st_size == shard["bytes"]
         assert hashlib.sha256(path.read_bytes()).hexdigest() == shard["sha256"]
         with tarfile.open(path) as tar:
@@ -98,7 +99,7 @@ def test_a_batch_goes_on_without_the_workers_that_die_and_has_each_frame_once(
     assert not list((scene.parents[1] / "jobs").glob("[0-9a-f]*"))
     with store.database.engine.connect() as connection:
         assert connection.execute(sa.select(sa.func.count()).select_from(SHARDS)).scalar() == 0
-        assert connection.execute(sa.select(sa.func.count()).select_from(WORKFLOWS)).scalar() == 0
+        assert connection.execute(sa.select(sa.func.count()).select_from(JOBS)).scalar() == 0
 
 
 @pytest.mark.long
@@ -136,8 +137,8 @@ def test_cancelling_ends_the_batch_and_its_shares(
     store.cancel(job.id)
     until(job, lambda _: not any(worker.job_process() for worker in workers), timeout_s=20)
     with store.database.engine.connect() as connection:
-        left = connection.execute(sa.select(WORKFLOWS.c.status).distinct()).scalars().all()
-    assert left == ["CANCELLED"]
+        left = connection.execute(sa.select(JOBS.c.state).distinct()).scalars().all()
+    assert left == ["cancelled"]
 
 
 @pytest.mark.long

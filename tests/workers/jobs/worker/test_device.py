@@ -14,10 +14,12 @@ import pytest
 
 from ultragray.installation import memory_bytes
 from ultragray_workers.errors import StartupFailed
-from ultragray_workers.jobs.matching.offer import WorkerDevice
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.demand import WorkerDevice
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.worker.device import DeviceLock, HostDevice, devices_of, lock_path
-from ultragray_workers.jobs.worker.processes import holder_of
+from ultragray_workers.jobs.worker.process import holder_of
 
 from ....postgres import PostgresServer
 from ....waiting import wait_until

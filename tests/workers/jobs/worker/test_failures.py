@@ -19,7 +19,9 @@ from ultragray.phantom.demo import copy_demo_scene
 from ultragray_workers.errors import StorageFull
 from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.kinds.render import Poses
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
 
 from ....waiting import Deadline, at_this_load
 from ..conftest import FINAL, RunningWorker, store_dataset, train_job

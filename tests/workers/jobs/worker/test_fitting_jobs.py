@@ -9,11 +9,12 @@ from pathlib import Path
 import pytest
 
 from ultragray.installation import memory_bytes
-from ultragray_workers.jobs.matching.demand import Demand
-from ultragray_workers.jobs.matching.offer import WorkerDevice
-from ultragray_workers.jobs.queue.database import JobDatabase
-from ultragray_workers.jobs.queue.unfinished import demands_waiting
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.database import JobDatabase
+from ultragray_workers.jobs.demand import Demand, WorkerDevice
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.queue import demands_waiting
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.worker.device import DeviceLock, HostDevice
 from ultragray_workers.jobs.worker.gate import Gate
 
@@ -115,7 +116,7 @@ def workstation(jobs: JobDatabase, artifact_folder: Path) -> Callable[[str], Gat
         names = ("cuda:0", "cuda:1", "cpu")
         devices = [WorkerDevice(name=one, model="a model", memory_bytes=8 * 10**9) for one in names]
         locks = [DeviceLock(artifact_folder, HostDevice(one, one.name), name) for one in devices]
-        return Gate(jobs.folder, locks, (), lambda: demands_waiting(jobs))
+        return Gate(jobs.identity, locks, (), lambda: demands_waiting(jobs.engine))
 
     return make
 

@@ -15,9 +15,10 @@ import pytest
 from ultragray.phantom.demo import copy_demo_scene
 from ultragray_workers.errors import WorkerNotFound
 from ultragray_workers.jobs.kinds import RenderJob
-from ultragray_workers.jobs.queue.attendance import Worker, WorkerState
-from ultragray_workers.jobs.queue.wishes import Wanted
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
+from ultragray_workers.jobs.workers import Wanted, Worker, WorkerState
 
 from ....waiting import wait_until
 from ..conftest import RunningWorker, train_job

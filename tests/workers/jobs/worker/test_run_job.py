@@ -9,9 +9,11 @@ from typing import Any
 import pytest
 
 from ultragray.errors import FrameTooCostly
-from ultragray_workers.jobs.folder import JobFolder, Request
+from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.worker import run_job
 from ultragray_workers.jobs.worker.job_run import JobRun
+
+from ..conftest import request_of
 
 
 def failing(error: Exception) -> Any:
@@ -25,7 +27,7 @@ def outcome_of(error: Exception, folder: Path, monkeypatch: pytest.MonkeyPatch) 
     job_folder = JobFolder(folder, "one")
     job_folder.path.mkdir(parents=True)
     monkeypatch.setattr(run_job, "from_dict", lambda specification: failing(error))
-    return run_job._outcome_of(JobRun(job_folder, Request({}, None, None, "cpu", 1, 0), lambda: False))
+    return run_job._outcome_of(JobRun(job_folder, request_of({}, folder), lambda: False))
 
 
 def test_neither_the_reason_nor_the_log_of_a_fault_names_a_folder(

@@ -8,34 +8,38 @@ from typing import Any
 
 import numpy as np
 import pytest
-import sqlalchemy as sa
 
 from ultragray.phantom.demo import copy_demo_scene
 from ultragray_workers.errors import JobFinished
-from ultragray_workers.jobs import publication
-from ultragray_workers.jobs.folder import JobFolder, Outcome, Progress
+from ultragray_workers.jobs import queue
+from ultragray_workers.jobs.database import JobDatabase
+from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.kinds import RenderJob
-from ultragray_workers.jobs.queue import database, runs
-from ultragray_workers.jobs.queue.database import JobDatabase
-from ultragray_workers.jobs.queue.internals import WORKFLOWS
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.progress import JobState, Outcome, Progress
+from ultragray_workers.jobs.record import Job, Row
+from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.worker import supervision
 from ultragray_workers.jobs.worker.device import DeviceLock, devices_of
 from ultragray_workers.jobs.worker.gate import Gate
 from ultragray_workers.jobs.worker.supervision import Supervisor
+from ultragray_workers.storage.local import LocalStorage
 
 from ....waiting import wait_until
-from ..conftest import RunningWorker, train_job
+from ..conftest import RunningWorker, path_of, request_of, train_job
 
 
 @pytest.fixture
 def finished(store: JobStore, artifact_folder: Path) -> Callable[[str], tuple[Job, JobFolder]]:
-    """A queued job and its folder, as a process that was done and a worker that was killed leave it."""
+    """A job and its folder, as a process that was done and a worker of this host that was killed leave it."""
 
     def make(scene: str) -> tuple[Job, JobFolder]:
-        job, _ = store.submit(train_job(scene))
-        folder = JobFolder(artifact_folder, job.id)
+        job, _ = store.submit(train_job(scene), priority=len(store.list()[0]))  # it goes first
+        row = queue.take(store.database.engine, "dead", queue.demands_waiting(store.database.engine))
+        assert row is not None
+        queue.put_back(store.database.engine, row)
+        folder = JobFolder(artifact_folder, job.id, row.attempt)
         folder.run.mkdir(parents=True)
+        folder.write_request(request_of({}, artifact_folder, row.number))
         with folder.new_artifacts() as artifacts:
             (artifacts / f"{scene}.ugr").write_bytes(b"made")
         folder.write_outcome(Outcome(artifacts=folder.artifact_names(), progress=Progress(step=20, steps=20)))
@@ -61,78 +65,106 @@ def test_what_was_made_is_served_and_what_was_left_is_removed(
     start_worker()
 
     good, late = until(good), until(late)
-    assert (good.state, good.attempts, good.progress.step) == (JobState.SUCCEEDED, 1, 20), good
+    assert (good.state, good.attempts, good.progress.step) == (JobState.SUCCEEDED, 2, 20), good
     assert (scenes / "good.ugr").read_bytes() == b"made"
-    assert {path.name for path in folder.path.iterdir()} == {"outcome.json", "artifacts"}
+    assert list(folder.path.parent.iterdir()) == []
 
     assert (late.state, late.error) == (JobState.FAILED, "SCENE_EXISTS"), late
     assert "choose another name" in (late.reason or "")
-    assert store.artifact(late.id, "late.ugr").read_bytes() == b"made"
+    assert path_of(store.artifact(late.id, "late.ugr")).read_bytes() == b"made"
     assert (scenes / "late.ugr").read_bytes() == b"somebody else's"
 
 
 @pytest.fixture
-def alone(store: JobStore, artifact_folder: Path) -> Iterator[tuple[Supervisor, Callable[[str], Any]]]:
-    """The supervisor, in this process, and what DBOS does: takes a job, and has it done."""
+def alone(store: JobStore, artifact_folder: Path) -> Iterator[Callable[[], Row]]:
+    """Takes a job and does it, in this process; its row as it was taken."""
     jobs = JobDatabase(artifact_folder, None)
     folder = artifact_folder.resolve()
-    gate = Gate(jobs.folder, [DeviceLock(folder, device, "me") for device in devices_of("cpu")], (), list)
-    supervisor = Supervisor(supervision.WorkerConfig(folder, "me"), jobs, gate)
+    gate = Gate(jobs.identity, [DeviceLock(folder, device, "me") for device in devices_of("cpu")], (), list)
+    supervisor = Supervisor(supervision.WorkerConfig(folder, LocalStorage(folder), "me"), jobs, gate)
 
-    def take(job_id: str) -> Outcome:
-        taken = {"status": database.RUNNING[0], "executor_id": "me"}
-        with jobs.engine.begin() as connection:
-            connection.execute(sa.update(WORKFLOWS).where(WORKFLOWS.c.workflow_uuid == job_id).values(**taken))
-        row = jobs.workflow(job_id, with_input=True)
+    def do() -> Row:
+        row = queue.take(jobs.engine, "me", queue.demands_waiting(jobs.engine))
         assert row is not None
-        assert row.input is not None
-        return supervisor.supervise(job_id, row.input["args"][0])
+        supervisor.supervise(row)
+        return row
 
-    yield supervisor, take
+    yield do
     jobs.close()
-
-
-Alone = tuple[Supervisor, Callable[[str], Outcome]]
 
 
 def test_a_cancellation_while_the_scene_is_published_is_refused(
     store: JobStore,
     artifact_folder: Path,
     finished: Callable[[str], tuple[Job, JobFolder]],
-    alone: Alone,
+    alone: Callable[[], Row],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     job, _ = finished("late")
+    publish_made = supervision.publish_made
 
     def publish(*arguments: Any) -> None:
         with pytest.raises(JobFinished, match="being served"):
             store.cancel(job.id)
-        publication.publish_scene(*arguments)
+        publish_made(*arguments)
         with pytest.raises(JobFinished, match="being served"):
             store.cancel(job.id)
 
-    monkeypatch.setattr(supervision, "publish_scene", publish)
-    assert alone[1](job.id).error is None
+    monkeypatch.setattr(supervision, "publish_made", publish)
+    alone()
     assert (artifact_folder / "scenes" / "late.ugr").read_bytes() == b"made"
-    assert store.get(job.id).state is JobState.RUNNING  # DBOS writes the end
+    assert store.get(job.id).state is JobState.SUCCEEDED
 
 
-@pytest.mark.long
 def test_a_cancellation_that_comes_first_serves_nothing(
     store: JobStore,
     artifact_folder: Path,
     finished: Callable[[str], tuple[Job, JobFolder]],
-    alone: Alone,
+    alone: Callable[[], Row],
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    """Also where whoever cancelled died before the queue knew of it."""
     job, _ = finished("late")
-    assert runs.decide(store.database.engine, job.id, runs.CANCELLED)
-    with pytest.raises(supervision.Interrupted):
-        alone[1](job.id)
+    publish = queue.publish
+
+    def cancelled_first(*arguments: Any) -> bool:
+        store.cancel(job.id)
+        return publish(*arguments)
+
+    monkeypatch.setattr(queue, "publish", cancelled_first)
+    alone()
     assert not (artifact_folder / "scenes" / "late.ugr").exists()
     assert store.get(job.id).state is JobState.CANCELLED
     assert store.retry(job.id)[1]
+
+
+def test_a_worker_that_died_while_it_served_the_scene_is_followed_by_one_that_serves_it(
+    store: JobStore,
+    artifact_folder: Path,
+    finished: Callable[[str], tuple[Job, JobFolder]],
+    alone: Callable[[], Row],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """On another host, which has nothing but the record and the objects that it names."""
+    job, _ = finished("late")
+
+    class DiedError(BaseException):
+        pass
+
+    def die(*_: Any) -> None:
+        raise DiedError
+
+    with monkeypatch.context() as patched:
+        patched.setattr(supervision, "publish_made", die)
+        with pytest.raises(DiedError):
+            alone()
+    engine = store.database.engine
+    assert queue.put_back_of(engine) == [job.id]
+    with pytest.raises(JobFinished, match="being served"):
+        store.cancel(job.id)
+    assert list((artifact_folder / "work").iterdir()) == []
+    alone()
+    assert (artifact_folder / "scenes" / "late.ugr").read_bytes() == b"made"
+    assert (store.get(job.id).state, store.get(job.id).attempts) == (JobState.SUCCEEDED, 3)
 
 
 @pytest.mark.long
@@ -163,7 +195,7 @@ def test_the_result_of_a_lost_database_is_not_the_result_of_another_request(
     second = done(fresh, 4)
     assert second.id == first.id
     assert (second.state, second.progress.frames_done) == (JobState.SUCCEEDED, 4), second
-    with np.load(fresh.artifact(second.id, "frames.npz")) as archive:
+    with np.load(path_of(fresh.artifact(second.id, "frames.npz"))) as archive:
         assert len(archive["poses"]) == 4
     assert fresh.log_tail(second.id).count("rendering") == 1
     fresh.close()

@@ -14,11 +14,12 @@ from pathlib import Path
 
 import pytest
 
-from ultragray_workers.jobs.queue import runs
-from ultragray_workers.jobs.store import Job, JobState, JobStore
-from ultragray_workers.jobs.worker import watchdog
-from ultragray_workers.jobs.worker.processes import kill_group
-from ultragray_workers.jobs.worker.watchdog import Watchdog
+from ultragray_workers.jobs import queue
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
+from ultragray_workers.jobs.worker import process as watchdog
+from ultragray_workers.jobs.worker.process import Watchdog, kill_group
 
 from ....waiting import wait_until
 from ..conftest import RunningWorker, train_job
@@ -148,9 +149,10 @@ def test_a_job_runs_for_its_longest_time_in_all_and_a_retry_goes_on(
     assert (job.owner, job.private, store.unfinished_of("ada"), store.unfinished_of("bob")) == ("ada", True, 1, 0)
     until(job, is_training)
     assert worker.terminate() == 0  # writes a checkpoint
-    first_s = runs.run_s(engine, job.id)
-    assert 0.0 < first_s == store.usage_s("ada", began)["cpu"]
-    runs.add_run(engine, job.id, "ada", "cpu", LONGEST_S - first_s - 1.0)
+    row = queue.row_of(engine, job.id)
+    assert row is not None
+    assert 0.0 < row.run_s == store.usage_s("ada", began)["cpu"]
+    queue.add_run_time(engine, row, "cpu", LONGEST_S - row.run_s - 1.0)
 
     start_worker("one", **limits)
     job = until(job)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import shutil
 import signal
 import subprocess
 import sys
@@ -19,13 +18,16 @@ from ultragray.datasets.source import load_dataset
 from ultragray.learn.training import TrainingConfig, train
 from ultragray.samplers import AroundSampler
 from ultragray.scene.gaussians import GaussianScene
+from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import JobFinished, JobNotFinished, StartupFailed
 from ultragray_workers.jobs.kinds import RenderJob
-from ultragray_workers.jobs.store import Job, JobState, JobStore
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.worker.worker import claim_name
 
 from ....waiting import at_this_load
-from ..conftest import RunningWorker, store_dataset, train_job
+from ..conftest import RunningWorker, files_of, path_of, store_dataset, train_job
 
 StartWorker = Callable[..., RunningWorker]
 Until = Callable[..., Job]
@@ -39,14 +41,15 @@ def is_training(job: Job) -> bool:
 def test_good_jobs_run_in_order_and_bad_ones_fail_with_a_reason(
     store: JobStore, artifact_folder: Path, tmp_path: Path, start_worker: StartWorker, until: Until
 ) -> None:
-    poisoned = store_dataset(artifact_folder, "poisoned") / "files" / "poses_train.npy"
+    poisoned = store_dataset(artifact_folder, "poisoned") / "poses_train.npy"
     poses = np.load(poisoned)
     poses[1, 0, 3] = np.nan
     np.save(poisoned, poses)
     last, _ = store.submit(train_job("good"), priority=-5)
-    deleted, _ = store.submit(train_job("deleted", dataset=store_dataset(artifact_folder, "gone").name))
+    store_dataset(artifact_folder, "gone")
+    deleted, _ = store.submit(train_job("deleted", dataset="gone"))
     first, _ = store.submit(train_job("poisoned", dataset="poisoned"), priority=5)
-    shutil.rmtree(artifact_folder / "datasets" / "gone")
+    DatasetStore(artifact_folder).delete("gone")
     worker = start_worker()
 
     last = until(last)
@@ -66,16 +69,16 @@ def test_good_jobs_run_in_order_and_bad_ones_fail_with_a_reason(
     assert (last.progress.step, last.progress.steps, last.attempts, last.worker) == (20, 20, 1, "one")
     assert last.metrics["psnr_db"] > 5
     served = artifact_folder / "scenes" / "good.ugr"
-    assert store.artifact(last.id, "good.ugr").read_bytes() == served.read_bytes()
+    assert path_of(store.artifact(last.id, "good.ugr")).read_bytes() == served.read_bytes()
     assert {"metrics.json", "metrics.jsonl", "training_curve.png", "report.html"} < set(last.artifacts)
-    report = store.artifact(last.id, "report.html").read_text()
+    report = path_of(store.artifact(last.id, "report.html")).read_text()
     assert "<dt>Scene</dt><dd>good</dd>" in report
     assert f"{last.metrics['psnr_db']:.2f} ±" in report
     assert report.count("<img ") == 2 * 5  # both held-out frames, with all panels
     for name in last.artifacts:
         if name.endswith(".png"):
-            assert store.artifact(last.id, name).read_bytes().startswith(b"\x89PNG")
-    assert not (artifact_folder / "jobs" / last.id / "run").exists()
+            assert path_of(store.artifact(last.id, name)).read_bytes().startswith(b"\x89PNG")
+    assert list((artifact_folder / "work").iterdir()) == []
     with pytest.raises(JobFinished):
         store.cancel(last.id)
     with pytest.raises(JobNotFinished):
@@ -85,7 +88,7 @@ def test_good_jobs_run_in_order_and_bad_ones_fail_with_a_reason(
     render = until(render)
     assert render.state is JobState.SUCCEEDED, render
     assert (render.progress.frames_done, render.progress.frames, render.artifacts) == (40, 40, ("frames.npz",))
-    with np.load(store.artifact(render.id, "frames.npz")) as archive:
+    with np.load(path_of(store.artifact(render.id, "frames.npz"))) as archive:
         assert archive["bmode"].shape == (40, 20, 24)
         assert archive["bmode"].max() > 0
     assert worker.terminate() == 0
@@ -166,7 +169,7 @@ def test_killed_worker_is_replaced_and_the_scene_is_that_of_an_undisturbed_run(
     threads = torch.get_num_threads()
     torch.set_num_threads(1)
     config = TrainingConfig.preset("fast", **asked.settings)
-    undisturbed = train(load_dataset(artifact_folder / "datasets" / "tiny" / "files"), config)
+    undisturbed = train(load_dataset(files_of(artifact_folder, "tiny")), config)
     torch.set_num_threads(threads)
 
     one = start_worker("one")
@@ -175,7 +178,8 @@ def test_killed_worker_is_replaced_and_the_scene_is_that_of_an_undisturbed_run(
     assert one.terminate() == 0  # writes a checkpoint and puts the job back
     job = store.get(job.id)
     assert job.state is JobState.QUEUED
-    assert (artifact_folder / "jobs" / job.id / "run").exists()
+    with store.files.checkpoint(job.id) as checkpoint:
+        assert checkpoint is not None
 
     two = start_worker("two")
     process = until(job, lambda job: is_training(job) and two.job_process() is not None) and two.job_process()
@@ -186,9 +190,9 @@ def test_killed_worker_is_replaced_and_the_scene_is_that_of_an_undisturbed_run(
     assert (job.state, job.worker, job.attempts) == (JobState.SUCCEEDED, "three", 3), job
     assert not Path(f"/proc/{process}").exists()
     assert "going on from a checkpoint" in store.log_tail(job.id)
-    made = GaussianScene.load(store.artifact(job.id, "one.ugr"))
+    made = GaussianScene.load(path_of(store.artifact(job.id, "one.ugr")))
     for name, tensor in undisturbed.splats.items():
         assert torch.equal(made.splats[name], tensor), name
-    steps = [line.count('"step"') for line in store.artifact(job.id, "metrics.jsonl").read_text().splitlines()]
+    steps = [line.count('"step"') for line in path_of(store.artifact(job.id, "metrics.jsonl")).read_text().splitlines()]
     assert steps == [1] * 800
     assert three.terminate() == 0

@@ -8,7 +8,7 @@ from ultragray_workers.jobs.kinds.compare import CompareJob
 from ultragray_workers.jobs.kinds.evaluate import EvaluateJob
 from ultragray_workers.jobs.kinds.render import RenderJob
 from ultragray_workers.jobs.kinds.train import TrainJob
-from ultragray_workers.jobs.kinds.volumes.voxelize import VoxelizeJob
+from ultragray_workers.jobs.kinds.voxelize import VoxelizeJob
 
 __all__ = ["KINDS", "CompareJob", "EvaluateJob", "RenderJob", "Specification", "TrainJob", "VoxelizeJob"]
 

@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
-from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar
 
 from typing_extensions import Self
@@ -14,7 +13,7 @@ from typing_extensions import Self
 from ultragray.contract import Family, described
 from ultragray.errors import ExtraMissing
 from ultragray.scene.info import SceneHeader
-from ultragray_workers.jobs.matching.demand import AUTO, MAX_MEMORY_GB, check_device, check_labels
+from ultragray_workers.jobs.demand import AUTO, MAX_MEMORY_GB, check_device, check_labels
 from ultragray_workers.scene_names import check_scene_name, check_scene_reference
 
 MAX_RUN_S = 31_536_000.0
@@ -23,7 +22,7 @@ PLUGINS = "ultragray.job_kinds"  # entry points: the work of kinds that other di
 
 if TYPE_CHECKING:
     from ultragray.geometry.registration import Registration
-    from ultragray_workers.jobs.folder import Outcome
+    from ultragray_workers.jobs.progress import Outcome
     from ultragray_workers.jobs.worker.job_run import JobRun
 
 
@@ -32,7 +31,7 @@ class Surroundings:
     """The surroundings of a job at its submission."""
 
     scene: SceneHeader | None  # the one that `needs_scene` names
-    artifact_folder: Path | None  # None: what jobs make is not written on this host
+    free_bytes: int | None  # room for what the job makes; None: not known
     max_image_side: int  # pixels
 
 
@@ -68,7 +67,8 @@ class Specification(Family):
     worker_labels: dict[str, str] = described(
         'Labels that the worker must have, such as {"site": "lab1"}.', factory=dict, topic=TOPIC, kw_only=True
     )
-    run_module: ClassVar[str | None] = None  # below this folder: its `run(job_run, specification)` does the work
+    # Its `run(job_run, specification)` does the work; None: that of an entry point of PLUGINS does.
+    run_module: ClassVar[str | None] = None
     needs_dataset: ClassVar[str | None] = None  # field: the dataset stays while the job waits or runs
     needs_scene: ClassVar[str | None] = None  # field: the scene is kept for the job as it is at the submission
     needs_registration: ClassVar[str | None] = None  # field: it leads the poses of the job as it is at the submission
@@ -87,8 +87,8 @@ class Specification(Family):
     def check(self, surroundings: Surroundings) -> None:
         """Raises what the job would fail with, as far as its submission can know."""
 
-    def led(self, registration: Registration) -> Self:
-        """The job with its poses led into its scene, which names no registration any more."""
+    def registered(self, registration: Registration) -> Self:
+        """The job with its poses brought into its scene, which names no registration any more."""
         raise NotImplementedError
 
     @classmethod
@@ -98,9 +98,7 @@ class Specification(Family):
 
     def run(self, job_run: JobRun) -> Outcome:
         """Does the work; in the job's own process, for it imports torch."""
-        module: Any = (
-            self.plugin().load() if self.run_module is None else import_module(f".{self.run_module}", __package__)
-        )
+        module: Any = self.plugin().load() if self.run_module is None else import_module(self.run_module)
         outcome: Outcome = module.run(job_run, self)
         return outcome
 

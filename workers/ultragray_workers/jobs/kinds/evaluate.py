@@ -21,6 +21,6 @@ class EvaluateJob(Specification):
     baselines: bool = described("Also score compounding of the training frames: the classical way.", False)
     kind: Literal["evaluate"] = kind_field("evaluate")
 
-    run_module = "evaluate_run"
+    run_module = "ultragray_workers.jobs.kinds.evaluate_run"
     needs_dataset = "dataset"
     needs_scene = "scene"

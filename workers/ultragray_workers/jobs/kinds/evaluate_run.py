@@ -24,10 +24,10 @@ from ultragray.learn.evaluation.speckle import FrameSpeckle
 from ultragray.learn.sweep import Sweep
 from ultragray.learn.training.memory import training_device
 from ultragray.scene.gaussians import GaussianScene
-from ultragray_workers.jobs.folder import Outcome, Progress
 from ultragray_workers.jobs.kinds.evaluate import EvaluateJob
+from ultragray_workers.jobs.progress import Outcome, Progress
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
-from ultragray_workers.scenes import SUFFIX
+from ultragray_workers.scene_names import SUFFIX
 
 RESULT_FILE = "evaluation.json"
 PICTURES = 8  # held-out frames, evenly spread

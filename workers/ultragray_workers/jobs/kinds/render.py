@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-import shutil
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -74,7 +72,7 @@ class RenderJob(FrameSettings, Specification):
     registration: str | None = registration_field()
     kind: Literal["render"] = kind_field("render")
 
-    run_module = "render_run"
+    run_module = "ultragray_workers.jobs.kinds.render_run"
     needs_scene = "scene"
     needs_registration = "registration"
 
@@ -106,7 +104,7 @@ class RenderJob(FrameSettings, Specification):
 
     __hash__ = None  # type: ignore[assignment]
 
-    def led(self, registration: Registration) -> Self:
+    def registered(self, registration: Registration) -> Self:
         return replace(self, poses=registration.probe_to_scene(np.asarray(self.poses)), registration=None)
 
     @classmethod
@@ -160,8 +158,8 @@ class RenderJob(FrameSettings, Specification):
                 require_confidence(assessor.assess(poses, probe=settings.probe), self.least_confidence)
         with under("display"):
             picture = self.file_format.shown(settings).picture
-        if surroundings.artifact_folder is not None:
-            self.check_room(frames, picture, surroundings.artifact_folder)
+        if surroundings.free_bytes is not None:
+            self.check_room(frames, picture, surroundings.free_bytes)
 
     def outlook(self, scene: SceneHeader, settings: Resolved, most: int) -> tuple[int, FloatArray]:
         """The number of its frames, whatever their confidence, and at most `most` poses [C, 4, 4], evenly spread.
@@ -220,9 +218,9 @@ class RenderJob(FrameSettings, Specification):
             raise InvalidArgument(f"sampler needs training poses, the scene {self.scene!r} has none", field="sampler")
         return training_poses
 
-    def check_room(self, frames: int, picture: Picture, folder: Path) -> None:
-        """Raises StorageFull where the disk of a folder has no room for so many frames."""
-        needed, free = self.file_bytes(frames, picture), shutil.disk_usage(folder).free
+    def check_room(self, frames: int, picture: Picture, free: int) -> None:
+        """Raises StorageFull where so many bytes are no room for so many frames."""
+        needed = self.file_bytes(frames, picture)
         if needed > free:
             raise StorageFull(
                 f"{frames:,} frames of {picture.height}x{picture.width} take up to {_size(needed)}, the artifact "

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sys
 import time
 
@@ -15,11 +16,11 @@ from ultragray.samplers import Assess
 from ultragray.scene.confidence import Assessor, Extrapolation
 from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.info import SceneHeader, read_header
-from ultragray_workers.jobs.folder import Outcome, Progress
 from ultragray_workers.jobs.kinds import shards_run
 from ultragray_workers.jobs.kinds.render import RenderJob
+from ultragray_workers.jobs.progress import Outcome, Progress
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
-from ultragray_workers.scenes import SUFFIX
+from ultragray_workers.scene_names import SUFFIX
 
 ASSESSED_AT_ONCE = 100_000  # poses times training poses, of about a tenth of a second
 
@@ -38,8 +39,8 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
     settings = job.resolved(described.info, Encoding.FLOAT32)
     assess = _assessing(job_run, described, settings.probe)
     poses, extrapolations = job.assessed_poses(described.training_poses, settings.probe, assess)
-    if job_run.request.storage is not None:  # else the submission was refused
-        job.check_room(len(poses), job.file_format.shown(settings).picture, job_run.folder.path)
+    free = shutil.disk_usage(job_run.folder.path).free
+    job.check_room(len(poses), job.file_format.shown(settings).picture, free)
     scene = GaussianScene.load(path).to(device)
     size = f"{settings.height}x{settings.width}"
     sys.stderr.write(f"rendering {len(poses):,} frames of {size} of {job.scene} on {device}\n")

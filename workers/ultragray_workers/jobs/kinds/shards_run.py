@@ -19,14 +19,13 @@ from ultragray.rendering.limits import Limits
 from ultragray.scene.info import read_header
 from ultragray_workers.batches.place import ShardPlace
 from ultragray_workers.errors import StorageUnavailable
-from ultragray_workers.jobs.folder import BATCH, FOLDER, Outcome, Progress
+from ultragray_workers.jobs.files import batch_prefix
 from ultragray_workers.jobs.kinds.render import RenderJob
-from ultragray_workers.jobs.shards.queue import BatchFailed, ShardQueue
-from ultragray_workers.jobs.shards.shares import batch_of
+from ultragray_workers.jobs.progress import Outcome, Progress
+from ultragray_workers.jobs.shards.channel import BatchFailed, ShardQueue
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
-from ultragray_workers.scenes import SUFFIX
-from ultragray_workers.storage.opening import open_storage
-from ultragray_workers.storage.storage import Storage
+from ultragray_workers.scene_names import SUFFIX
+from ultragray_workers.storage.location import open_storage
 
 _RETRY_S = 2.0  # while the storage is away
 _PATIENCE_S = 600.0  # of a small request to it
@@ -38,18 +37,18 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
     Raises Stopped, what `BatchPlan.prepared` and `ShardRenderer` raise, and OSError.
     """
     assert job_run.channel is not None
-    batch = batch_of(job_run.folder.job_id)
-    storage = open_storage(job_run.request.storage or job_run.folder.artifact_folder, patience_s=_PATIENCE_S)
-    is_batch = batch == job_run.folder.job_id
-    scene_file = _scene_file(job_run, storage, batch, f"{job.scene}{SUFFIX}")
+    request = job_run.request
+    batch, is_batch = request.batch or job_run.folder.job_id, request.batch is None
+    storage = open_storage(request.storage, patience_s=_PATIENCE_S)
+    scene_file = job_run.folder.path / f"{job.scene}{SUFFIX}"
     plan = job.plan(read_header(scene_file), file_sha256(scene_file))
-    place = ShardPlace(storage, f"{FOLDER}/{batch}/{BATCH}", plan)
+    place = ShardPlace(storage, batch_prefix(batch), plan)
     queue = ShardQueue(job_run.channel)
     if is_batch:
         if place.is_finished():  # by a process that died before it said so
             return _complete(job_run, plan)
-        if job_run.request.retry_of is not None and not place.whole():
-            place.take_over(ShardPlace(storage, f"{FOLDER}/{job_run.request.retry_of}/{BATCH}", plan))
+        if request.retry_of is not None and not place.whole():
+            place.take_over(ShardPlace(storage, batch_prefix(request.retry_of), plan))
         queue.lay_out(plan, done := place.whole())
         sys.stderr.write(f"{plan.frames:,} frames in {plan.shard_count:,} shards, {len(done):,} of them are there\n")
     try:
@@ -148,7 +147,7 @@ class _Meter:
 
     def __init__(self, job_run: JobRun, queue: ShardQueue, plan: BatchPlan) -> None:
         self._job_run, self._queue = job_run, queue
-        self._is_batch = batch_of(job_run.folder.job_id) == job_run.folder.job_id
+        self._is_batch = job_run.request.batch is None
         self._frames = plan.frames
         self._finished = self._furthest = 0
         self._since: tuple[float, int] | None = None  # a time, and the frames that were done then
@@ -175,14 +174,3 @@ class _Meter:
         rate = (total - before) / (now_s - since_s) if total > before else None
         left_s = None if rate is None else (self._frames - total) / rate
         self._job_run.report(Progress(frames_done=total, frames=self._frames, rate_per_s=rate, seconds_left=left_s))
-
-
-def _scene_file(job_run: JobRun, storage: Storage, batch: str, name: str) -> Path:
-    """The scene as it was kept for the batch."""
-    key = f"{FOLDER}/{batch}/{name}"
-    if storage.local is not None:
-        return storage.local / key
-    path = job_run.folder.path / name
-    if not path.exists():
-        storage.download(key, path)
-    return path

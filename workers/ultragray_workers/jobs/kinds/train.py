@@ -28,7 +28,7 @@ class TrainJob(Specification):
     settings: dict[str, Any] = described("Any training settings instead of the preset's.", factory=dict)
     kind: Literal["train"] = kind_field("train")
 
-    run_module = "train_run"
+    run_module = "ultragray_workers.jobs.kinds.train_run"
     has_checkpoints = True
     needs_dataset = "dataset"
     makes_scene = "scene"

@@ -6,30 +6,108 @@ import json
 import math
 import shutil
 import sys
+import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
+
+from ultragray.files import write_whole
+from ultragray.learn.evaluation.baselines import affordable_voxel_mm, evaluate_baselines
+from ultragray.learn.evaluation.scoring import evaluate_frames
 from ultragray.learn.evaluation.side_by_side import write_spread
 from ultragray.learn.report.page import THIS_SCENE, Prediction, ScenePage, render_page
 from ultragray.learn.report.plots import write_training_curve
-from ultragray.learn.sweep import Dataset
+from ultragray.learn.sweep import Dataset, spread_places
 from ultragray.learn.training import Progress as TrainingProgress
 from ultragray.learn.training import TrainingConfig
 from ultragray.learn.training import train as train_scene
+from ultragray.learn.training.confidence import BLACK_FRAMES, LEAST_HELD_OUT, MEASURED_FRAMES, held_out_frames
 from ultragray.learn.training.memory import machine_in_words
 from ultragray.learn.training.pictures import pictures_in
 from ultragray.learn.training.progress import Course
 from ultragray.learn.training.run import FITTING
-from ultragray.learn.training.trainer import CHECKPOINT_FILE, JOURNAL_FILE
+from ultragray.learn.training.trainer import CHECKPOINT_FILE, JOURNAL_FILE, VALIDATION_FRAMES
 from ultragray.scene.gaussians import GaussianScene
 from ultragray_workers.jobs.files import BASELINES_NAME
-from ultragray_workers.jobs.folder import Outcome, Progress
-from ultragray_workers.jobs.kinds.earlier_run import take_over_run
 from ultragray_workers.jobs.kinds.train import TrainJob
-from ultragray_workers.jobs.kinds.training.baselines import write_baselines
-from ultragray_workers.jobs.kinds.training.remaining import PICTURES, REPORT_FRAMES, Finishing
+from ultragray_workers.jobs.progress import Outcome, Progress
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
-from ultragray_workers.scenes import SUFFIX
+from ultragray_workers.scene_names import SUFFIX
+
+METHODS = ("linear", "median")
+MAX_PIXELS = 1 << 26  # of the sweep: about ten seconds; a larger one begins at once, without the lines
+
+
+def write_baselines(dataset: Dataset, path: Path, should_stop: Callable[[], bool]) -> None:
+    """Writes the PSNR in dB of each method, by name, as JSON.
+
+    Nothing where there is a file already, no frame is held out, the sweep is too large, or it is to stop.
+    """
+    if path.exists() or not len(dataset.val) or dataset.train.images.size > MAX_PIXELS:
+        return
+    few = replace(dataset, val=dataset.val.select(spread_places(len(dataset.val), VALIDATION_FRAMES)))
+    voxel_mm, found = affordable_voxel_mm(dataset.train), {}
+    for method in METHODS:
+        if should_stop():
+            return
+        found[method] = evaluate_baselines(few, (method,), voxel_mm)[method].mean.psnr_db
+    path.parent.mkdir(parents=True, exist_ok=True)
+    write_whole(path, json.dumps(found) + "\n")
+
+
+# The time that a training takes after its steps, by what it takes here to render a frame and to score one.
+
+
+STEP_RENDERINGS = 3.0  # what a view of a step costs, with its gradients, in renderings of a frame
+CONFIDENCE_RENDERINGS = 4.0  # of a frame by which the confidence is fitted: image, coverage and uncertainty
+PLOTS_S = 5.0  # of the report, whatever it is about
+PICTURES, REPORT_FRAMES = 4, 24  # held-out frames, evenly spread
+_PANELS = 3  # of a frame in the report that are rendered
+
+
+class Finishing:
+    """The seconds from a phase to the end of the job, beside what is trained in it."""
+
+    def __init__(self, dataset: Dataset, config: TrainingConfig) -> None:
+        self._views = min(config.batch_size, len(dataset.train))
+        self._score_s = _scoring_s(dataset)
+        self._frame_s = 0.0
+        held_out = len(dataset.val)
+        measured = len(held_out_frames(dataset.train)) if config.confidence else 0
+        fitted = 0 if measured < LEAST_HELD_OUT else min(measured, MEASURED_FRAMES) + MEASURED_FRAMES // 3
+        shown = PICTURES + min(held_out, REPORT_FRAMES)
+        # renderings and scores of each phase
+        self._work = {
+            "evaluation": (float(held_out), held_out),
+            "confidence": (CONFIDENCE_RENDERINGS * fitted, fitted + (BLACK_FRAMES if fitted else 0)),
+            "report": (float(held_out + _PANELS * shown), held_out) if held_out else (0.0, 0),
+        }
+        self._plots_s = PLOTS_S if held_out else 0.0
+
+    def observe(self, steps_per_s: float) -> None:
+        """Takes the pace of the run, from which that of renderings follows."""
+        if steps_per_s:
+            self._frame_s = 1.0 / (steps_per_s * self._views * STEP_RENDERINGS)
+
+    def seconds_from(self, phase: str) -> float:
+        """Of this phase and all that come after it."""
+        phases = list(self._work)
+        work = [self._work[one] for one in phases[phases.index(phase) :]]
+        return self._plots_s + sum(frames * self._frame_s + scores * self._score_s for frames, scores in work)
+
+
+def _scoring_s(dataset: Dataset) -> float:
+    """The seconds of scoring a frame: measured on one."""
+    frame = dataset.train.select([0])
+    started = time.perf_counter()
+    evaluate_frames((frame.images / 255.0).astype(np.float32), frame)
+    return time.perf_counter() - started
+
+
+# The work of a training job: a dataset becomes a scene, its metrics, its curve and a few pictures.
+
 
 CHECKPOINT_INTERVAL_S = 10.0
 _LINES = 20  # of the log in a run
@@ -43,7 +121,6 @@ def run(job_run: JobRun, job: TrainJob) -> Outcome:
     device = job_run.request.device
     config = TrainingConfig.preset(job.preset, **job.settings)
     dataset = job_run.load_dataset(job.dataset)
-    take_over_run(job_run, CHECKPOINT_FILE)
     checkpoint = job_run.folder.run / CHECKPOINT_FILE
     resume = checkpoint.exists()
     sys.stderr.write(

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import time
+import uuid
 from collections import deque
 from contextlib import suppress
 from typing import Any
 
-from dbos import WorkflowStatus
+import sqlalchemy as sa
 
 from ultragray_workers.errors import DatabaseUnavailable, StorageFull
-from ultragray_workers.jobs.folder import Outcome
-from ultragray_workers.jobs.queue import database, unfinished
-from ultragray_workers.jobs.queue.database import JobDatabase
-from ultragray_workers.jobs.shards import claims
+from ultragray_workers.jobs import queue
+from ultragray_workers.jobs.progress import Outcome
+from ultragray_workers.jobs.record import Row
+from ultragray_workers.jobs.shards import table
 from ultragray_workers.jobs.shards.channel import channel
-from ultragray_workers.jobs.shards.claims import Failed
-from ultragray_workers.jobs.shards.shares import SHARE_OF, call_help
+from ultragray_workers.jobs.shards.table import Failed
 
 _TELL_INTERVAL_S = 1.0
 LONGEST_SHARE_S = 60.0  # then a share ends, where other jobs wait
@@ -29,12 +29,11 @@ class BatchOver(Exception):
 class ShardDesk:
     """The desk of one process at work at a batch."""
 
-    def __init__(self, jobs: JobDatabase, row: WorkflowStatus, request: dict[str, Any]) -> None:
+    def __init__(self, engine: sa.Engine, row: Row) -> None:
         """Raises DatabaseUnavailable."""
-        self._jobs, self._request = jobs, request
-        self._share = row.workflow_id
-        self._batch = request.get(SHARE_OF) or row.workflow_id
-        claims.release(jobs.engine, self._batch, self._share)
+        self._engine = engine
+        self._share, self._batch = row.id, row.batch or row.id
+        table.release(engine, self._batch, self._share)
         self._channel, self._there = channel()
         self._heard: deque[dict[str, Any]] = deque()  # and not answered, since the database is away
         self._at_hand: deque[int] = deque()  # handed out, in that order, and not done
@@ -66,13 +65,13 @@ class ShardDesk:
             self._heard.extend(self._channel.receive(0.0))
         self.attend(0.0)
         with suppress(DatabaseUnavailable, StorageFull):  # then the batch frees it
-            claims.release(self._jobs.engine, self._batch, self._share)
+            table.release(self._engine, self._batch, self._share)
 
     def fail(self, outcome: Outcome) -> None:
         """Blames the shard at hand for the end of the work. Raises DatabaseUnavailable."""
         if self._at_hand and outcome.error is not None:
             failed = Failed(self._at_hand[0], outcome.error, outcome.reason or outcome.error)
-            claims.fail(self._jobs.engine, self._batch, failed)
+            table.fail(self._engine, self._batch, failed)
 
     def close(self) -> None:
         """Ends the pipes."""
@@ -83,42 +82,42 @@ class ShardDesk:
         return self._share == self._batch
 
     def _answer(self, message: dict[str, Any]) -> None:
-        engine = self._jobs.engine
+        engine = self._engine
         if "plan" in message:
             plan = message["plan"]
-            claims.lay_out(engine, self._batch, plan["frames"], plan["shard_frames"], set(plan["done"]))
+            table.lay_out(engine, self._batch, plan["frames"], plan["shard_frames"], set(plan["done"]))
         elif "done" in message:
-            claims.complete(engine, self._batch, message["done"])
+            table.complete(engine, self._batch, message["done"])
             with suppress(ValueError):
                 self._at_hand.remove(message["done"])
-        elif (failed := claims.failed(engine, self._batch)) is not None:
+        elif (failed := table.failed(engine, self._batch)) is not None:
             self._channel.send({"failed": vars(failed)})
         else:
             self._hand_out()
 
     def _hand_out(self) -> None:
-        engine = self._jobs.engine
-        number = None if self._should_yield() else claims.take(engine, self._batch, self._share)
+        engine = self._engine
+        number = None if self._should_yield() else table.take(engine, self._batch, self._share)
         if number is None and self._is_batch:
-            claims.release_lost(engine, self._batch)
-            number = claims.take(engine, self._batch, self._share)
+            table.release_lost(engine, self._batch)
+            number = table.take(engine, self._batch, self._share)
         if number is not None:
             self._at_hand.append(number)
             self._channel.send({"shard": number})
             return
-        counted = claims.tally(engine, self._batch)
+        counted = table.tally(engine, self._batch)
         self._channel.send({"shard": None, "end": not self._is_batch or counted.done == counted.shards})
 
     def _should_yield(self) -> bool:
         """Whether this share leaves its worker to other jobs: the next one waits behind them."""
         has_worked = time.monotonic() - self._since_s > LONGEST_SHARE_S
-        return not self._is_batch and has_worked and unfinished.count_waiting(self._jobs) > 0
+        return not self._is_batch and has_worked and queue.count_waiting(self._engine) > 0
 
     def _look_after_batch(self) -> None:
-        batch = self._jobs.workflow(self._batch)
-        if batch is None or batch.status not in (*database.QUEUED, *database.RUNNING):
+        batch = queue.row_of(self._engine, self._batch)
+        if batch is None or batch.state.is_final:
             raise BatchOver
-        counted = claims.tally(self._jobs.engine, self._batch)
+        counted = table.tally(self._engine, self._batch)
         self._channel.send({"frames_done": counted.frames_done})
         if counted.free:
-            call_help(self._jobs, batch, self._request)
+            queue.add_share(self._engine, batch, f"{self._batch}-{uuid.uuid4().hex[:8]}")

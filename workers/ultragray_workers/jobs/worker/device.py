@@ -21,8 +21,7 @@ from typing import IO
 from ultragray.errors import InvalidArgument
 from ultragray.installation import memory_bytes, processor_name
 from ultragray_workers.errors import StartupFailed
-from ultragray_workers.jobs.matching.demand import AUTO, CPU, CUDA, check_device
-from ultragray_workers.jobs.matching.offer import WorkerDevice
+from ultragray_workers.jobs.demand import AUTO, CPU, CUDA, WorkerDevice, check_device
 
 LOCK_FOLDER = "workers"  # of the artifact folder, which several hosts may share
 _DRIVERS = (Path("/dev/nvidiactl"), Path("/dev/dxg"))

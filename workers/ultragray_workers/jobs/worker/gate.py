@@ -14,12 +14,13 @@ from collections.abc import Callable, Iterable, Sequence
 from contextlib import suppress
 
 from ultragray_workers.errors import ArtifactFolderUnavailable, DatabaseUnavailable
-from ultragray_workers.jobs.matching.demand import Demand, demand_of_key
-from ultragray_workers.jobs.matching.offer import Offer
-from ultragray_workers.jobs.queue import heartbeat
-from ultragray_workers.jobs.queue.folder_identity import FolderIdentity
+from ultragray_workers.jobs import queue
+from ultragray_workers.jobs.demand import Demand, Offer, demand_of_key
+from ultragray_workers.jobs.identity import StoreIdentity
 from ultragray_workers.jobs.worker.device import DeviceLock
-from ultragray_workers.jobs.worker.processes import holder_of, is_stopped
+from ultragray_workers.jobs.worker.process import holder_of, is_stopped
+
+_CHECKED_FOR_S = 2.0  # how long an artifact folder counts as the right one
 
 _log = logging.getLogger("ultragray.jobs")
 
@@ -29,13 +30,13 @@ class Gate:
 
     def __init__(
         self,
-        folder: FolderIdentity,
+        identity: StoreIdentity,
         devices: Sequence[DeviceLock],
         labels: tuple[tuple[str, str], ...],
         waiting: Callable[[], Iterable[str]],
     ) -> None:
         """`devices`: those that the worker offers, the preferred one first. `waiting`: the demands of waiting jobs."""
-        self.folder = folder
+        self.identity = identity
         self.offer = Offer(tuple(lock.device for lock in devices), labels)
         self._locks = {lock.device.name: lock for lock in devices}
         self._waiting = waiting
@@ -97,7 +98,7 @@ class Gate:
 
     def _has_folder(self) -> bool:
         try:
-            self.folder.check()
+            self.identity.check(_CHECKED_FOR_S)
         except ArtifactFolderUnavailable as error:
             if self._is_folder_there:
                 _log.error(f"no job is taken: {error.detail}")
@@ -121,7 +122,7 @@ class Gate:
         known, since_s = self._stopped.get(name, (None, now_s))
         if known != holder:
             self._stopped[name] = (holder, now_s)
-        elif now_s - since_s > heartbeat.DEAD_AFTER_S:
+        elif now_s - since_s > queue.DEAD_AFTER_S:
             pid, worker = holder
             _log.warning(f"the worker {worker} (process {pid}) was stopped, and kept {name}: it is ended")
             with suppress(ProcessLookupError):

@@ -8,9 +8,10 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import TYPE_CHECKING
 
-from ultragray_workers.datasets.opening import open_datasets
+from ultragray_workers.datasets.store import open_datasets
 from ultragray_workers.errors import StorageUnavailable
-from ultragray_workers.jobs.folder import JobFolder, Progress, Request
+from ultragray_workers.jobs.folder import JobFolder, Request
+from ultragray_workers.jobs.progress import Progress
 from ultragray_workers.jobs.shards.channel import Channel
 
 if TYPE_CHECKING:

@@ -22,7 +22,8 @@ from pathlib import Path
 
 from ultragray.errors import InvalidArgument, MemoryExceeded, UltragrayError
 from ultragray_workers.claims import is_no_room, storage_full
-from ultragray_workers.jobs.folder import JobFolder, Outcome
+from ultragray_workers.jobs.folder import JobFolder
+from ultragray_workers.jobs.progress import Outcome
 from ultragray_workers.jobs.shards.channel import Channel
 from ultragray_workers.jobs.specification import from_dict
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
@@ -43,7 +44,8 @@ def main(folder_path: str, worker_pid: str, *descriptors: str) -> int:
     signal.signal(signal.SIGTERM, lambda number, frame: received.append(number))
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     path = Path(folder_path)
-    folder = JobFolder(path.parent.parent, path.name)
+    job_id, _, attempt = path.name.rpartition(".")
+    folder = JobFolder(path.parent.parent, job_id, int(attempt))
     with folder.lock.open("a") as lock:
         while not _is_locked(lock.fileno()):  # another worker's process may still be at it, or have finished
             if received:
@@ -55,6 +57,8 @@ def main(folder_path: str, worker_pid: str, *descriptors: str) -> int:
         if folder.outcome() is not None:
             return 0
         request = folder.request()
+        if request is None:  # it was taken away
+            return FOLDER_LOST
         let_frames_go_first(request.nice)
         Path("/proc/self/oom_score_adj").write_text(_OOM_SCORE_ADJ, encoding="ascii")
         channel = Channel(*map(int, descriptors)) if descriptors else None

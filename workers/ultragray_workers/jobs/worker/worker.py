@@ -1,4 +1,8 @@
-"""A worker: takes one job at a time from the queue and supervises its process. Free of torch."""
+"""A worker: takes one job at a time from the queue and supervises its process. Free of torch.
+
+main thread: waits until it is told to stop       thread "jobs": gate → queue.take → supervision, again and again
+thread "heartbeat": `jobs.workers`                thread "housekeeper": `worker.housekeeping`
+"""
 
 from __future__ import annotations
 
@@ -14,25 +18,21 @@ import threading
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import MappingProxyType
-from typing import Any
 
-from dbos import DBOS, PortableWorkflowError, WorkflowSerializationFormat
+from sqlalchemy.exc import SQLAlchemyError
 
-from ultragray.errors import InvalidArgument
-from ultragray_workers.datasets.copies import DEFAULT_MAX_BYTES
+from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray_workers.errors import StartupFailed
-from ultragray_workers.jobs.kinds import KINDS
-from ultragray_workers.jobs.matching.demand import check_labels
-from ultragray_workers.jobs.queue import database, unfinished
-from ultragray_workers.jobs.queue.database import JobDatabase, dbos_config, quiet_dbos
-from ultragray_workers.jobs.queue.heartbeat import Heartbeat
-from ultragray_workers.jobs.queue.internals import NotMine, leave_others_room, take_only_through
-from ultragray_workers.jobs.queue.wishes import Wanted
-from ultragray_workers.jobs.shards.shares import SHARE
+from ultragray_workers.jobs import queue
+from ultragray_workers.jobs.database import JobDatabase
+from ultragray_workers.jobs.demand import check_labels
 from ultragray_workers.jobs.worker.device import DeviceLock, devices_of
 from ultragray_workers.jobs.worker.gate import Gate
 from ultragray_workers.jobs.worker.housekeeping import Housekeeper
-from ultragray_workers.jobs.worker.supervision import Interrupted, Supervisor, WorkerConfig
+from ultragray_workers.jobs.worker.supervision import Supervisor, WorkerConfig
+from ultragray_workers.jobs.workers import Heartbeat, Wanted
+from ultragray_workers.rounds import Rounds
+from ultragray_workers.storage.copies import DEFAULT_MAX_BYTES
 from ultragray_workers.storage.local import LocalStorage
 from ultragray_workers.storage.storage import Storage
 from ultragray_workers.store import OpenStore
@@ -50,7 +50,7 @@ def work(
     database_url: str | None,
     stop: threading.Event,
     *,
-    shared: Storage | None = None,
+    storage: Storage | None = None,
     max_copies_bytes: int = DEFAULT_MAX_BYTES,
     hurry: threading.Event | None = None,
     name: str | None = None,
@@ -75,29 +75,31 @@ def work(
     `device`: auto (every GPU of the host, and its processor), cpu, cuda (every GPU) or cuda:N. Jobs that ask for
     another one, for more memory than it has, or for other labels than `labels` are left to other workers.
 
-    `shared` is the storage in which several hosts have datasets and the files of jobs; the artifact folder is this
-    host's own then, with copies of datasets of at most `max_copies_bytes`. No other worker may have the `name` (None:
-    that of the host, numbered); a worker that is started again under its name goes on with its jobs at once. `threads`
-    0: all cores but one. A render job fails at a frame that costs more than `max_footprint_pixels`, see
-    ultragray.rendering.limits. Finished jobs are removed after `retention_days`; a job fails whose process does not get
-    on for
-    `stall_timeout_s`, or that runs for `max_run_s` in all; 0: never. Threads of DBOS are left behind: end the process
-    by os._exit. Raises StartupFailed.
+    `storage` has datasets, the files of jobs and the scenes that they make; None: the artifact folder has. With another
+    one the artifact folder is this host's own, with copies of datasets of at most `max_copies_bytes`. No other worker
+    may have the `name` (None: that of the host, numbered); a worker that is started again under its name goes on with
+    its jobs at once. `threads` 0: all cores but one. A render job fails at a frame that costs more than
+    `max_footprint_pixels`, see ultragray.rendering.limits. Finished jobs are removed after `retention_days`; a job
+    fails whose process does not get on for `stall_timeout_s`, or that runs for `max_run_s` in all; 0: never. Raises
+    StartupFailed.
     """
     try:
         check_labels(labels, "label")
     except InvalidArgument as error:
         raise StartupFailed(error.detail, field="label") from None
     devices = devices_of(device)
+    is_alone = storage is not None and storage.location != str(artifact_folder)  # workers elsewhere see it not
     with (
         contextlib.closing(OpenStore(artifact_folder)),
-        claim_name(artifact_folder, name, host_of_its_own=shared is not None) as executor,
+        claim_name(artifact_folder, name, host_of_its_own=is_alone) as worker,
     ):
-        jobs = JobDatabase(artifact_folder, database_url, shared)
+        folder = artifact_folder.resolve()
+        storage = storage or LocalStorage(folder)
+        jobs = JobDatabase(artifact_folder, database_url, storage)
         config = WorkerConfig(
-            artifact_folder=artifact_folder.resolve(),
-            executor=executor,
-            shared=shared,
+            artifact_folder=folder,
+            storage=storage,
+            name=worker,
             max_copies_bytes=max_copies_bytes,
             threads=threads or max(1, (os.cpu_count() or 1) - 1),
             nice=nice,
@@ -105,66 +107,61 @@ def work(
             stall_timeout_s=stall_timeout_s,
             max_run_s=max_run_s,
         )
-        locks = [DeviceLock(config.artifact_folder, one, executor) for one in devices]
-        gate = Gate(jobs.folder, locks, tuple(sorted(labels.items())), lambda: unfinished.demands_waiting(jobs))
+        locks = [DeviceLock(folder, one, worker) for one in devices]
+        gate = Gate(jobs.identity, locks, tuple(sorted(labels.items())), lambda: queue.demands_waiting(jobs.engine))
         supervisor = Supervisor(config, jobs, gate)
 
         def obey(wanted: Wanted) -> None:
             if gate.is_resting is not (wanted is not Wanted.WORK):
-                _log.info(f"worker {executor} is to {wanted.value}")
+                _log.info(f"worker {worker} is to {wanted.value}")
             gate.is_resting = wanted is not Wanted.WORK
             supervisor.is_draining = wanted is Wanted.DRAIN
 
         heartbeat = Heartbeat(
-            jobs,
-            executor,
+            jobs.engine,
+            worker,
             job_at_hand=lambda: supervisor.job_at_hand,
             is_stuck=lambda: supervisor.is_stuck,
             device=device,
             offer=gate.offer,
             obey=obey,
         )
-        unfinished.adopt_older(jobs)
-        _launch(jobs.url, config, supervisor, gate)
-        housekeeper = Housekeeper(jobs, config.artifact_folder, retention_days, shared)
+        for job_id in queue.put_back_of(jobs.engine, worker):
+            _log.info(f"the job {job_id} goes on: this worker had it before it died")
+        thread = threading.Thread(
+            target=_take_jobs, args=(jobs, worker, gate, supervisor, stop), name="jobs", daemon=True
+        )
+        thread.start()
+        housekeeper = Housekeeper(jobs, folder, storage, retention_days)
         if retention_days:
             housekeeper.start()
-        fields = {"worker": executor, "threads": config.threads, "offer": str(gate.offer)}
-        _log.info(f"worker {executor} takes jobs", extra={"fields": fields})
+        fields = {"worker": worker, "threads": config.threads, "offer": str(gate.offer)}
+        _log.info(f"worker {worker} takes jobs", extra={"fields": fields})
         ready()
         while not stop.wait(alive_every_s):
             if not supervisor.is_stuck:
                 tell_alive()
         housekeeper.stop()
         supervisor.stop(drain_timeout_s, hurry or threading.Event())
+        thread.join(POLLING_INTERVAL_S)
         heartbeat.stop()
-        _log.info(f"worker {executor} stopped")
+        jobs.close()
+        _log.info(f"worker {worker} stopped")
 
 
-def _launch(url: str, config: WorkerConfig, supervisor: Supervisor, gate: Gate) -> None:
-    def run(request: dict[str, Any]) -> dict[str, Any]:
-        job_id = DBOS.workflow_id
-        assert job_id is not None
-        try:
-            outcome = supervisor.supervise(job_id, request)
-        except Interrupted:
-            raise NotMine(job_id) from None  # any other error would be kept as the job's end
-        if outcome.error is not None:
-            raise PortableWorkflowError(outcome.reason or outcome.error, outcome.error, data=outcome.to_dict())
-        return outcome.to_dict()
-
-    dbos = DBOS(config=dbos_config(url, config.executor))
-    for kind in (*KINDS, SHARE):
-        # However often its worker dies, a job does not fail for it.
-        DBOS.workflow(name=kind, max_recovery_attempts=None, serialization_type=WorkflowSerializationFormat.PORTABLE)(
-            run
-        )
-    quiet_dbos()
-    DBOS.listen_queues([database.QUEUE])
-    DBOS.launch()
-    leave_others_room(dbos, database.QUEUE)
-    take_only_through(dbos, database.QUEUE, gate.opens, gate.close)
-    DBOS.register_queue(database.QUEUE, worker_concurrency=1, polling_interval_sec=POLLING_INTERVAL_S)
+def _take_jobs(jobs: JobDatabase, worker: str, gate: Gate, supervisor: Supervisor, stop: threading.Event) -> None:
+    """Does one job after another until `stop` is set."""
+    rounds = Rounds("taking jobs", _log)
+    while not stop.is_set():
+        with rounds.round():
+            row = None
+            with contextlib.suppress(UltragrayError, SQLAlchemyError):  # the heartbeat tells of a database that is away
+                row = queue.take(jobs.engine, worker, gate.opens())
+            if row is not None:
+                supervisor.supervise(row)
+                continue
+            gate.close()
+        stop.wait(POLLING_INTERVAL_S)
 
 
 @contextlib.contextmanager

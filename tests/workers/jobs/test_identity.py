@@ -1,0 +1,119 @@
+"""A folder that is not the one that the jobs belong to: nobody works in it, whether at the start or later."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+from ultragray_workers.errors import ArtifactFolderUnavailable, StartupFailed, StorageUnavailable
+from ultragray_workers.jobs.database import JobDatabase
+from ultragray_workers.jobs.identity import KEY as FILE
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.record import Job
+from ultragray_workers.jobs.store import JobStore
+from ultragray_workers.storage.local import LocalStorage
+
+from ...postgres import PostgresServer
+from ...waiting import wait_until
+from .conftest import RunningWorker, train_job
+
+
+@pytest.fixture
+def database_url(postgres: PostgresServer) -> str:
+    return postgres.create_database()
+
+
+def test_another_folder_is_refused_at_the_start_and_the_id_written_there_is_believed(
+    store: JobStore, artifact_folder: Path, database_url: str, tmp_path: Path
+) -> None:
+    JobDatabase(artifact_folder, database_url).close()
+    other = tmp_path / "not-mounted"
+    with pytest.raises(StartupFailed, match=f"{FILE} holds no id, expected [0-9a-f]{{32}}. Mount the share") as caught:
+        JobDatabase(other, database_url)
+    assert caught.value.field == "artifact_folder"
+    (other / FILE).write_text((artifact_folder / FILE).read_text())
+    JobDatabase(other, database_url).close()
+    (other / FILE).write_text("another\n")
+    with pytest.raises(StartupFailed, match="holds another, expected"):
+        JobDatabase(other, database_url)
+
+
+def test_a_new_database_takes_the_id_of_its_folder(
+    store: JobStore, artifact_folder: Path, postgres: PostgresServer
+) -> None:
+    before = (artifact_folder / FILE).read_text()
+    JobDatabase(artifact_folder, postgres.create_database()).close()
+    assert (artifact_folder / FILE).read_text() == before
+
+
+@pytest.mark.parametrize("database_url", [None])
+def test_a_database_within_the_folder_is_at_home_there(store: JobStore, artifact_folder: Path) -> None:
+    before = (artifact_folder / FILE).read_text()
+    (artifact_folder / FILE).unlink()
+    JobDatabase(artifact_folder, None).close()
+    assert (artifact_folder / FILE).read_text() == before
+
+
+@pytest.mark.long
+def test_a_share_that_vanishes_costs_no_job(
+    store: JobStore,
+    artifact_folder: Path,
+    tmp_path: Path,
+    start_worker: Callable[..., RunningWorker],
+    until: Callable[..., Job],
+) -> None:
+    """It is gone while a job runs, an empty folder of its name is there, and later it is back."""
+    worker = start_worker()
+    running, _ = store.submit(train_job("one", steps=3000))
+    until(running, lambda job: (job.progress.step or 0) > 0)
+    waiting = [store.submit(train_job(f"scene-{number}"))[0] for number in range(2)]
+    away = tmp_path / "away"
+    artifact_folder.rename(away)
+    artifact_folder.mkdir()
+    process = worker.job_process()
+    assert process is not None
+    wait_until(lambda: store.get(running.id).state is JobState.QUEUED, within_s=240)
+    with pytest.raises(ArtifactFolderUnavailable):
+        store.submit(train_job("refused"))
+    wait_until(lambda: "no job is taken" in (tmp_path / "one.log").read_text())
+    assert {store.get(job.id).attempts for job in waiting} == {0}
+    for path in artifact_folder.rglob("*"):
+        assert path.is_dir()  # nobody has worked here
+    wait_until(lambda: worker.job_process() is None)
+    artifact_folder.rename(tmp_path / "mountpoint")
+    away.rename(artifact_folder)
+    done = [until(job) for job in (running, *waiting)]
+    assert {job.state for job in done} == {JobState.SUCCEEDED}, done
+
+
+def test_a_storage_that_belongs_to_another_database_is_refused(
+    artifact_folder: Path, postgres: PostgresServer, tmp_path: Path
+) -> None:
+    first, storage = postgres.create_database(), LocalStorage(tmp_path / "bucket")
+    jobs = JobDatabase(artifact_folder, first, storage)
+    jobs.identity.check_writable()
+    assert [entry.key for entry in storage.entries()] == [FILE]
+    jobs.close()
+    JobDatabase(tmp_path / "another-host", first, storage).close()
+    with pytest.raises(StartupFailed, match=f"{FILE} holds no id"):
+        JobDatabase(artifact_folder, first, LocalStorage(tmp_path / "another-bucket"))
+
+
+def test_a_storage_that_is_another_now_or_away_is_not_worked_in(
+    artifact_folder: Path, database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    storage = LocalStorage(tmp_path / "bucket")
+    jobs = JobDatabase(artifact_folder, database_url, storage)
+    storage.write(FILE, b"another")
+    with pytest.raises(ArtifactFolderUnavailable, match="another bucket or prefix"):
+        jobs.identity.check()
+
+    def away(key: str, **_: object) -> bytes:
+        raise StorageUnavailable("it does not answer")
+
+    monkeypatch.setattr(storage, "read", away)
+    with pytest.raises(ArtifactFolderUnavailable, match="does not answer"):
+        jobs.identity.check()
+    jobs.close()

@@ -1,0 +1,120 @@
+"""Copies of the scenes and datasets of an installation into another storage, such as from a folder into a bucket.
+
+The keys are the same below both, so that a service that is started with the other location serves the same.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import re
+import tempfile
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+
+from ultragray.files import file_sha256
+from ultragray_workers.datasets.shelf import DatasetShelf, without_files
+from ultragray_workers.errors import RestoreRefused, StorageUnavailable
+from ultragray_workers.storage.storage import NotThere, Storage
+
+ARTIFACTS = "artifacts"  # the artifact folder, below a data folder
+_SCENES = re.compile(
+    rf"({ARTIFACTS}/)?(scenes/(objects/)?)?[A-Za-z0-9][A-Za-z0-9._-]*\.ugr|({ARTIFACTS}/)?scenes/[^./][^/]*\.json"
+)
+
+
+@dataclass(frozen=True)
+class Copied:
+    """What a copy has done."""
+
+    scenes: int = 0
+    bytes: int = 0
+    already_there: int = 0
+
+
+def copy_scenes(source: Storage, target: Storage, say: Callable[[str], None] = lambda sentence: None) -> Copied:
+    """Copies the scenes of `source` that `target` has not, and compares each with its copy by SHA-256.
+
+    Interrupted, the same call goes on: what is there already is compared, not copied. Names come after the files that
+    they name. Raises RestoreRefused where the target has other content under a key, StorageUnavailable, OSError.
+    """
+    keys = sorted((entry.key for entry in source.entries() if _SCENES.fullmatch(entry.key)), key=_names_last)
+    copied = bytes_ = there = 0
+    for number, key in enumerate(keys, 1):
+        with _file(source, key) as file:
+            sha256 = file_sha256(file)
+            is_new = target.entry(key) is None and target.upload(file, key, if_absent=True)
+            found = _sha256(target, key)
+            if found != sha256 and is_new:
+                raise StorageUnavailable(f"the copy of {key} in {target.location} has another SHA-256: copy again")
+            if found != sha256:
+                raise RestoreRefused(f"{target.location} has another {key}: remove it there, or choose another place")
+            copied, there = copied + is_new, there + (not is_new)
+            bytes_ += file.stat().st_size if is_new else 0
+        say(f"{number} of {len(keys)}: {key} {'copied' if is_new else 'is there already'}")
+    return Copied(copied, bytes_, there)
+
+
+def _names_last(key: str) -> tuple[bool, str]:
+    return key.endswith(".json"), key
+
+
+@contextmanager
+def _file(storage: Storage, key: str) -> Iterator[Path]:
+    if storage.local is not None:
+        yield storage.local / key
+        return
+    with tempfile.TemporaryDirectory(prefix="ultragray-copy-") as folder:
+        path = Path(folder, "object")
+        storage.download(key, path)
+        yield path
+
+
+def _sha256(storage: Storage, key: str) -> str:
+    digest = hashlib.sha256()
+    try:
+        for chunk in storage.chunks(key):
+            digest.update(chunk)
+    except NotThere as error:
+        raise StorageUnavailable(str(error)) from None
+    return digest.hexdigest()
+
+
+# Copies the datasets of one storage into another, such as from a folder into a bucket.
+
+
+@dataclass(frozen=True)
+class CopiedDatasets:
+    """What a copy has done."""
+
+    datasets: int = 0
+    datasets_already_there: int = 0
+
+
+def copy_datasets(
+    source: Storage, target: Storage, say: Callable[[str], None] = lambda sentence: None
+) -> CopiedDatasets:
+    """Copies the datasets that the target has not, each whole or not at all.
+
+    Interrupted, the same call goes on with those that are missing. Raises RestoreRefused where the target has another
+    dataset of a name, StorageUnavailable, OSError.
+    """
+    copied = there = 0
+    with tempfile.TemporaryDirectory(prefix="ultragray-copy-") as copies:
+        here, shelf = DatasetShelf(source, Path(copies, "from")), DatasetShelf(target, Path(copies, "to"))
+        names = sorted(here.names())
+        for number, name in enumerate(names, 1):
+            manifest = here.manifest(name)
+            if manifest is None:  # deleted meanwhile
+                continue
+            with here.folder(name) as folder:
+                is_new = shelf.manifest(name) is None and shelf.put(folder, manifest, name)
+            found = shelf.manifest(name)
+            if not is_new and (found is None or without_files(found) != without_files(manifest)):
+                raise RestoreRefused(
+                    f"{target.location} has another dataset {name!r}: delete it there, or choose another place"
+                )
+            copied, there = copied + is_new, there + (not is_new)
+            say(f"{number} of {len(names)}: dataset {name} {'copied' if is_new else 'is there already'}")
+    return CopiedDatasets(copied, there)

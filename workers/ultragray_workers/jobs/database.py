@@ -1,0 +1,176 @@
+"""The database of the jobs: a SQLite file in the artifact folder, or PostgreSQL, by one URL.
+
+`jobs.store` and the workers share it; the service's keys, owners, audit and registrations use its engine, too. While a
+database that was there is away or read-only, every use that needs it raises DatabaseUnavailable. Free of torch.
+"""
+
+from __future__ import annotations
+
+import os
+import uuid
+from contextlib import ExitStack, suppress
+from pathlib import Path
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.engine import ExceptionContext
+from sqlalchemy.exc import SQLAlchemyError
+
+from ultragray_workers.errors import DatabaseUnavailable, StartupFailed, StorageFull
+from ultragray_workers.jobs import tables
+from ultragray_workers.jobs.identity import StoreIdentity, identify
+from ultragray_workers.jobs.tables import SCHEMA, WORKERS
+from ultragray_workers.storage.local import LocalStorage
+from ultragray_workers.storage.storage import Storage
+from ultragray_workers.store import PRIVATE_FILE, PRIVATE_FOLDER
+
+SQLITE_FILE = "jobs.sqlite"
+_SQLITE_SETTINGS = {"busy_timeout": 30_000, "foreign_keys": 1}
+_POSTGRES_SCHEMES = ("postgresql", "postgres", "postgresql+psycopg")
+# libpq's: a server that cannot be reached, or from which nothing comes back any more, is given up. s, ms, ms, ms
+_PATIENCE = {
+    "connect_timeout": "5",
+    "tcp_user_timeout": "10000",
+    "options": "-c statement_timeout=30000 -c idle_in_transaction_session_timeout=60000",
+}
+_CONNECTIONS = 5
+# SQLSTATE: the connection is gone, the server lacks the means, a statement took too long, the server stops or starts.
+_AWAY = ("08", "53", "57014", "57P")
+_TAKES_NO_CHANGES = "the database of the jobs takes no changes: it is read-only"
+_IS_LOST = "the database of the jobs is not there any more, or has lost its tables"
+_REFUSALS = {  # by SQLSTATE, or by words of SQLite
+    "25006": _TAKES_NO_CHANGES,
+    "readonly database": _TAKES_NO_CHANGES,
+    "42P01": _IS_LOST,
+    "no such table": _IS_LOST,
+    "unable to open database file": _IS_LOST,
+    "disk I/O error": "the disk of the jobs' database fails",
+}
+
+
+class JobDatabase:
+    """A connection to the database, its tables made where they are missing. Free for use from several threads."""
+
+    def __init__(self, artifact_folder: Path, database_url: str | None, storage: Storage | None = None) -> None:
+        """`storage`: of the files of the jobs, which belongs to the database; None: the artifact folder.
+
+        Raises StartupFailed where the database cannot be used.
+        """
+        storage = storage or LocalStorage(artifact_folder)
+        try:
+            with ExitStack() as undo:
+                artifact_folder.mkdir(mode=PRIVATE_FOLDER, parents=True, exist_ok=True)
+                self.url = checked_url(database_url, artifact_folder)
+                engine = _engine(self.url)
+                undo.callback(engine.dispose)
+                self._file = engine.url.database if engine.dialect.name == "sqlite" else None
+                if self._file:
+                    with suppress(FileExistsError):
+                        Path(self._file).touch(PRIVATE_FILE, exist_ok=False)  # its companions get its mode
+                self.engine = engine.execution_options(
+                    schema_translate_map={SCHEMA: None if engine.dialect.name == "sqlite" else SCHEMA}
+                )
+                with tables.one_at_a_time(engine.url):
+                    tables.make_tables(self.engine)
+                    holds_database = self._file == str(artifact_folder.resolve() / SQLITE_FILE)
+                    with self.engine.begin() as connection:
+                        self.identity: StoreIdentity = identify(connection, storage, holds_database=holds_database)
+                undo.pop_all()
+        except (SQLAlchemyError, OSError) as error:
+            cause = getattr(error, "orig", None) or error
+            if isinstance(cause, OSError) and cause.strerror:
+                cause = f"{cause.filename}: {cause.strerror.lower()}"
+            raise StartupFailed(
+                f"the database of the jobs cannot be opened: {' '.join(str(cause).split())} "
+                "(ULTRAGRAY_DATABASE_URL names it: server and database must be there, user and password right)",
+                field="database_url",
+            ) from error
+        sa.event.listen(engine, "handle_error", _raise_as_ours)
+        if self._file:
+            self._opened = _inode(self._file)
+            # SQLite would make an empty file in place of one that was removed.
+            sa.event.listen(engine, "do_connect", lambda *_: self._require_same_file())
+
+    def check(self) -> None:
+        """Raises DatabaseUnavailable or StorageFull unless a row could be written now: one is written and taken back.
+
+        To read would not tell: a SQLite file that was removed is read to the end of the process, a full or read-only
+        disk shows with the first page, and a standby of PostgreSQL answers every question.
+        """
+        self._require_same_file()
+        try:
+            with self.engine.connect() as connection:  # whose end takes the row back
+                connection.execute(sa.insert(WORKERS).values(name=f"check {uuid.uuid4().hex}", seen_at_s=0.0))
+        except SQLAlchemyError as error:
+            raise DatabaseUnavailable("the database of the jobs refuses to write") from error
+
+    def close(self) -> None:
+        """Ends the connections."""
+        self.engine.dispose()
+
+    def _require_same_file(self) -> None:
+        if self._file and _inode(self._file) != self._opened:
+            raise DatabaseUnavailable(
+                "the file of the jobs' database was removed or replaced while it was in use: put it back, or start the "
+                "service again"
+            )
+
+
+def checked_url(database_url: str | None, artifact_folder: Path) -> str:
+    """The URL given, which gives up on a silent server in time; None: that of a SQLite file in the artifact folder.
+
+    Raises StartupFailed for one that names no database.
+    """
+    if database_url is None:
+        return f"sqlite:///{artifact_folder.resolve() / SQLITE_FILE}"
+    try:
+        url = sa.make_url(database_url)
+    except (SQLAlchemyError, ValueError):
+        url = sa.URL.create("unreadable")
+    if url.drivername == "sqlite" and url.database:
+        return database_url
+    is_split_rightly = "@" not in f"{url.host}{url.database}"  # else a part of the password
+    if url.drivername not in _POSTGRES_SCHEMES or not url.database or not is_split_rightly:
+        raise StartupFailed(  # without the URL: it may hold a password
+            "database_url must be postgresql://USER:PASSWORD@HOST:PORT/DATABASE (in the password, %40 stands for @, "
+            "%2F for /), or be left out for a SQLite file in the artifact folder",
+            field="database_url",
+        )
+    ours = url.set(drivername="postgresql+psycopg", query={**_PATIENCE, **url.query})
+    return ours.render_as_string(hide_password=False)
+
+
+def _engine(url: str) -> sa.Engine:
+    engine = sa.create_engine(url, pool_size=_CONNECTIONS, max_overflow=0, pool_timeout=30, pool_pre_ping=True)
+    if engine.dialect.name == "sqlite":
+
+        @sa.event.listens_for(engine, "connect")
+        def configure(connection: Any, record: Any) -> None:
+            connection.isolation_level = "IMMEDIATE"  # a change locks the file from its start; a question does not
+            for name, value in _SQLITE_SETTINGS.items():
+                connection.execute(f"PRAGMA {name}={value}")
+
+    return engine
+
+
+def _raise_as_ours(context: ExceptionContext) -> None:
+    if context.is_pre_ping:  # a connection that was lost while nobody used it is replaced
+        return
+    error = context.original_exception
+    if "disk is full" in str(error):
+        raise StorageFull("the disk of the jobs' database has no room") from error
+    state = getattr(error, "sqlstate", None) or ""
+    if context.connection is None or context.is_disconnect or state.startswith(_AWAY):
+        raise DatabaseUnavailable("the database of the jobs does not answer: try again in a few seconds") from error
+    for sign, meaning in _REFUSALS.items():
+        if sign == state or (not state and sign in str(error)):
+            raise DatabaseUnavailable(meaning) from error
+
+
+def _inode(file: str) -> tuple[int, int] | None:
+    """Of the file that stands at the path; None: there is none."""
+    try:
+        found = os.stat(file)
+    except OSError:
+        return None
+    return found.st_dev, found.st_ino

@@ -1,1 +1,0 @@
-"""Which worker can do which job: what jobs demand, what workers offer. Free of torch."""

@@ -1,0 +1,413 @@
+"""The queue: every change of a job's row, each one statement, so that of many workers and services one wins.
+
+    submit → queued ──take──→ running ──finish──→ succeeded, failed
+               ↑  ╰──cancel──╮   │ ╰──cancel──→ cancelled
+               ╰── put_back ─────╯
+
+A worker holds a job as long as the row names it and its attempt, and the worker gives signs of life (see
+`jobs.workers`): `put_back_of_dead` lets others go on with the jobs of one that does not. Whatever a worker writes of a
+job holds for its own attempt alone, so that one that was cut off, and comes back, changes nothing any more. What
+demands fit which worker is decided by `worker.gate`; here a job is taken by the keys of demands. All functions block,
+and raise DatabaseUnavailable where the database is away. Free of torch.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict
+from datetime import datetime, timezone
+from typing import Any
+
+import sqlalchemy as sa
+from sqlalchemy.dialects import postgresql, sqlite
+from sqlalchemy.exc import IntegrityError
+
+from ultragray.errors import InvalidArgument
+from ultragray_workers.jobs.demand import Demand, demand_of_key
+from ultragray_workers.jobs.owners import Kind, Ownership, claim_of_job, forget_owner
+from ultragray_workers.jobs.progress import JobState, Outcome, Progress
+from ultragray_workers.jobs.record import COLUMNS, Files, Row
+from ultragray_workers.jobs.tables import JOBS, SHARDS, USAGE, WORKERS
+
+SHARE = "share"  # the kind of a share of a batch
+DEAD_AFTER_S = 10.0  # without a sign of life a worker is taken for dead
+_QUEUED, _RUNNING = JobState.QUEUED.value, JobState.RUNNING.value
+_IS_JOB = JOBS.c.batch.is_(None)  # and no share of one
+_IS_UNFINISHED = JOBS.c.state.in_([_QUEUED, _RUNNING])
+
+
+class SceneTaken(Exception):
+    """Another job that waits or runs makes a scene of the same name."""
+
+
+def submit(engine: sa.Engine, values: dict[str, Any], also: Callable[[sa.Connection], None]) -> bool:
+    """Puts a job behind all others of its priority, and does `also` in the same transaction.
+
+    False: there is a job of the id, and nothing changed. Raises SceneTaken, and what `also` raises.
+    """
+    try:
+        with engine.begin() as connection:
+            inserted = _insert(connection, JOBS).values(state=_QUEUED, created_ms=_now_ms(), **values)
+            if connection.execute(inserted.on_conflict_do_nothing(index_elements=["id"])).rowcount == 0:
+                return False
+            also(connection)
+    except IntegrityError as error:
+        raise SceneTaken from error
+    return True
+
+
+def take(engine: sa.Engine, worker: str, demands: Sequence[str]) -> Row | None:
+    """The next job with one of the demands, which is the worker's now; None where there is none.
+
+    A job waits, too, while its owner has as many running as `most_running` says; two workers that look in the same
+    instant may start one more.
+    """
+    if not demands:
+        return None
+    running = JOBS.alias()
+    of_owner = (
+        sa.select(sa.func.count())
+        .where(running.c.state == _RUNNING, running.c.owner == JOBS.c.owner)
+        .correlate(JOBS)
+        .scalar_subquery()
+    )
+    has_room = sa.or_(JOBS.c.most_running.is_(None), of_owner < JOBS.c.most_running)
+    following = (
+        sa.select(JOBS.c.number)
+        .where(JOBS.c.state == _QUEUED, JOBS.c.demand.in_(demands), has_room)
+        .order_by(JOBS.c.priority.desc(), JOBS.c.number)
+        .limit(1)
+        .with_for_update(skip_locked=True, of=JOBS)
+    )
+    while True:  # on SQLite another worker may take it between the two
+        with engine.begin() as connection:
+            number = connection.execute(following).scalar()
+            if number is None:
+                return None
+            taken = (
+                sa.update(JOBS)
+                .where(JOBS.c.number == number, JOBS.c.state == _QUEUED)
+                .values(state=_RUNNING, worker=worker, attempt=JOBS.c.attempt + 1, started_ms=_now_ms())
+                .returning(*COLUMNS)
+            )
+            row = connection.execute(taken).one_or_none()
+        if row is not None:
+            return Row.of(row)
+
+
+def put_back(engine: sa.Engine, held: Row, *, is_untouched: bool = False) -> bool:
+    """Lets a job wait again; False where it is not the attempt of `held` any more.
+
+    `is_untouched`: nothing was done, and the attempt is not counted.
+    """
+    attempt = JOBS.c.attempt - (1 if is_untouched else 0)
+    return _change(engine, held, state=_QUEUED, attempt=attempt)
+
+
+def put_back_of_dead(engine: sa.Engine) -> list[str]:
+    """Lets the jobs wait again that no living worker runs; their ids."""
+    living = sa.select(WORKERS.c.name).where(WORKERS.c.seen_at_s > now_s(engine) - DEAD_AFTER_S)
+    dead = sa.and_(JOBS.c.state == _RUNNING, JOBS.c.worker.not_in(living))
+    return _put_back(engine, dead)
+
+
+def put_back_of(engine: sa.Engine, worker: str | None = None) -> list[str]:
+    """Lets the jobs of a worker wait again that has just begun, and so runs none; None: of all workers."""
+    return _put_back(engine, JOBS.c.state == _RUNNING if worker is None else _is_run_by(worker))
+
+
+def _put_back(engine: sa.Engine, condition: sa.ColumnElement[bool]) -> list[str]:
+    with engine.connect() as connection:  # a look locks nothing
+        if connection.execute(sa.select(JOBS.c.id).where(condition).limit(1)).first() is None:
+            return []
+    with engine.begin() as connection:
+        changed = sa.update(JOBS).where(condition).values(state=_QUEUED).returning(JOBS.c.id)
+        return list(connection.execute(changed).scalars())
+
+
+def is_held(engine: sa.Engine, held: Row) -> bool:
+    """Whether a job still is the attempt of `held`."""
+    with engine.connect() as connection:
+        return connection.execute(sa.select(JOBS.c.number).where(*_holds(held))).first() is not None
+
+
+def tell(engine: sa.Engine, held: Row, progress: Progress | None, files: Files) -> bool:
+    """Says how far a job is and what there is of it, also of one that was just cancelled: a retry goes on there.
+
+    False where it is not the attempt of `held` any more.
+    """
+    is_its = JOBS.c.state.in_([_RUNNING, JobState.CANCELLED.value]), JOBS.c.worker == held.worker
+    told = sa.update(JOBS).where(JOBS.c.id == held.id, *is_its, JOBS.c.attempt == held.attempt)
+    values = {"progress": None if progress is None else _json_of(progress), "files": files.to_json()}
+    with engine.begin() as connection:
+        return bool(connection.execute(told.values(values)).rowcount)
+
+
+def publish(engine: sa.Engine, held: Row, outcome: Outcome, files: Files) -> bool:
+    """Decides that the scene of a job is served: from now on it cannot be cancelled, and who takes it over serves it.
+
+    False where it was cancelled first, or is not the attempt of `held` any more.
+    """
+    return _change(engine, held, published=True, outcome=outcome.to_json(), files=files.to_json())
+
+
+def finish(engine: sa.Engine, held: Row, outcome: Outcome, files: Files) -> bool:
+    """Ends a job, which gives back the name of a scene that it did not make.
+
+    False where it is not the attempt of `held` any more.
+    """
+    state = JobState.SUCCEEDED if outcome.error is None else JobState.FAILED
+    ended = {
+        "state": state.value,
+        "outcome": outcome.to_json(),
+        "progress": _json_of(outcome.progress),
+        "files": files.to_json(),
+        "finished_ms": _now_ms(),
+    }
+    with engine.begin() as connection:
+        if not connection.execute(sa.update(JOBS).where(*_holds(held)).values(ended)).rowcount:
+            return False
+        if outcome.error is not None:
+            _give_name_back(connection, held.id, held.makes_scene, held.owner)
+    return True
+
+
+def cancel(engine: sa.Engine, job_id: str) -> bool:
+    """Cancels a job that waits or runs, with its shares; False where it has ended, or its scene is being served."""
+    is_asked = sa.or_(JOBS.c.id == job_id, JOBS.c.batch == job_id)
+    ended = {"state": JobState.CANCELLED.value, "finished_ms": _now_ms()}
+    changed = sa.update(JOBS).where(is_asked, _IS_UNFINISHED, JOBS.c.published.is_(False)).values(ended)
+    with engine.begin() as connection:
+        cancelled = connection.execute(changed.returning(JOBS.c.id, JOBS.c.makes_scene, JOBS.c.owner)).all()
+        for row in cancelled:
+            _give_name_back(connection, row.id, row.makes_scene, row.owner)
+    return any(row.id == job_id for row in cancelled)
+
+
+def _give_name_back(connection: sa.Connection, job_id: str, scene: str | None, owner: str | None) -> None:
+    if scene is not None:
+        forget_owner(connection, Kind.SCENE, scene, Ownership(owner, claim=claim_of_job(job_id)))
+
+
+def cancel_shares(engine: sa.Engine, batch: str) -> None:
+    """Ends the shares of a batch that is over: those that wait, and those that run within a second."""
+    ended = {"state": JobState.CANCELLED.value, "finished_ms": _now_ms()}
+    with engine.begin() as connection:
+        connection.execute(sa.update(JOBS).where(JOBS.c.batch == batch, _IS_UNFINISHED).values(ended))
+
+
+def forget(engine: sa.Engine, job_id: str) -> None:
+    """Removes the row of a job, of its shares and of its shards; what it ran stays in the usage of its owner."""
+    with engine.begin() as connection:
+        connection.execute(sa.delete(JOBS).where(sa.or_(JOBS.c.id == job_id, JOBS.c.batch == job_id)))
+        connection.execute(sa.delete(SHARDS).where(SHARDS.c.job == job_id))
+
+
+def row_of(engine: sa.Engine, job_id: str) -> Row | None:
+    """The row of a job; None where there is no such job."""
+    with engine.connect() as connection:
+        row = connection.execute(sa.select(*COLUMNS).where(JOBS.c.id == job_id)).one_or_none()
+    return None if row is None else Row.of(row)
+
+
+def specification_of(engine: sa.Engine, job_id: str) -> dict[str, Any]:
+    """The whole specification of a job that is there, in JSON."""
+    with engine.connect() as connection:
+        text = connection.execute(sa.select(JOBS.c.specification).where(JOBS.c.id == job_id)).scalar_one()
+    specification: dict[str, Any] = json.loads(text)
+    return specification
+
+
+def page(
+    engine: sa.Engine,
+    *,
+    state: JobState | None,
+    kind: str | None,
+    shown: Callable[[Row], bool],
+    page_size: int,
+    page_token: str | None,
+) -> tuple[list[Row], str | None]:
+    """One page of jobs, newest first, of those that are `shown`, and the token of the next; None on the last.
+
+    The token is the number of the last job, so that later jobs move nothing. Raises InvalidArgument for another.
+    """
+    before = _read_token(page_token)
+    chosen = sa.select(*COLUMNS).where(_IS_JOB).order_by(JOBS.c.number.desc()).limit(page_size + 1)
+    if state is not None:
+        chosen = chosen.where(JOBS.c.state == state.value)
+    if kind is not None:
+        chosen = chosen.where(JOBS.c.kind == kind)
+    found: list[Row] = []
+    while len(found) <= page_size:
+        with engine.connect() as connection:
+            some = connection.execute(chosen if before is None else chosen.where(JOBS.c.number < before)).all()
+        rows = [Row.of(row) for row in some]
+        found += filter(shown, rows)
+        if len(rows) <= page_size:
+            break
+        before = rows[-1].number
+    return found[:page_size], str(found[page_size - 1].number) if len(found) > page_size else None
+
+
+def _read_token(token: str | None) -> int | None:
+    if token is None:
+        return None
+    if not (token.isascii() and token.isdigit() and len(token) < 19):
+        raise InvalidArgument(f"page_token must be one that a page gave, got {token[:64]!r}", field="page_token")
+    return int(token)
+
+
+def count_by_state(engine: sa.Engine) -> dict[JobState, int]:
+    """The number of jobs in each state that some are in."""
+    counted = sa.select(JOBS.c.state, sa.func.count()).where(_IS_JOB).group_by(JOBS.c.state)
+    with engine.connect() as connection:
+        return {JobState(state): count for state, count in connection.execute(counted)}
+
+
+def count_waiting(engine: sa.Engine) -> int:
+    """The number of jobs that wait."""
+    return _count(engine, JOBS.c.state == _QUEUED)
+
+
+def count_of_owner(engine: sa.Engine, owner: str) -> int:
+    """The number of an owner's jobs that wait or run."""
+    return _count(engine, sa.and_(_IS_UNFINISHED, JOBS.c.owner == owner))
+
+
+def _count(engine: sa.Engine, condition: sa.ColumnElement[bool]) -> int:
+    with engine.connect() as connection:
+        return connection.execute(sa.select(sa.func.count()).select_from(JOBS).where(_IS_JOB, condition)).scalar_one()
+
+
+def demands_waiting(engine: sa.Engine) -> list[str]:
+    """The keys of the demands that jobs which wait have: one step in an index for each, however many jobs there are."""
+    waits, key = JOBS.c.state == _QUEUED, JOBS.c.demand
+    found = sa.select(sa.func.min(key).label("key")).where(waits).cte("found", recursive=True)
+    following = sa.select(sa.func.min(key)).where(waits, key > found.c.key).scalar_subquery()
+    found = found.union_all(sa.select(following).where(found.c.key.is_not(None)))
+    with engine.connect() as connection:
+        return list(connection.execute(sa.select(found.c.key).where(found.c.key.is_not(None))).scalars())
+
+
+def waiting(engine: sa.Engine) -> list[tuple[Demand, int, int]]:
+    """Each demand of jobs that wait, how many there are, and when the first was submitted, ms since 1970."""
+    grouped = sa.select(JOBS.c.demand, sa.func.count(), sa.func.min(JOBS.c.created_ms)).group_by(JOBS.c.demand)
+    with engine.connect() as connection:
+        rows = connection.execute(grouped.where(JOBS.c.state == _QUEUED, _IS_JOB)).all()
+    return [(demand_of_key(row[0]), row[1], row[2]) for row in rows]
+
+
+def find(engine: sa.Engine, *, needs_dataset: str | None = None, makes_scene: str | None = None) -> Row | None:
+    """A job that waits or runs, and needs a dataset or makes a scene; None where there is none."""
+    chosen = JOBS.c.dataset == needs_dataset if makes_scene is None else JOBS.c.makes_scene == makes_scene
+    with engine.connect() as connection:
+        row = connection.execute(sa.select(*COLUMNS).where(chosen, _IS_UNFINISHED, _IS_JOB).limit(1)).first()
+    return None if row is None else Row.of(row)
+
+
+def successor(engine: sa.Engine, job_id: str) -> str | None:
+    """A job that waits or runs and goes on from this one; None where there is none."""
+    found = sa.select(JOBS.c.id).where(_IS_UNFINISHED, JOBS.c.retry_of == job_id).limit(1)
+    with engine.connect() as connection:
+        return connection.execute(found).scalar()
+
+
+def known_ids(engine: sa.Engine, ids: Sequence[str]) -> set[str]:
+    """Those of the ids that are jobs or shares."""
+    with engine.connect() as connection:
+        return set(connection.execute(sa.select(JOBS.c.id).where(JOBS.c.id.in_(ids))).scalars())
+
+
+def ids_of_owner(engine: sa.Engine, owner: str) -> list[str]:
+    """The jobs of an owner, whatever became of them."""
+    with engine.connect() as connection:
+        return list(connection.execute(sa.select(JOBS.c.id).where(_IS_JOB, JOBS.c.owner == owner)).scalars())
+
+
+def finished_before(engine: sa.Engine, epoch_s: float, but: set[str], limit: int) -> list[str]:
+    """Jobs that ended before a time and that no unfinished one goes on from, without `but`."""
+    other = JOBS.alias()
+    goes_on = sa.select(other.c.id).where(other.c.retry_of == JOBS.c.id, other.c.state.in_([_QUEUED, _RUNNING]))
+    old = sa.select(JOBS.c.id).where(_IS_JOB, JOBS.c.finished_ms < int(epoch_s * 1000), ~goes_on.exists())
+    with engine.connect() as connection:
+        return list(connection.execute(old.where(JOBS.c.id.not_in(but)).limit(limit)).scalars())
+
+
+def add_share(engine: sa.Engine, batch: Row, share: str) -> None:
+    """Puts a share of a batch into the queue, unless one waits there."""
+    waits = sa.select(JOBS.c.id).where(JOBS.c.batch == batch.id, JOBS.c.state == _QUEUED).limit(1)
+    copied = ("priority", "owner", "private", "asked", "summary", "specification", "dataset", "demand", "most_running")
+    values = {
+        **{name: JOBS.c[name] for name in (*copied, "trace")},
+        "id": sa.literal(share),
+        "kind": sa.literal(SHARE),
+        "state": sa.literal(_QUEUED),
+        "batch": sa.literal(batch.id),
+        "created_ms": sa.literal(_now_ms(), sa.BigInteger),
+        "attempt": sa.literal(0),
+        "run_s": sa.literal(0.0),
+        "published": sa.false(),
+    }
+    with engine.connect() as connection:
+        if connection.execute(waits).first() is not None:
+            return
+    with engine.begin() as connection:
+        of_batch = sa.select(*values.values()).where(JOBS.c.id == batch.id, _IS_UNFINISHED)
+        connection.execute(sa.insert(JOBS).from_select(list(values), of_batch, include_defaults=False))
+
+
+def add_run_time(engine: sa.Engine, held: Row, device: str, seconds: float) -> None:
+    """Counts time that a job's process ran, for the job and for its owner."""
+    key: dict[str, Any] = {
+        "owner": held.owner or "",
+        "device": "cpu" if device == "cpu" else "gpu",
+        "day": datetime.now(timezone.utc).date(),
+    }
+    with engine.begin() as connection:
+        of_job = sa.update(JOBS).where(JOBS.c.id == held.id).values(run_s=JOBS.c.run_s + seconds)
+        connection.execute(of_job)
+        counted = _insert(connection, USAGE).values(**key, run_s=seconds)
+        more = {"run_s": USAGE.c.run_s + seconds}
+        connection.execute(counted.on_conflict_do_update(index_elements=list(key), set_=more))
+
+
+def usage_s(engine: sa.Engine, owner: str | None, since: datetime) -> dict[str, float]:
+    """Seconds that the jobs of an owner ran since the day of `since` (UTC), by device: cpu, gpu."""
+    chosen = sa.and_(USAGE.c.owner == (owner or ""), USAGE.c.day >= since.astimezone(timezone.utc).date())
+    summed = sa.select(USAGE.c.device, sa.func.sum(USAGE.c.run_s)).where(chosen).group_by(USAGE.c.device)
+    with engine.connect() as connection:
+        return {"cpu": 0.0, "gpu": 0.0} | {row[0]: row[1] for row in connection.execute(summed)}
+
+
+def now_s(engine: sa.Engine) -> sa.ColumnElement[float]:
+    """The time by the clock of the database, which all hosts share."""
+    if engine.dialect.name == "sqlite":  # days since noon of a day long ago
+        return (sa.func.julianday("now", type_=sa.Double) - 2440587.5) * 86400.0
+    return sa.cast(sa.func.extract("epoch", sa.func.clock_timestamp()), sa.Double)
+
+
+def _change(engine: sa.Engine, held: Row, **values: Any) -> bool:
+    with engine.begin() as connection:
+        return bool(connection.execute(sa.update(JOBS).where(*_holds(held)).values(values)).rowcount)
+
+
+def _holds(held: Row) -> tuple[sa.ColumnElement[bool], ...]:
+    return JOBS.c.id == held.id, _is_run_by(held.worker), JOBS.c.attempt == held.attempt
+
+
+def _is_run_by(worker: str | None) -> sa.ColumnElement[bool]:
+    return sa.and_(JOBS.c.state == _RUNNING, JOBS.c.worker == worker)
+
+
+def _insert(connection: sa.Connection, table: sa.Table) -> Any:
+    return (sqlite if connection.dialect.name == "sqlite" else postgresql).insert(table)
+
+
+def _json_of(progress: Progress) -> str:
+    return json.dumps(asdict(progress))
+
+
+def _now_ms() -> int:
+    return int(time.time() * 1000)

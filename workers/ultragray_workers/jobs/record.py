@@ -1,0 +1,191 @@
+"""The record of a job: its row in the table `jobs`, and the job as callers see it.
+
+A job waits (queued), is done by a worker (running), and ends (succeeded, failed or cancelled). `jobs.queue` has every
+change of a row; what a row says of progress, files and outcome is JSON of the classes here. Free of torch.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field, fields, replace
+from datetime import datetime, timezone
+from typing import Any
+
+import sqlalchemy as sa
+
+from ultragray.contract import described
+from ultragray_workers.jobs.demand import LivingWorker, demand_of_key, waits_for
+from ultragray_workers.jobs.kinds import KINDS
+from ultragray_workers.jobs.owners import Ownership
+from ultragray_workers.jobs.progress import JobState, Outcome, Progress
+from ultragray_workers.jobs.tables import JOBS
+
+MAX_PRIORITY = 1000
+
+
+@dataclass(frozen=True)
+class StoredFile:
+    """A whole object of the storage."""
+
+    key: str
+    bytes: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A part of a file that grows: the first bytes of an object, which may have more already."""
+
+    key: str
+    bytes: int
+
+
+@dataclass(frozen=True)
+class Files:
+    """The objects of a job that count. Others under its keys are half written, or of an attempt that was cut off.
+
+    jobs/ID/NAME.ugr            the scene that the job needs, as it was when the job was submitted
+    jobs/ID/ATTEMPT/log-N       pieces of the log; the last of an attempt grows; likewise journal-N, of a training
+    jobs/ID/ATTEMPT/run-N/      a checkpoint, with all that a process needs to go on from it
+    jobs/ID/ATTEMPT/artifacts/  what can be downloaded
+    jobs/ID/batch/              what can be downloaded of a batch, see `batches.place`: many workers write it
+    """
+
+    log: tuple[Piece, ...] = ()
+    journal: tuple[Piece, ...] = ()  # of the attempt at hand
+    run: Mapping[str, StoredFile] = field(default_factory=dict)  # the newest checkpoint, by the paths of its files
+    artifacts: Mapping[str, StoredFile] = field(default_factory=dict)
+
+    def keys(self) -> set[str]:
+        """The keys of the objects."""
+        return {one.key for one in (*self.log, *self.journal, *self.run.values(), *self.artifacts.values())}
+
+    def to_json(self) -> str:
+        """The list as a row holds it."""
+        return json.dumps(asdict(self))
+
+    @classmethod
+    def from_json(cls, text: str | None) -> Files:
+        """Inverse of `to_json`; None: there are none yet."""
+        if text is None:
+            return cls()
+        values = json.loads(text)
+        return cls(
+            *(tuple(Piece(**piece) for piece in values[name]) for name in ("log", "journal")),
+            *({path: StoredFile(**one) for path, one in values[name].items()} for name in ("run", "artifacts")),
+        )
+
+
+@dataclass(frozen=True)
+class Row:
+    """The columns of a job that are read together; the whole specification is read apart: it may hold many poses."""
+
+    number: int
+    id: str
+    kind: str
+    state: JobState
+    priority: int
+    owner: str | None
+    private: bool
+    request_id: str | None
+    asked: str
+    retry_of: str | None
+    batch: str | None
+    summary: dict[str, Any]
+    demand: str
+    trace: dict[str, str]
+    created_ms: int
+    worker: str | None
+    attempt: int
+    started_ms: int | None
+    run_s: float
+    progress: Progress | None
+    files: Files
+    published: bool
+    outcome: Outcome | None
+    finished_ms: int | None
+    makes_scene: str | None
+    most_running: int | None
+
+    @property
+    def ownership(self) -> Ownership:
+        """Whose the job is."""
+        return Ownership(self.owner, self.private)
+
+    @classmethod
+    def of(cls, row: sa.Row[Any]) -> Row:
+        """The row of a query for `COLUMNS`."""
+        values = dict(row._mapping)
+        return cls(
+            **{
+                **values,
+                "state": JobState(values["state"]),
+                "summary": json.loads(values["summary"]),
+                "trace": json.loads(values["trace"]),
+                "progress": None if values["progress"] is None else Progress.from_dict(json.loads(values["progress"])),
+                "files": Files.from_json(values["files"]),
+                "outcome": None if values["outcome"] is None else Outcome.from_json(values["outcome"]),
+            }
+        )
+
+
+COLUMNS = tuple(JOBS.c[item.name] for item in fields(Row))
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job:
+    """A job as it is now."""
+
+    id: str
+    kind: str = described("What is done.", choices=KINDS)
+    state: JobState
+    request_id: str | None
+    specification: dict[str, Any] = described("As it was sent; of poses only their number, as pose_count.")
+    priority: int
+    created_at: str = described("ISO 8601, UTC; likewise the other times.")
+    started_at: str | None = described("The last time.")
+    finished_at: str | None
+    reason: str | None = described("Why it failed: one sentence.")
+    error: str | None = described("Why it failed: the stable reason, such as DATASET_INVALID.")
+    progress: Progress
+    artifacts: tuple[str, ...] = described("Names of files to download; frames-{000000..000199}.tar stands for 200.")
+    metrics: dict[str, float] = described("Of a scene on the held-out frames.")
+    worker: str | None
+    retry_of: str | None = described("The job that this one goes on from.")
+    attempts: int = described("How often it was started.")
+    owner: str | None = described("Who submitted it; null: nobody who is known.")
+    private: bool = described("Whether others may not see it, nor the scene that it makes.")
+
+
+def job_of(row: Row, workers: Sequence[LivingWorker]) -> Job:
+    """The job of a row. `workers`: those that live; of a job that does not wait, none need be given."""
+    outcome = row.outcome if row.state.is_final else None
+    if outcome is None:
+        outcome = Outcome(progress=row.progress or Progress(), attempts=row.attempt)
+    waits = waits_for(demand_of_key(row.demand), workers) if row.state is JobState.QUEUED else None
+    return Job(
+        id=row.id,
+        kind=row.kind,
+        state=row.state,
+        request_id=row.request_id,
+        specification={name: value for name, value in row.summary.items() if name != "kind"},
+        priority=row.priority,
+        created_at=_iso(row.created_ms),
+        started_at=None if row.started_ms is None else _iso(max(row.created_ms, row.started_ms)),
+        finished_at=None if row.finished_ms is None else _iso(max(row.started_ms or row.created_ms, row.finished_ms)),
+        reason=outcome.reason,
+        error=outcome.error,
+        progress=replace(outcome.progress, waits_for=waits),
+        artifacts=outcome.artifacts,
+        metrics=outcome.metrics,
+        worker=row.worker if row.attempt else None,
+        retry_of=row.retry_of,
+        attempts=outcome.attempts,
+        owner=row.owner,
+        private=row.private,
+    )
+
+
+def _iso(epoch_ms: int) -> str:
+    return datetime.fromtimestamp(epoch_ms / 1000, timezone.utc).isoformat(timespec="milliseconds")

@@ -1,0 +1,180 @@
+"""The process of a job: started, ended with a checkpoint, never left behind, and watched by what the kernel tells.
+
+`supervision` starts it and decides about it; `run_job` is what runs in it. Free of torch.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from pathlib import Path
+
+from ultragray_workers.jobs.folder import JobFolder
+from ultragray_workers.jobs.worker.device import DeviceLock
+
+STOP_WAIT_S = 10.0  # for the checkpoint of a training that is to stop
+_KILL_WAIT_S, _KILL_POLL_S = 5.0, 0.02
+_PROC = Path("/proc")
+_TICK_S = 1.0 / os.sysconf("SC_CLK_TCK")
+LEAST_CPU_S = 0.1  # of a process that gets on; waiting with a look now and then takes less
+LONGEST_STEP_S = 2.0  # between two looks; what is longer, this worker itself was stopped for
+
+
+@contextmanager
+def job_process(
+    folder: JobFolder, device: DeviceLock, threads: int, descriptors: Sequence[int] = ()
+) -> Iterator[subprocess.Popen[bytes]]:
+    """A process at work in the folder, which shares the lock of its device; killed with its group at the end.
+
+    `descriptors`: its end of a channel to this worker; this process has it no more.
+    """
+    with folder.log.open("ab") as log:
+        process = subprocess.Popen(
+            [
+                *(sys.executable, "-m", "ultragray_workers.jobs.worker.run_job", str(folder.path), str(os.getpid())),
+                *map(str, descriptors),
+            ],
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            env={
+                **os.environ,
+                "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
+                "OMP_NUM_THREADS": str(threads),
+                "OPENBLAS_NUM_THREADS": str(threads),
+            },
+            start_new_session=True,
+            pass_fds=[device.fileno(), *descriptors],
+        )
+    for descriptor in descriptors:
+        os.close(descriptor)
+    try:
+        yield process
+    finally:
+        kill_group(process.pid)
+        process.wait()
+
+
+def end_with_checkpoint(process: subprocess.Popen[bytes]) -> None:
+    """Asks a process to write a checkpoint and end, and waits for a while."""
+    process.terminate()
+    with suppress(subprocess.TimeoutExpired):
+        process.wait(STOP_WAIT_S)
+
+
+def end_process_of_another_worker(folder: JobFolder) -> None:
+    """Kills the process of a worker of this host that has lost the job, but lives or was stopped."""
+    end_s = time.monotonic() + _KILL_WAIT_S
+    while (holder := holder_of(folder.lock)) is not None and time.monotonic() < end_s:
+        kill_group(holder[0])
+        time.sleep(_KILL_POLL_S)
+
+
+class Watchdog:
+    """Looks at one process now and then: whether it gets on, and how long it has run.
+
+    Getting on is told by the kernel's account of the process, not by the job: loading a dataset, evaluating and writing
+    an archive take the processor or move bytes like any training step does, however long one takes. A process that is
+    stopped or waits for something that never comes does neither. One that computes for ever is ended by its longest
+    time.
+    """
+
+    def __init__(self, pid: int, stall_timeout_s: float) -> None:
+        """`stall_timeout_s` 0: never."""
+        self._pid, self._stall_timeout_s = pid, stall_timeout_s
+        self._looked_at_s = time.monotonic()
+        self._at_last_sign = Account()
+        self._idle_s = 0.0
+
+    @property
+    def is_stalled(self) -> bool:
+        """Whether the process has not got on for the whole timeout."""
+        return 0.0 < self._stall_timeout_s <= self._idle_s
+
+    def look(self) -> float:
+        """Looks at the process; the seconds since the last look, as far as this worker was there to see."""
+        now_s = time.monotonic()
+        passed_s = min(LONGEST_STEP_S, now_s - self._looked_at_s)
+        self._looked_at_s = now_s
+        account, before = account_of(self._pid), self._at_last_sign
+        if (
+            account.is_ready
+            or account.io_bytes != before.io_bytes
+            or not 0.0 <= account.cpu_s - before.cpu_s < LEAST_CPU_S  # less than before: a child has ended
+        ):
+            self._at_last_sign, self._idle_s = account, 0.0
+        else:
+            self._idle_s += passed_s
+        return passed_s
+
+
+@dataclass(frozen=True)
+class Account:
+    """The work of a process and its children until now."""
+
+    cpu_s: float = 0.0
+    io_bytes: int = 0
+    is_ready: bool = False  # at work, or waiting for a core
+
+    def __add__(self, other: Account) -> Account:
+        return Account(self.cpu_s + other.cpu_s, self.io_bytes + other.io_bytes, self.is_ready or other.is_ready)
+
+
+def account_of(pid: int) -> Account:
+    """The account of a process and all below it; of one that has ended, nothing."""
+    total = Account()
+    with suppress(OSError, ValueError):
+        state, fields = _status(pid)
+        cpu_s = (int(fields[11]) + int(fields[12])) * _TICK_S  # utime, stime
+        total += Account(cpu_s, _io_bytes(pid), state == "R")
+        for children in (_PROC / str(pid) / "task").glob("*/children"):
+            for child in children.read_text(encoding="ascii").split():
+                total += account_of(int(child))
+    return total
+
+
+def is_stopped(pid: int) -> bool:
+    """Whether a process was stopped by a signal or a debugger, and does nothing until it is let go on."""
+    with suppress(OSError, ValueError):
+        return _status(pid)[0] in "Tt"
+    return False
+
+
+def holder_of(lock: Path) -> tuple[int, str] | None:
+    """The process of this host that has a lock file open, by the number that it wrote there, and the rest of the file.
+
+    None where there is no such process: it has ended, or is another host's.
+    """
+    with suppress(OSError, ValueError):
+        number, _, rest = lock.read_text(encoding="utf-8").strip().partition(" ")
+        target = lock.resolve()
+        for descriptor in (_PROC / number / "fd").iterdir():
+            with suppress(OSError):
+                if descriptor.resolve() == target:
+                    return int(number), rest
+    return None
+
+
+def kill_group(pid: int) -> None:
+    """Ends a process that leads a group, and all of the group; stopped ones, too."""
+    with suppress(ProcessLookupError):
+        os.killpg(pid, signal.SIGKILL)
+
+
+def _io_bytes(pid: int) -> int:
+    with suppress(OSError, ValueError):
+        read, written = (_PROC / str(pid) / "io").read_text(encoding="ascii").splitlines()[:2]  # rchar, wchar
+        return int(read.split()[1]) + int(written.split()[1])
+    return 0
+
+
+def _status(pid: int) -> tuple[str, list[str]]:
+    """The state of a process, and the fields of its status from the state on."""
+    fields = (_PROC / str(pid) / "stat").read_text(encoding="utf-8", errors="replace").rpartition(")")[2].split()
+    return fields[0], fields
