@@ -10,6 +10,7 @@ import { CLASSICAL, type Grey, type Measured, readGrey, worstFirst } from "./pic
 const MOST = 16;
 const STEP = 1.25;
 
+/** Where all pictures of the bench are enlarged, and where the pointer is: linked, in shares of width and height. */
 export class Lens {
   zoom = $state(1);
   /** The share that lies in the middle. */
@@ -43,6 +44,7 @@ export class Lens {
   }
 }
 
+/** A picture of the service that follows its address; the one before stays, told to be old, until it is there. */
 export class LoadedPicture {
   picture = $state.raw<Grey | null>(null);
   problem = $state<string | null>(null);
@@ -127,6 +129,7 @@ export type Against = { way: Measured } | { scene: string };
 const POLL_MS = 700;
 const SCENE = "scene:";
 
+/** What Compare looks at: the frame, what it is compared with, how, and where the pictures are enlarged. */
 export class Bench {
   comparison = $state.raw<Comparison | null>(null);
   problem = $state<string | null>(null);

@@ -10,6 +10,7 @@ import { base64, polled } from "../shared/asking.svelte";
 
 const EVERY_MS = 1000;
 
+/** The streams that other programs have open on a scene, looked for every second. */
 export class OpenStreams {
   /** null: not known yet. */
   others = $state.raw<StreamSummary[] | null>(null);
@@ -25,6 +26,7 @@ export class OpenStreams {
   }
 }
 
+/** A path that becomes a data set: a job of the service, from its start to its files. */
 export class Rendering {
   job = $state.raw<Job | null>(null);
   problem = $state<string | null>(null);

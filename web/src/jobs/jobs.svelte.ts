@@ -15,6 +15,7 @@ export function toneOf(state: JobState): string {
 
 const PAGE = 30;
 
+/** The jobs of the service, as lists show them: the newest of a kind and state, asked for while somebody looks. */
 export class JobList extends Listed<Awaited<ReturnType<typeof listJobs>>[]> {
   /** null: not asked for yet. */
   jobs = $state.raw<Job[] | null>(null);
@@ -62,6 +63,7 @@ const LOG_KEPT = 20_000; // characters
 const POINTS_KEPT = 1500; // then the curve is asked for again, thinned
 const TICK_MS = 1000;
 
+/** One job, followed until its end: what it says, its curve, its log. */
 export class FollowedJob {
   job = $state.raw<Job | null>(null);
   curve = $state.raw<CurvePoint[]>([]);
@@ -158,6 +160,7 @@ export class FollowedJob {
 const LISTED = 100;
 export const MOST_SHOWN = 4; // as many colours are left
 
+/** Curves of earlier trainings of a dataset, laid over that of a job: the person chooses which. */
 export class EarlierRuns {
   /** Newest first; null: not asked for yet. */
   runs = $state.raw<Job[] | null>(null);

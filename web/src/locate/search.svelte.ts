@@ -58,6 +58,7 @@ function looksLikeFan({ data, width, height }: ImageData): boolean {
   return brightest(0) < BLACK && brightest(width - columns) < BLACK && brightest(middle) > LIT;
 }
 
+/** A search for where a real frame was taken, kept while other views are shown. */
 export class Search {
   within = $state.raw(Object.fromEntries(WITHIN.map(({ name, field }) => [name, field.default])) as unknown as Within);
   frame = $state.raw<RealFrame | null>(null);

@@ -40,6 +40,7 @@ export function labelNamesOf({ scene, tools }: Session): Record<string, string> 
 const BETWEEN = "_"; // stands in addresses as it is
 const FIRST: Output = "bmode";
 
+/** What a person looks at in Maps of a scene: the large map and the cursor. Kept while other views are shown, and in the address. */
 export class MapsState {
   large = $state<Output>(FIRST);
   /** In the image plane, so that it stays where it is when the picture changes. */

@@ -35,6 +35,7 @@ interface Tokens {
 /** The login does not renew or give a token, and will not. */
 class Refused extends Error {}
 
+/** Signing in at the login of the hospital: OpenID Connect, an authorization code with PKCE (RFC 7636). */
 class Login {
   /** null: people sign in with keys alone. */
   provider = $state.raw<SignInProvider | null>(null);
@@ -207,6 +208,7 @@ const POLL_DOWN_MS = 1000;
 
 export type ServiceStatus = "asking" | "ready" | "starting" | "down" | "locked";
 
+/** Whether the service answers, whether it wants a key, and whose that is. */
 class ServiceState {
   status = $state<ServiceStatus>("asking");
   scenes = $state.raw<SceneEntry[]>([]);

@@ -28,6 +28,7 @@ export interface Loop {
   index: number;
 }
 
+/** The last frames of one setting, kept for looking at again: at most so many, and so many bytes. */
 export class CineLoop {
   playing = $state(false);
   /** Frames of the loop that stands, and which of them is shown. */
@@ -129,6 +130,7 @@ const POINTS: Record<MarkKind, number> = { distance: 2, ellipse: 3, angle: 3, te
 const KEYBOARD_MM = 5; // half of what is put down for keys to move
 const SECOND_AXIS = 0.6; // of the first, until it is set
 
+/** What a person set on frozen frames: distances, ellipses, angles and texts, in mm of the image plane. */
 export class Marks {
   /** What a press on the image begins. */
   tool = $state<MarkKind | null>(null);
@@ -299,6 +301,7 @@ export function lettersOf(
   return lettered.map((mark, index) => ({ letter: marks.letterOf(mark.id), box: boxes[index]! }));
 }
 
+/** What is kept of the Scan view of each scene while another view is shown: the frozen frames with what was set on them. */
 export class ScanState {
   readonly cine: CineLoop;
   readonly marks: Marks;
@@ -384,6 +387,7 @@ export const scanOf = besideSession((session) => new ScanState(session));
 
 export const MOST_MM = 10_000; // beyond, a typed position is a slip
 
+/** How poses are told in a session: against what, in which form. */
 export class PoseTelling {
   reference = $state<Reference>("absolute");
   form = $state<PoseForm>("json");
@@ -447,6 +451,7 @@ const WRITTEN_EVERY_MS = 250;
 
 type Values = Record<string, string | null>;
 
+/** The address of Scan: what a reload, a sent link or a step back brings back. */
 export class Address {
   /** What of the address that was opened cannot be used. */
   refused = $state.raw<readonly string[]>([]);

@@ -10,6 +10,7 @@ export const SPEEDS = [0.25, 0.5, 1, 2, 4] as const;
 /** Groups that are closed until a person opens them. */
 const SELDOM = ["locate", "registrations"];
 
+/** How a person likes the Scan view, kept by the browser. */
 class ScanSettings {
   /** Whether the image has nearly all of the window. */
   large = $state(false);

@@ -31,6 +31,7 @@ export interface Page {
   marks: readonly Mark[];
 }
 
+/** A frame drawn for keeping: square pixels, a centimetre scale, what was set on it, and lines that say what it is. */
 export class Sheet {
   readonly canvas = document.createElement("canvas");
   readonly #context: CanvasRenderingContext2D;
@@ -264,6 +265,7 @@ function pause(for_ms: number): Promise<void> {
   return new Promise((resolve) => setTimeout(resolve, Math.max(0, for_ms)));
 }
 
+/** Storing what is shown: as a picture, as DICOM, and the loop as DICOM or as a video. */
 export class Store {
   /** What is being done, in words; null: nothing. */
   doing = $state<string | null>(null);

@@ -11,6 +11,7 @@ import { service } from "../page/service.svelte";
 import { Sending } from "../shared/asking.svelte";
 import { nameOfFile } from "../shared/text";
 
+/** The scene file that is chosen and sent in Scenes. */
 class SceneImport extends Sending {
   file = $state.raw<File | null>(null);
   name = $state("");
@@ -63,6 +64,7 @@ async function pixel_mm(probe: Probe): Promise<number | null> {
   return Math.max(across, down) / SIDE;
 }
 
+/** The thumbnails of the scenes that are held in memory: rendering one of another would load it, and let go of one in use. */
 class Thumbnails {
   /** By scene; null: there will be none. */
   #known = new SvelteMap<string, string | null>();

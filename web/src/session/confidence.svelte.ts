@@ -132,6 +132,7 @@ function rgba(red: number, green: number, blue: number, alpha: number): number {
 
 const NEARLY_ALL = 0.995; // of the pixels with support: there is nothing to hatch
 
+/** What is drawn over the image of a session, and which outputs that takes. */
 export class Overlays {
   /** Hatches what no Gaussians support, of views that are guesses: in a view of the sweep, that is black tissue or shadow. */
   hatch = $state(true);
@@ -172,6 +173,7 @@ const MOST_PLACES = 160;
 const MOST_BETWEEN = 4; // places from one pose to the next
 const SETTLED_MS = 250; // after the last change of what is played
 
+/** How far the image along the poses that are played can be trusted: asked for once, without rendering. */
 export class SweepConfidence {
   /** At even distances from the first pose to the last; empty until it is known. */
   along = $state.raw<Extrapolation[]>([]);

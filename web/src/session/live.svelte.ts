@@ -17,6 +17,7 @@ export interface LatencyFigures {
   dropped: number;
 }
 
+/** How long frames take, from being asked for to being on the screen. */
 export class Latency {
   #times_ms: number[] = [];
   #asked_ms = 0;
@@ -52,6 +53,7 @@ export interface FollowEvents {
   ended(): void;
 }
 
+/** Another program's stream, shown in place of the page's own: its frames, its poses, its probe. */
 export class Following {
   /** Whether the connection was lost, and is tried again: what is shown is old. */
   lost = $state(false);
@@ -130,6 +132,7 @@ const RATES_EVERY_MS = 500;
 const SCENE_ASKED_AGAIN_MS = 3000;
 const FAILURES_SAID = 5; // in a row; by then the state of the service is known
 
+/** The live frames of a session: at most one a screen refresh, the newest, with the rate they come at. */
 export class LiveView {
   frame = $state.raw<Frame | null>(null);
   connected = $state(false);

@@ -11,6 +11,7 @@ import { skinOf } from "../geometry/skin";
 
 const MOST_PLACED = 32;
 
+/** The image planes of the probes that were seen, asked for once each. */
 class Planes {
   #known = new SvelteMap<string, ImagePlane>();
   #asked = new Map<string, Promise<ImagePlane>>();
@@ -74,6 +75,7 @@ const NOTHING: Held = {
 
 const UNKNOWN_BOUNDS = { min_mm: { x: -50, y: -50, z: -50 }, max_mm: { x: 50, y: 50, z: 50 } };
 
+/** What the service tells of a scene: its description, its own probe, the views that it was trained from. */
 export class KnownScene {
   description = $state.raw<SceneDescription | null>(null);
   /** Why there is no description. */

@@ -41,6 +41,7 @@ class Change<T> implements Step {
   }
 }
 
+/** What can be undone and done again, in the order in which it was done. */
 export class History {
   #done = $state.raw<readonly Step[]>([]);
   #undone = $state.raw<readonly Step[]>([]);
@@ -103,6 +104,7 @@ export class History {
 export const SIZES = [128, 256, 384, 512, 768];
 const MOST_PICTURE_PIXELS = 640; // on the longer side of a scan-converted fan
 
+/** How the frames of a scene are shown, whatever the probe. */
 export class ImageSettings {
   /** How frames are shown, but for the scan conversion. */
   display = $state.raw<Display>(AS_RENDERED);
@@ -153,6 +155,7 @@ function squarePixel_mm({ lines_mm }: ImagePlane): number | null {
   return Math.max(right - left, bottom - top) / MOST_PICTURE_PIXELS;
 }
 
+/** The tools in the image of a session, and which of them is worked on. */
 export class Tools {
   #all = $state.raw<readonly Tool[]>([]);
   #chosen = $state(0);
@@ -204,6 +207,7 @@ export interface Trajectory {
   poses: Pose[];
 }
 
+/** One scene as it is scanned: the probe, where it is held and how its frames are shown. */
 export class Session {
   readonly scene: KnownScene;
   #pose = $state.raw<Pose>(IDENTITY);

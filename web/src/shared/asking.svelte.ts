@@ -5,6 +5,7 @@ import type { Told } from "../api/datasets";
 
 const EVERY_MS = 125;
 
+/** A value for reading: it follows another at most a few times a second, so that live images leave time to draw. */
 export class Calm<T> {
   value: T = $state.raw() as T;
   #latest: T;
@@ -62,6 +63,7 @@ export function polled<Answer>(
   };
 }
 
+/** Files on their way to the service. They outlive the view that sends them; leaving the page asks first. */
 export class Sending {
   /** Share of the bytes that were sent, 0 to 1; null: nothing is under way. */
   share = $state<number | null>(null);

@@ -160,6 +160,7 @@ void main() {
   gl_FragColor = vec4(vec3(texture2D(image, place).r), 0.96);
 }`;
 
+/** The live image in its plane, at the pose that it was rendered at. */
 export class LiveImage {
   readonly object: Mesh<BufferGeometry, ShaderMaterial>;
   #texture: DataTexture | null = null;
@@ -252,6 +253,7 @@ const THINNEST_MM = 0.5; // radius: what is thinner is not seen
 const SIDES = 16;
 const UP = new Vector3(0, 1, 0); // along which three.js makes cylinders
 
+/** The tools of an image as things in space: solid, and as a pale trace through the tissue that hides them. */
 export class ToolBodies {
   readonly object = new Group();
   /** Those that move with the probe. */

@@ -128,6 +128,7 @@ void main() {
   gl_FragColor = vec4(texture2D(palette, vec2(tint.x, 0.5)).rgb * light * alpha, alpha);
 }`;
 
+/** The Gaussians as splats: each an ellipse as large as it is, drawn from back to front. */
 export class Splats {
   readonly object: Points<BufferGeometry>;
   #positions: Float32Array;
@@ -318,6 +319,7 @@ void main() {
   gl_FragColor = sum;
 }`;
 
+/** The volume, marched through along each line of sight. */
 export class VolumeLayer {
   readonly object: Mesh<BufferGeometry, ShaderMaterial>;
   #texture: Data3DTexture;

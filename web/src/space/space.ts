@@ -32,6 +32,7 @@ const TRUST = 0.5; // in the newest measurement
 
 export type Cause = "person" | "frame";
 
+/** When the 3D view is drawn, and how finely: at once for the person, within a share of the time for the live image. */
 export class DrawingLoop {
   #request = 0;
   #fence: WebGLSync | null = null;
@@ -164,6 +165,7 @@ interface EyeEvents {
   handled: (now: boolean) => void;
 }
 
+/** The eye of the person in the scene: turned by dragging, put to viewpoints, kept for the next time. */
 export class Eye {
   readonly camera = new PerspectiveCamera(SEEN_DEG, 1, 1, 5000);
   #orbit: OrbitControls;
@@ -270,6 +272,7 @@ interface Events {
   picked: (place: Vector) => void;
 }
 
+/** The scene in space: its Gaussians, the training planes, the skin, the probe with its live image. */
 export class SpaceView {
   #renderer: WebGLRenderer;
   #scene = new Scene();

@@ -11,6 +11,7 @@ export type Value = number | string | boolean | null;
 
 export const SETTINGS: readonly [string, Described][] = Object.entries(trainingSettings.properties ?? {});
 
+/** The training that is prepared: its name, preset and settings, and the earlier run that it repeats. It outlives the view. */
 class TrainingPlan {
   /** What the person called the scene; null: a free name is proposed. */
   scene = $state<string | null>(null);
@@ -123,6 +124,7 @@ const STARTS: Record<string, Record<string, unknown>> = {
 /** Those of its fields that say how frames are rendered, not where and into what. */
 const OF_JOB = ["scene", "poses", "sampler", "format", "dtype", "shard_frames", "outputs", "max_run_s", "device", "min_memory_gb", "worker_labels", "min_confidence", "below_min_confidence"];
 
+/** The data set that is prepared: its scene, sampler and files, and what the service expects of it. It outlives the view. */
 class RenderPlan {
   scene = $state("");
   /** What the service says of the scene; null: not yet. */

@@ -30,6 +30,7 @@ const HEADER_BYTES = 4 << 20; // transforms of some thousand frames; a longer on
 const MOST_HEADER_BYTES = 256 << 20;
 const ENDINGS = /\.(mha|mhd|nrrd|nhdr)$/i;
 
+/** Frames out of a PLUS or 3D Slicer sequence (MetaImage or NRRD) on the person's own disk: it is looked at before it is sent. */
 export class Sequence {
   private constructor(private readonly stored: Stored) {}
 
@@ -153,6 +154,7 @@ function oriented(frame: SequenceFrame, orientation: string): SequenceFrame {
   return { width, height, grey };
 }
 
+/** The sweeps of the service, as Train lists them, and which is looked at. */
 class Datasets extends Listed<Dataset[]> {
   /** null: not asked for yet. */
   all = $state.raw<Dataset[] | null>(null);
@@ -179,6 +181,7 @@ class Datasets extends Listed<Dataset[]> {
 
 export const datasets = new Datasets();
 
+/** The sweep that is chosen and sent in Train. */
 class SweepUpload extends Sending {
   files = $state.raw<File[]>([]);
   name = $state("");
@@ -283,6 +286,7 @@ function within(value: number, low: number, high: number): number {
 
 export type Preview = "none" | "reading" | "shown" | "unreadable";
 
+/** The crop that is drawn on a frame of the sweep that was chosen, before it is sent. */
 class CropDrawing {
   state = $state<Preview>("none");
   frame = $state.raw<SequenceFrame | null>(null);
