@@ -65,7 +65,8 @@ export const renderedAs: Described = ${JSON.stringify(described(schemas.RenderSp
 export const roles = ${JSON.stringify(schemas.Role.enum)} as const;
 export const operations = ${JSON.stringify(operations(document.paths), null, 1)} as const;
 `),
-  "work.ts": contract(`export const jobs: Record<string, Described> = ${JSON.stringify(jobKinds(schemas.JobBody.properties), null, 1)};
+  "work.ts": contract(`/** What a job of each kind is specified by. */
+export const JOB_KINDS: ReadonlyMap<string, Described> = new Map(Object.entries(${JSON.stringify(jobKinds(schemas.JobBody.properties), null, 1)} as Record<string, Described>));
 export const trainingSettings: Described = ${JSON.stringify(described(schemas.TrainingConfig), null, 1)};
 export const trainingPresets: Record<string, Record<string, unknown>> = ${JSON.stringify(schemas.TrainingConfig["x-presets"], null, 1)};
 export const uploadOptions: Record<string, Described> = ${JSON.stringify(queryOf(document.paths["/v1/datasets/{dataset}"].put), null, 1)};

@@ -3,7 +3,7 @@ import { svelte } from "@sveltejs/vite-plugin-svelte";
 import { defineConfig, type Plugin } from "vite";
 
 // What nearly all views need, as one file: each request takes its time.
-const COMMON = /\/src\/(api|geometry|session|shared)\/(?!generated\/work|job_kinds)/;
+const COMMON = /\/src\/(api|geometry|page|session|shared)\/(?!generated\/work)/;
 const FIRST_VIEW = "/scan/Scan.svelte";
 // `npm run dev` serves the sources and passes on what is asked of the API to a service that runs.
 const service = process.env.ULTRAGRAY_ADDRESS ?? "http://127.0.0.1:8000";

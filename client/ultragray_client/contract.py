@@ -470,7 +470,7 @@ class Dataset:
     region: ImageRegion | None = None
     """Of a sequence: where its frames lie in the stored images, and its calibration; null where that is not known."""
     owner: str | None = None
-    """Who uploaded it; null: from before there were owners."""
+    """Who uploaded it; null: nobody who is known."""
     private: bool = False
     """Whether others may not see it."""
 

@@ -1,24 +1,12 @@
 /** What Train works out without a browser: crops, sequences on the person's disk, the scales of charts, settings. */
 
 import assert from "node:assert/strict";
-import { createRequire } from "node:module";
-import path from "node:path";
 import { describe, it } from "node:test";
 import { deflateSync, gzipSync } from "node:zlib";
 
-import { ROOT } from "./harness.mjs";
+import { built } from "./sources.mjs";
 
-const { buildSync } = createRequire(path.join(ROOT, "web/package.json"))("esbuild");
-
-async function built(contents, folder = "web/src") {
-  const options = { bundle: true, format: "esm", write: false };
-  const { outputFiles } = buildSync({ stdin: { contents, resolveDir: path.join(ROOT, folder), loader: "ts" }, ...options });
-  return import(`data:text/javascript,${encodeURIComponent(outputFiles[0].text)}`);
-}
-
-const { between, moved, readCrop, whole, writeCrop, Sequence, rangeOf, ticks, tickText, readCalibration } = await built(
-  ["geometry/crop", "train/sequence", "shared/chart_scale", "geometry/calibration"].map((one) => `export * from "./${one}";`).join("\n"),
-);
+const { between, moved, readCrop, whole, writeCrop, Sequence, rangeOf, ticks, tickText, readCalibration } = await built("train/sweeps.svelte", "shared/chart");
 
 const SIZE = { width: 640, height: 480 };
 

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { describe, it } from "node:test";
 
-import { openPage, picture, seriousFindings, until } from "./harness.mjs";
+import { laidOut, openPage, picture, seriousFindings, until } from "./harness.mjs";
 import { makeSequence, REGION } from "./make_sequence.mjs";
 import { tested } from "./tested.mjs";
 
@@ -172,13 +172,13 @@ describe("the list of jobs", () => {
     await row.waitFor();
     await page.waitForResponse(/\/v1\/datasets\?/);
     await page.waitForResponse(/\/v1\/jobs\?/);
-    await page.waitForTimeout(200);
+    await laidOut(page);
     await page.evaluate(() => {
       globalThis.changes = 0;
       new MutationObserver((found) => (globalThis.changes += found.length)).observe(document.querySelector(".side"), { subtree: true, childList: true, characterData: true, attributes: true });
     });
     for (let polls = 0; polls < 2; polls++) await page.waitForResponse(/\/v1\/jobs\?/);
-    await page.waitForTimeout(200);
+    await laidOut(page);
     assert.equal(await page.evaluate(() => globalThis.changes), 0, "each answer draws the list anew");
   });
 });

@@ -1,22 +1,11 @@
 /** What Compare computes, without a browser: differences, similarity, correlation. */
 
 import assert from "node:assert/strict";
-import { createRequire } from "node:module";
-import path from "node:path";
 import { describe, it } from "node:test";
 
-import { ROOT } from "./harness.mjs";
+import { built } from "./sources.mjs";
 
-const { buildSync } = createRequire(path.join(ROOT, "web/package.json"))("esbuild");
-const { outputFiles } = buildSync({
-  stdin: { contents: 'export * from "./picture"; export * from "./statistics";', resolveDir: path.join(ROOT, "web/src/compare"), loader: "ts" },
-  bundle: true,
-  write: false,
-  format: "esm",
-});
-const { difference, similarity, valueAt, correlation, worstFirst } = await import(
-  `data:text/javascript;base64,${Buffer.from(outputFiles[0].contents).toString("base64")}`
-);
+const { difference, similarity, valueAt, correlation, worstFirst } = await built("compare/pictures");
 
 const grey = (width, height, value) => ({
   width,

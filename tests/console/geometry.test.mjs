@@ -1,22 +1,11 @@
 /** Pictures on the planes of any probe: web/src/geometry without a browser. */
 
 import assert from "node:assert/strict";
-import { createRequire } from "node:module";
-import path from "node:path";
 import { describe, it } from "node:test";
 
-import { ROOT } from "./harness.mjs";
+import { built } from "./sources.mjs";
 
-const { buildSync } = createRequire(path.join(ROOT, "web/package.json"))("esbuild");
-const { outputFiles } = buildSync({
-  stdin: { contents: 'export * from "./picture"; export * from "./plane";', resolveDir: path.join(ROOT, "web/src/geometry"), loader: "ts" },
-  bundle: true,
-  format: "esm",
-  write: false,
-});
-const { areAllAround, areUpright, boxOf, isShown, outline, pixelAt, placedOn, pointAt } = await import(
-  `data:text/javascript,${encodeURIComponent(outputFiles[0].text)}`
-);
+const { areAllAround, areUpright, boxOf, isShown, outline, pixelAt, placedOn, pointAt } = await built("geometry/plane");
 
 const shares = Array.from({ length: 65 }, (_, i) => i / 64);
 const radians = (degrees) => (degrees / 180) * Math.PI;

@@ -130,6 +130,11 @@ export async function picture(page, name) {
   }
 }
 
+/** Waits until the page has laid itself out for what it knows. */
+export function laidOut(page) {
+  return page.evaluate(() => new Promise((resolve) => requestAnimationFrame(() => requestAnimationFrame(resolve))));
+}
+
 /** What axe finds that is moderate, serious or critical, one string a finding. */
 export async function seriousFindings(page) {
   const source = readFileSync(require.resolve("axe-core/axe.min.js"), "utf8");

@@ -1,13 +1,11 @@
 /** Maps: every output of one view side by side, with one cursor and the values that the service gives. */
 
 import assert from "node:assert/strict";
-import { readFileSync } from "node:fs";
-import { createRequire } from "node:module";
-import path from "node:path";
 import { describe, it } from "node:test";
 
-import { canvasState, openPage, picture, ROOT, seriousFindings, until } from "./harness.mjs";
+import { canvasState, openPage, picture, seriousFindings, until } from "./harness.mjs";
 import { openScan } from "./scan_page.mjs";
+import { built } from "./sources.mjs";
 import { tested } from "./tested.mjs";
 
 const SIDE = 256; // of the frames of the demo scene
@@ -154,9 +152,7 @@ describe("maps", () => {
 
 describe("the colours of maps", () => {
   it("grow lighter all the way, so that grey is enough to read them", async () => {
-    const { transformSync } = createRequire(path.join(ROOT, "web/package.json"))("esbuild");
-    const { code } = transformSync(readFileSync(path.join(ROOT, "web/src/shared/colours.ts"), "utf8"), { loader: "ts" });
-    const { shareColour } = await import(`data:text/javascript,${encodeURIComponent(code)}`);
+    const { shareColour } = await built("shared/colours");
     for (const output of outputs.filter((one) => one !== "labels")) {
       const grey = Array.from({ length: 33 }, (_, i) => shareColour(output, i / 32)).map(([r, g, b]) => 0.2126 * r + 0.7152 * g + 0.0722 * b);
       grey.slice(1).forEach((value, i) => assert.ok(value > grey[i] + 0.5, `${output} is not lighter at ${i + 1} of 32`));

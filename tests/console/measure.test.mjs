@@ -1,24 +1,11 @@
 /** Measuring, letters and places on a track: web/src/geometry without a browser. */
 
 import assert from "node:assert/strict";
-import { createRequire } from "node:module";
-import path from "node:path";
 import { describe, it } from "node:test";
 
-import { ROOT } from "./harness.mjs";
+import { built } from "./sources.mjs";
 
-const { buildSync } = createRequire(path.join(ROOT, "web/package.json"))("esbuild");
-const { outputFiles } = buildSync({
-  stdin: {
-    contents: 'export * from "./measure"; export * from "./labels"; export * from "./pose";',
-    resolveDir: path.join(ROOT, "web/src/geometry"),
-    loader: "ts",
-  },
-  bundle: true,
-  format: "esm",
-  write: false,
-});
-const geometry = await import(`data:text/javascript,${encodeURIComponent(outputFiles[0].text)}`);
+const geometry = await built("geometry/plane", "geometry/pose");
 
 const point = (x_mm, z_mm) => ({ x_mm, z_mm });
 const near = (a, b, most) => assert.ok(Math.abs(a - b) <= most, `${a} is not ${b}`);

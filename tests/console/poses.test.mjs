@@ -1,29 +1,15 @@
 /** Files and texts of poses: web/src/geometry without a browser, and what the console says of what is wrong in them. */
 
 import assert from "node:assert/strict";
-import { createRequire } from "node:module";
-import path from "node:path";
 import { describe, it } from "node:test";
 
-import { ROOT } from "./harness.mjs";
+import { bundled } from "./sources.mjs";
 
-const { buildSync } = createRequire(path.join(ROOT, "web/package.json"))("esbuild");
-const { outputFiles } = buildSync({
-  stdin: {
-    contents: `export * from "./geometry/pose"; export * from "./geometry/pose_text"; export * from "./geometry/pose_frames";
-      export * from "./geometry/pose_files/read"; export * from "./geometry/pose_files/write";
-      export { connect as english } from "./words/en/connect"; export { connect as german } from "./words/de/connect";`,
-    resolveDir: path.join(ROOT, "web/src"),
-    loader: "ts",
-  },
-  bundle: true,
-  format: "esm",
-  write: false,
-});
 const {
   angle_deg, anglesFrom, distance_mm, english, fromPositionQuaternion, german, IDENTITY, POSE_FORMS, placeIn, poseFileOf, poseFromText,
   poseText, readPoses, REFERENCES, withPlaceIn, WRITTEN,
-} = await import(`data:text/javascript,${encodeURIComponent(outputFiles[0].text)}`);
+} = await bundled(`export * from "./geometry/pose"; export * from "./geometry/pose_files";
+  export { connect as english } from "./words/en/programs"; import { german as texts } from "./words/de/german"; export const german = texts.connect;`);
 
 const TURNED = fromPositionQuaternion([12.5, -3, 40], [0.5, 0.5, -0.5, 0.5]);
 const TILTED = fromPositionQuaternion([-1.25, 0, 0.5], [Math.cos(0.3), Math.sin(0.3), 0, 0]);

@@ -100,7 +100,7 @@ describe("a frozen image", () => {
     const { print } = await canvasState(page, IMAGE);
     const pose = await poseOf(page);
     await page.getByRole("link", { name: "Maps", exact: true }).click();
-    await page.waitForTimeout(500);
+    await until(() => canvasState(page, '[data-testid="map-echo"]'), ({ mean }) => mean > 1, "no map came");
     await page.getByRole("link", { name: "Scan", exact: true }).click();
     await until(() => canvasState(page, IMAGE), (state) => state.print === print, "the frame is gone");
     assert.equal(await frozen(page), "true");

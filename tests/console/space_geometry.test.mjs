@@ -1,23 +1,11 @@
 /** From where the scene is looked at, the skin, contact, and the volume: web/src without a browser. */
 
 import assert from "node:assert/strict";
-import { createRequire } from "node:module";
-import path from "node:path";
 import { describe, it } from "node:test";
 
-import { ROOT } from "./harness.mjs";
+import { built } from "./sources.mjs";
 
-const { buildSync } = createRequire(path.join(ROOT, "web/package.json"))("esbuild");
-const contents = ["geometry/pose", "geometry/vector", "geometry/skin", "space/viewpoints", "space/volume"].map(
-  (name) => `export * from "./${name}";`,
-);
-const { outputFiles } = buildSync({
-  stdin: { contents: `${contents.join("")} export { Gaussians } from "./api/gaussians";`, resolveDir: path.join(ROOT, "web/src"), loader: "ts" },
-  bundle: true,
-  format: "esm",
-  write: false,
-});
-const space = await import(`data:text/javascript,${encodeURIComponent(outputFiles[0].text)}`);
+const space = await built("geometry/pose", "geometry/skin", "space/volume", "space/appearance", "api/gaussians");
 const { apply, axis, cross, dot, fromPositionQuaternion, length, minus, position, rotated, scaled, translated, unit } = space;
 
 const near = (a, b, most, what) => assert.ok(Math.abs(a - b) <= most, `${what}: ${a} is not ${b}`);

@@ -1,16 +1,11 @@
 /** Numbers and times as people read them: web/src/shared/text.ts without a browser. */
 
 import assert from "node:assert/strict";
-import { readFileSync } from "node:fs";
-import { createRequire } from "node:module";
-import path from "node:path";
 import { it } from "node:test";
 
-import { ROOT } from "./harness.mjs";
+import { built } from "./sources.mjs";
 
-const { transformSync } = createRequire(path.join(ROOT, "web/package.json"))("esbuild");
-const { code } = transformSync(readFileSync(path.join(ROOT, "web/src/shared/text.ts"), "utf8"), { loader: "ts" });
-const { bytes, duration, nameOfFile } = await import(`data:text/javascript,${encodeURIComponent(code)}`);
+const { bytes, duration, nameOfFile } = await built("shared/text");
 
 it("durations carry over from seconds to minutes to hours", () => {
   const written = { 0.4: "0 s", 59.7: "1 min 0 s", 119.7: "2 min 0 s", 3599.7: "1 h 0 min", 7199: "2 h 0 min", 5400: "1 h 30 min" };

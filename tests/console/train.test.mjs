@@ -53,7 +53,7 @@ describe("train", () => {
 
     await start(page, "made", { confidence: "no", Steps: "60", "Most Gaussians": "800" });
     await until(() => state(page), (text) => text !== "waits", "nobody began", BACKGROUND_TIMEOUT_MS);
-    await page.getByRole("list", { name: "Phases of the training" }).getByText("Report and files").waitFor();
+    await page.getByRole("list", { name: "Phases of the training" }).getByText("Report and files").waitFor({ timeout: BACKGROUND_TIMEOUT_MS });
     const now = page.locator("[aria-current=step]");
     const told = await until(async () => {
       const [phase, left] = await Promise.all([now, page.getByTestId("time-left")].map((one) => one.textContent({ timeout: 500 }).catch(() => "")));

@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { describe, it } from "node:test";
 
-import { canvasState, openPage, picture, seriousFindings, until } from "./harness.mjs";
+import { canvasState, laidOut, openPage, picture, seriousFindings, until } from "./harness.mjs";
 import { cut, small, unreachable, walk } from "./reach.mjs";
 import { tested } from "./tested.mjs";
 
@@ -36,7 +36,7 @@ for (const view of Object.keys(VIEWS)) {
         const page = await open(view, { ...LARGE, scheme });
         assert.deepEqual(await seriousFindings(page), [], "at 100 %");
         await page.setViewportSize(ZOOMED);
-        await page.waitForTimeout(300);
+        await laidOut(page);
         assert.deepEqual(await seriousFindings(page), [], "at 200 %");
         assert.deepEqual([page.faults, page.foreign], [[], []]);
       });
@@ -46,7 +46,7 @@ for (const view of Object.keys(VIEWS)) {
       const found = { "100 %": [await cut(page), await unreachable(page)] };
       for (const [name, size] of Object.entries(SIZES)) {
         await page.setViewportSize(size);
-        await page.waitForTimeout(300);
+        await laidOut(page);
         found[name] = [await cut(page), await unreachable(page)];
         await picture(page, `size-${view}-${name.replace(/\W+/g, "")}`);
       }

@@ -16,7 +16,7 @@ import typer
 from ultragray.errors import InvalidArgument
 from ultragray_service.access.principals import NAMES, Role, read_limits
 from ultragray_service.cli.options import FieldsOf, with_options
-from ultragray_service.cli.terminal import Json, command_group, examples, print_table, tell, to_json
+from ultragray_service.cli.terminal import Json, argument, command_group, examples, option, print_table, tell, to_json
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from ultragray_workers.errors import BackupInvalid
 
@@ -70,23 +70,20 @@ _KEY_COLUMNS = ("id", "name", "role", "state", "created", "expires", "last used"
 )
 @with_options
 def create(
-    name: Annotated[str, typer.Argument(help="Whose it is: a person, a machine or a program.", show_default=False)],
+    name: Annotated[str, argument("Whose it is: a person, a machine or a program.", shown=False)],
     *,
     role: Annotated[
-        Role,
-        typer.Option(
-            help="reader: sees, renders, streams; operator: and has jobs, datasets and scenes; admin: everything."
-        ),
+        Role, option("reader: sees, renders, streams; operator: and has jobs, datasets and scenes; admin: everything.")
     ],
     expires_days: Annotated[
-        float | None, typer.Option(min=0.0, max=36_500.0, help="Days that it counts.", show_default="for ever")
+        float | None, option("Days that it counts.", min=0.0, max=36500.0, shown="for ever")
     ] = None,
     limit: Annotated[
         list[str] | None,
-        typer.Option(
+        option(
+            f"A limit of its own, NAME=none: no limit; may be repeated. Names: {', '.join(NAMES)}.",
             metavar="NAME=NUMBER",
-            help=f"A limit of its own, NAME=none: no limit; may be repeated. Names: {', '.join(NAMES)}.",
-            show_default="the settings key_NAME of the service",
+            shown="the settings key_NAME of the service",
         ),
     ] = None,
     json: Json = False,
@@ -127,7 +124,7 @@ def list_keys(
 @keys_app.command(epilog=examples("ultragray keys revoke alice"))
 @with_options
 def revoke(
-    name: Annotated[str, typer.Argument(help="Name, or id of one key.", show_default=False)],
+    name: Annotated[str, argument("Name, or id of one key.", shown=False)],
     *,
     json: Json = False,
     where: Where,
@@ -195,12 +192,10 @@ audit_app = command_group()
 @with_options
 def audit(
     *,
-    since_hours: Annotated[float, typer.Option(min=0.0, help="How far back.")] = 24.0,
-    who: Annotated[str | None, typer.Option(help="Only of this name.", show_default="all")] = None,
-    what: Annotated[
-        str | None, typer.Option(help="Only this operation, such as scene.delete, or scene.", show_default="all")
-    ] = None,
-    limit: Annotated[int, typer.Option(min=1, help="The last ones, at most.")] = 1000,
+    since_hours: Annotated[float, option("How far back.", min=0.0)] = 24.0,
+    who: Annotated[str | None, option("Only of this name.", shown="all")] = None,
+    what: Annotated[str | None, option("Only this operation, such as scene.delete, or scene.", shown="all")] = None,
+    limit: Annotated[int, option("The last ones, at most.", min=1)] = 1000,
     json: Json = False,
     where: Where,
 ) -> None:
@@ -227,9 +222,7 @@ def _timestamp(at_s: float) -> str:
 # `ultragray backup`: a whole installation into a folder.
 
 
-BackupFolder = Annotated[
-    Path, typer.Argument(help="Folder of backups, on another disk than the data.", show_default=False)
-]
+BackupFolder = Annotated[Path, argument("Folder of backups, on another disk than the data.", shown=False)]
 _SHOWN = 3
 backup_app = command_group()
 
@@ -243,11 +236,10 @@ backup_app = command_group()
 def backup(
     folder: BackupFolder,
     verify: Annotated[
-        bool, typer.Option("--verify", help="Make none: read all backups of the folder and check every hash.")
+        bool, option("Make none: read all backups of the folder and check every hash.", "--verify")
     ] = False,
     keep: Annotated[
-        int | None,
-        typer.Option(min=1, help="Remove all but so many of the newest backups of the folder.", show_default="all"),
+        int | None, option("Remove all but so many of the newest backups of the folder.", min=1, shown="all")
     ] = None,
     json: Json = False,
     *,
@@ -344,12 +336,8 @@ restore_app = command_group()
 @with_options
 def restore(
     folder: BackupFolder,
-    backup: Annotated[
-        str | None, typer.Option(help="Name of a backup of the folder.", show_default="the newest")
-    ] = None,
-    force: Annotated[
-        bool, typer.Option("--force", help="Replace all that the folders and the database hold now.")
-    ] = False,
+    backup: Annotated[str | None, option("Name of a backup of the folder.", shown="the newest")] = None,
+    force: Annotated[bool, option("Replace all that the folders and the database hold now.", "--force")] = False,
     json: Json = False,
     *,
     where: Where,
@@ -392,10 +380,8 @@ def places() -> None:
 )
 @with_options
 def copy(
-    source: Annotated[
-        str, typer.Argument(metavar="FROM", help="Data or artifact folder, or its URL.", show_default=False)
-    ],
-    target: Annotated[str, typer.Argument(metavar="TO", help="Where its scenes and datasets go.", show_default=False)],
+    source: Annotated[str, argument("Data or artifact folder, or its URL.", metavar="FROM", shown=False)],
+    target: Annotated[str, argument("Where its scenes and datasets go.", metavar="TO", shown=False)],
     *,
     json: Json = False,
 ) -> None:

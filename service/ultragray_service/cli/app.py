@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from ultragray_service.cli.terminal import examples
+from ultragray_service.cli.terminal import examples, option
 
 USER_ERROR = 2  # the exit code of a mistake that the caller can mend
 INTERRUPTED = 130  # the exit code of a command that Ctrl-C or SIGTERM stopped
@@ -286,9 +286,7 @@ def _print_version(wanted: bool) -> None:
 @app.callback()
 def main(
     context: typer.Context,
-    version: Annotated[
-        bool, typer.Option("--version", callback=_print_version, is_eager=True, help="Print the version.")
-    ] = False,
+    version: Annotated[bool, option("Print the version.", "--version", callback=_print_version, is_eager=True)] = False,
 ) -> None:
     """Look for environment variables that are misspelt, whatever the command; a service logs them itself."""
     from ultragray_service.cli.terminal import warn

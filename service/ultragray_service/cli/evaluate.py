@@ -22,6 +22,7 @@ from ultragray_service.cli.terminal import (
     check_folder,
     command_group,
     examples,
+    option,
     output_option,
     to_json,
     wide_console,
@@ -66,9 +67,9 @@ def evaluate(
     ] = None,
     force: Force = False,
     json: Json = False,
-    split: Annotated[Split, typer.Option(help="Frames to measure on.")] = Split.VAL,
+    split: Annotated[Split, option("Frames to measure on.")] = Split.VAL,
     register: Annotated[
-        bool, typer.Option("--register", help="Also move each frame by one half of it, and score the other half.")
+        bool, option("Also move each frame by one half of it, and score the other half.", "--register")
     ] = False,
     backend: Backend = "auto",
     *,

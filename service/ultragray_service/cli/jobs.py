@@ -22,10 +22,12 @@ from ultragray_service.cli.options import parameters_of, values_of, with_paramet
 from ultragray_service.cli.terminal import (
     Force,
     Json,
+    argument,
     check_file,
     command_group,
     counted,
     examples,
+    option,
     output_option,
     print_facts,
     print_table,
@@ -42,7 +44,7 @@ command_app = command_group("Work in the background, on a running service: it go
 submit_app = command_group("Put a job into the queue; its id is printed.")
 command_app.add_typer(submit_app, name="submit")
 
-JobArgument = Annotated[str, typer.Argument(help="Id of the job.", show_default=False)]
+JobArgument = Annotated[str, argument("Id of the job.", shown=False)]
 QUEUE = "Queue"
 _SUBMITS = {
     "train": (
@@ -73,11 +75,9 @@ _COLUMNS = ("id", "kind", "state", "scene or dataset", "progress", "created", "r
 @with_connection
 def list_jobs(
     connection: Connection,
-    state: Annotated[
-        str, typer.Option(help="Only queued, running, succeeded, failed or cancelled ones.", show_default="all")
-    ] = "",
-    kind: Annotated[str, typer.Option(help=f"Only {' or '.join(KINDS)} ones.", show_default="all")] = "",
-    limit: Annotated[int, typer.Option(min=1, help="How many at most.")] = 20,
+    state: Annotated[str, option("Only queued, running, succeeded, failed or cancelled ones.", shown="all")] = "",
+    kind: Annotated[str, option(f"Only {' or '.join(KINDS)} ones.", shown="all")] = "",
+    limit: Annotated[int, option("How many at most.", min=1)] = 20,
     json: Json = False,
 ) -> None:
     """List the jobs, newest first."""
@@ -141,7 +141,7 @@ def delete(connection: Connection, job: JobArgument, json: Json = False) -> None
 def logs(
     connection: Connection,
     job: JobArgument,
-    max_bytes: Annotated[int, typer.Option("--bytes", min=1, max=2**20, help="How much of its end.")] = 65536,
+    max_bytes: Annotated[int, option("How much of its end.", "--bytes", min=1, max=2**20)] = 65536,
     json: Json = False,
 ) -> None:
     """Print the end of a job's log."""
@@ -163,7 +163,7 @@ def logs(
 def download(
     connection: Connection,
     job: JobArgument,
-    name: Annotated[str, typer.Argument(help="One of the job's artifacts, or a range of them.", show_default=False)],
+    name: Annotated[str, argument("One of the job's artifacts, or a range of them.", shown=False)],
     output: Annotated[Path | None, output_option("File to write; of a range the folder.", default="NAME, here")] = None,
     force: Force = False,
     json: Json = False,
@@ -202,23 +202,13 @@ def _submit(
     specification: dict[str, Any],
     *,
     request_id: Annotated[
-        str | None,
-        typer.Option(
-            help="A name of your own: given again, it gives the same job.", show_default=False, rich_help_panel=QUEUE
-        ),
+        str | None, option("A name of your own: given again, it gives the same job.", shown=False, panel=QUEUE)
     ] = None,
-    priority: Annotated[
-        int, typer.Option(min=-1000, max=1000, help="Higher ones go first.", rich_help_panel=QUEUE)
-    ] = 0,
+    priority: Annotated[int, option("Higher ones go first.", min=-1000, max=1000, panel=QUEUE)] = 0,
     private: Annotated[
-        bool,
-        typer.Option(
-            "--private", help="Others see neither the job nor the scene that it makes.", rich_help_panel=QUEUE
-        ),
+        bool, option("Others see neither the job nor the scene that it makes.", "--private", panel=QUEUE)
     ] = False,
-    wait: Annotated[
-        bool, typer.Option("--wait", help="Follow the job to its end, as `jobs watch` does.", rich_help_panel=QUEUE)
-    ] = False,
+    wait: Annotated[bool, option("Follow the job to its end, as `jobs watch` does.", "--wait", panel=QUEUE)] = False,
     json: Json = False,
 ) -> None:
     beside = {"request_id": request_id, "priority": priority, "private": private}

@@ -20,9 +20,11 @@ from ultragray_service.cli.terminal import (
     Force,
     Json,
     SceneFile,
+    argument,
     check_file,
     command_group,
     examples,
+    option,
     output_option,
     tell,
     working,
@@ -48,17 +50,13 @@ def localize(
     scene: SceneFile,
     image: Annotated[
         Path,
-        typer.Argument(
-            help="The frame, .png or .npy: rows along depth, columns across scan lines, not scan-converted.",
-            show_default=False,
+        argument(
+            "The frame, .png or .npy: rows along depth, columns across scan lines, not scan-converted.", shown=False
         ),
     ],
-    start: Annotated[
-        Path,
-        typer.Option(help="A pose that is about right: .npy or .json, 4x4 or 3x4, in mm; .mcap.", show_default=False),
-    ],
-    within_mm: Annotated[float, typer.Option(help="How far the start may be off.")] = 3.0,
-    within_deg: Annotated[float, typer.Option(help="By which angle.")] = 5.0,
+    start: Annotated[Path, option("A pose that is about right: .npy or .json, 4x4 or 3x4, in mm; .mcap.", shown=False)],
+    within_mm: Annotated[float, option("How far the start may be off.")] = 3.0,
+    within_deg: Annotated[float, option("By which angle.")] = 5.0,
     output: Annotated[Path | None, output_option("The pose as .npy, [4, 4].", default="not written")] = None,
     force: Force = False,
     json: Json = False,
@@ -127,19 +125,14 @@ calibrate_app = command_group(
 )
 
 Output = Annotated[Path, output_option("The registration, .json.")]
-FlangePoses = Annotated[
-    Path, typer.Argument(metavar="FLANGE", help="Poses flange→base, mm: .npy or .json.", show_default=False)
-]
-Mounting = Annotated[
-    Path | None,
-    typer.Option(help="Pose probe→flange, mm: .npy or .json.", show_default="the frames are the same"),
-]
+FlangePoses = Annotated[Path, argument("Poses flange→base, mm: .npy or .json.", metavar="FLANGE", shown=False)]
+Mounting = Annotated[Path | None, option("Pose probe→flange, mm: .npy or .json.", shown="the frames are the same")]
 
 
 @calibrate_app.command(epilog=examples("ultragray calibrate points in_base.npy in_scene.npy -o robot.json"))
 def points(
-    in_base: Annotated[Path, typer.Argument(help="Points in the base, [N, 3] mm: .npy, .csv.", show_default=False)],
-    in_scene: Annotated[Path, typer.Argument(help="The same ones in the scene.", show_default=False)],
+    in_base: Annotated[Path, argument("Points in the base, [N, 3] mm: .npy, .csv.", shown=False)],
+    in_scene: Annotated[Path, argument("The same ones in the scene.", shown=False)],
     output: Output,
     probe_to_flange: Mounting = None,
     force: Force = False,
@@ -171,13 +164,11 @@ def points(
 )
 def poses(
     flange: FlangePoses,
-    probe: Annotated[
-        Path, typer.Argument(help="The poses probe→scene at the same times: .npy or .json.", show_default=False)
-    ],
+    probe: Annotated[Path, argument("The poses probe→scene at the same times: .npy or .json.", shown=False)],
     output: Output,
     probe_to_flange: Mounting = None,
     find_mounting: Annotated[
-        bool, typer.Option("--find-mounting", help="Find probe→flange as well, from turns about two axes or more.")
+        bool, option("Find probe→flange as well, from turns about two axes or more.", "--find-mounting")
     ] = False,
     force: Force = False,
     json: Json = False,
@@ -210,16 +201,13 @@ def frames(
     flange: FlangePoses,
     images: Annotated[
         list[Path],
-        typer.Argument(
-            help="The real frames at these poses: .png each, or one .npy [N, H, W]; not scan-converted.",
-            show_default=False,
-        ),
+        argument("The real frames at these poses: .png each, or one .npy [N, H, W]; not scan-converted.", shown=False),
     ],
-    start: Annotated[Path, typer.Option(help="A pose base→scene that is about right: .npy or .json.")],
+    start: Annotated[Path, option("A pose base→scene that is about right: .npy or .json.")],
     output: Output,
     probe_to_flange: Mounting = None,
-    within_mm: Annotated[float, typer.Option(help="How far the start puts the frames off.")] = 3.0,
-    within_deg: Annotated[float, typer.Option(help="By which angle.")] = 5.0,
+    within_mm: Annotated[float, option("How far the start puts the frames off.")] = 3.0,
+    within_deg: Annotated[float, option("By which angle.")] = 5.0,
     force: Force = False,
     json: Json = False,
     backend: Backend = "auto",

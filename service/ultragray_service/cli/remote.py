@@ -30,10 +30,12 @@ from ultragray_service.cli.terminal import (
     SCENE_SUFFIX,
     Force,
     Json,
+    argument,
     check_file,
     command_group,
     examples,
     frames_in_words,
+    option,
     output_option,
     print_facts,
     print_table,
@@ -140,9 +142,9 @@ _scenes.add_show(
 @with_connection
 def upload_scene(
     connection: Connection,
-    file: Annotated[Path, typer.Argument(help="Scene file (.ugr).", show_default=False)],
-    name: Annotated[str | None, typer.Option(help="Name of the scene.", show_default="that of the file")] = None,
-    private: Annotated[bool, typer.Option("--private", help="Others do not see it.")] = False,
+    file: Annotated[Path, argument("Scene file (.ugr).", shown=False)],
+    name: Annotated[str | None, option("Name of the scene.", shown="that of the file")] = None,
+    private: Annotated[bool, option("Others do not see it.", "--private")] = False,
     json: Json = False,
 ) -> None:
     """Have the service take a scene file in and render it."""
@@ -158,7 +160,7 @@ def upload_scene(
 @with_connection
 def download_scene(
     connection: Connection,
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the scene.", show_default=False)],
+    name: Annotated[str, argument("Name of the scene.", metavar="NAME", shown=False)],
     output: Annotated[Path | None, output_option("Scene file to write (.ugr).", default="NAME.ugr, here")] = None,
     force: Force = False,
     json: Json = False,
@@ -187,7 +189,7 @@ _scenes.add_delete("liver", "Delete a scene that was uploaded or trained there; 
 @with_connection
 def render_scene(
     connection: Connection,
-    name: Annotated[str, typer.Argument(metavar="NAME", help="Name of the scene.", show_default=False)],
+    name: Annotated[str, argument("Name of the scene.", metavar="NAME", shown=False)],
     output: Annotated[Path, output_option(f"A file ({', '.join(SUFFIXES)}), or a folder for PNGs.")],
     force: Force = False,
     json: Json = False,
@@ -251,13 +253,9 @@ _datasets.add_show("liver", "Print size, probe and split of a dataset, and what 
 @with_connection
 def upload_dataset(
     connection: Connection,
-    sweep: Annotated[
-        Path, typer.Argument(metavar="SWEEP", help=f"An archive (.zip, .tar), or {SWEEP_MEANING}.", show_default=False)
-    ],
-    name: Annotated[
-        str | None, typer.Option(help="Name of the dataset.", show_default="that of the file or folder")
-    ] = None,
-    private: Annotated[bool, typer.Option("--private", help="Others do not see it.")] = False,
+    sweep: Annotated[Path, argument(f"An archive (.zip, .tar), or {SWEEP_MEANING}.", metavar="SWEEP", shown=False)],
+    name: Annotated[str | None, option("Name of the dataset.", shown="that of the file or folder")] = None,
+    private: Annotated[bool, option("Others do not see it.", "--private")] = False,
     json: Json = False,
     *,
     source: SourceOptions,
@@ -371,9 +369,9 @@ _registrations.add_show("robot", "Print both links of a registration, mm, and ho
 @with_connection
 def upload_registration(
     connection: Connection,
-    file: Annotated[Path, typer.Argument(help="File of `ultragray calibrate` (.json).", show_default=False)],
-    scene: Annotated[str, typer.Option(help="Name of the scene that it leads into.", show_default=False)],
-    name: Annotated[str | None, typer.Option(help="Name of the registration.", show_default="that of the file")] = None,
+    file: Annotated[Path, argument("File of `ultragray calibrate` (.json).", shown=False)],
+    scene: Annotated[str, option("Name of the scene that it leads into.", shown=False)],
+    name: Annotated[str | None, option("Name of the registration.", shown="that of the file")] = None,
     json: Json = False,
 ) -> None:
     """Have the service keep a registration, in place of one of that name which is yours."""
@@ -423,7 +421,7 @@ def _add_wish(wish: str, meaning: str) -> None:
     @with_connection
     def command(
         connection: Connection,
-        name: Annotated[str, typer.Argument(help="Name of the worker.", show_default=False)],
+        name: Annotated[str, argument("Name of the worker.", shown=False)],
         json: Json = False,
     ) -> None:
         worker = connection.json("POST", route("workers", name, suffix=f":{wish}"))

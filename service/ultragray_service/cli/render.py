@@ -14,7 +14,6 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
-import typer
 
 from ultragray.errors import InvalidArgument, InvalidProbe
 from ultragray.exchange.batches import MANIFEST_FILE, SHARD_FRAMES, BatchPlan
@@ -44,6 +43,7 @@ from ultragray_service.cli.terminal import (
     examples,
     frames_in_words,
     is_folder_name,
+    option,
     output_option,
     tell,
 )
@@ -73,10 +73,7 @@ def render(
         ),
     ],
     dtype: Annotated[
-        str | None,
-        typer.Option(
-            help=f"{' or '.join(DTYPES)}, of a file.", show_default="the format's own", rich_help_panel=OUTPUT
-        ),
+        str | None, option(f"{' or '.join(DTYPES)}, of a file.", shown="the format's own", panel=OUTPUT)
     ] = None,
     force: Force = False,
     json: Json = False,
@@ -85,21 +82,18 @@ def render(
     sampler: Sampler | None,
     settings: FrameSettings,
     backend: Backend = "auto",
-    threads: Annotated[
-        int, typer.Option(min=0, help="Render threads; 0: all cores, of a shard one.", rich_help_panel=COMPUTE)
-    ] = 0,
+    threads: Annotated[int, option("Render threads; 0: all cores, of a shard one.", min=0, panel=COMPUTE)] = 0,
     on: Annotated[
         str | None,
-        typer.Option(
+        option(
+            "Render in shards on a Ray cluster, or on one of this machine; what is there already is kept.",
             metavar="ray|ray://HEAD:PORT",
-            help="Render in shards on a Ray cluster, or on one of this machine; what is there already is kept.",
-            show_default=False,
-            rich_help_panel=SHARDS,
+            shown=False,
+            panel=SHARDS,
         ),
     ] = None,
     shard_frames: Annotated[
-        int | None,
-        typer.Option(min=1, help="Frames of a shard.", show_default=f"{SHARD_FRAMES:,}", rich_help_panel=SHARDS),
+        int | None, option("Frames of a shard.", min=1, shown=f"{SHARD_FRAMES:,}", panel=SHARDS)
     ] = None,
 ) -> None:
     """Each frame comes with its pose and with how far it can be trusted. Lengths are in mm, angles in degrees."""

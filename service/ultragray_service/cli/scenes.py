@@ -24,10 +24,12 @@ from ultragray_service.cli.terminal import (
     Force,
     Json,
     SceneFile,
+    argument,
     check_ending,
     check_file,
     command_group,
     examples,
+    option,
     output_option,
     print_facts,
     tell,
@@ -78,10 +80,7 @@ show_app = command_group()
 )
 @with_options
 def show(
-    file: Annotated[
-        str,
-        typer.Argument(metavar="FILE", help=f"A scene file (.ugr), or a sweep: {SWEEP_MEANING}.", show_default=False),
-    ],
+    file: Annotated[str, argument(f"A scene file (.ugr), or a sweep: {SWEEP_MEANING}.", metavar="FILE", shown=False)],
     json: Json = False,
     *,
     source: SourceOptions,
@@ -226,49 +225,28 @@ import_app = command_group()
 def import_scene(
     file: Annotated[
         Path,
-        typer.Argument(
-            help="A .ply file that `ultragray export` wrote, or a .pt checkpoint of the released trainer.",
-            show_default=False,
+        argument(
+            "A .ply file that `ultragray export` wrote, or a .pt checkpoint of the released trainer.", shown=False
         ),
     ],
     output: Annotated[Path, output_option("Scene file to write (.ugr).")],
     force: Force = False,
     json: Json = False,
-    config: Annotated[
-        Path | None, typer.Option(help="conf.json of its dataset.", show_default=False, rich_help_panel=_CHECKPOINT)
-    ] = None,
+    config: Annotated[Path | None, option("conf.json of its dataset.", shown=False, panel=_CHECKPOINT)] = None,
     poses: Annotated[
         Path | None,
-        typer.Option(
-            help="Its training poses (poses_train.npy); they give the centre.",
-            show_default=False,
-            rich_help_panel=_CHECKPOINT,
-        ),
+        option("Its training poses (poses_train.npy); they give the centre.", shown=False, panel=_CHECKPOINT),
     ] = None,
     center: Annotated[
         tuple[float, float, float] | None,
-        typer.Option(
-            metavar="X Y Z",
-            help="Instead of --poses: the scene centre in mm.",
-            show_default=False,
-            rich_help_panel=_CHECKPOINT,
-        ),
+        option("Instead of --poses: the scene centre in mm.", metavar="X Y Z", shown=False, panel=_CHECKPOINT),
     ] = None,
     centered: Annotated[
-        bool,
-        typer.Option(
-            "--centered",
-            help="Instead of --poses: poses will be relative to the centre.",
-            rich_help_panel=_CHECKPOINT,
-        ),
+        bool, option("Instead of --poses: poses will be relative to the centre.", "--centered", panel=_CHECKPOINT)
     ] = False,
     image_height: Annotated[
         int | None,
-        typer.Option(
-            help="Height of the training images.",
-            show_default="from the images file that conf.json names",
-            rich_help_panel=_CHECKPOINT,
-        ),
+        option("Height of the training images.", shown="from the images file that conf.json names", panel=_CHECKPOINT),
     ] = None,
 ) -> None:
     """A checkpoint gets its place in the tracker's frame from the poses that it was trained with."""
@@ -348,22 +326,20 @@ def voxelize(
             "A volume: .nii.gz, .nii or .nrrd. A slice (--plane-mm): .png, .npy, or a volume of one layer of voxels."
         ),
     ],
-    field: Annotated[str, typer.Option(help=f"One of: {', '.join(VOLUME_FIELDS)}; attenuation is per mm.")] = "echo",
-    spacing_mm: Annotated[float, typer.Option(help="Distance of two voxels along each axis.")] = 0.5,
+    field: Annotated[str, option(f"One of: {', '.join(VOLUME_FIELDS)}; attenuation is per mm.")] = "echo",
+    spacing_mm: Annotated[float, option("Distance of two voxels along each axis.")] = 0.5,
     box_mm: Annotated[
         str | None,
-        typer.Option(
-            help="Ranges of x, y and z in the scene's frame, such as -20:20,0:30,-5:45. Default: the bounds of "
-            "the Gaussians.",
-            show_default=False,
+        option(
+            "Ranges of x, y and z in the scene's frame, such as -20:20,0:30,-5:45. "
+            "Default: the bounds of the Gaussians.",
+            shown=False,
         ),
     ] = None,
-    plane_mm: Annotated[
-        str | None, typer.Option(help="Corner x,y,z of a slice, instead of a volume.", show_default=False)
-    ] = None,
-    right: Annotated[str, typer.Option(help="Direction of the rows of the slice.")] = RIGHT,
-    down: Annotated[str, typer.Option(help="Direction of its columns.")] = DOWN,
-    size_mm: Annotated[str | None, typer.Option(help="Its width,height.", show_default=False)] = None,
+    plane_mm: Annotated[str | None, option("Corner x,y,z of a slice, instead of a volume.", shown=False)] = None,
+    right: Annotated[str, option("Direction of the rows of the slice.")] = RIGHT,
+    down: Annotated[str, option("Direction of its columns.")] = DOWN,
+    size_mm: Annotated[str | None, option("Its width,height.", shown=False)] = None,
     force: Force = False,
     json: Json = False,
 ) -> None:
@@ -425,8 +401,8 @@ SUFFIX, VOLUME_SUFFIX = ".mrml", "-echo.nii.gz"
 def slicer(
     scene: SceneFile,
     output: Annotated[Path, output_option(f"{SUFFIX}; the volume NAME{VOLUME_SUFFIX} is written beside it.")],
-    igtl_address: Annotated[str, typer.Option(help="HOST:PORT of the service's OpenIGTLink.")] = "127.0.0.1:18944",
-    spacing_mm: Annotated[float, typer.Option(help="Distance of two voxels of the volume.")] = 1.0,
+    igtl_address: Annotated[str, option("HOST:PORT of the service's OpenIGTLink.")] = "127.0.0.1:18944",
+    spacing_mm: Annotated[float, option("Distance of two voxels of the volume.")] = 1.0,
     force: Force = False,
     json: Json = False,
 ) -> None:

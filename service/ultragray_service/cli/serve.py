@@ -13,7 +13,7 @@ from ultragray.errors import InvalidArgument
 from ultragray.phantom.demo import copy_demo_scene
 from ultragray.scene.info import read_header
 from ultragray_service.cli.options import FieldsOf, with_options
-from ultragray_service.cli.terminal import command_group, examples
+from ultragray_service.cli.terminal import argument, command_group, examples
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from ultragray_workers.scenes import SUFFIX, SceneStore
 
@@ -32,8 +32,7 @@ command_app = command_group()
 @with_options
 def serve(
     scenes: Annotated[
-        list[Path] | None,
-        typer.Argument(help="Scene files to serve alone, without those of a data folder.", show_default=False),
+        list[Path] | None, argument("Scene files to serve alone, without those of a data folder.", shown=False)
     ] = None,
     *,
     options: Annotated[

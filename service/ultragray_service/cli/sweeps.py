@@ -16,10 +16,12 @@ from ultragray_service.cli.options import with_options
 from ultragray_service.cli.terminal import (
     Force,
     Json,
+    argument,
     check_file,
     check_folder,
     command_group,
     examples,
+    option,
     output_option,
     tell,
     to_json,
@@ -34,7 +36,7 @@ if TYPE_CHECKING:
 
 
 SWEEP_MEANING = "; ".join(one.meaning for one in FORMATS.values())
-SweepArgument = Annotated[str, typer.Argument(metavar="SWEEP", help=f"One of: {SWEEP_MEANING}.", show_default=False)]
+SweepArgument = Annotated[str, argument(f"One of: {SWEEP_MEANING}.", metavar="SWEEP", shown=False)]
 
 
 def check_source(source: str) -> None:
@@ -189,11 +191,7 @@ def convert(
     json: Json = False,
     poses_of: Annotated[
         Path | None,
-        typer.Option(
-            metavar="SCENE",
-            help="A scene trained from it: its corrected training poses are written.",
-            show_default=False,
-        ),
+        option("A scene trained from it: its corrected training poses are written.", metavar="SCENE", shown=False),
     ] = None,
     *,
     source: SourceOptions,

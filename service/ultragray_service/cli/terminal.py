@@ -44,6 +44,16 @@ def examples(*lines: str) -> str:
     return "\n\n".join(("[bold]Examples[/bold]", *(line.replace("[", r"\[") for line in lines)))
 
 
+def option(help: str, *flags: str, shown: str | bool = True, panel: str | None = None, **others: Any) -> Any:
+    """An option of a command, in a panel of its help; `shown`: the words for its default, False for none."""
+    return typer.Option(*flags, help=help, show_default=shown, rich_help_panel=panel, **others)
+
+
+def argument(help: str, *, shown: str | bool = True, **others: Any) -> Any:
+    """An argument of a command."""
+    return typer.Argument(help=help, show_default=shown, **others)
+
+
 def output_option(help: str, *, default: str | None = None) -> Any:
     """`--output FILE`, `-o FILE`; `default`: the words for what happens without it."""
     shown: Any = False if default is None else default

@@ -29,6 +29,7 @@ from ultragray_service.cli.terminal import (
     check_file,
     command_group,
     examples,
+    option,
     output_option,
     progress_bars,
     stop_on_signal,
@@ -62,49 +63,23 @@ def train(
     output: Annotated[Path, output_option("Scene file to write (.ugr).")],
     force: Force = False,
     json: Json = False,
-    preset: Annotated[
-        str | None,
-        typer.Option(help=PRESET_MEANINGS, show_default="fast", rich_help_panel=RUN),
-    ] = None,
+    preset: Annotated[str | None, option(PRESET_MEANINGS, shown="fast", panel=RUN)] = None,
     config: Annotated[
-        Path | None,
-        typer.Option(
-            help="TOML file of settings: any field of TrainingConfig, and preset.",
-            show_default=False,
-            rich_help_panel=RUN,
-        ),
+        Path | None, option("TOML file of settings: any field of TrainingConfig, and preset.", shown=False, panel=RUN)
     ] = None,
     setting: Annotated[
         list[str] | None,
-        typer.Option(
-            "--set",
-            metavar="NAME=VALUE",
-            help="Any field of TrainingConfig; repeat.",
-            show_default=False,
-            rich_help_panel=RUN,
-        ),
+        option("Any field of TrainingConfig; repeat.", "--set", metavar="NAME=VALUE", shown=False, panel=RUN),
     ] = None,
     folder: Annotated[
-        Path | None,
-        typer.Option(
-            help="Folder of the run: checkpoint, metrics.jsonl, config.json.",
-            show_default="OUTPUT.run",
-            rich_help_panel=RUN,
-        ),
+        Path | None, option("Folder of the run: checkpoint, metrics.jsonl, config.json.", shown="OUTPUT.run", panel=RUN)
     ] = None,
-    resume: Annotated[
-        bool, typer.Option("--resume", help="Go on from the checkpoint in the run's folder.", rich_help_panel=RUN)
-    ] = False,
+    resume: Annotated[bool, option("Go on from the checkpoint in the run's folder.", "--resume", panel=RUN)] = False,
     checkpoint_every: Annotated[
-        float,
-        typer.Option(metavar="SECONDS", min=0.0, help="How often a checkpoint is written.", rich_help_panel=RUN),
+        float, option("How often a checkpoint is written.", metavar="SECONDS", min=0.0, panel=RUN)
     ] = 30.0,
-    tensorboard: Annotated[
-        bool, typer.Option("--tensorboard", help="Also write TensorBoard events.", rich_help_panel=RUN)
-    ] = False,
-    device: Annotated[
-        str, typer.Option(help="cpu, or a GPU: cuda, or cuda:N for one of several.", rich_help_panel=COMPUTE)
-    ] = "cpu",
+    tensorboard: Annotated[bool, option("Also write TensorBoard events.", "--tensorboard", panel=RUN)] = False,
+    device: Annotated[str, option("cpu, or a GPU: cuda, or cuda:N for one of several.", panel=COMPUTE)] = "cpu",
     backend: Backend = "auto",
     threads: Threads = 0,
     *,

@@ -10,11 +10,9 @@ from collections.abc import Mapping
 from types import MappingProxyType
 from typing import Annotated, Any
 
-import typer
-
 from ultragray.errors import UltragrayError
 from ultragray_service.cli.options import FieldsOf, pairs_of, with_options
-from ultragray_service.cli.terminal import command_group, examples
+from ultragray_service.cli.terminal import command_group, examples, option
 from ultragray_service.server import ALIVE, READY, ServiceManager
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from ultragray_workers.errors import StartupFailed
@@ -31,15 +29,12 @@ command_app = command_group()
 )
 @with_options
 def worker(
-    name: Annotated[
-        str | None, typer.Option(help="Name of this worker, its alone.", show_default="of the host, numbered")
-    ] = None,
+    name: Annotated[str | None, option("Name of this worker, its alone.", shown="of the host, numbered")] = None,
     device: Annotated[
-        str, typer.Option(help="auto: every GPU of the host, and its processor; cpu; cuda: every GPU; or cuda:N.")
+        str, option("auto: every GPU of the host, and its processor; cpu; cuda: every GPU; or cuda:N.")
     ] = "auto",
     label: Annotated[
-        list[str] | None,
-        typer.Option(metavar="NAME=VALUE", help="A label that jobs can ask for; may be given several times."),
+        list[str] | None, option("A label that jobs can ask for; may be given several times.", metavar="NAME=VALUE")
     ] = None,
     *,
     options: Annotated[

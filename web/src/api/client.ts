@@ -139,14 +139,30 @@ export async function getJson<P extends Path>(
   return (await answer.json()) as AnswerTo<P, "get">;
 }
 
-/** The JSON that a POST answers, with or without a JSON body. */
-export async function postJson<P extends Path>(path: P, places: Places<P>, body?: unknown): Promise<AnswerTo<P, "post">> {
-  const init: RequestInit = { method: "POST" };
-  if (body !== undefined) {
-    init.body = JSON.stringify(body);
-    init.headers = { "Content-Type": "application/json" };
-  }
-  return (await (await request(address(path, places), init)).json()) as AnswerTo<P, "post">;
+/** What a POST answers, with or without a JSON body. */
+export function post(
+  path: string,
+  body?: unknown,
+  { accept = "application/json", signal = null }: { accept?: string; signal?: AbortSignal | null } = {},
+): Promise<Response> {
+  if (body === undefined) return request(path, { method: "POST", signal });
+  const headers = { "Content-Type": "application/json", Accept: accept };
+  return request(path, { method: "POST", body: JSON.stringify(body), headers, signal });
+}
+
+/** The JSON that a POST to an address of `path` answers. */
+export async function postJson<P extends Path>(
+  path: P,
+  places: Places<P>,
+  body?: unknown,
+  signal: AbortSignal | null = null,
+): Promise<AnswerTo<P, "post">> {
+  return (await (await post(address(path, places), body, { signal })).json()) as AnswerTo<P, "post">;
+}
+
+/** A pose, 16 numbers row by row, as bodies of requests hold it. */
+export function poseBody(pose: readonly number[]): { matrix: number[][] } {
+  return { matrix: [0, 4, 8, 12].map((start) => pose.slice(start, start + 4)) };
 }
 
 /** Deletes what stands at an address of `path`. */

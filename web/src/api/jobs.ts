@@ -63,10 +63,8 @@ export function deleteJob(job: string): Promise<void> {
 }
 
 /** What a render job of this specification would make; nothing is started. */
-export async function estimateRendering(specification: Record<string, unknown>, signal: AbortSignal): Promise<JobEstimate> {
-  const body = JSON.stringify({ kind: "render", specification });
-  const headers = { "Content-Type": "application/json" };
-  return (await (await request("/v1/jobs:estimate", { method: "POST", body, headers, signal })).json()) as JobEstimate;
+export function estimateRendering(specification: Record<string, unknown>, signal: AbortSignal): Promise<JobEstimate> {
+  return postJson("/v1/jobs:estimate", {}, { kind: "render", specification }, signal);
 }
 
 /** The training so far, in a few hundred points, and what classical methods reach on the same frames. */

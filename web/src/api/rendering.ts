@@ -1,6 +1,15 @@
-/** Single frames, rendered on request. */
+/** Frames on request: as a PNG, as DICOM; how far their poses can be trusted, and where a real one was taken.
+ *
+ * Poses are 16 numbers row by row, mm.
+ */
 
-import { address, request } from "./client";
+import { address, poseBody, post, postJson, type Schemas } from "./client";
+import { type FrameHeader, type Probe, settingsAgain, type StreamSettings } from "./contract";
+import type { Described } from "./described";
+import { within } from "./generated/contract";
+
+export type Extrapolation = Schemas["Extrapolation"];
+export type Located = Schemas["Located"];
 
 export interface RenderedPicture {
   picture: Blob;
@@ -8,20 +17,51 @@ export interface RenderedPicture {
   confidence: number | null;
 }
 
-/** A frame as a PNG. `settings` are those of RenderSettings; `pose` 16 numbers row by row, mm. */
+/** A frame as a PNG. `settings` are those of RenderSettings. */
 export async function renderPicture(
   scene: string,
   pose: readonly number[],
   settings: Record<string, unknown>,
-  signal: AbortSignal,
+  signal: AbortSignal | null = null,
 ): Promise<RenderedPicture> {
-  const matrix = [0, 4, 8, 12].map((start) => pose.slice(start, start + 4));
-  const response = await request(address("/v1/scenes/{scene}/render", { scene }), {
-    method: "POST",
-    headers: { "Content-Type": "application/json", Accept: "image/png" },
-    body: JSON.stringify({ ...settings, outputs: ["bmode"], pose: { matrix } }),
-    signal,
-  });
-  const told = response.headers.get("X-Ultragray-Confidence") ?? "";
-  return { picture: await response.blob(), confidence: told === "" ? null : Number(told) };
+  const body = { ...settings, outputs: ["bmode"], pose: poseBody(pose) };
+  const response = await post(address("/v1/scenes/{scene}/render", { scene }), body, { accept: "image/png", signal });
+  const confidence = response.headers.get("X-Ultragray-Confidence") ?? "";
+  return { picture: await response.blob(), confidence: confidence === "" ? null : Number(confidence) };
+}
+
+export const MOST_DICOM_FRAMES = 100; // of one file: the service lets so many wait beside the live ones
+
+/** Frames of one setting and one scene file. `settings`: as they were asked for, where the frames do not tell. */
+export async function framesAsDicom(headers: readonly FrameHeader[], settings: StreamSettings): Promise<Blob> {
+  const [first] = headers;
+  const { min_confidence, below_min_confidence } = settings;
+  const poses = headers.map(({ pose }) => ({ matrix: pose }));
+  const body = { ...settingsAgain(first!), min_confidence, below_min_confidence, poses };
+  const path = address("/v1/scenes/{scene}/render", { scene: `${first!.scene}@${first!.scene_sha256}` });
+  return await (await post(path, body, { accept: "application/dicom" })).blob();
+}
+
+/** Of each pose of a probe; null: the scene's own. */
+export async function assessPoses(scene: string, poses: readonly (readonly number[])[], probe: Probe | null): Promise<Extrapolation[]> {
+  return (await postJson("/v1/scenes/{scene}:assess", { scene }, { poses: poses.map(poseBody), probe })).extrapolations;
+}
+
+/** How far the start of a search may be off. */
+export interface Within {
+  within_mm: number;
+  within_deg: number;
+}
+export const WITHIN: { name: keyof Within; field: Described }[] = (["within_mm", "within_deg"] as const).map((name) => ({
+  name,
+  field: within.properties![name]!,
+}));
+
+/** Looks for a frame, the base64 of a PNG file, about `start`. `probe`: null for the scene's own. */
+export function localize(
+  scene: string,
+  { start, ...asked }: { image: string; start: readonly number[]; probe: Probe | null } & Within,
+  signal: AbortSignal,
+): Promise<Located> {
+  return postJson("/v1/scenes/{scene}:localize", { scene }, { ...asked, start: poseBody(start) }, signal);
 }

@@ -1,7 +1,9 @@
-/** Scenes: what there is, what they say about themselves, their Gaussians and training views. */
+/** Scenes and registrations: what there is, what they say about themselves, their files, their comparison with held-out frames. */
 
-import { address, getJson, request, type Schemas } from "./client";
+import { address, getJson, postJson, remove, request, type Schemas } from "./client";
+import { putFile, type Told } from "./datasets";
 import { FIELDS, Gaussians } from "./gaussians";
+import type { paths } from "./generated/schema";
 
 export type SceneEntry = Schemas["SceneEntry"];
 export type SceneDescription = Schemas["Scene"];
@@ -37,4 +39,68 @@ export type TrainingPoses = Schemas["ScenePoses"];
 /** The poses that the scene was trained from, each 16 numbers row by row, and how far each was corrected. */
 export async function trainingPoses(scene: string): Promise<TrainingPoses> {
   return await getJson("/v1/scenes/{scene}/training-poses", { scene });
+}
+
+export const SCENE_SUFFIX = ".ugr";
+
+export async function loadScene(scene: string): Promise<void> {
+  await postJson("/v1/scenes/{scene}:load", { scene });
+}
+
+export async function unloadScene(scene: string): Promise<void> {
+  await postJson("/v1/scenes/{scene}:unload", { scene });
+}
+
+/** Others do not see a private scene. */
+export function importScene(
+  scene: string,
+  file: File,
+  isPrivate: boolean,
+  told: Told,
+  signal: AbortSignal,
+): Promise<SceneDescription> {
+  const path = address("/v1/scenes/{scene}", { scene }) + (isPrivate ? "?private=true" : "");
+  return putFile(path, new Blob([file]), told, signal);
+}
+
+export function deleteScene(scene: string): Promise<void> {
+  return remove("/v1/scenes/{scene}", { scene });
+}
+
+export function sceneFilePath(scene: string): string {
+  return address("/v1/scenes/{scene}/file", { scene });
+}
+
+export type Comparison = Schemas["Comparison"];
+export type ComparedFrame = Schemas["ComparedFrame"];
+type MetricOf<Field> = Field extends `median_${infer Name}` ? Name : never;
+export type Metric = MetricOf<keyof Schemas["ComparedFrame"]>;
+export type ComparedPicture =
+  paths["/v1/scenes/{scene}/comparison/{index}/{what}.png"]["get"]["parameters"]["path"]["what"];
+
+/** Begins the comparison where it is not there. Throws ServiceError DATASET_NOT_FOUND without the scene's dataset. */
+export function comparisonOf(scene: string, signal: AbortSignal): Promise<Comparison> {
+  return getJson("/v1/scenes/{scene}/comparison", { scene }, { signal });
+}
+
+export function comparedPicturePath(scene: string, index: number, what: ComparedPicture): string {
+  return address("/v1/scenes/{scene}/comparison/{index}/{what}.png", { scene, index, what });
+}
+
+export type Registration = Schemas["NamedRegistration"];
+
+/** Every registration of the service, by name. */
+export async function listRegistrations(signal: AbortSignal): Promise<Registration[]> {
+  const all: Registration[] = [];
+  let token = "";
+  do {
+    const page = await getJson("/v1/registrations", {}, { query: { page_size: "1000", page_token: token }, signal });
+    all.push(...page.registrations);
+    token = page.next_page_token;
+  } while (token !== "");
+  return all;
+}
+
+export function deleteRegistration(registration: string): Promise<void> {
+  return remove("/v1/registrations/{registration}", { registration });
 }

@@ -1,14 +1,8 @@
-/** The WebSocket of a scene: poses out, frames in; only the newest pose counts. */
+/** The WebSockets of the service: frames of a scene for the poses that are sent, and a stream of another program to watch. */
 
-import type { Pose } from "../geometry/pose";
-import { apiKey, type Schemas } from "./client";
-import type { Output } from "./outputs";
+import { apiKey, getJson, poseBody, type Schemas } from "./client";
+import type { FrameHeader, Output, StreamSettings } from "./contract";
 
-export type StreamSettings = Omit<Schemas["RenderSettings"], "encoding">;
-export type Display = Schemas["FrameMessage"]["display"];
-export type Contact = Schemas["Contact"];
-export type FrameHeader = Schemas["FrameMessage"];
-export type Extrapolation = FrameHeader["extrapolation"];
 /** Why a pose got no frame. */
 export type Refusal = Schemas["RefusalMessage"]["error"];
 
@@ -52,7 +46,7 @@ export class FrameStream {
   #sentSettings = "";
   /** Those of the newest frame: what was not answered with one must be sent again. */
   #takenSettings = "";
-  #wanted: { pose: Pose; settings: StreamSettings } | null = null;
+  #wanted: { pose: readonly number[]; settings: StreamSettings } | null = null;
   #waiting = false;
   #later: ReturnType<typeof setTimeout> | undefined;
   #again: ReturnType<typeof setTimeout> | undefined;
@@ -68,7 +62,7 @@ export class FrameStream {
   }
 
   /** Asks for a frame; takes the place of what was asked for and not sent yet. */
-  ask(pose: Pose, settings: StreamSettings): void {
+  ask(pose: readonly number[], settings: StreamSettings): void {
     this.#wanted = { pose, settings };
     this.#waiting = true;
     this.#send();
@@ -156,7 +150,7 @@ export class FrameStream {
       window: WINDOW,
       timeout_ms: TIMEOUT_MS,
       client_time_ms: performance.now(),
-      pose: { matrix: [0, 4, 8, 12].map((start) => pose.slice(start, start + 4)), position_mm: null, quaternion: null },
+      pose: { ...poseBody(pose), position_mm: null, quaternion: null },
     };
     const known = written === this.#sentSettings && written === this.#takenSettings;
     if (!known) message.settings = { ...settings, encoding: "uint8" };
@@ -245,4 +239,74 @@ export function subprotocols(key: string | null): string[] {
 function base64url(text: string): string {
   const bytes = new TextEncoder().encode(text);
   return btoa(String.fromCharCode(...bytes)).replaceAll("+", "-").replaceAll("/", "_").replaceAll("=", "");
+}
+
+export type StreamSummary = Schemas["StreamSummary"];
+
+/** Each page of the console calls itself so. */
+export const PAGE_NAME = "console ";
+
+export async function listStreams(scene: string, signal: AbortSignal): Promise<StreamSummary[]> {
+  return (await getJson("/v1/streams", {}, { query: { scene }, signal })).streams;
+}
+
+export interface WatchEvents {
+  frame(frame: Frame): void;
+  refused(refusal: Refusal): void;
+  connected(yes: boolean): void;
+  /** The stream has ended, or is not there (any more). */
+  ended(): void;
+}
+
+const ENDED_CODE = 1000;
+const WATCH_AGAIN_MS = 500;
+const MOST_TRIES = 10;
+
+/** Watches a stream until it ends or this is closed; a connection that is lost is opened again. */
+export class WatchStream {
+  #socket: WebSocket | null = null;
+  #timer: ReturnType<typeof setTimeout> | undefined;
+  #closed = false;
+  #tries = 0;
+
+  constructor(
+    private readonly id: string,
+    private readonly events: WatchEvents,
+  ) {
+    this.#open();
+  }
+
+  close(): void {
+    this.#closed = true;
+    clearTimeout(this.#timer);
+    this.#socket?.close();
+  }
+
+  #open(): void {
+    const socket = new WebSocket(socketAddress(`/v1/streams/${encodeURIComponent(this.id)}/watch`), subprotocols(apiKey()));
+    socket.binaryType = "arraybuffer";
+    socket.onopen = () => {
+      this.#tries = 0;
+      this.events.connected(true);
+    };
+    socket.onmessage = ({ data }: MessageEvent<ArrayBuffer | string>) => {
+      if (this.#closed) return;
+      if (typeof data === "string") this.events.refused((JSON.parse(data) as Schemas["RefusalMessage"]).error);
+      else this.events.frame(decodeFrame(data));
+    };
+    socket.onclose = ({ code }) => this.#lose(code);
+    this.#socket = socket;
+  }
+
+  #lose(code: number): void {
+    if (this.#closed) return;
+    this.#tries += 1;
+    if (code === ENDED_CODE || this.#tries > MOST_TRIES) {
+      this.#closed = true;
+      this.events.ended();
+      return;
+    }
+    this.events.connected(false);
+    this.#timer = setTimeout(() => this.#open(), WATCH_AGAIN_MS);
+  }
 }

@@ -1,10 +1,122 @@
-/** What Compare looks at: the frame, what it is compared with, how, and where the pictures are enlarged. */
+/** What Compare looks at: the frame, what it is compared with and how, the pictures of it, and where they are enlarged. */
 
-import { comparisonOf, type ComparedFrame, type Comparison, type Metric } from "../api/comparison";
 import { explain, ServiceError, untilAnswered } from "../api/client";
-import { METRICS } from "../shared/metrics";
-import { router } from "../shell/router.svelte";
-import { CLASSICAL, worstFirst, type Measured } from "./statistics";
+import { type ComparedFrame, type Comparison, comparisonOf, describeScene, type Metric } from "../api/scenes";
+import { router } from "../page/router.svelte";
+import { service } from "../page/service.svelte";
+import { METRICS } from "../shared/text";
+import { CLASSICAL, type Grey, type Measured, readGrey, worstFirst } from "./pictures";
+
+const MOST = 16;
+const STEP = 1.25;
+
+/** Where all pictures of the bench are enlarged, and where the pointer is: linked, in shares of width and height. */
+export class Lens {
+  zoom = $state(1);
+  /** The share that lies in the middle. */
+  x = $state(0.5);
+  y = $state(0.5);
+  cursor = $state.raw<{ u: number; v: number } | null>(null);
+
+  /** Enlarges about a place, which stays where it is. */
+  zoomBy(steps: number, about = { u: this.x, v: this.y }): void {
+    const zoom = Math.max(1, Math.min(MOST, this.zoom * STEP ** steps));
+    const kept = this.zoom / zoom;
+    [this.x, this.y] = [about.u + (this.x - about.u) * kept, about.v + (this.y - about.v) * kept];
+    this.zoom = zoom;
+    this.#stay();
+  }
+
+  /** Moves the pictures by shares of their enlarged size. */
+  moveBy(u: number, v: number): void {
+    [this.x, this.y] = [this.x - u, this.y - v];
+    this.#stay();
+  }
+
+  reset(): void {
+    [this.zoom, this.x, this.y] = [1, 0.5, 0.5];
+  }
+
+  #stay(): void {
+    const half = 0.5 / this.zoom;
+    this.x = Math.max(half, Math.min(1 - half, this.x));
+    this.y = Math.max(half, Math.min(1 - half, this.y));
+  }
+}
+
+/** A picture of the service that follows its address; the one before stays, told to be old, until it is there. */
+export class LoadedPicture {
+  picture = $state.raw<Grey | null>(null);
+  problem = $state<string | null>(null);
+  stale = $state(true);
+
+  /** Follows `path`; null: there is none yet. Must be made while a component is being made; ends with it. */
+  constructor(path: () => string | null) {
+    $effect(() => {
+      const wanted = path();
+      this.stale = true;
+      if (wanted === null) return;
+      const ending = new AbortController();
+      const tell = (error: unknown): void => {
+        if (ending.signal.aborted) return;
+        this.picture = null;
+        this.problem = explain(error);
+      };
+      untilAnswered(() => readGrey(wanted, ending.signal), tell, ending.signal)
+        .then((picture) => {
+          if (ending.signal.aborted) return;
+          this.picture = picture;
+          this.problem = null;
+          this.stale = false;
+        })
+        .catch(tell);
+      return () => ending.abort();
+    });
+  }
+}
+
+const MOST_ASKED = 40; // scenes
+
+/** Has the service compare another scene with its held-out frames, too, until that is done. */
+export class Rival {
+  isReady = $state(false);
+  problem = $state<string | null>(null);
+
+  /** Follows `scene`; null: none. Must be made while a component is being made; ends with it. */
+  constructor(scene: () => string | null) {
+    $effect(() => {
+      const wanted = scene();
+      this.isReady = false;
+      this.problem = null;
+      if (wanted === null) return;
+      const ending = new AbortController();
+      const tell = (error: unknown): void => {
+        if (!ending.signal.aborted) this.problem = explain(error);
+      };
+      this.#follow(wanted, tell, ending.signal).catch(tell);
+      return () => ending.abort();
+    });
+  }
+
+  async #follow(scene: string, tell: (error: unknown) => void, signal: AbortSignal): Promise<void> {
+    for (;;) {
+      const { state, reason } = await untilAnswered(() => comparisonOf(scene, signal), tell, signal);
+      if (signal.aborted) return;
+      this.isReady = state === "ready";
+      this.problem = reason;
+      if (state !== "running") return;
+      await new Promise((resolve) => setTimeout(resolve, POLL_MS));
+    }
+  }
+}
+
+/** The names of the other scenes that were trained from the same sweep. */
+export async function scenesOfSameSweep(scene: string): Promise<string[]> {
+  const { dataset_sha256: sweep } = await describeScene(scene);
+  const others = service.scenes.filter((one) => one.error == null && one.name !== scene).slice(0, MOST_ASKED);
+  const described = await Promise.all(others.map(({ name }) => describeScene(name).catch(() => null)));
+  return others.filter((_, place) => sweep !== null && described[place]?.dataset_sha256 === sweep).map(({ name }) => name);
+}
 
 export const MODES = ["side", "wipe", "flicker"] as const;
 export type Mode = (typeof MODES)[number];
@@ -17,6 +129,7 @@ export type Against = { way: Measured } | { scene: string };
 const POLL_MS = 700;
 const SCENE = "scene:";
 
+/** What Compare looks at: the frame, what it is compared with, how, and where the pictures are enlarged. */
 export class Bench {
   comparison = $state.raw<Comparison | null>(null);
   problem = $state<string | null>(null);

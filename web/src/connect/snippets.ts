@@ -1,9 +1,25 @@
 /** The frame of now as programs in other languages ask for it: whole programs, which run as they stand. */
 
-import type { StreamSettings } from "../api/stream";
-import { differingFields, type Tool } from "../api/tools";
-import { entry, position, quaternion, type Pose } from "../geometry/pose";
-import { capital, keywords, literal } from "./python_literal";
+import { differingFields, type StreamSettings, type Tool } from "../api/contract";
+import { entry, type Pose, position, quaternion } from "../geometry/pose";
+
+export function keywords(values: Given): string {
+  return Object.entries(values).map(([name, value]) => `${name}=${literal(value)}`).join(", ");
+}
+
+/** A value as Python writes it. */
+export function literal(value: unknown): string {
+  if (value === null) return "None";
+  if (typeof value === "boolean") return value ? "True" : "False";
+  if (Array.isArray(value)) return `[${value.map(literal).join(", ")}]`;
+  if (typeof value === "object")
+    return `{${Object.entries(value as Given).map(([name, one]) => `${JSON.stringify(name)}: ${literal(one)}`).join(", ")}}`;
+  return JSON.stringify(value);
+}
+
+export function capital(word: string): string {
+  return word.charAt(0).toUpperCase() + word.slice(1);
+}
 
 export const LANGUAGES = ["curl", "python", "grpc", "websocket", "igtl", "ros"] as const;
 export type Language = (typeof LANGUAGES)[number];

@@ -1,4 +1,19 @@
-/** Rigid probe→scene transforms: 16 numbers row by row, translation in mm. */
+/** Vectors and rigid transforms: poses lead from the probe to the scene, as 16 numbers row by row, translation in mm. */
+
+import type { Registration } from "../api/scenes";
+
+export const dot = (a: Vector, b: Vector): number => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+export const plus = (a: Vector, b: Vector): Vector => [a[0] + b[0], a[1] + b[1], a[2] + b[2]];
+export const minus = (a: Vector, b: Vector): Vector => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
+export const scaled = (a: Vector, by: number): Vector => [a[0] * by, a[1] * by, a[2] * by];
+export const length = (a: Vector): number => Math.hypot(...a);
+/** Of length 1; nothing stays nothing. */
+export const unit = (a: Vector): Vector => scaled(a, 1 / (length(a) || 1));
+export const cross = (a: Vector, b: Vector): Vector => [
+  a[1] * b[2] - a[2] * b[1],
+  a[2] * b[0] - a[0] * b[2],
+  a[0] * b[1] - a[1] * b[0],
+];
 
 export type Pose = readonly number[];
 export type Vector = readonly [number, number, number];
@@ -200,4 +215,82 @@ export function placeOn(track: readonly Pose[], pose: Pose): number | null {
 /** Whether two poses differ by no more than what is lost in writing them. */
 function isSame(a: Pose, b: Pose): boolean {
   return distance_mm(a, b) < 0.01 && angle_deg(a, b) < 0.01;
+}
+
+/**
+ * absolute: against the scene's origin and axes. relativeScene: the way from another pose along the scene's axes, and the
+ * turn against it. relativeProbe: the same way along that pose's own lateral, elevation and axial axes.
+ */
+export const REFERENCES = ["absolute", "relativeScene", "relativeProbe"] as const;
+export type Reference = (typeof REFERENCES)[number];
+
+/** Tilt, rock and rotate in degrees, as `anglesFrom` has them. */
+export interface Place {
+  position_mm: Vector;
+  angles_deg: Vector;
+}
+
+export function placeIn(pose: Pose, reference: Reference, other: Pose): Place {
+  if (reference === "absolute") return { position_mm: position(pose), angles_deg: anglesFrom(IDENTITY, pose) };
+  const [p, q] = [position(pose), position(other)];
+  const way: Vector = [p[0] - q[0], p[1] - q[1], p[2] - q[2]];
+  return {
+    position_mm: reference === "relativeScene" ? way : alongAxes(other, way),
+    angles_deg: anglesFrom(other, pose),
+  };
+}
+
+/** Its inverse. */
+export function withPlaceIn({ position_mm, angles_deg }: Place, reference: Reference, other: Pose): Pose {
+  if (reference === "absolute") return fromPositionQuaternion(position_mm, orientationFrom(IDENTITY, angles_deg));
+  const turned = fromPositionQuaternion(position(other), orientationFrom(other, angles_deg));
+  const [x, y, z] = position(other);
+  if (reference === "relativeScene")
+    return withPosition(turned, [x + position_mm[0], y + position_mm[1], z + position_mm[2]]);
+  return withPosition(turned, position(translated(other, position_mm)));
+}
+
+/** A direction in the scene as the pose's own axes have it. */
+function alongAxes(pose: Pose, way: Vector): Vector {
+  const q = quaternion(pose);
+  return apply(fromPositionQuaternion([0, 0, 0], [q[0], -q[1], -q[2], -q[3]]), way);
+}
+
+/** What a registration makes of poses. */
+export interface Registered {
+  name: string;
+  baseToScene: Pose;
+  probeToFlange: Pose;
+}
+
+export function registeredBy({ name, base_to_scene, probe_to_flange }: Registration): Registered {
+  return { name, baseToScene: base_to_scene.flat(), probeToFlange: probe_to_flange.flat() };
+}
+
+/** Whether both convert every pose alike. */
+export function leadAlike(one: Registered, other: Registered): boolean {
+  const same = (of: Pose, as: Pose): boolean => of.every((value, place) => value === as[place]);
+  return same(one.baseToScene, other.baseToScene) && same(one.probeToFlange, other.probeToFlange);
+}
+
+/** Flange to base of a pose of the probe in the scene. */
+export function flangePose({ baseToScene, probeToFlange }: Registered, pose: Pose): Pose {
+  return composed(inverse(baseToScene), composed(pose, inverse(probeToFlange)));
+}
+
+/** Its inverse. */
+export function probePose({ baseToScene, probeToFlange }: Registered, flange: Pose): Pose {
+  return composed(baseToScene, composed(flange, probeToFlange));
+}
+
+/** The corners of a box about all places of the flange whose probe is within a box of the scene. */
+export function flangeBounds({ baseToScene, probeToFlange }: Registered, low: Vector, high: Vector): { low: Vector; high: Vector } {
+  const back = inverse(baseToScene);
+  const reach_mm = length(position(probeToFlange));
+  const corners = [0, 1, 2, 3, 4, 5, 6, 7].map((bits) =>
+    apply(back, [0, 1, 2].map((axis) => (bits & (1 << axis) ? high : low)[axis]!) as unknown as Vector),
+  );
+  const outermost = (choose: (...values: number[]) => number, by_mm: number): Vector =>
+    [0, 1, 2].map((axis) => choose(...corners.map((corner) => corner[axis]!)) + by_mm) as unknown as Vector;
+  return { low: outermost(Math.min, -reach_mm), high: outermost(Math.max, reach_mm) };
 }

@@ -1,8 +1,11 @@
 /** The skin as the sweep tells it: a smooth surface through the faces of its views, on which the probe can be kept. */
 
-import { areAllAround, type ImagePlane } from "./plane";
-import { apply, axis, multiply, pivoted, quaternion, translated, type Pose, type Quaternion, type Vector } from "./pose";
-import { cross, dot, length, minus, plus, scaled, unit } from "./vector";
+import type { ImagePlane } from "../api/contract";
+import { areAllAround } from "./plane";
+import {
+  apply, axis, cross, dot, length, minus, multiply, pivoted, plus, type Pose, quaternion, type Quaternion,
+  scaled, translated, unit, type Vector,
+} from "./pose";
 
 const FACE_POINTS = 9; // of each view
 const MARGIN_MM = 15; // beyond the sweep the surface goes on

@@ -1,9 +1,11 @@
 /** Where a tool is: its points in mm, in the frame of the scene or of the probe, and how it is moved. */
 
-import type { Tool, ToolFrame } from "../api/tools";
-import { boxOf, pointOf, type ImagePlane, type PlanePoint } from "./plane";
-import { apply, axis, fromPositionQuaternion, IDENTITY, inverse, multiply, quaternion, type Pose, type Quaternion, type Vector } from "./pose";
-import { length, minus, plus, scaled, unit } from "./vector";
+import type { ImagePlane, Tool, ToolFrame } from "../api/contract";
+import { boxOf, type PlanePoint, pointOf } from "./plane";
+import {
+  apply, axis, fromPositionQuaternion, IDENTITY, inverse, length, minus, multiply, plus, type Pose, quaternion,
+  type Quaternion, scaled, unit, type Vector,
+} from "./pose";
 
 /** A needle or a cylinder: a straight line from its tip to its hub. */
 export type Rod = Extract<Tool, { tip_mm: unknown }>;

@@ -1,17 +1,46 @@
-/** What a person looks at in Maps of a scene: the large map and the cursor. Kept while other views are shown, and in the address. */
+/** What a person looks at in Maps of a scene: its outputs and labels, the large map and the cursor, kept in the address. */
 
 import { untrack } from "svelte";
 
-import { OUTPUTS, type Output } from "../api/outputs";
+import { type Output, OUTPUTS } from "../api/contract";
 import type { PlanePoint } from "../geometry/plane";
-import { Calm } from "../shared/calm.svelte";
-import { router, type Kept } from "../shell/router.svelte";
+import { type Kept, router } from "../page/router.svelte";
 import { poseOrNull, poseValue } from "../session/link";
-import type { Session } from "../session/session.svelte";
+import { besideSession, type Session } from "../session/session.svelte";
+import { Calm } from "../shared/asking.svelte";
+import { nameIn } from "../shared/text";
+import { words } from "../words/words.svelte";
+
+/** A pixel of the frame. */
+export interface Cursor {
+  column: number;
+  row: number;
+}
+
+const LABELS: Output = "labels";
+
+/** The outputs of a scene; labels are among them as soon as there is a tool in its image. */
+export function outputsOf({ scene, tools }: Session): Output[] {
+  const outputs = scene.description?.outputs ?? [];
+  return tools.all.length === 0 || outputs.includes(LABELS) ? outputs : [...outputs, LABELS];
+}
+
+/** Names by label; what is both tissue and a tool has both names. */
+export function labelNamesOf({ scene, tools }: Session): Record<string, string> {
+  const names: Record<string, string[]> = {};
+  for (const [label, name] of Object.entries(scene.description?.label_names ?? {})) names[label] = [name];
+  for (const { kind, label } of tools.all) {
+    const known = (names[label] ??= []);
+    const name = nameIn(words.tools.kinds, kind);
+    if (!known.includes(name)) known.push(name);
+  }
+  return Object.fromEntries(Object.entries(names).map(([label, known]) => [label, known.join(", ")]));
+}
 
 const BETWEEN = "_"; // stands in addresses as it is
 const FIRST: Output = "bmode";
 
+/** What a person looks at in Maps of a scene: the large map and the cursor. Kept while other views are shown, and in the address. */
 export class MapsState {
   large = $state<Output>(FIRST);
   /** In the image plane, so that it stays where it is when the picture changes. */
@@ -71,11 +100,5 @@ function numbersOf(text: string | undefined, count: number): number[] | null {
   return parts.length === count && !parts.includes("") && numbers.every(Number.isFinite) ? numbers : null;
 }
 
-const states = new WeakMap<Session, MapsState>();
-
 /** What is looked at of a session; the same each time that Maps are shown. */
-export function mapsOf(session: Session): MapsState {
-  let state = states.get(session);
-  if (state === undefined) states.set(session, (state = new MapsState(session)));
-  return state;
-}
+export const mapsOf = besideSession((session) => new MapsState(session));

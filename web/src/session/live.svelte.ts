@@ -1,16 +1,138 @@
-/** The live frames of a session: at most one a screen refresh, the newest, with the rate they come at. */
+/** The live frames of a session: at most one a screen refresh, the newest; those of its own stream, or of another program's that is followed. */
 
-import { FrameStream, type Frame, type Refusal, type StreamSettings } from "../api/stream";
-import type { StreamSummary } from "../api/streams";
-import { service } from "../shell/service.svelte";
-import { Following } from "./following.svelte";
-import { Latency, type LatencyFigures } from "./latency";
+import { settingsAgain, type StreamSettings } from "../api/contract";
+import { type Frame, FrameStream, type Refusal, type StreamSummary, WatchStream } from "../api/stream";
+import type { Pose } from "../geometry/pose";
+import { service } from "../page/service.svelte";
 import type { Session } from "./session.svelte";
+
+const KEPT = 240; // frames
+
+export interface LatencyFigures {
+  p50_ms: number;
+  p99_ms: number;
+  /** Since what is on the screen was asked for. */
+  age_ms: number;
+  /** Poses that newer ones replaced, in all. */
+  dropped: number;
+}
+
+/** How long frames take, from being asked for to being on the screen. */
+export class Latency {
+  #times_ms: number[] = [];
+  #asked_ms = 0;
+  #dropped = 0;
+
+  /** A frame that was asked for so long ago is on the screen now. */
+  shown(took_ms: number, now_ms: number): void {
+    this.#times_ms.push(took_ms);
+    if (this.#times_ms.length > KEPT) this.#times_ms.shift();
+    this.#asked_ms = now_ms - took_ms;
+  }
+
+  /** So many poses were replaced before a frame that has come. */
+  dropped(poses: number): void {
+    this.#dropped += poses;
+  }
+
+  /** null before the first frame. */
+  figures(now_ms: number): LatencyFigures | null {
+    if (this.#times_ms.length === 0) return null;
+    const ordered = [...this.#times_ms].sort((a, b) => a - b);
+    const at = (share: number): number => ordered[Math.min(ordered.length - 1, Math.floor(share * ordered.length))]!;
+    return { p50_ms: at(0.5), p99_ms: at(0.99), age_ms: now_ms - this.#asked_ms, dropped: this.#dropped };
+  }
+}
+
+export interface FollowEvents {
+  /** A frame as the program got it. */
+  frame(frame: Frame): void;
+  /** A frame whose pixels no page can show: the same is to be rendered for the page. */
+  render(pose: Pose, settings: StreamSettings): void;
+  refused(refusal: Refusal): void;
+  ended(): void;
+}
+
+/** Another program's stream, shown in place of the page's own: its frames, its poses, its probe. */
+export class Following {
+  /** Whether the connection was lost, and is tried again: what is shown is old. */
+  lost = $state(false);
+  /** Whether the frames are rendered for the page. */
+  renderedHere = $state(false);
+  /** The scene that the program asks for in place of this one. */
+  otherScene = $state<string | null>(null);
+  #pose: Pose | null = null;
+  #choosing = false;
+  #watch: WatchStream;
+
+  constructor(
+    readonly stream: StreamSummary,
+    private readonly session: Session,
+    private readonly events: FollowEvents,
+  ) {
+    this.#watch = new WatchStream(stream.id, {
+      frame: (frame) => this.#take(frame),
+      refused: (refusal) => this.events.refused(refusal),
+      connected: (yes) => (this.lost = !yes),
+      ended: () => this.events.ended(),
+    });
+  }
+
+  close(): void {
+    this.#watch.close();
+  }
+
+  /** Whether the probe was moved since by somebody else than the program. An image that stands moves nothing. */
+  wasSteered(pose: Pose): boolean {
+    if (this.session.frozen) this.#pose = null; // the first frame after that places the probe again
+    return !this.#choosing && this.#pose !== null && pose !== this.#pose;
+  }
+
+  /** Puts the probe where the frame on the screen has it, unless the image stands. */
+  shown({ header }: Frame): void {
+    if (this.otherScene !== null || this.session.frozen) return;
+    this.#place(header.pose.flat());
+    if (sameProbe(header.probe, this.session.probe) || this.#choosing) return;
+    this.#choosing = true;
+    const chosen = sameProbe(header.probe, this.session.scene.own.probe) ? null : header.probe;
+    void this.session
+      .chooseProbe(chosen)
+      .catch(() => undefined)
+      .finally(() => {
+        if (this.#pose !== null) this.#place(this.#pose);
+        this.#choosing = false;
+      });
+  }
+
+  #place(pose: Pose): void {
+    this.session.pose = this.#pose = pose;
+  }
+
+  #take(frame: Frame): void {
+    const { header } = frame;
+    this.otherScene = header.scene === this.session.name ? null : header.scene;
+    if (this.otherScene !== null) return;
+    this.renderedHere = !isShowable(frame);
+    if (this.renderedHere) this.events.render(header.pose.flat(), settingsAgain(header));
+    else this.events.frame(frame);
+  }
+}
+
+function isShowable({ header, pixels }: Frame): boolean {
+  const bytes = header.height * header.width * header.outputs.length;
+  return header.encoding === "uint8" && header.outputs.includes("bmode") && pixels.length >= bytes;
+}
+
+function sameProbe(a: object, b: object): boolean {
+  const sorted = (probe: object): string => JSON.stringify(Object.entries(probe).sort());
+  return sorted(a) === sorted(b);
+}
 
 const RATES_EVERY_MS = 500;
 const SCENE_ASKED_AGAIN_MS = 3000;
 const FAILURES_SAID = 5; // in a row; by then the state of the service is known
 
+/** The live frames of a session: at most one a screen refresh, the newest, with the rate they come at. */
 export class LiveView {
   frame = $state.raw<Frame | null>(null);
   connected = $state(false);

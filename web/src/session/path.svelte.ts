@@ -1,12 +1,10 @@
 /** The path of the probe in a session: poses of a file or a recording, with their times. */
 
-import { distance_mm, type Pose } from "../geometry/pose";
-import { MOST_BYTES, readPoses } from "../geometry/pose_files/read";
-import type { Chosen, PoseFile } from "../geometry/pose_files/pose_file";
-import { words } from "../words/words.svelte";
-import { PoseError } from "../geometry/pose_faults";
 import { explain } from "../api/client";
-import type { Session } from "./session.svelte";
+import { distance_mm, type Pose } from "../geometry/pose";
+import { type Chosen, MOST_BYTES, PoseError, type PoseFile, readPoses } from "../geometry/pose_files";
+import { words } from "../words/words.svelte";
+import { besideSession, type Session } from "./session.svelte";
 
 const EVERY_MS = 33;
 const MOST_RECORDED = 100_000;
@@ -107,14 +105,5 @@ export class Path {
   }
 }
 
-const known = new WeakMap<Session, Path>();
-
 /** That of a session; the same for every view. */
-export function pathOf(session: Session): Path {
-  const before = known.get(session);
-  if (before !== undefined) return before;
-  let begun!: Path;
-  $effect.root(() => void (begun = new Path(session))); // what it derives outlives the view that asked first
-  known.set(session, begun);
-  return begun;
-}
+export const pathOf = besideSession((session) => new Path(session));

@@ -1,25 +1,205 @@
-/** One scene as it is scanned: the probe, where it is held and how its frames are shown. */
+/** One scene as it is scanned: the probe, where it is held, how its frames are shown, which tools are in them, and what can be undone. */
 
-import type { Output } from "../api/outputs";
-import type { Probe } from "../api/probes";
-import type { StreamSettings } from "../api/stream";
 import {
-  between,
-  IDENTITY,
-  nearest,
-  pivoted,
-  placeOn,
-  rotated,
-  translated,
-  type Pose,
-  type Quaternion,
-  type Vector,
+  AS_RENDERED, AS_TRAINED, type Display, exampleTool, type ImagePlane, MOST_TOOLS, type Output,
+  type PlainSettings, type Probe, type StreamSettings, type Tool, type ToolKind,
+} from "../api/contract";
+import { areUpright, boxOf } from "../geometry/plane";
+import {
+  between, IDENTITY, nearest, pivoted, placeOn, type Pose, type Quaternion, rotated, translated, type Vector,
 } from "../geometry/pose";
-import { History } from "./history.svelte";
-import { ImageSettings } from "./image_settings.svelte";
-import { KnownScene, type Held } from "./known_scene.svelte";
-import { planes } from "./planes.svelte";
-import { Tools } from "./tools.svelte";
+import { service } from "../page/service.svelte";
+import { type Held, KnownScene, planes } from "./scene.svelte";
+
+const MOST = 200;
+const PAUSE_MS = 500; // what goes on without a longer pause is one step
+
+interface Step {
+  undo(): void;
+  redo(): void;
+  /** What it belongs to, and is forgotten with. */
+  of?: object | undefined;
+}
+
+/** A value that went from one to another. */
+class Change<T> implements Step {
+  constructor(
+    private readonly put: (value: T) => void,
+    private readonly before: T,
+    private after: T,
+    readonly of?: object,
+  ) {}
+  undo(): void {
+    this.put(this.before);
+  }
+  redo(): void {
+    this.put(this.after);
+  }
+  /** Goes on to a further value. */
+  extend(after: unknown): void {
+    this.after = after as T;
+  }
+}
+
+/** What can be undone and done again, in the order in which it was done. */
+export class History {
+  #done = $state.raw<readonly Step[]>([]);
+  #undone = $state.raw<readonly Step[]>([]);
+  readonly canUndo = $derived(this.#done.length > 0);
+  readonly canRedo = $derived(this.#undone.length > 0);
+  /** What may still go on: its name, its step, and when it went on last. */
+  #open: { run: string; step: Change<unknown>; at_ms: number } | null = null;
+
+  add(step: Step): void {
+    this.#done = [...this.#done, step].slice(-MOST);
+    this.#undone = [];
+    this.#open = null;
+  }
+
+  /** Adds a change of a value. Changes of the same `run` without a pause between them are one step. */
+  change<T>(put: (value: T) => void, before: T, after: T, { run = null, of }: { run?: string | null; of?: object } = {}): void {
+    const now_ms = performance.now();
+    if (run !== null && this.#open?.run === run && now_ms - this.#open.at_ms < PAUSE_MS) {
+      this.#open.step.extend(after);
+      this.#open.at_ms = now_ms;
+      return;
+    }
+    const step = new Change(put, before, after, of);
+    this.add(step);
+    if (run !== null) this.#open = { run, step: step as Change<unknown>, at_ms: now_ms };
+  }
+
+  undo(): void {
+    const step = this.#done.at(-1);
+    if (step === undefined) return;
+    this.#done = this.#done.slice(0, -1);
+    this.#undone = [...this.#undone, step];
+    this.#open = null;
+    step.undo();
+  }
+
+  redo(): void {
+    const step = this.#undone.at(-1);
+    if (step === undefined) return;
+    this.#undone = this.#undone.slice(0, -1);
+    this.#done = [...this.#done, step];
+    this.#open = null;
+    step.redo();
+  }
+
+  /** Forgets the steps that belong to something. */
+  forget(of: object): void {
+    this.#done = this.#done.filter((step) => step.of !== of);
+    this.#undone = this.#undone.filter((step) => step.of !== of);
+    this.#open = null;
+  }
+
+  clear(): void {
+    this.#done = this.#undone = [];
+    this.#open = null;
+  }
+}
+
+/** Depth samples and scan lines that are offered, beside those of the training. */
+export const SIZES = [128, 256, 384, 512, 768];
+const MOST_PICTURE_PIXELS = 640; // on the longer side of a scan-converted fan
+
+/** How the frames of a scene are shown, whatever the probe. */
+export class ImageSettings {
+  /** How frames are shown, but for the scan conversion. */
+  display = $state.raw<Display>(AS_RENDERED);
+  scanConverted = $state(true);
+  /** Depth samples and scan lines; null: as trained. */
+  samples = $state<number | null>(null);
+  /** What else is set, by the names of the contract. */
+  plain = $state.raw<PlainSettings>(AS_TRAINED);
+  /** Whether what no Gaussians support is black. */
+  hidesUnsupported = $state(false);
+
+  /** The display as the stream takes it, of images in that plane; `plain`: without what changes the values of pixels. */
+  displayIn(plane: ImagePlane, plain: boolean): Display {
+    const { depth_mm, flip } = this.display;
+    return {
+      ...(plain ? { ...AS_RENDERED, depth_mm, flip } : this.display),
+      pixel_mm: this.scanConverted ? squarePixel_mm(plane) : null,
+    };
+  }
+
+  set(change: Partial<PlainSettings>): void {
+    this.plain = { ...this.plain, ...change };
+  }
+
+  /** Takes back what the display panel sets, but for the number of samples; ghosts are set beside the tools. */
+  reset(): void {
+    this.display = AS_RENDERED;
+    this.plain = { ...AS_TRAINED, ghost: this.plain.ghost };
+  }
+
+  /** What fits any probe is kept, the depth of another one is not. */
+  forgetDepth(): void {
+    this.display = { ...this.display, depth_mm: null };
+  }
+
+  /** What was chosen for another scene does not fit this one. */
+  beginAnew(): void {
+    this.samples = null;
+    this.plain = AS_TRAINED;
+    this.forgetDepth();
+  }
+}
+
+/** The pixel of a scan-converted picture; null for probes whose frames are pictures already. */
+function squarePixel_mm({ lines_mm }: ImagePlane): number | null {
+  if (areUpright(lines_mm)) return null;
+  const { left, right, top, bottom } = boxOf(lines_mm);
+  return Math.max(right - left, bottom - top) / MOST_PICTURE_PIXELS;
+}
+
+/** The tools in the image of a session, and which of them is worked on. */
+export class Tools {
+  #all = $state.raw<readonly Tool[]>([]);
+  #chosen = $state(0);
+  readonly chosen = $derived.by(() => Math.min(this.#chosen, this.#all.length - 1));
+  readonly current = $derived.by<Tool | null>(() => this.#all[this.chosen] ?? null);
+  readonly isFull = $derived.by(() => this.#all.length >= MOST_TOOLS);
+
+  constructor(private readonly history: History) {}
+
+  get all(): readonly Tool[] {
+    return this.#all;
+  }
+
+  choose(index: number): void {
+    this.#chosen = index;
+  }
+
+  /** Adds one, which is then worked on. `placed` puts it somewhere. */
+  add(kind: ToolKind, placed: (tool: Tool) => Tool): void {
+    this.#change([...this.#all, placed(exampleTool(kind))]);
+    this.#chosen = this.#all.length - 1;
+  }
+
+  /** Puts a changed one in the place of that which is worked on. */
+  change(tool: Tool): void {
+    this.#change(this.#all.map((before, index) => (index === this.chosen ? tool : before)), `tool ${this.chosen}`);
+  }
+
+  removeChosen(): void {
+    this.#change(this.#all.filter((_, index) => index !== this.chosen));
+  }
+
+  /** Takes all of them from elsewhere; not a step that can be undone. */
+  take(all: readonly Tool[]): void {
+    this.#all = all;
+    this.#chosen = 0;
+  }
+
+  /** Changes of one `run` are one step. */
+  #change(all: readonly Tool[], run: string | null = null): void {
+    this.history.change((put) => (this.#all = put), this.#all, all, { run });
+    this.#all = all;
+  }
+}
 
 /** Poses to play, of the scene's own probe. */
 export interface Trajectory {
@@ -27,6 +207,7 @@ export interface Trajectory {
   poses: Pose[];
 }
 
+/** One scene as it is scanned: the probe, where it is held and how its frames are shown. */
 export class Session {
   readonly scene: KnownScene;
   #pose = $state.raw<Pose>(IDENTITY);
@@ -64,19 +245,17 @@ export class Session {
 
   /** What to ask the stream for; `plain`: without what changes the values of pixels. */
   settings(outputs: Output[], { plain = false } = {}): StreamSettings {
-    const { samples, sliceThickness_mm, contact, hidesUnsupported } = this.image;
+    const { samples, plain: others, hidesUnsupported } = this.image;
     return {
+      ...others,
       height: samples,
       width: samples,
       probe: this.scene.description?.probe ? this.chosenProbe : this.probe,
       display: this.image.displayIn(this.plane, plain),
       outputs,
-      slice_thickness_mm: sliceThickness_mm,
       min_confidence: hidesUnsupported && this.scene.description?.confidence ? 1 : null,
       below_min_confidence: "mask",
-      contact,
       tools: this.tools.all.length > 0 ? [...this.tools.all] : null,
-      ghost: this.tools.ghost > 0 ? this.tools.ghost : null,
       registration: null,
     };
   }
@@ -235,7 +414,7 @@ export class Session {
     this.#choices += 1;
     this.#chosen = this.trajectory = null;
     this.image.beginAnew();
-    this.tools.take([], 0);
+    this.tools.take([]);
     this.goHome();
     this.history.clear();
   }
@@ -253,7 +432,17 @@ export function sessionOf(scene: string): Session {
   return session;
 }
 
-/** Lets go of what was kept about a scene that is gone. */
-export function forgetSession(scene: string): void {
-  sessions.delete(scene);
+service.whenGone((scene) => sessions.delete(scene));
+
+/** What is kept beside each session: made when it is first asked for, the same for every view. */
+export function besideSession<T>(make: (session: Session) => T): (session: Session) => T {
+  const all = new WeakMap<Session, T>();
+  return (session) => {
+    const known = all.get(session);
+    if (known !== undefined) return known;
+    let begun!: T;
+    $effect.root(() => void (begun = make(session))); // what it derives outlives the view that asked first
+    all.set(session, begun);
+    return begun;
+  };
 }

@@ -1,4 +1,4 @@
-/** What charts draw. */
+/** What charts draw: their series, their scales with round ticks, and the numbers beside them. */
 
 export interface Point {
   x: number;
@@ -53,4 +53,55 @@ export function nearestOf(values: readonly number[], wanted: number): number {
 export function valueAt({ points, dots }: Series, x: number): number | null {
   const found = dots ? points.findLast((point) => point.x <= x && point.y !== null) : points.find((point) => point.x === x);
   return found?.y ?? null;
+}
+
+export interface Range {
+  low: number;
+  high: number;
+}
+
+const MARGIN = 0.06; // of the values, above and below
+
+/** The range of values, with room around them; `fromZero` begins it there. */
+export function rangeOf(values: readonly number[], { fromZero = false, margin = true } = {}): Range {
+  const known = values.filter(Number.isFinite);
+  if (known.length === 0) return { low: 0, high: 1 };
+  let low = known.reduce((least, value) => Math.min(least, value));
+  let high = known.reduce((most, value) => Math.max(most, value));
+  if (fromZero) low = Math.min(0, low);
+  if (low === high) return fromZero && low === 0 ? { low: 0, high: 1 } : { low: low - 0.5, high: high + 0.5 };
+  if (margin && !fromZero) [low, high] = [low - MARGIN * (high - low), high + MARGIN * (high - low)];
+  else if (margin) high += MARGIN * (high - low);
+  return { low, high };
+}
+
+/** Round numbers within the range, at most `most` of them (two at least are tried); whole ones where `whole`. */
+export function ticks({ low, high }: Range, most: number, whole = false): number[] {
+  const rough = (high - low) / Math.max(1, most);
+  const power = 10 ** Math.floor(Math.log10(rough));
+  const factors = whole ? [1, 2, 5, 10] : [1, 2, 2.5, 5, 10];
+  const round = factors.map((factor) => factor * power).find((one) => one >= rough * (1 - 1e-9)) ?? 10 * power;
+  const step = whole ? Math.max(1, Math.round(round)) : round;
+  const first = Math.ceil(low / step - 1e-9);
+  const last = Math.floor(high / step + 1e-9);
+  return Array.from({ length: Math.max(0, last - first + 1) }, (_, i) => Number(((first + i) * step).toPrecision(12)));
+}
+
+/** How ticks are written: all with the same number of decimals, thousands as k where they are many. */
+export function tickText(all: readonly number[], language = "en"): (value: number) => string {
+  const largest = Math.max(0, ...all.map(Math.abs));
+  const isThousands = largest >= 10_000 && all.every((value) => Math.abs((value / 100) % 1) < 1e-9);
+  const shown = all.map((value) => (isThousands ? value / 1000 : value));
+  const digits = Math.max(0, ...shown.map(decimals));
+  return (value) => {
+    const number = isThousands ? value / 1000 : value;
+    const text = number.toLocaleString(language, { minimumFractionDigits: digits, maximumFractionDigits: digits });
+    return isThousands && value !== 0 ? `${text}k` : text;
+  };
+}
+
+function decimals(value: number): number {
+  const text = Number(value.toPrecision(6)).toString();
+  const [mantissa = "", exponent = "0"] = text.split("e");
+  return Math.min(8, Math.max(0, (mantissa.split(".")[1]?.length ?? 0) - Number(exponent)));
 }

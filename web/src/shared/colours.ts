@@ -5,54 +5,18 @@ export type Colour = readonly [number, number, number];
 
 /** From low to high; each grows lighter all the way, so that it can be read in grey and by those who see few colours. */
 const STOPS = {
-  intensity: [
-    [20, 16, 38],
-    [85, 30, 105],
-    [168, 48, 98],
-    [233, 107, 62],
-    [250, 193, 98],
-    [255, 250, 225],
-  ],
-  transmittance: [
-    [12, 18, 40],
-    [26, 60, 105],
-    [30, 112, 140],
-    [63, 165, 145],
-    [150, 210, 130],
-    [250, 245, 170],
-  ],
-  coverage: [
-    [0, 32, 77],
-    [61, 78, 107],
-    [114, 117, 121],
-    [165, 156, 116],
-    [214, 200, 97],
-    [255, 234, 70],
-  ],
-  uncertainty: [
-    [16, 20, 28],
-    [66, 44, 50],
-    [128, 66, 50],
-    [190, 100, 44],
-    [232, 152, 60],
-    [255, 224, 140],
-  ],
-} satisfies Record<string, Colour[]>;
+  intensity: coloursOf("#141026 #551e69 #a83062 #e96b3e #fac162 #fffae1"),
+  transmittance: coloursOf("#0c1228 #1a3c69 #1e708c #3fa591 #96d282 #faf5aa"),
+  coverage: coloursOf("#00204d #3d4e6b #727579 #a59c74 #d6c861 #ffea46"),
+  uncertainty: coloursOf("#10141c #422c32 #804232 #be642c #e8983c #ffe08c"),
+  tissue: coloursOf("#26181e #70423c #ba8a6c #e8d0ac #fffaee"), // of the intensity in space: from dark tissue to bright bone
+};
 
 /** The share at which the colours of a map end, where it hardly ever shows more. */
 const ENDS: Record<string, number> = { attenuation: 0.4, uncertainty: 0.3 };
 
 /** Of labels from 1 on; 0 is nothing. */
-const CATEGORIES: Colour[] = [
-  [240, 228, 200],
-  [204, 92, 84],
-  [238, 190, 80],
-  [86, 140, 214],
-  [92, 178, 120],
-  [176, 120, 200],
-  [230, 140, 180],
-  [120, 190, 200],
-];
+const CATEGORIES = coloursOf("#f0e4c8 #cc5c54 #eebe50 #568cd6 #5cb278 #b078c8 #e68cb4 #78bec8");
 
 /** Whether values of that name have a ramp of their own. */
 export function isRamp(name: string): name is Ramp {
@@ -94,4 +58,36 @@ export function table(colour: (value: number) => Colour): Uint32Array {
 
 export function css([r, g, b]: Colour): string {
   return `rgb(${r} ${g} ${b})`;
+}
+
+/** The grey of each value, as RGBA in the byte order of a canvas. */
+export const GREYS = table((value) => [value, value, value]);
+
+/** Fills pixels with the colours of values. */
+export function colour(pixels: Uint32Array, values: Uint8Array, colours: Uint32Array): void {
+  for (let index = 0; index < pixels.length; index++) pixels[index] = colours[values[index]!]!;
+}
+
+const images = new WeakMap<HTMLCanvasElement, ImageData>(); // one each: a live image leaves no time to clear up after it
+
+/** Paints a canvas, which becomes as large. `fill` sets the pixels, RGBA in its byte order; they are what they were before. */
+export function paint(
+  canvas: HTMLCanvasElement,
+  width: number,
+  height: number,
+  fill: (pixels: Uint32Array) => void,
+  settings: CanvasRenderingContext2DSettings = {},
+): void {
+  const context = canvas.getContext("2d", settings);
+  if (canvas.width !== width) canvas.width = width;
+  if (canvas.height !== height) canvas.height = height;
+  const before = images.get(canvas);
+  const image = before?.width === width && before.height === height ? before : new ImageData(width, height);
+  images.set(canvas, image);
+  fill(new Uint32Array(image.data.buffer));
+  context?.putImageData(image, 0, 0);
+}
+
+function coloursOf(hex: string): Colour[] {
+  return hex.split(" ").map((one) => [1, 3, 5].map((at) => parseInt(one.slice(at, at + 2), 16)) as unknown as Colour);
 }

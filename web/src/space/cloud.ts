@@ -1,33 +1,15 @@
 /** The Gaussians in space: drawn into a picture of their own, as coarse as there is time for, that is laid over the rest. */
 
 import {
-  BufferAttribute,
-  BufferGeometry,
-  Color,
-  DepthTexture,
-  DoubleSide,
-  Mesh,
-  MeshBasicMaterial,
-  Scene,
-  UnsignedIntType,
-  Vector2,
-  Vector3,
-  WebGLRenderTarget,
-  type PerspectiveCamera,
-  type Plane,
-  type ShaderMaterial,
-  type Texture,
-  type WebGLRenderer,
+  BufferAttribute, BufferGeometry, Color, DepthTexture, DoubleSide, Mesh, MeshBasicMaterial,
+  type PerspectiveCamera, type Plane, Scene, type ShaderMaterial, type Texture, UnsignedIntType, Vector2,
+  Vector3, type WebGLRenderer, WebGLRenderTarget,
 } from "three";
 
 import type { Gaussians } from "../api/gaussians";
-import { USUAL, type Appearance } from "./appearance";
-import { cloudMaterial, cloudUniforms } from "./cloud_material";
-import { middleOf } from "./middle";
-import { fillPalette, fillShown } from "./palette";
-import { Splats } from "./splats";
+import { type Appearance, middleOf, USUAL } from "./appearance";
+import { cloudMaterial, cloudUniforms, fillPalette, fillShown, Splats, VolumeLayer } from "./cloud_layers";
 import type { Volume } from "./volume";
-import { VolumeLayer } from "./volume_layer";
 
 /** The layer of what hides parts of the cloud: the image and the probe. */
 export const OCCLUDERS = 1;

@@ -1,16 +1,24 @@
 /** The probe in space: a body that is dragged over the skin, and a gizmo that moves and turns it. */
 
-import { Group, Mesh, Plane, Vector3, type Camera, type Intersection, type Raycaster } from "three";
+import { type Camera, Group, type Intersection, Mesh, Plane, Raycaster, Vector2, Vector3 } from "three";
 import { TransformControls } from "three/examples/jsm/controls/TransformControls.js";
 
-import type { ImagePlane } from "../geometry/plane";
-import { axis, fromPositionQuaternion, IDENTITY, position, translated, type Pose } from "../geometry/pose";
-import { dot, minus } from "../geometry/vector";
+import type { ImagePlane } from "../api/contract";
+import { axis, dot, fromPositionQuaternion, IDENTITY, minus, type Pose, position, translated } from "../geometry/pose";
+import { drop, placeObject, probeBody } from "./bodies";
 import { OCCLUDERS } from "./cloud";
-import { drop } from "./drop";
-import { placeObject } from "./place";
-import { placeOf, pointedAt } from "./pointing";
-import { probeBody } from "./probe_body";
+
+/** The place of the pointer on the element, -1 to 1 each way, y up. */
+export function placeOf(event: MouseEvent): Vector2 {
+  const { left, top, width, height } = (event.target as Element).getBoundingClientRect();
+  return new Vector2((2 * (event.clientX - left)) / width - 1, 1 - (2 * (event.clientY - top)) / height);
+}
+
+export function pointedAt(event: MouseEvent, camera: Camera): Raycaster {
+  const ray = new Raycaster();
+  ray.setFromCamera(placeOf(event), camera);
+  return ray;
+}
 
 export type Gizmo = "translate" | "rotate" | "none";
 

@@ -1,15 +1,12 @@
 /** The 3D view of a scene, kept while other views are shown: how it is looked at, and what is shown of it. */
 
 import type { Gaussians } from "../api/gaussians";
-import { sceneGaussians, type SceneDescription } from "../api/scenes";
-import { apply, axis, translated, withPosition, type Pose, type Vector } from "../geometry/pose";
+import { type SceneDescription, sceneGaussians } from "../api/scenes";
+import { apply, axis, type Pose, translated, type Vector, withPosition } from "../geometry/pose";
 import { keptOn, putOn } from "../geometry/skin";
-import { sessionOf, type Session } from "../session/session.svelte";
-import { USUAL, type Appearance, type ColourBy, type Cut } from "./appearance";
-import { recalled, remember } from "./memory";
-import { middleOf } from "./middle";
+import { besideSession, type Session } from "../session/session.svelte";
+import { type Appearance, type ColourBy, type Cut, type Look, middleOf, USUAL, type Viewpoint } from "./appearance";
 import type { Gizmo } from "./probe_handle";
-import type { Look, Viewpoint } from "./viewpoints";
 import { brightestOf, type Volume } from "./volume";
 import type { VolumeDelivery, VolumeOrder } from "./volume.worker";
 
@@ -153,15 +150,23 @@ export class Room {
   }
 }
 
-const rooms = new Map<string, Room>();
-
 /** What is kept of a scene; a session that was forgotten begins anew. */
-export function roomOf(scene: string): Room {
-  const session = sessionOf(scene);
-  let room = rooms.get(scene);
-  if (room === undefined || room.session !== session) {
-    $effect.root(() => void (room = new Room(session))); // what it derives outlives the view that asked first
-    rooms.set(scene, room!);
-  }
-  return room!;
+export const roomOf = besideSession((session) => new Room(session));
+
+/** What the tab remembers of the 3D view of a scene over a reload. */
+const REMEMBERED = ["appearance", "cut", "gizmo", "viewpoint", "look", "showSweep", "showSkin", "contact", "open", "begun"] as const;
+type Remembered = Partial<Pick<Room, (typeof REMEMBERED)[number]>>;
+
+/** Of another version of the console nothing is taken. */
+const VERSION = 1;
+const keyOf = (scene: string): string => `ultragray.space.${VERSION}.${scene}`;
+
+function remember(scene: string, room: Room): void {
+  const kept = Object.fromEntries(REMEMBERED.map((name) => [name, room[name]]));
+  sessionStorage.setItem(keyOf(scene), JSON.stringify(kept));
+}
+
+function recalled(scene: string): Remembered {
+  const text = sessionStorage.getItem(keyOf(scene));
+  return text === null ? {} : (JSON.parse(text) as Remembered);
 }

@@ -1,29 +1,264 @@
-/** The scene in space: its Gaussians, the training planes, the skin, the probe with its live image. */
+/** The 3D view: when it is drawn and how finely, the eye of the person, and what stands in the room. */
 
-import { AmbientLight, Color, DirectionalLight, Group, Mesh, Plane, Scene, Vector3, WebGLRenderer, type LineSegments } from "three";
+import {
+  AmbientLight, Color, DirectionalLight, Group, type LineSegments, Mesh, PerspectiveCamera, Plane, Scene,
+  Vector3, WebGLRenderer,
+} from "three";
+import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
 
+import type { ImagePlane, Tool } from "../api/contract";
 import type { Gaussians } from "../api/gaussians";
 import type { Frame } from "../api/stream";
-import type { Tool } from "../api/tools";
-import type { Placed } from "../geometry/picture";
-import type { ImagePlane } from "../geometry/plane";
-import type { Pose, Vector } from "../geometry/pose";
+import type { Placed } from "../geometry/plane";
+import { apply, axis, IDENTITY, length, minus, type Pose, type Vector } from "../geometry/pose";
 import type { Skin } from "../geometry/skin";
-import type { Appearance, Cut, Form } from "./appearance";
-import { boxLines } from "./box_lines";
-import { Eye, SEEN_DEG } from "./camera";
+import {
+  type Appearance, type Box, type Cut, type CutAcross, type Form, type Look, lookFrom, type Sides,
+  type Viewpoint,
+} from "./appearance";
+import { boxLines, drop, LiveImage, skinMesh, sweepPlanes, ToolBodies } from "./bodies";
 import { Cloud, OCCLUDERS, type Sight } from "./cloud";
-import { placeCut } from "./cut";
-import { DrawingLoop, drawnBySoftware } from "./drawing";
-import { drop } from "./drop";
-import { LiveImage } from "./image_plane";
-import { pointedAt } from "./pointing";
-import { ProbeHandle, type Gizmo } from "./probe_handle";
-import { skinMesh } from "./skin_mesh";
-import { sweepPlanes } from "./sweep";
-import { ToolBodies } from "./tool_bodies";
+import { type Gizmo, pointedAt, ProbeHandle } from "./probe_handle";
 import type { Volume } from "./volume";
-import { lookFrom, type Box, type Look, type Sides, type Viewpoint } from "./viewpoints";
+
+const BUSY_SHARE = 0.3; // of the time, at most, goes into drawing what the live image changes: it comes first itself
+const SOFTWARE_SHARE = 0.15; // where the processor draws
+const HANDLED_SHARE = 0.8; // while the person turns the view or drags
+const STILL_MS = 250; // after the last change it is drawn finely
+const BUDGET_MS = { card: 25, software: 40 }; // of one drawing: a click waits for it, and so does the live image
+const SCALES = [0.2, 0.3, 0.4, 0.55, 0.75, 1]; // of the pixels, each way
+const FIRST_GUESS_MS = { card: 8, software: 250 }; // of the cloud at full size
+const TRUST = 0.5; // in the newest measurement
+
+export type Cause = "person" | "frame";
+
+/** When the 3D view is drawn, and how finely: at once for the person, within a share of the time for the live image. */
+export class DrawingLoop {
+  #request = 0;
+  #fence: WebGLSync | null = null;
+  #dirty: Cause | null = null;
+  /** Of the fine picture, how many bands are drawn; null: all of them. */
+  #band: number | null = 0;
+  #bands = 1;
+  #touched_ms = 0;
+  #started_ms = 0;
+  #taken_ms = 0;
+  #scale = 1;
+  /** Of the cloud at full size, as measured. */
+  #cost_ms: number;
+  #measures = false;
+  readonly #kind: "card" | "software";
+  /** Whether the person turns the view, or drags the probe. */
+  handled = false;
+
+  /** `draw`: draws at a scale of the pixels; true where that says what the cloud costs.
+   *
+   * `refine`: draws one of so many bands of the fine picture, and shows it with the last; false: nothing is to be refined.
+   */
+  constructor(
+    private readonly context: WebGL2RenderingContext,
+    readonly software: boolean,
+    private readonly draw: (scale: number) => boolean,
+    private readonly refine: (band: number, bands: number) => boolean,
+  ) {
+    this.#kind = software ? "software" : "card";
+    this.#cost_ms = FIRST_GUESS_MS[this.#kind];
+  }
+
+  /** Something changed: what the person did is shown at once. */
+  touch(cause: Cause): void {
+    if (this.#dirty !== "person") this.#dirty = cause;
+    this.#touched_ms = performance.now();
+    this.#band = 0;
+    this.#ask();
+  }
+
+  /** What is drawn costs something else from now on. */
+  forgetCost(): void {
+    this.#cost_ms = FIRST_GUESS_MS[this.#kind];
+  }
+
+  /** A fence of a context that was lost would never be signalled. */
+  restart(): void {
+    this.#fence = null;
+    this.touch("person");
+  }
+
+  stop(): void {
+    cancelAnimationFrame(this.#request);
+  }
+
+  #ask(): void {
+    if (this.#request === 0) this.#request = requestAnimationFrame(this.#tick);
+  }
+
+  #tick = (): void => {
+    this.#request = 0;
+    if (this.#fence !== null && !this.#finished(this.#fence)) return this.#ask();
+    const now = performance.now();
+    if (this.#dirty !== null) {
+      const after_ms = this.#taken_ms / this.#share(this.#dirty);
+      if (now < this.#started_ms + after_ms) return this.#ask();
+      this.#drawNow();
+    } else if (this.#band !== null) {
+      if (now < this.#touched_ms + STILL_MS || this.handled) return this.#ask();
+      this.#refineNow(this.#band);
+    }
+  };
+
+  #drawNow(): void {
+    this.#scale = SCALES.findLast((scale) => this.#cost_ms * scale ** 2 <= BUDGET_MS[this.#kind]) ?? SCALES[0]!;
+    this.#dirty = null;
+    this.#started_ms = performance.now();
+    this.#measures = this.draw(this.#scale);
+    this.#await();
+  }
+
+  /** The next band, so narrow that a click need not wait long. */
+  #refineNow(band: number): void {
+    if (band === 0) this.#bands = Math.max(1, Math.ceil(this.#cost_ms / BUDGET_MS[this.#kind]));
+    this.#started_ms = performance.now();
+    this.#measures = false;
+    const goesOn = this.refine(band, this.#bands);
+    this.#band = goesOn && band < this.#bands - 1 ? band + 1 : null;
+    if (goesOn) this.#await();
+  }
+
+  #await(): void {
+    this.#fence = this.context.fenceSync(this.context.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    this.context.flush();
+    this.#ask();
+  }
+
+  #share(cause: Cause): number {
+    if (cause === "person") return this.handled ? HANDLED_SHARE : 1;
+    return this.software ? SOFTWARE_SHARE : BUSY_SHARE;
+  }
+
+  #finished(fence: WebGLSync): boolean {
+    if (this.context.getSyncParameter(fence, this.context.SYNC_STATUS) !== this.context.SIGNALED) return false;
+    this.context.deleteSync(fence);
+    this.#fence = null;
+    this.#taken_ms = performance.now() - this.#started_ms;
+    if (this.#measures) this.#cost_ms += TRUST * (this.#taken_ms / this.#scale ** 2 - this.#cost_ms);
+    return true;
+  }
+}
+
+/** Whether the processor draws, for want of a graphics card. */
+export function drawnBySoftware(): boolean {
+  const context = document.createElement("canvas").getContext("webgl2");
+  const information = context?.getExtension("WEBGL_debug_renderer_info");
+  const name = information ? String(context?.getParameter(information.UNMASKED_RENDERER_WEBGL)) : "";
+  context?.getExtension("WEBGL_lose_context")?.loseContext();
+  return /swiftshader|llvmpipe|software|basic render/i.test(name);
+}
+
+export const SEEN_DEG = 34;
+const KEY_STEP_RAD = 0.12;
+const KEY_ZOOM = 1.15;
+
+interface EyeEvents {
+  /** The eye is somewhere else. */
+  moved: () => void;
+  /** Whether the person turns the view now. */
+  handled: (now: boolean) => void;
+}
+
+/** The eye of the person in the scene: turned by dragging, put to viewpoints, kept for the next time. */
+export class Eye {
+  readonly camera = new PerspectiveCamera(SEEN_DEG, 1, 1, 5000);
+  #orbit: OrbitControls;
+
+  constructor(
+    private readonly element: HTMLElement,
+    private readonly events: EyeEvents,
+  ) {
+    this.#orbit = this.#controls();
+  }
+
+  set enabled(enabled: boolean) {
+    this.#orbit.enabled = enabled;
+  }
+
+  get look(): Look {
+    const { camera } = this;
+    return {
+      position: camera.position.toArray(),
+      target: this.#orbit.target.toArray(),
+      up: camera.up.toArray(),
+    };
+  }
+
+  set look({ position, target, up }: Look) {
+    if (this.camera.up.distanceTo(new Vector3(...up)) > 1e-6) {
+      this.camera.up.set(...up);
+      this.#orbit.dispose(); // they take what is up once, when they are made
+      this.#orbit = this.#controls();
+    }
+    this.camera.position.set(...position);
+    this.#orbit.target.set(...target);
+    const away = length(minus(position, target));
+    this.camera.near = away / 60;
+    this.camera.far = away * 20;
+    this.camera.updateProjectionMatrix();
+    this.#orbit.update();
+    this.events.moved();
+  }
+
+  resize(aspect: number): void {
+    this.camera.aspect = aspect;
+    this.camera.updateProjectionMatrix();
+  }
+
+  /** Goes round by a key; true where it is one of those. */
+  press(key: string): boolean {
+    const ways: Record<string, () => void> = {
+      ArrowLeft: () => this.#orbit.rotateLeft(KEY_STEP_RAD),
+      ArrowRight: () => this.#orbit.rotateLeft(-KEY_STEP_RAD),
+      ArrowUp: () => this.#orbit.rotateUp(KEY_STEP_RAD),
+      ArrowDown: () => this.#orbit.rotateUp(-KEY_STEP_RAD),
+      "+": () => this.#orbit.dollyIn(1 / KEY_ZOOM),
+      "-": () => this.#orbit.dollyOut(1 / KEY_ZOOM),
+    };
+    ways[key]?.();
+    return key in ways;
+  }
+
+  dispose(): void {
+    this.#orbit.dispose();
+  }
+
+  #controls(): OrbitControls {
+    const orbit = new OrbitControls(this.camera, this.element);
+    orbit.addEventListener("change", this.events.moved);
+    orbit.addEventListener("start", () => this.events.handled(true));
+    orbit.addEventListener("end", () => this.events.handled(false));
+    return orbit;
+  }
+}
+
+type Across = Exclude<CutAcross, "none">;
+
+/** The axis that each is across. */
+const AXES: Record<Across, 0 | 1 | 2> = { image: 1, lateral: 0, elevation: 1, axial: 2, x: 0, y: 1, z: 2 };
+const OF_SCENE: readonly CutAcross[] = ["x", "y", "z"];
+
+/** Puts the plane where the cut is, or so that it cuts nothing. `image`: the pose of the live image, where there is one. */
+export function placeCut(plane: Plane, { across, at_mm }: Cut, image: Pose | null, eye: Vector3): void {
+  const frame = OF_SCENE.includes(across) ? IDENTITY : image;
+  if (across === "none" || frame === null) {
+    plane.setComponents(0, 0, 0, 1);
+    return;
+  }
+  const along = AXES[across];
+  const from = [0, 0, 0] as [number, number, number];
+  if (across !== "image") from[along] = at_mm;
+  const point = new Vector3(...apply(frame, from));
+  const normal = new Vector3(...axis(frame, along));
+  if (normal.dot(eye.clone().sub(point)) > 0) normal.negate();
+  plane.setFromNormalAndCoplanarPoint(normal, point);
+}
 
 const SOFTWARE_PIXELS = 0.8; // of the pixels of the screen, each way
 const BACKGROUND = 0x12161b; // --space of styles.css
@@ -37,6 +272,7 @@ interface Events {
   picked: (place: Vector) => void;
 }
 
+/** The scene in space: its Gaussians, the training planes, the skin, the probe with its live image. */
 export class SpaceView {
   #renderer: WebGLRenderer;
   #scene = new Scene();

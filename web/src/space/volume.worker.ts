@@ -1,7 +1,7 @@
 /** Adds Gaussians up to a volume beside the page: coarsely at once, then as finely as there is time for. */
 
 import { Gaussians } from "../api/gaussians";
-import { gridAround, voxelise, workOf, type Volume } from "./volume";
+import { gridAround, type Volume, voxelise, workOf } from "./volume";
 
 export interface VolumeOrder {
   count: number;

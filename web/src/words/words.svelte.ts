@@ -1,6 +1,7 @@
 /** What the console says, in the language of the person: `words.scan.freeze`. Each area has a file in `en` and in `de`. */
 
 import { english, type Words } from "./en/english";
+import { translated } from "./translated";
 
 /** Each in its own name, as the choice of the language writes it. */
 export const LANGUAGES = { en: "English", de: "Deutsch" } as const;
@@ -9,7 +10,7 @@ export type LanguageName = keyof typeof LANGUAGES;
 const STORAGE = "ultragray.language";
 const CATALOGUES: Record<LanguageName, () => Promise<Words>> = {
   en: async () => english,
-  de: async () => (await import("./de/german")).german,
+  de: async () => translated(english, (await import("./de/german")).german),
 };
 
 class Language {

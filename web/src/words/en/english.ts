@@ -1,19 +1,9 @@
-/** The English catalogue, which also says what every other one must have. */
+/** The English catalogue, which has every text of the console. */
 
-import { compare } from "./compare";
-import { connect } from "./connect";
-import { jobs } from "./jobs";
-import { locate } from "./locate";
-import { maps } from "./maps";
-import { registrations } from "./registrations";
-import { scan } from "./scan";
-import { scenes } from "./scenes";
-import { session } from "./session";
-import { shared } from "./shared";
-import { shell } from "./shell";
-import { space } from "./space";
-import { tools } from "./tools";
-import { train } from "./train";
+import { scan, session, space, tools } from "./image";
+import { compare, maps, shared, shell } from "./page";
+import { connect, locate, registrations } from "./programs";
+import { jobs, scenes, train } from "./work";
 
 export const english = { compare, connect, jobs, locate, maps, registrations, scan, scenes, session, shared, shell, space, tools, train };
 

@@ -1,0 +1,564 @@
+/** Poses as people and programs write them: one as text, many as JSON, CSV, TUM, NumPy or PLUS. What is read is checked as the service checks it. */
+
+import {
+  anglesFrom, entry, fromPositionQuaternion, IDENTITY, orientationFrom, type Pose, position, quaternion,
+  type Quaternion, type Vector, withPosition,
+} from "./pose";
+
+export type PoseFault =
+  | { kind: "json"; problem: string }
+  | { kind: "jsonNumbers"; key: string; names: string[] }
+  | { kind: "empty" }
+  | { kind: "tooMany"; count: number; most: number }
+  | { kind: "suffix"; suffix: string }
+  | { kind: "count"; found: number; expected: string }
+  | { kind: "number"; text: string }
+  | { kind: "quaternion"; length: number }
+  | { kind: "rotation"; mirrors: boolean }
+  | { kind: "lastRow" }
+  | { kind: "ros"; missing: string }
+  | { kind: "npy"; problem: "magic" | "short" }
+  | { kind: "npyType"; type: string }
+  | { kind: "npyShape"; shape: string }
+  | { kind: "csvHeader"; missing: string[] }
+  | { kind: "plusHeader" }
+  | { kind: "plusTransforms"; found: string[] };
+
+/** Poses that cannot be read: what is wrong, and in which line, or pose, counted from 1. */
+export class PoseError extends Error {
+  constructor(
+    readonly fault: PoseFault,
+    readonly line: number | null = null,
+    readonly pose: number | null = null,
+  ) {
+    super(JSON.stringify(fault));
+    this.name = "PoseError";
+  }
+}
+
+const ROTATION_TOLERANCE = 1e-3; // as of the service
+const LENGTH_TOLERANCE = 1e-2;
+
+/** Where numbers stand, for errors. */
+export interface Where {
+  line?: number;
+  pose?: number;
+}
+
+/** The pose of 12 or 16 numbers, row by row. */
+export function poseOfMatrix(numbers: readonly number[], where: Where = {}): Pose {
+  const pose = numbers.length === 12 ? [...numbers, 0, 0, 0, 1] : numbers;
+  if (pose.length !== 16) throw fault({ kind: "count", found: numbers.length, expected: "12, 16" }, where);
+  const last = [0, 0, 0, 1].some((expected, column) => Math.abs(entry(pose, 3, column) - expected) > ROTATION_TOLERANCE);
+  if (last) throw fault({ kind: "lastRow" }, where);
+  if (rotationError(pose) > ROTATION_TOLERANCE) throw fault({ kind: "rotation", mirrors: false }, where);
+  if (determinant(pose) < 0) throw fault({ kind: "rotation", mirrors: true }, where);
+  return fromPositionQuaternion(position(pose), quaternion(pose));
+}
+
+/** The pose of a place and a quaternion w, x, y, z. */
+export function poseOfQuaternion(place: Vector, rotation: Quaternion, where: Where = {}): Pose {
+  const length = Math.hypot(...rotation);
+  if (Math.abs(length - 1) > LENGTH_TOLERANCE) throw fault({ kind: "quaternion", length }, where);
+  return fromPositionQuaternion(place, rotation);
+}
+
+/** A number as it is written. */
+export function numberOf(text: string, where: Where = {}): number {
+  const number = Number(text);
+  if (text.trim() === "" || !Number.isFinite(number)) throw fault({ kind: "number", text: text.slice(0, 40) }, where);
+  return number;
+}
+
+export function fault(what: ConstructorParameters<typeof PoseError>[0], { line, pose }: Where = {}): PoseError {
+  return new PoseError(what, line ?? null, pose ?? null);
+}
+
+/** The largest entry of RᵀR − 1. */
+function rotationError(pose: Pose): number {
+  let largest = 0;
+  for (let a = 0; a < 3; a++)
+    for (let b = 0; b < 3; b++) {
+      const product = [0, 1, 2].reduce((sum, row) => sum + entry(pose, row, a) * entry(pose, row, b), 0);
+      largest = Math.max(largest, Math.abs(product - (a === b ? 1 : 0)));
+    }
+  return Number.isFinite(largest) ? largest : Infinity;
+}
+
+function determinant(pose: Pose): number {
+  const m = (row: number, column: number): number => entry(pose, row, column);
+  return (
+    m(0, 0) * (m(1, 1) * m(2, 2) - m(1, 2) * m(2, 1)) -
+    m(0, 1) * (m(1, 0) * m(2, 2) - m(1, 2) * m(2, 0)) +
+    m(0, 2) * (m(1, 0) * m(2, 1) - m(1, 1) * m(2, 0))
+  );
+}
+
+const MOST_POSES = 100_000;
+
+/** The pose as the JSON object that the service reads. */
+export function poseJson(pose: Pose): string {
+  const round = (value: number, digits: number): number => Number(value.toFixed(digits));
+  const [x, y, z] = position(pose).map((value) => round(value, 3));
+  const [w, i, j, k] = quaternion(pose).map((value) => round(value, 6));
+  return JSON.stringify({ position_mm: { x, y, z }, quaternion: { w, x: i, y: j, z: k } });
+}
+
+/** The pose of such an object, or of one with a `matrix`. Throws PoseError. */
+export function poseFromJson(text: string): Pose {
+  return poseOf(parsed(text));
+}
+
+/** One or more poses: such objects or matrices of three or four rows, in a list or under `poses`. Throws PoseError. */
+export function posesFromJson(text: string): Pose[] {
+  const document = parsed(text);
+  const given = isObject(document) && "poses" in document ? document.poses : document;
+  const list = Array.isArray(given) && !isMatrix(given) ? (given as unknown[]) : [given];
+  requireCount(list.length);
+  return list.map((one, index) => poseOf(one, list.length > 1 ? { pose: index + 1 } : {}));
+}
+
+/** Seconds of each pose under `times_s`; null where there are none. */
+export function timesFromJson(text: string): number[] | null {
+  const document = parsed(text);
+  const times = isObject(document) ? document.times_s : null;
+  return Array.isArray(times) && times.every(Number.isFinite) ? (times as number[]) : null;
+}
+
+/** Throws PoseError for none, and for more than one file may have. */
+export function requireCount(count: number): void {
+  if (count === 0) throw fault({ kind: "empty" });
+  if (count > MOST_POSES) throw fault({ kind: "tooMany", count, most: MOST_POSES });
+}
+
+function parsed(text: string): unknown {
+  try {
+    return JSON.parse(text);
+  } catch (error) {
+    throw fault({ kind: "json", problem: error instanceof Error ? error.message : "" });
+  }
+}
+
+function poseOf(given: unknown, where: Where = {}): Pose {
+  if (Array.isArray(given)) return poseOfMatrix(numbersIn(given), where);
+  if (!isObject(given)) throw fault({ kind: "json", problem: "position_mm, quaternion" }, where);
+  if (given.matrix !== undefined) return poseOfMatrix(numbersIn(given.matrix), where);
+  const place = numbersOf(given, "position_mm", ["x", "y", "z"], where);
+  const [w, x, y, z] = numbersOf(given, "quaternion", ["w", "x", "y", "z"], where) as [number, number, number, number];
+  return poseOfQuaternion(place as unknown as Vector, [w, x, y, z], where);
+}
+
+function numbersIn(given: unknown): number[] {
+  const numbers = Array.isArray(given) ? (given.flat() as unknown[]) : [];
+  return numbers.every(Number.isFinite) ? (numbers as number[]) : [];
+}
+
+/** Whether a list is one matrix, and not a list of poses. */
+function isMatrix(list: unknown[]): boolean {
+  const rows = list.every((row) => Array.isArray(row) && row.length === 4 && row.every(Number.isFinite));
+  return rows && (list.length === 3 || list.length === 4);
+}
+
+function isObject(value: unknown): value is Record<string, unknown> {
+  return typeof value === "object" && value !== null && !Array.isArray(value);
+}
+
+function numbersOf(given: Record<string, unknown>, key: string, names: string[], where: Where): number[] {
+  const value = given[key];
+  const numbers = names.map((name) => (isObject(value) ? value[name] : undefined));
+  if (!numbers.every((number) => typeof number === "number" && Number.isFinite(number)))
+    throw fault({ kind: "jsonNumbers", key, names }, where);
+  return numbers as number[];
+}
+
+export const POSE_FORMS = ["json", "matrix", "quaternion", "euler", "numpy", "ros"] as const;
+export type PoseForm = (typeof POSE_FORMS)[number];
+
+const PER_METRE = 1000;
+const NUMBER = /[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?/g;
+
+/** Millimetres, but metres for ROS, as its messages want. */
+export function poseText(pose: Pose, form: PoseForm): string {
+  const [x, y, z] = position(pose).map((value) => fixed(value, 3));
+  const [w, i, j, k] = quaternion(pose).map((value) => fixed(value, 6));
+  switch (form) {
+    case "json":
+      return poseJson(pose);
+    case "matrix":
+      return rows(pose).map((row) => row.join(" ")).join("\n");
+    case "quaternion":
+      return `${x} ${y} ${z}  ${w} ${i} ${j} ${k}`;
+    case "euler":
+      return `${x} ${y} ${z}  ${anglesFrom(IDENTITY, pose).map((angle) => fixed(angle, 3)).join(" ")}`;
+    case "numpy":
+      return `np.array([${rows(pose).map((row) => `[${row.join(", ")}]`).join(",\n          ")}])`;
+    case "ros": {
+      const metres = position(pose).map((value) => fixed(value / PER_METRE, 6));
+      const place = `position: {x: ${metres[0]}, y: ${metres[1]}, z: ${metres[2]}}`;
+      return `${place}\norientation: {x: ${i}, y: ${j}, z: ${k}, w: ${w}}`;
+    }
+  }
+}
+
+/** Reads what `poseText` writes, and what people make of it. Throws PoseError. */
+export function poseFromText(text: string, form: PoseForm): Pose {
+  if (form === "json") return poseFromJson(text);
+  if (form === "ros") return poseFromRos(text);
+  const numbers = (text.replace(/\b(np|numpy)\.|\bfloat(32|64)\b/g, "").match(NUMBER) ?? []).map((one) => numberOf(one));
+  if (form === "matrix" || form === "numpy") return poseOfMatrix(numbers);
+  const [x, y, z, ...turn] = numbers as [number, number, number, ...number[]];
+  if (form === "euler") {
+    if (numbers.length !== 6) throw fault({ kind: "count", found: numbers.length, expected: "6" });
+    return fromPositionQuaternion([x, y, z], orientationFrom(IDENTITY, turn as unknown as [number, number, number]));
+  }
+  if (numbers.length !== 7) throw fault({ kind: "count", found: numbers.length, expected: "7" });
+  return poseOfQuaternion([x, y, z], turn as unknown as [number, number, number, number]);
+}
+
+/** geometry_msgs/Pose as YAML, in either of its styles, metres. */
+function poseFromRos(text: string): Pose {
+  const part = (name: string): string => {
+    const found = new RegExp(`${name}\\s*:([\\s\\S]*?)(?=\\b(?:position|orientation)\\s*:|$)`).exec(text)?.[1];
+    if (found === undefined) throw fault({ kind: "ros", missing: name });
+    return found;
+  };
+  const value = (name: string, axis: string): number => {
+    const found = new RegExp(`\\b${axis}\\s*:\\s*(${NUMBER.source})`).exec(part(name))?.[1];
+    if (found === undefined) throw fault({ kind: "ros", missing: `${name}.${axis}` });
+    return numberOf(found);
+  };
+  const [x, y, z] = ["x", "y", "z"].map((axis) => value("position", axis) * PER_METRE) as [number, number, number];
+  const [w, i, j, k] = ["w", "x", "y", "z"].map((axis) => value("orientation", axis)) as [number, number, number, number];
+  return poseOfQuaternion([x, y, z], [w, i, j, k]);
+}
+
+function rows(pose: Pose): string[][] {
+  return [0, 1, 2, 3].map((row) => [0, 1, 2, 3].map((column) => fixed(entry(pose, row, column), column === 3 ? 3 : 6)));
+}
+
+/** So many digits at most, and no minus before zero. */
+function fixed(value: number, digits: number): string {
+  return String(Number(value.toFixed(digits)) + 0);
+}
+
+export type Unit = "mm" | "m";
+
+export interface PoseFile {
+  /** Translation in mm. */
+  poses: Pose[];
+  /** Seconds of each; null: the file has none. */
+  times_s: number[] | null;
+  /** Of lengths in the file. */
+  unit: Unit;
+  /** Whether the format, or the file, says so; else it is a guess. */
+  unitIsKnown: boolean;
+  /** Whether another unit can be chosen: the format does not fix it. */
+  takesUnit: boolean;
+  /** The transforms that a file with several of them holds, and the one that was read. */
+  transforms: string[];
+  transform: string | null;
+  /** Frames without a valid pose. */
+  skipped: number;
+}
+
+/** What a person chose where a file leaves it open. */
+export interface Chosen {
+  unit?: Unit;
+  transform?: string;
+}
+
+export const PLAIN = { takesUnit: true, transforms: [], transform: null, skipped: 0 };
+
+/** Poses whose lengths are in `unit`, in mm. */
+export function inMillimetres(poses: Pose[], unit: Unit): Pose[] {
+  if (unit === "mm") return poses;
+  return poses.map((pose) => {
+    const [x, y, z] = position(pose);
+    return withPosition(pose, [x * 1000, y * 1000, z * 1000]);
+  });
+}
+
+interface Row {
+  line: number;
+  cells: string[];
+}
+
+const TIMES = ["time_s", "timestamp_s", "t_s", "time", "timestamp", "t"];
+const QUATERNION = ["qw", "qx", "qy", "qz"];
+const SEPARATOR = /[,;\t]\s*|\s+/;
+
+/** timestamp tx ty tz qx qy qz qw, metres; lines that begin with # are left out. Throws PoseError. */
+export function posesFromTum(text: string, { unit = "m" }: Chosen): PoseFile {
+  const rows = rowsOf(text, /[\s,]+/);
+  const times_s: number[] = [];
+  const poses = rows.map(({ line, cells }) => {
+    if (cells.length !== 8) throw fault({ kind: "count", found: cells.length, expected: "8" }, { line });
+    const [time, x, y, z, qx, qy, qz, qw] = cells.map((cell) => numberOf(cell, { line })) as Eight;
+    times_s.push(time);
+    return poseOfQuaternion([x, y, z], [qw, qx, qy, qz], { line });
+  });
+  requireCount(poses.length);
+  return { ...PLAIN, poses: inMillimetres(poses, unit), times_s, unit, unitIsKnown: true };
+}
+
+/**
+ * With a header of x, y, z (or x_mm …, x_m …), qw, qx, qy, qz and perhaps time_s; without one, 12 or 16 numbers of a
+ * matrix a line. Throws PoseError.
+ */
+export function posesFromCsv(text: string, chosen: Chosen): PoseFile {
+  const [first, ...others] = rowsOf(text, SEPARATOR);
+  if (first === undefined) throw fault({ kind: "empty" });
+  const isHeader = first.cells.some((cell) => !Number.isFinite(Number(cell)));
+  return isHeader ? withHeader(first, others, chosen) : matrices([first, ...others], chosen);
+}
+
+/** x_mm …, quaternion and time_s. */
+export function csvOf(poses: readonly Pose[], times_s: readonly number[] | null): string {
+  const header = [...(times_s ? ["time_s"] : []), "x_mm", "y_mm", "z_mm", ...QUATERNION].join(",");
+  const lines = poses.map((pose, index) => {
+    const time = times_s ? [times_s[index]!.toFixed(4)] : [];
+    return [...time, ...position(pose).map((value) => value.toFixed(4)), ...quaternion(pose).map(digits)].join(",");
+  });
+  return [header, ...lines, ""].join("\n");
+}
+
+/** Metres; poses without times are numbered. */
+export function tumOf(poses: readonly Pose[], times_s: readonly number[] | null): string {
+  const lines = poses.map((pose, index) => {
+    const [w, x, y, z] = quaternion(pose);
+    const place = position(pose).map((value) => (value / 1000).toFixed(7));
+    return [(times_s?.[index] ?? index).toFixed(4), ...place, ...[x, y, z, w].map(digits)].join(" ");
+  });
+  return ["# timestamp tx ty tz qx qy qz qw", ...lines, ""].join("\n");
+}
+
+type Eight = [number, number, number, number, number, number, number, number];
+
+function digits(value: number): string {
+  return value.toFixed(8);
+}
+
+function rowsOf(text: string, separator: RegExp): Row[] {
+  return text
+    .split(/\r?\n/)
+    .map((line, index) => ({ line: index + 1, written: line.trim() }))
+    .filter(({ written }) => written !== "" && !written.startsWith("#"))
+    .map(({ line, written }) => ({ line, cells: written.split(separator).map((cell) => cell.replace(/^"|"$/g, "")) }));
+}
+
+function withHeader(header: Row, rows: Row[], chosen: Chosen): PoseFile {
+  const names = header.cells.map((cell) => cell.toLowerCase());
+  const suffix = ["_mm", "_m", ""].find((one) => names.includes(`x${one}`)) ?? "";
+  const needed = [...["x", "y", "z"].map((axis) => axis + suffix), ...QUATERNION];
+  const missing = needed.filter((name) => !names.includes(name));
+  if (missing.length > 0) throw fault({ kind: "csvHeader", missing }, { line: header.line });
+  const time = TIMES.map((name) => names.indexOf(name)).find((column) => column >= 0);
+  const times_s: number[] = [];
+  const poses = rows.map(({ line, cells }) => {
+    if (cells.length !== names.length)
+      throw fault({ kind: "count", found: cells.length, expected: String(names.length) }, { line });
+    const values = needed.map((name) => numberOf(cells[names.indexOf(name)]!, { line }));
+    if (time !== undefined) times_s.push(numberOf(cells[time]!, { line }));
+    return poseOfQuaternion(values.slice(0, 3) as unknown as Vector, values.slice(3) as unknown as Quaternion, { line });
+  });
+  requireCount(poses.length);
+  const known = { _mm: "mm", _m: "m" }[suffix] as Unit | undefined;
+  const unit = chosen.unit ?? known ?? "mm";
+  const times = time === undefined ? null : times_s;
+  return { ...PLAIN, poses: inMillimetres(poses, unit), times_s: times, unit, unitIsKnown: known !== undefined };
+}
+
+function matrices(rows: Row[], { unit = "mm" }: Chosen): PoseFile {
+  const poses = rows.map(({ line, cells }) => {
+    if (cells.length !== 12 && cells.length !== 16)
+      throw fault({ kind: "csvHeader", missing: ["x_mm", "y_mm", "z_mm", ...QUATERNION] }, { line });
+    return poseOfMatrix(cells.map((cell) => numberOf(cell, { line })), { line });
+  });
+  requireCount(poses.length);
+  return { ...PLAIN, poses: inMillimetres(poses, unit), times_s: null, unit, unitIsKnown: false };
+}
+
+const MAGIC = [0x93, 0x4e, 0x55, 0x4d, 0x50, 0x59];
+
+/** Throws PoseError. */
+export function posesFromNpy(buffer: ArrayBuffer, { unit = "mm" }: Chosen): PoseFile {
+  const { type, columnsFirst, shape, start } = headerOf(buffer);
+  const item = /^([<>])f([48])$/.exec(type);
+  if (item === null) throw fault({ kind: "npyType", type });
+  const size = Number(item[2]);
+  const each = sizeOfOne(shape);
+  const total = shape.reduce((product, side) => product * side, 1);
+  requireCount(total / each);
+  if (buffer.byteLength < start + total * size) throw fault({ kind: "npy", problem: "short" });
+  const view = new DataView(buffer, start);
+  const little = item[1] === "<";
+  const at = (index: number): number => (size === 8 ? view.getFloat64(index * 8, little) : view.getFloat32(index * 4, little));
+  const place = columnsFirst ? (index: number) => at(fortran(index, shape)) : at;
+  const poses = Array.from({ length: total / each }, (_, pose) =>
+    poseOfMatrix(Array.from({ length: each }, (_, index) => place(pose * each + index)), { pose: pose + 1 }),
+  );
+  return { ...PLAIN, poses: inMillimetres(poses, unit), times_s: null, unit, unitIsKnown: false };
+}
+
+/** [N, 4, 4] of float64, mm. */
+export function npyOf(poses: readonly Pose[]): Blob {
+  const about = `{'descr': '<f8', 'fortran_order': False, 'shape': (${poses.length}, 4, 4), }`;
+  const header = about.padEnd(Math.ceil((about.length + 11) / 64) * 64 - 11) + "\n"; // data begin at a multiple of 64
+  const numbers = new Float64Array(poses.length * IDENTITY.length);
+  poses.forEach((pose, index) => numbers.set(pose, index * IDENTITY.length));
+  const length = new Uint8Array([header.length & 0xff, header.length >> 8]);
+  return new Blob([new Uint8Array([...MAGIC, 1, 0]), length, header, numbers]);
+}
+
+function headerOf(buffer: ArrayBuffer): { type: string; columnsFirst: boolean; shape: number[]; start: number } {
+  const bytes = new Uint8Array(buffer);
+  if (MAGIC.some((byte, index) => bytes[index] !== byte) || bytes.length < 12) throw fault({ kind: "npy", problem: "magic" });
+  const view = new DataView(buffer);
+  const isOld = bytes[6] === 1;
+  const start = (isOld ? 10 : 12) + (isOld ? view.getUint16(8, true) : view.getUint32(8, true));
+  const about = new TextDecoder("latin1").decode(bytes.subarray(isOld ? 10 : 12, start));
+  const type = /'descr':\s*'([^']*)'/.exec(about)?.[1] ?? "";
+  const shape = /'shape':\s*\(([^)]*)\)/.exec(about)?.[1] ?? "";
+  const sides = shape.split(",").filter((side) => side.trim() !== "");
+  return { type, columnsFirst: /'fortran_order':\s*True/.test(about), shape: sides.map(Number), start };
+}
+
+/** How many numbers a pose has. */
+function sizeOfOne(shape: number[]): number {
+  const [rows, columns] = shape.slice(-2);
+  if (columns === 4 && (rows === 4 || rows === 3) && shape.length <= 3) return 4 * rows;
+  if (shape.length === 2 && (columns === 12 || columns === 16)) return columns;
+  throw fault({ kind: "npyShape", shape: `(${shape.join(", ")})` });
+}
+
+/** Where an element lies whose first index runs fastest. */
+function fortran(index: number, shape: number[]): number {
+  let place = 0;
+  let rest = index;
+  for (let axis = shape.length - 1; axis >= 0; axis--) {
+    const stride = shape.slice(0, axis).reduce((product, side) => product * side, 1);
+    place += (rest % shape[axis]!) * stride;
+    rest = Math.floor(rest / shape[axis]!);
+  }
+  return place;
+}
+
+const ENTRY = /^Seq_Frame(\d+)_(\w+)$/;
+const LIKELY = ["ProbeToReference", "ProbeToTracker", "ProbeToWorld"];
+
+interface SequenceFrame {
+  line: number;
+  time_s: number | null;
+  matrices: Map<string, { line: number; text: string }>;
+  invalid: Set<string>;
+}
+
+/** Throws PoseError. */
+export function posesFromPlus(text: string, chosen: Chosen): PoseFile {
+  const frames = framesOf(text);
+  const names = [...new Set(frames.flatMap((frame) => [...frame.matrices.keys()]))];
+  if (names.length === 0) throw fault({ kind: "plusHeader" });
+  const rigid = names.filter((name) => isRigid(frames, name));
+  if (rigid.length === 0) throw fault({ kind: "plusTransforms", found: names });
+  const likely = LIKELY.find((name) => rigid.includes(name)) ?? rigid.find((name) => name.startsWith("Probe"));
+  const transform = chosen.transform ?? likely ?? rigid[0]!;
+  const used = frames.filter((frame) => frame.matrices.has(transform) && !frame.invalid.has(transform));
+  const poses: Pose[] = used.map((frame) => read(frame.matrices.get(transform)!));
+  requireCount(poses.length);
+  const times = used.map((frame) => frame.time_s);
+  return {
+    poses,
+    times_s: times.includes(null) ? null : (times as number[]),
+    unit: "mm",
+    unitIsKnown: true,
+    takesUnit: false,
+    transforms: rigid,
+    transform,
+    skipped: frames.length - used.length,
+  };
+}
+
+function read({ line, text }: { line: number; text: string }): Pose {
+  return poseOfMatrix(text.trim().split(/\s+/).map((cell) => numberOf(cell, { line })), { line });
+}
+
+/** Whether the first valid matrix of a name can be a pose; those of images hold the size of pixels, too. */
+function isRigid(frames: SequenceFrame[], name: string): boolean {
+  const first = frames.find((frame) => frame.matrices.has(name) && !frame.invalid.has(name));
+  if (first === undefined) return false;
+  try {
+    read(first.matrices.get(name)!);
+    return true;
+  } catch (error) {
+    if (error instanceof PoseError && error.fault.kind === "rotation") return false;
+    throw error;
+  }
+}
+
+function framesOf(text: string): SequenceFrame[] {
+  const frames = new Map<number, SequenceFrame>();
+  for (const [index, written] of text.split(/\r?\n/).entries()) {
+    const [key = "", ...rest] = written.split("=");
+    if (key.trim() === "ElementDataFile") break; // pixels follow
+    const found = ENTRY.exec(key.trim());
+    if (found === null) continue;
+    const number = Number(found[1]);
+    const frame = frames.get(number) ?? { line: index + 1, time_s: null, matrices: new Map(), invalid: new Set() };
+    frames.set(number, frame);
+    note(frame, found[2]!, rest.join("=").trim(), index + 1);
+  }
+  return [...frames].sort(([a], [b]) => a - b).map(([, frame]) => frame);
+}
+
+function note(frame: SequenceFrame, field: string, value: string, line: number): void {
+  if (field === "Timestamp") frame.time_s = numberOf(value, { line });
+  else if (field.endsWith("TransformStatus")) {
+    if (value !== "OK") frame.invalid.add(field.slice(0, -"TransformStatus".length));
+  } else if (field.endsWith("Transform")) frame.matrices.set(field.slice(0, -"Transform".length), { line, text: value });
+}
+
+/** As a file input takes them. */
+export const POSE_SUFFIXES = [".json", ".npy", ".csv", ".tum", ".txt", ".mha", ".mhd"];
+/** How much of a file is read: PLUS puts its images behind the poses. */
+export const MOST_BYTES = 64 * 2 ** 20;
+
+/** The poses of a file. Throws PoseError. */
+export function readPoses(name: string, buffer: ArrayBuffer, chosen: Chosen = {}): PoseFile {
+  const suffix = /\.[^.]*$/.exec(name.toLowerCase())?.[0] ?? "";
+  const text = (): string => new TextDecoder("utf-8").decode(buffer);
+  switch (suffix) {
+    case ".json":
+      return { ...PLAIN, poses: posesFromJson(text()), times_s: timesFromJson(text()), unit: "mm", unitIsKnown: true, takesUnit: false };
+    case ".npy":
+      return posesFromNpy(buffer, chosen);
+    case ".csv":
+      return posesFromCsv(text(), chosen);
+    case ".tum":
+    case ".txt":
+      return posesFromTum(text(), chosen);
+    case ".mha":
+    case ".mhd":
+      return posesFromPlus(new TextDecoder("latin1").decode(buffer), chosen);
+    default:
+      throw fault({ kind: "suffix", suffix });
+  }
+}
+
+export const WRITTEN = ["json", "csv", "tum", "npy"] as const;
+export type WrittenAs = (typeof WRITTEN)[number];
+
+/** `times_s`: of each pose; NumPy's array has no place for them. */
+export function poseFileOf(poses: readonly Pose[], times_s: readonly number[] | null, as: WrittenAs): Blob {
+  switch (as) {
+    case "json": {
+      const times = times_s === null ? "" : `"times_s": ${JSON.stringify(times_s.map((time) => Number(time.toFixed(4))))},\n`;
+      return new Blob([`{${times}"poses": [\n${poses.map(poseJson).join(",\n")}\n]}\n`], { type: "application/json" });
+    }
+    case "csv":
+      return new Blob([csvOf(poses, times_s)], { type: "text/csv" });
+    case "tum":
+      return new Blob([tumOf(poses, times_s)], { type: "text/plain" });
+    case "npy":
+      return npyOf(poses);
+  }
+}

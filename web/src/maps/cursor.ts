@@ -1,5 +1,0 @@
-/** A pixel of the frame. */
-export interface Cursor {
-  column: number;
-  row: number;
-}
