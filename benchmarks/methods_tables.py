@@ -14,9 +14,10 @@ from ultragray.learn.evaluation.methods import ComparisonSettings
 from ultragray.learn.report.tables import by_mean_rank, rank
 from ultragray_studies.bench.report import commit
 from ultragray_studies.comparison.result import Comparison
-from ultragray_studies.comparison.run import ComparisonProgress, compare
+from ultragray_studies.comparison.run import ComparisonProgress, compare_methods
 from ultragray_studies.comparison.tables import COST_HEADINGS, cost_texts
 from ultragray_studies.methods.method import Paces
+from ultragray_studies.methods.registry import chosen_methods
 
 FOLDER = ROOT / "build" / "methods"
 SOURCES = ("ultranerf_liver", "liver_convex", "spine_phantom", "nwire_phantom", PHANTOM)
@@ -43,7 +44,9 @@ def measure(name: str, data_folder: Path) -> Document:
             log.info("%s: %s, %d of %d", name, progress.method, progress.number, progress.of)
 
     paces = Paces(place / "paces.json")  # not the user's, which may be of a busier hour
-    comparison = compare(dataset, settings, folder=place, paces=paces, report=report)
+    comparison = compare_methods(
+        dataset, chosen_methods(settings.methods), settings, folder=place, paces=paces, report=report
+    )
     assert comparison is not None  # nobody tells it to stop
     return summary(comparison, data_folder)
 

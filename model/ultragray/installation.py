@@ -88,16 +88,16 @@ def processor_name() -> str:
 
 def processor_maker() -> str | None:
     """The maker as the processor names itself, such as AuthenticAMD, or its number on Arm; None where nothing tells."""
-    told = _cpu_info()
-    return told.get("vendor_id") or told.get("CPU implementer")
+    facts = _cpu_info()
+    return facts.get("vendor_id") or facts.get("CPU implementer")
 
 
 def processor_model() -> str | None:
     """The maker's numbers for the generation: a virtual machine often hides it from the name."""
-    told = _cpu_info()
-    if "cpu family" in told:
-        return f"family {told['cpu family']}, model {told.get('model')}"
-    return f"part {told['CPU part']}" if "CPU part" in told else None
+    facts = _cpu_info()
+    if "cpu family" in facts:
+        return f"family {facts['cpu family']}, model {facts.get('model')}"
+    return f"part {facts['CPU part']}" if "CPU part" in facts else None
 
 
 def _cpu_info() -> dict[str, str]:

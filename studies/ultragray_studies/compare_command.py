@@ -110,7 +110,7 @@ def _check_output(output: Path, *, force: bool) -> None:
 
     TrainingStateInvalid where the folder of the run is another thing's: --force would remove it.
     """
-    from ultragray_studies.comparison.place import RUN_FILE
+    from ultragray_studies.comparison.run import RUN_FILE
 
     run = run_folder(output)
     is_a_run = (run / RUN_FILE).is_file()
@@ -124,7 +124,8 @@ def _check_output(output: Path, *, force: bool) -> None:
 def _compare(
     dataset: Dataset, settings: ComparisonSettings, device: str, run: Path, output: Path | None, *, as_json: bool
 ) -> None:
-    from ultragray_studies.comparison.run import compare as compare_methods
+    from ultragray_studies.comparison.run import compare_methods
+    from ultragray_studies.methods.registry import chosen_methods
 
     last: ComparisonProgress | None = None
     with stop_on_signal() as should_stop, _progress_bar() as show:
@@ -135,7 +136,13 @@ def _compare(
             show(state)
 
         comparison = compare_methods(
-            dataset, settings, folder=run, device=device, report=report, should_stop=should_stop
+            dataset,
+            chosen_methods(settings.methods),
+            settings,
+            folder=run,
+            device=device,
+            report=report,
+            should_stop=should_stop,
         )
         written = [] if comparison is None or output is None else _write(comparison, dataset, run, output)
     if comparison is None:

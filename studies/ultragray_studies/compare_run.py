@@ -9,7 +9,8 @@ from dataclasses import replace
 
 from ultragray.errors import TrainingDiverged
 from ultragray_studies.comparison.page import write_comparison
-from ultragray_studies.comparison.run import ComparisonProgress, compare
+from ultragray_studies.comparison.run import ComparisonProgress, compare_methods
+from ultragray_studies.methods.registry import chosen_methods
 from ultragray_workers.jobs.kinds.compare import CompareJob
 from ultragray_workers.jobs.progress import Outcome, Progress
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
@@ -28,8 +29,9 @@ def run(job_run: JobRun, job: CompareJob) -> Outcome:
     sys.stderr.write(
         f"comparing {', '.join(job.methods)} on {job.dataset} on {device}, {job_run.request.threads} threads\n"
     )
-    comparison = compare(
+    comparison = compare_methods(
         dataset,
+        chosen_methods(job.methods),
         job,
         folder=job_run.folder.run,
         device=device,

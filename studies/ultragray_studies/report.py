@@ -14,23 +14,22 @@ from typing import TypeVar
 import numpy as np
 
 from ultragray.errors import DatasetInvalid, UltragrayError
-from ultragray.geometry.pose import rotation_angles_deg
 from ultragray.geometry.probe import FloatArray
+from ultragray.geometry.rotations import turns_of
 from ultragray.learn.evaluation.baselines import FOLDS as VOLUME_METHODS
-from ultragray.learn.evaluation.baselines import VOXEL_MM, evaluate_baselines, mean_axes, nearest_frames
+from ultragray.learn.evaluation.baselines import VOXEL_MM, evaluate_baselines
 from ultragray.learn.evaluation.metrics import FrameMetrics
 from ultragray.learn.evaluation.scoring import Evaluation, evaluate, require_frames
 from ultragray.learn.report.page import Prediction, ScenePage, render_page
 from ultragray.learn.report.tables import Row, metric_rows
-from ultragray.learn.sweep import Dataset, IntArray, Sweep
+from ultragray.learn.sweep import Dataset, Distances, IntArray, Sweep, mean_axes
 from ultragray.learn.training import Progress, TrainingConfig, train
 from ultragray.learn.training.progress import Course
 from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.info import read_header
-from ultragray_studies.comparison.place import frames_of
-from ultragray_studies.comparison.plots import plot_counts, plot_distances, plot_tilt
+from ultragray_studies.comparison.page import plot_counts, plot_distances, plot_tilt
 from ultragray_studies.comparison.result import Comparison, MethodResult
-from ultragray_studies.comparison.run import SCENE
+from ultragray_studies.comparison.run import SCENE, frames_of
 from ultragray_studies.methods.classical import Compounding, FromFrames
 from ultragray_studies.methods.gaussians import SCENE_FILE, SceneMethod
 from ultragray_studies.methods.method import Method
@@ -147,11 +146,7 @@ def frame_tilts_deg(sweep: Sweep) -> FloatArray:  # [F]
 
     Signed so that tilts grow along the sweep.
     """
-    turned = mean_axes(sweep.poses).T @ sweep.poses[:, :3, :3]
-    vectors = np.stack([turned[:, i, j] - turned[:, j, i] for i, j in ((2, 1), (0, 2), (1, 0))], axis=1) / 2.0
-    lengths = np.linalg.norm(vectors, axis=1)
-    angles = np.arctan2(lengths, (np.trace(turned, axis1=1, axis2=2) - 1.0) / 2.0)
-    vectors *= (np.degrees(angles) / np.maximum(lengths, 1e-12))[:, None]
+    vectors = np.degrees(turns_of(mean_axes(sweep.poses).T @ sweep.poses[:, :3, :3]))
     axis = np.linalg.svd(vectors)[2][0]
     tilts: FloatArray = vectors @ axis
     later = np.arange(len(tilts)) - (len(tilts) - 1) / 2.0
@@ -177,13 +172,11 @@ def study_tilt(
         return None
     low, high = halves
     dataset = Dataset(name=f"{sweep.source} by tilt", train=sweep.select(low), val=sweep.select(high))
-    nearest = nearest_frames(dataset.train, dataset.val.poses)
-    angles = rotation_angles_deg(dataset.val.poses, dataset.train.poses)
     trained = train_and_evaluate(dataset, config, report=report)
     return TiltStudy(
         train_tilts_deg=(float(tilts[low].min()), float(tilts[low].max())),
         val_tilts_deg=(float(tilts[high].min()), float(tilts[high].max())),
-        angles_deg=angles[np.arange(len(high)), nearest],
+        angles_deg=Distances.of(dataset).deg,
         evaluations={"scene": trained.evaluation, **evaluate_baselines(dataset, TILT_BASELINES, voxel_mm)},
     )
 

@@ -18,8 +18,8 @@ import torch
 from ultragray import GaussianScene, LinearProbe, read_header, render
 from ultragray.datasets import Dataset, Sweep
 from ultragray.errors import InvalidArgument
-from ultragray.learn.evaluation.baselines import pixel_positions_mm
 from ultragray.learn.evaluation.scoring import evaluate, render_sweep
+from ultragray.learn.sweep import pixel_positions_mm
 from ultragray.learn.training import TrainingConfig
 from ultragray.phantom import Tissue, load_phantom, simulate, sweeps, tissue_at
 from ultragray.phantom import make_demo as make

@@ -23,7 +23,7 @@ from ultragray.rendering.settings import Additions, Resolved, SettingsUsed, sett
 from ultragray.rendering.tools import Needle
 from ultragray.scene.confidence import Extrapolation
 from ultragray_client.frames import frame_from_message, origin_of
-from ultragray_service.core.open_streams import Answered
+from ultragray_service.core.open_streams import StreamAnswer
 from ultragray_service.http.routes.rendering import render_headers
 from ultragray_service.http.routes.streams import frame_bytes
 from ultragray_service.igtl.frames import Frame, PoseMessage, image_of
@@ -98,7 +98,7 @@ def http(settings: Resolved) -> dict[str, Any]:
 
 
 def websocket(settings: Resolved) -> dict[str, Any]:
-    message = frame_bytes(Answered(1, None, result(settings)))
+    message = frame_bytes(StreamAnswer(1, None, result(settings)))
     told: dict[str, Any] = json.loads(message[4 : 4 + int.from_bytes(message[:4], "little")])
     return told
 

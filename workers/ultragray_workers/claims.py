@@ -63,11 +63,6 @@ def remove_whole(folder: Path, prefix: str = DELETED_PREFIX) -> None:
         pass
 
 
-def is_claimed(folder: Path) -> bool:
-    """Whether a service that lives, on any machine, has claimed the folder."""
-    return folder.is_dir() and not _is_abandoned(folder)
-
-
 def remove_abandoned(parent: Path, prefix: str) -> int:
     """Remove the folders of a prefix that no living service, on any machine, holds; how many there were."""
     abandoned = [folder for folder in parent.glob(f"{prefix}*") if _is_abandoned(folder)]

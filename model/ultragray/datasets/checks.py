@@ -14,7 +14,8 @@ import numpy as np
 
 from ultragray.geometry.pose import rotation_angles_deg
 from ultragray.geometry.probe import FloatArray, Probe
-from ultragray.learn.sweep import Dataset, Sweep, corner_distances_mm
+from ultragray.geometry.rotations import turns_of
+from ultragray.learn.sweep import Dataset, Distances, Sweep, corner_distances_mm
 
 VOXEL_MM = 1.0
 MAX_VOXELS = 8_000_000
@@ -132,7 +133,8 @@ class DatasetReport:
 
 def check_dataset(dataset: Dataset) -> DatasetReport:
     """Describe both parts and how far the held-out frames lie from the training frames."""
-    distances, angles = _nearest_training_frames(dataset)
+    away = Distances.of(dataset)
+    distances, angles = away.mm, away.deg
     return DatasetReport(
         name=dataset.name,
         sha256=dataset.sha256,
@@ -155,6 +157,7 @@ def check_sweep(sweep: Sweep) -> SweepReport:
     swept = swept_volume(sweep)
     axial_mm, lateral_mm = sweep.pixel_mm
     origins = sweep.poses[:, :3, 3]
+    turns = turns_of(sweep.poses[len(sweep) // 2, :3, :3].T @ sweep.poses[:, :3, :3])
     return SweepReport(
         source=sweep.source,
         frames=len(sweep),
@@ -169,7 +172,7 @@ def check_sweep(sweep: Sweep) -> SweepReport:
         step_max_mm=float(steps_mm.max(initial=0.0)),
         step_max_deg=float(steps_deg.max(initial=0.0)),
         tilt_deg=float(rotation_angles_deg(thinned, thinned).max()),
-        tilt_range_deg=_vector(np.ptp(_rotations_from_middle_deg(sweep.poses), axis=0)),
+        tilt_range_deg=_vector(np.ptp(np.degrees(turns), axis=0)),
         swept_ml=swept.swept_ml,
         coverage=swept.coverage,
         voxel_mm=swept.voxel_mm,
@@ -180,34 +183,6 @@ def check_sweep(sweep: Sweep) -> SweepReport:
 def _vector(values: FloatArray) -> tuple[float, float, float]:
     x, y, z = (float(value) for value in values)
     return x, y, z
-
-
-def _rotations_from_middle_deg(poses: FloatArray) -> FloatArray:  # [F, 3]
-    """Rotation vectors, in degrees, from the middle frame's orientation, along its axes."""
-    relative = poses[len(poses) // 2, :3, :3].T @ poses[:, :3, :3]
-    skew = np.stack(
-        [
-            relative[:, 2, 1] - relative[:, 1, 2],
-            relative[:, 0, 2] - relative[:, 2, 0],
-            relative[:, 1, 0] - relative[:, 0, 1],
-        ],
-        axis=1,
-    )
-    sine = np.linalg.norm(skew, axis=1) / 2
-    angle = np.arctan2(sine, (np.trace(relative, axis1=1, axis2=2) - 1) / 2)
-    rotations: FloatArray = np.degrees(skew / 2 * (angle / np.maximum(sine, 1e-12))[:, None])
-    return rotations
-
-
-def _nearest_training_frames(dataset: Dataset) -> tuple[FloatArray, FloatArray]:  # [V] mm, [V] degrees
-    train_corners = dataset.train.corners_mm()
-    distances, angles = np.zeros(len(dataset.val)), np.zeros(len(dataset.val))
-    for place, corners in enumerate(dataset.val.corners_mm()):
-        travel = corner_distances_mm(train_corners, corners)
-        nearest = int(np.argmin(travel))
-        distances[place] = travel[nearest]
-        angles[place] = rotation_angles_deg(dataset.val.poses[[place]], dataset.train.poses[[nearest]])[0, 0]
-    return distances, angles
 
 
 def _jumps(sweep: Sweep, steps_mm: FloatArray) -> list[str]:

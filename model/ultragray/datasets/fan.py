@@ -1,4 +1,8 @@
-"""The geometry of a fan in an image, as PLUS and its device sets write it, and the transforms beside."""
+"""The geometry of a fan in an image, and the named transforms of PLUS sequences and device sets that lead to it.
+
+`ProbeToTracker` maps points of Probe to Tracker: p_Tracker = ProbeToTracker · p_Probe, [4, 4], mm; coordinates of
+`Image` are pixels.
+"""
 
 from __future__ import annotations
 

@@ -1,6 +1,8 @@
 """MCAP files with images and poses of ROS 2, as `ros2 bag record -s mcap` writes them. The extra `mcap`.
 
-First the geometry of the image, then the poses of the probe, then the sweep of both.
+First the geometry of the image, as the topic `geometry` of the ROS 2 node says it, or a file beside the recording:
+`{"probe": {"kind": "linear", …}}`, with a `picture` where the pixels are not the probe's own scan lines. Then the poses
+of the probe, then the sweep of both.
 """
 
 from __future__ import annotations

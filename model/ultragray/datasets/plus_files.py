@@ -1,6 +1,7 @@
 """Sequences of PLUS as files, MetaImage and NRRD: header, orientation and pixels, nothing of which is trusted.
 
-The readers are ours: pynrrd and SimpleITK inflate whatever a header promises, and SimpleITK alone weighs 50 MB.
+Both formats write the fields of frame 12 as `Seq_Frame0012_NAME`. The readers are ours: pynrrd and SimpleITK inflate
+whatever a header promises, and SimpleITK alone weighs 50 MB.
 """
 
 from __future__ import annotations

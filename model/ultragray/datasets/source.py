@@ -96,7 +96,8 @@ class DatasetFormat:
         if isinstance(found, Dataset):
             train, val = split_parts(found.train, found.val, *wanted)
             return replace(found, train=train, val=val)
-        return Dataset(path.name.split(".")[0], *split_sequence(*found, *wanted))
+        sweep, frame_count = found
+        return Dataset(path.name.split(".")[0], *split_sequence(sweep, frame_count, *wanted))
 
     def check_upload(self, source: Path, folder: Path) -> None:
         """Raises DatasetInvalid where an upload in this format names files outside of its folder."""

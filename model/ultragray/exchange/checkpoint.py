@@ -1,4 +1,10 @@
-"""Checkpoints of the released code, both ways: import, export, and the intensity that each side means."""
+"""Checkpoints of the released UltraG-Ray trainer, both ways (docs/physics.md §1, §2, §3, §6).
+
+A released checkpoint holds the six raw parameter tensors and nothing about where they are: its unit is the centimetre,
+its origin the mean of the image corners of the training frames, and its depth grid is stretched by H/(H−1). The dataset
+it was trained on (conf.json, poses_train.npy, images_train.npy) says the rest; the imported scene then answers poses in
+the tracker's own frame, in mm. First the import, then the fit of the released intensity, then the export.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""Fields of ROS messages that others wrote: checked before they are used, and poses among them."""
+"""Fields of ROS 2 messages that others wrote, checked before they are used, and poses among them.
+
+A file brings its own definitions, and may call others by these names.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,8 @@
-"""Shards of a batch: tar files of frames, rendered one after the other."""
+"""Shards of a batch: WebDataset tars, of each frame a .npy of each output and a .json with pose and figures.
+
+Written here rather than by `tarfile`, whose members and PNGs took a quarter of the time that the kernel takes for a
+frame of 64x64 pixels. Times and owners are 0, so that the same frames are the same bytes.
+"""
 
 from __future__ import annotations
 

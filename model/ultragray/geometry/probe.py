@@ -5,8 +5,10 @@ rows). Origin: centre of the transducer face (linear), apex of the fan (convex),
 depth samples, W scan lines; sample i lies at depth near + (far − near)·(i+½)/H along its scan line, so the geometry in
 mm does not depend on H.
 
-A kind of probe is one class in one file (`linear.py`): its numbers, and the bundle of scan lines that they mean
-(`scan_lines.py`). `Probe` derives the rest, and nothing outside this package asks for a kind.
+In reading order: bundles of scan lines; `Picture`, the place of pixels in the image plane; `Probe`; its kinds; the
+elevational beam. A kind of probe is one class, such as `LinearProbe`: its numbers, and the bundle that they mean.
+`Probe` derives the rest, and nothing outside this module asks for a kind. Backends take probes by way of
+`ultragray.rendering.backends.inputs`.
 """
 
 from __future__ import annotations

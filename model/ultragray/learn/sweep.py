@@ -15,7 +15,7 @@ import numpy.typing as npt
 
 from ultragray.contract import Contract, described, to_dict
 from ultragray.errors import DatasetInvalid, InvalidArgument, InvalidPose
-from ultragray.geometry.pose import check_poses
+from ultragray.geometry.pose import check_poses, rotation_angles_deg
 from ultragray.geometry.probe import FloatArray, Probe
 
 
@@ -147,6 +147,27 @@ def corner_distances_mm(corners: FloatArray, others: FloatArray) -> FloatArray: 
     return distances
 
 
+def pixel_positions_mm(probe: Probe, height: int, width: int) -> FloatArray:  # [H·W, 3], row by row
+    """The place of each pixel in the probe frame, mm."""
+    origins, directions = probe.scan_lines(width)
+    positions: FloatArray = origins + probe.depths_mm(height)[:, None, None] * directions
+    return positions.reshape(-1, 3)
+
+
+def mean_axes(poses: FloatArray) -> FloatArray:  # [F, 4, 4] -> [3, 3]
+    """The rotation nearest to the mean of the poses' rotations."""
+    left, _, right = np.linalg.svd(poses[:, :3, :3].mean(axis=0))
+    mean: FloatArray = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    return mean
+
+
+def nearest_frames(sweep: Sweep, poses: FloatArray) -> IntArray:  # [C]
+    """The place of the sweep's frame whose corners lie nearest on average, for each pose [C, 4, 4] (mm)."""
+    asked = np.einsum("cij,pj->cpi", poses[:, :3, :3], sweep.probe.corners_mm()) + poses[:, None, :3, 3]
+    corners = sweep.corners_mm()
+    return np.array([corner_distances_mm(corners, own).argmin() for own in asked], np.int64)
+
+
 @dataclass(frozen=True, eq=False)
 class Dataset:
     """Frames to train from and frames held out to measure with (there may be none), of one probe and image size.
@@ -189,6 +210,22 @@ class Dataset:
             digest.update(np.ascontiguousarray(part.images).reshape(-1).data)
             digest.update(np.ascontiguousarray(part.poses).reshape(-1).data)
         return digest.hexdigest()
+
+
+@dataclass(frozen=True, eq=False)
+class Distances:
+    """How far each held-out frame is from the nearest training view, by the mean distance of their corners."""
+
+    mm: FloatArray  # [F]
+    deg: FloatArray  # [F] between the orientations of the same two frames
+
+    @classmethod
+    def of(cls, dataset: Dataset) -> Distances:
+        nearest = nearest_frames(dataset.train, dataset.val.poses)
+        places = np.arange(len(nearest))
+        corners = dataset.train.corners_mm()[nearest]
+        turned = rotation_angles_deg(dataset.val.poses, dataset.train.poses)[places, nearest]
+        return cls(np.linalg.norm(dataset.val.corners_mm() - corners, axis=-1).mean(axis=1), turned)
 
 
 # The split of a sweep into frames to train from and frames held out.

@@ -1,4 +1,8 @@
-"""Contact of a probe with the skin: which scan lines have it, and how tissue gives way to pressure. Needs no torch."""
+"""Contact of a probe with the skin: which scan lines have it, and how tissue gives way to pressure. Needs no torch.
+
+A scene's training poses tell its `Skin`, the skin and a probe at poses their `Touch`, and a touch under pressure the
+probe that sees at rest what this one sees pressed (`at_rest`). `ultragray.rendering.frames` asks for them first.
+"""
 
 from __future__ import annotations
 

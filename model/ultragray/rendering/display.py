@@ -1,4 +1,7 @@
-"""Settings of a scanner's display, and frames as they look with them. Free of torch but for `frames`."""
+"""Settings of a scanner's display: gain, dynamic range, time-gain compensation, depth, flip, scan conversion.
+
+Free of torch: doors take them. `show` of `ultragray.rendering.frames` applies them, after the outputs are derived.
+"""
 
 from __future__ import annotations
 
@@ -10,11 +13,6 @@ from ultragray.contract import Contract, described
 from ultragray.errors import InvalidImageSize
 from ultragray.geometry.image_size import MAX_IMAGE_SIDE
 from ultragray.geometry.probe import FloatArray, Picture, Probe, length_field
-
-# The settings of a scanner's display: gain, dynamic range, time-gain compensation, depth, flip, scan conversion.
-#
-# Free of torch; `show` in `ultragray.rendering.frames` applies it.
-
 
 FRAME_RANGE_DB = 60.0  # a B-mode frame is taken as compressed logarithmically over this range, 1 being 0 dB
 MAX_TGC_POINTS = 16

@@ -1,4 +1,6 @@
-"""What is put into the planes of frames when the backend has drawn them: tools, and the second echo."""
+"""What is put into the planes of frames after the backend has drawn them, before outputs are derived: tools, then the
+second echo. Both are the same on every backend; gradients pass to the planes.
+"""
 
 from __future__ import annotations
 

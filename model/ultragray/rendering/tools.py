@@ -1,4 +1,9 @@
-"""Things in the image that the sweep did not have, such as a needle. Needs no torch."""
+"""Things in the image that the sweep did not have, such as a needle. Needs no torch.
+
+In reading order: where scan lines cross a body (`ScanView`, `Crossing`); `Tool`; convex solids, and the kinds; their
+file. A kind is a class: its numbers, and its `crossing`. What that does to a frame, echo, comet tail and shadow,
+is in `ultragray.rendering.overlays`.
+"""
 
 from __future__ import annotations
 

@@ -1,4 +1,7 @@
-"""The fields of a scene on the grids of volumes and slices, and the files that these are written to."""
+"""The fields of a scene on the grids of volumes and slices (`ultragray.rendering.volumes`), and files of them.
+
+Fields are sums over Gaussians as `reference` has them, without a probe: nothing is rendered on the way.
+"""
 
 from __future__ import annotations
 
@@ -203,14 +206,17 @@ def write_volume(
         raise InvalidArgument(f"a volume must end in {', '.join(VOLUME_SUFFIXES)}, got {path.name!r}", field="output")
     slabs = sample_volume(scene, field, grid)
     with atomic_path(path) as temporary, temporary.open("wb") as file:
-        if suffix == ".nrrd":
-            file.write(_nrrd_header(field, grid, scene.info.label_names))
-            _write_compressed(file, b"", slabs, after_slab)
-        elif suffix == ".nii":
-            file.write(_nifti_header(field, grid))
-            _write_slabs(file, slabs, after_slab)
-        else:
-            _write_compressed(file, _nifti_header(field, grid), slabs, after_slab)
+        match suffix:
+            case ".nrrd":
+                file.write(_nrrd_header(field, grid, scene.info.label_names))
+                _write_compressed(file, b"", slabs, after_slab)
+            case ".nii":
+                file.write(_nifti_header(field, grid))
+                _write_slabs(file, slabs, after_slab)
+            case ".nii.gz":
+                _write_compressed(file, _nifti_header(field, grid), slabs, after_slab)
+            case _:
+                raise NotImplementedError(suffix)
 
 
 def write_slice(path: str | Path, scene: GaussianScene, field: str, grid: VolumeGrid) -> None:
@@ -223,12 +229,15 @@ def write_slice(path: str | Path, scene: GaussianScene, field: str, grid: Volume
     if path.suffix not in SLICE_SUFFIXES:
         raise InvalidArgument(f"a slice must end in {', '.join(SLICE_SUFFIXES)}, got {path.name!r}", field="output")
     pixels = sample_slice(scene, field, grid)
-    if path.suffix == ".npy":
-        data = io.BytesIO()
-        np.save(data, pixels)
-        write_whole(path, data.getvalue())
-        return
-    write_whole(path, image_file(as_grey(pixels, field), ".png").tobytes())
+    match path.suffix:
+        case ".npy":
+            data = io.BytesIO()
+            np.save(data, pixels)
+            write_whole(path, data.getvalue())
+        case ".png":
+            write_whole(path, image_file(as_grey(pixels, field), ".png").tobytes())
+        case _:
+            raise NotImplementedError(path.suffix)
 
 
 def as_grey(pixels: npt.NDArray[Any], field: str) -> npt.NDArray[Any]:  # [J, I] -> [J, I]

@@ -1,4 +1,9 @@
-"""The extrapolation of a frame from what its scene was trained on, and the confidence in it."""
+"""How far a frame extrapolates from what its scene was trained on, and how much to trust it: what the pose alone tells.
+
+In reading order: measures of poses to the training views; the model of pixels' errors and that of whole frames, fitted
+by `ultragray.learn.training.confidence` and kept in the scene's file; `Assessor`, which gives each pose its
+`Extrapolation`; a least confidence. What only a rendered frame tells is in `ultragray.rendering.confidence`. No torch.
+"""
 
 from __future__ import annotations
 
@@ -256,9 +261,7 @@ def _amounts(name: str, values: Any, count: int) -> tuple[float, ...]:
 #
 # Where Gaussians support only the share s of a frame's pixels, c ≤ b + (1 − b)·g·s; the gain g is fitted to frames
 # with little support. For a pose alone s is estimated as s₀·mean over points of exp(−d²/r²); of a rendered frame it
-# is known.
-#
-# Version 1, of older scenes, takes the curve of the means over the points, and has neither limit. Needs no torch.
+# is known. Needs no torch.
 
 
 VERSION = 2
@@ -303,7 +306,6 @@ class ConfidenceModel:
     support: Support | None = None  # None: it sets no limit
     fitted_to_mm: float | None = None  # the farthest point of those views; None: any
     uncertainty: Uncertainty | None = None  # of pixels; None: not known
-    version: int = VERSION
 
     def __post_init__(self) -> None:
         weights = _numbers("weights", self.weights)
@@ -326,8 +328,6 @@ class ConfidenceModel:
 
     def predict(self, measures: ViewMeasures) -> FloatArray:  # [C]
         """The MS-SSIM expected at each pose, in [0, 1]."""
-        if self.version == 1:
-            measures = measures.averaged()
         terms = terms_of(measures, np.array(self.hardness), self.fitted_to_mm)
         expected = predicted(np.array(self.weights), terms, self.black_ms_ssim)
         return expected if self.support is None else self.limited(expected, self.support.expected_shares(measures))
@@ -342,13 +342,13 @@ class ConfidenceModel:
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON object, as a scene's metadata holds it."""
-        document = {
+        return {
+            "version": VERSION,
             **asdict(self),
             "weights": list(self.weights),
             "hardness": [round(value, HARDNESS_DIGITS) for value in self.hardness],
             "uncertainty": None if self.uncertainty is None else self.uncertainty.to_dict(),
         }
-        return {key: document[key] for key in _KEYS[self.version]}
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> ConfidenceModel:
@@ -357,26 +357,19 @@ class ConfidenceModel:
         Raises InvalidArgument for another version, a missing or a surplus key, and values that cannot be.
         """
         version = document.get("version") if isinstance(document, Mapping) else None
-        if type(version) is not int or version not in _KEYS:
-            known = " or ".join(map(str, _KEYS))
+        if version != VERSION:
             raise InvalidArgument(
-                f"confidence must be an object of version {known}, got {version!r}", field="confidence"
+                f"confidence must be an object of version {VERSION}, got {version!r}", field="confidence"
             )
-        if set(document) != set(_KEYS[version]):
+        names = [one.name for one in fields(cls)]
+        if set(document) != {"version", *names}:
             raise InvalidArgument(
-                f"confidence of version {version} must have the keys {sorted(_KEYS[version])}, got {sorted(document)}",
+                f"confidence must have the keys {sorted(('version', *names))}, got {sorted(document)}",
                 field="confidence",
             )
-        support, uncertainty = document.get("support"), document.get("uncertainty")
-        parts = {
-            "support": None if support is None else _support_of(support),
-            "uncertainty": None if uncertainty is None else Uncertainty.from_dict(uncertainty),
-        }
-        return cls(**{**document, **parts})
-
-
-_KEYS_1 = ("version", "weights", "black_ms_ssim", "hardness", "fitted_on", "error")
-_KEYS = {1: _KEYS_1, 2: (*_KEYS_1, "support", "fitted_to_mm", "uncertainty")}
+        values = {name: document[name] for name in names}
+        readers = {"support": _support_of, "uncertainty": Uncertainty.from_dict}
+        return cls(**values | {name: read(values[name]) for name, read in readers.items() if values[name] is not None})
 
 
 def terms_of(
@@ -457,8 +450,8 @@ class Extrapolation:
 
     def figures(self) -> dict[str, float | None]:
         """FIGURES, and the share of contact where it was judged: what files hold of a frame."""
-        told = {name: getattr(self, name) for name in FIGURES}
-        return told if self.contact_share is None else told | {CONTACT_SHARE: self.contact_share}
+        figures = {name: getattr(self, name) for name in FIGURES}
+        return figures if self.contact_share is None else figures | {CONTACT_SHARE: self.contact_share}
 
 
 CONTACT_SHARE = "contact_share"

@@ -293,8 +293,8 @@ def _watched(connection: Connection, job_id: str, show: Callable[[dict[str, Any]
     while True:
         asked, gone = time.monotonic(), NotReady(f"nothing is heard of the job {job_id}")
         try:
-            job: dict[str, Any]
-            for job in connection.events(route("jobs", job_id, "events"), "progress"):
+            for event in connection.events(route("jobs", job_id, "events"), "progress"):
+                job: dict[str, Any] = event
                 show(job)
                 if job["state"] in _FINAL_STATES:
                     return job

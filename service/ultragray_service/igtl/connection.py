@@ -15,8 +15,7 @@ from ultragray.rendering.settings import FrameSettings
 from ultragray_service.core.open_streams import OpenStream, StreamAnswer
 from ultragray_service.core.unread import Unread, hold_little
 from ultragray_service.errors import IgtlMessageInvalid
-from ultragray_service.igtl import commands as answer
-from ultragray_service.igtl.commands import Scanner, Setup
+from ultragray_service.igtl.commands import Scanner, Setup, answer
 from ultragray_service.igtl.contents import (
     CAPABILITY,
     COMMAND_TYPES,

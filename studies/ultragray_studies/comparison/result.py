@@ -10,14 +10,11 @@ import numpy as np
 
 from ultragray.contract import to_dict
 from ultragray.files import require_version
-from ultragray.geometry.pose import rotation_angles_deg
-from ultragray.geometry.probe import FloatArray
-from ultragray.learn.evaluation.baselines import nearest_frames
 from ultragray.learn.evaluation.metrics import FrameMetrics
 from ultragray.learn.evaluation.scoring import Evaluation
 from ultragray.learn.evaluation.speckle import FrameSpeckle, Speckle
 from ultragray.learn.report.tables import DatasetFacts
-from ultragray.learn.sweep import Dataset, IntArray
+from ultragray.learn.sweep import Distances, IntArray
 from ultragray_studies.methods.method import Cost, Description
 
 FORMAT_VERSION = 1
@@ -82,22 +79,6 @@ class MethodResult:
 
 
 _PLAIN = ("machine", "steps", "of_steps", "seconds", "frame_ms", "model_bytes", "failure")
-
-
-@dataclass(frozen=True, eq=False)
-class Distances:
-    """How far each held-out frame is from the nearest training view, by the mean distance of their corners."""
-
-    mm: FloatArray  # [F]
-    deg: FloatArray  # [F] between the orientations of the same two frames
-
-    @classmethod
-    def of(cls, dataset: Dataset) -> Distances:
-        nearest = nearest_frames(dataset.train, dataset.val.poses)
-        places = np.arange(len(nearest))
-        corners = dataset.train.corners_mm()[nearest]
-        turned = rotation_angles_deg(dataset.val.poses, dataset.train.poses)[places, nearest]
-        return cls(np.linalg.norm(dataset.val.corners_mm() - corners, axis=-1).mean(axis=1), turned)
 
 
 @dataclass(frozen=True, eq=False)

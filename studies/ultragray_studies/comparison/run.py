@@ -1,37 +1,125 @@
-"""A comparison: each method is fitted within the same budget and measured on the same held-out frames."""
+"""A comparison: each method is fitted within the same budget and measured on the same held-out frames.
+
+One that was killed goes on in its folder:
+
+run.json                     which comparison it is: dataset, budget, seed; and the equal time once it is known
+NAME/                        what the fit of a method continues from, and its model
+NAME/result.json             its row, once it is measured
+NAME/frames.npy              uint8 [F, H, W], the held-out frames that it expects
+"""
 
 from __future__ import annotations
 
+import io
+import json
 import os
 import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 
-from ultragray.errors import TrainingDiverged, UltragrayError
+from ultragray.errors import TrainingDiverged, TrainingStateInvalid, UltragrayError
+from ultragray.files import map_npy, write_whole
 from ultragray.installation import __version__
 from ultragray.learn.evaluation.methods import BudgetKind, ComparisonSettings
 from ultragray.learn.evaluation.scoring import evaluate_frames, require_frames
 from ultragray.learn.report.tables import DatasetFacts
-from ultragray.learn.sweep import Dataset, Sweep, spread_places
+from ultragray.learn.sweep import ByteArray, Dataset, Distances, Sweep, spread_places
 from ultragray.learn.training.memory import machine_in_words, training_device
-from ultragray_studies.comparison.place import Place
-from ultragray_studies.comparison.result import Comparison, Distances, MethodResult
+from ultragray.rendering.pixels import to_uint8
+from ultragray_studies.comparison.result import FORMAT_VERSION, Comparison, MethodResult
 from ultragray_studies.methods.gaussians import SceneMethod
-from ultragray_studies.methods.method import (
-    Budget,
-    FitProgress,
-    FitRun,
-    Fitted,
-    FrameArray,
-    Method,
-    Pace,
-    Paces,
-)
-from ultragray_studies.methods.registry import chosen_methods
+from ultragray_studies.methods.method import Budget, FitProgress, FitRun, Fitted, FrameArray, Method, Pace, Paces
+
+RUN_FILE, METHOD_FILE, FRAMES_FILE = "run.json", "result.json", "frames.npy"
+
+
+@dataclass(frozen=True)
+class Place:
+    """A folder, and which comparison it holds."""
+
+    folder: Path
+    comparison: dict[str, Any]
+
+    @classmethod
+    def of(cls, folder: Path, dataset: Dataset, *, budget: str, times: float, seed: int) -> Place:
+        """The folder, made where it is not there. Raises TrainingStateInvalid where it holds another comparison."""
+        own = {
+            "format_version": FORMAT_VERSION,
+            "dataset": dataset.sha256,
+            "budget": budget,
+            "times": times,
+            "seed": seed,
+        }
+        place = cls(folder, own)
+        folder.mkdir(parents=True, exist_ok=True)
+        found = place.read()
+        for name, value in own.items():
+            if found and found.get(name) != value:
+                raise TrainingStateInvalid(
+                    f"{folder}: it holds a comparison with {name} {found.get(name)}, this one has {value}; "
+                    "give another folder"
+                )
+        if not found:
+            place.write({})
+        return place
+
+    def read(self) -> dict[str, Any]:
+        """What is known of the comparison; empty before it began."""
+        path = self.folder / RUN_FILE
+        if not path.exists():
+            return {}
+        try:
+            document = json.loads(path.read_text(encoding="utf-8"))
+        except ValueError as error:
+            raise TrainingStateInvalid(f"{path}: not the state of a comparison: {error}") from error
+        if not isinstance(document, dict) or not document:
+            raise TrainingStateInvalid(f"{path}: not the state of a comparison")
+        return document
+
+    def write(self, known: dict[str, Any]) -> None:
+        """Keeps what is known beside which comparison it is."""
+        write_whole(self.folder / RUN_FILE, json.dumps({**self.comparison, **known}, indent=1) + "\n")
+
+    def of_method(self, name: str) -> Path:
+        """The folder of a method's fit."""
+        folder = self.folder / name
+        folder.mkdir(exist_ok=True)
+        return folder
+
+    def result(self, name: str) -> MethodResult | None:
+        """The row of a method; None where it is not measured yet. Raises TrainingStateInvalid for a damaged one."""
+        path = self.folder / name / METHOD_FILE
+        if not path.exists():
+            return None
+        try:
+            return MethodResult.from_dict(json.loads(path.read_text(encoding="utf-8")))
+        except (ValueError, TypeError, LookupError) as error:
+            raise TrainingStateInvalid(f"{path}: not a result that can be read: {error!r}") from error
+
+    def write_result(self, result: MethodResult, frames: FrameArray) -> None:  # [F, H, W] in [0, 1]
+        """The frames first: a row without them would count as done."""
+        array = io.BytesIO()
+        np.save(array, to_uint8(frames))
+        write_whole(self.folder / result.name / FRAMES_FILE, array.getvalue())
+        write_whole(self.folder / result.name / METHOD_FILE, json.dumps(result.to_dict()) + "\n")
+
+
+def frames_of(folder: Path, name: str) -> ByteArray:  # [F, H, W]
+    """The frames that a method of the comparison in a folder expects. Raises TrainingStateInvalid."""
+    path = folder / name / FRAMES_FILE
+    try:
+        return map_npy(path)
+    except (OSError, ValueError) as error:
+        raise TrainingStateInvalid(f"{path}: not frames that can be read: {error}") from error
+
+
+# A comparison: each method is fitted within the same budget and measured on the same held-out frames.
+
 
 SCENE = SceneMethod.name
 EQUAL_TIME = "equal time"  # among the paces: the seconds of the scene
@@ -48,27 +136,6 @@ class ComparisonProgress:
     fit: FitProgress | None
 
 
-def compare(
-    dataset: Dataset,
-    settings: ComparisonSettings,
-    *,
-    folder: Path,
-    device: str = "cpu",
-    paces: Paces | None = None,
-    report: Callable[[ComparisonProgress], None] | None = None,
-    should_stop: Callable[[], bool] | None = None,
-) -> Comparison | None:
-    """Compares the chosen methods; None where it was told to stop. The same call on the same folder goes on.
-
-    `paces` are `default_paces` unless given. Raises DatasetInvalid where no frames are held out, BackendUnavailable,
-    and TrainingStateInvalid for a folder of another comparison.
-    """
-    methods = chosen_methods(settings.methods)
-    return compare_methods(
-        dataset, methods, settings, folder=folder, device=device, paces=paces, report=report, should_stop=should_stop
-    )
-
-
 def compare_methods(
     dataset: Dataset,
     methods: Mapping[str, Method],
@@ -80,7 +147,11 @@ def compare_methods(
     report: Callable[[ComparisonProgress], None] | None = None,
     should_stop: Callable[[], bool] | None = None,
 ) -> Comparison | None:
-    """As `compare`, of any methods by name."""
+    """Compares methods by name; None where it was told to stop. The same call on the same folder goes on.
+
+    `paces` are `default_paces` unless given. Raises DatasetInvalid where no frames are held out, BackendUnavailable,
+    and TrainingStateInvalid for a folder of another comparison.
+    """
     require_frames(dataset.val)
     training_device(device, "auto")
     paces = default_paces(dataset, device) if paces is None else paces

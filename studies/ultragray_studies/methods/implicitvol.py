@@ -11,8 +11,7 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ultragray.geometry.probe import FloatArray
-from ultragray.learn.evaluation.baselines import mean_axes
-from ultragray.learn.sweep import Dataset, Sweep
+from ultragray.learn.sweep import Dataset, Sweep, mean_axes
 from ultragray_studies.methods.learner import LearnedMethod, Learner
 from ultragray_studies.methods.method import Budget, Description
 from ultragray_studies.methods.parts import SliceLearner, as_tensor, encode, encoded_size, set_rate

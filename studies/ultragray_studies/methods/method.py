@@ -1,4 +1,13 @@
-"""What a method is: how long it may learn (its budget), what it says of itself, and how it is fitted and renders."""
+"""What a method is: how long it may learn (its budget), what it says of itself, and how it is fitted and renders.
+
+- equal: as many seconds as the scene's preset `fast` took on the same machine. Before its first step a method is timed
+  for a moment, and gets as many steps as fit; its schedules are stretched to that number.
+- author: the steps that its author's recipe takes, however long that is.
+
+A number of steps that follows from a clock would differ from run to run, and the table with it. So `Paces` keeps what
+was measured: the same comparison on the same machine gets the same steps. The moment may have been a busy one, and
+nobody is to lose by that: a fit that then takes a part of its time only is made again, with the pace that it showed.
+"""
 
 from __future__ import annotations
 

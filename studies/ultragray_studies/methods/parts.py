@@ -13,8 +13,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from ultragray.geometry.probe import FloatArray, Probe
-from ultragray.learn.evaluation.baselines import pixel_positions_mm
-from ultragray.learn.sweep import Dataset, Sweep
+from ultragray.learn.sweep import Dataset, Sweep, pixel_positions_mm
 from ultragray_studies.methods.learner import Learner
 
 

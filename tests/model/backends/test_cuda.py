@@ -216,7 +216,7 @@ from triton.backends.compiler import GPUTarget
 from triton.runtime import driver
 from triton.runtime.jit import JITFunction
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, RadialProbe
-from ultragray.backends import cuda
+from ultragray.rendering.backends import cuda
 
 class Driver:  # of a GPU that is only compiled for
     def get_current_target(self): return GPUTarget("cuda", int(sys.argv[1]), 32)

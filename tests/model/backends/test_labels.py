@@ -25,7 +25,7 @@ from ultragray.errors import InvalidArgument, SceneFileInvalid, UnknownOutput
 from ultragray.exchange.checkpoint import export_checkpoint
 from ultragray.exchange.ply import read_ply, write_ply
 from ultragray.geometry.probe import FloatArray
-from ultragray.learn.evaluation.baselines import pixel_positions_mm
+from ultragray.learn.sweep import pixel_positions_mm
 
 PROBES = {
     "linear": LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0),

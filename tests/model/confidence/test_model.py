@@ -21,7 +21,6 @@ MODEL = ConfidenceModel(
     support=Support(1.5, 0.9, 4.0),
     fitted_to_mm=2.0,
 )
-OLD = replace(MODEL, version=1, support=None, fitted_to_mm=None)
 
 
 def measures(
@@ -40,14 +39,13 @@ def test_the_formula() -> None:
     assert MODEL.predict(measures(2.0, 0.9, 5.0, 0.25)) == pytest.approx([expected])
 
 
-def test_each_point_has_its_own_curve_but_in_old_scenes_the_means_have_one() -> None:
+def test_each_point_has_its_own_curve() -> None:
     half_known = ViewMeasures(
         *(np.array([[0.0, far]]) for far in (20.0, 20.0, 20.0, 0.0)), weights=np.array([[1.0, 0.0]])
     )
     model = replace(MODEL, support=None)
     known, unknown = model.predict(measures())[0], model.predict(measures(20.0, 20.0))[0]
     assert model.predict(half_known) == pytest.approx([0.5 * (known + unknown)])
-    assert OLD.predict(half_known) == pytest.approx(OLD.predict(measures(10.0, 10.0)))
 
 
 def test_distance_beyond_what_it_was_fitted_on_counts_twice() -> None:
@@ -60,7 +58,7 @@ def test_distance_beyond_what_it_was_fitted_on_counts_twice() -> None:
 def test_little_support_limits_the_confidence() -> None:
     told = MODEL.limited(np.array([0.8, 0.2, 0.99]), np.array([0.2, 0.2, 0.7]))
     assert told == pytest.approx([0.06 + 0.94 * 1.5 * 0.2, 0.2, 0.99])
-    assert OLD.limited(np.array([0.8]), np.array([0.0])) == [0.8]
+    assert replace(MODEL, support=None).limited(np.array([0.8]), np.array([0.0])) == [0.8]
 
 
 def test_a_pose_alone_is_taken_to_have_the_support_of_its_distance() -> None:
@@ -82,18 +80,16 @@ def test_far_away_it_is_what_a_black_frame_reaches() -> None:
 
 
 def test_json_and_back() -> None:
-    for model, version in ((MODEL, 2), (OLD, 1)):
+    for model in (MODEL, replace(MODEL, support=None, fitted_to_mm=None)):
         document = json.loads(json.dumps(model.to_dict(), allow_nan=False))
-        assert document["version"] == version
+        assert document["version"] == 2
         assert ConfidenceModel.from_dict(document) == model
-    assert set(OLD.to_dict()) == {"version", "weights", "black_ms_ssim", "hardness", "fitted_on", "error"}
 
 
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"version": 3}, "version 1 or 2, got 3"),
-        ({"version": 1}, "version 1 must have the keys"),
+        ({"version": 3}, "version 2, got 3"),
         ({"support": {"gain": 0.0, "share": 0.5, "reach_mm": 1.0}}, "support must be positive"),
         ({"support": {"gain": "much", "share": 0.5, "reach_mm": 1.0}}, "support must be numbers"),
         ({"support": 1.5}, "support must be an object"),

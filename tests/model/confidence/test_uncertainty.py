@@ -75,8 +75,7 @@ def test_it_can_be_asked_for_beside_others(scene: GaussianScene) -> None:
 
 def test_scenes_without_it_say_so(scene: GaussianScene) -> None:
     known = ConfidenceModel.from_dict(scene.info.confidence)
-    old = replace(known, uncertainty=None, version=1).to_dict()
-    for confidence in ({}, old, replace(known, uncertainty=None).to_dict()):
+    for confidence in ({}, replace(known, uncertainty=None).to_dict()):
         without = replace(scene, info=replace(scene.info, confidence=confidence))
         with pytest.raises(UnknownOutput, match="only for a scene whose training fitted its uncertainty") as caught:
             shown(without, moved(0.0))

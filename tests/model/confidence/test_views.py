@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 
@@ -107,18 +105,6 @@ def test_weights_are_those_of_the_views_around() -> None:
 def test_a_pose_that_is_not_rigid_is_refused() -> None:
     with pytest.raises(InvalidPose):
         TrainingViews(parallel(0.0), LINEAR).measure(2.0 * np.eye(4)[None], LINEAR)
-
-
-@pytest.mark.parametrize("probe", [LINEAR, CONVEX])
-def test_a_thousand_views_cost_a_frame_half_a_millisecond(probe: Probe) -> None:
-    views, poses = TrainingViews(parallel(*np.linspace(0, 200, 1000)), probe), parallel(*np.linspace(0, 210, 20))
-    views.measure(poses, probe)
-    times_s = []
-    for _ in range(5):
-        started = time.process_time()
-        views.measure(poses, probe)
-        times_s.append((time.process_time() - started) / len(poses))
-    assert min(times_s) < 4 * 0.5e-3  # a machine shared with others may take four times as long
 
 
 def test_of_very_many_views_those_around_a_pose_count() -> None:

@@ -58,12 +58,6 @@ def test_a_token_opens_both_doors(guarded: RunningService, provider: IdentityPro
             client.scenes.list()
 
 
-def test_a_token_for_ever_is_one_until_the_last_date(guarded: RunningService, provider: IdentityProvider) -> None:
-    headers = {"Authorization": f"Bearer {provider.token(exp=1e300)}"}
-    answer = httpx.get(f"{guarded.http}/v1/me", headers=headers, timeout=60)
-    assert (answer.status_code, answer.json()["expires_at"][:4]) == (200, "9999")
-
-
 def test_tokens_that_are_refused_say_why_at_the_doors(guarded: RunningService, provider: IdentityProvider) -> None:
     for token, status, reason in (
         (provider.token(aud="another"), 401, "UNAUTHENTICATED"),
@@ -98,14 +92,6 @@ def test_an_issuer_that_is_away_shuts_out_only_its_tokens(start_service: StartSe
         assert identity_provider(service) == "available"
     finally:
         provider.close()
-
-
-def test_with_an_issuer_alone_nobody_passes_without_a_token(
-    start_service: StartService, provider: IdentityProvider
-) -> None:
-    service = start_service(**provider.settings(), host="127.0.0.1")
-    assert httpx.get(f"{service.http}/v1/scenes", timeout=60).status_code == 401
-    wait_until(lambda: ask(service, provider.token()).status_code == 200)
 
 
 @pytest.mark.long

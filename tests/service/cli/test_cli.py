@@ -86,7 +86,7 @@ def test_every_command_that_tells_something_tells_it_to_programs_too(command: st
 def test_lists_of_commands_load_none_of_them() -> None:
     program = (
         "from ultragray_service.cli.app import app; app(standalone_mode=False); "
-        "print(sorted(name for name in sys.modules if name in ('numpy', 'pydantic', 'ultragray.errors')))"
+        "print(sorted(name for name in sys.modules if name in ('numpy', 'pydantic', 'ultragray_service.cli.scenes')))"
     )
     answer = subprocess.run(python(program, "--help"), capture_output=True, text=True, check=True)
     assert answer.stdout.splitlines()[-1] == "[]"

@@ -14,8 +14,7 @@ from ultragray.learn.evaluation.methods import ComparisonSettings
 from ultragray.learn.evaluation.metrics import FrameMetrics
 from ultragray.learn.evaluation.scoring import Evaluation
 from ultragray.learn.report.page import telling_places
-from ultragray_studies.comparison.page import write_comparison
-from ultragray_studies.comparison.plots import DISTANCE_BINS, binned_medians
+from ultragray_studies.comparison.page import DISTANCE_BINS, binned_medians, write_comparison
 from ultragray_studies.comparison.result import Comparison
 from ultragray_studies.comparison.run import compare_methods
 from ultragray_studies.methods.method import Method, Paces

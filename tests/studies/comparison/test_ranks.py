@@ -8,7 +8,8 @@ import pytest
 from ultragray.learn.evaluation.metrics import FrameMetrics
 from ultragray.learn.evaluation.scoring import Evaluation
 from ultragray.learn.report.tables import by_mean_rank, rank, rank_rows
-from ultragray_studies.comparison.result import Comparison, DatasetFacts, Distances, MethodResult
+from ultragray.learn.sweep import Distances
+from ultragray_studies.comparison.result import Comparison, DatasetFacts, MethodResult
 from ultragray_studies.comparison.tables import duration_text, escaped, latex_table, steps_text
 from ultragray_studies.methods.method import Description
 

@@ -10,7 +10,8 @@ import pytest
 
 from ultragray.datasets import Dataset
 from ultragray.learn.evaluation.methods import ComparisonSettings
-from ultragray_studies.comparison.result import FORMAT_VERSION, Comparison, Distances
+from ultragray.learn.sweep import Distances
+from ultragray_studies.comparison.result import FORMAT_VERSION, Comparison
 from ultragray_studies.comparison.run import compare_methods
 from ultragray_studies.methods.method import Method, Paces
 

@@ -14,11 +14,11 @@ from ultragray.datasets import Dataset
 from ultragray.errors import DatasetInvalid, InvalidArgument, TrainingStateInvalid
 from ultragray.learn.evaluation.methods import ComparisonSettings
 from ultragray.learn.evaluation.scoring import evaluate_frames
-from ultragray_studies.comparison.place import frames_of
 from ultragray_studies.comparison.result import Comparison
-from ultragray_studies.comparison.run import EQUAL_TIME, ComparisonProgress, compare, compare_methods, default_paces
+from ultragray_studies.comparison.run import EQUAL_TIME, ComparisonProgress, compare_methods, default_paces, frames_of
 from ultragray_studies.methods.classical import FromFrames
 from ultragray_studies.methods.method import Method, Pace, Paces
+from ultragray_studies.methods.registry import chosen_methods
 
 from .conftest import LevelMethod
 
@@ -188,7 +188,8 @@ def test_where_the_scene_fails_there_is_no_equal_time(dataset: Dataset, level: L
 
 
 def test_classical_methods_need_no_scene(dataset: Dataset, tmp_path: Path) -> None:
-    found = compare(dataset, ComparisonSettings(methods=("nearest", "median")), folder=tmp_path)
+    chosen = chosen_methods(("nearest", "median"))
+    found = compare_methods(dataset, chosen, ComparisonSettings(), folder=tmp_path)
     assert found is not None
     assert [row.name for row in found.results] == ["median", "nearest"]
     assert found.budget_s is None
@@ -201,8 +202,9 @@ def test_the_authors_steps_are_those_of_the_author(dataset: Dataset, level: Leve
 
 
 def test_without_held_out_frames_nothing_begins(dataset: Dataset, tmp_path: Path) -> None:
+    nothing = replace(dataset, val=dataset.val.select([]))
     with pytest.raises(DatasetInvalid, match="no frames to measure with"):
-        compare(replace(dataset, val=dataset.val.select([])), ComparisonSettings(), folder=tmp_path / "none")
+        compare_methods(nothing, chosen_methods(("all",)), ComparisonSettings(), folder=tmp_path / "none")
     assert not (tmp_path / "none").exists()
 
 

@@ -2,16 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 
-from ultragray_studies.methods.method import FitProgress, FitRun
 from ultragray_studies.methods.rapidvol import RapidVol, TriPlaneLearner, TriPlanes
 
-from .volumes import along_elevation, one_frame, psnr_of_fit, seen, steps_of
+from .volumes import along_elevation, one_frame, seen
 
 CPU = torch.device("cpu")
 SMALL = seen(along_elevation(np.arange(3.0)), (12, 8))
@@ -89,24 +86,3 @@ def test_rates_fall_to_1_percent() -> None:
 def test_the_recipe_is_5_000_epochs_and_says_that_it_is_ours() -> None:
     assert RapidVol().published_steps(SMALL) == 5_000 * 3
     assert any("This project's: 5,000 epochs" in choice for choice in RapidVol().describe().choices)
-
-
-def test_a_killed_fit_ends_in_the_model_of_an_undisturbed_one(tmp_path: Path) -> None:
-    method, told = RapidVol(), list[FitProgress]()
-    budget = steps_of(method, 16)
-
-    def at_step_7() -> bool:
-        return len(told) == 7
-
-    assert method.fit(SMALL, budget, FitRun(folder=tmp_path, report=told.append, should_stop=at_step_7)) is None
-    resumed, undisturbed = method.fit(SMALL, budget, FitRun(folder=tmp_path)), method.fit(SMALL, budget)
-    assert resumed is not None
-    assert undisturbed is not None
-    models = resumed.learner.model(), undisturbed.learner.model()
-    assert models[0].keys() == models[1].keys()
-    assert all(torch.equal(tensor, models[1][name]) for name, tensor in models[0].items())
-
-
-@pytest.mark.slow
-def test_a_single_frame_is_fitted_above_30_db() -> None:
-    assert psnr_of_fit(RapidVol(), one_frame(32, 24), 200) > 30.0

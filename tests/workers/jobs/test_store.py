@@ -7,6 +7,7 @@ import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -56,6 +57,9 @@ def test_submitted_job_waits(store: JobStore) -> None:
 def test_same_request_id_gives_the_same_job(store: JobStore) -> None:
     job, _ = store.submit(train_job("one"), request_id="mine")
     assert store.submit(train_job("one"), request_id="mine") == (job, False)
+    otherwise = train_job("one")
+    other_order = replace(otherwise, settings=dict(reversed(otherwise.settings.items())))  # as another door has it
+    assert store.submit(other_order, request_id="mine") == (job, False)
     store.cancel(job.id)
     assert store.submit(train_job("one"), request_id="mine") == (store.get(job.id), False)
     for other in (train_job("two"), RenderJob(scene="one", sampler=TRAINING_POSES)):

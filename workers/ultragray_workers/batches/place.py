@@ -17,8 +17,7 @@ from dataclasses import asdict
 from pathlib import Path
 
 from ultragray.errors import InvalidArgument
-from ultragray.exchange import batches as manifest
-from ultragray.exchange.batches import MANIFEST_FILE, BatchPlan, ShardEntry
+from ultragray.exchange.batches import MANIFEST_FILE, BatchPlan, ShardEntry, manifest
 from ultragray.files import sync
 from ultragray_workers.storage.storage import NotThere, Storage
 

@@ -115,7 +115,7 @@ class _Submission:
     @property
     def asked(self) -> str:
         """The hash of what is asked for: the same request_id must ask for the same."""
-        text = json.dumps([to_dict(self.specification), self.priority, self.private])
+        text = json.dumps([_plain(to_dict(self.specification)), self.priority, self.private], sort_keys=True)
         return hashlib.sha256(text.encode()).hexdigest()
 
 
@@ -478,6 +478,15 @@ def _check_request_id(request_id: str) -> None:
         raise InvalidArgument(
             "request_id must be text without NUL and without halves of characters", field="request_id"
         )
+
+
+def _plain(value: Any) -> Any:
+    """A value of JSON as every door writes it: 2.0 and 2 are the same."""
+    if isinstance(value, dict):
+        return {name: _plain(one) for name, one in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_plain(one) for one in value]
+    return int(value) if isinstance(value, float) and value.is_integer() else value
 
 
 def _id_of(text: str, owner: str | None) -> str:

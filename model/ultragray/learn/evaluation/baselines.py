@@ -1,11 +1,15 @@
-"""Classical predictions of a frame, without learning: compounding into a volume, the nearest frame, linear between
-frames.
+"""Classical predictions of a frame, without learning: a compounded volume, the nearest frame, linear between frames.
+
+Compounding: every pixel of every frame goes to its nearest voxel of an isotropic grid, which keeps the median, mean or
+maximum of what it received. Empty voxels in the gaps between frames are filled from their neighbours, layer by layer;
+what lies farther from every frame than half such a gap, or 3 mm, stays unknown. A plane is read by trilinear
+interpolation between the known voxels and is 0 where none is near.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
@@ -20,7 +24,16 @@ from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.geometry.scan_conversion import interpolated, pixel_places
 from ultragray.learn.evaluation.scoring import Evaluation, evaluate_frames, require_frames
-from ultragray.learn.sweep import Dataset, IntArray, Sweep, corner_distances_mm
+from ultragray.learn.sweep import (
+    ByteArray,
+    Dataset,
+    IntArray,
+    Sweep,
+    corner_distances_mm,
+    mean_axes,
+    nearest_frames,
+    pixel_positions_mm,
+)
 
 FOLDS = ("median", "mean", "maximum")
 VOXEL_MM = 0.5
@@ -99,20 +112,6 @@ def affordable_voxel_mm(sweep: Sweep, wanted_mm: float = VOXEL_MM) -> float:
     return hundredths / 100.0
 
 
-def mean_axes(poses: FloatArray) -> FloatArray:  # [F, 4, 4] -> [3, 3]
-    """The rotation nearest to the mean of the poses' rotations."""
-    left, _, right = np.linalg.svd(poses[:, :3, :3].mean(axis=0))
-    mean: FloatArray = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-    return mean
-
-
-def pixel_positions_mm(probe: Probe, height: int, width: int) -> FloatArray:  # [H·W, 3], row by row
-    """The place of each pixel in the probe frame, mm."""
-    origins, directions = probe.scan_lines(width)
-    positions: FloatArray = origins + probe.depths_mm(height)[:, None, None] * directions
-    return positions.reshape(-1, 3)
-
-
 def _on_grid(
     points: FloatArray,  # [P, 3] mm, probe frame
     pose: FloatArray,  # [4, 4] mm
@@ -161,13 +160,19 @@ def _folded(
         voxels, grey = keys >> 8, (keys & 255).astype(np.uint8)
         starts = np.flatnonzero(np.diff(voxels, prepend=-1))
         sizes = np.diff(starts, append=len(voxels))
-        if method == "maximum":
-            folded = grey[starts + sizes - 1].astype(np.float64)
-        elif method == "mean":
-            folded = np.add.reduceat(grey, starts, dtype=np.float64) / sizes if len(starts) else np.zeros(0)
-        else:
-            folded = (grey[starts + (sizes - 1) // 2].astype(np.float64) + grey[starts + sizes // 2]) / 2.0
-        yield voxels[starts], folded
+        yield voxels[starts], _FOLDED[method](grey, starts, sizes)
+
+
+# Of the grey values of all voxels, sorted in each: the first place of each voxel, and how many it has.
+_FOLDED: dict[str, Callable[[ByteArray, IntArray, IntArray], FloatArray]] = {
+    "median": lambda grey, starts, sizes: (
+        (grey[starts + (sizes - 1) // 2].astype(np.float64) + grey[starts + sizes // 2]) / 2.0
+    ),
+    "mean": lambda grey, starts, sizes: (
+        np.add.reduceat(grey, starts, dtype=np.float64) / sizes if len(starts) else np.zeros(0)
+    ),
+    "maximum": lambda grey, starts, sizes: grey[starts + sizes - 1].astype(np.float64),
+}
 
 
 def _layers(sweep: Sweep, voxel_mm: float) -> int:
@@ -245,12 +250,6 @@ def evaluate_baselines(
         method: evaluate_frames(predict(dataset.train, dataset.val.poses, method, voxel_mm=voxel_mm), dataset.val)
         for method in methods
     }
-
-
-def nearest_frames(sweep: Sweep, poses: FloatArray) -> IntArray:  # [C]
-    """The place of the sweep's frame whose corners lie nearest on average, for each pose [C, 4, 4] (mm)."""
-    nearest: IntArray = _distances_to_frames_mm(sweep, poses).argmin(axis=1)
-    return nearest
 
 
 def interpolate_planes(sweep: Sweep, poses: FloatArray) -> FrameArray:  # [C, H, W] in [0, 1]

@@ -22,8 +22,8 @@ from ultragray.errors import InvalidArgument
 from ultragray.geometry.image_size import check_image_size
 from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray, Probe
-from ultragray.learn.evaluation.baselines import pixel_positions_mm
 from ultragray.learn.localization.settings import NEAR_DEG, NEAR_MM, Localization, LocalizationSettings
+from ultragray.learn.sweep import pixel_positions_mm
 from ultragray.learn.training.poses import turned_by
 from ultragray.rendering.frames import render
 from ultragray.rendering.limits import UNLIMITED, Limits

@@ -1,5 +1,13 @@
-"""Poses put right before a training: the noise of the tracker along the path, and sweeps registered to each other
-where they overlap.
+"""Poses put right before a training, from the tracked path and the images alone. Read after `poses`, which calls it.
+
+First the likelihood of second differences, then the tracker's noise and the path without it, then the registration of
+whole sweeps where they overlap.
+
+D takes the second differences of a path of F poses: D·p is [F−2], D·Dᵀ has the rows 1 −4 6 −4 1. With noise of variance
+r on the poses and accelerations of variance q, the second differences that one sees have the covariance
+r·(ρ·1 + D·Dᵀ), ρ = q/r. It has five diagonals; in its factors L·diag(d)·Lᵀ the lower triangle L has ones on the
+diagonal and two diagonals below it, and each row follows from the two rows before it. So a likelihood, or the smoothed
+path, takes time and memory that grow linearly with the length of the path.
 """
 
 from __future__ import annotations
@@ -17,8 +25,7 @@ import numpy.typing as npt
 from ultragray.geometry.probe import FloatArray
 from ultragray.geometry.rotations import rotations_of, turns_of
 from ultragray.geometry.scan_conversion import FloatImage, interpolated_frames, pixel_places
-from ultragray.learn.evaluation.baselines import mean_axes
-from ultragray.learn.sweep import IntArray, Sweep, corner_distances_mm, spread_places
+from ultragray.learn.sweep import IntArray, Sweep, corner_distances_mm, mean_axes, spread_places
 
 
 def likelihood_terms(bends: FloatArray, ratios: FloatArray) -> tuple[FloatArray, FloatArray]:

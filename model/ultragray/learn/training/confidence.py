@@ -1,5 +1,14 @@
-"""The fit of a scene's confidence and uncertainty: a shorter training holds frames out, and what it reaches on them
-says what to expect elsewhere.
+"""The fit of a scene's confidence and uncertainty, by a shorter training that holds frames out. Called at a run's end.
+
+Expected is MS-SSIM = black + (1 − black)·mean over points of σ(w · terms), σ the logistic curve: `terms` grow with the
+distance of a point to the views around it, with the gap between these, and with how hard those views are to predict
+from their neighbours (`hardness_of_views`). Four kinds of evidence determine w: frames that the shorter training did
+not see, some that it did, frames extrapolated from one side of the sweep, and a prior about w from ten scenes, which
+decides what a scene's own frames leave open. The least squares are solved by Levenberg-Marquardt steps with w ≥ 0 but
+for its first entry. `fit_uncertainty` explains squared errors of pixels by the same distances.
+
+In reading order: which frames are held out, predictions of frames from others, hardness, the fit of the weights,
+one-sided examples, uncertainty, and `fit_confidence`, which calls all of them.
 """
 
 from __future__ import annotations

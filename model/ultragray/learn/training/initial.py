@@ -1,4 +1,11 @@
-"""The Gaussians that a training starts from, as raw parameters (docs/physics.md §2), lengths in cm."""
+"""The Gaussians that a training starts from, as raw parameters (docs/physics.md §2), lengths in cm.
+
+An informed start samples the volume as the frames saw it: a plane is drawn between neighbouring frames, a pixel on it,
+and the Gaussian there gets the turn of the nearer frame, the elevation of a slice and the brightness that both frames
+show. A pixel in shadow shows B = E·T with T < 1; as the start absorbs hardly anything, its echo is estimated as B / T
+from the share of the beam that the frame itself says is left, at most 1.5 times the smoothed tissue, and where nearly
+nothing is left the smoothed tissue itself. A floor under it makes what lies above learn to absorb.
+"""
 
 from __future__ import annotations
 
@@ -64,7 +71,7 @@ def initial_parameters(
     if config.start == "random":
         means = (2.0 * torch.rand((count, 3), generator=generator) - 1.0) * RELEASED_CUBE * geometry.scene_scale_cm
         brightness = torch.full((count,), RELEASED_INTENSITY)
-    else:
+    elif config.start == "informed":
         pixels = _on_planes(dataset, neighbours, count, shadows, generator)
         means = torch.from_numpy((pixels.points_mm - geometry.centre_mm) / 10.0).float()
         brightness = torch.from_numpy(pixels.brightness).float()
@@ -74,6 +81,8 @@ def initial_parameters(
         most_mm = max(10.0 * UNPRUNED * config.prune_above * geometry.scene_scale_cm, config.initial_elevation_mm)
         beyond_mm = torch.from_numpy(BEYOND_ELEVATION * np.abs(pixels.beyond_mm)).float()
         scales_mm[:, 1] = beyond_mm.clamp(config.initial_elevation_mm, most_mm)
+    else:
+        raise AssertionError(config.start)
     logit = math.log(config.initial_transmittance / (1.0 - config.initial_transmittance))
     parameters = {
         "means": means,

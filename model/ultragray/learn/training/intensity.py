@@ -26,8 +26,10 @@ def sh0_of_intensity(brightness: Tensor, intensity: str) -> Tensor:  # [N] in [0
     """The sh0 that gives this intensity, or the nearest one that still has a gradient."""
     if intensity == "sigmoid":
         value = torch.logit(brightness.clamp(*SIGMOID_START_RANGE)) / 4.0
-    else:
+    elif intensity == "released":
         value = brightness.clamp(*RELEASED_RANGE) - 1.0
+    else:
+        raise AssertionError(intensity)
     return value / SH_C0
 
 

@@ -1,5 +1,10 @@
-"""Poses that are trained with the scene: corrections of sweeps or of single frames, and what the held-out frames gain
-from them.
+"""Poses that are trained with the scene, and scores of held-out frames whose own poses may be wrong.
+
+`PoseRefinement` begins with what `alignment` finds. Then each group of frames, one frame or a whole sweep, has a twist
+ξ = (ω, t) in mm along the axes of its probe, and its poses are corrected by the motion exp(ω̂ / lever) about the middle
+of its images, then the shift t. The gradient of the loss with respect to ξ is that of the renderer (docs/physics.md
+§4). A common motion of all frames changes no image, so the mean of the corrections, or that of the first sweep, is
+taken to be none.
 """
 
 from __future__ import annotations

@@ -1,4 +1,7 @@
-"""Scenes, poses, scan lines and beams as the backends take them, in cm, and the way back for gradients."""
+"""Scenes, poses, scan lines and beams as all backends take them, in cm, and the way back for gradients.
+
+`ultragray.rendering.frames` makes them once for a call, whichever backend draws.
+"""
 
 from __future__ import annotations
 

@@ -13,13 +13,8 @@ from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.source import load_dataset
 from ultragray.errors import DatasetInvalid, InvalidArgument
 from ultragray.geometry.probe import FloatArray
-from ultragray.learn.evaluation.baselines import (
-    BASELINES,
-    evaluate_baselines,
-    interpolate_planes,
-    nearest_frames,
-    predict,
-)
+from ultragray.learn.evaluation.baselines import BASELINES, evaluate_baselines, interpolate_planes, predict
+from ultragray.learn.sweep import nearest_frames
 
 LINEAR = LinearProbe(width_mm=8.0, near_mm=0.0, far_mm=10.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=8.0, far_mm=20.0)

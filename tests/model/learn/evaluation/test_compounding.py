@@ -15,13 +15,8 @@ from ultragray.datasets.source import load_dataset
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation import baselines as compounding
-from ultragray.learn.evaluation.baselines import (
-    affordable_voxel_mm,
-    compound,
-    evaluate_baselines,
-    mean_axes,
-    pixel_positions_mm,
-)
+from ultragray.learn.evaluation.baselines import affordable_voxel_mm, compound, evaluate_baselines
+from ultragray.learn.sweep import mean_axes, pixel_positions_mm
 
 HEIGHT, WIDTH = 12, 10
 PROBE = LinearProbe(width_mm=WIDTH * 0.5, near_mm=0.0, far_mm=HEIGHT * 0.5)  # a pixel is a voxel of 0.5 mm

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from ultragray import ConvexProbe, LinearProbe, Probe
-from ultragray.learn.evaluation.baselines import pixel_positions_mm
 from ultragray.learn.localization.search import Motions, places_after, slid
+from ultragray.learn.sweep import pixel_positions_mm
 
 ROWS, COLUMNS = 41, 21
 LINEAR = LinearProbe(40.0, 0.0, 80.0)

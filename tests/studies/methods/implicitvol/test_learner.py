@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -11,18 +9,14 @@ import torch
 from ultragray_studies.methods.implicitvol import (
     FieldLearner,
     ImplicitVol,
-    RefinedImplicitVol,
     RefiningLearner,
     published_epoch,
 )
-from ultragray_studies.methods.learner import LearnedMethod
-from ultragray_studies.methods.method import FitProgress, FitRun
 from ultragray_studies.methods.parts import pixel_points_mm
 
-from ..volumes import PROBE, along_elevation, one_frame, psnr_of_fit, seen, steps_of
+from ..volumes import PROBE, along_elevation, seen
 
 CPU = torch.device("cpu")
-BOTH = [ImplicitVol(), RefinedImplicitVol()]
 SMALL = seen(along_elevation(np.arange(3.0)), (12, 8))
 
 
@@ -120,25 +114,3 @@ def test_a_frame_that_moved_alone_leaves_held_out_frames_where_they_are_on_avera
         learner.poses.shifts[0, 0] += 0.3
     _, translation = learner.poses.common_motion()
     assert translation[0].item() == pytest.approx(0.1, abs=0.02)  # a third of the way: there are three frames
-
-
-@pytest.mark.parametrize("method", BOTH, ids=["fixed", "refined"])
-def test_a_killed_fit_ends_in_the_model_of_an_undisturbed_one(method: LearnedMethod, tmp_path: Path) -> None:
-    budget, told = steps_of(method, 24), list[FitProgress]()
-
-    def at_step_10() -> bool:
-        return len(told) == 10
-
-    assert method.fit(SMALL, budget, FitRun(folder=tmp_path, report=told.append, should_stop=at_step_10)) is None
-    resumed, undisturbed = method.fit(SMALL, budget, FitRun(folder=tmp_path)), method.fit(SMALL, budget)
-    assert resumed is not None
-    assert undisturbed is not None
-    models = resumed.learner.model(), undisturbed.learner.model()
-    assert models[0].keys() == models[1].keys()
-    assert all(torch.equal(tensor, models[1][name]) for name, tensor in models[0].items())
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize(("method", "steps"), [(BOTH[0], 60), (BOTH[1], 140)], ids=["fixed", "refined"])
-def test_a_single_frame_is_fitted_above_30_db(method: LearnedMethod, steps: int) -> None:
-    assert psnr_of_fit(method, one_frame(32, 24), steps) > 30.0

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray.learn.evaluation.baselines import mean_axes
+from ultragray.learn.sweep import mean_axes
 from ultragray_studies.methods.implicitvol import FramePoses, angles_of, rotation_of
 from ultragray_studies.methods.parts import pixel_points_mm
 

@@ -14,14 +14,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from ultragray.errors import InvalidArgument, MemoryExceeded, TrainingDiverged
+from ultragray.errors import ExtraMissing, InvalidArgument, MemoryExceeded, TrainingDiverged
 from ultragray.learn.evaluation.baselines import evaluate_baselines
 from ultragray_studies import compare_run
 from ultragray_studies.methods.classical import Compounding, FromFrames
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import DatasetNotFound
 from ultragray_workers.jobs.folder import JobFolder
-from ultragray_workers.jobs.kinds import CompareJob
+from ultragray_workers.jobs.kinds import CompareJob, base
 from ultragray_workers.jobs.progress import JobState, Outcome
 from ultragray_workers.jobs.record import Job
 from ultragray_workers.jobs.specification import from_dict, to_dict
@@ -129,3 +129,10 @@ def test_killed_comparison_goes_on_and_repeats_no_step(
     assert {"scene_psnr_db", "nearest_gmsd"} < set(done.metrics)
     lines = [line for line in store.log_tail(job.id).splitlines() if line.startswith("scene: step")]
     assert len(lines) == len({line.partition(" of ")[0] for line in lines}) == 10, lines
+
+
+def test_without_the_studies_a_comparison_is_refused_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(base, "entry_points", lambda **_: ())
+    surroundings = base.Surroundings(scene=None, artifact_folder=None, max_image_side=1024)
+    with pytest.raises(ExtraMissing, match="ultragray-studies, which is not installed"):
+        JOB.check(surroundings)

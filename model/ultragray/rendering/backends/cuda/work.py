@@ -54,11 +54,11 @@ def count_work(
     views = upload(torch.from_numpy(view_table(probe, poses_cm, height)), scene.means.device)
     gaussians = sorted_gaussians(scene)
     with launching(scene.means.device):
-        made = cut(gaussians, views, geometry, record=False)
+        slices_of_poses = cut(gaussians, views, geometry, record=False)
     poses = len(views)
-    rank = torch.arange(how.block, device=made.counts.device)
-    present = (rank < made.counts[:, :, None]).reshape(-1)  # [C * B * BLOCK]
-    edges = made.rectangles[present].long()
+    rank = torch.arange(how.block, device=slices_of_poses.counts.device)
+    present = (rank < slices_of_poses.counts[:, :, None]).reshape(-1)  # [C * B * BLOCK]
+    edges = slices_of_poses.rectangles[present].long()
     first_column, last_column, first_row, last_row = (edges[:, k] for k in range(4))
     pixels = (last_column - first_column + 1) * (last_row - first_row + 1)
     across = last_column // how.tile_columns - first_column // how.tile_columns + 1

@@ -1,4 +1,4 @@
-"""What the kernels share: their constants, profiles along a line, spherical harmonics."""
+"""What the kernels share: constants of the model (docs/physics.md §3), profiles along a line, spherical harmonics."""
 
 import triton
 import triton.language as tl
