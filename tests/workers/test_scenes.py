@@ -41,7 +41,8 @@ def test_the_first_folder_wins_over_further_ones(scene_folder, tmp_path):
     assert store.names() == ["a", "b", "c"]
     assert store.path("b") == scene_folder / "b.ugr"
     assert store.path("c") == further / "c.ugr"
-    assert store.file("d") is None
+    with pytest.raises(SceneNotFound, match="known scenes: a, b, c"):
+        store.path("d")
     assert store.header("c").info == store.header("a").info
     (scene_folder / "b.ugr").unlink()
     assert store.path("b") == further / "b.ugr"

@@ -50,7 +50,8 @@ def submit(engine: sa.Engine, values: dict[str, Any], also: Callable[[sa.Connect
     try:
         with engine.begin() as connection:
             inserted = _insert(connection, JOBS).values(state=_QUEUED, created_ms=_now_ms(), **values)
-            if connection.execute(inserted.on_conflict_do_nothing(index_elements=["id"])).rowcount == 0:
+            made = inserted.on_conflict_do_nothing(index_elements=["id"]).returning(JOBS.c.number)
+            if connection.execute(made).first() is None:
                 return False
             also(connection)
     except IntegrityError as error:

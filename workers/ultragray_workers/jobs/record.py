@@ -59,7 +59,8 @@ class Files:
 
     def keys(self) -> set[str]:
         """The keys of the objects."""
-        return {one.key for one in (*self.log, *self.journal, *self.run.values(), *self.artifacts.values())}
+        pieces = {piece.key for piece in (*self.log, *self.journal)}
+        return pieces | {file.key for file in (*self.run.values(), *self.artifacts.values())}
 
     def to_json(self) -> str:
         """The list as a row holds it."""
@@ -71,10 +72,11 @@ class Files:
         if text is None:
             return cls()
         values = json.loads(text)
-        return cls(
-            *(tuple(Piece(**piece) for piece in values[name]) for name in ("log", "journal")),
-            *({path: StoredFile(**one) for path, one in values[name].items()} for name in ("run", "artifacts")),
+        log, journal = (tuple(Piece(**piece) for piece in values[name]) for name in ("log", "journal"))
+        run, artifacts = (
+            {path: StoredFile(**one) for path, one in values[name].items()} for name in ("run", "artifacts")
         )
+        return cls(log, journal, run, artifacts)
 
 
 @dataclass(frozen=True)

@@ -22,7 +22,7 @@ from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import DatasetNotFound
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.kinds import CompareJob, base
-from ultragray_workers.jobs.progress import JobState, Outcome
+from ultragray_workers.jobs.progress import JobState
 from ultragray_workers.jobs.record import Job
 from ultragray_workers.jobs.specification import from_dict, to_dict
 from ultragray_workers.jobs.store import JobStore
@@ -88,14 +88,6 @@ def test_a_comparison_of_which_every_method_fails_fails(
         compare_run.run(job_run(), JOB)
 
 
-def test_a_retry_begins_anew_where_the_run_before_was_no_good(job_run: Callable[..., JobRun]) -> None:
-    first = job_run()
-    first.folder.run.mkdir()
-    (first.folder.run / "run.json").write_text("no JSON")
-    first.folder.write_outcome(Outcome(error="TRAINING_STATE_INVALID", reason="it is damaged"))
-    assert compare_run.run(job_run("again", retry_of="job"), JOB).metrics
-
-
 def test_what_cannot_be_is_refused_at_the_submission(artifact_folder: Path, store: JobStore) -> None:
     with pytest.raises(InvalidArgument, match="got 'newest'"):
         CompareJob(dataset="tiny", methods=("newest",))
@@ -133,6 +125,6 @@ def test_killed_comparison_goes_on_and_repeats_no_step(
 
 def test_without_the_studies_a_comparison_is_refused_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(base, "entry_points", lambda **_: ())
-    surroundings = base.Surroundings(scene=None, artifact_folder=None, max_image_side=1024)
+    surroundings = base.Surroundings(scene=None, free_bytes=None, max_image_side=1024)
     with pytest.raises(ExtraMissing, match="ultragray-studies, which is not installed"):
         JOB.check(surroundings)
