@@ -163,6 +163,7 @@ class _SkippingLoop(asyncio.SelectorEventLoop):
         return self.now
 
     def _run_once(self) -> None:
+        self.now += 1e-6  # no clock stands still while there is something to do
         if not self._ready and self._scheduled:  # type: ignore[attr-defined]
             self.now = max(self.now, self._scheduled[0].when())  # type: ignore[attr-defined]
         super()._run_once()  # type: ignore[misc]
