@@ -312,4 +312,5 @@ def test_a_service_that_dies_or_stops_leaves_nothing(start_service: StartService
     assert "DRAINING" in upload.answer()
     upload.close()
     assert second.terminate() == 0
-    assert not list((tmp_path / "datasets").iterdir())
+    assert not uploads_under_way(tmp_path)
+    assert not list(tmp_path.glob("dataset*/*"))
