@@ -20,7 +20,7 @@ def test_an_installation_goes_into_a_bucket(tmp_path: Path, new_bucket: Callable
     result = run("storage", "copy", data, bucket)
     assert (result.exit_code, result.stdout.count("1 copied")) == (0, 2), result.output
     keys = {entry.key for entry in open_storage(bucket).entries()}
-    assert {"demo.ugr", "artifacts/datasets/tiny/dataset.json"} < keys
+    assert {"demo.ugr", "artifacts/datasets/tiny.json"} < keys
     again = json.loads(run("storage", "copy", data, bucket, "--json").stdout)
     assert (again["scenes"], again["datasets"]) == (0, 0)
     assert (again["already_there"], again["datasets_already_there"]) == (1, 1)

@@ -186,7 +186,7 @@ print(int(peak[1]) * 1024, memory.required_bytes(dataset, config))
     ids=["gaussians", "slices", "held-out"],
 )
 def test_what_is_said_is_an_upper_bound(tmp_path: Path, data: dict[str, float], settings: dict[str, int]) -> None:
-    conftest = str(Path(__file__).with_name("conftest.py"))
+    conftest = str(Path(__file__).parents[1] / "conftest.py")
     program = PROGRAM.format(path=sys.path, conftest=conftest, folder=str(tmp_path), data=data, settings=settings)
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     found = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True, env=environment)

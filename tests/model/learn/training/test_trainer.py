@@ -122,7 +122,7 @@ train(tiny.make_tiny_dataset(), tiny.make_tiny_config(), folder=pathlib.Path({fo
 def test_killed_run_that_is_resumed_ends_in_the_same_scene(
     tiny_dataset: Datasets, tiny_config: Configs, tmp_path: Path
 ) -> None:
-    conftest = str(Path(__file__).with_name("conftest.py"))
+    conftest = str(Path(__file__).parents[1] / "conftest.py")
     program = PROGRAM.format(path=sys.path, conftest=conftest, folder=str(tmp_path))
     process = subprocess.Popen([sys.executable, "-c", program], env={**os.environ, "OMP_NUM_THREADS": "1"})
     journal, lines_before = tmp_path / "metrics.jsonl", random.randint(2, 18)
