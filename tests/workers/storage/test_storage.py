@@ -118,3 +118,11 @@ def test_a_folder_without_links_keeps_the_promises(tmp_path: Path, monkeypatch: 
     assert storage.upload(tmp_path / "file", "b", if_absent=True)
     assert not storage.upload(tmp_path / "file", "a", if_absent=True)
     assert (storage.read("a"), storage.read("b")) == (b"first", b"content")
+
+
+def test_what_a_killed_writer_left_is_removed(tmp_path: Path) -> None:
+    storage = LocalStorage(tmp_path)
+    storage.write("a/whole", b"x")
+    (tmp_path / "a" / ".other.0123456789ab.tmp").write_bytes(b"half")
+    storage.delete_half_written("a")
+    assert [path.name for path in (tmp_path / "a").iterdir()] == ["whole"]

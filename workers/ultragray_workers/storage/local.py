@@ -137,6 +137,10 @@ class LocalStorage:
     def delete_all(self, prefix: str) -> None:
         remove_whole(self._folder(prefix))
 
+    def delete_half_written(self, prefix: str) -> None:
+        for path in self._folder(prefix).rglob(f".*{TEMPORARY_SUFFIX}"):
+            path.unlink(missing_ok=True)
+
     @contextlib.contextmanager
     def held(self, prefix: str, sha256: Mapping[str, str], folder: Path, max_bytes: int) -> Iterator[Path]:
         place = self._folder(prefix)

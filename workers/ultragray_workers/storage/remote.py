@@ -162,6 +162,9 @@ class RemoteStorage:
         for entry in list(self.entries(prefix)):
             self.delete(entry.key)
 
+    def delete_half_written(self, prefix: str) -> None:
+        """Does nothing: an object is there whole or not at all."""
+
     @contextlib.contextmanager
     def held(self, prefix: str, sha256: Mapping[str, str], folder: Path, max_bytes: int) -> Iterator[Path]:
         def fetch_all(target: Path) -> None:

@@ -116,6 +116,9 @@ class Storage(Protocol):
     def delete_all(self, prefix: str) -> None:
         """Removes the objects below `prefix`."""
 
+    def delete_half_written(self, prefix: str) -> None:
+        """Removes what killed writers left below `prefix`, where nobody writes any more."""
+
     def held(
         self, prefix: str, sha256: Mapping[str, str], folder: Path, max_bytes: int
     ) -> AbstractContextManager[Path]:

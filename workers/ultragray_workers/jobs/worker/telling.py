@@ -126,6 +126,7 @@ class Telling:
                 is_shard = entry.key.startswith(f"{batch_prefix(self._row.id)}/")
                 if is_of_attempt and not is_shard and entry.key not in named:
                     self._storage.delete(entry.key)
+            self._storage.delete_half_written(top)
 
     def forget(self) -> None:
         """Removes the folder of the job."""
