@@ -39,7 +39,7 @@ from ..model.datasets.conftest import (
     write_mha,
     write_nrrd,
 )
-from ..model.learn.training.conftest import make_tiny_config, make_tiny_dataset
+from ..model.learn.conftest import make_tiny_config, make_tiny_dataset
 from .conftest import EnterDoor
 from .mutations import Strategy, as_json, chosen_parts, mutated_bytes, mutated_json, mutated_lines, places
 from .reading import ReaderProcess

@@ -25,7 +25,7 @@ from ultragray.datasets.released import write_released
 from ultragray.files import file_sha256
 from ultragray_studies.bench.report import measured
 
-from ..model.learn.training.conftest import make_tiny_dataset
+from ..model.learn.conftest import make_tiny_dataset
 from ..processes import Growth, Taken, by_role, family
 from ..service.conftest import RunningService, service_starter
 from ..service.igtl.conftest import address_of
