@@ -30,8 +30,6 @@ _IPV6_NETWORK_BITS = 64  # what one subscriber has
 
 
 class Connections:
-    """The connections of one door. Each takes a place, and gives it back once."""
-
     def __init__(self, total: int, per_address: int) -> None:
         self._total = total
         self._per_address = per_address
@@ -39,7 +37,6 @@ class Connections:
         self._count = 0
 
     def enter(self, host: str) -> Place:
-        """A place for a connection from `host`. Raises TooManyConnections."""
         address = address_of(host)
         if self._by_address[address] >= self._per_address:
             raise TooManyConnections(f"at most {self._per_address} connections of one address may be open")
@@ -50,7 +47,6 @@ class Connections:
         return Place(self, address)
 
     def leave(self, address: str) -> None:
-        """Gives back a place; `Place.leave` calls it."""
         self._count -= 1
         self._by_address[address] -= 1
         if not self._by_address[address]:
@@ -58,15 +54,12 @@ class Connections:
 
 
 class Place:
-    """The place of one connection."""
-
     def __init__(self, connections: Connections, address: str) -> None:
         self._connections = connections
         self._address = address
         self._is_taken = True
 
     def leave(self) -> None:
-        """Gives the place back, if that was not done before."""
         if self._is_taken:
             self._is_taken = False
             self._connections.leave(self._address)
@@ -82,17 +75,12 @@ def address_of(host: str) -> str:
     return str(int(address) >> (128 - _IPV6_NETWORK_BITS))
 
 
-# Accepting connections, each of which has a place before anything of it is read.
-
-
 _RETRY_S = 0.1  # where there is no file descriptor for another connection
 
 _log = logging.getLogger("ultragray.service")
 
 
 class Acceptor:
-    """Accepts from a socket that listens, until it is closed."""
-
     def __init__(
         self,
         listener: socket.socket,
@@ -121,7 +109,6 @@ class Acceptor:
         self._task.cancel()
 
     async def wait_closed(self) -> None:
-        """Returns when nothing is being accepted any more."""
         await asyncio.wait({self._task})
 
     async def _accept(self) -> None:
@@ -171,18 +158,13 @@ class Acceptor:
 
 
 # A cap by address on connections that a library accepts by itself, as gRPC does.
-#
 # This process finds its own sockets among its open files, and shuts down those of an address that has too many: the
 # library sees them end as if the peer had hung up. Connections that are known stay; new ones go.
-
-
 INTERVAL_S = 0.25
 _OPEN_FILES = "/dev/fd"
 
 
 class OpenSockets:
-    """The connections to one port of this process."""
-
     def __init__(self, port: int, connections: Connections) -> None:
         self._port = port
         self._connections = connections
@@ -190,7 +172,6 @@ class OpenSockets:
         self._places: dict[int, Place] = {}  # the connections, by inode
 
     async def run(self) -> None:
-        """Look again and again, until cancelled."""
         rounds = Rounds(f"the watch over connections to port {self._port}", _log)
         while True:
             with rounds.round():
@@ -216,7 +197,6 @@ class OpenSockets:
         return refused
 
     def _let_in(self, file: int, inode: int) -> bool:
-        """Notes a socket that is new. Raises OSError where it has gone."""
         with socket.socket(fileno=os.dup(file)) as found:
             if os.fstat(found.fileno()).st_ino != inode:
                 return True  # another has its number by now, and is seen the next time
@@ -241,14 +221,10 @@ class OpenSockets:
             return None
 
 
-# Sockets as this service sets them up.
-
-
 _BACKLOG = 2048
 
 
 def listen(host: str, port: int, what: str, field: str) -> socket.socket:
-    """A socket that listens. Raises StartupFailed, naming the setting `field`, where the port cannot be had."""
     listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -270,7 +246,6 @@ def check_port_is_free(host: str, port: int, what: str, field: str) -> None:
 
 
 def _remedy(error: OSError, field: str) -> str:
-    """Why a port cannot be had, and what to give instead."""
     if error.errno == errno.EADDRINUSE:
         return f"the port is in use; give another one with {_named(field)}"
     reason = (error.strerror or str(error)).lower()
@@ -282,7 +257,6 @@ def _named(field: str) -> str:
 
 
 def authority(host: str, port: int) -> str:
-    """Host and port as a URL has them."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
@@ -294,7 +268,6 @@ def give_up_on_silent_peers(connection: socket.socket, patience_s: float) -> Non
 
 
 def raise_open_files_limit(wanted: int) -> None:
-    """Raise the limit of open files to `wanted`, or as far as the hard limit allows, and warn where that is less."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     possible = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
     if soft != resource.RLIM_INFINITY and soft < possible:
@@ -304,9 +277,6 @@ def raise_open_files_limit(wanted: int) -> None:
             f"this process may open {hard} files, {wanted} are needed for all connections that the settings allow: "
             "raise the hard limit (ulimit -n, LimitNOFILE of systemd)"
         )
-
-
-# How long a transfer may lag behind the least rate.
 
 
 class Patience:
@@ -321,7 +291,6 @@ class Patience:
         self._left_s = limit_s
 
     def renew(self) -> None:
-        """Begin again: another transfer, or one that does not wait for the peer."""
         self._left_s = self._limit_s
 
     def is_over(self, moved_bytes: int, elapsed_s: float) -> bool:

@@ -75,12 +75,10 @@ class EmbeddedWorker:
         self._thread = ThreadPoolExecutor(1, "embedded-worker")  # not the loop's, which others need
 
     def start(self) -> None:
-        """Starts the worker and returns at once; nothing where the settings want none."""
         if self._settings.embedded_worker:
             self._task = asyncio.create_task(self._keep_alive())
 
     async def stop(self) -> None:
-        """Ends the worker, which puts the job at hand back into the queue."""
         self._stop.set()
         if self._process is not None and self._process.poll() is None:
             self._process.terminate()
@@ -123,18 +121,13 @@ class EmbeddedWorker:
 
 
 # The words that systemd understands: the process is ready, still alive, stopping. Without systemd they go nowhere.
-#
 # A unit of `Type=notify` names a socket in NOTIFY_SOCKET; one with `WatchdogSec` expects a word within that time, and
 # restarts a process from which it hears none.
-
-
 READY, ALIVE, STOPPING = "READY=1", "WATCHDOG=1", "STOPPING=1"
 _WORDS_WITHIN_TIMEOUT = 3
 
 
 class ServiceManager:
-    """The service manager that started this process, if one did."""
-
     def __init__(self) -> None:
         """Takes its variables out of the environment: they are not for processes that this one starts."""
         address = os.environ.pop("NOTIFY_SOCKET", "")
@@ -151,13 +144,9 @@ class ServiceManager:
                 sender.sendto(word.encode(), self._address)
 
     async def tell_alive(self) -> None:
-        """Tells for as long as the event loop turns that it does."""
         while self.alive_every_s is not None:
             self.tell(ALIVE)
             await asyncio.sleep(self.alive_every_s)
-
-
-# Both servers in one process on one event loop, from start to a clean stop.
 
 
 _HEALTH_POLL_S = 0.2
@@ -171,7 +160,6 @@ _OTHER_FILES = 1024
 
 
 def run(settings: Settings) -> None:
-    """Serve until SIGTERM or SIGINT. Raises StartupFailed where it cannot start."""
     configure_logging(settings.log_level, settings.log_format)
     for sentence in unknown_variables():
         _log.warning(sentence)
@@ -275,11 +263,9 @@ class _StopSignals:
         (self.force if self.stop.is_set() else self.stop).set()
 
     async def unless_stopped(self, work: Awaitable[Any]) -> bool:
-        """Await `work` and return True; False where the first signal cancelled it."""
         return await _unless(self.stop, work)
 
     async def unless_forced(self, work: Awaitable[Any]) -> bool:
-        """Await `work` and return True; False where the second signal cancelled it."""
         return await _unless(self.force, work)
 
 
@@ -311,12 +297,10 @@ def _bind_grpc(server: GrpcServer, settings: Settings, certificates: Certificate
 
 
 async def _cap_grpc(settings: Settings, port: int) -> None:
-    """Keeps the connections of each address to gRPC, which accepts by itself, below the cap."""
     await OpenSockets(port, Connections(settings.max_connections, settings.max_connections_per_address)).run()
 
 
 async def _start_igtl(server: IgtlServer, settings: Settings, sockets: contextlib.ExitStack) -> str | None:
-    """Begins to answer and returns the address; None where it has no port."""
     if settings.igtl_port is None:
         return None
     host = _LOOPBACK if server.is_local and not is_loopback(settings.host) else settings.host
@@ -327,7 +311,6 @@ async def _start_igtl(server: IgtlServer, settings: Settings, sockets: contextli
 
 
 async def _mirror_health(service: Service, server: GrpcServer) -> None:
-    """Keep the health of gRPC equal to the readiness of HTTP."""
     rounds = Rounds("the health of gRPC", _log)
     while True:
         with rounds.round():

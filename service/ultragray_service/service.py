@@ -42,8 +42,6 @@ from ultragray_workers.scenes import SceneStore
 
 @dataclass(eq=False, kw_only=True)
 class Service:
-    """All that the front doors share."""
-
     settings: Settings
     life: Life
     doors: Doors  # as they will be, until they are open
@@ -142,7 +140,6 @@ class Service:
             prepared.end()
 
     async def close(self) -> None:
-        """Closes what `open` opened, and sends the last traces."""
         for task in self._following:
             task.cancel()
         if self._snapshot is not None:
@@ -155,13 +152,11 @@ class Service:
             await asyncio.to_thread(self.tracing.stop)
 
     async def delete_dataset(self, name: str) -> None:
-        """Deletes a dataset, and all that was made of it to be looked at. Raises DatasetNotFound, DatasetInUse."""
         gone = await self.datasets.delete(name, self.jobs.uses_dataset)
         if gone is not None:
             await self._forget(lambda key: key.endswith(gone))
 
     async def delete_job(self, job_id: str) -> None:
-        """Deletes a finished job and its files. Raises JobNotFound, JobInUse, DatabaseUnavailable."""
         await self.jobs.do(JobStore.delete, job_id)
         await self.training_views.forget_job(job_id)
 

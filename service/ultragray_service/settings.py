@@ -364,7 +364,6 @@ class Settings(Contract):
 
     @property
     def allowance(self) -> Allowance:
-        """How much a key may take that has no limits of its own."""
         return Allowance(**{name: getattr(self, f"key_{name}") for name in NAMES})
 
     @property
@@ -383,12 +382,10 @@ class Settings(Contract):
 
     @property
     def is_there(self) -> bool:
-        """Whether a folder of scenes or of artifacts is there; of a bucket that is not asked."""
         return any(not isinstance(one, Path) or one.is_dir() for one in (self.artifacts, self.data_folder))
 
     @property
     def cache(self) -> Path:
-        """The folder of this host for what is fetched from buckets."""
         if self.cache_folder is not None:
             return self.cache_folder
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ultragray"

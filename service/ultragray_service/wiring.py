@@ -40,7 +40,6 @@ from ultragray_workers.storage.location import open_storage
 
 
 def make_service(settings: Settings) -> Service:
-    """A service that is not open yet. Raises StartupFailed for a data folder that does not exist, InvalidArgument."""
     life, metrics, tracing = Life(), Metrics(), start_tracing("service")
 
     keys, tokens = KnownKeys(), oidc_tokens(settings)
@@ -116,7 +115,6 @@ def make_service(settings: Settings) -> Service:
 
 
 def _pool(settings: Settings, places: ScenePlaces, metrics: Metrics, tracing: Tracing | None) -> RenderPool:
-    """The render processes; each result is counted and traced."""
     config = PoolConfig(
         processes=settings.processes,
         threads_per_process=settings.threads_per_process,
@@ -141,7 +139,6 @@ def _pool(settings: Settings, places: ScenePlaces, metrics: Metrics, tracing: Tr
 
 
 def oidc_tokens(settings: Settings) -> OidcTokens | None:
-    """The tokens of the settings; None: they name no issuer."""
     if settings.oidc_issuer is None:
         return None
     return OidcTokens(

@@ -14,8 +14,6 @@ from ultragray_service.access.rules import Operation
 
 
 class Admission:
-    """Counts, audits and permits what callers ask for."""
-
     def __init__(self, audit: AuditLog, limits: Limits, sessions: Sessions, permissions: Permissions) -> None:
         self._audit, self._limits, self._sessions, self._permissions = audit, limits, sessions, permissions
 

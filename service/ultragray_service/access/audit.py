@@ -45,8 +45,6 @@ _log = logging.getLogger("ultragray.audit")
 
 @dataclass(frozen=True)
 class Entry:
-    """One line of the log."""
-
     who: str
     address: str
     what: str  # an operation of access/rules.py
@@ -87,7 +85,6 @@ class AuditLog:
         self._thread = threading.Thread(target=self._run, name="audit", daemon=True)
 
     def open(self, engine: sa.Engine) -> None:
-        """Begins to write."""
         self._engine = engine
         self._thread.start()
 
@@ -98,7 +95,6 @@ class AuditLog:
             self._thread.join()
 
     def tell(self, entry: Entry) -> None:
-        """Writes one entry."""
         if len(self._waiting) >= MAX_WAITING:
             self._lost += 1
         else:
@@ -125,7 +121,6 @@ class AuditLog:
 
     @contextmanager
     def refusals(self, who: str, address: str, operation: Operation, target: str) -> Iterator[None]:
-        """Counts what the body refuses, before there is anything to tell of."""
         try:
             yield
         except UltragrayError as error:
@@ -217,7 +212,6 @@ def _row(entry: Entry) -> dict[str, Any]:
 
 
 def _kept(text: str) -> str:
-    """Text as every database takes it."""
     return text[:_LONGEST].encode("utf-8", "replace").decode().replace("\0", "�")
 
 

@@ -46,7 +46,6 @@ class Key:
     limits: Mapping[str, Number | None] = described("Its own, in place of those of all keys.", factory=dict)
 
     def is_valid(self, now_s: float) -> bool:
-        """Whether it opens the doors."""
         return self.revoked_at_s is None and (self.expires_at_s is None or now_s < self.expires_at_s)
 
 
@@ -116,7 +115,6 @@ class KeyStore:
             return read_keys(connection)
 
     def note_uses(self, last_used_at_s: Mapping[str, float]) -> None:
-        """Writes when keys were used last, by their ids."""
         if last_used_at_s:
             with self._engine.begin() as connection:
                 connection.execute(
@@ -126,7 +124,6 @@ class KeyStore:
 
 
 def read_keys(connection: sa.Connection) -> dict[bytes, Key]:
-    """As KeyStore.keys."""
     columns = KEYS.c
     rows = connection.execute(sa.select(KEYS).order_by(columns.created_at_s, columns.id))
     return {
@@ -181,11 +178,8 @@ class KnownKeys:
 
 
 # The copy in memory of what the jobs' database knows of keys, owners and registrations, a second or two old.
-#
 # Requests are checked against the copy: no frame waits for the database. While the database is away the last copy
 # holds, and so do the times at which keys expire.
-
-
 INTERVAL_S = 1.0
 _USES_EVERY = 30  # intervals
 _COPIED = "keys, owners and registrations"
@@ -220,7 +214,6 @@ class Snapshot:
                 self._number = number
 
     def close(self) -> None:
-        """Ends the thread."""
         self._stop.set()
         self._thread.join()
 

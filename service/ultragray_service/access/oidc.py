@@ -39,7 +39,6 @@ def check_url(url: str, field: str) -> str:
 
 
 def parse_roles(mapping: Sequence[str]) -> dict[str, Role]:
-    """Roles by the values of a claim, from `VALUE=ROLE`. Raises InvalidArgument."""
     roles = {}
     for item in mapping:
         value, equals, role = item.rpartition("=")
@@ -67,9 +66,6 @@ def highest_role(values: Any, roles: Mapping[str, Role]) -> Role | None:
     listed = values.split() if isinstance(values, str) else values if isinstance(values, list) else []
     given = [roles[value] for value in listed if isinstance(value, str) and value in roles]
     return max(given, key=list(Role).index, default=None)
-
-
-# The public keys of an OpenID Connect issuer, fetched in the background and kept while it is away.
 
 
 DISCOVERY_PATH = "/.well-known/openid-configuration"
@@ -102,8 +98,6 @@ class SigningKey:
 
 @dataclass(frozen=True)
 class Endpoints:
-    """Where browsers sign people in, and get their tokens."""
-
     authorization: str
     token: str
 
@@ -151,7 +145,6 @@ class Issuer:
         )
 
     async def follow(self) -> None:
-        """Fetches the keys, again after a while and when tokens name others, for ever."""
         rounds = Rounds("the watch over the issuer's keys", _log)
         while True:
             with rounds.round():
@@ -234,9 +227,6 @@ def _usable(published: Any) -> tuple[str | None, SigningKey] | None:
     return published.get("kid"), SigningKey(key, algorithms)
 
 
-# Tokens of an OpenID Connect issuer: verified with its keys, their claims mapped to a role.
-
-
 MAX_TOKEN_BYTES = 16_384
 LEEWAY_S = 30.0  # by which clocks may differ
 _MAX_VERIFIED = 4096
@@ -261,7 +251,6 @@ class OidcTokens:
     def __init__(
         self, issuer: Issuer, *, audience: str | None, role_claim: str, name_claim: str, roles: Mapping[str, Role]
     ) -> None:
-        """`roles`: by the values of `role_claim`."""
         self.issuer = issuer
         self._audience = audience
         self._role_claim = role_claim

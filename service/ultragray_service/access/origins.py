@@ -33,7 +33,6 @@ class Origins:
         self._is_allowed_host = lru_cache(maxsize=256)(self._allows_host)
 
     def require_host(self, host: str | None) -> None:
-        """Raises HostRefused for a name that is not known as one of this service."""
         if host is not None and not self._is_allowed_host(host):
             raise HostRefused(
                 f"this service is not known as {host[:128]!r}: allow the name with ULTRAGRAY_ALLOWED_HOSTS, or give the"

@@ -43,7 +43,6 @@ class Owners:
         self._threads: Executor | None = None
 
     def open(self, engine: sa.Engine, threads: Executor) -> None:
-        """From now on changes are written by `engine`, in `threads`."""
         self._engine, self._threads = engine, threads
 
     def read(self, connection: sa.Connection) -> None:
@@ -56,7 +55,6 @@ class Owners:
         return self._known.get((kind, base_name(name) if kind is Kind.SCENE else name), NOBODYS)
 
     def owned(self, kind: Kind, owner: str) -> list[str]:
-        """The datasets or scenes of an owner. May be called from any thread."""
         with self._changing:
             return [name for (one, name), whose in self._known.items() if one is kind and whose.owner == owner]
 
@@ -103,7 +101,6 @@ class Owners:
 
     @asynccontextmanager
     async def removing(self, kind: Kind, name: str) -> AsyncIterator[None]:
-        """Forgets whose the dataset or scene was that the body removes. Raises DatabaseUnavailable."""
         ownership = await self._write(lambda connection: read_owner(connection, kind, name))
         yield
         await self.forget(kind, name, ownership)
@@ -128,7 +125,6 @@ class Claim:
     """A dataset or scene that the caller is about to make."""
 
     def __init__(self, owners: Owners, kind: Kind, name: str, token: str, *, private: bool) -> None:
-        """`token`: no other claim has it."""
         self._owners, self._kind, self._name = owners, kind, name
         self._ownership = Ownership(acting().name, private, token)
         self._taken_at_s: float | None = None
@@ -156,17 +152,14 @@ class Claim:
 
 
 def may_see(principal: Principal, ownership: Ownership) -> bool:
-    """Whether something is there at all, as a principal sees it."""
     return not ownership.private or may_change(principal, ownership)
 
 
 def may_change(principal: Principal, ownership: Ownership) -> bool:
-    """Whether a principal may delete, cancel or retry something."""
     return principal.role is Role.ADMIN or principal.name == ownership.owner
 
 
 def require_role(principal: Principal, operation: Operation) -> None:
-    """Raises PermissionDenied, which names the role."""
     if operation.role is not None and not principal.role.includes(operation.role):
         raise PermissionDenied(
             f"{operation.name} needs the role {operation.role.value}, and {principal.name} has {principal.role.value}"
@@ -174,8 +167,6 @@ def require_role(principal: Principal, operation: Operation) -> None:
 
 
 class Permissions:
-    """Whether a principal may do an operation on something."""
-
     def __init__(
         self,
         owners: Owners,
@@ -208,7 +199,6 @@ class Permissions:
 
 
 def _not_own(operation: Operation, name: str, owner: str | None) -> UltragrayError:
-    """The error at something that belongs to somebody else."""
     assert operation.about is not None
     whose = "nobody's" if owner is None else f"{owner}'s"
     return PermissionDenied(

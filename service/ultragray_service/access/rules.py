@@ -174,8 +174,6 @@ OPERATIONS = (
 
 
 class HttpRules:
-    """The operation of a request."""
-
     def __init__(self, operations: Iterable[Operation] = OPERATIONS) -> None:
         self._routes: dict[str, list[tuple[str, Operation]]] = {}
         for operation in operations:
@@ -198,14 +196,12 @@ class HttpRules:
         return None
 
     def require_all(self, routes: Iterable[tuple[str, str]]) -> None:
-        """Raises LookupError for a method and path that no rule names."""
         known = {(method, path) for method, found in self._routes.items() for path, _ in found}
         missing = sorted({(method, path) for method, path in routes if method not in ("HEAD", "OPTIONS")} - known)
         if missing:
             raise LookupError(f"access/rules.py does not say who may ask for {missing}")
 
     def routes(self) -> Iterator[tuple[str, str, Operation]]:
-        """Each method and path that there is a rule for."""
         for method, found in self._routes.items():
             for path, operation in found:
                 yield method, path, operation
@@ -221,6 +217,5 @@ IGTL = Operation(STREAM, _READER)
 
 
 def require_all_methods(methods: Iterable[str]) -> None:
-    """Raises LookupError for a method of gRPC ("/package.Service/Method") that no rule names."""
     if missing := sorted(set(methods) - GRPC_OPERATIONS.keys()):
         raise LookupError(f"access/rules.py does not say who may call {missing}")

@@ -54,9 +54,6 @@ def opened_database(where: dict[str, Any]) -> Iterator[JobDatabase]:
         database.close()
 
 
-# `ultragray keys …`: the named API keys of a service, in the database of its jobs.
-
-
 keys_app = command_group("They live in the installation's database; changes count within two seconds.")
 
 _KEY_COLUMNS = ("id", "name", "role", "state", "created", "expires", "last used", "limits")
@@ -176,9 +173,6 @@ def _time(at_s: float | None, otherwise: str) -> str:
     return datetime.fromtimestamp(at_s, timezone.utc).isoformat(sep=" ", timespec="minutes")
 
 
-# `ultragray audit`: who did what on a service, from the database of its jobs.
-
-
 _AUDIT_COLUMNS = ("time", "who", "address", "what", "target", "result", "facts")
 _HOUR_S = 3600.0
 
@@ -217,9 +211,6 @@ def audit(
 
 def _timestamp(at_s: float) -> str:
     return datetime.fromtimestamp(at_s, timezone.utc).isoformat(timespec="milliseconds")
-
-
-# `ultragray backup`: a whole installation into a folder.
 
 
 BackupFolder = Annotated[Path, argument("Folder of backups, on another disk than the data.", shown=False)]
@@ -292,7 +283,6 @@ def _verify(folder: Path, *, as_json: bool) -> None:
 
 
 def folders_of(settings: Settings) -> Folders:
-    """The folders that a backup saves. Raises InvalidArgument where they are in a bucket."""
     from ultragray_workers.backup.contents import Folders
 
     data, artifacts = settings.data_folder, settings.artifacts
@@ -306,22 +296,16 @@ def folders_of(settings: Settings) -> Folders:
 
 
 def in_words(manifest: Manifest) -> str:
-    """A backup in one sentence."""
     counts = ", ".join(f"{count:,} {what}" for what, count in manifest.counts.items())
     return f"backup {manifest.name}: {counts}; {len(manifest.files):,} files, {megabytes(manifest.bytes)}"
 
 
 def document_of(manifest: Manifest) -> dict[str, Any]:
-    """The same for a program."""
     return {"backup": manifest.name, **manifest.counts, "files": len(manifest.files), "bytes": manifest.bytes}
 
 
 def megabytes(size: int) -> str:
-    """A size for a person, in 10^6 bytes."""
     return f"{size / 1e6:,.1f} MB"
-
-
-# `ultragray restore`: an installation as it was at a backup.
 
 
 restore_app = command_group()
@@ -359,9 +343,6 @@ def restore(
         say=lambda sentence: typer.echo(sentence, err=True),
     )
     tell(f"restored {in_words(manifest)}", document_of(manifest), as_json=json)
-
-
-# `ultragray storage …`: the places in which an installation keeps its scenes and datasets.
 
 
 storage_app = command_group("A place is a folder, or a bucket: s3://BUCKET/PREFIX, gs://, az://.")

@@ -21,15 +21,12 @@ INTERRUPTED = 130  # the exit code of a command that Ctrl-C or SIGTERM stopped
 
 @dataclass(frozen=True)
 class Entry:
-    """A command of the group that is not loaded yet."""
-
     name: str
     app: str  # "module:name" of the typer app of the command, or of the group of commands; .module: of this package
     panel: str
     summary: str  # the first line of its help
 
     def load(self) -> Any:
-        """The command, or the group of commands, with its whole help. Imports its module."""
         module, _, name = self.app.partition(":")
         command = typer.main.get_command(getattr(import_module(module, __package__), name))
         command.name = self.name
@@ -43,8 +40,6 @@ class Entry:
 
 
 class _Loaded(Mapping[str, Any]):
-    """Commands of a group by name, each loaded when it is asked for."""
-
     def __init__(self, group: LazyGroup) -> None:
         self._group = group
 
@@ -94,11 +89,9 @@ class LazyGroup(TyperGroup):
         return {**{entry.name: entry for point in found for entry in _entries_of(point)}, **self._own}
 
     def entry(self, name: str) -> Entry | None:
-        """The entry of a command; None: there is none of that name."""
         return self._own.get(name) or self._all.get(name)
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """The names, the own ones first, in the order of the entries."""
         return [*self._own, *(name for name in self._all if name not in self._own)]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
@@ -107,7 +100,6 @@ class LazyGroup(TyperGroup):
         return None if entry is None else entry.described()
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """The command that the arguments begin with, loaded."""
         name, found, rest = super().resolve_command(ctx, args)
         entry = self.entry(name or "")
         return name, found if entry is None else entry.load(), rest
@@ -121,7 +113,6 @@ class LazyGroup(TyperGroup):
         windows_expand_args: bool = True,
         **extra: Any,
     ) -> Any:
-        """Run the command line; in standalone mode the process ends with its exit code."""
         prog_name = prog_name or "ultragray"  # also by `python -m` and the like
         if not standalone_mode:
             return super().main(args, prog_name, complete_var, False, windows_expand_args, **extra)
@@ -136,7 +127,6 @@ class LazyGroup(TyperGroup):
         raise SystemExit(code if isinstance(code, int) else 0)
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command; errors of the project and of the file system become a line and exit code 2."""
         from ultragray.errors import UltragrayError
         from ultragray.installation import missing_extra
 
@@ -159,7 +149,6 @@ def _say_error(message: str) -> None:
 
 
 def _in_one_line(error: typer.TyperException) -> str:
-    """The sentence of a mistake in the command line, with what was perhaps meant, and where the help is."""
     context = getattr(error, "ctx", None)
     option = getattr(error, "option_name", None)
     if option is not None and type(error).__name__ == "NoSuchOption":
@@ -194,9 +183,6 @@ def _options_of(context: Any) -> list[str]:
 def _perhaps(word: str, known: list[str]) -> str:
     found = get_close_matches(word, known, n=2)
     return f"; did you mean {' or '.join(found)}?" if found else ""
-
-
-# The command line `ultragray`. Its commands stand in one table here; each is imported when it is used.
 
 
 _SERVING, _SCENES, _SWEEPS = "Serve", "Scenes and frames", "Sweeps and training"

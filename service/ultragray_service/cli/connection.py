@@ -47,7 +47,6 @@ class Connection:
     """
 
     def __init__(self, address: str, api_key: str | None = None, tls: ssl.SSLContext | None = None) -> None:
-        """Connects to nothing yet. Raises InvalidArgument for an address that is not a URL."""
         parts = urlsplit(address)
         if parts.scheme not in ("http", "https") or not parts.netloc:
             raise InvalidArgument(
@@ -62,17 +61,14 @@ class Connection:
         self._headers = {} if api_key is None else {"X-API-Key": api_key}
 
     def json(self, method: str, route: str, body: Mapping[str, Any] | None = None) -> Any:
-        """The JSON of an answer; None where it has none."""
         with self.open(method, route, body) as answer:
             return self._document(self.whole(answer))
 
     def text(self, route: str) -> str:
-        """An answer that is text."""
         with self.open("GET", route, accept="*/*") as answer:
             return self.whole(answer).decode("utf-8", "replace")
 
     def whole(self, answer: http.client.HTTPResponse) -> bytes:
-        """All that is left of an answer. Raises NotReady where it breaks off."""
         try:
             return answer.read()
         except (OSError, http.client.HTTPException) as error:
@@ -96,7 +92,6 @@ class Connection:
     def open(
         self, method: str, route: str, body: Mapping[str, Any] | None = None, accept: str = JSON
     ) -> http.client.HTTPResponse:
-        """An answer that is still to be read."""
         content = None if body is None else json.dumps(body, default=str).encode()
         headers = self._headers | {"Accept": accept} | ({} if content is None else {"Content-Type": JSON})
         request = urllib.request.Request(self.address + route, content, headers, method=method)
@@ -203,15 +198,11 @@ class Connection:
 
 
 class _NoRedirect(urllib.request.HTTPRedirectHandler):
-    """Takes a redirection for the refusal that it is to us."""
-
     def redirect_request(self, *_: object) -> None:
         return None
 
 
 class _Counted:
-    """A file that tells how much of it was read."""
-
     def __init__(self, file: IO[bytes], count: Count) -> None:
         self._file, self._count = file, count
         self.is_begun = False
@@ -224,12 +215,10 @@ class _Counted:
 
 
 def route(*parts: str, suffix: str = "") -> str:
-    """The path of a resource, below /v1; `suffix` stands behind it as it is."""
     return "/v1/" + "/".join(quote(part, safe="") for part in parts) + suffix
 
 
 def _in_words(reason: object) -> str:
-    """Why a connection failed, without the number of the error."""
     if isinstance(reason, OSError) and reason.strerror:
         return reason.strerror.lower()
     return str(reason) or type(reason).__name__

@@ -183,7 +183,6 @@ def download(
 def _download_all(
     connection: Connection, job: str, names: list[str], folder: Path, *, as_json: bool, force: bool
 ) -> None:
-    """Downloads the files that are not in the folder yet, whole each."""
     folder.mkdir(parents=True, exist_ok=True)
     missing = [name for name in names if force or not (folder / Path(name).name).exists()]
     size = 0
@@ -224,7 +223,6 @@ def _submit(
 
 
 def _add_submit_command(kind: str, cls: type[Specification]) -> None:
-    """`jobs submit KIND`, with an option for each field of the specification."""
     hints = get_type_hints(_submit, include_extras=True)
     common = [
         parameter.replace(annotation=hints[parameter.name])
@@ -342,7 +340,6 @@ def amount(job: dict[str, Any]) -> str:
 
 
 def figures(job: dict[str, Any]) -> str:
-    """The figures of the progress that are known, in short."""
     progress = job["progress"]
     parts = []
     if progress["waits_for"] is not None:

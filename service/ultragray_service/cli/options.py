@@ -88,7 +88,6 @@ def _made(cls: Any, name: str, given: Mapping[str, Any]) -> Any:
 
 
 def with_parameters(command: Callable[..., Any], parameters: list[inspect.Parameter]) -> Callable[..., Any]:
-    """The command, as typer sees it, with these parameters."""
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return command
@@ -147,7 +146,6 @@ def _fields(cls: Any) -> Iterator[tuple[Field[Any], Any]]:
 
 
 def _is_within(kind: Any) -> bool:
-    """Tell whether the fields of this type have options of their own."""
     is_contract = isinstance(kind, type) and issubclass(kind, Contract)
     return is_contract and (not issubclass(kind, Family) or kind in _WITH_AN_OPTION_A_FIELD)
 
@@ -214,12 +212,10 @@ def poses_option(*, default: str) -> Any:
 
 
 def _signature(member: Any) -> str:
-    """A member of a family as JSON without its values."""
     return "{" + ", ".join([f'"kind": "{member.kind}"', *(f'"{item.name}": …' for item, _ in _fields(member))]) + "}"
 
 
 def keyword(name: str, annotation: Any, default: Any = inspect.Parameter.empty) -> inspect.Parameter:
-    """A parameter of a command, as typer annotates it."""
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
@@ -250,7 +246,6 @@ def _part(cls: Any, name: str, given: Mapping[str, Any]) -> Any:
 
 
 def _read(value: Any, kind: Any, name: str) -> Any:
-    """The value of an option in the type of its field."""
     if name in _FILES:
         return load_poses(value) if name == "poses" else load_tools(value)
     if get_origin(kind) is tuple:
@@ -277,7 +272,6 @@ def parse_settings(settings: list[str]) -> dict[str, Any]:
 
 
 def pairs_of(texts: list[str], flag: str) -> dict[str, str]:
-    """NAME=VALUE pairs as they were written. Raises InvalidArgument, naming the option."""
     found = {}
     for text in texts:
         name, equals, value = text.partition("=")

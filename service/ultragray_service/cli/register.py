@@ -115,9 +115,6 @@ def _in_words(found: Localization, output: Path | None) -> str:
     )
 
 
-# `ultragray calibrate …`: the frame of a robot or tracker registered to a scene.
-
-
 SUFFIXES = (".json",)
 calibrate_app = command_group(
     "What leads a robot's poses into a scene: probe→scene = base→scene · flange→base · probe→flange. For a tracked "

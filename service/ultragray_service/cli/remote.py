@@ -60,7 +60,6 @@ class _Resource:
     row: Callable[[dict[str, Any]], tuple[str, ...]]
 
     def add_list(self, meaning: str, *more: str) -> None:
-        """`list`: a table, or the documents of all."""
         line = f"ultragray {self.kind} list"
 
         @self.app.command("list", help=meaning, epilog=examples(line, *more or (f"{line} --json | jq '.[].name'",)))
@@ -73,8 +72,6 @@ class _Resource:
                 print_table(self.columns, map(self.row, found))
 
     def add_show(self, example: str, meaning: str, *more: str) -> None:
-        """`show`: the facts of one."""
-
         def show(connection: Connection, name: str, json: Json = False) -> None:
             found = connection.json("GET", route(self.kind, name))
             if json:
@@ -85,8 +82,6 @@ class _Resource:
         self._add("show", show, meaning, f"ultragray {self.kind} show {example}", *more)
 
     def add_delete(self, example: str, meaning: str) -> None:
-        """`delete`."""
-
         def delete(connection: Connection, name: str, json: Json = False) -> None:
             connection.json("DELETE", route(self.kind, name))
             tell(f"{name} deleted", {"deleted": name}, as_json=json)
@@ -94,7 +89,6 @@ class _Resource:
         self._add("delete", delete, meaning, f"ultragray {self.kind} delete {example}")
 
     def _add(self, name: str, command: Callable[..., None], meaning: str, *lines: str) -> None:
-        """Adds a command that takes the name of one."""
         argument = typer.Argument(metavar="NAME", help=f"Name of the {self.thing}.", show_default=False)
         command.__annotations__["name"] = Annotated[str, argument]
         self.app.command(name, help=meaning, epilog=examples(*lines))(with_connection(command))
@@ -106,9 +100,6 @@ def _time(text: str | None) -> str:
 
 def _owner(found: dict[str, Any]) -> str:
     return f"{found.get('owner') or ''}{' (private)' if found.get('private') else ''}"
-
-
-# Scenes.
 
 
 def _scene_row(scene: dict[str, Any]) -> tuple[str, ...]:
@@ -211,9 +202,6 @@ def render_scene(
         document,
         as_json=json,
     )
-
-
-# Datasets.
 
 
 def _dataset_row(record: dict[str, Any]) -> tuple[str, ...]:
@@ -333,9 +321,6 @@ def _is_hidden(path: Path, folder: Path) -> bool:
     return any(part.startswith(".") for part in path.relative_to(folder).parts)
 
 
-# Registrations.
-
-
 def _registration_row(found: dict[str, Any]) -> tuple[str, ...]:
     residual_mm = found["residual_mm"]
     return (
@@ -384,9 +369,6 @@ def upload_registration(
 
 
 _registrations.add_delete("robot", "Forget a registration. Jobs that were accepted with it keep it.")
-
-
-# Workers.
 
 
 def _worker_row(worker: dict[str, Any]) -> tuple[str, ...]:

@@ -27,8 +27,6 @@ FRAMES_FILE = "frames.json"
 
 @dataclass(frozen=True)
 class RenderRequest:
-    """What a command line asks for. Raises InvalidArgument for a registration that has no poses to lead."""
-
     scene: str
     output: Path
     suffix: str | None  # of SUFFIXES; None: a folder of PNGs
@@ -65,7 +63,6 @@ def checked_kind(output: Path, settings: FrameSettings, *, force: bool) -> str |
 
 
 def render_remotely(connection: Connection, request: RenderRequest) -> dict[str, Any]:
-    """Write the frames; what they are, for a program. Raises InvalidArgument and what the connection raises."""
     given = None if request.pose_file is None else load_poses(request.pose_file)
     poses = _poses(connection, request, given)
     settings = to_dict(request.settings, with_none=False)
@@ -132,13 +129,10 @@ def _write_folder(connection: Connection, request: RenderRequest, settings: dict
 
 @dataclass(frozen=True)
 class _Answer:
-    """Rendered frames as the service encoded them, and what its headers say about them."""
-
     data: bytes
     headers: dict[str, str]
 
     def fact(self, name: str) -> Any:
-        """A header that holds JSON, by the end of its name; None where it is not there."""
         text = self.headers.get(f"x-ultragray-{name}")
         return None if text is None else json.loads(text)
 
@@ -149,7 +143,6 @@ def _rendered(connection: Connection, scene: str, body: dict[str, Any], media_ty
 
 
 def _training_poses(connection: Connection, scene: str) -> FloatArray:  # [P, 4, 4] mm
-    """The poses that a scene was trained from, at most 10,000 of them."""
     found = connection.json("GET", route("scenes", scene, "training-poses"))
     return check_poses(np.array(found["poses"], np.float64).reshape(-1, 4, 4))
 

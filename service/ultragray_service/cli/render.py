@@ -113,7 +113,6 @@ def render(
 
 @contextlib.contextmanager
 def _probe_as_an_option() -> Iterator[None]:
-    """Tells of a probe as the command line calls it."""
     try:
         yield
     except InvalidProbe as error:
@@ -151,7 +150,6 @@ class Task:
 
     @classmethod
     def prepared(cls, scene_file: Path, pose_file: Path | None, sampler: Sampler | None, asked: FrameSettings) -> Task:
-        """The task of a command line. Raises InvalidArgument and its kind, SceneFileInvalid."""
         given_poses = None if pose_file is None else load_poses(pose_file)
         header = read_header(scene_file)
         with _probe_as_an_option():
@@ -231,7 +229,6 @@ def plan_of_shards(
     dtype: str | None,
     shard_frames: int | None,
 ) -> BatchPlan:
-    """The batch of a command line. Raises InvalidArgument and its kind, SceneFileInvalid."""
     poses = None if pose_file is None else load_poses(pose_file)
     header = read_header(scene_file)
     if settings.least_confidence is not None and sampler is not None:

@@ -65,9 +65,6 @@ def demo(
     )
 
 
-# `ultragray show`: the description of a scene file or of a sweep, as a table or as JSON.
-
-
 show_app = command_group()
 
 
@@ -102,7 +99,6 @@ def show(
 
 
 def describe_scene(path: Path) -> dict[str, Any]:
-    """The fields of SceneInfo without hardness, the file, and a summary of the poses. Raises SceneFileInvalid."""
     from ultragray.files import file_sha256
     from ultragray.scene.info import read_header
 
@@ -138,9 +134,6 @@ def _describe_sweep(source: str, options: SourceOptions) -> dict[str, Any]:
         "position_min_mm": positions.min(axis=0).tolist(),
         "position_max_mm": positions.max(axis=0).tolist(),
     }
-
-
-# `ultragray export`: a scene for other programs.
 
 
 EXCHANGED = (".ply", ".pt")
@@ -206,9 +199,6 @@ def _write_checkpoint(scene: GaussianScene, output: Path, replace: bool) -> dict
         "centre_mm": [float(one) for one in written.centre_mm],
         "notes": list(written.notes),
     }
-
-
-# `ultragray import`: a scene file out of what other programs wrote, told apart by the name's ending.
 
 
 _CHECKPOINT = "Checkpoint (.pt)"
@@ -304,9 +294,6 @@ def import_scene(
     tell(f"wrote {output}: {scene.gaussian_count:,} Gaussians, {place}", document, as_json=json)
 
 
-# `ultragray voxelize`: a scene's fields as a volume, or as a slice.
-
-
 RIGHT, DOWN = "1,0,0", "0,0,1"
 voxelize_app = command_group()
 
@@ -380,11 +367,7 @@ def voxelize(
 
 
 def _is_beyond(info: SceneInfo, low: Sequence[float], high: Sequence[float]) -> bool:  # [3] mm both
-    """Whether a box lies beyond the centres of all Gaussians."""
     return any(map(lt, high, info.bounds_min_mm)) or any(map(gt, low, info.bounds_max_mm))
-
-
-# `ultragray slicer`: a scene file of 3D Slicer, connected to the service that serves a scene.
 
 
 slicer_app = command_group()

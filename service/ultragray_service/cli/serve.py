@@ -112,7 +112,6 @@ def ensure_scenes(folder: Path) -> None:
 
 
 def link_scenes(files: Iterable[Path], folder: Path) -> None:
-    """Link scene files into `folder`; refuse what could not be served under its own name."""
     for file in files:
         read_header(file)
         link = folder / f"{file.stem}{SUFFIX}"

@@ -45,7 +45,6 @@ def check_source(source: str) -> None:
 
 
 def read_dataset(source: str, options: SourceOptions) -> Dataset:
-    """The dataset that a command's argument and options name. Raises DatasetInvalid and InvalidArgument."""
     if source == PHANTOM:
         typer.echo("simulating the phantom …", err=True)
         return load_dataset(source, options)
@@ -55,7 +54,6 @@ def read_dataset(source: str, options: SourceOptions) -> Dataset:
 
 
 def warn_about_dataset(dataset: Dataset) -> None:
-    """Say on stderr what `ultragray check` warns of."""
     from ultragray.datasets.checks import check_dataset
 
     for text in check_dataset(dataset).labelled_warnings:
@@ -68,9 +66,6 @@ def check_scene_fits(info: SceneInfo, dataset: Dataset) -> None:
 
     for text in check_same_origin(info, dataset):
         warn(text)
-
-
-# `ultragray check`: what is in a sweep, and what looks wrong about it.
 
 
 check_app = command_group()
@@ -146,9 +141,6 @@ def _range(part: SweepReport, axis: int) -> str:
     return f"{part.extent_min_mm[axis]:.1f} … {part.extent_max_mm[axis]:.1f}"
 
 
-# `ultragray draw`: the image planes of a sweep in space, and a contact sheet of its frames.
-
-
 draw_app = command_group()
 
 
@@ -169,9 +161,6 @@ def draw(
 
     draw_dataset(read_dataset(sweep, source), output)
     tell(f"wrote {output}", {"output": str(output)}, as_json=json)
-
-
-# `ultragray convert`: a sweep in the layout of the released trainer.
 
 
 convert_app = command_group()
@@ -221,7 +210,6 @@ def convert(
 
 
 def _with_poses_of(path: Path | None, header: SceneHeader, dataset: Dataset) -> Dataset:
-    """The dataset with a scene's corrected training poses."""
     if header.info.dataset_sha256 != dataset.sha256:
         raise InvalidArgument(
             f"{path} was trained from {header.info.dataset_name or 'other data'}, not from {dataset.name} split as "

@@ -33,14 +33,12 @@ SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.u
 
 
 def command_group(help: str | None = None) -> typer.Typer:
-    """A typer app for one command, or for a group of commands."""
     return typer.Typer(
         add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode="rich", help=help
     )
 
 
 def examples(*lines: str) -> str:
-    """The epilogue of a help: each line is a command that a shell takes as it stands, or a # comment."""
     return "\n\n".join(("[bold]Examples[/bold]", *(line.replace("[", r"\[") for line in lines)))
 
 
@@ -50,7 +48,6 @@ def option(help: str, *flags: str, shown: str | bool = True, panel: str | None =
 
 
 def argument(help: str, *, shown: str | bool = True, **others: Any) -> Any:
-    """An argument of a command."""
     return typer.Argument(help=help, show_default=shown, **others)
 
 
@@ -61,7 +58,6 @@ def output_option(help: str, *, default: str | None = None) -> Any:
 
 
 def tell(sentence: str, document: Any, *, as_json: bool) -> None:
-    """Print what a command did, as one sentence for a person or as a JSON document for a program."""
     typer.echo(to_json(document) if as_json else sentence)
 
 
@@ -79,16 +75,11 @@ def _finite(value: Any) -> Any:
 
 
 def frames_in_words(count: int) -> str:
-    """Such as `1 frame` or `1,200 frames`."""
     return f"{count:,} frame{'' if count == 1 else 's'}"
 
 
 def warn(text: str) -> None:
-    """A warning on stderr."""
     typer.secho(f"warning: {text}", fg=typer.colors.YELLOW, err=True)
-
-
-# Where a command writes: checked before the work starts. What exists is replaced only with --force.
 
 
 SCENE_SUFFIX = ".ugr"  # the service lists no other files
@@ -142,12 +133,10 @@ def check_ending(path: Path, suffixes: Sequence[str], *, otherwise: str = "") ->
 
 
 def is_folder_name(path: Path) -> bool:
-    """Whether a name that no format claims stands for a folder: it has no ending, or it is one already."""
     return path.is_dir() or not path.suffix
 
 
 def print_facts(document: dict[str, Any]) -> None:
-    """A table of names and values for a person; what is unknown is left out."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -177,7 +166,6 @@ def _text(value: Any) -> str:
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print rows under their columns; the first column is never cut."""
     from rich.markup import escape
     from rich.table import Table
 
@@ -196,9 +184,6 @@ def wide_console() -> Console:
     if not console.is_terminal:
         console.width = _PIPE_COLUMNS
     return console
-
-
-# Progress of a command on standard error: a bar on a terminal, elsewhere nothing or a line a step.
 
 
 @contextlib.contextmanager
@@ -258,9 +243,6 @@ def working(what: str) -> Iterator[None]:
             yield
     else:
         yield
-
-
-# Commands that end with something to go on from when Ctrl-C or SIGTERM asks them to stop.
 
 
 @contextlib.contextmanager

@@ -126,8 +126,6 @@ def train(
 
 @dataclass(frozen=True)
 class RunOptions:
-    """The place and the means of a run; none of it changes the scene on one thread."""
-
     output: Path
     folder: Path
     resume: bool
@@ -138,7 +136,6 @@ class RunOptions:
 
 
 def _check_no_run(run: RunOptions, *, force: bool) -> None:
-    """Raise TrainingStateInvalid where the folder of the run holds one that was stopped, and is not to be replaced."""
     if not run.folder.is_dir() or force:
         return
     from ultragray.learn.training.trainer import CHECKPOINT_FILE
@@ -150,14 +147,12 @@ def _check_no_run(run: RunOptions, *, force: bool) -> None:
 
 
 def _forget_run(run: RunOptions) -> None:
-    """Remove the checkpoint of a run that is begun anew."""
     from ultragray.learn.training.trainer import CHECKPOINT_FILE
 
     (run.folder / CHECKPOINT_FILE).unlink(missing_ok=True)
 
 
 def _check_resumable(run: RunOptions) -> None:
-    """Raise TrainingStateInvalid, with the reason, where the folder of the run holds no checkpoint."""
     if not run.folder.is_dir():
         raise TrainingStateInvalid(f"{run.folder}: no such folder, so there is no checkpoint to resume from")
     from ultragray.learn.training.trainer import CHECKPOINT_FILE, CONFIG_FILE, JOURNAL_FILE
@@ -262,7 +257,6 @@ def _train(dataset: Any, config: TrainingConfig, run: RunOptions, *, as_json: bo
 
 
 def _cost(state: Progress) -> str:
-    """The time of a step at the end, and the most memory of a GPU that was in use."""
     step = f"{1000.0 / state.steps_per_s:.1f} ms a step"
     return step if state.peak_memory_mb is None else f"{step}, at most {state.peak_memory_mb:,.0f} MB of the GPU"
 

@@ -31,7 +31,6 @@ class FrameFacts:
 
     @classmethod
     def of(cls, result: RenderResult, **others: Any) -> Self:
-        """The facts of a result of one pose; `others` are what else the class has."""
         return cls(
             scene=result.scene,
             scene_sha256=result.scene_sha256,
@@ -72,7 +71,6 @@ class SliceFacts:
 
     @classmethod
     def of(cls, result: RenderResult[SliceView]) -> SliceFacts:
-        """The facts of a result of one slice."""
         view = result.settings
         return cls(
             scene=result.scene,

@@ -33,7 +33,6 @@ class Position:
 
     @classmethod
     def of(cls, point: Any) -> Position:  # [3] mm
-        """The point of three numbers."""
         x, y, z = (float(value) for value in point)
         return cls(x, y, z)
 
@@ -88,7 +87,6 @@ class PoseInBothForms:
 
     @classmethod
     def of(cls, pose: FloatArray) -> PoseInBothForms:  # [4, 4] mm
-        """The forms of a pose."""
         return cls(pose.tolist(), Position.of(pose[:3, 3]), Quaternion(*quaternion_from_pose(pose)))
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> FloatArray:  # [4, 4] mm
@@ -96,7 +94,6 @@ class PoseInBothForms:
 
 
 def exact_pose(matrix: Any, path: str) -> FloatArray:  # [4, 4] mm
-    """The exact pose of a 4x4 matrix. Raises InvalidPose."""
     pose: FloatArray = check_poses(matrix, field=path)[0]
     return pose
 
@@ -111,7 +108,6 @@ async def exact_poses(count: int, pose: Callable[[int], FloatArray]) -> FloatArr
 
 
 def check_pose_count(count: int, limit: int) -> None:
-    """Raises TooManyPoses above `limit`, InvalidArgument for none."""
     if count > limit:
         raise TooManyPoses(f"poses must be at most {limit}, got {count}", field="poses")
     if count == 0:

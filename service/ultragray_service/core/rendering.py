@@ -67,7 +67,6 @@ class Plan(Generic[S]):
         self.registration = registration
 
     def placed(self, poses: FloatArray) -> FloatArray:  # [..., 4, 4] mm, exact, both
-        """The poses probe→scene of those that the client sent."""
         return poses if self.registration is None else self.registration.probe_to_scene(poses)
 
     async def renew(self) -> None:
@@ -78,27 +77,22 @@ class Plan(Generic[S]):
 
 
 def as_resolved(settings: Resolved) -> Resolved:
-    """The settings as they are."""
     return settings
 
 
 class RequestPlanner:
-    """Checks requests against the scenes and the limits of the service."""
-
     def __init__(
         self,
         settings: Settings,
         catalog: SceneCatalog,
         registration: Callable[[str, str], Awaitable[Registration]],
     ) -> None:
-        """`registration`: finds that of a name, for a scene."""
         self._settings = settings
         self._catalog = catalog
         self._registration = registration
 
     @property
     def max_poses(self) -> int:
-        """Poses that one call may carry."""
         return self._settings.max_poses_per_request
 
     @property
@@ -190,8 +184,6 @@ class RequestPlanner:
 
 
 class Rendering:
-    """Frames for plans, from the pool: what every door asks for, whether once or in a stream."""
-
     def __init__(
         self, pool: RenderPool, planner: RequestPlanner, life: Life, owners: Owners, limits: Limits, metrics: Metrics
     ) -> None:
@@ -199,7 +191,6 @@ class Rendering:
         self._owners = owners
 
     def require_frames(self) -> None:
-        """Raises NotReady or Draining, saying why no frame would be rendered now."""
         self.life.require_serving()
         if not self.pool.ready:
             raise NotReady("no render process is alive and gets on with its work at the moment")

@@ -53,7 +53,6 @@ class ScenePlaces(Collector):
     """`data`, whose scenes are the operator's, and `made`, whose scenes were imported or made by jobs."""
 
     def __init__(self, settings: Settings) -> None:
-        """Raises StartupFailed for a data folder that does not exist, ExtraMissing, InvalidArgument."""
         if isinstance(settings.data_folder, Path) and not settings.data_folder.is_dir():
             raise StartupFailed(
                 f"data_folder must be an existing folder, got {str(settings.data_folder)!r}", field="data_folder"
@@ -65,12 +64,10 @@ class ScenePlaces(Collector):
 
     @property
     def buckets(self) -> tuple[BucketShelf, ...]:
-        """Those of the two that are in a bucket."""
         return tuple(self._buckets())
 
     @property
     def problem(self) -> StorageUnavailable | None:
-        """What keeps a list of scenes from being read; None: nothing does."""
         return next((one.index.problem for one in self.buckets if one.index.problem is not None), None)
 
     @property
@@ -79,7 +76,6 @@ class ScenePlaces(Collector):
         return next((one.index.problem for one in self.buckets if not one.index.is_usable), None)
 
     def collect(self) -> Iterator[Metric]:
-        """What Prometheus shows of the cache and the buckets."""
         buckets, counts = self.buckets, self.cache.counts
         counter, gauge = CounterMetricFamily, GaugeMetricFamily
         yield counter("ultragray_scene_cache_hits", "Requests whose scene was cached.", counts.hits)
@@ -94,14 +90,12 @@ class ScenePlaces(Collector):
         yield gauge("ultragray_scene_list_age_seconds", "Age of the oldest list of the scenes of a bucket.", age)
 
     async def open(self) -> None:
-        """Reads the lists of scenes, and follows their changes."""
         for bucket in self.buckets:
             with suppress(StorageUnavailable):  # told by health, and read as soon as it can be
                 await asyncio.to_thread(bucket.index.read)
             bucket.follow()
 
     async def close(self) -> None:
-        """Follows them no more."""
         for bucket in self.buckets:
             await asyncio.to_thread(bucket.close)
 
@@ -116,9 +110,6 @@ class ScenePlaces(Collector):
         for shelf in (self.data, self.made):
             if isinstance(shelf, BucketShelf):
                 yield shelf
-
-
-# Facts about scenes, read from their files without blocking the event loop.
 
 
 T = TypeVar("T")
@@ -140,8 +131,6 @@ class CatalogEntry:
 
 
 class SceneCatalog:
-    """Headers, pages of scene names, and Gaussians as points."""
-
     def __init__(self, store: SceneStore) -> None:
         self._store = store
         self._reading_points = asyncio.Lock()
@@ -153,13 +142,11 @@ class SceneCatalog:
             return cached[1] if cached is not None else await _fetched(self._store.header, name)
 
     async def versioned_header(self, name: str) -> tuple[FileVersion, SceneHeader]:
-        """The same, with the version of the file that it is of."""
         with scene_to_blame():
             cached = self._store.cached_versioned_header(name)
             return cached if cached is not None else await _fetched(self._store.versioned_header, name)
 
     async def version(self, name: str) -> FileVersion:
-        """The version of the content that the file of a scene has now. Raises SceneNotFound, SceneFileInvalid."""
         with scene_to_blame():
             return await asyncio.to_thread(self._store.version, name)
 
@@ -175,7 +162,6 @@ class SceneCatalog:
                 return await in_own_thread(lambda: point_message(path, header.info, limit, fields))
 
     async def names(self) -> list[str]:
-        """The names of the scenes that the caller may see, sorted."""
         return await asyncio.to_thread(self.shown_names)
 
     def shown_names(self) -> list[str]:
@@ -262,9 +248,6 @@ def _name_of_token(token: str) -> str:
         ) from None
 
 
-# Scenes as all front doors tell them.
-
-
 @dataclass(frozen=True)
 class SceneEntry:
     """A scene in the list. A file that cannot be read has `error`, and null for what is in the file."""
@@ -313,7 +296,6 @@ class TrainingPoses:
 
     @classmethod
     def of(cls, header: SceneHeader) -> TrainingPoses:
-        """The training poses of a scene, in short."""
         poses = header.training_poses
         if not len(poses):
             return cls(count=0)
@@ -373,7 +355,6 @@ class Scene:
 
     @classmethod
     def of(cls, name: str, header: SceneHeader, loaded_processes: int, ownership: Ownership) -> Scene:
-        """The scene of a header, which so many render processes hold."""
         info, model = header.info, read_model(header.info.confidence, len(header.training_poses))
         return cls(
             name=name,
@@ -411,13 +392,10 @@ class SceneLoaded:
 
     @classmethod
     def of(cls, scene: str, loaded_processes: int) -> SceneLoaded:
-        """The scene, which so many render processes hold."""
         return cls(base_name(scene), loaded_processes > 0, loaded_processes)
 
 
 class Scenes:
-    """The scenes of the service as all front doors tell them: read, listed, and loaded into the render processes."""
-
     def __init__(
         self,
         catalog: SceneCatalog,
@@ -431,12 +409,10 @@ class Scenes:
         self._pool, self._owners, self._life = pool, owners, life
 
     async def get(self, name: str) -> Scene:
-        """All about one scene. Raises SceneNotFound, SceneFileInvalid."""
         header, name = await self._catalog.header(name), base_name(name)
         return Scene.of(name, header, self._pool.loaded().get(name, 0), self._owners.known(Kind.SCENE, name))
 
     async def page(self, page_size: int, page_token: str) -> ScenePage:
-        """One page of scenes by name. Raises InvalidArgument."""
         entries, next_page_token = await self._catalog.page(page_size, page_token)
         loaded, removable = self._pool.loaded(), await asyncio.to_thread(self._store.names_of, self._places.made)
         rows = [
@@ -446,11 +422,9 @@ class Scenes:
         return ScenePage(rows, next_page_token)
 
     async def load(self, scene: str) -> SceneLoaded:
-        """Loads a scene into every process. Raises SceneNotFound, SceneFileInvalid, SceneTooLarge."""
         return await self._changed(self._pool.load, scene)
 
     async def unload(self, scene: str) -> SceneLoaded:
-        """Frees a scene. Raises SceneNotFound."""
         return await self._changed(self._pool.unload, scene)
 
     async def _changed(self, change: Callable[[str], Awaitable[None]], scene: str) -> SceneLoaded:

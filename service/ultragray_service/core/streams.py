@@ -55,8 +55,6 @@ class _Underway:
 
 
 class _Room:
-    """For answers under way: a few, and of large frames fewer."""
-
     def __init__(self) -> None:
         self._count = self._bytes = 0
         self._left = asyncio.Event()
@@ -70,7 +68,6 @@ class _Room:
         self._bytes += size
 
     def leave(self, size: int) -> None:
-        """The answer is sent."""
         self._count -= 1
         self._bytes -= size
         self._left.set()
@@ -89,7 +86,6 @@ class _Window:
         self._entered: deque[int] = deque()  # sequences, in the order of the answers
 
     def open(self, size: int) -> None:
-        """The client acknowledges from now on."""
         self._size = size
 
     @property
@@ -101,11 +97,9 @@ class _Window:
         return len(self._entered) < (1 if self._size is None else self._size)
 
     def enter(self, sequence: int) -> None:
-        """An answer is ready to be sent."""
         self._entered.append(sequence)
 
     def sent(self) -> None:
-        """The transport has done with the oldest answer."""
         if self._size is None:
             self._entered.popleft()
 
@@ -117,10 +111,7 @@ class _Window:
 
 
 class PoseStream:
-    """One stream of one client."""
-
     def __init__(self, rendering: Rendering, record: OpenStream | None = None) -> None:
-        """`record`: where others may see what is asked and answered."""
         self.mode = StreamMode.ORDERED  # to be set before the first pose, likewise:
         self.destination: Destination | None = None  # of its frames
         self._rendering = rendering
@@ -187,11 +178,9 @@ class PoseStream:
         self._advance()
 
     def open_window(self, size: int) -> None:
-        """The client of a latest stream acknowledges answers, and wants so many of them ahead."""
         self._window.open(size)
 
     def acknowledge(self, sequence: int) -> None:
-        """The client has taken the answer of that sequence."""
         self._window.acknowledge(sequence)
         self._advance()
 
@@ -306,9 +295,6 @@ def unexpected(error: Exception) -> UltragrayError:
 
 def _cancel(task: asyncio.Task[None], _: asyncio.Future[bool]) -> None:
     task.cancel()
-
-
-# A stream of one client: its messages in their order, whatever they come through.
 
 
 MAX_TIMEOUT_MS = 3_600_000.0
@@ -442,7 +428,6 @@ class FrameStream:
 
 
 def checked_s(name: str, milliseconds: float) -> float:
-    """The seconds of a time that a client gave as the field `name`. Raises InvalidArgument."""
     if not 0.0 < milliseconds <= MAX_TIMEOUT_MS:
         raise InvalidArgument(
             f"{name} must be above 0 and at most {MAX_TIMEOUT_MS:g}, got {milliseconds:g}", field=name

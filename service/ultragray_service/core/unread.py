@@ -20,9 +20,6 @@ def hold_little(transport: asyncio.BaseTransport) -> None:
         endpoint.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_BYTES)
 
 
-# Bytes that a client has not read yet, as the kernel of the service knows them of a TCP connection.
-
-
 _POLL_S = 0.004
 _QUIET_S = 0.25  # a client that sends nothing tells nothing about its window
 _LONGEST_S = 5.0  # for a client whose window shrank for good
@@ -68,7 +65,6 @@ class Unread:
                 self._socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
 
     def write(self, message: bytes) -> None:
-        """Gives a message to the transport, which must not gather what it is given."""
         if (state := self._state()) is not None:
             self._window_bytes = max(self._window_bytes, state.window_bytes)
         self._message_bytes = len(message)

@@ -58,22 +58,15 @@ async def arrival(arriving: Awaitable[T], idle_timeout_s: float, stopping: async
         work.cancel()
 
 
-# Limits of what the owners of jobs, datasets and scenes have, on all services of the database together.
-
-
 class Room:
-    """The bytes that an upload may still store, of those that its key may."""
-
     def __init__(self, limits: Limits, left_bytes: int | None) -> None:
         self._limits, self._left_bytes = limits, left_bytes
 
     def at_most(self, max_bytes: int) -> int:
-        """The largest upload, where any may have `max_bytes`."""
         return max_bytes if self._left_bytes is None else min(max_bytes, self._left_bytes)
 
     @contextmanager
     def to_blame(self, max_bytes: int) -> Iterator[None]:
-        """Raises LimitReached where the body finds an upload too large that other keys might store."""
         try:
             yield
         except UploadTooLarge:
@@ -83,8 +76,6 @@ class Room:
 
 
 class Quotas:
-    """What whoever the running code works for has, and whether there may be more."""
-
     def __init__(self, limits: Limits, owners: Owners, datasets: DatasetStore, scenes: SceneStore) -> None:
         self._limits, self._owners = limits, owners
         self._datasets, self._scenes = datasets, scenes
@@ -115,7 +106,6 @@ class Quotas:
         return mine.running_jobs
 
     async def room(self, jobs: Jobs) -> Room:
-        """The room for an upload. Raises LimitReached where there is none."""
         if self._limits.mine.stored_gb is None:
             return Room(self._limits, None)
         return Room(self._limits, await jobs.do(self._left_bytes))
@@ -149,9 +139,6 @@ def _too_many_bytes(limit_gb: float | None) -> LimitReached:
 
 def _next_day(now: datetime) -> datetime:
     return datetime.combine(now.date() + timedelta(days=1), time(), timezone.utc)
-
-
-# Uploads of datasets, from either front door: to the disk as they come, then checked in a process of their own.
 
 
 MAX_UPLOADS = 8
@@ -214,14 +201,11 @@ class DatasetUploads:
                 stopping.cancel()
 
     async def remove_stale(self) -> None:
-        """Removes what uploads of dead services left."""
         if removed := await asyncio.to_thread(remove_stale, self._store):
             _log.info(f"removed {removed} uploads and deletions that were not finished")
 
 
 class DatasetUpload:
-    """One upload: files or an archive, a block at a time, then the check."""
-
     def __init__(
         self,
         incoming: IncomingDataset,
@@ -252,16 +236,13 @@ class DatasetUpload:
         return await arrival(arriving, self._settings.upload_idle_timeout_s, self._stopping)
 
     async def begin_file(self, name: str) -> None:
-        """Begin the file `name`. Raises DatasetInvalid, UploadTooLarge, StorageFull."""
         await self._flush()
         await asyncio.to_thread(self._incoming.begin_file, name)
 
     async def begin_archive(self) -> None:
-        """Begin the one archive. Raises StorageFull."""
         await asyncio.to_thread(self._incoming.begin_archive)
 
     async def write(self, data: bytes) -> None:
-        """Raises UploadTooLarge, StorageFull, DatasetInvalid."""
         self._block += data
         if len(self._block) >= _BLOCK_BYTES:
             await self._flush()
@@ -317,16 +298,11 @@ class DatasetUpload:
             pass
 
 
-# Scenes that clients send and delete: they lie beside those that jobs make.
-
-
 SCENE_CHECK_TIMEOUT_S = 600.0
 MAX_IMPORTS = 4
 
 
 class SceneImports:
-    """Takes scene files in, whole or not at all, and removes them."""
-
     def __init__(
         self,
         store: SceneStore,
@@ -337,7 +313,6 @@ class SceneImports:
         owners: Owners,
         quotas: Quotas,
     ) -> None:
-        """`shelf`: of the store, for what is imported."""
         self._store = store
         self._settings = settings
         self._jobs = jobs
@@ -394,14 +369,11 @@ class SceneImports:
         return header
 
     async def delete(self, name: str) -> None:
-        """Removes the file of a scene. Raises SceneNotFound, and SceneReadOnly for one of the data folder."""
         await asyncio.to_thread(self._store.require, name)
         async with self._owners.removing(Kind.SCENE, name):
             await asyncio.to_thread(self._delete, name)
 
     async def remove_stale(self) -> None:
-        """Removes what services that died during an import left."""
-
         await asyncio.to_thread(self._shelf.remove_abandoned)
 
     async def _write(self, path: Path, blocks: AsyncIterator[bytes], max_bytes: int) -> None:

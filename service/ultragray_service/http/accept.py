@@ -90,7 +90,6 @@ def choose(accept: str, *, frames: int, outputs: int, dtype: str | None, lossles
 
 
 def choose_of_slice(accept: str) -> str:
-    """The media type of a slice: PNG, npy or raw numbers. Raises NotAcceptable."""
     return _best(accept, SLICE_TYPES, "a slice")[0]
 
 

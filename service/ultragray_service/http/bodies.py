@@ -57,7 +57,6 @@ class Apart:
 
 
 async def read_large(body: bytes, cls: type[T], apart: Apart | None, read_small: ReadSmall) -> T:
-    """The body, checked as a small one would be. Raises BodyTooLarge, InvalidArgument and what the classes raise."""
     if apart is not None and len(body) > apart.max_bytes:
         raise BodyTooLarge(f"this body must be at most {apart.max_bytes} bytes, got {len(body)}", field="body")
     return await asyncio.get_running_loop().run_in_executor(_READER, _read, body, cls, apart, read_small)
@@ -110,7 +109,6 @@ def _element(apart: Apart, index: int, value: Any, read_small: ReadSmall) -> Any
 
 
 def _is_small(value: Any, most: int) -> bool:
-    """Whether a value holds at most `most` others, and no long text."""
     waiting, values, characters = [value], 0, 0
     while waiting and values <= most and characters <= INLINE_BYTES:
         one = waiting.pop()
@@ -124,12 +122,8 @@ def _is_small(value: Any, most: int) -> bool:
     return not waiting and values <= most and characters <= INLINE_BYTES
 
 
-# JSON bodies, read as the classes of the contract.
-
-
 @cache
 def adapter_of(cls: Any) -> TypeAdapter[Any]:
-    """The reader and writer of a class's JSON."""
     return TypeAdapter(cls)
 
 
@@ -157,7 +151,6 @@ async def read_json_body(request: Request, cls: type[T], apart: Apart | None = N
 
 
 def read_json(text: str | bytes, cls: type[T]) -> T:
-    """The value of a JSON text. Raises InvalidArgument, and what the class raises."""
     try:
         kind: Any = cls
         value: T = adapter_of(kind).validate_json(text)
@@ -166,14 +159,10 @@ def read_json(text: str | bytes, cls: type[T]) -> T:
     return value
 
 
-# Bodies of HTTP and messages over a WebSocket: the contract's settings, with poses and the times of a request.
-
-
 _POSE_BYTES = 1024  # with room for indentation
 
 
 def _many_poses(limit: int) -> Apart:
-    """The part of a body that may be large."""
     return Apart(
         "poses",
         list,
@@ -298,7 +287,6 @@ def _again(item: Field[Any]) -> Any:
 
 
 def _without_arrays(annotation: Any) -> Any:
-    """An annotation without the arrays that it allows beside lists."""
     kinds = [one for one in get_args(annotation) if getattr(one, "__origin__", None) is not np.ndarray]
     if len(kinds) == len(get_args(annotation)):
         return annotation
@@ -333,14 +321,8 @@ class JobBody(Contract):
     private: bool = described("Whether others may not see it, nor the scene that it makes.", False)
 
 
-# The files of a multipart/form-data body, as they come.
-
-
 class FileParts:
-    """Turns blocks of the body into the names and the bytes of its files."""
-
     def __init__(self, content_type: str) -> None:
-        """Raises InvalidArgument for a Content-Type without a boundary."""
         _, parameters = parse_options_header(content_type)
         boundary = parameters.get(b"boundary", b"")
         self._events: list[str | bytes] = []
@@ -378,7 +360,6 @@ class FileParts:
         return events
 
     def finish(self) -> None:
-        """Raises InvalidArgument where the body ended too early."""
         if not self._complete:
             raise InvalidArgument("the body is truncated: its last boundary is missing", field="body")
 

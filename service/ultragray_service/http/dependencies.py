@@ -71,9 +71,6 @@ _MEANINGS = {
 }
 
 
-# Work that is abandoned when its client goes away or its time is up.
-
-
 T = TypeVar("T")
 
 
@@ -103,9 +100,6 @@ async def _disconnected(receive: Receive) -> None:
         pass
 
 
-# Answers that a client keeps and asks about: sent again only where they changed.
-
-
 NOT_MODIFIED = "It is as the client has it (If-None-Match)."
 
 
@@ -120,9 +114,6 @@ async def revalidated(request: Request, version: str, make: Callable[[], Awaitab
     answer.headers["ETag"] = tag
     answer.headers.setdefault("Cache-Control", "private, no-cache")
     return answer
-
-
-# The examples of the documentation. They work when pasted against the demo scene.
 
 
 DEMO_SCENE = "demo"

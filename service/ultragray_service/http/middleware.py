@@ -145,7 +145,6 @@ class Authorize:
                 await send({"type": "websocket.close", "code": _POLICY_VIOLATION, "reason": error.reason})
 
     async def _permitted(self, operation: Operation, target: str, scope: Scope, receive: Receive, send: Send) -> None:
-        """Raises Unauthenticated, RateLimited, PermissionDenied, JobNotFound."""
         service, headers = self._service, Headers(scope=scope)
         address, port = scope.get("client") or ("", 0)
         keys = [*headers.getlist("x-api-key"), *credentials_of_subprotocols(scope.get("subprotocols", ()))]

@@ -114,9 +114,6 @@ class PromptWebSocket(WebSocketsSansIOProtocol):
         self.transport.write(b"".join(self.conn.data_to_send()))
 
 
-# HTTP connections with bounds: on what is read before it is parsed, on time, and on requests that pile up.
-
-
 MAX_PIPELINED = 32
 MAX_TARGET_BYTES = 16 * 1024
 _MAX_UNWANTED_BYTES = 2**20  # of a body whose request was answered already: a longer one costs the connection
@@ -237,11 +234,9 @@ class BoundedHttp(HttpToolsProtocol):
         raise ValueError  # the parser hands over to `send_400_response`
 
     def send_400_response(self, msg: str) -> None:
-        """Answers where the parser stopped."""
         self._refuse(self._refused_for or RequestMalformed("this is no HTTP request that can be read"))
 
     def look(self, now: float) -> None:
-        """Cuts the connection where the client has been too slow."""
         elapsed_s, self._looked_at = now - self._looked_at, now
         body_bytes, self._body_bytes = self._body_bytes, 0
         limits = self._limits
@@ -328,8 +323,6 @@ class _Closing:
 
 
 class _BoundedWebSocket(PromptWebSocket):
-    """What a connection becomes by an upgrade."""
-
     def __init__(self, *arguments: Any, limits: HttpLimits, place: Place, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self._place = place
@@ -354,21 +347,17 @@ class _BoundedWebSocket(PromptWebSocket):
             super().handle_connect(event)
 
     def look(self, now: float) -> None:
-        """Cuts the connection where the client does not take what is sent."""
         elapsed_s, self._looked_at = now - self._looked_at, now
         if self._sending.is_stalled(self.transport, elapsed_s):
             self.transport.abort()
 
 
 class _Sending:
-    """Whether a client takes what is sent."""
-
     def __init__(self, limits: HttpLimits) -> None:
         self._patience = Patience(limits.min_bytes_per_s, limits.transfer_patience_s)
         self._waiting_bytes = 0
 
     def is_stalled(self, transport: asyncio.Transport, elapsed_s: float) -> bool:
-        """Whether it has been too slow, `elapsed_s` after the last question."""
         before, self._waiting_bytes = self._waiting_bytes, transport.get_write_buffer_size()
         if not before or not self._waiting_bytes or self._waiting_bytes > before:  # more comes when there is room only
             self._patience.renew()
@@ -385,7 +374,6 @@ def _may_be_long(headers: list[tuple[bytes, bytes]]) -> bool:
 
 
 def refusal_bytes(error: UltragrayError, default_headers: list[tuple[bytes, bytes]]) -> bytes:
-    """The answer to a request that never reached the application."""
     token = request_id.set(choose_request_id(None))
     try:
         response = problem_response(error, {"Connection": "close", "X-Request-Id": request_id.get()})
@@ -394,9 +382,6 @@ def refusal_bytes(error: UltragrayError, default_headers: list[tuple[bytes, byte
     headers = [*default_headers, *response.raw_headers]
     lines = [STATUS_LINE[response.status_code], *(b"%s: %s\r\n" % header for header in headers), b"\r\n"]
     return b"".join([*lines, bytes(response.body)])
-
-
-# uvicorn, with connections of ours.
 
 
 MAX_STREAM_MESSAGE_BYTES = 2**16  # of a client, on a WebSocket
@@ -409,7 +394,6 @@ class HttpServer(uvicorn.Server):
     def __init__(
         self, app: ASGIApp, settings: Settings, metrics: Metrics, certificates: CertificateWatch | None, flush_s: float
     ) -> None:
-        """`flush_s`: how long the last answers may take after a stop."""
         super().__init__(
             uvicorn.Config(
                 app,
@@ -456,7 +440,6 @@ class HttpServer(uvicorn.Server):
         self.started = True
 
     async def on_tick(self, counter: int) -> bool:
-        """Every 0.1 s."""
         if counter % _TICKS_PER_LOOK == 0:
             now = asyncio.get_running_loop().time()
             connections: set[Any] = self.server_state.connections

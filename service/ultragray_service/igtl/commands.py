@@ -52,7 +52,6 @@ def pack_command(command: Command) -> bytes:
 
 
 def unpack_string(content: bytes) -> str:
-    """The text of a STRING. Raises IgtlMessageInvalid."""
     if len(content) < _STRING.size:
         raise IgtlMessageInvalid(f"STRING must hold {_STRING.size} bytes or more, got {len(content)}", field="body")
     _, length = _STRING.unpack_from(content)
@@ -75,19 +74,14 @@ def _text(type_name: str, data: bytes, length: int) -> str:
 
 
 # The XML of commands and replies, as PLUS has it.
-#
 # <Command Name="SetUsParameter"><Parameter Name="DepthMm" Value="40"/></Command> <CommandReply Name="SetUsParameter"
 # Status="SUCCESS" Message="…"><Parameter Name="DepthMm" Success="true"/>…
-
-
 MAX_COMMAND_BYTES = 4096
 MAX_PARAMETERS = 32  # of one command
 
 
 @dataclass(frozen=True)
 class Request:
-    """A command: its name, and its parameters with the values that they are given."""
-
     name: str
     parameters: Mapping[str, str | None]
 
@@ -103,8 +97,6 @@ class Outcome:
 
 @dataclass(frozen=True)
 class Reply:
-    """The reply to a command. It failed where it has an error, or where a parameter has one."""
-
     name: str
     message: str = ""
     error: str = ""
@@ -112,7 +104,6 @@ class Reply:
 
     @property
     def errors(self) -> str:
-        """Every error, in one text; empty: success."""
         return "; ".join(filter(None, [self.error, *(outcome.error for outcome in self.outcomes)]))
 
     @property
@@ -185,34 +176,25 @@ def _plain(text: str) -> str:
     return "".join(one if one.isprintable() else "?" for one in text)
 
 
-# Tools in the frames of one connection: those that stay, and those that a device of the client moves.
-
-
 _DEVICE, _FRAME = "device", "frame"
 _EXAMPLE = '[{"kind": "needle", "tip_mm": [0, 0, 0], "hub_mm": [0, 0, -120], "device": "NeedleToReference"}]'
 
 
 @dataclass(frozen=True)
 class ClientTool:
-    """A tool as a client set it."""
-
     tool: Tool
     device: str | None  # that moves it, and whose frame its points are in; None: it stays
 
 
 @dataclass(frozen=True, eq=False)
 class ClientTools:
-    """The tools of a client, and the poses that its devices sent last."""
-
     tools: tuple[ClientTool, ...] = ()
     poses: Mapping[str, FloatArray] = field(default_factory=dict)  # [4, 4] mm, exact, by device
 
     def are_moved_by(self, device: str) -> bool:
-        """Whether a device moves any of them."""
         return any(one.device == device for one in self.tools)
 
     def moved(self, device: str, pose: FloatArray) -> ClientTools:  # [4, 4] mm, exact
-        """The tools with a new pose of a device that moves some of them."""
         return replace(self, poses={**self.poses, device: pose})
 
     def placed(self, registration: Registration | None) -> tuple[Tool, ...]:
@@ -249,7 +231,6 @@ def read_tools(text: str, before: ClientTools) -> ClientTools:
 
 
 def tools_text(tools: ClientTools) -> str:
-    """The tools as `read_tools` takes them."""
     return json.dumps([_document(one) for one in tools.tools])
 
 
@@ -276,9 +257,6 @@ def _document(one: ClientTool) -> dict[str, Any]:
     return {**{name: value for name, value in document.items() if name != _FRAME}, _DEVICE: one.device}
 
 
-# The scanner of one connection: the settings of its frames under the names that PLUS has for them.
-
-
 _NO_GAIN_PERCENT = 50.0
 _DB_A_PERCENT = FRAME_RANGE_DB / 100.0
 _SCENE, _PROBE, _REGISTRATION, _TOOLS = "Scene", "Probe", "Registration", "Tools"
@@ -286,8 +264,6 @@ _SCENE, _PROBE, _REGISTRATION, _TOOLS = "Scene", "Probe", "Registration", "Tools
 
 @dataclass(frozen=True)
 class _DisplayParameter:
-    """A parameter that is a field of `Display`."""
-
     field: str
     read: Callable[[str], Any]
     write: Callable[[Any], str]
@@ -342,7 +318,6 @@ class Scanner:
         self._registrations = registrations
 
     def move(self, device: str, pose: FloatArray) -> None:  # [4, 4] mm, exact
-        """Takes the pose of a device that moves tools, for the frames to come."""
         self.setup = replace(self.setup, tools=self.setup.tools.moved(device, pose))
 
     async def set(self, parameter: str, value: str) -> None:
@@ -408,9 +383,6 @@ def _probe_text(probe: Probe) -> str:
     return json.dumps(to_dict(probe, with_none=False))
 
 
-# Answers the commands of one connection.
-
-
 _ASKS, _ANSWERS = "CMD_", "ACK_"  # beginnings of the names of devices whose STRING is a command, and a reply
 _SET, _GET = "SetUsParameter", "GetUsParameter"
 
@@ -445,7 +417,6 @@ async def _reply(scanner: Scanner, name: str, text: str) -> Reply:
 
 
 async def _obey(scanner: Scanner, request: Request) -> Reply:
-    """Raises IgtlMessageInvalid for an unknown command and for one without parameters."""
     known = {name.casefold(): name for name in (_SET, _GET)}
     name = known.get(request.name.casefold())
     if name is None:

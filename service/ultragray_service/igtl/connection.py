@@ -52,8 +52,6 @@ _log = logging.getLogger("ultragray.igtl")
 
 
 class Frames(Protocol):
-    """The part of the server that connections share."""
-
     def newest(self) -> Frame | None:
         """The newest frame of a scene that the caller may see."""
 
@@ -92,7 +90,6 @@ class Connection:
         self._unread = Unread(writer.transport)
 
     async def run(self) -> None:
-        """Until the client goes, sends what is no message, or takes too long."""
         work = [asyncio.ensure_future(self._render()), asyncio.ensure_future(self.feed.run())]
         try:
             while True:
@@ -119,11 +116,9 @@ class Connection:
             self._writer.close()
 
     def abort(self) -> None:
-        """Closes at once."""
         self._writer.transport.abort()
 
     async def _take_message(self) -> None:
-        """Raises IgtlMessageInvalid where what follows cannot be found any more."""
         begun = await self._reader.readexactly(1)
         slow = asyncio.get_running_loop().call_later(MESSAGE_TIMEOUT_S, self.abort)
         try:
@@ -254,7 +249,6 @@ class Connection:
             self._count(asked.type_name, "OK", frame.posed.arrived)
 
     def _note(self, posed: PoseMessage, outcome: RenderResult | UltragrayError) -> None:
-        """Shows an answer to those who watch."""
         self.record.name = posed.message.device_name
         self._answers += 1
         self.record.note(StreamAnswer(self._answers, None, outcome, posed.replaced))
@@ -269,7 +263,6 @@ class Connection:
         self._service.metrics.count_request("igtl", route, status, time.perf_counter() - arrived)
 
     async def _send(self, message: Message) -> None:
-        """Raises ConnectionError where the client has gone, or takes nothing for too long."""
         async with self._sending:
             self._unread.write(pack_message(message))
             stalled = asyncio.get_running_loop().call_later(SEND_TIMEOUT_S, self.abort)

@@ -58,7 +58,6 @@ class Underway:
 
     @property
     def pose(self) -> FloatArray:  # [4, 4] mm, exact
-        """The pose of the probe in the scene."""
         return self._placed(self.posed.pose)
 
     def give_to(self, posed: PoseMessage, deadline: float, setup: Setup) -> bool:
@@ -119,16 +118,11 @@ class WaitingPoses:
             await self._come.wait()
 
     def take(self) -> Underway:
-        """Takes a pose out, of which there is one."""
         self._underway = Underway(self._poses.pop(next(iter(self._poses))), Turn())
         return self._underway
 
     async def settled(self) -> None:
-        """Waits until every pose so far was answered or replaced."""
         await self._settled.wait()
-
-
-# A rendered frame, and the messages that carry it.
 
 
 _SLICE_MM = 1.0  # nominal thickness: an image of one slice has none
@@ -136,8 +130,6 @@ _SLICE_MM = 1.0  # nominal thickness: an image of one slice has none
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """The rendering of a pose."""
-
     posed: PoseMessage
     result: RenderResult
     image: Image
@@ -149,7 +141,6 @@ class Frame:
         return name in ("", self.posed.message.device_name, image_name(self.posed.message.device_name))
 
     def message(self, kind: str, version: int, message_id: int = 0, name: str = "") -> Message:
-        """The frame as an IMAGE, or its pose as a TRANSFORM, POSITION, TDATA or QTDATA; `name` in place of its own."""
         device_name, pose = self.posed.message.device_name, self.result.poses[0]
         if self.registration is not None:
             pose = self.registration.flange_to_base(pose)
@@ -179,7 +170,6 @@ class Frame:
         }
 
     def _placing(self) -> dict[str, str]:
-        """The pose in the scene, where a registration led there."""
         is_led = self.result.settings.registration is not None
         return {"probe_to_scene": json.dumps(self.result.poses[0].tolist(), separators=(",", ":"))} if is_led else {}
 
@@ -191,8 +181,6 @@ def _settings_texts(settings: Resolved) -> Mapping[str, str]:
 
 
 class FrameMaker:
-    """Renders poses of devices."""
-
     def __init__(self, service: Service, scenes: SceneChooser, scanner: Scanner) -> None:
         self._service = service
         self._scenes = scenes
@@ -245,9 +233,6 @@ def image_of(result: RenderResult, registration: Registration | None = None) -> 
     return Image(pixels, to_scene if registration is None else registration.in_base(to_scene))
 
 
-# Subscriptions of a client: the newest frame that it has not seen, at most as often as it asked for.
-
-
 EnterTurn = Callable[[], AbstractAsyncContextManager[None]]
 
 
@@ -271,12 +256,10 @@ class Feed:
         self._changed = asyncio.Event()
 
     def start(self, kind: str, name: str, interval_s: float, version: int) -> None:
-        """From now on frames that go by `name` are told as messages of `kind`."""
         self._subscriptions[kind] = _Subscription(name, interval_s, version)
         self._changed.set()
 
     def stop(self, kind: str) -> None:
-        """No longer."""
         self._subscriptions.pop(kind, None)
         self._fresh.pop(kind, None)
 
@@ -288,7 +271,6 @@ class Feed:
                 self._changed.set()
 
     async def run(self) -> None:
-        """Sends until cancelled. Raises what `send` raises."""
         while True:
             await self._wait(self._next_due())
             now = time.monotonic()
@@ -303,7 +285,6 @@ class Feed:
         return min((self._subscriptions[kind].due for kind in self._fresh), default=None)
 
     async def _wait(self, until: float | None) -> None:
-        """Until that time.monotonic(), or a change."""
         timeout_s = None if until is None else until - time.monotonic()
         if timeout_s is None or timeout_s > 0:
             with contextlib.suppress(asyncio.TimeoutError):

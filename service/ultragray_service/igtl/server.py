@@ -40,11 +40,9 @@ class IgtlServer:
 
     @property
     def is_local(self) -> bool:
-        """Whether no other machine may connect."""
         return self._roles.is_local
 
     async def start(self, listener: socket.socket) -> None:
-        """Begins to answer on a bound socket."""
         self._server = await asyncio.start_server(self._connected, sock=listener)
 
     async def stop(self, grace_s: float) -> None:
@@ -66,11 +64,9 @@ class IgtlServer:
             connection.abort()
 
     def newest(self) -> Frame | None:
-        """The newest frame of a scene that the caller may see."""
         return next((frame for frame in reversed(self._frames.values()) if self._may_see(acting(), frame)), None)
 
     def publish(self, frame: Frame, source: Connection) -> None:
-        """Tells every client that may see its scene about a frame that was rendered for `source`."""
         kept_for = frame.ownership.owner if frame.ownership.private else None
         self._frames.pop(kept_for, None)
         self._frames[kept_for] = frame

@@ -32,9 +32,6 @@ def address_of(peer: str) -> str:
     return unquote(peer.partition(":")[2].rpartition(":")[0]).strip("[]")
 
 
-# Every error as google.rpc.Status, with the reason and the field that HTTP tells.
-
-
 ERROR_DOMAIN = "ultragray"
 REQUEST_ID_KEY = "x-request-id"
 _DETAILS_KEY = "grpc-status-details-bin"
@@ -69,14 +66,10 @@ async def abort(context: grpc.aio.ServicerContext, error: UltragrayError) -> NoR
     raise AssertionError("abort always raises")
 
 
-# Handlers of gRPC, taken apart and put together again by interceptors.
-
-
 Method = Callable[[Any, Any], Awaitable[Any]]
 
 
 def method_of(handler: Any) -> Method:
-    """The method of a handler, which has one."""
     for method in (handler.unary_unary, handler.unary_stream, handler.stream_unary, handler.stream_stream):
         if method is not None:
             return method  # type: ignore[no-any-return]
@@ -84,7 +77,6 @@ def method_of(handler: Any) -> Method:
 
 
 def with_method(handler: Any, method: Method) -> Any:
-    """The same handler, its method replaced."""
     return _with(handler, method, handler.request_deserializer)
 
 
@@ -118,9 +110,6 @@ def _with(handler: Any, method: Method, deserializer: Callable[[bytes], Any] | N
         (True, True): grpc.stream_stream_rpc_method_handler,
     }[handler.request_streaming, handler.response_streaming]
     return make(method, deserializer, handler.response_serializer)
-
-
-# The surroundings of every call: API keys, request id, errors as statuses, log line and metrics.
 
 
 _OPEN_PREFIX = "/grpc.health.v1."
@@ -170,7 +159,6 @@ class CallContext(grpc.aio.ServerInterceptor):  # type: ignore[misc]
         return with_method(handler, self._wrap(details.method, method_of(handler), headers))
 
     def _permitted(self, principal: Principal, credential: str | None, operation: Operation, method: Method) -> Method:
-        """The method, for who may; it ends when the credential counts no more."""
         service = self._service
 
         async def call(request: Any, context: Any) -> Any:
@@ -237,9 +225,6 @@ def name_in(request: Any, operation: Operation) -> str:
         return ""
     holder = getattr(request, "settings", request)
     return str(getattr(holder, operation.about.value, ""))
-
-
-# An interceptor for a service that is traced: a span for each call.
 
 
 class TracedCalls(grpc.aio.ServerInterceptor):  # type: ignore[misc]

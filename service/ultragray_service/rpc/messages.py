@@ -40,7 +40,6 @@ def read(message: Any, cls: Any, **others: Any) -> Any:
 
 
 def read_settings(message: Any) -> tuple[str, RenderSettings]:
-    """The scene and the settings of a message that holds `settings`. Raises InvalidArgument; its field is a path."""
     if not message.HasField("settings"):
         raise InvalidArgument("settings is required", field="settings")
     with under("settings"):
@@ -57,7 +56,6 @@ def read_word(message: Any, field: str) -> str:
 
 
 def read_pose(message: geometry_pb2.Pose, field: str) -> FloatArray:  # [4, 4] mm
-    """The exact pose. Raises InvalidPose, naming the part of `field` to blame."""
     form = message.WhichOneof("form")
     if form == "matrix":
         values = message.matrix.values
@@ -78,7 +76,6 @@ def read_pose(message: geometry_pb2.Pose, field: str) -> FloatArray:  # [4, 4] m
 
 
 def read_poses(messages: Sequence[geometry_pb2.Pose], field: str) -> FloatArray:  # [C, 4, 4] mm
-    """The exact poses; many of them, as matrices, at once. Raises InvalidPose, naming the part of `field` to blame."""
     if all(pose.WhichOneof("form") == "matrix" and len(pose.matrix.values) == 16 for pose in messages):
         matrices = np.empty((len(messages), 16))
         for index, pose in enumerate(messages):
@@ -89,7 +86,6 @@ def read_poses(messages: Sequence[geometry_pb2.Pose], field: str) -> FloatArray:
 
 
 def frame_message(result: RenderResult, sequence: int, **others: Any) -> rendering_pb2.Frame:
-    """The frame of a result of one pose."""
     if (place := result.place) is not None:
         others["shared_data"] = rendering_pb2.SharedData(slot=place.slot, bytes=place.size)
     frame = to_message(FrameFacts.of(result), rendering_pb2.Frame, sequence=sequence, data=result.data, **others)
@@ -104,7 +100,6 @@ def _settings_message(settings: Resolved) -> rendering_pb2.Frame:
 
 
 def slice_message(result: RenderResult[SliceView]) -> rendering_pb2.Slice:
-    """The slice of a result of one."""
     return to_message(SliceFacts.of(result), rendering_pb2.Slice, data=result.data)
 
 
@@ -124,7 +119,6 @@ def read_specification(message: jobs_pb2.SubmitJobRequest) -> tuple[Specificatio
 
 
 def job_message(job: Job) -> jobs_pb2.Job:
-    """The message of a job."""
     error = None if job.reason is None else scenes_pb2.Error(reason=job.error or "", detail=job.reason)
     shown = replace(job, specification={"kind": job.kind, **job.specification}, error=None)
     return to_message(shown, jobs_pb2.Job, error=error)

@@ -34,8 +34,6 @@ Context: TypeAlias = grpc.aio.ServicerContext
 
 
 class _Message:
-    """A RenderStreamRequest."""
-
     def __init__(self, message: rendering_pb2.RenderStreamRequest, left_s: float | None) -> None:
         self.message = message
         self.sequence: int = message.sequence
@@ -45,7 +43,6 @@ class _Message:
 
     @property
     def window(self) -> int | None:
-        """Raises InvalidArgument for one beyond the limit."""
         if self.message.window > MAX_WINDOW:
             raise InvalidArgument(
                 f"window must be at most {MAX_WINDOW}, 0 for none, got {self.message.window}", field="window"
@@ -137,9 +134,6 @@ class CallTransport:
     hand_over = send  # flow control tells the client's library what was taken, not the service
 
 
-# RenderService: one frame, a batch of frames.
-
-
 _RETRY_S = 0.02
 _STREAM_NAME = "x-ultragray-stream-name"  # metadata
 
@@ -153,8 +147,6 @@ class _OfProbe:
 
 
 class RenderService:
-    """The methods of ultragray.v1.RenderService."""
-
     def __init__(self, service: Service) -> None:
         self._service = service
 
@@ -243,7 +235,6 @@ class RenderService:
         return to_message(found, rendering_pb2.LocalizeResponse)
 
     async def _plan(self, request: rendering_pb2.RenderRequest | rendering_pb2.RenderBatchRequest) -> Plan:
-        """The plan of a request. Raises what RequestPlanner.plan raises; the field is a path."""
         scene, asked = read_settings(request)
         return await self._service.planner.plan(
             scene, asked, asked.encoding, path="settings", registration=asked.registration
@@ -256,13 +247,11 @@ class RenderService:
         pose: FloatArray,
         context: Context,
     ) -> RenderResult:
-        """Renders a frame of a batch once the caller may have one more."""
         left_s = context.time_remaining()
         await self._service.limits.frame_turn(None if left_s is None else time.monotonic() + left_s)
         return await render(plan, pose, self._service.planner.deadline(context.time_remaining()))
 
     async def _render(self, plan: Plan, pose: FloatArray, deadline: float) -> RenderResult:
-        """Renders a frame of a batch."""
         return await self._service.rendering.render(plan, pose, priority=Priority.BATCH, deadline=deadline)
 
     async def _render_when_room(self, plan: Plan, pose: FloatArray, deadline: float) -> RenderResult:

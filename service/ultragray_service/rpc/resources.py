@@ -39,8 +39,6 @@ Context: TypeAlias = grpc.aio.ServicerContext
 
 
 class SceneService:
-    """The methods of ultragray.v1.SceneService."""
-
     def __init__(self, service: Service) -> None:
         self._service = service
 
@@ -64,12 +62,7 @@ class SceneService:
         return to_message(loaded, scenes_pb2.UnloadSceneResponse)
 
 
-# DatasetService.
-
-
 class DatasetService:
-    """The methods of ultragray.v1.DatasetService."""
-
     def __init__(self, service: Service) -> None:
         self._service = service
 
@@ -122,16 +115,11 @@ async def _receive(context: Context, upload: DatasetUpload, *, archive: bool) ->
             raise InvalidArgument(f"a message after the header must hold {expected}, got {part or 'neither'}")
 
 
-# JobService.
-
-
 _CHUNK_BYTES = 2**20
 _LOOK_AROUND_S = 15.0  # how long a watch waits for news at a time
 
 
 class JobService:
-    """The methods of ultragray.v1.JobService."""
-
     def __init__(self, service: Service) -> None:
         self._service = service
 
@@ -212,12 +200,7 @@ class JobService:
             watch.close()
 
 
-# WorkerService.
-
-
 class WorkerService:
-    """The methods of ultragray.v1.WorkerService."""
-
     def __init__(self, service: Service) -> None:
         self._service = service
 
@@ -239,15 +222,10 @@ class WorkerService:
         return to_message(await self._service.jobs.do(JobStore.want, worker, wanted), workers_pb2.Worker)
 
 
-# RegistrationService.
-
-
 _LINKS = ("base_to_scene", "probe_to_flange")
 
 
 class RegistrationService:
-    """The methods of ultragray.v1.RegistrationService."""
-
     def __init__(self, service: Service) -> None:
         self._service = service
 
@@ -288,12 +266,7 @@ def _rows(matrix: geometry_pb2.Matrix, field: str) -> object:
     return rows(np.reshape(matrix.values, (4, 4)))
 
 
-# AccessService.
-
-
 class AccessService:
-    """The methods of ultragray.v1.AccessService."""
-
     def __init__(self, service: Service) -> None:
         self._service = service
 

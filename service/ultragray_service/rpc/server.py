@@ -60,14 +60,11 @@ SERVICE_NAMES = tuple(one.full_name for one in _DESCRIPTORS.values())
 
 
 def _methods() -> Iterator[str]:
-    """Every method of our services, as calls name them."""
     for service in _DESCRIPTORS.values():
         yield from (f"/{service.full_name}/{method.name}" for method in service.methods)
 
 
 class GrpcServer:
-    """A server that listens once started, and tells its health."""
-
     def __init__(self, service: Service) -> None:
         require_all_methods(_methods())
         self._server = grpc.aio.server(
@@ -96,7 +93,6 @@ class GrpcServer:
         )
 
     def bind(self, host: str, port: int, certificates: CertificateWatch | None) -> int:
-        """Takes the port (0: a free one) and returns it; None: without TLS. Raises RuntimeError where it is in use."""
         address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
         if certificates is None:
             return int(self._server.add_insecure_port(address))
@@ -109,7 +105,6 @@ class GrpcServer:
         await self._server.start()
 
     async def tell_health(self, readiness: Readiness) -> None:
-        """Sets the answers of grpc.health.v1 from now on: that of the server as a whole, and of each service."""
         parts = readiness.components
         serving = {
             "RenderService": parts.frames.ready,
@@ -128,7 +123,6 @@ class GrpcServer:
                 await self._health.set(name, code.SERVING if is_serving else code.NOT_SERVING)
 
     async def stop(self, grace_s: float) -> None:
-        """Refuses new calls and gives those that run `grace_s` seconds."""
         await self._server.stop(grace_s)
 
 
@@ -167,12 +161,7 @@ def _connection_options(settings: Settings) -> list[tuple[str, int]]:
     ]
 
 
-# grpc.health.v1, with the method that the library's servicer leaves out.
-
-
 class Health(health.aio.HealthServicer):  # type: ignore[misc]
-    """Tells what `set` was told."""
-
     def __init__(self) -> None:
         super().__init__()
         self._statuses: dict[str, Any] = {}
@@ -182,6 +171,5 @@ class Health(health.aio.HealthServicer):  # type: ignore[misc]
         await super().set(service, status)
 
     async def List(self, request: Any, context: Any) -> Any:  # the name of the method
-        """The health of all services."""
         statuses = {name: health_pb2.HealthCheckResponse(status=status) for name, status in self._statuses.items()}
         return health_pb2.HealthListResponse(statuses=statuses)

@@ -53,7 +53,6 @@ class SharedMemory:
             os.unlink(path)
 
     def _check_file(self, asked: rendering_pb2.SharedMemory) -> None:
-        """Raises InvalidArgument unless the file is one that the client made to be shared."""
         status = os.fstat(self._descriptor)
         expected = HEADER_BYTES + self._slots * self._slot_bytes
         if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid():

@@ -95,15 +95,12 @@ class ServiceStatistics:
 
 
 class Statistics:
-    """A ring of steps. Belongs to one event loop."""
-
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._steps: deque[_Step] = deque(maxlen=STEPS)
         self._random = random.Random(0)
 
     def observe(self, frames: int, queue_ms: float, render_ms: float, encode_ms: float) -> None:
-        """One rendered request of the pool."""
         step = self._now()
         step.frames += frames
         step.requests += 1
@@ -115,7 +112,6 @@ class Statistics:
                 samples[place] = milliseconds
 
     def count_error(self) -> None:
-        """One request or message that the service could not answer as asked."""
         self._now().errors += 1
 
     def summaries(self) -> list[StatisticsStep]:
@@ -167,9 +163,6 @@ def _quantile(ordered: dict[str, list[float]], share: float) -> StageTimes:
     )
 
 
-# Prometheus metrics. Queue time is kept apart from render time and encode time.
-
-
 _MILLISECONDS = (0.5, 1, 2, 4, 6, 8, 12, 16, 24, 32, 64, 125, 250, 500, 1000, 2000, 5000, 10_000, 30_000)
 _SECONDS = tuple(ms / 1000 for ms in _MILLISECONDS)
 _OVERLOADED = ("429", "RESOURCE_EXHAUSTED", "UNAVAILABLE", "DEADLINE_EXCEEDED", "INTERNAL")
@@ -185,8 +178,6 @@ def _is_of_service(status: str) -> bool:
 
 
 class _PoolCollector(Collector):
-    """Reads the pool's state when it is scraped."""
-
     def __init__(self, pool: RenderPool) -> None:
         self._pool = pool
 
@@ -230,7 +221,6 @@ class _JobsCollector(Collector):
 
 
 def _role() -> str:
-    """The role of who asks."""
     try:
         return acting().role.value
     except LookupError:  # a door that knows nobody
@@ -238,8 +228,6 @@ def _role() -> str:
 
 
 class Metrics:
-    """One registry per service."""
-
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
         self.statistics = Statistics()
@@ -288,7 +276,6 @@ class Metrics:
             self.registry.register(collector)
 
     def tell_certificate_expiry(self, not_after: Callable[[], datetime]) -> None:
-        """The end of the certificate in use, which is asked for at each scrape."""
         expiry = Gauge(
             "ultragray_certificate_expires_timestamp_seconds",
             "Unix time at which the TLS certificate in use expires.",
@@ -297,32 +284,26 @@ class Metrics:
         expiry.set_function(lambda: not_after().timestamp())
 
     def count_request(self, door: str, route: str, status: str, seconds: float) -> None:
-        """One answered request of `door` http, websocket, grpc or igtl, whose errors are also frame errors."""
         self._requests.labels(door, route, status).inc()
         self._request_seconds.labels(door, route).observe(seconds)
         if door != "igtl" and _is_of_service(status) and not route.startswith(_HEALTH_ROUTES):
             self.statistics.count_error()
 
     def count_frame_error(self, error: UltragrayError) -> None:
-        """One message of a stream that was answered with an error."""
         self._frame_errors.labels(error.reason).inc()
         if _is_of_service(str(statuses_of(error).http)):
             self.statistics.count_error()
 
     def count_stream(self, change: int) -> None:
-        """One stream opened (+1) or closed (-1)."""
         self._streams.inc(change)
 
     def count_dropped(self) -> None:
-        """One pose of a stream that a newer one replaced."""
         self._dropped.inc()
 
     def count_limited(self, limit: str) -> None:
-        """One refusal by a limit of a key."""
         self._limited.labels(limit, _role()).inc()
 
     def observe_result(self, result: RenderResult[Any]) -> None:
-        """One rendered request of the pool."""
         self._frames.labels(self._label_of(result.scene), _role()).inc(len(result.poses))
         self._queue.observe(result.queue_ms / 1000)
         self._render.observe(result.render_ms / 1000)
@@ -331,7 +312,6 @@ class Metrics:
         self.statistics.observe(len(result.poses), result.queue_ms, result.render_ms, result.encode_ms)
 
     def observe_search(self, result: LocalizeResult) -> None:
-        """One frame that was looked for."""
         self._searches.labels(self._label_of(result.scene), str(result.found.is_found).lower()).inc()
         self._search.observe(result.search_ms / 1000)
 
@@ -344,5 +324,4 @@ class Metrics:
         return scene
 
     def exposition(self) -> bytes:
-        """The text that Prometheus scrapes."""
         return generate_latest(self.registry)

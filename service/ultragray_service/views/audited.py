@@ -36,7 +36,6 @@ class AuditEntry:
 
     @classmethod
     def of(cls, entry: Entry) -> AuditEntry:
-        """The line that an entry is."""
         return cls(iso_time(entry.at_s), entry.who, entry.address, entry.what, entry.target, entry.result, entry.facts)
 
 
@@ -50,7 +49,6 @@ class AuditEntries:
 async def audit_entries(
     engine: sa.Engine, *, since_hours: float, who: str | None, what: str | None, limit: int
 ) -> AuditEntries:
-    """The last entries of all services that share the database. Raises InvalidArgument."""
     if not 0.0 < since_hours <= MAX_HOURS:
         raise InvalidArgument(f"since_hours must be above 0 and at most {MAX_HOURS:g}", field="since_hours")
     if not 1 <= limit <= MAX_ENTRIES:

@@ -45,7 +45,6 @@ class Located:
 
     @classmethod
     def of(cls, result: LocalizeResult, plan: Plan) -> Located:
-        """A result of the pool, for a plan."""
         found = result.found
         in_base = None if plan.registration is None else plan.registration.flange_to_base(found.pose)
         return cls(
@@ -67,7 +66,6 @@ class Located:
 
 
 def sought_frame(image: bytes, height: int | None, width: int | None, settings: LocalizationSettings) -> Sought:
-    """The frame that a request asks for. Raises InvalidArgument for one side without the other."""
     if (height is None) != (width is None):
         raise InvalidArgument(
             "image_height and image_width go together: both for grey pixels, neither for a PNG file",

@@ -20,8 +20,6 @@ T = TypeVar("T")
 
 
 class DatabaseThreads:
-    """The few threads that ask the database."""
-
     def __init__(self) -> None:
         self.executor = ThreadPoolExecutor(_THREADS, "database")
 

@@ -78,13 +78,11 @@ class JobWatch:
         self._news.set()
 
     def end(self, error: Exception | None = None) -> None:
-        """Nothing more will come."""
         self._ended = True
         self._error = error
         self._news.set()
 
     def close(self) -> None:
-        """Frees what is kept for the watcher."""
         self._leave(self)
 
 
@@ -101,7 +99,6 @@ class _Reader:
         self.task = asyncio.ensure_future(self._run())
 
     def add(self, watch: JobWatch) -> None:
-        """Adds a watcher, whose first news are the job as it is known and its log."""
         self.watches.add(watch)
         if self._job is not None:
             watch.tell(self._job)
@@ -139,7 +136,6 @@ class JobHub:
     """The watchers of all jobs. Belongs to one event loop."""
 
     def __init__(self, get: Callable[[str], Job], log: Callable[[str], Log], threads: Executor | None = None) -> None:
-        """`threads`: where jobs are read; None: the event loop's own."""
         self._get = get
         self._threads = threads
         self._log = log
@@ -148,7 +144,6 @@ class JobHub:
 
     @property
     def readers(self) -> int:
-        """The number of jobs that are being read."""
         return len(self._readers)
 
     async def watch(self, job_id: str, log_offset: int | None = None) -> JobWatch:
@@ -180,7 +175,6 @@ class JobHub:
                 del self._readers[job_id]
 
     def close(self) -> None:
-        """Ends every watcher, now and from now on: the service stops."""
         self._closed = True
         for reader in self._readers.values():
             reader.task.cancel()

@@ -66,8 +66,6 @@ class WorkerList:
 
 
 class Jobs:
-    """The jobs of one service."""
-
     def __init__(
         self,
         settings: Settings,
@@ -97,7 +95,6 @@ class Jobs:
         return self._opened
 
     async def open(self) -> None:
-        """Opens the store. Raises StartupFailed where its database cannot be reached."""
         settings = self._settings
         self._opened = await asyncio.to_thread(
             JobStore,
@@ -113,16 +110,13 @@ class Jobs:
 
     @property
     def database(self) -> JobDatabase:
-        """The opened database. Raises NotReady before `open`."""
         return self._store.database
 
     @property
     def files(self) -> JobFiles:
-        """The files of the jobs. Raises NotReady before `open`."""
         return self._store.files
 
     def start(self) -> None:
-        """Begins to count the jobs."""
         self._counting = asyncio.create_task(self._count())
 
     async def do(self, method: Callable[Concatenate[JobStore, P], T], *arguments: P.args, **options: P.kwargs) -> T:
@@ -154,7 +148,6 @@ class Jobs:
         return job, is_new
 
     async def retry(self, job_id: str) -> tuple[Job, bool]:
-        """As JobStore.retry. Raises LimitReached."""
         return await self.do(JobStore.retry, job_id, by=acting().name, admit=self._admit)
 
     async def page(self, *, state: str, kind: str, page_size: int, page_token: str) -> JobPage:
@@ -177,19 +170,15 @@ class Jobs:
         return JobPage(jobs, token or "")
 
     async def workers(self) -> WorkerList:
-        """The workers, without the jobs that others keep to themselves."""
         return WorkerList(await self.do(JobStore.workers, partial(may_see, acting())))
 
     def uses_dataset(self, name: str) -> str | None:
-        """The waiting or running job that needs a dataset, in words; blocks. Raises NotReady before the start."""
         return self._store.uses_dataset(name, partial(may_see, acting()))
 
     async def makes_scene(self, name: str) -> str | None:
-        """The waiting or running job that will serve a scene of that name, in words."""
         return await self.do(JobStore.makes_scene, name, partial(may_see, acting()))
 
     async def close(self) -> None:
-        """Closes the store."""
         if self._counting is not None:
             self._counting.cancel()
         if self._opened is not None:
@@ -208,7 +197,6 @@ class Jobs:
 
 @contextmanager
 def _specification_to_blame(field: str) -> Iterator[None]:
-    """Errors about what a specification names have their field below `field`."""
     try:
         with scene_to_blame():
             yield

@@ -20,7 +20,6 @@ class GrowingLog:
 
     @property
     def offset(self) -> int:
-        """The byte of the log up to which it was read."""
         return self._offset or 0
 
     def read(self) -> str:

@@ -181,7 +181,6 @@ async def _receive_files(request: Request, upload: DatasetUpload) -> None:
 
 
 async def _blocks(request: Request, upload: DatasetUpload) -> AsyncIterator[bytes]:
-    """The body as it comes. Raises ClientDisconnect, and as `DatasetUpload.next`."""
     more = True
     while more:
         message = await upload.next(request.receive())
@@ -189,9 +188,6 @@ async def _blocks(request: Request, upload: DatasetUpload) -> AsyncIterator[byte
             raise ClientDisconnect
         more = message.get("more_body", False)
         yield message.get("body", b"")
-
-
-# Pictures to compare: a scene beside the frames held out from it, and the frames and poses of a dataset.
 
 
 comparison_router = APIRouter(prefix="/v1", tags=["console"])

@@ -46,9 +46,6 @@ async def probe_plane(request: Request) -> ImagePlane:
     return ImagePlane(probe.face_depth_mm, probe.pivot_depth_mm, lines_mm)
 
 
-# Registrations of robots and trackers to scenes.
-
-
 registrations_router = APIRouter(prefix="/v1/registrations", tags=["registrations"])
 
 Name = Annotated[str, Path(description="Name of the registration.", examples=["robot"])]

@@ -77,9 +77,6 @@ async def ready(service: ServiceDep) -> Ready | Response:
     return Ready(components, identity_provider="available" if is_available else "unavailable")
 
 
-# What the service is, and where its other doors are.
-
-
 service_router = APIRouter(prefix="/v1/service", tags=["service"])
 
 
@@ -87,9 +84,6 @@ service_router = APIRouter(prefix="/v1/service", tags=["service"])
 async def get_service(service: ServiceDep) -> ServiceInfo:
     """Version, and the ports of gRPC and OpenIGTLink, for pages that tell how to connect."""
     return service.doors.info(key_required=service.guard.asks)
-
-
-# The service at work: its frames and its jobs in numbers, and Prometheus.
 
 
 statistics_router = APIRouter()
@@ -122,9 +116,6 @@ async def get_statistics(service: ServiceDep) -> ServiceStatistics:
 async def metrics(service: ServiceDep) -> Response:
     """Requests, frames, queue, render and encode times, and the state of the render pool."""
     return Response(service.metrics.exposition(), media_type=CONTENT_TYPE_LATEST)
-
-
-# Who asks, how people sign in, and who did what.
 
 
 @dataclass(frozen=True)

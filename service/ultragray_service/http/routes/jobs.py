@@ -55,7 +55,6 @@ class LastEvent:
 
     @classmethod
     def read(cls, event_id: str) -> LastEvent:
-        """The inverse of `str`; for the id of another stream: nothing is known."""
         if (found := _ID.fullmatch(event_id)) is None:
             return cls()
         return cls(int(found[1]), found[2])
@@ -87,7 +86,6 @@ async def _events(watch: JobWatch, last: LastEvent) -> AsyncIterator[bytes]:
 
 
 def _written(change: JobChange, last: LastEvent) -> tuple[str, LastEvent]:
-    """The events of a change, and the id of the last of them."""
     text = ""
     if change.log:
         last = replace(last, log_offset=change.log_offset)
@@ -105,9 +103,6 @@ def _event(name: str, event_id: LastEvent, data: str) -> str:
     whole = data.replace("\r\n", "\n").replace("\r", "\n").removesuffix("\n")
     lines = "".join(f"data: {line}\n" for line in whole.split("\n"))
     return f"event: {name}\nid: {event_id}\n{lines}\n"
-
-
-# Training and batch rendering in the background.
 
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
@@ -287,9 +282,6 @@ async def watch_job(service: ServiceDep, job: JobId, last_event_id: LastEventId 
     return JobEvents(await service.jobs.hub.watch(job, last.log_offset), last)
 
 
-# A file of a job as an answer of HTTP: whole, or the range that was asked for.
-
-
 # A page that a job made is shown without scripts, in an origin of its own, and fetches nothing.
 SHOWN = {
     "content-security-policy": "sandbox; default-src 'none'; style-src 'unsafe-inline'; img-src data:; "
@@ -345,9 +337,6 @@ def _read(file: Artifact, start: int, length: int) -> bytes:
     return chunk
 
 
-# A training while it runs.
-
-
 training_router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
 
 _Answers2 = dict[int | str, dict[str, Any]]
@@ -374,9 +363,6 @@ async def get_preview(service: ServiceDep, job: JobId) -> Response:
     """A held-out frame, rendered from the last checkpoint of a running training: a new one comes every ten seconds."""
     service.life.require_serving()
     return Response(await service.training_views.preview_png(job), media_type=PNG)
-
-
-# The workers that do the jobs.
 
 
 workers_router = APIRouter(prefix="/v1/workers", tags=["jobs"])

@@ -133,7 +133,6 @@ def _dicom_of(result: RenderResult) -> bytes:
 
 
 def render_headers(result: RenderResult) -> dict[str, str]:
-    """The facts of an answer that stand beside the pixels."""
     settings, poses = result.settings, result.poses
     times = {stage: f"{getattr(result, f'{stage}_ms'):.3f}" for stage in STAGES}
     confidences = ["" if one.confidence is None else f"{one.confidence:.3f}" for one in result.extrapolations]
@@ -155,12 +154,8 @@ def render_headers(result: RenderResult) -> dict[str, str]:
 
 @lru_cache(maxsize=256)
 def _settings_headers(settings: Resolved) -> dict[str, str]:
-    """The headers that settings alone decide."""
     texts = {"dtype": settings.encoding.pixel_type.name, **settings_used(settings).texts()}
     return {_header_of(name): text for name, text in texts.items()}
-
-
-# Slices of a scene on any plane. The Accept header chooses the form.
 
 
 slices_router = APIRouter(prefix="/v1/scenes", tags=["render"])

@@ -114,9 +114,6 @@ async def unload_scene(service: ServiceDep, scene: SceneName) -> SceneLoaded:
     return await service.scenes.unload(scene)
 
 
-# Scene files: downloaded, imported, deleted, and looked into.
-
-
 @dataclass(frozen=True)
 class ScenePoses:
     """Training poses of a scene, evenly taken."""
@@ -230,7 +227,6 @@ def _poses_json(header: SceneHeader) -> bytes:
 
 
 async def _blocks(request: Request, service: ServiceDep) -> AsyncIterator[bytes]:
-    """The body as it comes. Raises ClientDisconnect, and as `arrival`."""
     stopping: asyncio.Future[Any] = asyncio.ensure_future(service.life.draining.wait())
     more = True
     try:

@@ -72,7 +72,6 @@ def frame_bytes(answer: StreamAnswer) -> bytes:
 
 
 def refusal_text(answer: StreamAnswer) -> str:
-    """The text message in place of a frame."""
     assert isinstance(answer.outcome, UltragrayError)
     message = RefusalMessage(
         sequence=answer.sequence,
@@ -82,9 +81,6 @@ def refusal_text(answer: StreamAnswer) -> str:
     )
     text: bytes = adapter_of(RefusalMessage).dump_json(message)
     return text.decode()
-
-
-# The WebSocket: poses in, frames out.
 
 
 router = APIRouter(prefix="/v1/scenes", tags=["render"])
@@ -130,7 +126,6 @@ async def stream(websocket: WebSocket, scene: SceneName, name: StreamName = "") 
 
 
 def check_subprotocols(offered: list[str]) -> None:
-    """Raises InvalidArgument for an offer without the one that is spoken: browsers hang up without it."""
     if offered and STREAM_PROTOCOL not in offered:
         raise InvalidArgument(
             f"Sec-WebSocket-Protocol must offer {STREAM_PROTOCOL}, also beside a key", field="Sec-WebSocket-Protocol"
@@ -138,8 +133,6 @@ def check_subprotocols(offered: list[str]) -> None:
 
 
 class _Message:
-    """A message that could be read."""
-
     def __init__(self, message: StreamMessage, scene: str) -> None:
         self.sequence = message.sequence
         self.client_time = message.client_time_ms
@@ -200,8 +193,6 @@ _NUMBERS = TypeAdapter(_Numbers)
 
 
 class _WebSocketTransport:
-    """One connection. Its mode is read from the first message that can be read."""
-
     destination = None
 
     def __init__(self, websocket: WebSocket, scene: str) -> None:
@@ -209,7 +200,6 @@ class _WebSocketTransport:
         self._scene = scene
 
     async def receive(self) -> _Message | _Unreadable:
-        """Raises WebSocketDisconnect."""
         await asyncio.sleep(0)  # reading does not wait while the buffer is full: others get their turn
         received = await self._websocket.receive()
         if received["type"] == "websocket.disconnect":
@@ -236,9 +226,6 @@ def _contents(answer: StreamAnswer) -> dict[str, Any]:
     if isinstance(answer.outcome, UltragrayError):
         return {"text": refusal_text(answer)}
     return {"bytes": frame_bytes(answer)}
-
-
-# The open streams, and the WebSocket that shows what one of them asks for and gets.
 
 
 streams_router = APIRouter(prefix="/v1/streams", tags=["streams"])
@@ -319,7 +306,6 @@ async def _show(service: Service, websocket: WebSocket, watcher: Watcher) -> str
 
 
 async def _pass_on(websocket: WebSocket, watcher: Watcher) -> None:
-    """Sends answers as the stream's own client gets them, as many as the watcher takes."""
     while (answer := await watcher.next()) is not None:
         if isinstance(answer.outcome, UltragrayError):
             await websocket.send({"type": "websocket.send", "text": refusal_text(answer)})
