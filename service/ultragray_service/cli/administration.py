@@ -16,7 +16,17 @@ import typer
 from ultragray.errors import InvalidArgument
 from ultragray_service.access.principals import NAMES, Role, read_limits
 from ultragray_service.cli.options import FieldsOf, with_options
-from ultragray_service.cli.terminal import Json, argument, command_group, examples, option, print_table, tell, to_json
+from ultragray_service.cli.terminal import (
+    Json,
+    argument,
+    command_group,
+    examples,
+    option,
+    print_table,
+    single,
+    tell,
+    to_json,
+)
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from ultragray_workers.errors import BackupInvalid
 
@@ -177,12 +187,7 @@ _AUDIT_COLUMNS = ("time", "who", "address", "what", "target", "result", "facts")
 _HOUR_S = 3600.0
 
 
-audit_app = command_group()
-
-
-@audit_app.command(
-    epilog=examples("ultragray audit --since-hours 168 --who console", "ultragray audit --what scene.delete --json")
-)
+@single("ultragray audit --since-hours 168 --who console", "ultragray audit --what scene.delete --json")
 @with_options
 def audit(
     *,
@@ -215,14 +220,9 @@ def _timestamp(at_s: float) -> str:
 
 BackupFolder = Annotated[Path, argument("Folder of backups, on another disk than the data.", shown=False)]
 _SHOWN = 3
-backup_app = command_group()
 
 
-@backup_app.command(
-    epilog=examples(
-        "ultragray backup /mnt/backups --keep 14", "ultragray backup /mnt/backups --verify  # reads every byte"
-    )
-)
+@single("ultragray backup /mnt/backups --keep 14", "ultragray backup /mnt/backups --verify  # reads every byte")
 @with_options
 def backup(
     folder: BackupFolder,
@@ -308,14 +308,9 @@ def megabytes(size: int) -> str:
     return f"{size / 1e6:,.1f} MB"
 
 
-restore_app = command_group()
-
-
-@restore_app.command(
-    epilog=examples(
-        "ultragray restore /mnt/backups --data-folder /srv/ultragray/data",
-        "ultragray restore /mnt/backups --backup 20261122T070301.123Z --force",
-    )
+@single(
+    "ultragray restore /mnt/backups --data-folder /srv/ultragray/data",
+    "ultragray restore /mnt/backups --backup 20261122T070301.123Z --force",
 )
 @with_options
 def restore(

@@ -192,26 +192,22 @@ _REMOTE, _INSTALLATION = "A running service (--address)", "An installation's fol
 class _Commands(LazyGroup):
     plugins = "ultragray.commands"
     entries = (
-        Entry("serve", ".serve:command_app", _SERVING, "Serve scenes over HTTP and gRPC, until Ctrl-C or SIGTERM."),
-        Entry("worker", ".worker:command_app", _SERVING, "Take jobs from the queue, one at a time, until Ctrl-C."),
-        Entry("demo", ".scenes:demo_app", _SCENES, "Write the built-in demo scene."),
-        Entry("show", ".scenes:show_app", _SCENES, "Print what a scene file or a sweep says about itself."),
-        Entry("render", ".render:command_app", _SCENES, "Render frames from poses into one file or a folder of PNGs."),
-        Entry("export", ".scenes:export_app", _SCENES, "Write a scene as PLY or as a checkpoint of the released code."),
-        Entry("localize", ".register:localize_app", _SCENES, "Find the pose of a real frame in a scene."),
+        Entry("serve", ".serve:serve", _SERVING, "Serve scenes over HTTP and gRPC, until Ctrl-C or SIGTERM."),
+        Entry("worker", ".worker:worker", _SERVING, "Take jobs from the queue, one at a time, until Ctrl-C."),
+        Entry("demo", ".scenes:demo", _SCENES, "Write the built-in demo scene."),
+        Entry("show", ".scenes:show", _SCENES, "Print what a scene file or a sweep says about itself."),
+        Entry("render", ".render:render", _SCENES, "Render frames from poses into one file or a folder of PNGs."),
+        Entry("export", ".scenes:export", _SCENES, "Write a scene as PLY or as a checkpoint of the released code."),
+        Entry("localize", ".register:localize", _SCENES, "Find the pose of a real frame in a scene."),
         Entry("calibrate", ".register:calibrate_app", _SCENES, "Register a robot or tracker to a scene."),
-        Entry(
-            "voxelize", ".scenes:voxelize_app", _SCENES, "Sample a scene on a grid: a NIfTI or NRRD volume, or a slice."
-        ),
-        Entry(
-            "slicer", ".scenes:slicer_app", _SCENES, "Write a scene file of 3D Slicer that shows a served scene live."
-        ),
-        Entry("import", ".scenes:import_app", _SCENES, "Turn a PLY file or a released checkpoint into a scene file."),
+        Entry("voxelize", ".scenes:voxelize", _SCENES, "Sample a scene on a grid: a NIfTI or NRRD volume, or a slice."),
+        Entry("slicer", ".scenes:slicer", _SCENES, "Write a scene file of 3D Slicer that shows a served scene live."),
+        Entry("import", ".scenes:import_scene", _SCENES, "Turn a PLY file or a released checkpoint into a scene file."),
         Entry("check", ".sweeps:check_app", _SWEEPS, "Tell what is in a sweep, and what looks wrong."),
-        Entry("draw", ".sweeps:draw_app", _SWEEPS, "Draw the image planes in space and a contact sheet of the frames."),
-        Entry("convert", ".sweeps:convert_app", _SWEEPS, "Write a sweep in the layout of the released trainer."),
-        Entry("train", ".train:command_app", _SWEEPS, "Train a scene from a tracked sweep."),
-        Entry("eval", ".evaluate:command_app", _SWEEPS, "Measure a scene on the held-out frames of a sweep."),
+        Entry("draw", ".sweeps:draw", _SWEEPS, "Draw the image planes in space and a contact sheet of the frames."),
+        Entry("convert", ".sweeps:convert", _SWEEPS, "Write a sweep in the layout of the released trainer."),
+        Entry("train", ".train:train", _SWEEPS, "Train a scene from a tracked sweep."),
+        Entry("eval", ".evaluate:evaluate", _SWEEPS, "Measure a scene on the held-out frames of a sweep."),
         Entry("scenes", ".remote:scenes_app", _REMOTE, "List, upload, download, delete and render scenes."),
         Entry(
             "datasets",
@@ -238,10 +234,10 @@ class _Commands(LazyGroup):
             "List the workers of the jobs; pause, drain and resume them.",
         ),
         Entry("keys", ".administration:keys_app", _INSTALLATION, "Make, list and revoke API keys."),
-        Entry("backup", ".administration:backup_app", _INSTALLATION, "Save scenes, datasets, jobs and their database."),
-        Entry("restore", ".administration:restore_app", _INSTALLATION, "Make an installation what it was at a backup."),
+        Entry("backup", ".administration:backup", _INSTALLATION, "Save scenes, datasets, jobs and their database."),
+        Entry("restore", ".administration:restore", _INSTALLATION, "Make an installation what it was at a backup."),
         Entry("storage", ".administration:storage_app", _INSTALLATION, "Copy scenes into a bucket, or out of it."),
-        Entry("audit", ".administration:audit_app", _INSTALLATION, "Print who did what: the audit log."),
+        Entry("audit", ".administration:audit", _INSTALLATION, "Print who did what: the audit log."),
     )
 
 

@@ -20,10 +20,9 @@ from ultragray_service.cli.terminal import (
     Json,
     SceneFile,
     check_folder,
-    command_group,
-    examples,
     option,
     output_option,
+    single,
     to_json,
     wide_console,
     working,
@@ -35,21 +34,16 @@ if TYPE_CHECKING:
     from ultragray.scene.gaussians import GaussianScene
 
 
-command_app = command_group()
-
-
 class Split(str, enum.Enum):
     VAL = "val"
     TRAIN = "train"
 
 
-@command_app.command(
-    "eval",
-    epilog=examples(
-        "ultragray eval liver.ugr sweep/",
-        "ultragray eval liver.ugr sweep/ -o pictures/  # truth beside rendering, frame by frame",
-        "ultragray eval liver.ugr sweep/ --json | jq .mean",
-    ),
+@single(
+    "ultragray eval liver.ugr sweep/",
+    "ultragray eval liver.ugr sweep/ -o pictures/  # truth beside rendering, frame by frame",
+    "ultragray eval liver.ugr sweep/ --json | jq .mean",
+    name="eval",
 )
 @with_options
 def evaluate(

@@ -59,11 +59,10 @@ class FieldsOf:
 
 def with_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Make a command of typer out of a function that takes contract dataclasses."""
-    hints = get_type_hints(command, include_extras=True)
     contracts: dict[str, Any] = {}
-    parameters: list[inspect.Parameter] = []
-    for name, parameter in inspect.signature(command).parameters.items():
-        cls, _ = optional_of(hints[name])
+    own, parameters = parameters_in(command), list[inspect.Parameter]()
+    for parameter in own:
+        name, (cls, _) = parameter.name, optional_of(parameter.annotation)
         if isinstance(asked := getattr(cls, "__metadata__", (None,))[0], FieldsOf):
             contracts[name] = asked
             parameters += _chosen_parameters(asked)
@@ -71,12 +70,12 @@ def with_options(command: Callable[..., Any]) -> Callable[..., Any]:
             contracts[name] = cls
             parameters += parameters_of(cls, name)
         else:
-            parameters.append(parameter.replace(annotation=hints[name], kind=parameter.KEYWORD_ONLY))
+            parameters.append(parameter)
 
     @wraps(command)
     def run(**given: Any) -> Any:
         made = {name: _made(cls, name, given) for name, cls in contracts.items()}
-        return command(**{name: made[name] if name in made else given[name] for name in hints if name != "return"})
+        return command(**{one.name: made[one.name] if one.name in made else given[one.name] for one in own})
 
     return with_parameters(run, parameters)
 
@@ -91,6 +90,12 @@ def with_parameters(command: Callable[..., Any], parameters: list[inspect.Parame
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return command
+
+
+def parameters_in(function: Callable[..., Any]) -> list[inspect.Parameter]:
+    hints = get_type_hints(function, include_extras=True)
+    found = inspect.signature(function).parameters.items()
+    return [one.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY) for name, one in found]
 
 
 def parameters_of(cls: Any, name: str = "") -> list[inspect.Parameter]:

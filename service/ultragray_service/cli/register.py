@@ -26,6 +26,7 @@ from ultragray_service.cli.terminal import (
     examples,
     option,
     output_option,
+    single,
     tell,
     working,
 )
@@ -37,14 +38,11 @@ if TYPE_CHECKING:
 
 
 POSE_SUFFIXES = (".npy",)
-localize_app = command_group()
 
 
-@localize_app.command(
-    epilog=examples(
-        "ultragray localize liver.ugr frame.png --start pose.npy",
-        "ultragray localize liver.ugr frame.npy --start pose.json --within-mm 10 -o found.npy",
-    )
+@single(
+    "ultragray localize liver.ugr frame.png --start pose.npy",
+    "ultragray localize liver.ugr frame.npy --start pose.json --within-mm 10 -o found.npy",
 )
 def localize(
     scene: SceneFile,

@@ -38,29 +38,25 @@ from ultragray_service.cli.terminal import (
     check_ending,
     check_file,
     check_folder,
-    command_group,
     counted,
-    examples,
     frames_in_words,
     is_folder_name,
     option,
     output_option,
+    single,
     tell,
 )
 
 SHARDS = "Shards"
 SUFFIXES = tuple(one.suffix for one in FORMATS.values())
-command_app = command_group()
 
 
-@command_app.command(
-    epilog=examples(
-        "ultragray render liver.ugr -o frames.npz  # the training poses",
-        "ultragray render liver.ugr -o pictures/ --poses path.npy  # a folder of PNGs",
-        "ultragray render liver.ugr -o augmented.tar --sampler around --count 500 --translation-mm 3",
-        "ultragray render liver.ugr -o labels.h5 --outputs bmode,labels --min-confidence 0.8",
-        "ultragray render liver.ugr -o s3://frames/liver --sampler around --count 10000000 --on ray://head:10001",
-    )
+@single(
+    "ultragray render liver.ugr -o frames.npz  # the training poses",
+    "ultragray render liver.ugr -o pictures/ --poses path.npy  # a folder of PNGs",
+    "ultragray render liver.ugr -o augmented.tar --sampler around --count 500 --translation-mm 3",
+    "ultragray render liver.ugr -o labels.h5 --outputs bmode,labels --min-confidence 0.8",
+    "ultragray render liver.ugr -o s3://frames/liver --sampler around --count 10000000 --on ray://head:10001",
 )
 @with_options
 def render(

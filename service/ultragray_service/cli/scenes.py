@@ -27,11 +27,10 @@ from ultragray_service.cli.terminal import (
     argument,
     check_ending,
     check_file,
-    command_group,
-    examples,
     option,
     output_option,
     print_facts,
+    single,
     tell,
     to_json,
     warn,
@@ -42,10 +41,7 @@ if TYPE_CHECKING:
     from ultragray import GaussianScene
 
 
-demo_app = command_group()
-
-
-@demo_app.command(epilog=examples("ultragray demo -o demo.ugr", "ultragray serve demo.ugr"))
+@single("ultragray demo -o demo.ugr", "ultragray serve demo.ugr")
 def demo(
     output: Annotated[Path, output_option("Scene file to write (.ugr).", default="demo.ugr")] = Path("demo.ugr"),
     force: Force = False,
@@ -65,15 +61,10 @@ def demo(
     )
 
 
-show_app = command_group()
-
-
-@show_app.command(
-    epilog=examples(
-        "ultragray show liver.ugr",
-        "ultragray show liver.ugr --json | jq .metrics",
-        "ultragray show sweep/  # see also: ultragray check",
-    )
+@single(
+    "ultragray show liver.ugr",
+    "ultragray show liver.ugr --json | jq .metrics",
+    "ultragray show sweep/  # see also: ultragray check",
 )
 @with_options
 def show(
@@ -137,14 +128,10 @@ def _describe_sweep(source: str, options: SourceOptions) -> dict[str, Any]:
 
 
 EXCHANGED = (".ply", ".pt")
-export_app = command_group()
 
 
-@export_app.command(
-    epilog=examples(
-        "ultragray export liver.ugr -o liver.ply",
-        "ultragray export liver.ugr -o released/ckpt.pt  # a folder of its own",
-    )
+@single(
+    "ultragray export liver.ugr -o liver.ply", "ultragray export liver.ugr -o released/ckpt.pt  # a folder of its own"
 )
 def export(
     scene: SceneFile,
@@ -202,15 +189,12 @@ def _write_checkpoint(scene: GaussianScene, output: Path, replace: bool) -> dict
 
 
 _CHECKPOINT = "Checkpoint (.pt)"
-import_app = command_group()
 
 
-@import_app.command(
-    "import",
-    epilog=examples(
-        "ultragray import liver.ply -o liver.ugr",
-        "ultragray import ckpt.pt --config conf.json --poses poses_train.npy -o liver.ugr",
-    ),
+@single(
+    "ultragray import liver.ply -o liver.ugr",
+    "ultragray import ckpt.pt --config conf.json --poses poses_train.npy -o liver.ugr",
+    name="import",
 )
 def import_scene(
     file: Annotated[
@@ -295,15 +279,12 @@ def import_scene(
 
 
 RIGHT, DOWN = "1,0,0", "0,0,1"
-voxelize_app = command_group()
 
 
-@voxelize_app.command(
-    epilog=examples(
-        "ultragray voxelize liver.ugr -o liver.nii.gz --spacing-mm 0.5",
-        "ultragray voxelize liver.ugr -o bone.nrrd --field attenuation --box-mm=-20:20,-30:30,0:60",
-        "ultragray voxelize liver.ugr -o cut.png --plane-mm=-20,0,0 --right 1,0,0 --down 0,0,1 --size-mm 40,60",
-    )
+@single(
+    "ultragray voxelize liver.ugr -o liver.nii.gz --spacing-mm 0.5",
+    "ultragray voxelize liver.ugr -o bone.nrrd --field attenuation --box-mm=-20:20,-30:30,0:60",
+    "ultragray voxelize liver.ugr -o cut.png --plane-mm=-20,0,0 --right 1,0,0 --down 0,0,1 --size-mm 40,60",
 )
 def voxelize(
     scene: SceneFile,
@@ -370,16 +351,12 @@ def _is_beyond(info: SceneInfo, low: Sequence[float], high: Sequence[float]) -> 
     return any(map(lt, high, info.bounds_min_mm)) or any(map(gt, low, info.bounds_max_mm))
 
 
-slicer_app = command_group()
-
 SUFFIX, VOLUME_SUFFIX = ".mrml", "-echo.nii.gz"
 
 
-@slicer_app.command(
-    epilog=examples(
-        "ultragray slicer scenes/liver.ugr -o liver.mrml",
-        "ultragray slicer scenes/liver.ugr -o liver.mrml --igtl-address 10.0.0.5:18944",
-    )
+@single(
+    "ultragray slicer scenes/liver.ugr -o liver.mrml",
+    "ultragray slicer scenes/liver.ugr -o liver.mrml --igtl-address 10.0.0.5:18944",
 )
 def slicer(
     scene: SceneFile,

@@ -13,21 +13,18 @@ from ultragray.errors import InvalidArgument
 from ultragray.phantom.demo import copy_demo_scene
 from ultragray.scene.info import read_header
 from ultragray_service.cli.options import FieldsOf, with_options
-from ultragray_service.cli.terminal import argument, command_group, examples
+from ultragray_service.cli.terminal import argument, single
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from ultragray_workers.scenes import SUFFIX, SceneStore
 
 DEMO_NAME = "demo"
-command_app = command_group()
 
 
-@command_app.command(
-    epilog=examples(
-        "ultragray serve  # the scenes of ./data; the demo scene where there are none",
-        "ultragray serve liver.ugr spine.ugr --http-port 8080",
-        "ultragray keys create alice --role admin > alice.key",
-        "ultragray serve --host 0.0.0.0 --tls-certificate tls.crt --tls-key tls.key",
-    )
+@single(
+    "ultragray serve  # the scenes of ./data; the demo scene where there are none",
+    "ultragray serve liver.ugr spine.ugr --http-port 8080",
+    "ultragray keys create alice --role admin > alice.key",
+    "ultragray serve --host 0.0.0.0 --tls-certificate tls.crt --tls-key tls.key",
 )
 @with_options
 def serve(

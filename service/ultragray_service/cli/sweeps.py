@@ -23,6 +23,7 @@ from ultragray_service.cli.terminal import (
     examples,
     option,
     output_option,
+    single,
     tell,
     to_json,
     warn,
@@ -141,10 +142,7 @@ def _range(part: SweepReport, axis: int) -> str:
     return f"{part.extent_min_mm[axis]:.1f} … {part.extent_max_mm[axis]:.1f}"
 
 
-draw_app = command_group()
-
-
-@draw_app.command(epilog=examples("ultragray draw sweep/ -o sweep.png"))
+@single("ultragray draw sweep/ -o sweep.png")
 @with_options
 def draw(
     sweep: SweepArgument,
@@ -163,14 +161,9 @@ def draw(
     tell(f"wrote {output}", {"output": str(output)}, as_json=json)
 
 
-convert_app = command_group()
-
-
-@convert_app.command(
-    epilog=examples(
-        "ultragray convert scan.igs.mha --device-set plus.xml -o sweep/",
-        "ultragray convert sweep/ --poses-of liver.ugr -o corrected/  # with the poses that the training corrected",
-    )
+@single(
+    "ultragray convert scan.igs.mha --device-set plus.xml -o sweep/",
+    "ultragray convert sweep/ --poses-of liver.ugr -o corrected/  # with the poses that the training corrected",
 )
 @with_options
 def convert(

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 
 OUTPUT, COMPUTE = "Output", "Compute"
+Columns = Mapping[str, Callable[[Any], str]]
 
 Json = Annotated[
     bool, typer.Option("--json", help="One JSON document on standard output, for scripts.", rich_help_panel=OUTPUT)
@@ -36,6 +37,17 @@ def command_group(help: str | None = None) -> typer.Typer:
     return typer.Typer(
         add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode="rich", help=help
     )
+
+
+def single(*lines: str, name: str | None = None) -> Callable[[Callable[..., Any]], typer.Typer]:
+    """A decorator that makes an app of one command, with these examples, of a function."""
+
+    def made(command: Callable[..., Any]) -> typer.Typer:
+        app = command_group()
+        app.command(name, epilog=examples(*lines))(command)
+        return app
+
+    return made
 
 
 def examples(*lines: str) -> str:
@@ -61,6 +73,21 @@ def tell(sentence: str, document: Any, *, as_json: bool) -> None:
     typer.echo(to_json(document) if as_json else sentence)
 
 
+def tell_facts(document: dict[str, Any], *, as_json: bool) -> None:
+    if as_json:
+        typer.echo(to_json(document))
+    else:
+        print_facts(document)
+
+
+def tell_table(columns: Columns, documents: Sequence[Any], *, as_json: bool) -> None:
+    """A row for each document under the columns, each of which says what it holds of one; or the documents."""
+    if as_json:
+        typer.echo(to_json(documents))
+    else:
+        print_table([*columns], [[cell(one) for cell in columns.values()] for one in documents])
+
+
 def to_json(document: Any) -> str:
     """A JSON document as commands print it: paths and the like as text, numbers that JSON does not have as null."""
     return json.dumps(_finite(document), indent=2, ensure_ascii=False, allow_nan=False, default=str)
@@ -76,6 +103,10 @@ def _finite(value: Any) -> Any:
 
 def frames_in_words(count: int) -> str:
     return f"{count:,} frame{'' if count == 1 else 's'}"
+
+
+def minutes_and_seconds(seconds: float) -> str:
+    return "{}:{:02d}".format(*divmod(round(seconds), 60))
 
 
 def warn(text: str) -> None:

@@ -27,11 +27,11 @@ from ultragray_service.cli.terminal import (
     Json,
     Threads,
     check_file,
-    command_group,
-    examples,
+    minutes_and_seconds,
     option,
     output_option,
     progress_bars,
+    single,
     stop_on_signal,
     tell,
 )
@@ -46,16 +46,11 @@ MEASURING = "measuring what was reached"
 METRIC_NAMES = {"psnr_db": "PSNR, dB", "ms_ssim": "MS-SSIM", "gms": "GMS", "gmsd": "GMSD"}
 
 
-command_app = command_group()
-
-
-@command_app.command(
-    epilog=examples(
-        "ultragray train sweep/ -o liver.ugr",
-        "ultragray train sweep/ -o liver.ugr --preset best --threads 8",
-        "ultragray train scan.igs.mha --device-set plus.xml -o liver.ugr --set steps=4000 --set sh_degree=2",
-        "ultragray train sweep/ -o liver.ugr --resume  # after Ctrl-C",
-    )
+@single(
+    "ultragray train sweep/ -o liver.ugr",
+    "ultragray train sweep/ -o liver.ugr --preset best --threads 8",
+    "ultragray train scan.igs.mha --device-set plus.xml -o liver.ugr --set steps=4000 --set sh_degree=2",
+    "ultragray train sweep/ -o liver.ugr --resume  # after Ctrl-C",
 )
 @with_options
 def train(
@@ -288,10 +283,9 @@ def _progress_bar() -> Iterator[Callable[[Any], None]]:
 
 def _figures(state: Any) -> str:
     held_out = "" if state.val_psnr_db is None else f" · held out {state.val_psnr_db:.2f} dB"
-    minutes, seconds = divmod(round(state.seconds_left), 60)
     return (
         f"loss {state.loss:.4f} · {state.gaussian_count:,} Gaussians · {state.steps_per_s:.1f} steps/s · "
-        f"{minutes}:{seconds:02d} left{held_out}"
+        f"{minutes_and_seconds(state.seconds_left)} left{held_out}"
     )
 
 

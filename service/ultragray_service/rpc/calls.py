@@ -103,13 +103,19 @@ def refusing_what_is_no_message(handler: Any) -> Any:
 
 
 def _with(handler: Any, method: Method, deserializer: Callable[[bytes], Any] | None) -> Any:
+    streaming = handler.request_streaming, handler.response_streaming
+    return make_handler(streaming, method, deserializer, handler.response_serializer)
+
+
+def make_handler(streaming: tuple[bool, bool], method: Method, *codecs: Any) -> grpc.RpcMethodHandler:
+    """A handler of gRPC; `streaming`: whether requests and answers are several, `codecs`: what reads and writes one."""
     make = {
         (False, False): grpc.unary_unary_rpc_method_handler,
         (False, True): grpc.unary_stream_rpc_method_handler,
         (True, False): grpc.stream_unary_rpc_method_handler,
         (True, True): grpc.stream_stream_rpc_method_handler,
-    }[handler.request_streaming, handler.response_streaming]
-    return make(method, deserializer, handler.response_serializer)
+    }[streaming]
+    return make(method, *codecs)
 
 
 _OPEN_PREFIX = "/grpc.health.v1."
