@@ -22,7 +22,7 @@ from ultragray_service.core.registrations import Registrations
 from ultragray_service.core.rendering import Rendering, RequestPlanner
 from ultragray_service.core.scenes import SceneCatalog, ScenePlaces, Scenes
 from ultragray_service.core.threads import HelperProcesses
-from ultragray_service.core.uploads import DatasetUploads, Quotas, SceneImports
+from ultragray_service.core.uploads import DatasetUploads, Means, Quotas, SceneImports
 from ultragray_service.doors import Doors
 from ultragray_service.service import Service
 from ultragray_service.settings import Settings
@@ -72,6 +72,7 @@ def make_service(settings: Settings) -> Service:
     )
     # Each process may take all the memory that settings allow to one: one checks at a time, and one makes pictures.
     checks, pictures = (HelperProcesses(settings.dataset_memory_mb << 20) for _ in range(2))
+    means = Means(settings, jobs, life.draining, checks, owners, quotas)
     return Service(
         settings=settings,
         life=life,
@@ -92,8 +93,8 @@ def make_service(settings: Settings) -> Service:
         datasets=Datasets(datasets, owners),
         registrations=registrations,
         jobs=jobs,
-        uploads=DatasetUploads(datasets, settings, jobs, life.draining, checks, owners, quotas),
-        imports=SceneImports(scenes, places.made, settings, jobs, checks, owners, quotas),
+        uploads=DatasetUploads(datasets, means),
+        imports=SceneImports(scenes, places.made, means),
         pool=pool,
         planner=planner,
         rendering=rendering,

@@ -302,35 +302,32 @@ MAX_TIMEOUT_MS = 3_600_000.0
 SceneSettings = tuple[str, RenderSettings]
 
 
-class Message(Protocol):
-    """A message of the client. What cannot be used is raised, as InvalidArgument, by the method that would give it."""
+def nothing() -> None:
+    """What a message says that leaves something out."""
 
-    @property
-    def sequence(self) -> int: ...
 
-    @property
-    def client_time(self) -> float | None: ...
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Message:
+    """A message of the client. What cannot be used is raised, as InvalidArgument, by the call that would give it."""
 
-    @property
-    def window(self) -> int | None:
-        """Answers of a latest stream that may wait to be acknowledged; of the first message. None: none ever is."""
+    sequence: int = 0
+    client_time: float | None = None
+    mode: Callable[[], StreamMode | None] = nothing  # asked of the first; None: it cannot be read, the next one may
+    window: int | None = None  # of the first: answers of a latest stream that may wait to be acknowledged; None: none
+    acknowledged: int | None = None  # the sequence of the newest answer that the client has taken
+    settings: Callable[[], SceneSettings | None] = nothing  # from now on; None: as before
+    asks: bool = True  # for a frame
+    pose: Callable[[], FloatArray]  # [4, 4] mm, exact
+    timeout_s: Callable[[], float | None] = nothing  # that the pose may wait; None: the default of the service
 
-    @property
-    def acknowledged(self) -> int | None:
-        """The sequence of the newest answer that the client has taken; None: no news."""
 
-    def settings(self) -> SceneSettings | None:
-        """The scene and what to render of it from now on; None: as before."""
+def unreadable(error: InvalidArgument, *, of_settings: bool = False, **numbers: Any) -> Message:
+    """A message that could not be read: it has its numbers, as far as these can, and raises why."""
 
-    @property
-    def asks(self) -> bool:
-        """Whether it asks for a frame."""
+    def refuse() -> Any:
+        raise error
 
-    def pose(self) -> FloatArray:  # [4, 4] mm, exact
-        """The pose to render, of a message that asks."""
-
-    def timeout_s(self) -> float | None:
-        """The time that the pose may wait; None: the default of the service."""
+    return Message(**numbers, settings=refuse if of_settings else nothing, pose=refuse)
 
 
 class Transport(Protocol):
@@ -338,13 +335,10 @@ class Transport(Protocol):
 
     @property
     def destination(self) -> Destination | None:
-        """Where frames are put, of a transport whose mode was asked for; None: into the answers."""
+        """Where frames are put, once the mode was asked for; None: into the answers."""
 
     async def receive(self) -> Message | None:
         """The next message; None after the last."""
-
-    def mode(self, message: Message) -> StreamMode | None:
-        """The mode that the first message asks for; None where it cannot be read: then the next one may."""
 
     async def send(self, answer: StreamAnswer) -> None:
         """Sends a frame, or why there is none."""
@@ -382,7 +376,7 @@ class FrameStream:
     async def _read(self) -> None:
         mode = None
         while (message := await self._transport.receive()) is not None:
-            if mode is None and (mode := self._transport.mode(message)) is not None:
+            if mode is None and (mode := message.mode()) is not None:
                 self._poses.mode, self._poses.destination = mode, self._transport.destination
                 if message.window is not None:
                     self._poses.open_window(message.window)

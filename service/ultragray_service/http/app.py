@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -137,10 +138,8 @@ def add_console(
 
 
 async def _file(request: Request, path: Path, media_type: str, token_origin: str | None) -> Response:
-    async def whole() -> Response:
-        return Response(await asyncio.to_thread(path.read_bytes), media_type=media_type)
-
-    response = await revalidated(request, FileVersion.of(path).tag, whole)
+    content = partial(asyncio.to_thread, path.read_bytes)
+    response = await revalidated(request, FileVersion.of(path).tag, content, media_type)
     response.headers.update(_headers(request, token_origin))
     return response
 

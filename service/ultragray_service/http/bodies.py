@@ -27,6 +27,7 @@ from ultragray.rendering.settings import FrameSettings, RenderSettings, registra
 from ultragray_service.core.poses import Pose, check_pose_count
 from ultragray_service.core.streams import MAX_TIMEOUT_MS, MAX_WINDOW, StreamMode
 from ultragray_service.errors import BodyTooLarge, UnsupportedMediaType
+from ultragray_service.http.dependencies import require_uncompressed
 from ultragray_service.http.problems import invalid_argument
 from ultragray_workers.jobs.kinds import KINDS, Specification
 from ultragray_workers.jobs.record import MAX_PRIORITY
@@ -144,8 +145,7 @@ async def read_json_body(request: Request, cls: type[T], apart: Apart | None = N
     media_type = content_type.partition(";")[0].strip().lower()
     if media_type != "application/json" and not media_type.endswith("+json"):
         raise UnsupportedMediaType(f"Content-Type must be application/json, got {content_type!r}", field="Content-Type")
-    if request.headers.get("content-encoding", "identity").lower() != "identity":
-        raise UnsupportedMediaType("the body must not be compressed", field="Content-Encoding")
+    require_uncompressed(request)
     body = await request.body()
     return read_json(body, cls) if len(body) <= INLINE_BYTES else await read_large(body, cls, apart, read_json)
 

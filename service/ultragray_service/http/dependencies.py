@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable, Coroutine, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
 from typing import Annotated, Any, TypeVar
 
-from fastapi import Depends, Path
+from fastapi import Depends, Path, Query
 from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import Response
 from starlette.types import Receive
 
+from ultragray_service.core.uploads import Next
+from ultragray_service.errors import UnsupportedMediaType
 from ultragray_service.http.problems import PROBLEM_TYPE, Problem
 from ultragray_service.service import Service
-from ultragray_workers.errors import DeadlineExceeded
+from ultragray_workers.errors import DeadlineExceeded, UploadTooLarge
 
 
 async def _service(connection: HTTPConnection) -> Service:  # async: FastAPI runs plain functions in a thread
@@ -95,25 +97,63 @@ async def finish_or_abandon(work: Coroutine[Any, Any, T], receive: Receive, dead
         leaving.cancel()
 
 
+async def blocks_of(request: Request, arrival: Next[Any]) -> AsyncIterator[bytes]:
+    """The body as it comes. Raises ClientDisconnect, and what `arrival` raises, see `arrivals`."""
+    more = True
+    while more:
+        message = await arrival(request.receive())
+        if message["type"] == "http.disconnect":
+            raise ClientDisconnect
+        more = message.get("more_body", False)
+        yield message.get("body", b"")
+
+
+def check_upload(request: Request, limit_bytes: int, what: str) -> None:
+    """Raise UploadTooLarge where an upload announces too many bytes, UnsupportedMediaType where it is compressed."""
+    require_uncompressed(request)
+    announced = request.headers.get("content-length", "")
+    if announced.isdigit() and int(announced) > limit_bytes:
+        raise UploadTooLarge(f"{what} may have at most {limit_bytes} bytes, {announced} were announced", field="body")
+
+
+def require_uncompressed(request: Request) -> None:
+    if request.headers.get("content-encoding", "identity").lower() != "identity":
+        raise UnsupportedMediaType("the body must not be compressed", field="Content-Encoding")
+
+
 async def _disconnected(receive: Receive) -> None:
     while (await receive())["type"] != "http.disconnect":
         pass
 
 
-NOT_MODIFIED = "It is as the client has it (If-None-Match)."
+Answers = dict[int | str, dict[str, Any]]
+BINARY = {"schema": {"type": "string", "format": "binary"}}
+NOT_MODIFIED: Answers = {304: {"description": "It is as the client has it (If-None-Match)."}}
+PageToken = Annotated[str, Query(description="next_page_token of the page before.")]
 
 
-async def revalidated(request: Request, version: str, make: Callable[[], Awaitable[Response]]) -> Response:
-    """What `make` answers, with `version` as its ETag; 304 without asking it where the client has that version.
+def answer(description: str, *media_types: str, headers: Mapping[str, str] | None = None) -> Answers:
+    """The documentation of an answer of bytes, with its headers and their meanings."""
+    document: dict[str, Any] = {"description": description, "content": dict.fromkeys(media_types, BINARY)}
+    if headers is not None:
+        document["headers"] = {
+            name: {"description": text, "schema": {"type": "string"}} for name, text in headers.items()
+        }
+    return {200: document}
 
-    `version` names the content: letters, digits and '-'. A Cache-Control of the answer stays.
+
+async def revalidated(
+    request: Request, version: str, make: Callable[[], Awaitable[bytes]], media_type: str
+) -> Response:
+    """What `make` gives, with `version` as its ETag; 304 without asking it where the client has that version.
+
+    `version` names the content: letters, digits and '-'.
     """
     tag = f'"{version}"'
     known = [known.strip().removeprefix("W/") for known in request.headers.get("if-none-match", "").split(",")]
-    answer = Response(status_code=304) if tag in known else await make()
-    answer.headers["ETag"] = tag
-    answer.headers.setdefault("Cache-Control", "private, no-cache")
-    return answer
+    response = Response(status_code=304) if tag in known else Response(await make(), media_type=media_type)
+    response.headers.update({"ETag": tag, "Cache-Control": "private, no-cache"})
+    return response
 
 
 DEMO_SCENE = "demo"

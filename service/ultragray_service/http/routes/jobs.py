@@ -26,7 +26,7 @@ from ultragray_service.core.jobs.log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
 from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
 from ultragray_service.http.accept import NPZ, PNG
 from ultragray_service.http.bodies import SPECIFICATION, JobBody, adapter_of, body_schema, read_json_body
-from ultragray_service.http.dependencies import JOB_EXAMPLES, ServiceDep, problems
+from ultragray_service.http.dependencies import JOB_EXAMPLES, Answers, PageToken, ServiceDep, answer, problems
 from ultragray_service.views.prepared import TrainingCurve
 from ultragray_workers.jobs.files import Artifact
 from ultragray_workers.jobs.kinds import KINDS, Specification
@@ -127,25 +127,16 @@ _AnyKind: Any = Literal.__getitem__(("", *KINDS))
 StateFilter = Annotated[_AnyState, Query(description="Only jobs in this state; empty: all.")]
 KindFilter = Annotated[_AnyKind, Query(description="Only jobs of this kind; empty: all.")]
 PageSize = Annotated[int, Query(ge=1, le=MAX_PAGE_SIZE, description="Jobs on one page.")]
-PageToken = Annotated[str, Query(description="next_page_token of the page before.")]
 LogBytes = Annotated[int, Query(ge=1, le=MAX_LOG_BYTES, description="How much of the log's end is given.")]
 LastEventId = Annotated[str, Header(alias="Last-Event-ID", description="Id of the last event of an earlier stream.")]
 
 _SUBMIT = body_schema(JobBody, JOB_EXAMPLES)
-_Answers = dict[int | str, dict[str, Any]]
-_SAME_JOB: _Answers = {200: {"model": Job, "description": "The job that this request_id made before."}}
-_SAME_RETRY: _Answers = {200: {"model": Job, "description": "The job that an earlier call made."}}
-_LOG: _Answers = {200: {"description": "The end of the log.", "content": {"text/plain": {}}}}
-_FILE: _Answers = {
-    200: {
-        "description": "The file.",
-        "content": {
-            media_type: {"schema": {"type": "string", "format": "binary"}}
-            for media_type in (*MEDIA_TYPES.values(), _ANY_FILE)
-        },
-    }
-}
-_EVENTS: _Answers = {
+_SAME_JOB: Answers = {200: {"model": Job, "description": "The job that this request_id made before."}}
+_SAME_RETRY: Answers = {200: {"model": Job, "description": "The job that an earlier call made."}}
+_LOG: Answers = {200: {"description": "The end of the log.", "content": {"text/plain": {}}}}
+_FILE = answer("The file.", *MEDIA_TYPES.values(), _ANY_FILE)
+_PREVIEW = answer("8-bit grey: the frame as it was recorded, and to its right as it is rendered.", PNG)
+_EVENTS: Answers = {
     200: {
         "description": "Server-sent events: `progress` with the job (Job) at first and whenever it changed, at most "
         "twice a second; `log` with new lines. The stream ends after the job's final state.",
@@ -338,14 +329,6 @@ def _read(file: Artifact, start: int, length: int) -> bytes:
 
 
 training_router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
-
-_Answers2 = dict[int | str, dict[str, Any]]
-_PREVIEW: _Answers2 = {
-    200: {
-        "description": "8-bit grey: the frame as it was recorded, and to its right as it is rendered.",
-        "content": {PNG: {"schema": {"type": "string", "format": "binary"}}},
-    }
-}
 
 
 @training_router.get("/{job}/curve", responses=problems(401, 404, 422, 503))

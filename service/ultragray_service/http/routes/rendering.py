@@ -29,6 +29,7 @@ from ultragray_service.http.dependencies import (
     SLICE_EXAMPLES,
     SceneName,
     ServiceDep,
+    answer,
     finish_or_abandon,
     problems,
 )
@@ -66,18 +67,15 @@ _OPENAPI: dict[str, Any] = {
     "parameters": [{"name": "scene", "in": "path", "required": True, **SCENE_NAME}],
     **body_schema(RenderBody, RENDER_EXAMPLES),
 }
-_BINARY = {"schema": {"type": "string", "format": "binary"}}
-_ANSWER: dict[int | str, dict[str, Any]] = {
-    200: {
-        "description": "The frames. image/png and image/jpeg: one pose, one output. application/octet-stream "
-        "(parameter dtype=uint8 or float32): the outputs one after another, each [C, H, W]. application/x-npz "
-        "holds one float32 array [C, H, W] per output, `poses` [C, 4, 4], and the strings scene, scene_sha256 and "
-        "renderer. application/dicom: a multi-frame ultrasound image of bmode, true to scale: fans are scan-converted. "
-        "`*/*` gives PNG where it can hold the request, else npz.",
-        "content": {PNG: _BINARY, JPEG: _BINARY, RAW: _BINARY, NPZ: _BINARY, DICOM: _BINARY},
-        "headers": {name: {"description": text, "schema": {"type": "string"}} for name, text in RENDER_HEADERS.items()},
-    }
-}
+_ANSWER = answer(
+    "The frames. image/png and image/jpeg: one pose, one output. application/octet-stream (parameter dtype=uint8 or "
+    "float32): the outputs one after another, each [C, H, W]. application/x-npz holds one float32 array [C, H, W] per "
+    "output, `poses` [C, 4, 4], and the strings scene, scene_sha256 and renderer. application/dicom: a multi-frame "
+    "ultrasound image of bmode, true to scale: fans are scan-converted. `*/*` gives PNG where it can hold the request, "
+    "else npz.",
+    *(PNG, JPEG, RAW, NPZ, DICOM),
+    headers=RENDER_HEADERS,
+)
 
 
 @router.post(
@@ -168,16 +166,12 @@ SLICE_HEADERS = {
     "X-Ultragray-Pixel-To-Scene": "4x4 matrix from (column, row, k, 1), from 0 at pixels' centres, to mm, JSON.",
     "Server-Timing": "Waiting, sampling and encoding time, for browsers.",
 }
-_BINARY2 = {"schema": {"type": "string", "format": "binary"}}
-_SLICE_ANSWER: dict[int | str, dict[str, Any]] = {
-    200: {
-        "description": "The slice, [H, W]. image/png: grey, 255 at 1 (attenuation: at the largest value of the slice); "
-        "labels keep their numbers. application/x-npy and application/octet-stream: the values, row by row. `*/*` "
-        "gives PNG.",
-        "content": {PNG: _BINARY2, NPY: _BINARY2, RAW: _BINARY2},
-        "headers": {name: {"description": text, "schema": {"type": "string"}} for name, text in SLICE_HEADERS.items()},
-    }
-}
+_SLICE_ANSWER = answer(
+    "The slice, [H, W]. image/png: grey, 255 at 1 (attenuation: at the largest value of the slice); labels keep their "
+    "numbers. application/x-npy and application/octet-stream: the values, row by row. `*/*` gives PNG.",
+    *(PNG, NPY, RAW),
+    headers=SLICE_HEADERS,
+)
 
 
 @slices_router.post(
