@@ -71,6 +71,28 @@ def account() -> Account:
     return _account.get() or Account()
 
 
+class AskedDatabase:
+    """Tells the log once that a database is away, and once that it is back."""
+
+    def __init__(self, away: str, back: str, log: logging.Logger) -> None:
+        self._away, self._back, self._log = away, back, log
+        self._is_away = False
+
+    @contextmanager
+    def asked(self) -> Iterator[None]:
+        """The body asks; it may fail, and is to be tried again."""
+        try:
+            yield
+        except (UltragrayError, SQLAlchemyError) as error:
+            if not self._is_away:
+                self._log.warning(f"{self._away}: {str(error).splitlines()[0]}")
+            self._is_away = True
+        else:
+            if self._is_away:
+                self._log.warning(self._back)
+            self._is_away = False
+
+
 class AuditLog:
     """Takes entries on the thread of the event loop, and writes them in a thread of its own."""
 
@@ -79,7 +101,7 @@ class AuditLog:
         self._tallies: dict[Entry, int] = {}
         self._different: Counter[str] = Counter()  # tallies by callers
         self._lost = 0
-        self._is_away = False
+        self._database = AskedDatabase("the audit log waits in memory", "the audit log is written again", _log)
         self._engine: sa.Engine | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="audit", daemon=True)
@@ -146,9 +168,8 @@ class AuditLog:
             _account.reset(before)
             entry = Entry(who, address, operation.name, mine.target, mine.result)
             if operation.lasts:
-                self.tell(
-                    replace(entry, facts={"frames": mine.frames, "seconds": round(time.monotonic() - began_s, 1)})
-                )
+                seconds = round(time.monotonic() - began_s, 1)
+                self.tell(replace(entry, facts={"frames": mine.frames, "seconds": seconds}))
             elif operation.changes and mine.result not in _COUNTED:
                 self.tell(entry)
             else:
@@ -164,19 +185,8 @@ class AuditLog:
                 if stopping or time.monotonic() - tallied_s >= TALLY_INTERVAL_S:
                     tallied_s = time.monotonic()
                     self._tell_tallies()
-                self._try_to_write()
-
-    def _try_to_write(self) -> None:
-        try:
-            self._write()
-        except (UltragrayError, SQLAlchemyError) as error:
-            if not self._is_away:
-                _log.warning(f"the audit log waits in memory: {str(error).splitlines()[0]}")
-            self._is_away = True
-        else:
-            if self._is_away:
-                _log.warning("the audit log is written again")
-            self._is_away = False
+                with self._database.asked():
+                    self._write()
 
     def _tell_tallies(self) -> None:
         tallies, self._tallies = self._tallies, {}

@@ -13,10 +13,10 @@ from dataclasses import dataclass
 from types import MappingProxyType
 
 import sqlalchemy as sa
-from sqlalchemy.exc import SQLAlchemyError
 
 from ultragray.contract import described
-from ultragray.errors import InvalidArgument, UltragrayError
+from ultragray.errors import InvalidArgument
+from ultragray_service.access.audit import AskedDatabase
 from ultragray_service.access.credentials import digest_of
 from ultragray_service.access.principals import Number, Principal, Role
 from ultragray_service.errors import Unauthenticated
@@ -197,7 +197,7 @@ class Snapshot:
         """
         self._engine, self._keys, self._copies = engine, keys, copies
         self._number: int | None = None
-        self._is_away = False
+        self._database = AskedDatabase(f"{_COPIED} stay as they are for now", f"{_COPIED} are read again", _log)
         self._stop = threading.Event()
         self.refresh()
         self._thread = threading.Thread(target=self._run, name="access", daemon=True)
@@ -221,19 +221,7 @@ class Snapshot:
         rounds, round_number = Rounds(f"the watch over {_COPIED}", _log), 0
         while not self._stop.wait(INTERVAL_S):
             round_number += 1
-            with rounds.round():
-                self._look(notes_uses=round_number % _USES_EVERY == 0)
-
-    def _look(self, *, notes_uses: bool) -> None:
-        try:
-            self.refresh()
-            if notes_uses:
-                KeyStore(self._engine).note_uses(self._keys.take_uses())
-        except (UltragrayError, SQLAlchemyError) as error:
-            if not self._is_away:
-                _log.warning(f"{_COPIED} stay as they are for now: {str(error).splitlines()[0]}")
-            self._is_away = True
-        else:
-            if self._is_away:
-                _log.warning(f"{_COPIED} are read again")
-            self._is_away = False
+            with rounds.round(), self._database.asked():
+                self.refresh()
+                if round_number % _USES_EVERY == 0:
+                    KeyStore(self._engine).note_uses(self._keys.take_uses())
