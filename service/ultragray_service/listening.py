@@ -22,7 +22,7 @@ from ipaddress import IPv6Address, ip_address
 
 from ultragray_service.errors import TooManyConnections
 from ultragray_service.settings import ENVIRONMENT_PREFIX
-from ultragray_service.tls.server import HANDSHAKE_TIMEOUT_S
+from ultragray_service.tls import HANDSHAKE_TIMEOUT_S
 from ultragray_workers.errors import StartupFailed
 from ultragray_workers.rounds import Rounds
 

@@ -38,7 +38,7 @@ from ultragray_service.rpc.server import GrpcServer
 from ultragray_service.service import Service
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings
 from ultragray_service.telemetry.logs import configure_logging, is_for_people
-from ultragray_service.tls.server import CertificateWatch
+from ultragray_service.tls import CertificateWatch
 from ultragray_service.wiring import make_service
 from ultragray_workers.errors import StartupFailed
 from ultragray_workers.rounds import Rounds

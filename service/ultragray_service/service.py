@@ -10,17 +10,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ultragray.errors import UltragrayError
-from ultragray_service.access.admission import Admission
 from ultragray_service.access.audit import AuditLog
 from ultragray_service.access.credentials import Guard, Sessions
 from ultragray_service.access.keys import KnownKeys, Snapshot
 from ultragray_service.access.limits import Limits
 from ultragray_service.access.oidc import OidcTokens
 from ultragray_service.access.origins import Origins
-from ultragray_service.access.owners import Owners
+from ultragray_service.access.owners import Admission, Owners
 from ultragray_service.access.principals import is_loopback
 from ultragray_service.core.datasets import Datasets
-from ultragray_service.core.jobs.jobs import Jobs
+from ultragray_service.core.jobs import Jobs
 from ultragray_service.core.life import Life
 from ultragray_service.core.open_streams import OpenStreams
 from ultragray_service.core.readiness import Readiness
@@ -32,7 +31,7 @@ from ultragray_service.doors import Doors
 from ultragray_service.settings import Settings
 from ultragray_service.telemetry.logs import Tracing
 from ultragray_service.telemetry.metrics import Metrics
-from ultragray_service.views.assessments import Assessing
+from ultragray_service.views.poses import Assessing
 from ultragray_service.views.prepared import Comparisons, DatasetViews, TrainingViews, simulated_sha256
 from ultragray_workers.errors import StartupFailed
 from ultragray_workers.jobs.store import JobStore

@@ -5,16 +5,15 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-from ultragray_service.access.admission import Admission
 from ultragray_service.access.audit import AuditLog
 from ultragray_service.access.credentials import EnvironmentKeys, Guard, Sessions
 from ultragray_service.access.keys import KnownKeys
 from ultragray_service.access.limits import Limits
 from ultragray_service.access.oidc import Issuer, OidcTokens, parse_roles
 from ultragray_service.access.origins import Origins
-from ultragray_service.access.owners import Owners, Permissions
+from ultragray_service.access.owners import Admission, Owners, Permissions
 from ultragray_service.core.datasets import Datasets
-from ultragray_service.core.jobs.jobs import Jobs
+from ultragray_service.core.jobs import Jobs
 from ultragray_service.core.life import Life
 from ultragray_service.core.open_streams import OpenStreams
 from ultragray_service.core.readiness import Readiness
@@ -28,7 +27,7 @@ from ultragray_service.service import Service
 from ultragray_service.settings import Settings
 from ultragray_service.telemetry.logs import Tracing, start_tracing
 from ultragray_service.telemetry.metrics import Metrics
-from ultragray_service.views.assessments import Assessing
+from ultragray_service.views.poses import Assessing
 from ultragray_service.views.prepared import Comparisons, DatasetViews, TrainingViews
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.jobs.owners import Kind

@@ -1,4 +1,4 @@
-"""Whose datasets, scenes and jobs are, and who may see and change them: the copy in memory, and what changes it."""
+"""Whose datasets, scenes and jobs are, and who may see and change them; and the admission of what callers ask for."""
 
 from __future__ import annotations
 
@@ -13,19 +13,14 @@ from typing import TypeVar
 import sqlalchemy as sa
 
 from ultragray.errors import UltragrayError
-from ultragray_service.access.principals import Principal, Role, acting
+from ultragray_service.access.audit import AuditLog
+from ultragray_service.access.credentials import Sessions
+from ultragray_service.access.limits import Limits
+from ultragray_service.access.principals import Principal, Role, act_as, acting
 from ultragray_service.access.rules import Operation
 from ultragray_service.errors import PermissionDenied
 from ultragray_workers.errors import job_not_found
-from ultragray_workers.jobs.owners import (
-    NOBODYS,
-    Kind,
-    Ownership,
-    add_owner,
-    forget_owner,
-    read_owner,
-    read_owners,
-)
+from ultragray_workers.jobs.owners import NOBODYS, Kind, Ownership, add_owner, forget_owner, read_owner, read_owners
 from ultragray_workers.scene_names import base_name
 
 SPREAD_S = 2.0  # in which every service has read who owns what again, see `snapshot`
@@ -206,3 +201,33 @@ def _not_own(operation: Operation, name: str, owner: str | None) -> UltragrayErr
         f"{name[:128]!r} is {whose}",
         field=operation.about.value,
     )
+
+
+class Admission:
+    def __init__(self, audit: AuditLog, limits: Limits, sessions: Sessions, permissions: Permissions) -> None:
+        self._audit, self._limits, self._sessions, self._permissions = audit, limits, sessions, permissions
+
+    @asynccontextmanager
+    async def permitted(
+        self,
+        principal: Principal,
+        credential: str | None,
+        operation: Operation,
+        target: str,
+        *,
+        address: str,
+        connection: str,
+    ) -> AsyncIterator[None]:
+        """What a caller may do runs within: counted, audited, and cut off when the credential counts no more.
+
+        `connection`: the caller's address with the port. Raises RateLimited, PermissionDenied and JobNotFound.
+        """
+        act_as(principal, address=address, connection=connection)
+        with self._audit.refusals(principal.name, address, operation, target):
+            self._limits.take_request()
+        with (
+            self._audit.request(principal.name, address, operation, target),
+            self._sessions.held(principal, credential),
+        ):
+            await self._permissions.require(principal, operation, target)
+            yield

@@ -6,8 +6,10 @@ import json as json_text
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 from datetime import datetime, timezone
+from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -17,14 +19,15 @@ from ultragray.errors import InvalidArgument
 from ultragray_service.access.principals import NAMES, Role, read_limits
 from ultragray_service.cli.options import FieldsOf, with_options
 from ultragray_service.cli.terminal import (
+    Columns,
     Json,
     argument,
     command_group,
     examples,
     option,
-    print_table,
     single,
     tell,
+    tell_table,
     to_json,
 )
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings, load_settings
@@ -46,7 +49,6 @@ Where = Annotated[
 @contextmanager
 def opened_database(where: dict[str, Any]) -> Iterator[JobDatabase]:
     """The database that the options name. Raises InvalidArgument where there is no such installation, StartupFailed."""
-
     from ultragray_workers.jobs.database import JobDatabase
     from ultragray_workers.storage.location import open_storage
 
@@ -66,7 +68,17 @@ def opened_database(where: dict[str, Any]) -> Iterator[JobDatabase]:
 
 keys_app = command_group("They live in the installation's database; changes count within two seconds.")
 
-_KEY_COLUMNS = ("id", "name", "role", "state", "created", "expires", "last used", "limits")
+_KEY_COLUMNS: Columns = {
+    **{name: itemgetter(name) for name in ("id", "name")},
+    "role": lambda key: str(key["role"].value),
+    "state": itemgetter("state"),
+    "created": lambda key: _time(key["created_at_s"], ""),
+    "expires": lambda key: _time(key["expires_at_s"], "never"),
+    "last used": lambda key: _time(key["last_used_at_s"], "never"),
+    "limits": lambda key: " ".join(
+        f"{name}={'none' if value is None else f'{value:g}'}" for name, value in key["limits"].items()
+    ),
+}
 
 
 @keys_app.command(
@@ -121,11 +133,7 @@ def list_keys(
 ) -> None:
     """List the keys, oldest first, also those that count no more; no secrets."""
     with _key_store(where) as store:
-        keys = list(store.keys().values())
-    if json:
-        typer.echo(to_json([_document(key) for key in keys]))
-        return
-    print_table(_KEY_COLUMNS, [_row(key) for key in keys])
+        tell_table(_KEY_COLUMNS, [_document(key) for key in store.keys().values()], as_json=json)
 
 
 @keys_app.command(epilog=examples("ultragray keys revoke alice"))
@@ -155,26 +163,8 @@ def _key_store(where: dict[str, Any]) -> Iterator[KeyStore]:
 
 
 def _document(key: Key) -> dict[str, Any]:
-    return {**asdict(key), "state": _state(key)}
-
-
-def _row(key: Key) -> tuple[str, ...]:
-    return (
-        key.id,
-        key.name,
-        key.role.value,
-        _state(key),
-        _time(key.created_at_s, ""),
-        _time(key.expires_at_s, "never"),
-        _time(key.last_used_at_s, "never"),
-        " ".join(f"{name}={'none' if value is None else f'{value:g}'}" for name, value in key.limits.items()),
-    )
-
-
-def _state(key: Key) -> str:
-    if key.revoked_at_s is not None:
-        return "revoked"
-    return "valid" if key.is_valid(time.time()) else "expired"
+    expired = "valid" if key.is_valid(time.time()) else "expired"
+    return {**asdict(key), "state": expired if key.revoked_at_s is None else "revoked"}
 
 
 def _time(at_s: float | None, otherwise: str) -> str:
@@ -183,7 +173,10 @@ def _time(at_s: float | None, otherwise: str) -> str:
     return datetime.fromtimestamp(at_s, timezone.utc).isoformat(sep=" ", timespec="minutes")
 
 
-_AUDIT_COLUMNS = ("time", "who", "address", "what", "target", "result", "facts")
+_AUDIT_COLUMNS: Columns = {
+    **{name: itemgetter(name) for name in ("time", "who", "address", "what", "target", "result")},
+    "facts": lambda entry: json_text.dumps(entry["facts"]),
+}
 _HOUR_S = 3600.0
 
 
@@ -204,14 +197,8 @@ def audit(
     since_s = time.time() - since_hours * _HOUR_S
     with opened_database(where) as database:
         entries = read_audit(database.engine, since_s=since_s, who=who, what=what, limit=limit)
-    if json:
-        typer.echo(to_json([{**asdict(entry), "time": _timestamp(entry.at_s)} for entry in entries]))
-        return
-    rows = [
-        (_timestamp(one.at_s), one.who, one.address, one.what, one.target, one.result, json_text.dumps(one.facts))
-        for one in entries
-    ]
-    print_table(_AUDIT_COLUMNS, rows)
+    documents = [{**asdict(entry), "time": _timestamp(entry.at_s)} for entry in entries]
+    tell_table(_AUDIT_COLUMNS, documents, as_json=json)
 
 
 def _timestamp(at_s: float) -> str:
@@ -250,13 +237,8 @@ def backup(
     lines = [in_words(report.manifest), f"new: {report.new_files:,} files, {megabytes(report.new_bytes)}"]
     if report.removed_backups:
         lines.append(f"removed: {report.removed_backups} older backups, {megabytes(report.removed_bytes)}")
-    document = {
-        **document_of(report.manifest),
-        "new_files": report.new_files,
-        "new_bytes": report.new_bytes,
-        "removed_backups": report.removed_backups,
-        "removed_bytes": report.removed_bytes,
-    }
+    counts = ("new_files", "new_bytes", "removed_backups", "removed_bytes")
+    document = {**document_of(report.manifest), **{name: getattr(report, name) for name in counts}}
     tell("\n".join(lines), document, as_json=json)
 
 
@@ -335,7 +317,7 @@ def restore(
         settings.database_url,
         name=backup,
         overwrite=force,
-        say=lambda sentence: typer.echo(sentence, err=True),
+        say=partial(typer.echo, err=True),
     )
     tell(f"restored {in_words(manifest)}", document_of(manifest), as_json=json)
 
@@ -368,19 +350,14 @@ def copy(
     from ultragray_workers.backup.copying import ARTIFACTS, CopiedDatasets, copy_datasets, copy_scenes
     from ultragray_workers.storage.location import below, open_storage, parse_location
 
-    def say(sentence: str) -> None:
-        typer.echo(sentence, err=True)
-
+    say = partial(typer.echo, err=True)
     here, there = parse_location(source, "FROM"), parse_location(target, "TO")
     if isinstance(here, Path) and not here.is_dir():
         raise InvalidArgument(f"FROM must be an existing folder or the URL of a bucket, got {source!r}", field="FROM")
     done = copy_scenes(open_storage(here), open_storage(there), say)
-    datasets = copy_datasets(open_storage(here), open_storage(there), say)
-    below_data = copy_datasets(open_storage(below(here, ARTIFACTS)), open_storage(below(there, ARTIFACTS)), say)
-    datasets = CopiedDatasets(
-        datasets.datasets + below_data.datasets,
-        datasets.datasets_already_there + below_data.datasets_already_there,
-    )
+    in_data = copy_datasets(open_storage(here), open_storage(there), say)
+    in_artifacts = copy_datasets(open_storage(below(here, ARTIFACTS)), open_storage(below(there, ARTIFACTS)), say)
+    datasets = CopiedDatasets(*map(sum, zip(astuple(in_data), astuple(in_artifacts), strict=True)))
     line = (
         f"scene files: {done.scenes:,} copied ({megabytes(done.bytes)}), {done.already_there:,} already there; "
         f"datasets: {datasets.datasets:,} copied, {datasets.datasets_already_there:,} already there"

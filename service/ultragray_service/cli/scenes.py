@@ -38,7 +38,7 @@ from ultragray_service.cli.terminal import (
 )
 
 if TYPE_CHECKING:
-    from ultragray import GaussianScene
+    pass
 
 
 @single("ultragray demo -o demo.ugr", "ultragray serve demo.ugr")
@@ -154,38 +154,23 @@ def export(
     from ultragray import GaussianScene
 
     loaded = GaussianScene.load(scene)
-    written = _write_ply(loaded, output) if output.suffix == ".ply" else _write_checkpoint(loaded, output, force)
-    for note in written["notes"]:
+    facts: dict[str, Any] = {"gaussian_count": loaded.gaussian_count, "files": [str(output)], "notes": []}
+    if output.suffix == ".ply":
+        from ultragray.exchange.ply import write_ply
+
+        write_ply(loaded, output)
+        facts["training_poses"] = len(loaded.training_poses)
+        place = f", {facts['training_poses']} training poses"
+    else:
+        from ultragray.exchange.checkpoint import export_checkpoint
+
+        written = export_checkpoint(loaded, output, replace=force)
+        x, y, z = written.centre_mm
+        facts |= {"files": [*map(str, written.files)], "centre_mm": [*map(float, (x, y, z))], "notes": [*written.notes]}
+        place = f" about ({x:.2f}, {y:.2f}, {z:.2f}) mm"
+    for note in facts["notes"]:
         typer.secho(f"note: {note}", fg=typer.colors.YELLOW, err=True)
-    tell(f"wrote {', '.join(written['files'])}: {written.pop('sentence')}", written, as_json=json)
-
-
-def _write_ply(scene: GaussianScene, output: Path) -> dict[str, Any]:
-    from ultragray.exchange.ply import write_ply
-
-    write_ply(scene, output)
-    poses = len(scene.training_poses)
-    return {
-        "sentence": f"{scene.gaussian_count:,} Gaussians, {poses} training poses",
-        "files": [str(output)],
-        "gaussian_count": scene.gaussian_count,
-        "training_poses": poses,
-        "notes": [],
-    }
-
-
-def _write_checkpoint(scene: GaussianScene, output: Path, replace: bool) -> dict[str, Any]:
-    from ultragray.exchange.checkpoint import export_checkpoint
-
-    written = export_checkpoint(scene, output, replace=replace)
-    x, y, z = written.centre_mm
-    return {
-        "sentence": f"{scene.gaussian_count:,} Gaussians about ({x:.2f}, {y:.2f}, {z:.2f}) mm",
-        "files": [str(path) for path in written.files],
-        "gaussian_count": scene.gaussian_count,
-        "centre_mm": [float(one) for one in written.centre_mm],
-        "notes": list(written.notes),
-    }
+    tell(f"wrote {', '.join(facts['files'])}: {loaded.gaussian_count:,} Gaussians{place}", facts, as_json=json)
 
 
 _CHECKPOINT = "Checkpoint (.pt)"

@@ -1,4 +1,4 @@
-"""Poses as the front doors take and tell them."""
+"""Poses and frames as the front doors take and tell them: what renders a frame again, and what it cost."""
 
 from __future__ import annotations
 
@@ -9,11 +9,16 @@ from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
+from typing_extensions import Self
 
-from ultragray.contract import Contract
+from ultragray.contract import Contract, described
 from ultragray.errors import InvalidArgument, InvalidPose, TooManyPoses
 from ultragray.geometry.pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
 from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.settings import Encoding, SettingsUsed
+from ultragray.rendering.volumes import SliceView
+from ultragray.scene.confidence import Extrapolation
+from ultragray_workers.pool.messages import RenderResult
 
 _CHECKED_INLINE = 16  # more go to a thread, so that the loop keeps answering
 
@@ -112,3 +117,78 @@ def check_pose_count(count: int, limit: int) -> None:
         raise TooManyPoses(f"poses must be at most {limit}, got {count}", field="poses")
     if count == 0:
         raise InvalidArgument("poses must hold at least one pose, got none", field="poses")
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FrameFacts:
+    """The facts of one frame beside its settings: its origin, its pose, and what it cost."""
+
+    scene: str = described("Name.")
+    scene_sha256: str = described("Of the scene file.")
+    renderer: str = described("Name, version and backend of the renderer.")
+    pose: MatrixRows = described("Matrix as used.")
+    extrapolation: Extrapolation = described("How far the frame lies from the training views.")
+    queue_ms: float = described("Waiting time.")
+    render_ms: float = described("Of the batch that it was rendered in.")
+    encode_ms: float = described("Encoding time.")
+
+    @classmethod
+    def of(cls, result: RenderResult, **others: Any) -> Self:
+        return cls(
+            scene=result.scene,
+            scene_sha256=result.scene_sha256,
+            renderer=result.renderer,
+            pose=result.poses[0].tolist(),
+            extrapolation=result.extrapolations[0],
+            queue_ms=round(result.queue_ms, 3),
+            render_ms=round(result.render_ms, 3),
+            encode_ms=round(result.encode_ms, 3),
+            **others,
+        )
+
+    @property
+    def timings(self) -> FrameFacts:
+        """Itself: gRPC has the three times in a message of their own."""
+        return self
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FrameHeader(SettingsUsed, FrameFacts):
+    """All that is needed to render a frame again, and what it cost."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SliceFacts:
+    """A slice but for its pixels."""
+
+    scene: str
+    scene_sha256: str
+    field: str
+    height: int
+    width: int
+    encoding: Encoding
+    pixel_to_scene: FloatArray  # [4, 4] mm
+    queue_ms: float
+    render_ms: float
+    encode_ms: float
+
+    @classmethod
+    def of(cls, result: RenderResult[SliceView]) -> SliceFacts:
+        view = result.settings
+        return cls(
+            scene=result.scene,
+            scene_sha256=result.scene_sha256,
+            field=view.field,
+            height=view.height,
+            width=view.width,
+            encoding=view.encoding,
+            pixel_to_scene=view.grid(result.poses[0]).affine,
+            queue_ms=round(result.queue_ms, 3),
+            render_ms=round(result.render_ms, 3),
+            encode_ms=round(result.encode_ms, 3),
+        )
+
+    @property
+    def timings(self) -> SliceFacts:
+        """Itself: gRPC has the three times in a message of their own."""
+        return self

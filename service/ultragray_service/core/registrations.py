@@ -22,7 +22,7 @@ from ultragray.geometry.registration import Registration
 from ultragray_service.access.limits import Limits
 from ultragray_service.access.owners import Owners, may_change
 from ultragray_service.access.principals import Principal, Role, acting, iso_time
-from ultragray_service.core.jobs.database_threads import DatabaseThreads
+from ultragray_service.core.jobs import DatabaseThreads
 from ultragray_service.core.scenes import SceneCatalog, page_of_names
 from ultragray_service.errors import LimitReached, PermissionDenied
 from ultragray_workers.errors import RegistrationNotFound

@@ -23,7 +23,7 @@ from ultragray_service.access.audit import account
 from ultragray_service.access.limits import Limits, Slots
 from ultragray_service.access.owners import Claim, Owners
 from ultragray_service.access.principals import GB, acting
-from ultragray_service.core.jobs.jobs import Jobs
+from ultragray_service.core.jobs import Jobs
 from ultragray_service.core.threads import HelperProcesses, in_own_thread, to_its_end
 from ultragray_service.errors import LimitReached, SceneReadOnly
 from ultragray_service.settings import Settings

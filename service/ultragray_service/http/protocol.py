@@ -32,7 +32,7 @@ from ultragray_service.listening import Acceptor, Connections, Patience, Place
 from ultragray_service.settings import Settings
 from ultragray_service.telemetry.logs import choose_request_id, request_id
 from ultragray_service.telemetry.metrics import Metrics
-from ultragray_service.tls.server import CertificateWatch
+from ultragray_service.tls import CertificateWatch
 
 HAND_OVER = "ultragray.hand_over"  # of an ASGI message with bytes: to return once the client has taken it
 _FRAGMENTS = 32  # of a message that is handed over

@@ -18,8 +18,7 @@ from ultragray.rendering.settings import RenderSettings, Resolved, settings_used
 from ultragray.rendering.volumes import SliceView
 from ultragray_proto.codec import MessageInvalid, from_message, to_message, words
 from ultragray_proto.v1 import geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2
-from ultragray_service.core.frames import FrameFacts, SliceFacts
-from ultragray_service.core.poses import exact_pose
+from ultragray_service.core.poses import FrameFacts, SliceFacts, exact_pose
 from ultragray_workers.jobs.kinds import KINDS, Specification
 from ultragray_workers.jobs.record import Job
 from ultragray_workers.pool.messages import RenderResult

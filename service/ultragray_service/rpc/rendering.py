@@ -27,7 +27,7 @@ from ultragray_service.errors import Refusal
 from ultragray_service.rpc.messages import frame_message, read, read_pose, read_settings, read_word, slice_message
 from ultragray_service.rpc.shared_memory import SharedMemory
 from ultragray_service.service import Service
-from ultragray_service.views.localizing import locate, sought_frame
+from ultragray_service.views.poses import locate, sought_frame
 from ultragray_workers.errors import QueueFull
 from ultragray_workers.pool.messages import Priority, RenderResult
 

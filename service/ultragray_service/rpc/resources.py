@@ -20,15 +20,14 @@ from ultragray.errors import InvalidArgument, InvalidPose
 from ultragray.geometry.registration import Registration, rows
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import datasets_pb2, geometry_pb2, jobs_pb2
+from ultragray_service.access.audit import DEFAULT_ENTRIES, DEFAULT_HOURS, audit_entries
 from ultragray_service.access.principals import Me, me
-from ultragray_service.core.jobs.estimates import estimate
-from ultragray_service.core.jobs.log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
+from ultragray_service.core.jobs import DEFAULT_LOG_BYTES, MAX_LOG_BYTES, estimate
 from ultragray_service.core.registrations import NamedRegistration
 from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE
 from ultragray_service.core.uploads import DatasetUpload
 from ultragray_service.rpc.messages import job_message, read, read_specification, read_word
 from ultragray_service.service import Service
-from ultragray_service.views.audited import DEFAULT_ENTRIES, DEFAULT_HOURS, audit_entries
 from ultragray_workers.errors import Draining
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.workers import Wanted

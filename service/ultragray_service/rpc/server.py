@@ -30,7 +30,7 @@ from ultragray_service.rpc.rendering import RenderService
 from ultragray_service.rpc.resources import CALLS, STREAMS
 from ultragray_service.service import Service
 from ultragray_service.settings import Settings
-from ultragray_service.tls.server import HANDSHAKE_TIMEOUT_S, Certificates, CertificateWatch
+from ultragray_service.tls import HANDSHAKE_TIMEOUT_S, Certificates, CertificateWatch
 
 LEAST_MAX_MESSAGE_BYTES = 2 * 2**20  # room for a chunk of an upload
 LEAST_PING_INTERVAL_MS = 10_000

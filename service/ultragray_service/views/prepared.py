@@ -29,7 +29,7 @@ from ultragray.phantom.demo import DEMO_FILE
 from ultragray.rendering.pixels import encoded_image
 from ultragray.rendering.settings import Encoding
 from ultragray.scene.info import read_header
-from ultragray_service.core.jobs.jobs import Jobs
+from ultragray_service.core.jobs import Jobs
 from ultragray_service.core.poses import MatrixRows
 from ultragray_service.core.scenes import SceneCatalog
 from ultragray_service.core.threads import HelperProcesses, in_own_thread, to_its_end

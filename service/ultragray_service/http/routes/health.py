@@ -12,13 +12,7 @@ from starlette.responses import Response
 
 from ultragray import __version__
 from ultragray.contract import described
-from ultragray_service.access.principals import Me, me
-from ultragray_service.core.readiness import Components
-from ultragray_service.doors import ServiceInfo
-from ultragray_service.http.dependencies import ServiceDep, problems
-from ultragray_service.http.problems import problem_response
-from ultragray_service.telemetry.metrics import ServiceStatistics, memory_bytes
-from ultragray_service.views.audited import (
+from ultragray_service.access.audit import (
     DEFAULT_ENTRIES,
     DEFAULT_HOURS,
     MAX_ENTRIES,
@@ -26,6 +20,12 @@ from ultragray_service.views.audited import (
     AuditEntries,
     audit_entries,
 )
+from ultragray_service.access.principals import Me, me
+from ultragray_service.core.readiness import Components
+from ultragray_service.doors import ServiceInfo
+from ultragray_service.http.dependencies import ServiceDep, problems
+from ultragray_service.http.problems import problem_response
+from ultragray_service.telemetry.metrics import ServiceStatistics, memory_bytes
 
 
 @dataclass(frozen=True)

@@ -19,10 +19,16 @@ from starlette.types import Receive, Scope, Send
 
 from ultragray.contract import under
 from ultragray.errors import InvalidArgument
-from ultragray_service.core.jobs.estimates import JobEstimate, estimate
-from ultragray_service.core.jobs.hub import JobChange, JobWatch
-from ultragray_service.core.jobs.jobs import JobPage, WorkerList
-from ultragray_service.core.jobs.log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
+from ultragray_service.core.jobs import (
+    DEFAULT_LOG_BYTES,
+    MAX_LOG_BYTES,
+    JobChange,
+    JobEstimate,
+    JobPage,
+    JobWatch,
+    WorkerList,
+    estimate,
+)
 from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
 from ultragray_service.http.accept import NPZ, PNG
 from ultragray_service.http.bodies import SPECIFICATION, JobBody, adapter_of, body_schema, read_json_body

@@ -19,8 +19,7 @@ from ultragray.exchange.exports.formats import FORMATS, check_format, export_byt
 from ultragray.rendering.outputs import OUTPUTS
 from ultragray.rendering.settings import Encoding, Resolved, SettingsUsed, settings_used
 from ultragray.rendering.volumes import SliceSettings, SliceView
-from ultragray_service.core.frames import SliceFacts
-from ultragray_service.core.poses import exact_poses
+from ultragray_service.core.poses import SliceFacts, exact_poses
 from ultragray_service.http.accept import DICOM, JPEG, NPY, NPZ, PNG, RAW, choose, choose_of_slice
 from ultragray_service.http.bodies import RenderBody, body_schema, read_json_body
 from ultragray_service.http.dependencies import (

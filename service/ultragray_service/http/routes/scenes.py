@@ -48,8 +48,7 @@ from ultragray_service.http.dependencies import (
     revalidated,
 )
 from ultragray_service.http.routes.datasets import Private
-from ultragray_service.views.assessments import Assessments
-from ultragray_service.views.localizing import Located, locate, sought_frame
+from ultragray_service.views.poses import Assessments, Located, locate, sought_frame
 from ultragray_workers.jobs.owners import Kind
 from ultragray_workers.scene_names import SUFFIX, base_name
 

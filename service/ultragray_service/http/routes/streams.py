@@ -18,8 +18,8 @@ from ultragray.contract import described
 from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray.rendering.settings import RenderSettings, settings_used
 from ultragray_service.access.credentials import STREAM_PROTOCOL
-from ultragray_service.core.frames import FrameHeader
 from ultragray_service.core.open_streams import OpenStream, StreamAnswer, StreamSummary, Watcher
+from ultragray_service.core.poses import FrameHeader
 from ultragray_service.core.streams import FrameStream, Message, StreamMode, nothing, unreadable
 from ultragray_service.errors import Refusal, statuses_of
 from ultragray_service.http.bodies import StreamMessage, adapter_of, read_json
