@@ -91,10 +91,7 @@ class Acceptor:
         send_patience_s: float,
         tls: Callable[[], ssl.SSLContext | None],
     ) -> None:
-        """`protocol` serves a connection and gives its place back; `refusal` is sent to one that gets none.
-
-        `tls` is asked for each connection, so that new ones get a new certificate.
-        """
+        """`protocol` serves a connection, `refusal` is sent to one without a place, `tls` is asked for each of them."""
         self._listener = listener
         self._connections = connections
         self._protocol = protocol

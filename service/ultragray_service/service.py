@@ -84,10 +84,7 @@ class Service:
         self._snapshot: Snapshot | None = None
 
     async def open(self) -> None:
-        """Opens the jobs' database, and reads keys, owners and registrations; before any door opens.
-
-        Raises StartupFailed.
-        """
+        """Opens database and copies of keys, owners and registrations, before any door opens. Raises StartupFailed."""
         await self.places.open()
         await self.jobs.open()
         engine = self.jobs.database.engine
@@ -110,10 +107,7 @@ class Service:
             )
 
     async def start(self) -> None:
-        """Starts the pool, loads the scenes to preload, clears what dead uploads left.
-
-        Raises StartupFailed.
-        """
+        """Starts the pool, loads the scenes to preload, clears what dead uploads left. Raises StartupFailed."""
         await self.uploads.remove_stale()
         await self.imports.remove_stale()
         for prepared in self._prepared:

@@ -125,10 +125,7 @@ class AuditLog:
             self._waiting.append(entry)
 
     def count(self, entry: Entry) -> None:
-        """Counts something that happens often; a refusal is told the first time.
-
-        What a caller without a name asked for is left out: each could be told once.
-        """
+        """Counts something that happens often; a refusal is told the first time; of nobody without its target."""
         if entry.who == NOBODY:
             entry = replace(entry, target="")
         seen = self._tallies.get(entry)

@@ -94,10 +94,7 @@ class KeyStore:
         return key, secret
 
     def revoke(self, name_or_id: str) -> list[Key]:
-        """Revokes the key of an id, or all keys of a name; the keys that opened doors until now.
-
-        Raises InvalidArgument where there is none of that name.
-        """
+        """Revokes the key of an id, or all of a name; those that were valid. Raises InvalidArgument for none."""
         now_s = time.time()
         found = [key for key in self.keys().values() if name_or_id in (key.id, key.name)]
         if not found:
@@ -191,10 +188,7 @@ class Snapshot:
     """Reads what is copied again whenever something of it changed, in a thread of its own."""
 
     def __init__(self, engine: sa.Engine, keys: KnownKeys, copies: Sequence[Callable[[sa.Connection], None]]) -> None:
-        """Fills `keys`, and calls `copies` to be filled: the first copy is there when this returns.
-
-        Raises DatabaseUnavailable.
-        """
+        """Fills `keys` and calls `copies`; the first copy is there when this returns. Raises DatabaseUnavailable."""
         self._engine, self._keys, self._copies = engine, keys, copies
         self._number: int | None = None
         self._database = AskedDatabase(f"{_COPIED} stay as they are for now", f"{_COPIED} are read again", _log)

@@ -134,10 +134,7 @@ class Limits:
             await self._wait_for_frames(per_s, min(per_s, count - first), deadline)
 
     async def frame_turn(self, deadline: float | None) -> None:
-        """Counts a frame of a batch or a stream, once there may be one more.
-
-        Raises RateLimited where that would be after the `deadline` (time.monotonic(), s).
-        """
+        """Counts a frame of a batch or stream in turn. Raises RateLimited after `deadline` (time.monotonic())."""
         if (per_s := self.mine.frames_per_s) is not None:
             await self._wait_for_frames(per_s, 1, deadline)
 

@@ -126,10 +126,7 @@ class Issuer:
         self.problem: str | None = "its keys were not fetched yet"  # for the log alone: it may name addresses
 
     def key(self, key_id: str | None) -> SigningKey:
-        """The key of an id; None: the only one there is.
-
-        Raises Unauthenticated where the issuer has none of that id, IssuerUnavailable where that is not known yet.
-        """
+        """The key of an id; None: the only one. Raises Unauthenticated, IssuerUnavailable where it is not known yet."""
         found = self.keys.get(key_id)
         if found is not None:
             return found

@@ -43,10 +43,7 @@ class Origins:
     def require_page(
         self, *, origin: str | None, host: str | None, fetch_site: str | None = None, is_link: bool = False
     ) -> None:
-        """Raises OriginRefused for a request of another site's page, by the headers that browsers send.
-
-        `is_link`: whether it fetches a whole page, as whoever follows a link does.
-        """
+        """Raises OriginRefused for a request of another site's page; `is_link`: whether it follows a link to a page."""
         if origin is not None:
             self._require_origin(origin, host)
         elif fetch_site == "cross-site" and not is_link:

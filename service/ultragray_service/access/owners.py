@@ -168,17 +168,11 @@ class Permissions:
         kept_with_rows: Mapping[Kind, Callable[[str], Awaitable[Ownership]]],
         find: Mapping[Kind, Callable[[str], object]],
     ) -> None:
-        """`kept_with_rows`: reads the owner of a job or registration. Raises JobNotFound, RegistrationNotFound.
-
-        `find`: raises DatasetNotFound or SceneNotFound where there is no such thing; it blocks.
-        """
+        """`kept_with_rows` reads owners of jobs and registrations; `find` blocks, and raises for what is not there."""
         self._owners, self._kept_with_rows, self._find = owners, kept_with_rows, find
 
     async def require(self, principal: Principal, operation: Operation, name: str) -> None:
-        """Raises PermissionDenied; JobNotFound for a job that is private to somebody else.
-
-        Scenes and datasets that are private to somebody else are found by nobody else, see `Owners.hides`.
-        """
+        """Raises PermissionDenied, and JobNotFound for another's private job; see also `Owners.hides`."""
         require_role(principal, operation)
         about = operation.about
         if about is None or principal.role is Role.ADMIN or not (operation.owned or about is Kind.JOB):

@@ -171,10 +171,7 @@ class HttpRules:
         }
 
     def find(self, method: str, path: str) -> tuple[Operation, str] | None:
-        """The operation, and the name of what it is about; None where no route is known.
-
-        A path goes to the first route that it matches, as in the application.
-        """
+        """The operation, by the first route that matches, and the name of what it is about; None: no route is known."""
         for pattern, operation in self._compiled.get("GET" if method == "HEAD" else method, ()):
             if (match := pattern.match(path)) is not None:
                 return operation, "" if operation.about is None else match[operation.about.value]

@@ -30,10 +30,7 @@ from ultragray_workers.errors import NotReady
 
 
 def client_context(ca: Path | None, certificate: Path | None, key: Path | None) -> ssl.SSLContext:
-    """The certificates of a client. `ca` None: the authorities that the system trusts.
-
-    Raises InvalidArgument for a file that cannot be used, and for a certificate without its key.
-    """
+    """The certificates of a client; `ca` None: the system's. Raises InvalidArgument for files that cannot be used."""
     if (certificate is None) is not (key is None):
         raise InvalidArgument("--client-certificate and --client-key must be given together", field="client_key")
     try:
@@ -164,10 +161,7 @@ class Connection:
                         yield json.loads(value)
 
     def download(self, route: str, path: Path, progress: Callable[[int | None], Count]) -> int:
-        """Write an answer to `path`, whole or not at all, and return its size in bytes.
-
-        `progress` is given the size that the service announces, and returns what is told of each block.
-        """
+        """Write an answer to `path`, whole or not at all; its bytes. `progress`: of the size, then of blocks."""
         with self.open("GET", route, accept="*/*") as answer, atomic_path(path) as temporary:
             announced = answer.headers.get("Content-Length")
             size = None if announced is None else int(announced)
@@ -183,10 +177,7 @@ class Connection:
         return written
 
     def upload(self, route: str, path: Path, count: Count) -> tuple[Any, bool]:
-        """The JSON of the answer to a PUT of a file, and whether something new was made of it.
-
-        A service that has seen enough answers before the file is sent: its refusal is raised all the same.
-        """
+        """The JSON of the answer to a PUT of a file, which may come early, and whether something new was made of it."""
         headers = {"Content-Type": "application/octet-stream", "Content-Length": str(path.stat().st_size)}
         with path.open("rb") as file:
             body = _Counted(file, path.name, count)

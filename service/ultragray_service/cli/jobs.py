@@ -222,10 +222,7 @@ for _kind, _class in Specification.members.items():
 
 
 def follow(connection: Connection, job_id: str, *, as_json: bool = False) -> None:
-    """Return when the job has succeeded; exit with 3 where it failed, 4 where it was cancelled, 130 at Ctrl-C.
-
-    Raises UltragrayError: no such job, or a service that stays away.
-    """
+    """Return when the job has succeeded; exit with 3 where it failed, 4 where it was cancelled, 130 at Ctrl-C."""
     try:
         with _display(job_id) as show:
             job = _watched(connection, job_id, show)

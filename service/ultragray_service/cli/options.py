@@ -99,10 +99,7 @@ def parameters_in(function: Callable[..., Any]) -> list[inspect.Parameter]:
 
 
 def parameters_of(cls: Any, name: str = "") -> list[inspect.Parameter]:
-    """The options of a contract dataclass, or of a family under a name, each in the panel of its topic.
-
-    The first required field is an argument.
-    """
+    """The options of a contract dataclass or family, in panels of their topics; the first required is an argument."""
     if issubclass(cls, _WITH_AN_OPTION_A_FIELD):
         return [*_family_parameters(cls, name)]
     argument = next((item for item, _ in _fields(cls) if _is_required(item)), None)
@@ -127,10 +124,7 @@ def _chosen_parameters(asked: FieldsOf) -> Iterator[inspect.Parameter]:
 
 
 def values_of(cls: Any, given: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of a contract dataclass that options gave, as Python has them.
-
-    Raises InvalidArgument and its kind, naming the option for what cannot be read.
-    """
+    """The fields that options gave, as Python has them. Raises InvalidArgument, naming the option."""
     found = {}
     for item, kind in _fields(cls):
         if kind is bool:
@@ -169,10 +163,7 @@ def _family_parameters(family: Any, name: str) -> Iterator[inspect.Parameter]:
 def _parameter(
     item: Field[Any], kind: Any, *, topic: str | None, is_argument: bool = False, takers: Sequence[str] = ()
 ) -> inspect.Parameter:
-    """The option of a field, in the panel of its own topic, else of `topic`.
-
-    `takers`: the kinds of a family that take it, each in its own right.
-    """
+    """The option of a field, in the panel of its own topic, else of `topic`; `takers`: the kinds that take it."""
     meaning = str(item.metadata["description"])
     if takers:
         meaning = f"{', '.join(takers)}: {meaning[:1].lower()}{meaning[1:]}"

@@ -74,10 +74,7 @@ class RenderRequest:
 
 
 def checked_kind(output: Path, settings: FrameSettings, *, force: bool) -> str | None:
-    """The ending of the output, of SUFFIXES; None for a folder.
-
-    Raises InvalidArgument for an output that cannot or may not be written, and for a picture of several outputs.
-    """
+    """The ending of the output, of SUFFIXES; None: a folder. Raises InvalidArgument where it cannot be written."""
     if is_folder_name(output):
         check_folder(output, force=force)
         return None

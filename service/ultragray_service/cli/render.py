@@ -116,11 +116,7 @@ def _probe_as_an_option() -> Iterator[None]:
 
 
 def checked_format(output: Path, settings: FrameSettings, dtype: str | None, *, force: bool) -> str | None:
-    """The format that the name of the output stands for; None for a folder of PNGs.
-
-    Raises InvalidArgument for an output that cannot or may not be written, ExtraMissing where the format's package is
-    not installed.
-    """
+    """The format of the output's name; None: a folder of PNGs. Raises InvalidArgument, ExtraMissing."""
     format = format_of(output.name)
     if format is None and not is_folder_name(output):
         check_ending(output, SUFFIXES, otherwise=OR_A_FOLDER)
@@ -162,10 +158,7 @@ class Task:
 def render_frames(
     task: Task, output: Path, format: str | None, *, dtype: str | None, backend: str, threads: int
 ) -> tuple[str, dict[str, Any]]:
-    """Render and write; `format` None writes a folder of PNGs. What was written: a sentence, and a document.
-
-    Raises InvalidArgument, SceneFileInvalid, BackendUnavailable, MemoryExceeded, OSError; a file is then not written.
-    """
+    """Render and write, None: a folder of PNGs; a sentence and a document of it. At an error no file is written."""
     import torch
 
     from ultragray.exchange.rendering import render_to_file
@@ -245,10 +238,7 @@ def plan_of_shards(
 def render_shards(
     plan: BatchPlan, scene_file: Path, output: str, on: str, *, backend: str, threads: int
 ) -> tuple[str, dict[str, Any]]:
-    """Render what is missing of a batch on a cluster, and write its manifest. A sentence and a document tell of it.
-
-    Raises InvalidArgument for an output that is no folder or holds something else, and what `RayBatch.render` raises.
-    """
+    """Render what is missing of a batch on a cluster, and write its manifest; a sentence and a document of it."""
     from ultragray_workers.batches.on_ray import RayBatch, check_address
     from ultragray_workers.storage.location import open_storage
 

@@ -92,10 +92,7 @@ def _run(settings: Settings) -> None:
 
 
 def ensure_scenes(folder: Path) -> None:
-    """Put the demo scene into a data folder that holds no scene, and say so on stderr.
-
-    Raises InvalidArgument where there is no such folder.
-    """
+    """Put the demo scene into a data folder without scenes, and say so. Raises InvalidArgument for no such folder."""
     if not folder.is_dir():
         raise InvalidArgument(f"data_folder must be an existing folder, got {str(folder)!r}", field="data_folder")
     if SceneStore(folder).names():

@@ -149,10 +149,7 @@ def check_folder(path: Path, *, force: bool) -> None:
 
 
 def check_ending(path: Path, suffixes: Sequence[str], *, otherwise: str = "") -> None:
-    """Raise InvalidArgument where a name ends in none of `suffixes`, with the one that was perhaps meant.
-
-    `otherwise`: what the output may be instead, for the message.
-    """
+    """Raise InvalidArgument where a name ends in none of `suffixes`; `otherwise`: what else it may be, in words."""
     if suffixes and not path.name.endswith(tuple(suffixes)):
         given = path.suffix.lower()
         similar = _SIMILAR.get(given)
@@ -249,10 +246,7 @@ def counted(what: str, total: int) -> Iterator[Callable[[int], None]]:
 
 @contextlib.contextmanager
 def transferred(what: str) -> Iterator[Callable[[int | None], Callable[[int], None]]]:
-    """A function that begins a transfer of so many bytes (None: nobody knows), and returns what is told of each block.
-
-    A bar with rate and time left on a terminal, nothing elsewhere.
-    """
+    """A function that begins a transfer of so many bytes (None: unknown), and returns what is told of each block."""
     with progress_bars("{task.description}", "bar", "bytes", "rate", "left") as bars:
 
         def begin(total: int | None) -> Callable[[int], None]:

@@ -56,10 +56,7 @@ def run_worker(
     device: str = "auto",
     labels: Mapping[str, str] = MappingProxyType({}),
 ) -> None:
-    """Do jobs until SIGTERM or SIGINT, then end the process; a second signal ends the drain at once.
-
-    Raises StartupFailed, InvalidArgument.
-    """
+    """Do jobs until SIGTERM or SIGINT, then end the process; a second signal ends the drain at once."""
     from opentelemetry import trace
 
     from ultragray_service.telemetry.logs import configure_logging, start_tracing

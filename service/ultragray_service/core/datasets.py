@@ -58,10 +58,7 @@ class Datasets:
         return await asyncio.to_thread(read)
 
     async def delete(self, name: str, in_use: Callable[[str], str | None]) -> str | None:
-        """Deletes a dataset; its SHA-256, if no other one has the same content.
-
-        Raises DatasetNotFound, and DatasetInUse where `in_use` names in words who needs it.
-        """
+        """Deletes a dataset; its SHA-256 if no other has it. Raises DatasetNotFound, DatasetInUse."""
         deleted = (await asyncio.to_thread(self._store.get, name)).sha256
         async with self._owners.removing(Kind.DATASET, name):
             await asyncio.to_thread(self._store.delete, name, in_use)

@@ -99,10 +99,7 @@ class GrowingLog:
         return self._offset or 0
 
     def read(self) -> str:
-        """The next lines that are whole; a line longer than a step comes in pieces.
-
-        A log that became shorter was begun again, and is read from its start. Raises StorageUnavailable.
-        """
+        """The next whole lines; a line longer than a step comes in pieces. A log that became shorter is read anew."""
         self._offset = self._begin()
         added = self._log.read(self._offset, _STEP_BYTES)
         self.has_more = len(added) == _STEP_BYTES
@@ -254,10 +251,7 @@ class JobHub:
         return len(self._readers)
 
     async def watch(self, job_id: str, log_offset: int | None = None) -> JobWatch:
-        """A watcher of a job, whose first change tells the job, and of its log what follows `log_offset`.
-
-        None: the last lines. It must be closed. Raises JobNotFound.
-        """
+        """A watcher, to be closed, of a job and its log after `log_offset`; None: the last lines. Raises JobNotFound."""
         reader = self._readers.get(job_id)
         if reader is None or reader.task.done():
             await asyncio.get_running_loop().run_in_executor(self._threads, self._get, job_id)
@@ -312,10 +306,7 @@ class JobEstimate:
 
 
 async def estimate(rendering: Rendering, specification: Specification, *, field: str) -> JobEstimate:
-    """The estimate of a job. `field` is where the caller wrote the specification.
-
-    Raises InvalidArgument for a job of another kind, and what its submission would raise for what it asks of the scene.
-    """
+    """Raises InvalidArgument for another kind, and what the submission would; `field`: where the caller wrote it."""
     if not isinstance(specification, RenderJob):
         raise InvalidArgument(
             f"only render jobs can be estimated, this is of the kind {specification.kind}", field="kind"
@@ -429,10 +420,7 @@ class Jobs:
         self._counting = asyncio.create_task(self._count())
 
     async def do(self, method: Callable[Concatenate[JobStore, P], T], *arguments: P.args, **options: P.kwargs) -> T:
-        """Calls a method of the store in a thread: `do(JobStore.get, job_id)`.
-
-        Raises what the method raises, NotReady before the start, DatabaseUnavailable where the database is silent.
-        """
+        """Calls a method of the store in a thread: `do(JobStore.get, job_id)`. Raises NotReady, DatabaseUnavailable."""
         return await self.threads.ask(method, self._store, *arguments, **options)
 
     async def submit(
@@ -460,10 +448,7 @@ class Jobs:
         return await self.do(JobStore.retry, job_id, by=acting().name, admit=self._admit)
 
     async def page(self, *, state: str, kind: str, page_size: int, page_token: str) -> JobPage:
-        """One page of jobs; empty filters pass all.
-
-        Raises InvalidArgument for a page_size outside 1 to 1000 and for a token that no page gave.
-        """
+        """One page of jobs; empty filters pass all. Raises InvalidArgument."""
         if not 1 <= page_size <= MAX_PAGE_SIZE:
             raise InvalidArgument(
                 f"page_size must be an integer from 1 to {MAX_PAGE_SIZE}, got {page_size}", field="page_size"

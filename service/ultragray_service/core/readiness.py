@@ -98,10 +98,7 @@ class Readiness:
         scenes: ScenePlaces,
         without_jobs: bool,
     ) -> None:
-        """`require_serving`, `require_frames`: raise what keeps everything, and frames, from being answered.
-
-        `without_jobs`: whether the service is ready as soon as frames are.
-        """
+        """`require_…`: raise what keeps everything, and frames, away. `without_jobs`: ready as soon as frames are."""
         self._require_serving, self._require_frames = require_serving, require_frames
         self._scenes = scenes
         self._without_jobs = without_jobs

@@ -209,11 +209,7 @@ class Registrations:
         return RegistrationPage([seen[name] for name in names], next_page_token)
 
     async def put(self, name: str, scene: str, registration: Registration) -> NamedRegistration:
-        """Keeps a registration, in place of one of the name that is the caller's.
-
-        Raises InvalidArgument for a name, SceneNotFound, SceneFileInvalid, PermissionDenied, LimitReached,
-        DatabaseUnavailable.
-        """
+        """Keeps a registration, in place of one of the name that is the caller's; else PermissionDenied is raised."""
         if NAME.fullmatch(name) is None:
             raise InvalidArgument(
                 "registration must be 1 to 128 letters, digits, '.', '_' and '-', the first a letter or digit, got "

@@ -131,10 +131,7 @@ class RequestPlanner:
     async def plan_slice(
         self, scene: str, request: SliceSettings, encoding: Encoding, *, path: str = ""
     ) -> Plan[SliceView]:
-        """The settings of a slice for a scene; `path` is their place in the client's message.
-
-        Raises SceneNotFound, SceneFileInvalid; InvalidArgument for labels of a scene without them, InvalidImageSize.
-        """
+        """The settings of a slice; `path`: their place in the message. Raises SceneNotFound, InvalidArgument."""
         view = request.view(encoding)
         side, pixels = max(view.height, view.width), view.height * view.width
         if side > self._settings.max_image_side or pixels > self._settings.max_request_pixels:
@@ -206,10 +203,7 @@ class Rendering:
         begin_by: float | None = None,  # time.monotonic() in seconds; else it is refused
         destination: Destination | None = None,
     ) -> RenderResult[S]:
-        """Renders, with the settings as they are for the scene that is there when it is rendered.
-
-        Raises what RenderPool.render and Plan.renew raise; cancelling drops a request that still waits.
-        """
+        """Renders for the scene that is there by then. Raises what RenderPool.render and Plan.renew raise."""
         self.life.require_serving()
         mine = account()
         mine.target = plan.scene

@@ -151,10 +151,6 @@ class SceneCatalog:
             return await asyncio.to_thread(self._store.version, name)
 
     async def points(self, name: str, limit: int, fields: Sequence[str]) -> bytes:
-        """At most `limit` Gaussians of a scene, as `point_message`.
-
-        Raises SceneNotFound, SceneFileInvalid, InvalidArgument for fields that there are not.
-        """
         header = await self.header(name)
         with scene_to_blame():
             path = await asyncio.to_thread(self._store.path, name)
@@ -169,10 +165,7 @@ class SceneCatalog:
         return self._store.shown_names()
 
     async def page(self, page_size: int, page_token: str) -> tuple[list[CatalogEntry], str]:
-        """One page of scenes by name and the token of the next (empty on the last).
-
-        Raises InvalidArgument for a page_size outside 1 to 1000 and for a token that no page gave.
-        """
+        """One page by name, and the token of the next (empty on the last). Raises InvalidArgument."""
         chosen, next_page_token = page_of_names(await self.names(), page_size, page_token)
         at_once = asyncio.Semaphore(_READ_AT_ONCE)
 
@@ -201,10 +194,7 @@ async def _fetched(read: Callable[[str], T], name: str) -> T:
 
 
 def page_of_names(names: list[str], page_size: int, page_token: str) -> tuple[list[str], str]:
-    """The names of one page of the sorted `names`, and the token of the next page (empty on the last).
-
-    Raises InvalidArgument for a page_size outside 1 to 1000 and for a token that no page gave.
-    """
+    """The names of one page of the sorted `names`, and the token of the next (empty on the last)."""
     if not 1 <= page_size <= MAX_PAGE_SIZE:
         raise InvalidArgument(
             f"page_size must be an integer from 1 to {MAX_PAGE_SIZE}, got {page_size}", field="page_size"

@@ -367,10 +367,7 @@ class FrameStream:
         self._poses = PoseStream(rendering, record)
 
     async def run(self) -> None:
-        """Answers until the client has sent its last message and got its last frame.
-
-        Raises Draining when the service stops, and what the transport raises.
-        """
+        """Until the client has sent its last message and got its last frame. Raises Draining when the service stops."""
         await self._poses.run(self._read, self._transport.send, self._transport.hand_over)
 
     async def _read(self) -> None:

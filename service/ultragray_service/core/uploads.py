@@ -46,10 +46,7 @@ Next = Callable[[Awaitable[T]], Awaitable[T]]
 
 @contextmanager
 def arrivals(draining: asyncio.Event, idle_timeout_s: float) -> Iterator[Next[Any]]:
-    """A function that awaits the next part of what a client sends.
-
-    It raises DeadlineExceeded where nothing comes in time, Draining once the service stops.
-    """
+    """A function that awaits the next part of what a client sends; it raises DeadlineExceeded and Draining."""
     stopping = asyncio.ensure_future(draining.wait())
 
     async def arrival(arriving: Awaitable[T]) -> T:
@@ -176,10 +173,7 @@ class DatasetUploads:
 
     @asynccontextmanager
     async def receive(self, name: str, options: dict[str, str], *, private: bool) -> AsyncIterator[DatasetUpload]:
-        """An upload; what has not become a dataset at the end is removed.
-
-        Raises InvalidArgument for a bad name or option, QueueFull, LimitReached, Draining, StorageFull.
-        """
+        """An upload; what is no dataset at the end goes. Raises InvalidArgument, QueueFull, LimitReached, Draining."""
         check_dataset_name(name)
         account().target = name
         from_dict(SourceOptions, options)
@@ -239,11 +233,7 @@ class DatasetUpload:
             await asyncio.to_thread(self._incoming.write, block)
 
     async def finish(self) -> tuple[DatasetRecord, bool]:
-        """Checks what was sent and makes it a dataset; its record, and whether it is new.
-
-        Raises DatasetInvalid with the file and the frame, InvalidArgument for an option, DatasetExists, UploadTooLarge,
-        MemoryExceeded, StorageFull, DeadlineExceeded.
-        """
+        """Checks what was sent and makes it a dataset; its record, and whether it is new. Raises DatasetInvalid."""
         async with self._finishing, self._claim.held():
             await self._flush()
             await asyncio.to_thread(self._incoming.finish)
@@ -297,11 +287,7 @@ class SceneImports:
 
     @asynccontextmanager
     async def receive(self, name: str, blocks: AsyncIterator[bytes]) -> AsyncIterator[Path]:
-        """Writes what arrives into a file, to be given to `accept` within this context; it is removed at the end.
-
-        Raises InvalidArgument for a name that no scene can have, SceneExists, UploadTooLarge, QueueFull, LimitReached,
-        StorageFull.
-        """
+        """Writes what arrives into a file, to be given to `accept` within this context; it is removed at the end."""
         check_scene_name(name)
         await self._require_free(name)
         most = self._means.settings.max_dataset_bytes
@@ -318,11 +304,7 @@ class SceneImports:
                 await to_its_end(claim.close)
 
     async def accept(self, received: Path, name: str, *, private: bool) -> SceneHeader:
-        """Checks a file that was received and serves it as the scene `name`.
-
-        Cancelling it ends the check. Raises SceneFileInvalid, SceneExists, StorageFull, MemoryExceeded,
-        DeadlineExceeded.
-        """
+        """Checks a file that was received and serves it as the scene `name`; cancelling ends the check."""
         await self._require_free(name)
         claim = Claim(self._means.owners, Kind.SCENE, name, received.parent.name, private=private)
         async with claim.held():

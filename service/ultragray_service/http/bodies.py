@@ -137,10 +137,7 @@ def body_schema(cls: Any, examples: dict[str, Any] | None = None) -> dict[str, A
 
 
 async def read_json_body(request: Request, cls: type[T], apart: Apart | None = None) -> T:
-    """The body, checked; `apart` says which part of it may be large.
-
-    Raises UnsupportedMediaType, BodyTooLarge, InvalidArgument and what the class raises.
-    """
+    """The body, checked; `apart` says which part of it may be large. Raises UnsupportedMediaType, BodyTooLarge."""
     content_type = request.headers.get("content-type", "application/json")
     media_type = content_type.partition(";")[0].strip().lower()
     if media_type != "application/json" and not media_type.endswith("+json"):
@@ -348,10 +345,7 @@ class FileParts:
             raise InvalidArgument("Content-Type multipart/form-data must have a boundary", field="Content-Type")
 
     def feed(self, block: bytes) -> list[str | bytes]:
-        """The content of the block, in order: the name of each file (str), then its bytes.
-
-        Raises InvalidArgument for a damaged body and for a part that is no file.
-        """
+        """The names of files (str) and their bytes in the block. Raises InvalidArgument for a damaged body."""
         try:
             self._parser.write(block)
         except FormParserError as error:

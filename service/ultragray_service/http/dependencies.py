@@ -36,10 +36,7 @@ SCENE_NAME = {"description": _NAME_MEANS, "schema": {"type": "string", "title": 
 
 
 def problems(*statuses: int, members: Mapping[str, type] | None = None) -> dict[int | str, dict[str, Any]]:
-    """The documentation of error answers, for `responses=`; `members`: of the document, beside those of Problem.
-
-    Whoever needs a key (401) has limits (429).
-    """
+    """The documentation of error answers; `members`: more of the document. Who needs a key (401) has limits (429)."""
     statuses = tuple(sorted({*statuses, 429})) if 401 in statuses else statuses
     schema: dict[str, Any] = {"$ref": _REFERENCE.format(Problem.__name__)}
     if members:
@@ -145,10 +142,7 @@ def answer(description: str, *media_types: str, headers: Mapping[str, str] | Non
 async def revalidated(
     request: Request, version: str, make: Callable[[], Awaitable[bytes]], media_type: str
 ) -> Response:
-    """What `make` gives, with `version` as its ETag; 304 without asking it where the client has that version.
-
-    `version` names the content: letters, digits and '-'.
-    """
+    """What `make` gives, with `version` (letters, digits, '-') as ETag; 304 where the client has that version."""
     tag = f'"{version}"'
     known = [known.strip().removeprefix("W/") for known in request.headers.get("if-none-match", "").split(",")]
     response = Response(status_code=304) if tag in known else Response(await make(), media_type=media_type)

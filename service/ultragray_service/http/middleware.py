@@ -113,10 +113,7 @@ class CheckOrigin:
 
 
 class Authorize:
-    """Finds out who asks, and whether they may, and not too often; keeps account of it.
-
-    Ends what goes on when its key counts no more.
-    """
+    """Finds out who asks and whether they may, keeps account of it, and ends it when the key counts no more."""
 
     def __init__(self, app: ASGIApp, service: Service, rules: HttpRules) -> None:
         self._app = app
@@ -159,10 +156,7 @@ class Authorize:
 
 
 class LimitBody:
-    """Refuses bodies over the limit, whether they announce their length or come in chunks.
-
-    Uploads go straight to a disk and count for themselves.
-    """
+    """Refuses bodies over the limit, announced or not; uploads go straight to a disk and count for themselves."""
 
     def __init__(self, app: ASGIApp, limit_bytes: int) -> None:
         self._app = app

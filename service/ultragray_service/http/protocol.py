@@ -293,10 +293,7 @@ class BoundedHttp(HttpToolsProtocol):
 
 
 class _Closing:
-    """A transport that drops what is written once it closes: the answers under way hear of that a moment later.
-
-    It closes later where `linger` says so.
-    """
+    """A transport that drops what is written once it closes, and closes later where `linger` says so."""
 
     def __init__(self, transport: Any, linger: Callable[[], bool]) -> None:
         self._transport = transport

@@ -213,10 +213,7 @@ class ClientTools:
 
 
 def read_tools(text: str, before: ClientTools) -> ClientTools:
-    """The tools of a JSON text; devices that moved tools of `before` are where they were.
-
-    Raises InvalidArgument, naming the tool.
-    """
+    """The tools of a JSON text; devices of `before` are where they were. Raises InvalidArgument, naming the tool."""
     try:
         documents = json.loads(text)
     except (ValueError, RecursionError):
@@ -321,11 +318,7 @@ class Scanner:
         self.setup = replace(self.setup, tools=self.setup.tools.moved(device, pose))
 
     async def set(self, parameter: str, value: str) -> None:
-        """Sets a parameter for the frames to come.
-
-        Raises InvalidArgument for an unknown parameter and for a value that cannot be, InvalidProbe, SceneNotFound,
-        RegistrationNotFound.
-        """
+        """Sets a parameter for the frames to come. Raises InvalidArgument, SceneNotFound, RegistrationNotFound."""
         if parameter == _SCENE:
             await self._scenes.prefer(value)
         elif parameter == _REGISTRATION:
@@ -388,10 +381,7 @@ _SET, _GET = "SetUsParameter", "GetUsParameter"
 
 
 async def answer(scanner: Scanner, message: Message) -> Message:
-    """The reply to a COMMAND, or to a STRING of a device CMD_…; it says what was wrong with the command, if so.
-
-    Raises IgtlMessageInvalid where the message holds no command.
-    """
+    """The reply to a COMMAND, or to a STRING of a device CMD_…, also to a wrong one. Raises IgtlMessageInvalid."""
     if message.type_name == "COMMAND":
         command = unpack_command(message.content)
         reply = await _reply(scanner, command.name, command.text)

@@ -188,10 +188,7 @@ class Connection:
         return frame.message(kind, query.version, query.message_id, query.device_name)
 
     async def _take_poses(self, message: Message, arrived: float) -> None:
-        """Moves the tools of devices that do so, and takes the poses of the others.
-
-        Where only tools have moved, the frame of the pose before is rendered again.
-        """
+        """Moves tools of devices, takes poses of others; where only tools moved, the last pose is rendered again."""
         tools = self._scanner.setup.tools
         if message.type_name == "TRANSFORM":
             poses = [(message.device_name, unpack_transform(message.content))]

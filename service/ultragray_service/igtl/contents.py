@@ -210,10 +210,7 @@ def pack_capability(type_names: Iterable[str]) -> bytes:
 
 
 def unpack_interval_s(content: bytes) -> float:
-    """The least time between two messages that an STT_TDATA or STT_QTDATA asks for; none: 0.
-
-    Raises IgtlMessageInvalid.
-    """
+    """The least time between two messages of an STT_TDATA or STT_QTDATA; none: 0. Raises IgtlMessageInvalid."""
     if not content:
         return 0.0
     if len(content) < _INTERVAL.size:

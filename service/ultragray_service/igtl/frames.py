@@ -100,10 +100,7 @@ class WaitingPoses:
         return older is not None
 
     def again(self, posed: PoseMessage) -> None:
-        """Takes a pose that was there before and is to be rendered with another setup.
-
-        One of its device that still waits will be.
-        """
+        """Takes a pose again, to be rendered with another setup, unless one of its device still waits."""
         if posed.message.device_name not in self._poses:
             self._poses[posed.message.device_name] = posed
             self._come.set()

@@ -46,10 +46,7 @@ class IgtlServer:
         self._server = await asyncio.start_server(self._connected, sock=listener)
 
     async def stop(self, grace_s: float) -> None:
-        """Lets what is being answered be answered, tells every client that the service stops, and closes.
-
-        Each may take `grace_s` seconds.
-        """
+        """Lets what is being answered be answered, each within `grace_s`, tells every client, and closes."""
         if self._server is None:
             return
         self._server.close()

@@ -103,10 +103,7 @@ def slice_message(result: RenderResult[SliceView]) -> rendering_pb2.Slice:
 
 
 def read_specification(message: jobs_pb2.SubmitJobRequest) -> tuple[Specification, str]:
-    """The checked specification, and the field that holds it.
-
-    Raises InvalidArgument, InvalidPose, UnknownOutput; their field is a path.
-    """
+    """The checked specification, and the field that holds it. Raises InvalidArgument and its kinds; field: a path."""
     kind = message.WhichOneof("specification")
     if kind is None:
         raise InvalidArgument(f"specification must hold one of {', '.join(KINDS)}", field="specification")

@@ -136,10 +136,7 @@ class Tracing:
 
     @contextmanager
     def call(self, name: str, carrier: Mapping[str, str]) -> Iterator[trace.Span]:
-        """A span for a call of gRPC, a part of the trace that the `traceparent` of its metadata names.
-
-        FastAPI makes those of HTTP, with our `provider`.
-        """
+        """A span for a call of gRPC, within the trace that its metadata name; FastAPI makes those of HTTP."""
         with self._tracer.start_as_current_span(
             name,
             context=propagate.extract(carrier),

@@ -292,10 +292,7 @@ _RANGE = re.compile(r"bytes=(\d*)-(\d*)")
 def artifact_response(
     file: Artifact, asked: Headers, media_type: str, beside: Mapping[str, str], disposition: str
 ) -> Response:
-    """The answer to a GET with these headers. Of several ranges none is answered, but the whole file.
-
-    `beside`: further headers of the answer. `disposition`: inline or attachment.
-    """
+    """The answer to a GET of a file or of one range; `beside`: further headers, `disposition`: inline or attachment."""
     etag = f'"{file.stored.sha256}"'
     headers = {
         **beside,
