@@ -29,10 +29,12 @@ from ultragray_workers.rounds import Rounds
 _IPV6_NETWORK_BITS = 64  # what one subscriber has
 
 
+Place = contextlib.ExitStack  # of one connection; closing it, the first time, gives the place back
+
+
 class Connections:
     def __init__(self, total: int, per_address: int) -> None:
-        self._total = total
-        self._per_address = per_address
+        self._total, self._per_address = total, per_address
         self._by_address: Counter[str] = Counter()
         self._count = 0
 
@@ -44,25 +46,15 @@ class Connections:
             raise TooManyConnections(f"at most {self._total} connections may be open")
         self._count += 1
         self._by_address[address] += 1
-        return Place(self, address)
+        place = Place()
+        place.callback(self._leave, address)
+        return place
 
-    def leave(self, address: str) -> None:
+    def _leave(self, address: str) -> None:
         self._count -= 1
         self._by_address[address] -= 1
         if not self._by_address[address]:
             del self._by_address[address]
-
-
-class Place:
-    def __init__(self, connections: Connections, address: str) -> None:
-        self._connections = connections
-        self._address = address
-        self._is_taken = True
-
-    def leave(self) -> None:
-        if self._is_taken:
-            self._is_taken = False
-            self._connections.leave(self._address)
 
 
 def address_of(host: str) -> str:
@@ -85,19 +77,15 @@ class Acceptor:
         self,
         listener: socket.socket,
         connections: Connections,
-        protocol: Callable[[Place], asyncio.Protocol],
+        protocol: Callable[..., asyncio.Protocol],
         *,
         refusal: Callable[[TooManyConnections], bytes],
         send_patience_s: float,
         tls: Callable[[], ssl.SSLContext | None],
     ) -> None:
         """`protocol` serves a connection, `refusal` is sent to one without a place, `tls` is asked for each of them."""
-        self._listener = listener
-        self._connections = connections
-        self._protocol = protocol
-        self._refusal = refusal
-        self._send_patience_s = send_patience_s
-        self._tls = tls
+        self._listener, self._connections, self._protocol = listener, connections, protocol
+        self._refusal, self._send_patience_s, self._tls = refusal, send_patience_s, tls
         self._serving: set[asyncio.Task[None]] = set()
         self._task = asyncio.ensure_future(self._accept())
 
@@ -143,14 +131,14 @@ class Acceptor:
         try:
             give_up_on_silent_peers(connection, self._send_patience_s)
             await asyncio.get_running_loop().connect_accepted_socket(
-                lambda: self._protocol(place), connection, ssl=tls, ssl_handshake_timeout=timeout_s
+                lambda: self._protocol(place=place), connection, ssl=tls, ssl_handshake_timeout=timeout_s
             )
             is_served = True
         except OSError:
             pass  # the peer has gone, or its TLS handshake failed
         finally:
             if not is_served:
-                place.leave()
+                place.close()
                 connection.close()
 
 
@@ -163,8 +151,7 @@ _OPEN_FILES = "/dev/fd"
 
 class OpenSockets:
     def __init__(self, port: int, connections: Connections) -> None:
-        self._port = port
-        self._connections = connections
+        self._port, self._connections = port, connections
         self._others: set[int] = set()  # sockets that are no connections to the port, by inode
         self._places: dict[int, Place] = {}  # the connections, by inode
 
@@ -190,7 +177,7 @@ class OpenSockets:
                     refused += not self._let_in(file, status.st_ino)
         self._others &= inodes
         for inode in self._places.keys() - inodes:
-            self._places.pop(inode).leave()
+            self._places.pop(inode).close()
         return refused
 
     def _let_in(self, file: int, inode: int) -> bool:
@@ -283,8 +270,7 @@ class Patience:
     """
 
     def __init__(self, min_bytes_per_s: float, limit_s: float) -> None:
-        self._min_bytes_per_s = min_bytes_per_s
-        self._limit_s = limit_s
+        self._min_bytes_per_s, self._limit_s = min_bytes_per_s, limit_s
         self._left_s = limit_s
 
     def renew(self) -> None:

@@ -95,8 +95,7 @@ class Limits:
         def allowance(own: tuple[tuple[str, Number | None], ...]) -> Allowance:
             return replace(default, **dict(own))  # type: ignore[arg-type]  # checked when the key was made
 
-        self._allowance = allowance
-        self._on_refused = on_refused
+        self._allowance, self._on_refused = allowance, on_refused
         self._requests, self._frames = Rate(), Rate()
         self._streams: Counter[str] = Counter()
 

@@ -248,11 +248,8 @@ class OidcTokens:
     def __init__(
         self, issuer: Issuer, *, audience: str | None, role_claim: str, name_claim: str, roles: Mapping[str, Role]
     ) -> None:
-        self.issuer = issuer
-        self._audience = audience
-        self._role_claim = role_claim
-        self._name_claim = name_claim
-        self._roles = roles
+        self.issuer, self._audience, self._role_claim = issuer, audience, role_claim
+        self._name_claim, self._roles = name_claim, roles
         self._verified: dict[bytes, Principal] = {}
         self._verified_with: Mapping[str | None, SigningKey] = {}
 

@@ -6,7 +6,7 @@ import contextlib
 import json
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -59,18 +59,10 @@ class RenderRequest:
     scene: str
     output: Path
     suffix: str | None  # of SUFFIXES; None: a folder of PNGs
-    pose_file: Path | None
+    poses: FloatArray | None  # [C, 4, 4] mm, of a file
     sampler: Sampler | None
-    registration: str | None  # that leads the poses of the file into the scene
+    registration: str | None  # that leads these poses into the scene
     settings: FrameSettings
-
-    def __post_init__(self) -> None:
-        if self.registration is not None and (self.pose_file is None or self.sampler is not None):
-            raise InvalidArgument(
-                "a registration leads the poses of a file, which must be given with --poses and without --sampler; "
-                "ultragray jobs submit render samples about such poses",
-                field="registration",
-            )
 
 
 def checked_kind(output: Path, settings: FrameSettings, *, force: bool) -> str | None:
@@ -89,8 +81,13 @@ def checked_kind(output: Path, settings: FrameSettings, *, force: bool) -> str |
 
 
 def render_remotely(connection: Connection, request: RenderRequest) -> dict[str, Any]:
-    given = None if request.pose_file is None else load_poses(request.pose_file)
-    poses = _poses(connection, request, given)
+    if request.registration is not None and (request.poses is None or request.sampler is not None):
+        raise InvalidArgument(
+            "a registration leads the poses of a file, which must be given with --poses and without --sampler; "
+            "ultragray jobs submit render samples about such poses",
+            field="registration",
+        )
+    poses = _poses(connection, request)
     settings = to_dict(request.settings, with_none=False)
     if request.registration is not None:
         settings["registration"] = request.registration
@@ -103,9 +100,9 @@ def render_remotely(connection: Connection, request: RenderRequest) -> dict[str,
                 field="output",
             )
         body = {**settings, **({"pose": _pose(poses[0])} if len(poses) == 1 else {"poses": list(map(_pose, poses))})}
-        answer = _rendered(connection, request.scene, body, MEDIA_TYPES[request.suffix])
-        write_whole(request.output, answer.data)
-        shape = answer.headers["x-ultragray-shape"]
+        data, headers = _rendered(connection, request.scene, body, MEDIA_TYPES[request.suffix])
+        write_whole(request.output, data)
+        shape = headers["x-ultragray-shape"]
     _, _, height, width = map(int, shape.split(","))
     return {
         "output": str(request.output),
@@ -117,11 +114,14 @@ def render_remotely(connection: Connection, request: RenderRequest) -> dict[str,
     }
 
 
-def _poses(connection: Connection, request: RenderRequest, given: FloatArray | None) -> FloatArray:  # [C, 4, 4] mm
+def _poses(connection: Connection, request: RenderRequest) -> FloatArray:  # [C, 4, 4] mm
     """The poses of a file, or those that a sampler makes; without either the middle training pose."""
-    if request.sampler is None and given is not None:
-        return given
-    base = _training_poses(connection, request.scene) if given is None else given
+    base = request.poses
+    if request.sampler is None and base is not None:
+        return base
+    if base is None:  # at most 10,000 training poses
+        found = connection.json("GET", route("scenes", request.scene, "training-poses"))
+        base = check_poses(np.array(found["poses"], np.float64).reshape(-1, 4, 4))
     if not len(base):
         raise InvalidArgument("--poses must be given: the scene holds no training poses", field="poses")
     if request.sampler is None:
@@ -143,34 +143,23 @@ def _write_folder(connection: Connection, request: RenderRequest, settings: dict
         for number, pose in enumerate(poses):
             for output in request.settings.outputs:
                 body = {**settings, "outputs": [output], "pose": _pose(pose)}
-                answer = _rendered(connection, request.scene, body, MEDIA_TYPES[".png"])
+                data, headers = _rendered(connection, request.scene, body, MEDIA_TYPES[".png"])
                 request.output.mkdir(parents=True, exist_ok=True)  # only now: a refusal leaves no folder
-                write_whole(request.output / f"frame_{number:05d}_{output}.png", answer.data)
-                shape = answer.headers["x-ultragray-shape"]
-            documents.append({"frame": number, "pose": answer.fact("pose"), **(answer.fact("extrapolation") or {})})
+                write_whole(request.output / f"frame_{number:05d}_{output}.png", data)
+            shape = headers["x-ultragray-shape"]
+            about = {name: json.loads(headers[f"x-ultragray-{name}"]) for name in ("pose", "extrapolation")}
+            documents.append({"frame": number, "pose": about["pose"], **about["extrapolation"]})
             report(number + 1)
     write_whole(request.output / FRAMES_FILE, json.dumps(documents))
     return shape
 
 
-@dataclass(frozen=True)
-class _Answer:
-    data: bytes
-    headers: dict[str, str]
-
-    def fact(self, name: str) -> Any:
-        text = self.headers.get(f"x-ultragray-{name}")
-        return None if text is None else json.loads(text)
-
-
-def _rendered(connection: Connection, scene: str, body: dict[str, Any], media_type: str) -> _Answer:
+def _rendered(
+    connection: Connection, scene: str, body: dict[str, Any], media_type: str
+) -> tuple[bytes, Mapping[str, str]]:
+    """Frames as the service encoded them, and what its headers say about them."""
     with connection.open("POST", route("scenes", scene, "render"), body, accept=media_type) as answer:
-        return _Answer(connection.whole(answer), {key.lower(): value for key, value in answer.headers.items()})
-
-
-def _training_poses(connection: Connection, scene: str) -> FloatArray:  # [P, 4, 4] mm
-    found = connection.json("GET", route("scenes", scene, "training-poses"))
-    return check_poses(np.array(found["poses"], np.float64).reshape(-1, 4, 4))
+        return connection.whole(answer), answer.headers
 
 
 def _pose(pose: FloatArray) -> dict[str, Any]:  # [4, 4] mm
@@ -294,7 +283,8 @@ def render_scene(
     from ultragray_service.cli.remote import render_remotely
 
     suffix = checked_kind(output, settings, force=force)
-    request = RenderRequest(name, output, suffix, poses, sampler, of_poses.get("registration"), settings)
+    given = None if poses is None else load_poses(poses)
+    request = RenderRequest(name, output, suffix, given, sampler, of_poses.get("registration"), settings)
     document = render_remotely(connection, request)
     size = f"{document['height']}x{document['width']}"
     tell(

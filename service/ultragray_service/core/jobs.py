@@ -90,8 +90,7 @@ class GrowingLog:
 
     def __init__(self, log: Log, offset: int | None = None) -> None:
         """`offset`: the byte of the log to go on from; None: the last lines that are there at the first read."""
-        self._log = log
-        self._offset = offset
+        self._log, self._offset = log, offset
         self.has_more = False  # whether there may be more to read at once
 
     @property
@@ -194,9 +193,7 @@ class _Reader:
     """Reads one job for all of its watchers, until its final state or until nobody watches."""
 
     def __init__(self, read: Callable[[], Job], log: Log, threads: Executor | None) -> None:
-        self._read = read
-        self._threads = threads
-        self._log = log
+        self._read, self._threads, self._log = read, threads, log
         self._log_bytes = 0
         self._job: Job | None = None
         self.watches: set[JobWatch] = set()
@@ -240,9 +237,7 @@ class JobHub:
     """The watchers of all jobs. Belongs to one event loop."""
 
     def __init__(self, get: Callable[[str], Job], log: Callable[[str], Log], threads: Executor | None = None) -> None:
-        self._get = get
-        self._threads = threads
-        self._log = log
+        self._get, self._threads, self._log = get, threads, log
         self._readers: dict[str, _Reader] = {}
         self._closed = False
 
@@ -251,7 +246,7 @@ class JobHub:
         return len(self._readers)
 
     async def watch(self, job_id: str, log_offset: int | None = None) -> JobWatch:
-        """A watcher, to be closed, of a job and its log after `log_offset`; None: the last lines. Raises JobNotFound."""
+        """A watcher, to be closed, of a job and its log from `log_offset` on (None: its end). Raises JobNotFound."""
         reader = self._readers.get(job_id)
         if reader is None or reader.task.done():
             await asyncio.get_running_loop().run_in_executor(self._threads, self._get, job_id)
@@ -375,9 +370,7 @@ class Jobs:
         admit: Admit,
     ) -> None:
         """`registration`: finds that of a name, for a scene; it blocks, as `admit` does, which each new job passes."""
-        self._settings = settings
-        self._scenes = scenes
-        self._datasets = datasets
+        self._settings, self._scenes, self._datasets = settings, scenes, datasets
         self._registration = registration
         self._opened: JobStore | None = None
         self.threads = DatabaseThreads()

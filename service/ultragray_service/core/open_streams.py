@@ -110,9 +110,7 @@ class OpenStream:
     def __init__(self, door: Door = "websocket", name: str = "", owner: str = "", client: str = "") -> None:
         self.id = secrets.token_hex(8)
         self.name = "".join(letter for letter in name if letter.isprintable())[:MAX_NAME]
-        self.owner = owner
-        self._door = door
-        self._client = client
+        self.owner, self._door, self._client = owner, door, client
         self._opened_at = datetime.now(timezone.utc)
         self._opened = self._asked_at = time.monotonic()
         self._poses = self._frames = self._refused = self._dropped = 0

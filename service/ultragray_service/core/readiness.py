@@ -100,8 +100,7 @@ class Readiness:
     ) -> None:
         """`require_…`: raise what keeps everything, and frames, away. `without_jobs`: ready as soon as frames are."""
         self._require_serving, self._require_frames = require_serving, require_frames
-        self._scenes = scenes
-        self._without_jobs = without_jobs
+        self._scenes, self._without_jobs = scenes, without_jobs
         self._jobs = WatchedPart("the database of the jobs", lambda: database().check(), DatabaseUnavailable)
         self._artifacts = WatchedPart(
             "the artifact folder", lambda: database().identity.check_writable(), ArtifactFolderUnavailable

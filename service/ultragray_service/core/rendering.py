@@ -61,10 +61,7 @@ class Plan(Generic[S]):
         """`path`: the place of the settings in the client's message, for errors. To be renewed before it is used."""
         self.scene = base_name(scene)
         self._reference = scene
-        self._catalog = catalog
-        self._resolve = resolve
-        self._path = path
-        self.registration = registration
+        self._catalog, self._resolve, self._path, self.registration = catalog, resolve, path, registration
 
     def placed(self, poses: FloatArray) -> FloatArray:  # [..., 4, 4] mm, exact, both
         return poses if self.registration is None else self.registration.probe_to_scene(poses)
@@ -87,9 +84,7 @@ class RequestPlanner:
         catalog: SceneCatalog,
         registration: Callable[[str, str], Awaitable[Registration]],
     ) -> None:
-        self._settings = settings
-        self._catalog = catalog
-        self._registration = registration
+        self._settings, self._catalog, self._registration = settings, catalog, registration
 
     @property
     def max_poses(self) -> int:

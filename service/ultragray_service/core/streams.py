@@ -360,9 +360,7 @@ class FrameStream:
         unset: SceneSettings | None = None,
         record: OpenStream | None = None,
     ) -> None:
-        self._rendering = rendering
-        self._transport = transport
-        self._unset = unset
+        self._rendering, self._transport, self._unset = rendering, transport, unset
         self._plan: Plan | None = None
         self._poses = PoseStream(rendering, record)
 

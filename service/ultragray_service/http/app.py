@@ -186,16 +186,13 @@ _SECURITY_SCHEMES = {
 # render comes first: its route is the one that must be found fast
 _ROUTERS = (
     rendering.router,
-    rendering.slices_router,
     streams.router,
     scenes.router,
-    scenes.files_router,
     geometry.router,
     geometry.registrations_router,
     datasets.router,
     datasets.comparison_router,
     jobs.router,
-    jobs.training_router,
     jobs.workers_router,
     streams.streams_router,
     health.statistics_router,

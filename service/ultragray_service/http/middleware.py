@@ -34,8 +34,7 @@ class RequestContext:
     """Outermost: gives each request its id, logs and counts the answer, and answers what nobody caught."""
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
-        self._app = app
-        self._metrics = metrics
+        self._app, self._metrics = app, metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "websocket":
@@ -87,9 +86,7 @@ class CheckOrigin:
     """Keeps pages of other sites away: from everything where no key is asked for, else from WebSockets."""
 
     def __init__(self, app: ASGIApp, guard: Guard, origins: Origins) -> None:
-        self._app = app
-        self._guard = guard
-        self._origins = origins
+        self._app, self._guard, self._origins = app, guard, origins
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         try:
@@ -116,9 +113,7 @@ class Authorize:
     """Finds out who asks and whether they may, keeps account of it, and ends it when the key counts no more."""
 
     def __init__(self, app: ASGIApp, service: Service, rules: HttpRules) -> None:
-        self._app = app
-        self._service = service
-        self._rules = rules
+        self._app, self._service, self._rules = app, service, rules
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         method = WEBSOCKET if scope["type"] == "websocket" else scope["method"]
@@ -159,8 +154,7 @@ class LimitBody:
     """Refuses bodies over the limit, announced or not; uploads go straight to a disk and count for themselves."""
 
     def __init__(self, app: ASGIApp, limit_bytes: int) -> None:
-        self._app = app
-        self._limit_bytes = limit_bytes
+        self._app, self._limit_bytes = app, limit_bytes
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http" or (scope["method"] == "PUT" and scope["path"].startswith(_UPLOAD_PATHS)):

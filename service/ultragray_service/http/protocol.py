@@ -11,7 +11,6 @@ import contextlib
 import socket
 import ssl
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -120,16 +119,7 @@ _MAX_UNWANTED_BYTES = 2**20  # of a body whose request was answered already: a l
 _LINGER_S = 1.0  # in which a client that still sends can read its answer
 
 
-@dataclass(frozen=True)
-class HttpLimits:
-    """The bounds of each connection. `on_refused` is told of each refusal."""
-
-    max_header_bytes: int
-    max_headers: int
-    header_timeout_s: float
-    min_bytes_per_s: float
-    transfer_patience_s: float
-    on_refused: Callable[[UltragrayError], None]
+Refused = Callable[[UltragrayError], bytes]  # the answer to a refused request, which it counts
 
 
 class BoundedHttp(HttpToolsProtocol):
@@ -139,11 +129,10 @@ class BoundedHttp(HttpToolsProtocol):
     else brings neither a head to its end nor a body on. Trailers are bounded like a head, and thrown away.
     """
 
-    def __init__(self, *arguments: Any, limits: HttpLimits, place: Place, **options: Any) -> None:
+    def __init__(self, *arguments: Any, limits: Settings, refused: Refused, place: Place, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self.ws_protocol_class: Any = partial(_BoundedWebSocket, limits=limits, place=place)
-        self._limits = limits
-        self._place = place
+        self.ws_protocol_class: Any = partial(_BoundedWebSocket, limits=limits, refused=refused, place=place)
+        self._limits, self._refused, self._place = limits, refused, place
         self._in_head = True
         self._head_since: float | None = self.loop.time()
         self._looked_at = self.loop.time()
@@ -160,7 +149,7 @@ class BoundedHttp(HttpToolsProtocol):
         super().connection_made(_Closing(transport, self._linger))  # type: ignore[arg-type]  # it has all that a transport has
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._place.leave()
+        self._place.close()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
@@ -271,8 +260,7 @@ class BoundedHttp(HttpToolsProtocol):
             cycle.message_event.set()
         self.pipeline.clear()
         if can_answer:
-            self._limits.on_refused(error)
-            self.transport.write(refusal_bytes(error, self.server_state.default_headers))
+            self.transport.write(self._refused(error))
         self._end()
 
     def _linger(self) -> bool:
@@ -296,8 +284,7 @@ class _Closing:
     """A transport that drops what is written once it closes, and closes later where `linger` says so."""
 
     def __init__(self, transport: Any, linger: Callable[[], bool]) -> None:
-        self._transport = transport
-        self._linger = linger
+        self._transport, self._linger = transport, linger
         self._has_ended = False
 
     def __getattr__(self, name: str) -> Any:
@@ -320,15 +307,14 @@ class _Closing:
 
 
 class _BoundedWebSocket(PromptWebSocket):
-    def __init__(self, *arguments: Any, limits: HttpLimits, place: Place, **options: Any) -> None:
+    def __init__(self, *arguments: Any, limits: Settings, refused: Refused, place: Place, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self._place = place
-        self._limits = limits
+        self._refused, self._place = refused, place
         self._looked_at = self.loop.time()
         self._sending = _Sending(limits)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._place.leave()
+        self._place.close()
         super().connection_lost(exc)
 
     def handle_connect(self, event: Request) -> None:
@@ -337,8 +323,7 @@ class _BoundedWebSocket(PromptWebSocket):
         except InvalidHandshake:
             error = RequestMalformed("the headers are no handshake of a WebSocket of version 13 (RFC 6455)")
             self.handshake_initiated = self.handshake_complete = self.close_sent = True
-            self._limits.on_refused(error)
-            self.transport.write(refusal_bytes(error, self.default_headers))
+            self.transport.write(self._refused(error))
             self.transport.close()
         else:
             super().handle_connect(event)
@@ -350,7 +335,7 @@ class _BoundedWebSocket(PromptWebSocket):
 
 
 class _Sending:
-    def __init__(self, limits: HttpLimits) -> None:
+    def __init__(self, limits: Settings) -> None:
         self._patience = Patience(limits.min_bytes_per_s, limits.transfer_patience_s)
         self._waiting_bytes = 0
 
@@ -407,32 +392,15 @@ class HttpServer(uvicorn.Server):
                 timeout_graceful_shutdown=int(flush_s),
             )
         )
-        self._settings = settings
-        self._metrics = metrics
-        self._certificates = certificates
-        self._limits = HttpLimits(
-            max_header_bytes=settings.max_header_bytes,
-            max_headers=settings.max_headers,
-            header_timeout_s=settings.header_timeout_s,
-            min_bytes_per_s=settings.min_bytes_per_s,
-            transfer_patience_s=settings.transfer_patience_s,
-            on_refused=self._count,
-        )
+        self._settings, self._metrics, self._certificates = settings, metrics, certificates
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Begins to accept. uvicorn's own would not know whom it accepts."""
-        connections = Connections(self._settings.max_connections, self._settings.max_connections_per_address)
-        servers: list[Any] = [
-            Acceptor(
-                listener,
-                connections,
-                self._protocol,
-                refusal=self._refusal,
-                send_patience_s=self._settings.transfer_patience_s,
-                tls=self._tls,
-            )
-            for listener in sockets or ()
-        ]
+        limits, refusal = self._settings, self._refusal
+        connections = Connections(limits.max_connections, limits.max_connections_per_address)
+        protocol = partial(BoundedHttp, self.config, self.server_state, {}, limits=limits, refused=refusal)
+        means: dict[str, Any] = {"refusal": refusal, "send_patience_s": limits.transfer_patience_s, "tls": self._tls}
+        servers: list[Any] = [Acceptor(one, connections, protocol, **means) for one in sockets or ()]
         self.servers = servers
         self.started = True
 
@@ -451,12 +419,6 @@ class HttpServer(uvicorn.Server):
     def _tls(self) -> ssl.SSLContext | None:
         return None if self._certificates is None else self._certificates.current.http_context
 
-    def _protocol(self, place: Place) -> BoundedHttp:
-        return BoundedHttp(self.config, self.server_state, {}, limits=self._limits, place=place)
-
     def _refusal(self, error: UltragrayError) -> bytes:
-        self._count(error)
-        return refusal_bytes(error, self.server_state.default_headers)
-
-    def _count(self, error: UltragrayError) -> None:
         self._metrics.count_request("http", "refused", str(statuses_of(error).http), 0.0)
+        return refusal_bytes(error, self.server_state.default_headers)

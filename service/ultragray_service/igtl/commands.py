@@ -310,9 +310,7 @@ class Scanner:
     """The setup of the frames of one connection, and the scene of its devices that name none."""
 
     def __init__(self, scenes: SceneChooser, registrations: Registrations, setup: Setup) -> None:
-        self.setup = setup
-        self._scenes = scenes
-        self._registrations = registrations
+        self.setup, self._scenes, self._registrations = setup, scenes, registrations
 
     def move(self, device: str, pose: FloatArray) -> None:  # [4, 4] mm, exact
         self.setup = replace(self.setup, tools=self.setup.tools.moved(device, pose))

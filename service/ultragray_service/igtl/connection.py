@@ -73,15 +73,12 @@ class Connection:
         self.feed = Feed(self._turn, self._send)
         self.record = OpenStream("openigtlink")
         self._answers = 0
-        self._service = service
-        self._scenes = scenes
-        self._frames = frames
+        self._service, self._scenes, self._frames = service, scenes, frames
         thickness_mm = service.settings.igtl_slice_thickness_mm
         setup = Setup(FrameSettings(slice_thickness_mm=thickness_mm), service.settings.igtl_registration)
         self._scanner = Scanner(scenes, service.registrations, setup)
         self._maker = FrameMaker(service, scenes, self._scanner)
-        self._reader = reader
-        self._writer = writer
+        self._reader, self._writer = reader, writer
         self._sending = asyncio.Lock()
         self._showing = asyncio.Lock()
         self._poses = WaitingPoses()

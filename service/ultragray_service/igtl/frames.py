@@ -179,9 +179,7 @@ def _settings_texts(settings: Resolved) -> Mapping[str, str]:
 
 class FrameMaker:
     def __init__(self, service: Service, scenes: SceneChooser, scanner: Scanner) -> None:
-        self._service = service
-        self._scenes = scenes
-        self._scanner = scanner
+        self._service, self._scenes, self._scanner = service, scenes, scanner
 
     async def render(self, underway: Underway) -> Frame:
         """The frame of a pose, or of one that took its turn, as the scanner is set; else probe and size are those the
@@ -246,8 +244,7 @@ class Feed:
 
     def __init__(self, turn: EnterTurn, send: Callable[[Message], Awaitable[None]]) -> None:
         """`turn` is entered for each message, and waits until the client has read what came before."""
-        self._turn = turn
-        self._send = send
+        self._turn, self._send = turn, send
         self._subscriptions: dict[str, _Subscription] = {}
         self._fresh: dict[str, Frame] = {}
         self._changed = asyncio.Event()

@@ -38,8 +38,7 @@ class SceneChooser:
     """Chooses scenes by the names of devices; knows the scenes as they were at most a second ago."""
 
     def __init__(self, catalog: SceneCatalog, default: str | None) -> None:
-        self._catalog = catalog
-        self._default = default
+        self._catalog, self._default = catalog, default
         self._names: list[str] = []
         self._read_at = -_NAMES_LIVE_S
 

@@ -89,7 +89,7 @@ class IgtlServer:
         with contextlib.ExitStack() as places:
             try:
                 self._service.limits.take_request()
-                places.callback(self._places.enter(host).leave)
+                places.enter_context(self._places.enter(host))
                 places.enter_context(self._service.limits.stream())
                 connection.record = places.enter_context(self._service.streams.opened("openigtlink", ""))
             except (TooManyConnections, RateLimited, LimitReached) as error:

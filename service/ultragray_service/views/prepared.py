@@ -328,8 +328,7 @@ class TrainingViews(Prepared):
 
     def __init__(self, jobs: Jobs, datasets: DatasetStore, settings: Settings, processes: HelperProcesses) -> None:
         super().__init__(settings, processes)
-        self._jobs = jobs
-        self._datasets = datasets
+        self._jobs, self._datasets = jobs, datasets
 
     async def curve(self, job_id: str) -> TrainingCurve:
         journal, baselines = await self._jobs.do(_texts, job_id)
@@ -444,9 +443,7 @@ class Comparisons(Prepared):
         processes: HelperProcesses,
     ) -> None:
         super().__init__(settings, processes)
-        self._scenes = scenes
-        self._catalog = catalog
-        self._datasets = datasets
+        self._scenes, self._catalog, self._datasets = scenes, catalog, datasets
 
     async def get(self, scene: str) -> Comparison:
         """Begin the comparison unless it is there; how far it is.

@@ -331,16 +331,13 @@ def _read(file: Artifact, start: int, length: int) -> bytes:
     return chunk
 
 
-training_router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
-
-
-@training_router.get("/{job}/curve", responses=problems(401, 404, 422, 503))
+@router.get("/{job}/curve", responses=problems(401, 404, 422, 503))
 async def get_curve(service: ServiceDep, job: JobId) -> TrainingCurve:
     """Loss and held-out PSNR of a training so far, in at most 500 points."""
     return await service.training_views.curve(job)
 
 
-@training_router.get(
+@router.get(
     "/{job}/preview",
     response_class=Response,
     responses=_PREVIEW | problems(401, 404, 422, 500, 503, 504, 507),

@@ -155,8 +155,6 @@ def _settings_headers(settings: Resolved) -> dict[str, str]:
     return {_header_of(name): text for name, text in texts.items()}
 
 
-slices_router = APIRouter(prefix="/v1/scenes", tags=["render"])
-
 SLICE_HEADERS = {
     "X-Ultragray-Scene": "Name of the scene.",
     "X-Ultragray-Scene-Sha256": "SHA-256 of the scene file.",
@@ -173,7 +171,7 @@ _SLICE_ANSWER = answer(
 )
 
 
-@slices_router.post(
+@router.post(
     "/{scene}:slice",
     response_class=Response,
     openapi_extra=body_schema(SliceSettings, SLICE_EXAMPLES),

@@ -125,8 +125,6 @@ class ScenePoses:
     turn_deg: list[float] | None = described("And turned.", None)
 
 
-files_router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
-
 PointLimit = Annotated[int, Query(ge=1, le=MAX_POINTS, description="Gaussians at most.")]
 PointFields = Annotated[
     list[str] | None,
@@ -151,7 +149,7 @@ _IMPORT: dict[str, Any] = {
 }
 
 
-@files_router.get("/{scene}/gaussians", response_class=Response, responses=_POINTS | problems(401, 404, 422))
+@router.get("/{scene}/gaussians", response_class=Response, responses=_POINTS | problems(401, 404, 422))
 async def get_gaussians(
     request: Request,
     service: ServiceDep,
@@ -164,7 +162,7 @@ async def get_gaussians(
     return await revalidated(request, version, partial(service.catalog.points, scene, limit, fields or FIELDS), RAW)
 
 
-@files_router.get("/{scene}/training-poses", response_class=Response, responses=_POSES | problems(401, 404, 422))
+@router.get("/{scene}/training-poses", response_class=Response, responses=_POSES | problems(401, 404, 422))
 async def get_training_poses(request: Request, service: ServiceDep, scene: SceneName) -> Response:
     """The poses that the scene was trained from, at most 10,000 of them, evenly taken."""
 
@@ -174,7 +172,7 @@ async def get_training_poses(request: Request, service: ServiceDep, scene: Scene
     return await revalidated(request, (await service.catalog.version(scene)).tag, poses, "application/json")
 
 
-@files_router.get("/{scene}/file", response_class=FileResponse, responses=_FILE | problems(401, 404, 422))
+@router.get("/{scene}/file", response_class=FileResponse, responses=_FILE | problems(401, 404, 422))
 async def download_scene(service: ServiceDep, scene: SceneName) -> FileResponse:
     """Downloads the scene file. Ranges are answered, so that a download can go on."""
     await service.catalog.header(scene)
@@ -182,7 +180,7 @@ async def download_scene(service: ServiceDep, scene: SceneName) -> FileResponse:
     return FileResponse(path, media_type=RAW, filename=f"{base_name(scene)}{SUFFIX}")
 
 
-@files_router.put(
+@router.put(
     "/{scene}",
     status_code=201,
     openapi_extra=_IMPORT,
@@ -200,7 +198,7 @@ async def import_scene(request: Request, service: ServiceDep, scene: SceneName, 
     return Scene.of(scene, header, 0, service.owners.known(Kind.SCENE, scene))
 
 
-@files_router.delete("/{scene}", status_code=204, responses=problems(401, 403, 404, 422, 503))
+@router.delete("/{scene}", status_code=204, responses=problems(401, 403, 404, 422, 503))
 async def delete_scene(service: ServiceDep, scene: SceneName) -> None:
     """Deletes a scene that was imported or that a job made, and frees its memory. Others are not the service's."""
     service.life.require_serving()

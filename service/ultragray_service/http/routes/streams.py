@@ -184,8 +184,7 @@ class _WebSocketTransport:
     destination = None
 
     def __init__(self, websocket: WebSocket, scene: str) -> None:
-        self._websocket = websocket
-        self._scene = scene
+        self._websocket, self._scene = websocket, scene
 
     async def receive(self) -> Message:
         await asyncio.sleep(0)  # reading does not wait while the buffer is full: others get their turn
