@@ -81,57 +81,40 @@ MAX_PARAMETERS = 32  # of one command
 
 
 @dataclass(frozen=True)
-class Request:
-    name: str
-    parameters: Mapping[str, str | None]
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """The end of one parameter: an error, or else the value that was asked for."""
-
-    parameter: str
-    error: str = ""
-    value: str | None = None
-
-
-@dataclass(frozen=True)
 class Reply:
+    """The reply to a command, which failed where it has an error, or where a parameter has one."""
+
     name: str
-    message: str = ""
     error: str = ""
-    outcomes: tuple[Outcome, ...] = ()
+    outcomes: tuple[tuple[str, str, str | None], ...] = ()  # parameters, errors, else the values that were asked for
 
     @property
     def errors(self) -> str:
-        return "; ".join(filter(None, [self.error, *(outcome.error for outcome in self.outcomes)]))
-
-    @property
-    def status(self) -> str:
-        return "FAIL" if self.errors else "SUCCESS"
+        return "; ".join(filter(None, [self.error, *(error for _, error, _ in self.outcomes)]))
 
     @property
     def xml(self) -> str:
-        root = ElementTree.Element("CommandReply", Name=_plain(self.name), Status=self.status)
-        root.set("Message", _plain(self.errors or self.message))
-        if self.errors:
-            root.set("Error", _plain(self.errors))
-        for outcome in self.outcomes:
-            found = ElementTree.SubElement(root, "Parameter", Name=outcome.parameter)
-            found.set("Success", "false" if outcome.error else "true")
-            if outcome.value is not None:
-                found.set("Value", _plain(outcome.value))
+        errors = self.errors
+        root = ElementTree.Element("CommandReply", Name=_plain(self.name), Status="FAIL" if errors else "SUCCESS")
+        root.set("Message", _plain(errors or f"{self.name} completed"))
+        if errors:
+            root.set("Error", _plain(errors))
+        for parameter, error, value in self.outcomes:
+            found = ElementTree.SubElement(root, "Parameter", Name=parameter)
+            found.set("Success", "false" if error else "true")
+            if value is not None:
+                found.set("Value", _plain(value))
         return ElementTree.tostring(root, encoding="unicode")
 
     @property
     def metadata(self) -> dict[str, str]:
         """The reply as messages of version 2 carry it beside the XML."""
-        found = {one.parameter: "FAIL" if one.error else one.value or "SUCCESS" for one in self.outcomes}
-        return {**found, "Status": self.status, **({"Error": self.errors} if self.errors else {})}
+        found = {parameter: "FAIL" if error else value or "SUCCESS" for parameter, error, value in self.outcomes}
+        return {**found, **({"Status": "FAIL", "Error": self.errors} if self.errors else {"Status": "SUCCESS"})}
 
 
-def read_request(name: str, text: str) -> Request:
-    """The command in an XML text. `name` is its name as the message has it; empty: the text has it.
+def read_request(name: str, text: str) -> tuple[str, Mapping[str, str | None]]:
+    """The command of an XML text: its name, which the message may have told, and the values of its parameters.
 
     Raises IgtlMessageInvalid for a text that is none. It may define no entities, which could grow without bounds.
     """
@@ -149,7 +132,7 @@ def read_request(name: str, text: str) -> Request:
         if parameter in parameters:
             raise _invalid(f"each parameter may be named once, got {shown(parameter)} twice")
         parameters[parameter] = element.get("Value")
-    return Request(name or own_name, parameters)
+    return name or own_name, parameters
 
 
 def _root(text: str) -> ElementTree.Element:
@@ -225,10 +208,6 @@ def read_tools(text: str, before: ClientTools) -> ClientTools:
     tools = tuple(_read(number, one) for number, one in enumerate(documents))
     devices = {one.device for one in tools}
     return ClientTools(tools, {device: pose for device, pose in before.poses.items() if device in devices})
-
-
-def tools_text(tools: ClientTools) -> str:
-    return json.dumps([_document(one) for one in tools.tools])
 
 
 def _read(number: int, document: Any) -> ClientTool:
@@ -336,24 +315,23 @@ class Scanner:
         self.setup = replace(self.setup, settings=replace(self.setup.settings, **values))
 
     async def get(self, parameter: str) -> str:
-        """The value of a parameter. Raises InvalidArgument for an unknown one and for one that is not set,
-        SceneNotFound where no scene is chosen."""
+        """Raises InvalidArgument for a parameter that is unknown or not set, SceneNotFound where none is chosen."""
         if parameter == _SCENE:
             return await self._scenes.choose("")
         if parameter == _REGISTRATION:
             return self.setup.registration or ""
         if parameter == _TOOLS:
-            return tools_text(self.setup.tools)
-        settings = self.setup.settings
-        write: Callable[[Any], str]
+            return json.dumps([_document(one) for one in self.setup.tools.tools])
         if parameter == _PROBE:
-            value, write = settings.probe, _probe_text
+            probe = self.setup.settings.probe
+            text = None if probe is None else json.dumps(to_dict(probe, with_none=False))
         else:
             of_display = _of_display(parameter)
-            value, write = getattr(settings.display or AS_RENDERED, of_display.field), of_display.write
-        if value is None:
+            value = getattr(self.setup.settings.display or AS_RENDERED, of_display.field)
+            text = None if value is None else of_display.write(value)
+        if text is None:
             raise InvalidArgument("is not set: frames have that of their scene")
-        return write(value)
+        return text
 
 
 def _of_display(parameter: str) -> _DisplayParameter:
@@ -368,10 +346,6 @@ def _probe(text: str) -> Probe:
     except (ValueError, RecursionError):
         raise InvalidProbe(f'must be JSON such as {{"kind": "linear", …}}, got {shown(text)}') from None
     return from_dict(Probe, document)
-
-
-def _probe_text(probe: Probe) -> str:
-    return json.dumps(to_dict(probe, with_none=False))
 
 
 _ASKS, _ANSWERS = "CMD_", "ACK_"  # beginnings of the names of devices whose STRING is a command, and a reply
@@ -398,33 +372,28 @@ async def answer(scanner: Scanner, message: Message) -> Message:
 
 async def _reply(scanner: Scanner, name: str, text: str) -> Reply:
     try:
-        request = read_request(name, text)
-        return await _obey(scanner, request)
+        asked, parameters = read_request(name, text)
+        known = {name.casefold(): name for name in (_SET, _GET)}
+        if (command := known.get(asked.casefold())) is None:
+            raise _invalid(f"the command must be {_SET} or {_GET}, got {shown(asked)}")
+        if not parameters:
+            raise _invalid(f'{command} must hold an element <Parameter Name="…"/> or more')
     except IgtlMessageInvalid as error:
-        return Reply(name, error=error.detail)
-
-
-async def _obey(scanner: Scanner, request: Request) -> Reply:
-    known = {name.casefold(): name for name in (_SET, _GET)}
-    name = known.get(request.name.casefold())
-    if name is None:
-        raise IgtlMessageInvalid(f"the command must be {_SET} or {_GET}, got {shown(request.name)}", field="body")
-    if not request.parameters:
-        raise IgtlMessageInvalid(f'{name} must hold an element <Parameter Name="…"/> or more', field="body")
-    outcomes = []
-    for parameter, value in request.parameters.items():
+        return Reply(name, error.detail)
+    outcomes: list[tuple[str, str, str | None]] = []
+    for parameter, value in parameters.items():
+        problem, found = "", None
         try:
-            if name == _GET:
-                outcome = Outcome(parameter, value=await scanner.get(parameter))
+            if command == _GET:
+                found = await scanner.get(parameter)
             elif value is None:
-                outcome = Outcome(parameter, f"{parameter}: a Value is required")
+                problem = f"{parameter}: a Value is required"
             else:
                 await scanner.set(parameter, value)
-                outcome = Outcome(parameter)
         except UltragrayError as error:
-            outcome = Outcome(parameter, f"{parameter}: {error.detail}")
-        outcomes.append(outcome)
-    return Reply(name, f"{name} completed", outcomes=tuple(outcomes))
+            problem = f"{parameter}: {error.detail}"
+        outcomes.append((parameter, problem, found))
+    return Reply(command, outcomes=tuple(outcomes))
 
 
 def _message(type_name: str, asked: Message, device_name: str, content: bytes, metadata: Mapping[str, str]) -> Message:
