@@ -195,16 +195,17 @@ async def serve(settings: Settings) -> None:
         await grpc_server.start()
         http_task = asyncio.ensure_future(http_server.serve([http_socket]))
         alive_task = asyncio.ensure_future(manager.tell_alive())
+        cap = Connections(settings.max_connections, settings.max_connections_per_address)  # gRPC accepts by itself
         watching = [
             asyncio.ensure_future(_mirror_health(service, grpc_server)),
-            asyncio.ensure_future(_cap_grpc(settings, grpc_port)),
+            asyncio.ensure_future(OpenSockets(grpc_port, cap).run()),
         ]
         if certificates is not None:
             watching.append(asyncio.ensure_future(certificates.follow()))
         _log.info(f"starting to serve the scenes of {settings.data_folder}")
         worker = EmbeddedWorker(settings)
         try:
-            if await signals.unless_stopped(service.start()):
+            if await _unless(signals.stop, service.start()):
                 worker.start()
                 gc.freeze()  # what lives this long is never garbage: shorter pauses
                 _tell_where(service.doors, service.guard.asks)
@@ -214,7 +215,7 @@ async def serve(settings: Settings) -> None:
             if settings.drain_delay_s:
                 service.life.begin_leaving()
                 _log.info(f"not ready any more; stopping in {settings.drain_delay_s:g} s")
-                await signals.unless_forced(asyncio.sleep(settings.drain_delay_s))
+                await _unless(signals.force, asyncio.sleep(settings.drain_delay_s))
             _log.info("stopping: frames that wait are answered first; Ctrl-C again stops at once")
         finally:
             for task in watching:
@@ -222,14 +223,14 @@ async def serve(settings: Settings) -> None:
             service.begin_draining()
             worker_stop = asyncio.ensure_future(worker.stop())
             await grpc_server.tell_health(service.readiness)
-            await signals.unless_forced(service.pool.drain(settings.drain_timeout_s))
+            await _unless(signals.force, service.pool.drain(settings.drain_timeout_s))
             await service.pool.close()
             http_server.should_exit = True
             http_server.force_exit = signals.force.is_set()
-            await signals.unless_forced(
-                asyncio.gather(grpc_server.stop(_FLUSH_S), igtl_server.stop(_FLUSH_S), http_task)
+            await _unless(
+                signals.force, asyncio.gather(grpc_server.stop(_FLUSH_S), igtl_server.stop(_FLUSH_S), http_task)
             )
-            await signals.unless_forced(worker_stop)
+            await _unless(signals.force, worker_stop)
             await service.close()
             alive_task.cancel()
     _log.info("stopped")
@@ -262,14 +263,9 @@ class _StopSignals:
     def _received(self) -> None:
         (self.force if self.stop.is_set() else self.stop).set()
 
-    async def unless_stopped(self, work: Awaitable[Any]) -> bool:
-        return await _unless(self.stop, work)
-
-    async def unless_forced(self, work: Awaitable[Any]) -> bool:
-        return await _unless(self.force, work)
-
 
 async def _unless(event: asyncio.Event, work: Awaitable[Any]) -> bool:
+    """Await `work` and return True; False where the event came first and cancelled it."""
     task = asyncio.ensure_future(work)
     waiting = asyncio.ensure_future(event.wait())
     try:
@@ -294,10 +290,6 @@ def _bind_grpc(server: GrpcServer, settings: Settings, certificates: Certificate
             f"gRPC cannot listen on {authority(settings.host, settings.grpc_port)}: the port is in use",
             field="grpc_port",
         ) from error
-
-
-async def _cap_grpc(settings: Settings, port: int) -> None:
-    await OpenSockets(port, Connections(settings.max_connections, settings.max_connections_per_address)).run()
 
 
 async def _start_igtl(server: IgtlServer, settings: Settings, sockets: contextlib.ExitStack) -> str | None:

@@ -64,7 +64,7 @@ class ScenePlaces(Collector):
 
     @property
     def buckets(self) -> tuple[BucketShelf, ...]:
-        return tuple(self._buckets())
+        return tuple(one for one in (self.data, self.made) if isinstance(one, BucketShelf))
 
     @property
     def problem(self) -> StorageUnavailable | None:
@@ -105,11 +105,6 @@ class ScenePlaces(Collector):
         storage = open_storage(location, patience_s=PATIENCE_S)
         index = SceneIndex(storage, folder, self._settings.scene_list_max_age_s)
         return BucketShelf(index, self.cache, self._settings.working_folder / SCENES_FOLDER)
-
-    def _buckets(self) -> Iterator[BucketShelf]:
-        for shelf in (self.data, self.made):
-            if isinstance(shelf, BucketShelf):
-                yield shelf
 
 
 T = TypeVar("T")

@@ -330,12 +330,11 @@ class FileParts:
             self._parser = MultipartParser(
                 boundary,
                 {
-                    "on_part_begin": self._begin_part,
-                    "on_header_field": self._take_header_name,
-                    "on_header_value": self._take_header_value,
+                    "on_header_field": lambda data, start, end: self._header_name.extend(data[start:end]),
+                    "on_header_value": lambda data, start, end: self._header_value.extend(data[start:end]),
                     "on_header_end": self._end_header,
                     "on_headers_finished": self._end_headers,
-                    "on_part_data": self._take_data,
+                    "on_part_data": lambda data, start, end: self._events.append(data[start:end]),
                     "on_end": self._end,
                 },
             )
@@ -357,15 +356,6 @@ class FileParts:
         if not self._complete:
             raise InvalidArgument("the body is truncated: its last boundary is missing", field="body")
 
-    def _begin_part(self) -> None:
-        self._disposition = b""
-
-    def _take_header_name(self, data: bytes, start: int, end: int) -> None:
-        self._header_name += data[start:end]
-
-    def _take_header_value(self, data: bytes, start: int, end: int) -> None:
-        self._header_value += data[start:end]
-
     def _end_header(self) -> None:
         if self._header_name.lower() == b"content-disposition":
             self._disposition = bytes(self._header_value)
@@ -374,6 +364,7 @@ class FileParts:
 
     def _end_headers(self) -> None:
         _, parameters = parse_options_header(self._disposition)
+        self._disposition = b""
         name = parameters.get(b"filename")
         if name is None:
             field = parameters.get(b"name", b"").decode(errors="replace")[:80]
@@ -382,9 +373,6 @@ class FileParts:
                 field="body",
             )
         self._events.append(name.decode(errors="replace"))
-
-    def _take_data(self, data: bytes, start: int, end: int) -> None:
-        self._events.append(data[start:end])
 
     def _end(self) -> None:
         self._complete = True

@@ -7,6 +7,7 @@ import time
 from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
 from typing import Annotated, Any, TypeVar
 
+import numpy as np
 from fastapi import Depends, Path, Query
 from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import Response
@@ -163,29 +164,12 @@ RENDER_EXAMPLES: dict[str, Any] = {
     },
     "matrix": {
         "summary": "One small frame, by matrix",
-        "value": {
-            "pose": {
-                "matrix": [
-                    [1.0, 0.0, 0.0, DEMO_POSITION_MM["x"]],
-                    [0.0, 1.0, 0.0, DEMO_POSITION_MM["y"]],
-                    [0.0, 0.0, 1.0, DEMO_POSITION_MM["z"]],
-                    [0.0, 0.0, 0.0, 1.0],
-                ]
-            },
-            "height": 256,
-            "width": 256,
-        },
+        "value": {"pose": {"matrix": np.eye(4).tolist()}, "height": 256, "width": 256},
     },
     "batch": {
         "summary": "Two poses 2 mm apart, two outputs (application/x-npz by default)",
         "value": {
-            "poses": [
-                _POSE,
-                {
-                    "position_mm": {**DEMO_POSITION_MM, "y": DEMO_POSITION_MM["y"] + 2.0},
-                    "quaternion": DEMO_QUATERNION,
-                },
-            ],
+            "poses": [_POSE, {**_POSE, "position_mm": {**DEMO_POSITION_MM, "y": 2.0}}],
             "outputs": ["bmode", "transmittance"],
         },
     },
