@@ -6,8 +6,9 @@ import contextlib
 import json
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from http.client import HTTPMessage
 from pathlib import Path
 from typing import Annotated, Any
 from urllib.parse import urlencode
@@ -154,9 +155,7 @@ def _write_folder(connection: Connection, request: RenderRequest, settings: dict
     return shape
 
 
-def _rendered(
-    connection: Connection, scene: str, body: dict[str, Any], media_type: str
-) -> tuple[bytes, Mapping[str, str]]:
+def _rendered(connection: Connection, scene: str, body: dict[str, Any], media_type: str) -> tuple[bytes, HTTPMessage]:
     """Frames as the service encoded them, and what its headers say about them."""
     with connection.open("POST", route("scenes", scene, "render"), body, accept=media_type) as answer:
         return connection.whole(answer), answer.headers

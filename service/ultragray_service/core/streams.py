@@ -321,7 +321,7 @@ class Message:
     timeout_s: Callable[[], float | None] = nothing  # that the pose may wait; None: the default of the service
 
 
-def unreadable(error: InvalidArgument, *, of_settings: bool = False, **numbers: Any) -> Message:
+def unreadable(error: UltragrayError, *, of_settings: bool = False, **numbers: Any) -> Message:
     """A message that could not be read: it has its numbers, as far as these can, and raises why."""
 
     def refuse() -> Any:

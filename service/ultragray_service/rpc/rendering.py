@@ -55,7 +55,7 @@ class CallTransport:
             return unreadable(error)
         if message is grpc.aio.EOF:
             return None
-        left_s = self._context.time_remaining()
+        left_s: float | None = self._context.time_remaining()
         has = message.HasField
 
         def pose() -> FloatArray:  # [4, 4] mm

@@ -42,7 +42,7 @@ _LINKS = ("base_to_scene", "probe_to_flange")
 
 
 def _size(request: Any) -> int:
-    return request.page_size or DEFAULT_PAGE_SIZE  # type: ignore[no-any-return]
+    return request.page_size or DEFAULT_PAGE_SIZE
 
 
 async def _contact_sheet(service: Service, request: Any) -> Mapping[str, Any]:

@@ -174,8 +174,11 @@ def _is_of_service(status: str) -> bool:
 class _Collector(Collector):
     """Asks a function when it is scraped."""
 
-    def __init__(self, collect: Callable[[], Iterable[Metric]]) -> None:
-        self.collect = collect  # type: ignore[method-assign]
+    def __init__(self, ask: Callable[[], Iterable[Metric]]) -> None:
+        self._ask = ask
+
+    def collect(self) -> Iterable[Metric]:
+        return self._ask()
 
 
 def _of_pool(pool: RenderPool) -> Iterator[Metric]:

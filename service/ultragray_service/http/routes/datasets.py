@@ -87,7 +87,7 @@ _PRESENT: Answers = {
 }
 _PICTURE = answer("The image planes in space and some frames.", PNG)
 _FRAME_PICTURE = answer("8-bit grey, square pixels, 512 on the longer side.", PNG) | NOT_MODIFIED
-_POSES: Answers = {200: {"model": DatasetPoses}} | NOT_MODIFIED
+_POSES: Answers = {200: {"model": DatasetPoses}, **NOT_MODIFIED}
 
 
 @router.put(

@@ -142,7 +142,7 @@ _POINTS = (
     )
     | NOT_MODIFIED
 )
-_POSES: Answers = {200: {"model": ScenePoses}} | NOT_MODIFIED
+_POSES: Answers = {200: {"model": ScenePoses}, **NOT_MODIFIED}
 _FILE = answer("The scene file.", RAW)
 _IMPORT: dict[str, Any] = {
     "requestBody": {"required": True, "description": "A scene file (.ugr).", "content": {RAW: BINARY}}
