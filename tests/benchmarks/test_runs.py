@@ -1,7 +1,5 @@
 """What `make results`, `methods` and `ablations` measure, and the tables that come of it."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,7 +17,7 @@ results, methods, ablations, tables = map(benchmark, ("results_tables", "methods
 SETTINGS = {"steps": 3, "max_gaussians": 40}
 
 
-def test_a_training_is_measured_beside_classical_methods(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_training_is_measured_beside_classical_methods(data, monkeypatch):
     run = results.Run("ball", options=SourceOptions("0:3", "3:6"), settings=SETTINGS)
     monkeypatch.setattr(results, "RUNS", {"two": run})
     monkeypatch.setattr(tables, "README_ROWS", {"two": "a ball, the other half"})
@@ -35,7 +33,7 @@ def test_a_training_is_measured_beside_classical_methods(data: Path, monkeypatch
     assert row.startswith(f"| a ball, the other half | {figures['two']['total_s']:.0f} s |")
 
 
-def test_the_phantom_is_measured_in_the_shadow_of_bone(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_phantom_is_measured_in_the_shadow_of_bone(monkeypatch):
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, 1, 3] = range(4)
     images = np.random.default_rng(0).integers(100, 200, (4, 24, 24), dtype=np.uint8)
@@ -54,7 +52,7 @@ def test_the_phantom_is_measured_in_the_shadow_of_bone(monkeypatch: pytest.Monke
     assert "Where bone" not in "\n".join(tables.results({"phantom": figures}))
 
 
-def test_parts_leave_out_two_of_three_frames_or_a_band(data: Path) -> None:
+def test_parts_leave_out_two_of_three_frames_or_a_band(data):
     dataset = load_dataset(data / "ball", SourceOptions("0:5", "5:6"))
     third = results.part_of(dataset, results.Part.THIRD)
     assert [third.train.frame_numbers.tolist(), third.val.frame_numbers.tolist()] == [[0, 3], [1, 2, 4]]
@@ -64,7 +62,7 @@ def test_parts_leave_out_two_of_three_frames_or_a_band(data: Path) -> None:
     assert len(band.train) == 21
 
 
-def test_each_run_is_compared_with_the_better_baseline() -> None:
+def test_each_run_is_compared_with_the_better_baseline():
     means = {
         "scene": {"psnr_db": 30.0, "ms_ssim": 0.9, "gms": 0.9, "gmsd": 0.10},
         "median": {"psnr_db": 29.0, "ms_ssim": 0.95, "gms": 0.8, "gmsd": 0.08},
@@ -74,9 +72,7 @@ def test_each_run_is_compared_with_the_better_baseline() -> None:
     assert list(tables._leads(run)) == ["+0.50", "-0.050", "+0.100", "-0.020"]
 
 
-def test_methods_are_compared_and_what_failed_is_a_row_with_its_reason(
-    data: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_methods_are_compared_and_what_failed_is_a_row_with_its_reason(data, monkeypatch, tmp_path):
     classical = ComparisonSettings(methods=("median", "linear", "nearest"))
     monkeypatch.setattr(methods, "RUNS", {"one": ("ball", classical)})
     monkeypatch.setattr(methods, "FOLDER", tmp_path / "fits")
@@ -91,7 +87,7 @@ def test_methods_are_compared_and_what_failed_is_a_row_with_its_reason(
     assert any(line.startswith("| Other | failed: the loss is nan") for line in lines)
 
 
-def test_an_ablation_says_its_spread() -> None:
+def test_an_ablation_says_its_spread():
     runs = {f"ball, as it is, seed {seed}": {"psnr_db": 30.0 + seed, "ms_ssim": 0.9} for seed in ablations.SEEDS}
     lines = list(tables.trained_without(runs))
     assert "| as it is | 31.00 ± 0.82 / 0.900 ± 0.000 |" in lines

@@ -1,14 +1,10 @@
 """Every code block of the documents runs, or says why not. README.md beside this file has the convention."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 
 from ..surroundings import ROOT
-from .blocks import Page, PageInvalid, read_page
-from .conftest import TUTORIAL, RunPage
+from .blocks import PageInvalid, read_page
+from .conftest import TUTORIAL
 from .running import PageRun
 
 DOCUMENTS = sorted(
@@ -29,22 +25,22 @@ HOW_TO = ROOT / "docs/howto"  # long, with services and jobs of their own
         for path in DOCUMENTS
     ],
 )
-def test_blocks_run(path: Path, run_page: RunPage) -> None:
+def test_blocks_run(path, run_page):
     run_page(path)
 
 
-def page_of(text: str, folder: Path) -> Page:
+def page_of(text, folder):
     path = folder / "page.md"
     path.write_text(text, encoding="utf-8")
     return read_page(path)
 
 
-def test_commands_are_told_from_output(tmp_path: Path) -> None:
+def test_commands_are_told_from_output(tmp_path):
     (block,) = page_of("```console\n$ a \\\n    b\nout $ c\n$ d '{\n}'  # isn't\nout\n```\n", tmp_path).blocks
     assert block.script() == "a \\\n    b\nd '{\n}'  # isn't\n"
 
 
-def test_comments_belong_to_the_next_block(tmp_path: Path) -> None:
+def test_comments_belong_to_the_next_block(tmp_path):
     text = "<!-- needs: x -->\n\n<!-- not run: no -->\n\n```bash\nfalse\n```\n\n1. list\n\n   ```python\n   x\n   ```\n"
     page = page_of(text, tmp_path)
     assert page.needs == ("x",)
@@ -59,7 +55,7 @@ def test_comments_belong_to_the_next_block(tmp_path: Path) -> None:
         "<!-- not run -->\n```bash\nfalse\n```\n",
     ],
 )
-def test_what_the_convention_does_not_know_is_refused(text: str, tmp_path: Path) -> None:
+def test_what_the_convention_does_not_know_is_refused(text, tmp_path):
     with pytest.raises(PageInvalid, match=r"page\.md:1: "):
         page_of(text, tmp_path)
 
@@ -77,7 +73,7 @@ def test_what_the_convention_does_not_know_is_refused(text: str, tmp_path: Path)
         "<!-- prepare: false -->\n```python\n```\n",
     ],
 )
-def test_a_block_that_fails_fails_its_page(text: str, tmp_path: Path) -> None:
+def test_a_block_that_fails_fails_its_page(text, tmp_path):
     page = page_of(text, tmp_path)
     *before, last = page.runs
     with PageRun(page, tmp_path, None) as run:
@@ -87,7 +83,7 @@ def test_a_block_that_fails_fails_its_page(text: str, tmp_path: Path) -> None:
             run.run(last)
 
 
-def test_addresses_become_those_of_the_service(tmp_path: Path) -> None:
+def test_addresses_become_those_of_the_service(tmp_path):
     text = "```python\nfound = ['localhost:8000', 'localhost:50051', ('127.0.0.1', 18944), 8000]\n```\n"
     page = page_of(text, tmp_path)
     with PageRun(page, tmp_path, {"http": 1, "grpc": 2, "igtl": 3}) as run:

@@ -1,19 +1,16 @@
 """Inputs that are nearly right: valid ones with a few changes, as strategies that shrink towards the valid."""
 
-from __future__ import annotations
-
 import copy
 import json
 import math
 import re
 import struct
-from collections.abc import Callable, Mapping, Sequence
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 from hypothesis import strategies as st
 
-Strategy: TypeAlias = st.SearchStrategy[Any]
+Strategy = st.SearchStrategy[Any]
 
 NUMBERS = (
     0,
@@ -52,7 +49,7 @@ TEXTS = (
     "nan",
     "1e999",
 )
-JSON_VALUES: tuple[Any, ...] = (
+JSON_VALUES = (
     *(None, True, False, [], {}, [[]], {"": 0}, [None], [0] * 17, {"w": 1}, [[1.0] * 4] * 4),
     *NUMBERS,
     *(-(2**63) - 1, 10**400),
@@ -65,7 +62,7 @@ _REAL_LAYOUTS = "fd"
 places = st.floats(0.0, 1.0, exclude_max=True)  # of the whole, so that a change keeps its place while the rest shrinks
 
 
-def _edits(alphabet: bytes | None) -> Strategy:
+def _edits(alphabet):
     """One change of bytes; the inserted ones are of `alphabet`, or any."""
     inserted = st.binary(max_size=_LARGEST_INSERT)
     if alphabet is not None:
@@ -82,29 +79,29 @@ def _edits(alphabet: bytes | None) -> Strategy:
     )
 
 
-def _flip(data: bytearray, at: int, bit: int) -> None:
+def _flip(data, at, bit):
     if data:
         data[at] ^= 1 << bit
 
 
-def _overwrite(data: bytearray, at: int, new: bytes) -> None:
+def _overwrite(data, at, new):
     data[at : at + len(new)] = new
 
 
-def _insert(data: bytearray, at: int, new: bytes) -> None:
+def _insert(data, at, new):
     data[at:at] = new
 
 
-def _delete(data: bytearray, at: int, count: int) -> None:
+def _delete(data, at, count):
     del data[at : at + count]
 
 
-def _repeat(data: bytearray, at: int, how: tuple[int, int]) -> None:
+def _repeat(data, at, how):
     count, times = how
     data[at:at] = data[at : at + count] * times
 
 
-def _number(data: bytearray, at: int, what: tuple[str, float]) -> None:
+def _number(data, at, what):
     layout, value = what
     size = struct.calcsize(layout)
     if layout[1] in _REAL_LAYOUTS:
@@ -115,14 +112,14 @@ def _number(data: bytearray, at: int, what: tuple[str, float]) -> None:
     data[at : at + size] = new
 
 
-def _truncate(data: bytearray, at: int, _: None) -> None:
+def _truncate(data, at, _):
     del data[at:]
 
 
-def mutated_bytes(valid: Sequence[bytes], *, alphabet: bytes | None = None, most: int = 5) -> Strategy:
+def mutated_bytes(valid, *, alphabet=None, most=5):
     """One of the valid inputs with up to `most` changes of bytes, numbers and lengths."""
 
-    def apply(index: int, edits: list[tuple[Callable[..., None], float, Any]]) -> bytes:
+    def apply(index, edits):
         changed = bytearray(valid[index])
         for edit, place, argument in edits:
             edit(changed, int(place * len(changed)), argument)
@@ -131,18 +128,18 @@ def mutated_bytes(valid: Sequence[bytes], *, alphabet: bytes | None = None, most
     return st.builds(apply, _indices(valid), st.lists(_edits(alphabet), max_size=most))
 
 
-def _indices(valid: Sequence[Any]) -> Strategy:
+def _indices(valid):
     """Of the valid inputs: hypothesis writes out what it samples from."""
     return st.integers(0, len(valid) - 1)
 
 
-def mutated_json(valid: Sequence[Any], *, most: int = 4) -> Strategy:
+def mutated_json(valid, *, most=4):
     """One of the valid documents, with up to `most` of its values replaced, doubled, renamed or taken away."""
     change = st.tuples(
         places, st.sampled_from(["set", "set", "set", "delete", "rename", "copy", "wrap"]), json_values()
     )
 
-    def apply(index: int, changes: list[tuple[float, str, Any]]) -> Any:
+    def apply(index, changes):
         changed = {"": copy.deepcopy(valid[index])}
         for place, what, value in changes:
             spots = list(_spots(changed))
@@ -152,7 +149,7 @@ def mutated_json(valid: Sequence[Any], *, most: int = 4) -> Strategy:
     return st.builds(apply, _indices(valid), st.lists(change, max_size=most))
 
 
-def json_values() -> Strategy:
+def json_values():
     """Values that a document could not be expected to hold."""
     scalars = st.one_of(st.sampled_from(JSON_VALUES), st.floats(), st.integers(), st.text(max_size=20))
     nested = st.recursive(
@@ -163,7 +160,7 @@ def json_values() -> Strategy:
     return st.one_of(st.sampled_from(JSON_VALUES), st.sampled_from(JSON_VALUES), nested)
 
 
-def _spots(container: Any) -> Any:
+def _spots(container):
     """Every place in a document: its container and its key there."""
     keys = range(len(container)) if isinstance(container, list) else list(container)
     for key in keys:
@@ -172,7 +169,7 @@ def _spots(container: Any) -> Any:
             yield from _spots(container[key])
 
 
-def _change(spots: list[Any], spot: tuple[Any, Any], what: str, value: Any) -> None:
+def _change(spots, spot, what, value):
     container, key = spot
     match what:
         case "set":
@@ -190,12 +187,12 @@ def _change(spots: list[Any], spot: tuple[Any, Any], what: str, value: Any) -> N
             raise AssertionError(what)
 
 
-def as_json(document: Any) -> bytes:
+def as_json(document):
     """JSON as Python writes it: NaN and Infinity too, and lone surrogates escaped."""
     return json.dumps(document).encode()
 
 
-def mutated_lines(head: bytes, tail: bytes, *, most: int = 4) -> Strategy:
+def mutated_lines(head, tail, *, most=4):
     """A header of text lines with up to `most` lines doubled, lost, moved, or with another number or word in them."""
     lines = head.split(b"\n")
     words = st.sampled_from([*(str(number).encode() for number in (*NUMBERS, *REALS, 10**30)), *_words(TEXTS)])
@@ -206,7 +203,7 @@ def mutated_lines(head: bytes, tail: bytes, *, most: int = 4) -> Strategy:
         words,
     )
 
-    def apply(changes: list[tuple[int, str, float, bytes]], kept: float) -> bytes:
+    def apply(changes, kept):
         changed = list(lines)
         for index, what, place, word in changes:
             index %= len(changed)
@@ -234,14 +231,14 @@ def mutated_lines(head: bytes, tail: bytes, *, most: int = 4) -> Strategy:
     return st.builds(apply, st.lists(change, min_size=1, max_size=most), whole)
 
 
-def _words(texts: Sequence[str]) -> list[bytes]:
+def _words(texts):
     return [text.encode("utf-8", "surrogatepass") for text in texts]
 
 
-def chosen_parts(valid: Mapping[str, bytes], mutated: Mapping[str, Strategy]) -> Strategy:
+def chosen_parts(valid, mutated):
     """The files of a folder, of which one or two are mutated; `mutated` has a strategy for each of these names."""
 
-    def strategy(names: list[str]) -> Strategy:
+    def strategy(names):
         changed = st.fixed_dictionaries({name: mutated[name] for name in names})
         return changed.map(lambda files: {**valid, **files})
 

@@ -1,9 +1,5 @@
 """The output `attenuation`: the share of the beam that ends in each pixel."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 import torch
@@ -15,9 +11,7 @@ PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
-def test_what_each_pixel_takes_leaves_the_transmittance(
-    random_scene: Callable[..., GaussianScene], random_poses: Callable[..., np.ndarray], backend: str
-) -> None:
+def test_what_each_pixel_takes_leaves_the_transmittance(random_scene, random_poses, backend):
     scene = random_scene(60, seed=3, sigma_cm=(0.2, 0.6))
     frames = render(
         scene,
@@ -38,7 +32,7 @@ def test_what_each_pixel_takes_leaves_the_transmittance(
     assert (left - transmittance)[reached].abs().max() < 0.02
 
 
-def test_a_spent_beam_has_nothing_to_lose(random_scene: Callable[..., GaussianScene]) -> None:
+def test_a_spent_beam_has_nothing_to_lose(random_scene):
     scene = random_scene(400, seed=1, sigma_cm=(0.5, 0.9))
     scene = GaussianScene.from_splats({**scene.splats, "transmittances": torch.full((400,), -9.0)})
     frames = render(scene, PROBE, np.eye(4), height=64, width=16, outputs=("attenuation", "transmittance"))
@@ -47,7 +41,7 @@ def test_a_spent_beam_has_nothing_to_lose(random_scene: Callable[..., GaussianSc
     assert (frames["attenuation"][:, 1:][spent] == 0.0).all()
 
 
-def test_gradients_pass_through_it(random_scene: Callable[..., GaussianScene]) -> None:
+def test_gradients_pass_through_it(random_scene):
     scene = random_scene(20, seed=2, dtype=torch.float64)
     leaves = {name: tensor.clone().requires_grad_() for name, tensor in scene.splats.items()}
     frames = render(GaussianScene.from_splats(leaves), PROBE, np.eye(4), height=24, width=16, outputs=("attenuation",))

@@ -1,16 +1,11 @@
 """The name of the processor, and how much memory there is."""
 
-from __future__ import annotations
-
 import platform
-from pathlib import Path
-
-import pytest
 
 from ultragray import installation as machine
 
 
-def test_what_the_system_tells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_the_system_tells(tmp_path, monkeypatch):
     told = tmp_path / "cpuinfo"
     told.write_text("processor : 0\nmodel name\t: Abacus 3000: fast\nmodel name\t: another\n")
     monkeypatch.setattr(machine, "Path", lambda _: told)
@@ -22,13 +17,13 @@ def test_what_the_system_tells(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) 
     assert (machine.processor_maker(), machine.processor_model()) == ("0x41", "part 0xd40")
 
 
-def test_else_the_architecture(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_else_the_architecture(tmp_path, monkeypatch):
     monkeypatch.setattr(machine, "Path", lambda _: tmp_path / "none")
     monkeypatch.setattr(platform, "processor", lambda: "")
     assert machine.processor_name() == platform.machine()
 
 
-def test_a_container_may_have_less_memory_than_the_machine(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_container_may_have_less_memory_than_the_machine(tmp_path, monkeypatch):
     limits = (tmp_path / "memory.max", tmp_path / "none")
     monkeypatch.setattr(machine, "_GROUP_LIMITS", limits)
     limits[0].write_text("max\n")

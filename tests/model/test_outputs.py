@@ -1,10 +1,5 @@
 """Outputs, as asked for."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
@@ -17,20 +12,20 @@ from ultragray.rendering.pixels import to_uint8
 from ultragray_workers.pool.pixels import render_to_host, round_to_uint8
 
 
-def test_outputs_keep_their_order_without_repetitions() -> None:
+def test_outputs_keep_their_order_without_repetitions():
     assert check_outputs(["coverage", "bmode", "coverage"]) == ("coverage", "bmode")
     assert check_outputs("echo") == ("echo",)
     assert check_outputs(tuple(OUTPUTS)) == tuple(OUTPUTS)
 
 
 @pytest.mark.parametrize("outputs", [[], ["bmod"], "b-mode", ["bmode", ""], [None]])
-def test_other_outputs_are_refused(outputs: Any) -> None:
+def test_other_outputs_are_refused(outputs):
     with pytest.raises(UnknownOutput, match=", ".join(OUTPUTS)) as caught:
         check_outputs(outputs)
     assert caught.value.field == "outputs"
 
 
-def test_labels_need_a_scene_that_has_them() -> None:
+def test_labels_need_a_scene_that_has_them():
     check_available(("bmode", "labels"), SceneInfo(label_names={3: "fat"}))
     check_available(("bmode",), SceneInfo())
     with pytest.raises(UnknownOutput, match="only for a scene whose Gaussians carry labels") as caught:
@@ -38,7 +33,7 @@ def test_labels_need_a_scene_that_has_them() -> None:
     assert caught.value.field == "outputs"
 
 
-def test_eight_bits_hold_the_shares_of_a_scale(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_eight_bits_hold_the_shares_of_a_scale(tmp_path, monkeypatch):
     level = Output(
         "level", "echo in dB", ("echo",), lambda drawing: drawing.plane("echo"), unit="dB", scale=(-60.0, 0.0)
     )

@@ -1,7 +1,5 @@
 """GaussianScene: checks, units, and scene files that are truncated, foreign or hostile."""
 
-from __future__ import annotations
-
 import copy
 import hashlib
 import json
@@ -9,9 +7,6 @@ import os
 import pickle
 import struct
 import threading
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -25,7 +20,7 @@ from ultragray.scene.gaussians import PARAMETERS
 from ultragray.scene.info import METADATA_KEY, info_to_json
 
 
-def splats(count: int = 4, sh_degree: int = 1) -> dict[str, torch.Tensor]:
+def splats(count=4, sh_degree=1):
     return {
         "means": torch.arange(count * 3.0).reshape(count, 3),
         "scales": torch.zeros(count, 3),
@@ -37,12 +32,12 @@ def splats(count: int = 4, sh_degree: int = 1) -> dict[str, torch.Tensor]:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_the_degree_follows_from_the_coefficients(degree: int) -> None:
+def test_the_degree_follows_from_the_coefficients(degree):
     scene = GaussianScene.from_splats(splats(sh_degree=degree))
     assert (scene.sh_degree, scene.gaussian_count) == (degree, 4)
 
 
-def test_a_copy_is_the_same_scene_and_prepares_itself_anew() -> None:
+def test_a_copy_is_the_same_scene_and_prepares_itself_anew():
     scene = GaussianScene.from_splats(splats(), training_poses=np.eye(4)[None])
     scene.prepared("lock", threading.Lock)  # as backends keep what cannot be copied
     for copied in (copy.deepcopy(scene), pickle.loads(pickle.dumps(scene))):
@@ -50,7 +45,7 @@ def test_a_copy_is_the_same_scene_and_prepares_itself_anew() -> None:
         assert copied.prepared("lock", lambda: "anew") == "anew"
 
 
-def test_shn_may_be_left_out() -> None:
+def test_shn_may_be_left_out():
     raw = splats()
     del raw["shN"]
     scene = GaussianScene.from_splats(raw)
@@ -79,8 +74,8 @@ def test_shn_may_be_left_out() -> None:
         ("quats", torch.zeros(4, 4), "zero"),
     ],
 )
-def test_splats_that_do_not_fit_are_refused_by_name(name: str, value: Any, message: str) -> None:
-    raw: dict[str, Any] = splats()
+def test_splats_that_do_not_fit_are_refused_by_name(name, value, message):
+    raw = splats()
     if value is None:
         del raw[name]
     else:
@@ -89,7 +84,7 @@ def test_splats_that_do_not_fit_are_refused_by_name(name: str, value: Any, messa
         GaussianScene.from_splats(raw)
 
 
-def test_poses_go_from_the_sweep_in_mm_to_the_scene_in_cm() -> None:
+def test_poses_go_from_the_sweep_in_mm_to_the_scene_in_cm():
     scene = GaussianScene.from_splats(splats(), info=SceneInfo(centre_mm=(100.0, 0.0, -50.0)))
     pose = np.eye(4)[None].copy()
     pose[0, :3, 3] = (110.0, 5.0, -50.0)
@@ -98,7 +93,7 @@ def test_poses_go_from_the_sweep_in_mm_to_the_scene_in_cm() -> None:
     assert pose[0, 0, 3] == 110.0
 
 
-def test_to_changes_the_dtype_of_every_tensor_and_nothing_else() -> None:
+def test_to_changes_the_dtype_of_every_tensor_and_nothing_else():
     scene = GaussianScene.from_splats(splats(), info=SceneInfo(dataset_name="x"), training_poses=np.eye(4))
     double = scene.to(torch.float64)
     assert {t.dtype for t in double.splats.values()} == {torch.float64}
@@ -106,9 +101,7 @@ def test_to_changes_the_dtype_of_every_tensor_and_nothing_else() -> None:
     assert len(double.training_poses) == 1
 
 
-def test_a_file_brings_everything_back(
-    tmp_path: Path, random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any]
-) -> None:
+def test_a_file_brings_everything_back(tmp_path, random_scene, random_poses):
     info = {"centre_mm": (1.5, -2.0, 3.0), "probe": LinearProbe(40.0, 0.0, 50.0), "metrics": {"psnr_db": 26.9}}
     made = random_scene(11, sh_degree=3, intensity="sigmoid", info=info)
     scene = GaussianScene.from_splats(made.splats, info=made.info, training_poses=random_poses(5))
@@ -122,15 +115,13 @@ def test_a_file_brings_everything_back(
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_small_scenes_have_files_too(tmp_path: Path, count: int) -> None:
+def test_small_scenes_have_files_too(tmp_path, count):
     path = tmp_path / "a.ugr"
     GaussianScene.from_splats(splats(count)).save(path)
     assert GaussianScene.load(path).gaussian_count == count
 
 
-def test_equal_scenes_have_equal_files_and_the_hash_is_of_the_file(
-    tmp_path: Path, random_scene: Callable[..., GaussianScene]
-) -> None:
+def test_equal_scenes_have_equal_files_and_the_hash_is_of_the_file(tmp_path, random_scene):
     first, second = tmp_path / "a.ugr", tmp_path / "b.ugr"
     random_scene(5).save(first)
     random_scene(5).to(torch.float64).save(second)
@@ -138,28 +129,28 @@ def test_equal_scenes_have_equal_files_and_the_hash_is_of_the_file(
     assert file_sha256(first) == hashlib.sha256(first.read_bytes()).hexdigest()
 
 
-def test_saving_to_nowhere_is_an_os_error(tmp_path: Path) -> None:
+def test_saving_to_nowhere_is_an_os_error(tmp_path):
     with pytest.raises(OSError, match="nowhere"):
         GaussianScene.from_splats(splats()).save(tmp_path / "nowhere" / "a.ugr")
 
 
 class Hostile:
-    def __reduce__(self) -> tuple[object, ...]:
+    def __reduce__(self):
         return os.system, ("touch pwned",)
 
 
-def bundle(change: Callable[[dict[str, torch.Tensor]], None] = lambda _: None, info: str | None = None) -> bytes:
+def bundle(change=lambda _: None, info=None):
     tensors = {**splats(), "training_poses": torch.zeros(0, 4, 4, dtype=torch.float64)}
     change(tensors)
     scene = GaussianScene.from_splats(splats())
     return save(tensors, metadata={METADATA_KEY: info_to_json(scene.info) if info is None else info})
 
 
-def metadata(**changes: Any) -> str:
+def metadata(**changes):
     return json.dumps({**json.loads(info_to_json(GaussianScene.from_splats(splats()).info)), **changes})
 
 
-BAD_FILES: dict[str, bytes] = {
+BAD_FILES = {
     "empty": b"",
     "short": b"\x01\x02",
     "text": b"not a scene at all, just text that goes on for a while",
@@ -186,14 +177,14 @@ BAD_FILES: dict[str, bytes] = {
     "bad_pose": bundle(lambda t: t.update(training_poses=torch.zeros(1, 4, 4, dtype=torch.float64))),
     "pose_shape": bundle(lambda t: t.update(training_poses=torch.zeros(4, dtype=torch.float64))),
 }
-BAD_VALUES: dict[str, bytes] = {
+BAD_VALUES = {
     "nan": bundle(lambda t: t.update(means=torch.full((4, 3), float("nan")))),
     "zero_quaternion": bundle(lambda t: t.update(quats=torch.zeros(4, 4))),
 }
 
 
 @pytest.mark.parametrize("name", BAD_FILES)
-def test_a_bad_file_gives_one_clear_error(name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bad_file_gives_one_clear_error(name, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     path = tmp_path / f"{name}.ugr"
     path.write_bytes(BAD_FILES[name])
@@ -206,14 +197,14 @@ def test_a_bad_file_gives_one_clear_error(name: str, tmp_path: Path, monkeypatch
 
 
 @pytest.mark.parametrize("name", BAD_VALUES)
-def test_bad_values_are_found_on_loading(name: str, tmp_path: Path) -> None:
+def test_bad_values_are_found_on_loading(name, tmp_path):
     path = tmp_path / f"{name}.ugr"
     path.write_bytes(BAD_VALUES[name])
     with pytest.raises(SceneFileInvalid, match=f"{name}.ugr: "):
         GaussianScene.load(path)
 
 
-def test_a_missing_file_and_a_folder(tmp_path: Path) -> None:
+def test_a_missing_file_and_a_folder(tmp_path):
     with pytest.raises(SceneFileInvalid, match="no such file"):
         GaussianScene.load(tmp_path / "absent.ugr")
     with pytest.raises(SceneFileInvalid):

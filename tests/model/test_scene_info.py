@@ -1,14 +1,10 @@
 """The scene's own description: JSON round trip, limits, and headers that are read without torch."""
 
-from __future__ import annotations
-
 import json
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -52,7 +48,7 @@ OTHERS = (
 
 
 @pytest.mark.parametrize("info", [FULL, *OTHERS])
-def test_json_round_trip(info: SceneInfo) -> None:
+def test_json_round_trip(info):
     assert info_from_json(info_to_json(info)) == info
 
 
@@ -77,30 +73,30 @@ def test_json_round_trip(info: SceneInfo) -> None:
         ({"probe": {"kind": "linear"}}, "width_mm is required by kind linear"),
     ],
 )
-def test_a_wrong_entry_is_named(change: dict[str, Any], message: str) -> None:
+def test_a_wrong_entry_is_named(change, message):
     document = {**json.loads(info_to_json(FULL)), **change}
     with pytest.raises(ValueError, match=message):
         info_from_json(json.dumps(document))
 
 
 @pytest.mark.parametrize("text", ["", "[]", "null", "{", '{"format_version": 1,}'])
-def test_other_text_is_refused(text: str) -> None:
+def test_other_text_is_refused(text):
     with pytest.raises(ValueError, match=r"."):
         info_from_json(text)
 
 
-def test_a_scene_without_a_beam_keeps_its_bytes() -> None:
+def test_a_scene_without_a_beam_keeps_its_bytes():
     assert "beam" not in json.loads(info_to_json(SceneInfo()))
 
 
-def test_nan_cannot_be_written() -> None:
+def test_nan_cannot_be_written():
     with pytest.raises(ValueError, match="JSON"):
         info_to_json(SceneInfo(metrics={"psnr_db": float("nan")}))
     with pytest.raises(InvalidArgument, match=r"centre_mm\[1\] must be a finite number"):
         SceneInfo(centre_mm=(0.0, float("nan"), 0.0))
 
 
-def test_the_summary_is_in_the_frame_of_the_sweep() -> None:
+def test_the_summary_is_in_the_frame_of_the_sweep():
     info = with_summary(SceneInfo(centre_mm=(100.0, 0.0, -50.0)), np.array([[1.0, 2, 3], [-1, 0, 5]]), 1)
     assert info.gaussian_count == 2
     assert info.sh_degree == 1
@@ -110,9 +106,7 @@ def test_the_summary_is_in_the_frame_of_the_sweep() -> None:
     assert empty.bounds_min_mm == empty.bounds_max_mm == (1.0, 2.0, 3.0)
 
 
-def test_a_header_is_read_without_torch(
-    tmp_path: Path, random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any]
-) -> None:
+def test_a_header_is_read_without_torch(tmp_path, random_scene, random_poses):
     scene = random_scene(9, sh_degree=2, info={"centre_mm": (1.0, 2.0, 3.0), "dataset_name": "x"})
     poses = random_poses(4)
     path = tmp_path / "a.ugr"
@@ -132,20 +126,20 @@ def test_a_header_is_read_without_torch(
     assert answer.stdout.split() == ["9", "False"]
 
 
-def write_without_gaussians(path: Path, poses: int, **more_metadata: str) -> None:
+def write_without_gaussians(path, poses, **more_metadata):
     tensors = {name: np.zeros(shape, np.float32) for name, shape in expected_shapes(0, 0).items()}
     tensors["training_poses"] = np.tile(np.eye(4), (poses, 1, 1))
     save_file(tensors, path, {"ultragray": info_to_json(SceneInfo()), **more_metadata})
 
 
-def test_a_file_of_another_kind_is_told_to_be_one(tmp_path: Path) -> None:
+def test_a_file_of_another_kind_is_told_to_be_one(tmp_path):
     path = tmp_path / "thesis.ugr"
     path.write_bytes(b"%PDF-1.7\n and so on")
     with pytest.raises(SceneFileInvalid, match="it does not begin as a scene file does: it is damaged, or a file of"):
         read_header(path)
 
 
-def test_a_description_has_limits(tmp_path: Path) -> None:
+def test_a_description_has_limits(tmp_path):
     path = tmp_path / "large.ugr"
     write_without_gaussians(path, MAX_TRAINING_POSES)
     assert len(read_header(path).training_poses) == MAX_TRAINING_POSES
@@ -159,7 +153,7 @@ def test_a_description_has_limits(tmp_path: Path) -> None:
         SceneInfo(metrics={str(number): 1.0 for number in range(1001)})
 
 
-def test_what_is_over_a_limit_is_not_read(tmp_path: Path) -> None:
+def test_what_is_over_a_limit_is_not_read(tmp_path):
     path = tmp_path / "sparse.ugr"
     write_without_gaussians(path, 0)
     length = int.from_bytes(path.read_bytes()[:8], "little")
@@ -172,7 +166,7 @@ def test_what_is_over_a_limit_is_not_read(tmp_path: Path) -> None:
         read_header(path)
 
 
-def test_a_scene_that_could_not_be_read_again_is_not_made(random_scene: Callable[..., GaussianScene]) -> None:
+def test_a_scene_that_could_not_be_read_again_is_not_made(random_scene):
     scene = random_scene(3)
     with pytest.raises(InvalidArgument, match="training_poses must be at most"):
         GaussianScene.from_splats(scene.splats, training_poses=np.tile(np.eye(4), (MAX_TRAINING_POSES + 1, 1, 1)))

@@ -3,12 +3,11 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, field, fields
 from enum import Enum
-from typing import Any, ClassVar, Literal, TypeAlias
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 import numpy.typing as npt
 import pytest
-from google.protobuf.descriptor import Descriptor
 
 from ultragray.geometry.probe import Probe
 from ultragray.rendering.display import Display
@@ -27,7 +26,7 @@ from ultragray_workers.jobs.progress import Progress
 from ultragray_workers.jobs.record import Job
 
 # A dataclass and its message, and the fields that stand on one side only, for a reason.
-PAIRS: list[tuple[type[Any], type[Any], set[str]]] = [
+PAIRS = [
     *(
         (Probe.members[one.name], one.message_type._concrete_class, set())
         for one in geometry_pb2.Probe.DESCRIPTOR.fields
@@ -64,7 +63,7 @@ PAIRS: list[tuple[type[Any], type[Any], set[str]]] = [
 ]
 
 
-def names_of_message(descriptor: Descriptor) -> set[str]:
+def names_of_message(descriptor):
     """The fields; those of a oneof by its one name."""
     return {
         one.containing_oneof.name
@@ -75,12 +74,12 @@ def names_of_message(descriptor: Descriptor) -> set[str]:
 
 
 @pytest.mark.parametrize(("cls", "message", "alone"), PAIRS, ids=lambda one: getattr(one, "__name__", ""))
-def test_fields_stand_on_both_sides(cls: type[Any], message: type[Any], alone: set[str]) -> None:
+def test_fields_stand_on_both_sides(cls, message, alone):
     given = {one.name for one in fields(cls) if one.init and one.name != "kind"}
     assert given ^ (names_of_message(message.DESCRIPTOR) - {"kind"}) == alone
 
 
-def test_every_kind_has_a_message() -> None:
+def test_every_kind_has_a_message():
     """And every word its number."""
     assert {one.name for one in geometry_pb2.Probe.DESCRIPTOR.fields} == set(Probe.members)
     (specification,) = jobs_pb2.SubmitJobRequest.DESCRIPTOR.oneofs
@@ -99,7 +98,7 @@ class Linear:
     far_mm: float
     kind: Literal["linear"] = field(default="linear", repr=False, kw_only=True)
 
-    def __post_init__(self) -> None:
+    def __post_init__(self):
         if not self.near_mm < self.far_mm:
             raise ValueError("far_mm must be beyond near_mm")
 
@@ -111,7 +110,7 @@ class Phased:
     kind: Literal["phased"] = field(default="phased", repr=False, kw_only=True)
 
 
-AnyProbe: TypeAlias = Linear | Phased
+AnyProbe = Linear | Phased
 
 
 class Pixels(Enum):
@@ -207,7 +206,7 @@ class Uploaded:
     options: dict[str, str]
 
 
-TOLD: list[tuple[Any, Any]] = [
+TOLD = [
     (Settings("liver"), rendering_pb2.RenderSettings),
     (Settings("liver", 0, ("echo", "labels"), Pixels.PNG, Linear(1.0, 0.0, 2.0)), rendering_pb2.RenderSettings),
     (Settings("", display=Shown(3.0, tgc_db=(1.0, 2.0), depth_mm=0.0)), rendering_pb2.RenderSettings),
@@ -222,12 +221,12 @@ TOLD: list[tuple[Any, Any]] = [
 
 
 @pytest.mark.parametrize(("value", "cls"), TOLD)
-def test_there_and_back(value: Any, cls: Any) -> None:
+def test_there_and_back(value, cls):
     message = cls.FromString(to_message(value, cls).SerializeToString())
     assert from_message(message, type(value)) == value
 
 
-def test_scene() -> None:
+def test_scene():
     pose = np.arange(16.0).reshape(4, 4)
     scene = Scene("liver", None, None, {"psnr_db": 30.5}, {1: "bone"}, Trained(7, (1.0, 2.0, 3.0), pose))
     message = to_message(scene, scenes_pb2.Scene)
@@ -240,31 +239,31 @@ def test_scene() -> None:
     assert (again.training_poses.first == pose).all()
 
 
-def test_arrays_are_points() -> None:
-    message = to_message(Trained(1, np.array([1.0, 2.0, 3.0], np.float32), None), scenes_pb2.TrainingPoses)  # type: ignore[arg-type]
+def test_arrays_are_points():
+    message = to_message(Trained(1, np.array([1.0, 2.0, 3.0], np.float32), None), scenes_pb2.TrainingPoses)
     assert message.position_min_mm == geometry_pb2.Position(x=1.0, y=2.0, z=3.0)
 
 
-def test_members_of_a_family_by_themselves() -> None:
+def test_members_of_a_family_by_themselves():
     probe = geometry_pb2.Probe(phased=geometry_pb2.PhasedProbe(opening_angle_deg=60.0, far_mm=50.0))
     assert from_message(probe, AnyProbe) == Phased(60.0, 50.0)
     assert from_message(jobs_pb2.PoseSampler(kind="covered", count=3), Sampler) == Covered(3)
 
 
-def test_defaults_are_left_out() -> None:
+def test_defaults_are_left_out():
     assert to_message(Settings("a"), rendering_pb2.RenderSettings) == rendering_pb2.RenderSettings(
         scene="a", outputs=["OUTPUT_BMODE"], encoding="ENCODING_UINT8", below_min_confidence="BELOW_CONFIDENCE_REFUSE"
     )
     assert from_message(rendering_pb2.RenderSettings(scene="a"), Settings) == Settings("a")
 
 
-def test_fields_beside_the_value() -> None:
+def test_fields_beside_the_value():
     message = to_message(Shown(3.0), rendering_pb2.Display, flip=True)
     assert (message.gain_db, message.flip) == (3.0, True)
     assert from_message(message, Shown, flip=False) == Shown(3.0)
 
 
-REFUSED: list[tuple[Any, Any, str, str]] = [
+REFUSED = [
     (geometry_pb2.Probe(), AnyProbe, "kind", "kind must be one of linear, phased, got none"),
     (
         geometry_pb2.Probe(convex=geometry_pb2.ConvexProbe()),
@@ -309,21 +308,21 @@ REFUSED: list[tuple[Any, Any, str, str]] = [
 
 
 @pytest.mark.parametrize(("message", "cls", "path", "detail"), REFUSED)
-def test_refused(message: Any, cls: Any, path: str, detail: str) -> None:
+def test_refused(message, cls, path, detail):
     with pytest.raises(MessageInvalid) as raised:
         from_message(message, cls)
     assert raised.value.field == path
     assert detail in str(raised.value)
 
 
-def test_infinite_settings_are_refused() -> None:
+def test_infinite_settings_are_refused():
     message = jobs_pb2.TrainJob()
     message.settings.update({"rate": math.inf})
     with pytest.raises(MessageInvalid, match=r"settings\.rate must be a finite number, got inf"):
         from_message(message, Train)
 
 
-def test_the_error_of_a_dataclass_is_kept() -> None:
+def test_the_error_of_a_dataclass_is_kept():
     probe = geometry_pb2.Probe(linear=geometry_pb2.LinearProbe(width_mm=1.0, near_mm=3.0, far_mm=2.0))
     with pytest.raises(MessageInvalid) as raised:
         from_message(rendering_pb2.RenderSettings(probe=probe), Settings)
@@ -331,5 +330,5 @@ def test_the_error_of_a_dataclass_is_kept() -> None:
     assert str(raised.value.original) == "far_mm must be beyond near_mm"
 
 
-def test_words() -> None:
+def test_words():
     assert words(rendering_pb2.BelowConfidence.DESCRIPTOR) == {1: "refuse", 2: "mask"}

@@ -1,7 +1,5 @@
 """Cases of the CUDA kernels are slow where they are interpreted: `make test` leaves most to `make test-long`."""
 
-from __future__ import annotations
-
 import pytest
 
 from ultragray.rendering.backends import cuda
@@ -22,7 +20,7 @@ IN_EVERY_RUN = {
 }
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items):
     if cuda.available() and not cuda.interpreted():
         return
     for item in items:
@@ -33,6 +31,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
                 item.add_marker(pytest.mark.long)
 
 
-def is_one_of(case: str, names: set[str]) -> bool:
+def is_one_of(case, names):
     """Whether one of the names stands in a case as a parameter of its own."""
     return any(f"-{name}-" in f"-{case}-" for name in names)

@@ -1,14 +1,8 @@
 """The elevational beam (docs/physics.md §3): its meaning by the reference, the same by every kernel, its gradients."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Mapping
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from ultragray import (
     ConvexProbe,
@@ -16,7 +10,6 @@ from ultragray import (
     GaussianScene,
     LinearProbe,
     PhasedProbe,
-    Probe,
     RadialProbe,
     SteeredProbe,
     render,
@@ -34,7 +27,7 @@ KERNELS = ("cuda", *cpu.INSTRUCTION_SETS)
 FOCUSED = ElevationBeam(thickness_mm=2.0, focus_mm=15.0, depth_of_field_mm=12.0)
 CONSTANT = ElevationBeam(thickness_mm=3.0)
 
-CASES: dict[str, tuple[Mapping[str, Any], Probe, ElevationBeam]] = {
+CASES = {
     "linear": ({}, LINEAR, FOCUSED),
     "linear, constant": ({}, LINEAR, CONSTANT),
     "convex": ({}, ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=60.0), FOCUSED),
@@ -47,13 +40,11 @@ CASES: dict[str, tuple[Mapping[str, Any], Probe, ElevationBeam]] = {
 }
 
 
-def numbers(beam: ElevationBeam) -> Tensor:
+def numbers(beam):
     return torch.tensor(beam.numbers, dtype=torch.float64)
 
 
-def drawn(
-    kernel: str, scene: GaussianScene, probe: Probe, poses: Any, beam: Any, outputs: tuple[str, ...] = PLANES
-) -> Mapping[str, Tensor]:
+def drawn(kernel, scene, probe, poses, beam, outputs=PLANES):
     inside, prepared = scene_poses(scene, poses), beam_cm(beam, probe)
     if kernel == "cuda":
         there = scene.to(cuda.device())
@@ -63,19 +54,17 @@ def drawn(
     return cpu.render_outputs(scene, probe, inside, HEIGHT, WIDTH, outputs, UNLIMITED, prepared, instruction_set=kernel)
 
 
-def shifted_along_elevation(pose: np.ndarray, shift_mm: np.ndarray) -> np.ndarray:  # [4, 4], [K] -> [K, 4, 4]
+def shifted_along_elevation(pose, shift_mm):  # [4, 4], [K] -> [K, 4, 4]
     poses = np.repeat(pose[None], len(shift_mm), axis=0)
     poses[:, :3, 3] += shift_mm[:, None] * pose[:3, 1]
     return poses
 
 
-def weight_sums(scene: GaussianScene, poses: np.ndarray, beam: ElevationBeam | None) -> Tensor:  # [C, H, W]
+def weight_sums(scene, poses, beam):  # [C, H, W]
     return drawn("reference", scene, LINEAR, poses, beam, (WEIGHT_SUM,))[WEIGHT_SUM]
 
 
-def test_a_constant_beam_is_the_mean_of_thin_slices(
-    random_scene: Callable[..., GaussianScene], random_poses: Callable[..., np.ndarray]
-) -> None:
+def test_a_constant_beam_is_the_mean_of_thin_slices(random_scene, random_poses):
     scene = random_scene(4, seed=1, sigma_cm=(0.2, 0.6), dtype=torch.float64)
     (pose,) = random_poses(1, seed=2)
     nodes, weights = np.polynomial.hermite_e.hermegauss(31)
@@ -87,7 +76,7 @@ def test_a_constant_beam_is_the_mean_of_thin_slices(
     assert (thick - mean).abs().max() < 4 / 255  # of each Gaussian, weights below 1/255 may be left out
 
 
-def test_a_beam_conserves_the_weight_that_lies_across_elevation(random_scene: Callable[..., GaussianScene]) -> None:
+def test_a_beam_conserves_the_weight_that_lies_across_elevation(random_scene):
     scene = random_scene(4, seed=1, sigma_cm=(0.1, 0.3), dtype=torch.float64)
     across = np.linspace(-25.0, 25.0, 101)
     poses = shifted_along_elevation(np.eye(4), across)
@@ -95,7 +84,7 @@ def test_a_beam_conserves_the_weight_that_lies_across_elevation(random_scene: Ca
     assert thick == pytest.approx(float(thin), rel=0.1)
 
 
-def test_a_thickness_grows_by_the_square_root_of_two_within_half_the_depth_of_field() -> None:
+def test_a_thickness_grows_by_the_square_root_of_two_within_half_the_depth_of_field():
     for offset in (-6.0, 6.0):
         assert FOCUSED.thickness_at_mm(15.0 + offset) == pytest.approx(2.0 * np.sqrt(2.0))
     assert CONSTANT.thickness_at_mm(40.0) == 3.0
@@ -103,12 +92,7 @@ def test_a_thickness_grows_by_the_square_root_of_two_within_half_the_depth_of_fi
 
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("name", CASES)
-def test_frames_match_the_reference_in_float64(
-    name: str,
-    kernel: str,
-    random_scene: Callable[..., GaussianScene],
-    random_poses: Callable[..., np.ndarray],
-) -> None:
+def test_frames_match_the_reference_in_float64(name, kernel, random_scene, random_poses):
     options, probe, beam = CASES[name]
     scene, poses = random_scene(**{"seed": 3, "count": 200, **options}), random_poses(2, seed=5)
     exact = drawn("reference", scene.to(torch.float64), probe, poses, beam)
@@ -121,12 +105,7 @@ def test_frames_match_the_reference_in_float64(
 
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("name", CASES)
-def test_gradients_of_parameters_poses_and_beam_are_the_true_ones(
-    name: str,
-    kernel: str,
-    random_scene: Callable[..., GaussianScene],
-    random_poses: Callable[..., np.ndarray],
-) -> None:
+def test_gradients_of_parameters_poses_and_beam_are_the_true_ones(name, kernel, random_scene, random_poses):
     options, probe, beam = CASES[name]
     scene, poses = random_scene(**{"seed": 3, "count": 120, **options}), random_poses(2, seed=5)
     with torch.no_grad():
@@ -139,7 +118,7 @@ def test_gradients_of_parameters_poses_and_beam_are_the_true_ones(
         for output in PLANES
     }
 
-    def gradients(kernel: str, scene: GaussianScene) -> dict[str, Tensor]:
+    def gradients(kernel, scene):
         leaves = {raw: tensor.clone().requires_grad_() for raw, tensor in scene.splats.items()}
         of_beam, of_poses = numbers(beam).requires_grad_(), torch.from_numpy(poses).requires_grad_()
         frames = drawn(kernel, GaussianScene.from_splats(leaves, info=scene.info), probe, of_poses, of_beam)
@@ -161,13 +140,11 @@ def test_gradients_of_parameters_poses_and_beam_are_the_true_ones(
         assert error < 1e-3, f"{of}: relative error {error:.2g}"
 
 
-def test_the_reference_by_finite_differences(
-    random_scene: Callable[..., GaussianScene], random_poses: Callable[..., np.ndarray]
-) -> None:
+def test_the_reference_by_finite_differences(random_scene, random_poses):
     scene = random_scene(8, seed=2, sigma_cm=(0.3, 0.9), dtype=torch.float64)
     pose = random_poses(1, seed=4)
 
-    def frames(beam: Tensor, *splats: Tensor) -> tuple[Tensor, ...]:
+    def frames(beam, *splats):
         moved = GaussianScene.from_splats(dict(zip(scene.splats, splats, strict=True)), info=scene.info)
         found = render(moved, LINEAR, pose, height=5, width=4, backend="reference", beam=beam)
         return tuple(found[name] for name in PLANES)
@@ -176,7 +153,7 @@ def test_the_reference_by_finite_differences(
     assert torch.autograd.gradcheck(frames, leaves, eps=1e-7, atol=1e-6, rtol=1e-4)
 
 
-def test_the_gradient_of_the_beam_alone(random_scene: Callable[..., GaussianScene]) -> None:
+def test_the_gradient_of_the_beam_alone(random_scene):
     scene = random_scene(100)
     found = []
     for backend in ("reference", "cpu"):
@@ -186,10 +163,10 @@ def test_the_gradient_of_the_beam_alone(random_scene: Callable[..., GaussianScen
     assert torch.allclose(*found, rtol=1e-3)
 
 
-def test_the_beam_of_the_scene_holds_unless_another_is_asked_for(random_scene: Callable[..., GaussianScene]) -> None:
+def test_the_beam_of_the_scene_holds_unless_another_is_asked_for(random_scene):
     scene, thick = random_scene(100), random_scene(100, info={"beam": CONSTANT})
 
-    def frame(scene: GaussianScene, beam: ElevationBeam | None = None) -> Tensor:
+    def frame(scene, beam=None):
         return render(scene, LINEAR, np.eye(4), height=32, width=32, beam=beam).bmode
 
     assert torch.equal(frame(thick), frame(scene, CONSTANT))
@@ -197,7 +174,7 @@ def test_the_beam_of_the_scene_holds_unless_another_is_asked_for(random_scene: C
     assert torch.equal(frame(thick, ElevationBeam(thickness_mm=0.0)), frame(scene))
 
 
-def test_a_thick_slice_cuts_more_gaussians_and_costs_more(random_scene: Callable[..., GaussianScene]) -> None:
+def test_a_thick_slice_cuts_more_gaussians_and_costs_more(random_scene):
     scene = random_scene(2000, sigma_cm=(0.02, 0.05))
     thin, thick = (
         footprint_pixels(scene, LINEAR, np.eye(4), height=64, width=64, beam=beam)[0] for beam in (None, CONSTANT)
@@ -208,11 +185,11 @@ def test_a_thick_slice_cuts_more_gaussians_and_costs_more(random_scene: Callable
 @pytest.mark.parametrize(
     ("given", "missing"), [({"focus_mm": 10.0}, "depth_of_field_mm"), ({"depth_of_field_mm": 10.0}, "focus_mm")]
 )
-def test_a_focus_needs_a_depth_of_field(given: dict[str, float], missing: str) -> None:
+def test_a_focus_needs_a_depth_of_field(given, missing):
     with pytest.raises(InvalidArgument, match=f"{missing} must be given"):
         ElevationBeam(thickness_mm=1.0, **given)
 
 
-def test_a_beam_of_another_shape_is_refused(random_scene: Callable[..., GaussianScene]) -> None:
+def test_a_beam_of_another_shape_is_refused(random_scene):
     with pytest.raises(InvalidArgument, match=r"an ElevationBeam or a tensor \[3\]"):
         render(random_scene(2), LINEAR, np.eye(4), height=8, width=8, beam=torch.ones(2))

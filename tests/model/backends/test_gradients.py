@@ -1,16 +1,10 @@
 """One suite of gradients for every backend and instruction set: of every output, by every parameter, the true one."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Mapping
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe, render
+from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, RadialProbe, SteeredProbe, render
 from ultragray.rendering.backends import cpu, cuda
 from ultragray.rendering.outputs import PLANES
 
@@ -19,7 +13,7 @@ CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=60.0)
 HEIGHT, WIDTH = 37, 53
 KERNELS = ("cuda", *cpu.INSTRUCTION_SETS)
 
-SCENES: dict[str, tuple[Mapping[str, Any], Probe]] = {
+SCENES = {
     "linear": ({}, LINEAR),
     "convex": ({}, CONVEX),
     "phased": ({"centre_cm": (0, 0, 1.5)}, PhasedProbe(opening_angle_deg=90.0, far_mm=50.0)),
@@ -44,9 +38,7 @@ SCENES: dict[str, tuple[Mapping[str, Any], Probe]] = {
 }
 
 
-def gradients(
-    scene: GaussianScene, weights: Mapping[str, Tensor], draw: Callable[[GaussianScene], Mapping[str, Tensor]]
-) -> dict[str, np.ndarray]:
+def gradients(scene, weights, draw):
     """Of the weighted sum of the outputs, by raw parameter."""
     leaves = {name: tensor.clone().requires_grad_() for name, tensor in scene.splats.items()}
     frames = draw(GaussianScene.from_splats(leaves, info=scene.info))
@@ -58,17 +50,15 @@ def gradients(
     }
 
 
-def by_reference(probe: Probe, poses: Any) -> Callable[[GaussianScene], Mapping[str, Tensor]]:
+def by_reference(probe, poses):
     return lambda scene: render(scene, probe, poses, height=HEIGHT, width=WIDTH, backend="reference")
 
 
-def by_kernel(
-    probe: Probe, poses: Any, kernel: str, height: int = HEIGHT, width: int = WIDTH
-) -> Callable[[GaussianScene], Mapping[str, Tensor]]:
+def by_kernel(probe, poses, kernel, height=HEIGHT, width=WIDTH):
     """The CUDA backend, which takes the scene's tensors to its device, or an instruction set of the CPU's."""
     if kernel == "cuda":
 
-        def draw(scene: GaussianScene) -> Mapping[str, Tensor]:
+        def draw(scene):
             there = scene.to(cuda.device())
             return cuda.render_outputs(there, probe, there.poses_to_scene_cm(poses), height, width, PLANES)
 
@@ -79,13 +69,11 @@ def by_kernel(
 
 
 @pytest.fixture(scope="session")
-def expected(
-    random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any]
-) -> Callable[[str, tuple[str, ...]], Any]:
+def expected(random_scene, random_poses):
     """By scene and outputs: what the backends are to be given, and the reference's gradient in float64."""
-    done: dict[tuple[str, tuple[str, ...]], Any] = {}
+    done = {}
 
-    def prepare(name: str, outputs: tuple[str, ...]) -> Any:
+    def prepare(name, outputs):
         if (name, outputs) not in done:
             options, probe = SCENES[name]
             scene, poses = random_scene(**{"seed": 3, "count": 120, **options}), random_poses(3, seed=5)
@@ -103,7 +91,7 @@ def expected(
     return prepare
 
 
-def assert_same_direction_and_length(got: Mapping[str, np.ndarray], want: Mapping[str, np.ndarray]) -> None:
+def assert_same_direction_and_length(got, want):
     assert got.keys() == want.keys()
     for name, exact in want.items():
         size = np.linalg.norm(exact)
@@ -116,7 +104,7 @@ def assert_same_direction_and_length(got: Mapping[str, np.ndarray], want: Mappin
 
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("name", SCENES)
-def test_all_outputs_together(name: str, kernel: str, expected: Callable[..., Any]) -> None:
+def test_all_outputs_together(name, kernel, expected):
     scene, probe, poses, weights, want = expected(name, PLANES)
     assert_same_direction_and_length(gradients(scene, weights, by_kernel(probe, poses, kernel)), want)
 
@@ -124,13 +112,13 @@ def test_all_outputs_together(name: str, kernel: str, expected: Callable[..., An
 @pytest.mark.parametrize("kernel", ["cuda", "auto"])
 @pytest.mark.parametrize("output", PLANES)
 @pytest.mark.parametrize("name", ["linear", "convex", "shadows"])
-def test_each_output_alone(name: str, output: str, kernel: str, expected: Callable[..., Any]) -> None:
+def test_each_output_alone(name, output, kernel, expected):
     scene, probe, poses, weights, want = expected(name, (output,))
     assert_same_direction_and_length(gradients(scene, weights, by_kernel(probe, poses, kernel)), want)
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-def test_golden_gradient(golden: Callable[[str], Any], kernel: str) -> None:
+def test_golden_gradient(golden, kernel):
     file = golden("g05")
     scene = file.scene(torch.float32)
     draw = by_kernel(file.probe, file.poses, kernel, file.height, file.width)
@@ -142,13 +130,11 @@ def test_golden_gradient(golden: Callable[[str], Any], kernel: str) -> None:
 
 
 @pytest.mark.parametrize("probe", [LINEAR, CONVEX], ids=["linear", "convex"])
-def test_the_reference_by_finite_differences(
-    random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any], probe: Probe
-) -> None:
+def test_the_reference_by_finite_differences(random_scene, random_poses, probe):
     scene = random_scene(8, seed=2, sigma_cm=(0.3, 0.9), dtype=torch.float64)
     pose = random_poses(1, seed=4)
 
-    def outputs(*splats: Tensor) -> tuple[Tensor, ...]:
+    def outputs(*splats):
         moved = GaussianScene.from_splats(dict(zip(scene.splats, splats, strict=True)), info=scene.info)
         frames = render(moved, probe, pose, height=5, width=4, backend="reference")
         return tuple(frames[name] for name in PLANES)
@@ -157,9 +143,7 @@ def test_the_reference_by_finite_differences(
     assert torch.autograd.gradcheck(outputs, leaves, eps=1e-7, atol=1e-6, rtol=1e-4)
 
 
-def test_the_thread_count_does_not_change_a_bit(
-    random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any]
-) -> None:
+def test_the_thread_count_does_not_change_a_bit(random_scene, random_poses):
     scene, poses = random_scene(9000, sigma_cm=(0.02, 0.1)), random_poses(3)
     weights = {"bmode": torch.randn(3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))}
     before = torch.get_num_threads()
@@ -174,20 +158,17 @@ def test_the_thread_count_does_not_change_a_bit(
         assert np.array_equal(gradient, found[1][name]), name
 
 
-def test_strided_parameters_and_gradients(
-    random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any]
-) -> None:
+def test_strided_parameters_and_gradients(random_scene, random_poses):
     scene, poses = random_scene(50), random_poses(2)
     weights = {"bmode": torch.ones(1).expand(2, HEIGHT, WIDTH)}
     packed = gradients(scene, weights, by_kernel(LINEAR, poses, "auto"))
     means = scene.means.t().contiguous().t().requires_grad_()
     strided = GaussianScene.from_splats({**scene.splats, "means": means}, info=scene.info)
     by_kernel(LINEAR, poses, "auto")(strided)["bmode"].sum().backward()
-    assert means.grad is not None
     assert np.array_equal(means.grad.double().numpy(), packed["means"])
 
 
-def test_no_poses_give_zero_gradients(random_scene: Callable[..., GaussianScene]) -> None:
+def test_no_poses_give_zero_gradients(random_scene):
     scene = random_scene(5)
     for tensor in scene.splats.values():
         tensor.requires_grad_()
@@ -195,7 +176,7 @@ def test_no_poses_give_zero_gradients(random_scene: Callable[..., GaussianScene]
     assert all(tensor.grad is not None and not tensor.grad.any() for tensor in scene.splats.values())
 
 
-def test_the_graph_may_be_used_twice(random_scene: Callable[..., GaussianScene]) -> None:
+def test_the_graph_may_be_used_twice(random_scene):
     scene = random_scene(30)
     scene.sh0.requires_grad_()
     bmode = render(scene, LINEAR, np.eye(4), height=8, width=8).bmode

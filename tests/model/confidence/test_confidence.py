@@ -1,27 +1,21 @@
 """What a scene tells of a frame: with a model, without one, without views, and without torch."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, SceneInfo, read_header
+from ultragray import ConvexProbe, LinearProbe, SceneInfo, read_header
 from ultragray.errors import InvalidArgument, InvalidPose, SceneFileInvalid
-from ultragray.geometry.probe import FloatArray
 from ultragray.scene.confidence import SUPPORT_COVERAGE, Assessor, ConfidenceModel, Extrapolation, supported
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 MODEL = ConfidenceModel((3.5, 1.2, 0.8, 0.1, 0.6), 0.06, (0.0, 0.5, 1.0), 20, 0.04)
 
 
-def moved(*elevations_mm: float) -> FloatArray:
+def moved(*elevations_mm):
     poses = np.tile(np.eye(4), (len(elevations_mm), 1, 1))
     poses[:, 1, 3] = elevations_mm
     return poses
@@ -31,7 +25,7 @@ VIEWS = moved(0.0, 1.0, 2.0)
 INFO = SceneInfo(probe=PROBE, confidence=MODEL.to_dict())
 
 
-def test_a_frame_tells_how_far_it_extrapolates() -> None:
+def test_a_frame_tells_how_far_it_extrapolates():
     on_a_view, beyond = Assessor(INFO, VIEWS).assess(moved(1.0, 6.0))
     assert (on_a_view.distance_mm, on_a_view.angle_deg) == pytest.approx((0.0, 0.0), abs=1e-5)
     assert beyond.distance_mm == pytest.approx(4.0)
@@ -41,11 +35,11 @@ def test_a_frame_tells_how_far_it_extrapolates() -> None:
     assert beyond.supported_share is None
 
 
-def test_one_pose_is_one_frame() -> None:
+def test_one_pose_is_one_frame():
     assert Assessor(INFO, VIEWS).assess(np.eye(4)) == Assessor(INFO, VIEWS).assess(moved(0.0))
 
 
-def test_the_share_of_pixels_with_support() -> None:
+def test_the_share_of_pixels_with_support():
     coverage = np.array([[[0.0, SUPPORT_COVERAGE - 0.01], [SUPPORT_COVERAGE, 1.0]]], np.float32)
     (told,) = Assessor(INFO, VIEWS).assess(moved(1.0), coverage=coverage)
     assert told.supported_share == 0.5
@@ -54,7 +48,7 @@ def test_the_share_of_pixels_with_support() -> None:
         Assessor(INFO, VIEWS).assess(moved(0.0, 1.0), coverage=coverage)
 
 
-def test_another_probe_is_measured_where_it_looks() -> None:
+def test_another_probe_is_measured_where_it_looks():
     wide = LinearProbe(width_mm=80.0, near_mm=0.0, far_mm=50.0)
     (own,), (other,) = (Assessor(INFO, VIEWS).assess(moved(1.0), probe) for probe in (None, wide))
     assert own.distance_mm == pytest.approx(0.0, abs=1e-9)
@@ -62,7 +56,7 @@ def test_another_probe_is_measured_where_it_looks() -> None:
     assert other.distance_mm > 3.0
 
 
-def test_a_scene_tells_no_more_than_it_knows() -> None:
+def test_a_scene_tells_no_more_than_it_knows():
     coverage = np.ones((1, 4, 4))
     assert Assessor(SceneInfo(probe=PROBE), np.zeros((0, 4, 4))).assess(np.eye(4), coverage=coverage) == [
         Extrapolation(None, None, None, 1.0)
@@ -73,14 +67,14 @@ def test_a_scene_tells_no_more_than_it_knows() -> None:
     assert told.confidence is None
 
 
-def test_what_does_not_fit_is_refused() -> None:
+def test_what_does_not_fit_is_refused():
     with pytest.raises(InvalidPose):
         Assessor(INFO, VIEWS).assess(3.0 * np.eye(4))
     with pytest.raises(InvalidArgument, match="each of 2 training poses, got 3"):
         Assessor(INFO, VIEWS[:2])
 
 
-def test_it_is_kept_in_the_scene_file(random_scene: Callable[..., GaussianScene], tmp_path: Path) -> None:
+def test_it_is_kept_in_the_scene_file(random_scene, tmp_path):
     scene = random_scene(info={"probe": PROBE, "confidence": MODEL.to_dict()})
     replace(scene, training_poses=VIEWS).save(tmp_path / "scene.ugr")
     header = read_header(tmp_path / "scene.ugr")
@@ -89,16 +83,14 @@ def test_it_is_kept_in_the_scene_file(random_scene: Callable[..., GaussianScene]
 
 
 @pytest.mark.parametrize("change", [{"weights": [1.0]}, {"hardness": [0.0]}, {"version": 9}])
-def test_a_scene_file_with_a_damaged_model_is_refused(
-    random_scene: Callable[..., GaussianScene], tmp_path: Path, change: dict[str, Any]
-) -> None:
+def test_a_scene_file_with_a_damaged_model_is_refused(random_scene, tmp_path, change):
     scene = random_scene(info={"probe": PROBE, "confidence": {**MODEL.to_dict(), **change}})
     replace(scene, training_poses=VIEWS).save(tmp_path / "scene.ugr")
     with pytest.raises(SceneFileInvalid, match=r"scene\.ugr.*confidence|weights|hardness"):
         read_header(tmp_path / "scene.ugr")
 
 
-def test_no_torch_is_needed() -> None:
+def test_no_torch_is_needed():
     program = (
         "import sys, numpy as np; from ultragray import SceneInfo; from ultragray.scene.confidence import Assessor; "
         "Assessor(SceneInfo(), np.zeros((0, 4, 4))).assess(np.eye(4)); assert 'torch' not in sys.modules"
@@ -106,7 +98,7 @@ def test_no_torch_is_needed() -> None:
     subprocess.run([sys.executable, "-c", program], check=True)
 
 
-def test_a_fan_beside_its_views() -> None:
+def test_a_fan_beside_its_views():
     fan = ConvexProbe(opening_angle_deg=60.0, near_mm=40.0, far_mm=120.0)
     pose = moved(1.0)
     pose[0, 0, 3] = 200.0

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import pytest
 
 from ultragray.errors import LowConfidence
@@ -10,14 +8,14 @@ FAR = Extrapolation(12.34, 5.67, 0.3, None)
 UNKNOWN = Extrapolation(None, None, None, 0.5)
 
 
-def test_the_limit_itself_will_do_and_what_is_not_known_has_none() -> None:
+def test_the_limit_itself_will_do_and_what_is_not_known_has_none():
     assert is_confident(NEAR, 0.8)
     assert not is_confident(NEAR, 0.81)
     assert is_confident(UNKNOWN, 0.0)
     assert not is_confident(UNKNOWN, 0.01)
 
 
-def test_the_first_pose_below_the_limit_is_named() -> None:
+def test_the_first_pose_below_the_limit_is_named():
     require_confidence([NEAR, FAR, UNKNOWN], None)
     require_confidence([NEAR, FAR], 0.3)
     with pytest.raises(LowConfidence) as caught:

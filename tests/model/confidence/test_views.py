@@ -1,13 +1,10 @@
 """Distances, angles and neighbourhoods of poses to training views, against geometry done by hand or by brute force."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
+from ultragray import ConvexProbe, LinearProbe, PhasedProbe, RadialProbe, SteeredProbe
 from ultragray.errors import InvalidPose
-from ultragray.geometry.probe import FloatArray
 from ultragray.scene.confidence import MAX_VIEWS, POINTS_PER_SIDE, TrainingViews
 
 LINEAR = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
@@ -17,13 +14,13 @@ RADIAL = RadialProbe(near_mm=2.0, far_mm=30.0)
 STEERED = SteeredProbe(width_mm=40.0, steering_deg=-25.0, near_mm=5.0, far_mm=50.0)
 
 
-def parallel(*elevations_mm: float) -> FloatArray:
+def parallel(*elevations_mm):
     poses = np.tile(np.eye(4), (len(elevations_mm), 1, 1))
     poses[:, 1, 3] = elevations_mm
     return poses
 
 
-def tilted(angle_deg: float) -> FloatArray:
+def tilted(angle_deg):
     """About x, the probe's lateral axis."""
     c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
     pose = np.eye(4)
@@ -31,7 +28,7 @@ def tilted(angle_deg: float) -> FloatArray:
     return pose[None]
 
 
-def in_plane(angle_deg: float) -> FloatArray:
+def in_plane(angle_deg):
     """About y, so that the image plane stays."""
     c, s = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
     pose = np.eye(4)
@@ -40,7 +37,7 @@ def in_plane(angle_deg: float) -> FloatArray:
 
 
 @pytest.mark.parametrize("probe", [LINEAR, CONVEX, PHASED, RADIAL, STEERED])
-def test_a_training_view_is_no_distance_away(probe: Probe) -> None:
+def test_a_training_view_is_no_distance_away(probe):
     measured = TrainingViews(parallel(0.0, 3.0), probe).measure(parallel(3.0), probe)
     for values in (measured.nearest_mm, measured.distance_mm, measured.interpolation_mm, measured.angle_deg):
         assert values.shape == (1, POINTS_PER_SIDE**2)
@@ -51,16 +48,14 @@ def test_a_training_view_is_no_distance_away(probe: Probe) -> None:
     ("at_mm", "distance_mm", "interpolation_mm"),
     [(2.0, 2.0, 1.0), (1.0, 1.0, 0.75), (7.0, 3.0, 3.0), (-5.0, 5.0, 5.0), (104.0, 20.0, 20.0)],
 )
-def test_between_two_views_counts_half_and_beyond_them_all(
-    at_mm: float, distance_mm: float, interpolation_mm: float
-) -> None:
+def test_between_two_views_counts_half_and_beyond_them_all(at_mm, distance_mm, interpolation_mm):
     measured = TrainingViews(parallel(0.0, 4.0), LINEAR).measure(parallel(at_mm), LINEAR).averaged()
     assert measured.distance_mm[0] == pytest.approx([distance_mm])
     assert measured.interpolation_mm[0] == pytest.approx([interpolation_mm], rel=1e-3)
     assert measured.nearest_mm[0] == pytest.approx([min(abs(at_mm), abs(at_mm - 4.0))])
 
 
-def test_a_view_of_a_probe_that_was_turned_round_is_on_the_same_side() -> None:
+def test_a_view_of_a_probe_that_was_turned_round_is_on_the_same_side():
     views = parallel(0.0, 4.0)
     views[1, :3, :3] = np.diag([-1.0, -1.0, 1.0])
     measured = TrainingViews(views, LINEAR).measure(parallel(2.0), LINEAR).averaged()
@@ -68,7 +63,7 @@ def test_a_view_of_a_probe_that_was_turned_round_is_on_the_same_side() -> None:
 
 
 @pytest.mark.parametrize("probe", [LINEAR, CONVEX, PHASED, RADIAL, STEERED])
-def test_distance_to_an_image_and_not_to_its_plane(probe: Probe) -> None:
+def test_distance_to_an_image_and_not_to_its_plane(probe):
     pose = tilted(12.0)
     pose[0, :3, 3] = (15.0, 4.0, 9.0)
     measured = TrainingViews(np.eye(4)[None], probe).measure(pose, probe).averaged()
@@ -82,19 +77,19 @@ def test_distance_to_an_image_and_not_to_its_plane(probe: Probe) -> None:
     assert measured.nearest_mm[0, 0] == pytest.approx(np.mean(exact), rel=0.02)
 
 
-def test_angle_is_the_rotation_to_the_nearest_view() -> None:
+def test_angle_is_the_rotation_to_the_nearest_view():
     views = np.concatenate([np.eye(4)[None], parallel(60.0)])
     measured = TrainingViews(views, LINEAR).measure(tilted(7.0), LINEAR).averaged()
     assert measured.angle_deg[0] == pytest.approx([7.0])
 
 
-def test_of_two_views_as_near_the_less_turned_is_the_nearest() -> None:
+def test_of_two_views_as_near_the_less_turned_is_the_nearest():
     views = np.concatenate([in_plane(20.0), in_plane(5.0)])
     (angle_deg,) = TrainingViews(views, LINEAR).measure(np.eye(4)[None], LINEAR).averaged().angle_deg
     assert 5.0 - 1e-6 <= angle_deg < 8.0  # the corners of the image lie in neither
 
 
-def test_weights_are_those_of_the_views_around() -> None:
+def test_weights_are_those_of_the_views_around():
     views = TrainingViews(parallel(0.0, 2.0, 30.0), LINEAR)
     near, far = views.measure(parallel(0.0, 60.0), LINEAR).weights
     assert near.sum() == pytest.approx(1.0)
@@ -102,12 +97,12 @@ def test_weights_are_those_of_the_views_around() -> None:
     assert far.argmax() == 2
 
 
-def test_a_pose_that_is_not_rigid_is_refused() -> None:
+def test_a_pose_that_is_not_rigid_is_refused():
     with pytest.raises(InvalidPose):
         TrainingViews(parallel(0.0), LINEAR).measure(2.0 * np.eye(4)[None], LINEAR)
 
 
-def test_of_very_many_views_those_around_a_pose_count() -> None:
+def test_of_very_many_views_those_around_a_pose_count():
     """The nearest are found among ten times as many as are looked at, and the measures are those of all."""
     poses = parallel(*np.linspace(0.0, 100.0, 10 * MAX_VIEWS))
     near = np.abs(poses[:, 1, 3] - 40.0) < 5.0

@@ -1,13 +1,10 @@
 """The skin under training views, for every kind of probe, and the contact of poses with it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
+from ultragray import ConvexProbe, LinearProbe, PhasedProbe, RadialProbe, SteeredProbe
 from ultragray.errors import InvalidArgument
-from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.contact import COUPLING_MM, MARGIN_MM, Skin, Touch
 
 WIDTH = 32
@@ -20,19 +17,19 @@ PROBES = [
 ]
 
 
-def placed(probe: Probe, x: float = 0.0, y: float = 0.0, lifted_mm: float = 0.0) -> FloatArray:  # [4, 4]
+def placed(probe, x=0.0, y=0.0, lifted_mm=0.0):  # [4, 4]
     """Upright, the middle of the face over (x, y) of the plane z = 0, which is the skin."""
     pose = np.eye(4)
     pose[:3, 3] = x, y, -probe.face_depth_mm - lifted_mm
     return pose
 
 
-def swept(probe: Probe) -> FloatArray:  # [21, 4, 4]
+def swept(probe):  # [21, 4, 4]
     return np.stack([placed(probe, y=y) for y in np.linspace(0.0, 40.0, 21)])
 
 
 @pytest.mark.parametrize("probe", PROBES, ids=str)
-def test_training_views_have_contact_and_are_not_pressed(probe: Probe) -> None:
+def test_training_views_have_contact_and_are_not_pressed(probe):
     rng = np.random.default_rng(0)
     views = swept(probe)
     views[:, 2, 3] += rng.uniform(-2.0, 2.0, len(views))  # one was pressed harder than the other
@@ -42,7 +39,7 @@ def test_training_views_have_contact_and_are_not_pressed(probe: Probe) -> None:
 
 
 @pytest.mark.parametrize("probe", PROBES, ids=str)
-def test_a_lifted_probe_loses_contact_where_the_gap_is_more_than_the_gel(probe: Probe) -> None:
+def test_a_lifted_probe_loses_contact_where_the_gap_is_more_than_the_gel(probe):
     skin = Skin.under(swept(probe), probe)
     for lifted_mm, share in ((0.8 * COUPLING_MM, 1.0), (1.3 * COUPLING_MM, 0.0), (30.0, 0.0)):
         touch = Touch.of(skin, probe, placed(probe, y=20.0, lifted_mm=lifted_mm), WIDTH)
@@ -56,7 +53,7 @@ def test_a_lifted_probe_loses_contact_where_the_gap_is_more_than_the_gel(probe: 
             assert touch.shares[0] == share
 
 
-def test_the_gap_is_measured_along_the_scan_line() -> None:
+def test_the_gap_is_measured_along_the_scan_line():
     probe = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
     angle = np.radians(10.0)
     pose = placed(probe, y=20.0)
@@ -71,7 +68,7 @@ def test_the_gap_is_measured_along_the_scan_line() -> None:
     assert touch.lines[0].tolist() == (-x * np.tan(angle) <= COUPLING_MM).tolist()
 
 
-def test_it_does_not_matter_how_the_sweep_lies_in_space() -> None:
+def test_it_does_not_matter_how_the_sweep_lies_in_space():
     probe = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
     motion = np.eye(4)
     motion[:3, :3] = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
@@ -83,7 +80,7 @@ def test_it_does_not_matter_how_the_sweep_lies_in_space() -> None:
     np.testing.assert_allclose(there.gaps_mm, here.gaps_mm, atol=1e-2)
 
 
-def test_a_round_skin_is_followed() -> None:
+def test_a_round_skin_is_followed():
     """Views around a limb of 60 mm radius, 80° of it."""
     probe, radius = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=40.0), 60.0
     views = []
@@ -104,7 +101,7 @@ def test_a_round_skin_is_followed() -> None:
     assert off.shares[0] == 0.0
 
 
-def test_a_curved_face_on_flat_skin_touches_in_the_middle() -> None:
+def test_a_curved_face_on_flat_skin_touches_in_the_middle():
     flat = LinearProbe(width_mm=60.0, near_mm=0.0, far_mm=50.0)
     convex = ConvexProbe(opening_angle_deg=60.0, near_mm=40.0, far_mm=90.0)
     touch = Touch.of(Skin.under(swept(flat), flat), convex, placed(convex, y=20.0), WIDTH)
@@ -113,7 +110,7 @@ def test_a_curved_face_on_flat_skin_touches_in_the_middle() -> None:
     assert 0.3 < touch.shares[0] < 0.7
 
 
-def test_beyond_its_margin_no_skin_is_known() -> None:
+def test_beyond_its_margin_no_skin_is_known():
     probe = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=50.0)
     skin = Skin.under(swept(probe), probe)
     inside, outside = (placed(probe, y=40.0 + MARGIN_MM + off) for off in (-1.5, 1.5))
@@ -122,14 +119,14 @@ def test_beyond_its_margin_no_skin_is_known() -> None:
     assert np.isinf(Touch.of(skin, probe, placed(probe, x=500.0), WIDTH).gaps_mm).all()
 
 
-def test_a_probe_that_looks_away_has_no_contact() -> None:
+def test_a_probe_that_looks_away_has_no_contact():
     probe = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=50.0)
     away = placed(probe, y=20.0) @ np.diag([1.0, -1.0, -1.0, 1.0])
     touch = Touch.of(Skin.under(swept(probe), probe), probe, away, WIDTH)
     assert touch.shares[0] == 0.0
 
 
-def test_pressure_is_what_goes_beyond_the_innermost_face() -> None:
+def test_pressure_is_what_goes_beyond_the_innermost_face():
     probe = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=50.0)
     views = np.concatenate([swept(probe), swept(probe)])
     views[21:, 2, 3] = 2.0  # the second pass was pressed by 2 mm
@@ -147,7 +144,7 @@ def test_pressure_is_what_goes_beyond_the_innermost_face() -> None:
         (np.stack([np.eye(4), np.diag([1.0, -1.0, -1.0, 1.0])]), PROBES[0], "all around"),
     ],
 )
-def test_no_skin_where_there_is_no_surface(poses: FloatArray, probe: Probe | None, match: str) -> None:
+def test_no_skin_where_there_is_no_surface(poses, probe, match):
     with pytest.raises(InvalidArgument, match=match) as error:
         Skin.under(poses, probe)
     assert error.value.field == "contact"

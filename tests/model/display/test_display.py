@@ -1,12 +1,10 @@
 """Display settings: what is shown, and where its pixels lie."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 
-from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
+from ultragray import ConvexProbe, LinearProbe, PhasedProbe, RadialProbe, SteeredProbe
 from ultragray.errors import InvalidArgument, InvalidImageSize
 from ultragray.geometry.scan_conversion import scan_convert, scan_convert_labels
 from ultragray.rendering.display import Display
@@ -19,7 +17,7 @@ PROBES = (LINEAR, CONVEX, PHASED)
 HEIGHT, WIDTH = 40, 30
 
 
-def frames(seed: int = 0) -> dict[str, torch.Tensor]:
+def frames(seed=0):
     generator = torch.Generator().manual_seed(seed)
     names = ("bmode", "echo")
     return {name: torch.rand((2, HEIGHT, WIDTH), generator=generator) for name in names} | {
@@ -28,7 +26,7 @@ def frames(seed: int = 0) -> dict[str, torch.Tensor]:
 
 
 @pytest.mark.parametrize("probe", PROBES, ids=lambda probe: probe.kind)
-def test_the_defaults_show_frames_as_they_are(probe: Probe) -> None:
+def test_the_defaults_show_frames_as_they_are(probe):
     given = frames()
     shown = show(given, probe, Display())
     assert {name: torch.equal(shown[name], given[name]) for name in given} == dict.fromkeys(given, True)
@@ -36,7 +34,7 @@ def test_the_defaults_show_frames_as_they_are(probe: Probe) -> None:
     assert (picture.height, picture.width) == (HEIGHT, WIDTH)
 
 
-def test_grey_levels_follow_their_definition() -> None:
+def test_grey_levels_follow_their_definition():
     display = Display(gain_db=6.0, dynamic_range_db=40.0, tgc_db=(0.0, -10.0, 20.0))
     bmode = frames()["bmode"]
     shown = show({"bmode": bmode, "echo": bmode}, LINEAR, display)
@@ -48,7 +46,7 @@ def test_grey_levels_follow_their_definition() -> None:
 
 
 @pytest.mark.parametrize(("probe", "rows"), [(LINEAR, 16), (CONVEX, 13), (PHASED, 10)], ids=lambda value: str(value))
-def test_depth_counts_from_the_face(probe: Probe, rows: int) -> None:
+def test_depth_counts_from_the_face(probe, rows):
     display = Display(depth_mm=20.0)
     given = frames()
     shown = show(given, probe, display)
@@ -56,14 +54,14 @@ def test_depth_counts_from_the_face(probe: Probe, rows: int) -> None:
     assert display.picture(probe, HEIGHT, WIDTH).height == rows
 
 
-def test_depth_beyond_the_frame_cuts_nothing() -> None:
+def test_depth_beyond_the_frame_cuts_nothing():
     assert Display(depth_mm=500.0).rows_shown(LINEAR, HEIGHT) == HEIGHT
     assert Display(depth_mm=0.001).rows_shown(LINEAR, HEIGHT) == 1
 
 
 @pytest.mark.parametrize("flip", [False, True])
 @pytest.mark.parametrize("probe", PROBES, ids=lambda probe: probe.kind)
-def test_pixels_of_a_picture_lie_where_it_says(probe: Probe, flip: bool) -> None:
+def test_pixels_of_a_picture_lie_where_it_says(probe, flip):
     """A frame whose values are positions shows at each pixel the position that its picture tells."""
     display = Display(flip=flip, pixel_mm=1.3, depth_mm=45.0)
     origins, directions = probe.scan_lines(WIDTH)
@@ -89,7 +87,7 @@ def test_pixels_of_a_picture_lie_where_it_says(probe: Probe, flip: bool) -> None
 @pytest.mark.parametrize(
     "probe", [CONVEX, RadialProbe(2.0, 20.0), SteeredProbe(30.0, 20.0, 0.0, 40.0)], ids=lambda probe: probe.kind
 )
-def test_frames_are_scan_converted_as_arrays_are(probe: Probe) -> None:
+def test_frames_are_scan_converted_as_arrays_are(probe):
     given = frames()
     shown = show(given, probe, Display(pixel_mm=0.8))
     for k in range(2):
@@ -99,7 +97,7 @@ def test_frames_are_scan_converted_as_arrays_are(probe: Probe) -> None:
     assert (shown["labels"][0].numpy() == labels).mean() > 0.999  # samples half-way between two
 
 
-def test_flipping_twice_is_nothing() -> None:
+def test_flipping_twice_is_nothing():
     picture = CONVEX.picture(0.7)
     assert picture.flipped() != picture
     assert picture.flipped().flipped() == picture
@@ -117,18 +115,18 @@ def test_flipping_twice_is_nothing() -> None:
         ("pixel_mm", {"pixel_mm": -1.0}),
     ],
 )
-def test_settings_beyond_their_limits_are_refused(field: str, settings: dict[str, object]) -> None:
+def test_settings_beyond_their_limits_are_refused(field, settings):
     with pytest.raises(InvalidArgument) as refusal:
-        Display(**settings)  # type: ignore[arg-type]
+        Display(**settings)
     assert refusal.value.field == field
 
 
-def test_a_huge_picture_is_refused() -> None:
+def test_a_huge_picture_is_refused():
     with pytest.raises(InvalidImageSize, match=r"pixels of 0\.001 mm"):
         Display(pixel_mm=0.001).picture(CONVEX, HEIGHT, WIDTH)
 
 
-def test_edge_enhancement_raises_the_bright_side_of_an_edge_and_lowers_the_dark_one() -> None:
+def test_edge_enhancement_raises_the_bright_side_of_an_edge_and_lowers_the_dark_one():
     step = torch.full((1, 9, 12), 0.4)
     step[..., 6:] = 0.6
     shown = show({"bmode": step, "echo": step}, LINEAR, Display(edge=1.0))

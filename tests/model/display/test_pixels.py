@@ -1,7 +1,5 @@
 """Pixels as bytes."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 

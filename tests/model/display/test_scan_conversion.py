@@ -1,21 +1,19 @@
 """Scan conversion: what lies where in a picture with square pixels."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 import pytest
 from skimage.transform import warp
 
-from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe
+from ultragray import ConvexProbe, LinearProbe, PhasedProbe
 from ultragray.geometry.scan_conversion import samples, scan_convert, scan_convert_labels
 
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=50.0, far_mm=150.0)
 PHASED = PhasedProbe(opening_angle_deg=90.0, far_mm=120.0)
 
 
-def test_a_phased_frame_is_drawn_from_its_apex_on() -> None:
+def test_a_phased_frame_is_drawn_from_its_apex_on():
     picture = scan_convert(np.ones((64, 64)), PHASED, pixel_mm=1.0)
     assert picture.shape == (120, 170)
     assert picture[0].sum() <= 2  # the apex, at the top in the middle
@@ -24,7 +22,7 @@ def test_a_phased_frame_is_drawn_from_its_apex_on() -> None:
     np.testing.assert_array_equal(picture[30] > 0, np.abs(angle) <= 45)
 
 
-def test_labels_are_drawn_without_mixing_them() -> None:
+def test_labels_are_drawn_without_mixing_them():
     labels = np.zeros((40, 40), np.uint8)
     labels[:, 20:] = 200
     labels[20:, :20] = 7
@@ -38,7 +36,7 @@ def test_labels_are_drawn_without_mixing_them() -> None:
         np.testing.assert_array_equal(picture[drawn == 0.0] == 200, False)
 
 
-def test_scan_conversion_puts_range_and_angle_where_they_are() -> None:
+def test_scan_conversion_puts_range_and_angle_where_they_are():
     """A frame whose pixels hold their own range, then their own angle, shows them at the right places."""
     height, width, pixel_mm = 200, 180, 0.5
     ranges = np.tile(CONVEX.depths_mm(height)[:, None], (1, width))
@@ -60,14 +58,14 @@ def test_scan_conversion_puts_range_and_angle_where_they_are() -> None:
 
 
 @pytest.mark.parametrize("probe", [CONVEX, PHASED, LinearProbe(40.0, 0.0, 50.0)])
-def test_pixels_are_interpolated_as_scikit_image_does(probe: Probe) -> None:
+def test_pixels_are_interpolated_as_scikit_image_does(probe):
     frame = np.random.default_rng(0).random((60, 50))
     rows, columns, inside = samples(probe, frame.shape, 0.9)
     expected = np.where(inside, warp(frame, np.stack([rows, columns]), order=1, mode="edge"), 0.0)
     np.testing.assert_allclose(scan_convert(frame, probe, 0.9), expected, atol=1e-6)
 
 
-def test_scan_conversion_of_one_pixel() -> None:
+def test_scan_conversion_of_one_pixel():
     picture = scan_convert(np.ones((1, 1)), CONVEX, 5.0)
     assert picture.dtype == np.float32
     assert set(np.unique(picture)) == {0.0, 1.0}

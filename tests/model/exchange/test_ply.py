@@ -1,15 +1,10 @@
 """PLY: a scene comes back to the bit; whatever is no such file is named."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re
 import struct
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -36,10 +31,8 @@ INFO = {
 
 
 @pytest.fixture
-def make_scene(
-    random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any]
-) -> Callable[..., GaussianScene]:
-    def make(count: int = 7, *, poses: int = 3, **options: Any) -> GaussianScene:
+def make_scene(random_scene, random_poses):
+    def make(count=7, *, poses=3, **options):
         made = random_scene(count, **{"info": INFO, **options})
         return GaussianScene.from_splats(made.splats, info=made.info, training_poses=random_poses(poses))
 
@@ -47,19 +40,19 @@ def make_scene(
 
 
 @pytest.fixture
-def file(tmp_path: Path, make_scene: Callable[..., GaussianScene]) -> Path:
+def file(tmp_path, make_scene):
     path = tmp_path / "scene.ply"
     write_ply(make_scene(), path)
     return path
 
 
-def change(path: Path, old: bytes, new: bytes) -> None:
+def change(path, old, new):
     content = path.read_bytes()
     assert old in content
     path.write_bytes(content.replace(old, new, 1))
 
 
-def refused(path: Path, message: str) -> None:
+def refused(path, message):
     with pytest.raises(SceneFileInvalid, match=rf"{re.escape(str(path))}: .*{message}") as caught:
         read_ply(path)
     assert "\n" not in caught.value.detail
@@ -68,9 +61,7 @@ def refused(path: Path, message: str) -> None:
 
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("intensity", ["released", "sigmoid"])
-def test_a_scene_comes_back_to_the_bit(
-    tmp_path: Path, make_scene: Callable[..., GaussianScene], sh_degree: int, intensity: str
-) -> None:
+def test_a_scene_comes_back_to_the_bit(tmp_path, make_scene, sh_degree, intensity):
     scene = make_scene(sh_degree=sh_degree, intensity=intensity)
     scene = replace(scene, info=replace(scene.info, beam=ElevationBeam(2.5, 30.0, 20.0)))
     write_ply(scene, tmp_path / "a.ply")
@@ -79,7 +70,7 @@ def test_a_scene_comes_back_to_the_bit(
     assert back.to_bytes() == scene.to_bytes()
 
 
-def test_odd_numbers_come_back_to_the_bit(tmp_path: Path, make_scene: Callable[..., GaussianScene]) -> None:
+def test_odd_numbers_come_back_to_the_bit(tmp_path, make_scene):
     scene = make_scene(poses=0, info={**INFO, "probe": ConvexProbe(60.56, 50.8, 228.0)})
     scene.means[0] = torch.tensor([-0.0, 1e-45, 3.14159274])
     scene.transmittances[1] = -3.4e38
@@ -90,13 +81,13 @@ def test_odd_numbers_come_back_to_the_bit(tmp_path: Path, make_scene: Callable[.
     assert back.training_poses.shape == (0, 4, 4)
 
 
-def test_a_scene_without_gaussians(tmp_path: Path, make_scene: Callable[..., GaussianScene]) -> None:
+def test_a_scene_without_gaussians(tmp_path, make_scene):
     scene = make_scene(0, poses=2)
     write_ply(scene, tmp_path / "a.ply")
     assert read_ply(tmp_path / "a.ply").to_bytes() == scene.to_bytes()
 
 
-def test_what_other_tools_find(tmp_path: Path, make_scene: Callable[..., GaussianScene]) -> None:
+def test_what_other_tools_find(tmp_path, make_scene):
     """Read as any reader of PLY would: by the types and names of the header alone."""
     scene = make_scene()
     write_ply(scene, tmp_path / "a.ply")
@@ -114,7 +105,7 @@ def test_what_other_tools_find(tmp_path: Path, make_scene: Callable[..., Gaussia
     np.testing.assert_array_equal(pose, scene.training_poses[0])
 
 
-def test_a_tool_may_reorder_and_take_gaussians_away(tmp_path: Path, make_scene: Callable[..., GaussianScene]) -> None:
+def test_a_tool_may_reorder_and_take_gaussians_away(tmp_path, make_scene):
     scene = make_scene()
     write_ply(scene, tmp_path / "a.ply")
     header, _, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
@@ -159,14 +150,7 @@ def test_a_tool_may_reorder_and_take_gaussians_away(tmp_path: Path, make_scene: 
         (b'"centre_mm":[12.5', b'"centre_mm":[1' + b"0" * 400, "."),
     ],
 )
-def test_a_wrong_header_is_named(
-    tmp_path: Path,
-    make_scene: Callable[..., GaussianScene],
-    monkeypatch: pytest.MonkeyPatch,
-    old: bytes,
-    new: bytes,
-    message: str,
-) -> None:
+def test_a_wrong_header_is_named(tmp_path, make_scene, monkeypatch, old, new, message):
     path = tmp_path / "scene.ply"
     monkeypatch.setattr(ply, "COMMENT_CHARACTERS", 10_000)
     write_ply(make_scene(intensity="sigmoid"), path)
@@ -174,7 +158,7 @@ def test_a_wrong_header_is_named(
     refused(path, message)
 
 
-def test_a_ply_of_something_else_is_named(tmp_path: Path) -> None:
+def test_a_ply_of_something_else_is_named(tmp_path):
     path = tmp_path / "scene.ply"
     path.write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty float x\nend_header\n")
     refused(path, "no comments `ultragray")
@@ -182,7 +166,7 @@ def test_a_ply_of_something_else_is_named(tmp_path: Path) -> None:
     refused(path, "lacks|elements are|nests too deeply")
 
 
-def test_values_that_cannot_be_are_named(file: Path) -> None:
+def test_values_that_cannot_be_are_named(file):
     content = file.read_bytes()
     body = content.index(b"end_header\n") + len(b"end_header\n")
     file.write_bytes(content[:body] + struct.pack("<f", float("nan")) + content[body + 4 :])
@@ -191,7 +175,7 @@ def test_values_that_cannot_be_are_named(file: Path) -> None:
     refused(file, r"training_poses\[2\] must end in the row 0 0 0 1")
 
 
-def test_files_that_are_not_there(tmp_path: Path) -> None:
+def test_files_that_are_not_there(tmp_path):
     refused(tmp_path / "none.ply", "no such file")
     refused(tmp_path, "no such file")
     os.mkfifo(tmp_path / "pipe.ply")
@@ -200,7 +184,7 @@ def test_files_that_are_not_there(tmp_path: Path) -> None:
 
 @settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 @given(data=st.data())
-def test_no_file_does_anything_but_load_or_be_refused(file: Path, data: st.DataObject) -> None:
+def test_no_file_does_anything_but_load_or_be_refused(file, data):
     content = bytearray(file.read_bytes())
     header = content.index(b"end_header\n")
     hostile = file.with_name("hostile.ply")
@@ -225,7 +209,7 @@ def test_no_file_does_anything_but_load_or_be_refused(file: Path, data: st.DataO
         read_ply(hostile)
 
 
-def test_a_file_that_cannot_be_written_leaves_nothing(tmp_path: Path, make_scene: Callable[..., GaussianScene]) -> None:
+def test_a_file_that_cannot_be_written_leaves_nothing(tmp_path, make_scene):
     with pytest.raises(OSError, match="no_such_folder"):
         write_ply(make_scene(), tmp_path / "no_such_folder" / "a.ply")
     (tmp_path / "taken.ply").mkdir()

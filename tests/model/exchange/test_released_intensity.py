@@ -1,8 +1,5 @@
 """Sigmoid intensities in the released activation: exact where it can be, honest where it cannot."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -13,10 +10,8 @@ from ultragray import GaussianScene
 from ultragray.exchange.checkpoint import fit_released_intensity
 from ultragray.rendering.backends.reference import intensity
 
-SceneMaker = Callable[..., GaussianScene]
 
-
-def fitted(scene: GaussianScene) -> tuple[GaussianScene, float, float]:
+def fitted(scene):
     fit = fit_released_intensity(scene)
     splats = {**scene.splats, "sh0": fit.sh0, "shN": fit.shN}
     released = GaussianScene.from_splats(
@@ -25,15 +20,15 @@ def fitted(scene: GaussianScene) -> tuple[GaussianScene, float, float]:
     return released, fit.largest_error, fit.mean_error
 
 
-def errors(scene: GaussianScene, released: GaussianScene) -> torch.Tensor:  # [C, N]
+def errors(scene, released):  # [C, N]
     """What a renderer finds: the intensities of both, seen from each training pose."""
     origins = torch.from_numpy(scene.poses_to_scene_cm(scene.training_poses)[:, :3, 3]).float()
     return torch.stack([(intensity(scene, origin) - intensity(released, origin)).abs() for origin in origins])
 
 
 @pytest.fixture
-def make_scene(random_scene: SceneMaker, random_poses: Callable[..., np.ndarray]) -> SceneMaker:
-    def make(sh_degree: int, *, sh0: tuple[float, float], spread: float, poses: int = 6) -> GaussianScene:
+def make_scene(random_scene, random_poses):
+    def make(sh_degree, *, sh0, spread, poses=6):
         made = random_scene(300, sh_degree=sh_degree, intensity="sigmoid", info={"centre_mm": (1.0, 2.0, 3.0)})
         rng = np.random.default_rng(5)
         splats = {
@@ -46,7 +41,7 @@ def make_scene(random_scene: SceneMaker, random_poses: Callable[..., np.ndarray]
     return make
 
 
-def test_intensities_above_the_floor_fit_exactly_without_directions(make_scene: SceneMaker) -> None:
+def test_intensities_above_the_floor_fit_exactly_without_directions(make_scene):
     scene = make_scene(0, sh0=(0.1, 5.0), spread=1.0)  # I from 0.53 to 0.996
     released, largest, mean = fitted(scene)
     assert largest < 1e-6
@@ -55,7 +50,7 @@ def test_intensities_above_the_floor_fit_exactly_without_directions(make_scene: 
 
 
 @pytest.mark.parametrize("sh_degree", [1, 2, 3])
-def test_directions_fit_where_the_scene_was_seen_from(make_scene: SceneMaker, sh_degree: int) -> None:
+def test_directions_fit_where_the_scene_was_seen_from(make_scene, sh_degree):
     scene = make_scene(sh_degree, sh0=(2.0, 3.0), spread=0.5)  # none under the floor
     released, largest, _ = fitted(scene)
     assert largest < 5e-3
@@ -65,11 +60,11 @@ def test_directions_fit_where_the_scene_was_seen_from(make_scene: SceneMaker, sh
     assert float(found.mean()) < 0.2 * float(errors(scene, constant).mean())
 
 
-def replace_sh(scene: GaussianScene, factor: float) -> GaussianScene:
+def replace_sh(scene, factor):
     return GaussianScene.from_splats({**scene.splats, "shN": scene.shN * factor}, info=scene.info)
 
 
-def test_what_lies_under_the_floor_is_told(make_scene: SceneMaker) -> None:
+def test_what_lies_under_the_floor_is_told(make_scene):
     scene = make_scene(1, sh0=(-5.0, -3.0), spread=0.0)  # I from 0.0035 to 0.033
     released, largest, mean = fitted(scene)
     found = errors(scene, released)
@@ -78,12 +73,12 @@ def test_what_lies_under_the_floor_is_told(make_scene: SceneMaker) -> None:
     assert 0.46 < mean <= largest < 0.5
 
 
-def test_without_training_poses_all_directions_count(make_scene: SceneMaker) -> None:
+def test_without_training_poses_all_directions_count(make_scene):
     scene = make_scene(1, sh0=(1.0, 2.0), spread=0.3, poses=0)
     _, largest, mean = fitted(scene)
     assert 0.0 < mean < largest < 0.05
 
 
-def test_no_gaussians(random_scene: SceneMaker) -> None:
+def test_no_gaussians(random_scene):
     fit = fit_released_intensity(random_scene(0, intensity="sigmoid"))
     assert (fit.largest_error, fit.mean_error, fit.shN.shape) == (0.0, 0.0, (0, 3, 1))

@@ -1,11 +1,7 @@
 """Files are complete or absent."""
 
-from __future__ import annotations
-
 import errno
 import os
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
@@ -13,13 +9,13 @@ from ultragray.files import atomic_path, remove_stale_temporaries
 
 
 @pytest.fixture
-def umask() -> Iterator[None]:
+def umask():
     before = os.umask(0o027)
     yield
     os.umask(before)
 
 
-def test_a_new_file_appears_whole_with_ordinary_permissions(tmp_path: Path, umask: None) -> None:
+def test_a_new_file_appears_whole_with_ordinary_permissions(tmp_path, umask):
     path = tmp_path / "scene.ugr"
     with atomic_path(path) as temporary:
         temporary.write_bytes(b"part")
@@ -31,11 +27,11 @@ def test_a_new_file_appears_whole_with_ordinary_permissions(tmp_path: Path, umas
     assert os.listdir(tmp_path) == ["scene.ugr"]
 
 
-def test_a_failure_keeps_the_old_file_and_leaves_nothing(tmp_path: Path) -> None:
+def test_a_failure_keeps_the_old_file_and_leaves_nothing(tmp_path):
     path = tmp_path / "scene.ugr"
     path.write_bytes(b"old")
 
-    def interrupted() -> None:
+    def interrupted():
         with atomic_path(path) as temporary:
             temporary.write_bytes(b"half of the n")
             raise KeyError
@@ -46,12 +42,12 @@ def test_a_failure_keeps_the_old_file_and_leaves_nothing(tmp_path: Path) -> None
     assert os.listdir(tmp_path) == ["scene.ugr"]
 
 
-def test_a_missing_folder_is_an_os_error(tmp_path: Path) -> None:
+def test_a_missing_folder_is_an_os_error(tmp_path):
     with pytest.raises(FileNotFoundError), atomic_path(tmp_path / "nowhere" / "scene.ugr"):
         pass
 
 
-def test_what_a_killed_process_left_is_removed_and_nothing_else(tmp_path: Path) -> None:
+def test_what_a_killed_process_left_is_removed_and_nothing_else(tmp_path):
     path = tmp_path / "scene[1].ugr"
     with atomic_path(path) as temporary:
         temporary.write_bytes(b"half")
@@ -65,7 +61,7 @@ def test_what_a_killed_process_left_is_removed_and_nothing_else(tmp_path: Path) 
     assert sorted(os.listdir(tmp_path)) == sorted(others)
 
 
-def test_an_error_names_the_file_that_was_wanted(tmp_path: Path) -> None:
+def test_an_error_names_the_file_that_was_wanted(tmp_path):
     path = tmp_path / "none" / "scene.ugr"
     with pytest.raises(FileNotFoundError) as missing, atomic_path(path):
         raise AssertionError("its folder is not there")

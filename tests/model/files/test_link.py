@@ -1,9 +1,5 @@
-from __future__ import annotations
-
 import errno
 import os
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -11,24 +7,24 @@ from ultragray.files import link_or_copy
 
 
 @pytest.fixture
-def source(tmp_path: Path) -> Path:
+def source(tmp_path):
     path = tmp_path / "source"
     path.write_bytes(b"new")
     return path
 
 
-def refuse(*arguments: Any) -> None:
+def refuse(*arguments):
     raise OSError(errno.EPERM, "no links here")
 
 
-def test_one_file_with_two_names(source: Path, tmp_path: Path) -> None:
+def test_one_file_with_two_names(source, tmp_path):
     (tmp_path / "symbolic").symlink_to(source)
     link_or_copy(tmp_path / "symbolic", tmp_path / "target")
     assert (tmp_path / "target").samefile(source)
     assert not (tmp_path / "target").is_symlink()
 
 
-def test_copied_where_links_cannot_be(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_copied_where_links_cannot_be(source, tmp_path, monkeypatch):
     monkeypatch.setattr(os, "link", refuse)
     link_or_copy(source, tmp_path / "target")
     assert not (tmp_path / "target").samefile(source)
@@ -36,10 +32,10 @@ def test_copied_where_links_cannot_be(source: Path, tmp_path: Path, monkeypatch:
     assert {path.name for path in tmp_path.iterdir()} == {"source", "target"}
 
 
-def test_copied_from_another_file_system(source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_copied_from_another_file_system(source, tmp_path, monkeypatch):
     link = os.link
 
-    def across(one: Path, other: Path) -> None:
+    def across(one, other):
         if one == source:
             raise OSError(errno.EXDEV, "another file system")
         (tmp_path / "target").write_bytes(b"meanwhile")
@@ -52,7 +48,7 @@ def test_copied_from_another_file_system(source: Path, tmp_path: Path, monkeypat
 
 
 @pytest.mark.parametrize("links", [True, False])
-def test_what_is_there_stays(links: bool, source: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_there_stays(links, source, tmp_path, monkeypatch):
     if not links:
         monkeypatch.setattr(os, "link", refuse)
     (tmp_path / "target").write_bytes(b"old")
@@ -61,7 +57,7 @@ def test_what_is_there_stays(links: bool, source: Path, tmp_path: Path, monkeypa
     assert {path.name for path in tmp_path.iterdir()} == {"source", "target"}
 
 
-def test_no_source(tmp_path: Path) -> None:
+def test_no_source(tmp_path):
     with pytest.raises(FileNotFoundError):
         link_or_copy(tmp_path / "none", tmp_path / "target")
     assert not list(tmp_path.iterdir())

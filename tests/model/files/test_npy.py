@@ -1,9 +1,6 @@
 """A .npy file is mapped, and what is wrong with it is said without numpy's advice."""
 
-from __future__ import annotations
-
 import pickle
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,13 +8,13 @@ import pytest
 from ultragray.files import map_npy
 
 
-def npy(path: Path, array: np.ndarray) -> bytes:
+def npy(path, array):
     np.save(path, array, allow_pickle=True)
     return path.read_bytes()
 
 
 @pytest.mark.parametrize("array", [np.arange(6, dtype=np.uint8).reshape(1, 2, 3), np.zeros((0, 4)), np.array(2.5)])
-def test_an_array_is_mapped(tmp_path: Path, array: np.ndarray) -> None:
+def test_an_array_is_mapped(tmp_path, array):
     path = tmp_path / "a.npy"
     npy(path, array)
     mapped = map_npy(path)
@@ -26,7 +23,7 @@ def test_an_array_is_mapped(tmp_path: Path, array: np.ndarray) -> None:
     assert not mapped.flags.writeable
 
 
-def test_what_is_wrong_is_named(tmp_path: Path) -> None:
+def test_what_is_wrong_is_named(tmp_path):
     path = tmp_path / "a.npy"
     numbers = npy(path, np.arange(6.0))
     archive = tmp_path / "a.npz"

@@ -1,11 +1,9 @@
 """The shadow of bone: where it lies, and what is measured in it."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
-from ultragray import ConvexProbe, LinearProbe, Probe
+from ultragray import ConvexProbe, LinearProbe
 from ultragray.datasets import Sweep
 from ultragray.errors import DatasetInvalid
 from ultragray.phantom.imaging import BoneShadow
@@ -14,7 +12,7 @@ PROBE = LinearProbe(width_mm=60.0, near_mm=0.0, far_mm=60.0)
 SIDE = 60  # a pixel a millimetre
 
 
-def sweep_at(x_mm: float, probe: Probe = PROBE) -> Sweep:
+def sweep_at(x_mm, probe=PROBE):
     """A frame over the middle vertebra and one between two, shifted along x, of nothing but noise."""
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, 0, 3] = x_mm
@@ -23,7 +21,7 @@ def sweep_at(x_mm: float, probe: Probe = PROBE) -> Sweep:
     return Sweep(images, poses, probe, np.arange(2), "noise")
 
 
-def test_it_lies_behind_the_laminae_and_not_beside_or_between_them() -> None:
+def test_it_lies_behind_the_laminae_and_not_beside_or_between_them():
     over, between = BoneShadow.of(sweep_at(0.0)).hidden
     assert over[40:, 20:40].all()
     assert not over[:12].any()
@@ -31,7 +29,7 @@ def test_it_lies_behind_the_laminae_and_not_beside_or_between_them() -> None:
     assert not between[:52, 26:34].any()
 
 
-def test_means_are_taken_over_the_shadow_alone() -> None:
+def test_means_are_taken_over_the_shadow_alone():
     sweep = sweep_at(0.0)
     shadow = BoneShadow.of(sweep)
     inside = shadow.hidden.astype(np.float32)
@@ -42,7 +40,7 @@ def test_means_are_taken_over_the_shadow_alone() -> None:
     assert shadow.mean_absolute_error(truth - 0.25 * inside) == pytest.approx(0.25, abs=1e-6)
 
 
-def test_sweeps_that_cannot_tell_are_refused() -> None:
+def test_sweeps_that_cannot_tell_are_refused():
     with pytest.raises(DatasetInvalid, match="noise: no pixel lies in the shadow"):
         BoneShadow.of(sweep_at(90.0))
     with pytest.raises(DatasetInvalid, match="noise: the phantom is scanned along upright lines, got convex probe"):

@@ -89,7 +89,7 @@ def test_json_and_repr_give_the_probe_back(probe: Probe) -> None:
     assert eval(repr(probe), {one.__name__: one for one in Probe.members.values()}) == probe
 
 
-def test_a_radial_picture_is_a_disc_with_a_hole() -> None:
+def test_a_radial_picture_is_a_disc_with_a_hole():
     picture = scan_convert(np.ones((50, 64)), RadialProbe(near_mm=4.0, far_mm=20.0), 0.25)
     assert picture.shape == (160, 160)
     x, z = (np.arange(160) - 79.5) * 0.25, (np.arange(160)[:, None] - 79.5) * 0.25
@@ -97,13 +97,13 @@ def test_a_radial_picture_is_a_disc_with_a_hole() -> None:
     np.testing.assert_array_equal(picture > 0, (radius >= 4.0) & (radius <= 20.0))
 
 
-def test_the_first_radial_line_runs_along_z_and_the_next_towards_x() -> None:
+def test_the_first_radial_line_runs_along_z_and_the_next_towards_x():
     _, directions = RadialProbe(near_mm=1.0, far_mm=10.0).scan_lines(360)
     angles = np.degrees(np.arctan2(directions[:, 0], directions[:, 2])) % 360
     np.testing.assert_allclose(angles, np.arange(360) + 0.5)
 
 
-def test_radial_scan_conversion_mixes_the_last_line_with_the_first() -> None:
+def test_radial_scan_conversion_mixes_the_last_line_with_the_first():
     frame = np.zeros((20, 8))
     frame[:, 0], frame[:, 7] = 1.0, 1.0
     probe = RadialProbe(near_mm=1.0, far_mm=20.0)
@@ -114,19 +114,19 @@ def test_radial_scan_conversion_mixes_the_last_line_with_the_first() -> None:
     assert (np.abs(scan_convert(frame, probe, 0.5)[60:79, 39:41].mean(axis=1) - 0.5) < 0.02).all()
 
 
-def test_steered_lines_leave_the_face_at_their_angle() -> None:
+def test_steered_lines_leave_the_face_at_their_angle():
     origins, directions = SteeredProbe(width_mm=40.0, steering_deg=30.0, near_mm=0.0, far_mm=50.0).scan_lines(4)
     np.testing.assert_allclose(origins, [[-15, 0, 0], [-5, 0, 0], [5, 0, 0], [15, 0, 0]])
     np.testing.assert_allclose(directions, np.tile([0.5, 0.0, np.sqrt(0.75)], (4, 1)))
 
 
-def test_lines_that_are_not_steered_are_those_of_a_linear_probe() -> None:
+def test_lines_that_are_not_steered_are_those_of_a_linear_probe():
     steered, linear = SteeredProbe(40.0, 0.0, 5.0, 50.0), LinearProbe(40.0, 5.0, 50.0)
     assert steered.lines == linear.lines
     assert steered.is_true_to_scale
 
 
-def test_a_message_names_a_probe_in_words() -> None:
+def test_a_message_names_a_probe_in_words():
     assert f"{SteeredProbe(40.0, -15.0, 0.0, 50.0)}" == (
         "steered probe (width 40 mm, steering -15°, near 0 mm, far 50 mm)"
     )

@@ -1,9 +1,6 @@
 """Registrations from points, poses and frames: exact where the input is, told where it cannot be."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -11,7 +8,6 @@ import pytest
 
 from ultragray import render
 from ultragray.errors import InvalidArgument, InvalidPose
-from ultragray.geometry.probe import FloatArray
 from ultragray.geometry.registration import (
     Registration,
     load_registration,
@@ -26,7 +22,7 @@ from ultragray.learn.registration import register_frames
 from ultragray.phantom.demo import demo_poses, load_demo_scene
 
 
-def motion(rng: np.random.Generator, turn_deg: float = 60.0, shift_mm: float = 100.0) -> FloatArray:
+def motion(rng, turn_deg=60.0, shift_mm=100.0):
     pose = np.eye(4)
     axis = rng.normal(size=3)
     pose[:3, :3] = cv2.Rodrigues(np.radians(turn_deg) * axis / np.linalg.norm(axis))[0]
@@ -34,12 +30,11 @@ def motion(rng: np.random.Generator, turn_deg: float = 60.0, shift_mm: float = 1
     return pose
 
 
-def through(transform: FloatArray, points: FloatArray) -> FloatArray:
-    moved: FloatArray = points @ transform[:3, :3].T + transform[:3, 3]
-    return moved
+def through(transform, points):
+    return points @ transform[:3, :3].T + transform[:3, 3]
 
 
-def test_points_without_errors_give_the_transform() -> None:
+def test_points_without_errors_give_the_transform():
     rng = np.random.default_rng(0)
     true, points = motion(rng), 50.0 * rng.normal(size=(4, 3))
     fit = register_points(points, through(true, points))
@@ -47,13 +42,13 @@ def test_points_without_errors_give_the_transform() -> None:
     assert fit.rms_mm < 1e-10
 
 
-def test_three_points_in_a_plane_are_enough() -> None:
+def test_three_points_in_a_plane_are_enough():
     rng = np.random.default_rng(1)
     true, points = motion(rng), np.array([[0.0, 0.0, 0.0], [40.0, 0.0, 0.0], [0.0, 30.0, 0.0]])
     np.testing.assert_allclose(register_points(points, through(true, points)).transform, true, atol=1e-10)
 
 
-def test_the_standard_deviations_of_points_are_those_of_many_repetitions() -> None:
+def test_the_standard_deviations_of_points_are_those_of_many_repetitions():
     rng = np.random.default_rng(2)
     points, true = 40.0 * rng.normal(size=(8, 3)), motion(rng)
     targets = through(true, points)
@@ -84,12 +79,12 @@ SPREAD = [[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [0.0, 10.0, 0.0], [0.0, 0.0, 10.0]]
         ("abc", SPREAD, r"points must be numbers \[N, 3\]"),
     ],
 )
-def test_points_that_tell_no_transform_are_refused(points: object, targets: object, told: str) -> None:
+def test_points_that_tell_no_transform_are_refused(points, targets, told):
     with pytest.raises(InvalidArgument, match=told):
         register_points(points, targets)
 
 
-def test_points_nearly_in_a_plane_are_no_mirror_image() -> None:
+def test_points_nearly_in_a_plane_are_no_mirror_image():
     """Noise out of the plane may mirror it a little: that is no reason to refuse."""
     rng = np.random.default_rng(3)
     points = np.concatenate([40.0 * rng.normal(size=(6, 2)), 0.3 * rng.normal(size=(6, 1))], axis=1)
@@ -98,7 +93,7 @@ def test_points_nearly_in_a_plane_are_no_mirror_image() -> None:
         assert np.degrees(np.linalg.norm(cv2.Rodrigues(register_points(points, targets).transform[:3, :3])[0])) < 5.0
 
 
-def test_one_pose_gives_the_link_and_tells_no_deviations() -> None:
+def test_one_pose_gives_the_link_and_tells_no_deviations():
     rng = np.random.default_rng(4)
     base_to_scene, mounting, flange = motion(rng), motion(rng), motion(rng)
     fit = register_poses(flange, base_to_scene @ flange @ mounting, mounting)
@@ -106,7 +101,7 @@ def test_one_pose_gives_the_link_and_tells_no_deviations() -> None:
     assert fit.position_std_mm is None
 
 
-def test_the_deviations_of_poses_are_those_of_many_repetitions() -> None:
+def test_the_deviations_of_poses_are_those_of_many_repetitions():
     rng = np.random.default_rng(5)
     base_to_scene = motion(rng)
     flanges = np.stack([motion(rng) for _ in range(8)])
@@ -119,7 +114,7 @@ def test_the_deviations_of_poses_are_those_of_many_repetitions() -> None:
     np.testing.assert_allclose(np.degrees(np.std(turns, axis=0)), told_deg, rtol=0.4)
 
 
-def test_mounting_and_base_are_found_together() -> None:
+def test_mounting_and_base_are_found_together():
     rng = np.random.default_rng(6)
     base_to_scene, mounting = motion(rng), motion(rng)
     flanges = np.stack([motion(rng) for _ in range(5)])
@@ -134,7 +129,7 @@ def test_mounting_and_base_are_found_together() -> None:
     assert turn_deg[0] < 0.5
 
 
-def test_a_mounting_that_turns_about_one_axis_cannot_tell_is_refused() -> None:
+def test_a_mounting_that_turns_about_one_axis_cannot_tell_is_refused():
     rng = np.random.default_rng(7)
     flanges = np.tile(np.eye(4), (4, 1, 1))
     for index, turn in enumerate((0.0, 0.3, 0.7, 1.1)):
@@ -148,7 +143,7 @@ def test_a_mounting_that_turns_about_one_axis_cannot_tell_is_refused() -> None:
         register_poses(flanges, flanges[:2])
 
 
-def test_frames_register_a_robot_and_one_foreign_frame_does_no_harm() -> None:
+def test_frames_register_a_robot_and_one_foreign_frame_does_no_harm():
     scene, rng = load_demo_scene(), np.random.default_rng(8)
     true, mounting = motion(rng, 90.0, 200.0), motion(rng, 180.0, 50.0)
     poses = demo_poses(7)[1:6]
@@ -164,7 +159,7 @@ def test_frames_register_a_robot_and_one_foreign_frame_does_no_harm() -> None:
     assert turns_deg.max() < 0.3
 
 
-def test_frames_that_show_nothing_are_told() -> None:
+def test_frames_that_show_nothing_are_told():
     scene, noise = load_demo_scene(), np.random.default_rng(0)
     images = [noise.random((64, 64)) for _ in range(3)]
     with pytest.raises(InvalidArgument, match="of 3 frames were found"):
@@ -173,7 +168,7 @@ def test_frames_that_show_nothing_are_told() -> None:
         register_frames(scene, images[:2], demo_poses(2), np.eye(4))
 
 
-def test_a_registration_leads_poses_into_the_scene_and_survives_its_file(tmp_path: Path) -> None:
+def test_a_registration_leads_poses_into_the_scene_and_survives_its_file(tmp_path):
     rng = np.random.default_rng(9)
     base_to_scene, mounting = motion(rng), motion(rng)
     registration = Registration(
@@ -200,13 +195,13 @@ def test_a_registration_leads_poses_into_the_scene_and_survives_its_file(tmp_pat
         (json.dumps({"format_version": 1, "base_to_scene": [[1, 2], [3, 4]]}), "a list of 4 values"),
     ],
 )
-def test_a_file_that_is_no_registration_is_refused(document: str, told: str, tmp_path: Path) -> None:
+def test_a_file_that_is_no_registration_is_refused(document, told, tmp_path):
     path = tmp_path / "robot.json"
     path.write_text(document)
     with pytest.raises(InvalidArgument, match=told):
         load_registration(path)
 
 
-def test_a_mirrored_link_is_refused() -> None:
+def test_a_mirrored_link_is_refused():
     with pytest.raises(InvalidPose, match="mirrored"):
         Registration(base_to_scene=rows(np.diag([1.0, 1.0, -1.0, 1.0])))

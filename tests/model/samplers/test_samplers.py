@@ -1,9 +1,6 @@
-from __future__ import annotations
-
 import json
 import subprocess
 import sys
-from typing import Any
 
 import numpy as np
 import pytest
@@ -29,7 +26,7 @@ from ultragray.scene.confidence import Extrapolation
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 
 
-def turned(axis: int, angles_deg: Any) -> np.ndarray:  # [C] -> [C, 4, 4]
+def turned(axis, angles_deg):  # [C] -> [C, 4, 4]
     angles = np.radians(np.atleast_1d(angles_deg))
     poses = np.tile(np.eye(4), (len(angles), 1, 1))
     i, j = (axis + 1) % 3, (axis + 2) % 3
@@ -38,7 +35,7 @@ def turned(axis: int, angles_deg: Any) -> np.ndarray:  # [C] -> [C, 4, 4]
     return poses
 
 
-def swept(count: int = 9, length_mm: float = 16.0) -> np.ndarray:
+def swept(count=9, length_mm=16.0):
     """A curved sweep that sways, [C, 4, 4]."""
     u = np.linspace(0.0, 1.0, count)
     poses = turned(0, 20.0 * u) @ turned(1, 5.0 * np.sin(6.0 * u))
@@ -57,7 +54,7 @@ def swept(count: int = 9, length_mm: float = 16.0) -> np.ndarray:
         CoveredSampler(7, seed=3),
     ],
 )
-def test_there_and_back_and_again(sampler: Any) -> None:
+def test_there_and_back_and_again(sampler):
     document = json.loads(json.dumps(to_dict(sampler, with_none=False)))
     assert from_dict(Sampler, document) == sampler
     poses = sampler.poses(swept(), PROBE)
@@ -65,14 +62,14 @@ def test_there_and_back_and_again(sampler: Any) -> None:
     np.testing.assert_array_equal(from_dict(Sampler, document).poses(swept(), PROBE), poses)
 
 
-def test_around_has_the_spread_asked_for() -> None:
+def test_around_has_the_spread_asked_for():
     poses = AroundSampler(4000, translation_mm=2.0, rotation_deg=5.0, seed=1).poses(np.eye(4), PROBE)
     assert poses[:, :3, 3].std(axis=0) == pytest.approx([2.0] * 3, rel=0.05)
     angles = rotation_angles_deg(poses, np.eye(4)[None])[:, 0]
     assert np.sqrt((angles**2).mean()) == pytest.approx(5.0, rel=0.05)
 
 
-def test_around_lies_about_every_base_pose_and_follows_the_seed() -> None:
+def test_around_lies_about_every_base_pose_and_follows_the_seed():
     base = np.tile(np.eye(4), (2, 1, 1))
     base[1, 0, 3] = 1000.0
     poses = AroundSampler(50, seed=3).poses(base, PROBE)
@@ -80,7 +77,7 @@ def test_around_lies_about_every_base_pose_and_follows_the_seed() -> None:
     assert not np.array_equal(poses, AroundSampler(50, seed=4).poses(base, PROBE))
 
 
-def test_spline_goes_through_its_base_poses_and_does_not_break() -> None:
+def test_spline_goes_through_its_base_poses_and_does_not_break():
     base = swept(7)
     fine = SplineSampler(count=6001).poses(base, PROBE)
     at = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(base[:, :3, 3], axis=0), axis=1))])
@@ -95,7 +92,7 @@ def test_spline_goes_through_its_base_poses_and_does_not_break() -> None:
     assert np.abs(second[[0, -1]]).max() < 0.01 * np.abs(second).max()
 
 
-def test_spline_turns_at_even_speed_the_short_way() -> None:
+def test_spline_turns_at_even_speed_the_short_way():
     base = turned(2, [10.0, 350.0])
     base[1, 0, 3] = 8.0
     poses = SplineSampler(spacing_mm=2.0).poses(base, PROBE)
@@ -108,7 +105,7 @@ def test_spline_turns_at_even_speed_the_short_way() -> None:
         np.testing.assert_allclose(end, ends[1, :3, :3], atol=1e-9)
 
 
-def test_spline_passes_over_repetitions_but_not_over_turns_on_the_spot() -> None:
+def test_spline_passes_over_repetitions_but_not_over_turns_on_the_spot():
     base = swept(4)
     twice = base[[0, 0, 1, 2, 2, 3]]
     sampler = SplineSampler(count=5)
@@ -121,7 +118,7 @@ def test_spline_passes_over_repetitions_but_not_over_turns_on_the_spot() -> None
         SplineSampler(spacing_mm=1e-9).poses(base, PROBE)
 
 
-def test_fan_tilts_whole_sweeps_about_the_face() -> None:
+def test_fan_tilts_whole_sweeps_about_the_face():
     base = swept(3)
     poses = FanSampler(tilt_deg=5.0, step_deg=2.5).poses(base, PROBE)
     assert len(poses) == 15
@@ -139,7 +136,7 @@ def test_fan_tilts_whole_sweeps_about_the_face() -> None:
     assert np.abs(poses[0, :3, 3] - base[0, :3, 3]).max() > 1.0
 
 
-def test_fan_takes_no_step_beyond_its_tilt() -> None:
+def test_fan_takes_no_step_beyond_its_tilt():
     poses = FanSampler(tilt_deg=5.0, step_deg=2.0).poses(np.eye(4), PROBE)
     np.testing.assert_allclose(np.degrees(np.arctan2(poses[:, 2, 1], poses[:, 2, 2])), [-4, -2, 0, 2, 4])
     with pytest.raises(InvalidArgument, match="step_deg") as caught:
@@ -147,7 +144,7 @@ def test_fan_takes_no_step_beyond_its_tilt() -> None:
     assert caught.value.field == "step_deg"
 
 
-def test_covered_stays_between_neighbours_and_out_of_gaps() -> None:
+def test_covered_stays_between_neighbours_and_out_of_gaps():
     one = np.tile(np.eye(4), (5, 1, 1))
     one[:, 1, 3] = np.arange(5)
     other = one.copy()
@@ -161,7 +158,7 @@ def test_covered_stays_between_neighbours_and_out_of_gaps() -> None:
     np.testing.assert_allclose(share, [0.203, 0.25, 0.25, 0.203], atol=0.02)  # the ends lose 3/64 to their outside
 
 
-def test_more_poses_than_can_be_made_at_once_are_refused_in_words() -> None:
+def test_more_poses_than_can_be_made_at_once_are_refused_in_words():
     with pytest.raises(InvalidArgument, match=r"100,001 is more than the 100,000 poses .* in shards") as caught:
         AroundSampler(100_001).poses(np.eye(4), PROBE)
     assert caught.value.field == "count"
@@ -169,8 +166,8 @@ def test_more_poses_than_can_be_made_at_once_are_refused_in_words() -> None:
 
 @pytest.mark.parametrize("sampler", [AroundSampler(BLOCK_POSES * 2 + 7, seed=3), CoveredSampler(BLOCK_POSES + 7)])
 @pytest.mark.parametrize("limit", [None, 0.5])
-def test_any_part_of_drawn_poses_is_made_alone(sampler: Any, limit: float | None) -> None:
-    def assess(poses: Any) -> list[Extrapolation]:
+def test_any_part_of_drawn_poses_is_made_alone(sampler, limit):
+    def assess(poses):
         return [Extrapolation(None, None, float(pose[0, 3] > 0.0), None) for pose in poses]
 
     whole, found = assessed_poses(sampler, swept(), PROBE, assess, limit)
@@ -181,8 +178,8 @@ def test_any_part_of_drawn_poses_is_made_alone(sampler: Any, limit: float | None
         assert list(told) == list(found[first:last])
 
 
-def test_any_part_of_other_poses_has_the_numbers_of_the_whole() -> None:
-    def assess(poses: Any) -> list[Extrapolation]:
+def test_any_part_of_other_poses_has_the_numbers_of_the_whole():
+    def assess(poses):
         return [Extrapolation(1.0, 1.0, 0.5, None) for _ in poses]
 
     sampler = SplineSampler(count=30)
@@ -194,7 +191,7 @@ def test_any_part_of_other_poses_has_the_numbers_of_the_whole() -> None:
         assessed_part(None, swept(), PROBE, assess, 0.9, 3, 5)
 
 
-def test_covered_turns_no_further_than_its_neighbours() -> None:
+def test_covered_turns_no_further_than_its_neighbours():
     base = turned(0, [0.0, 2.0, 4.0])
     poses = CoveredSampler(500, seed=1).poses(base, PROBE)
     np.testing.assert_array_equal(poses[:, :3, 3], 0.0)
@@ -228,27 +225,27 @@ def test_covered_turns_no_further_than_its_neighbours() -> None:
         ({"kind": "covered", "count": 1, "seed": -1}, "seed", "integer"),
     ],
 )
-def test_mistakes_name_the_field(document: Any, field: str | None, told: str) -> None:
+def test_mistakes_name_the_field(document, field, told):
     with pytest.raises(InvalidArgument, match=told) as caught:
         from_dict(Sampler, document)
     assert caught.value.field == field
 
 
 @pytest.mark.parametrize("kind", Sampler.members)
-def test_no_base_poses(kind: str) -> None:
+def test_no_base_poses(kind):
     numbers = {"around": {"count": 1}, "spline": {"count": 1}, "covered": {"count": 1}}
     numbers["fan"] = {"tilt_deg": 1, "step_deg": 1}
     with pytest.raises(InvalidArgument, match="needs base poses"):
         from_dict(Sampler, {"kind": kind, **numbers.get(kind, {})}).poses(np.zeros((0, 4, 4)), PROBE)
 
 
-def test_needs_no_torch() -> None:
+def test_needs_no_torch():
     program = f"import sys; sys.path[:] = {sys.path!r}; import ultragray.samplers; print('torch' in sys.modules)"
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "False"
 
 
-def test_turns_come_back_from_their_rotations() -> None:
+def test_turns_come_back_from_their_rotations():
     turns = np.random.default_rng(0).normal(0.0, 0.8, (50, 3))
     turns[0] = 0.0
     np.testing.assert_allclose(turns_of(rotations_of(turns)), turns, atol=1e-12)

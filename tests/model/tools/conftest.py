@@ -1,17 +1,12 @@
 """Frames with nothing in them but tools, and tools that lie where an image says."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
-from ultragray.geometry.probe import FloatArray
+from ultragray import ConvexProbe, LinearProbe, PhasedProbe, RadialProbe, SteeredProbe
 
 LINEAR = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
-PROBES: tuple[Probe, ...] = (
+PROBES = (
     LINEAR,
     SteeredProbe(width_mm=40.0, steering_deg=20.0, near_mm=0.0, far_mm=50.0),
     ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=80.0),
@@ -21,14 +16,14 @@ PROBES: tuple[Probe, ...] = (
 
 
 @pytest.fixture(scope="session")
-def empty_scene(random_scene: Callable[..., GaussianScene]) -> GaussianScene:
+def empty_scene(random_scene):
     """A scene without anything in sight: echo 0, transmittance 1."""
     return random_scene(1, centre_cm=(0.0, 0.0, -500.0))
 
 
 @pytest.fixture(scope="session")
-def point_at() -> Callable[[Probe, FloatArray, float, float], FloatArray]:
-    def find(probe: Probe, pose: FloatArray, row: float, column: float) -> FloatArray:  # [3] mm in the scene frame
+def point_at():
+    def find(probe, pose, row, column):  # [3] mm in the scene frame
         """The point of the image plane at a row and a column, from 0 to 1."""
         return pose[:3, :3] @ probe.points_mm(np.array(row), np.array(column)) + pose[:3, 3]
 

@@ -1,9 +1,6 @@
 """Tools in files and in settings: what is read is what was written, and what is none is named."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import pytest
 
@@ -19,7 +16,7 @@ TOOLS = (
 )
 
 
-def test_a_file_gives_back_the_tools_that_were_written(tmp_path: Path) -> None:
+def test_a_file_gives_back_the_tools_that_were_written(tmp_path):
     path = tmp_path / "tools.json"
     path.write_text(json.dumps(to_dict(TOOLS)))
     assert load_tools(path) == TOOLS
@@ -39,7 +36,7 @@ def test_a_file_gives_back_the_tools_that_were_written(tmp_path: Path) -> None:
         ('[{"kind": "box", "centre_mm": [0, 0, NaN], "size_mm": [1, 1, 1]}]', r"tools\[0\].centre_mm\[2\] must be a"),
     ],
 )
-def test_what_is_no_file_of_tools_is_refused(tmp_path: Path, text: str, words: str) -> None:
+def test_what_is_no_file_of_tools_is_refused(tmp_path, text, words):
     path = tmp_path / "tools.json"
     path.write_text(text)
     with pytest.raises(InvalidArgument, match=words) as told:
@@ -49,18 +46,18 @@ def test_what_is_no_file_of_tools_is_refused(tmp_path: Path, text: str, words: s
         load_tools(tmp_path / "other.json")
 
 
-def test_settings_take_tools_as_json_holds_them() -> None:
+def test_settings_take_tools_as_json_holds_them():
     settings = FrameSettings(tools=TOOLS, ghost=0.25)
     assert from_dict(FrameSettings, to_dict(settings)) == settings
     assert from_dict(FrameSettings, {"tools": None}) == FrameSettings()
 
 
-def test_settings_refuse_what_is_no_tool_and_too_many() -> None:
+def test_settings_refuse_what_is_no_tool_and_too_many():
     with pytest.raises(InvalidArgument, match=f"tools must be a list of at most {MAX_TOOLS} values, got 9"):
         FrameSettings(tools=TOOLS * 3)
     for wrong in (None, "needle", {"kind": "needle"}):
         with pytest.raises(InvalidArgument, match=r"tools\[1\] must be a Tool"):
-            FrameSettings(tools=(TOOLS[0], wrong))  # type: ignore[arg-type]
+            FrameSettings(tools=(TOOLS[0], wrong))
     with pytest.raises(InvalidArgument, match=r"tools\[0\].opacity must be a finite number from 0 to 0.999"):
         from_dict(FrameSettings, {"tools": [to_dict(TOOLS[0]) | {"opacity": 1.0}]})
     with pytest.raises(InvalidArgument, match="ghost must be a finite number from 0 to 1"):

@@ -1,17 +1,13 @@
 """Needles in frames: where the tip is, how bright the shaft, how dark its shadow, and the echoes behind it."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from itertools import pairwise
 
 import numpy as np
 import pytest
 import torch
 
-from ultragray import ElevationBeam, Frames, GaussianScene, LinearProbe, Probe, RadialProbe, render
+from ultragray import ElevationBeam, LinearProbe, RadialProbe, render
 from ultragray.errors import InvalidArgument
-from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.tools import Needle, ToolFrame
 
 from .conftest import LINEAR, PROBES
@@ -20,28 +16,24 @@ SIDE = 128
 POSES_PER_PROBE = 40  # times five probes: 200
 OUTPUTS = ("bmode", "echo", "transmittance", "labels")
 
-PointAt = Callable[[Probe, FloatArray, float, float], FloatArray]
+
+def shown(scene, *needles, probe=LINEAR, side=SIDE, **more):
+    return render(scene, probe, np.eye(4), height=side, width=side, outputs=OUTPUTS, tools=needles, **more)
 
 
-def shown(scene: GaussianScene, *needles: Needle, probe: Probe = LINEAR, side: int = SIDE, **more: object) -> Frames:
-    return render(scene, probe, np.eye(4), height=side, width=side, outputs=OUTPUTS, tools=needles, **more)  # type: ignore[arg-type]
-
-
-def tilted(angle_deg: float, depth_mm: float = 20.0, **material: float) -> Needle:
+def tilted(angle_deg, depth_mm=20.0, **material):
     """A needle through the middle of the image, 30 mm long, at an angle to its rows."""
     angle = np.radians(angle_deg)
     x, z = 15.0 * np.cos(angle), 15.0 * np.sin(angle)
-    return Needle(tip_mm=(x, 0.0, depth_mm + z), hub_mm=(-x, 0.0, depth_mm - z), **material)  # type: ignore[arg-type]
+    return Needle(tip_mm=(x, 0.0, depth_mm + z), hub_mm=(-x, 0.0, depth_mm - z), **material)
 
 
-def middle(plane: torch.Tensor) -> torch.Tensor:  # [1, H, W] -> [H]
+def middle(plane):  # [1, H, W] -> [H]
     return plane[0, :, plane.shape[2] // 2]
 
 
 @pytest.mark.parametrize("probe", PROBES, ids=lambda probe: probe.kind)
-def test_the_tip_is_within_one_pixel_of_the_projected_one_over_random_poses(
-    empty_scene: GaussianScene, random_poses: Callable[..., FloatArray], point_at: PointAt, probe: Probe
-) -> None:
+def test_the_tip_is_within_one_pixel_of_the_projected_one_over_random_poses(empty_scene, random_poses, point_at, probe):
     random = np.random.default_rng(5)
     for pose in random_poses(POSES_PER_PROBE, seed=3, tilt_deg=180.0, shift_mm=200.0):
         row, column = random.uniform(0.25, 0.85, 2)
@@ -64,7 +56,7 @@ def test_the_tip_is_within_one_pixel_of_the_projected_one_over_random_poses(
         assert beyond_mm.max() <= pixel_mm
 
 
-def test_a_needle_beside_the_slice_is_not_seen_and_a_thick_slice_shows_it(empty_scene: GaussianScene) -> None:
+def test_a_needle_beside_the_slice_is_not_seen_and_a_thick_slice_shows_it(empty_scene):
     beside = Needle(tip_mm=(10.0, 2.0, 20.0), hub_mm=(-10.0, 2.0, 20.0))
     assert shown(empty_scene, beside)["bmode"].max() == 0.0
     thick = shown(empty_scene, beside, beam=ElevationBeam(4.0))
@@ -75,7 +67,7 @@ def test_a_needle_beside_the_slice_is_not_seen_and_a_thick_slice_shows_it(empty_
     assert sharp["bmode"].max() < 0.1
 
 
-def test_a_needle_through_the_plane_is_a_dot_with_a_shadow(empty_scene: GaussianScene) -> None:
+def test_a_needle_through_the_plane_is_a_dot_with_a_shadow(empty_scene):
     through = Needle(tip_mm=(4.0, 10.0, 20.0), hub_mm=(4.0, -10.0, 20.0), diameter_mm=1.0)
     frames = shown(empty_scene, through, side=200)
     rows, columns = torch.nonzero(frames["labels"][0] == through.label, as_tuple=True)
@@ -85,7 +77,7 @@ def test_a_needle_through_the_plane_is_a_dot_with_a_shadow(empty_scene: Gaussian
     assert frames["transmittance"][0, -1].min() == pytest.approx(0.4, abs=1e-5)
 
 
-def test_brightness_falls_off_away_from_perpendicular(empty_scene: GaussianScene) -> None:
+def test_brightness_falls_off_away_from_perpendicular(empty_scene):
     found = [float(shown(empty_scene, tilted(angle))["echo"].max()) for angle in (0.0, 10.0, 20.0, 40.0, 60.0)]
     assert found[0] == pytest.approx(1.0, abs=0.02)
     assert all(steeper < flatter - 0.01 for flatter, steeper in pairwise(found))
@@ -94,7 +86,7 @@ def test_brightness_falls_off_away_from_perpendicular(empty_scene: GaussianScene
     assert dim["echo"].max() == pytest.approx(0.5, abs=0.02)
 
 
-def test_the_shadow_follows_the_opacity_and_the_path_through_the_shaft(empty_scene: GaussianScene) -> None:
+def test_the_shadow_follows_the_opacity_and_the_path_through_the_shaft(empty_scene):
     for opacity in (0.3, 0.6, 0.9):
         for angle in (0.0, 30.0, 60.0):
             passed = middle(shown(empty_scene, tilted(angle, opacity=opacity))["transmittance"])
@@ -104,7 +96,7 @@ def test_the_shadow_follows_the_opacity_and_the_path_through_the_shaft(empty_sce
     assert (clear["transmittance"] == 1.0).all()
 
 
-def test_the_shadow_begins_at_the_shaft_and_lies_below_it_alone(empty_scene: GaussianScene) -> None:
+def test_the_shadow_begins_at_the_shaft_and_lies_below_it_alone(empty_scene):
     passed = shown(empty_scene, tilted(0.0, reverberation=0.0))["transmittance"][0]
     depths, columns = LINEAR.depths_mm(SIDE), (np.arange(SIDE) + 0.5) / SIDE * 40.0 - 20.0
     assert (passed[depths < 19.9] == 1.0).all()
@@ -112,7 +104,7 @@ def test_the_shadow_begins_at_the_shaft_and_lies_below_it_alone(empty_scene: Gau
     assert (passed[:, np.abs(columns) > 15.2] == 1.0).all()
 
 
-def test_the_echoes_of_the_comet_tail_are_a_diameter_apart_and_each_weaker(empty_scene: GaussianScene) -> None:
+def test_the_echoes_of_the_comet_tail_are_a_diameter_apart_and_each_weaker(empty_scene):
     needle = tilted(0.0, depth_mm=12.0, diameter_mm=3.0, reverberation=0.5)
     bmode = middle(shown(empty_scene, needle, side=500)["bmode"]).numpy()
     peaks = [row for row in range(1, 499) if bmode[row - 1] < bmode[row] >= bmode[row + 1] and bmode[row] > 0.02]
@@ -124,7 +116,7 @@ def test_the_echoes_of_the_comet_tail_are_a_diameter_apart_and_each_weaker(empty
     assert without[LINEAR.depths_mm(500) > 21.0].max() < 1e-6
 
 
-def test_labels_are_those_of_the_needles_and_lie_on_their_shafts(empty_scene: GaussianScene) -> None:
+def test_labels_are_those_of_the_needles_and_lie_on_their_shafts(empty_scene):
     first = Needle(tip_mm=(10.0, 0.0, 30.0), hub_mm=(-15.0, 0.0, 8.0), label=7)
     second = Needle(tip_mm=(-10.0, 0.0, 40.0), hub_mm=(-10.0, 0.0, 20.0))
     labels = shown(empty_scene, first, second)["labels"][0].numpy()
@@ -142,7 +134,7 @@ def test_labels_are_those_of_the_needles_and_lie_on_their_shafts(empty_scene: Ga
 
 
 @pytest.mark.parametrize("angle_deg", [0.0, 30.0, 60.0])
-def test_labels_are_as_thick_as_the_shaft_and_end_where_it_ends(empty_scene: GaussianScene, angle_deg: float) -> None:
+def test_labels_are_as_thick_as_the_shaft_and_end_where_it_ends(empty_scene, angle_deg):
     needle = tilted(angle_deg, depth_mm=25.0, diameter_mm=3.0)
     labels = shown(empty_scene, needle, side=200)["labels"][0].numpy() == needle.label
     rows, columns = np.nonzero(labels)
@@ -158,9 +150,7 @@ def test_labels_are_as_thick_as_the_shaft_and_end_where_it_ends(empty_scene: Gau
     assert len(rows) * 0.2 * 0.25 == pytest.approx(30.0 * 3.0, rel=0.15)
 
 
-def test_a_needle_of_the_probe_frame_moves_with_the_probe(
-    empty_scene: GaussianScene, random_poses: Callable[..., FloatArray]
-) -> None:
+def test_a_needle_of_the_probe_frame_moves_with_the_probe(empty_scene, random_poses):
     held = Needle(tip_mm=(8.0, 0.0, 30.0), hub_mm=(-15.0, 0.0, 5.0), frame=ToolFrame.PROBE)
     poses = random_poses(3, tilt_deg=90.0)
     frames = render(empty_scene, LINEAR, poses, height=SIDE, width=SIDE, outputs=OUTPUTS, tools=(held,))
@@ -170,7 +160,7 @@ def test_a_needle_of_the_probe_frame_moves_with_the_probe(
     assert frames["bmode"].max() > 0.2
 
 
-def test_a_needle_around_a_catheter_is_seen_on_both_sides_of_its_first_line(empty_scene: GaussianScene) -> None:
+def test_a_needle_around_a_catheter_is_seen_on_both_sides_of_its_first_line(empty_scene):
     probe = RadialProbe(near_mm=2.0, far_mm=30.0)
     across = Needle(tip_mm=(-8.0, 0.0, 15.0), hub_mm=(8.0, 0.0, 15.0))
     labels = shown(empty_scene, across, probe=probe)["labels"][0].numpy() == across.label
@@ -182,16 +172,16 @@ def test_a_needle_around_a_catheter_is_seen_on_both_sides_of_its_first_line(empt
     assert np.abs(probe.depths_mm(SIDE)[rows] - 15.0).max() < 0.5
 
 
-def test_a_needle_without_direction_is_refused() -> None:
+def test_a_needle_without_direction_is_refused():
     with pytest.raises(InvalidArgument, match="hub_mm must differ from tip_mm"):
         Needle(tip_mm=(1.0, 2.0, 3.0), hub_mm=(1.0, 2.0, 3.0))
     with pytest.raises(InvalidArgument, match=r"tip_mm must be a list of 3 values"):
-        Needle(tip_mm=(1.0, 2.0), hub_mm=(1.0, 2.0, 3.0))  # type: ignore[arg-type]
+        Needle(tip_mm=(1.0, 2.0), hub_mm=(1.0, 2.0, 3.0))
     with pytest.raises(InvalidArgument, match="diameter_mm must be a finite number"):
         Needle(tip_mm=(1.0, 2.0, 3.0), hub_mm=(0.0, 0.0, 0.0), diameter_mm=0.0)
 
 
-def test_a_needle_outside_the_image_changes_nothing(random_scene: Callable[..., GaussianScene]) -> None:
+def test_a_needle_outside_the_image_changes_nothing(random_scene):
     scene = random_scene(100)
     far = Needle(tip_mm=(100.0, 0.0, 20.0), hub_mm=(80.0, 0.0, 20.0))
     plain = render(scene, LINEAR, np.eye(4), height=SIDE, width=SIDE)
@@ -200,7 +190,7 @@ def test_a_needle_outside_the_image_changes_nothing(random_scene: Callable[..., 
         assert torch.equal(plain[name], with_it[name])
 
 
-def test_needles_above_the_face_are_not_seen(empty_scene: GaussianScene) -> None:
+def test_needles_above_the_face_are_not_seen(empty_scene):
     above = LinearProbe(width_mm=40.0, near_mm=5.0, far_mm=50.0)
     entering = Needle(tip_mm=(10.0, 0.0, 20.0), hub_mm=(-20.0, 0.0, -20.0))
     passed = shown(empty_scene, entering, probe=above)["transmittance"][0, -1].numpy()

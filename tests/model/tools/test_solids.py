@@ -1,17 +1,15 @@
 """Cylinders and boxes in frames: their near side is bright, their inside is theirs, and the beam ends in them."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
 import pytest
 import torch
 
-from ultragray import ElevationBeam, Frames, GaussianScene, LinearProbe, Probe, render
+from ultragray import ElevationBeam, LinearProbe, render
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.pose import pose_from_position_quaternion
-from ultragray.rendering.tools import Box, Cylinder, ScanView, Tool, ToolFrame
+from ultragray.rendering.tools import Box, Cylinder, ScanView, ToolFrame
 
 from .conftest import LINEAR, PROBES
 
@@ -20,22 +18,21 @@ OUTPUTS = ("bmode", "echo", "transmittance", "labels")
 DEPTHS, COLUMNS = LINEAR.depths_mm(SIDE), (np.arange(SIDE) + 0.5) / SIDE * 40.0 - 20.0
 
 
-def shown(scene: GaussianScene, *tools: Tool, probe: Probe = LINEAR, **more: object) -> Frames:
-    return render(scene, probe, np.eye(4), height=SIDE, width=SIDE, outputs=OUTPUTS, tools=tools, **more)  # type: ignore[arg-type]
+def shown(scene, *tools, probe=LINEAR, **more):
+    return render(scene, probe, np.eye(4), height=SIDE, width=SIDE, outputs=OUTPUTS, tools=tools, **more)
 
 
-def labelled(frames: Frames, tool: Tool) -> np.ndarray:  # [H, W]
-    found: np.ndarray = frames["labels"][0].numpy() == tool.label
-    return found
+def labelled(frames, tool):  # [H, W]
+    return frames["labels"][0].numpy() == tool.label
 
 
-def turn(angle_deg: float) -> tuple[float, float, float, float]:
+def turn(angle_deg):
     """About the elevation, from z towards +x."""
     half = math.radians(angle_deg) / 2.0
     return math.cos(half), 0.0, math.sin(half), 0.0
 
 
-def test_the_labels_of_a_box_fill_it(empty_scene: GaussianScene) -> None:
+def test_the_labels_of_a_box_fill_it(empty_scene):
     box = Box(centre_mm=(2.0, 0.0, 25.03), size_mm=(16.0, 10.0, 6.0))
     expected = (np.abs(COLUMNS - 2.0) < 8.0) & (np.abs(DEPTHS - 25.03) < 3.0)[:, None]
     found = labelled(shown(empty_scene, box), box)
@@ -44,7 +41,7 @@ def test_the_labels_of_a_box_fill_it(empty_scene: GaussianScene) -> None:
 
 
 @pytest.mark.parametrize("angle_deg", [10.0, 30.0, 75.0])
-def test_the_labels_of_a_turned_box_fill_it(empty_scene: GaussianScene, angle_deg: float) -> None:
+def test_the_labels_of_a_turned_box_fill_it(empty_scene, angle_deg):
     box = Box(centre_mm=(0.0, 0.0, 25.0), size_mm=(20.0, 10.0, 6.0), quaternion=turn(angle_deg))
     angle = math.radians(angle_deg)
     x, z = np.broadcast_arrays(COLUMNS, DEPTHS[:, None] - 25.0)
@@ -55,9 +52,9 @@ def test_the_labels_of_a_turned_box_fill_it(empty_scene: GaussianScene, angle_de
 
 
 @pytest.mark.parametrize("kind", [Box, Cylinder])
-def test_a_moved_tool_looks_as_its_frame_does_from_where_it_was(empty_scene: GaussianScene, kind: type[Tool]) -> None:
+def test_a_moved_tool_looks_as_its_frame_does_from_where_it_was(empty_scene, kind):
     if kind is Box:
-        tool: Tool = Box(centre_mm=(3.0, 1.0, 25.0), size_mm=(16.0, 10.0, 6.0), quaternion=turn(20.0))
+        tool = Box(centre_mm=(3.0, 1.0, 25.0), size_mm=(16.0, 10.0, 6.0), quaternion=turn(20.0))
     else:
         tool = Cylinder(tip_mm=(4.0, 0.0, 25.0), hub_mm=(-9.0, 2.0, 20.0), diameter_mm=4.0)
     pose = pose_from_position_quaternion((400.0, -30.0, 90.0), (0.5, 0.5, -0.1, math.sqrt(0.49)))
@@ -68,7 +65,7 @@ def test_a_moved_tool_looks_as_its_frame_does_from_where_it_was(empty_scene: Gau
     assert labelled(led, tool).any()
 
 
-def test_the_near_side_is_bright_and_the_inside_dark(empty_scene: GaussianScene) -> None:
+def test_the_near_side_is_bright_and_the_inside_dark(empty_scene):
     box = Box(centre_mm=(0.0, 0.0, 25.0), size_mm=(16.0, 10.0, 6.0), reverberation=0.0)
     frames = shown(empty_scene, box)
     echo = frames["echo"][0, :, SIDE // 2].numpy()
@@ -81,7 +78,7 @@ def test_the_near_side_is_bright_and_the_inside_dark(empty_scene: GaussianScene)
     assert passed[DEPTHS > 28.2] == pytest.approx(0.4, abs=1e-5)
 
 
-def test_a_tilted_side_is_darker(empty_scene: GaussianScene) -> None:
+def test_a_tilted_side_is_darker(empty_scene):
     boxes = [
         Box(centre_mm=(0.0, 0.0, 25.0), size_mm=(16.0, 10.0, 6.0), quaternion=turn(angle)) for angle in (0, 15, 40)
     ]
@@ -89,7 +86,7 @@ def test_a_tilted_side_is_darker(empty_scene: GaussianScene) -> None:
     assert found[0] > found[1] + 0.05 > found[2] + 0.1
 
 
-def test_a_cylinder_across_the_plane_is_a_disc(empty_scene: GaussianScene) -> None:
+def test_a_cylinder_across_the_plane_is_a_disc(empty_scene):
     rod = Cylinder(tip_mm=(3.0, 20.0, 25.0), hub_mm=(3.0, -20.0, 25.0), diameter_mm=8.0, reverberation=0.0)
     frames = shown(empty_scene, rod)
     expected = np.hypot(COLUMNS - 3.0, DEPTHS[:, None] - 25.0) < 4.0
@@ -104,7 +101,7 @@ def test_a_cylinder_across_the_plane_is_a_disc(empty_scene: GaussianScene) -> No
     assert passed[np.argmin(np.abs(COLUMNS - 6.5))] > 0.6  # a shorter way through it
 
 
-def test_a_cylinder_along_the_plane_ends_where_its_ends_are(empty_scene: GaussianScene) -> None:
+def test_a_cylinder_along_the_plane_ends_where_its_ends_are(empty_scene):
     rod = Cylinder(tip_mm=(10.0, 0.0, 20.0), hub_mm=(-12.0, 0.0, 20.0), diameter_mm=4.0)
     found = labelled(shown(empty_scene, rod), rod)
     touched = COLUMNS[found.any(axis=0)]
@@ -115,14 +112,14 @@ def test_a_cylinder_along_the_plane_ends_where_its_ends_are(empty_scene: Gaussia
     assert rows[-1] == pytest.approx(22.0, abs=0.3)
 
 
-def test_a_thick_slice_shows_the_edge_of_a_box_beside_the_plane(empty_scene: GaussianScene) -> None:
+def test_a_thick_slice_shows_the_edge_of_a_box_beside_the_plane(empty_scene):
     beside = Box(centre_mm=(0.0, 6.0, 25.0), size_mm=(16.0, 10.0, 6.0))  # it begins 1 mm beside
     assert shown(empty_scene, beside)["bmode"].max() == 0.0
     assert 0.1 < shown(empty_scene, beside, beam=ElevationBeam(5.0))["bmode"].max() < 0.7
 
 
 @pytest.mark.parametrize("probe", PROBES, ids=lambda probe: probe.kind)
-def test_a_disc_is_where_it_is_for_every_kind_of_probe(empty_scene: GaussianScene, probe: Probe) -> None:
+def test_a_disc_is_where_it_is_for_every_kind_of_probe(empty_scene, probe):
     middle = probe.points_mm(np.array(0.5), np.array(0.4))
     x, _, z = middle.tolist()
     rod = Cylinder(tip_mm=(x, 9.0, z), hub_mm=(x, -9.0, z), diameter_mm=6.0)
@@ -134,7 +131,7 @@ def test_a_disc_is_where_it_is_for_every_kind_of_probe(empty_scene: GaussianScen
     assert (labelled(frames, rod) != expected).sum() < 0.12 * expected.sum()
 
 
-def test_a_face_within_a_box_sees_nothing_else() -> None:
+def test_a_face_within_a_box_sees_nothing_else():
     box = Box(centre_mm=(0.0, 0.0, 0.0), size_mm=(80.0, 80.0, 80.0), frame=ToolFrame.PROBE, opacity=0.999)
     probe = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=30.0)
     crossing = box.crossing(ScanView(probe, np.eye(4)[None], 8))
@@ -142,16 +139,14 @@ def test_a_face_within_a_box_sees_nothing_else() -> None:
     assert crossing.cover.sum(axis=0) == pytest.approx(1.0)
 
 
-def test_a_long_way_through_an_opaque_box_leaves_no_beam_and_the_beam_before_it_whole(
-    empty_scene: GaussianScene,
-) -> None:
+def test_a_long_way_through_an_opaque_box_leaves_no_beam_and_the_beam_before_it_whole(empty_scene):
     plate = Box(centre_mm=(0.0, 0.0, 25.0), size_mm=(1.0, 10.0, 30.0), opacity=0.999, reverberation=0.0)
     passed = shown(empty_scene, plate)["transmittance"][0, :, SIDE // 2].numpy()
     assert (passed[DEPTHS < 9.8] == 1.0).all()
     assert passed[-1] < 1e-5
 
 
-def test_a_box_that_is_not_turned_rightly_is_refused() -> None:
+def test_a_box_that_is_not_turned_rightly_is_refused():
     with pytest.raises(InvalidArgument, match=r"quaternion must have norm 1 within 0\.001, got norm 0\.5") as told:
         Box(centre_mm=(0.0, 0.0, 0.0), size_mm=(1.0, 1.0, 1.0), quaternion=(0.5, 0.0, 0.0, 0.0))
     assert told.value.field == "quaternion"
@@ -159,7 +154,7 @@ def test_a_box_that_is_not_turned_rightly_is_refused() -> None:
         Box(centre_mm=(0.0, 0.0, 0.0), size_mm=(1.0, 0.0, 1.0))
 
 
-def test_tools_behind_each_other_share_the_beam(empty_scene: GaussianScene) -> None:
+def test_tools_behind_each_other_share_the_beam(empty_scene):
     upper = Box(centre_mm=(0.0, 0.0, 15.0), size_mm=(16.0, 10.0, 4.0), reverberation=0.0, label=1)
     lower = Box(centre_mm=(0.0, 0.0, 30.0), size_mm=(16.0, 10.0, 4.0), reverberation=0.0, label=2)
     both, other_way = shown(empty_scene, upper, lower), shown(empty_scene, lower, upper)

@@ -1,14 +1,8 @@
 """Slices as callers ask for them, as planes and as poses."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 
-from ultragray import GaussianScene
 from ultragray.errors import FrameTooCostly, InvalidArgument
 from ultragray.geometry.pose import check_poses
 from ultragray.rendering.limits import GivenUp, Limits
@@ -19,7 +13,7 @@ from ultragray.rendering.volumes import SliceSettings
 PLANE = SliceSettings(origin_mm=(3, -2, 10), right=(2, 1, 0), down=(0, 0, 4), size_mm=(12, 7.5), spacing_mm=0.5)
 
 
-def test_the_pose_of_a_slice_leads_back_to_its_pixels() -> None:
+def test_the_pose_of_a_slice_leads_back_to_its_pixels():
     pose, grid = PLANE.pose(), PLANE.grid()
     np.testing.assert_allclose(check_poses(pose)[0], pose, atol=1e-12)  # rigid
     view = PLANE.view(Encoding.FLOAT32)
@@ -46,21 +40,19 @@ def test_the_pose_of_a_slice_leads_back_to_its_pixels() -> None:
         ({"origin_mm": (0, 0, float("nan"))}, "origin_mm[2]"),
     ],
 )
-def test_planes_that_cannot_be_are_refused(changes: dict[str, Any], field: str) -> None:
+def test_planes_that_cannot_be_are_refused(changes, field):
     with pytest.raises(InvalidArgument) as caught:
         SliceSettings(**{"origin_mm": (0, 0, 0), "size_mm": (10, 10), **changes})
     assert caught.value.field == field
 
 
 @pytest.mark.parametrize("length", [5e-324, 1e-200, 1e200, 1.7e308])
-def test_a_direction_may_have_any_length(length: float) -> None:
+def test_a_direction_may_have_any_length(length):
     grid = SliceSettings(origin_mm=(0, 0, 0), size_mm=(10, 10), right=(0, length, 0), down=(length, 0, 0)).grid()
     np.testing.assert_array_equal(grid.axes, [[0, 1, 0], [1, 0, 0], [0, 0, -1]])
 
 
-def test_a_slice_is_bound_by_its_cost_and_ends_where_it_is_given_up(
-    random_scene: Callable[..., GaussianScene],
-) -> None:
+def test_a_slice_is_bound_by_its_cost_and_ends_where_it_is_given_up(random_scene):
     scene = random_scene(100)
     grid = SliceSettings(origin_mm=(-20, 0, 0), size_mm=(40, 40)).grid()
     assert sample_slice(scene, "echo", grid, Limits(10**9)).any()

@@ -1,11 +1,6 @@
 """Volumes and slices of a scene against sums over all Gaussians in float64, read back by nibabel and SimpleITK."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import nibabel
 import numpy as np
@@ -15,7 +10,6 @@ import torch
 
 from ultragray import GaussianScene, LinearProbe, render
 from ultragray.errors import InvalidArgument
-from ultragray.geometry.probe import FloatArray
 from ultragray.rendering import volume_fields as fields_module
 from ultragray.rendering.volume_fields import sample_slice, sample_volume, write_slice, write_volume
 from ultragray.rendering.volumes import MAX_VOXELS, VOLUME_FIELDS, VolumeGrid, parse_box, parse_numbers
@@ -26,20 +20,19 @@ TILTED = VolumeGrid.on_plane((0, -36, 60), (3, 0, 1), (-0.5, 1, 1.5), (25, 20), 
 
 
 @pytest.fixture
-def scene(random_scene: Callable[..., GaussianScene]) -> GaussianScene:
+def scene(random_scene):
     made = random_scene(150, sh_degree=1)
     labels = torch.from_numpy(np.random.default_rng(1).choice([0, 1, 2, 9], 150).astype(np.uint8))
     info = replace(made.info, centre_mm=CENTRE_MM, label_names={1: "bone", 2: "muscle", 9: "a\nvessel"})
     return GaussianScene.from_splats(made.splats, info=info, labels=labels)
 
 
-def expected_at(scene: GaussianScene, field: str, points_mm: FloatArray) -> np.ndarray:  # [P, 3] -> [P]
+def expected_at(scene, field, points_mm):  # [P, 3] -> [P]
     """The sums as the module's docstring writes them, one Gaussian after the other."""
     splats = {name: tensor.double().numpy() for name, tensor in scene.splats.items()}
     points = (points_mm - np.array(CENTRE_MM)) / 10.0
     sums, weighted, absorbed = (np.zeros(len(points)) for _ in range(3))
     by_label = np.zeros((256, len(points)))
-    assert scene.labels is not None
     for n in range(len(splats["means"])):
         w, x, y, z = splats["quats"][n] / np.linalg.norm(splats["quats"][n])
         turn = np.array(
@@ -61,7 +54,7 @@ def expected_at(scene: GaussianScene, field: str, points_mm: FloatArray) -> np.n
         by_label[int(scene.labels[n])] += weight
     if field == "labels":
         return np.where(by_label.max(axis=0) >= 1 / 255, by_label.argmax(axis=0), 0)
-    values: dict[str, np.ndarray] = {
+    values = {
         "coverage": 1 - np.exp(-sums),
         "echo": (1 - np.exp(-sums)) * weighted / (sums + 1e-8),
         "attenuation": absorbed,
@@ -69,14 +62,14 @@ def expected_at(scene: GaussianScene, field: str, points_mm: FloatArray) -> np.n
     return values[field]
 
 
-def points_of(grid: VolumeGrid) -> FloatArray:  # [K·J·I, 3]
+def points_of(grid):  # [K·J·I, 3]
     k, j, i = np.indices(grid.shape[::-1]).reshape(3, -1)
     return (np.stack([i, j, k, np.ones_like(i)], axis=1) @ grid.affine.T)[:, :3]
 
 
 @pytest.mark.parametrize("field", VOLUME_FIELDS)
 @pytest.mark.parametrize("grid", [GRID, TILTED], ids=["box", "tilted plane"])
-def test_values_are_the_sums_over_all_gaussians(scene: GaussianScene, field: str, grid: VolumeGrid) -> None:
+def test_values_are_the_sums_over_all_gaussians(scene, field, grid):
     got = np.concatenate(list(sample_volume(scene, field, grid)))
     expected = expected_at(scene, field, points_of(grid)).reshape(grid.shape[::-1])
     assert (expected > 0).mean() > 0.05  # the grid meets the scene
@@ -85,7 +78,7 @@ def test_values_are_the_sums_over_all_gaussians(scene: GaussianScene, field: str
 
 
 @pytest.mark.parametrize("field", VOLUME_FIELDS)
-def test_small_portions_give_the_same(scene: GaussianScene, field: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_small_portions_give_the_same(scene, field, monkeypatch):
     whole = np.concatenate(list(sample_volume(scene, field, GRID)))
     monkeypatch.setattr(fields_module, "POINTS_AT_ONCE", 300)  # two layers at once, a few Gaussians at once
     slabs = list(sample_volume(scene, field, GRID))
@@ -93,22 +86,21 @@ def test_small_portions_give_the_same(scene: GaussianScene, field: str, monkeypa
     np.testing.assert_allclose(np.concatenate(slabs), whole, atol=1e-6)
 
 
-def test_coverage_is_what_a_probe_sees_there(random_scene: Callable[..., GaussianScene]) -> None:
+def test_coverage_is_what_a_probe_sees_there(random_scene):
     scene = random_scene(40, sh_degree=0, dtype=torch.float64, extent_cm=(2.0, 0.4, 2.0))
     probe, pose = LinearProbe(30.0, 0.0, 40.0), np.eye(4)
     frame = render(scene, probe, pose[None], height=40, width=30, outputs=("coverage",), backend="reference")
     grid = VolumeGrid.on_plane((-15, 0, 0), (1, 0, 0), (0, 0, 1), (30, 40), 1.0)
-    assert frame.coverage is not None
     # a renderer also counts w below 1/255 where the Gaussian absorbs: a few tails of at most 1/255
     np.testing.assert_allclose(sample_slice(scene, "coverage", grid), frame.coverage[0].numpy(), atol=2 / 255)
 
 
 @pytest.mark.parametrize("suffix", [".nii.gz", ".nii"])
 @pytest.mark.parametrize("field", ["echo", "labels"])
-def test_nibabel_reads_the_volume_where_it_lies(scene: GaussianScene, tmp_path: Path, suffix: str, field: str) -> None:
+def test_nibabel_reads_the_volume_where_it_lies(scene, tmp_path, suffix, field):
     path = tmp_path / f"v{suffix}"
     write_volume(path, scene, field, GRID)
-    image: Any = nibabel.load(path)
+    image = nibabel.load(path)
     assert nibabel.aff2axcodes(image.affine) == ("R", "A", "S")
     assert image.header.get_xyzt_units()[0] == "mm"
     np.testing.assert_allclose(image.affine, GRID.affine, atol=1e-5)
@@ -120,9 +112,7 @@ def test_nibabel_reads_the_volume_where_it_lies(scene: GaussianScene, tmp_path: 
 
 @pytest.mark.parametrize("suffix", [".nii.gz", ".nrrd"])
 @pytest.mark.parametrize("grid", [GRID, TILTED], ids=["box", "tilted plane"])
-def test_simpleitk_finds_each_point_where_the_scene_has_it(
-    scene: GaussianScene, tmp_path: Path, suffix: str, grid: VolumeGrid
-) -> None:
+def test_simpleitk_finds_each_point_where_the_scene_has_it(scene, tmp_path, suffix, grid):
     path = tmp_path / f"v{suffix}"
     write_volume(path, scene, "echo", grid)
     image = SimpleITK.ReadImage(str(path))
@@ -140,7 +130,7 @@ def test_simpleitk_finds_each_point_where_the_scene_has_it(
     assert SimpleITK.GetArrayFromImage(image).max() == pytest.approx(value, abs=1e-3)
 
 
-def test_nrrd_names_the_labels(scene: GaussianScene, tmp_path: Path) -> None:
+def test_nrrd_names_the_labels(scene, tmp_path):
     write_volume(tmp_path / "l.nrrd", scene, "labels", GRID)
     image = SimpleITK.ReadImage(str(tmp_path / "l.nrrd"))
     assert image.GetMetaData("label 2") == "muscle"
@@ -148,13 +138,13 @@ def test_nrrd_names_the_labels(scene: GaussianScene, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("suffix", [".nii.gz", ".nrrd"])
-def test_the_same_volume_is_the_same_bytes(scene: GaussianScene, tmp_path: Path, suffix: str) -> None:
+def test_the_same_volume_is_the_same_bytes(scene, tmp_path, suffix):
     for name in ("a", "b"):
         write_volume(tmp_path / f"{name}{suffix}", scene, "echo", GRID)
     assert (tmp_path / f"a{suffix}").read_bytes() == (tmp_path / f"b{suffix}").read_bytes()
 
 
-def test_a_slice_is_a_picture_or_an_array(scene: GaussianScene, tmp_path: Path) -> None:
+def test_a_slice_is_a_picture_or_an_array(scene, tmp_path):
     import cv2
 
     expected = sample_slice(scene, "attenuation", TILTED)
@@ -167,8 +157,8 @@ def test_a_slice_is_a_picture_or_an_array(scene: GaussianScene, tmp_path: Path) 
     np.testing.assert_allclose(picture / 255.0, expected / expected.max(), atol=0.5 / 255 + 1e-6)
 
 
-def test_a_stopped_volume_leaves_nothing(scene: GaussianScene, tmp_path: Path) -> None:
-    def stop(done: int) -> None:
+def test_a_stopped_volume_leaves_nothing(scene, tmp_path):
+    def stop(done):
         raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
@@ -176,12 +166,12 @@ def test_a_stopped_volume_leaves_nothing(scene: GaussianScene, tmp_path: Path) -
     assert not list(tmp_path.iterdir())
 
 
-def test_an_empty_scene_is_an_empty_volume(scene: GaussianScene) -> None:
+def test_an_empty_scene_is_an_empty_volume(scene):
     none = GaussianScene.from_splats({name: tensor[:0] for name, tensor in scene.splats.items()})
     assert not np.concatenate(list(sample_volume(none, "echo", GRID))).any()
 
 
-def test_mistakes_are_told(scene: GaussianScene, tmp_path: Path, random_scene: Callable[..., GaussianScene]) -> None:
+def test_mistakes_are_told(scene, tmp_path, random_scene):
     with pytest.raises(InvalidArgument, match=f"the limit is {MAX_VOXELS:,}.*take about 0.15"):
         VolumeGrid.over_box((0, 0, 0), (100, 100, 100), 0.1)
     VolumeGrid.over_box((0, 0, 0), (100, 100, 100), 0.16)  # what the message says does

@@ -1,7 +1,5 @@
 """Ranks, and the table of LaTeX that shows them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -14,7 +12,7 @@ from ultragray_studies.comparison.tables import duration_text, escaped, latex_ta
 from ultragray_studies.methods.method import Description
 
 
-def scores(psnr_db: float, ms_ssim: float, gms: float, gmsd: float) -> Evaluation:
+def scores(psnr_db, ms_ssim, gms, gmsd):
     return Evaluation([FrameMetrics(psnr_db, ms_ssim, gms, gmsd)], np.arange(1), 5, [])
 
 
@@ -25,7 +23,7 @@ EVALUATIONS = {
 }
 
 
-def test_ties_share_the_better_place_and_less_of_gmsd_is_better() -> None:
+def test_ties_share_the_better_place_and_less_of_gmsd_is_better():
     ranks = rank(EVALUATIONS)
     assert ranks["a"].by_metric == {"psnr_db": 2, "ms_ssim": 1, "gms": 2, "gmsd": 2}
     assert ranks["b"].by_metric == {"psnr_db": 1, "ms_ssim": 1, "gms": 2, "gmsd": 1}
@@ -35,7 +33,7 @@ def test_ties_share_the_better_place_and_less_of_gmsd_is_better() -> None:
     assert rank({}) == {}
 
 
-def test_the_first_of_each_column_is_marked() -> None:
+def test_the_first_of_each_column_is_marked():
     marked = {row.name: [best for _, best in row.cells] for row in rank_rows(EVALUATIONS)}
     assert marked == {
         "a": [False, True, False, False, False],
@@ -47,11 +45,11 @@ def test_the_first_of_each_column_is_marked() -> None:
 @pytest.mark.parametrize(
     ("seconds", "text"), [(0.25, "0.2 s"), (172.4, "172 s"), (900.0, "15 min"), (90_000.0, "25.0 h")]
 )
-def test_durations_read_well(seconds: float, text: str) -> None:
+def test_durations_read_well(seconds, text):
     assert duration_text(seconds) == text
 
 
-def test_the_latex_table_escapes_what_latex_would_read() -> None:
+def test_the_latex_table_escapes_what_latex_would_read():
     assert escaped("50 % of a_b & c\\d ±") == r"50 \% of a\_b \& c\textbackslash{}d $\pm$"
     rows = [
         MethodResult(

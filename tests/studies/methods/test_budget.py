@@ -1,38 +1,34 @@
 """Budgets: an equal time becomes a number of steps, and the same number when it is asked again."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import pytest
 
 from ultragray.errors import InvalidArgument
 from ultragray_studies.methods.method import Budget, Pace, Paces
 
 
-def never() -> Pace:
+def never():
     raise AssertionError("it was measured again")
 
 
-def test_an_author_gets_the_published_steps() -> None:
+def test_an_author_gets_the_published_steps():
     assert Budget.author().steps("any", 200_000, never) == 200_000
 
 
-def test_an_equal_time_holds_the_start_and_the_steps() -> None:
+def test_an_equal_time_holds_the_start_and_the_steps():
     assert Budget.equal(10.0).steps("any", 200_000, lambda: Pace(start_s=1.0, step_s=0.09)) == 100
 
 
-def test_a_time_that_is_too_short_still_holds_a_step() -> None:
+def test_a_time_that_is_too_short_still_holds_a_step():
     assert Budget.equal(0.5).steps("any", 10, lambda: Pace(start_s=1.0, step_s=3.0)) == 1
 
 
 @pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan"), float("inf")])
-def test_a_time_that_is_none_is_refused(seconds: float) -> None:
+def test_a_time_that_is_none_is_refused(seconds):
     with pytest.raises(InvalidArgument, match="must be positive"):
         Budget.equal(seconds)
 
 
-def test_a_pace_is_measured_once_on_a_machine(tmp_path: Path) -> None:
+def test_a_pace_is_measured_once_on_a_machine(tmp_path):
     path = tmp_path / "cache" / "paces.json"
     here = {"processor": "one", "threads": 2}
     first = Budget.equal(10.0, Paces(path, here)).steps("any", 9, lambda: Pace(0.0, 0.1))
@@ -42,7 +38,7 @@ def test_a_pace_is_measured_once_on_a_machine(tmp_path: Path) -> None:
     assert Budget.equal(10.0, Paces(path, elsewhere)).steps("any", 9, lambda: Pace(0.0, 0.2)) == 50
 
 
-def test_a_fit_that_used_a_part_of_its_time_shows_its_pace() -> None:
+def test_a_fit_that_used_a_part_of_its_time_shows_its_pace():
     budget = Budget.equal(10.0)
     budget.steps("any", 9, lambda: Pace(1.0, 0.9, is_confirmed=False))
     assert budget.shown_pace("any", 10, 9.0) is None  # as promised
@@ -53,7 +49,7 @@ def test_a_fit_that_used_a_part_of_its_time_shows_its_pace() -> None:
 
 
 @pytest.mark.parametrize("content", ["", "[]", '{"{}": {"any": ["x", 1, true]}}', '{"{}": {"any": [1]}}', '{"{}": 3}'])
-def test_a_damaged_file_of_paces_is_measured_again(tmp_path: Path, content: str) -> None:
+def test_a_damaged_file_of_paces_is_measured_again(tmp_path, content):
     path = tmp_path / "paces.json"
     path.write_text(content)
     assert Paces(path).get("any", lambda: Pace(1.0, 2.0)) == Pace(1.0, 2.0)

@@ -1,7 +1,5 @@
 """A sweep that moves and turns, small enough to study in a second."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -16,7 +14,7 @@ LARGEST_TILT_DEG = 10.0
 
 
 @pytest.fixture
-def turning_dataset() -> Dataset:
+def turning_dataset():
     """A ball in noise under a probe that turns from −10° to +10° about its lateral axis; every fourth is held out."""
     poses = np.tile(np.eye(4), (FRAMES, 1, 1))
     angles = np.radians(np.linspace(-LARGEST_TILT_DEG, LARGEST_TILT_DEG, FRAMES))
@@ -33,5 +31,5 @@ def turning_dataset() -> Dataset:
 
 
 @pytest.fixture
-def small_config() -> TrainingConfig:
+def small_config():
     return TrainingConfig.preset("fast", steps=6, max_gaussians=60, batch_size=3)

@@ -1,15 +1,11 @@
 """The page: complete, self-contained, and safe with any name."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ultragray.datasets import Dataset
 from ultragray.learn.evaluation.methods import ComparisonSettings
 from ultragray.learn.evaluation.metrics import FrameMetrics
 from ultragray.learn.evaluation.scoring import Evaluation
@@ -18,10 +14,9 @@ from ultragray.learn.training import TrainingConfig
 from ultragray.learn.training.config import VIEWS_BETWEEN
 from ultragray.learn.training.geometry import Geometry
 from ultragray_studies import report as report_module
-from ultragray_studies.comparison.result import Comparison, MethodResult
+from ultragray_studies.comparison.result import MethodResult
 from ultragray_studies.comparison.run import SCENE, compare_methods
 from ultragray_studies.methods.gaussians import GivenScene, SceneMethod
-from ultragray_studies.methods.method import Method
 from ultragray_studies.report import (
     Failed,
     ReportContent,
@@ -36,7 +31,7 @@ from ...model.learn.report.test_page import Checked
 
 
 @pytest.fixture
-def content(turning_dataset: Dataset, small_config: TrainingConfig, tmp_path: Path) -> ReportContent:
+def content(turning_dataset, small_config, tmp_path):
     trained = train_and_evaluate(turning_dataset, small_config)
     ablated = ablation_methods(small_config, small_config.max_gaussians or 0)
     methods = {SCENE: GivenScene(trained.scene, trained.course.seconds), **baselines(0.5), **ablated}
@@ -51,13 +46,13 @@ def content(turning_dataset: Dataset, small_config: TrainingConfig, tmp_path: Pa
     )
 
 
-def compared(dataset: Dataset, methods: dict[str, Method], folder: Path) -> Comparison:
+def compared(dataset, methods, folder):
     found = compare_methods(dataset, methods, ComparisonSettings(), folder=folder)
     assert found is not None
     return found
 
 
-def with_failures(content: ReportContent, reason: str, *names: str) -> ReportContent:
+def with_failures(content, reason, *names):
     """The same where these methods failed."""
     results = tuple(
         MethodResult(one.name, one.description, one.machine, failure=reason) if one.name in names else one
@@ -66,7 +61,7 @@ def with_failures(content: ReportContent, reason: str, *names: str) -> ReportCon
     return replace(content, comparison=replace(content.comparison, results=results))
 
 
-def test_the_page_is_whole_and_needs_nothing_else(content: ReportContent) -> None:
+def test_the_page_is_whole_and_needs_nothing_else(content):
     text = render_report(content)
     page = Checked(text)
     assert page.open_tags == []
@@ -99,23 +94,23 @@ def test_the_page_is_whole_and_needs_nothing_else(content: ReportContent) -> Non
     assert f"{mean.gmsd:.3f} ±" in text
 
 
-def of_rows(content: ReportContent, *names: str) -> ReportContent:
+def of_rows(content, *names):
     results = tuple(one for one in content.comparison.results if one.name in names)
     return replace(content, comparison=replace(content.comparison, results=results))
 
 
-def without_ablations(content: ReportContent) -> ReportContent:
+def without_ablations(content):
     return replace(of_rows(content, *(one.name for one in content.compared)), ablations=())
 
 
-def test_a_scene_from_a_file_without_ablations(content: ReportContent) -> None:
+def test_a_scene_from_a_file_without_ablations(content):
     text = render_report(replace(without_ablations(content), course=None, tilt=None))
     assert Checked(text).open_tags == []
     assert re.findall(r"<h2>(.*?)</h2>", text) == ["Against the baselines", "Pictures"]
 
 
 @pytest.mark.long
-def test_a_study_that_failed_says_why_in_place_of_its_figures(content: ReportContent) -> None:
+def test_a_study_that_failed_says_why_in_place_of_its_figures(content):
     name = "half of the Gaussians"
     reason = "it needs 9 GB & more"
     text = render_report(replace(with_failures(content, reason, name), tilt=Failed("<diverged>")))
@@ -129,16 +124,14 @@ def test_a_study_that_failed_says_why_in_place_of_its_figures(content: ReportCon
     assert everything.count('class="failure"') == len(content.ablations)
 
 
-def test_a_baseline_that_failed_is_a_row(content: ReportContent) -> None:
+def test_a_baseline_that_failed_is_a_row(content):
     text = render_report(with_failures(content, "voxels too small", "linear"))
     assert Checked(text).open_tags == []
     assert '<th scope="row">linear between frames</th><td class="failure" colspan="4">voxels too small</td>' in text
 
 
-def test_the_plot_of_counts_holds_the_runs_that_differ_in_nothing_else(
-    content: ReportContent, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    plotted: list[int] = []
+def test_the_plot_of_counts_holds_the_runs_that_differ_in_nothing_else(content, monkeypatch):
+    plotted = []
     monkeypatch.setattr(report_module, "plot_counts", lambda points: plotted.extend(points) or "<svg></svg>")
     other = SceneMethod("opaque", "opaque", TrainingConfig(steps=1, max_gaussians=77, transmittance=False).to_dict())
     extra = compared(content.dataset, {"opaque": other}, content.folder)
@@ -148,7 +141,7 @@ def test_the_plot_of_counts_holds_the_runs_that_differ_in_nothing_else(
 
 
 @pytest.mark.long
-def test_what_the_data_decides_is_told_as_it_was_decided(turning_dataset: Dataset, tmp_path: Path) -> None:
+def test_what_the_data_decides_is_told_as_it_was_decided(turning_dataset, tmp_path):
     dataset = replace(turning_dataset, train=turning_dataset.train.select([3, 4]))
     trained = train_and_evaluate(dataset, TrainingConfig())
     comparison = compared(dataset, {SCENE: GivenScene(trained.scene)}, tmp_path)
@@ -159,7 +152,7 @@ def test_what_the_data_decides_is_told_as_it_was_decided(turning_dataset: Datase
     assert "= None" not in text.replace("memory_gb = None", "")
 
 
-def test_one_held_out_frame_is_shown_once(content: ReportContent, tmp_path: Path) -> None:
+def test_one_held_out_frame_is_shown_once(content, tmp_path):
     dataset = replace(content.dataset, val=content.dataset.val.select([0]))
     folder = tmp_path / "alone"
     comparison = compared(dataset, {SCENE: GivenScene(content.scene), **baselines(0.5)}, folder)
@@ -167,8 +160,8 @@ def test_one_held_out_frame_is_shown_once(content: ReportContent, tmp_path: Path
     assert text.count("<figcaption>") == 1
 
 
-def test_the_best_of_each_column_is_marked_as_numbers_not_as_words() -> None:
-    def of(psnr_db: float, gmsd: float) -> Evaluation:
+def test_the_best_of_each_column_is_marked_as_numbers_not_as_words():
+    def of(psnr_db, gmsd):
         return Evaluation([FrameMetrics(psnr_db, 0.5, 0.5, gmsd)], np.arange(1), 5, [])
 
     rows = metric_rows({"a": of(9.5, 0.2), "b": of(10.5, 0.1)})

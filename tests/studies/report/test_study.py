@@ -1,18 +1,13 @@
 """What a report measures: trainings, ablations that differ in one thing, and tilts that grow."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from ultragray.datasets import Dataset
 from ultragray.errors import DatasetInvalid, TrainingDiverged
 from ultragray.learn.evaluation.scoring import evaluate
 from ultragray.learn.training import Progress, TrainingConfig
-from ultragray.scene.gaussians import GaussianScene
 from ultragray_studies import report as study
 from ultragray_studies.report import (
     Failed,
@@ -25,8 +20,8 @@ from ultragray_studies.report import (
 )
 
 
-def test_a_training_is_followed_and_measured(turning_dataset: Dataset, small_config: TrainingConfig) -> None:
-    seen: list[Progress] = []
+def test_a_training_is_followed_and_measured(turning_dataset, small_config):
+    seen = []
     trained = train_and_evaluate(turning_dataset, small_config, report=seen.append)
     assert trained.course.losses == [progress.loss for progress in seen]
     assert len(trained.course.losses) == 6
@@ -36,12 +31,9 @@ def test_a_training_is_followed_and_measured(turning_dataset: Dataset, small_con
 
 
 def test_each_validation_is_a_point_even_where_nothing_changed(
-    turning_dataset: Dataset,
-    small_config: TrainingConfig,
-    random_scene: Callable[..., GaussianScene],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    def train(dataset: Dataset, config: TrainingConfig, *, report: Callable[[Progress], None]) -> GaussianScene:
+    turning_dataset, small_config, random_scene, monkeypatch
+):
+    def train(dataset, config, *, report):
         for step, val_step in ((1, None), (2, 2), (3, 2), (4, 4), (5, 4)):
             report(Progress(step, 5, 0.1, 7, 1.0, 1.0, None if val_step is None else 20.0, val_step))
         return random_scene(7)
@@ -50,8 +42,8 @@ def test_each_validation_is_a_point_even_where_nothing_changed(
     assert train_and_evaluate(turning_dataset, small_config).course.val_psnr_db == {2: 20.0, 4: 20.0}
 
 
-def test_a_study_that_fails_gives_its_reason() -> None:
-    def fail() -> int:
+def test_a_study_that_fails_gives_its_reason():
+    def fail():
         raise TrainingDiverged("the loss is nan")
 
     assert attempt(fail) == Failed("the loss is nan")
@@ -60,9 +52,7 @@ def test_a_study_that_fails_gives_its_reason() -> None:
         attempt(lambda: 1 // 0)
 
 
-def test_a_training_without_held_out_frames_is_refused_before_it_begins(
-    turning_dataset: Dataset, small_config: TrainingConfig
-) -> None:
+def test_a_training_without_held_out_frames_is_refused_before_it_begins(turning_dataset, small_config):
     with pytest.raises(DatasetInvalid, match="no frames to measure with"):
         train_and_evaluate(
             replace(turning_dataset, val=turning_dataset.val.select([])),
@@ -71,7 +61,7 @@ def test_a_training_without_held_out_frames_is_refused_before_it_begins(
         )
 
 
-def test_ablations_differ_in_what_they_are_named_after(small_config: TrainingConfig) -> None:
+def test_ablations_differ_in_what_they_are_named_after(small_config):
     full = small_config.to_dict()
     changed = {
         name: {key: value for key, value in config.to_dict().items() if value != full[key]}
@@ -87,7 +77,7 @@ def test_ablations_differ_in_what_they_are_named_after(small_config: TrainingCon
     }
 
 
-def test_a_share_of_the_gaussians_is_a_share_from_the_start() -> None:
+def test_a_share_of_the_gaussians_is_a_share_from_the_start():
     paper = TrainingConfig.preset("paper", initial_gaussians=300_000, max_gaussians=500_000)
     counts = {
         name: (config.initial_gaussians, config.max_gaussians)
@@ -103,7 +93,7 @@ def test_a_share_of_the_gaussians_is_a_share_from_the_start() -> None:
     assert (pruned.initial_gaussians, pruned.max_gaussians) == (200_000, 200_000)
 
 
-def test_tilts_are_signed_angles_about_the_axis_of_turning(turning_dataset: Dataset) -> None:
+def test_tilts_are_signed_angles_about_the_axis_of_turning(turning_dataset):
     tilts = frame_tilts_deg(turning_dataset.train)
     expected = np.linspace(-10, 10, 12)[turning_dataset.train.frame_numbers]
     expected -= expected.mean()
@@ -112,7 +102,7 @@ def test_tilts_are_signed_angles_about_the_axis_of_turning(turning_dataset: Data
     np.testing.assert_allclose(frame_tilts_deg(backwards), -expected[::-1], atol=0.05)
 
 
-def test_halves_of_the_tilts() -> None:
+def test_halves_of_the_tilts():
     low, high = split_by_tilt(np.array([5.0, -5.0, 4.0, -4.0, 0.0])) or ([], [])
     assert list(low) == [1, 3]
     assert list(high) == [0, 2, 4]
@@ -120,11 +110,8 @@ def test_halves_of_the_tilts() -> None:
     assert split_by_tilt(np.array([0.0, 10.0, 20.0])) is None
 
 
-def test_a_study_of_tilt_measures_what_was_not_trained_on(
-    turning_dataset: Dataset, small_config: TrainingConfig
-) -> None:
+def test_a_study_of_tilt_measures_what_was_not_trained_on(turning_dataset, small_config):
     tilt = study_tilt(turning_dataset.train, small_config)
-    assert tilt is not None
     assert tilt.train_tilts_deg[1] < tilt.val_tilts_deg[0]
     assert set(tilt.evaluations) == {"scene", "median", "nearest"}
     between_frames = 20.0 / 11.0

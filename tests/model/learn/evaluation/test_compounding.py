@@ -1,19 +1,14 @@
 """Compounding: exact where pixels meet voxels, sensible between frames, honest beyond them."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ultragray import ConvexProbe, LinearProbe, Probe, RadialProbe, SteeredProbe
+from ultragray import ConvexProbe, LinearProbe, RadialProbe, SteeredProbe
 from ultragray.datasets import Sweep
 from ultragray.datasets.source import load_dataset
 from ultragray.errors import InvalidArgument
-from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation import baselines as compounding
 from ultragray.learn.evaluation.baselines import affordable_voxel_mm, compound, evaluate_baselines
 from ultragray.learn.sweep import mean_axes, pixel_positions_mm
@@ -22,55 +17,50 @@ HEIGHT, WIDTH = 12, 10
 PROBE = LinearProbe(width_mm=WIDTH * 0.5, near_mm=0.0, far_mm=HEIGHT * 0.5)  # a pixel is a voxel of 0.5 mm
 
 
-def sweep_of(images: np.ndarray, poses: FloatArray, probe: Probe = PROBE) -> Sweep:
+def sweep_of(images, poses, probe=PROBE):
     return Sweep(images.astype(np.uint8), poses, probe, np.arange(len(images)), "made")
 
 
-def at(*elevations_mm: float) -> FloatArray:
+def at(*elevations_mm):
     poses = np.tile(np.eye(4), (len(elevations_mm), 1, 1))
     poses[:, 1, 3] = elevations_mm
     return poses
 
 
 @pytest.fixture
-def images() -> np.ndarray:  # [4, H, W]
+def images():  # [4, H, W]
     return np.random.default_rng(0).integers(0, 256, (4, HEIGHT, WIDTH))
 
 
 @pytest.mark.parametrize(("method", "expected"), [("median", np.median), ("mean", np.mean), ("maximum", np.max)])
-def test_frames_of_one_plane_are_folded_pixel_by_pixel(
-    images: np.ndarray,
-    random_poses: Callable[..., FloatArray],
-    method: str,
-    expected: Callable[..., np.ndarray],
-) -> None:
+def test_frames_of_one_plane_are_folded_pixel_by_pixel(images, random_poses, method, expected):
     pose = random_poses(1, seed=5)
     volume = compound(sweep_of(images, np.repeat(pose, 4, axis=0)), method, 0.5)
     plane = volume.reslice(PROBE, pose, HEIGHT, WIDTH)
     np.testing.assert_allclose(plane[0], expected(images, axis=0) / 255.0, atol=2e-5)
 
 
-def test_the_median_of_an_even_number_lies_between_the_middle_two(images: np.ndarray) -> None:
+def test_the_median_of_an_even_number_lies_between_the_middle_two(images):
     images[:, 3, 3] = (10, 20, 40, 200)
     plane = compound(sweep_of(images, at(0, 0, 0, 0)), "median", 0.5).reslice(PROBE, at(0), HEIGHT, WIDTH)
     assert plane[0, 3, 3] == pytest.approx(30 / 255, abs=1e-5)
 
 
-def test_sorting_in_parts_gives_the_same_volume(images: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_sorting_in_parts_gives_the_same_volume(images, monkeypatch):
     sweep = sweep_of(images, at(0, 0.3, 0.6, 2.0))
     whole = compound(sweep, "median", 0.5)
     monkeypatch.setattr(compounding, "MAX_SAMPLES", 100)
     assert compound(sweep, "median", 0.5).values.equal(whole.values)
 
 
-def test_filling_in_slabs_gives_the_same_volume(images: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_filling_in_slabs_gives_the_same_volume(images, monkeypatch):
     sweep = sweep_of(images, at(0, 1.5, 3.0, 5.5))
     whole = compound(sweep, "mean", 0.5)
     monkeypatch.setattr(compounding, "SLAB_VOXELS", 1)
     assert compound(sweep, "mean", 0.5).values.equal(whole.values)
 
 
-def test_a_gap_between_two_frames_is_filled_with_what_lies_on_either_side() -> None:
+def test_a_gap_between_two_frames_is_filled_with_what_lies_on_either_side():
     ramp = np.linspace(20, 40, WIDTH).round()
     images = np.stack([np.tile(ramp, (HEIGHT, 1)), np.tile(ramp + 100, (HEIGHT, 1))])
     volume = compound(sweep_of(images, at(0.0, 2.0)), "median", 0.5)
@@ -79,13 +69,13 @@ def test_a_gap_between_two_frames_is_filled_with_what_lies_on_either_side() -> N
     np.testing.assert_allclose(plane[[0, 2]], images, atol=1e-2)
 
 
-def test_a_gap_wider_than_the_least_reach_is_closed_too() -> None:
+def test_a_gap_wider_than_the_least_reach_is_closed_too():
     images = np.random.default_rng(1).integers(50, 60, (3, HEIGHT, WIDTH))
     volume = compound(sweep_of(images, at(0.0, 9.0, 18.0)), "median", 0.5)
     assert (volume.reslice(PROBE, at(4.5), HEIGHT, WIDTH) > 0.19).all()
 
 
-def test_what_no_frame_comes_near_is_black(images: np.ndarray) -> None:
+def test_what_no_frame_comes_near_is_black(images):
     volume = compound(sweep_of(images, at(0, 0.5, 1.0, 1.5)), "median", 0.5)
     away = at(0.0, 0.0)
     away[:, 0, 3] = (WIDTH * 0.5 + 1.0, 50.0)
@@ -96,19 +86,19 @@ def test_what_no_frame_comes_near_is_black(images: np.ndarray) -> None:
 
 
 @pytest.mark.parametrize("count", [1, 3])
-def test_a_probe_that_was_held_still_is_not_seen_from_afar(images: np.ndarray, count: int) -> None:
+def test_a_probe_that_was_held_still_is_not_seen_from_afar(images, count):
     volume = compound(sweep_of(images[:1].repeat(count, axis=0), at(*[0.0] * count)), "median", 0.5)
     planes = volume.reslice(PROBE, at(-500.0, -1.0, 0.0, 1.0, 500.0), HEIGHT, WIDTH)
     np.testing.assert_allclose(planes[2], images[0] / 255.0, atol=2e-5)
     assert not planes[[0, 1, 3, 4]].any()
 
 
-def test_a_convex_sweep_keeps_its_geometry(random_poses: Callable[..., FloatArray]) -> None:
+def test_a_convex_sweep_keeps_its_geometry(random_poses):
     """A smooth field in space, seen by a fan that moves along elevation, comes back on a plane in between."""
     probe = ConvexProbe(opening_angle_deg=70.0, near_mm=10.0, far_mm=30.0)
     base = random_poses(1, seed=2, tilt_deg=40.0)[0]
 
-    def seen_from(elevation_mm: float) -> tuple[FloatArray, np.ndarray]:
+    def seen_from(elevation_mm):
         pose = base.copy()
         pose[:3, 3] += elevation_mm * base[:3, 1]
         x, y, z = (pixel_positions_mm(probe, 48, 40) @ pose[:3, :3].T + pose[:3, 3]).T
@@ -122,13 +112,13 @@ def test_a_convex_sweep_keeps_its_geometry(random_poses: Callable[..., FloatArra
     assert np.abs(plane[:, ::-1] - expected).mean() > 20.0
 
 
-def test_pixels_lie_on_their_scan_lines() -> None:
+def test_pixels_lie_on_their_scan_lines():
     positions = pixel_positions_mm(PROBE, HEIGHT, WIDTH).reshape(HEIGHT, WIDTH, 3)
     np.testing.assert_allclose(positions[0, 0], (-2.25, 0.0, 0.25))
     np.testing.assert_allclose(positions[-1, 3], (-0.75, 0.0, 5.75))
 
 
-def test_voxels_too_small_are_refused_with_one_that_fits(images: np.ndarray, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_voxels_too_small_are_refused_with_one_that_fits(images, monkeypatch):
     sweep = sweep_of(images, at(0, 1, 2, 3))
     monkeypatch.setattr(compounding, "MAX_VOXELS", 1000)
     fits_mm = affordable_voxel_mm(sweep, 0.1)
@@ -141,17 +131,17 @@ def test_voxels_too_small_are_refused_with_one_that_fits(images: np.ndarray, mon
 
 
 @pytest.mark.parametrize("voxel_mm", [0.0, -1.0, math.nan, math.inf])
-def test_a_voxel_is_a_positive_length(images: np.ndarray, voxel_mm: float) -> None:
+def test_a_voxel_is_a_positive_length(images, voxel_mm):
     with pytest.raises(InvalidArgument, match="voxel_mm must be a positive length"):
         compound(sweep_of(images, at(0, 1, 2, 3)), "median", voxel_mm)
 
 
-def test_methods_are_named(images: np.ndarray) -> None:
+def test_methods_are_named(images):
     with pytest.raises(InvalidArgument, match="median, mean, maximum, got 'mode'"):
         compound(sweep_of(images, at(0, 1, 2, 3)), "mode")
 
 
-def test_the_mean_of_poses_is_a_rotation(random_poses: Callable[..., FloatArray]) -> None:
+def test_the_mean_of_poses_is_a_rotation(random_poses):
     poses = random_poses(9, seed=1, tilt_deg=60.0)
     axes = mean_axes(poses)
     np.testing.assert_allclose(axes.T @ axes, np.eye(3), atol=1e-12)
@@ -159,7 +149,7 @@ def test_the_mean_of_poses_is_a_rotation(random_poses: Callable[..., FloatArray]
     np.testing.assert_allclose(mean_axes(poses[:1]), poses[0, :3, :3], atol=1e-12)
 
 
-def test_a_real_sweep_is_predicted_as_well_as_by_an_independent_prototype(data_folder: Path) -> None:
+def test_a_real_sweep_is_predicted_as_well_as_by_an_independent_prototype(data_folder):
     mean = evaluate_baselines(load_dataset(data_folder / "spine_phantom"), ("median",))["median"].mean
     assert mean.psnr_db == pytest.approx(22.30, abs=0.3)
     assert mean.ms_ssim == pytest.approx(0.821, abs=0.005)
@@ -177,11 +167,11 @@ def test_a_real_sweep_is_predicted_as_well_as_by_an_independent_prototype(data_f
     ],
     ids=lambda probe: probe.kind,
 )
-def test_a_smooth_volume_comes_back_whatever_the_probe(probe: Probe) -> None:
+def test_a_smooth_volume_comes_back_whatever_the_probe(probe):
     size = (80, 100)
     points = pixel_positions_mm(probe, *size)
 
-    def frames(poses: FloatArray) -> FloatArray:  # [C, H, W] in [0, 1]
+    def frames(poses):  # [C, H, W] in [0, 1]
         places = np.einsum("cij,pj->cpi", poses[:, :3, :3], points) + poses[:, None, :3, 3]
         return (0.5 + 0.15 * np.sin(places / (3.0, 4.0, 5.0)).sum(axis=2)).reshape(-1, *size)
 

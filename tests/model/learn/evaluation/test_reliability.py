@@ -1,15 +1,12 @@
 """Expected against actual errors: what holds is told, and so is what is too sure."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from ultragray import GaussianScene, LinearProbe, render
+from ultragray import LinearProbe, render
 from ultragray.datasets import Sweep
 from ultragray.errors import DatasetInvalid
 from ultragray.learn.evaluation.scoring import compare_deviations, measure_reliability
@@ -19,14 +16,14 @@ PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 POSES = np.tile(np.eye(4), (4, 1, 1))
 
 
-def drawn(spread: float) -> tuple[np.ndarray, np.ndarray]:
+def drawn(spread):
     """Deviations of 100,000 pixels, and normal errors that are `spread` times as large."""
     rng = np.random.default_rng(0)
     deviations = rng.choice([0.015, 0.05, 0.2], 100_000).astype(np.float32)
     return (spread * deviations * rng.normal(size=100_000)).astype(np.float32), deviations
 
 
-def test_what_holds() -> None:
+def test_what_holds():
     found = compare_deviations(*drawn(1.0))
     assert (found.within_1, found.within_2) == pytest.approx((0.683, 0.954), abs=0.01)
     assert found.actual == pytest.approx(found.expected, rel=0.02)
@@ -36,13 +33,13 @@ def test_what_holds() -> None:
     json.dumps(found.to_dict(), allow_nan=False)
 
 
-def test_what_is_too_sure() -> None:
+def test_what_is_too_sure():
     found = compare_deviations(*drawn(2.0))
     assert found.within_1 == pytest.approx(0.383, abs=0.01)
     assert found.actual == pytest.approx(2.0 * found.expected, rel=0.02)
 
 
-def test_of_a_scene(random_scene: Callable[..., GaussianScene]) -> None:
+def test_of_a_scene(random_scene):
     floor = tuple(0.4 if name == "floor" else 0.0 for name in VARIANCE_TERMS)  # a variance of 0.4 times 0.001
     confidence = ConfidenceModel(
         (3.5, 1.2, 0.8, 0.1, 0.6),
@@ -59,7 +56,6 @@ def test_of_a_scene(random_scene: Callable[..., GaussianScene]) -> None:
     images = (255.0 * np.clip(frames + noise, 0.0, 1.0)).round().astype(np.uint8)
     sweep = Sweep(images, POSES, PROBE, np.arange(4), "noisy")
     found = measure_reliability(scene, sweep)
-    assert found is not None
     assert found.expected == pytest.approx(0.02, rel=1e-3)
     assert found.actual == pytest.approx(0.02, rel=0.3)  # black pixels lose half of it
     assert measure_reliability(random_scene(20), sweep) is None

@@ -1,38 +1,32 @@
 """A scene measured on its own frames, in numbers that a script can read."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, render
+from ultragray import ConvexProbe, LinearProbe, render
 from ultragray.datasets import Sweep
 from ultragray.errors import DatasetInvalid, InvalidArgument
-from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation import scoring as evaluation
-from ultragray.learn.evaluation.metrics import FrameMetrics, frame_metrics
+from ultragray.learn.evaluation.metrics import frame_metrics
 from ultragray.learn.evaluation.scoring import evaluate, evaluate_frames, render_sweep
 
 
 @pytest.fixture(params=[LinearProbe(30.0, 0.0, 40.0), ConvexProbe(60.0, 10.0, 50.0)], ids=["linear", "convex"])
-def probe(request: pytest.FixtureRequest) -> Probe:
-    chosen: Probe = request.param
-    return chosen
+def probe(request):
+    return request.param
 
 
 @pytest.fixture
-def scene(random_scene: Callable[..., GaussianScene]) -> GaussianScene:
-    made: GaussianScene = random_scene(80)
-    return made
+def scene(random_scene):
+    return random_scene(80)
 
 
 @pytest.fixture
-def sweep(scene: GaussianScene, probe: Probe, random_poses: Callable[..., FloatArray]) -> Sweep:
+def sweep(scene, probe, random_poses):
     """What the scene itself shows, in 8 bits."""
     poses = random_poses(5)
     frames = render(scene, probe, poses, height=24, width=20, outputs=("bmode",)).bmode
@@ -40,14 +34,14 @@ def sweep(scene: GaussianScene, probe: Probe, random_poses: Callable[..., FloatA
     return Sweep((frames * 255).round().byte().numpy(), poses, probe, np.array([3, 7, 8, 20, 21]), "rendered")
 
 
-def test_a_scene_meets_its_own_frames_up_to_their_8_bits(scene: GaussianScene, sweep: Sweep) -> None:
+def test_a_scene_meets_its_own_frames_up_to_their_8_bits(scene, sweep):
     reached = evaluate(scene, sweep)
     assert min(frame.psnr_db for frame in reached.frames) > 57.0
     assert reached.mean.ms_ssim > 0.999
     assert evaluate(scene, sweep, backend="reference").mean.psnr_db > 57.0
 
 
-def test_frames_are_kept_apart_and_in_order(scene: GaussianScene, sweep: Sweep) -> None:
+def test_frames_are_kept_apart_and_in_order(scene, sweep):
     images = sweep.images.copy()
     images[3] = np.clip(images[3].astype(int) + 20, 0, 255)
     reached = evaluate(scene, replace(sweep, images=images))
@@ -56,7 +50,7 @@ def test_frames_are_kept_apart_and_in_order(scene: GaussianScene, sweep: Sweep) 
     assert reached.std.psnr_db == pytest.approx(np.std([frame.psnr_db for frame in reached.frames]))
 
 
-def test_as_json(scene: GaussianScene, sweep: Sweep) -> None:
+def test_as_json(scene, sweep):
     reached = evaluate(scene, sweep)
     document = json.loads(json.dumps(reached.to_dict(), allow_nan=False))
     assert document["mean"] == reached.mean.to_dict()
@@ -66,9 +60,7 @@ def test_as_json(scene: GaussianScene, sweep: Sweep) -> None:
     assert document["frames"] == [frame.to_dict() for frame in reached.frames]
 
 
-def test_frames_rendered_in_chunks_are_the_same(
-    scene: GaussianScene, sweep: Sweep, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_rendered_in_chunks_are_the_same(scene, sweep, monkeypatch):
     whole = {output: render_sweep(scene, sweep, output=output) for output in ("bmode", "transmittance")}
     monkeypatch.setattr(evaluation, "CHUNK_PIXELS", 2 * 24 * 20)
     for output, frames in whole.items():
@@ -76,14 +68,12 @@ def test_frames_rendered_in_chunks_are_the_same(
     assert np.abs(whole["bmode"] - whole["transmittance"]).max() > 0.1
 
 
-def test_frames_are_rendered_and_measured_a_few_at_a_time(
-    scene: GaussianScene, sweep: Sweep, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_are_rendered_and_measured_a_few_at_a_time(scene, sweep, monkeypatch):
     whole = evaluate(scene, sweep)
     predicted = render_sweep(scene, sweep)
-    at_once: list[int] = []
+    at_once = []
 
-    def counted(rendered: torch.Tensor, truth: torch.Tensor) -> list[FrameMetrics]:
+    def counted(rendered, truth):
         at_once.append(len(rendered))
         return frame_metrics(rendered, truth)
 
@@ -95,17 +85,17 @@ def test_frames_are_rendered_and_measured_a_few_at_a_time(
     assert at_once == [2, 2, 1] * 2
 
 
-def test_a_prediction_of_another_size_is_refused(sweep: Sweep) -> None:
+def test_a_prediction_of_another_size_is_refused(sweep):
     with pytest.raises(InvalidArgument, match=r"be \[5, 24, 20\] like those of rendered, got \[6, 24, 20\]"):
         evaluate_frames(np.zeros((6, 24, 20), np.float32), sweep)
 
 
-def test_any_prediction_is_measured_alike(sweep: Sweep) -> None:
+def test_any_prediction_is_measured_alike(sweep):
     predicted = np.full(sweep.images.shape, 0.3, np.float32)
     expected = frame_metrics(torch.from_numpy(predicted), torch.from_numpy(sweep.images) / 255.0)
     assert evaluate_frames(predicted, sweep).frames == expected
 
 
-def test_nothing_to_measure_with(scene: GaussianScene, sweep: Sweep) -> None:
+def test_nothing_to_measure_with(scene, sweep):
     with pytest.raises(DatasetInvalid, match="rendered: it holds no frames to measure with"):
         evaluate(scene, sweep.select([]))

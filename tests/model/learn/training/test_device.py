@@ -1,7 +1,5 @@
 """Which device a training takes, and what is said where that cannot be."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 
@@ -10,21 +8,21 @@ from ultragray.learn.training.memory import peak_memory_mb, training_device
 
 
 @pytest.fixture
-def one_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+def one_gpu(monkeypatch):
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
     monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
 
 
 @pytest.fixture
-def no_gpu(monkeypatch: pytest.MonkeyPatch) -> None:
+def no_gpu(monkeypatch):
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
 
 
 @pytest.mark.parametrize("backend", ["auto", "cuda", "reference"])
 @pytest.mark.usefixtures("one_gpu")
-def test_gpus_by_number(backend: str) -> None:
+def test_gpus_by_number(backend):
     assert training_device("cuda", backend) == torch.device("cuda", 0)
     assert training_device("cuda:0", backend) == torch.device("cuda", 0)
     with pytest.raises(BackendUnavailable, match="CUDA device 7 was asked for, but there are 1"):
@@ -32,7 +30,7 @@ def test_gpus_by_number(backend: str) -> None:
 
 
 @pytest.mark.usefixtures("one_gpu")
-def test_a_backend_that_renders_elsewhere_is_refused() -> None:
+def test_a_backend_that_renders_elsewhere_is_refused():
     with pytest.raises(
         BackendUnavailable, match="backend cuda renders on a GPU, but the device is cpu: give device cu"
     ):
@@ -42,7 +40,7 @@ def test_a_backend_that_renders_elsewhere_is_refused() -> None:
 
 
 @pytest.mark.usefixtures("no_gpu")
-def test_says_what_is_missing_without_a_gpu() -> None:
+def test_says_what_is_missing_without_a_gpu():
     for device, backend in (("cuda", "auto"), ("cuda:7", "auto"), ("cpu", "cuda"), ("cuda", "cpu")):
         with pytest.raises(BackendUnavailable, match="backend cuda needs an NVIDIA GPU and torch's CUDA build, but"):
             training_device(device, backend)
@@ -51,16 +49,16 @@ def test_says_what_is_missing_without_a_gpu() -> None:
 
 @pytest.mark.usefixtures("one_gpu")
 @pytest.mark.parametrize("name", ["", "warp", "cuda:", "cuda:x", "cuda:-1", "cuda:²", "cudaX", "cpu:1", "meta", "mps"])
-def test_other_names_are_refused(name: str) -> None:
+def test_other_names_are_refused(name):
     with pytest.raises(BackendUnavailable, match="device must be cpu, cuda or cuda:N, got"):
         training_device(name, "auto")
 
 
-def test_kernels_that_are_interpreted_train_on_the_cpu(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_kernels_that_are_interpreted_train_on_the_cpu(monkeypatch):
     pytest.importorskip("triton")
     monkeypatch.setenv("TRITON_INTERPRET", "1")
     assert training_device("cuda", "cuda") == torch.device("cpu") == training_device("cpu", "cuda")
 
 
-def test_the_cpu_counts_no_memory() -> None:
+def test_the_cpu_counts_no_memory():
     assert peak_memory_mb(torch.device("cpu")) is None

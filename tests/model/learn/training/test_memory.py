@@ -1,11 +1,8 @@
 """A training that would not fit is refused before it starts."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,13 +16,13 @@ from ultragray.learn.training import alignment as overlap
 from ultragray.learn.training.geometry import Geometry
 
 
-def test_names_what_to_lower(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_names_what_to_lower(tiny_dataset):
     config = TrainingConfig.preset("fast", max_gaussians=50_000_000, memory_gb=4.0)
     with pytest.raises(MemoryExceeded, match=r"50,000,000 Gaussians .* memory_gb allows 4\.0 GiB: lower max_gaussians"):
         train(tiny_dataset(), config)
 
 
-def test_uses_what_is_free(tiny_dataset: Callable[..., Dataset], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_uses_what_is_free(tiny_dataset, monkeypatch):
     dataset, config = tiny_dataset(), TrainingConfig(max_gaussians=1000)
     needed = memory.required_bytes(dataset, config)
     monkeypatch.setattr(memory, "available_bytes", lambda: needed)
@@ -35,9 +32,7 @@ def test_uses_what_is_free(tiny_dataset: Callable[..., Dataset], monkeypatch: py
         memory.check_memory(dataset, config, torch.device("cpu"))
 
 
-def test_a_gpu_is_asked_for_its_own_memory(
-    tiny_dataset: Callable[..., Dataset], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_gpu_is_asked_for_its_own_memory(tiny_dataset, monkeypatch):
     dataset, device = tiny_dataset(), torch.device("cuda", 1)
     config = TrainingConfig(max_gaussians=1000)
     needed = memory.required_device_bytes(dataset, config)
@@ -56,10 +51,10 @@ def test_a_gpu_is_asked_for_its_own_memory(
         memory.check_memory(dataset, TrainingConfig(max_gaussians=1000, memory_gb=0.1), device)
 
 
-def test_a_gpu_keeps_a_slice_of_each_gaussian_for_each_frame(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_a_gpu_keeps_a_slice_of_each_gaussian_for_each_frame(tiny_dataset):
     dataset = tiny_dataset(frames=90)
 
-    def needed(batch_size: int, gaussians: int) -> int:
+    def needed(batch_size, gaussians):
         return memory.required_device_bytes(dataset, TrainingConfig(max_gaussians=gaussians, batch_size=batch_size))
 
     per_frame = (needed(64, 500_000) - needed(32, 500_000)) / 32
@@ -67,8 +62,8 @@ def test_a_gpu_keeps_a_slice_of_each_gaussian_for_each_frame(tiny_dataset: Calla
     assert needed(8, 500_000) < 2 << 30  # the training of the paper fits every GPU that is in use
 
 
-def test_grows_with_gaussians_and_pixels(tiny_dataset: Callable[..., Dataset]) -> None:
-    def needed(dataset: Dataset, **settings: int) -> int:
+def test_grows_with_gaussians_and_pixels(tiny_dataset):
+    def needed(dataset, **settings):
         return memory.required_bytes(dataset, TrainingConfig.preset("fast", **{"max_gaussians": 1000, **settings}))
 
     small = tiny_dataset()
@@ -78,23 +73,21 @@ def test_grows_with_gaussians_and_pixels(tiny_dataset: Callable[..., Dataset]) -
     assert needed(small, sh_degree=3) > needed(small)
 
 
-def test_batches_take_room_for_the_slices_of_all_gaussians(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_batches_take_room_for_the_slices_of_all_gaussians(tiny_dataset):
     dataset = tiny_dataset(frames=90)
 
-    def needed(batch_size: int) -> int:
+    def needed(batch_size):
         return memory.required_bytes(dataset, TrainingConfig(max_gaussians=150_000, batch_size=batch_size))
 
     per_frame = (needed(64) - needed(32)) / 32
     assert 72 * 150_000 < per_frame < 72 * 150_000 * 1.2
 
 
-def test_held_out_frames_take_bounded_room(
-    tiny_dataset: Callable[..., Dataset], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_held_out_frames_take_bounded_room(tiny_dataset, monkeypatch):
     dataset, config = tiny_dataset(frames=400), TrainingConfig(max_gaussians=1000, batch_size=1)
     monkeypatch.setattr(memory, "CHUNK_PIXELS", 20 * 20 * 16)
 
-    def needed(held_out: int) -> int:
+    def needed(held_out):
         val = dataset.val.select(np.arange(held_out))
         return memory.required_bytes(Dataset("some", dataset.train.select([0, 1]), val), config)
 
@@ -102,9 +95,7 @@ def test_held_out_frames_take_bounded_room(
     assert needed(80) - needed(20) == 60 * 20 * 16  # the frames themselves
 
 
-def test_frames_that_cannot_be_compared_are_refused_before_they_are(
-    tiny_dataset: Callable[..., Dataset], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_that_cannot_be_compared_are_refused_before_they_are(tiny_dataset, monkeypatch):
     dataset, config = tiny_dataset(), TrainingConfig(max_gaussians=1000)
     monkeypatch.setattr(memory, "available_bytes", lambda: memory.comparison_bytes(dataset, config) - 1)
     monkeypatch.setattr(Geometry, "of", lambda dataset: pytest.fail("the frames were compared"))
@@ -112,7 +103,7 @@ def test_frames_that_cannot_be_compared_are_refused_before_they_are(
         train(dataset, config)
 
 
-def test_comparing_frames_grows_with_their_square(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_comparing_frames_grows_with_their_square(tiny_dataset):
     datasets = [tiny_dataset(frames=frames) for frames in (40, 80, 120)]  # 30, 60 and 90 to train from
     config = TrainingConfig(max_gaussians=1000)
     first, second, third = (memory.comparison_bytes(dataset, config) for dataset in datasets)
@@ -121,9 +112,7 @@ def test_comparing_frames_grows_with_their_square(tiny_dataset: Callable[..., Da
     assert large - small > second - first
 
 
-def test_the_registration_of_sweeps_takes_a_bounded_share(
-    tiny_dataset: Callable[..., Dataset], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_registration_of_sweeps_takes_a_bounded_share(tiny_dataset, monkeypatch):
     plain, refined = (TrainingConfig(max_gaussians=1000, refine_poses=mode) for mode in ("none", "sweeps"))
     dataset = tiny_dataset(height=500, width=500, frames=8)  # 6 to train from
     assert memory.comparison_bytes(dataset, refined) == memory.REGISTERED_BYTES * 6 * 500**2
@@ -139,9 +128,7 @@ def test_the_registration_of_sweeps_takes_a_bounded_share(
         ("memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
     ],
 )
-def test_file_caches_of_a_control_group_are_free(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str, limit: str, used: str, entry: str
-) -> None:
+def test_file_caches_of_a_control_group_are_free(tmp_path, monkeypatch, folder, limit, used, entry):
     group = tmp_path / folder
     group.mkdir(exist_ok=True)
     (group / limit).write_text("1000000\n")
@@ -154,7 +141,7 @@ def test_file_caches_of_a_control_group_are_free(
     assert available is None or available > 1_000_000
 
 
-def test_finds_out_what_is_available() -> None:
+def test_finds_out_what_is_available():
     available = memory.available_bytes()
     assert available is None or available > 0
 
@@ -185,7 +172,7 @@ print(int(peak[1]) * 1024, memory.required_bytes(dataset, config))
     ],
     ids=["gaussians", "slices", "held-out"],
 )
-def test_what_is_said_is_an_upper_bound(tmp_path: Path, data: dict[str, float], settings: dict[str, int]) -> None:
+def test_what_is_said_is_an_upper_bound(tmp_path, data, settings):
     conftest = str(Path(__file__).parents[1] / "conftest.py")
     program = PROGRAM.format(path=sys.path, conftest=conftest, folder=str(tmp_path), data=data, settings=settings)
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}

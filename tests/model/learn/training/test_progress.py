@@ -1,27 +1,24 @@
 """The journal never holds a step twice."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
 
 import pytest
 
 from ultragray.learn.training.progress import Journal, StepTimer
 
 
-def steps_in(path: Path) -> list[int]:
+def steps_in(path):
     return [json.loads(line)["step"] for line in path.read_text().splitlines()]
 
 
-def test_lines_are_there_at_once(tmp_path: Path) -> None:
+def test_lines_are_there_at_once(tmp_path):
     journal = Journal(tmp_path / "metrics.jsonl", steps_done=0)
     journal.write({"step": 1, "loss": 0.5})
     assert steps_in(tmp_path / "metrics.jsonl") == [1]
     journal.close()
 
 
-def test_goes_on_after_the_checkpoint(tmp_path: Path) -> None:
+def test_goes_on_after_the_checkpoint(tmp_path):
     path = tmp_path / "metrics.jsonl"
     path.write_text("".join(f'{{"step": {step}}}\n' for step in range(1, 6)) + '{"step": 6, "lo')
     journal = Journal(path, steps_done=3)
@@ -32,7 +29,7 @@ def test_goes_on_after_the_checkpoint(tmp_path: Path) -> None:
     assert steps_in(path) == []
 
 
-def test_half_a_line_is_dropped(tmp_path: Path) -> None:
+def test_half_a_line_is_dropped(tmp_path):
     path = tmp_path / "metrics.jsonl"
     path.write_text('{"step": 1}\n{"step": 2')
     Journal(path, steps_done=9).close()
@@ -42,7 +39,7 @@ def test_half_a_line_is_dropped(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     "damage", [b"{nonsense\n", b"\xff\xfe\n", b"3\n", b'{"loss": 0.5}\n', b'{"step": null}\n', b"\0" * 9]
 )
-def test_a_damaged_line_ends_what_is_kept(tmp_path: Path, damage: bytes) -> None:
+def test_a_damaged_line_ends_what_is_kept(tmp_path, damage):
     path = tmp_path / "metrics.jsonl"
     path.write_bytes(b'{"step": 1}\n' + damage + b'{"step": 3}\n')
     journal = Journal(path, steps_done=9)
@@ -51,7 +48,7 @@ def test_a_damaged_line_ends_what_is_kept(tmp_path: Path, damage: bytes) -> None
     assert steps_in(path) == [1, 10]
 
 
-def test_timer() -> None:
+def test_timer():
     timer = StepTimer(elapsed_s=10.0)
     assert timer.rate() == 0.0
     timer.add(0.5)

@@ -1,7 +1,5 @@
 """The fits of ImplicitVol: schedules, restarts, what has gradients, and fits that end where they must."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
@@ -20,17 +18,16 @@ CPU = torch.device("cpu")
 SMALL = seen(along_elevation(np.arange(3.0)), (12, 8))
 
 
-def rate_of(learner: FieldLearner, name: str, step: int, steps: int) -> float:
+def rate_of(learner, name, step, steps):
     learner.set_rates(step, steps)
-    rate: float = learner.optimizers[name].param_groups[0]["lr"]
-    return rate
+    return learner.optimizers[name].param_groups[0]["lr"]
 
 
-def test_the_authors_recipe_is_10_001_epochs_of_the_training_frames() -> None:
+def test_the_authors_recipe_is_10_001_epochs_of_the_training_frames():
     assert ImplicitVol().published_steps(SMALL) == 10_001 * 3
 
 
-def test_coordinates_are_in_half_heights_of_the_image_from_the_scenes_centre() -> None:
+def test_coordinates_are_in_half_heights_of_the_image_from_the_scenes_centre():
     learner = FieldLearner(SMALL, 0, CPU)
     points = learner.training_points(1).detach().numpy()  # the middle one of three frames
     expected = (pixel_points_mm(PROBE, SMALL.train.poses[1], 12, 8) - SMALL.centre_mm) / 12.5
@@ -38,7 +35,7 @@ def test_coordinates_are_in_half_heights_of_the_image_from_the_scenes_centre() -
     assert np.abs(points).max() < 1.0
 
 
-def test_the_networks_rate_falls_every_10_epochs_to_1_percent() -> None:
+def test_the_networks_rate_falls_every_10_epochs_to_1_percent():
     learner = FieldLearner(SMALL, 0, CPU)
     steps = 10_001
     assert [published_epoch(step, 3 * steps) for step in (0, 2, 3, 29, 30, 3 * steps - 1)] == [0, 0, 1, 9, 10, 10_000]
@@ -48,20 +45,19 @@ def test_the_networks_rate_falls_every_10_epochs_to_1_percent() -> None:
     assert rate_of(learner, "field", 39, 40) == pytest.approx(rate_of(learner, "field", 9_750, steps))
 
 
-def test_the_rate_of_poses_falls_every_100_epochs() -> None:
+def test_the_rate_of_poses_falls_every_100_epochs():
     learner = RefiningLearner(SMALL, 0, CPU)
     rates = [rate_of(learner, "poses", step, 10_001) for step in (0, 99, 100, 250)]
     assert rates == pytest.approx([1e-3, 1e-3, 0.9e-3, 0.81e-3])
 
 
-def test_only_the_refined_method_moves_frames() -> None:
+def test_only_the_refined_method_moves_frames():
     fixed, refining = FieldLearner(SMALL, 0, CPU), RefiningLearner(SMALL, 0, CPU)
     assert not fixed.training_points(0).requires_grad
     assert not any(name.startswith("poses") for name in fixed.model())
     before = refining.training_points(0).detach()
-    refining.loss(0, 1_000).backward()  # type: ignore[no-untyped-call]
+    refining.loss(0, 1_000).backward()
     for parameter in (refining.poses.angles, refining.poses.shifts):
-        assert parameter.grad is not None
         assert (parameter.grad.abs().amax(dim=1) > 0).sum() == 1  # of the frame whose turn it was
     refining.take_step(0, 1_000)
     refining.take_step(1, 1_000)
@@ -69,7 +65,7 @@ def test_only_the_refined_method_moves_frames() -> None:
     assert not torch.equal(refining.training_points(0).detach(), before)
 
 
-def test_the_network_restarts_nine_times_in_the_first_half_and_poses_stay() -> None:
+def test_the_network_restarts_nine_times_in_the_first_half_and_poses_stay():
     steps, restarts = 60, []
     learner = RefiningLearner(seen(along_elevation(np.arange(2.0)), (6, 5)), 0, CPU)
     for step in range(steps):
@@ -78,13 +74,13 @@ def test_the_network_restarts_nine_times_in_the_first_half_and_poses_stay() -> N
             restarts.append(step + 1)
             poses = learner.poses.angles.detach().clone()
             assert not learner.optimizers["poses"].state
-            assert 0.95 / 63 < learner.field.near[0].weight.abs().max() <= 1 / 63  # type: ignore[union-attr]
+            assert 0.95 / 63 < learner.field.near[0].weight.abs().max() <= 1 / 63
             assert poses.abs().max() > 0.0
     assert restarts == [3, 6, 9, 12, 15, 18, 21, 24, 27]
     assert learner.poses.shifts.isfinite().all()
 
 
-def test_a_restart_keeps_the_poses_and_draws_other_weights() -> None:
+def test_a_restart_keeps_the_poses_and_draws_other_weights():
     learner = RefiningLearner(SMALL, 0, CPU)
     first = learner.field.last.weight.detach().clone()
     with torch.no_grad():
@@ -99,7 +95,7 @@ def test_a_restart_keeps_the_poses_and_draws_other_weights() -> None:
     assert torch.equal(learner.field.last.weight, second)
 
 
-def test_frames_that_moved_together_are_rendered_as_the_tracker_saw_them() -> None:
+def test_frames_that_moved_together_are_rendered_as_the_tracker_saw_them():
     learner = RefiningLearner(SMALL, 0, CPU)
     with torch.no_grad():
         learner.poses.shifts += torch.tensor([0.2, -0.1, 0.3])
@@ -108,7 +104,7 @@ def test_frames_that_moved_together_are_rendered_as_the_tracker_saw_them() -> No
     np.testing.assert_allclose(rendered, moved, atol=2e-3)  # the finest octave makes much of a rounding
 
 
-def test_a_frame_that_moved_alone_leaves_held_out_frames_where_they_are_on_average() -> None:
+def test_a_frame_that_moved_alone_leaves_held_out_frames_where_they_are_on_average():
     learner = RefiningLearner(SMALL, 0, CPU)
     with torch.no_grad():
         learner.poses.shifts[0, 0] += 0.3

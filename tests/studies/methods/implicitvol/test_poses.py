@@ -1,7 +1,5 @@
 """Refined poses: the tracker's at first, angles and translations that mean what they say, and the common motion."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -19,7 +17,7 @@ HALF_HEIGHT_MM = 12.5
 QUARTER = np.array([[0.0, 0.0, 1.0], [0.0, 1.0, 0.0], [-1.0, 0.0, 0.0]])  # 90° about y: where Rz Ry Rx is singular
 
 
-def turned_sweep() -> tuple[np.ndarray, FramePoses, np.ndarray]:
+def turned_sweep():
     """Poses that all lie near a quarter turn about y, their refinement, and the scene's centre."""
     poses = along_elevation(np.arange(4) * 1.5)
     for place, pose in enumerate(poses):
@@ -28,8 +26,8 @@ def turned_sweep() -> tuple[np.ndarray, FramePoses, np.ndarray]:
     return poses, FramePoses(dataset.train, dataset.centre_mm, HALF_HEIGHT_MM, CPU), dataset.centre_mm
 
 
-def test_a_rotation_is_about_x_then_y_then_z() -> None:
-    def about(axis: int, angle: float) -> torch.Tensor:
+def test_a_rotation_is_about_x_then_y_then_z():
+    def about(axis, angle):
         angles = torch.zeros(3)
         angles[axis] = angle
         return rotation_of(angles)
@@ -41,13 +39,13 @@ def test_a_rotation_is_about_x_then_y_then_z() -> None:
     torch.testing.assert_close(rotation_of(torch.tensor([0.5, -0.4, 0.3])), together)
 
 
-def test_angles_are_those_of_the_rotation() -> None:
+def test_angles_are_those_of_the_rotation():
     angles = np.array([[0.5, -0.4, 0.3], [-2.0, 1.0, 3.0]])
     rotations = np.stack([rotation_of(torch.from_numpy(one)).numpy() for one in angles])
     np.testing.assert_allclose(angles_of(rotations), angles, atol=1e-12)
 
 
-def test_frames_begin_where_the_tracker_saw_them_near_a_quarter_turn_too() -> None:
+def test_frames_begin_where_the_tracker_saw_them_near_a_quarter_turn_too():
     poses, refined, centre_mm = turned_sweep()
     pixels_mm = torch.from_numpy(pixel_points_mm(PROBE, np.eye(4), 10, 8)).float()
     for place, pose in enumerate(poses):
@@ -56,14 +54,14 @@ def test_frames_begin_where_the_tracker_saw_them_near_a_quarter_turn_too() -> No
     assert refined.angles.abs().max() < 0.5
 
 
-def test_frames_that_did_not_move_have_no_common_motion() -> None:
+def test_frames_that_did_not_move_have_no_common_motion():
     _, refined, _ = turned_sweep()
     rotation, translation = refined.common_motion()
     torch.testing.assert_close(rotation, torch.eye(3), atol=2e-6, rtol=0.0)
     torch.testing.assert_close(translation, torch.zeros(3), atol=2e-6, rtol=0.0)
 
 
-def test_the_common_motion_is_the_one_that_all_frames_made() -> None:
+def test_the_common_motion_is_the_one_that_all_frames_made():
     poses, refined, _ = turned_sweep()
     turn = rotation_of(torch.tensor([0.1, 0.2, -0.15]).double()).numpy()
     shift = np.array([0.3, -0.2, 0.1])
@@ -76,7 +74,7 @@ def test_the_common_motion_is_the_one_that_all_frames_made() -> None:
     np.testing.assert_allclose(translation.numpy(), shift, atol=1e-5)
 
 
-def test_frames_of_one_plane_have_a_common_motion_that_is_no_mirror() -> None:
+def test_frames_of_one_plane_have_a_common_motion_that_is_no_mirror():
     refined = FramePoses(seen(along_elevation(np.zeros(2)), (10, 8)).train, np.zeros(3), HALF_HEIGHT_MM, CPU)
     with torch.no_grad():
         refined.angles += torch.tensor([0.0, 0.0, math.pi])

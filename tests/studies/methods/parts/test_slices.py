@@ -1,12 +1,10 @@
 """Learning from a slice a step: which frame is whose turn, and where its pixels lie."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 
-from ultragray import ConvexProbe, Probe
+from ultragray import ConvexProbe
 from ultragray_studies.methods.learner import LearnedMethod
 from ultragray_studies.methods.method import Budget
 from ultragray_studies.methods.parts import SIMILARITY, SliceLearner, frame_of_step, pixel_points_mm
@@ -18,7 +16,7 @@ SLICE_METHODS = ("implicitvol", "implicitvol-refined", "rapidvol")
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0)
 
 
-def learner_of(name: str, probe: Probe = PROBE) -> SliceLearner:
+def learner_of(name, probe=PROBE):
     method = METHODS[name]
     assert isinstance(method, LearnedMethod)
     dataset = seen(along_elevation(np.array([0.0, 2.0, 3.0])), (12, 8), probe)
@@ -27,25 +25,25 @@ def learner_of(name: str, probe: Probe = PROBE) -> SliceLearner:
     return learner
 
 
-def test_each_epoch_takes_each_frame_once_in_an_order_of_its_own() -> None:
+def test_each_epoch_takes_each_frame_once_in_an_order_of_its_own():
     epochs = [[frame_of_step(7 * epoch + place, 7, seed=3) for place in range(7)] for epoch in range(4)]
     assert all(sorted(epoch) == list(range(7)) for epoch in epochs)
     assert len({tuple(epoch) for epoch in epochs}) == 4
     assert epochs[0] != [frame_of_step(place, 7, seed=4) for place in range(7)]
 
 
-def test_identical_images_are_similar_to_1() -> None:
+def test_identical_images_are_similar_to_1():
     image = torch.rand((1, 12, 9), generator=torch.Generator().manual_seed(0))
     assert SIMILARITY.ssim(image, image) == pytest.approx(1.0, abs=1e-6)
     assert SIMILARITY.ssim(image, 1.0 - image) < 0.0
 
 
 @pytest.mark.parametrize("name", SLICE_METHODS)
-def test_a_field_that_shows_the_image_has_no_loss(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_field_that_shows_the_image_has_no_loss(name, monkeypatch):
     learner = learner_of(name)
     place = frame_of_step(0, 3, seed=5)
 
-    def image(points: torch.Tensor) -> torch.Tensor:
+    def image(points):
         return learner.image(place) + 0.0 * points.sum(dim=-1)
 
     monkeypatch.setattr(learner, "values", image)
@@ -54,11 +52,11 @@ def test_a_field_that_shows_the_image_has_no_loss(name: str, monkeypatch: pytest
 
 @pytest.mark.parametrize("probe", [PROBE, CONVEX], ids=["linear", "convex"])
 @pytest.mark.parametrize("name", SLICE_METHODS)
-def test_a_frame_is_taken_at_the_places_of_its_pixels(name: str, probe: Probe, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frame_is_taken_at_the_places_of_its_pixels(name, probe, monkeypatch):
     learner = learner_of(name, probe)
     direction = torch.tensor([0.03, 0.02, 0.05])
 
-    def ramp(points: torch.Tensor) -> torch.Tensor:
+    def ramp(points):
         return 0.5 + points @ direction
 
     monkeypatch.setattr(learner, "values", ramp)
@@ -70,17 +68,17 @@ def test_a_frame_is_taken_at_the_places_of_its_pixels(name: str, probe: Probe, m
 
 
 @pytest.mark.parametrize("name", SLICE_METHODS)
-def test_training_points_are_those_of_the_tracked_frames(name: str) -> None:
+def test_training_points_are_those_of_the_tracked_frames(name):
     learner = learner_of(name, CONVEX)
     for place, pose in enumerate(learner.dataset.train.poses):
         expected = (pixel_points_mm(CONVEX, pose, 12, 8) - learner.centre_mm) / learner.half_mm
         np.testing.assert_allclose(learner.training_points(place).detach().numpy(), expected, atol=2e-6)
 
 
-def test_frames_are_cut_off_at_0_and_1_only_where_they_are_rendered(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_frames_are_cut_off_at_0_and_1_only_where_they_are_rendered(monkeypatch):
     learner = learner_of("rapidvol")
 
-    def beyond(points: torch.Tensor) -> torch.Tensor:
+    def beyond(points):
         return 1.5 * points[..., 2].sign()
 
     monkeypatch.setattr(learner, "values", beyond)

@@ -1,17 +1,13 @@
 """Fits of UltraGauss: what they learn, and that an interrupted one is no other."""
 
-from __future__ import annotations
-
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
 
-from ultragray import ConvexProbe, LinearProbe, Probe
+from ultragray import ConvexProbe, LinearProbe
 from ultragray.errors import DatasetInvalid
 from ultragray.learn.sweep import Dataset, Sweep
-from ultragray_studies.methods.method import Budget, FitProgress, FitRun, Pace, Paces
+from ultragray_studies.methods.method import Budget, FitRun, Pace, Paces
 from ultragray_studies.methods.registry import METHODS
 from ultragray_studies.methods.ultragauss import UltraGauss, UltraGaussLearner, even_start
 
@@ -20,7 +16,7 @@ CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0)
 VARIANTS = ("ultragauss", "ultragauss-shadow")
 
 
-def ball(frames: int, height: int, width: int, probe: Probe = LINEAR) -> Dataset:
+def ball(frames, height, width, probe=LINEAR):
     """A bright ball in grey noise, with a shadow below it, in frames 0.8 mm apart."""
     poses = np.tile(np.eye(4), (frames, 1, 1))
     poses[:, :3, 3] = (30.0, -20.0, 10.0)
@@ -34,25 +30,25 @@ def ball(frames: int, height: int, width: int, probe: Probe = LINEAR) -> Dataset
     return Dataset("ball", sweep, sweep.select([]))
 
 
-def small_learner(dataset: Dataset, variant: str, count: int = 300) -> UltraGaussLearner:
+def small_learner(dataset, variant, count=300):
     gaussians = even_start(dataset, count, torch.Generator().manual_seed(0))
     return UltraGaussLearner(dataset, 0, torch.device("cpu"), gaussians, casts_shadow=variant == "ultragauss-shadow")
 
 
-def budget_of(steps: int, variant: str) -> Budget:
+def budget_of(steps, variant):
     """An equal time in which so many steps fit."""
     paces = Paces()
     paces.get(variant, lambda: Pace(0.0, 1.0))
     return Budget.equal(float(steps), paces)
 
 
-def psnr_db(got: np.ndarray, want: np.ndarray) -> float:
+def psnr_db(got, want):
     return float(-10.0 * np.log10(np.square(got - want).mean()))
 
 
 @pytest.mark.long
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_frames_are_learned_above_30_db(variant: str) -> None:
+def test_frames_are_learned_above_30_db(variant):
     dataset = ball(2, 40, 32)
     learner = small_learner(dataset, variant, count=600)
     for step in range(600):
@@ -64,16 +60,14 @@ def test_frames_are_learned_above_30_db(variant: str) -> None:
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_a_killed_fit_ends_in_the_model_of_an_undisturbed_one(
-    variant: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_killed_fit_ends_in_the_model_of_an_undisturbed_one(variant, tmp_path, monkeypatch):
     """Killed between two resamplings, each of which finds Gaussians to replace."""
     monkeypatch.setattr("ultragray_studies.methods.ultragauss.LEAST_WEIGHT", 0.6)
     monkeypatch.setattr("ultragray.learn.training.geometry.MIN_GAUSSIANS", 300)
     dataset, method = ball(4, 20, 16, CONVEX), METHODS[variant]
     budget, seen = budget_of(420, variant), []
 
-    def note(progress: FitProgress) -> None:
+    def note(progress):
         seen.append(progress.step)
 
     killed = FitRun(folder=tmp_path / "killed", report=note, should_stop=lambda: seen[-1] == 150)
@@ -88,7 +82,7 @@ def test_a_killed_fit_ends_in_the_model_of_an_undisturbed_one(
     assert np.array_equal(frames[0], frames[2])
 
 
-def test_a_learner_takes_over_another_number_of_gaussians() -> None:
+def test_a_learner_takes_over_another_number_of_gaussians():
     dataset = ball(3, 20, 16)
     few, many = small_learner(dataset, "ultragauss", count=50), small_learner(dataset, "ultragauss", count=80)
     few.take_step(0, 10)
@@ -97,7 +91,7 @@ def test_a_learner_takes_over_another_number_of_gaussians() -> None:
     assert all(torch.equal(tensor, few.model()[name]) for name, tensor in many.model().items())
 
 
-def test_weights_that_vanish_are_resampled() -> None:
+def test_weights_that_vanish_are_resampled():
     dataset = ball(3, 20, 16)
     learner = small_learner(dataset, "ultragauss", count=120)
     with torch.no_grad():
@@ -109,15 +103,15 @@ def test_weights_that_vanish_are_resampled() -> None:
     assert float(weights.min()) > 0.005
 
 
-def test_everything_learned_gets_a_gradient() -> None:
+def test_everything_learned_gets_a_gradient():
     learner = small_learner(ball(2, 20, 16), "ultragauss-shadow")
-    learner.loss(0, 10).backward()  # type: ignore[no-untyped-call]
+    learner.loss(0, 10).backward()
     for name, parameter in learner.module.named_parameters():
         assert parameter.grad is not None, name
         assert bool(parameter.grad.any()), name
 
 
-def test_the_shadow_begins_faint() -> None:
+def test_the_shadow_begins_faint():
     """The first image's last row has an optical depth of 0.1 on average."""
     dataset = ball(2, 20, 16)
     plain, shadowed = (small_learner(dataset, variant) for variant in VARIANTS)
@@ -129,7 +123,7 @@ def test_the_shadow_begins_faint() -> None:
 
 
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_a_frame_is_rendered_of_what_was_learned_last(variant: str) -> None:
+def test_a_frame_is_rendered_of_what_was_learned_last(variant):
     learner = small_learner(ball(2, 20, 16), variant)
     for step in range(5):
         learner.take_step(step, 60)
@@ -140,13 +134,13 @@ def test_a_frame_is_rendered_of_what_was_learned_last(variant: str) -> None:
         assert torch.equal(shown, learner.frame(LINEAR, pose, 20, 16))
 
 
-def test_images_smaller_than_the_window_of_ssim_are_refused() -> None:
+def test_images_smaller_than_the_window_of_ssim_are_refused():
     with pytest.raises(DatasetInvalid, match="at least 11 rows and columns, got 10x16"):
         small_learner(ball(2, 10, 16), "ultragauss")
 
 
 @pytest.mark.parametrize("casts_shadow", [False, True])
-def test_the_description_says_what_is_not_published(casts_shadow: bool) -> None:
+def test_the_description_says_what_is_not_published(casts_shadow):
     described = UltraGauss(casts_shadow=casts_shadow).describe()
     assert described.published_steps == 30_000
     assert ("The unit of delta" in " ".join(described.choices)) is casts_shadow

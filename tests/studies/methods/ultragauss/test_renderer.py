@@ -1,7 +1,5 @@
 """The average with a background and the shadow, against hand-computed values."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np
@@ -9,7 +7,7 @@ import torch
 
 from ultragray import LinearProbe
 from ultragray.rendering.backends import cpu
-from ultragray.rendering.backends.registry import WeightedSums, weighted_sums
+from ultragray.rendering.backends.registry import weighted_sums
 from ultragray_studies.methods.ultragauss import Field, average, shadow
 
 # One pixel, whose middle lies at the depth of 1 cm on the axis of the probe.
@@ -17,7 +15,7 @@ PROBE = LinearProbe(width_mm=2.0, near_mm=9.0, far_mm=11.0)
 INTENSITIES = torch.tensor([0.2, 0.7], dtype=torch.float64)
 
 
-def two_gaussians(weights: tuple[float, float], heights_cm: tuple[float, float]) -> Field:
+def two_gaussians(weights, heights_cm):
     """Round, σ = 0.5 cm, above one another along elevation, at the depth of 0.95 cm."""
     gaussians = {
         "means": torch.tensor([[0.0, height, 0.95] for height in heights_cm]),
@@ -29,12 +27,12 @@ def two_gaussians(weights: tuple[float, float], heights_cm: tuple[float, float])
     return Field(gaussians, casts_shadow=False)
 
 
-def one_pixel(field: Field) -> WeightedSums:
+def one_pixel(field):
     with torch.no_grad():
         return weighted_sums(field.scene(np.zeros(3)), PROBE, np.eye(4)[None], 1, 1, "cpu")
 
 
-def test_two_gaussians_on_one_pixel() -> None:
+def test_two_gaussians_on_one_pixel():
     field = two_gaussians((0.8, 0.3), (0.1, -0.4))
     # δ = (0, ∓height, 0.05) cm, A = 4 cm⁻²
     first = 0.8 * math.exp(-0.5 * 4.0 * (0.1**2 + 0.05**2))
@@ -44,7 +42,7 @@ def test_two_gaussians_on_one_pixel() -> None:
     assert math.isclose(float(got), want, abs_tol=1e-6)
 
 
-def test_weights_of_one_without_a_background_are_the_echo_over_the_coverage() -> None:
+def test_weights_of_one_without_a_background_are_the_echo_over_the_coverage():
     field = two_gaussians((0.9999999, 0.9999999), (0.1, -0.4))
     scene, pose = field.scene(np.zeros(3)), np.eye(4)[None]
     with torch.no_grad():
@@ -53,18 +51,18 @@ def test_weights_of_one_without_a_background_are_the_echo_over_the_coverage() ->
     assert torch.allclose(got, planes["echo"] / planes["coverage"], atol=1e-6)
 
 
-def test_a_pixel_without_gaussians_shows_the_background() -> None:
+def test_a_pixel_without_gaussians_shows_the_background():
     nothing = torch.zeros(1, 2, 2)
     assert torch.allclose(average(nothing, nothing, torch.tensor(1e-3), torch.tensor(0.4)), torch.tensor(0.4))
 
 
-def test_the_shadow_is_the_sum_down_each_scan_line() -> None:
+def test_the_shadow_is_the_sum_down_each_scan_line():
     weights = torch.tensor([[[1.0, 0.0], [2.0, 0.5], [0.0, 3.0]]])  # [1, 3, 2]
     got = shadow(weights, torch.tensor(0.5), 0.2)
     want = torch.exp(-0.5 * 0.2 * torch.tensor([[[1.0, 0.0], [3.0, 0.5], [3.0, 3.5]]]))
     assert torch.allclose(got, want, rtol=1e-6)
 
 
-def test_the_first_pixel_lies_in_its_own_shadow() -> None:
+def test_the_first_pixel_lies_in_its_own_shadow():
     got = shadow(torch.full((1, 4, 1), 2.0), torch.tensor(1.0), 0.25)
     assert math.isclose(float(got[0, 0, 0]), math.exp(-0.5), rel_tol=1e-6)

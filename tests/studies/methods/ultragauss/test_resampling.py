@@ -1,13 +1,11 @@
 """Densify and resample: what goes, what comes instead, and what Adam remembers."""
 
-from __future__ import annotations
-
 import torch
 
 from ultragray_studies.methods.ultragauss import follow, is_due, resample
 
 
-def gaussians(count: int) -> dict[str, torch.Tensor]:
+def gaussians(count):
     generator = torch.Generator().manual_seed(0)
     return {
         "means": torch.rand((count, 3), generator=generator),
@@ -18,7 +16,7 @@ def gaussians(count: int) -> dict[str, torch.Tensor]:
     }
 
 
-def test_useless_weights_make_room_for_what_is_pulled_at_most() -> None:
+def test_useless_weights_make_room_for_what_is_pulled_at_most():
     before, pull = gaussians(6), torch.tensor([1.0, 9.0, 2.0, 3.0, 4.0, 5.0])
     before["transmittances"][[0, 3]] = -8.0  # α = 3e-4
     after, origin = resample(before, pull, limit=6, scene_scale_cm=1.0, generator=torch.Generator().manual_seed(0))
@@ -29,14 +27,14 @@ def test_useless_weights_make_room_for_what_is_pulled_at_most() -> None:
     assert torch.allclose(halves, torch.tensor(-1.0) - torch.log(torch.tensor(1.6)))
 
 
-def test_without_room_nothing_changes_but_the_order() -> None:
+def test_without_room_nothing_changes_but_the_order():
     before = gaussians(5)
     after, origin = resample(before, torch.ones(5), limit=5, scene_scale_cm=1.0, generator=torch.Generator())
     for name, tensor in before.items():
         assert torch.equal(after[name], tensor[origin])
 
 
-def test_new_rows_begin_without_momentum() -> None:
+def test_new_rows_begin_without_momentum():
     state = {"step": torch.tensor(7.0), "exp_avg": torch.tensor([1.0, 2.0]), "exp_avg_sq": torch.tensor([3.0, 4.0])}
     moved = follow(state, torch.tensor([1, -1, 0]))
     assert moved["exp_avg"].tolist() == [2.0, 0.0, 1.0]
@@ -44,6 +42,6 @@ def test_new_rows_begin_without_momentum() -> None:
     assert moved["step"] == 7.0
 
 
-def test_every_hundredth_step_of_the_first_half_is_due() -> None:
+def test_every_hundredth_step_of_the_first_half_is_due():
     assert [done for done in range(1, 30_001) if is_due(done, 30_000)] == list(range(500, 15_001, 100))
     assert [done for done in range(1, 601) if is_due(done, 600)] == [100, 200, 300]

@@ -1,16 +1,13 @@
 """What a fit starts from: where Gaussians lie, how wide they are, the published start."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from ultragray import ConvexProbe, LinearProbe, Probe
+from ultragray import ConvexProbe, LinearProbe
 from ultragray.learn.sweep import Dataset, Sweep
 from ultragray.learn.training.optimizer import rotate
 from ultragray_studies.methods.parts import Box
@@ -20,7 +17,7 @@ LINEAR = LinearProbe(width_mm=20.0, near_mm=5.0, far_mm=25.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0)
 
 
-def sweep_along_elevation(probe: Probe) -> Dataset:
+def sweep_along_elevation(probe):
     """Ten frames, 1 mm apart."""
     poses = np.tile(np.eye(4), (10, 1, 1))
     poses[:, :3, 3] = (30.0, -20.0, 10.0)
@@ -32,7 +29,7 @@ def sweep_along_elevation(probe: Probe) -> Dataset:
 
 @pytest.mark.parametrize("probe", [LINEAR, CONVEX], ids=["linear", "convex"])
 @pytest.mark.parametrize("start", [even_start, wide_start])
-def test_means_lie_in_the_space_of_the_frames(start: Callable[..., dict[str, torch.Tensor]], probe: Probe) -> None:
+def test_means_lie_in_the_space_of_the_frames(start, probe):
     dataset = sweep_along_elevation(probe)
     gaussians = start(dataset, 4_000, torch.Generator().manual_seed(0))
     placed = 10.0 * gaussians["means"].double().numpy() + dataset.centre_mm - (30.0, -20.0, 10.0)
@@ -45,13 +42,13 @@ def test_means_lie_in_the_space_of_the_frames(start: Callable[..., dict[str, tor
     assert 0.47 < (depths < middle).mean() < 0.53
 
 
-def test_even_gaussians_are_as_wide_as_their_share_of_the_volume() -> None:
+def test_even_gaussians_are_as_wide_as_their_share_of_the_volume():
     gaussians = even_start(sweep_along_elevation(LINEAR), 500, torch.Generator().manual_seed(0))
     volume_mm3 = 20.0 * 20.0 * 10.0
     assert torch.allclose(10.0 * gaussians["scales"].exp(), torch.tensor((volume_mm3 / 500) ** (1 / 3)))
 
 
-def test_even_gaussians_reach_over_the_gaps_between_frames_along_the_frames_own_elevation() -> None:
+def test_even_gaussians_reach_over_the_gaps_between_frames_along_the_frames_own_elevation():
     """Ten frames, 1 mm apart, turned by a quarter about the axis of depth: elevation lies along -x of the tracker."""
     dataset = sweep_along_elevation(LINEAR)
     turn = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
@@ -66,7 +63,7 @@ def test_even_gaussians_reach_over_the_gaps_between_frames_along_the_frames_own_
     assert torch.allclose(along, torch.tensor([[-1.0, 0.0, 0.0]]), atol=1e-6)
 
 
-def test_the_published_start_has_its_precision() -> None:
+def test_the_published_start_has_its_precision():
     """L of entries in [4, 5) in the cube of side 2 around the frames: bounds of each entry of L·Lᵀ follow."""
     dataset = sweep_along_elevation(LINEAR)
     gaussians = wide_start(dataset, 300, torch.Generator().manual_seed(0))
@@ -80,7 +77,7 @@ def test_the_published_start_has_its_precision() -> None:
 
 
 @pytest.mark.parametrize("start", [even_start, wide_start])
-def test_weights_and_intensities_are_the_published_ones(start: Callable[..., dict[str, torch.Tensor]]) -> None:
+def test_weights_and_intensities_are_the_published_ones(start):
     gaussians = start(sweep_along_elevation(LINEAR), 20, torch.Generator().manual_seed(0))
     assert torch.allclose(gaussians["transmittances"].sigmoid(), torch.tensor(0.7310586))
     assert not gaussians["sh0"].any()

@@ -1,7 +1,5 @@
 """The field of Ultra-NeRF: its encoding, its size and its start."""
 
-from __future__ import annotations
-
 import math
 
 import pytest
@@ -11,11 +9,11 @@ from ultragray_studies.methods.parts import encode
 from ultragray_studies.methods.ultranerf import TissueField
 
 
-def field(seed: int = 0) -> TissueField:
+def field(seed=0):
     return TissueField(torch.Generator().manual_seed(seed))
 
 
-def test_a_point_becomes_itself_and_ten_octaves_of_sines_and_cosines() -> None:
+def test_a_point_becomes_itself_and_ten_octaves_of_sines_and_cosines():
     point = torch.tensor([math.pi / 2, 0.0, -math.pi / 4], dtype=torch.float64)
     encoded = encode(point)
     assert encoded.shape == (63,)
@@ -27,18 +25,18 @@ def test_a_point_becomes_itself_and_ten_octaves_of_sines_and_cosines() -> None:
     torch.testing.assert_close(encoded[-3:], torch.cos(512.0 * point))
 
 
-def test_the_finest_period_in_metres_is_12_3_millimetres() -> None:
+def test_the_finest_period_in_metres_is_12_3_millimetres():
     x_m = torch.tensor([0.0, 12.27e-3, 12.27e-3 / 2], dtype=torch.float64)
     points = torch.stack([x_m, torch.zeros_like(x_m), torch.zeros_like(x_m)], dim=-1)
     finest = encode(points)[:, -3]  # cos 512 x
     torch.testing.assert_close(finest, torch.tensor([1.0, 1.0, -1.0], dtype=torch.float64), atol=1e-3, rtol=0.0)
 
 
-def test_the_field_has_132485_parameters() -> None:
+def test_the_field_has_132485_parameters():
     assert sum(one.numel() for one in field().parameters()) == 132_485
 
 
-def test_the_encoding_joins_again_before_the_sixth_layer() -> None:
+def test_the_encoding_joins_again_before_the_sixth_layer():
     module = field()
     layers = [one for one in module.modules() if isinstance(one, torch.nn.Linear)]
     assert [(one.in_features, one.out_features) for one in layers] == [
@@ -51,7 +49,7 @@ def test_the_encoding_joins_again_before_the_sixth_layer() -> None:
     assert raw.std(dim=0).min() > 0.0
 
 
-def test_weights_are_glorot_uniform_and_biases_zero() -> None:
+def test_weights_are_glorot_uniform_and_biases_zero():
     for layer in field().modules():
         if isinstance(layer, torch.nn.Linear):
             bound = math.sqrt(6.0 / (layer.in_features + layer.out_features))
@@ -60,7 +58,7 @@ def test_weights_are_glorot_uniform_and_biases_zero() -> None:
             assert not layer.bias.any()
 
 
-def test_the_start_comes_from_the_given_generator_alone() -> None:
+def test_the_start_comes_from_the_given_generator_alone():
     torch.manual_seed(1)
     before = torch.random.get_rng_state()
     one = field(3)

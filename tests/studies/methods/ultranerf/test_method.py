@@ -13,12 +13,11 @@ import torch
 from ultragray import ConvexProbe, LinearProbe
 from ultragray.datasets.source import load_dataset
 from ultragray.errors import DatasetInvalid
-from ultragray.geometry.probe import Probe
 from ultragray.learn.sweep import Dataset, Sweep
 from ultragray_studies.methods import ultranerf
-from ultragray_studies.methods.method import Budget, FitProgress, FitRun, Pace, Paces
+from ultragray_studies.methods.method import Budget, FitRun, Pace, Paces
 from ultragray_studies.methods.registry import METHODS
-from ultragray_studies.methods.ultranerf import VARIANTS, Coordinates, UltraNerf, UltraNerfLearner
+from ultragray_studies.methods.ultranerf import VARIANTS, Coordinates, UltraNerf
 
 SIDE = 24
 LINEAR = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=20.0)
@@ -26,7 +25,7 @@ CPU = torch.device("cpu")
 by_name = pytest.mark.parametrize("method", VARIANTS, ids=lambda one: one.name)
 
 
-def sweep(probe: Probe = LINEAR, frames: int = 3, height: int = SIDE, width: int = SIDE) -> Sweep:
+def sweep(probe=LINEAR, frames=3, height=SIDE, width=SIDE):
     """Frames 1 mm apart with a bright bow that shadows what lies under it."""
     poses = np.tile(np.eye(4), (frames, 1, 1))
     poses[:, 1, 3] = np.arange(frames)
@@ -39,30 +38,30 @@ def sweep(probe: Probe = LINEAR, frames: int = 3, height: int = SIDE, width: int
     return Sweep(images, poses, probe, np.arange(frames), "bow")
 
 
-def dataset(probe: Probe = LINEAR, frames: int = 3, **size: int) -> Dataset:
+def dataset(probe=LINEAR, frames=3, **size):
     train = sweep(probe, frames, **size)
     return Dataset("bow", train, train.select([0]))
 
 
-def budget(method: UltraNerf, steps: int) -> Budget:
+def budget(method, steps):
     """A time that holds so many steps, without a clock."""
     paces = Paces()
     paces.get(method.name, lambda: Pace(0.0, 1.0))
     return Budget.equal(steps + 0.5, paces)
 
 
-def learner(method: UltraNerf, of: Dataset | None = None, seed: int = 0) -> UltraNerfLearner:
+def learner(method, of=None, seed=0):
     return method.learner(of or dataset(), Budget.author(), seed, CPU)
 
 
-def head_gradient(method: UltraNerf) -> torch.Tensor:  # [5]
+def head_gradient(method):  # [5]
     """The largest gradient of each row of the head after a step."""
     one = learner(method)
     (gradient,) = torch.autograd.grad(one.loss(0, 10), one.module.head.weight)
     return gradient.abs().amax(dim=1)
 
 
-def test_the_variants_are_methods_of_the_registry_by_their_names() -> None:
+def test_the_variants_are_methods_of_the_registry_by_their_names():
     names = ["ultranerf-released", "ultranerf-unit", "ultranerf-mean"]
     assert [one.name for one in VARIANTS] == names
     assert [METHODS[name] for name in names] == list(VARIANTS)
@@ -79,16 +78,16 @@ def test_a_variant_tells_its_source_and_its_steps(method: UltraNerf) -> None:
 
 
 @pytest.mark.parametrize("name", ["ultranerf-released", "ultranerf-unit"])
-def test_the_heads_of_drawn_probabilities_get_no_gradient(name: str) -> None:
+def test_the_heads_of_drawn_probabilities_get_no_gradient(name):
     reached = head_gradient(next(one for one in VARIANTS if one.name == name)) > 0.0
     assert reached.tolist() == [True, True, False, False, True]  # a, b, p_b, p_s, s
 
 
-def test_the_heads_of_expected_probabilities_get_gradients() -> None:
+def test_the_heads_of_expected_probabilities_get_gradients():
     assert (head_gradient(VARIANTS[2]) > 0.0).all()
 
 
-def test_the_field_sees_metres_or_the_scaled_box() -> None:
+def test_the_field_sees_metres_or_the_scaled_box():
     train = sweep()
     corner = np.array([10.0, 2.0, 20.0])
     np.testing.assert_allclose(Coordinates.metres(train).of(corner), [0.010, 0.002, 0.020])
@@ -97,7 +96,7 @@ def test_the_field_sees_metres_or_the_scaled_box() -> None:
 
 
 @pytest.mark.parametrize(("name", "length"), [("ultranerf-released", 0.020), ("ultranerf-unit", 2.0)])
-def test_attenuation_is_counted_per_unit_of_the_coordinates(name: str, length: float) -> None:
+def test_attenuation_is_counted_per_unit_of_the_coordinates(name, length):
     """A field of constant attenuation 1.5, no reflection, and scatterers of amplitude 1: I = exp(−1.5 depth)."""
     one = learner(next(one for one in VARIANTS if one.name == name))
     with torch.no_grad():
@@ -127,14 +126,14 @@ def test_frames_are_the_same_each_time_and_within_limits(method: UltraNerf) -> N
     assert first.std() > 0.0
 
 
-def test_a_frame_in_chunks_is_the_frame(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frame_in_chunks_is_the_frame(monkeypatch):
     one = learner(VARIANTS[1])
     whole = one.render(LINEAR, np.eye(4)[None], SIDE, SIDE)
     monkeypatch.setattr(ultranerf, "CHUNK_POINTS", 100)
     np.testing.assert_allclose(one.render(LINEAR, np.eye(4)[None], SIDE, SIDE), whole, atol=1e-6)
 
 
-def test_a_fan_is_rendered_along_its_own_scan_lines() -> None:
+def test_a_fan_is_rendered_along_its_own_scan_lines():
     probe = ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0)
     one = learner(VARIANTS[1], dataset(probe, width=20))
     assert math.isfinite(one.take_step(0, 10))
@@ -148,7 +147,7 @@ def test_a_fan_is_rendered_along_its_own_scan_lines() -> None:
         np.testing.assert_allclose(frame[3:-3, column], expected, rtol=1e-5)
 
 
-def test_the_rate_falls_as_published_over_the_steps_of_any_budget() -> None:
+def test_the_rate_falls_as_published_over_the_steps_of_any_budget():
     one = learner(VARIANTS[1])
     rates = []
     for step, steps in ((0, 10), (5, 10), (100_000, 200_000), (250, 250)):
@@ -161,12 +160,10 @@ def test_the_rate_falls_as_published_over_the_steps_of_any_budget() -> None:
 def test_a_stopped_fit_ends_in_the_model_of_an_undisturbed_one(method: UltraNerf, tmp_path: Path) -> None:
     of, steps = dataset(), 6
     whole = method.fit(of, budget(method, steps))
-    told: list[FitProgress] = []
+    told = []
     stopped = FitRun(folder=tmp_path, report=told.append, should_stop=lambda: len(told) == 3)
     assert method.fit(of, budget(method, steps), stopped) is None
     ended = method.fit(of, budget(method, steps), FitRun(folder=tmp_path))
-    assert whole is not None
-    assert ended is not None
     assert (whole.cost.steps, ended.cost.steps, ended.cost.is_short) == (steps, steps, True)
     assert ended.cost.model_bytes == 4 * 132_485
     undisturbed = whole.learner.model()
@@ -176,13 +173,13 @@ def test_a_stopped_fit_ends_in_the_model_of_an_undisturbed_one(method: UltraNerf
     np.testing.assert_array_equal(ended.render(LINEAR, poses, SIDE, SIDE), whole.render(LINEAR, poses, SIDE, SIDE))
 
 
-def test_frames_too_small_for_the_loss_are_refused() -> None:
+def test_frames_too_small_for_the_loss_are_refused():
     with pytest.raises(DatasetInvalid, match="at least 7 pixels a side, got 24x6"):
         learner(VARIANTS[0], dataset(width=6))
 
 
 @pytest.mark.long
-def test_the_mean_variant_learns_a_single_frame_by_heart() -> None:
+def test_the_mean_variant_learns_a_single_frame_by_heart():
     train = sweep(frames=2)
     same = replace(train, images=train.images[[0, 0]], poses=train.poses[[0, 0]])
     one = learner(VARIANTS[2], Dataset("one", same, same.select([])))

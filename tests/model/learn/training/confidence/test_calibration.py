@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
@@ -10,21 +9,18 @@ import pytest
 
 from ultragray import GaussianScene
 from ultragray.errors import TrainingDiverged
-from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation.scoring import evaluate, render_sweep
 from ultragray.learn.sweep import Dataset, Sweep
-from ultragray.learn.training import Progress, TrainingConfig, run, train
+from ultragray.learn.training import TrainingConfig, run, train
 from ultragray.learn.training.confidence import fit_confidence, shorter
 from ultragray.learn.training.geometry import Geometry
 from ultragray.phantom import PHANTOM_PROBE, freehand_poses, simulate
 from ultragray.scene.confidence import VARIANCE_TERMS, Assessor, ConfidenceModel
 
-Datasets = Callable[..., Dataset]
-Configs = Callable[..., TrainingConfig]
 SIDE = 64
 
 
-def simulated(poses: FloatArray) -> Sweep:
+def simulated(poses):
     images = simulate(poses, probe=PHANTOM_PROBE, height=SIDE, width=SIDE)
     return Sweep(images, poses, PHANTOM_PROBE, np.arange(len(poses)), "phantom")
 
@@ -47,11 +43,11 @@ def trained() -> GaussianScene:
     return train(dataset, TrainingConfig.preset("fast", steps=120, max_gaussians=4_000))
 
 
-def ranks(values: FloatArray) -> FloatArray:
+def ranks(values):
     return values.argsort().argsort().astype(np.float64)
 
 
-def told_and_actual() -> tuple[FloatArray, FloatArray]:
+def told_and_actual():
     scene, (_, val) = trained(), phantom()
     actual = np.array([frame.ms_ssim for frame in evaluate(scene, val).frames])
     told = np.array([frame.confidence for frame in Assessor(scene.info, scene.training_poses).assess(val.poses)])
@@ -59,20 +55,20 @@ def told_and_actual() -> tuple[FloatArray, FloatArray]:
 
 
 @pytest.mark.long
-def test_frames_that_will_reach_more_are_told_more() -> None:
+def test_frames_that_will_reach_more_are_told_more():
     told, actual = told_and_actual()
     assert actual.std() > 0.1
     assert np.corrcoef(ranks(told), ranks(actual))[0, 1] > 0.8
 
 
 @pytest.mark.long
-def test_it_tells_what_frames_will_reach() -> None:
+def test_it_tells_what_frames_will_reach():
     told, actual = told_and_actual()
     assert np.abs(told - actual).mean() < 0.1
 
 
 @pytest.mark.long
-def test_the_same_training_ends_in_the_same_scene() -> None:
+def test_the_same_training_ends_in_the_same_scene():
     dataset, _ = phantom()
     again = train(dataset, TrainingConfig.preset("fast", steps=120, max_gaussians=4_000))
     assert again.to_bytes() == trained().to_bytes()
@@ -82,15 +78,14 @@ def test_the_same_training_ends_in_the_same_scene() -> None:
     assert 0.0 < model.error < 0.15
 
 
-def test_nothing_of_what_is_left_out_is_trained_from(tiny_dataset: Datasets) -> None:
+def test_nothing_of_what_is_left_out_is_trained_from(tiny_dataset):
     dataset, parts = tiny_dataset(frames=40), []
 
-    def train_part(part: Dataset) -> GaussianScene:
+    def train_part(part):
         parts.append(part)
         return train(part, TrainingConfig.preset("fast", steps=5, max_gaussians=50, confidence=False))
 
     model = fit_confidence(dataset, train_part, backend="auto")
-    assert model is not None
     (part,) = parts
     assert len(part.train) + model.fitted_on == len(dataset.train)
     assert set(part.train.frame_numbers) < set(dataset.train.frame_numbers)
@@ -98,9 +93,7 @@ def test_nothing_of_what_is_left_out_is_trained_from(tiny_dataset: Datasets) -> 
 
 
 @pytest.mark.parametrize(("steps", "fewer_steps"), [(1_001, 251), (400, 150), (24, 24)])
-def test_a_quarter_of_the_steps_and_fewer_gaussians(
-    tiny_dataset: Datasets, tiny_config: Configs, steps: int, fewer_steps: int
-) -> None:
+def test_a_quarter_of_the_steps_and_fewer_gaussians(tiny_dataset, tiny_config, steps, fewer_steps):
     config = tiny_config(steps=steps).resolved(Geometry.of(tiny_dataset()))
     fewer = shorter(config, 0.6)
     assert (fewer.steps, fewer.max_gaussians, fewer.initial_gaussians) == (fewer_steps, 36, 18)
@@ -108,7 +101,7 @@ def test_a_quarter_of_the_steps_and_fewer_gaussians(
 
 
 @pytest.mark.long
-def test_it_can_be_left_out(tiny_dataset: Datasets, tiny_config: Configs) -> None:
+def test_it_can_be_left_out(tiny_dataset, tiny_config):
     dataset = tiny_dataset(frames=40)
     without = train(dataset, tiny_config(confidence=False))
     assert without.info.confidence == {}
@@ -119,8 +112,8 @@ def test_it_can_be_left_out(tiny_dataset: Datasets, tiny_config: Configs) -> Non
 
 
 @pytest.mark.long
-def test_the_time_left_holds_the_fit_and_the_fit_is_told(tiny_dataset: Datasets, tiny_config: Configs) -> None:
-    seen: list[Progress] = []
+def test_the_time_left_holds_the_fit_and_the_fit_is_told(tiny_dataset, tiny_config):
+    seen = []
     train(tiny_dataset(frames=40), tiny_config(), report=seen.append)
     own = [progress for progress in seen if progress.beside is None]
     fit = [progress for progress in seen if progress.beside == run.FITTING]
@@ -132,20 +125,20 @@ def test_the_time_left_holds_the_fit_and_the_fit_is_told(tiny_dataset: Datasets,
     assert steps_left == pytest.approx([own[-1].steps - progress.step + later for progress in own])
 
 
-def test_too_few_frames_give_none(tiny_dataset: Datasets, tiny_config: Configs) -> None:
+def test_too_few_frames_give_none(tiny_dataset, tiny_config):
     assert train(tiny_dataset(frames=6), tiny_config()).info.confidence == {}
 
 
-def test_a_stopped_run_is_not_calibrated(tiny_dataset: Datasets, tiny_config: Configs) -> None:
+def test_a_stopped_run_is_not_calibrated(tiny_dataset, tiny_config):
     scene = train(tiny_dataset(frames=40), tiny_config(), should_stop=lambda: True)
     assert scene.info.training["step"] == 1
     assert scene.info.confidence == {}
 
 
-def test_a_stop_while_it_is_calibrated_leaves_the_scene(tiny_dataset: Datasets, tiny_config: Configs) -> None:
+def test_a_stop_while_it_is_calibrated_leaves_the_scene(tiny_dataset, tiny_config):
     asked = 0
 
-    def after_the_last_step() -> bool:
+    def after_the_last_step():
         nonlocal asked
         asked += 1
         return asked > 24 + 3
@@ -156,10 +149,8 @@ def test_a_stop_while_it_is_calibrated_leaves_the_scene(tiny_dataset: Datasets, 
     assert scene.info.confidence == {}
 
 
-def test_a_calibration_that_diverges_costs_no_scene(
-    tiny_dataset: Datasets, tiny_config: Configs, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
-    def diverge(*_: object, **__: object) -> None:
+def test_a_calibration_that_diverges_costs_no_scene(tiny_dataset, tiny_config, monkeypatch, caplog):
+    def diverge(*_, **__):
         raise TrainingDiverged("training diverged in step 3: the loss is nan")
 
     monkeypatch.setattr(run, "fit_confidence", diverge)
@@ -169,7 +160,7 @@ def test_a_calibration_that_diverges_costs_no_scene(
 
 
 @pytest.mark.long
-def test_it_tells_the_errors_of_pixels() -> None:
+def test_it_tells_the_errors_of_pixels():
     scene, (_, val) = trained(), phantom()
     bmode, uncertainty = (render_sweep(scene, val, output=output) for output in ("bmode", "uncertainty"))
     errors = np.abs(val.images / 255.0 - bmode)

@@ -1,7 +1,5 @@
 """Hardness: where the anatomy changes between frames it is high, where it does not it is low."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -12,7 +10,7 @@ from ultragray.learn.training.confidence import hardness_of_views
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=40.0)
 
 
-def changing_sweep(count: int, side: int) -> Sweep:
+def changing_sweep(count, side):
     """The same texture in the first half of the frames, another in each frame of the second."""
     rng = np.random.default_rng(1)
     coarse = rng.integers(0, 255, (count, 16, 16))
@@ -25,11 +23,11 @@ def changing_sweep(count: int, side: int) -> Sweep:
 
 @pytest.mark.long
 @pytest.mark.parametrize("side", [32, 128])
-def test_hard_is_where_neighbours_do_not_tell(side: int) -> None:
+def test_hard_is_where_neighbours_do_not_tell(side):
     hardness = hardness_of_views(changing_sweep(24, side))
     assert hardness.shape == (24,)
     assert hardness[:9].max() < -1.0 < 1.0 < hardness[15:].min()
 
 
-def test_two_frames_tell_nothing() -> None:
+def test_two_frames_tell_nothing():
     assert hardness_of_views(changing_sweep(24, 32).select([0, 1])).tolist() == [0.0, 0.0]

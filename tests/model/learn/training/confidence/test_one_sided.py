@@ -1,7 +1,5 @@
 """Frames extrapolated from one side: farther away is worse where anatomy changes, and no worse where it does not."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -14,7 +12,7 @@ PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=40.0)
 STEP_MM = 1.0
 
 
-def drifting_sweep(count: int, columns_per_frame: int) -> Sweep:
+def drifting_sweep(count, columns_per_frame):
     """Parallel frames of one texture that shifts sideways from each to the next."""
     texture = np.kron(np.random.default_rng(1).integers(0, 255, (8, 60)), np.ones((8, 4), int)).astype(np.uint8)
     images = np.stack([np.roll(texture, columns_per_frame * frame, axis=1)[:, :64] for frame in range(count)])
@@ -23,7 +21,7 @@ def drifting_sweep(count: int, columns_per_frame: int) -> Sweep:
     return Sweep(images, poses, PROBE, np.arange(count), "test")
 
 
-def test_each_frame_is_predicted_from_either_side_and_ever_farther_away() -> None:
+def test_each_frame_is_predicted_from_either_side_and_ever_farther_away():
     examples = one_sided_examples(drifting_sweep(30, 1), np.zeros(30))
     distances = -examples.terms[:, 0, 2] * DISTANCE_MM
     assert sorted(set(distances.round(3))) == [1.0, 2.0, 4.0, 6.0, 9.0, 13.0]  # one step beyond each of BEYOND_MM
@@ -32,7 +30,7 @@ def test_each_frame_is_predicted_from_either_side_and_ever_farther_away() -> Non
     assert (distances.round(3) == 1.0).sum() == nearest_frames
 
 
-def test_scores_fall_with_distance_where_anatomy_changes_and_only_there() -> None:
+def test_scores_fall_with_distance_where_anatomy_changes_and_only_there():
     for columns_per_frame, falls in ((1, True), (0, False)):
         examples = one_sided_examples(drifting_sweep(30, columns_per_frame), np.zeros(30))
         distances = -examples.terms[:, 0, 2] * DISTANCE_MM
@@ -40,6 +38,6 @@ def test_scores_fall_with_distance_where_anatomy_changes_and_only_there() -> Non
         assert (near - far > 0.2) if falls else (near == pytest.approx(far, abs=1e-6))
 
 
-def test_two_frames_are_no_examples() -> None:
+def test_two_frames_are_no_examples():
     examples = one_sided_examples(drifting_sweep(2, 1), np.zeros(2))
     assert len(examples.ms_ssim) == len(examples.terms) == 0

@@ -1,13 +1,9 @@
 """The fit of the uncertainty: variances that are known are found again, and the far away is not forgotten."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 
-from ultragray import GaussianScene, LinearProbe, render
+from ultragray import LinearProbe, render
 from ultragray.datasets import Sweep
 from ultragray.learn.training.confidence import fit_uncertainty, likeliest_variances
 from ultragray.scene.confidence import DEPTHS, VARIANCE_TERMS, TrainingViews
@@ -15,7 +11,7 @@ from ultragray.scene.confidence import DEPTHS, VARIANCE_TERMS, TrainingViews
 PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 
 
-def test_variances_are_found_again() -> None:
+def test_variances_are_found_again():
     rng = np.random.default_rng(0)
     terms = rng.uniform(0.0, 1.0, (20_000, 4))
     truth = np.array([0.02, 0.0, 0.3, 0.1])
@@ -25,13 +21,13 @@ def test_variances_are_found_again() -> None:
     assert (found >= 0.0).all()
 
 
-def test_a_term_that_is_never_there_is_no_error() -> None:
+def test_a_term_that_is_never_there_is_no_error():
     found = likeliest_variances(np.stack([np.ones(50), np.zeros(50)], axis=1), np.full(50, 0.04), np.ones(50))
     assert found[0] == pytest.approx(0.04)
     assert np.isfinite(found).all()
 
 
-def test_errors_that_grow_away_from_the_views_do_so_in_the_model(random_scene: Callable[..., GaussianScene]) -> None:
+def test_errors_that_grow_away_from_the_views_do_so_in_the_model(random_scene):
     """The true frames are the scene's own, with noise that grows with elevation; the views lie at 0."""
     scene, rng = random_scene(150), np.random.default_rng(1)
     poses = np.tile(np.eye(4), (9, 1, 1))

@@ -1,8 +1,5 @@
 """Views between frames and beyond the ends of a sweep."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -10,14 +7,13 @@ import pytest
 import torch
 
 from ultragray.geometry.pose import rotation_angles_deg
-from ultragray.learn.sweep import Dataset, Sweep
 from ultragray.learn.training.between import Places, ViewsBetween, draw_places, features_follow_probe, neighbours_of
 from ultragray.learn.training.losses import image_loss
 
 PIXELS_A_MM = 2.0
 
 
-def drifting(sweep: Sweep, *, with_probe: bool) -> Sweep:
+def drifting(sweep, *, with_probe):
     """The probe slides sideways while it moves on; what it sees stays in space, or in the image."""
     count, height, width = 12, 40, 40
     poses = np.tile(np.eye(4), (count, 1, 1))
@@ -29,9 +25,7 @@ def drifting(sweep: Sweep, *, with_probe: bool) -> Sweep:
     return replace(sweep, images=images, poses=poses, frame_numbers=np.arange(count))
 
 
-def test_poses_between_move_the_middle_of_the_image_straight_and_turn_evenly(
-    tiny_dataset: Callable[..., Dataset],
-) -> None:
+def test_poses_between_move_the_middle_of_the_image_straight_and_turn_evenly(tiny_dataset):
     sweep = tiny_dataset().train
     poses = sweep.poses[:2].copy()
     angle = np.radians(8.0)
@@ -44,7 +38,7 @@ def test_poses_between_move_the_middle_of_the_image_straight_and_turn_evenly(
     assert np.allclose(found[1] @ middle, (0.75 * poses[0] + 0.25 * poses[1]) @ middle)
 
 
-def test_places_fill_the_gaps_by_their_length(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_places_fill_the_gaps_by_their_length(tiny_dataset):
     sweep = tiny_dataset(frames=12).train  # every fourth frame is missing
     neighbours = neighbours_of(sweep)
     places = draw_places(neighbours, 4000, torch.Generator().manual_seed(0))
@@ -56,14 +50,14 @@ def test_places_fill_the_gaps_by_their_length(tiny_dataset: Callable[..., Datase
     assert {float(np.sign(value)) for value in beyond} == {-1.0, 1.0}
 
 
-def test_frames_blend_where_their_features_are(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_frames_blend_where_their_features_are(tiny_dataset):
     for with_probe in (True, False):
         sweep = drifting(tiny_dataset().train, with_probe=with_probe)
         assert features_follow_probe(sweep, neighbours_of(sweep)) is with_probe
 
 
 @pytest.mark.parametrize("with_probe", [True, False])
-def test_images_between_show_what_is_there(tiny_dataset: Callable[..., Dataset], with_probe: bool) -> None:
+def test_images_between_show_what_is_there(tiny_dataset, with_probe):
     sweep = drifting(tiny_dataset().train, with_probe=with_probe)
     every_other = sweep.select(range(0, len(sweep), 2))
     views = ViewsBetween(every_other, neighbours_of(every_other), torch.tensor(every_other.images))
@@ -76,7 +70,7 @@ def test_images_between_show_what_is_there(tiny_dataset: Callable[..., Dataset],
     assert float(errors.max()) < 0.08
 
 
-def test_beyond_an_end_the_last_frame_goes_on(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_beyond_an_end_the_last_frame_goes_on(tiny_dataset):
     sweep = tiny_dataset().train
     views = ViewsBetween(sweep, neighbours_of(sweep), torch.tensor(sweep.images))
     _, poses, images, _ = views.draw(100, torch.Generator().manual_seed(2))
@@ -89,7 +83,7 @@ def test_beyond_an_end_the_last_frame_goes_on(tiny_dataset: Callable[..., Datase
 
 
 @pytest.mark.parametrize("with_probe", [True, False])
-def test_where_neighbours_disagree_a_blend_counts_less(tiny_dataset: Callable[..., Dataset], with_probe: bool) -> None:
+def test_where_neighbours_disagree_a_blend_counts_less(tiny_dataset, with_probe):
     sweep = drifting(tiny_dataset().train, with_probe=with_probe)
     images = sweep.images.copy()
     images[1::2, 20:, 5:20] //= 20
@@ -101,12 +95,11 @@ def test_where_neighbours_disagree_a_blend_counts_less(tiny_dataset: Callable[..
     rendered = (0.9 * drawn.images + 0.07).requires_grad_()
     image_loss(drawn.weighted(rendered), drawn.images, texture=0.0).backward()
     pull = rendered.grad
-    assert pull is not None
     in_doubt, agreed = pull[between][:, 26:34, 10:15].abs().mean(), pull[between][:, :14, 26:].abs().mean()
     assert float(in_doubt) < 0.4 * float(agreed)
 
 
-def test_what_neither_frame_shows_does_not_count(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_what_neither_frame_shows_does_not_count(tiny_dataset):
     sweep = drifting(tiny_dataset().train, with_probe=False)
     views = ViewsBetween(sweep, neighbours_of(sweep), torch.tensor(sweep.images))
     assert not views.follow_probe
@@ -116,7 +109,7 @@ def test_what_neither_frame_shows_does_not_count(tiny_dataset: Callable[..., Dat
     assert float(drawn.weights[~unseen].min()) > 0.0
 
 
-def test_frames_that_are_far_apart_count_as_usual(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_frames_that_are_far_apart_count_as_usual(tiny_dataset):
     sweep = tiny_dataset().train
     two = sweep.select([0, len(sweep) - 1])
     drawn = ViewsBetween(two, neighbours_of(two), torch.tensor(two.images)).draw(50, torch.Generator().manual_seed(4))

@@ -1,13 +1,11 @@
 """Planes between two frames, blended in space: as the baseline `linear` predicts them."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 
 from ultragray.geometry.pose import pose_from_position_quaternion
-from ultragray.geometry.probe import ConvexProbe, FloatArray, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe
+from ultragray.geometry.probe import ConvexProbe, LinearProbe, PhasedProbe, RadialProbe, SteeredProbe
 from ultragray.learn.evaluation.baselines import interpolate_planes
 from ultragray.learn.sweep import Sweep
 from ultragray.learn.training.between import blend_in_space
@@ -22,7 +20,7 @@ PROBES = (
 )
 
 
-def two_frames(probe: Probe, apart_mm: float = 4.0) -> Sweep:
+def two_frames(probe, apart_mm=4.0):
     """Smooth frames that close in themselves from right to left, the second one moved and turned within its plane."""
     rows, columns = np.meshgrid(np.arange(SIZE), np.arange(SIZE), indexing="ij")
     waves = [np.sin(rows / 5 + phase) + np.cos(2 * np.pi * columns / SIZE + phase) for phase in (0.0, 1.0)]
@@ -32,20 +30,20 @@ def two_frames(probe: Probe, apart_mm: float = 4.0) -> Sweep:
     return Sweep(images, np.stack([np.eye(4), moved]), probe, np.arange(2), "two frames")
 
 
-def between(*heights_mm: float) -> FloatArray:  # [V, 4, 4] mm
+def between(*heights_mm):  # [V, 4, 4] mm
     poses = np.tile(np.eye(4), (len(heights_mm), 1, 1))
     poses[:, 1, 3] = heights_mm
     poses[:, 0, 3] = 0.3
     return poses
 
 
-def blended(sweep: Sweep, poses: FloatArray) -> FloatArray:
+def blended(sweep, poses):
     sides = (torch.from_numpy(sweep.images).float() / 255.0).expand(len(poses), -1, -1, -1)
     return blend_in_space(sides, np.stack([sweep.poses] * len(poses)), poses, sweep.probe).images.numpy()
 
 
 @pytest.mark.parametrize("probe", PROBES, ids=lambda probe: probe.kind)
-def test_planes_between_two_frames_are_those_of_the_baseline(probe: Probe) -> None:
+def test_planes_between_two_frames_are_those_of_the_baseline(probe):
     sweep, poses = two_frames(probe), between(0.5, 2.0, 3.0)
     expected = interpolate_planes(sweep, poses)
     errors = np.abs(blended(sweep, poses) - expected)
@@ -54,12 +52,12 @@ def test_planes_between_two_frames_are_those_of_the_baseline(probe: Probe) -> No
     assert np.quantile(np.abs(expected - expected.mean()), 0.5) > 0.05
 
 
-def test_a_plane_that_is_a_frame_shows_that_frame() -> None:
+def test_a_plane_that_is_a_frame_shows_that_frame():
     sweep = two_frames(PROBES[0])
     assert np.allclose(blended(sweep, sweep.poses), sweep.images / 255.0, atol=1e-4)
 
 
-def test_what_no_frame_shows_is_black_and_what_one_shows_is_its() -> None:
+def test_what_no_frame_shows_is_black_and_what_one_shows_is_its():
     sweep = two_frames(PROBES[0])
     aside = between(2.0, 2.0)
     aside[:, 0, 3] = [100.0, 25.0]

@@ -1,20 +1,16 @@
 """The lengths that training follows."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from ultragray import LinearProbe
-from ultragray.learn.sweep import Dataset
 from ultragray.learn.training.geometry import Geometry, frame_spacing_mm
 
 
-def test_lengths_of_a_straight_sweep(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_lengths_of_a_straight_sweep(tiny_dataset):
     dataset = tiny_dataset(frames=9, spacing_mm=2.0)  # frames 2 and 6 are held out: 0 1 3 4 5 7 8 are left
     geometry = Geometry.of(dataset)
     assert geometry.frame_spacing_mm == pytest.approx(2.0)
@@ -31,12 +27,12 @@ def test_lengths_of_a_straight_sweep(tiny_dataset: Callable[..., Dataset]) -> No
     assert geometry.initial_elevation_mm(9.0) == pytest.approx(4.5)
 
 
-def test_dense_sweep_keeps_the_pixel(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_dense_sweep_keeps_the_pixel(tiny_dataset):
     geometry = Geometry.of(tiny_dataset(spacing_mm=0.01))
     assert geometry.initial_scale_mm == geometry.initial_elevation_mm(0.0) == pytest.approx(geometry.pixel_mm)
 
 
-def test_spacing_of_a_raster_is_that_across_the_frames(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_spacing_of_a_raster_is_that_across_the_frames(tiny_dataset):
     """Frames of the next lane lie in almost the same planes, but they are not neighbours."""
     sweep = tiny_dataset(frames=12, spacing_mm=1.0).train
     poses = np.concatenate([sweep.poses, sweep.poses])
@@ -47,7 +43,7 @@ def test_spacing_of_a_raster_is_that_across_the_frames(tiny_dataset: Callable[..
     assert frame_spacing_mm(both) == pytest.approx(1.0)
 
 
-def test_spacing_of_a_tilt_is_that_of_the_image_points(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_spacing_of_a_tilt_is_that_of_the_image_points(tiny_dataset):
     sweep = tiny_dataset(probe=LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=40.0)).train
     poses = np.tile(np.eye(4), (len(sweep), 1, 1))
     step = math.radians(1.0)

@@ -1,39 +1,33 @@
 """Where the Gaussians begin."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from ultragray import GaussianScene, Probe, SceneInfo
-from ultragray.learn.sweep import Dataset
+from ultragray import GaussianScene, SceneInfo
 from ultragray.learn.training import TrainingConfig
 from ultragray.learn.training.between import neighbours_of
 from ultragray.learn.training.geometry import Geometry, Shadows
-from ultragray.learn.training.initial import Start, initial_parameters
+from ultragray.learn.training.initial import initial_parameters
 from ultragray.learn.training.optimizer import rotate
 from ultragray.rendering.backends import reference
 
 
-def whole_start_of(dataset: Dataset, config: TrainingConfig) -> Start:
+def whole_start_of(dataset, config):
     geometry, neighbours = Geometry.of(dataset), neighbours_of(dataset.train)
     shadows = Shadows(dataset.train) if config.transmittance else None
     generator = torch.Generator().manual_seed(3)
     return initial_parameters(dataset, neighbours, shadows, geometry, config.resolved(geometry), generator)
 
 
-def start_of(dataset: Dataset, config: TrainingConfig) -> dict[str, torch.Tensor]:
+def start_of(dataset, config):
     return whole_start_of(dataset, config).parameters
 
 
-def test_informed_start_lies_on_pixels_of_that_brightness(
-    tiny_dataset: Callable[..., Dataset], tiny_config: Callable[..., TrainingConfig], probe: Probe
-) -> None:
+def test_informed_start_lies_on_pixels_of_that_brightness(tiny_dataset, tiny_config, probe):
     dataset = tiny_dataset(probe=probe, frames=9)
     images = np.repeat(dataset.train.images[:1], len(dataset.train), axis=0)  # so that y does not matter
     dataset = replace(dataset, train=replace(dataset.train, images=images))
@@ -42,9 +36,9 @@ def test_informed_start_lies_on_pixels_of_that_brightness(
     points_mm = parameters["means"].double().numpy() * 10.0 + geometry.centre_mm
     x, y, z = (points_mm - dataset.train.poses[0, :3, 3]).T
     if probe.kind == "linear":
-        across, depth = x / probe.width_mm + 0.5, z  # type: ignore[union-attr]
+        across, depth = x / probe.width_mm + 0.5, z
     else:
-        across = np.degrees(np.arctan2(x, z)) / probe.opening_angle_deg + 0.5  # type: ignore[union-attr]
+        across = np.degrees(np.arctan2(x, z)) / probe.opening_angle_deg + 0.5
         depth = np.hypot(x, z)
     row = (depth - probe.near_mm) / probe.scan_line_length_mm * dataset.train.height
     column = across * dataset.train.width
@@ -63,9 +57,7 @@ def test_informed_start_lies_on_pixels_of_that_brightness(
     assert shares.min() > 0.6 * shares.mean(), "no gap stays empty"
 
 
-def test_random_start_is_the_released_cube(
-    tiny_dataset: Callable[..., Dataset], tiny_config: Callable[..., TrainingConfig]
-) -> None:
+def test_random_start_is_the_released_cube(tiny_dataset, tiny_config):
     dataset = tiny_dataset()
     half_side = 0.8 * Geometry.of(dataset).scene_scale_cm
     config = TrainingConfig.preset("paper", max_gaussians=8000)
@@ -77,23 +69,17 @@ def test_random_start_is_the_released_cube(
     assert torch.allclose(torch.sigmoid(parameters["transmittances"]), torch.tensor(0.99))
 
 
-def test_nothing_absorbs_without_transmittance(
-    tiny_dataset: Callable[..., Dataset], tiny_config: Callable[..., TrainingConfig]
-) -> None:
+def test_nothing_absorbs_without_transmittance(tiny_dataset, tiny_config):
     parameters = start_of(tiny_dataset(), tiny_config(transmittance=False))
     assert bool((torch.sigmoid(parameters["transmittances"]) == 1.0).all())
 
 
-def test_depends_on_the_generator_alone(
-    tiny_dataset: Callable[..., Dataset], tiny_config: Callable[..., TrainingConfig]
-) -> None:
+def test_depends_on_the_generator_alone(tiny_dataset, tiny_config):
     first, second = (start_of(tiny_dataset(), tiny_config()) for _ in range(2))
     assert all(torch.equal(first[name], second[name]) for name in first)
 
 
-def test_informed_gaussians_are_turned_like_their_frame_and_as_thick_as_a_slice(
-    tiny_dataset: Callable[..., Dataset], tiny_config: Callable[..., TrainingConfig]
-) -> None:
+def test_informed_gaussians_are_turned_like_their_frame_and_as_thick_as_a_slice(tiny_dataset, tiny_config):
     dataset = tiny_dataset()
     turn = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     poses = dataset.train.poses.copy()
@@ -105,9 +91,7 @@ def test_informed_gaussians_are_turned_like_their_frame_and_as_thick_as_a_slice(
     assert torch.allclose(parameters["scales"].exp(), torch.tensor([0.1, 0.4, 0.1]))
 
 
-def test_gaussians_beyond_an_end_are_the_thicker_the_farther_they_lie(
-    tiny_dataset: Callable[..., Dataset], tiny_config: Callable[..., TrainingConfig]
-) -> None:
+def test_gaussians_beyond_an_end_are_the_thicker_the_farther_they_lie(tiny_dataset, tiny_config):
     dataset = tiny_dataset()
     parameters = start_of(dataset, tiny_config(max_gaussians=500, initial_elevation_mm=0.3))
     y = parameters["means"][:, 1].double().numpy() * 10.0 + Geometry.of(dataset).centre_mm[1]
@@ -120,9 +104,7 @@ def test_gaussians_beyond_an_end_are_the_thicker_the_farther_they_lie(
     assert (beyond_mm > 1.0).sum() > 20
 
 
-def test_what_lies_in_a_shadow_begins_as_bright_as_beside_it_and_keeps_a_floor(
-    tiny_dataset: Callable[..., Dataset], tiny_config: Callable[..., TrainingConfig]
-) -> None:
+def test_what_lies_in_a_shadow_begins_as_bright_as_beside_it_and_keeps_a_floor(tiny_dataset, tiny_config):
     dataset = tiny_dataset(height=60, width=40)
     images = np.full_like(dataset.train.images, 100)
     images[:, 20:, 10:16] = 3  # a shadow below something of the usual brightness

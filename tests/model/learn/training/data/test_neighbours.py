@@ -1,18 +1,14 @@
 """The neighbours of frames, across gaps, and the ends of sweeps."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from ultragray.learn.sweep import Dataset, Sweep
 from ultragray.learn.training.between import neighbours_of
 
 
-def moved(sweep: Sweep, y_mm: list[float], *, x_mm: list[float] | None = None) -> Sweep:
+def moved(sweep, y_mm, *, x_mm=None):
     poses = np.tile(sweep.poses[0], (len(y_mm), 1, 1))
     poses[:, 1, 3] += y_mm
     poses[:, 0, 3] += x_mm or 0.0
@@ -20,7 +16,7 @@ def moved(sweep: Sweep, y_mm: list[float], *, x_mm: list[float] | None = None) -
     return replace(sweep, images=images, poses=poses, frame_numbers=np.arange(len(y_mm)))
 
 
-def test_neighbours_are_the_nearest_on_either_side_whatever_the_order(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_neighbours_are_the_nearest_on_either_side_whatever_the_order(tiny_dataset):
     neighbours = neighbours_of(moved(tiny_dataset().train, [0.0, 2.0, 1.0, 9.0]))
     found = {tuple(pair): gap for pair, gap in zip(neighbours.pairs.tolist(), neighbours.gaps_mm, strict=True)}
     assert found == {(0, 2): pytest.approx(1.0), (1, 2): pytest.approx(1.0), (1, 3): pytest.approx(7.0)}
@@ -28,9 +24,7 @@ def test_neighbours_are_the_nearest_on_either_side_whatever_the_order(tiny_datas
     assert list(zip(neighbours.ends.tolist(), neighbours.outward.tolist(), strict=True)) == [(0, -1.0), (3, 1.0)]
 
 
-def test_a_gap_weighs_as_much_as_it_is_long_and_never_less_than_the_usual_one(
-    tiny_dataset: Callable[..., Dataset],
-) -> None:
+def test_a_gap_weighs_as_much_as_it_is_long_and_never_less_than_the_usual_one(tiny_dataset):
     neighbours = neighbours_of(moved(tiny_dataset().train, [0.0, 1.0, 2.0, 2.2, 7.2]))
     weights = neighbours.weights
     assert weights.sum() == pytest.approx(1.0)
@@ -39,14 +33,14 @@ def test_a_gap_weighs_as_much_as_it_is_long_and_never_less_than_the_usual_one(
     assert neighbours.beyond_mm(np.array([0.0, 1.0])).tolist() == pytest.approx([1.0, 6.25])
 
 
-def test_a_frame_beside_is_no_neighbour_and_hides_no_end(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_a_frame_beside_is_no_neighbour_and_hides_no_end(tiny_dataset):
     sweep = moved(tiny_dataset().train, [0.0, 1.0, 0.5, 1.5], x_mm=[0.0, 0.0, 60.0, 60.0])
     neighbours = neighbours_of(sweep)
     assert neighbours.pairs.tolist() == [[0, 1], [2, 3]]
     assert len(neighbours.ends) == 4
 
 
-def test_a_probe_held_still_has_no_gaps_but_every_frame_takes_part(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_a_probe_held_still_has_no_gaps_but_every_frame_takes_part(tiny_dataset):
     neighbours = neighbours_of(moved(tiny_dataset().train, [0.0, 0.0, 0.0]))
     assert neighbours.spacing_mm == 0.0
     assert neighbours.pairs.tolist() == [[0, 0], [1, 1], [2, 2]]
@@ -54,9 +48,7 @@ def test_a_probe_held_still_has_no_gaps_but_every_frame_takes_part(tiny_dataset:
     assert len(neighbours.without_ends().ends) == 0
 
 
-def test_frames_of_a_probe_that_turns_in_place_are_neighbours_by_their_turn(
-    tiny_dataset: Callable[..., Dataset],
-) -> None:
+def test_frames_of_a_probe_that_turns_in_place_are_neighbours_by_their_turn(tiny_dataset):
     sweep = moved(tiny_dataset().train, [0.0] * 12)
     poses = sweep.poses.copy()
     angles = np.radians(4.0 * np.arange(12))
@@ -68,7 +60,7 @@ def test_frames_of_a_probe_that_turns_in_place_are_neighbours_by_their_turn(
     assert len(neighbours.ends) == 0
 
 
-def test_a_frame_that_only_slides_sideways_is_paired_with_itself(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_a_frame_that_only_slides_sideways_is_paired_with_itself(tiny_dataset):
     sweep = moved(tiny_dataset().train, [0.0, 0.1, -0.1], x_mm=[0.0, 8.0, -8.0])
     neighbours = neighbours_of(sweep)
     used = {*neighbours.pairs.flatten().tolist(), *neighbours.ends.tolist()}

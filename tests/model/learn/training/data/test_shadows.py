@@ -1,29 +1,25 @@
 """The evidence for shadows in frames."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
-from ultragray.learn.sweep import ByteArray, Dataset, Sweep
 from ultragray.learn.training.geometry import Shadows
 
 HEIGHT, WIDTH = 100, 60
 
 
-def speckled(sweep: Sweep, level: float = 90.0) -> ByteArray:
+def speckled(sweep, level=90.0):
     noise = np.random.default_rng(0).gamma(4.0, level / 4.0, (len(sweep), HEIGHT, WIDTH))
     return np.clip(noise, 0, 255).astype(np.uint8)
 
 
-def evidence(sweep: Sweep, images: ByteArray) -> Shadows:
+def evidence(sweep, images):
     return Shadows(replace(sweep, images=images))
 
 
-def test_a_shadow_lasts_to_the_end_of_the_line_and_a_vessel_does_not(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_a_shadow_lasts_to_the_end_of_the_line_and_a_vessel_does_not(tiny_dataset):
     sweep = tiny_dataset().train
     images = speckled(sweep)
     images[:, 30:, 10:20] //= 20
@@ -35,7 +31,7 @@ def test_a_shadow_lasts_to_the_end_of_the_line_and_a_vessel_does_not(tiny_datase
     assert beam.echo[35:, 12:18].mean() == pytest.approx(90 / 255, rel=0.2), "as bright as tissue with the whole beam"
 
 
-def test_half_of_the_beam_is_told(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_half_of_the_beam_is_told(tiny_dataset):
     sweep = tiny_dataset().train
     images = speckled(sweep)
     images[:, 30:, 10:20] //= 2
@@ -43,7 +39,7 @@ def test_half_of_the_beam_is_told(tiny_dataset: Callable[..., Dataset]) -> None:
     assert left[35:85, 12:18].mean() == pytest.approx(0.5, abs=0.12)
 
 
-def test_a_depth_that_is_dark_everywhere_is_no_evidence(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_a_depth_that_is_dark_everywhere_is_no_evidence(tiny_dataset):
     sweep = tiny_dataset().train
     dots = np.zeros((len(sweep), HEIGHT, WIDTH), np.uint8)
     dots[:, 40:43, 20:24] = 250
@@ -55,7 +51,7 @@ def test_a_depth_that_is_dark_everywhere_is_no_evidence(tiny_dataset: Callable[.
 
 
 @pytest.mark.parametrize("level", [0, 1])
-def test_a_line_without_contact_casts_no_shadow(tiny_dataset: Callable[..., Dataset], level: int) -> None:
+def test_a_line_without_contact_casts_no_shadow(tiny_dataset, level):
     sweep = tiny_dataset().train
     images = speckled(sweep)
     images[:, :, 10:20] = level

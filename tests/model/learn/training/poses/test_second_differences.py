@@ -1,7 +1,5 @@
 """Banded factors of second differences against the same in dense matrices."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 
@@ -10,12 +8,12 @@ from ultragray.learn.training.alignment import likelihood_terms, smoothed
 RATIOS = np.array([1e-6, 1e-2, 1.0, 1e6])
 
 
-def differences(count: int) -> np.ndarray:  # [F − 2, F]
+def differences(count):  # [F − 2, F]
     return np.diff(np.eye(count), 2, axis=0)
 
 
 @pytest.mark.parametrize("count", [5, 40])
-def test_likelihoods_are_those_of_dense_matrices(count: int) -> None:
+def test_likelihoods_are_those_of_dense_matrices(count):
     d, bends = differences(count), np.random.default_rng(0).normal(size=(count - 2, 6))
     log_determinants, squares = likelihood_terms(bends, RATIOS)
     for place, ratio in enumerate(RATIOS):
@@ -27,7 +25,7 @@ def test_likelihoods_are_those_of_dense_matrices(count: int) -> None:
 
 @pytest.mark.parametrize("ratio", RATIOS)
 @pytest.mark.parametrize("count", [5, 40])
-def test_the_smooth_path_is_that_of_a_dense_matrix(count: int, ratio: float) -> None:
+def test_the_smooth_path_is_that_of_a_dense_matrix(count, ratio):
     d, values = differences(count), np.random.default_rng(1).normal(size=count).cumsum()
     expected = np.linalg.solve(np.eye(count) + d.T @ d / ratio, values)
     np.testing.assert_allclose(smoothed(values, ratio), expected, rtol=1e-6, atol=1e-6)

@@ -1,7 +1,5 @@
 """The image loss against an independent SSIM and closed forms."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 from pytorch_msssim import ssim as other_ssim
@@ -9,7 +7,7 @@ from pytorch_msssim import ssim as other_ssim
 from ultragray.learn.training.losses import image_loss, plain_image_loss, ssim
 
 
-def test_ssim_agrees_with_another_implementation() -> None:
+def test_ssim_agrees_with_another_implementation():
     generator = torch.Generator().manual_seed(0)
     x = torch.rand((3, 24, 17), generator=generator)
     y = (x + 0.2 * torch.randn(x.shape, generator=generator)).clamp(0, 1)
@@ -17,7 +15,7 @@ def test_ssim_agrees_with_another_implementation() -> None:
     assert float(ssim(x, y)) == pytest.approx(float(expected), abs=1e-6)
 
 
-def test_loss_of_constant_frames() -> None:
+def test_loss_of_constant_frames():
     # SSIM of constants a, b is (2ab + C1)/(a² + b² + C1): there is no variance.
     a, b = torch.full((2, 11, 12), 0.25, dtype=torch.float64), torch.full((2, 11, 12), 0.75, dtype=torch.float64)
     dissimilarity = 1.0 - (2 * 0.25 * 0.75 + 1e-4) / (0.25**2 + 0.75**2 + 1e-4)
@@ -27,13 +25,13 @@ def test_loss_of_constant_frames() -> None:
         assert float(image_loss(a, a, texture)) == pytest.approx(0.0, abs=1e-9)
 
 
-def test_gradient() -> None:
+def test_gradient():
     generator = torch.Generator().manual_seed(1)
     x, y = torch.rand((2, 1, 12, 13), generator=generator, dtype=torch.float64)
     assert torch.autograd.gradcheck(lambda rendered: image_loss(rendered, y, 0.3), (x.requires_grad_(),))
 
 
-def test_kernel_gives_the_same_as_torch() -> None:
+def test_kernel_gives_the_same_as_torch():
     generator = torch.Generator().manual_seed(2)
     x, y = torch.rand((2, 3, 19, 14), generator=generator)
     gradients = []
@@ -47,7 +45,7 @@ def test_kernel_gives_the_same_as_torch() -> None:
     assert torch.allclose(*gradients, rtol=1e-3, atol=1e-7)
 
 
-def test_truth_of_another_dtype_does_not_reach_the_kernel() -> None:
+def test_truth_of_another_dtype_does_not_reach_the_kernel():
     generator = torch.Generator().manual_seed(3)
     x, y = torch.rand((2, 1, 12, 13), generator=generator)
     expected = float(plain_image_loss(x.double(), y.double(), 0.3))
@@ -55,11 +53,11 @@ def test_truth_of_another_dtype_does_not_reach_the_kernel() -> None:
     assert float(image_loss(x.double(), y, 0.3)) == pytest.approx(expected, abs=1e-7)
 
 
-def test_windows_are_not_left_to_cudnn(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_windows_are_not_left_to_cudnn(monkeypatch):
     """It would round to ten bits, and a variance is the small difference of two means; see `_blurred`."""
     true_conv2d, groups = torch.nn.functional.conv2d, []
 
-    def watched(fields: torch.Tensor, window: torch.Tensor, **options: int) -> torch.Tensor:
+    def watched(fields, window, **options):
         groups.append((options["groups"], fields.shape[1]))
         return true_conv2d(fields, window, **options)
 

@@ -1,7 +1,5 @@
 """Adam by its definition, and its moments through a refinement and a checkpoint."""
 
-from __future__ import annotations
-
 import torch
 
 from ultragray.learn.training.optimizer import Optimizer
@@ -9,7 +7,7 @@ from ultragray.learn.training.optimizer import Optimizer
 RATES = {"means": 0.1, "sh0": 0.01}
 
 
-def parameters(seed: int = 0) -> dict[str, torch.Tensor]:
+def parameters(seed=0):
     generator = torch.Generator().manual_seed(seed)
     return {
         "means": torch.randn((5, 3), generator=generator).requires_grad_(),
@@ -18,14 +16,14 @@ def parameters(seed: int = 0) -> dict[str, torch.Tensor]:
     }
 
 
-def set_gradients(tensors: dict[str, torch.Tensor], seed: int) -> None:
+def set_gradients(tensors, seed):
     generator = torch.Generator().manual_seed(seed)
     for tensor in tensors.values():
         if tensor.requires_grad:
             tensor.grad = torch.randn(tensor.shape, generator=generator)
 
 
-def test_steps_of_adam_for_a_batch() -> None:
+def test_steps_of_adam_for_a_batch():
     b, given = 4, parameters()
     optimizer = Optimizer(given, batch_size=b)
     first, second = 1 - 0.1 * b, 1 - 0.001 * b
@@ -48,7 +46,7 @@ def test_steps_of_adam_for_a_batch() -> None:
     assert bool((given["quats"] == 1).all())
 
 
-def test_moments_follow_the_gaussians() -> None:
+def test_moments_follow_the_gaussians():
     given = parameters()
     optimizer = Optimizer(given, batch_size=4)
     set_gradients(given, 1)
@@ -70,7 +68,7 @@ def test_moments_follow_the_gaussians() -> None:
     assert bool((grown["means"].detach()[2:] != 0).all())
 
 
-def test_goes_on_bit_for_bit_from_its_tensors() -> None:
+def test_goes_on_bit_for_bit_from_its_tensors():
     first = parameters()
     optimizer = Optimizer(first, batch_size=4)
     set_gradients(first, 1)
@@ -84,7 +82,7 @@ def test_goes_on_bit_for_bit_from_its_tensors() -> None:
     assert all(torch.equal(first[name], second[name]) for name in first)
 
 
-def test_moments_are_taken_to_the_device_of_the_parameters() -> None:
+def test_moments_are_taken_to_the_device_of_the_parameters():
     first = parameters()
     optimizer = Optimizer(first, batch_size=4)
     set_gradients(first, 1)
