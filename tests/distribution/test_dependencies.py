@@ -93,12 +93,6 @@ def test_advice_fits_the_installation(extra, tmp_path, monkeypatch):
     assert install_advice(extra) == f".venv/bin/pip install {stubs}'ultragray[{extra}]'"
 
 
-def test_advice_on_a_python_that_is_too_old(monkeypatch):
-    monkeypatch.setattr(sys, "version_info", (3, 10, 13))
-    assert "Python 3.11" in install_advice("serve")
-    assert "pip install" in install_advice("hdf5")
-
-
 def test_a_module_of_nobody_is_no_missing_extra():
     with pytest.raises(ModuleNotFoundError):
         missing_extra(ModuleNotFoundError("no module", name="ultragray.renderring"), "it")

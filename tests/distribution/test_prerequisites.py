@@ -23,11 +23,6 @@ def program(path, text):
     return path
 
 
-def test_a_machine_that_has_everything(prerequisites):
-    assert prerequisites.headers_problem() is None
-    assert prerequisites.compiler_problem() is None
-
-
 def test_without_the_headers_of_python(prerequisites, tmp_path, monkeypatch):
     monkeypatch.setattr(prerequisites.sysconfig, "get_path", lambda name: str(tmp_path / name))
     told = prerequisites.headers_problem()
@@ -44,21 +39,6 @@ def test_without_a_compiler(prerequisites, tmp_path, monkeypatch):
     )
     program(tmp_path / "apt-get", "exit 0")
     assert prerequisites.compiler_problem().endswith("to install: sudo apt-get install g++")
-
-
-def test_with_a_compiler_that_is_too_old(prerequisites, tmp_path, monkeypatch):
-    monkeypatch.setenv("CXX", str(program(tmp_path / "old-g++", "cat > /dev/null; exit 1")))
-    assert "old-g++ or its library is too old for C++17" in prerequisites.compiler_problem()
-    monkeypatch.setenv("CXX", "absent-g++ -m64")
-    assert "'absent-g++', which CXX names, does not start" in prerequisites.compiler_problem()
-
-
-def test_without_the_console(prerequisites, tmp_path, monkeypatch):
-    page = tmp_path / "index.html"
-    monkeypatch.setattr(prerequisites, "CONSOLE_PAGE", page)
-    assert "make console" in prerequisites.console_problem()
-    page.touch()
-    assert prerequisites.console_problem() is None
 
 
 def test_the_script_ends_with_one_line_for_each_problem(tmp_path):

@@ -42,14 +42,6 @@ def test_the_network_learns_squares_and_the_same_seed_gives_the_same_network(une
     assert torch.equal(unet.segmented(first, frames), unet.segmented(again, frames))
 
 
-def test_ignored_pixels_teach_nothing(unet):
-    frames, labels = squares(10)
-    halves = labels.clone()
-    halves[:, :, 7:] = unet.IGNORED  # as background, they would teach that squares end there
-    net = unet.train_unet(frames, halves, classes=2, steps=30, seed=0)
-    assert unet.dice(unet.segmented(net, frames), labels, 1) > 0.9
-
-
 @pytest.mark.long
 def test_a_scene_is_served_for_as_long_as_the_block_runs(running_service, tmp_path):
     scene_file = tmp_path / "spine.ugr"

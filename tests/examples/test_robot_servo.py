@@ -76,13 +76,6 @@ def test_the_robot_converges_and_follows(servo, demo_service):
     assert f"in {len(record.errors_mm)} frames" in record.tell()
 
 
-def test_the_error_is_that_of_the_control(servo, demo_service, monkeypatch):
-    """Without control the patient's sway is what remains."""
-    monkeypatch.setattr(servo, "GAIN_PER_S", 0.0)
-    record = asyncio.run(servo.servo(demo_service.grpc, seconds=4.0))
-    assert not record.errors_mm or np.abs(record.errors_mm).max() > 3.0
-
-
 def test_as_a_program(demo_service):
     command = [sys.executable, EXAMPLES / "robot_servo.py", "--address", demo_service.grpc, "--seconds", "2.5"]
     told = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout

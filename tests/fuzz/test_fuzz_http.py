@@ -2,10 +2,8 @@
 
 import contextlib
 import http.client
-import io
 import json
 import socket
-import zipfile
 from urllib.parse import quote
 
 import pytest
@@ -21,14 +19,10 @@ from schemathesis.specs.openapi.checks import (
     status_code_conformance,
 )
 
-from ultragray.datasets import Dataset
-from ultragray.datasets.released import write_released
-
 from ..model.datasets.conftest import make_sweep
 from ..waiting import at_this_load
 from .fuzzed import EXPECTED_5XX
 from .mutations import TEXTS, as_json, mutated_bytes, mutated_json
-from .test_fuzz_files import mutated_bundle, mutated_released, packed
 from .test_fuzz_websocket import MATRIX, POSE, SETTINGS
 
 __all__ = ["make_sweep"]
@@ -254,22 +248,3 @@ def test_bytes(door, well):
                 assert is_expected(int(answer[9:12])), answer[:1000]
 
     door("http bytes").enter(mutated_bytes(whole), attempt)
-
-
-def test_uploads(door, connection, demo_scene, make_sweep, tmp_path):
-    demo_scene.save(tmp_path / "whole.ugr")
-    write_released(Dataset("tiny", make_sweep(8), make_sweep(2)), tmp_path / "released")
-    files = {path.name: path.read_bytes() for path in (tmp_path / "released").iterdir()}
-    scenes = mutated_bundle((tmp_path / "whole.ugr").read_bytes()).map(lambda data: ("/v1/scenes/new", data))
-    archives = mutated_released(files).map(lambda changed: packed(list(changed.items()), "zip"))
-    datasets = archives.map(lambda data: ("/v1/datasets/new", data))
-
-    def attempt(asked):
-        path, data = asked
-        kind = "application/zip" if zipfile.is_zipfile(io.BytesIO(data)) else "application/octet-stream"
-        status, answer = connection.ask("PUT", path, data, {"Content-Type": kind})
-        assert is_expected(status), (status, answer[:500])
-        if status in (200, 201):
-            connection.ask("DELETE", path, None, {})
-
-    door("uploads").enter(st.one_of(scenes, datasets), attempt)

@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray import SceneInfo
 from ultragray.errors import UnknownOutput
 from ultragray.exchange.exports.exporter import stored_pixels
-from ultragray.rendering.outputs import OUTPUTS, Output, check_available, check_outputs
+from ultragray.rendering.outputs import OUTPUTS, Output, check_outputs
 from ultragray.rendering.pixels import to_uint8
 from ultragray_workers.pool.pixels import render_to_host, round_to_uint8
 
@@ -22,14 +21,6 @@ def test_outputs_keep_their_order_without_repetitions():
 def test_other_outputs_are_refused(outputs):
     with pytest.raises(UnknownOutput, match=", ".join(OUTPUTS)) as caught:
         check_outputs(outputs)
-    assert caught.value.field == "outputs"
-
-
-def test_labels_need_a_scene_that_has_them():
-    check_available(("bmode", "labels"), SceneInfo(label_names={3: "fat"}))
-    check_available(("bmode",), SceneInfo())
-    with pytest.raises(UnknownOutput, match="only for a scene whose Gaussians carry labels") as caught:
-        check_available(("bmode", "labels"), SceneInfo())
     assert caught.value.field == "outputs"
 
 

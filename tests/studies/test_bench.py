@@ -16,7 +16,7 @@ from ultragray.rendering.backends import cpu
 from ultragray_studies.bench import clients, parts, report
 from ultragray_studies.bench.clients import ClientsExtent, JobsExtent, bench_clients, bench_jobs
 from ultragray_studies.bench.kernel import BenchScene
-from ultragray_studies.bench.parts import LANES, PARTS, View, bench_kernel_details, bench_training, measure_training
+from ultragray_studies.bench.parts import LANES, PARTS, View, bench_kernel_details, bench_training
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=40.0)
 
@@ -48,12 +48,6 @@ def test_the_work_of_a_gaussian_is_its_footprint(instruction_set):
     assert work["lanes"] <= work["rows"] * LANES[instruction_set]
 
 
-def test_nothing_to_draw_is_no_work():
-    away = np.eye(4)[None].copy()
-    away[0, 1, 3] = 5.0
-    assert not any(counts.any() for counts in cpu.drawing_work(one_gaussian(1.0), PROBE, away, 80, 80).values())
-
-
 def test_bench_of_the_kernels_parts(tmp_path, monkeypatch, capsys):
     def tiny(quick):
         yield View("one", one_gaussian(1.0), PROBE, np.eye(4)[None].repeat(4, 0), 80, 80)
@@ -70,26 +64,6 @@ def test_bench_of_the_kernels_parts(tmp_path, monkeypatch, capsys):
         assert row["modelled_speedups"]["16"] >= row["modelled_speedups"]["2"]
     printed = capsys.readouterr().out
     assert all(f"{row['groups']:,.0f}" in printed for row in rows)
-
-
-TINY = BenchScene(300, 0.1, height=24, width=20)
-
-
-def test_parts_make_up_the_step():
-    timing = measure_training(TINY, threads=1, repeats=3)
-    assert list(timing.part_ms) == list(PARTS)
-    assert len(timing.step_ms) == 3
-    assert np.sum(list(timing.part_ms.values()), axis=0).tolist() == pytest.approx(timing.step_ms)
-    assert min(min(times) for times in timing.part_ms.values()) > 0.0
-    assert all(0.0 < timing.share(part) < 1.0 for part in PARTS)
-
-
-def test_leaves_the_scene_and_the_threads_as_they_were():
-    before = {name: tensor.clone() for name, tensor in TINY.scene.splats.items()}
-    threads = torch.get_num_threads()
-    measure_training(TINY, threads=threads + 1, repeats=1)
-    assert torch.get_num_threads() == threads
-    assert all(torch.equal(before[name], tensor) for name, tensor in TINY.scene.splats.items())
 
 
 @pytest.mark.parametrize(("quick", "gaussians"), [(True, [300]), (False, [400, 300])])
@@ -172,8 +146,3 @@ def test_the_head_says_commit_date_and_machine(capsys):
     assert machine["instruction_set"] == cpu.INSTRUCTION_SETS[0]
     assert machine["memory_gib"] > 0.1
     assert report.measured(1)["machine"] == {**machine, "threads": 1}
-
-
-def test_an_installed_package_has_no_commit(tmp_path, monkeypatch):
-    monkeypatch.setattr(report, "ROOT", tmp_path)
-    assert report.commit() is None

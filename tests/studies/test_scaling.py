@@ -1,7 +1,6 @@
 """The simulation of replicas: right where the answer is known, true to Envoy's rules, the same for the same seed."""
 
 import math
-from collections import Counter
 
 import numpy as np
 import pytest
@@ -14,7 +13,6 @@ from ultragray_studies.scaling import (
     CacheSizes,
     Case,
     Change,
-    LeastRequest,
     OpenRequests,
     Policy,
     ReplicaCache,
@@ -67,14 +65,6 @@ def test_the_mean_wait_at_80_percent_is_that_of_queueing_theory(constant, known)
     assert np.mean(waits) == pytest.approx(known, rel=0.06)
 
 
-@pytest.mark.parametrize("points", [2, 66])
-def test_the_parts_of_a_ring_vary_as_sums_of_gaps_do(points):
-    scenes, replicas = 200_000, 1000
-    counts = np.bincount(Ring(range(replicas), scenes, replicas * points, 0).homes, minlength=replicas)
-    beta = math.sqrt((replicas - 1) / (replicas * points + 1))  # the share of a replica is the sum of `points` gaps
-    assert counts.std() / counts.mean() == pytest.approx(math.hypot(beta, math.sqrt(replicas / scenes)), rel=0.06)
-
-
 def test_the_hits_of_a_cache_are_ches_approximation():
     same, slots, shares = SceneCosts(1, 1, 1, 0.0, 1.0, 0.0, 0.0), 100, Workload().popularity()
 
@@ -115,12 +105,6 @@ def test_a_scene_is_fetched_once_and_loaded_again_after_it_was_dropped():
     assert sources == [(storage, 0.5), (storage, 1.5), (memory, 2.0), (storage, 3.5), (folder, 4.0), (folder, 5.0)]
 
 
-def test_who_asks_during_a_fetch_waits_for_its_end():
-    cache = ReplicaCache(CacheSizes(), [SMALL], Storage(first_byte_s=2.0, bytes_per_s=math.inf))
-    cache.ask(0, 0.0)
-    assert cache.ask(0, 0.5) == (Source.MEMORY, 2.0)
-
-
 # Envoy's rules.
 
 
@@ -145,34 +129,12 @@ def test_a_replica_above_its_share_is_passed_over():
         bounded(100)
 
 
-def test_the_replicas_that_relieve_a_home_depend_on_the_scene_alone():
-    full = opened(*([20] + [0] * 19))
-    chosen = [bounded(110, 20).choose(scene, full) for scene in range(9)]
-    assert chosen == [bounded(110, 20).choose(scene, full) for scene in range(9)]
-    assert len(set(chosen)) > 4
-
-
-def test_no_replica_has_more_open_requests_than_the_bound_lets_it():
-    balancer, load = bounded(110, 10), opened(*([0] * 10))
-    for _ in range(500):
-        replica = balancer.choose(0, load)
-        load.of[replica] += 1
-        load.total += 1
-    assert max(load.of) <= math.ceil(math.ceil(1.1 * 500) / 10) + 1
-
-
 def test_only_some_scenes_move_where_a_replica_dies():
     before, after = (Ring(numbers, 5_000, 4096, 0).homes for numbers in (range(20), range(1, 20)))
     moved = before != after
     assert 0.0 < moved[before != 0].mean() < 0.07  # of a ring of the same size the others get more points
     assert moved[before == 0].all()
     assert (Ring(range(20), 5_000, 4096, 0, HTTP).homes != before).mean() > 0.9, "doors have homes of their own"
-
-
-def test_of_two_replicas_the_one_with_fewer_open_requests_is_taken():
-    balancer = LeastRequest(range(4), 0)
-    counts = Counter(balancer.choose(0, opened(0, 5, 5, 5)) for _ in range(4_000))
-    assert counts[0] / 4_000 == pytest.approx(1.0 - 0.75**2, abs=0.03)
 
 
 # Whole runs.
@@ -212,9 +174,3 @@ def test_streams_of_dead_replicas_come_again_and_nothing_reaches_the_dead():
     cut = int((dead & (end == 11.0)).sum())
     assert 0 < len(asked) - len(traffic.time_s) <= cut
     assert (replica[asked > 11.0] == REPLICAS).any()
-
-
-def test_the_work_of_replicas_is_that_of_the_clients():
-    mean_s = 0.8 * SMALL.frame_s + 0.2 * LARGE.frame_s
-    work = (FEW.streams * FEW.poses_per_s + FEW.requests_per_s) * mean_s / REPLICAS
-    assert run(small(), KINDS, 0).busy == pytest.approx(work, rel=0.2)

@@ -47,22 +47,6 @@ def test_the_number_of_threads_does_not_change_a_bit(random_scene, instruction_s
     assert torch.equal(frames[0], frames[2])
 
 
-def test_a_batch_is_its_poses_one_by_one(random_scene):
-    scene = random_scene(count=1000)
-    batch = render(scene, PROBE, poses(19), height=64, width=70, outputs=("bmode",)).bmode
-    for c, pose in enumerate(poses(19)):
-        single = render(scene, PROBE, pose, height=64, width=70, outputs=("bmode",)).bmode
-        assert torch.equal(batch[c], single[0])
-
-
-def test_a_tensor_changed_in_place_is_noticed(random_scene):
-    scene = random_scene(count=200)
-    before = render(scene, PROBE, poses(1), height=32, width=32, outputs=("transmittance",)).transmittance
-    scene.transmittances.fill_(-10.0)
-    after = render(scene, PROBE, poses(1), height=32, width=32, outputs=("transmittance",)).transmittance
-    assert after.mean() < before.mean() - 0.01
-
-
 @pytest.mark.long
 @pytest.mark.usefixtures("threads")
 def test_helpers_leave_the_caller_the_processors_it_may_run_on(random_scene):
@@ -118,13 +102,6 @@ def test_what_it_cannot_render_is_refused(random_scene):
         render(scene.to(torch.float64), PROBE, poses(1), height=8, width=8, backend="cpu")
     with pytest.raises(BackendUnavailable, match="instruction_set must be auto or one of"):
         cpu.render_outputs(scene, PROBE, poses(1), 8, 8, ("bmode",), instruction_set="sse9")
-
-
-def test_only_what_was_asked_for_comes_back(random_scene):
-    frames = render(random_scene(count=10), PROBE, poses(2), height=8, width=9, outputs=("echo", "coverage"))
-    assert frames.bmode is None
-    assert frames.transmittance is None
-    assert frames.echo.shape == (2, 8, 9)
 
 
 def test_a_scene_that_shares_tensors_has_its_own_preparation(random_scene):

@@ -269,12 +269,6 @@ def test_a_convex_probe_culls_by_range_in_the_plane(mean_cm, visible):
     assert compare(scene, CONVEX, HERE, (10, 5)).any() == visible
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_dtype_of_the_scene_is_kept(random_scene, dtype):
-    frames = render(random_scene(3, dtype=dtype), LINEAR, HERE, height=4, width=4, backend="reference")
-    assert {getattr(frames, name).dtype for name in PLANES} == {dtype}
-
-
 def test_only_the_outputs_asked_for_come_back(random_scene):
     frames = render(random_scene(3), LINEAR, HERE, height=4, width=5, outputs=["echo"], backend="reference")
     assert frames.echo.shape == (1, 4, 5)

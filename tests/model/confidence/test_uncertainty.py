@@ -61,11 +61,6 @@ def test_another_size_says_the_same(scene):
     assert small == pytest.approx(float(large), rel=0.03)
 
 
-def test_it_can_be_asked_for_beside_others(scene):
-    frames = render(scene, None, moved(0.4), height=24, width=20, outputs=("uncertainty", "bmode"))
-    torch.testing.assert_close(frames["bmode"], render(scene, None, moved(0.4), height=24, width=20)["bmode"])
-
-
 def test_scenes_without_it_say_so(scene):
     known = ConfidenceModel.from_dict(scene.info.confidence)
     for confidence in ({}, replace(known, uncertainty=None).to_dict()):

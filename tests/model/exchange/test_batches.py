@@ -131,14 +131,6 @@ def test_a_costly_frame_is_named_by_its_number_in_the_batch(scene_file, tmp_path
     assert caught.value.field == "frame 40"
 
 
-def test_a_stop_leaves_the_rendering(scene_file, tmp_path):
-    def stop(done):
-        raise TimeoutError
-
-    with pytest.raises(TimeoutError):
-        ShardRenderer(plan_of(scene_file), scene_file, CPU).render(0, tmp_path / "shard.tar", stop)
-
-
 def test_another_scene_is_refused(scene_file):
     with pytest.raises(InvalidArgument, match="not the scene of the plan"):
         ShardRenderer(plan_of(scene_file, scene_sha256="0"), scene_file, CPU)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, render
+from ultragray import GaussianScene, LinearProbe, render
 from ultragray.errors import CheckpointInvalid, InvalidArgument, InvalidPose
 from ultragray.exchange.checkpoint import import_checkpoint
 from ultragray.exchange.poses import load_poses
@@ -114,14 +114,6 @@ def test_a_tracker_pose_shows_what_the_released_view_shows(dataset):
     torch.testing.assert_close(ours, released, atol=1e-5, rtol=0)
 
 
-def test_an_imported_scene_survives_its_file(dataset, tmp_path):
-    scene = dataset.import_it()
-    scene.save(tmp_path / "a.ugr")
-    back = GaussianScene.load(tmp_path / "a.ugr")
-    assert back.info == scene.info
-    np.testing.assert_allclose(back.training_poses, dataset.pose_array, atol=1e-9)
-
-
 def test_a_bare_splats_dictionary_and_other_dtypes_load(dataset):
     torch.save({name: t.double() for name, t in dataset.splats.items()}, dataset.checkpoint)
     scene = dataset.import_it()
@@ -187,18 +179,6 @@ def test_a_config_may_name_the_image_size_itself(dataset):
     assert dataset.import_it(image_height=51).info.image_height == 51
     dataset.images.unlink()
     assert dataset.import_it().info == scene.info
-
-
-@pytest.mark.parametrize("height", [1, 0, -5, 2.5, True])
-def test_an_image_height_that_no_grid_has_is_refused(dataset, height):
-    with pytest.raises(InvalidArgument, match="image_height must be an integer of at least 2"):
-        dataset.import_it(image_height=height)
-
-
-def test_a_convex_config(dataset):
-    dataset.write_config(ultrasound_opening_width=None, ultrasound_opening_angle=60.0)
-    far_mm = 5.0 + 40.0 * HEIGHT / (HEIGHT - 1)
-    assert dataset.import_it().info.probe == ConvexProbe(opening_angle_deg=60.0, near_mm=5.0, far_mm=far_mm)
 
 
 def test_poses_that_are_not_the_training_poses_are_noticed(dataset, caplog):
@@ -318,12 +298,6 @@ def test_bad_poses_are_named(dataset, tmp_path, name, content, message):
         dataset.import_it(poses=path)
     with pytest.raises(InvalidPose, match=message):
         load_poses(path)
-
-
-def test_missing_poses_are_named(dataset):
-    dataset.poses.unlink()
-    with pytest.raises(CheckpointInvalid, match=r"poses_train\.npy: no such file"):
-        dataset.import_it()
 
 
 class Hostile:

@@ -42,11 +42,6 @@ def test_a_failure_keeps_the_old_file_and_leaves_nothing(tmp_path):
     assert os.listdir(tmp_path) == ["scene.ugr"]
 
 
-def test_a_missing_folder_is_an_os_error(tmp_path):
-    with pytest.raises(FileNotFoundError), atomic_path(tmp_path / "nowhere" / "scene.ugr"):
-        pass
-
-
 def test_what_a_killed_process_left_is_removed_and_nothing_else(tmp_path):
     path = tmp_path / "scene[1].ugr"
     with atomic_path(path) as temporary:

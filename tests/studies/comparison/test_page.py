@@ -2,51 +2,29 @@
 
 import json
 import re
-from html.parser import HTMLParser
 
 import numpy as np
+import pytest
 
 from ultragray.learn.evaluation.methods import ComparisonSettings
 from ultragray.learn.evaluation.metrics import FrameMetrics
 from ultragray.learn.evaluation.scoring import Evaluation
 from ultragray.learn.report.page import telling_places
 from ultragray_studies.comparison.page import DISTANCE_BINS, binned_medians, write_comparison
-from ultragray_studies.comparison.result import Comparison
+from ultragray_studies.comparison.result import FORMAT_VERSION, Comparison
 from ultragray_studies.comparison.run import compare_methods
 
-VOID = {"meta", "img", "link", "br"}
-
-
-class Checked(HTMLParser):
-    """Tags that are closed in order, ids, and every address that the page refers to."""
-
-    def __init__(self, text):
-        super().__init__()
-        self.open_tags = []
-        self.addresses = []
-        self.ids = set()
-        self.feed(text)
-
-    def handle_starttag(self, tag, attrs):
-        self.addresses += [value or "" for name, value in attrs if name in ("src", "href", "xlink:href")]
-        self.ids |= {value or "" for name, value in attrs if name == "id"}
-        if tag not in VOID:
-            self.open_tags.append(tag)
-
-    def handle_startendtag(self, tag, attrs):
-        self.handle_starttag(tag, attrs)
-        if tag not in VOID:
-            self.open_tags.pop()
-
-    def handle_endtag(self, tag):
-        assert self.open_tags.pop() == tag
+from ...model.learn.report.test_page import Checked
 
 
 def test_the_page_has_every_method_and_needs_nothing_else(dataset, methods, paces, tmp_path):
     found = compare_methods(dataset, methods, ComparisonSettings(), folder=tmp_path, paces=paces)
     paths = write_comparison(found, dataset, tmp_path)
     assert [path.name for path in paths] == ["comparison.json", "comparison.tex", "comparison.html"]
-    assert Comparison.from_dict(json.loads(paths[0].read_text())).to_dict() == json.loads(json.dumps(found.to_dict()))
+    document = json.loads(paths[0].read_text())
+    assert Comparison.from_dict(document).to_dict() == document == json.loads(json.dumps(found.to_dict()))
+    with pytest.raises(ValueError, match="a newer release wrote it"):
+        Comparison.from_dict({**document, "format_version": FORMAT_VERSION + 1})
     text = paths[2].read_text()
     page = Checked(text)
     assert page.open_tags == []

@@ -13,12 +13,11 @@ from ultragray.rendering.contact import Skin, Touch
 from ultragray.rendering.pixels import to_uint8
 from ultragray.rendering.settings import Contact
 from ultragray_studies.gym import STANDARD_PLANE, StandardPlaneEnv
-from ultragray_studies.gym.standard_plane import StandardPlaneSettings, moved
+from ultragray_studies.gym.standard_plane import moved
 
 LINEAR = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 CONVEX = ConvexProbe(opening_angle_deg=50.0, near_mm=20.0, far_mm=60.0)
 SMALL = {"height": 24, "width": 20, "start_mm": 4.0, "start_deg": 5.0}
-GOAL = 4  # of nine training views
 FAR_AWAY = np.eye(4)
 FAR_AWAY[1, 3] = 5000.0
 
@@ -173,15 +172,6 @@ def test_pictures_show_frame_and_goal(scene):
     assert StandardPlaneEnv(scene, **SMALL).render() is None
 
 
-def test_many_at_once(scene):
-    many = gymnasium.make_vec(STANDARD_PLANE, num_envs=3, vectorization_mode="sync", scene=scene, **SMALL)
-    frames, _ = many.reset(seed=7)
-    assert frames.shape == (3, 24, 20, 1)
-    frames, rewards, *_ = many.step(many.action_space.sample())
-    assert rewards.shape == (3,)
-    many.close()
-
-
 def test_a_scene_without_skin_is_scanned_with_assumed_contact(random_scene):
     bare = random_scene(50, info={"probe": LINEAR})
     with pytest.raises(InvalidArgument, match="contact needs a scene"):
@@ -226,13 +216,3 @@ def test_a_start_must_be_one_from_which_the_goal_can_be_reached(env):
         env.reset(options={"pose": "here"})
     with pytest.raises(InvalidArgument, match="options may hold pose alone, got poes"):
         env.reset(options={"poes": env.goal})
-
-
-def test_a_scene_without_a_probe_needs_one(random_scene):
-    with pytest.raises(InvalidProbe):
-        StandardPlaneEnv(random_scene(20), np.eye(4), **SMALL)
-
-
-def test_the_settings_say_how_far_it_gets():
-    settings = StandardPlaneSettings(start_mm=5.0, start_deg=85.0)
-    assert (settings.reach_mm, settings.reach_deg) == (20.0, 180.0)

@@ -37,13 +37,6 @@ def test_a_fit_learns_and_tells_its_cost(mean_image, make_dataset):
     assert np.abs(frames[0] - dataset.train.images.mean(axis=0) / 255.0).mean() < 0.02
 
 
-def test_a_fit_takes_no_time_over_subnormal_numbers(mean_image, make_dataset):
-    smallest, halves = torch.tensor(torch.finfo(torch.float32).tiny), []
-    mean_image.fit(make_dataset(), AUTHOR, FitRun(report=lambda _: halves.append((smallest * 0.5).view(torch.int32))))
-    assert halves
-    assert not any(halves)
-
-
 def test_a_stopped_fit_ends_in_the_model_of_an_undisturbed_one(mean_image, make_dataset, tmp_path):
     dataset = make_dataset()
     for stop in (30, 90):

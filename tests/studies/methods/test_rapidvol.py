@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray_studies.methods.rapidvol import RapidVol, TriPlaneLearner, TriPlanes
+from ultragray_studies.methods.rapidvol import TriPlaneLearner, TriPlanes
 
 from .volumes import along_elevation, one_frame, seen
 
@@ -79,8 +79,3 @@ def test_rates_fall_to_1_percent():
     assert [one.param_groups[0]["lr"] for one in learner.optimizers.values()] == [1e-2, 1e-3]
     learner.set_rates(50, 100)
     assert [one.param_groups[0]["lr"] for one in learner.optimizers.values()] == pytest.approx([1e-3, 1e-4])
-
-
-def test_the_recipe_is_5_000_epochs_and_says_that_it_is_ours():
-    assert RapidVol().published_steps(SMALL) == 5_000 * 3
-    assert any("This project's: 5,000 epochs" in choice for choice in RapidVol().describe().choices)

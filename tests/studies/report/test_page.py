@@ -3,13 +3,9 @@
 import re
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from ultragray.learn.evaluation.methods import ComparisonSettings
-from ultragray.learn.evaluation.metrics import FrameMetrics
-from ultragray.learn.evaluation.scoring import Evaluation
-from ultragray.learn.report.tables import metric_rows
 from ultragray.learn.training import TrainingConfig
 from ultragray.learn.training.config import VIEWS_BETWEEN
 from ultragray.learn.training.geometry import Geometry
@@ -150,20 +146,3 @@ def test_what_the_data_decides_is_told_as_it_was_decided(turning_dataset, tmp_pa
     assert f"{steps:,} steps in " in text
     assert f"<code>steps = {steps}</code>" in text
     assert "= None" not in text.replace("memory_gb = None", "")
-
-
-def test_one_held_out_frame_is_shown_once(content, tmp_path):
-    dataset = replace(content.dataset, val=content.dataset.val.select([0]))
-    folder = tmp_path / "alone"
-    comparison = compared(dataset, {SCENE: GivenScene(content.scene), **baselines(0.5)}, folder)
-    text = render_report(replace(content, dataset=dataset, comparison=comparison, folder=folder, ablations=()))
-    assert text.count("<figcaption>") == 1
-
-
-def test_the_best_of_each_column_is_marked_as_numbers_not_as_words():
-    def of(psnr_db, gmsd):
-        return Evaluation([FrameMetrics(psnr_db, 0.5, 0.5, gmsd)], np.arange(1), 5, [])
-
-    rows = metric_rows({"a": of(9.5, 0.2), "b": of(10.5, 0.1)})
-    assert [[best for _, best in row.cells] for row in rows] == [[False, True, True, False], [True, True, True, True]]
-    assert [best for _, best in metric_rows({"a": of(9.5, 0.2)})[0].cells] == [False] * 4

@@ -321,13 +321,6 @@ def test_a_full_disk_is_told_as_such(tmp_path, format):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_pixels_are_rounded_and_held_below_256():
-    values = np.array([[[0.0, 0.5 / 255, 0.6 / 255, 1.0, 1.5]]], np.float32)
-    np.testing.assert_array_equal(stored_pixels("bmode", values, np.dtype("u1")), [[[0, 0, 1, 255, 255]]])
-    labels = np.arange(5, dtype=np.uint8).reshape(1, 1, 5)
-    np.testing.assert_array_equal(stored_pixels("labels", labels, np.dtype("u1")), labels)
-
-
 @pytest.mark.parametrize(
     ("format", "outputs", "dtype", "field", "told"),
     [

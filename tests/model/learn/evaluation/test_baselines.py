@@ -8,7 +8,7 @@ import pytest
 from ultragray import ConvexProbe, LinearProbe, PhasedProbe, RadialProbe, SteeredProbe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.source import load_dataset
-from ultragray.errors import DatasetInvalid, InvalidArgument
+from ultragray.errors import DatasetInvalid
 from ultragray.learn.evaluation.baselines import BASELINES, evaluate_baselines, interpolate_planes, predict
 from ultragray.learn.sweep import nearest_frames
 
@@ -64,17 +64,6 @@ def test_nearest_looks_at_the_whole_plane_not_only_its_origin():
     asked = at(0.3)  # nearer to the origin of the tilted one
     assert nearest_frames(sweep, asked).tolist() == [0]
     np.testing.assert_array_equal(predict(sweep, asked, "nearest")[0], (sweep.images[0] / 255.0).astype(np.float32))
-
-
-def test_every_baseline_predicts_every_pose():
-    sweep = sweep_of(at(0.0, 0.5, 1.0, 1.5))
-    for method in BASELINES:
-        frames = predict(sweep, at(0.6, 0.9), method)
-        assert frames.shape == (2, 20, 16)
-        assert frames.dtype == np.float32
-        assert predict(sweep, at(), method).shape == (0, 20, 16)
-    with pytest.raises(InvalidArgument, match="nearest, got 'best'"):
-        predict(sweep, at(0.6), "best")
 
 
 def test_baselines_are_measured_on_the_held_out_frames():

@@ -51,10 +51,3 @@ def test_a_picture_has_square_pixels():
     assert tall[55:].max() == 0
     wide = as_picture(frame, sweep_of(LinearProbe(60.0, 0.0, 30.0), np.eye(4)[None]), 100)
     assert wide.shape == (50, 100)
-
-
-def test_a_fan_is_black_beside_the_fan():
-    fan = as_picture(np.ones((24, 20), np.float32), sweep_of(CONVEX, np.eye(4)[None]), 200)
-    assert max(fan.shape) == 200
-    assert fan[0, 0] == fan[-1, 0] == 0
-    assert fan[fan.shape[0] // 2, 100] == 255

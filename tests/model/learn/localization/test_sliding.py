@@ -39,8 +39,3 @@ def test_on_a_fan_only_the_middle_line_moves_along_itself():
     middle = COLUMNS // 2
     torch.testing.assert_close(deeper[:, :-1, middle], frames()[:, 1:, middle], atol=1e-4, rtol=0.0)
     assert (deeper[:, :-1, 0] - frames()[:, 1:, 0]).abs().max() > 0.1
-
-
-def test_what_comes_in_from_outside_is_as_the_edge_was():
-    aside = after(LINEAR, (ACROSS_MM, 0, 0, 0, 0, 0))[:, 0]
-    torch.testing.assert_close(aside[..., -1], frames()[..., -1], atol=1e-4, rtol=0.0)

@@ -17,15 +17,16 @@ VOID = {"meta", "img", "link", "br"}
 
 
 class Checked(HTMLParser):
-    """Tags that are closed in order, and every address that the page refers to."""
+    """Tags that are closed in order, ids, and every address that the page refers to."""
 
     def __init__(self, text):
         super().__init__()
         self.open_tags = []
-        self.addresses = []
+        self.addresses, self.ids = [], set()
         self.feed(text)
 
     def handle_starttag(self, tag, attrs):
+        self.ids |= {value or "" for name, value in attrs if name == "id"}
         self.addresses += [value or "" for name, value in attrs if name in ("src", "href", "xlink:href")]
         if tag not in VOID:
             self.open_tags.append(tag)

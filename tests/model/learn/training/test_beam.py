@@ -67,14 +67,6 @@ def imaged(scene, poses, beam):
     return Dataset("phantom", whole, whole.select([]))
 
 
-@pytest.fixture(autouse=True)
-def one_thread():
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
 def width_across_mm(scene, beam, places_mm):
     """Full width at half maximum of points across elevation: the median over those well inside the volume."""
     across = np.arange(-6.0, 6.01, 0.25)

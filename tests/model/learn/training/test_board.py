@@ -24,13 +24,6 @@ def write(folder, losses, *, steps_done):
     board.close()
 
 
-def test_shows_values_by_step(tmp_path):
-    pytest.importorskip("tensorboard", reason="the extra tensorboard is not installed")
-    write(tmp_path, {1: 0.5, 2: 0.25}, steps_done=0)
-    assert shown(tmp_path, "loss") == [(1, 0.5), (2, 0.25)]
-    assert shown(tmp_path, "gaussians") == [(1, 60.0), (2, 60.0)]
-
-
 def test_a_resumed_run_hides_the_steps_that_it_takes_again(tmp_path):
     pytest.importorskip("tensorboard", reason="the extra tensorboard is not installed")
     write(tmp_path, {1: 0.5, 2: 0.25, 3: 0.125}, steps_done=0)

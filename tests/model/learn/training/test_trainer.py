@@ -70,12 +70,6 @@ def test_scene_says_what_it_is(tiny_dataset, tiny_config, tmp_path):
     assert np.array_equal(scene.training_poses, dataset.train.poses)
 
 
-def test_same_seed_same_scene(tiny_dataset, tiny_config):
-    first, second, other = (train(tiny_dataset(), tiny_config(seed=seed)).to_bytes() for seed in (1, 1, 2))
-    assert first == second
-    assert first != other
-
-
 def test_resumed_run_ends_in_the_same_scene(tiny_dataset, tiny_config, tmp_path):
     """Stopped at every third step, which is before, at and after refinements and rounds of frames."""
     dataset, config = tiny_dataset(), tiny_config(steps=12)

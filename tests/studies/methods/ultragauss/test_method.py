@@ -7,9 +7,11 @@ import torch
 from ultragray import ConvexProbe, LinearProbe
 from ultragray.errors import DatasetInvalid
 from ultragray.learn.sweep import Dataset, Sweep
-from ultragray_studies.methods.method import Budget, FitRun, Pace, Paces
+from ultragray_studies.methods.method import FitRun
 from ultragray_studies.methods.registry import METHODS
-from ultragray_studies.methods.ultragauss import UltraGauss, UltraGaussLearner, even_start
+from ultragray_studies.methods.ultragauss import UltraGaussLearner, even_start
+
+from ..volumes import steps_of
 
 LINEAR = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=25.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0)
@@ -35,13 +37,6 @@ def small_learner(dataset, variant, count=300):
     return UltraGaussLearner(dataset, 0, torch.device("cpu"), gaussians, casts_shadow=variant == "ultragauss-shadow")
 
 
-def budget_of(steps, variant):
-    """An equal time in which so many steps fit."""
-    paces = Paces()
-    paces.get(variant, lambda: Pace(0.0, 1.0))
-    return Budget.equal(float(steps), paces)
-
-
 def psnr_db(got, want):
     return float(-10.0 * np.log10(np.square(got - want).mean()))
 
@@ -65,7 +60,7 @@ def test_a_killed_fit_ends_in_the_model_of_an_undisturbed_one(variant, tmp_path,
     monkeypatch.setattr("ultragray_studies.methods.ultragauss.LEAST_WEIGHT", 0.6)
     monkeypatch.setattr("ultragray.learn.training.geometry.MIN_GAUSSIANS", 300)
     dataset, method = ball(4, 20, 16, CONVEX), METHODS[variant]
-    budget, seen = budget_of(420, variant), []
+    budget, seen = steps_of(method, 420), []
 
     def note(progress):
         seen.append(progress.step)
@@ -122,25 +117,6 @@ def test_the_shadow_begins_faint():
     assert 0.99 < float(left[0].mean()) < 1.0
 
 
-@pytest.mark.parametrize("variant", VARIANTS)
-def test_a_frame_is_rendered_of_what_was_learned_last(variant):
-    learner = small_learner(ball(2, 20, 16), variant)
-    for step in range(5):
-        learner.take_step(step, 60)
-    pose = learner.dataset.train.poses[0]
-    with torch.no_grad():
-        shown = learner.frame(LINEAR, pose, 20, 16)
-        learner._scene = learner.module.scene(learner.dataset.centre_mm)
-        assert torch.equal(shown, learner.frame(LINEAR, pose, 20, 16))
-
-
 def test_images_smaller_than_the_window_of_ssim_are_refused():
     with pytest.raises(DatasetInvalid, match="at least 11 rows and columns, got 10x16"):
         small_learner(ball(2, 10, 16), "ultragauss")
-
-
-@pytest.mark.parametrize("casts_shadow", [False, True])
-def test_the_description_says_what_is_not_published(casts_shadow):
-    described = UltraGauss(casts_shadow=casts_shadow).describe()
-    assert described.published_steps == 30_000
-    assert ("The unit of delta" in " ".join(described.choices)) is casts_shadow

@@ -6,7 +6,6 @@ import numpy as np
 import torch
 
 from ultragray import LinearProbe
-from ultragray.rendering.backends import cpu
 from ultragray.rendering.backends.registry import weighted_sums
 from ultragray_studies.methods.ultragauss import Field, average, shadow
 
@@ -42,27 +41,8 @@ def test_two_gaussians_on_one_pixel():
     assert math.isclose(float(got), want, abs_tol=1e-6)
 
 
-def test_weights_of_one_without_a_background_are_the_echo_over_the_coverage():
-    field = two_gaussians((0.9999999, 0.9999999), (0.1, -0.4))
-    scene, pose = field.scene(np.zeros(3)), np.eye(4)[None]
-    with torch.no_grad():
-        planes = cpu.render_outputs(scene, PROBE, pose, 1, 1, ("echo", "coverage"))
-    got = average(*one_pixel(field), torch.tensor(0.0), torch.tensor(0.5))
-    assert torch.allclose(got, planes["echo"] / planes["coverage"], atol=1e-6)
-
-
-def test_a_pixel_without_gaussians_shows_the_background():
-    nothing = torch.zeros(1, 2, 2)
-    assert torch.allclose(average(nothing, nothing, torch.tensor(1e-3), torch.tensor(0.4)), torch.tensor(0.4))
-
-
 def test_the_shadow_is_the_sum_down_each_scan_line():
     weights = torch.tensor([[[1.0, 0.0], [2.0, 0.5], [0.0, 3.0]]])  # [1, 3, 2]
     got = shadow(weights, torch.tensor(0.5), 0.2)
     want = torch.exp(-0.5 * 0.2 * torch.tensor([[[1.0, 0.0], [3.0, 0.5], [3.0, 3.5]]]))
     assert torch.allclose(got, want, rtol=1e-6)
-
-
-def test_the_first_pixel_lies_in_its_own_shadow():
-    got = shadow(torch.full((1, 4, 1), 2.0), torch.tensor(1.0), 0.25)
-    assert math.isclose(float(got[0, 0, 0]), math.exp(-0.5), rel_tol=1e-6)

@@ -27,13 +27,6 @@ def test_useless_weights_make_room_for_what_is_pulled_at_most():
     assert torch.allclose(halves, torch.tensor(-1.0) - torch.log(torch.tensor(1.6)))
 
 
-def test_without_room_nothing_changes_but_the_order():
-    before = gaussians(5)
-    after, origin = resample(before, torch.ones(5), limit=5, scene_scale_cm=1.0, generator=torch.Generator())
-    for name, tensor in before.items():
-        assert torch.equal(after[name], tensor[origin])
-
-
 def test_new_rows_begin_without_momentum():
     state = {"step": torch.tensor(7.0), "exp_avg": torch.tensor([1.0, 2.0]), "exp_avg_sq": torch.tensor([3.0, 4.0])}
     moved = follow(state, torch.tensor([1, -1, 0]))

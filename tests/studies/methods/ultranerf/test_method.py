@@ -4,25 +4,21 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
 from ultragray import ConvexProbe, LinearProbe
-from ultragray.datasets.source import load_dataset
 from ultragray.errors import DatasetInvalid
 from ultragray.learn.sweep import Dataset, Sweep
 from ultragray_studies.methods import ultranerf
-from ultragray_studies.methods.method import Budget, FitRun, Pace, Paces
-from ultragray_studies.methods.registry import METHODS
-from ultragray_studies.methods.ultranerf import VARIANTS, Coordinates, UltraNerf
+from ultragray_studies.methods.method import Budget
+from ultragray_studies.methods.ultranerf import VARIANTS, Coordinates
 
 SIDE = 24
 LINEAR = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=20.0)
 CPU = torch.device("cpu")
-by_name = pytest.mark.parametrize("method", VARIANTS, ids=lambda one: one.name)
 
 
 def sweep(probe=LINEAR, frames=3, height=SIDE, width=SIDE):
@@ -43,48 +39,8 @@ def dataset(probe=LINEAR, frames=3, **size):
     return Dataset("bow", train, train.select([0]))
 
 
-def budget(method, steps):
-    """A time that holds so many steps, without a clock."""
-    paces = Paces()
-    paces.get(method.name, lambda: Pace(0.0, 1.0))
-    return Budget.equal(steps + 0.5, paces)
-
-
 def learner(method, of=None, seed=0):
     return method.learner(of or dataset(), Budget.author(), seed, CPU)
-
-
-def head_gradient(method):  # [5]
-    """The largest gradient of each row of the head after a step."""
-    one = learner(method)
-    (gradient,) = torch.autograd.grad(one.loss(0, 10), one.module.head.weight)
-    return gradient.abs().amax(dim=1)
-
-
-def test_the_variants_are_methods_of_the_registry_by_their_names():
-    names = ["ultranerf-released", "ultranerf-unit", "ultranerf-mean"]
-    assert [one.name for one in VARIANTS] == names
-    assert [METHODS[name] for name in names] == list(VARIANTS)
-
-
-@by_name
-def test_a_variant_tells_its_source_and_its_steps(method: UltraNerf) -> None:
-    told = method.describe()
-    assert told.title == f"Ultra-NeRF ({method.name.removeprefix('ultranerf-')})"
-    assert "2301.10520" in told.source
-    assert told.published_steps == 200_000
-    assert told.equations
-    assert told.choices
-
-
-@pytest.mark.parametrize("name", ["ultranerf-released", "ultranerf-unit"])
-def test_the_heads_of_drawn_probabilities_get_no_gradient(name):
-    reached = head_gradient(next(one for one in VARIANTS if one.name == name)) > 0.0
-    assert reached.tolist() == [True, True, False, False, True]  # a, b, p_b, p_s, s
-
-
-def test_the_heads_of_expected_probabilities_get_gradients():
-    assert (head_gradient(VARIANTS[2]) > 0.0).all()
 
 
 def test_the_field_sees_metres_or_the_scaled_box():
@@ -106,24 +62,6 @@ def test_attenuation_is_counted_per_unit_of_the_coordinates(name, length):
     middle = frame[3:-3, SIDE // 2]
     expected = np.exp(-1.5 * length * np.arange(3, SIDE - 3) / SIDE)
     np.testing.assert_allclose(middle, expected, rtol=1e-5)
-
-
-@by_name
-def test_frames_are_the_same_each_time_and_within_limits(method: UltraNerf) -> None:
-    one = learner(method)
-    one.take_step(0, 10)
-    with torch.no_grad():
-        one.module.head.weight.mul_(30.0)
-    state = one.generator.get_state()
-    poses = sweep().poses
-    first, second = (one.render(LINEAR, poses, SIDE, SIDE) for _ in range(2))
-    np.testing.assert_array_equal(first, second)
-    assert torch.equal(one.generator.get_state(), state)
-    assert first.shape == (3, SIDE, SIDE)
-    assert first.dtype == np.float32
-    assert first.min() >= 0.0
-    assert first.max() <= 1.0
-    assert first.std() > 0.0
 
 
 def test_a_frame_in_chunks_is_the_frame(monkeypatch):
@@ -156,23 +94,6 @@ def test_the_rate_falls_as_published_over_the_steps_of_any_budget():
     assert rates == pytest.approx([1e-4, 1e-4 * 0.1**0.4, 1e-4 * 0.1 ** (100_000 / 250_000), 1e-4 * 0.1**0.8])
 
 
-@by_name
-def test_a_stopped_fit_ends_in_the_model_of_an_undisturbed_one(method: UltraNerf, tmp_path: Path) -> None:
-    of, steps = dataset(), 6
-    whole = method.fit(of, budget(method, steps))
-    told = []
-    stopped = FitRun(folder=tmp_path, report=told.append, should_stop=lambda: len(told) == 3)
-    assert method.fit(of, budget(method, steps), stopped) is None
-    ended = method.fit(of, budget(method, steps), FitRun(folder=tmp_path))
-    assert (whole.cost.steps, ended.cost.steps, ended.cost.is_short) == (steps, steps, True)
-    assert ended.cost.model_bytes == 4 * 132_485
-    undisturbed = whole.learner.model()
-    for name, tensor in ended.learner.model().items():
-        assert torch.equal(tensor, undisturbed[name]), name
-    poses = of.train.poses
-    np.testing.assert_array_equal(ended.render(LINEAR, poses, SIDE, SIDE), whole.render(LINEAR, poses, SIDE, SIDE))
-
-
 def test_frames_too_small_for_the_loss_are_refused():
     with pytest.raises(DatasetInvalid, match="at least 7 pixels a side, got 24x6"):
         learner(VARIANTS[0], dataset(width=6))
@@ -187,14 +108,3 @@ def test_the_mean_variant_learns_a_single_frame_by_heart():
         one.take_step(step, 2000)
     frame = one.render(LINEAR, same.poses[:1], SIDE, SIDE)[0]
     assert -10.0 * math.log10(float(((frame - same.images[0] / 255.0) ** 2).mean())) > 30.0
-
-
-@pytest.mark.long
-@by_name
-def test_the_authors_own_data_are_learned(method: UltraNerf, data_folder: Path) -> None:
-    """A few steps on one frame of the simulated liver, at half its size."""
-    of = load_dataset(data_folder / "ultranerf_liver")
-    small = replace(of.train, images=of.train.images[:, ::4, ::4].copy()).select([90, 90])
-    one = learner(method, Dataset("liver", small, small.select([])))
-    losses = [one.take_step(step, 30) for step in range(30)]
-    assert np.mean(losses[-5:]) < np.mean(losses[:5])

@@ -129,12 +129,6 @@ def test_too_few_frames_give_none(tiny_dataset, tiny_config):
     assert train(tiny_dataset(frames=6), tiny_config()).info.confidence == {}
 
 
-def test_a_stopped_run_is_not_calibrated(tiny_dataset, tiny_config):
-    scene = train(tiny_dataset(frames=40), tiny_config(), should_stop=lambda: True)
-    assert scene.info.training["step"] == 1
-    assert scene.info.confidence == {}
-
-
 def test_a_stop_while_it_is_calibrated_leaves_the_scene(tiny_dataset, tiny_config):
     asked = 0
 

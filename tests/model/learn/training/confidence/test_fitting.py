@@ -55,9 +55,3 @@ def test_interpolated_frames_tell_how_scores_fall_and_not_how_high_they_are():
     assert without[1] == pytest.approx(PRIOR_WEIGHTS[1])
     assert 0.5 * (PRIOR_WEIGHTS[1] + 3.0) < fitted[1] < 3.1  # more than half of the way from the prior
     assert fitted[0] == pytest.approx(2.0, abs=0.3)
-
-
-def test_the_number_of_interpolated_frames_does_not_matter():
-    rendered = along_a_line(np.linspace(0.0, 0.5, 60), (2.0, 1.0))
-    few, many = (along_a_line(np.linspace(0.0, 2.0, count), (1.0, 3.0)) for count in (50, 1000))
-    assert fit_weights(rendered, 0.05, few) == pytest.approx(fit_weights(rendered, 0.05, many), abs=0.05)

@@ -69,16 +69,6 @@ def test_random_start_is_the_released_cube(tiny_dataset, tiny_config):
     assert torch.allclose(torch.sigmoid(parameters["transmittances"]), torch.tensor(0.99))
 
 
-def test_nothing_absorbs_without_transmittance(tiny_dataset, tiny_config):
-    parameters = start_of(tiny_dataset(), tiny_config(transmittance=False))
-    assert bool((torch.sigmoid(parameters["transmittances"]) == 1.0).all())
-
-
-def test_depends_on_the_generator_alone(tiny_dataset, tiny_config):
-    first, second = (start_of(tiny_dataset(), tiny_config()) for _ in range(2))
-    assert all(torch.equal(first[name], second[name]) for name in first)
-
-
 def test_informed_gaussians_are_turned_like_their_frame_and_as_thick_as_a_slice(tiny_dataset, tiny_config):
     dataset = tiny_dataset()
     turn = np.array([[0.0, 0.0, 1.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])

@@ -245,10 +245,3 @@ def test_the_sizes_of_corrections():
     assert str(sizes) == (
         "poses of 2 training frames were corrected by 2.50 mm (at most 5.00) and 1.50° (at most 3.00) on average"
     )
-
-
-def test_a_run_on_good_poses_is_the_run_without_refinement(tiny_dataset, tiny_config):
-    dataset = tiny_dataset()
-    plain, refined = (train(dataset, tiny_config(refine_poses=m, confidence=False)) for m in ("none", "frames"))
-    assert torch.equal(plain.means, refined.means)
-    assert refined.pose_corrections is None

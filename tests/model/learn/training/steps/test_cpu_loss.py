@@ -26,17 +26,6 @@ def test_value_and_gradient(shape, instruction_set, texture):
     )
 
 
-def test_equal_images_cost_nothing():
-    image = torch.rand(2, 20, 20)
-    assert kernel_image_loss(image, image, 0.5).item() == pytest.approx(0.0, abs=1e-6)
-
-
-def test_a_batch_is_the_mean_of_its_images():
-    rendered, truth = torch.rand(4, 30, 30), torch.rand(4, 30, 30)
-    alone = torch.stack([kernel_image_loss(rendered[i : i + 1], truth[i : i + 1], 0.5) for i in range(4)])
-    assert kernel_image_loss(rendered, truth, 0.5).item() == pytest.approx(alone.mean().item(), rel=1e-6)
-
-
 @pytest.mark.parametrize("shape", [(1, 10, 20), (1, 20, 10), (0, 20, 20)])
 def test_images_smaller_than_the_window_are_refused(shape):
     with pytest.raises(ValueError, match="11x11"):
