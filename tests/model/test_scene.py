@@ -60,9 +60,6 @@ def test_shn_may_be_left_out():
         ("sh0", None, "missing sh0"),
         ("means", torch.zeros(4, 2), r"\[4, 3\], got \[4, 2\]"),
         ("means", torch.tensor(0.0), "shape"),
-        ("scales", torch.zeros(5, 3), r"\[4, 3\], got \[5, 3\]"),
-        ("quats", torch.ones(4, 3), r"\[4, 4\]"),
-        ("transmittances", torch.zeros(4, 1), r"\[4\]"),
         ("sh0", torch.zeros(4, 1), r"\[4, 1, 1\]"),
         ("shN", torch.zeros(4, 2, 1), "0, 3, 8, 15"),
         ("shN", torch.zeros(4, 3, 3), r"\[4, 3, 1\]"),
@@ -70,7 +67,6 @@ def test_shn_may_be_left_out():
         ("scales", np.zeros((4, 3)), "floating tensor, got ndarray"),
         ("scales", torch.zeros(4, 3, dtype=torch.float64), "float32"),
         ("scales", torch.full((4, 3), float("nan")), "finite"),
-        ("sh0", torch.full((4, 1, 1), float("-inf")), "finite"),
         ("quats", torch.zeros(4, 4), "zero"),
     ],
 )
@@ -152,7 +148,6 @@ def metadata(**changes):
 
 BAD_FILES = {
     "empty": b"",
-    "short": b"\x01\x02",
     "text": b"not a scene at all, just text that goes on for a while",
     "pickle": pickle.dumps({"splats": Hostile()}),
     "truncated": bundle()[:-10],
@@ -165,17 +160,13 @@ BAD_FILES = {
     "other_version": bundle(info=metadata(format_version=99)),
     "wrong_count": bundle(info=metadata(gaussian_count=5)),
     "huge_count": bundle(info=metadata(gaussian_count=10**18)),
-    "negative_count": bundle(info=metadata(gaussian_count=-1)),
-    "wrong_degree": bundle(info=metadata(sh_degree=2)),
     "degree_beyond": bundle(info=metadata(sh_degree=400)),
-    "degree_text": bundle(info=metadata(sh_degree="1")),
     "bad_probe": bundle(info=metadata(probe={"kind": "linear", "width_mm": -1, "near_mm": 0, "far_mm": 1})),
     "missing_tensor": bundle(lambda t: t.__delitem__("quats")),
     "surplus_tensor": bundle(lambda t: t.update(extra=torch.zeros(1))),
     "wrong_shape": bundle(lambda t: t.update(means=torch.zeros(4, 2))),
     "wrong_dtype": bundle(lambda t: t.update(means=torch.zeros(4, 3, dtype=torch.float64))),
     "bad_pose": bundle(lambda t: t.update(training_poses=torch.zeros(1, 4, 4, dtype=torch.float64))),
-    "pose_shape": bundle(lambda t: t.update(training_poses=torch.zeros(4, dtype=torch.float64))),
 }
 BAD_VALUES = {
     "nan": bundle(lambda t: t.update(means=torch.full((4, 3), float("nan")))),

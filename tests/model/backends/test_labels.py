@@ -5,10 +5,8 @@ import pytest
 import torch
 
 from ultragray import (
-    ConvexProbe,
     GaussianScene,
     LinearProbe,
-    PhasedProbe,
     SceneInfo,
     read_header,
     render,
@@ -18,14 +16,11 @@ from ultragray.exchange.checkpoint import export_checkpoint
 from ultragray.exchange.ply import read_ply, write_ply
 from ultragray.learn.sweep import pixel_positions_mm
 
-PROBES = {
-    "linear": LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0),
-    "convex": ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=60.0),
-    "phased": PhasedProbe(opening_angle_deg=90.0, far_mm=60.0),
-}
+from .conftest import CONVEX, HEIGHT, LINEAR, PHASED, WIDTH
+
+PROBES = {"linear": LINEAR, "convex": CONVEX, "phased": PHASED}
 BACKENDS = ("reference", "cpu", "cuda")
 NAMES = {1: "bone", 2: "muscle", 9: "vessel"}
-HEIGHT, WIDTH = 37, 53
 SEEN = 1.0 / 255.0
 
 

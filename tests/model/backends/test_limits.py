@@ -6,21 +6,17 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, RadialProbe, render
+from ultragray import GaussianScene, render
 from ultragray.errors import FrameTooCostly
 from ultragray.rendering.backends import reference
 from ultragray.rendering.frames import footprint_pixels
 from ultragray.rendering.limits import GivenUp, Limits
 
-LINEAR = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
-PROBES = [
-    LINEAR,
-    ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=60.0),
-    PhasedProbe(opening_angle_deg=90.0, far_mm=60.0),
-    RadialProbe(near_mm=1.0, far_mm=30.0),
-]
+from .conftest import CONVEX, HEIGHT, LINEAR, PHASED, RADIAL, WIDTH
+
+PROBES = [LINEAR, CONVEX, PHASED, RADIAL]
 BACKENDS = ["reference", "cpu", pytest.param("cuda", marks=pytest.mark.slow)]
-SIZE = {"height": 37, "width": 53}
+SIZE = {"height": HEIGHT, "width": WIDTH}
 
 
 def placed(scene, backend, on_device):

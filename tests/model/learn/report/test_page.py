@@ -45,7 +45,7 @@ def page(tiny_dataset, tiny_config, tmp_path):
     """The page of a training, whose course is that of the journal of its run."""
     dataset = replace(tiny_dataset(), name="tiny <sweep>")
     seen = []
-    scene = train(dataset, tiny_config(steps=6, confidence=False), folder=tmp_path, report=seen.append)
+    scene = train(dataset, tiny_config(steps=6), folder=tmp_path, report=seen.append)
     course = Course.of_journal(tmp_path / JOURNAL_FILE)
     assert course.losses == [progress.loss for progress in seen]
     assert course.val_psnr_db == {one.val_step: one.val_psnr_db for one in seen if one.val_step is not None}

@@ -55,12 +55,8 @@ def test_refuses_what_is_no_checkpoint(tmp_path):
     ("changes", "reason"),
     [
         ({"step": 10}, "its step is 10, expected 1 to 9"),
-        ({"step": 0}, "its step is 0, expected 1 to 9"),
-        ({"step": 7.0}, r"its step is 7\.0, expected 1 to 9"),
         ({"step": True}, "its step is True, expected 1 to 9"),
         ({"elapsed_s": math.nan}, "its elapsed_s is nan, expected seconds"),
-        ({"elapsed_s": "1"}, "its elapsed_s is '1', expected seconds"),
-        ({"dataset_sha256": 5}, "its dataset_sha256 is 5, expected text"),
         ({"config": {"steps": 9, "max_gaussians": 40, "colour": 1}}, "a training has no setting colour"),
         ({"config": 3}, "int"),
         ({"config": {"steps": 9}}, "its max_gaussians is null, expected a number"),

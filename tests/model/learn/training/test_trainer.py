@@ -38,15 +38,14 @@ def learned(dataset, config, **options):
     return train(dataset, config, report=seen.append, **options), seen
 
 
-@pytest.mark.parametrize("intensity", ["released", "sigmoid"])
-def test_learns(tiny_dataset, tiny_config, intensity):
-    _, seen = learned(tiny_dataset(), tiny_config(intensity=intensity, steps=120, refinements=0))
+def test_learns(tiny_dataset, tiny_config):
+    _, seen = learned(tiny_dataset(), tiny_config(steps=80, refinements=0))
     first, last = (sum(progress.loss for progress in some) for some in (seen[:8], seen[-8:]))
     assert last < 0.8 * first
 
 
 def test_reports_every_step(tiny_dataset, tiny_config):
-    scene, seen = learned(tiny_dataset(), tiny_config(confidence=False))
+    scene, seen = learned(tiny_dataset(), tiny_config())
     assert [progress.step for progress in seen] == list(range(1, 25))
     assert {progress.steps for progress in seen} == {24}
     assert seen[-1].seconds_left == 0
@@ -72,7 +71,7 @@ def test_scene_says_what_it_is(tiny_dataset, tiny_config, tmp_path):
 
 def test_resumed_run_ends_in_the_same_scene(tiny_dataset, tiny_config, tmp_path):
     """Stopped at every third step, which is before, at and after refinements and rounds of frames."""
-    dataset, config = tiny_dataset(), tiny_config(steps=12)
+    dataset, config = tiny_dataset(), tiny_config(steps=12, confidence=True)
     expected = train(dataset, config)
     count = 0
 
@@ -158,19 +157,13 @@ def spoilt(path, **changed):
             r"adam\.sh0\.exp_avg_sq is .*\[30, 1\], expected .*\[30, 1, 1\]",
         ),
         ({"adam__quats__step": torch.tensor(7.0)}, r"adam\.quats\.step is 7, expected 2"),
-        ({"adam__quats__step": None}, r"missing or unexpected tensors: adam\.quats\.step"),
         ({"adam__colours__step": torch.tensor(2.0)}, r"missing or unexpected tensors: adam\.colours\.step"),
         ({"parameter__means": torch.zeros(30, 3).double()}, r"parameter\.means is torch\.float64"),
-        ({"parameter__means": torch.zeros(())}, r"it holds 0 Gaussians, expected 1 to 60"),
         ({"parameter__means": torch.zeros(61, 3)}, r"it holds 61 Gaussians, expected 1 to 60"),
         ({"parameter__quats": torch.ones(29, 4)}, r"parameter\.quats is torch\.float32 \[29, 4\]"),
         ({"parameter__scales": torch.full((30, 3), float("nan"))}, r"parameter\.scales is not finite"),
-        ({"pull__total": torch.zeros(29)}, r"pull\.total is torch\.float32 \[29\]"),
         ({"waiting": torch.tensor([999])}, r"waiting names frames that the 8 do not have"),
-        ({"waiting": torch.tensor([-1])}, r"waiting names frames"),
         ({"waiting": torch.zeros(8, dtype=torch.int64)}, r"waiting names frames"),
-        ({"waiting": torch.tensor([1.0])}, r"waiting is torch\.float32"),
-        ({"generator": torch.zeros(7, dtype=torch.uint8)}, r"generator is torch\.uint8 \[7\]"),
         ({"generator": torch.full((5056,), 255, dtype=torch.uint8)}, r"generator is no generator's state"),
     ],
 )

@@ -103,9 +103,9 @@ def test_a_quarter_of_the_steps_and_fewer_gaussians(tiny_dataset, tiny_config, s
 @pytest.mark.long
 def test_it_can_be_left_out(tiny_dataset, tiny_config):
     dataset = tiny_dataset(frames=40)
-    without = train(dataset, tiny_config(confidence=False))
+    without = train(dataset, tiny_config())
     assert without.info.confidence == {}
-    having = train(dataset, tiny_config())
+    having = train(dataset, tiny_config(confidence=True))
     assert having.info.confidence["version"] == 2
     assert len(having.info.confidence["uncertainty"]["variances"]) == len(VARIANCE_TERMS)
     assert having.means.equal(without.means)
@@ -114,7 +114,7 @@ def test_it_can_be_left_out(tiny_dataset, tiny_config):
 @pytest.mark.long
 def test_the_time_left_holds_the_fit_and_the_fit_is_told(tiny_dataset, tiny_config):
     seen = []
-    train(tiny_dataset(frames=40), tiny_config(), report=seen.append)
+    train(tiny_dataset(frames=40), tiny_config(confidence=True), report=seen.append)
     own = [progress for progress in seen if progress.beside is None]
     fit = [progress for progress in seen if progress.beside == run.FITTING]
     assert seen == own + fit
@@ -126,7 +126,7 @@ def test_the_time_left_holds_the_fit_and_the_fit_is_told(tiny_dataset, tiny_conf
 
 
 def test_too_few_frames_give_none(tiny_dataset, tiny_config):
-    assert train(tiny_dataset(frames=6), tiny_config()).info.confidence == {}
+    assert train(tiny_dataset(frames=6), tiny_config(confidence=True)).info.confidence == {}
 
 
 def test_a_stop_while_it_is_calibrated_leaves_the_scene(tiny_dataset, tiny_config):
@@ -137,7 +137,7 @@ def test_a_stop_while_it_is_calibrated_leaves_the_scene(tiny_dataset, tiny_confi
         asked += 1
         return asked > 24 + 3
 
-    scene = train(tiny_dataset(frames=40), tiny_config(), should_stop=after_the_last_step)
+    scene = train(tiny_dataset(frames=40), tiny_config(confidence=True), should_stop=after_the_last_step)
     assert asked == 24 + 4
     assert scene.info.training["step"] == 24
     assert scene.info.confidence == {}
@@ -148,7 +148,7 @@ def test_a_calibration_that_diverges_costs_no_scene(tiny_dataset, tiny_config, m
         raise TrainingDiverged("training diverged in step 3: the loss is nan")
 
     monkeypatch.setattr(run, "fit_confidence", diverge)
-    scene = train(tiny_dataset(frames=40), tiny_config())
+    scene = train(tiny_dataset(frames=40), tiny_config(confidence=True))
     assert scene.info.confidence == {}
     assert "the scene gets no confidence: training diverged in step 3" in caplog.text
 

@@ -10,6 +10,7 @@ from ultragray.scene.confidence import DISTANCE_MM
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=40.0)
 STEP_MM = 1.0
+FRAMES = 18
 
 
 def drifting_sweep(count, columns_per_frame):
@@ -22,17 +23,17 @@ def drifting_sweep(count, columns_per_frame):
 
 
 def test_each_frame_is_predicted_from_either_side_and_ever_farther_away():
-    examples = one_sided_examples(drifting_sweep(30, 1), np.zeros(30))
+    examples = one_sided_examples(drifting_sweep(FRAMES, 1), np.zeros(FRAMES))
     distances = -examples.terms[:, 0, 2] * DISTANCE_MM
     assert sorted(set(distances.round(3))) == [1.0, 2.0, 4.0, 6.0, 9.0, 13.0]  # one step beyond each of BEYOND_MM
     assert len(BEYOND_MM) == 6
-    nearest_frames = 2 * (30 - 2)  # with at least two frames on that side
+    nearest_frames = 2 * (FRAMES - 2)  # with at least two frames on that side
     assert (distances.round(3) == 1.0).sum() == nearest_frames
 
 
 def test_scores_fall_with_distance_where_anatomy_changes_and_only_there():
     for columns_per_frame, falls in ((1, True), (0, False)):
-        examples = one_sided_examples(drifting_sweep(30, columns_per_frame), np.zeros(30))
+        examples = one_sided_examples(drifting_sweep(FRAMES, columns_per_frame), np.zeros(FRAMES))
         distances = -examples.terms[:, 0, 2] * DISTANCE_MM
         near, far = (examples.ms_ssim[chosen].mean() for chosen in (distances < 1.5, distances > 8.0))
         assert (near - far > 0.2) if falls else (near == pytest.approx(far, abs=1e-6))

@@ -157,7 +157,7 @@ def noisy(dataset):
 
 def test_corrections_are_trained_and_stored(tiny_dataset, tiny_config, tmp_path):
     dataset = noisy(tiny_dataset(frames=40))
-    scene = train(dataset, tiny_config(refine_poses="frames", confidence=False))
+    scene = train(dataset, tiny_config(refine_poses="frames"))
     assert scene.pose_corrections is not None
     np.testing.assert_allclose(scene.pose_corrections @ dataset.train.poses, scene.training_poses, atol=1e-9)
     before_training = PoseRefinement.of(dataset, "frames").poses()
@@ -190,7 +190,7 @@ def test_a_run_brings_back_a_sweep_that_is_off_as_a_whole(tiny_config):
     given[40:] = error @ true[40:]
     train_part = replace(seen(true), poses=given)
     dataset = Dataset("tissue", train_part, train_part.select([]))
-    scene = train(dataset, tiny_config(refine_poses="sweeps", confidence=False))
+    scene = train(dataset, tiny_config(refine_poses="sweeps"))
     assert scene.pose_corrections is not None
     before_training = PoseRefinement.of(dataset, "sweeps").poses()
     assert np.abs(scene.training_poses[40:] - before_training[40:]).max() > 1e-5
@@ -205,13 +205,13 @@ def test_a_run_brings_back_a_sweep_that_is_off_as_a_whole(tiny_config):
 
 
 def test_a_scene_without_corrections_holds_no_tensor_of_them(tiny_dataset, tiny_config):
-    scene = train(tiny_dataset(), tiny_config(confidence=False))
+    scene = train(tiny_dataset(), tiny_config())
     assert scene.pose_corrections is None
     assert b"pose_corrections" not in scene.to_bytes()
 
 
 def test_a_resumed_run_gives_the_same_corrections(tiny_dataset, tiny_config, tmp_path):
-    dataset, config = noisy(tiny_dataset(frames=40)), tiny_config(refine_poses="frames", confidence=False)
+    dataset, config = noisy(tiny_dataset(frames=40)), tiny_config(refine_poses="frames")
     whole = train(dataset, config)
     steps = []
 
@@ -227,7 +227,7 @@ def test_a_resumed_run_gives_the_same_corrections(tiny_dataset, tiny_config, tmp
 def test_a_frame_that_is_off_is_scored_by_the_half_that_did_not_move_it(tiny_dataset, tiny_config):
     """Registered on one half it scores better on the other; a frame in place gains little."""
     dataset = tiny_dataset(frames=16, height=40, width=40)
-    scene = train(dataset, tiny_config(steps=120, max_gaussians=400, refinements=0, confidence=False))
+    scene = train(dataset, tiny_config(steps=120, max_gaussians=400, refinements=0))
     moved = dataset.val.poses.copy()
     moved[:, 0, 3] += 2.0
     off = score_halves(scene, replace(dataset.val, poses=moved))
