@@ -32,7 +32,7 @@ MOST_FILES = {  # by hand, tests and what is generated apart
 }
 CONCERNED = (
     *("tests/proto", "tests/client/test_client_generated.py", "tests/documents/test_snapshots.py"),
-    *("tests/service/test_settings_used.py", "tests/model/test_outputs.py", "tests/model/probe"),
+    *("tests/service/test_settings_used.py", "tests/model/test_outputs.py", "tests/model/test_probe.py"),
 )
 
 _BLOCK = re.compile(r"<!-- (file|in): (\S+?)(?:; (before|after): (.*?))? -->\n```python\n(.*?)```\n", flags=re.DOTALL)

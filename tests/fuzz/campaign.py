@@ -20,7 +20,6 @@ SHARES = {  # of the inputs, by door: about as many as each takes in its part of
     "http bodies": 0.10,
     "http paths": 0.07,
     "http bytes": 0.05,
-    "uploads": 0.001,
     "websocket": 0.18,
     "websocket paths": 0.01,
     "grpc messages": 0.08,

@@ -7,11 +7,12 @@ import numpy.typing as npt
 import pytest
 
 from ultragray import ConvexProbe, LinearProbe
-from ultragray.errors import InvalidPose, InvalidProbe
+from ultragray.datasets import Sweep
+from ultragray.errors import DatasetInvalid, InvalidPose, InvalidProbe
 from ultragray.phantom import Tissue, anatomy, bone_attenuation_db, imaging, simulate, tissue_at, tissues
 from ultragray.phantom import anatomy as bone
 from ultragray.phantom.anatomy import ACOUSTICS, FREQUENCY_MHZ
-from ultragray.phantom.imaging import NOTHING, PER_MM3, ScattererField, Scatterers
+from ultragray.phantom.imaging import NOTHING, PER_MM3, BoneShadow, ScattererField, Scatterers
 
 PROBE = LinearProbe(width_mm=24.0, near_mm=0.0, far_mm=50.0)
 HEIGHT, WIDTH = 214, 102  # about the phantom's own pixels
@@ -192,3 +193,42 @@ def test_tissues_are_those_in_the_middle_of_each_pixel():
 def test_tissues_of_scan_lines_that_are_not_upright_are_refused():
     with pytest.raises(InvalidProbe, match="upright"):
         tissues(at(), probe=ConvexProbe(opening_angle_deg=60.0, near_mm=40.0, far_mm=95.0), height=8, width=8)
+
+
+SQUARE_PROBE = LinearProbe(width_mm=60.0, near_mm=0.0, far_mm=60.0)
+SIDE = 60  # a pixel a millimetre
+
+
+def sweep_at(x_mm, probe=SQUARE_PROBE):
+    """A frame over the middle vertebra and one between two, shifted along x, of nothing but noise."""
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[:, 0, 3] = x_mm
+    poses[1, 1, 3] = 19.0
+    images = np.random.default_rng(0).integers(0, 256, (2, SIDE, SIDE), dtype=np.uint8)
+    return Sweep(images, poses, probe, np.arange(2), "noise")
+
+
+def test_it_lies_behind_the_laminae_and_not_beside_or_between_them():
+    over, between = BoneShadow.of(sweep_at(0.0)).hidden
+    assert over[40:, 20:40].all()
+    assert not over[:12].any()
+    assert not over[:, :6].any()
+    assert not between[:52, 26:34].any()
+
+
+def test_means_are_taken_over_the_shadow_alone():
+    sweep = sweep_at(0.0)
+    shadow = BoneShadow.of(sweep)
+    inside = shadow.hidden.astype(np.float32)
+    assert shadow.mean(inside) == 1.0
+    assert shadow.mean(1.0 - inside) == 0.0
+    truth = (sweep.images / 255.0).astype(np.float32)
+    assert shadow.mean_absolute_error(truth + 1.0 - inside) == pytest.approx(0.0, abs=1e-7)
+    assert shadow.mean_absolute_error(truth - 0.25 * inside) == pytest.approx(0.25, abs=1e-6)
+
+
+def test_sweeps_that_cannot_tell_are_refused():
+    with pytest.raises(DatasetInvalid, match="noise: no pixel lies in the shadow"):
+        BoneShadow.of(sweep_at(90.0))
+    with pytest.raises(DatasetInvalid, match="noise: the phantom is scanned along upright lines, got convex probe"):
+        BoneShadow.of(sweep_at(0.0, ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=50.0)))

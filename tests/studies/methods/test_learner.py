@@ -1,12 +1,12 @@
-"""Fits of learned methods: interrupted ones end as undisturbed ones, folders of others are refused."""
+"""Fits of learned methods within their budgets: interrupted ones end as undisturbed ones."""
 
 import numpy as np
 import pytest
 import torch
 
-from ultragray.errors import TrainingDiverged, TrainingStateInvalid
-from ultragray_studies.methods.learner import MODEL_FILE, STATE_FILE
-from ultragray_studies.methods.method import Budget, FitRun, Pace
+from ultragray.errors import InvalidArgument, TrainingDiverged, TrainingStateInvalid
+from ultragray_studies.methods.learner import MODEL_FILE, STATE_FILE, without_subnormals
+from ultragray_studies.methods.method import Budget, FitRun, Pace, Paces
 
 from .conftest import SIDE
 
@@ -102,3 +102,78 @@ def test_a_fit_that_diverges_says_in_which_step(mean_image, make_dataset):
     learner.module.get_parameter("image").data.fill_(float("inf"))
     with pytest.raises(TrainingDiverged, match="step 5: the loss is"):
         learner.take_step(4, 10)
+
+
+def never():
+    raise AssertionError("it was measured again")
+
+
+def test_an_author_gets_the_published_steps():
+    assert Budget.author().steps("any", 200_000, never) == 200_000
+
+
+def test_an_equal_time_holds_the_start_and_the_steps():
+    assert Budget.equal(10.0).steps("any", 200_000, lambda: Pace(start_s=1.0, step_s=0.09)) == 100
+
+
+def test_a_time_that_is_too_short_still_holds_a_step():
+    assert Budget.equal(0.5).steps("any", 10, lambda: Pace(start_s=1.0, step_s=3.0)) == 1
+
+
+@pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_time_that_is_none_is_refused(seconds):
+    with pytest.raises(InvalidArgument, match="must be positive"):
+        Budget.equal(seconds)
+
+
+def test_a_pace_is_measured_once_on_a_machine(tmp_path):
+    path = tmp_path / "cache" / "paces.json"
+    here = {"processor": "one", "threads": 2}
+    first = Budget.equal(10.0, Paces(path, here)).steps("any", 9, lambda: Pace(0.0, 0.1))
+    assert Budget.equal(10.0, Paces(path, here)).steps("any", 9, never) == first == 100
+    assert Budget.equal(10.0, Paces(path, here)).steps("another", 9, lambda: Pace(0.0, 1.0)) == 10
+    elsewhere = {"processor": "another", "threads": 2}
+    assert Budget.equal(10.0, Paces(path, elsewhere)).steps("any", 9, lambda: Pace(0.0, 0.2)) == 50
+
+
+def test_a_fit_that_used_a_part_of_its_time_shows_its_pace():
+    budget = Budget.equal(10.0)
+    budget.steps("any", 9, lambda: Pace(1.0, 0.9, is_confirmed=False))
+    assert budget.shown_pace("any", 10, 9.0) is None  # as promised
+    assert budget.shown_pace("any", 10, 4.0) == Pace(1.0, 0.3, is_confirmed=False)
+    budget.paces.confirm("any")
+    assert budget.shown_pace("any", 10, 4.0) is None  # the table stays
+    assert Budget.author().shown_pace("any", 10, 4.0) is None
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"{}": {"any": ["x", 1, true]}}', '{"{}": {"any": [1]}}', '{"{}": 3}'])
+def test_a_damaged_file_of_paces_is_measured_again(tmp_path, content):
+    path = tmp_path / "paces.json"
+    path.write_text(content)
+    assert Paces(path).get("any", lambda: Pace(1.0, 2.0)) == Pace(1.0, 2.0)
+    assert Paces(path).get("any", never) == Pace(1.0, 2.0)
+
+
+LARGE = 4_000_000  # values: torch takes all its threads
+
+
+def halves_that_stay():
+    """How many of many smallest normal numbers are not 0 when they are halved."""
+    smallest = torch.full((LARGE,), torch.finfo(torch.float32).tiny)
+    return int((smallest * 0.5).view(torch.int32).count_nonzero())  # as bits: to compare is arithmetic too
+
+
+def test_they_are_zero_in_every_thread_and_none_elsewhere():
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        assert halves_that_stay() == LARGE  # and torch has its helpers
+        assert without_subnormals(halves_that_stay) == 0
+        assert halves_that_stay() == LARGE
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_an_error_comes_through():
+    with pytest.raises(ZeroDivisionError):
+        without_subnormals(lambda: 1 // 0)
