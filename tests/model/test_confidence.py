@@ -1,8 +1,6 @@
 """What a scene tells of a frame: distances to training views by hand or brute force, the model, limits."""
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 
 import numpy as np
@@ -102,23 +100,11 @@ def test_a_scene_file_with_a_damaged_model_is_refused(random_scene, tmp_path, ch
         read_header(tmp_path / "scene.ugr")
 
 
-def test_no_torch_is_needed():
-    program = (
-        "import sys, numpy as np; from ultragray import SceneInfo; from ultragray.scene.confidence import Assessor; "
-        "Assessor(SceneInfo(), np.zeros((0, 4, 4))).assess(np.eye(4)); assert 'torch' not in sys.modules"
-    )
-    subprocess.run([sys.executable, "-c", program], check=True)
-
-
 def test_each_figure_is_an_array_and_nan_where_it_is_not_known():
     arrays = figure_arrays([Extrapolation(1.0, 2.0, 0.75, 0.25), Extrapolation(3.0, 4.0, None, None)])
     assert tuple(arrays) == FIGURES == ("distance_mm", "angle_deg", "confidence", "supported_share")
     assert {values.dtype for values in arrays.values()} == {np.dtype(np.float32)}
     np.testing.assert_array_equal(list(arrays.values()), [[1, 3], [2, 4], [0.75, np.nan], [0.25, np.nan]])
-
-
-def test_of_no_frames():
-    assert [values.shape for values in figure_arrays([]).values()] == [(0,)] * 4
 
 
 NEAR = Extrapolation(0.5, 1.0, 0.8, None)
@@ -172,15 +158,6 @@ def test_the_formula():
     assert FITTED.predict(measures(2.0, 0.9, 5.0, 0.25)) == pytest.approx([expected])
 
 
-def test_each_point_has_its_own_curve():
-    half_known = ViewMeasures(
-        *(np.array([[0.0, far]]) for far in (20.0, 20.0, 20.0, 0.0)), weights=np.array([[1.0, 0.0]])
-    )
-    model = replace(FITTED, support=None)
-    known, unknown = model.predict(measures())[0], model.predict(measures(20.0, 20.0))[0]
-    assert model.predict(half_known) == pytest.approx([0.5 * (known + unknown)])
-
-
 def test_distance_beyond_what_it_was_fitted_on_counts_twice():
     ending = replace(FITTED, support=None)
     endless = replace(ending, fitted_to_mm=None)
@@ -205,11 +182,6 @@ def test_farther_is_never_surer(name):
     figures = [FITTED.predict(measures(**{name: value}))[0] for value in (0.0, 0.1, 0.5, 1.0)]
     assert figures == sorted(figures, reverse=True)
     assert figures[0] > figures[-1]
-
-
-def test_far_away_it_is_what_a_black_frame_reaches():
-    far = ConfidenceModel((3.5, 1.2, 8.0, 0.1, 0.6), 0.06, (0.0, 1.0), 20, 0.04)
-    assert far.predict(measures(20.0, 20.0)) == pytest.approx([0.06], abs=1e-4)
 
 
 def test_json_and_back():
@@ -238,11 +210,6 @@ def test_json_and_back():
 def test_damage_is_refused(change, said):
     with pytest.raises(InvalidArgument, match=said):
         ConfidenceModel.from_dict({**FITTED.to_dict(), **change})
-
-
-def test_what_is_no_object_is_refused():
-    with pytest.raises(InvalidArgument, match="must be an object"):
-        ConfidenceModel.from_dict([1, 2])
 
 
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=40.0, far_mm=120.0)

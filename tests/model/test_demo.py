@@ -2,8 +2,6 @@
 
 import logging
 import math
-import subprocess
-import sys
 from dataclasses import replace
 
 import cv2
@@ -20,7 +18,7 @@ from ultragray.learn.sweep import pixel_positions_mm
 from ultragray.learn.training import TrainingConfig
 from ultragray.phantom import Tissue, load_phantom, simulate, sweeps, tissue_at
 from ultragray.phantom import make_demo as make
-from ultragray.phantom.demo import DEMO_FILE, DEMO_IMAGE_SIDE, DEMO_PROBE, copy_demo_scene, demo_poses, load_demo_scene
+from ultragray.phantom.demo import DEMO_FILE, DEMO_IMAGE_SIDE, DEMO_PROBE, demo_poses, load_demo_scene
 from ultragray.phantom.imaging import BoneShadow
 
 SIDE = 256
@@ -96,19 +94,6 @@ def test_the_file_is_small_and_describes_itself(phantom):
     assert info.training["step"] == info.training["steps"]
     np.testing.assert_allclose(info.centre_mm, phantom.centre_mm, atol=1e-6)
     np.testing.assert_allclose(header.training_poses, phantom.train.poses, atol=1e-12)
-
-
-def test_copying_it_needs_no_torch(tmp_path):
-    program = (
-        "import sys; from ultragray.phantom.demo import copy_demo_scene; copy_demo_scene(sys.argv[1]); "
-        "print('torch' in sys.modules)"
-    )
-    copy = tmp_path / "copy.ugr"
-    command = [sys.executable, "-c", program, str(copy)]
-    assert subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip() == "False"
-    assert copy.read_bytes() == DEMO_FILE.read_bytes()
-    with pytest.raises(FileNotFoundError):
-        copy_demo_scene(tmp_path / "absent" / "copy.ugr")
 
 
 # Its figures

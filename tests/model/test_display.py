@@ -57,11 +57,6 @@ def test_depth_counts_from_the_face(probe, rows):
     assert display.picture(probe, HEIGHT, WIDTH).height == rows
 
 
-def test_depth_beyond_the_frame_cuts_nothing():
-    assert Display(depth_mm=500.0).rows_shown(LINEAR, HEIGHT) == HEIGHT
-    assert Display(depth_mm=0.001).rows_shown(LINEAR, HEIGHT) == 1
-
-
 @pytest.mark.parametrize("flip", [False, True])
 @pytest.mark.parametrize("probe", PROBES, ids=lambda probe: probe.kind)
 def test_pixels_of_a_picture_lie_where_it_says(probe, flip):
@@ -98,12 +93,6 @@ def test_frames_are_scan_converted_as_arrays_are(probe):
         np.testing.assert_allclose(shown["bmode"][k].numpy(), expected, atol=2e-5)
     labels = scan_convert_labels(given["labels"][0].numpy(), probe, 0.8)
     assert (shown["labels"][0].numpy() == labels).mean() > 0.999  # samples half-way between two
-
-
-def test_flipping_twice_is_nothing():
-    picture = CONVEX.picture(0.7)
-    assert picture.flipped() != picture
-    assert picture.flipped().flipped() == picture
 
 
 @pytest.mark.parametrize(

@@ -8,6 +8,7 @@ import sys
 import pytest
 
 from ultragray import installation as machine
+from ultragray.phantom.demo import DEMO_FILE
 
 
 def test_what_the_system_tells(tmp_path, monkeypatch):
@@ -47,3 +48,27 @@ def test_they_sleep_unless_the_environment_says_otherwise(given, expected):
     environment = {name: value for name, value in os.environ.items() if name != "OMP_WAIT_POLICY"} | given
     done = subprocess.run([sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, check=True)
     assert done.stdout.split() == [expected, "False"]
+
+
+# What the service's own process and the command line import, before anything is rendered.
+WITHOUT_TORCH = (
+    "import ultragray; ultragray.read_header",
+    "from ultragray.phantom.demo import copy_demo_scene; copy_demo_scene('copy.ugr')",
+    "from ultragray.learn.training import TrainingConfig; TrainingConfig.preset('fast', steps=3)",
+    "from ultragray.learn.evaluation.methods import ComparisonSettings; ComparisonSettings(methods=('median',))",
+    "import ultragray.samplers",
+    "from ultragray.exchange.exports import check_format",
+    "import numpy as np; from ultragray import SceneInfo; from ultragray.scene.confidence import Assessor; "
+    "Assessor(SceneInfo(), np.zeros((0, 4, 4))).assess(np.eye(4))",
+)
+
+
+@pytest.mark.slow
+def test_little_is_imported_before_it_is_needed(working_folder):
+    program = "import sys\n"
+    for statement in WITHOUT_TORCH:
+        program += f"{statement}\nassert 'torch' not in sys.modules, {statement!r}\n"
+    program += "from ultragray.learn.training import train; ultragray.render\n"
+    program += "assert 'torch' in sys.modules and 'triton' not in sys.modules"
+    subprocess.run([sys.executable, "-c", program], check=True)
+    assert (working_folder / "copy.ugr").read_bytes() == DEMO_FILE.read_bytes()

@@ -42,12 +42,6 @@ def test_points_without_errors_give_the_transform():
     assert fit.rms_mm < 1e-10
 
 
-def test_three_points_in_a_plane_are_enough():
-    rng = np.random.default_rng(1)
-    true, points = motion(rng), np.array([[0.0, 0.0, 0.0], [40.0, 0.0, 0.0], [0.0, 30.0, 0.0]])
-    np.testing.assert_allclose(register_points(points, through(true, points)).transform, true, atol=1e-10)
-
-
 def test_the_standard_deviations_of_points_are_those_of_many_repetitions():
     rng = np.random.default_rng(2)
     points, true = 40.0 * rng.normal(size=(8, 3)), motion(rng)
@@ -82,15 +76,6 @@ SPREAD = [[0.0, 0.0, 0.0], [10.0, 0.0, 0.0], [0.0, 10.0, 0.0], [0.0, 0.0, 10.0]]
 def test_points_that_tell_no_transform_are_refused(points, targets, told):
     with pytest.raises(InvalidArgument, match=told):
         register_points(points, targets)
-
-
-def test_points_nearly_in_a_plane_are_no_mirror_image():
-    """Noise out of the plane may mirror it a little: that is no reason to refuse."""
-    rng = np.random.default_rng(3)
-    points = np.concatenate([40.0 * rng.normal(size=(6, 2)), 0.3 * rng.normal(size=(6, 1))], axis=1)
-    for _ in range(50):
-        targets = points + rng.normal(scale=0.5, size=points.shape)
-        assert np.degrees(np.linalg.norm(cv2.Rodrigues(register_points(points, targets).transform[:3, :3])[0])) < 5.0
 
 
 def test_one_pose_gives_the_link_and_tells_no_deviations():

@@ -1,8 +1,6 @@
 """Samplers of poses, and what they leave out for want of confidence."""
 
 import json
-import subprocess
-import sys
 
 import numpy as np
 import pytest
@@ -10,7 +8,7 @@ import pytest
 from ultragray import ConvexProbe, LinearProbe
 from ultragray.contract import from_dict, to_dict
 from ultragray.errors import InvalidArgument, LowConfidence
-from ultragray.geometry.pose import check_poses, position_distances_mm, rotation_angles_deg
+from ultragray.geometry.pose import check_poses, rotation_angles_deg
 from ultragray.geometry.rotations import rotations_of, turns_of
 from ultragray.samplers import (
     AroundSampler,
@@ -70,14 +68,6 @@ def test_around_has_the_spread_asked_for():
     assert poses[:, :3, 3].std(axis=0) == pytest.approx([2.0] * 3, rel=0.05)
     angles = rotation_angles_deg(poses, np.eye(4)[None])[:, 0]
     assert np.sqrt((angles**2).mean()) == pytest.approx(5.0, rel=0.05)
-
-
-def test_around_lies_about_every_base_pose_and_follows_the_seed():
-    base = np.tile(np.eye(4), (2, 1, 1))
-    base[1, 0, 3] = 1000.0
-    poses = AroundSampler(50, seed=3).poses(base, PROBE)
-    assert set(position_distances_mm(poses, base).argmin(axis=1)) == {0, 1}
-    assert not np.array_equal(poses, AroundSampler(50, seed=4).poses(base, PROBE))
 
 
 def test_spline_goes_through_its_base_poses_and_does_not_break():
@@ -234,12 +224,6 @@ def test_no_base_poses(kind):
     numbers["fan"] = {"tilt_deg": 1, "step_deg": 1}
     with pytest.raises(InvalidArgument, match="needs base poses"):
         from_dict(Sampler, {"kind": kind, **numbers.get(kind, {})}).poses(np.zeros((0, 4, 4)), PROBE)
-
-
-def test_needs_no_torch():
-    program = f"import sys; sys.path[:] = {sys.path!r}; import ultragray.samplers; print('torch' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout.strip() == "False"
 
 
 def test_turns_come_back_from_their_rotations():

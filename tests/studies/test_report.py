@@ -9,14 +9,12 @@ import pytest
 
 from ultragray import LinearProbe
 from ultragray.datasets import Dataset, Sweep
-from ultragray.errors import TrainingDiverged
 from ultragray.learn.evaluation.methods import ComparisonSettings
 from ultragray.learn.evaluation.scoring import evaluate
-from ultragray.learn.training import Progress, TrainingConfig
+from ultragray.learn.training import TrainingConfig
 from ultragray.learn.training.config import VIEWS_BETWEEN
 from ultragray.learn.training.geometry import Geometry
 from ultragray_studies import report as report_module
-from ultragray_studies import report as study
 from ultragray_studies.comparison.result import MethodResult
 from ultragray_studies.comparison.run import SCENE, compare_methods
 from ultragray_studies.methods.gaussians import GivenScene, SceneMethod
@@ -25,11 +23,9 @@ from ultragray_studies.report import (
     ReportContent,
     ablation_methods,
     ablations,
-    attempt,
     baselines,
     frame_tilts_deg,
     render_report,
-    split_by_tilt,
     study_tilt,
     train_and_evaluate,
 )
@@ -72,28 +68,6 @@ def test_a_training_is_followed_and_measured(turning_dataset, small_config):
     assert trained.course.seconds == pytest.approx(6 * trained.course.step_s)
 
 
-def test_each_validation_is_a_point_even_where_nothing_changed(
-    turning_dataset, small_config, random_scene, monkeypatch
-):
-    def train(dataset, config, *, report):
-        for step, val_step in ((1, None), (2, 2), (3, 2), (4, 4), (5, 4)):
-            report(Progress(step, 5, 0.1, 7, 1.0, 1.0, None if val_step is None else 20.0, val_step))
-        return random_scene(7)
-
-    monkeypatch.setattr(study, "train", train)
-    assert train_and_evaluate(turning_dataset, small_config).course.val_psnr_db == {2: 20.0, 4: 20.0}
-
-
-def test_a_study_that_fails_gives_its_reason():
-    def fail():
-        raise TrainingDiverged("the loss is nan")
-
-    assert attempt(fail) == Failed("the loss is nan")
-    assert attempt(lambda: 3) == 3
-    with pytest.raises(ZeroDivisionError):
-        attempt(lambda: 1 // 0)
-
-
 def test_ablations_differ_in_what_they_are_named_after(small_config):
     full = small_config.to_dict()
     changed = {
@@ -133,14 +107,6 @@ def test_tilts_are_signed_angles_about_the_axis_of_turning(turning_dataset):
     np.testing.assert_allclose(tilts, expected, atol=0.05)
     backwards = turning_dataset.train.select(range(len(tilts))[::-1])
     np.testing.assert_allclose(frame_tilts_deg(backwards), -expected[::-1], atol=0.05)
-
-
-def test_halves_of_the_tilts():
-    low, high = split_by_tilt(np.array([5.0, -5.0, 4.0, -4.0, 0.0])) or ([], [])
-    assert list(low) == [1, 3]
-    assert list(high) == [0, 2, 4]
-    assert split_by_tilt(np.array([0.0, 1.0, 2.0, 2.9])) is None
-    assert split_by_tilt(np.array([0.0, 10.0, 20.0])) is None
 
 
 def test_a_study_of_tilt_measures_what_was_not_trained_on(turning_dataset, small_config):

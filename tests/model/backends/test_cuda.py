@@ -13,7 +13,6 @@ import torch
 from ultragray import ConvexProbe, GaussianScene, LinearProbe, render
 from ultragray.errors import BackendUnavailable, FrameTooCostly, MemoryExceeded
 from ultragray.rendering.backends import cuda
-from ultragray.rendering.backends.registry import renderer_name
 from ultragray.rendering.limits import Limits
 from ultragray.rendering.outputs import PLANES
 
@@ -159,15 +158,6 @@ def test_out_of_memory_fails_the_frame_and_nothing_else(scene, random_poses, mon
     np.testing.assert_array_equal(planes(scene, LINEAR, poses), before)
 
 
-def test_frames_say_what_rendered_them(scene):
-    assert renderer_name("cuda", scene).endswith("cuda-interpreted" if cuda.interpreted() else "")
-    assert " cuda-" in renderer_name("cuda", scene)
-
-
-def test_auto_leaves_scenes_of_the_cpu_to_the_cpu(random_scene):
-    assert " cpu-" in renderer_name("auto", random_scene(3))
-
-
 def test_it_refuses_what_it_would_get_wrong(scene):
     with pytest.raises(BackendUnavailable, match=r"backend cuda renders float32 scenes on the device .*float64"):
         render(scene.to(torch.float64), LINEAR, np.eye(4), backend="cuda", **SIZE)
@@ -189,12 +179,6 @@ def test_a_device_that_is_not_there_is_named():
         pytest.skip("interpreted kernels know no device numbers")
     with pytest.raises(BackendUnavailable, match=r"CUDA device 99 was asked for"):
         cuda.device(99)
-
-
-@pytest.mark.slow
-def test_importing_the_library_imports_no_triton():
-    program = "import sys, ultragray; ultragray.render; sys.exit('triton' in sys.modules)"
-    assert subprocess.run([sys.executable, "-c", program], check=False).returncode == 0
 
 
 COMPILE = """

@@ -155,15 +155,6 @@ def test_changed_labels_and_parameters_are_noticed(renderer, labelled):
     assert not label_frames(renderer(scene, PROBES["linear"], np.eye(4), **size)).any()
 
 
-def test_labels_have_no_gradient_and_leave_that_of_the_others_alone(labelled):
-    scene = labelled()
-    scene.sh0.requires_grad_()
-    frames = render(scene, PROBES["linear"], np.eye(4), height=20, width=30, outputs=("bmode", "labels"))
-    assert not frames.labels.requires_grad
-    frames.bmode.sum().backward()
-    assert scene.sh0.grad.any()
-
-
 def test_a_scene_without_labels_refuses_them(random_scene):
     with pytest.raises(UnknownOutput, match="labels only for a scene whose Gaussians carry labels") as caught:
         render(random_scene(5), PROBES["linear"], np.eye(4), height=4, width=4, outputs=("bmode", "labels"))
@@ -190,10 +181,6 @@ def test_labels_that_do_not_fit_are_refused(random_scene, labels, names, match):
 def test_names_that_are_none_are_refused(names):
     with pytest.raises(InvalidArgument, match="label_names must give labels from 1 to 255 a name each"):
         SceneInfo(label_names=names)
-
-
-def test_labels_without_a_name_are_called_after_their_number(labelled):
-    assert labelled(names={2: "muscle"}).info.label_names == {1: "label 1", 2: "muscle", 9: "label 9"}
 
 
 def test_files_keep_labels_and_a_scene_without_is_written_as_before(labelled, tmp_path):

@@ -181,13 +181,6 @@ def test_a_config_may_name_the_image_size_itself(dataset):
     assert dataset.import_it().info == scene.info
 
 
-def test_poses_that_are_not_the_training_poses_are_noticed(dataset, caplog):
-    np.save(dataset.poses, dataset.pose_array[:3])
-    dataset.import_it()
-    assert "3 poses" in caplog.text
-    assert "5 images" in caplog.text
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [

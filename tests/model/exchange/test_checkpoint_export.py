@@ -118,11 +118,6 @@ def test_a_scene_that_does_not_know_its_probe(tmp_path, make_scene):
     assert any("does not know its probe" in note for note in export.notes)
 
 
-def test_a_convex_probe_is_told_to_be_too_much_for_the_released_trainer(tmp_path, make_scene):
-    assert any("linear probes only" in note for note in export_checkpoint(make_scene(CONVEX), tmp_path / "a.pt").notes)
-    assert "ultrasound_opening_width" not in json.loads((tmp_path / "conf.json").read_text())
-
-
 def test_a_scene_with_a_beam_is_told_to_be_cut_by_a_plane(tmp_path, make_scene):
     scene = make_scene()
     assert not any("beam" in note for note in export_checkpoint(scene, tmp_path / "a" / "ckpt.pt").notes)
@@ -172,13 +167,6 @@ def test_every_tensor_has_a_storage_of_its_own(tmp_path, make_scene):
     assert (tmp_path / "ckpt.pt").stat().st_size < 20_000
     saved = torch.load(tmp_path / "ckpt.pt", weights_only=True)["splats"]
     assert torch.equal(saved["shN"], made.shN)
-
-
-def test_a_scene_that_asks_for_gradients_or_is_in_double(tmp_path, make_scene):
-    splats = {name: tensor.double().requires_grad_() for name, tensor in make_scene().splats.items()}
-    export_checkpoint(GaussianScene.from_splats(splats), tmp_path / "ckpt.pt")
-    for tensor in torch.load(tmp_path / "ckpt.pt", weights_only=True)["splats"].values():
-        assert (tensor.dtype, tensor.requires_grad) == (torch.float32, False)
 
 
 def fitted(scene):
@@ -241,14 +229,3 @@ def test_what_lies_under_the_floor_is_told(make_sigmoid_scene):
     assert largest == pytest.approx(float(found.max()), abs=1e-5)
     assert mean == pytest.approx(float(found.mean()), abs=1e-5)
     assert 0.46 < mean <= largest < 0.5
-
-
-def test_without_training_poses_all_directions_count(make_sigmoid_scene):
-    scene = make_sigmoid_scene(1, sh0=(1.0, 2.0), spread=0.3, poses=0)
-    _, largest, mean = fitted(scene)
-    assert 0.0 < mean < largest < 0.05
-
-
-def test_no_gaussians(random_scene):
-    fit = fit_released_intensity(random_scene(0, intensity="sigmoid"))
-    assert (fit.largest_error, fit.mean_error, fit.shN.shape) == (0.0, 0.0, (0, 3, 1))

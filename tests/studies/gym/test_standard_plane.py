@@ -134,14 +134,6 @@ def test_the_goal_is_not_reached_in_the_air(scene):
     assert env.step(still)[2]
 
 
-def test_lost_contact_costs(env):
-    env.reset(options={"pose": moved(env.goal, np.array([0.0, 0.0, -9.0]), np.zeros(3), 0.0)})
-    frame, reward, _, _, info = env.step(np.zeros(6))
-    assert info["contact_share"] == 0.0
-    assert frame.max() == 0
-    assert reward == pytest.approx(-2.0)
-
-
 def test_the_probe_stays_around_the_goal(env):
     env.reset(seed=0)
     for _ in range(40):

@@ -1,8 +1,5 @@
 """The methods by name."""
 
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 import torch
@@ -41,15 +38,6 @@ def test_a_method_that_is_not_there_is_refused_with_the_list(names, got):
     with pytest.raises(InvalidArgument, match=f"scene, median, mean, maximum.* got {got}") as caught:
         chosen_methods(names)
     assert caught.value.field == "methods"
-
-
-def test_the_settings_of_a_comparison_need_no_torch():
-    program = (
-        f"import sys; sys.path[:] = {sys.path!r}; "
-        "from ultragray.learn.evaluation.methods import ComparisonSettings; "
-        "ComparisonSettings(methods=('median',)); print('torch' in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", program], capture_output=True, check=True).stdout == b"False\n"
 
 
 @pytest.mark.parametrize("name", ["median", "maximum", "linear", "nearest"])

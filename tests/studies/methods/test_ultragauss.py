@@ -229,27 +229,6 @@ def test_a_killed_fit_ends_in_the_model_of_an_undisturbed_one(variant, tmp_path,
     assert np.array_equal(frames[0], frames[2])
 
 
-def test_a_learner_takes_over_another_number_of_gaussians():
-    dataset = ball(3, 20, 16)
-    few, many = small_learner(dataset, "ultragauss", count=50), small_learner(dataset, "ultragauss", count=80)
-    few.take_step(0, 10)
-    many.load({name: tensor.clone() for name, tensor in few.state().items()})
-    assert many.take_step(1, 10) == few.take_step(1, 10)
-    assert all(torch.equal(tensor, few.model()[name]) for name, tensor in many.model().items())
-
-
-def test_weights_that_vanish_are_resampled():
-    dataset = ball(3, 20, 16)
-    learner = small_learner(dataset, "ultragauss", count=120)
-    with torch.no_grad():
-        learner.module.gaussians["transmittances"][:30] = -8.0
-    for step in range(98, 101):
-        learner.take_step(step, 300)
-    weights = learner.module.gaussians["transmittances"].detach().sigmoid()
-    assert len(weights) == 120
-    assert float(weights.min()) > 0.005
-
-
 def test_everything_learned_gets_a_gradient():
     learner = small_learner(ball(2, 20, 16), "ultragauss-shadow")
     learner.loss(0, 10).backward()

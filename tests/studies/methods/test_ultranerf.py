@@ -13,7 +13,6 @@ from torch.nn import functional
 from ultragray import ConvexProbe, LinearProbe
 from ultragray.errors import DatasetInvalid
 from ultragray.learn.sweep import Dataset, Sweep
-from ultragray_studies.methods import ultranerf
 from ultragray_studies.methods.method import Budget
 from ultragray_studies.methods.parts import encode
 from ultragray_studies.methods.ultranerf import (
@@ -55,15 +54,6 @@ def test_the_encoding_joins_again_before_the_sixth_layer():
         raw = module(torch.rand(8, 3, generator=torch.Generator().manual_seed(0)))
     assert raw.shape == (8, 5)
     assert raw.std(dim=0).min() > 0.0
-
-
-def test_weights_are_glorot_uniform_and_biases_zero():
-    for layer in field().modules():
-        if isinstance(layer, torch.nn.Linear):
-            bound = math.sqrt(6.0 / (layer.in_features + layer.out_features))
-            assert 0.95 * bound < layer.weight.abs().max() <= bound
-            assert float(layer.weight.detach().std()) == pytest.approx(bound / math.sqrt(3.0), rel=0.1)
-            assert not layer.bias.any()
 
 
 SPACING = 0.5
@@ -218,13 +208,6 @@ def test_attenuation_is_counted_per_unit_of_the_coordinates(name, length):
     middle = frame[3:-3, SIDE // 2]
     expected = np.exp(-1.5 * length * np.arange(3, SIDE - 3) / SIDE)
     np.testing.assert_allclose(middle, expected, rtol=1e-5)
-
-
-def test_a_frame_in_chunks_is_the_frame(monkeypatch):
-    one = learner(VARIANTS[1])
-    whole = one.render(LINEAR, np.eye(4)[None], SIDE, SIDE)
-    monkeypatch.setattr(ultranerf, "CHUNK_POINTS", 100)
-    np.testing.assert_allclose(one.render(LINEAR, np.eye(4)[None], SIDE, SIDE), whole, atol=1e-6)
 
 
 def test_a_fan_is_rendered_along_its_own_scan_lines():

@@ -1,4 +1,3 @@
-import io
 import json
 import subprocess
 import sys
@@ -143,15 +142,6 @@ def test_what_is_not_known(tmp_path):
         assert file is not None
         told = json.load(file)
     assert {name: told[name] for name in FIGURES} == UNKNOWN.figures()
-
-
-def test_tar_of_floats(tmp_path):
-    expected = export(tmp_path / "frames.tar", "tar", header())
-    with tarfile.open(tmp_path / "frames.tar") as tar:
-        assert tar.getnames()[:4] == ["000000.bmode.npy", "000000.echo.npy", "000000.labels.png", "000000.json"]
-        file = tar.extractfile("000003.echo.npy")
-        echo = np.load(io.BytesIO(file.read()))
-    np.testing.assert_array_equal(echo, expected["echo"][3])
 
 
 @pytest.mark.parametrize("dtype", ["float32", "uint8"])
@@ -337,20 +327,6 @@ def test_what_a_format_cannot_hold(format, outputs, dtype, field, told):
     with pytest.raises(InvalidArgument, match=told) as caught:
         check_format(format, outputs, dtype)
     assert caught.value.field == field
-
-
-def test_default_types():
-    chosen = {name: check_format(name, ("bmode",), None) for name in FORMATS}
-    assert chosen == {
-        "npz": "float32",
-        "tar": "uint8",
-        "zarr": "float32",
-        "hdf5": "float32",
-        "dicom": "uint8",
-        "plus": "uint8",
-        "mcap": "uint8",
-    }
-    assert check_format("npz", OUTPUTS, "uint8") == "uint8"
 
 
 @pytest.mark.parametrize(

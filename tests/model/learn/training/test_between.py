@@ -180,13 +180,6 @@ def test_what_neither_frame_shows_does_not_count(tiny_dataset):
     assert float(drawn.weights[~unseen].min()) > 0.0
 
 
-def test_frames_that_are_far_apart_count_as_usual(tiny_dataset):
-    sweep = tiny_dataset().train
-    two = sweep.select([0, len(sweep) - 1])
-    drawn = ViewsBetween(two, neighbours_of(two), torch.tensor(two.images)).draw(50, torch.Generator().manual_seed(4))
-    assert float(drawn.weights.mean()) > 0.5
-
-
 SIZE = 48
 PROBES = (
     LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=30.0),
@@ -227,11 +220,6 @@ def test_planes_between_two_frames_are_those_of_the_baseline(probe):
     assert expected.std() > 0.1
     assert np.quantile(errors, 0.99) < 2e-3  # at the outline, pixels may fall inside here and outside there
     assert np.quantile(np.abs(expected - expected.mean()), 0.5) > 0.05
-
-
-def test_a_plane_that_is_a_frame_shows_that_frame():
-    sweep = two_frames(PROBES[0])
-    assert np.allclose(blended(sweep, sweep.poses), sweep.images / 255.0, atol=1e-4)
 
 
 def test_what_no_frame_shows_is_black_and_what_one_shows_is_its():

@@ -1,8 +1,6 @@
 """TrainingConfig: presets, overrides, and one sentence for what cannot be."""
 
 import json
-import subprocess
-import sys
 from dataclasses import replace
 
 import pytest
@@ -76,17 +74,6 @@ def test_an_unknown_setting_is_refused_with_the_known_ones():
     ) as caught:
         TrainingConfig.preset("fast", stepz=3)
     assert caught.value.field == "stepz"
-
-
-@pytest.mark.slow
-def test_a_configuration_needs_no_torch():
-    program = (
-        f"import sys; sys.path[:] = {sys.path!r}; from ultragray.learn.training import TrainingConfig; "
-        "TrainingConfig.preset('fast', steps=3); print('torch' in sys.modules); "
-        "from ultragray.learn.training import train; print('torch' in sys.modules)"
-    )
-    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    assert told.split() == ["False", "True"]
 
 
 def test_survives_json():

@@ -91,10 +91,6 @@ def test_an_effort_that_the_memory_does_not_allow_is_not_chosen(tiny_dataset, ca
     assert "effort 2 cannot be tried: too many Gaussians" in caplog.text
 
 
-def test_few_frames_are_trained_with_the_usual_effort(tiny_dataset):
-    assert choose_effort(tiny_dataset(frames=6), OPEN, TryOut({}), None) == 1.0
-
-
 def trying(effort):
     return f"trying effort {effort:g} on a part of the frames"
 
@@ -127,10 +123,3 @@ def test_a_run_whose_choice_is_stopped_goes_on_with_it(tiny_dataset, tmp_path):
     effort = read_checkpoint_header(tmp_path / CHECKPOINT_FILE).config.effort
     whole = train(dataset, config, folder=tmp_path, resume=True)
     assert whole.to_bytes() == train(dataset, replace(config, effort=effort)).to_bytes()
-
-
-def test_nothing_is_chosen_where_the_effort_changes_nothing(tiny_dataset):
-    seen = []
-    config = TrainingConfig(effort=None, steps=3, max_gaussians=40, batch_size=3, confidence=False)
-    train(tiny_dataset(frames=40), config, report=seen.append)
-    assert [progress.beside for progress in seen] == [None] * 3

@@ -38,11 +38,6 @@ def test_lengths_of_a_straight_sweep(tiny_dataset):
     assert geometry.initial_elevation_mm(9.0) == pytest.approx(4.5)
 
 
-def test_dense_sweep_keeps_the_pixel(tiny_dataset):
-    geometry = Geometry.of(tiny_dataset(spacing_mm=0.01))
-    assert geometry.initial_scale_mm == geometry.initial_elevation_mm(0.0) == pytest.approx(geometry.pixel_mm)
-
-
 def test_spacing_of_a_raster_is_that_across_the_frames(tiny_dataset):
     """Frames of the next lane lie in almost the same planes, but they are not neighbours."""
     sweep = tiny_dataset(frames=12, spacing_mm=1.0).train

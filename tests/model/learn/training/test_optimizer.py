@@ -183,12 +183,6 @@ def test_too_large_and_too_small_are_pruned():
     assert found["transmittances"].tolist() == [float(place) for place in origin]
 
 
-def test_a_half_that_is_small_enough_stays_where_the_whole_would_go():
-    found, origin, _ = refined([1.5], [1.0], limit=10)
-    assert origin.tolist() == [-1, -1]
-    assert len(found["means"]) == 2
-
-
 def test_pull_is_a_mean_over_the_steps_in_which_a_gaussian_was_seen():
     pull = PullStatistics.empty(3, torch.device("cpu"))
     pull.add(torch.tensor([[3.0, 4.0, 0.0], [0.0, 0.0, 2.0], [0.0, 0.0, 0.0]]))
@@ -229,20 +223,10 @@ def test_schedules_scale_with_the_run():
     assert [schedule.sh_degree(step) for step in (0, 39, 40, 1_199)] == [0, 0, 1, 1]
 
 
-def test_no_refinement_at_the_ends_of_a_very_short_run():
-    schedule = schedule_of(steps=3)
-    assert [schedule.refinement(done) is None for done in (0, 3)] == [True, True]
-
-
 def test_each_degree_joins_a_while_after_the_last():
     schedule = schedule_of(sh_degree=3)
     assert [schedule.sh_degree(step) for step in (999, 1_000, 2_000, 3_000, 9_000)] == [0, 1, 2, 3, 3]
     assert schedule_of(sh_start=0.0).sh_degree(0) == 1
-
-
-def test_even_growth_ends_at_the_limit():
-    schedule = schedule_of(growth="even", initial_gaussians=100, max_gaussians=170)
-    assert [schedule.gaussian_limit(k) for k in range(7)] == [110, 120, 130, 140, 150, 160, 170]
 
 
 @pytest.mark.parametrize(

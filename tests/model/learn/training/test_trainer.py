@@ -175,14 +175,6 @@ def test_a_checkpoint_with_other_tensors_is_refused(tiny_dataset, tiny_config, t
         train(tiny_dataset(), tiny_config(), folder=tmp_path, resume=True)
 
 
-def test_opening_a_folder_removes_what_a_killed_run_left(tiny_dataset, tiny_config, tmp_path):
-    train(tiny_dataset(), tiny_config(), folder=tmp_path, should_stop=lambda: True)
-    for name in ("checkpoint.safetensors", "metrics.jsonl", "config.json", "scene.ugr"):
-        (tmp_path / f".{name}.abcdefgh.tmp").touch()
-    train(tiny_dataset(), tiny_config(), folder=tmp_path, resume=True, should_stop=lambda: True)
-    assert [path.name for path in tmp_path.glob(".*")] == [".scene.ugr.abcdefgh.tmp"]
-
-
 def test_divergence_keeps_the_last_good_checkpoint(tiny_dataset, tiny_config, tmp_path, monkeypatch):
     true_loss, calls = trainer.image_loss, 0
 
@@ -256,11 +248,6 @@ def test_neither_do_corrections_that_are_not_finite(tiny_dataset, tiny_config, t
     with pytest.raises(TrainingDiverged, match=f"{what} are no longer finite"):
         run.save_checkpoint()
     assert not (tmp_path / "checkpoint.safetensors").exists()
-
-
-def test_without_transmittance_nothing_absorbs(tiny_dataset, tiny_config):
-    scene, _ = learned(tiny_dataset(), tiny_config(transmittance=False))
-    assert bool((torch.sigmoid(scene.transmittances) == 1.0).all())
 
 
 def test_harmonics_are_learned_once_they_join(tiny_dataset, tiny_config):
