@@ -116,7 +116,7 @@ class Scene:
 class Render:
     scene: str
     sampler: PoseSampler | None = None
-    kind: Literal[render] = field(default="render", kw_only=True)
+    kind: Literal["render"] = field(default="render", kw_only=True)
 
 
 @dataclass(frozen=True)

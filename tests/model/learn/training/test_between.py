@@ -5,18 +5,21 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from torch.nn import functional
 
 from ultragray.geometry.pose import pose_from_position_quaternion, rotation_angles_deg
 from ultragray.geometry.probe import ConvexProbe, LinearProbe, PhasedProbe, RadialProbe, SteeredProbe
 from ultragray.learn.evaluation.baselines import interpolate_planes
 from ultragray.learn.sweep import Sweep
 from ultragray.learn.training.between import (
+    SMOOTHED,
     Places,
     ViewsBetween,
     blend_in_space,
     draw_places,
     features_follow_probe,
     neighbours_of,
+    smoothed_sizes,
 )
 from ultragray.learn.training.losses import image_loss
 
@@ -168,6 +171,12 @@ def test_where_neighbours_disagree_a_blend_counts_less(tiny_dataset, with_probe)
     pull = rendered.grad
     in_doubt, agreed = pull[between][:, 26:34, 10:15].abs().mean(), pull[between][:, :14, 26:].abs().mean()
     assert float(in_doubt) < 0.4 * float(agreed)
+
+
+def test_differences_are_averaged_over_a_square_that_ends_with_the_image():
+    differences = torch.randn(2, 13, 31, generator=torch.Generator().manual_seed(0))
+    pooled = functional.avg_pool2d(differences, SMOOTHED, 1, SMOOTHED // 2, count_include_pad=False).abs()
+    assert (smoothed_sizes(differences) - pooled).abs().max() < 1e-6
 
 
 def test_what_neither_frame_shows_does_not_count(tiny_dataset):
