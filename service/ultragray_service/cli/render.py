@@ -153,23 +153,26 @@ def render_frames(
     if sampler is None and given_poses is None:
         sampler = TrainingSampler()
     assess = partial(Assessor(header.info, header.training_poses).assess, probe=settings.probe)
-    poses, extrapolations = assessed_poses(sampler, base, settings.probe, assess, asked.least_confidence)
+    poses, extrapolations = assessed_poses(sampler, base, settings.probe, assess, settings.least_confidence)
 
     import torch  # everything that can be wrong was found before
 
-    from ultragray.exchange.rendering import render_to_file
+    from ultragray.exchange.rendering import assess_by_rendering, render_to_file
     from ultragray.rendering.backends.registry import render_device
     from ultragray.scene.gaussians import GaussianScene
 
-    scene = GaussianScene.load(scene_file)
+    scene = GaussianScene.load(scene_file).to(render_device(backend))
     if threads:
         torch.set_num_threads(threads)
     started = time.perf_counter()
+    if sampler is not None and settings.least_confidence is not None:  # until now poses alone were looked at
+        seen = assess_by_rendering(scene, settings, assess, backend=backend)
+        poses, extrapolations = assessed_poses(sampler, base, settings.probe, seen, settings.least_confidence)
     with counted("rendering", len(poses)) as report:
         found = render_to_file(
             output,
             format,
-            scene.to(render_device(backend)),
+            scene,
             settings,
             poses,
             extrapolations,
