@@ -280,8 +280,7 @@ class Settings(Contract):
         repr=False,
     )
     oidc_issuer: str | None = described(
-        "URL of an OpenID Connect issuer, as tokens name it: they are taken beside API keys; none: no tokens.",
-        None,
+        "URL of an OpenID Connect issuer, as tokens name it: they are taken beside API keys; none: no tokens.", None
     )
     oidc_audience: str | None = described("Audience that tokens must be for, usually this service's client id.", None)
     oidc_role_claim: str = described("Claim that gives roles; dots lead inwards: realm_access.roles.", "roles")

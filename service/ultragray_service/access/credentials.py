@@ -110,8 +110,7 @@ class Guard:
             return LOCAL
         if credential is None:
             raise Unauthenticated(
-                "an API key is required: send Authorization: Bearer KEY, or X-API-Key: KEY",
-                field="Authorization",
+                "an API key is required: send Authorization: Bearer KEY, or X-API-Key: KEY", field="Authorization"
             )
         for source in self._authenticators:
             principal = source.authenticate(credential)

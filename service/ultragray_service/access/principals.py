@@ -25,10 +25,7 @@ class Allowance(Contract):
     """How much one name may take, with however many keys; None: no limit."""
 
     requests_per_s: int | None = described(
-        "Requests and calls of one key in any second; a stream is one; none: any number.",
-        None,
-        low=1,
-        high=1_000_000,
+        "Requests and calls of one key in any second; a stream is one; none: any number.", None, low=1, high=1_000_000
     )
     frames_per_s: int | None = described(
         "Frames of one key in any second, asked for one by one, in batches and in streams; none: any number.",

@@ -41,8 +41,7 @@ if TYPE_CHECKING:
 
 
 Where = Annotated[
-    dict[str, Any],
-    FieldsOf(Settings, "data_folder", "artifact_folder", "database_url", environment=ENVIRONMENT_PREFIX),
+    dict[str, Any], FieldsOf(Settings, "data_folder", "artifact_folder", "database_url", environment=ENVIRONMENT_PREFIX)
 ]
 
 
@@ -126,11 +125,7 @@ def create(
 
 @keys_app.command("list", epilog=examples("ultragray keys list", "ultragray keys list --json"))
 @with_options
-def list_keys(
-    *,
-    json: Json = False,
-    where: Where,
-) -> None:
+def list_keys(*, json: Json = False, where: Where) -> None:
     """List the keys, oldest first, also those that count no more; no secrets."""
     with _key_store(where) as store:
         tell_table(_KEY_COLUMNS, [_document(key) for key in store.keys().values()], as_json=json)
@@ -139,10 +134,7 @@ def list_keys(
 @keys_app.command(epilog=examples("ultragray keys revoke alice"))
 @with_options
 def revoke(
-    name: Annotated[str, argument("Name, or id of one key.", shown=False)],
-    *,
-    json: Json = False,
-    where: Where,
+    name: Annotated[str, argument("Name, or id of one key.", shown=False)], *, json: Json = False, where: Where
 ) -> None:
     """Revoke all keys of a name, or the one of an id. What runs on them is cut within two seconds."""
     with _key_store(where) as store:

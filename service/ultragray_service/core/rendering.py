@@ -79,10 +79,7 @@ def as_resolved(settings: Resolved) -> Resolved:
 
 class RequestPlanner:
     def __init__(
-        self,
-        settings: Settings,
-        catalog: SceneCatalog,
-        registration: Callable[[str, str], Awaitable[Registration]],
+        self, settings: Settings, catalog: SceneCatalog, registration: Callable[[str, str], Awaitable[Registration]]
     ) -> None:
         self._settings, self._catalog, self._registration = settings, catalog, registration
 

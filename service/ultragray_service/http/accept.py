@@ -98,8 +98,7 @@ def _best(accept: str, able: tuple[str, ...], what: str) -> tuple[str, MediaRang
     best = _liked(accept, able)
     if best is None:
         raise NotAcceptable(
-            f"Accept must allow a type that can hold {what}: {', '.join(able)}; got {accept!r}",
-            field="Accept",
+            f"Accept must allow a type that can hold {what}: {', '.join(able)}; got {accept!r}", field="Accept"
         )
     return best
 

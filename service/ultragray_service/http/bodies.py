@@ -188,7 +188,7 @@ class LocalizeBody(LocalizationSettings):
 
     image: str = described(
         "The frame in base64, rows along depth, columns across scan lines, not scan-converted: a PNG file, or, with "
-        "image_height and image_width, grey pixels of 8 bits, row by row.",
+        "image_height and image_width, grey pixels of 8 bits, row by row."
     )
     image_height: int | None = described("Of grey pixels.", None, low=1, high=MAX_IMAGE_SIDE, error=InvalidImageSize)
     image_width: int | None = described("Of grey pixels.", None, low=1, high=MAX_IMAGE_SIDE, error=InvalidImageSize)

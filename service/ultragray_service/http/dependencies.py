@@ -158,10 +158,7 @@ DEMO_QUATERNION = {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
 _POSE = {"position_mm": DEMO_POSITION_MM, "quaternion": DEMO_QUATERNION}
 
 RENDER_EXAMPLES: dict[str, Any] = {
-    "one frame": {
-        "summary": "One frame, by position and quaternion (image/png by default)",
-        "value": {"pose": _POSE},
-    },
+    "one frame": {"summary": "One frame, by position and quaternion (image/png by default)", "value": {"pose": _POSE}},
     "matrix": {
         "summary": "One small frame, by matrix",
         "value": {"pose": {"matrix": np.eye(4).tolist()}, "height": 256, "width": 256},
@@ -208,5 +205,5 @@ SLICE_EXAMPLES: dict[str, Any] = {
     "a plane parallel to the skin": {
         "summary": "10 mm deep, 50 x 40 mm (image/png by default)",
         "value": {"origin_mm": [-25, -20, 10], "right": [1, 0, 0], "down": [0, 1, 0], "size_mm": [50, 40]},
-    },
+    }
 }

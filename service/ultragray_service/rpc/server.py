@@ -66,10 +66,7 @@ class GrpcServer:
             f"/{one.full_name}/{method.name}" for one in _DESCRIPTORS.values() for method in one.methods
         )
         self._server = grpc.aio.server(
-            interceptors=[
-                CallContext(service),
-                *([] if service.tracing is None else [TracedCalls(service.tracing)]),
-            ],
+            interceptors=[CallContext(service), *([] if service.tracing is None else [TracedCalls(service.tracing)])],
             options=[
                 ("grpc.max_receive_message_length", max(service.settings.max_body_bytes, LEAST_MAX_MESSAGE_BYTES)),
                 ("grpc.max_send_message_length", _UNLIMITED),

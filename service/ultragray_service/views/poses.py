@@ -138,13 +138,7 @@ async def locate(
     await rendering.limits.take_frames(FRAMES_OF_A_SEARCH, deadline)
     for _ in range(MAX_SCENE_CHANGES):
         asked = RenderRequest(
-            plan.scene,
-            sought,
-            plan.placed(start)[None],
-            Priority.BATCH,
-            deadline,
-            plan.version,
-            caller(),
+            plan.scene, sought, plan.placed(start)[None], Priority.BATCH, deadline, plan.version, caller()
         )
         try:
             with scene_to_blame():

@@ -133,11 +133,7 @@ async def get_dataset(service: ServiceDep, dataset: DatasetName) -> DatasetRecor
     return await service.datasets.get(dataset)
 
 
-@router.get(
-    "/{dataset}/contact-sheet",
-    response_class=Response,
-    responses=_PICTURE | problems(401, 404, 422, 503),
-)
+@router.get("/{dataset}/contact-sheet", response_class=Response, responses=_PICTURE | problems(401, 404, 422, 503))
 async def get_contact_sheet(service: ServiceDep, dataset: DatasetName) -> Response:
     """A picture of the dataset, PNG."""
     return Response(await service.datasets.contact_sheet(dataset), media_type=PNG)
@@ -208,9 +204,7 @@ async def get_compared_picture(
 
 
 @comparison_router.get(
-    "/datasets/{dataset}/poses",
-    response_class=Response,
-    responses=_POSES | problems(401, 404, 422, 500, 503, 504, 507),
+    "/datasets/{dataset}/poses", response_class=Response, responses=_POSES | problems(401, 404, 422, 500, 503, 504, 507)
 )
 async def get_dataset_poses(request: Request, service: ServiceDep, dataset: DatasetName) -> Response:
     """Probe to scene, of the training frames and the held-out ones."""

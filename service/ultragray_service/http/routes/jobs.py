@@ -238,21 +238,13 @@ async def delete_job(service: ServiceDep, job: JobId) -> None:
     await service.delete_job(job)
 
 
-@router.get(
-    "/{job}/log",
-    response_class=PlainTextResponse,
-    responses=_LOG | problems(401, 404, 422, 503),
-)
+@router.get("/{job}/log", response_class=PlainTextResponse, responses=_LOG | problems(401, 404, 422, 503))
 async def get_job_log(service: ServiceDep, job: JobId, max_bytes: LogBytes = DEFAULT_LOG_BYTES) -> PlainTextResponse:
     """What the job's process wrote."""
     return PlainTextResponse(await service.jobs.do(JobStore.log_tail, job, max_bytes))
 
 
-@router.get(
-    "/{job}/artifacts/{name}",
-    response_class=FileResponse,
-    responses=_FILE | problems(401, 404, 422, 503),
-)
+@router.get("/{job}/artifacts/{name}", response_class=FileResponse, responses=_FILE | problems(401, 404, 422, 503))
 async def get_artifact(
     request: Request,
     service: ServiceDep,
@@ -267,11 +259,7 @@ async def get_artifact(
     return artifact_response(found, request.headers, media_type, SHOWN, disposition)
 
 
-@router.get(
-    "/{job}/events",
-    response_class=StreamingResponse,
-    responses=_EVENTS | problems(401, 404, 422, 503),
-)
+@router.get("/{job}/events", response_class=StreamingResponse, responses=_EVENTS | problems(401, 404, 422, 503))
 async def watch_job(service: ServiceDep, job: JobId, last_event_id: LastEventId = "") -> JobEvents:
     """Follows a job. A stream that ends before the final state goes on where it ended: say the id of its last event."""
     service.life.require_serving()
@@ -337,11 +325,7 @@ async def get_curve(service: ServiceDep, job: JobId) -> TrainingCurve:
     return await service.training_views.curve(job)
 
 
-@router.get(
-    "/{job}/preview",
-    response_class=Response,
-    responses=_PREVIEW | problems(401, 404, 422, 500, 503, 504, 507),
-)
+@router.get("/{job}/preview", response_class=Response, responses=_PREVIEW | problems(401, 404, 422, 500, 503, 504, 507))
 async def get_preview(service: ServiceDep, job: JobId) -> Response:
     """A held-out frame, rendered from the last checkpoint of a running training: a new one comes every ten seconds."""
     service.life.require_serving()

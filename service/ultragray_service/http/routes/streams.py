@@ -111,10 +111,7 @@ async def stream(websocket: WebSocket, scene: SceneName, name: StreamName = "") 
 
 
 async def _serve(
-    websocket: WebSocket,
-    route: str,
-    enter: Callable[[ExitStack], Awaitable[T]],
-    answer: Callable[[T], Awaitable[None]],
+    websocket: WebSocket, route: str, enter: Callable[[ExitStack], Awaitable[T]], answer: Callable[[T], Awaitable[None]]
 ) -> None:
     """Answers a WebSocket that `enter` lets in; what that enters lasts as long. Counts it at its end."""
     service: Service = websocket.app.state.service
