@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from functools import partial
 from typing import Any
 
@@ -115,19 +116,8 @@ def make_service(settings: Settings) -> Service:
 
 
 def _pool(settings: Settings, places: ScenePlaces, metrics: Metrics, tracing: Tracing | None) -> RenderPool:
-    config = PoolConfig(
-        processes=settings.processes,
-        threads_per_process=settings.threads_per_process,
-        queue_limit_frames=settings.queue_limit_frames,
-        client_limit_frames=settings.client_limit_frames,
-        max_queue_ms=settings.max_queue_ms,
-        max_batch_poses=settings.max_batch_poses,
-        memory_budget_bytes=settings.memory_budget_mb * 2**20,
-        max_footprint_pixels=settings.max_footprint_pixels,
-        worker_grace_s=settings.worker_grace_s,
-        worker_timeout_s=settings.worker_timeout_s,
-        backend=settings.backend,
-    )
+    same = {item.name: getattr(settings, item.name) for item in fields(PoolConfig) if hasattr(settings, item.name)}
+    config = PoolConfig(**same, memory_budget_bytes=settings.memory_budget_mb * 2**20)
 
     def observe(result: RenderResult[Any]) -> None:
         metrics.observe_result(result)

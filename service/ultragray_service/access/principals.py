@@ -5,7 +5,7 @@ from __future__ import annotations
 import ipaddress
 from collections.abc import Sequence
 from contextvars import ContextVar
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from enum import Enum
 from typing import Any
@@ -65,12 +65,6 @@ class Allowance(Contract):
     registrations: int | None = described(
         "Registrations that one key keeps; none: any number.", None, low=0, high=1_000_000
     )
-
-
-def of_key(name: str) -> Any:
-    """The setting of the service that limits every key as the field `name` of an Allowance says."""
-    (item,) = (item for item, _ in annotated_fields(Allowance) if item.name == name)
-    return field(default=item.default, metadata=item.metadata)
 
 
 NAMES = tuple(item.name for item, _ in annotated_fields(Allowance))
