@@ -9,7 +9,7 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from types import MappingProxyType
 
 import sqlalchemy as sa
@@ -78,18 +78,10 @@ class KeyStore:
             expires_at_s=expires_at_s,
             limits=dict(limits),
         )
+        row = {**asdict(key), "digest": digest_of(secret).hex(), "role": role.value}
+        row["limits"] = json.dumps(key.limits) if limits else None
         with self._engine.begin() as connection:
-            connection.execute(
-                sa.insert(KEYS).values(
-                    id=key.id,
-                    digest=digest_of(secret).hex(),
-                    name=name,
-                    role=role.value,
-                    created_at_s=now_s,
-                    expires_at_s=expires_at_s,
-                    limits=json.dumps(key.limits) if limits else None,
-                )
-            )
+            connection.execute(sa.insert(KEYS).values(row))
             tell_change(connection)
         return key, secret
 
@@ -121,21 +113,11 @@ class KeyStore:
 
 
 def read_keys(connection: sa.Connection) -> dict[bytes, Key]:
-    columns = KEYS.c
-    rows = connection.execute(sa.select(KEYS).order_by(columns.created_at_s, columns.id))
-    return {
-        bytes.fromhex(row.digest): Key(
-            id=row.id,
-            name=row.name,
-            role=Role(row.role),
-            created_at_s=row.created_at_s,
-            expires_at_s=row.expires_at_s,
-            revoked_at_s=row.revoked_at_s,
-            last_used_at_s=row.last_used_at_s,
-            limits=json.loads(row.limits or "{}"),
-        )
-        for row in rows
-    }
+    found = {}
+    for row in connection.execute(sa.select(KEYS).order_by(KEYS.c.created_at_s, KEYS.c.id)).mappings():
+        values = {**row, "role": Role(row["role"]), "limits": json.loads(row["limits"] or "{}")}
+        found[bytes.fromhex(values.pop("digest"))] = Key(**values)
+    return found
 
 
 class KnownKeys:

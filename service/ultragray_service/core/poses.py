@@ -119,6 +119,10 @@ def check_pose_count(count: int, limit: int) -> None:
         raise InvalidArgument("poses must hold at least one pose, got none", field="poses")
 
 
+def _timings(result: RenderResult[Any]) -> dict[str, float]:
+    return {name: round(getattr(result, name), 3) for name in ("queue_ms", "render_ms", "encode_ms")}
+
+
 @dataclass(frozen=True, eq=False, kw_only=True)
 class FrameFacts:
     """The facts of one frame beside its settings: its origin, its pose, and what it cost."""
@@ -140,9 +144,7 @@ class FrameFacts:
             renderer=result.renderer,
             pose=result.poses[0].tolist(),
             extrapolation=result.extrapolations[0],
-            queue_ms=round(result.queue_ms, 3),
-            render_ms=round(result.render_ms, 3),
-            encode_ms=round(result.encode_ms, 3),
+            **_timings(result),
             **others,
         )
 
@@ -183,9 +185,7 @@ class SliceFacts:
             width=view.width,
             encoding=view.encoding,
             pixel_to_scene=view.grid(result.poses[0]).affine,
-            queue_ms=round(result.queue_ms, 3),
-            render_ms=round(result.render_ms, 3),
-            encode_ms=round(result.encode_ms, 3),
+            **_timings(result),
         )
 
     @property

@@ -5,10 +5,9 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import replace
-from typing import Protocol
 
 from ultragray.errors import UltragrayError
 from ultragray.rendering.settings import FrameSettings
@@ -51,14 +50,6 @@ _MANY_POSES = ("TDATA", "QTDATA")  # types that tell those of several instrument
 _log = logging.getLogger("ultragray.igtl")
 
 
-class Frames(Protocol):
-    def newest(self) -> Frame | None:
-        """The newest frame of a scene that the caller may see."""
-
-    def publish(self, frame: Frame, source: Connection) -> None:
-        """Tells all connections that may see its scene about a frame."""
-
-
 class Connection:
     """Reads messages, renders the newest pose of each device, one after another, and sends."""
 
@@ -66,14 +57,17 @@ class Connection:
         self,
         service: Service,
         scenes: SceneChooser,
-        frames: Frames,
+        newest: Callable[[], Frame | None],
+        publish: Callable[[Frame, Connection], None],
         reader: asyncio.StreamReader,
         writer: asyncio.StreamWriter,
     ) -> None:
+        """`newest`: the newest frame that the caller may see; `publish`: shows one to all who may see it."""
         self.feed = Feed(self._turn, self._send)
         self.record = OpenStream("openigtlink")
         self._answers = 0
-        self._service, self._scenes, self._frames = service, scenes, frames
+        self._service, self._scenes = service, scenes
+        self._newest_of_all, self._publish = newest, publish
         thickness_mm = service.settings.igtl_slice_thickness_mm
         setup = Setup(FrameSettings(slice_thickness_mm=thickness_mm), service.settings.igtl_registration)
         self._scanner = Scanner(scenes, service.registrations, setup)
@@ -179,7 +173,7 @@ class Connection:
 
     def _newest_frame(self, kind: str, query: Message) -> Message:
         """The newest frame as the query wants it; without content where there is none of that name."""
-        frame = self._frames.newest()
+        frame = self._newest_of_all()
         if frame is None or not frame.goes_by(query.device_name):
             return _reply(kind, query, b"")
         return frame.message(kind, query.version, query.message_id, query.device_name)
@@ -236,7 +230,7 @@ class Connection:
             unexpected = UltragrayError("an unexpected error, see the log")
             await self._refuse(underway.posed.message, unexpected, underway.posed.arrived)
         else:
-            self._frames.publish(frame, self)
+            self._publish(frame, self)
             self._note(frame.posed, frame.result)
             asked = frame.posed.message
             await self._send(frame.message("IMAGE", asked.version, asked.message_id))

@@ -78,7 +78,7 @@ class IgtlServer:
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         # Its own: a client knows the scenes that it may see.
         scenes = SceneChooser(self._service.catalog, self._service.settings.igtl_scene)
-        connection = Connection(self._service, scenes, self, reader, writer)
+        connection = Connection(self._service, scenes, self.newest, self.publish, reader, writer)
         host, port, *_ = writer.get_extra_info("peername") or ("::", 0)  # none of a peer that has gone already
         principal = self._roles.principal_of(host, asks=self._service.guard.asks)
         if principal is None:

@@ -88,19 +88,15 @@ class Located:
     def of(cls, result: LocalizeResult, plan: Plan) -> Located:
         found = result.found
         in_base = None if plan.registration is None else plan.registration.flange_to_base(found.pose)
+        same = ("similarity", "is_found", "position_std_mm", "angle_std_deg", "shift_mm", "turn_deg")
         return cls(
+            **{name: getattr(found, name) for name in same},
             scene=result.scene,
             scene_sha256=result.scene_sha256,
             renderer=result.renderer,
             pose=found.pose.tolist(),
             flange_to_base=None if in_base is None else in_base.tolist(),
             registration=plan.settings.registration,
-            similarity=found.similarity,
-            is_found=found.is_found,
-            position_std_mm=found.position_std_mm,
-            angle_std_deg=found.angle_std_deg,
-            shift_mm=found.shift_mm,
-            turn_deg=found.turn_deg,
             queue_ms=round(result.queue_ms, 3),
             search_ms=round(result.search_ms, 3),
         )
