@@ -116,7 +116,8 @@ def read_keys(connection: sa.Connection) -> dict[bytes, Key]:
     found = {}
     for row in connection.execute(sa.select(KEYS).order_by(KEYS.c.created_at_s, KEYS.c.id)).mappings():
         values = {**row, "role": Role(row["role"]), "limits": json.loads(row["limits"] or "{}")}
-        found[bytes.fromhex(values.pop("digest"))] = Key(**values)
+        digest = bytes.fromhex(values.pop("digest"))
+        found[digest] = Key(**values)
     return found
 
 

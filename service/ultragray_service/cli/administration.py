@@ -88,7 +88,7 @@ _KEY_COLUMNS: Columns = {
 )
 @with_options
 def create(
-    name: Annotated[str, argument("Whose it is: a person, a machine or a program.", shown=False)],
+    name: Annotated[str, argument("Whose it is: a person, a machine or a program.")],
     *,
     role: Annotated[
         Role, option("reader: sees, renders, streams; operator: and has jobs, datasets and scenes; admin: everything.")
@@ -133,9 +133,7 @@ def list_keys(*, json: Json = False, where: Where) -> None:
 
 @keys_app.command(epilog=examples("ultragray keys revoke alice"))
 @with_options
-def revoke(
-    name: Annotated[str, argument("Name, or id of one key.", shown=False)], *, json: Json = False, where: Where
-) -> None:
+def revoke(name: Annotated[str, argument("Name, or id of one key.")], *, json: Json = False, where: Where) -> None:
     """Revoke all keys of a name, or the one of an id. What runs on them is cut within two seconds."""
     with _key_store(where) as store:
         revoked = store.revoke(name)
@@ -197,7 +195,7 @@ def _timestamp(at_s: float) -> str:
     return datetime.fromtimestamp(at_s, timezone.utc).isoformat(timespec="milliseconds")
 
 
-BackupFolder = Annotated[Path, argument("Folder of backups, on another disk than the data.", shown=False)]
+BackupFolder = Annotated[Path, argument("Folder of backups, on another disk than the data.")]
 _SHOWN = 3
 
 
@@ -330,8 +328,8 @@ def places() -> None:
 )
 @with_options
 def copy(
-    source: Annotated[str, argument("Data or artifact folder, or its URL.", metavar="FROM", shown=False)],
-    target: Annotated[str, argument("Where its scenes and datasets go.", metavar="TO", shown=False)],
+    source: Annotated[str, argument("Data or artifact folder, or its URL.", metavar="FROM")],
+    target: Annotated[str, argument("Where its scenes and datasets go.", metavar="TO")],
     *,
     json: Json = False,
 ) -> None:

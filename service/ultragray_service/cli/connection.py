@@ -349,6 +349,6 @@ class Resource:
 
     def _add(self, name: str, command: Callable[..., None], meaning: str, *more: str) -> None:
         thing = self.meaning.format(thing=self.kind.removesuffix("s"))
-        command.__annotations__["name"] = Annotated[str, argument(thing, metavar=self.metavar, shown=False)]
+        command.__annotations__["name"] = Annotated[str, argument(thing, metavar=self.metavar)]
         line = f"ultragray {self.kind} {name} {self.example}"
         self.app.command(name, help=meaning, epilog=examples(line, *more))(with_connection(command))

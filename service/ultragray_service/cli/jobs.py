@@ -77,7 +77,7 @@ _COLUMNS: Columns = {
 }
 
 _jobs = Resource(command_app, "jobs", "7f3c2a", _COLUMNS, "JOB", "Id of the job.")
-JobArgument = Annotated[str, argument("Id of the job.", shown=False)]
+JobArgument = Annotated[str, argument("Id of the job.")]
 
 
 @command_app.command(
@@ -140,7 +140,7 @@ def logs(
 def download(
     connection: Connection,
     job: JobArgument,
-    name: Annotated[str, argument("One of the job's artifacts, or a range of them.", shown=False)],
+    name: Annotated[str, argument("One of the job's artifacts, or a range of them.")],
     output: Annotated[Path | None, output_option("File to write; of a range the folder.", default="NAME, here")] = None,
     force: Force = False,
     json: Json = False,

@@ -47,10 +47,7 @@ POSE_SUFFIXES = (".npy",)
 def localize(
     scene: SceneFile,
     image: Annotated[
-        Path,
-        argument(
-            "The frame, .png or .npy: rows along depth, columns across scan lines, not scan-converted.", shown=False
-        ),
+        Path, argument("The frame, .png or .npy: rows along depth, columns across scan lines, not scan-converted.")
     ],
     start: Annotated[Path, option("A pose that is about right: .npy or .json, 4x4 or 3x4, in mm; .mcap.", shown=False)],
     within_mm: Annotated[float, option("How far the start may be off.")] = 3.0,
@@ -120,14 +117,14 @@ calibrate_app = command_group(
 )
 
 Output = Annotated[Path, output_option("The registration, .json.")]
-FlangePoses = Annotated[Path, argument("Poses flange→base, mm: .npy or .json.", metavar="FLANGE", shown=False)]
+FlangePoses = Annotated[Path, argument("Poses flange→base, mm: .npy or .json.", metavar="FLANGE")]
 Mounting = Annotated[Path | None, option("Pose probe→flange, mm: .npy or .json.", shown="the frames are the same")]
 
 
 @calibrate_app.command(epilog=examples("ultragray calibrate points in_base.npy in_scene.npy -o robot.json"))
 def points(
-    in_base: Annotated[Path, argument("Points in the base, [N, 3] mm: .npy, .csv.", shown=False)],
-    in_scene: Annotated[Path, argument("The same ones in the scene.", shown=False)],
+    in_base: Annotated[Path, argument("Points in the base, [N, 3] mm: .npy, .csv.")],
+    in_scene: Annotated[Path, argument("The same ones in the scene.")],
     output: Output,
     probe_to_flange: Mounting = None,
     force: Force = False,
@@ -159,7 +156,7 @@ def points(
 )
 def poses(
     flange: FlangePoses,
-    probe: Annotated[Path, argument("The poses probe→scene at the same times: .npy or .json.", shown=False)],
+    probe: Annotated[Path, argument("The poses probe→scene at the same times: .npy or .json.")],
     output: Output,
     probe_to_flange: Mounting = None,
     find_mounting: Annotated[
@@ -195,8 +192,7 @@ def frames(
     scene: SceneFile,
     flange: FlangePoses,
     images: Annotated[
-        list[Path],
-        argument("The real frames at these poses: .png each, or one .npy [N, H, W]; not scan-converted.", shown=False),
+        list[Path], argument("The real frames at these poses: .png each, or one .npy [N, H, W]; not scan-converted.")
     ],
     start: Annotated[Path, option("A pose base→scene that is about right: .npy or .json.")],
     output: Output,

@@ -192,7 +192,7 @@ def _size(found: dict[str, Any]) -> str:
     return "" if found.get("image_height") is None else f"{found['image_width']}x{found['image_height']}"
 
 
-NameArgument = Annotated[str, argument("Name of the scene.", metavar="NAME", shown=False)]
+NameArgument = Annotated[str, argument("Name of the scene.", metavar="NAME")]
 scenes_app = command_group("The service renders them for clients; `ultragray render` does without a service.")
 _scenes = Resource(
     scenes_app,
@@ -221,7 +221,7 @@ _scenes.add_show(
 @with_connection
 def upload_scene(
     connection: Connection,
-    file: Annotated[Path, argument("Scene file (.ugr).", shown=False)],
+    file: Annotated[Path, argument("Scene file (.ugr).")],
     name: Annotated[str | None, option("Name of the scene.", shown="that of the file")] = None,
     private: Annotated[bool, option("Others do not see it.", "--private")] = False,
     json: Json = False,
@@ -325,7 +325,7 @@ _datasets.add_show("Print size, probe and split of a dataset, and what its check
 @with_connection
 def upload_dataset(
     connection: Connection,
-    sweep: Annotated[Path, argument(f"An archive (.zip, .tar), or {SWEEP_MEANING}.", metavar="SWEEP", shown=False)],
+    sweep: Annotated[Path, argument(f"An archive (.zip, .tar), or {SWEEP_MEANING}.", metavar="SWEEP")],
     name: Annotated[str | None, option("Name of the dataset.", shown="that of the file or folder")] = None,
     private: Annotated[bool, option("Others do not see it.", "--private")] = False,
     json: Json = False,
@@ -432,7 +432,7 @@ _registrations.add_show("Print both links of a registration, mm, and how exact i
 @with_connection
 def upload_registration(
     connection: Connection,
-    file: Annotated[Path, argument("File of `ultragray calibrate` (.json).", shown=False)],
+    file: Annotated[Path, argument("File of `ultragray calibrate` (.json).")],
     scene: Annotated[str, option("Name of the scene that it leads into.", shown=False)],
     name: Annotated[str | None, option("Name of the registration.", shown="that of the file")] = None,
     json: Json = False,

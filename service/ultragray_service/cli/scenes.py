@@ -68,7 +68,7 @@ def demo(
 )
 @with_options
 def show(
-    file: Annotated[str, argument(f"A scene file (.ugr), or a sweep: {SWEEP_MEANING}.", metavar="FILE", shown=False)],
+    file: Annotated[str, argument(f"A scene file (.ugr), or a sweep: {SWEEP_MEANING}.", metavar="FILE")],
     json: Json = False,
     *,
     source: SourceOptions,
@@ -183,10 +183,7 @@ _CHECKPOINT = "Checkpoint (.pt)"
 )
 def import_scene(
     file: Annotated[
-        Path,
-        argument(
-            "A .ply file that `ultragray export` wrote, or a .pt checkpoint of the released trainer.", shown=False
-        ),
+        Path, argument("A .ply file that `ultragray export` wrote, or a .pt checkpoint of the released trainer.")
     ],
     output: Annotated[Path, output_option("Scene file to write (.ugr).")],
     force: Force = False,

@@ -29,7 +29,7 @@ DEMO_NAME = "demo"
 @with_options
 def serve(
     scenes: Annotated[
-        list[Path] | None, argument("Scene files to serve alone, without those of a data folder.", shown=False)
+        list[Path] | None, argument("Scene files to serve alone, without those of a data folder.")
     ] = None,
     *,
     options: Annotated[

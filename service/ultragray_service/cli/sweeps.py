@@ -37,7 +37,7 @@ if TYPE_CHECKING:
 
 
 SWEEP_MEANING = "; ".join(one.meaning for one in FORMATS.values())
-SweepArgument = Annotated[str, argument(f"One of: {SWEEP_MEANING}.", metavar="SWEEP", shown=False)]
+SweepArgument = Annotated[str, argument(f"One of: {SWEEP_MEANING}.", metavar="SWEEP")]
 
 
 def check_source(source: str) -> None:

@@ -59,8 +59,8 @@ def option(help: str, *flags: str, shown: str | bool = True, panel: str | None =
     return typer.Option(*flags, help=help, show_default=shown, rich_help_panel=panel, **others)
 
 
-def argument(help: str, *, shown: str | bool = True, **others: Any) -> Any:
-    return typer.Argument(help=help, show_default=shown, **others)
+def argument(help: str, **others: Any) -> Any:
+    return typer.Argument(help=help, show_default=False, **others)
 
 
 def output_option(help: str, *, default: str | None = None) -> Any:
