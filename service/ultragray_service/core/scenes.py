@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from contextvars import copy_context
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
@@ -194,9 +194,18 @@ def page_of_names(names: list[str], page_size: int, page_token: str) -> tuple[li
         raise InvalidArgument(
             f"page_size must be an integer from 1 to {MAX_PAGE_SIZE}, got {page_size}", field="page_size"
         )
-    start = bisect_right(names, _name_of_token(page_token)) if page_token else 0
+    start = 0
+    if page_token:
+        try:
+            after = base64.b64decode(page_token + "=" * (-len(page_token) % 4), altchars=b"-_", validate=True)
+            start = bisect_right(names, after.decode())
+        except (binascii.Error, ValueError):
+            raise InvalidArgument(
+                "page_token must be a next_page_token that an earlier page gave", field="page_token"
+            ) from None
     chosen = names[start : start + page_size]
-    return chosen, _token_of_name(chosen[-1]) if start + page_size < len(names) else ""
+    is_last = start + page_size >= len(names)
+    return chosen, "" if is_last else base64.urlsafe_b64encode(chosen[-1].encode()).decode().rstrip("=")
 
 
 @contextmanager
@@ -210,27 +219,12 @@ def scene_to_blame() -> Iterator[None]:
 
 def finite_metrics(header: SceneHeader) -> dict[str, float]:
     """The scene's metrics that are numbers (a file may claim anything)."""
-    return {name: float(value) for name, value in header.info.metrics.items() if _is_number(value)}
-
-
-def _is_number(value: Any) -> bool:
-    try:
-        return isinstance(value, (int, float)) and math.isfinite(value)
-    except OverflowError:  # an integer beyond all floats
-        return False
-
-
-def _token_of_name(name: str) -> str:
-    return base64.urlsafe_b64encode(name.encode()).decode().rstrip("=")
-
-
-def _name_of_token(token: str) -> str:
-    try:
-        return base64.b64decode(token + "=" * (-len(token) % 4), altchars=b"-_", validate=True).decode()
-    except (binascii.Error, ValueError):
-        raise InvalidArgument(
-            "page_token must be a next_page_token that an earlier page gave", field="page_token"
-        ) from None
+    found = {}
+    for name, value in header.info.metrics.items():
+        with suppress(OverflowError):  # an integer beyond all floats
+            if isinstance(value, (int, float)) and math.isfinite(value):
+                found[name] = float(value)
+    return found
 
 
 @dataclass(frozen=True)

@@ -32,7 +32,7 @@ from ultragray_service.igtl.contents import (
     unpack_position,
     unpack_transform,
 )
-from ultragray_service.igtl.frames import Feed, Frame, FrameMaker, PoseMessage, Underway, WaitingPoses
+from ultragray_service.igtl.frames import Feed, Frame, PoseMessage, Underway, WaitingPoses, render_frame
 from ultragray_service.igtl.messages import HEADER_BYTES, Header, Message, pack_message, unpack_header, unpack_message
 from ultragray_service.igtl.routes import SceneChooser
 from ultragray_service.service import Service
@@ -71,7 +71,6 @@ class Connection:
         thickness_mm = service.settings.igtl_slice_thickness_mm
         setup = Setup(FrameSettings(slice_thickness_mm=thickness_mm), service.settings.igtl_registration)
         self._scanner = Scanner(scenes, service.registrations, setup)
-        self._maker = FrameMaker(service, scenes, self._scanner)
         self._reader, self._writer = reader, writer
         self._sending = asyncio.Lock()
         self._showing = asyncio.Lock()
@@ -221,7 +220,7 @@ class Connection:
 
     async def _show(self, underway: Underway) -> None:
         try:
-            frame = await self._maker.render(underway)
+            frame = await render_frame(self._service, self._scenes, self._scanner, underway)
         except UltragrayError as error:
             self._note(underway.posed, error)
             await self._refuse(underway.posed.message, error, underway.posed.arrived)

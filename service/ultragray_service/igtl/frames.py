@@ -152,23 +152,21 @@ class Frame:
         )
 
     def _metadata(self) -> dict[str, str]:
-        result = self.result
+        result, placing = self.result, {}
+        if result.settings.registration is not None:
+            placing["probe_to_scene"] = json.dumps(result.poses[0].tolist(), separators=(",", ":"))
         return {
             "device": self.posed.message.device_name,
             "scene": result.scene,
             "scene_sha256": result.scene_sha256,
             "renderer": result.renderer,
             **_settings_texts(result.settings),
-            **self._placing(),
+            **placing,
             "replaced_poses": str(self.posed.replaced),
             **{name: f"{value:.3f}" for name, value in asdict(result.extrapolations[0]).items() if value is not None},
             "queue_ms": f"{result.queue_ms:.3f}",
             "render_ms": f"{result.render_ms:.3f}",
         }
-
-    def _placing(self) -> dict[str, str]:
-        is_led = self.result.settings.registration is not None
-        return {"probe_to_scene": json.dumps(self.result.poses[0].tolist(), separators=(",", ":"))} if is_led else {}
 
 
 @lru_cache(maxsize=256)
@@ -177,39 +175,30 @@ def _settings_texts(settings: Resolved) -> Mapping[str, str]:
     return settings_used(settings).texts()
 
 
-class FrameMaker:
-    def __init__(self, service: Service, scenes: SceneChooser, scanner: Scanner) -> None:
-        self._service, self._scenes, self._scanner = service, scenes, scanner
+async def render_frame(service: Service, scenes: SceneChooser, scanner: Scanner, underway: Underway) -> Frame:
+    """The frame of a pose, or of one that took its turn, as the scanner is set.
 
-    async def render(self, underway: Underway) -> Frame:
-        """The frame of a pose, or of one that took its turn, as the scanner is set; else probe and size are those the
-        scene was trained with, and its thickness is that of the service's setting, else that of the scene's beam.
+    Probe and size are else those that the scene was trained with, and its thickness is that of the service's setting,
+    else that of the scene's beam. Raises SceneNotFound, RegistrationNotFound, and what planner and rendering raise.
+    """
+    service.life.require_serving()
+    scene = await scenes.choose(underway.posed.message.device_name)
+    ownership = service.owners.known(Kind.SCENE, scene)
+    setup, found = scanner.setup, None
+    if setup.registration is not None:
+        found = await service.registrations.of_scene(setup.registration, scene)
+    underway.setup, underway.registration = setup, found
+    asked = replace(setup.settings, tools=tools) if (tools := setup.tools.placed(found)) else setup.settings
 
-        Raises SceneNotFound, RegistrationNotFound, and what RequestPlanner.plan and Service.render raise.
-        """
-        self._service.life.require_serving()
-        scene = await self._scenes.choose(underway.posed.message.device_name)
-        ownership = self._service.owners.known(Kind.SCENE, scene)
-        setup, found = self._scanner.setup, None
-        if setup.registration is not None:
-            found = await self._service.registrations.of_scene(setup.registration, scene)
-        underway.setup, underway.registration = setup, found
-        asked = replace(setup.settings, tools=tools) if (tools := setup.tools.placed(found)) else setup.settings
+    def complete(settings: Resolved) -> Resolved:
+        to_scale = true_to_scale(settings.probe, settings.height, service.settings.max_image_side)
+        display = replace(settings.display, pixel_mm=to_scale.pixel_mm)
+        return replace(settings, display=display, registration=setup.registration)
 
-        def complete(settings: Resolved) -> Resolved:
-            return replace(self._true_to_scale(settings), registration=setup.registration)
-
-        planner = self._service.planner
-        plan = await planner.plan(scene, asked, Encoding.UINT8, complete=complete)
-        result = await self._service.rendering.render(
-            plan, underway.pose[None], deadline=planner.deadline(None), turn=underway.turn
-        )
-        return Frame(underway.posed, result, image_of(result, found), ownership, found)
-
-    def _true_to_scale(self, settings: Resolved) -> Resolved:
-        side = self._service.settings.max_image_side
-        pixel_mm = true_to_scale(settings.probe, settings.height, side).pixel_mm
-        return replace(settings, display=replace(settings.display, pixel_mm=pixel_mm))
+    plan = await service.planner.plan(scene, asked, Encoding.UINT8, complete=complete)
+    deadline = service.planner.deadline(None)
+    result = await service.rendering.render(plan, underway.pose[None], deadline=deadline, turn=underway.turn)
+    return Frame(underway.posed, result, image_of(result, found), ownership, found)
 
 
 def image_of(result: RenderResult, registration: Registration | None = None) -> Image:
@@ -266,7 +255,12 @@ class Feed:
 
     async def run(self) -> None:
         while True:
-            await self._wait(self._next_due())
+            due = min((self._subscriptions[kind].due for kind in self._fresh), default=None)
+            timeout_s = None if due is None else due - time.monotonic()
+            if timeout_s is None or timeout_s > 0:
+                with contextlib.suppress(asyncio.TimeoutError):
+                    await asyncio.wait_for(self._changed.wait(), timeout_s)
+            self._changed.clear()
             now = time.monotonic()
             for kind in [kind for kind in self._fresh if self._subscriptions[kind].due <= now]:
                 async with self._turn():
@@ -274,13 +268,3 @@ class Feed:
                         subscription = self._subscriptions[kind]
                         subscription.due = time.monotonic() + subscription.interval_s
                         await self._send(frame.message(kind, subscription.version))
-
-    def _next_due(self) -> float | None:
-        return min((self._subscriptions[kind].due for kind in self._fresh), default=None)
-
-    async def _wait(self, until: float | None) -> None:
-        timeout_s = None if until is None else until - time.monotonic()
-        if timeout_s is None or timeout_s > 0:
-            with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._changed.wait(), timeout_s)
-        self._changed.clear()

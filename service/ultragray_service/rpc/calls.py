@@ -158,7 +158,10 @@ class CallContext(grpc.aio.ServerInterceptor):  # type: ignore[misc]
         else:
             if not is_own:
                 return handler
-            method = self._permitted(principal, credential, operation, method_of(handler))
+            method = method_of(handler)
+            if is_own and self._service.tracing is not None:
+                method = _traced(self._service.tracing, details.method.removeprefix("/"), headers, method)
+            method = self._permitted(principal, credential, operation, method)
         handler = with_method(handler, method)
         if is_own:
             handler = refusing_what_is_no_message(handler)
@@ -215,6 +218,14 @@ class CallContext(grpc.aio.ServerInterceptor):  # type: ignore[misc]
         return call
 
 
+def _traced(tracing: Tracing, name: str, headers: dict[str, str], method: Method) -> Method:
+    async def call(request: Any, context: grpc.aio.ServicerContext) -> Any:
+        with tracing.call(name, headers):
+            return await method(request, context)
+
+    return call
+
+
 def _telling_errors(method: Method) -> Method:
     async def call(request: Any, context: grpc.aio.ServicerContext) -> Any:
         try:
@@ -231,23 +242,3 @@ def name_in(request: Any, operation: Operation) -> str:
         return ""
     holder = getattr(request, "settings", request)
     return str(getattr(holder, operation.about.value, ""))
-
-
-class TracedCalls(grpc.aio.ServerInterceptor):  # type: ignore[misc]
-    """Stands within `CallContext`, whose request id its spans carry."""
-
-    def __init__(self, tracing: Tracing) -> None:
-        self._tracing = tracing
-
-    async def intercept_service(self, continuation: Callable[[Any], Awaitable[Any]], details: Any) -> Any:
-        handler = await continuation(details)
-        if handler is None or not details.method.startswith(OWN_PREFIX):
-            return handler
-        method = method_of(handler)
-        headers = {key: value for key, value in details.invocation_metadata or () if isinstance(value, str)}
-
-        async def call(request: Any, context: grpc.aio.ServicerContext) -> Any:
-            with self._tracing.call(details.method.removeprefix("/"), headers):
-                return await method(request, context)
-
-        return with_method(handler, call)

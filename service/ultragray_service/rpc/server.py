@@ -25,7 +25,7 @@ from ultragray_proto.v1 import (
 )
 from ultragray_service.access.rules import require_all_methods
 from ultragray_service.core.readiness import Readiness
-from ultragray_service.rpc.calls import CallContext, TracedCalls, make_handler
+from ultragray_service.rpc.calls import CallContext, make_handler
 from ultragray_service.rpc.rendering import RenderService
 from ultragray_service.rpc.resources import CALLS, STREAMS
 from ultragray_service.service import Service
@@ -66,7 +66,7 @@ class GrpcServer:
             f"/{one.full_name}/{method.name}" for one in _DESCRIPTORS.values() for method in one.methods
         )
         self._server = grpc.aio.server(
-            interceptors=[CallContext(service), *([] if service.tracing is None else [TracedCalls(service.tracing)])],
+            interceptors=[CallContext(service)],
             options=[
                 ("grpc.max_receive_message_length", max(service.settings.max_body_bytes, LEAST_MAX_MESSAGE_BYTES)),
                 ("grpc.max_send_message_length", _UNLIMITED),
