@@ -12,7 +12,7 @@ from ultragray_service.access.keys import KnownKeys
 from ultragray_service.access.limits import Limits
 from ultragray_service.access.oidc import Issuer, OidcTokens, parse_roles
 from ultragray_service.access.origins import Origins
-from ultragray_service.access.owners import Admission, Owners, Permissions
+from ultragray_service.access.owners import Admission, Owners
 from ultragray_service.core.datasets import Datasets
 from ultragray_service.core.jobs import Jobs
 from ultragray_service.core.life import Life
@@ -65,7 +65,10 @@ def make_service(settings: Settings) -> Service:
     rendering = Rendering(pool, planner, life, owners, limits, metrics)
     metrics.read(pool, lambda: jobs.overview, places)
 
-    permissions = Permissions(
+    admission = Admission(
+        audit,
+        limits,
+        sessions,
         owners,
         {Kind.JOB: lambda job: jobs.do(JobStore.ownership, job), Kind.REGISTRATION: registrations.ownership},
         {Kind.SCENE: scenes.require, Kind.DATASET: datasets.get},
@@ -85,7 +88,7 @@ def make_service(settings: Settings) -> Service:
         owners=owners,
         limits=limits,
         audit=audit,
-        admission=Admission(audit, limits, sessions, permissions),
+        admission=admission,
         places=places,
         scene_store=scenes,
         catalog=catalog,

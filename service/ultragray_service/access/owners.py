@@ -12,7 +12,6 @@ from typing import TypeVar
 
 import sqlalchemy as sa
 
-from ultragray.errors import UltragrayError
 from ultragray_service.access.audit import AuditLog
 from ultragray_service.access.credentials import Sessions
 from ultragray_service.access.limits import Limits
@@ -154,52 +153,21 @@ def may_change(principal: Principal, ownership: Ownership) -> bool:
     return principal.role is Role.ADMIN or principal.name == ownership.owner
 
 
-def require_role(principal: Principal, operation: Operation) -> None:
-    if operation.role is not None and not principal.role.includes(operation.role):
-        raise PermissionDenied(
-            f"{operation.name} needs the role {operation.role.value}, and {principal.name} has {principal.role.value}"
-        )
+class Admission:
+    """Counts, audits and permits what callers ask for, whichever door it came through."""
 
-
-class Permissions:
     def __init__(
         self,
+        audit: AuditLog,
+        limits: Limits,
+        sessions: Sessions,
         owners: Owners,
         kept_with_rows: Mapping[Kind, Callable[[str], Awaitable[Ownership]]],
         find: Mapping[Kind, Callable[[str], object]],
     ) -> None:
         """`kept_with_rows` reads owners of jobs and registrations; `find` blocks, and raises for what is not there."""
-        self._owners, self._kept_with_rows, self._find = owners, kept_with_rows, find
-
-    async def require(self, principal: Principal, operation: Operation, name: str) -> None:
-        """Raises PermissionDenied, and JobNotFound for another's private job; see also `Owners.hides`."""
-        require_role(principal, operation)
-        about = operation.about
-        if about is None or principal.role is Role.ADMIN or not (operation.owned or about is Kind.JOB):
-            return
-        read = self._kept_with_rows.get(about)
-        ownership = self._owners.known(about, name) if read is None else await read(name)
-        if about is Kind.JOB and not may_see(principal, ownership):
-            raise job_not_found(name)
-        if operation.owned and not may_change(principal, ownership):
-            if about in self._find:  # something that is not there, or hidden, is nobody's
-                await asyncio.to_thread(self._find[about], name)
-            raise _not_own(operation, name, ownership.owner)
-
-
-def _not_own(operation: Operation, name: str, owner: str | None) -> UltragrayError:
-    assert operation.about is not None
-    whose = "nobody's" if owner is None else f"{owner}'s"
-    return PermissionDenied(
-        f"{operation.name} needs the role {Role.ADMIN.value}, or to be the owner's: the {operation.about.value} "
-        f"{name[:128]!r} is {whose}",
-        field=operation.about.value,
-    )
-
-
-class Admission:
-    def __init__(self, audit: AuditLog, limits: Limits, sessions: Sessions, permissions: Permissions) -> None:
-        self._audit, self._limits, self._sessions, self._permissions = audit, limits, sessions, permissions
+        self._audit, self._limits, self._sessions, self._owners = audit, limits, sessions, owners
+        self._kept_with_rows, self._find = kept_with_rows, find
 
     @asynccontextmanager
     async def permitted(
@@ -217,11 +185,31 @@ class Admission:
         `connection`: the caller's address with the port. Raises RateLimited, PermissionDenied and JobNotFound.
         """
         act_as(principal, address=address, connection=connection)
-        with self._audit.refusals(principal.name, address, operation, target):
+        caller = principal.name, address, operation, target
+        with self._audit.refusals(*caller):
             self._limits.take_request()
-        with (
-            self._audit.request(principal.name, address, operation, target),
-            self._sessions.held(principal, credential),
-        ):
-            await self._permissions.require(principal, operation, target)
+        with self._audit.request(*caller), self._sessions.held(principal, credential):
+            await self._require(principal, operation, target)
             yield
+
+    async def _require(self, principal: Principal, operation: Operation, name: str) -> None:
+        """Raises PermissionDenied, and JobNotFound for another's private job; see also `Owners.hides`."""
+        if operation.role is not None and not principal.role.includes(operation.role):
+            needed, has = operation.role.value, principal.role.value
+            raise PermissionDenied(f"{operation.name} needs the role {needed}, and {principal.name} has {has}")
+        about = operation.about
+        if about is None or principal.role is Role.ADMIN or not (operation.owned or about is Kind.JOB):
+            return
+        read = self._kept_with_rows.get(about)
+        ownership = self._owners.known(about, name) if read is None else await read(name)
+        if about is Kind.JOB and not may_see(principal, ownership):
+            raise job_not_found(name)
+        if operation.owned and not may_change(principal, ownership):
+            if about in self._find:  # something that is not there, or hidden, is nobody's
+                await asyncio.to_thread(self._find[about], name)
+            whose = "nobody's" if ownership.owner is None else f"{ownership.owner}'s"
+            raise PermissionDenied(
+                f"{operation.name} needs the role {Role.ADMIN.value}, or to be the owner's: the {about.value} "
+                f"{name[:128]!r} is {whose}",
+                field=about.value,
+            )
