@@ -204,6 +204,8 @@ class Connection:
                         raise
                 answer = connection.getresponse()
                 unless_answered.pop_all()
+            if connection.sock is not None:  # the answer has it
+                connection.sock.close()
         except (OSError, http.client.HTTPException) as error:
             if sent is not None and sent.is_begun:
                 raise NotReady(f"{self.address} closed the connection while {sent.name} was sent") from error
