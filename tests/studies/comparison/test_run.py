@@ -127,13 +127,6 @@ def test_where_the_scene_fails_there_is_no_equal_time(dataset, level, tmp_path):
     assert list(found.measured) == ["nearest"]
 
 
-def test_classical_methods_need_no_scene(dataset, tmp_path):
-    chosen = chosen_methods(("nearest", "median"))
-    found = compare_methods(dataset, chosen, ComparisonSettings(), folder=tmp_path)
-    assert [row.name for row in found.results] == ["median", "nearest"]
-    assert found.budget_s is None
-
-
 def test_the_authors_steps_are_those_of_the_author(dataset, level, tmp_path):
     found = compare_methods(dataset, {"level": level}, ComparisonSettings(budget="author"), folder=tmp_path)
     assert (found.results[0].steps, found.results[0].title, found.budget_s) == (1_000, "one level", None)

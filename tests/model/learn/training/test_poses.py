@@ -165,6 +165,9 @@ def test_whole_sweeps_are_trained_but_for_the_first():
         (found - true).square().sum().backward()
         corrections.step(0.5)
     motions = corrections.all_motions()
+    (corrections.corrected(torch.arange(12), sweep.poses) ** 2).sum().backward()
+    corrections.step(1.0)
+    np.testing.assert_array_equal(corrections.all_motions(), motions, "at the end of a run nothing moves any more")
     np.testing.assert_array_equal(motions[:6], np.tile(np.eye(4), (6, 1, 1)))
     np.testing.assert_array_equal(motions[7:], np.broadcast_to(motions[6], (5, 4, 4)))
     left = (motions @ sweep.poses)[6:, :3, 3] - true[6:].numpy()
@@ -224,6 +227,26 @@ def test_a_frame_that_is_off_is_scored_by_the_half_that_did_not_move_it(tiny_dat
     assert 0.5 < off.moved_mm < 4.0
     in_place = score_halves(scene, dataset.val)
     assert in_place.registered_psnr_db - in_place.as_given_psnr_db < off.registered_psnr_db - off.as_given_psnr_db
+
+
+def test_a_half_is_scored_as_the_other_moved_it(tiny_dataset, random_scene, monkeypatch):
+    """The left half asks for a shift that does nothing but make the right one better."""
+    sweep = tiny_dataset(frames=16, height=40, width=40).val
+    given = torch.from_numpy(sweep.poses)
+
+    def fitted(scene, frames, truth, columns, backend):
+        return given + (5.0 if columns.start == 0 else 0.0) * torch.from_numpy(np.eye(4, k=3))
+
+    def rendered(scene, frames, poses, backend):
+        found = torch.from_numpy(frames.images).float() / 255.0 + 0.1
+        found[..., 20:] -= 0.0 if torch.equal(poses, given) else 0.09
+        return found
+
+    monkeypatch.setattr(trained, "_fitted", fitted)
+    monkeypatch.setattr(trained, "_rendered", rendered)
+    score = score_halves(random_scene(3), sweep)
+    assert score.registered_psnr_db == pytest.approx(score.as_given_psnr_db + 10.0, abs=0.1)
+    assert score.moved_mm == pytest.approx(2.5)
 
 
 def test_the_sizes_of_corrections():
