@@ -120,10 +120,7 @@ def test_where_the_scene_fails_there_is_no_equal_time(dataset, level, tmp_path):
 
     methods = {"scene": Diverging(), "nearest": FromFrames("nearest"), "level": level}
     found = compare_methods(dataset, methods, ComparisonSettings(), folder=tmp_path, paces=Paces())
-    assert found.failures == {
-        "scene": "the loss is nan",
-        "level": "there is no equal time, since the scene failed",
-    }
+    assert found.failures == {"scene": "the loss is nan", "level": "there is no equal time, since the scene failed"}
     assert list(found.measured) == ["nearest"]
 
 
