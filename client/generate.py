@@ -106,48 +106,33 @@ _RAISES = re.compile(r"\s*\bRaises\s.*?(?=\n\n|\Z)", flags=re.DOTALL)
 
 def generate_errors(output_folder: Path) -> Path:
     """Writes errors.py and returns its path."""
-    classes = {name: (base, source) for name, base, source in _error_classes()}
-    tree = _below("ClientError", {name: base for name, (base, _) in classes.items()})
+    classes = dict(_error_classes())
+    tree = _below("ClientError", {name: bases[0] for name, (bases, _) in classes.items()})
     drawn = "\n".join(["ClientError", *(line for line, _ in tree)])
-    names = [name for _, name in tree]
-    listed = f"ERRORS = (ClientError, {', '.join(names)})\n"
+    sources = [
+        f"class {name}({', '.join(classes[name][0])}):\n    {_quoted(_wrapped(classes[name][1]))}\n" for _, name in tree
+    ]
     target = output_folder / "errors.py"
-    sources = (classes[name][1] for name in names)
-    target.write_text(_ERRORS_HEADER.format(tree=drawn) + "\n".join([*sources, listed]))
+    target.write_text(_ERRORS_HEADER.format(tree=drawn) + "\n".join([*sources, "ERRORS = ClientError.branch()\n"]))
     return formatted([target])[0]
 
 
-def _error_classes() -> Iterator[tuple[str, str, str]]:
-    """Name, base and source of each class: below that of its gRPC status, which stands for all its reasons."""
+def _error_classes() -> Iterator[tuple[str, tuple[list[str], str]]]:
+    """Name, bases and meaning of each class: below that of its gRPC status, which stands for all its reasons."""
     meanings = {
         cls.reason: " ".join(inspect.cleandoc(cls.__doc__ or "").split("\n\n")[0].split()) for cls in error_classes()
     }
-    roots = {"INTERNAL"}
+    found = {}
     for reason, statuses in STATUSES.items():
         status = statuses.grpc
-        if reason in NOT_OVER_GRPC:
-            continue
-        if status not in roots:
-            roots.add(status)
-            meaning = meanings.get(status, f"Base of the errors whose gRPC status is {status}.")
-            yield _error_class(status, "ClientError", meaning, f"grpc_status = {status!r}")
-        if reason not in roots:
-            yield _error_class(reason, "ClientError" if status == "INTERNAL" else _camel(status), meanings[reason])
-    for reason, (base, meaning) in OWN_ERRORS.items():
-        yield _error_class(reason, base, meaning)
-
-
-def _error_class(reason: str, base: str, meaning: str, status: str = "") -> tuple[str, str, str]:
-    name = _camel(reason)
-    bases = ", ".join([base, *_ALSO.get(name, ())])
-    lines = (
-        f"class {name}({bases}):",
-        f"    {_quoted(_wrapped(meaning))}",
-        "",
-        f"    reason = {reason!r}",
-        status and f"    {status}",
-    )
-    return name, base, "\n".join(lines)
+        if reason not in {*NOT_OVER_GRPC, "INTERNAL"}:
+            base = "ClientError" if status == "INTERNAL" else _camel(status)
+            root = meanings.get(status, f"Base of the errors whose gRPC status is {status}.")
+            found.setdefault(base, ("ClientError", root))
+            found.setdefault(_camel(reason), (base, meanings[reason]))
+    found.pop("ClientError", None)
+    found |= {_camel(reason): base_and_meaning for reason, base_and_meaning in OWN_ERRORS.items()}
+    return ((name, ([base, *_ALSO.get(name, ())], meaning)) for name, (base, meaning) in found.items())
 
 
 def _camel(reason: str) -> str:
