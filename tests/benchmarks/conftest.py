@@ -37,9 +37,9 @@ class Repository:
 
 def adopt(monkeypatch: pytest.MonkeyPatch, root: Path) -> None:
     """Let the scripts take a folder for the root of their checkout."""
-    for module in (benchmark("figures"), report):
+    for module in (benchmark("measuring"), report):
         monkeypatch.setattr(module, "ROOT", root)
-    monkeypatch.setattr(benchmark("figures"), "STAGE", root / "build" / "bench")
+    monkeypatch.setattr(benchmark("measuring"), "STAGE", root / "build" / "bench")
 
 
 @pytest.fixture

@@ -12,7 +12,7 @@ import pytest
 from ..scripts import benchmark
 from .conftest import Repository, adopt
 
-figures, tables = benchmark("figures"), benchmark("tables")
+figures, measuring = benchmark("figures"), benchmark("measuring")
 
 
 def of(commit: str | None, value: int) -> dict[str, Any]:
@@ -88,7 +88,7 @@ def test_runs_are_kept_one_by_one_and_not_repeated_at_their_commit(
 
     def measure(*arguments: str) -> None:
         monkeypatch.setattr("sys.argv", ["results_tables.py", str(tmp_path), *arguments])
-        figures.measure_runs("results_tables", "Runs.", runs)
+        measuring.measure_runs("results_tables", "Runs.", runs)
 
     measure("--only", "second")
     with pytest.raises(OSError, match="no room"):
@@ -104,7 +104,7 @@ def test_runs_are_kept_one_by_one_and_not_repeated_at_their_commit(
 
 def test_every_place_has_its_block_and_every_block_its_place() -> None:
     text = "".join(page.read_text(encoding="utf-8") for page in figures.documents())
-    assert {name for name in tables.BLOCKS if f"<!-- measured: {name} -->\n" not in text} == set()
+    assert {name for name in figures.BLOCKS if f"<!-- measured: {name} -->\n" not in text} == set()
     assert figures.current(text), "a place without a block is a KeyError"
 
 
@@ -124,5 +124,5 @@ def test_another_measurement_makes_another_document() -> None:
 
 def test_a_block_names_the_commits_of_what_it_shows() -> None:
     shown, hidden = of("abc", 1), of("def", 1)
-    one = tables.Block("ablations", lambda found: list(found), lambda found: {"one": found["one"]})
+    one = figures.Block("ablations", lambda found: list(found), lambda found: {"one": found["one"]})
     assert one.of({"one": shown, "two": hidden}) == ["one", "", "commit abc, , P."]

@@ -15,23 +15,23 @@ from ultragray.learn.evaluation.methods import ComparisonSettings
 
 from ..scripts import benchmark
 
-results, methods, ablations, tables = map(benchmark, ("results_tables", "methods_tables", "ablations", "tables"))
+results, methods, ablations = map(benchmark, ("results_tables", "methods_tables", "ablations"))
 SETTINGS = {"steps": 3, "max_gaussians": 40}
 
 
 def test_a_training_is_measured_beside_classical_methods(data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     run = results.Run("ball", options=SourceOptions("0:3", "3:6"), settings=SETTINGS)
     monkeypatch.setattr(results, "RUNS", {"two": run})
-    monkeypatch.setattr(tables, "README_ROWS", {"two": "a ball, the other half"})
+    monkeypatch.setattr(results, "README_ROWS", {"two": "a ball, the other half"})
     figures = {"two": results.measure("two", data)}
     assert (figures["two"]["train_frames"], figures["two"]["steps"]) == (3, 3)
     assert figures["two"]["total_s"] == pytest.approx(0.003 * figures["two"]["step_ms"])
-    text = "\n".join(tables.results(figures))
+    text = "\n".join(results.results(figures))
     mean = figures["two"]["metrics"]["scene"]["mean"]
     assert f"{mean['psnr_db']:.2f}" in text
     assert "Training frames 0:3, held out 3:6" in text
     assert text.count("| nearest training frame |") == 1
-    *_, row = tables.results_at_a_glance(tables.glanced_at({**figures, "other": {}}))
+    *_, row = results.results_at_a_glance(results.glanced_at({**figures, "other": {}}))
     assert row.startswith(f"| a ball, the other half | {figures['two']['total_s']:.0f} s |")
 
 
@@ -48,10 +48,10 @@ def test_the_phantom_is_measured_in_the_shadow_of_bone(monkeypatch: pytest.Monke
     assert 0.0 < shadow["median_mae"] < 0.4  # noise against the median of three times noise
     assert 0.0 < shadow["scene_mae"] < 0.8
     assert 0.0 <= shadow["scene_transmittance"] <= 1.0
-    text = "\n".join(tables.results({"phantom": figures}))
+    text = "\n".join(results.results({"phantom": figures}))
     assert f"{shadow['scene_mae']:.4f} (scene) against {shadow['median_mae']:.4f} (median compounding)" in text
     del figures["shadow"]
-    assert "Where bone" not in "\n".join(tables.results({"phantom": figures}))
+    assert "Where bone" not in "\n".join(results.results({"phantom": figures}))
 
 
 def test_parts_leave_out_two_of_three_frames_or_a_band(data: Path) -> None:
@@ -71,7 +71,7 @@ def test_each_run_is_compared_with_the_better_baseline() -> None:
         "linear": {"psnr_db": 29.5, "ms_ssim": 0.8, "gms": 0.7, "gmsd": 0.12},
     }
     run = {"metrics": {name: {"mean": mean} for name, mean in means.items()}}
-    assert list(tables._leads(run)) == ["+0.50", "-0.050", "+0.100", "-0.020"]
+    assert list(results._leads(run)) == ["+0.50", "-0.050", "+0.100", "-0.020"]
 
 
 def test_methods_are_compared_and_what_failed_is_a_row_with_its_reason(
@@ -84,7 +84,7 @@ def test_methods_are_compared_and_what_failed_is_a_row_with_its_reason(
     assert list(one["methods"]) == ["median", "linear", "nearest"]
     assert methods.measure("one", data)["methods"] == one["methods"], "what was measured is not measured again"
     one["methods"]["other"] = {"title": "Other", "failure": "the loss is nan", "cost": {}}
-    lines = list(tables.methods({"one": one}))
+    lines = list(methods.methods({"one": one}))
     assert lines[0] == "### one"
     psnr = one["methods"]["median"]["mean"]["psnr_db"]
     assert any(line.startswith("| median compounding") and f"{psnr:.2f}" in line for line in lines)
@@ -93,6 +93,6 @@ def test_methods_are_compared_and_what_failed_is_a_row_with_its_reason(
 
 def test_an_ablation_says_its_spread() -> None:
     runs = {f"ball, as it is, seed {seed}": {"psnr_db": 30.0 + seed, "ms_ssim": 0.9} for seed in ablations.SEEDS}
-    lines = list(tables.trained_without(runs))
+    lines = list(ablations.trained_without(runs))
     assert "| as it is | 31.00 ± 0.82 / 0.900 ± 0.000 |" in lines
     assert "| no absorption | – |" in lines
