@@ -61,7 +61,7 @@ def summary(comparison: Comparison, data_folder: Path) -> Document:
             "title": result.title,
             "failure": result.failure and result.failure.replace(f"{data_folder.resolve()}/", ""),
             "cost": dict(zip(COST_HEADINGS, cost_texts(result), strict=True)),
-            "seconds": result.seconds,
+            "seconds": result.cost.seconds,
             "frame_ms": result.frame_ms,
         }
         if result.evaluation is not None:

@@ -344,11 +344,11 @@ class _Client(Group[AnyConnection]):
         timeout_s: float = DEFAULT_TIMEOUT_S,
     ) -> None:
         super().__init__(self._connects(address, api_key, tls, timeout_s))
-        self.scenes = Scenes(self._connection)
-        self.datasets = Datasets(self._connection)
-        self.jobs = Jobs(self._connection)
-        self.workers = Workers(self._connection)
-        self.registrations = Registrations(self._connection)
+        self.scenes: Scenes[AnyConnection] = Scenes(self._connection)
+        self.datasets: Datasets[AnyConnection] = Datasets(self._connection)
+        self.jobs: Jobs[AnyConnection] = Jobs(self._connection)
+        self.workers: Workers[AnyConnection] = Workers(self._connection)
+        self.registrations: Registrations[AnyConnection] = Registrations(self._connection)
 
     @operation
     def render(

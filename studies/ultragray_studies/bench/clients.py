@@ -191,14 +191,23 @@ def _ping_pong(port: int, repeats: int) -> dict[str, float]:
 def _augment(client: Client, extent: ClientsExtent) -> float:
     """Frames per second of a rendering job, from its start to the whole archive."""
     sampler = AroundSampler(count=extent.frames)
-    size = {"height": extent.side, "width": extent.side}
-    job = _finished(client, RenderJob(scene=AUGMENTED, poses=bench_poses(100), sampler=sampler, dtype="uint8", **size))
+    job = _finished(
+        client,
+        RenderJob(
+            scene=AUGMENTED,
+            poses=bench_poses(100),
+            sampler=sampler,
+            dtype="uint8",
+            height=extent.side,
+            width=extent.side,
+        ),
+    )
     started, finished = (datetime.fromisoformat(at or "") for at in (job.started_at, job.finished_at))
     return extent.frames / (finished - started).total_seconds()
 
 
 def _finished(client: Client, specification: RenderJob) -> Job:
-    job = client.jobs.wait(client.jobs.submit(specification).id, timeout_s=WAIT_S)
+    job: Job = client.jobs.wait(client.jobs.submit(specification).id, timeout_s=WAIT_S)
     if job.state is not JobState.SUCCEEDED:
         raise NotReady(f"the job of the benchmark is {job.state.value}: {job.error}")
     return job

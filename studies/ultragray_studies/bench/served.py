@@ -17,7 +17,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from typing import Any
 import torch
 
 from ultragray.geometry.probe import FloatArray
-from ultragray_client import Client, FrameStream, RenderSettings
+from ultragray_client import Client, Encoding, FrameStream, RenderSettings
 from ultragray_studies.bench.kernel import BenchScene, bench_poses, bench_scenes, measure_kernel, time_ms
 from ultragray_studies.bench.report import Report, percentiles
 from ultragray_workers.errors import NotReady
@@ -103,12 +103,12 @@ def running_server(
     started = time.perf_counter()
     process = subprocess.Popen([python, "-m", "ultragray_service"], env=environment)
     try:
-        server = RunningServer(*ports.values(), process.pid, 0.0)
+        server = RunningServer(ports["HTTP"], ports["GRPC"], ports["IGTL"], process.pid, 0.0)
         _wait(partial(_is_ready, server, process), 0.1, "was not ready")
-        ready_s = time.perf_counter() - started
+        server = replace(server, ready_s=time.perf_counter() - started)
         # The worker for jobs starts too, which takes some seconds of both cores.
         _wait(partial(_is_settled, process.pid), 0.0, "did not come to rest")
-        yield RunningServer(*ports.values(), process.pid, ready_s)
+        yield server
     finally:
         process.terminate()
         process.wait(timeout=30)
@@ -191,7 +191,7 @@ def _one_by_one(what: str, poses: FloatArray, render: Callable[[FloatArray], obj
     return FrontDoor(what, counted, 1000.0 * len(counted) / sum(counted))
 
 
-_PLANES = RenderSettings(outputs=("bmode", "echo", "transmittance"), encoding="float32")
+_PLANES = RenderSettings(outputs=("bmode", "echo", "transmittance"), encoding=Encoding.FLOAT32)
 _STREAMS = {
     "gRPC stream": (RenderSettings(), False),
     "gRPC stream, shared memory": (RenderSettings(), True),

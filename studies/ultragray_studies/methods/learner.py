@@ -183,9 +183,8 @@ class LearnedMethod(Method):
             loss = learner.take_step(done, steps)
             step_s += time.perf_counter()
             done, elapsed_s = done + 1, elapsed_s + step_s
-            if run.report is not None:
-                run.report(FitProgress(done, steps, loss, (steps - done) * elapsed_s / done))
-            stop = run.should_stop is not None and run.should_stop() and done < steps
+            run.report(FitProgress(done, steps, loss, (steps - done) * elapsed_s / done))
+            stop = run.should_stop() and done < steps
             if stop or time.monotonic() - saved_at >= run.checkpoint_interval_s:
                 saved.write_state(learner, done, steps, elapsed_s)
                 saved_at = time.monotonic()

@@ -156,6 +156,10 @@ class FitProgress:
     loss: float
     seconds_left: float
 
+    def ends_part(self, parts: int) -> bool:
+        """Whether the step is the last of one of so many parts of the fit."""
+        return self.step * parts // self.steps > (self.step - 1) * parts // self.steps
+
 
 @dataclass(frozen=True)
 class FitRun:
@@ -168,8 +172,8 @@ class FitRun:
     folder: Path | None = None
     device: str = "cpu"  # cpu, cuda or cuda:N
     seed: int = 0
-    report: Callable[[FitProgress], None] | None = None
-    should_stop: Callable[[], bool] | None = None
+    report: Callable[[FitProgress], None] = lambda progress: None
+    should_stop: Callable[[], bool] = lambda: False
     checkpoint_interval_s: float = 30.0
 
 

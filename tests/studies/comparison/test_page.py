@@ -15,7 +15,6 @@ from ultragray.learn.evaluation.metrics import FrameMetrics
 from ultragray.learn.evaluation.scoring import Evaluation
 from ultragray.learn.report.page import telling_places
 from ultragray_studies.comparison.page import DISTANCE_BINS, binned_medians, write_comparison
-from ultragray_studies.comparison.result import Comparison
 from ultragray_studies.comparison.run import compare_methods
 from ultragray_studies.methods.method import Method, Paces
 
@@ -54,7 +53,7 @@ def test_the_page_has_every_method_and_needs_nothing_else(
     assert found is not None
     paths = write_comparison(found, dataset, tmp_path)
     assert [path.name for path in paths] == ["comparison.json", "comparison.tex", "comparison.html"]
-    assert Comparison.from_dict(json.loads(paths[0].read_text())).to_dict() == json.loads(json.dumps(found.to_dict()))
+    assert json.loads(paths[0].read_text()) == json.loads(json.dumps(found.to_dict()))
     text = paths[2].read_text()
     page = Checked(text)
     assert page.open_tags == []
@@ -97,13 +96,13 @@ def test_a_comparison_in_which_all_fail_has_a_page(
 def test_medians_of_frames_that_are_about_equally_far() -> None:
     distances = np.array([4.0, 1.0, 3.0, 2.0, 8.0, 7.0, 6.0, 5.0] * 4)
     found = binned_medians(distances, 10.0 * distances + np.repeat([0.0, 1.0, 2.0, 30.0], 8))
-    assert len(found.distances) == DISTANCE_BINS
-    np.testing.assert_allclose(found.distances, np.arange(1.0, 9.0))
-    np.testing.assert_allclose(found.medians, 10.0 * np.arange(1.0, 9.0) + 1.5)
+    assert found.shape == (2, DISTANCE_BINS)
+    np.testing.assert_allclose(found[0], np.arange(1.0, 9.0))
+    np.testing.assert_allclose(found[1], 10.0 * np.arange(1.0, 9.0) + 1.5)
     alike = binned_medians(np.full(5, 2.0), np.array([1.0, 5.0, 2.0, 3.0, 4.0]))
-    assert (alike.distances.tolist(), alike.medians.tolist()) == ([2.0], [3.0])
+    assert alike.tolist() == [[2.0], [3.0]]
     two = binned_medians(np.array([1.0, 3.0]), np.array([20.0, 10.0]))
-    assert (two.distances.tolist(), two.medians.tolist()) == ([2.0], [15.0])  # too few for two bins
+    assert two.tolist() == [[2.0], [15.0]]  # too few for two bins
 
 
 def test_the_pictures_are_of_the_worst_a_typical_and_the_best_frame() -> None:

@@ -11,7 +11,7 @@ from ultragray.learn.report.tables import by_mean_rank, rank, rank_rows
 from ultragray.learn.sweep import Distances
 from ultragray_studies.comparison.result import Comparison, DatasetFacts, MethodResult
 from ultragray_studies.comparison.tables import duration_text, escaped, latex_table, steps_text
-from ultragray_studies.methods.method import Description
+from ultragray_studies.methods.method import Cost, Description
 
 
 def scores(psnr_db: float, ms_ssim: float, gms: float, gmsd: float) -> Evaluation:
@@ -58,9 +58,7 @@ def test_the_latex_table_escapes_what_latex_would_read() -> None:
             name=name,
             description=Description(f"{name}_1 & co", "", "", published_steps=200_000),
             machine="a machine",
-            steps=1_240,
-            of_steps=200_000,
-            seconds=172.0,
+            cost=Cost(172.0, 1_240, 200_000, 0),
             evaluation=evaluation,
         )
         for name, evaluation in EVALUATIONS.items()

@@ -43,7 +43,7 @@ def test_each_method_is_a_row_and_one_that_fails_says_why(
     assert list(found.measured) == ["scene", "median", "nearest", "level"]
     assert found.budget_s == 2.0
     level = found.results[3]
-    assert (level.title, level.steps, level.of_steps) == ("one level, short", 40, 1_000)
+    assert (level.title, level.cost.steps, level.cost.of_steps) == ("one level, short", 40, 1_000)
     assert level.frame_ms > 0.0
     assert [state.method for state in seen if state.fit is None] == list(methods)
     assert {(state.number, state.of) for state in seen} == {(number, 5) for number in range(1, 6)}
@@ -93,7 +93,7 @@ def test_a_killed_comparison_goes_on_and_repeats_nothing(
     assert len(level.fits) == fits
     assert again is not None
     assert found is not None
-    assert [row.seconds for row in again.results] == [row.seconds for row in found.results]
+    assert [row.cost.seconds for row in again.results] == [row.cost.seconds for row in found.results]
 
 
 @pytest.mark.slow
@@ -198,7 +198,7 @@ def test_classical_methods_need_no_scene(dataset: Dataset, tmp_path: Path) -> No
 def test_the_authors_steps_are_those_of_the_author(dataset: Dataset, level: LevelMethod, tmp_path: Path) -> None:
     found = compare_methods(dataset, {"level": level}, ComparisonSettings(budget="author"), folder=tmp_path)
     assert found is not None
-    assert (found.results[0].steps, found.results[0].title, found.budget_s) == (1_000, "one level", None)
+    assert (found.results[0].cost.steps, found.results[0].title, found.budget_s) == (1_000, "one level", None)
 
 
 def test_without_held_out_frames_nothing_begins(dataset: Dataset, tmp_path: Path) -> None:
