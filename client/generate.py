@@ -218,18 +218,19 @@ def _dataclass_source(cls: Any, name: str, bases: list[Any]) -> str:
 def _field_source(item: Field[Any], *, kw_only: bool) -> str:
     if str(item.type).startswith("Literal"):  # what tells a member of a family apart
         return f"    kind: Literal[{item.default!r}] = field_of(default={item.default!r}, repr=False, kw_only=True)"
-    default = ""
+    given = ""
     if item.default is not MISSING:
-        default = f" = {_default_source(item.default)}"
-    elif item.default_factory is not MISSING:
-        default = f" = field_of(default_factory={item.default_factory.__name__})"
-    if kw_only:
         given = f"default={_default_source(item.default)}"
-        if item.default_factory is not MISSING:
-            given = f"default_factory={item.default_factory.__name__}"
-        default = f" = field_of({given}, kw_only=True)"
+    elif item.default_factory is not MISSING:
+        given = f"default_factory={item.default_factory.__name__}"
+    default = f" = field_of({given}{', kw_only=True' if kw_only else ''})" if given else ""
+    if given.startswith("default=") and not kw_only:
+        default = f" = {given.removeprefix('default=')}"
     annotation = re.sub(r"\w+", lambda word: OWN_TYPES.get(word[0], word[0]), str(item.type))
-    return f"    {item.name}: {annotation}{default}\n    {_quoted(_wrapped(item.metadata['description']))}"
+    source, words = f"    {item.name}: {annotation}{default}", item.metadata["description"]
+    if len(line := f"{source}  # {words}") <= 120:
+        return line
+    return "\n".join([*(f"    # {part}" for part in textwrap.wrap(words, 110)), source])
 
 
 def _default_source(default: Any) -> str:
