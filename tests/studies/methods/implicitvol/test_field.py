@@ -40,7 +40,7 @@ def test_weights_fill_the_papers_ranges() -> None:
 
 
 def test_the_first_layer_is_the_sine_of_30_times_its_sum() -> None:
-    layer = SineLayer.first(2, 1)
+    layer = SineLayer(2, 1, is_first=True)
     layer.load_state_dict({"weight": torch.tensor([[0.1, -0.2]]), "bias": torch.tensor([0.05])})
     found = layer(torch.tensor([0.3, 0.1]))
     assert found.item() == pytest.approx(math.sin(30.0 * (0.03 - 0.02 + 0.05)), abs=1e-6)

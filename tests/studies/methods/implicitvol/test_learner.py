@@ -103,7 +103,7 @@ def test_frames_that_moved_together_are_rendered_as_the_tracker_saw_them() -> No
     learner = RefiningLearner(SMALL, 0, CPU)
     with torch.no_grad():
         learner.poses.shifts += torch.tensor([0.2, -0.1, 0.3])
-        moved = learner.values(learner.training_points(1)).clamp(0.0, 1.0).numpy()
+        moved = learner.field(learner.training_points(1)).clamp(0.0, 1.0).numpy()
     rendered = learner.render(PROBE, SMALL.train.poses[1:2], 12, 8)[0]
     np.testing.assert_allclose(rendered, moved, atol=2e-3)  # the finest octave makes much of a rounding
 

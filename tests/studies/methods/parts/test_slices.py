@@ -48,7 +48,7 @@ def test_a_field_that_shows_the_image_has_no_loss(name: str, monkeypatch: pytest
     def image(points: torch.Tensor) -> torch.Tensor:
         return learner.image(place) + 0.0 * points.sum(dim=-1)
 
-    monkeypatch.setattr(learner, "values", image)
+    monkeypatch.setattr(learner, "field", image)
     assert learner.loss(0, 10).item() == pytest.approx(0.0, abs=1e-5)
 
 
@@ -61,7 +61,7 @@ def test_a_frame_is_taken_at_the_places_of_its_pixels(name: str, probe: Probe, m
     def ramp(points: torch.Tensor) -> torch.Tensor:
         return 0.5 + points @ direction
 
-    monkeypatch.setattr(learner, "values", ramp)
+    monkeypatch.setattr(learner, "field", ramp)
     pose = learner.dataset.train.poses[1].copy()
     pose[:3, :3] = [[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]]
     frame = learner.render(probe, pose[None], 12, 8)[0]
@@ -83,7 +83,7 @@ def test_frames_are_cut_off_at_0_and_1_only_where_they_are_rendered(monkeypatch:
     def beyond(points: torch.Tensor) -> torch.Tensor:
         return 1.5 * points[..., 2].sign()
 
-    monkeypatch.setattr(learner, "values", beyond)
+    monkeypatch.setattr(learner, "field", beyond)
     frame = learner.render(PROBE, learner.dataset.train.poses[:1], 12, 8)[0]
     assert set(np.unique(frame)) == {0.0, 1.0}
-    assert learner.values(learner.training_points(0)).max() == 1.5
+    assert learner.field(learner.training_points(0)).max() == 1.5
