@@ -153,6 +153,8 @@ def published_epoch(step: int, steps: int) -> int:
 class FieldLearner(SliceLearner):
     """A fit with the tracker's poses."""
 
+    field: SineField
+
     def __init__(self, dataset: Dataset, seed: int, device: torch.device) -> None:
         self.half_height_mm = dataset.probe.scan_line_length_mm / 2.0
         super().__init__(dataset, seed, device, dataset.centre_mm, np.full(3, self.half_height_mm))
