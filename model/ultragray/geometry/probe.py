@@ -334,8 +334,7 @@ class Probe(Family):
     def cull(self, x_mm: FloatArray, z_mm: FloatArray, height: int) -> BoolArray:  # [N] each
         """A mask of the means of Gaussians that count, by their depth: up to the top edge of the last row."""
         depth, _ = self.lines.coordinates(x_mm, z_mm)
-        seen: BoolArray = (depth >= self.near_mm) & (depth <= self.cull_far_mm(height))
-        return seen
+        return (depth >= self.near_mm) & (depth <= self.cull_far_mm(height))
 
     def scan_lines(self, width: int) -> tuple[FloatArray, FloatArray]:  # [W, 3] mm, [W, 3]
         """The point of depth 0 of each scan line (mm), and its unit direction, in the probe frame."""
@@ -367,8 +366,7 @@ class Probe(Family):
 
     def ending_at(self: _P, far_mm: float) -> _P:
         """The same probe with another end of its scan lines."""
-        changed: _P = replace(self, far_mm=far_mm)  # type: ignore[type-var]  # every member is a dataclass
-        return changed
+        return replace(self, far_mm=far_mm)  # type: ignore[type-var]  # every member is a dataclass
 
     def frame_picture(self, height: int, width: int) -> Picture:
         """A frame [H, W] as it is."""

@@ -76,8 +76,7 @@ def _rotation(points: FloatArray, targets: FloatArray) -> FloatArray:  # [N, 3] 
             "targets are the mirror image of points: one of the two frames is left-handed, or has two axes exchanged",
             field="targets",
         )
-    rotation: FloatArray = right.T @ np.diag([1.0, 1.0, sign]) @ left.T
-    return rotation
+    return right.T @ np.diag([1.0, 1.0, sign]) @ left.T
 
 
 def _deviations(
@@ -234,8 +233,7 @@ def _pose_deviations(
 
 
 def _as_points(poses: FloatArray) -> FloatArray:  # [N, 4, 4] -> [4N, 3]
-    points: FloatArray = (_ARMS @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]).reshape(-1, 3)
-    return points
+    return (_ARMS @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]).reshape(-1, 3)
 
 
 def _pairs(flange_to_base: Any, probe_to_scene: Any) -> tuple[FloatArray, FloatArray]:
@@ -305,26 +303,22 @@ class Registration(Contract):
     def probe_to_scene(self, flange_to_base: FloatArray) -> FloatArray:  # [..., 4, 4] mm, exact -> [..., 4, 4]
         """The poses of the probe in the scene, of poses of the flange in the base."""
         base_to_scene, probe_to_flange = self._links
-        poses: FloatArray = base_to_scene @ flange_to_base @ probe_to_flange
-        return poses
+        return base_to_scene @ flange_to_base @ probe_to_flange
 
     def marker_to_scene(self, marker_to_base: FloatArray) -> FloatArray:  # [..., 4, 4] mm, exact -> [..., 4, 4]
         """The poses in the scene of something else in the base than the probe, such as a needle's marker."""
         base_to_scene, _ = self._links
-        poses: FloatArray = base_to_scene @ marker_to_base
-        return poses
+        return base_to_scene @ marker_to_base
 
     def in_base(self, to_scene: FloatArray) -> FloatArray:  # [..., 4, 4] mm -> [..., 4, 4]
         """Transforms into the scene as such into the base."""
         base_to_scene, _ = self._links
-        poses: FloatArray = np.linalg.inv(base_to_scene) @ to_scene
-        return poses
+        return np.linalg.inv(base_to_scene) @ to_scene
 
     def flange_to_base(self, probe_to_scene: FloatArray) -> FloatArray:  # [..., 4, 4] mm, exact -> [..., 4, 4]
         """The poses of the flange in the base, of poses of the probe in the scene."""
         base_to_scene, probe_to_flange = self._links
-        poses: FloatArray = np.linalg.inv(base_to_scene) @ probe_to_scene @ np.linalg.inv(probe_to_flange)
-        return poses
+        return np.linalg.inv(base_to_scene) @ probe_to_scene @ np.linalg.inv(probe_to_flange)
 
 
 def rows(pose: FloatArray) -> Rows:  # [4, 4]

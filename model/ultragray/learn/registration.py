@@ -115,8 +115,7 @@ def _agreeing(in_base: FloatArray, localizations: Sequence[Localization]) -> Boo
 def _residuals(poses: FloatArray, others: FloatArray) -> FloatArray:  # [N, 4, 4] both -> [N] mm
     """Shifts, and turns as the way at the lever."""
     shifts_mm, turns_deg = pose_residuals(poses, others)
-    together: FloatArray = np.hypot(shifts_mm, LEVER_MM * np.radians(turns_deg))
-    return together
+    return np.hypot(shifts_mm, LEVER_MM * np.radians(turns_deg))
 
 
 def _fit_of(

@@ -150,8 +150,7 @@ def straightened(points: Floats) -> Floats:  # [N, 3] -> [N, 3]
 
 def fascia_depth_mm(x: Floats) -> Floats:
     """The thoracolumbar fascia: over the two muscle bellies, down to the spinous processes between them."""
-    depth: Floats = 10.0 - 1.6 * np.exp(-(((np.abs(x) - 14.0) / 9.0) ** 2)) + 2.0 * np.exp(-((x / 5.0) ** 2))
-    return depth
+    return 10.0 - 1.6 * np.exp(-(((np.abs(x) - 14.0) / 9.0) ** 2)) + 2.0 * np.exp(-((x / 5.0) ** 2))
 
 
 def deep_fascia_depth_mm(x: Floats) -> Floats:
@@ -168,8 +167,7 @@ def vessel_distance_mm(points: Floats) -> Floats:  # [N, 3] -> [N]
     """Distance from the wall of a vessel that winds along the right erector spinae, negative inside."""
     x, y, z = points.T
     centre_x, centre_z = 20.0 + 1.5 * np.sin(y / 14.0), 23.0 + 1.2 * np.sin(y / 19.0)
-    distance: Floats = np.hypot(x - centre_x, z - centre_z) - VESSEL_RADIUS_MM
-    return distance
+    return np.hypot(x - centre_x, z - centre_z) - VESSEL_RADIUS_MM
 
 
 def sac_distance_mm(points: Floats) -> Floats:  # [N, 3] -> [N]
@@ -177,8 +175,7 @@ def sac_distance_mm(points: Floats) -> Floats:  # [N, 3] -> [N]
     x, z = points[:, 0] / SAC_HALF_WIDTH_MM, (points[:, 2] - SAC_DEPTH_MM) / SAC_HALF_DEPTH_MM
     radius = np.hypot(x, z)
     steepness = np.hypot(x / SAC_HALF_WIDTH_MM, z / SAC_HALF_DEPTH_MM) / np.maximum(radius, 1e-9)
-    distance: Floats = (radius - 1.0) / np.maximum(steepness, 1e-9)
-    return distance
+    return (radius - 1.0) / np.maximum(steepness, 1e-9)
 
 
 # Scattering and absorption of the phantom's tissues, and the probe's pulse and beam.
@@ -232,14 +229,12 @@ def compensated_db_per_mm() -> float:
 
 def lateral_sigma_mm(depth_mm: Floats) -> Floats:
     """Width of the beam in the image plane, there and back."""
-    sigma: Floats = np.hypot(0.34, 0.011 * (depth_mm - FOCUS_MM))
-    return sigma
+    return np.hypot(0.34, 0.011 * (depth_mm - FOCUS_MM))
 
 
 def elevation_sigma_mm(depth_mm: Floats) -> Floats:
     """Thickness of the slice: 1.4 mm at half amplitude in the focus of the lens, more before and behind."""
-    sigma: Floats = np.hypot(0.6, 0.022 * (depth_mm - FOCUS_MM))
-    return sigma
+    return np.hypot(0.6, 0.022 * (depth_mm - FOCUS_MM))
 
 
 def elevation_weight(elevation_mm: Floats, depth_mm: Floats) -> Floats:
@@ -270,8 +265,7 @@ class LatticeNoise:
 
         def along_z(i: IntArray, j: IntArray) -> Floats:
             near = nodes[i, j, k]
-            value: Floats = near + w * (nodes[i, j, (k + 1) & _LAST] - near)
-            return value
+            return near + w * (nodes[i, j, (k + 1) & _LAST] - near)
 
         def along_y(i: IntArray) -> Floats:
             near = along_z(i, j)

@@ -288,8 +288,7 @@ class Grid:
         """The mean over the cells of each pixel."""
         top, left = self.margins
         image = values[top : top + CELLS_PER_ROW * self.height, left : left + self.width]
-        mean: Floats = image.reshape(self.height, CELLS_PER_ROW, self.width).mean(axis=1)
-        return mean
+        return image.reshape(self.height, CELLS_PER_ROW, self.width).mean(axis=1)
 
 
 def _tissue(pose: FloatArray, depths_mm: Floats, laterals_mm: Floats) -> npt.NDArray[np.uint8]:  # [R], [C] -> [R, C]
@@ -355,8 +354,7 @@ def _blurred(echoes: Complex64Array, grid: Grid) -> Complex64Array:  # [R, C]
 
 def _compressed(power: Floats) -> ByteArray:  # [H, W]
     grey = MUSCLE_GREY + 10.0 * np.log10(power + 1e-12) / DYNAMIC_RANGE_DB
-    frame: ByteArray = np.round(255.0 * np.clip(grey, 0.0, 1.0)).astype(np.uint8)
-    return frame
+    return np.round(255.0 * np.clip(grey, 0.0, 1.0)).astype(np.uint8)
 
 
 # The shadow of bone in the phantom, and the error of a rendering there.

@@ -118,8 +118,7 @@ class Skin:
         down, right = y - i, x - j
         upper = heights[i, j] * (1.0 - right) + heights[i, j + 1] * right
         lower = heights[i + 1, j] * (1.0 - right) + heights[i + 1, j + 1] * right
-        found: FloatArray = upper * (1.0 - down) + lower * down
-        return found
+        return upper * (1.0 - down) + lower * down
 
 
 def way_in(poses: FloatArray, probe: Probe | None) -> tuple[FloatArray, Probe]:  # [P, 4, 4] mm -> [3]
@@ -200,8 +199,7 @@ class Touch:
     def pressed_mm(self) -> FloatArray:  # [C]
         """How far the face lies beyond the innermost training face, a mean over the lines with contact; at least 0."""
         pressed = np.where(self.lines, self.skin.pressed_mm(self.faces, self.directions), 0.0).sum(axis=1)
-        mean: FloatArray = pressed / np.maximum(self.lines.sum(axis=1), 1)
-        return mean
+        return pressed / np.maximum(self.lines.sum(axis=1), 1)
 
     @property
     def lines(self) -> npt.NDArray[np.bool_]:  # [C, W]
@@ -211,8 +209,7 @@ class Touch:
     @property
     def shares(self) -> FloatArray:  # [C]
         """The share of the scan lines of each pose that have contact, 0 to 1."""
-        shares: FloatArray = self.lines.mean(axis=1)
-        return shares
+        return self.lines.mean(axis=1)
 
 
 # Tissue under pressure: compressed evenly between the face and the far end of the image, which stays where it was.

@@ -104,8 +104,7 @@ class Output:
         low, high = self.scale
         if self.is_numbers or (low, high) == (0.0, 1.0):
             return values
-        found: _Values = (values.clip(low, high) - low) / (high - low)
-        return found
+        return (values.clip(low, high) - low) / (high - low)
 
 
 OUTPUTS: dict[str, Output] = {}

@@ -82,8 +82,7 @@ class ScanView:
     def in_probe_frame(self, points: FloatArray) -> FloatArray:  # [N, 3] mm -> [C, N, 3] mm
         """Points of the scene frame as each pose sees them."""
         rotations, positions = self.poses[:, :3, :3], self.poses[:, :3, 3]
-        seen: FloatArray = (points - positions[:, None]) @ rotations
-        return seen
+        return (points - positions[:, None]) @ rotations
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,8 +107,7 @@ def covered(gap_mm: FloatArray, half_mm: float | FloatArray, spacing_mm: FloatAr
 
 def dot(vectors: FloatArray, others: FloatArray) -> FloatArray:  # [..., 3] both -> [...]
     """Scalar products."""
-    product: FloatArray = (vectors * others).sum(axis=-1)
-    return product
+    return (vectors * others).sum(axis=-1)
 
 
 # The base of all tools: their material, and the frame that they lie in.

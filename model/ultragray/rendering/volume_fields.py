@@ -77,8 +77,7 @@ def sample_slice(
     """A field on a plane (`VolumeGrid.on_plane`). Raises what `sample_volume` raises, and FrameTooCostly and GivenUp by
     `limits`: footprint pixels are those of the boxes around Gaussians."""
     check_field(field, has_labels=scene.labels is not None)
-    layer: npt.NDArray[np.generic] = np.concatenate(list(_slabs(scene, field, grid, limits)))[0]
-    return layer
+    return np.concatenate(list(_slabs(scene, field, grid, limits)))[0]
 
 
 def _slabs(scene: GaussianScene, field: str, grid: VolumeGrid, limits: Limits) -> Iterator[npt.NDArray[np.generic]]:
@@ -108,8 +107,7 @@ class _Slab:
         return int(self._box_voxels(self._touching).sum())
 
     def _box_voxels(self, ids: IndexArray) -> IndexArray:
-        voxels: IndexArray = (self._high[ids] - self._low[ids] + 1).prod(axis=1)
-        return voxels
+        return (self._high[ids] - self._low[ids] + 1).prod(axis=1)
 
     def values(self, field: str) -> npt.NDArray[np.generic]:  # [voxels]
         ellipsoids = self.ellipsoids
@@ -124,8 +122,7 @@ class _Slab:
 
     @staticmethod
     def _coverage(weight: FloatArray) -> FloatArray:
-        coverage: FloatArray = -np.expm1(-weight)
-        return coverage
+        return -np.expm1(-weight)
 
     def _labels(self) -> npt.NDArray[np.uint8]:
         found, heaviest = np.zeros(math.prod(self.shape), np.uint8), np.zeros(math.prod(self.shape))

@@ -167,8 +167,7 @@ def _direction(values: Sequence[float], field: str) -> FloatArray:
     if largest == 0.0:
         raise InvalidArgument(f"{field} must be a direction, got {_words(vector)}", field=field)
     vector = vector / largest  # of which the square is a number
-    unit: FloatArray = vector / np.linalg.norm(vector)
-    return unit
+    return vector / np.linalg.norm(vector)
 
 
 def _check_spacing(spacing_mm: float) -> None:

@@ -208,8 +208,7 @@ def _shortest_links(packed: bytes, count: int) -> tuple[np.ndarray, FloatArray]:
 
 def _angles_rad(first: FloatArray, second: FloatArray) -> FloatArray:  # [C, 4, 4] both -> [C]
     half_chords = np.linalg.norm(first[:, :3, :3] - second[:, :3, :3], axis=(1, 2)) / np.sqrt(8.0)
-    angles: FloatArray = 2.0 * np.arcsin(np.clip(half_chords, 0.0, 1.0))
-    return angles
+    return 2.0 * np.arcsin(np.clip(half_chords, 0.0, 1.0))
 
 
 # Tilted sweeps, as the paper records them.
@@ -289,8 +288,7 @@ class SplineSampler(Sampler):
         assert self.spacing_mm is not None
         steps = min(length_mm / self.spacing_mm + 1e-9, 10.0 * MAX_POSES)
         self._require_few(math.floor(steps) + 1, "spacing_mm")
-        every: FloatArray = np.minimum(self.spacing_mm * np.arange(math.floor(steps) + 1), length_mm)
-        return every
+        return np.minimum(self.spacing_mm * np.arange(math.floor(steps) + 1), length_mm)
 
 
 def _without_repetitions(base: FloatArray) -> FloatArray:  # [P, 4, 4] -> [K, 4, 4]
@@ -316,8 +314,7 @@ def _natural_cubic(
     rest = 1.0 - share
     straight = rest * values[segments] + share * values[segments + 1]
     bend = (rest**3 - rest) * second[segments] + (share**3 - share) * second[segments + 1]
-    curve: FloatArray = straight + length**2 / 6.0 * bend
-    return curve
+    return straight + length**2 / 6.0 * bend
 
 
 def _second_derivatives(values: FloatArray, lengths: FloatArray) -> FloatArray:  # [K, 3], [K-1] -> [K, 3]

@@ -120,8 +120,7 @@ def _on_grid(
     voxel_mm: float,
 ) -> FloatArray:  # [P, 3] voxels
     rotation = axes.T @ pose[:3, :3] / voxel_mm
-    places: FloatArray = points @ rotation.T + axes.T @ (pose[:3, 3] - origin_mm) / voxel_mm
-    return places
+    return points @ rotation.T + axes.T @ (pose[:3, 3] - origin_mm) / voxel_mm
 
 
 def _extent_mm(sweep: Sweep, axes: FloatArray) -> tuple[FloatArray, FloatArray]:  # [3], [3]
@@ -289,8 +288,7 @@ def _between(sweep: Sweep, points: FloatArray, frames: IntArray) -> FloatArray: 
                 values[side, nearer[inside]] = sampled
     weights = 1.0 / np.maximum(distances, 1e-9)  # 0 for a side without a frame
     total = weights.sum(axis=0)
-    blended: FloatArray = (weights * values).sum(axis=0) / np.where(total > 0, total, 1.0)
-    return blended
+    return (weights * values).sum(axis=0) / np.where(total > 0, total, 1.0)
 
 
 def _sample(sweep: Sweep, frame: int, local: FloatArray) -> tuple[npt.NDArray[np.bool_], FloatArray]:  # [P, 3] mm

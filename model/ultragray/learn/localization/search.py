@@ -424,8 +424,7 @@ def _step(fit: _Fit, damping: Tensor) -> Tensor:  # [K] -> [K, 6] mm
     floor = 1e-2 * own.mean(dim=1, keepdim=True) + torch.finfo(torch.float64).tiny
     damped = curvature + torch.diag_embed(damping[:, None] * (own + floor) + 1e-9 * floor)
     downhill: Tensor = -torch.linalg.lstsq(damped, slope).solution[..., 0]
-    shortened: Tensor = downhill * (LONGEST_STEP_MM / downhill.norm(dim=1, keepdim=True).clamp(min=LONGEST_STEP_MM))
-    return shortened
+    return downhill * (LONGEST_STEP_MM / downhill.norm(dim=1, keepdim=True).clamp(min=LONGEST_STEP_MM))
 
 
 def _starts(start: Tensor, motions: Motions, within_mm: float, within_deg: float) -> Tensor:  # [4, 4] -> [S, 4, 4]

@@ -51,8 +51,7 @@ class Neighbours:
         gaps = np.maximum(self.gaps_mm, usual) / usual
         ends = np.full(len(self.ends), self.doublings)
         weights = np.concatenate([gaps, ends])
-        shares: FloatArray = weights / weights.sum()
-        return shares
+        return weights / weights.sum()
 
     @property
     def doublings(self) -> float:

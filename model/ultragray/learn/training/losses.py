@@ -19,8 +19,7 @@ def kernel_image_loss(rendered: Tensor, truth: Tensor, texture: float, *, instru
     inside the image.
     Differentiable with respect to `rendered`. Raises ValueError for smaller images.
     """
-    loss: Tensor = _ImageLoss.apply(rendered, truth, texture, instruction_set)  # type: ignore[no-untyped-call]
-    return loss
+    return _ImageLoss.apply(rendered, truth, texture, instruction_set)  # type: ignore[no-untyped-call]
 
 
 class _ImageLoss(torch.autograd.Function):

@@ -115,8 +115,7 @@ def footprint_pixels(
         )
     except _cpu.GivenUp:
         raise GivenUp from None
-    found: list[int] = pixels.tolist()
-    return found
+    return pixels.tolist()
 
 
 def drawing_work(

@@ -62,8 +62,7 @@ def want_gradient(poses: ScenePoses) -> bool:
 
 def as_array(poses: ScenePoses) -> FloatArray:  # [C, 4, 4]
     """The numbers alone."""
-    array: FloatArray = poses.detach().numpy() if isinstance(poses, Tensor) else poses
-    return array
+    return poses.detach().numpy() if isinstance(poses, Tensor) else poses
 
 
 def gradient_by_poses(poses: Tensor, by_motion: Tensor) -> Tensor:  # [C, 4, 4], [C, 2, 3] -> [C, 4, 4]
