@@ -98,9 +98,6 @@ def file_sha256(path: str | Path) -> str:
     return digest.hexdigest()
 
 
-# A second name for a file that never changes.
-
-
 def link_or_copy(source: Path, target: Path) -> None:
     """Makes `target` the same file as `source`, or a whole copy where that cannot be; an existing target stays.
 
@@ -129,9 +126,6 @@ def _copy(source: Path, target: Path) -> None:
                 raise FileExistsError from None
 
 
-# The version that a file of ours names: one of this release, or a sentence that says what to do.
-
-
 def require_version(found: Any, known: int) -> None:
     """Raises ValueError where a file is of another version than the release reads."""
     if type(found) is int and found > known:
@@ -146,7 +140,6 @@ def require_version(found: Any, known: int) -> None:
 # One array of numbers in a `.npy` file, mapped and not read; what is wrong with a file, in our words.
 #
 # The header is checked before numpy maps the file: its own messages advise to unpickle what is no array.
-
 
 _DAMAGED = "its .npy header is damaged or truncated"
 _MAGIC, _ZIP_MAGIC = b"\x93NUMPY", b"PK\x03\x04"

@@ -59,9 +59,6 @@ def stands_for(name: str, one: str) -> bool:
     return is_number and int(first) <= int(number) <= int(last)
 
 
-# The plan of a batch: which frames it has, and how they are divided into shards. Free of torch.
-
-
 SHARD_FRAMES = BLOCK_POSES  # of a shard where nothing else is asked for; a search draws no block twice then
 MAX_SHARDS = 20_000  # the queue keeps a row of each, and a manifest names them all
 _VERSION = 1  # of how frames follow from a plan: another one gives other plans
@@ -187,9 +184,6 @@ class BatchPlan:
     def identity(self) -> str:
         """Tells the plan from any other: the SHA-256 of its document."""
         return hashlib.sha256(json.dumps(self.document(), sort_keys=True).encode()).hexdigest()
-
-
-# The manifest of a batch: what was asked for, and each file with its hash. Free of torch.
 
 
 MANIFEST_FILE = "manifest.json"

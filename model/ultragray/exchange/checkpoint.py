@@ -216,7 +216,6 @@ def _check_tensors(path: Path, tensors: Mapping[str, Any]) -> None:
 # exp(−4·h)) does. For each Gaussian the coefficients of h are fitted anew, at the scene's own degree, to what the
 # released code can show.
 
-
 LOWEST, HIGHEST = 0.5, 0.999
 MAX_TRAINING_VIEWS = 32
 SPHERE_DIRECTIONS = 64
@@ -292,7 +291,6 @@ def _sphere_directions() -> Tensor:  # [F, 3] unit
 # (docs/physics.md §2). What it cannot say lies beside it as the released dataset layout has it: conf.json (planes and
 # width in cm, on the released depth grid, §3) and poses_train.npy (mm). The released code puts the origin at the mean
 # image corner of those poses (§6), so the Gaussians are moved there: a pose in the tracker's frame shows the same.
-
 
 CONFIG_NAME = "conf.json"
 POSES_NAME = "poses_train.npy"

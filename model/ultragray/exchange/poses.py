@@ -82,9 +82,6 @@ def _reason(error: BaseException) -> str:
     return f"not a file of poses that can be read: {error}"
 
 
-# Poses in MCAP files: geometry_msgs/PoseStamped of ROS 2, metres, such as `ros2 bag record -s mcap` writes them.
-
-
 PREFERRED = "/probe_pose"  # the end of the topic of the ROS 2 node
 
 

@@ -126,9 +126,6 @@ def _rounded(value: float | None) -> float | None:
     return None if value is None else round(value, _FIGURE_DIGITS)
 
 
-# The work of a batch: a process that holds its scene makes one file after another.
-
-
 class ShardRenderer:
     """The scene of a batch, loaded once, and the rendering of its shards."""
 

@@ -31,7 +31,6 @@ from ultragray.errors import InvalidArgument, InvalidProbe
 # line j has start + span·(j+½)/W. A point of the plane has x and z, lateral and axial, or its depth along the line
 # through it and the across of that line.
 
-
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 
 
@@ -193,9 +192,6 @@ class RadialLines(_Angular):
 Lines: TypeAlias = ParallelLines | FannedLines | RadialLines
 
 
-# The place of a picture's pixels in the image plane of a probe.
-
-
 @dataclass(frozen=True)
 class Picture:
     """The grid of a picture [H, W].
@@ -248,9 +244,6 @@ class Picture:
         """With left and right exchanged."""
         last = self.first[0] + (self.width - 1) * self.step[0]
         return replace(self, first=(last, self.first[1]), step=(-self.step[0], self.step[1]))
-
-
-# The base of all probes: what follows from a bundle of scan lines, a near and a far depth.
 
 
 _P = TypeVar("_P", bound="Probe")
@@ -398,9 +391,6 @@ def _in_probe_frame(vectors: FloatArray) -> FloatArray:  # [..., 2] (x, z) -> [.
     return np.stack([vectors[..., 0], np.zeros(vectors.shape[:-1]), vectors[..., 1]], axis=-1)
 
 
-# The base of convex and phased arrays.
-
-
 LARGEST_OPENING_DEG = 175.0
 SMALLEST_USUAL_OPENING_DEG = 5.0
 
@@ -432,9 +422,6 @@ class Fan(Probe):
             )
 
 
-# The curved array.
-
-
 @dataclass(frozen=True)
 class ConvexProbe(Fan):
     """A curved array: scan lines fan out from the apex, which is the origin."""
@@ -445,9 +432,6 @@ class ConvexProbe(Fan):
         "Distance from the apex at which the image ends, beyond `near_mm`.", above=0.0, example=90.0
     )
     kind: Literal["convex"] = kind_field("convex")
-
-
-# The linear array.
 
 
 USUAL_WIDTHS_MM = (5.0, 200.0)
@@ -474,9 +458,6 @@ class LinearProbe(Probe):
         yield from super().oddities()
 
 
-# The phased array.
-
-
 @dataclass(frozen=True)
 class PhasedProbe(Fan):
     """A phased array: scan lines fan out from the centre of the face; `near_mm` is 0."""
@@ -486,9 +467,6 @@ class PhasedProbe(Fan):
     kind: Literal["phased"] = kind_field("phased")
 
     near_mm = 0.0
-
-
-# The radial probe: intravascular and endobronchial catheters, rotating endoscopes.
 
 
 @dataclass(frozen=True)
@@ -521,9 +499,6 @@ class RadialProbe(Probe):
         return 0.0
 
 
-# The linear array with steered beams.
-
-
 LARGEST_STEERING_DEG = 45.0
 
 
@@ -549,9 +524,6 @@ class SteeredProbe(Probe):
     @property
     def lines(self) -> ParallelLines:
         return ParallelLines(self.width_mm, self.steering_deg)
-
-
-# ElevationBeam: how thick a slice of tissue an image shows, by depth.
 
 
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))

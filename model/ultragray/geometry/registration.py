@@ -118,7 +118,6 @@ def _require_a_plane(points: FloatArray, field: str) -> None:
 # Convention. probe→scene = base→scene · flange→base · probe→flange, all [4, 4], mm. For a tracked probe the base is
 # the tracker, and the flange the marker on the probe.
 
-
 LEVER_MM = 50.0  # at which a turn weighs as a shift: about half the depth of an image
 LEAST_POSES = 3  # where the mounting is unknown, too
 LEAST_TURN_DEG = 5.0  # of the probe, about two axes, where the mounting is unknown
@@ -258,7 +257,6 @@ def _rotation_vectors(rotations: FloatArray) -> FloatArray:  # [N, 3, 3] -> [N, 
 #
 # Convention. probe→scene = base→scene · flange→base · probe→flange, mm. For a tracked probe the base is the tracker,
 # and the flange the marker on the probe.
-
 
 FORMAT_VERSION = 1
 MAX_FILE_BYTES = 1 << 20

@@ -44,7 +44,6 @@ class ImageRegion(Contract):
 # §3); poses are rigid probe→tracker transforms [F, 4, 4] in mm. A scene trained from a dataset answers poses in that
 # frame.
 
-
 ByteArray: TypeAlias = npt.NDArray[np.uint8]
 IntArray: TypeAlias = npt.NDArray[np.int64]
 
@@ -228,7 +227,6 @@ class Distances:
 # The split of a sweep into frames to train from and frames held out.
 #
 # Ranges of frames are what a user writes: `0:90`, `0:90,100:120:2`, `7`, `:50`, `150:`.
-
 
 HELD_OUT_START, HELD_OUT_STEP = 2, 5  # of a single sequence: every fifth frame, from the third
 _PART = re.compile(r"(?P<start>\d{0,9})(?P<range>:(?P<stop>\d{0,9})(:(?P<step>\d{1,9}))?)?")

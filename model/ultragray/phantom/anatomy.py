@@ -88,7 +88,6 @@ def _blend(a: Floats, b: Floats) -> Floats:
 # Shapes are drawn straight and symmetric; `straightened` takes a point of the phantom to where it lies in the
 # drawing.
 
-
 LabelArray = npt.NDArray[np.uint8]
 
 SKIN_MM = 1.7
@@ -178,9 +177,6 @@ def sac_distance_mm(points: Floats) -> Floats:  # [N, 3] -> [N]
     return (radius - 1.0) / np.maximum(steepness, 1e-9)
 
 
-# Scattering and absorption of the phantom's tissues, and the probe's pulse and beam.
-
-
 SPEED_MM_PER_US = 1.54
 FREQUENCY_MHZ = 5.0
 FREQUENCIES_MHZ = (3.8, 5.0, 6.2)  # whose echoes a scanner averages for smoother speckle
@@ -243,9 +239,6 @@ def elevation_weight(elevation_mm: Floats, depth_mm: Floats) -> Floats:
     return np.where(np.abs(sigmas) < ELEVATION_REACH, np.exp(-0.5 * sigmas * sigmas), 0.0)
 
 
-# Smooth seeded noise: the irregularity of fascicles and septa, a function of position alone.
-
-
 _PERIOD = 32  # lattice cells, a power of two
 _LAST = _PERIOD - 1
 
@@ -285,7 +278,6 @@ class LatticeNoise:
 # The surfaces of the phantom that reflect: bone, skin, fasciae, septa, vessel wall, dura.
 #
 # Each is the zero of a function of the straight drawing, roughly a distance in mm, where `present` says so.
-
 
 Level = Callable[[Floats], Floats]  # [N, 3] -> [N]
 Present = Callable[[Floats], npt.NDArray[np.bool_]]  # [N, 3] -> [N]

@@ -55,9 +55,6 @@ def demo_poses(count: int) -> FloatArray:  # [C, 4, 4] mm
     return freehand_poses(count)
 
 
-# The labels of the demo scene, and which tissues of the phantom they stand for.
-
-
 LABELS: dict[int, tuple[str, tuple[Tissue, ...]]] = {
     1: ("bone", (Tissue.BONE,)),
     2: ("muscle", (Tissue.MUSCLE,)),

@@ -172,7 +172,6 @@ def _gradient(interface: Interface, points: Floats, level: Floats) -> Floats:  #
 # convolved with the pulse along depth and with the beam, which widens away from its focus, across; its magnitude is
 # the envelope.
 
-
 Complex64Array = npt.NDArray[np.complex64]
 
 CELLS_PER_ROW = 2  # the pulse is shorter than the beam is wide
@@ -355,9 +354,6 @@ def _blurred(echoes: Complex64Array, grid: Grid) -> Complex64Array:  # [R, C]
 def _compressed(power: Floats) -> ByteArray:  # [H, W]
     grey = MUSCLE_GREY + 10.0 * np.log10(power + 1e-12) / DYNAMIC_RANGE_DB
     return np.round(255.0 * np.clip(grey, 0.0, 1.0)).astype(np.uint8)
-
-
-# The shadow of bone in the phantom, and the error of a rendering there.
 
 
 SHADOW_DB = 30.0  # taken by bone, there and back

@@ -25,7 +25,6 @@ from ultragray.geometry.probe import FloatArray, Probe
 # outermost face was, and the most that is known of it to give way is where the innermost face was: a training view is
 # neither in the air nor pressed beyond what was recorded.
 
-
 HeightArray: TypeAlias = npt.NDArray[np.float32]
 
 COUPLING_MM = 1.0  # of gel between face and skin: a face so near to the skin has contact
@@ -170,9 +169,6 @@ def _filled(heights: HeightArray, met: npt.NDArray[np.bool_], nearest: npt.NDArr
     return filled
 
 
-# The contact of probes at poses with the skin, scan line by scan line.
-
-
 @dataclass(frozen=True, eq=False)
 class Touch:
     """Where the W scan lines of C poses meet the skin. Made by `Touch.of`."""
@@ -217,7 +213,6 @@ class Touch:
 # Of a scan line of length L from the face, pressed in by d, the sample at depth z shows the tissue that lay at z −
 # d·(1 − z/L) before: d above the face at the face itself, the same place at the far end. This is what a probe sees
 # that is d farther out along its middle scan line and whose lines are longer by d, with as many samples.
-
 
 MOST_COMPRESSION = 0.5  # of the depth of the image: a face pressed in farther moves on through the tissue
 

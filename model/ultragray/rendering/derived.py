@@ -73,7 +73,6 @@ def _parts(scene: GaussianScene) -> list[tuple[int, GaussianScene]]:
 #     gap r      reach(i, r)·V         beyond     reach(d, 5 mm)·V
 #     thin       (1 − γ)·V             shadow     (1 − T)·B̄/10
 
-
 CELLS = 32  # a side; no more than pixels
 POINTS_PER_SIDE = 12
 GAPS_MM = (0.3, 1.0, 3.0)

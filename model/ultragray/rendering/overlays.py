@@ -139,9 +139,6 @@ def _mirrored(tool: Tool, slant: Tensor) -> Tensor:  # [...] -> [...]
     return tool.brightness * (1.0 - tool.roughness) * torch.exp(-0.5 * (angle_deg / HEAD_ON_SIGMA_DEG) ** 2)
 
 
-# The second echo: beyond the first strong interface of a scan line, a mirror image of what lies before it.
-
-
 STRONG_BMODE = 0.6  # of an interface that mirrors
 LEAST_DEPTH_MM = 5.0  # below the face, whose own bright lines mirror nothing
 SMOOTHED_SHARE = 0.06  # of the lines

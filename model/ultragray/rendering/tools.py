@@ -30,9 +30,6 @@ from ultragray.geometry.pose import (
 )
 from ultragray.geometry.probe import MAX_LENGTH_MM, FloatArray, Probe, length_field
 
-# Where scan lines meet a tool: what its echo and its shadow follow from, whatever its shape.
-
-
 LEAST_SLICE_SIGMA_MM = 0.1  # of the slice that tools are seen in, where the frames show a thinner one
 _LEAST_SPACING_MM = 1e-6
 
@@ -110,9 +107,6 @@ def dot(vectors: FloatArray, others: FloatArray) -> FloatArray:  # [..., 3] both
     return (vectors * others).sum(axis=-1)
 
 
-# The base of all tools: their material, and the frame that they lie in.
-
-
 MAX_TOOLS = 8  # of one frame
 DEFAULT_LABEL = 255
 LEAST_THICKNESS_MM = 0.05
@@ -180,9 +174,6 @@ class Tool(Family):
         if self.frame is ToolFrame.SCENE:
             return view.in_probe_frame(array)
         return np.broadcast_to(array, (len(view.poses), *array.shape))
-
-
-# Convex bodies thicker than the beam: the side that is met first is seen, and hides what lies behind it.
 
 
 _LAYERS = np.array([-1.2816, -0.5244, 0.0, 0.5244, 1.2816])  # σ: the middles of fifths of a Gaussian slice
@@ -264,9 +255,6 @@ def crossing_of_solid(tool: Tool, view: ScanView, placed: FloatArray, span_of: S
     )
 
 
-# A box: a plate, a block, a guide.
-
-
 @dataclass(frozen=True, kw_only=True)
 class Box(Tool):
     """A solid box about a point, turned about it.
@@ -314,9 +302,6 @@ class Box(Tool):
         return crossing_of_solid(self, view, np.vstack([pose[:3, 3], pose[:3, 3] + pose[:3, :3].T]), span)
 
 
-# What is straight and has two ends.
-
-
 @dataclass(frozen=True, kw_only=True)
 class Shaft(Tool):
     """A round shaft from its tip to its hub.
@@ -342,9 +327,6 @@ class Shaft(Tool):
         return replace(self, frame=ToolFrame.SCENE, tip_mm=tip_mm, hub_mm=hub_mm)
 
 
-# A cylinder: a rod, a trocar, a drill.
-
-
 @dataclass(frozen=True, kw_only=True)
 class Cylinder(Shaft):
     """A solid cylinder with flat ends, thicker than the beam: its near side is seen. What is thinner is a needle.
@@ -368,9 +350,6 @@ class Cylinder(Shaft):
 
         axes = np.stack([np.cross(aside, axis), aside, axis])
         return crossing_of_solid(self, view, np.vstack([middle, middle + axes]), span)
-
-
-# A needle: a shaft thinner than the beam, of which the middle line is seen.
 
 
 _LEAST_NEEDLE = 1e-12
@@ -460,9 +439,6 @@ def _bounded(low: FloatArray, high: FloatArray, slope: FloatArray, most: FloatAr
     limit = most / np.where(np.abs(slope) < _LEAST_NEEDLE, _LEAST_NEEDLE, slope)
     low = np.where(slope <= -_LEAST_NEEDLE, np.maximum(low, limit), low)
     return low, np.where(slope > -_LEAST_NEEDLE, np.minimum(high, limit), high)
-
-
-# Tools in files: a JSON list of them, each an object with its kind.
 
 
 def load_tools(path: str | Path) -> tuple[Tool, ...]:

@@ -176,7 +176,6 @@ class _Slab:
 # takes the poses that arrive over OpenIGTLink. A program that shows LPS coordinates, such as ITK, negates the first
 # two.
 
-
 _COMPRESSION = 4  # of 1 to 9: beyond, seconds buy hardly a byte
 _UINT8, _FLOAT32 = 2, 16  # data types of NIfTI
 _ALIGNED, _MILLIMETRES = 2, 2

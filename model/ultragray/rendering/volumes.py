@@ -42,7 +42,6 @@ def voxel_bytes(field: str) -> int:
 # Convention. Voxel (i, j, k) has its centre at origin_mm + spacing_mm · (i·axes[0] + j·axes[1] + k·axes[2]), in mm of
 # the frame of the training sweep, the frame of every pose (docs/poses.md).
 
-
 MAX_VOXELS = 1 << 28
 MAX_SIDE = 32767  # NIfTI-1 counts voxels along an axis in 16 bits
 SMALLEST_SPACING_MM = 1e-3
@@ -194,9 +193,6 @@ def _counts(extent_mm: FloatArray, spacing_mm: float) -> list[int]:
 
 def _words(vector: FloatArray) -> str:
     return "(" + ", ".join(f"{value:g}" for value in vector) + ")"
-
-
-# Slices as callers ask for them: a plane through a scene, and the field that is sampled on it. Free of torch.
 
 
 @dataclass(frozen=True, kw_only=True)

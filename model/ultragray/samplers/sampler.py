@@ -108,9 +108,6 @@ def seed_field() -> Any:
     return described("Of the random choices.", 0, low=0, high=MAX_SEED)
 
 
-# Random poses around a trajectory.
-
-
 @dataclass(frozen=True)
 class AroundSampler(DrawnSampler):
     """`count` of the base poses, drawn at random with repetition, each turned and shifted at random.
@@ -133,9 +130,6 @@ class AroundSampler(DrawnSampler):
         moved[:, :3, :3] = moved[:, :3, :3] @ about_axes(axes, angles)
         moved[:, :3, 3] += random.normal(0.0, self.translation_mm, (self.count, 3))
         return moved
-
-
-# Random poses within the region that the base poses cover.
 
 
 MAX_BASE_POSES = 10_000  # all are compared with all
@@ -211,9 +205,6 @@ def _angles_rad(first: FloatArray, second: FloatArray) -> FloatArray:  # [C, 4, 
     return 2.0 * np.arcsin(np.clip(half_chords, 0.0, 1.0))
 
 
-# Tilted sweeps, as the paper records them.
-
-
 MAX_TILT_DEG = 90.0  # the beam lies along the skin then
 
 
@@ -241,9 +232,6 @@ class FanSampler(Sampler):
         axial = base[:, :3, 2] - fan[..., :3, 2]
         fan[..., :3, 3] += probe.pivot_depth_mm * axial
         return fan.reshape(-1, 4, 4)
-
-
-# Evenly spaced poses on a smooth path.
 
 
 SMALLEST_STEP_MM, SMALLEST_TURN_DEG = 1e-9, 1e-6
@@ -331,9 +319,6 @@ def _second_derivatives(values: FloatArray, lengths: FloatArray) -> FloatArray: 
     for knot in range(len(values) - 2, 0, -1):
         second[knot] -= above[knot] * second[knot + 1]
     return second
-
-
-# The base poses themselves.
 
 
 @dataclass(frozen=True)

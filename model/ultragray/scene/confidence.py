@@ -20,9 +20,6 @@ from ultragray.errors import InvalidArgument, LowConfidence
 from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray, Probe
 
-# The place of a pose relative to the views that a scene was trained on. Needs no torch.
-
-
 POINTS_PER_SIDE = 6  # of the grid of image points at which distances are taken
 ANGLE_MM_PER_DEG = 0.02  # added to distances to choose the nearest view: of two about as near, the less turned one
 FAR_MM = 20.0  # a frame is expected to be no worse farther away: larger distances count as this
@@ -176,7 +173,6 @@ def _root_mean_square(values: FloatArray) -> FloatArray:  # [B, K, P] -> [B, P]
 # are shares of V = spread + (level − B̄)²: the mean squared error of a pixel that shows B̄ where the true grey value
 # may be any of those that the training images have at that depth.
 
-
 VARIANCE_TERMS = (
     "floor",
     "level",
@@ -261,7 +257,6 @@ def _amounts(name: str, values: Any, count: int) -> tuple[float, ...]:
 # Where Gaussians support only the share s of a frame's pixels, c ≤ b + (1 − b)·g·s; the gain g is fitted to frames
 # with little support. For a pose alone s is estimated as s₀·mean over points of exp(−d²/r²); of a rendered frame it
 # is known. Needs no torch.
-
 
 VERSION = 2
 NEAR_MM, DISTANCE_MM, ANGLE_DEG = 0.3, 5.0, 10.0  # units of the terms
@@ -426,9 +421,6 @@ def _numbers(name: str, values: Any) -> tuple[float, ...]:
     return numbers
 
 
-# The assessment of a frame: its extrapolation, and how much a real frame would look like it. Needs no torch.
-
-
 SUPPORT_COVERAGE = 0.3  # γ below which a pixel's error is more than twice that of the others
 
 
@@ -537,9 +529,6 @@ def read_model(document: dict[str, Any], view_count: int) -> ConfidenceModel | N
             field="confidence",
         )
     return model
-
-
-# A least confidence that frames must have. Needs no torch.
 
 
 def is_confident(extrapolation: Extrapolation, min_confidence: float) -> bool:

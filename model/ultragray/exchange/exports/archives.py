@@ -61,9 +61,6 @@ class NpzExporter(Exporter):
                 np.lib.format.write_array(member, np.asarray(value), allow_pickle=False)
 
 
-# WebDataset: a tar with some files of one name for each frame.
-
-
 class TarExporter(Exporter):
     """A writer of 000012.OUTPUT.png (float32: .npy) for each output and 000012.json (pose, figures, origin)."""
 
@@ -93,9 +90,6 @@ def _npy(frame: PixelArray) -> bytes:
     file = io.BytesIO()
     np.lib.format.write_array(file, frame, allow_pickle=False)
     return file.getvalue()
-
-
-# A folder of grey PNGs, one a frame and output, a pixel of labels holding the label; FRAMES_FILE describes each.
 
 
 FRAMES_FILE = "frames.json"

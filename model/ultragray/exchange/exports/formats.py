@@ -148,9 +148,6 @@ def exporter_class(name: str) -> type[Exporter]:
     return found
 
 
-# Writing an export beside the rendering: a thread takes the frames, two portions may wait.
-
-
 WAITING_PORTIONS = 2
 
 # The next frames, each output [B, H, W], and the extrapolation of each, [B]; neither is changed after.
@@ -214,9 +211,6 @@ def _beside(exporter: Exporter, header: ExportHeader) -> Iterator[Add]:
         writer.join()
     if failed:
         raise failed[0]
-
-
-# An export that is small enough to be answered at once: its file as bytes.
 
 
 def export_bytes(

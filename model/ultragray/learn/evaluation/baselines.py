@@ -221,7 +221,6 @@ def _spread(grid: Tensor) -> Tensor:  # [X, Y, Z]
 # between the two training planes that enclose it, by its distance to them along their normals; - nearest: the
 # training frame whose corners lie nearest on average, as it is.
 
-
 FrameArray = npt.NDArray[np.float32]
 BASELINES = (*FOLDS, "linear", "nearest")
 

@@ -151,9 +151,6 @@ def render_sweep(
     return frames
 
 
-# The reliability of the output `uncertainty`: expected against actual errors of pixels, on held-out frames.
-
-
 BINS = np.array([0.0, 0.01, 0.02, 0.03, 0.045, 0.065, 0.09, 0.12, 0.16, 0.22, 0.3, 1.0])  # of the expected deviation
 LEAST_SHARE = 0.001  # of all pixels: bins with fewer are left out, their figures would be chance
 

@@ -71,7 +71,6 @@ def _coordinates(probe: Probe, points_mm: FloatArray) -> tuple[FloatArray, Float
 # A turn is given by the way that it moves a point at the typical distance from the middle, so that steps of all six
 # numbers weigh alike.
 
-
 GRID = 16  # rows and columns of the image that are looked at
 
 
@@ -118,7 +117,6 @@ class Motions:
 #
 # A frame is smoothed, its mean over a wider neighbourhood is taken off, and what is left is divided by its own
 # strength there. Coarse structures match from far away, fine ones tell the place exactly.
-
 
 NEIGHBOURHOOD = 3.0  # times as wide as the smoothing
 LEAST_STRENGTH = 0.02  # of grey values in [0, 1]: what varies less is noise
@@ -184,7 +182,6 @@ def _smoother(count: int, sigma: float) -> Tensor:  # [count, count]
 #
 # Fine structures hold a search fast at places a millimetre beside the right one. So it goes back to smoother frames
 # once before it ends: from such a place they lead on.
-
 
 Rendered = Callable[[Tensor, int, int], Tensor]  # [C, 4, 4], rows, columns -> [C, rows, columns] in [0, 1]
 

@@ -76,7 +76,6 @@ def _factor_rows(count: int, ratios: FloatArray) -> Iterator[tuple[FloatArray, F
 # but a probe that moves unevenly along its path looks noisy in that direction: the smallest r of the three is taken
 # for all.
 
-
 JUMP = 6.0  # median steps: a longer step begins a new sweep
 LEAST_FRAMES = 5  # of a sweep: fewer are not a path
 RATIOS = 10.0 ** np.arange(-6.0, 6.01, 0.25)  # of the variances q/r that are tried
@@ -188,7 +187,6 @@ class _Likelihood:
 # searched with large steps first, then with small ones. The mean brightness of a wider neighbourhood is subtracted
 # before: shadows turn with the probe, and with them two sweeps that cross correlate best where they are parallel (6
 # mm and 6° off on the simulated liver).
-
 
 HalfArray: TypeAlias = npt.NDArray[np.float16]
 

@@ -115,9 +115,6 @@ def _crosses(heights_mm: FloatArray) -> bool:  # [K] of the corners of a frame o
     return min(-low, high) > CROSSING * max(-low, high)
 
 
-# Planes that lie between two frames, blended from what these show where the plane is in space.
-
-
 ON_PLANE_MM = 1e-6  # distances are at least that: the nearer frame then has all the weight
 
 
@@ -199,7 +196,6 @@ def _on_lines(lines: Lines, x: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
 # Frames show only the edges of the gap between them, and a training could put anything inside. So it also sees planes
 # between neighbouring frames (`neighbours_of`), at a place drawn anew each time, with the two frames blended by their
 # distances, in the way that predicts the sweep's own frames best (`features_follow_probe`).
-
 
 EXACT = 1e-9  # a squared error that counts as none
 TRIED_FRAMES = 32  # enough to tell which blend is better

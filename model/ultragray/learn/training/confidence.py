@@ -108,9 +108,6 @@ def _most_tilted(poses: FloatArray) -> IntArray:  # [F, 4, 4] -> [≤ F]
     return np.argsort(farthest, kind="stable")[:count].astype(np.int64)
 
 
-# Frames of a sweep, predicted from other frames of it by linear interpolation: no learning, small pictures.
-
-
 PICTURE_SIDE = 64  # structure smaller than its pixels is speckle
 MOST_HELPERS = 16
 
@@ -161,9 +158,6 @@ def _pooled(images: ByteArray) -> ByteArray:  # [F, H, W] -> [F, h, w]
     return torch.stack(pooled).round().to(torch.uint8).numpy()
 
 
-# The difficulty of predicting each training view from the other frames alone.
-
-
 MAX_FRAMES = 192  # that are predicted; the others take the hardness of their neighbours
 EXCLUDED_MM = (0.0, 1.5, 3.0, 5.0)  # frames within this distance of the one that is predicted are not used
 LIMITS = (0.02, 0.995)  # of an MS-SSIM whose logit is taken
@@ -201,9 +195,6 @@ def hardness_of_views(sweep: Sweep) -> FloatArray:  # [F]
     own = np.bincount(rows, misses, len(targets)) / np.maximum(counts, 1)  # [T]
     weights = TrainingViews(sweep.poses[targets], sweep.probe).measure(sweep.poses, sweep.probe).weights  # [F, T]
     return weights @ own
-
-
-# The fit of the model of `confidence` to frames whose scores are known.
 
 
 PRIOR_WEIGHTS = (3.6, 1.1, 1.5, 0.3, 0.6)  # about those of ten scenes; one that no view determines stays near its own
@@ -286,9 +277,6 @@ def fit_weights(
     return weights[:-1]
 
 
-# Frames predicted from one side only: how fast anatomy changes along a sweep, where no frame was held out.
-
-
 ONE_SIDED_FRAMES = 96  # that are predicted
 BEYOND_MM = (0.0, 1.5, 3.0, 5.0, 8.0, 12.0)  # along the path: only frames farther away are used
 
@@ -310,9 +298,6 @@ def one_sided_examples(sweep: Sweep, hardness: FloatArray) -> Examples:
     distances = {name: np.concatenate([getattr(one.measures, name) for one in predictions]) for name in names}
     measures = ViewMeasures(**distances, weights=neighbours.weights[[one.row for one in predictions]])
     return Examples(terms_of(measures, hardness), np.array([one.ms_ssim for one in predictions]))
-
-
-# The fit of a scene's uncertainty: the variances that explain the errors of frames that a training did not see.
 
 
 LOOKED_AT = 40_000  # cells, over all frames
@@ -376,9 +361,6 @@ def _far_away(bands: DepthBands) -> tuple[FloatArray, FloatArray]:  # [DEPTHS, T
     columns = [term.flatten() for term in variance_terms((dark, dark, lit), (far, far), bands)]
     squares = np.array(bands.spread) + np.square(bands.level)
     return torch.stack(columns, dim=1).double().numpy(), squares
-
-
-# The model of `confidence`, fitted on frames that a shorter training of its own did not see.
 
 
 SHORTER, ENOUGH_STEPS = 0.25, 150  # share of the steps, and the number that is not cut: longer tells the same

@@ -89,9 +89,6 @@ def shift_out_of_plane(poses: FloatArray, shift_mm: float) -> FloatArray:  # [C,
     return shifted
 
 
-# Facts of a dataset that a training needs: its size, the spacing of its frames and pixels.
-
-
 SCALE_MARGIN = 1.1  # of the released recipe
 FRAMES_AT_ONCE = 64
 LEAST_RANGE = 1.5  # of the shift out of the plane, × the spacing of the frames
@@ -185,7 +182,6 @@ def frame_spacing_mm(sweep: Sweep) -> float:
 # is left is at most what the brightest place from here down reaches of what is usual at its depth. Where a whole
 # depth is dark in every frame, and along lines that are dark from the face on, which have no contact, there is no
 # evidence, and the share is 1.
-
 
 USUAL = 0.7  # quantile over all scan lines at a depth: brighter than most shadows, less than a reflector
 LEAST_USUAL = 0.03  # grey value, of 1, below which a depth tells nothing

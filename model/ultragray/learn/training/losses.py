@@ -43,7 +43,6 @@ class _ImageLoss(torch.autograd.Function):
 #
 # Written in torch for any device and dtype; where both images are float32 on the CPU, the C++ kernel gives the same.
 
-
 SSIM_WINDOW = 11
 SSIM_SIGMA = 1.5
 SSIM_C1 = 0.01**2

@@ -68,7 +68,6 @@ def peak_memory_mb(device: torch.device) -> float | None:
 # The machine's for the backend `cpu`, the GPU's where that trains; `reference` keeps a graph of [H, W] for every
 # Gaussian that a frame touches, which nobody can foresee.
 
-
 BASE_BYTES = 512 << 20  # the process with torch loaded, and the scratch memory of its kernels (measured: up to 500)
 COPIES = 16  # parameters, gradients, moments; what refinements, checkpoints and the kernel copy (measured: 14)
 STATISTICS = 2

@@ -69,9 +69,6 @@ class Schedule:
         return config.initial_gaussians + round(share * (config.max_gaussians - config.initial_gaussians))
 
 
-# Adam over the raw parameters, whose moments follow the Gaussians through refinement and into checkpoints.
-
-
 MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
@@ -133,9 +130,6 @@ class Optimizer:
             state = {key: value.to(parameter.device) for key, value in stored.items() if value is not None}
             if state:
                 self._adam.state[parameter] = state
-
-
-# Refinement: Gaussians whose position the images pull at are duplicated or split, useless ones are pruned.
 
 
 SPLIT_SHRINK = 1.6  # standard deviations of the halves of a split Gaussian are divided by this

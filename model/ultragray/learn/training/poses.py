@@ -148,9 +148,6 @@ def turned_by(turns: Tensor) -> Tensor:  # [G, 3] rad -> [G, 3, 3]
     return torch.linalg.matrix_exp(cross)
 
 
-# Pose refinement of a training run: before it by the path and the images, and in it together with the scene.
-
-
 _TRAINED: dict[str, type[FrameCorrections | SweepCorrections]] = {
     "frames": FrameCorrections,
     "sweeps": SweepCorrections,
@@ -226,7 +223,6 @@ class PoseRefinement:
 # A frame whose pose is off by a millimetre scores badly even in a perfect scene. Registering all of it first would
 # score the scene too well, so a frame is moved by its left half alone and scored on its right half, and the other way
 # round.
-
 
 STEPS = 60
 TEXTURE = 0.5  # share of SSIM in the loss that a frame is moved by

@@ -113,9 +113,6 @@ def _step_of(line: bytes) -> int:
     return step if type(step) is int else 0
 
 
-# Metrics as TensorBoard event files, where the extra `tensorboard` is installed.
-
-
 def require_tensorboard() -> None:
     """Raises InvalidArgument where TensorBoard is not installed."""
     try:

@@ -94,9 +94,6 @@ class _Tried:
         write_whole(self._path, json.dumps({**self._run, "metrics": found}, indent=2) + "\n")
 
 
-# train(): a dataset becomes a scene.
-
-
 FITTING = "fitting the confidence"
 
 Report: TypeAlias = Callable[[Progress], None]

@@ -37,9 +37,6 @@ class Kind(NamedTuple):
         return f"{backend}, weighted" if self.weighted else backend
 
 
-# Poses as the backends take them: cm about the scene's centre, and the way back for a gradient.
-
-
 ScenePoses: TypeAlias = FloatArray | Tensor  # [C, 4, 4]; a tensor, float64 on the CPU, where it wants a gradient
 
 
@@ -98,9 +95,6 @@ class _Rigid(torch.autograd.Function):
         return by_poses.reshape(ctx.like.shape).to(ctx.like), None, None
 
 
-# Scan lines as the fast kernels take them, in cm and radians.
-
-
 class KernelLines(NamedTuple):
     """A bundle of lines that run side by side along z, or fan out from the origin.
 
@@ -134,9 +128,6 @@ class KernelLines(NamedTuple):
         sheared = poses.copy()
         sheared[:, :3, :3] = poses[:, :3, :3] @ self.axes
         return sheared
-
-
-# The elevational beam as the backends take it: three numbers in cm, differentiable (docs/physics.md §3).
 
 
 def beam_cm(beam: ElevationBeam | Tensor | None, probe: Probe) -> Tensor | None:
@@ -195,9 +186,6 @@ class BeamVariance(NamedTuple):
 
 
 THIN = BeamVariance(0.0, 0.0, 0.0, 0.0)
-
-
-# The order in which Gaussians that lie near each other come one after another.
 
 
 def spatial_order(means: Tensor) -> Tensor:  # [N, 3] -> [N]
