@@ -8,12 +8,12 @@ import contextlib
 import errno
 import glob
 import hashlib
+import io
 import math
 import os
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from tokenize import TokenError
 from typing import Any, BinaryIO
@@ -35,7 +35,9 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         os.close(descriptor)
         temporary = Path(name)
         yield temporary
-        temporary.chmod(0o666 & ~_umask())
+        mask = os.umask(0)
+        os.umask(mask)
+        temporary.chmod(0o666 & ~mask)
         sync(temporary)
         temporary.replace(path)
         sync(path.parent)
@@ -71,6 +73,13 @@ def write_whole(path: str | Path, content: str | bytes) -> None:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
+def npy_bytes(array: Any) -> bytes:
+    """An array as a `.npy` file holds it."""
+    file = io.BytesIO()
+    np.save(file, array, allow_pickle=False)
+    return file.getvalue()
+
+
 def sync(path: Path) -> None:
     """Make a file, or the names in a folder, survive a loss of power; folders where their file system can."""
     descriptor = os.open(path, os.O_RDONLY)
@@ -81,12 +90,6 @@ def sync(path: Path) -> None:
             raise
     finally:
         os.close(descriptor)
-
-
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
 
 
 def file_sha256(path: str | Path) -> str:
@@ -103,7 +106,7 @@ def link_or_copy(source: Path, target: Path) -> None:
 
     What is there then survives a loss of power. Raises OSError.
     """
-    with suppress(FileExistsError):
+    with contextlib.suppress(FileExistsError):
         try:
             os.link(source.resolve(), target)
         except FileExistsError:

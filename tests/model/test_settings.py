@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 
 from ultragray import ElevationBeam, LinearProbe, SceneInfo
@@ -24,7 +26,7 @@ def resolved(beam: ElevationBeam | None, thickness_mm: float | None) -> Resolved
         (None, 0.0, PLANE),
         (None, 3.0, ElevationBeam(thickness_mm=3.0)),
         (FOCUSED, None, FOCUSED),
-        (FOCUSED, 0.0, FOCUSED.as_thick_as(0.0)),
+        (FOCUSED, 0.0, replace(FOCUSED, thickness_mm=0.0)),
         (FOCUSED, 3.0, ElevationBeam(thickness_mm=3.0, focus_mm=30.0, depth_of_field_mm=20.0)),
     ],
 )

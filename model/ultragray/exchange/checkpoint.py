@@ -36,7 +36,7 @@ from ultragray.exchange.released_config import (
     read_released_config,
     released_centre_mm,
 )
-from ultragray.files import write_whole
+from ultragray.files import npy_bytes, write_whole
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.rendering.backends.reference import spherical_harmonics
 from ultragray.scene.gaussians import PARAMETERS, GaussianScene
@@ -329,7 +329,7 @@ def export_checkpoint(scene: GaussianScene, checkpoint: str | Path, *, replace: 
             notes.append(f"the released trainer knows linear probes only: it does not read this {CONFIG_NAME}")
         if len(scene.training_poses):
             centre_mm = tuple(released_centre_mm(released_probe, scene.training_poses).tolist())
-            beside[POSES_NAME] = _npy(scene.training_poses)
+            beside[POSES_NAME] = npy_bytes(scene.training_poses)
         else:
             notes.append(f"no {POSES_NAME}: the scene has no training poses; poses are relative to its centre, {at}")
     if scene.labels is not None:
@@ -375,12 +375,6 @@ def _config(probe: Probe, height: int, width: int, sh_degree: int) -> bytes:
         "image_width": width,
     }
     return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
-
-
-def _npy(array: Any) -> bytes:
-    buffer = io.BytesIO()
-    np.save(buffer, array, allow_pickle=False)
-    return buffer.getvalue()
 
 
 def _splats(scene: GaussianScene, centre_mm: Vector, notes: list[str]) -> tuple[OrderedDict[str, Tensor], float]:

@@ -140,6 +140,10 @@ def position_distances_mm(poses: FloatArray, others: FloatArray) -> FloatArray: 
 
 def rotation_angles_deg(poses: FloatArray, others: FloatArray) -> FloatArray:  # [C, 4, 4], [P, 4, 4] -> [C, P]
     """Angle of the rotation from one probe orientation to the other, in degrees."""
-    difference = poses[:, None, :3, :3] - others[None, :, :3, :3]
-    half_chord = np.linalg.norm(difference, axis=(-2, -1)) / math.sqrt(8.0)  # sin(angle / 2)
-    return np.degrees(2.0 * np.arcsin(np.clip(half_chord, 0.0, 1.0)))
+    return np.degrees(turn_angles_rad(poses[:, None, :3, :3], others[None, :, :3, :3]))
+
+
+def turn_angles_rad(rotations: FloatArray, others: FloatArray) -> FloatArray:  # [..., 3, 3] both -> [...]
+    """Angle of the rotation from one to the other; shapes broadcast."""
+    half_chords = np.linalg.norm(rotations - others, axis=(-2, -1)) / math.sqrt(8.0)  # sin(angle / 2)
+    return 2.0 * np.arcsin(np.clip(half_chords, 0.0, 1.0))

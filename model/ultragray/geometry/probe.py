@@ -17,10 +17,11 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, TypeVar
+from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from typing_extensions import Self
 
 from ultragray.contract import Contract, Family, annotated_fields, described, kind_field
 from ultragray.errors import InvalidArgument, InvalidProbe
@@ -230,9 +231,8 @@ class Picture:
         """Square pixels over a box of the image plane, from its upper edge on, as many to the left as to the right."""
         columns, rows = (max(1, math.ceil(side / pixel_mm)) for side in (box.right - box.left, box.bottom - box.top))
         middle = (box.left + box.right) / 2
-        return cls(
-            rows, columns, "mm", (middle + (1 - columns) * pixel_mm / 2, box.top + pixel_mm / 2), (pixel_mm, pixel_mm)
-        )
+        first = middle + (1 - columns) * pixel_mm / 2, box.top + pixel_mm / 2
+        return cls(rows, columns, "mm", first, (pixel_mm, pixel_mm))
 
     def positions_mm(self) -> tuple[FloatArray, FloatArray]:  # [1, W], [H, 1]
         """Column and row of each pixel's centre, in the units of the picture."""
@@ -246,7 +246,6 @@ class Picture:
         return replace(self, first=(last, self.first[1]), step=(-self.step[0], self.step[1]))
 
 
-_P = TypeVar("_P", bound="Probe")
 BoolArray = npt.NDArray[np.bool_]
 
 MAX_LENGTH_MM = 10_000.0
@@ -320,9 +319,7 @@ class Probe(Family):
 
     def cull_far_mm(self, height: int) -> float:
         """Depth beyond which a Gaussian's mean is culled: the top edge of the last row (infinite for one row)."""
-        if height == 1:
-            return math.inf
-        return self.near_mm + self.scan_line_length_mm * (height - 1) / height
+        return math.inf if height == 1 else self.near_mm + self.scan_line_length_mm * (height - 1) / height
 
     def cull(self, x_mm: FloatArray, z_mm: FloatArray, height: int) -> BoolArray:  # [N] each
         """A mask of the means of Gaussians that count, by their depth: up to the top edge of the last row."""
@@ -353,11 +350,11 @@ class Probe(Family):
         columns = np.array(self.lines.corner_shares)
         return np.concatenate([self.points_mm(np.full(columns.shape, row), columns) for row in (0.0, 1.0)])
 
-    def cropped(self: _P, share: float) -> _P:
+    def cropped(self, share: float) -> Self:
         """The same probe with scan lines that end after this share of their length."""
         return self.ending_at(self.near_mm + share * self.scan_line_length_mm)
 
-    def ending_at(self: _P, far_mm: float) -> _P:
+    def ending_at(self, far_mm: float) -> Self:
         """The same probe with another end of its scan lines."""
         return replace(self, far_mm=far_mm)  # type: ignore[type-var]  # every member is a dataclass
 
@@ -572,15 +569,6 @@ class ElevationBeam(Contract):
         """Full width at half maximum at a depth below the face."""
         thickness, focus, depth_of_field = self.numbers
         return thickness * math.hypot(1.0, 2.0 * (depth_mm - focus) / depth_of_field)
-
-    @property
-    def is_thin(self) -> bool:
-        """Whether it is a plane."""
-        return self.thickness_mm == 0.0
-
-    def as_thick_as(self, thickness_mm: float) -> ElevationBeam:
-        """A beam of the same shape with another thickness."""
-        return replace(self, thickness_mm=thickness_mm)
 
 
 PLANE = ElevationBeam(thickness_mm=0.0)

@@ -51,8 +51,12 @@ def register_points(points: Any, targets: Any) -> PointFit:  # [N, 3] mm both
     points, targets = _checked(points, "points"), _checked(targets, "targets")
     if len(points) != len(targets):
         raise InvalidArgument(f"each point needs its target: got {len(points)} and {len(targets)}", field="targets")
-    for name, given in (("points", points), ("targets", targets)):
-        _require_a_plane(given, name)
+    for field, given in (("points", points), ("targets", targets)):
+        extents = np.linalg.svd(given - given.mean(axis=0), compute_uv=False)
+        if extents[1] <= LEAST_SPREAD * extents[0] or extents[0] == 0.0:
+            raise InvalidArgument(
+                f"{field} lie on a line, or in one place: a turn about it stays unknown; add one beside it", field=field
+            )
     middle, target_middle = points.mean(axis=0), targets.mean(axis=0)
     rotation = _rotation(points - middle, targets - target_middle)
     transform = np.eye(4)
@@ -105,14 +109,6 @@ def _checked(values: Any, field: str) -> FloatArray:  # [N, 3]
     return array
 
 
-def _require_a_plane(points: FloatArray, field: str) -> None:
-    extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    if extents[1] <= LEAST_SPREAD * extents[0] or extents[0] == 0.0:
-        raise InvalidArgument(
-            f"{field} lie on a line, or in one place: a turn about it stays unknown; add one beside it", field=field
-        )
-
-
 # Registration from poses of the probe that are known in the robot's frame and in the scene's.
 #
 # Convention. probe→scene = base→scene · flange→base · probe→flange, all [4, 4], mm. For a tracked probe the base is
@@ -152,7 +148,9 @@ def register_poses(
     mounting = np.eye(4) if probe_to_flange is None else check_poses(probe_to_flange, field="probe_to_flange")[0]
     in_base = flanges @ mounting
     transform = register_points(_as_points(in_base), _as_points(probes)).transform
-    return _fit(transform, in_base, probes, mounting)
+    fitted = transform @ in_base
+    deviations = _pose_deviations(fitted, probes) if len(probes) > 1 else (None, None)
+    return PoseFit(transform, mounting, *pose_residuals(fitted, probes), *deviations)
 
 
 def register_poses_and_mounting(flange_to_base: Any, probe_to_scene: Any) -> PoseFit:  # [N, 4, 4] mm both
@@ -196,12 +194,6 @@ def pose_residuals(poses: FloatArray, others: FloatArray) -> tuple[FloatArray, F
     turns = others[:, :3, :3].transpose(0, 2, 1) @ poses[:, :3, :3]
     shifts_mm = np.linalg.norm(poses[:, :3, 3] - others[:, :3, 3], axis=1)
     return shifts_mm, np.degrees(np.linalg.norm(_rotation_vectors(turns), axis=1))
-
-
-def _fit(base_to_scene: FloatArray, in_base: FloatArray, probes: FloatArray, mounting: FloatArray) -> PoseFit:
-    residuals_mm, residuals_deg = pose_residuals(base_to_scene @ in_base, probes)
-    deviations = _pose_deviations(base_to_scene @ in_base, probes) if len(probes) > 1 else (None, None)
-    return PoseFit(base_to_scene, mounting, residuals_mm, residuals_deg, *deviations)
 
 
 def _pose_deviations(
@@ -253,11 +245,6 @@ def _rotation_vectors(rotations: FloatArray) -> FloatArray:  # [N, 3, 3] -> [N, 
     return np.stack([cv2.Rodrigues(rotation)[0][:, 0] for rotation in rotations])
 
 
-# Registration: the two links of a chain that lead a robot's poses into a scene, and their file. Free of torch.
-#
-# Convention. probe→scene = base→scene · flange→base · probe→flange, mm. For a tracked probe the base is the tracker,
-# and the flange the marker on the probe.
-
 FORMAT_VERSION = 1
 MAX_FILE_BYTES = 1 << 20
 
@@ -305,13 +292,11 @@ class Registration(Contract):
 
     def marker_to_scene(self, marker_to_base: FloatArray) -> FloatArray:  # [..., 4, 4] mm, exact -> [..., 4, 4]
         """The poses in the scene of something else in the base than the probe, such as a needle's marker."""
-        base_to_scene, _ = self._links
-        return base_to_scene @ marker_to_base
+        return self._links[0] @ marker_to_base
 
     def in_base(self, to_scene: FloatArray) -> FloatArray:  # [..., 4, 4] mm -> [..., 4, 4]
         """Transforms into the scene as such into the base."""
-        base_to_scene, _ = self._links
-        return np.linalg.inv(base_to_scene) @ to_scene
+        return np.linalg.inv(self._links[0]) @ to_scene
 
     def flange_to_base(self, probe_to_scene: FloatArray) -> FloatArray:  # [..., 4, 4] mm, exact -> [..., 4, 4]
         """The poses of the flange in the base, of poses of the probe in the scene."""

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +18,7 @@ from ultragray.errors import UnknownOutput
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from ultragray.geometry.probe import FloatArray, Probe
-    from ultragray.scene.gaussians import GaussianScene
+    from ultragray.rendering.derived import Drawing
     from ultragray.scene.info import SceneInfo
 
 
@@ -29,31 +28,6 @@ SUMS = (WEIGHT_SUM, INTENSITY_SUM)  # which backends draw too, with gradients
 SPENT_BEAM = 1e-4  # a transmittance below it is noise: nothing can be said of what is taken from it
 _Values = TypeVar("_Values", "npt.NDArray[Any]", "Tensor")
 _AMOUNTS, _NUMBERS = np.dtype("<f4"), np.dtype("u1")
-
-
-class Drawing(Protocol):
-    """Views of a scene by one backend: what outputs are derived from."""
-
-    @property
-    def scene(self) -> GaussianScene: ...
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """C, H, W."""
-
-    @property
-    def probe(self) -> Probe: ...
-    @property
-    def poses_mm(self) -> FloatArray:
-        """[C, 4, 4] mm, in the frame of the sweep that the scene was trained from."""
-
-    def plane(self, name: str) -> Tensor:  # [C, H, W]
-        """One of the planes that the output names."""
-
-    def plane_of(self, part: GaussianScene, name: str) -> Tensor:  # [C, H, W]
-        """A plane of some of the scene's Gaussians alone."""
-
-    def mark_tools(self, labels: Tensor) -> None:
-        """Puts the labels of tools into labels [C, H, W], where they are."""
 
 
 @dataclass(frozen=True)
@@ -120,9 +94,7 @@ def _register(name: str, meaning: str, **properties: Any) -> Output:
 def _labels(drawing: Drawing) -> Tensor:
     from ultragray.rendering.derived import render_labels  # needs torch
 
-    labels = render_labels(drawing.scene, drawing.shape, lambda part: drawing.plane_of(part, WEIGHT_SUM))
-    drawing.mark_tools(labels)
-    return labels
+    return render_labels(drawing, WEIGHT_SUM)
 
 
 def _attenuation(drawing: Drawing) -> Tensor:
@@ -135,8 +107,7 @@ def _attenuation(drawing: Drawing) -> Tensor:
 def _uncertainty(drawing: Drawing) -> Tensor:
     from ultragray.rendering.derived import deviations  # needs torch
 
-    planes = tuple(drawing.plane(name) for name in UNCERTAINTY.planes)
-    return deviations(drawing.scene, planes, drawing.poses_mm, drawing.probe)
+    return deviations(drawing, UNCERTAINTY.planes)
 
 
 def _lacks_uncertainty(info: SceneInfo) -> str | None:

@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -146,18 +147,16 @@ def parse_box(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
     return tuple(low for low, _ in corners), tuple(high for _, high in corners)
 
 
-def _vector(values: Sequence[float], field: str, count: int = 3) -> FloatArray:
+def _vector(values: Sequence[float], field: str, count: int = 3, most: float = math.inf) -> FloatArray:
     vector = np.asarray(values, np.float64)
     if vector.shape != (count,) or not np.isfinite(vector).all():
         raise InvalidArgument(f"{field} must hold {count} finite numbers, got {values}", field=field)
+    if (np.abs(vector) > most).any():
+        raise InvalidArgument(f"{field} must be at most {most:g} mm, got {_words(vector)}", field=field)
     return vector
 
 
-def _lengths(values: Sequence[float], field: str, count: int = 3) -> FloatArray:
-    vector = _vector(values, field, count)
-    if (np.abs(vector) > MAX_POSITION_MM).any():
-        raise InvalidArgument(f"{field} must be at most {MAX_POSITION_MM:g} mm, got {_words(vector)}", field=field)
-    return vector
+_lengths = partial(_vector, most=MAX_POSITION_MM)
 
 
 def _direction(values: Sequence[float], field: str) -> FloatArray:
@@ -225,8 +224,11 @@ class SliceSettings(Contract):
         return SliceView(self.field, height, width, self.spacing_mm, encoding)
 
     def pose(self) -> FloatArray:  # [4, 4] mm
-        """Its place: the centre of the first pixel, x along the rows and z along the columns."""
-        return pose_of_grid(self.grid())
+        """Its place: the centre of the first pixel, x along its rows, z along its columns, y against its normal."""
+        grid, pose = self.grid(), np.eye(4)
+        pose[:3, :3] = np.stack([grid.axes[0], -grid.axes[2], grid.axes[1]], axis=1)
+        pose[:3, 3] = grid.origin_mm
+        return pose
 
 
 @dataclass(frozen=True)
@@ -258,11 +260,3 @@ class SliceView:
         right, against_normal, down = pose[:3, :3].T
         axes = np.stack([right, down, -against_normal])
         return VolumeGrid(pose[:3, 3], axes, self.spacing_mm, (self.width, self.height, 1))
-
-
-def pose_of_grid(grid: VolumeGrid) -> FloatArray:  # [4, 4] mm
-    """The pose of a slice's pixels: x along its rows, z along its columns, y against its normal."""
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([grid.axes[0], -grid.axes[2], grid.axes[1]], axis=1)
-    pose[:3, 3] = grid.origin_mm
-    return pose

@@ -11,7 +11,7 @@ import numpy as np
 
 from ultragray.contract import Family, described, kind_field
 from ultragray.errors import InvalidArgument
-from ultragray.geometry.pose import check_poses, rotation_angles_deg
+from ultragray.geometry.pose import check_poses, rotation_angles_deg, turn_angles_rad
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.geometry.rotations import about_axes, blended, random_directions
 
@@ -176,7 +176,7 @@ class CoveredSampler(DrawnSampler):
         made[:, :3, :3] = blended(first[:, :3, :3], second[:, :3, :3], shares)
         radii = np.linalg.norm(steps, axis=1) * np.cbrt(random.uniform(size=self.count))
         made[:, :3, 3] += radii[:, None] * random_directions(random, self.count)
-        turns = _angles_rad(first, second) * random.uniform(size=self.count)
+        turns = turn_angles_rad(first[:, :3, :3], second[:, :3, :3]) * random.uniform(size=self.count)
         made[:, :3, :3] = made[:, :3, :3] @ about_axes(random_directions(random, self.count), turns)
         return made
 
@@ -198,11 +198,6 @@ def _shortest_links(packed: bytes, count: int) -> tuple[np.ndarray, FloatArray]:
         waiting, nearest = np.delete(waiting, chosen), np.delete(nearest, chosen)
         distances = np.delete(distances, chosen)
     return links, lengths
-
-
-def _angles_rad(first: FloatArray, second: FloatArray) -> FloatArray:  # [C, 4, 4] both -> [C]
-    half_chords = np.linalg.norm(first[:, :3, :3] - second[:, :3, :3], axis=(1, 2)) / np.sqrt(8.0)
-    return 2.0 * np.arcsin(np.clip(half_chords, 0.0, 1.0))
 
 
 MAX_TILT_DEG = 90.0  # the beam lies along the skin then

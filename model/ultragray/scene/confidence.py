@@ -10,12 +10,12 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ultragray.contract import described
+from ultragray.contract import checked_number, described, under
 from ultragray.errors import InvalidArgument, LowConfidence
 from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray, Probe
@@ -43,16 +43,6 @@ class ViewMeasures:
     interpolation_mm: FloatArray  # [C, K]
     angle_deg: FloatArray  # [C, K]
     weights: FloatArray  # [C, P], each row sums to 1
-
-    def averaged(self) -> ViewMeasures:
-        """The same with the mean over the points as the only one."""
-        return ViewMeasures(
-            nearest_mm=self.nearest_mm.mean(axis=1, keepdims=True),
-            distance_mm=self.distance_mm.mean(axis=1, keepdims=True),
-            interpolation_mm=self.interpolation_mm.mean(axis=1, keepdims=True),
-            angle_deg=self.angle_deg.mean(axis=1, keepdims=True),
-            weights=self.weights,
-        )
 
 
 class TrainingViews:
@@ -191,31 +181,26 @@ DIGITS = 6  # in a scene's metadata
 
 @dataclass(frozen=True)
 class DepthBands:
-    """Mean and variance of the training images' grey values, in [0, 1], in bands of depth.
-
-    Raises InvalidArgument for numbers that cannot be.
-    """
+    """Mean and variance of the training images' grey values, in [0, 1], in bands of depth. Raises InvalidArgument."""
 
     level: tuple[float, ...]  # [DEPTHS]
     spread: tuple[float, ...]  # [DEPTHS]
 
     def __post_init__(self) -> None:
         for name in ("level", "spread"):
-            object.__setattr__(self, name, _amounts(name, getattr(self, name), DEPTHS))
+            object.__setattr__(self, name, _numbers(f"uncertainty.{name}", getattr(self, name), DEPTHS, low=0.0))
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Fitted cₖ, and the depth bands of the training images.
-
-    Raises InvalidArgument for numbers that cannot be.
-    """
+    """Fitted cₖ, and the depth bands of the training images. Raises InvalidArgument."""
 
     variances: tuple[float, ...]  # [TERMS]
     bands: DepthBands
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "variances", _amounts("variances", self.variances, len(VARIANCE_TERMS)))
+        variances = _numbers("uncertainty.variances", self.variances, len(VARIANCE_TERMS), low=0.0)
+        object.__setattr__(self, "variances", variances)
 
     def to_dict(self) -> dict[str, Any]:
         """A JSON object, as a scene's metadata holds it."""
@@ -225,23 +210,26 @@ class Uncertainty:
     @classmethod
     def from_dict(cls, document: Any) -> Uncertainty:
         """Inverse of `to_dict`, but for the digits. Raises InvalidArgument for keys or values that cannot be."""
-        expected = {"variances", "level", "spread"}
-        if not isinstance(document, Mapping) or set(document) != expected:
-            found = sorted(document) if isinstance(document, Mapping) else document
-            raise InvalidArgument(
-                f"uncertainty must be an object with the keys {sorted(expected)}, got {found!r}", field="uncertainty"
-            )
+        _check_keys("uncertainty", document, {"variances", "level", "spread"})
         return cls(document["variances"], DepthBands(document["level"], document["spread"]))
 
 
-def _amounts(name: str, values: Any, count: int) -> tuple[float, ...]:
-    field = f"uncertainty.{name}"
+def _check_keys(name: str, document: Any, keys: set[str]) -> None:
+    if not isinstance(document, Mapping) or set(document) != keys:
+        found = sorted(document) if isinstance(document, Mapping) else document
+        raise InvalidArgument(f"{name} must be an object with the keys {sorted(keys)}, got {found!r}", field=name)
+
+
+def _numbers(name: str, values: Any, count: int | None = None, low: float = -math.inf) -> tuple[float, ...]:
+    """Finite numbers, as many as `count` (None: any number of them), at least `low`."""
     try:
         numbers = tuple(float(value) for value in values)
     except (TypeError, ValueError, OverflowError):
-        raise InvalidArgument(f"{field} must be numbers, got {values!r}", field=field) from None
-    if len(numbers) != count or not all(math.isfinite(value) and value >= 0.0 for value in numbers):
-        raise InvalidArgument(f"{field} must be {count} numbers, at least 0, got {values!r}", field=field)
+        raise InvalidArgument(f"{name} must be numbers, got {values!r}", field=name) from None
+    if not all(map(math.isfinite, numbers)):
+        raise InvalidArgument(f"{name} must be finite, got {values!r}", field=name)
+    if count not in (None, len(numbers)) or min(numbers, default=low) < low:
+        raise InvalidArgument(f"{name} must be {count} numbers, at least {low:g}, got {values!r}", field=name)
     return numbers
 
 
@@ -302,21 +290,18 @@ class ConfidenceModel:
     uncertainty: Uncertainty | None = None  # of pixels; None: not known
 
     def __post_init__(self) -> None:
-        weights = _numbers("weights", self.weights)
-        if len(weights) != 1 + TERMS or min(weights[1:]) < 0.0:
-            raise InvalidArgument(
-                f"weights must be {1 + TERMS} numbers, from the second on at least 0, got {list(weights)}",
-                field="weights",
-            )
+        weights = _numbers("weights", self.weights, 1 + TERMS)
+        if min(weights[1:]) < 0.0:
+            raise InvalidArgument(f"weights must be at least 0 from the second on, got {weights}", field="weights")
         black, error = _numbers("black_ms_ssim and error", (self.black_ms_ssim, self.error))
         if not (0.0 <= black < 1.0 and 0.0 <= error <= 1.0):
             raise InvalidArgument(
                 f"black_ms_ssim and error must be in [0, 1], got {black:g} and {error:g}", field="black_ms_ssim"
             )
-        if type(self.fitted_on) is not int or self.fitted_on < 1:
-            raise InvalidArgument(f"fitted_on must be a positive integer, got {self.fitted_on!r}", field="fitted_on")
-        if self.fitted_to_mm is not None and _numbers("fitted_to_mm", [self.fitted_to_mm])[0] < 0.0:
-            raise InvalidArgument(f"fitted_to_mm must be at least 0, got {self.fitted_to_mm:g}", field="fitted_to_mm")
+        with under("fitted_on"):
+            checked_number(self.fitted_on, int, low=1)
+        if self.fitted_to_mm is not None:
+            _numbers("fitted_to_mm", [self.fitted_to_mm], 1, low=0.0)
         object.__setattr__(self, "weights", weights)
         object.__setattr__(self, "hardness", _numbers("hardness", self.hardness))
 
@@ -355,15 +340,15 @@ class ConfidenceModel:
             raise InvalidArgument(
                 f"confidence must be an object of version {VERSION}, got {version!r}", field="confidence"
             )
-        names = [one.name for one in fields(cls)]
-        if set(document) != {"version", *names}:
-            raise InvalidArgument(
-                f"confidence must have the keys {sorted(('version', *names))}, got {sorted(document)}",
-                field="confidence",
-            )
+        names = {one.name for one in fields(cls)}
+        _check_keys("confidence", document, {"version", *names})
         values = {name: document[name] for name in names}
-        readers = {"support": _support_of, "uncertainty": Uncertainty.from_dict}
-        return cls(**values | {name: read(values[name]) for name, read in readers.items() if values[name] is not None})
+        if (support := values["support"]) is not None:
+            _check_keys("support", support, set(Support.__dataclass_fields__))
+            values["support"] = Support(**support)
+        if values["uncertainty"] is not None:
+            values["uncertainty"] = Uncertainty.from_dict(values["uncertainty"])
+        return cls(**values)
 
 
 def terms_of(
@@ -401,26 +386,6 @@ def logistic(values: FloatArray) -> FloatArray:
     return 1.0 / (1.0 + np.exp(-np.clip(values, -500.0, 500.0)))
 
 
-def _support_of(document: Any) -> Support:
-    expected = set(Support.__dataclass_fields__)
-    if not isinstance(document, Mapping) or set(document) != expected:
-        found = sorted(document) if isinstance(document, Mapping) else document
-        raise InvalidArgument(
-            f"support must be an object with the keys {sorted(expected)}, got {found!r}", field="support"
-        )
-    return Support(**document)
-
-
-def _numbers(name: str, values: Any) -> tuple[float, ...]:
-    try:
-        numbers = tuple(float(value) for value in values)
-    except (TypeError, ValueError, OverflowError):
-        raise InvalidArgument(f"{name} must be numbers, got {values!r}", field=name) from None
-    if not all(map(math.isfinite, numbers)):
-        raise InvalidArgument(f"{name} must be finite, got {values!r}", field=name)
-    return numbers
-
-
 SUPPORT_COVERAGE = 0.3  # γ below which a pixel's error is more than twice that of the others
 
 
@@ -455,20 +420,10 @@ def figure_arrays(extrapolations: Sequence[Extrapolation]) -> dict[str, npt.NDAr
     return {name: np.array([getattr(one, name) for one in extrapolations], dtype=np.float32) for name in names}
 
 
-class Trained(Protocol):
-    """A description of a scene and of its training, such as `ultragray.SceneInfo`."""
-
-    @property
-    def probe(self) -> Probe | None: ...
-    @property
-    def confidence(self) -> dict[str, Any]: ...
-    def probe_or(self, asked: Probe | None) -> Probe: ...
-
-
 class Assessor:
     """Computes the extrapolation of frames of one scene. Its distances and confidence need the pose alone."""
 
-    def __init__(self, info: Trained, training_poses: FloatArray) -> None:  # [P, 4, 4] mm
+    def __init__(self, info: Any, training_poses: FloatArray) -> None:  # SceneInfo, [P, 4, 4] mm
         """Raises InvalidArgument where the scene's `confidence` is damaged or made for other training poses."""
         known = info.probe is not None and len(training_poses) > 0
         self._info = info
@@ -536,15 +491,6 @@ def is_confident(extrapolation: Extrapolation, min_confidence: float) -> bool:
     return (extrapolation.confidence or 0.0) >= min_confidence
 
 
-def _low_confidence(extrapolation: Extrapolation, min_confidence: float, field: str) -> LowConfidence:
-    """The error of a pose, named by its field, that does not have the least confidence."""
-    detail = f"{field} has a confidence of {extrapolation.confidence or 0.0:.2f}, {min_confidence:g} is asked for"
-    if extrapolation.distance_mm is not None and extrapolation.angle_deg is not None:
-        away = f"{extrapolation.distance_mm:.1f} mm and {extrapolation.angle_deg:.1f} degrees away"
-        detail = f"{detail}: the nearest training views are {away}"
-    return LowConfidence(detail, field=field)
-
-
 def require_confidence(
     extrapolations: Sequence[Extrapolation],
     min_confidence: float | None,
@@ -556,8 +502,10 @@ def require_confidence(
 
     `first`: the number that they begin with; `name_pose`: how the caller names the pose of a number.
     """
-    if min_confidence is None:
-        return
-    for number, extrapolation in enumerate(extrapolations, first):
-        if not is_confident(extrapolation, min_confidence):
-            raise _low_confidence(extrapolation, min_confidence, name_pose(number))
+    for number, one in enumerate(extrapolations, first):
+        if min_confidence is not None and not is_confident(one, min_confidence):
+            field, away = name_pose(number), ""
+            if one.distance_mm is not None and one.angle_deg is not None:
+                away = f": the nearest training views are {one.distance_mm:.1f} mm and {one.angle_deg:.1f} degrees away"
+            detail = f"{field} has a confidence of {one.confidence or 0.0:.2f}, {min_confidence:g} is asked for{away}"
+            raise LowConfidence(detail, field=field)

@@ -83,7 +83,7 @@ class SceneInfo(Contract):
         """The beam of the scene, as thick as asked for (None: as it is); where it has none, one without a focus."""
         if self.beam is None:
             return PLANE if thickness_mm is None else ElevationBeam(thickness_mm)
-        return self.beam if thickness_mm is None else self.beam.as_thick_as(thickness_mm)
+        return self.beam if thickness_mm is None else replace(self.beam, thickness_mm=thickness_mm)
 
     def image_size_or(self, height: int | None, width: int | None) -> tuple[int, int]:
         """Height and width as asked for, else those of the training images, else 512."""

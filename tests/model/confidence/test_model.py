@@ -93,7 +93,7 @@ def test_json_and_back() -> None:
         ({"support": {"gain": 0.0, "share": 0.5, "reach_mm": 1.0}}, "support must be positive"),
         ({"support": {"gain": "much", "share": 0.5, "reach_mm": 1.0}}, "support must be numbers"),
         ({"support": 1.5}, "support must be an object"),
-        ({"fitted_to_mm": -1.0}, "fitted_to_mm must be at least 0"),
+        ({"fitted_to_mm": -1.0}, "fitted_to_mm must be 1 numbers, at least 0"),
         ({"weights": [1.0, 2.0]}, "weights must be 5 numbers"),
         ({"weights": [1.0, -2.0, 0, 0, 0]}, "at least 0"),
         ({"weights": ["a"] * 5}, "weights must be numbers"),
@@ -102,8 +102,8 @@ def test_json_and_back() -> None:
         ({"hardness": None}, "hardness must be numbers"),
         ({"black_ms_ssim": 1.5}, r"in \[0, 1\], got 1.5"),
         ({"error": "much"}, "must be numbers"),
-        ({"fitted_on": 0}, "fitted_on must be a positive integer"),
-        ({"more": 1}, "must have the keys"),
+        ({"fitted_on": 0}, "fitted_on must be an integer of at least 1"),
+        ({"more": 1}, "with the keys"),
     ],
 )
 def test_damage_is_refused(change: dict[str, Any], said: str) -> None:

@@ -124,7 +124,8 @@ def without_noise(poses: FloatArray, ranges: Sequence[range]) -> FloatArray:  # 
     for number in range(_NUMBERS):
         if noise[number] == 0.0:
             continue
-        ratio = likelihood.best_ratio(number, noise[number])
+        costs = likelihood.log_determinants + likelihood.squares[:, number] / noise[number]
+        ratio = float(RATIOS[costs.argmin()])  # the likeliest q/r where r is the noise
         for frames in _long_enough(ranges):
             cleaned[frames, number] = smoothed(coordinates[frames, number], ratio)
     found = poses.copy()
@@ -173,10 +174,6 @@ class _Likelihood:
         costs = self.count * np.log(np.maximum(variances, TINY)) + self.log_determinants[:, None]
         best = variances[costs.argmin(axis=0), np.arange(_NUMBERS)]
         return float(best[:3].min()), float(best[3:].min())
-
-    def best_ratio(self, number: int, noise: float) -> float:
-        """The likeliest q/r of one coordinate where r is `noise`."""
-        return float(RATIOS[(self.log_determinants + self.squares[:, number] / noise).argmin()])
 
 
 # The registration of whole sweeps that cross: each is moved until its frames agree with those of the sweeps before
@@ -268,15 +265,10 @@ class _Match:
         if not _has_enough(self._crossings(here)):
             return None  # any agreement found elsewhere would be chance
         for level in LEVELS:
-            here, gain = self._climb_level(level, here)
+            correlation = partial(self._correlation, [_detail(sweep, *level.pixels) for sweep in self._sweeps])
+            here = _climbed(correlation, here, level)
+            gain = correlation(here) - correlation(np.zeros(_OVERLAP_NUMBERS))
         return self._motion(here) if gain >= LEAST_GAIN else None
-
-    def _climb_level(self, level: Level, start: FloatArray) -> tuple[FloatArray, float]:  # [6] -> [6]
-        """The best numbers that are found from `start`, and what the correlation gains against no motion."""
-        details = [_detail(sweep, *level.pixels) for sweep in self._sweeps]
-        correlation = partial(self._correlation, details)
-        here = _climbed(correlation, start, level)
-        return here, correlation(here) - correlation(np.zeros(_OVERLAP_NUMBERS))
 
     def _motion(self, numbers: FloatArray) -> FloatArray:  # [6] degrees, mm -> [4, 4]
         motion = np.eye(4)

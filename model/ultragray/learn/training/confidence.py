@@ -28,12 +28,12 @@ from ultragray.geometry.pose import rotation_angles_deg
 from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation.baselines import interpolate_planes
 from ultragray.learn.evaluation.metrics import frame_metrics
-from ultragray.learn.evaluation.scoring import evaluate, evaluate_frames, frames_at_once, render_sweep
+from ultragray.learn.evaluation.scoring import evaluate, evaluate_frames, render_sweep, rendered_parts
 from ultragray.learn.sweep import ByteArray, Dataset, IntArray, Sweep, spread_places
 from ultragray.learn.training.config import TrainingConfig
 from ultragray.rendering.derived import CELLS, in_cells, variance_terms, view_distances
 from ultragray.rendering.derived import POINTS_PER_SIDE as DEVIATION_POINTS
-from ultragray.rendering.frames import render
+from ultragray.rendering.outputs import UNCERTAINTY
 from ultragray.scene.confidence import (
     DEPTHS,
     FAR_MM,
@@ -314,17 +314,13 @@ def fit_uncertainty(scene: GaussianScene, views: TrainingViews, sweep: Sweep, *,
     bands = _bands(sweep.images)
     stride = max(1, len(sweep) * CELLS**2 // LOOKED_AT) | 1  # odd, while CELLS is even: cells of every column are taken
     terms, squares = [], []
-    portion = frames_at_once(sweep.height, sweep.width)
-    with torch.no_grad():
-        for first in range(0, len(sweep), portion):
-            some = sweep.select(np.arange(first, min(first + portion, len(sweep))))
-            frames = render(scene, some.probe, some.poses, height=some.height, width=some.width, backend=backend)
-            planes = tuple(frames[name].cpu() for name in ("bmode", "coverage", "transmittance"))
-            distances = view_distances(views, some.poses, some.probe)
-            columns = [term.flatten()[::stride] for term in variance_terms(planes, distances, bands)]
-            terms.append(torch.stack(columns, dim=1).double().numpy())
-            errors = torch.from_numpy(some.images).float().div_(255.0) - planes[0]
-            squares.append(in_cells(errors.square()).flatten()[::stride].double().numpy())
+    for some, frames in rendered_parts(scene, sweep, UNCERTAINTY.planes, backend):
+        planes = tuple(frames[name].cpu() for name in UNCERTAINTY.planes)
+        distances = view_distances(views, some.poses, some.probe)
+        columns = [term.flatten()[::stride] for term in variance_terms(planes, distances, bands)]
+        terms.append(torch.stack(columns, dim=1).double().numpy())
+        errors = torch.from_numpy(some.images).float().div_(255.0) - planes[0]
+        squares.append(in_cells(errors.square()).flatten()[::stride].double().numpy())
     far_terms, far_squares = _far_away(bands)
     weight = FAR_SHARE * sum(map(len, squares)) / len(far_squares)
     variances = likeliest_variances(

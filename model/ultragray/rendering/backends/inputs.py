@@ -136,7 +136,7 @@ def beam_cm(beam: ElevationBeam | Tensor | None, probe: Probe) -> Tensor | None:
     A tensor holds a beam's thickness, focus and depth of field in mm; gradients reach it.
     Raises InvalidArgument for one of another shape.
     """
-    if beam is None or (isinstance(beam, ElevationBeam) and beam.is_thin):
+    if beam is None or (isinstance(beam, ElevationBeam) and beam.thickness_mm == 0.0):
         return None
     if isinstance(beam, ElevationBeam):
         beam = torch.tensor(beam.numbers, dtype=torch.float64)

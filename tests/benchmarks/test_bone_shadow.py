@@ -8,8 +8,10 @@ import pytest
 from ultragray import ConvexProbe, LinearProbe, Probe
 from ultragray.datasets import Sweep
 from ultragray.errors import DatasetInvalid
-from ultragray.phantom.imaging import BoneShadow
 
+from ..scripts import benchmark
+
+BoneShadow = benchmark("bone_shadow").BoneShadow
 PROBE = LinearProbe(width_mm=60.0, near_mm=0.0, far_mm=60.0)
 SIDE = 60  # a pixel a millimetre
 
