@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -133,10 +134,8 @@ def turned_by(turns: Tensor) -> Tensor:  # [G, 3] rad -> [G, 3, 3]
     return torch.linalg.matrix_exp(cross)
 
 
-_TRAINED: dict[str, type[FrameCorrections | SweepCorrections]] = {
-    "frames": FrameCorrections,
-    "sweeps": SweepCorrections,
-}
+TrainedCorrections: TypeAlias = FrameCorrections | SweepCorrections
+_TRAINED: dict[str, type[TrainedCorrections]] = {"frames": FrameCorrections, "sweeps": SweepCorrections}
 
 
 class PoseRefinement:
