@@ -155,7 +155,6 @@ class Family(Contract):
 
 
 def kind_field(kind: str) -> Any:
-    """The field that tells a member of a family apart."""
     return field(default=kind, repr=False, kw_only=True, metadata={"description": "Always the same."})
 
 
@@ -277,7 +276,6 @@ def _title(cls: Any) -> str:
 
 
 def _read(value: Any, annotation: Any) -> Any:
-    """A value of JSON as what the annotation says, where that is a class of ours."""
     kind, _ = optional_of(annotation)
     if value is not None and isinstance(kind, type) and (is_dataclass(kind) or issubclass(kind, Family)):
         return from_dict(kind, value)

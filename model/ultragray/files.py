@@ -68,13 +68,11 @@ def remove_stale_temporaries(path: str | Path) -> None:
 
 
 def write_whole(path: str | Path, content: str | bytes) -> None:
-    """Write a file of this content (text as UTF-8), or leave what was there."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
 
 
 def npy_bytes(array: Any) -> bytes:
-    """An array as a `.npy` file holds it."""
     file = io.BytesIO()
     np.save(file, array, allow_pickle=False)
     return file.getvalue()

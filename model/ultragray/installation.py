@@ -98,7 +98,6 @@ def processor_model() -> str | None:
 
 
 def _cpu_info() -> dict[str, str]:
-    """What Linux says of the first processor."""
     path = Path("/proc/cpuinfo")
     if not path.exists():
         return {}

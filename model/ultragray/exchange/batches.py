@@ -128,11 +128,9 @@ class BatchPlan:
 
     @property
     def shard_count(self) -> int:
-        """The number of shards; all but the last have `shard_frames` frames."""
         return -(-self.frames // self.shard_frames)
 
     def frames_of(self, shard: int) -> range:
-        """The numbers of the frames of a shard."""
         first = shard * self.shard_frames
         return range(first, min(first + self.shard_frames, self.frames))
 
@@ -159,7 +157,6 @@ class BatchPlan:
         return assessed_part(self.sampler, base, probe, assess, least, places.start, places.stop)
 
     def resolved(self, header: SceneHeader) -> Resolved:
-        """The settings of the frames with nothing left open. Raises what `FrameSettings.resolved` raises."""
         return self.settings.resolved(header.info, Encoding.FLOAT32)
 
     def document(self) -> dict[str, Any]:
@@ -203,7 +200,6 @@ class ShardEntry:
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> ShardEntry:
-        """Inverse of `asdict`. Raises KeyError, TypeError."""
         return cls(**{item.name: document[item.name] for item in fields(cls)})
 
 

@@ -114,7 +114,6 @@ def read_mcap_poses(path: Path) -> FloatArray:  # [P, 4, 4]
 
 
 def _topic(summary: Any) -> str:
-    """The topic that holds the poses of the probe."""
     if summary is None:
         raise ValueError("it has no summary: its writing was not finished")
     kinds = {number: schema.name for number, schema in summary.schemas.items()}

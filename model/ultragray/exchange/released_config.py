@@ -240,7 +240,6 @@ def _candidates(path: Path, named: str) -> Iterator[Path]:
 
 
 def _joined(folder: Path, named: str) -> Path:
-    """A path from a folder, without its `..`."""
     return Path(os.path.normpath(folder / named))
 
 

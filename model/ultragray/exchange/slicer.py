@@ -31,7 +31,6 @@ class SlicerScene:
 
     @property
     def xml(self) -> str:
-        """The file's text."""
         root = ElementTree.Element("MRML", version="Slicer", userTags="")
         attributes = {
             "OpenIGTLinkIF.out.name": self.device,
@@ -77,7 +76,6 @@ class SlicerScene:
         return ElementTree.tostring(root, encoding="unicode") + "\n"
 
     def write(self, path: Path) -> None:
-        """Writes the file, whole or not at all. Raises OSError."""
         write_whole(path, f'<?xml version="1.0" encoding="UTF-8"?>\n{self.xml}')
 
 

@@ -133,7 +133,6 @@ def quaternion_from_pose(pose: FloatArray) -> tuple[float, float, float, float]:
 
 
 def position_distances_mm(poses: FloatArray, others: FloatArray) -> FloatArray:  # [C, 4, 4], [P, 4, 4] -> [C, P]
-    """Distance between the probe origins, in mm."""
     offsets = poses[:, None, :3, 3] - others[None, :, :3, 3]
     return np.linalg.norm(offsets, axis=-1)
 

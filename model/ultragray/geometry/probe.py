@@ -62,7 +62,6 @@ class ScanLines(ABC):
         return -self.span / 2
 
     def across(self, width: int) -> FloatArray:  # [W]
-        """The across of each of W lines."""
         return self.start + self.span * ((np.arange(width) + 0.5) / width)
 
     @abstractmethod
@@ -106,7 +105,6 @@ class ParallelLines(ScanLines):
 
     @property
     def direction(self) -> tuple[float, float]:
-        """Of every line: x and z."""
         steering = math.radians(self.steering_deg)
         return math.sin(steering), math.cos(steering)
 
@@ -241,7 +239,6 @@ class Picture:
         return columns[None, :], rows[:, None]
 
     def flipped(self) -> Picture:
-        """With left and right exchanged."""
         last = self.first[0] + (self.width - 1) * self.step[0]
         return replace(self, first=(last, self.first[1]), step=(-self.step[0], self.step[1]))
 
@@ -376,7 +373,6 @@ class Probe(Family):
 
 
 def odd_length(subject: str, measure: str, length_mm: float, usual_mm: tuple[float, float]) -> str:
-    """The sentence for a length that no probe has."""
     low, high = usual_mm
     return (
         f"the {subject} {length_mm:.3g} mm {measure}, where {low:g} to {high:g} mm are usual: a length in another "
@@ -393,7 +389,6 @@ SMALLEST_USUAL_OPENING_DEG = 5.0
 
 
 def opening_field() -> Any:
-    """The field for the angle of a fan."""
     return described("Full angle of the fan.", above=0.0, high=LARGEST_OPENING_DEG, example=60.0)
 
 

@@ -38,7 +38,6 @@ class PointFit:
 
     @property
     def rms_mm(self) -> float:
-        """Root mean square of the residuals."""
         return float(np.sqrt(np.square(self.residuals_mm).mean()))
 
 
@@ -305,13 +304,11 @@ class Registration(Contract):
 
 
 def rows(pose: FloatArray) -> Rows:  # [4, 4]
-    """A pose as the contract holds it."""
     first, second, third, fourth = ((float(a), float(b), float(c), float(d)) for a, b, c, d in pose)
     return first, second, third, fourth
 
 
 def save_registration(path: str | Path, registration: Registration) -> None:
-    """Writes the file of a registration, JSON, or leaves what was there."""
     document = {"format_version": FORMAT_VERSION, **to_dict(registration)}
     write_whole(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
 

@@ -19,7 +19,6 @@ def about_axes(axes: FloatArray, angles: FloatArray) -> FloatArray:  # [C, 3] of
 
 
 def random_directions(random: np.random.Generator, count: int) -> FloatArray:  # [C, 3]
-    """Unit vectors, uniform on the sphere."""
     directions = random.normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return directions
@@ -33,7 +32,6 @@ def blended(first: FloatArray, second: FloatArray, shares: FloatArray) -> FloatA
 
 
 def rotations_of(turns: FloatArray) -> FloatArray:  # [C, 3] rad -> [C, 3, 3]
-    """The rotations of turns, each an axis times an angle."""
     angles = np.linalg.norm(turns, axis=1)
     return about_axes(turns / np.maximum(angles, _NO_TURN)[:, None], angles)
 

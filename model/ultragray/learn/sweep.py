@@ -146,7 +146,6 @@ def corner_distances_mm(corners: FloatArray, others: FloatArray) -> FloatArray: 
 
 
 def pixel_positions_mm(probe: Probe, height: int, width: int) -> FloatArray:  # [H·W, 3], row by row
-    """The place of each pixel in the probe frame, mm."""
     origins, directions = probe.scan_lines(width)
     positions: FloatArray = origins + probe.depths_mm(height)[:, None, None] * directions
     return positions.reshape(-1, 3)

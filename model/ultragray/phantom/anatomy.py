@@ -34,7 +34,6 @@ BLEND_MM = 2.0  # radius with which the parts run into each other
 
 
 def distance_mm(points: Floats) -> Floats:  # [N, 3] -> [N]
-    """Signed distance to the nearest vertebra."""
     local = _local(points)
     half = (BODY_HALF_WIDTH_MM - 2.0, BODY_HALF_LENGTH_MM - 2.0, 13.0)
     body = _box(local, (0.0, 0.0, BODY_DEPTH_MM + 15.0), half, 2.0)
@@ -121,7 +120,6 @@ def tissue_at(points_mm: Floats) -> LabelArray:  # [N, 3] -> [N]
 
 
 def tissue_drawn(points: Floats) -> LabelArray:  # [N, 3] -> [N]
-    """The tissue at each point of the straight, symmetric drawing."""
     x, _, z = points.T
     fascia = fascia_depth_mm(x)
     in_canal = (np.abs(x) < CANAL_HALF_WIDTH_MM) & (z > canal_roof_mm(x))
@@ -209,7 +207,6 @@ COMPENSATED = 0.6  # dB/(cm·MHz) that the scanner's time-gain compensation expe
 
 
 def round_trip_db_per_mm() -> FloatArray:  # [tissues]
-    """The loss of an echo in each tissue over a millimetre of depth, there and back."""
     return np.array([0.2 * FREQUENCY_MHZ * ACOUSTICS[tissue].attenuation for tissue in Tissue])
 
 
@@ -219,7 +216,6 @@ def backscatter_amplitudes() -> FloatArray:  # [tissues]
 
 
 def compensated_db_per_mm() -> float:
-    """The gain of the time-gain compensation over a millimetre of depth."""
     return 0.2 * FREQUENCY_MHZ * COMPENSATED
 
 
@@ -252,7 +248,6 @@ class LatticeNoise:
         self._cell_mm = cell_mm
 
     def __call__(self, points: Floats) -> Floats:  # [N, 3] -> [N]
-        """The noise at each point, mm."""
         (i, u), (j, v), (k, w) = (self._cell(points[:, axis] / size) for axis, size in enumerate(self._cell_mm))
         nodes = self._nodes
 
@@ -373,7 +368,6 @@ def _within(half_width_mm: float) -> Present:
 
 
 def _sheet(depth_mm: Callable[[Floats], Floats]) -> Level:
-    """A surface at a depth that depends on x."""
     return lambda points: points[:, 2] - depth_mm(points[:, 0])
 
 

@@ -54,7 +54,6 @@ class Scatterers:
     lobe_rad: Float32Array  # [M] standard deviation of the specular lobe
 
     def between(self, pose: FloatArray, low_mm: float, high_mm: float) -> Scatterers:
-        """Those between two elevations in the frame of a pose."""
         axis = pose[:3, 1].astype(np.float32)
         zero = float(pose[:3, 3] @ pose[:3, 1])
         in_tissue, on_surface = (self.points_mm @ axis - zero, self.surface_mm @ axis - zero)
@@ -72,7 +71,6 @@ class Scatterers:
 
     @classmethod
     def join(cls, parts: list[Scatterers]) -> Scatterers:
-        """All scatterers of several blocks."""
         names = cls.__dataclass_fields__
         return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
@@ -159,7 +157,6 @@ def _on(
 
 
 def _gradient(interface: Interface, points: Floats, level: Floats) -> Floats:  # [M, 3], [M] -> [M, 3]
-    """Of the interface's function, in the phantom's frame."""
     shifted = (points + _GRADIENT_STEP_MM * axis for axis in np.eye(3, dtype=np.float32))
     steps = [interface.level(anatomy.straightened(there)) - level for there in shifted]
     return np.stack(steps, axis=1) / _GRADIENT_STEP_MM
@@ -246,7 +243,6 @@ class Grid:
 
     @property
     def first_mm(self) -> tuple[float, float]:
-        """Depth and lateral position of the grid's corner."""
         depth = self.probe.near_mm - self.margins[0] * self.cell_mm[0]
         return depth, -0.5 * self.probe.lines.span - self.margins[1] * self.cell_mm[1]
 
@@ -267,7 +263,6 @@ class Grid:
         return inside, row[inside] * columns + column[inside]
 
     def tissue(self, pose: FloatArray) -> npt.NDArray[np.uint8]:  # [R, C]
-        """The tissue in the middle of each cell."""
         return _tissue(pose, self.depths_mm, self.laterals_mm)
 
     def tissue_of_pixels(self, pose: FloatArray) -> npt.NDArray[np.uint8]:  # [H, W]
@@ -284,7 +279,6 @@ class Grid:
         return self.cell_mm[0] * (np.cumsum(seen, axis=0) - 0.5 * seen)
 
     def pixels(self, values: Floats) -> Floats:  # [R, C] -> [H, W]
-        """The mean over the cells of each pixel."""
         top, left = self.margins
         image = values[top : top + CELLS_PER_ROW * self.height, left : left + self.width]
         return image.reshape(self.height, CELLS_PER_ROW, self.width).mean(axis=1)

@@ -150,7 +150,6 @@ def _axes(out: FloatArray, lateral: FloatArray) -> FloatArray:  # [3], [3] -> [3
 
 
 def _face_points(views: FloatArray, probe: Probe) -> FloatArray:  # [P, 4, 4] mm -> [P·K, 3] mm
-    """Points of the faces, not farther apart than a cell."""
     lines, depth = probe.lines, probe.face_depth_mm
     count = 2 + math.ceil(lines.breadth_mm(depth) / _LEAST_CELL_MM)
     origins, directions = lines.rays(lines.start + lines.span * np.linspace(0.0, 1.0, count))
@@ -179,7 +178,6 @@ class Touch:
 
     @classmethod
     def of(cls, skin: Skin, probe: Probe, poses: FloatArray, width: int) -> Touch:  # [C, 4, 4] or [4, 4] mm
-        """The contact of a probe, which need not be that of the training views. Raises InvalidPose."""
         exact = check_poses(poses)
         origins, directions = probe.scan_lines(width)
         turned = exact[:, :3, :3].transpose(0, 2, 1)
@@ -204,7 +202,6 @@ class Touch:
 
     @property
     def shares(self) -> FloatArray:  # [C]
-        """The share of the scan lines of each pose that have contact, 0 to 1."""
         return self.lines.mean(axis=1)
 
 

@@ -78,7 +78,6 @@ class Drawing:
         return planes
 
     def plane(self, name: str) -> Tensor:  # [C, H, W]
-        """One of the planes that were drawn."""
         return self._planes[name]
 
     def plane_of(self, part: GaussianScene, name: str) -> Tensor:  # [C, H, W]
@@ -207,7 +206,6 @@ def variance_terms(
 
 
 def in_cells(frames: Tensor) -> Tensor:  # [C, H, W] -> [C, h, w]
-    """Means over the cells."""
     height, width = frames.shape[1:]
     return functional.adaptive_avg_pool2d(frames, (min(CELLS, height), min(CELLS, width)))
 

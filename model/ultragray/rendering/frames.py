@@ -143,7 +143,6 @@ def _tools_in_view(
 
 
 def _checked_contact(contact: Any) -> Contact | None:
-    """A Contact also by its word."""
     if contact is None:
         return None
     try:

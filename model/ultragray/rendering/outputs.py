@@ -57,7 +57,6 @@ class Output:
 
     @property
     def is_numbers(self) -> bool:
-        """Whether its pixels are numbers, not amounts."""
         return self.dtype == _NUMBERS
 
     @property
@@ -176,7 +175,6 @@ def check_outputs(outputs: Sequence[str], *, field: str = "outputs") -> tuple[st
 def check_available(
     outputs: Sequence[str], info: SceneInfo, *, with_tools: bool = False, field: str = "outputs"
 ) -> None:
-    """Raises UnknownOutput for outputs that a scene cannot give."""
     for name in outputs:
         if with_tools and OUTPUTS[name].shows_tools_alone:
             continue

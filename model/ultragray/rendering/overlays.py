@@ -124,7 +124,6 @@ class _Drawn:
 
 
 def _beyond(depth: Tensor, first: Tensor, last: Tensor) -> Tensor:  # [H, 1], [C, 1, w] -> [C, H, w]
-    """The distance of depths from the range between two others, 0 within it."""
     return torch.maximum(first - depth, depth - last).clamp(min=0.0)
 
 

@@ -34,12 +34,10 @@ class Encoding(str, Enum):
 
     @property
     def is_image_file(self) -> bool:
-        """Whether it holds exactly one frame of one output."""
         return self in (Encoding.PNG, Encoding.JPEG)
 
     @property
     def pixel_type(self) -> np.dtype[Any]:
-        """The type that pixels are rounded to."""
         return np.dtype("<f4") if self in (Encoding.FLOAT32, Encoding.NPZ) else np.dtype("u1")
 
 
@@ -143,7 +141,6 @@ class FrameSettings(Contract):
         )
 
     def _additions(self) -> dict[str, Any]:
-        """The additions that are asked for."""
         given = {one.name: getattr(self, one.name, None) for one in fields(Additions)}
         return {name: value for name, value in given.items() if value is not None}
 
@@ -251,7 +248,6 @@ class SettingsUsed(Additions):
 
 @lru_cache(maxsize=256)
 def settings_used(settings: Resolved) -> SettingsUsed:
-    """The settings of a request, as its frames tell them."""
     picture = settings.picture
     return SettingsUsed(
         probe=settings.probe,

@@ -61,7 +61,6 @@ class ScanView:
 
     @cached_property
     def _apart_mm(self) -> float:
-        """Distance of neighbouring lines at depth 0."""
         origins, along = self._neighbours
         return abs(float((origins[1] - origins[0]) @ (along[0, 1], -along[0, 0])))
 
@@ -77,7 +76,6 @@ class ScanView:
         return np.maximum(at_focus * np.hypot(1.0, (depth_mm - focus) / rayleigh), LEAST_SLICE_SIGMA_MM)
 
     def in_probe_frame(self, points: FloatArray) -> FloatArray:  # [N, 3] mm -> [C, N, 3] mm
-        """Points of the scene frame as each pose sees them."""
         rotations, positions = self.poses[:, :3, :3], self.poses[:, :3, 3]
         return (points - positions[:, None]) @ rotations
 
@@ -103,7 +101,6 @@ def covered(gap_mm: FloatArray, half_mm: float | FloatArray, spacing_mm: FloatAr
 
 
 def dot(vectors: FloatArray, others: FloatArray) -> FloatArray:  # [..., 3] both -> [...]
-    """Scalar products."""
     return (vectors * others).sum(axis=-1)
 
 
@@ -126,7 +123,6 @@ def point_field(meaning: str, **options: Any) -> Any:
 
 
 def moved_point(pose: FloatArray, point: Sequence[float]) -> tuple[float, float, float]:  # [4, 4] mm, [3] mm
-    """A point as a pose leads it."""
     x, y, z = (pose[:3, :3] @ np.array(point, np.float64) + pose[:3, 3]).tolist()
     return x, y, z
 
@@ -157,7 +153,6 @@ class Tool(Family):
         raise NotImplementedError
 
     def crossing(self, view: ScanView) -> Crossing:
-        """Where the scan lines meet it."""
         raise NotImplementedError
 
     def moved(self, pose: FloatArray) -> Self:  # [4, 4] mm, exact
@@ -169,7 +164,6 @@ class Tool(Family):
         return np.minimum(1.0 - (1.0 - self.opacity) ** (path_mm / self.thickness_mm), _MOST_STOPPED)
 
     def seen_by(self, view: ScanView, points: Sequence[Sequence[float]]) -> FloatArray:  # [N, 3] -> [C, N, 3]
-        """Points of the tool in the probe frame of each pose, mm."""
         array = np.array(points, np.float64)
         if self.frame is ToolFrame.SCENE:
             return view.in_probe_frame(array)
@@ -193,7 +187,6 @@ SpanOf = Callable[[FloatArray, FloatArray], Span]
 
 
 def overlap(one: Span, other: Span) -> Span:
-    """The part of lines that lies within both of two bodies."""
     return Span(
         np.maximum(one.enters, other.enters),
         np.minimum(one.leaves, other.leaves),

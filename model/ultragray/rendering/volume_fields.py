@@ -104,7 +104,6 @@ class _Slab:
 
     @property
     def footprint(self) -> int:
-        """Pairs of a Gaussian and a voxel of the box around it."""
         return int(self._box_voxels(self._touching).sum())
 
     def _box_voxels(self, ids: IndexArray) -> IndexArray:

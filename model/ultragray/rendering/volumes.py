@@ -210,7 +210,6 @@ class SliceSettings(Contract):
         self.grid()
 
     def grid(self) -> VolumeGrid:
-        """Its pixels. Raises InvalidArgument, naming the field."""
         return VolumeGrid.on_plane(self.origin_mm, self.right, self.down, self.size_mm, self.spacing_mm)
 
     @property
@@ -219,7 +218,6 @@ class SliceSettings(Contract):
         return Encoding.UINT8 if self.field == "labels" else Encoding.FLOAT32
 
     def view(self, encoding: Encoding) -> SliceView:
-        """The slice but for its place."""
         width, height, _ = self.grid().shape
         return SliceView(self.field, height, width, self.spacing_mm, encoding)
 
@@ -256,7 +254,6 @@ class SliceView:
         return (self.field, self.height, self.width, self.spacing_mm)
 
     def grid(self, pose: FloatArray) -> VolumeGrid:  # [4, 4]
-        """The pixels of a slice at a pose."""
         right, against_normal, down = pose[:3, :3].T
         axes = np.stack([right, down, -against_normal])
         return VolumeGrid(pose[:3, 3], axes, self.spacing_mm, (self.width, self.height, 1))

@@ -38,7 +38,6 @@ class Sampler(Family):
         return check_poses(self._made(checked, probe))
 
     def _made(self, base: FloatArray, probe: Probe) -> FloatArray:  # [P, 4, 4] -> [C, 4, 4] mm
-        """The poses from at least one checked base pose."""
         raise NotImplementedError
 
     def _require_few(self, made: float, name: str) -> None:
@@ -68,7 +67,6 @@ class DrawnSampler(Sampler):
         return self.with_draws(count, self.seed if number == 0 else seed_of(self.seed, number, _BLOCKS))
 
     def with_draws(self, count: int, seed: int) -> DrawnSampler:
-        """The same with another count and seed."""
         changes: Any = {"count": count, "seed": seed}
         return replace(self, **changes)  # type: ignore[type-var]  # its members are dataclasses
 
@@ -99,12 +97,10 @@ def seed_of(seed: int, *numbers: int) -> int:
 
 
 def count_field(*default: Any, high: int = MAX_POSES) -> Any:
-    """The field for the number of poses."""
     return described("How many poses.", *default, low=1, high=high)
 
 
 def seed_field() -> Any:
-    """The field for the seed of random choices."""
     return described("Of the random choices.", 0, low=0, high=MAX_SEED)
 
 

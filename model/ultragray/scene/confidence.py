@@ -140,7 +140,6 @@ class TrainingViews:
         return np.stack([nearest_mm, *capped, turned]), weights / weights.sum(axis=1, keepdims=True)
 
     def _angles_deg(self, poses: FloatArray) -> FloatArray:  # [B, 4, 4] -> [B, P]
-        """Angle of the rotation from each pose to each view."""
         cosine = 0.5 * (poses[:, :3, :3].reshape(-1, 9) @ self._rotations.T - 1.0)
         return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
@@ -203,7 +202,6 @@ class Uncertainty:
         object.__setattr__(self, "variances", variances)
 
     def to_dict(self) -> dict[str, Any]:
-        """A JSON object, as a scene's metadata holds it."""
         numbers = {"variances": self.variances, "level": self.bands.level, "spread": self.bands.spread}
         return {name: [round(value, DIGITS) for value in values] for name, values in numbers.items()}
 
@@ -269,7 +267,6 @@ class Support:
             raise InvalidArgument(f"support must be positive numbers, got {list(numbers)}", field="support")
 
     def expected_shares(self, measures: ViewMeasures) -> FloatArray:  # [C]
-        """The share of supported pixels that frames at these poses are taken to have."""
         return self.share * within(measures.distance_mm, self.reach_mm)
 
 
@@ -320,7 +317,6 @@ class ConfidenceModel:
         return np.minimum(confidences, most)
 
     def to_dict(self) -> dict[str, Any]:
-        """A JSON object, as a scene's metadata holds it."""
         return {
             "version": VERSION,
             **asdict(self),
@@ -382,7 +378,6 @@ def within(distance_mm: FloatArray, reach_mm: float) -> FloatArray:  # [C, K] ->
 
 
 def logistic(values: FloatArray) -> FloatArray:
-    """σ of the formula."""
     return 1.0 / (1.0 + np.exp(-np.clip(values, -500.0, 500.0)))
 
 

@@ -126,7 +126,6 @@ class DicomExporter(Exporter):
 
 
 def _uids(header: ExportHeader) -> tuple[str, str, str]:
-    """The UIDs of the image, the series and the study."""
     poses = hashlib.sha256(np.ascontiguousarray(header.poses, "<f8").tobytes()).hexdigest()
     made_of = json.dumps([header.origin(), header.settings.height, header.settings.width, poses], sort_keys=True)
     image, series = (f"{name} {made_of}" for name in ("image", "series"))

@@ -40,7 +40,6 @@ class Format:
 
     @property
     def extra(self) -> str | None:
-        """The extra that brings its package."""
         return None if self.package is None else extra_of(self.package)
 
     def shown(self, settings: Resolved) -> Resolved:

@@ -242,7 +242,6 @@ def predict(sweep: Sweep, poses: FloatArray, method: str, *, voxel_mm: float = V
 def evaluate_baselines(
     dataset: Dataset, methods: Sequence[str] = BASELINES, voxel_mm: float = VOXEL_MM
 ) -> dict[str, Evaluation]:
-    """The scores of each method on the held-out frames. Raises DatasetInvalid where there are none."""
     require_frames(dataset.val)
     return {
         method: evaluate_frames(predict(dataset.train, dataset.val.poses, method, voxel_mm=voxel_mm), dataset.val)
@@ -270,7 +269,6 @@ def _distances_to_frames_mm(sweep: Sweep, poses: FloatArray) -> FloatArray:  # [
 
 
 def _between(sweep: Sweep, points: FloatArray, frames: IntArray) -> FloatArray:  # [P, 3] mm, [F] -> [P]
-    """Grey values of points in the tracker's frame; `frames`, nearest first, are all tried."""
     sides = 2
     distances = np.full((sides, len(points)), np.inf)
     values = np.zeros((sides, len(points)))

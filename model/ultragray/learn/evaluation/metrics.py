@@ -40,11 +40,9 @@ class FrameMetrics:
     gmsd: float
 
     def to_dict(self) -> dict[str, float]:
-        """The four numbers by name, all finite."""
         return asdict(self)
 
     def is_better_than(self, other: FrameMetrics) -> bool:
-        """In each of the four."""
         higher = ("psnr_db", "ms_ssim", "gms")
         return self.gmsd < other.gmsd and all(getattr(self, name) > getattr(other, name) for name in higher)
 

@@ -34,17 +34,14 @@ class Evaluation:
 
     @property
     def mean(self) -> FrameMetrics:
-        """Over the frames."""
         return mean_and_std(self.frames)[0]
 
     @property
     def std(self) -> FrameMetrics:
-        """Standard deviation over the frames."""
         return mean_and_std(self.frames)[1]
 
     @property
     def speckle(self) -> SpeckleSummary:
-        """Means over the frames."""
         return summarize(self.frame_speckle)
 
     def to_dict(self) -> dict[str, Any]:
@@ -81,7 +78,6 @@ def evaluate_frames(frames: npt.NDArray[np.float32], sweep: Sweep) -> Evaluation
 
 
 def _measured(predictions: Iterable[npt.NDArray[np.float32]], sweep: Sweep) -> Evaluation:
-    """Measures the predicted frames of each of `_chunks`."""
     require_frames(sweep)
     scales = ms_ssim_scales(sweep.height, sweep.width)
     measured: list[FrameMetrics] = []
@@ -94,12 +90,10 @@ def _measured(predictions: Iterable[npt.NDArray[np.float32]], sweep: Sweep) -> E
 
 
 def frames_at_once(height: int, width: int) -> int:
-    """The number of frames of this size that are rendered and measured together."""
     return min(CHUNK_FRAMES, max(1, CHUNK_PIXELS // (height * width)))
 
 
 def _chunks(sweep: Sweep) -> Iterator[slice]:
-    """Places of the frames that are taken at once, in order."""
     count = frames_at_once(sweep.height, sweep.width)
     for first in range(0, len(sweep), count):
         yield slice(first, first + count)
@@ -178,11 +172,9 @@ class Reliability:
     bins: tuple[Bin, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """A JSON object."""
         return asdict(self)
 
     def figures(self) -> dict[str, float]:
-        """The numbers over all pixels, by name."""
         named = {"expected": self.expected, "actual": self.actual, "within_1": self.within_1, "within_2": self.within_2}
         return {f"uncertainty_{name}": value for name, value in named.items()}
 

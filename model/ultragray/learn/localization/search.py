@@ -62,7 +62,6 @@ def slid(frames: Tensor, places: Tensor) -> Tensor:  # [K, H, W], [S, H, W, 2] -
 
 
 def _coordinates(probe: Probe, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:  # [..., 3] -> [...] each
-    """Depth and place across the scan lines."""
     return probe.lines.coordinates(points_mm[..., 0], points_mm[..., 2])
 
 
@@ -88,7 +87,6 @@ class Motions:
         return cls(middle, float((positions - middle).square().sum(dim=1).mean().sqrt()))
 
     def moved(self, poses: Tensor, steps: Tensor) -> Tensor:  # [..., 4, 4], [..., 6] mm -> [..., 4, 4]
-        """Poses after steps."""
         return poses @ self.of_steps(steps)
 
     def of_steps(self, steps: Tensor) -> Tensor:  # [..., 6] mm -> [..., 4, 4]
@@ -109,7 +107,6 @@ class Motions:
         return shift_mm, math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
 
     def degrees(self, turns_mm: Tensor) -> Tensor:
-        """Turns given in mm."""
         return torch.rad2deg(turns_mm / self.lever_mm)
 
 
@@ -273,7 +270,6 @@ class _Fit:
 
     @property
     def error(self) -> Tensor:  # [K]
-        """Mean squares of what is left."""
         return self.left.square().mean(dim=1)
 
     def after(self, steps: Tensor, poses: Tensor, left: Tensor) -> tuple[Tensor, _Fit]:  # [K, 6] mm

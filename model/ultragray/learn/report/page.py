@@ -101,7 +101,6 @@ class Prediction:
 
     @classmethod
     def of_scene(cls, scene: GaussianScene, sweep: Sweep) -> Prediction:
-        """Raises as `evaluate_frames` does."""
         frames = np.clip(render_sweep(scene, sweep), 0.0, 1.0)
         return cls(evaluate_frames(frames, sweep), to_uint8(frames))
 
@@ -127,7 +126,6 @@ class ScenePage:
 
     @property
     def evaluation(self) -> Evaluation:
-        """That of the scene."""
         return next(iter(self.predictions.values())).evaluation
 
 
@@ -162,7 +160,6 @@ def environment(*packages: str) -> Environment:
 
 
 def _configuration(scene: GaussianScene) -> dict[str, Any]:
-    """The settings of the training, without those that were not used."""
     return {name: value for name, value in scene.info.training.items() if value is not None}
 
 

@@ -26,7 +26,6 @@ class CorrectionSizes:
         return cls(shifts, np.degrees(turn_angles_rad(corrections[:, :3, :3], np.eye(3))))
 
     def to_dict(self) -> dict[str, Any]:
-        """A JSON object."""
         return {"shift_mm": self.shift_mm.tolist(), "turn_deg": self.turn_deg.tolist()}
 
     def __str__(self) -> str:

@@ -93,7 +93,6 @@ class TrackerNoise:
 
     @property
     def is_small(self) -> bool:
-        """Whether the poses are good as they are."""
         return self.position_mm < GOOD_MM and self.turn_deg < GOOD_DEG
 
 
@@ -116,7 +115,6 @@ def tracker_noise(poses: FloatArray, ranges: Sequence[range]) -> TrackerNoise:  
 
 
 def without_noise(poses: FloatArray, ranges: Sequence[range]) -> FloatArray:  # [F, 4, 4] mm -> [F, 4, 4] mm
-    """The likeliest path of each sweep."""
     coordinates = _coordinates(poses, ranges)
     likelihood = _Likelihood.of(coordinates, ranges)
     noise = np.repeat(likelihood.noise_variances(), 3)

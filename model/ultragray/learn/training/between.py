@@ -37,7 +37,6 @@ class Neighbours:
     extent_mm: float  # the farthest
 
     def without_ends(self) -> Neighbours:
-        """The gaps alone."""
         return replace(self, ends=self.ends[:0], outward=self.outward[:0])
 
     @property
@@ -213,7 +212,6 @@ class Places:
 
     @property
     def nearer(self) -> IntArray:  # [V]
-        """The frame that lies nearer."""
         return np.where(self.shares > 0.5, self.frames[:, 1], self.frames[:, 0])
 
     def poses(self, sweep: Sweep) -> FloatArray:  # [V, 4, 4] mm

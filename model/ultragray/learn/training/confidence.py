@@ -140,7 +140,6 @@ class Neighbours:
         return tuple(order[allowed[order]][:MOST_HELPERS].tolist())
 
     def predict(self, row: int, helpers: tuple[int, ...]) -> Prediction:
-        """Predicts a target from these frames."""
         some, target = self._small.select(list(helpers)), self.targets[row]
         pose = self._small.poses[target : target + 1]
         picture = torch.from_numpy(interpolate_planes(some, pose))
@@ -430,13 +429,11 @@ def fit_confidence(dataset: Dataset, train_shorter: TrainShorter, *, backend: st
 
 
 def _measured(scene: GaussianScene, sweep: Sweep, backend: str) -> tuple[FloatArray, FloatArray]:  # [F], [F]
-    """MS-SSIM and the share of supported pixels of each frame."""
     ms_ssim = [frame.ms_ssim for frame in evaluate(scene, sweep, backend=backend).frames]
     coverage = render_sweep(scene, sweep, output="coverage", backend=backend)
     return np.array(ms_ssim), supported(coverage).mean(axis=(1, 2))
 
 
 def _black_ms_ssim(sweep: Sweep) -> float:
-    """The mean score of a black frame against the training frames."""
     some = sweep.select(spread_places(len(sweep), BLACK_FRAMES))
     return evaluate_frames(np.zeros(some.images.shape, np.float32), some).mean.ms_ssim

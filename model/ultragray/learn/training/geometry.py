@@ -31,7 +31,6 @@ class BatchSampler:
         self._frame_count = frame_count
 
     def next_batch(self) -> Tensor:  # [b]
-        """The places of the next frames."""
         while len(self.waiting) < self.batch_size:
             order = torch.randperm(self._frame_count, generator=self.generator)
             self.waiting = torch.cat([self.waiting, order])
@@ -83,7 +82,6 @@ def out_of_plane_shift_mm(range_mm: float, generator: torch.Generator) -> float:
 
 
 def shift_out_of_plane(poses: FloatArray, shift_mm: float) -> FloatArray:  # [C, 4, 4] mm -> [C, 4, 4] mm
-    """The poses, each moved along its own elevation axis."""
     shifted = poses.copy()
     shifted[:, :3, 3] += shift_mm * poses[:, :3, 1]
     return shifted
@@ -220,7 +218,6 @@ class Shadows:
         self._usual_below = _usual_by_depth(self._brightest_below(self._relative(some)))  # [H]
 
     def of(self, place: int) -> Beam:
-        """The evidence of the frame at a place of the sweep."""
         height, width = self._sweep.height, self._sweep.width
         if not len(self._bright_rows):
             return Beam(np.ones((height, width), np.float32), np.zeros((height, width), np.float32))
@@ -235,7 +232,6 @@ class Shadows:
         return Beam(left, (self._usual[:, None] * echo).astype(np.float32))
 
     def pixels(self) -> npt.NDArray[np.bool_]:  # [F, H, W]
-        """Which pixels of all frames lie in a shadow."""
         found = np.empty(self._sweep.images.shape, bool)
         for place, pixels in enumerate(found):
             pixels[:] = self.of(place).is_shadowed

@@ -45,7 +45,6 @@ def training_device(name: str, backend: str) -> torch.device:
 
 
 def machine_in_words(device: str = "cpu") -> str:
-    """The processor, the threads, and the GPU where one is used."""
     threads = torch.get_num_threads()
     words = f"{processor_name()}, {threads} thread{'' if threads == 1 else 's'}"
     on = training_device(device, "auto")
@@ -53,7 +52,6 @@ def machine_in_words(device: str = "cpu") -> str:
 
 
 def forget_peak_memory(device: torch.device) -> None:
-    """Start the count of `peak_memory_mb` anew."""
     if device.type == "cuda":
         torch.cuda.reset_peak_memory_stats(device)
 
@@ -105,7 +103,6 @@ def required_bytes(dataset: Dataset, config: TrainingConfig) -> int:
 
 
 def required_device_bytes(dataset: Dataset, config: TrainingConfig) -> int:
-    """An upper bound of what a training takes of a GPU."""
     assert config.max_gaussians is not None
     height, width = dataset.train.height, dataset.train.width
     per_frame = config.max_gaussians * CUDA_SLICE_BYTES + 4 * CUDA_PLANES * height * width

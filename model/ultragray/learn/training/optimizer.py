@@ -51,7 +51,6 @@ class Schedule:
         return min(reached, self._config.sh_degree)
 
     def has_floor(self, step: int) -> bool:
-        """Whether intensities are kept above their floors."""
         return step < self._config.floor_end * self.steps
 
     def refinement(self, done: int) -> int | None:
@@ -59,7 +58,6 @@ class Schedule:
         return self._refinements.get(done) if done > 0 else None
 
     def gaussian_limit(self, refinement: int) -> int:
-        """The number of Gaussians that there may be after a refinement."""
         config = self._config
         assert config.initial_gaussians is not None
         assert config.max_gaussians is not None
@@ -73,7 +71,6 @@ MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 def is_trained(name: str, shape: Sequence[int], config: TrainingConfig) -> bool:
-    """Whether a parameter of this shape changes in a run."""
     return math.prod(shape) > 0 and (config.transmittance or name != "transmittances")
 
 
@@ -115,7 +112,6 @@ class Optimizer:
                 self._adam.state[new] = state
 
     def tensors(self) -> dict[str, Tensor]:
-        """The moments and step counts by name, as `load` takes them."""
         found = {}
         for name, group in self._groups.items():
             for key, value in self._adam.state.get(group["params"][0], {}).items():

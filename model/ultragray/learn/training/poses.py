@@ -61,7 +61,6 @@ class Corrections:
         return self._motions(self._group_of[places]) @ torch.from_numpy(poses)
 
     def all_motions(self) -> FloatArray:  # [F, 4, 4]
-        """The correction of every frame."""
         with torch.no_grad():
             return self._motions(self._group_of).numpy()
 
@@ -72,12 +71,10 @@ class Corrections:
         self._adam.zero_grad(set_to_none=True)
 
     def tensors(self) -> dict[str, Tensor]:
-        """The state, for a checkpoint."""
         state = self._adam.state.get(self.twists, {})
         return {"twists": self.twists.detach(), **state}
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
-        """Inverse of `tensors`."""
         with torch.no_grad():
             self.twists.copy_(tensors["twists"])
         state = {name: value for name, value in tensors.items() if name != "twists"}
@@ -169,7 +166,6 @@ class PoseRefinement:
 
     @property
     def group_count(self) -> int:
-        """The number of corrections that are trained: 0 where none is."""
         return 0 if self._trained is None else len(self._trained.twists)
 
     def corrected(self, places: Tensor, poses: FloatArray) -> ScenePoses:  # [b], [b, 4, 4] mm -> [b, 4, 4] mm
@@ -191,11 +187,9 @@ class PoseRefinement:
         return None if self._trained is None else self.poses() @ np.linalg.inv(self._tracked)
 
     def tensors(self) -> dict[str, Tensor]:
-        """The state of the trained corrections, for a checkpoint."""
         return {} if self._trained is None else self._trained.tensors()
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
-        """Inverse of `tensors`."""
         if self._trained is not None:
             self._trained.load(tensors)
 
@@ -220,7 +214,6 @@ class HalvesScore:
     moved_mm: float
 
     def to_dict(self) -> dict[str, float]:
-        """A JSON object."""
         return asdict(self)
 
     def __str__(self) -> str:

@@ -55,7 +55,6 @@ class Course:
 
     @property
     def step_s(self) -> float:
-        """The mean over the steps."""
         return self.seconds / len(self.losses)
 
 
@@ -134,7 +133,6 @@ class Board:
         self._writer = SummaryWriter(str(folder), purge_step=steps_done + 1 if steps_done else None)
 
     def write(self, line: Mapping[str, float]) -> None:
-        """A line of the journal, by its step."""
         for name, value in line.items():
             if name != "step":
                 self._writer.add_scalar(name, value, int(line["step"]))

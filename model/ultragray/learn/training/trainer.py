@@ -170,7 +170,6 @@ class Trainer:
         should_stop: Callable[[], bool] | None,
         checkpoint_interval_s: float,
     ) -> None:
-        """Steps to the end, or until `should_stop`; see `train`."""
         saved_at = time.monotonic()
         while self.step < self._schedule.steps:
             progress = self._timed_step(log)

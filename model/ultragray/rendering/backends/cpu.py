@@ -140,7 +140,6 @@ def drawing_work(
 
 
 def _sorted(scene: GaussianScene, weighted: bool = False) -> _cpu.PreparedScene:
-    """The scene as the kernel takes it for many frames."""
     kind = Kind(scene.info.intensity, weighted)
     return scene.prepared(kind.place("cpu"), lambda: _prepare(scene.splats, kind))
 

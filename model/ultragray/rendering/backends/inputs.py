@@ -53,12 +53,10 @@ def scene_poses(scene: GaussianScene, poses: Any) -> ScenePoses:  # [C, 4, 4] or
 
 
 def want_gradient(poses: ScenePoses) -> bool:
-    """Whether a loss is to be differentiated by these poses."""
     return isinstance(poses, Tensor) and poses.requires_grad and torch.is_grad_enabled()
 
 
 def as_array(poses: ScenePoses) -> FloatArray:  # [C, 4, 4]
-    """The numbers alone."""
     return poses.detach().numpy() if isinstance(poses, Tensor) else poses
 
 
@@ -113,7 +111,6 @@ class KernelLines(NamedTuple):
 
     @classmethod
     def of(cls, probe: Probe) -> KernelLines:
-        """The lines of a probe."""
         match probe.lines:
             case ParallelLines() as lines:
                 along_x, along_z = lines.direction
@@ -124,7 +121,6 @@ class KernelLines(NamedTuple):
                 return cls(True, lines.wrap, math.radians(lines.start), math.radians(lines.span), np.eye(3))
 
     def view_axes(self, poses: FloatArray) -> FloatArray:  # [C, 4, 4] -> [C, 4, 4]
-        """Poses whose axes are those of the sheared plane."""
         sheared = poses.copy()
         sheared[:, :3, :3] = poses[:, :3, :3] @ self.axes
         return sheared
@@ -177,7 +173,6 @@ class BeamVariance(NamedTuple):
 
     @classmethod
     def of(cls, beam: Tensor, probe: Probe, height: int) -> BeamVariance:
-        """Of the numbers of `beam_cm`, for frames of a height."""
         sigma, focus, rayleigh = beam.tolist()
         slope2 = (sigma / rayleigh) ** 2
         ends = probe.near_mm / 10.0, probe.cull_far_mm(height) / 10.0
