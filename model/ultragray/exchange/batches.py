@@ -30,13 +30,6 @@ from ultragray.scene.info import SceneHeader
 _RANGE = re.compile(r"(?P<before>[^{}]*)\{(?P<first>\d{1,9})\.\.(?P<last>\d{1,9})\}(?P<after>[^{}]*)")
 
 
-def name_range(before: str, last: int, after: str) -> str:
-    """The names from number 0 to `last`; of one file, its name."""
-    if last == 0:
-        return f"{before}{0:06d}{after}"
-    return f"{before}{{{0:06d}..{last:06d}}}{after}"
-
-
 def names_in(name: str) -> Iterator[str]:
     """All names that a name stands for: those of its range, or itself."""
     found = _RANGE.fullmatch(name)
@@ -141,7 +134,8 @@ class BatchPlan:
     @property
     def file_names(self) -> str:
         """The names of all files, as WebDataset writes them: frames-{000000..000199}.tar."""
-        return name_range(f"{self.name}-", self.shard_count - 1, ".tar")
+        last = self.shard_count - 1
+        return f"{self.name}-{{000000..{last:06d}}}.tar" if last else self.file_name(0)
 
     def key(self, frame: int) -> str:
         """The name of a frame within its shard, unique in the batch and of one length."""

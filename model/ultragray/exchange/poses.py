@@ -43,7 +43,11 @@ def read_pose_array(path: str | Path) -> npt.NDArray[Any]:
     """
     path = Path(path)
     try:
-        return _with_last_row(_read(path))
+        array = np.asarray(_read(path))
+        if array.ndim not in (2, 3) or array.shape[-2:] != (3, 4) or array.dtype.kind not in "fiu":
+            return array
+        last = np.broadcast_to(np.array([0.0, 0.0, 0.0, 1.0]), (*array.shape[:-2], 1, 4))
+        return np.concatenate([array, last], axis=-2)
     except (OSError, ValueError, EOFError, RecursionError, MemoryError) as error:
         raise InvalidPose(f"{path}: {_reason(error)}", field="poses") from error
 
@@ -64,14 +68,6 @@ def _read(path: Path) -> Any:
     if path.suffix == ".mcap":
         return read_mcap_poses(path)
     raise ValueError("poses are read from .npy, .json and .mcap files")
-
-
-def _with_last_row(poses: Any) -> npt.NDArray[Any]:
-    array = np.asarray(poses)
-    if array.ndim not in (2, 3) or array.shape[-2:] != (3, 4) or array.dtype.kind not in "fiu":
-        return array
-    last = np.broadcast_to(np.array([0.0, 0.0, 0.0, 1.0]), (*array.shape[:-2], 1, 4))
-    return np.concatenate([array, last], axis=-2)
 
 
 def _reason(error: BaseException) -> str:

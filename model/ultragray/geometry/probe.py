@@ -347,6 +347,10 @@ class Probe(Family):
         columns = np.array(self.lines.corner_shares)
         return np.concatenate([self.points_mm(np.full(columns.shape, row), columns) for row in (0.0, 1.0)])
 
+    def corners_from(self, poses: FloatArray) -> FloatArray:  # [C, 4, 4] mm -> [C, 2·K, 3]
+        """`corners_mm` in the frame that poses lead into."""
+        return np.einsum("fij,cj->fci", poses[:, :3, :3], self.corners_mm()) + poses[:, None, :3, 3]
+
     def cropped(self, share: float) -> Self:
         """The same probe with scan lines that end after this share of their length."""
         return self.ending_at(self.near_mm + share * self.scan_line_length_mm)

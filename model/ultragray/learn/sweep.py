@@ -131,8 +131,7 @@ class Sweep:
 
     def corners_mm(self) -> FloatArray:  # [F, 4 or 6, 3]
         """Corners of each image plane in the tracker's frame."""
-        corners: FloatArray = np.einsum("fij,cj->fci", self.poses[:, :3, :3], self.probe.corners_mm())
-        return corners + self.poses[:, None, :3, 3]
+        return self.probe.corners_from(self.poses)
 
 
 def spread_places(count: int, most: int) -> IntArray:
@@ -159,8 +158,8 @@ def mean_axes(poses: FloatArray) -> FloatArray:  # [F, 4, 4] -> [3, 3]
 
 def nearest_frames(sweep: Sweep, poses: FloatArray) -> IntArray:  # [C]
     """The place of the sweep's frame whose corners lie nearest on average, for each pose [C, 4, 4] (mm)."""
-    asked = np.einsum("cij,pj->cpi", poses[:, :3, :3], sweep.probe.corners_mm()) + poses[:, None, :3, 3]
     corners = sweep.corners_mm()
+    asked = sweep.probe.corners_from(poses)
     return np.array([corner_distances_mm(corners, own).argmin() for own in asked], np.int64)
 
 

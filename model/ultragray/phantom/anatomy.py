@@ -150,11 +150,6 @@ def fascia_depth_mm(x: Floats) -> Floats:
     return 10.0 - 1.6 * np.exp(-(((np.abs(x) - 14.0) / 9.0) ** 2)) + 2.0 * np.exp(-((x / 5.0) ** 2))
 
 
-def deep_fascia_depth_mm(x: Floats) -> Floats:
-    """The middle layer of that fascia, in front of the erector spinae."""
-    return 42.5 + 0.02 * (np.abs(x) - 22.0) ** 2
-
-
 def canal_roof_mm(x: Floats) -> Floats:
     """The yellow ligament between the laminae."""
     return 36.0 + 0.28 * np.sqrt(x * x + 4.0)
@@ -213,10 +208,6 @@ def round_trip_db_per_mm() -> FloatArray:  # [tissues]
 def backscatter_amplitudes() -> FloatArray:  # [tissues]
     """Amplitude of each tissue's scatterers over those of muscle."""
     return np.array([10.0 ** (ACOUSTICS[tissue].backscatter_db / 20.0) for tissue in Tissue])
-
-
-def compensated_db_per_mm() -> float:
-    return 0.2 * FREQUENCY_MHZ * COMPENSATED
 
 
 def lateral_sigma_mm(depth_mm: Floats) -> Floats:
@@ -313,22 +304,6 @@ def _along_fibres(points: Floats) -> Floats:  # [N, 3] -> [N, 3]
     return np.stack([x + 0.10 * np.sign(x) * y, y, z - lean - 0.06 * y], axis=1)
 
 
-def _perimysium(points: Floats) -> Floats:
-    return 1.2 * _BUNDLES(_along_fibres(points))
-
-
-def _endomysium(points: Floats) -> Floats:
-    return 0.9 * _FIBRES(_along_fibres(points))
-
-
-def _fat_septa(points: Floats) -> Floats:
-    return 1.2 * _LOBULES(points)
-
-
-def _nerve_roots(points: Floats) -> Floats:
-    return 1.2 * (_ROOTS(points) - 0.35)
-
-
 def _muscle_septa(points: Floats) -> Floats:
     """Between multifidus and longissimus, and between longissimus and iliocostalis."""
     side, y, z = np.abs(points[:, 0]), points[:, 1], points[:, 2]
@@ -351,10 +326,6 @@ def _in_fat(points: Floats) -> npt.NDArray[np.bool_]:
     return np.asarray((z > SKIN_MM + 0.3) & (z < fascia_depth_mm(x) - 0.3))
 
 
-def _in_sac(points: Floats) -> npt.NDArray[np.bool_]:
-    return np.asarray(sac_distance_mm(points) < -0.8)
-
-
 def _outside_bone(points: Floats) -> npt.NDArray[np.bool_]:
     return np.asarray(distance_mm(points) > 0.3)
 
@@ -375,24 +346,27 @@ INTERFACES: tuple[Interface, ...] = (
     Interface(distance_mm, _everywhere, (10.0, 66.0), 38.0, 18.0, 26.0, 0.05),
     Interface(_sheet(lambda x: 0.5 + 0.0 * x), _everywhere, (0.0, 1.5), 26.0, 10.0, 25.0, 0.05),
     Interface(_sheet(lambda x: SKIN_MM + 0.0 * x), _everywhere, (0.5, 3.0), 20.0, 6.0, 20.0, 0.05),
-    Interface(_fat_septa, _in_fat, (1.0, 13.0), 15.0, 2.0, 18.0, 0.05),
+    Interface(lambda points: 1.2 * _LOBULES(points), _in_fat, (1.0, 13.0), 15.0, 2.0, 18.0, 0.05),
     Interface(_sheet(fascia_depth_mm), _outside_bone, (7.0, 14.0), 27.0, 8.0, 16.0, 0.04),
+    Interface(_sheet(lambda x: fascia_depth_mm(x) + FASCIA_MM), _outside_bone, (8.0, 15.0), 22.0, 6.0, 16.0, 0.04),
+    # the middle layer of that fascia, in front of the erector spinae
     Interface(
-        _sheet(lambda x: fascia_depth_mm(x) + FASCIA_MM),
-        _outside_bone,
-        (8.0, 15.0),
-        22.0,
-        6.0,
-        16.0,
-        0.04,
+        _sheet(lambda x: 42.5 + 0.02 * (np.abs(x) - 22.0) ** 2), _beside(16.0), (39.0, 52.0), 22.0, 6.0, 16.0, 0.04
     ),
-    Interface(_sheet(deep_fascia_depth_mm), _beside(16.0), (39.0, 52.0), 22.0, 6.0, 16.0, 0.04),
     Interface(_muscle_septa, _in_muscle, (10.0, 33.0), 16.0, 8.0, 18.0, 0.06),
-    Interface(_perimysium, _in_muscle, (9.0, 66.0), 20.0, 2.0, 13.0, 0.05),
-    Interface(_endomysium, _in_muscle, (9.0, 66.0), 9.0, -6.0, 13.0, 0.05),
+    Interface(  # perimysium
+        lambda points: 1.2 * _BUNDLES(_along_fibres(points)), _in_muscle, (9.0, 66.0), 20.0, 2.0, 13.0, 0.05
+    ),
+    Interface(  # endomysium
+        lambda points: 0.9 * _FIBRES(_along_fibres(points)), _in_muscle, (9.0, 66.0), 9.0, -6.0, 13.0, 0.05
+    ),
     Interface(vessel_distance_mm, _everywhere, (16.0, 30.0), 24.0, 8.0, 20.0, 0.04),
     Interface(_sheet(canal_roof_mm), _within(9.0), (33.0, 41.0), 20.0, 8.0, 20.0, 0.05),
     Interface(sac_distance_mm, _outside_bone, (38.0, 56.0), 22.0, 6.0, 18.0, 0.04),
-    Interface(_nerve_roots, _in_sac, (40.0, 54.0), 1.0, -9.0, 20.0, 0.05),
+    Interface(  # nerve roots
+        lambda points: 1.2 * (_ROOTS(points) - 0.35),
+        lambda points: np.asarray(sac_distance_mm(points) < -0.8),
+        *((40.0, 54.0), 1.0, -9.0, 20.0, 0.05),
+    ),
     Interface(_sheet(lambda x: BODY_DEPTH_MM + 0.0 * x), _within(17.0), (52.0, 57.0), 22.0, 8.0, 18.0, 0.05),
 )

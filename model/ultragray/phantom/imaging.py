@@ -18,7 +18,6 @@ from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.sweep import ByteArray, IntArray
 from ultragray.phantom import anatomy
-from ultragray.phantom import anatomy as acoustics
 from ultragray.phantom.anatomy import (
     INTERFACES,
     Floats,
@@ -59,15 +58,8 @@ class Scatterers:
         in_tissue, on_surface = (self.points_mm @ axis - zero, self.surface_mm @ axis - zero)
         inside = np.flatnonzero((in_tissue > low_mm) & (in_tissue < high_mm))
         facing = np.flatnonzero((on_surface > low_mm) & (on_surface < high_mm))
-        return Scatterers(
-            self.points_mm[inside],
-            self.amplitudes[inside],
-            self.surface_mm[facing],
-            self.normals[facing],
-            self.specular[facing],
-            self.diffuse[facing],
-            self.lobe_rad[facing],
-        )
+        on = self.surface_mm, self.normals, self.specular, self.diffuse, self.lobe_rad
+        return Scatterers(self.points_mm[inside], self.amplitudes[inside], *(values[facing] for values in on))
 
     @classmethod
     def join(cls, parts: list[Scatterers]) -> Scatterers:
@@ -139,7 +131,9 @@ def _on(
     level = interface.level(drawn[near])
     close = np.abs(level) < 2.0 * BAND_MM  # the function is only roughly a distance
     near, level = near[close], level[close]
-    gradient = _gradient(interface, points[near], level)
+    shifted = (points[near] + _GRADIENT_STEP_MM * axis for axis in np.eye(3, dtype=np.float32))
+    steps = [interface.level(anatomy.straightened(there)) - level for there in shifted]
+    gradient = np.stack(steps, axis=1) / _GRADIENT_STEP_MM  # of the interface's function, in the phantom's frame
     steepness = np.maximum(np.linalg.norm(gradient, axis=1), 1e-6)
     kept = np.abs(level) < BAND_MM * steepness
     kept[kept] = interface.present(drawn[near[kept]])
@@ -154,12 +148,6 @@ def _on(
         strength * 10.0 ** (interface.diffuse_db / 20.0),
         np.full(len(near), np.radians(interface.lobe_deg)),
     )
-
-
-def _gradient(interface: Interface, points: Floats, level: Floats) -> Floats:  # [M, 3], [M] -> [M, 3]
-    shifted = (points + _GRADIENT_STEP_MM * axis for axis in np.eye(3, dtype=np.float32))
-    steps = [interface.level(anatomy.straightened(there)) - level for there in shifted]
-    return np.stack(steps, axis=1) / _GRADIENT_STEP_MM
 
 
 # B-mode frames of the phantom: scatterers under a beam, attenuation along the scan lines, envelope, log compression.
@@ -186,7 +174,8 @@ def simulate(poses: npt.ArrayLike, *, probe: Probe, height: int, width: int) -> 
     checked = check_poses(poses)
     frames = np.zeros((len(checked), height, width), dtype=np.uint8)
     for frame, pose in zip(frames, checked, strict=True):
-        frame[:] = _compressed(_power(field, grid, pose))
+        grey = MUSCLE_GREY + 10.0 * np.log10(_power(field, grid, pose) + 1e-12) / DYNAMIC_RANGE_DB
+        frame[:] = np.round(255.0 * np.clip(grey, 0.0, 1.0)).astype(np.uint8)
     return frames
 
 
@@ -196,7 +185,7 @@ def bone_attenuation_db(poses: npt.ArrayLike, *, probe: Probe, height: int, widt
     Raises InvalidPose for poses that are not rigid.
     """
     grid = Grid.of(probe, height, width)
-    per_mm = acoustics.round_trip_db_per_mm()[Tissue.BONE]
+    per_mm = anatomy.round_trip_db_per_mm()[Tissue.BONE]
     checked = check_poses(poses)
     maps = np.zeros((len(checked), height, width), dtype=np.float32)
     for attenuation, pose in zip(maps, checked, strict=True):
@@ -292,8 +281,8 @@ def _tissue(pose: FloatArray, depths_mm: Floats, laterals_mm: Floats) -> npt.NDA
 
 def _power(field: ScattererField, grid: Grid, pose: FloatArray) -> Floats:  # [H, W]
     """Mean square of the envelope over each pixel and the frequencies of the scanner, 1 in muscle."""
-    gain_db = acoustics.compensated_db_per_mm() * grid.depths_mm[:, None]
-    loss_db = grid.above(acoustics.round_trip_db_per_mm()[grid.tissue(pose)])
+    gain_db = 0.2 * anatomy.FREQUENCY_MHZ * anatomy.COMPENSATED * grid.depths_mm[:, None]
+    loss_db = grid.above(anatomy.round_trip_db_per_mm()[grid.tissue(pose)])
     sensitivity = (10.0 ** ((gain_db - loss_db) / 20.0)).astype(np.float32)
     looks = [np.abs(_blurred(echoes * sensitivity, grid)) ** 2 for echoes in _echoes(field, grid, pose)]
     return grid.pixels(np.mean(looks, axis=0))
@@ -302,29 +291,24 @@ def _power(field: ScattererField, grid: Grid, pose: FloatArray) -> Floats:  # [H
 def _echoes(field: ScattererField, grid: Grid, pose: FloatArray) -> Iterator[Complex64Array]:  # [R, C]
     """The scatterers of the slice on the grid, as phasors at each frequency."""
     depths, laterals = grid.depths_mm, grid.laterals_mm
-    reach = acoustics.ELEVATION_REACH * float(acoustics.elevation_sigma_mm(depths).max())
+    reach = anatomy.ELEVATION_REACH * float(anatomy.elevation_sigma_mm(depths).max())
     low, high = np.array([laterals[0], -reach, depths[0]]), np.array([laterals[-1], reach, depths[-1]])
     scatterers = field.slice(pose, low, high)
     points = np.concatenate([scatterers.points_mm, scatterers.surface_mm])
-    amplitudes = np.concatenate([scatterers.amplitudes, _reflected(scatterers, pose)])
+    cosine = np.minimum(np.abs(scatterers.normals @ pose[:3, 2].astype(np.float32)), 1.0)
+    lobe = np.exp(-0.5 * (np.arccos(cosine) / scatterers.lobe_rad) ** 2)
+    amplitudes = np.concatenate([scatterers.amplitudes, scatterers.diffuse + scatterers.specular * lobe])
     local = (points - pose[:3, 3].astype(np.float32)) @ pose[:3, :3].astype(np.float32)
     inside, cells = grid.cells(local[:, 0], local[:, 2])
     _, y, z = local[inside].T
-    weights = amplitudes[inside] * acoustics.elevation_weight(y, z)
+    weights = amplitudes[inside] * anatomy.elevation_weight(y, z)
     count = grid.shape[0] * grid.shape[1]
-    for frequency in acoustics.FREQUENCIES_MHZ:
-        phase = np.float32(4.0 * math.pi * frequency / acoustics.SPEED_MM_PER_US) * z
+    for frequency in anatomy.FREQUENCIES_MHZ:
+        phase = np.float32(4.0 * math.pi * frequency / anatomy.SPEED_MM_PER_US) * z
         echoes = np.empty(count, dtype=np.complex64)
         echoes.real = np.bincount(cells, weights * np.cos(phase), count)
         echoes.imag = np.bincount(cells, weights * np.sin(phase), count)
         yield echoes.reshape(grid.shape)
-
-
-def _reflected(scatterers: Scatterers, pose: FloatArray) -> Float32Array:  # [M]
-    """Amplitudes of the scatterers on interfaces for the beam of this pose."""
-    cosine = np.minimum(np.abs(scatterers.normals @ pose[:3, 2].astype(np.float32)), 1.0)
-    lobe = np.exp(-0.5 * (np.arccos(cosine) / scatterers.lobe_rad) ** 2)
-    return scatterers.diffuse + scatterers.specular * lobe
 
 
 def _blurred(echoes: Complex64Array, grid: Grid) -> Complex64Array:  # [R, C]
@@ -332,19 +316,14 @@ def _blurred(echoes: Complex64Array, grid: Grid) -> Complex64Array:  # [R, C]
     rows, columns = echoes.shape
     down = 2.0 * math.pi * np.fft.fftfreq(rows, grid.cell_mm[0])  # rad/mm
     across = 2.0 * math.pi * np.fft.fftfreq(columns, grid.cell_mm[1])
-    sigma = acoustics.lateral_sigma_mm(grid.depths_mm)
-    pulse = np.exp(-0.5 * (acoustics.PULSE_SIGMA_MM * down) ** 2)[:, None]
+    sigma = anatomy.lateral_sigma_mm(grid.depths_mm)
+    pulse = np.exp(-0.5 * (anatomy.PULSE_SIGMA_MM * down) ** 2)[:, None]
     beam = np.exp(-0.5 * (sigma[:, None] * across) ** 2)
     # Σ amplitude² over the scatterers of one pixel, for kernels of unit sum: what a wider beam gathers is divided out.
-    elevation = acoustics.elevation_sigma_mm(grid.depths_mm)
+    elevation = anatomy.elevation_sigma_mm(grid.depths_mm)
     cell = grid.cell_mm[0] * grid.cell_mm[1]
-    gathered = PER_MM3 * cell**2 * elevation / (4.0 * math.sqrt(math.pi) * sigma * acoustics.PULSE_SIGMA_MM)
+    gathered = PER_MM3 * cell**2 * elevation / (4.0 * math.sqrt(math.pi) * sigma * anatomy.PULSE_SIGMA_MM)
     beam /= np.sqrt(gathered)[:, None]
     pulsed = np.fft.ifft(np.fft.fft(echoes, axis=0) * pulse.astype(np.float32), axis=0)
     blurred = np.fft.ifft(np.fft.fft(pulsed, axis=1) * beam.astype(np.float32), axis=1)
     return blurred.astype(np.complex64)
-
-
-def _compressed(power: Floats) -> ByteArray:  # [H, W]
-    grey = MUSCLE_GREY + 10.0 * np.log10(power + 1e-12) / DYNAMIC_RANGE_DB
-    return np.round(255.0 * np.clip(grey, 0.0, 1.0)).astype(np.uint8)

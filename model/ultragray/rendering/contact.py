@@ -30,9 +30,7 @@ HeightArray: TypeAlias = npt.NDArray[np.float32]
 COUPLING_MM = 1.0  # of gel between face and skin: a face so near to the skin has contact
 MARGIN_MM = 15.0  # beyond the training faces the skin goes on, at the height of the nearest ones
 LEAST_SLOPE = 0.2  # cosine between a scan line and the way into the body: a flatter line has no contact
-_LEAST_AGREEMENT = (
-    0.6  # length of the mean axis of the views, 1 where all look one way: around a limb there is no height
-)
+_LEAST_AGREEMENT = 0.6  # length of the views' mean axis, 1 where all look one way: around a limb there is no height
 _LEAST_CELL_MM = 1.0
 _MOST_CELLS = 256  # each way
 _MOST_VIEWS = 4096  # of more, every second one is taken, or every third

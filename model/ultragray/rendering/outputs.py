@@ -109,14 +109,6 @@ def _uncertainty(drawing: Drawing) -> Tensor:
     return deviations(drawing, UNCERTAINTY.planes)
 
 
-def _lacks_uncertainty(info: SceneInfo) -> str | None:
-    return None if info.confidence.get("uncertainty") else "whose training fitted its uncertainty; this one has none"
-
-
-def _lacks_labels(info: SceneInfo) -> str | None:
-    return None if info.label_names else "whose Gaussians carry labels; this one's carry none"
-
-
 BMODE = _register("bmode", "B = E T, what a scanner shows", is_toned=True)
 ECHO = _register("echo", "E, the reflected intensity")
 TRANSMITTANCE = _register("transmittance", "T, what is left of the beam at that depth")
@@ -134,7 +126,7 @@ LABELS = _register(
     derive=_labels,
     dtype=_NUMBERS,
     shows_tools_alone=True,
-    lacks=_lacks_labels,
+    lacks=lambda info: None if info.label_names else "whose Gaussians carry labels; this one's carry none",
 )
 UNCERTAINTY = _register(
     "uncertainty",
@@ -142,7 +134,9 @@ UNCERTAINTY = _register(
     planes=("bmode", "coverage", "transmittance"),
     derive=_uncertainty,
     tells_support=True,
-    lacks=_lacks_uncertainty,
+    lacks=lambda info: (
+        None if info.confidence.get("uncertainty") else "whose training fitted its uncertainty; this one has none"
+    ),
 )
 
 

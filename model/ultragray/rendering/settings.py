@@ -129,6 +129,7 @@ class FrameSettings(Contract):
                 "min_confidence needs a scene that knows the confidence of its frames; this one was trained without",
                 field="min_confidence",
             )
+        given = {one.name: getattr(self, one.name, None) for one in fields(Additions)}
         return Resolved(
             probe=info.probe_or(self.probe),
             beam=info.beam_or(self.slice_thickness_mm),
@@ -137,12 +138,8 @@ class FrameSettings(Contract):
             outputs=self.outputs,
             encoding=encoding,
             display=self.display or AS_RENDERED,
-            **self._additions(),
+            **{name: value for name, value in given.items() if value is not None},
         )
-
-    def _additions(self) -> dict[str, Any]:
-        given = {one.name: getattr(self, one.name, None) for one in fields(Additions)}
-        return {name: value for name, value in given.items() if value is not None}
 
 
 def registration_field() -> Any:

@@ -155,7 +155,7 @@ class CoveredSampler(DrawnSampler):
             raise InvalidArgument(
                 f"sampler covered takes at most {MAX_BASE_POSES:,} base poses, got {len(base):,}", field="kind"
             )
-        corners = np.einsum("pij,kj->pki", base[:, :3, :3], probe.corners_mm()) + base[:, None, :3, 3]  # [P, K, 3] mm
+        corners = probe.corners_from(base)  # [P, K, 3] mm
         links, lengths = _shortest_links(corners.tobytes(), len(corners))
         lengths = np.where(lengths > LARGEST_GAP * np.median(lengths), 0.0, lengths)
         ends = np.cumsum(lengths)

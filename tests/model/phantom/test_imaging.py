@@ -91,7 +91,7 @@ def test_speckle_has_the_statistics_of_three_independent_looks(monkeypatch: pyte
     rng = np.random.default_rng(0)
     grid = imaging.Grid.of(PROBE, HEIGHT, WIDTH)
     cells = grid.cell_mm[0] * grid.cell_mm[1]
-    thickness = np.sqrt(np.pi) * imaging.acoustics.elevation_sigma_mm(grid.depths_mm)[:, None]  # of a weight squared
+    thickness = np.sqrt(np.pi) * imaging.anatomy.elevation_sigma_mm(grid.depths_mm)[:, None]  # of a weight squared
     looks = []
     for _ in range(3):
         noise = rng.normal(size=grid.shape) + 1j * rng.normal(size=grid.shape)

@@ -215,12 +215,6 @@ def _spread(grid: Tensor) -> Tensor:  # [X, Y, Z]
     return grid
 
 
-# Classical baselines: frames predicted from the training frames themselves, without learning.
-#
-# - median, mean, maximum: a compounded volume, re-sliced (ultragray.learn.evaluation.baselines); - linear: each pixel
-# between the two training planes that enclose it, by its distance to them along their normals; - nearest: the
-# training frame whose corners lie nearest on average, as it is.
-
 FrameArray = npt.NDArray[np.float32]
 BASELINES = (*FOLDS, "linear", "nearest")
 
@@ -228,7 +222,8 @@ BASELINES = (*FOLDS, "linear", "nearest")
 def predict(sweep: Sweep, poses: FloatArray, method: str, *, voxel_mm: float = VOXEL_MM) -> FrameArray:  # [C, H, W]
     """The frames, in [0, 1], that one of BASELINES expects at poses [C, 4, 4] (mm) of the sweep's own probe.
 
-    `voxel_mm` is for the compounded volumes. Raises InvalidArgument for an unknown method, and as `compound` does.
+    `nearest`: the frame whose corners lie nearest on average. `linear`: `interpolate_planes`. The others: a compounded
+    volume of voxels of `voxel_mm`, re-sliced. Raises InvalidArgument for an unknown method, and as `compound` does.
     """
     if method not in BASELINES:
         raise InvalidArgument(f"method must be one of {', '.join(BASELINES)}, got {method!r}", field="method")
@@ -256,16 +251,12 @@ def interpolate_planes(sweep: Sweep, poses: FloatArray) -> FrameArray:  # [C, H,
     one side only it takes that, with none it is 0.
     """
     points = pixel_positions_mm(sweep.probe, sweep.height, sweep.width)
-    order = _distances_to_frames_mm(sweep, poses).argsort(axis=1)
+    asked = sweep.probe.corners_from(poses)
+    order = corner_distances_mm(asked[:, None], sweep.corners_mm()[None]).argsort(axis=1)  # [C, F]
     planes = np.zeros((len(poses), sweep.height, sweep.width), np.float32)
     for plane, pose, frames in zip(planes, check_poses(poses) if len(poses) else poses, order, strict=True):
         plane[:] = _between(sweep, points @ pose[:3, :3].T + pose[:3, 3], frames).reshape(plane.shape)
     return planes
-
-
-def _distances_to_frames_mm(sweep: Sweep, poses: FloatArray) -> FloatArray:  # [C, F]
-    asked = np.einsum("cij,pj->cpi", poses[:, :3, :3], sweep.probe.corners_mm()) + poses[:, None, :3, 3]
-    return corner_distances_mm(asked[:, None], sweep.corners_mm()[None])
 
 
 def _between(sweep: Sweep, points: FloatArray, frames: IntArray) -> FloatArray:  # [P, 3] mm, [F] -> [P]

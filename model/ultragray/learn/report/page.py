@@ -133,6 +133,7 @@ def render_page(page: ScenePage, template: str = "scene.html", *packages: str, *
     """The HTML text. A template of one of these packages that extends `scene.html` is given `more`, too."""
     evaluations = {title: one.evaluation for title, one in page.predictions.items()}
     is_alone = len(evaluations) + len(page.failures) == 1
+    settings = {} if page.course is None else page.scene.info.training
     values = {
         "title": page.dataset.name,
         "facts": _facts(page),
@@ -144,7 +145,7 @@ def render_page(page: ScenePage, template: str = "scene.html", *packages: str, *
         "frames_plot": plot_frames({t: one for t, one in evaluations.items() if t not in page.not_plotted}),
         "training_plot": None if page.course is None else svg(plot_training(page.course)),
         "pictures": _pictures(page),
-        "configuration": {} if page.course is None else _configuration(page.scene),
+        "configuration": {name: value for name, value in settings.items() if value is not None},
         **more,
     }
     return environment(*packages).get_template(template).render(values)
@@ -157,10 +158,6 @@ def environment(*packages: str) -> Environment:
     headings = [metric.heading for metric in METRICS]
     made.globals |= {"version": __version__, "gain": DIFFERENCE_GAIN, "headings": headings}
     return made
-
-
-def _configuration(scene: GaussianScene) -> dict[str, Any]:
-    return {name: value for name, value in scene.info.training.items() if value is not None}
 
 
 def _facts(page: ScenePage) -> dict[str, str]:
