@@ -300,7 +300,10 @@ def parse_frame_ranges(text: str, count: int, *, option: str) -> list[int]:
                 f"{option} must be frames such as 7, 0:90 or 0:90,100:120:2 (the stop is left out), got {text[:80]!r}",
                 field=option,
             )
-        frames = _frames(match, count)
+        start, stop, step = int(match["start"] or 0), int(match["stop"] or count), int(match["step"] or 1)
+        if match["range"] is None:
+            stop = start + 1
+        frames = range(start, stop, step) if step else range(0)
         if not len(frames):
             raise InvalidArgument(f"{option}: {part.strip()!r} names no frame", field=option)
         if frames[-1] >= count:
@@ -310,10 +313,3 @@ def parse_frame_ranges(text: str, count: int, *, option: str) -> list[int]:
             )
         chosen.update(frames)
     return sorted(chosen)
-
-
-def _frames(match: re.Match[str], count: int) -> range:
-    if match["range"] is None:
-        return range(int(match["start"]), int(match["start"]) + 1)
-    start, stop, step = int(match["start"] or 0), int(match["stop"] or count), int(match["step"] or 1)
-    return range(start, stop, step) if step else range(0)

@@ -18,6 +18,7 @@ import numpy.typing as npt
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.geometry.scan_conversion import interpolated
 
 # The skin as a sweep tells it: heights of the faces of its training views over a plane.
 #
@@ -111,11 +112,7 @@ class Skin:
         rows, columns = heights.shape
         x = np.clip(at[..., 0] / self.cell_mm, 0.0, columns - 1.001)
         y = np.clip(at[..., 1] / self.cell_mm, 0.0, rows - 1.001)
-        i, j = y.astype(np.intp), x.astype(np.intp)
-        down, right = y - i, x - j
-        upper = heights[i, j] * (1.0 - right) + heights[i, j + 1] * right
-        lower = heights[i + 1, j] * (1.0 - right) + heights[i + 1, j + 1] * right
-        return upper * (1.0 - down) + lower * down
+        return interpolated(heights, y, x)
 
 
 def way_in(poses: FloatArray, probe: Probe | None) -> tuple[FloatArray, Probe]:  # [P, 4, 4] mm -> [3]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from contextlib import suppress
 from pathlib import Path
 
 import torch
@@ -133,16 +134,13 @@ def available_bytes() -> int | None:
 
 
 def _free_memory() -> int | None:
-    try:
+    with suppress(OSError):
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
             if line.startswith("MemAvailable:"):
                 return int(line.split()[1]) * 1024
-    except OSError:
-        pass
-    try:
+    with suppress(ValueError, OSError):
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (ValueError, OSError):
-        return None
+    return None
 
 
 def _left_in_group() -> int | None:
@@ -150,18 +148,11 @@ def _left_in_group() -> int | None:
         (CONTROL_GROUPS, "memory.max", "memory.current", "inactive_file"),
         (CONTROL_GROUPS / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
     ):
-        try:
-            taken = int((folder / used).read_text()) - _entry(folder / "memory.stat", reclaimable)
-            return int((folder / limit).read_text()) - taken
-        except (OSError, ValueError):  # another layout, or "max": no limit
-            continue
+        with suppress(OSError, ValueError):  # another layout, or "max": no limit
+            lines = (folder / "memory.stat").read_text(encoding="ascii").splitlines()
+            cached = int(dict(line.split() for line in lines).get(reclaimable, 0))  # counts as used but can be had
+            return int((folder / limit).read_text()) - int((folder / used).read_text()) + cached
     return None
-
-
-def _entry(path: Path, name: str) -> int:
-    """A number of memory.stat; 0 where it has none. What files take in a cache counts as used but can be had."""
-    values = dict(line.split() for line in path.read_text(encoding="ascii").splitlines())
-    return int(values.get(name, 0))
 
 
 def check_memory(dataset: Dataset, config: TrainingConfig, device: torch.device) -> None:

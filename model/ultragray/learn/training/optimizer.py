@@ -175,7 +175,9 @@ def refine(
     split_scale × scene scale, else replaced by two of it, drawn from the Gaussian itself and 1.6 times smaller. Then
     all that are larger than prune_above, or smaller than prune_below, × scene scale go.
     """
-    chosen = _candidates(pull, limit - len(pull), config)
+    least = config.growth_gradient if config.growth == "threshold" else 0.0
+    order = torch.argsort(pull, descending=True, stable=True)[: max(0, limit - len(pull))]  # each takes one more place
+    chosen = order[pull[order] > least]
     is_large = _largest_cm(parameters["scales"][chosen]) > config.split_scale * scene_scale_cm
     split, duplicated = chosen[is_large], chosen[~is_large]
     stays = torch.ones(len(pull), dtype=torch.bool, device=pull.device)
@@ -190,13 +192,6 @@ def refine(
     order = left[spatial_order(grown["means"][left])]
     parent = torch.cat([kept, duplicated, split, split])
     return Refined({name: tensor[order] for name, tensor in grown.items()}, origin[order], parent[order])
-
-
-def _candidates(pull: Tensor, room: int, config: TrainingConfig) -> Tensor:  # [N] -> [n]
-    """Places of the Gaussians to refine, the most pulled first, each of which takes the room of one more."""
-    least = config.growth_gradient if config.growth == "threshold" else 0.0
-    order = torch.argsort(pull, descending=True, stable=True)[: max(0, room)]
-    return order[pull[order] > least]
 
 
 def _largest_cm(scales: Tensor) -> Tensor:  # [N, 3] log cm -> [N]

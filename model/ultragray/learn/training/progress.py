@@ -96,20 +96,15 @@ def _lines_until(path: Path, steps_done: int) -> list[bytes]:
         return []
     kept = []
     for line in path.read_bytes().splitlines(keepends=True):
-        if not line.endswith(b"\n") or not 1 <= _step_of(line) <= steps_done:
+        try:
+            document = json.loads(line)
+        except (ValueError, RecursionError):
+            break
+        step = document.get("step") if isinstance(document, dict) else None
+        if not line.endswith(b"\n") or type(step) is not int or not 1 <= step <= steps_done:
             break
         kept.append(line)
     return kept
-
-
-def _step_of(line: bytes) -> int:
-    """The step that a line is about; 0 where it is damaged."""
-    try:
-        document = json.loads(line)
-    except (ValueError, RecursionError):
-        return 0
-    step = document.get("step") if isinstance(document, dict) else None
-    return step if type(step) is int else 0
 
 
 def require_tensorboard() -> None:
