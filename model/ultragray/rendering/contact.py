@@ -94,25 +94,20 @@ class Skin:
         way = directions @ self.axes.T
         fall = np.minimum(way[..., 2], -LEAST_SLOPE)
         along = np.zeros(place.shape[:-1])
+        rows, columns = heights.shape
         for _ in range(_STEPS):
             at = place + along[..., None] * way
-            step = (at[..., 2] - self._height(heights, at)) / fall
+            y = np.clip(at[..., 1] / self.cell_mm, 0.0, rows - 1.001)  # beyond the cells, of the outermost ones
+            x = np.clip(at[..., 0] / self.cell_mm, 0.0, columns - 1.001)
+            step = (at[..., 2] - interpolated(heights, y, x)) / fall
             along -= step
             if np.abs(step).max(initial=0.0) < _MET_MM:
                 break
         at = place + along[..., None] * way
         column, row = (np.rint(at[..., axis] / self.cell_mm).astype(np.intp) for axis in (0, 1))
-        rows, columns = self.known.shape
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns) & (way[..., 2] <= -LEAST_SLOPE)
         met = inside & self.known[np.where(inside, row, 0), np.where(inside, column, 0)]
         return np.where(met, along, np.inf)
-
-    def _height(self, heights: HeightArray, at: FloatArray) -> FloatArray:  # [rows, columns], [..., 3] -> [...]
-        """Between the cells; beyond them that of the outermost ones."""
-        rows, columns = heights.shape
-        x = np.clip(at[..., 0] / self.cell_mm, 0.0, columns - 1.001)
-        y = np.clip(at[..., 1] / self.cell_mm, 0.0, rows - 1.001)
-        return interpolated(heights, y, x)
 
 
 def way_in(poses: FloatArray, probe: Probe | None) -> tuple[FloatArray, Probe]:  # [P, 4, 4] mm -> [3]

@@ -443,11 +443,10 @@ def load_tools(path: str | Path) -> tuple[Tool, ...]:
         document = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(document, list):
             raise InvalidArgument(f"it must hold a list of tools, got {shown(document)}")
-        return tuple(_tool(number, one) for number, one in enumerate(document))
+        tools = []
+        for number, one in enumerate(document):
+            with under(f"tools[{number}]"):
+                tools.append(from_dict(Tool, one))
+        return tuple(tools)
     except (OSError, ValueError, RecursionError) as error:  # InvalidArgument is a ValueError
         raise InvalidArgument(f"{path}: {error}", field="tools") from error
-
-
-def _tool(number: int, document: object) -> Tool:
-    with under(f"tools[{number}]"):
-        return from_dict(Tool, document)

@@ -81,7 +81,9 @@ def neighbours_of(sweep: Sweep) -> Neighbours:
         alike = rotation_angles_deg(pose[None], sweep.poses)[0] < ALIKE_DEG
         candidates = alike & ~beside & (distances > 0.0)
         nearest = np.flatnonzero(candidates)[np.argsort(distances[candidates], kind="stable")[:2]]
-        if len(nearest) and _crosses(offsets[nearest[0]] @ pose[:3, 1]):
+        heights_mm = offsets[nearest[0]] @ pose[:3, 1] if len(nearest) else np.zeros(1)
+        low, high = float(heights_mm.min()), float(heights_mm.max())
+        if min(-low, high) > CROSSING * max(-low, high):  # evenly: not as frames of a tilt do, whose faces meet
             found = nearest.tolist()
         else:
             found = []
@@ -106,12 +108,6 @@ def neighbours_of(sweep: Sweep) -> Neighbours:
         nearest_mm=min(spacing_mm or max(sweep.pixel_mm), extent_mm),
         extent_mm=extent_mm,
     )
-
-
-def _crosses(heights_mm: FloatArray) -> bool:  # [K] of the corners of a frame over the plane of another
-    """Whether the planes cross within the images, about evenly: not as frames of a tilt do, whose faces meet."""
-    low, high = float(heights_mm.min()), float(heights_mm.max())
-    return min(-low, high) > CROSSING * max(-low, high)
 
 
 ON_PLANE_MM = 1e-6  # distances are at least that: the nearer frame then has all the weight

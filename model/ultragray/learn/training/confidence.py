@@ -310,7 +310,9 @@ def fit_uncertainty(scene: GaussianScene, views: TrainingViews, sweep: Sweep, *,
     `views` are those that the scene was trained from. Far from them no errors are known, and there the variance is
     to be that of the training images.
     """
-    bands = _bands(sweep.images)
+    edges = np.linspace(0, sweep.height, DEPTHS + 1).round().astype(int)
+    by_depth = [sweep.images[:, low:high] / np.float32(255.0) for low, high in pairwise(edges)]
+    bands = DepthBands(tuple(float(one.mean()) for one in by_depth), tuple(float(one.var()) for one in by_depth))
     stride = max(1, len(sweep) * CELLS**2 // LOOKED_AT) | 1  # odd, while CELLS is even: cells of every column are taken
     terms, squares = [], []
     for some, frames in rendered_parts(scene, sweep, UNCERTAINTY.planes, backend):
@@ -341,12 +343,6 @@ def likeliest_variances(terms: FloatArray, squares: FloatArray, weights: FloatAr
         expected = np.maximum(terms @ found, 1e-9)
         found = found * (terms.T @ (weights * squares / expected)) / sums
     return found
-
-
-def _bands(images: ByteArray) -> DepthBands:  # [F, H, W]
-    edges = np.linspace(0, images.shape[1], DEPTHS + 1).round().astype(int)
-    bands = [images[:, low:high] / np.float32(255.0) for low, high in pairwise(edges)]
-    return DepthBands(tuple(float(band.mean()) for band in bands), tuple(float(band.var()) for band in bands))
 
 
 def _far_away(bands: DepthBands) -> tuple[FloatArray, FloatArray]:  # [DEPTHS, TERMS], [DEPTHS]
@@ -413,7 +409,9 @@ def fit_confidence(dataset: Dataset, train_shorter: TrainShorter, *, backend: st
     views = TrainingViews(part.train.poses, sweep.probe)
     measures = views.measure(both.poses, sweep.probe)
     terms = terms_of(measures, hardness_of_views(part.train))
-    black, hardness = _black_ms_ssim(sweep), hardness_of_views(sweep)
+    some = sweep.select(spread_places(len(sweep), BLACK_FRAMES))
+    black = evaluate_frames(np.zeros(some.images.shape, np.float32), some).mean.ms_ssim  # that black frames reach
+    hardness = hardness_of_views(sweep)
     weights = fit_weights(Examples(terms, ms_ssim), black, one_sided_examples(sweep, hardness))
     misses = np.abs(predicted(weights, terms, black) - ms_ssim)[: len(unseen)]
     return ConfidenceModel(
@@ -432,8 +430,3 @@ def _measured(scene: GaussianScene, sweep: Sweep, backend: str) -> tuple[FloatAr
     ms_ssim = [frame.ms_ssim for frame in evaluate(scene, sweep, backend=backend).frames]
     coverage = render_sweep(scene, sweep, output="coverage", backend=backend)
     return np.array(ms_ssim), supported(coverage).mean(axis=(1, 2))
-
-
-def _black_ms_ssim(sweep: Sweep) -> float:
-    some = sweep.select(spread_places(len(sweep), BLACK_FRAMES))
-    return evaluate_frames(np.zeros(some.images.shape, np.float32), some).mean.ms_ssim
