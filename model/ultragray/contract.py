@@ -158,9 +158,13 @@ def kind_field(kind: str) -> Any:
     return field(default=kind, repr=False, kw_only=True, metadata={"description": "Always the same."})
 
 
-@cache
 def annotated_fields(cls: Any) -> tuple[tuple[Field[Any], Any], ...]:
     """The fields of a dataclass that are given when it is made, each with its annotation as a type."""
+    return _annotated_fields(cls)  # mypy takes no class for what a cache can hold
+
+
+@cache
+def _annotated_fields(cls: Any) -> tuple[tuple[Field[Any], Any], ...]:
     hints = get_type_hints(cls)
     return tuple((item, hints[item.name]) for item in fields(cls) if item.init)
 

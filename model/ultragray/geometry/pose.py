@@ -132,11 +132,6 @@ def quaternion_from_pose(pose: FloatArray) -> tuple[float, float, float, float]:
     return w, x, y, z
 
 
-def position_distances_mm(poses: FloatArray, others: FloatArray) -> FloatArray:  # [C, 4, 4], [P, 4, 4] -> [C, P]
-    offsets = poses[:, None, :3, 3] - others[None, :, :3, 3]
-    return np.linalg.norm(offsets, axis=-1)
-
-
 def rotation_angles_deg(poses: FloatArray, others: FloatArray) -> FloatArray:  # [C, 4, 4], [P, 4, 4] -> [C, P]
     """Angle of the rotation from one probe orientation to the other, in degrees."""
     return np.degrees(turn_angles_rad(poses[:, None, :3, :3], others[None, :, :3, :3]))

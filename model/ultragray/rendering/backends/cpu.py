@@ -147,10 +147,7 @@ def _sorted(scene: GaussianScene, weighted: bool = False) -> _cpu.PreparedScene:
 def _view_arguments(probe: Probe, poses_cm: FloatArray, height: int, width: int, beam: Tensor | None) -> dict[str, Any]:
     lines = KernelLines.of(probe)
     return {
-        "fanned": lines.fanned,
-        "wrap": lines.wrap,
-        "start": lines.start,
-        "span": lines.span,
+        **{name: getattr(lines, name) for name in ("fanned", "wrap", "start", "span")},
         "near_cm": probe.near_mm / 10.0,
         "far_cm": probe.far_mm / 10.0,
         "cull_far_cm": probe.cull_far_mm(height) / 10.0,
@@ -226,10 +223,7 @@ class _Render(torch.autograd.Function):
 def _prepare(splats: Mapping[str, Tensor], kind: Kind, *, as_given: bool = False) -> _cpu.PreparedScene:
     raw = {name: tensor.detach().to("cpu", torch.float32).contiguous() for name, tensor in splats.items()}
     return _cpu.PreparedScene(
-        raw["means"].numpy(),
-        raw["scales"].numpy(),
-        raw["quats"].numpy(),
-        raw["transmittances"].numpy(),
+        *(raw[name].numpy() for name in ("means", "scales", "quats", "transmittances")),
         raw["sh0"].reshape(-1).numpy(),
         raw["shN"].squeeze(-1).numpy(),
         sh_degree=math.isqrt(raw["shN"].shape[1] + 1) - 1,
