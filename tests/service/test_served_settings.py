@@ -217,7 +217,8 @@ def test_openigtlink_has_the_thickness_of_its_setting(served: RunningService, sc
     assert message.metadata["slice_thickness_mm"] == "6.0"
     pixels = unpack_image(message.content).pixels
     height, width = pixels.shape
-    truth = render(scene, None, POSE, height=height, width=width, outputs=("bmode",), beam=replace(BEAM, thickness_mm=6.0)).bmode
+    beam = replace(BEAM, thickness_mm=6.0)
+    truth = render(scene, None, POSE, height=height, width=width, outputs=("bmode",), beam=beam).bmode
     assert truth is not None
     np.testing.assert_allclose(pixels / 255.0, truth[0].numpy(), atol=1.0 / 255.0)  # the pose came as float32
 

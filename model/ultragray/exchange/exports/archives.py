@@ -31,7 +31,7 @@ class NpzExporter(Exporter):
         header = self._header
         self._archive = self._held.enter_context(zipfile.ZipFile(self._path, "w"))
         first, *others = header.settings.outputs
-        nameless = partial(tempfile.TemporaryFile, dir=self._path.parent)
+        nameless = partial(tempfile.TemporaryFile, "w+b", dir=self._path.parent)
         self._waiting = {name: self._held.enter_context(nameless()) for name in others}
         self._first = self._held.enter_context(self._member(first))
         self._files: dict[str, IO[bytes]] = {first: self._first, **self._waiting}

@@ -131,9 +131,10 @@ def rendered_parts(
     """A few frames of the sweep at a time, and the outputs of the scene at their poses."""
     for places in _chunks(sweep):
         some = sweep.select(np.arange(len(sweep))[places])
-        size = {"height": some.height, "width": some.width}
         with torch.no_grad():
-            frames = render(scene, some.probe, some.poses, **size, outputs=outputs, backend=backend)
+            frames = render(
+                scene, some.probe, some.poses, height=some.height, width=some.width, outputs=outputs, backend=backend
+            )
         yield some, frames
 
 
