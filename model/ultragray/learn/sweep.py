@@ -56,7 +56,7 @@ def check_frame_poses(poses: FloatArray, frame_numbers: IntArray, source: str) -
     if poses.shape[1:] != (4, 4):
         raise DatasetInvalid(f"{source}: poses must be [F, 4, 4], got {list(poses.shape)}")
     try:
-        return check_poses(poses) if len(poses) else poses
+        return check_poses(poses)
     except InvalidPose:
         for number, pose in zip(frame_numbers, poses, strict=True):
             try:

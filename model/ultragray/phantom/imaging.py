@@ -18,15 +18,7 @@ from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.sweep import ByteArray, IntArray
 from ultragray.phantom import anatomy
-from ultragray.phantom.anatomy import (
-    INTERFACES,
-    Floats,
-    Interface,
-    Tissue,
-    backscatter_amplitudes,
-    fascicles,
-    tissue_at,
-)
+from ultragray.phantom.anatomy import Floats
 
 Float32Array = npt.NDArray[np.float32]
 
@@ -108,10 +100,10 @@ def _made(index: tuple[int, int, int]) -> Scatterers:
     points: Float32Array = ((np.asarray(index) + rng.random((count, 3))) * BLOCK_MM).astype(np.float32)
     drawn = anatomy.straightened(points)
     labels = anatomy.tissue_drawn(drawn)
-    amplitudes = backscatter_amplitudes()[labels] * rng.normal(0.0, 1.0, count)
+    amplitudes = anatomy.backscatter_amplitudes()[labels] * rng.normal(0.0, 1.0, count)
     muscle = labels == anatomy.Tissue.MUSCLE
-    amplitudes[muscle] *= 10.0 ** (FASCICLES_DB / 20.0 * fascicles(drawn[muscle]))
-    parts = [_on(interface, rng, points, drawn) for interface in INTERFACES]
+    amplitudes[muscle] *= 10.0 ** (FASCICLES_DB / 20.0 * anatomy.fascicles(drawn[muscle]))
+    parts = [_on(interface, rng, points, drawn) for interface in anatomy.INTERFACES]
     surface, normals, specular, diffuse, lobe = (np.concatenate(column) for column in zip(*parts, strict=True))
     heard = amplitudes != 0.0
     return Scatterers(
@@ -123,7 +115,7 @@ def _made(index: tuple[int, int, int]) -> Scatterers:
 
 
 def _on(
-    interface: Interface, rng: np.random.Generator, points: Floats, drawn: Floats
+    interface: anatomy.Interface, rng: np.random.Generator, points: Floats, drawn: Floats
 ) -> tuple[Floats, ...]:  # [M, 3], [M, 3], [M], [M], [M]
     """The scatterers near an interface moved onto it, with its normals there and their amplitudes."""
     low, high = interface.depths_mm
@@ -185,11 +177,11 @@ def bone_attenuation_db(poses: npt.ArrayLike, *, probe: Probe, height: int, widt
     Raises InvalidPose for poses that are not rigid.
     """
     grid = Grid.of(probe, height, width)
-    per_mm = anatomy.round_trip_db_per_mm()[Tissue.BONE]
+    per_mm = anatomy.round_trip_db_per_mm()[anatomy.Tissue.BONE]
     checked = check_poses(poses)
     maps = np.zeros((len(checked), height, width), dtype=np.float32)
     for attenuation, pose in zip(maps, checked, strict=True):
-        bone = grid.tissue(pose) == Tissue.BONE
+        bone = grid.tissue(pose) == anatomy.Tissue.BONE
         attenuation[:] = grid.pixels(grid.above(per_mm * bone))
     return maps
 
@@ -276,7 +268,7 @@ class Grid:
 def _tissue(pose: FloatArray, depths_mm: Floats, laterals_mm: Floats) -> npt.NDArray[np.uint8]:  # [R], [C] -> [R, C]
     across = pose[:3, 3] + laterals_mm[:, None] * pose[:3, 0]
     points = across + depths_mm[:, None, None] * pose[:3, 2]  # [R, C, 3]
-    return tissue_at(points.reshape(-1, 3).astype(np.float32)).reshape(len(depths_mm), len(laterals_mm))
+    return anatomy.tissue_at(points.reshape(-1, 3).astype(np.float32)).reshape(len(depths_mm), len(laterals_mm))
 
 
 def _power(field: ScattererField, grid: Grid, pose: FloatArray) -> Floats:  # [H, W]

@@ -67,7 +67,7 @@ class TrainingViews:
         count = len(poses)
         measures = np.zeros((4, count, len(points)))
         weights = np.zeros((count, len(self)))
-        checked = check_poses(poses) if count else poses
+        checked = check_poses(poses)
         for first in range(0, count, POSES_AT_ONCE):
             some = checked[first : first + POSES_AT_ONCE]
             places = np.arange(first, first + len(some))

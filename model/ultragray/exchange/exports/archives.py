@@ -10,7 +10,6 @@ import tempfile
 import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import partial
 from pathlib import Path
 from typing import IO, Any
 
@@ -31,8 +30,10 @@ class NpzExporter(Exporter):
         header = self._header
         self._archive = self._held.enter_context(zipfile.ZipFile(self._path, "w"))
         first, *others = header.settings.outputs
-        nameless = partial(tempfile.TemporaryFile, "w+b", dir=self._path.parent)
-        self._waiting = {name: self._held.enter_context(nameless()) for name in others}
+        self._waiting: dict[str, IO[bytes]] = {
+            name: self._held.enter_context(tempfile.TemporaryFile(dir=self._path.parent))  # noqa: SIM115
+            for name in others
+        }
         self._first = self._held.enter_context(self._member(first))
         self._files: dict[str, IO[bytes]] = {first: self._first, **self._waiting}
         for name, file in self._files.items():

@@ -62,7 +62,7 @@ class Volume:
         volume = torch.stack([self.values, self.known])[None]  # [1, 2, X, Y, Z]
         last = np.array(self.values.shape) - 1
         planes = np.zeros((len(poses), height, width), np.float32)
-        for plane, pose in zip(planes, check_poses(poses) if len(poses) else poses, strict=True):
+        for plane, pose in zip(planes, check_poses(poses), strict=True):
             places = _on_grid(points, pose, self.axes, self.origin_mm, self.voxel_mm) * (2.0 / last) - 1.0
             grid = torch.from_numpy(places[:, ::-1].astype(np.float32))  # grid_sample wants the last axis first
             value, known = functional.grid_sample(volume, grid[None, None, None], align_corners=True)[0, :, 0, 0]
@@ -254,7 +254,7 @@ def interpolate_planes(sweep: Sweep, poses: FloatArray) -> FrameArray:  # [C, H,
     asked = sweep.probe.corners_from(poses)
     order = corner_distances_mm(asked[:, None], sweep.corners_mm()[None]).argsort(axis=1)  # [C, F]
     planes = np.zeros((len(poses), sweep.height, sweep.width), np.float32)
-    for plane, pose, frames in zip(planes, check_poses(poses) if len(poses) else poses, order, strict=True):
+    for plane, pose, frames in zip(planes, check_poses(poses), order, strict=True):
         plane[:] = _between(sweep, points @ pose[:3, :3].T + pose[:3, 3], frames).reshape(plane.shape)
     return planes
 

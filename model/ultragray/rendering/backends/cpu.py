@@ -223,7 +223,10 @@ class _Render(torch.autograd.Function):
 def _prepare(splats: Mapping[str, Tensor], kind: Kind, *, as_given: bool = False) -> _cpu.PreparedScene:
     raw = {name: tensor.detach().to("cpu", torch.float32).contiguous() for name, tensor in splats.items()}
     return _cpu.PreparedScene(
-        *(raw[name].numpy() for name in ("means", "scales", "quats", "transmittances")),
+        raw["means"].numpy(),
+        raw["scales"].numpy(),
+        raw["quats"].numpy(),
+        raw["transmittances"].numpy(),
         raw["sh0"].reshape(-1).numpy(),
         raw["shN"].squeeze(-1).numpy(),
         sh_degree=math.isqrt(raw["shN"].shape[1] + 1) - 1,
