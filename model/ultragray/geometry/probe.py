@@ -570,5 +570,4 @@ class ElevationBeam(Contract):
         return thickness * math.hypot(1.0, 2.0 * (depth_mm - focus) / depth_of_field)
 
 
-PLANE = ElevationBeam(thickness_mm=0.0)
-"""No beam: an infinitely thin slice."""
+PLANE = ElevationBeam(thickness_mm=0.0)  # no beam: an infinitely thin slice

@@ -47,8 +47,7 @@ class Frames(Mapping[str, Tensor]):
 
     def __init__(self, outputs: Mapping[str, Tensor], touch: Touch | None = None) -> None:
         self._outputs = dict(outputs)
-        self.touch = touch
-        """The contact of each pose with the skin; None where it was assumed."""
+        self.touch = touch  # the contact of each pose with the skin; None where it was assumed
 
     def __getitem__(self, name: str) -> Tensor:
         return self._outputs[name]

@@ -36,24 +36,18 @@ class Output:
 
     name: str
     meaning: str
-    planes: tuple[str, ...]
-    """The planes that the backends draw for it."""
-    derive: Callable[[Drawing], Tensor]
-    """The output [C, H, W] of a drawing."""
+    planes: tuple[str, ...]  # the planes that the backends draw for it
+    derive: Callable[[Drawing], Tensor]  # the output [C, H, W] of a drawing
+    # float32: amounts. uint8: numbers that stand for something, which nothing may interpolate or scale
     dtype: np.dtype[Any] = _AMOUNTS
-    """float32: amounts. uint8: numbers that stand for something, which nothing may interpolate or scale."""
-    unit: str = "1"
-    """Of its values, such as dB/cm; 1: a share."""
+    unit: str = "1"  # of its values, such as dB/cm; 1: a share
+    # the values that 8 bits hold as 0 and as 255; those beyond are held as these. float32 holds the values
     scale: tuple[float, float] = (0.0, 1.0)
-    """The values that 8 bits hold as 0 and as 255; those beyond are held as these. float32 holds the values."""
-    is_toned: bool = False
-    """Whether gain, dynamic range and time-gain compensation change it."""
-    shows_tools_alone: bool = False
-    """Whether a scene that does not give it gives it of tools."""
-    tells_support: bool = False
-    """Whether it keeps its values where pixels without support are blackened."""
+    is_toned: bool = False  # whether gain, dynamic range and time-gain compensation change it
+    shows_tools_alone: bool = False  # whether a scene that does not give it gives it of tools
+    tells_support: bool = False  # whether it keeps its values where pixels without support are blackened
+    # the scenes that give it, in words, where a scene does not; None where it does
     lacks: Callable[[SceneInfo], str | None] = lambda _: None
-    """The scenes that give it, in words, where a scene does not; None where it does."""
 
     @property
     def is_numbers(self) -> bool:
