@@ -493,14 +493,18 @@ def require_confidence(
     first: int = 0,
     name_pose: Callable[[int], str] = "poses[{}]".format,
 ) -> None:
-    """Raises LowConfidence for the first of many poses that does not have the least confidence (None: any will do).
+    """Raises LowConfidence for the first of many poses, or frames, that does not have the least confidence (None: any
+    will do). That of a rendered frame is at most that of its pose.
 
     `first`: the number that they begin with; `name_pose`: how the caller names the pose of a number.
     """
     for number, one in enumerate(extrapolations, first):
         if min_confidence is not None and not is_confident(one, min_confidence):
-            field, away = name_pose(number), ""
+            field = name_pose(number)
+            detail = f"{field} has a confidence of {one.confidence or 0.0:.2f}, {min_confidence:g} is asked for"
             if one.distance_mm is not None and one.angle_deg is not None:
-                away = f": the nearest training views are {one.distance_mm:.1f} mm and {one.angle_deg:.1f} degrees away"
-            detail = f"{field} has a confidence of {one.confidence or 0.0:.2f}, {min_confidence:g} is asked for{away}"
+                away = f"{one.distance_mm:.1f} mm and {one.angle_deg:.1f} degrees away"
+                detail = f"{detail}: the nearest training views are {away}"
+            if one.supported_share is not None:
+                detail = f"{detail}; Gaussians support {one.supported_share:.0%} of its pixels"
             raise LowConfidence(detail, field=field)

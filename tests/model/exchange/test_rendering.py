@@ -2,18 +2,23 @@
 
 import errno
 import json
+from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
-from ultragray import ConvexProbe, render
+from ultragray import ConvexProbe, GaussianScene, render
 from ultragray.contract import to_dict
+from ultragray.errors import LowConfidence
 from ultragray.exchange import rendering
 from ultragray.exchange.exports.archives import NpzExporter
-from ultragray.exchange.rendering import render_to_file
+from ultragray.exchange.rendering import assess_by_rendering, render_to_file
+from ultragray.rendering.confidence import supported_shares
 from ultragray.rendering.display import Display
 from ultragray.rendering.settings import Below, Resolved
-from ultragray.scene.confidence import SUPPORT_COVERAGE, Extrapolation
+from ultragray.samplers import TrainingSampler, assessed_poses
+from ultragray.scene.confidence import SUPPORT_COVERAGE, Assessor, ConfidenceModel, Extrapolation, Support
 
 PROBE = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=50.0)
 POSES = np.tile(np.eye(4), (5, 1, 1))
@@ -53,6 +58,46 @@ def test_pixels_without_support_are_black_where_they_are_masked(tmp_path, random
             unsupported = coverage < SUPPORT_COVERAGE
             assert unsupported.any()
             assert (pixels[unsupported] == 0.0).all() == (confidence < 0.5)
+
+
+@pytest.fixture
+def thin(random_scene):
+    """A scene that knows its confidence: of its training poses above 0.8, of some of their frames below 0.5."""
+    made = random_scene(60, info={"probe": PROBE})
+    shares = supported_shares(render(made, PROBE, POSES, height=24, width=20, outputs=("coverage",))["coverage"])
+    gain = 0.468 / float(shares.min() + shares.max()) * 2
+    support = Support(gain, share=1.0 / gain, reach_mm=10.0)
+    model = ConfidenceModel((3.5, 1.2, 0.8, 0.1, 0.6), 0.06, (0.0,) * len(POSES), 20, 0.04, support)
+    info = replace(made.info, confidence=model.to_dict())
+    return GaussianScene.from_splats(made.splats, info=info, training_poses=POSES)
+
+
+def test_a_least_confidence_holds_for_what_a_frame_says_of_itself(thin, tmp_path):
+    assess = partial(Assessor(thin.info, POSES).assess, probe=PROBE)
+    coverage = render(thin, PROBE, POSES, height=24, width=20, outputs=("coverage",))["coverage"].numpy()
+    rendered = np.array([one.confidence for one in assess(POSES, coverage=coverage)])
+    assert min(one.confidence or 0.0 for one in assess(POSES)) > 0.8
+    assert 0 < (rendered >= 0.5).sum() < len(POSES)
+
+    asked = settings(Display(), min_confidence=0.5)
+    options = {"scene_name": "one", "scene_sha256": "0"}
+    first = int(np.argmin(rendered >= 0.5))
+    with pytest.raises(LowConfidence, match=rf"poses\[{first}\] .* 0\.5 is asked for: .* Gaussians support \d+%"):
+        render_to_file(tmp_path / "frames.npz", "npz", thin, asked, POSES, assess(POSES), **options)
+    assert list(tmp_path.iterdir()) == []
+
+    assess_frames = assess_by_rendering(thin, asked, assess)
+    poses, found = assessed_poses(TrainingSampler(), POSES, PROBE, assess_frames, 0.5)
+    np.testing.assert_array_equal(poses, POSES[rendered >= 0.5])
+    render_to_file(tmp_path / "frames.npz", "npz", thin, asked, poses, found, **options)
+    with np.load(tmp_path / "frames.npz") as archive:
+        np.testing.assert_allclose(archive["confidence"], rendered[rendered >= 0.5])
+
+    masking = settings(Display(), min_confidence=0.5, below_min_confidence=Below.MASK)
+    render_to_file(tmp_path / "masked.npz", "npz", thin, masking, POSES, assess(POSES), **options)
+    with np.load(tmp_path / "masked.npz") as archive:
+        for pixels, some, confidence in zip(archive["bmode"], coverage, rendered, strict=True):
+            assert (pixels[some < SUPPORT_COVERAGE] == 0.0).all() == (confidence < 0.5)
 
 
 def test_what_is_stopped_leaves_nothing(tmp_path, random_scene):

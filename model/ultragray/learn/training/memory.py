@@ -54,7 +54,7 @@ def machine_in_words(device: str = "cpu") -> str:
 
 def forget_peak_memory(device: torch.device) -> None:
     if device.type == "cuda":
-        torch.cuda.init()  # there is nothing to reset before
+        torch.cuda.init()  # type: ignore[no-untyped-call]  # there is nothing to reset before
         torch.cuda.reset_peak_memory_stats(device)
 
 

@@ -161,7 +161,7 @@ class _Graph:
         device = gaussians.means.device
         self._views = torch.zeros((1, VIEW.value), dtype=torch.float64, device=device)
         self._graph = torch.cuda.CUDAGraph()
-        stream = torch.cuda.Stream(device)  # the default stream cannot be recorded
+        stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]  # the default one cannot be recorded
         stream.wait_stream(torch.cuda.current_stream(device))
         with torch.cuda.stream(stream):
             self._graph.capture_begin(capture_error_mode="thread_local")
