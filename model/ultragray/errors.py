@@ -22,7 +22,8 @@ UltragrayError
 └── those of the front doors: ultragray_service.errors
 
 Each class carries a `reason` that never changes: clients match on it, and the service looks up the statuses that its
-front doors answer with. The first paragraph of its docstring is its line in docs/reference/errors.md.
+front doors answer with. It is the class's name in capitals, where the class does not say otherwise. The first
+paragraph of its docstring is its line in docs/reference/errors.md.
 """
 
 from __future__ import annotations
@@ -31,6 +32,8 @@ import re
 from collections.abc import Iterator
 from functools import partial
 from typing import ClassVar
+
+_WORD = re.compile(r"(?<!^)(?=[A-Z])")  # where a word of a class's name begins
 
 
 class UltragrayError(Exception):
@@ -43,9 +46,8 @@ class UltragrayError(Exception):
     title: ClassVar[str] = "Internal error"
 
     def __init_subclass__(cls) -> None:
-        """The stable reason follows from the class's name, unless it names another: InvalidPose has INVALID_POSE."""
         if "reason" not in vars(cls):
-            cls.reason = re.sub(r"(?<!^)(?=[A-Z])", "_", cls.__name__).upper()
+            cls.reason = _WORD.sub("_", cls.__name__).upper()
 
     def __init__(self, detail: str, *, field: str | None = None, retry_after_s: float | None = None) -> None:
         """`retry_after_s`: when the same request may succeed, where the one who raises it knows."""
