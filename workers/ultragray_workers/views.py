@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from ultragray_workers.datasets.store import open_datasets
 from ultragray_workers.helpers import write_progress, write_stacks
-from ultragray_workers.storage.copies import DEFAULT_MAX_BYTES
+from ultragray_workers.storage.cache import DEFAULT_MAX_BYTES
 
 if TYPE_CHECKING:
     from ultragray.learn.evaluation.scoring import Evaluation

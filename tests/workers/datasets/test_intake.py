@@ -16,8 +16,7 @@ from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
 from ultragray.errors import DatasetInvalid, InvalidArgument
 from ultragray_workers import claims
-from ultragray_workers.datasets.incoming import IncomingDataset, remove_stale
-from ultragray_workers.datasets.intake import take_in
+from ultragray_workers.datasets.intake import IncomingDataset, remove_stale, take_in
 from ultragray_workers.datasets.store import DatasetStore, check_dataset_name
 from ultragray_workers.errors import DatasetExists, DatasetInUse, DatasetNotFound
 
@@ -299,7 +298,7 @@ def test_nothing_is_written_after_a_discard(store: DatasetStore) -> None:
 def test_importing_the_store_and_the_intake_needs_no_torch() -> None:
     code = (
         "import sys, ultragray_workers.datasets.store, ultragray_workers.datasets.intake, "
-        "ultragray_workers.datasets.incoming; sys.exit('torch' in sys.modules or 'matplotlib' in sys.modules)"
+        "ultragray_workers.datasets.intake; sys.exit('torch' in sys.modules or 'matplotlib' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 

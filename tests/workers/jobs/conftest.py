@@ -21,8 +21,7 @@ import pytest
 from ultragray import LinearProbe
 from ultragray.datasets.released import write_released
 from ultragray.learn.sweep import Dataset, Sweep
-from ultragray_workers.datasets.shelf import FILES_NAME
-from ultragray_workers.datasets.store import DatasetRecord, DatasetStore, write_manifest
+from ultragray_workers.datasets.store import FILES_NAME, DatasetRecord, DatasetStore, write_manifest
 from ultragray_workers.jobs.database import SQLITE_FILE, JobDatabase
 from ultragray_workers.jobs.files import Artifact
 from ultragray_workers.jobs.folder import Request
@@ -99,8 +98,8 @@ def store_dataset(artifact_folder: Path, name: str) -> Path:
 
 def files_of(artifact_folder: Path, name: str) -> Path:
     """The files of a dataset in an artifact folder, as they were sent."""
-    with DatasetStore(artifact_folder).shelf.files(name) as files:
-        return files
+    with DatasetStore(artifact_folder).files(name) as folder:
+        return folder / FILES_NAME
 
 
 def request_of(specification: dict[str, Any], artifact_folder: Path, submitted: int = 1, **options: Any) -> Request:
@@ -111,8 +110,9 @@ def request_of(specification: dict[str, Any], artifact_folder: Path, submitted: 
 
 def path_of(artifact: Artifact) -> Path:
     """The file that an artifact is, of a folder."""
-    assert artifact.storage.local is not None
-    return artifact.storage.local / artifact.stored.key
+    path = artifact.storage.in_place(artifact.stored.key)
+    assert path is not None
+    return path
 
 
 def train_job(

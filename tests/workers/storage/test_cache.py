@@ -16,7 +16,7 @@ from ultragray_workers.errors import StorageFull, StorageUnavailable
 from ultragray_workers.storage import cache as cache_module
 from ultragray_workers.storage.cache import Cache
 from ultragray_workers.storage.local import LocalStorage
-from ultragray_workers.storage.storage import Entry, NotThere, Storage
+from ultragray_workers.storage.storage import Damaged, Entry, NotThere, Storage
 
 from ...object_storage import Fault, FaultyProxy
 from ...waiting import wait_until
@@ -42,7 +42,7 @@ class SlowStorage(LocalStorage):
 @pytest.fixture
 def cache(tmp_path: Path) -> Cache:
     """Of room for three objects."""
-    return Cache(tmp_path / "cache", 3 * SIZE)
+    return Cache(tmp_path / "cache", 3 * SIZE, keep_s=0.0)
 
 
 @pytest.fixture
@@ -56,7 +56,7 @@ def source(tmp_path: Path) -> SlowStorage:
 def fetch(cache: Cache, storage: Storage, key: str) -> bytes:
     entry = storage.entry(key)
     assert entry is not None
-    with cache.file(storage, key, entry.version) as path:
+    with cache.pin(storage, key, entry.version) as path:
         return path.read_bytes()
 
 
@@ -115,12 +115,12 @@ def test_an_object_larger_than_the_cache_names_the_setting(source: SlowStorage, 
 
 def test_content_is_kept_by_its_hash_and_checked(cache: Cache, source: SlowStorage) -> None:
     sha256 = hashlib.sha256(b"a" * SIZE).hexdigest()
-    with cache.file(source, "a", "any", sha256) as path:
+    with cache.pin(source, "a", "any", sha256) as path:
         assert path.name == sha256
     source.delete("a")
-    with cache.file(source, "elsewhere", "any", sha256) as path:
+    with cache.pin(source, "elsewhere", "any", sha256) as path:
         assert path.read_bytes() == b"a" * SIZE
-    with pytest.raises(StorageUnavailable, match=r"b in .* is damaged: its SHA-256 is"):
+    with pytest.raises(Damaged, match=r"b in .* is damaged: its SHA-256 is"):
         cache.pin(source, "b", "any", "0" * 64)
     assert [path.name for path in (cache.folder / "files").iterdir()] == [sha256]
 
@@ -146,7 +146,7 @@ class Deadly(LocalStorage):
             os._exit(7)
 
 storage = Deadly(Path(sys.argv[2]))
-Cache(Path(sys.argv[1]), 3000).pin(storage, "a", storage.entry("a").version)
+Cache(Path(sys.argv[1]), 3000, 0.0).pin(storage, "a", storage.entry("a").version)
 """
 
 
@@ -166,10 +166,10 @@ from pathlib import Path
 from ultragray_workers.storage.cache import Cache
 from ultragray_workers.storage.local import LocalStorage
 
-cache, storage = Cache(Path(sys.argv[1]), 3000), LocalStorage(Path(sys.argv[2]))
+cache, storage = Cache(Path(sys.argv[1]), 3000, 0.0), LocalStorage(Path(sys.argv[2]))
 for number in range(100):
     key = "abcd"[(int(sys.argv[3]) + number) % 4]
-    with cache.file(storage, key, storage.entry(key).version) as path:
+    with cache.pin(storage, key, storage.entry(key).version) as path:
         assert path.read_bytes() == key.encode() * 1000
 """
 
@@ -199,10 +199,10 @@ def test_what_is_cached_is_there_without_the_bucket(
     entry = bucket_of_one.entry("a")
     assert entry is not None
     object_proxy.faults.append(Fault("cut_answer", "GET", bytes=300))
-    with cache.file(bucket_of_one, "a", entry.version) as path:
+    with cache.pin(bucket_of_one, "a", entry.version) as path:
         assert path.read_bytes() == b"a" * SIZE
     object_proxy.away = True
-    with cache.file(bucket_of_one, "a", entry.version) as path:
+    with cache.pin(bucket_of_one, "a", entry.version) as path:
         assert path.read_bytes() == b"a" * SIZE
     with pytest.raises(StorageUnavailable):
         cache.pin(bucket_of_one, "b", "any")

@@ -7,10 +7,10 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
-from ultragray_workers.datasets.shelf import FILES, MANIFESTS
+from ultragray_workers.datasets.store import FILES, MANIFESTS
 from ultragray_workers.jobs.files import FOLDER as JOBS
+from ultragray_workers.scene_shelf import SCENES_FOLDER
 from ultragray_workers.scenes import SUFFIX, SceneStore
-from ultragray_workers.shelves.opening import SCENES_FOLDER
 from ultragray_workers.storage.local import FileVersion
 from ultragray_workers.store import MARKER
 

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ultragray.files import file_sha256
-from ultragray_workers.datasets.shelf import DatasetShelf, without_files
+from ultragray_workers.datasets.store import DatasetStore, without_files
 from ultragray_workers.errors import RestoreRefused, StorageUnavailable
 from ultragray_workers.storage.storage import NotThere, Storage
 
@@ -62,8 +62,8 @@ def _names_last(key: str) -> tuple[bool, str]:
 
 @contextmanager
 def _file(storage: Storage, key: str) -> Iterator[Path]:
-    if storage.local is not None:
-        yield storage.local / key
+    if (path := storage.in_place(key)) is not None:
+        yield path
         return
     with tempfile.TemporaryDirectory(prefix="ultragray-copy-") as folder:
         path = Path(folder, "object")
@@ -100,21 +100,21 @@ def copy_datasets(
     Interrupted, the same call goes on with those that are missing. Raises RestoreRefused where the target has another
     dataset of a name, StorageUnavailable, OSError.
     """
-    copied = there = 0
+    copied = kept = 0
     with tempfile.TemporaryDirectory(prefix="ultragray-copy-") as copies:
-        here, shelf = DatasetShelf(source, Path(copies, "from")), DatasetShelf(target, Path(copies, "to"))
-        names = sorted(here.names())
+        here, there = DatasetStore(Path(copies, "from"), source), DatasetStore(Path(copies, "to"), target)
+        names = here.names()
         for number, name in enumerate(names, 1):
             manifest = here.manifest(name)
             if manifest is None:  # deleted meanwhile
                 continue
-            with here.folder(name) as folder:
-                is_new = shelf.manifest(name) is None and shelf.put(folder, manifest, name)
-            found = shelf.manifest(name)
+            with here.files(name) as folder:
+                is_new = there.manifest(name) is None and there.put(folder, manifest, name)
+            found = there.manifest(name)
             if not is_new and (found is None or without_files(found) != without_files(manifest)):
                 raise RestoreRefused(
                     f"{target.location} has another dataset {name!r}: delete it there, or choose another place"
                 )
-            copied, there = copied + is_new, there + (not is_new)
+            copied, kept = copied + is_new, kept + (not is_new)
             say(f"{number} of {len(names)}: dataset {name} {'copied' if is_new else 'is there already'}")
-    return CopiedDatasets(copied, there)
+    return CopiedDatasets(copied, kept)

@@ -26,7 +26,7 @@ from typing import Any
 
 from ultragray.files import remove_stale_temporaries, sync, write_whole
 from ultragray_workers.jobs.progress import Outcome, Progress
-from ultragray_workers.storage.copies import DEFAULT_MAX_BYTES
+from ultragray_workers.storage.cache import DEFAULT_MAX_BYTES
 
 WORK = "work"  # of the artifact folder
 

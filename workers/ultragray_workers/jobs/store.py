@@ -59,8 +59,8 @@ from ultragray_workers.jobs.record import MAX_PRIORITY, Job, Row, job_of
 from ultragray_workers.jobs.requirements import Requirements
 from ultragray_workers.jobs.specification import from_dict, in_short, to_dict, value_in
 from ultragray_workers.jobs.workers import Wanted, Worker, WorkerState
+from ultragray_workers.scene_shelf import SCENES_FOLDER
 from ultragray_workers.scenes import SceneStore
-from ultragray_workers.shelves.opening import SCENES_FOLDER
 from ultragray_workers.storage.local import LocalStorage
 from ultragray_workers.storage.storage import Storage
 from ultragray_workers.store import OpenStore

@@ -49,7 +49,7 @@ class LocalStorage:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.location = str(folder)
-        self.local: Path | None = folder
+        self.is_near = True
 
     def entries(self, prefix: str = "") -> Iterator[Entry]:
         for folder, _, names in os.walk(self._folder(prefix)):
@@ -173,6 +173,9 @@ class LocalStorage:
 
     def free_bytes(self) -> int | None:
         return shutil.disk_usage(self.folder).free
+
+    def in_place(self, key: str) -> Path | None:
+        return self._path(key)
 
     def _folder(self, prefix: str) -> Path:
         return self.folder / check_key(prefix) if prefix else self.folder

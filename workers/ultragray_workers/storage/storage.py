@@ -68,8 +68,11 @@ class Storage(Protocol):
         """Where it is, as a person wrote it, without credentials."""
 
     @property
-    def local(self) -> Path | None:
-        """The folder whose files are the objects, to be read in place; None where they must be downloaded."""
+    def is_near(self) -> bool:
+        """Whether objects are files of this host, looked at in microseconds; `upload` takes a condition in one step."""
+
+    def in_place(self, key: str) -> Path | None:
+        """The file that an object is, there or not; None where objects must be downloaded."""
 
     def entries(self, prefix: str = "") -> Iterator[Entry]:
         """The objects below `prefix` (whole parts of a path: `jobs` has `jobs/a`, not `jobs2/a`), in any order."""

@@ -22,6 +22,7 @@ from ultragray_workers.jobs.worker import supervision
 from ultragray_workers.jobs.worker.device import DeviceLock, devices_of
 from ultragray_workers.jobs.worker.gate import Gate
 from ultragray_workers.jobs.worker.supervision import Supervisor
+from ultragray_workers.scene_shelf import SceneShelf
 from ultragray_workers.storage.local import LocalStorage
 
 from ....waiting import wait_until
@@ -101,16 +102,16 @@ def test_a_cancellation_while_the_scene_is_published_is_refused(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     job, _ = finished("late")
-    publish_made = supervision.publish_made
+    published = SceneShelf.publish
 
     def publish(*arguments: Any) -> None:
         with pytest.raises(JobFinished, match="being served"):
             store.cancel(job.id)
-        publish_made(*arguments)
+        published(*arguments)
         with pytest.raises(JobFinished, match="being served"):
             store.cancel(job.id)
 
-    monkeypatch.setattr(supervision, "publish_made", publish)
+    monkeypatch.setattr(SceneShelf, "publish", publish)
     alone()
     assert (artifact_folder / "scenes" / "late.ugr").read_bytes() == b"made"
     assert store.get(job.id).state is JobState.SUCCEEDED
@@ -154,7 +155,7 @@ def test_a_worker_that_died_while_it_served_the_scene_is_followed_by_one_that_se
         raise DiedError
 
     with monkeypatch.context() as patched:
-        patched.setattr(supervision, "publish_made", die)
+        patched.setattr(SceneShelf, "publish", die)
         with pytest.raises(DiedError):
             alone()
     engine = store.database.engine

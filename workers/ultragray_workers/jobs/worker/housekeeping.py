@@ -74,7 +74,7 @@ class Housekeeper:
         folders = {path.name: path for path in (self._artifact_folder / WORK).glob("*") if _age_s(path) > DAY_S}
         by_id = {name.partition(".")[0]: path for name, path in folders.items()}
         removed += self._remove_unknown(by_id, lambda job_id: remove_whole(by_id[job_id]))
-        return removed + DatasetStore(self._artifact_folder, self._storage).shelf.remove_stray_files()
+        return removed + DatasetStore(self._artifact_folder, self._storage).remove_stray_files()
 
     def _stored_ids(self) -> Iterable[str]:
         """The jobs of whose files the newest is a day old."""

@@ -49,8 +49,8 @@ from ultragray_workers.jobs.worker.process import (
 from ultragray_workers.jobs.worker.run_job import STOPPED, STORAGE_FULL
 from ultragray_workers.jobs.worker.telling import LAST_WAIT_S, Superseded, Telling
 from ultragray_workers.scene_names import SUFFIX
-from ultragray_workers.shelves.opening import publish_made
-from ultragray_workers.storage.copies import DEFAULT_MAX_BYTES
+from ultragray_workers.scene_shelf import SCENES_FOLDER, SceneShelf
+from ultragray_workers.storage.cache import DEFAULT_MAX_BYTES
 from ultragray_workers.storage.storage import Storage
 
 WATCH_INTERVAL_S = 0.25
@@ -409,7 +409,7 @@ class _JobAtHand:
         assert scene is not None
         file = self._folder.artifacts / f"{scene}{SUFFIX}"
         try:
-            self._telling.patiently(lambda: publish_made(self._config.storage, file, scene))
+            self._telling.patiently(lambda: SceneShelf(self._config.storage, SCENES_FOLDER).publish(file, scene))
         except SceneExists as error:
             reason = f"a scene {scene!r} appeared while this job made another: choose another name"
             return replace(outcome, error=error.reason, reason=reason)  # the scene can be downloaded

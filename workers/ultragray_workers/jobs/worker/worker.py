@@ -32,7 +32,7 @@ from ultragray_workers.jobs.worker.housekeeping import Housekeeper
 from ultragray_workers.jobs.worker.supervision import Supervisor, WorkerConfig
 from ultragray_workers.jobs.workers import Heartbeat, Wanted
 from ultragray_workers.rounds import Rounds
-from ultragray_workers.storage.copies import DEFAULT_MAX_BYTES
+from ultragray_workers.storage.cache import DEFAULT_MAX_BYTES
 from ultragray_workers.storage.local import LocalStorage
 from ultragray_workers.storage.storage import Storage
 from ultragray_workers.store import OpenStore

@@ -6,7 +6,7 @@ import json
 import tempfile
 import threading
 from collections import OrderedDict
-from typing import Generic, TypeVar
+from collections.abc import Hashable
 
 from ultragray.errors import SceneFileInvalid
 from ultragray.scene.info import (
@@ -18,8 +18,6 @@ from ultragray.scene.info import (
     scene_file_invalid,
 )
 from ultragray_workers.storage.storage import Storage
-
-V = TypeVar("V")
 
 _FIRST_READ_BYTES = 64 * 1024  # most headers with their poses
 _LENGTH_BYTES = 8
@@ -62,15 +60,15 @@ def fetch_header(storage: Storage, key: str, file_bytes: int, name: str) -> Scen
             raise SceneFileInvalid(error.detail.replace(sparse.name, name)) from None
 
 
-class KeptHeaders(Generic[V]):
+class KeptHeaders:
     """The headers that were used last, within a budget. Its methods may be called from any thread."""
 
     def __init__(self) -> None:
         self._lock = threading.Lock()
-        self._kept: OrderedDict[str, tuple[V, SceneHeader]] = OrderedDict()  # least recently used first
+        self._kept: OrderedDict[str, tuple[Hashable, SceneHeader]] = OrderedDict()  # least recently used first
         self._bytes = 0
 
-    def get(self, name: str, version: V) -> SceneHeader | None:
+    def get(self, name: str, version: Hashable) -> SceneHeader | None:
         """The header of a scene if it is of this version; one of another version is dropped."""
         with self._lock:
             kept = self._kept.get(name)
@@ -80,7 +78,7 @@ class KeptHeaders(Generic[V]):
             self._kept.move_to_end(name)
             return kept[1]
 
-    def keep(self, name: str, version: V, header: SceneHeader) -> None:
+    def keep(self, name: str, version: Hashable, header: SceneHeader) -> None:
         with self._lock:
             self._drop(name)
             self._kept[name] = version, header

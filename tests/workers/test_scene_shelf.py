@@ -14,18 +14,16 @@ import pytest
 
 from ultragray.errors import SceneFileInvalid
 from ultragray.scene.info import read_header
+from ultragray_workers import scene_shelf
 from ultragray_workers.errors import SceneExists, SceneNotFound, StorageUnavailable
+from ultragray_workers.scene_shelf import SceneShelf
 from ultragray_workers.scenes import SceneStore
-from ultragray_workers.shelves import bucket as bucket_module
-from ultragray_workers.shelves import index as index_module
-from ultragray_workers.shelves.bucket import BucketShelf
-from ultragray_workers.shelves.index import SceneIndex
 from ultragray_workers.storage.cache import Cache
 from ultragray_workers.storage.location import open_storage
 from ultragray_workers.storage.storage import Storage
 
-from ...object_storage import FaultyProxy
-from ...waiting import wait_until
+from ..object_storage import FaultyProxy
+from ..waiting import wait_until
 
 pytestmark = pytest.mark.slow
 MIB = 2**20
@@ -46,8 +44,10 @@ class Host:
     """A shelf of its own over the bucket, as each host has one."""
 
     def __init__(self, storage: Storage, folder: Path, max_cache_bytes: int = MIB) -> None:
-        self.cache = Cache(folder / "cache", max_cache_bytes)
-        self.shelf = BucketShelf(SceneIndex(storage, "scenes", STALE_S), self.cache, folder / "work")
+        self.cache = Cache(folder / "cache", max_cache_bytes, keep_s=0.1)
+        self.shelf = SceneShelf(
+            storage, "scenes", cache=self.cache, working_folder=folder / "work", longest_stale_s=STALE_S
+        )
         self.store = SceneStore(self.shelf)
 
 
@@ -62,6 +62,30 @@ def new_host(storage: Storage, tmp_path: Path) -> Iterator[Callable[..., Host]]:
     yield make
     for host in hosts:
         host.shelf.close()
+
+
+def test_a_folder_keeps_the_promises_of_a_bucket(tmp_path: Path, scene_folder: Path) -> None:
+    folder, content = tmp_path / "folder", sha256(scene_folder / "a.ugr")
+    one, other = (SceneShelf(open_storage(folder), "scenes") for _ in range(2))
+    with one.making() as made:
+        assert other.is_making(made.name)
+        (made / "new.ugr").write_bytes((scene_folder / "a.ugr").read_bytes())
+        for _ in range(2):
+            one.publish(made / "new.ugr", "liver")
+    assert not other.is_making(made.name)
+    assert other.names() == {"liver"}
+    assert (other.fetch("liver"), other.sha256("liver")) == (folder / "scenes" / "liver.ugr", None)
+    with pytest.raises(SceneExists, match="already a scene 'liver'"):
+        other.publish(scene_folder / "b.ugr", "liver")
+    storage = open_storage(folder)  # as copied from a bucket
+    storage.upload(scene_folder / "a.ugr", f"scenes/objects/{content}.ugr")
+    storage.write("scenes/copied.json", json.dumps({"format_version": 1, "sha256": content, "bytes": 1}).encode())
+    assert one.names() == {"liver", "copied"}
+    assert sha256(one.fetch("copied")) == one.sha256("copied") == content
+    assert one.remove("copied")
+    assert one.remove("liver")
+    assert not other.remove("liver")
+    assert other.names() == set()
 
 
 def sha256(path: Path) -> str:
@@ -117,7 +141,7 @@ def test_scenes_that_an_operator_copied_are_served_and_replaced(
     version, header = host.store.versioned_header("liver")
     assert host.store.cached_versioned_header("liver") == (version, header)
     storage.upload(scene_folder / "b.ugr", "scenes/liver.ugr")
-    host.shelf.index.read()
+    host.shelf.read()
     assert host.store.cached_versioned_header("liver") is None
     assert host.store.path("liver").read_bytes() == (scene_folder / "b.ugr").read_bytes()
     assert host.store.version("liver") != version
@@ -168,17 +192,15 @@ def test_what_is_cached_is_served_while_the_bucket_is_away(
     object_proxy: FaultyProxy,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(bucket_module, "FRESH_S", 0.1)
-    monkeypatch.setattr(bucket_module, "LET_GO_S", 0.1)
-    monkeypatch.setattr(index_module, "_OLD_S", 0.1)
+    monkeypatch.setattr(scene_shelf, "FRESH_S", 0.1)
+    monkeypatch.setattr(scene_shelf, "_OLD_S", 0.1)
     host = new_host()
     for name in ("a", "b"):
         host.shelf.publish(scene_folder / f"{name}.ugr", name)
-    host.shelf.index.read()
     host.shelf.follow()
     host.store.path("a")
     object_proxy.away = True
-    wait_until(lambda: host.shelf.index.problem is not None, within_s=10)
+    wait_until(lambda: host.shelf.problem is not None, within_s=10)
     for _ in range(10):  # while the list is being read, and between
         began = time.monotonic()
         assert host.store.path("a").read_bytes() == (scene_folder / "a.ugr").read_bytes()
@@ -192,29 +214,25 @@ def test_what_is_cached_is_served_while_the_bucket_is_away(
     assert time.monotonic() - began < 0.4  # the patience with the bucket is 0.5 s
     with pytest.raises(StorageUnavailable):
         host.store.path("perhaps-new")
-    monkeypatch.setattr(host.shelf.index, "_longest_stale_s", 0.0)
+    monkeypatch.setattr(host.shelf, "_longest_stale_s", 0.0)
     assert host.shelf.here("a") is None
     with pytest.raises(StorageUnavailable):
         host.store.names()
     object_proxy.away = False
-    monkeypatch.setattr(host.shelf.index, "_longest_stale_s", STALE_S)
-    wait_until(lambda: host.shelf.index.problem is None, within_s=10)
+    monkeypatch.setattr(host.shelf, "_longest_stale_s", STALE_S)
+    wait_until(lambda: host.shelf.problem is None, within_s=10)
     assert host.store.path("b").read_bytes() == (scene_folder / "b.ugr").read_bytes()
 
 
 def test_a_scene_that_is_held_stays_and_others_leave_the_cache(
-    new_host: Callable[..., Host], scene_folder: Path, monkeypatch: pytest.MonkeyPatch
+    new_host: Callable[..., Host], scene_folder: Path
 ) -> None:
-    monkeypatch.setattr(bucket_module, "FRESH_S", 0.05)
-    monkeypatch.setattr(bucket_module, "LET_GO_S", 0.1)
     size = (scene_folder / "a.ugr").stat().st_size
     host = new_host(max_cache_bytes=2 * size + 100)
     for number, name in enumerate(("one", "two", "three")):
         path = scene_folder / f"{name}.bytes"
         path.write_bytes((scene_folder / "a.ugr").read_bytes() + bytes([number]))
         host.shelf.publish(path, name)
-    host.shelf.index.read()
-    host.shelf.follow()
     first = host.store.path("one")
     with host.store.hold("one") as held:
         assert held == first
@@ -222,7 +240,7 @@ def test_a_scene_that_is_held_stays_and_others_leave_the_cache(
             host.store.path(name)
             assert host.cache.held_bytes() <= host.cache.max_bytes
             assert first.exists()
-    wait_until(lambda: not host.shelf._held, within_s=10)
+    time.sleep(0.1)
     host.store.path("two")
     host.store.path("three")
     assert not first.exists()
@@ -239,16 +257,16 @@ def test_a_removed_scene_is_gone_everywhere_and_its_object_later(
     assert one.shelf.remove("b")
     assert not one.shelf.remove("b")
     assert one.store.names() == ["a", "again"]
-    other.shelf.index.read()
+    other.shelf.read()
     assert other.store.names() == ["a", "again"]
     with pytest.raises(SceneNotFound):
         other.store.path("b")
-    assert one.shelf.index.remove_unused() == 0  # too young
+    assert one.shelf.remove_unused() == 0  # too young
     time.sleep(1.1)  # the bucket tells whole seconds
-    assert one.shelf.index.remove_unused(0.0) == 1
+    assert one.shelf.remove_unused(0.0) == 1
     keys = {entry.key for entry in storage.entries()}
     assert keys == {"scenes/a.json", "scenes/again.json", f"scenes/objects/{sha256(scene_folder / 'a.ugr')}.ugr"}
-    monkeypatch.setattr(index_module, "UNUSED_AFTER_S", 0.0)
+    monkeypatch.setattr(scene_shelf, "UNUSED_AFTER_S", 0.0)
     one.shelf.publish(scene_folder / "b.ugr", "b")
     assert other.store.path("b").read_bytes() == (scene_folder / "b.ugr").read_bytes()
 
