@@ -9,207 +9,120 @@ from ultragray.errors import UltragrayError
 _NAMES_IN_MESSAGE = 5
 
 
-class SceneNotFound(UltragrayError):
+class SceneNotFound(UltragrayError, title="No such scene"):
     """No scene of that name."""
 
-    reason = "SCENE_NOT_FOUND"
-    title = "No such scene"
 
-
-class RegistrationNotFound(UltragrayError):
+class RegistrationNotFound(UltragrayError, title="No such registration"):
     """No registration of that name."""
 
-    reason = "REGISTRATION_NOT_FOUND"
-    title = "No such registration"
 
-
-class DatasetNotFound(UltragrayError):
+class DatasetNotFound(UltragrayError, title="No such dataset"):
     """No dataset of that name."""
 
-    reason = "DATASET_NOT_FOUND"
-    title = "No such dataset"
 
-
-class DatasetExists(UltragrayError):
+class DatasetExists(UltragrayError, title="Another dataset has that name"):
     """A dataset of that name has another content or other options; delete it first."""
 
-    reason = "DATASET_EXISTS"
-    title = "Another dataset has that name"
 
-
-class DatasetInUse(UltragrayError):
+class DatasetInUse(UltragrayError, title="Dataset in use"):
     """A job needs the dataset."""
 
-    reason = "DATASET_IN_USE"
-    title = "Dataset in use"
 
-
-class UploadTooLarge(UltragrayError):
+class UploadTooLarge(UltragrayError, title="Upload too large"):
     """An upload over `ULTRAGRAY_MAX_DATASET_BYTES`, packed or unpacked, or of too many files."""
 
-    reason = "UPLOAD_TOO_LARGE"
-    title = "Upload too large"
 
-
-class StorageFull(UltragrayError):
+class StorageFull(UltragrayError, title="No room on the disk"):
     """The artifact folder has no room, or a render job would write more than it has room for."""
 
-    reason = "STORAGE_FULL"
-    title = "No room on the disk"
 
-
-class StorageUnavailable(UltragrayError):
+class StorageUnavailable(UltragrayError, title="The object storage cannot be used"):
     """The object storage does not answer, or refuses its credentials; what is cached is served all the same; retry."""
 
-    reason = "STORAGE_UNAVAILABLE"
-    title = "The object storage cannot be used"
 
-
-class SceneExists(UltragrayError):
+class SceneExists(UltragrayError, title="Scene already exists"):
     """A scene of that name is there, or a job is making it."""
 
-    reason = "SCENE_EXISTS"
-    title = "Scene already exists"
 
-
-class DatabaseUnavailable(UltragrayError):
+class DatabaseUnavailable(UltragrayError, title="The database of the jobs cannot be used"):
     """The database of the jobs is away or takes no changes; scenes are rendered all the same; retry."""
 
-    reason = "DATABASE_UNAVAILABLE"
-    title = "The database of the jobs cannot be used"
 
-
-class ArtifactFolderUnavailable(UltragrayError):
+class ArtifactFolderUnavailable(UltragrayError, title="The artifact folder is not there"):
     """The artifact folder is gone, or not the one that the jobs belong to: its share is not mounted; retry."""
 
-    reason = "ARTIFACT_FOLDER_UNAVAILABLE"
-    title = "The artifact folder is not there"
 
-
-class JobStalled(UltragrayError):
+class JobStalled(UltragrayError, title="The job got stuck"):
     """The process of a job neither computed nor read nor wrote for `ULTRAGRAY_JOB_STALL_TIMEOUT_S`, and was ended."""
 
-    reason = "JOB_STALLED"
-    title = "The job got stuck"
 
-
-class JobTimeExceeded(UltragrayError):
+class JobTimeExceeded(UltragrayError, title="The job took too long"):
     """A job ran longer than its `max_run_s`, or `ULTRAGRAY_JOB_MAX_RUN_S`, and was ended."""
 
-    reason = "JOB_TIME_EXCEEDED"
-    title = "The job took too long"
 
-
-class JobNotFound(UltragrayError):
+class JobNotFound(UltragrayError, title="No such job"):
     """No job of that id."""
 
-    reason = "JOB_NOT_FOUND"
-    title = "No such job"
 
-
-class JobConflict(UltragrayError):
+class JobConflict(UltragrayError, title="Request id used for another job", reason="REQUEST_ID_CONFLICT"):
     """The `request_id` was used for something else."""
 
-    reason = "REQUEST_ID_CONFLICT"
-    title = "Request id used for another job"
 
-
-class JobFinished(UltragrayError):
+class JobFinished(UltragrayError, title="Job is finished"):
     """A job that succeeded or failed cannot be cancelled."""
 
-    reason = "JOB_FINISHED"
-    title = "Job is finished"
 
-
-class JobNotFinished(UltragrayError):
+class JobNotFinished(UltragrayError, title="Job cannot be retried"):
     """Only a failed or cancelled job can be retried."""
 
-    reason = "JOB_NOT_FINISHED"
-    title = "Job cannot be retried"
 
-
-class JobInUse(UltragrayError):
+class JobInUse(UltragrayError, title="Job in use"):
     """A job that waits or runs, or that another of those goes on from, cannot be deleted."""
 
-    reason = "JOB_IN_USE"
-    title = "Job in use"
 
-
-class JobQueueFull(UltragrayError):
+class JobQueueFull(UltragrayError, title="Too many jobs are waiting"):
     """Too many jobs wait; retry."""
 
-    reason = "JOB_QUEUE_FULL"
-    title = "Too many jobs are waiting"
 
-
-class WorkerNotFound(UltragrayError):
+class WorkerNotFound(UltragrayError, title="No such worker"):
     """No worker of that name."""
 
-    reason = "WORKER_NOT_FOUND"
-    title = "No such worker"
 
-
-class ArtifactNotFound(UltragrayError):
+class ArtifactNotFound(UltragrayError, title="No such artifact"):
     """The job has no file of that name."""
 
-    reason = "ARTIFACT_NOT_FOUND"
-    title = "No such artifact"
 
-
-class SceneTooLarge(UltragrayError):
+class SceneTooLarge(UltragrayError, title="Scene exceeds the memory budget"):
     """A scene that does not fit `ULTRAGRAY_MEMORY_BUDGET_MB` at all."""
 
-    reason = "SCENE_TOO_LARGE"
-    title = "Scene exceeds the memory budget"
 
-
-class QueueFull(UltragrayError):
+class QueueFull(UltragrayError, title="Too much is waiting"):
     """Too many frames wait, or too many uploads are under way; retry."""
 
-    reason = "QUEUE_FULL"
-    title = "Too much is waiting"
 
-
-class DeadlineExceeded(UltragrayError):
+class DeadlineExceeded(UltragrayError, title="Deadline exceeded"):
     """The deadline passed first."""
 
-    reason = "DEADLINE_EXCEEDED"
-    title = "Deadline exceeded"
 
-
-class NotReady(UltragrayError):
+class NotReady(UltragrayError, title="Service is not ready"):
     """The service is starting, or cannot render at the moment; retry."""
 
-    reason = "NOT_READY"
-    title = "Service is not ready"
 
-
-class Draining(UltragrayError):
+class Draining(UltragrayError, title="Service is stopping"):
     """The service is stopping; retry elsewhere."""
 
-    reason = "DRAINING"
-    title = "Service is stopping"
 
-
-class BackupInvalid(UltragrayError):
+class BackupInvalid(UltragrayError, title="Backup cannot be used"):
     """A backup that is not there, damaged, or made by a newer release (command line)."""
 
-    reason = "BACKUP_INVALID"
-    title = "Backup cannot be used"
 
-
-class RestoreRefused(UltragrayError):
+class RestoreRefused(UltragrayError, title="Place of the backup or restore cannot be used"):
     """A backup or restore into a place that holds something else, or where somebody is at work (command line)."""
 
-    reason = "RESTORE_REFUSED"
-    title = "Place of the backup or restore cannot be used"
 
-
-class StartupFailed(UltragrayError):
+class StartupFailed(UltragrayError, title="Service cannot start"):
     """The service cannot start, such as on a port in use (command line)."""
-
-    reason = "STARTUP_FAILED"
-    title = "Service cannot start"
 
 
 def job_not_found(job_id: str) -> JobNotFound:

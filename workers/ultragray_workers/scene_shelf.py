@@ -109,7 +109,6 @@ class SceneShelf:
         self.read()
 
     def close(self) -> None:
-        """Ends what `follow` began."""
         self._stop.set()
         if self._thread is not None:
             self._thread.join()
@@ -194,7 +193,6 @@ class SceneShelf:
             raise SceneExists(f"there is already a scene {name!r}", field="scene")
 
     def remove(self, name: str) -> bool:
-        """Removes the scene; False where there was none."""
         there = self.look_up(name)
         if there is not None:
             self.storage.delete(there.key if there.sha256 is None else self._entry_key(name))
@@ -209,7 +207,6 @@ class SceneShelf:
             yield folder
 
     def is_making(self, token: str) -> bool:
-        """Whether whoever has the token is still alive."""
         return self.storage.is_claimed(token)
 
     def remove_abandoned(self) -> None:

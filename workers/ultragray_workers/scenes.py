@@ -51,7 +51,6 @@ class SceneStore:
         return sorted({name for shelf in self.shelves for name in shelf.names()})
 
     def shown_names(self) -> list[str]:
-        """As `names`, without those that are hidden."""
         return [name for name in self.names() if not self.hides(name)]
 
     def names_of(self, shelf: SceneShelf) -> set[str]:
@@ -60,7 +59,6 @@ class SceneStore:
         return shelf.names().difference(*(other.names() for other in before))
 
     def shelf_of(self, name: str) -> SceneShelf | None:
-        """The shelf that has the scene of a name; None where none does."""
         return next((shelf for shelf in self.shelves if shelf.has(name)), None)
 
     def require(self, text: str) -> str:
@@ -151,7 +149,6 @@ class SceneStore:
         return known or name, shelf.bytes_of(name)
 
     def forget(self, name: str) -> None:
-        """Drops what is kept of a scene that was deleted."""
         self._headers.drop(name)
         self._hashes.pop(name, None)
 

@@ -152,7 +152,6 @@ def compare(
 
 
 def _metrics(evaluation: Evaluation, index: int) -> dict[str, float]:
-    """Those of one frame."""
     frame = evaluation.frames[index]
     own = {name: getattr(frame, name) for name in _COMPARED}
     return {**own, "histogram_distance": evaluation.frame_speckle[index].histogram_distance}

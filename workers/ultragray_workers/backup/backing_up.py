@@ -89,8 +89,6 @@ def alone_in(backup_folder: Path) -> Iterator[None]:
 
 
 class _Backup:
-    """One backup as it is made."""
-
     def __init__(self, folders: Folders, database: Database, objects: Objects, known: _Known) -> None:
         self._folders, self._database, self._objects = folders, database, objects
         self._known = known

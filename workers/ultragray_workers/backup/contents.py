@@ -20,8 +20,6 @@ _OF_A_PROCESS = (".lock", ".tmp", ".new")
 
 @dataclass(frozen=True)
 class StoredFile:
-    """A file that belongs to a backup."""
-
     root: str
     path: PurePosixPath  # below it
     source: Path
@@ -38,18 +36,14 @@ class StoredFile:
 
 @dataclass(frozen=True)
 class Folders:
-    """The two folders of an installation."""
-
     data: Path
     artifacts: Path
 
     def root(self, name: str) -> Path:
-        """The folder of a root."""
         return {DATA: self.data, ARTIFACTS: self.artifacts}[name]
 
 
 def job_id_of(root: str, path: str) -> str | None:
-    """The job in whose folder a file lies."""
     parts = PurePosixPath(path).parts
     return parts[1] if root == ARTIFACTS and len(parts) > 2 and parts[0] == JOBS else None
 

@@ -26,8 +26,6 @@ _SCENES = re.compile(
 
 @dataclass(frozen=True)
 class Copied:
-    """What a copy has done."""
-
     scenes: int = 0
     bytes: int = 0
     already_there: int = 0
@@ -86,8 +84,6 @@ def _sha256(storage: Storage, key: str) -> str:
 
 @dataclass(frozen=True)
 class CopiedDatasets:
-    """What a copy has done."""
-
     datasets: int = 0
     datasets_already_there: int = 0
 

@@ -22,8 +22,6 @@ _ATTEMPTS = 5  # to read a file that somebody rewrites in its place
 
 @dataclass(frozen=True)
 class Stored:
-    """A file as it was read."""
-
     sha256: str
     bytes: int
     version: FileVersion
@@ -41,11 +39,9 @@ class Objects:
         return self.folder / sha256[:2] / sha256
 
     def has(self, sha256: str) -> bool:
-        """Whether the content is there; its bytes are not read."""
         return self.path(sha256).is_file()
 
     def is_whole(self, sha256: str) -> bool:
-        """Whether the content is there and has its hash."""
         return self.has(sha256) and file_sha256(self.path(sha256)) == sha256
 
     def add(self, source: Path, *, grows: bool = False) -> Stored:
@@ -93,7 +89,6 @@ class Objects:
         return count, size
 
     def remove_leftovers(self) -> None:
-        """Removes what a backup that was interrupted has half written."""
         for path in self.folder.glob(f"{_INCOMING}*"):
             path.unlink()
 

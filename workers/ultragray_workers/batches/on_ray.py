@@ -33,8 +33,6 @@ _MAKING = ".making-"  # begins the name of a folder in which a shard is made
 
 @dataclass(frozen=True)
 class RayBatch:
-    """A batch for a Ray cluster."""
-
     plan: BatchPlan
     scene_file: Path
     location: str  # of the files: a folder or the URL of a bucket

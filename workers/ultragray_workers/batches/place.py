@@ -31,7 +31,6 @@ class ShardPlace:
         self._prefix = prefix
 
     def key(self, name: str) -> str:
-        """The key of a file."""
         return f"{self._prefix}/{name}" if self._prefix else name
 
     def keep(self, path: Path, shard: int, entry: ShardEntry) -> None:
@@ -57,7 +56,6 @@ class ShardPlace:
             return [shard for shard, entry in zip(asked, threads.map(self.entry, asked), strict=True) if entry]
 
     def is_finished(self) -> bool:
-        """Whether the manifest is there. Raises InvalidArgument for that of another batch."""
         try:
             found = json.loads(self.storage.read(self.key(MANIFEST_FILE)))
         except NotThere:

@@ -63,7 +63,6 @@ class IncomingDataset:
             self._file = create_below(self.folder / DATASET_NAME / FILES_NAME, name)
 
     def begin_archive(self) -> None:
-        """Begin the one archive that is written next. Raises StorageFull."""
         with self._open():
             self._file = (self.folder / ARCHIVE_NAME).open("xb")
 
@@ -76,7 +75,6 @@ class IncomingDataset:
             self._file.write(data)
 
     def finish(self) -> None:
-        """End the last file. Raises StorageFull."""
         with self._open():
             self._finish_file()
 
@@ -88,17 +86,14 @@ class IncomingDataset:
         return (claim is not None and self.store.storage.is_claimed(claim)) or self.store.is_taken(name)
 
     def present(self, name: str) -> DatasetRecord:
-        """As `DatasetStore.present`."""
         with self._open():
             return self.store.present(self.folder / DATASET_NAME, name)
 
     def accept(self, name: str) -> tuple[DatasetRecord, bool]:
-        """Make the checked dataset one of the store, as `DatasetStore.add`."""
         with self._open():
             return self.store.add(self.folder / DATASET_NAME, name)
 
     def discard(self) -> None:
-        """Remove what has not become a dataset."""
         with self._using:
             if self._file is not None:
                 with contextlib.suppress(OSError):

@@ -61,7 +61,6 @@ class UploadedSource:
     companions: dict[str, Path]  # by the name of the option
 
     def load(self, options: dict[str, str]) -> Dataset:
-        """Read the dataset. Raises as `load_dataset`."""
         given: dict[str, Any] = {**options, **self.companions}
         return load_dataset(self.path, SourceOptions(**given))
 
@@ -135,7 +134,6 @@ class StoredFiles:
 
     @property
     def prefix(self) -> str:
-        """The prefix of their keys."""
         return f"{FILES}/{self.upload}"
 
     @classmethod
@@ -184,7 +182,6 @@ class DatasetStore:
         return sorted(entries)
 
     def shown_names(self) -> list[str]:
-        """As `names`, without those that are hidden."""
         return [name for name in self.names() if not self.hides(name)]
 
     def names_by_content(self) -> dict[str, str]:
@@ -207,7 +204,6 @@ class DatasetStore:
             return replace(find_source(folder / FILES_NAME).load(record.options), name=name)
 
     def contact_sheet(self, name: str) -> bytes:
-        """The PNG. Raises DatasetNotFound."""
         self._require_shown(name)
         try:
             return self.storage.read(f"{self._files_of(name).prefix}/{CONTACT_SHEET_NAME}")
@@ -359,7 +355,6 @@ class DatasetStore:
 
 
 def without_files(manifest: str) -> dict[str, Any]:
-    """What a manifest says beside where the files are."""
     return {key: value for key, value in json.loads(manifest).items() if key != _STORED}
 
 
@@ -377,7 +372,6 @@ def check_dataset_name(name: str) -> None:
 
 
 def write_manifest(record: DatasetRecord, folder: Path) -> None:
-    """Writes the manifest of a dataset whose other files are complete."""
     kept = {name: value for name, value in to_dict(record).items() if name not in _NOT_KEPT}
     document = {"format_version": FORMAT_VERSION, **kept}
     write_whole(folder / MANIFEST_NAME, json.dumps(document, indent=1) + "\n")
@@ -391,5 +385,4 @@ def _require_unused(name: str, in_use: Callable[[str], str | None]) -> None:
 def open_datasets(
     artifact_folder: str | Path, storage: str | None, max_copies_bytes: int = DEFAULT_MAX_BYTES
 ) -> DatasetStore:
-    """The datasets at a location that a process is told in words; None: in the artifact folder."""
     return DatasetStore(Path(artifact_folder), None if storage is None else open_storage(storage), max_copies_bytes)

@@ -105,7 +105,6 @@ class JobDatabase:
             raise DatabaseUnavailable("the database of the jobs refuses to write") from error
 
     def close(self) -> None:
-        """Ends the connections."""
         self.engine.dispose()
 
     def _require_same_file(self) -> None:

@@ -60,7 +60,6 @@ class Demand:
 
 @lru_cache(maxsize=4096)
 def demand_of_key(key: str) -> Demand:
-    """Inverse of `Demand.key`."""
     values = json.loads(key)
     return Demand(values["device"], values["min_memory_gb"], tuple(sorted(values["labels"].items())))
 
@@ -136,7 +135,6 @@ NO_OFFER = Offer(())
 
 @lru_cache(maxsize=1024)
 def offer_of_json(text: str | None) -> Offer:
-    """Inverse of `Offer.to_json`; None: of a worker that offers nothing yet."""
     if text is None:
         return NO_OFFER
     values = json.loads(text)

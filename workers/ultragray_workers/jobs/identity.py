@@ -22,8 +22,6 @@ _PROBES = "probes"  # prefix of objects that are written and removed again
 
 
 class StoreIdentity:
-    """The id that a storage must have."""
-
     def __init__(self, storage: Storage, known: str) -> None:
         self._storage, self._known = storage, known
         self._checking = threading.Lock()

@@ -75,7 +75,6 @@ Shown = Callable[[Ownership], bool]  # whether whoever asks may know of a job
 
 
 def _admit_any(jobs: JobStore) -> int | None:
-    """Keeps no job out, and has any number of them run."""
     return None
 
 
@@ -100,8 +99,6 @@ class JobsOverview:
 
 @dataclass(frozen=True)
 class _Submission:
-    """A job that is asked for."""
-
     id: str
     specification: Specification
     summary: Mapping[str, Any]  # as jobs tell it: before a registration brought its poses into the scene
@@ -282,7 +279,6 @@ class JobStore:
         return self._job(row)
 
     def get(self, job_id: str) -> Job:
-        """Raises JobNotFound."""
         return self._job(self._row(job_id))
 
     def list(
@@ -309,7 +305,6 @@ class JobStore:
         return self._jobs(rows), token
 
     def ownership(self, job_id: str) -> Ownership:
-        """Whose a job is. Raises JobNotFound."""
         return self._row(job_id).ownership
 
     def cancel(self, job_id: str) -> Job:
@@ -364,7 +359,6 @@ class JobStore:
         queue.forget(self._engine, job_id)
 
     def overview(self) -> JobsOverview:
-        """The jobs in numbers."""
         found = queue.count_by_state(self._engine)
         states = [worker.state for worker in workers.list_workers(self._engine)]
         oldest_s, unfit, now_s = dict.fromkeys((AUTO, CPU, CUDA), 0.0), 0, time.time()
@@ -381,7 +375,6 @@ class JobStore:
         )
 
     def unfinished_of(self, owner: str) -> int:
-        """The number of an owner's jobs that wait or run."""
         return queue.count_of_owner(self._engine, owner)
 
     def usage_s(self, owner: str | None, since: datetime) -> dict[str, float]:
@@ -433,7 +426,6 @@ class JobStore:
         return _in_words(queue.find(self._engine, makes_scene=name), shown)
 
     def close(self) -> None:
-        """Ends the connections to the database; the folder may be restored."""
         self.database.close()
         self._open.close()
 

@@ -145,17 +145,14 @@ class Dispatcher:
         return ticket.memory
 
     def _archive(self, ticket: Ticket) -> int:
-        """The file that the .npz of a ticket is written to."""
         if ticket.archive is None:
             ticket.archive = self._memories.acquire()
         return ticket.archive
 
     def on_idle(self) -> None:
-        """Gives the worker of a slot that has just become idle something to do."""
         self._dispatch()
 
     def on_answer(self, assignment: Assignment, answer: Answer) -> None:
-        """Takes over what a worker says of a step, or of a command."""
         outcome = answer.outcome
         if (command := assignment.command) is not None:
             if isinstance(outcome, UltragrayError):
@@ -219,7 +216,6 @@ class Dispatcher:
 
 
 async def _all(outcomes: Iterable[Awaitable[None]]) -> None:
-    """Waits for all of them, then raises the first error."""
     for outcome in await asyncio.gather(*outcomes, return_exceptions=True):
         if isinstance(outcome, BaseException):
             raise outcome
@@ -249,7 +245,6 @@ def _summary(steps: list[Rendered]) -> Rendered:
 
 
 def _extrapolations(steps: Iterable[Rendered]) -> tuple[Extrapolation, ...]:
-    """In the order of the poses."""
     return tuple(one for step in sorted(steps, key=lambda step: step.first) for one in step.extrapolations)
 
 

@@ -108,12 +108,10 @@ class RenderResult(Generic[S]):
 
     @property
     def height(self) -> int:
-        """H of the frames."""
         return self.settings.picture.height
 
     @property
     def width(self) -> int:
-        """W of the frames."""
         return self.settings.picture.width
 
 
@@ -205,16 +203,12 @@ class PackTask:
 
 @dataclass(frozen=True)
 class LoadTask:
-    """Load a scene, and render a frame of it."""
-
     scene: str
     path: str
 
 
 @dataclass(frozen=True)
 class UnloadTask:
-    """Drop a scene."""
-
     scene: str
 
 
@@ -223,8 +217,6 @@ AnyTask = Task[Any] | PackTask | LoadTask | UnloadTask
 
 @dataclass(frozen=True)
 class Rendered:
-    """A worker's report on one part."""
-
     size: int  # bytes of the reply so far: all of `data` when this was the request's only part
     scene_sha256: str
     renderer: str

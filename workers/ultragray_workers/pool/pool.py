@@ -223,7 +223,6 @@ class RenderPool:
         await self._dispatcher.command_all(UnloadTask(scene))
 
     def loaded(self) -> dict[str, int]:
-        """Each loaded scene, and how many processes hold it."""
         return dict(Counter(name for slot in self._dispatcher.slots for name in slot.resident))
 
     def statistics(self) -> PoolStatistics:
@@ -321,7 +320,6 @@ def _check_reply(settings: Resolved | SliceView, poses: int) -> None:
 
 
 async def _frames(ticket: Ticket, rendered: Rendered) -> RenderResult[Any]:
-    """The frames of a request, taken from its memory."""
     request, place = ticket.request, None
     if request.destination is not None:
         place = request.destination.put(ticket.reply_memory, rendered.size)
@@ -343,7 +341,6 @@ async def _frames(ticket: Ticket, rendered: Rendered) -> RenderResult[Any]:
 
 
 async def _place_found(ticket: Ticket, rendered: Rendered) -> LocalizeResult:
-    """Where the frame of a request was found."""
     assert rendered.found is not None
     return LocalizeResult(
         scene=ticket.request.scene,

@@ -122,7 +122,6 @@ _TEMPLATES = 2
 
 
 def start_template(descriptor: int) -> subprocess.Popen[bytes]:
-    """Starts a template process that serves the channel of a descriptor, which it inherits."""
     program = (
         f"import sys; sys.path[:] = {sys.path!r}; from ultragray_workers.pool.template import main; main({descriptor})"
     )
@@ -230,8 +229,6 @@ STUCK_AFTER_S = 5.0  # without a word from a worker that has work: whoever asks 
 
 @dataclass(frozen=True)
 class Patience:
-    """The time that a worker is given."""
-
     grace_s: float  # to take up a task, and after the deadline of one
     task_s: float  # for a task without a deadline, and to load a scene
 
@@ -259,7 +256,6 @@ class Watch:
 
     @property
     def quiet_s(self) -> float:
-        """How long the worker has told nothing of its task."""
         return time.monotonic() - self._heard
 
     def complaint(self, taken: bool) -> str | None:
@@ -376,7 +372,6 @@ class Slot:
         return self._assignment is not None and self._watch.quiet_s > STUCK_AFTER_S
 
     async def start(self) -> None:
-        """Returns when the first worker is ready. Raises what keeps it from starting."""
         self._launch()
         await self._settled.wait()
         if self._start_error is not None:
@@ -391,7 +386,6 @@ class Slot:
         os.close(memory)
 
     def assign(self, task: AnyTask, assignment: Assignment, descriptors: Sequence[int] = ()) -> None:
-        """Gives the idle worker a task."""
         assert self._peer is not None
         self._assignment = assignment
         self._tasks += 1

@@ -210,11 +210,9 @@ class Forecast:
         self._any_s = _FIRST_GUESS_S
 
     def frame_s(self, kind: Hashable) -> float:
-        """Seconds that a worker will take for a frame."""
         return self._frame_s.get(kind, self._any_s)
 
     def learn(self, kind: Hashable, frames: int, seconds: float) -> None:
-        """Takes note of what a worker took for some frames together."""
         measured_s = seconds / frames
         known_s = self._frame_s.get(kind, measured_s)
         self._frame_s[kind] = known_s + _WEIGHT * (measured_s - known_s)

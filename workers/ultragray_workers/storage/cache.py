@@ -130,7 +130,6 @@ class Cache:
             file.close()
 
     def held_bytes(self) -> int:
-        """Of the objects that are here or being fetched."""
         with self._room():
             return sum(size for _, size, _ in self._held())
 

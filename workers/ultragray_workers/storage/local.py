@@ -30,7 +30,6 @@ class FileVersion:
 
     @property
     def tag(self) -> str:
-        """The version as a word."""
         return f"{self.mtime_ns:x}-{self.size:x}-{self.inode:x}"
 
     @classmethod

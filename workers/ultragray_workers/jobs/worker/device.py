@@ -122,7 +122,6 @@ class DeviceLock:
         return self._file.fileno()
 
     def release(self) -> None:
-        """Lets other workers have the device; nothing where it is not held."""
         if self._file is not None:
             with suppress(OSError):
                 self._file.close()

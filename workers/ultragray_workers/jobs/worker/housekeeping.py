@@ -48,11 +48,9 @@ class Housekeeper:
         self._thread = threading.Thread(target=self._run, name="housekeeper", daemon=True)
 
     def start(self) -> None:
-        """Begins at once, in a thread of its own."""
         self._thread.start()
 
     def stop(self) -> None:
-        """Ends after the removal at hand."""
         self._stop.set()
 
     def keep_house(self) -> int:

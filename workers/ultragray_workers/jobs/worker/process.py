@@ -10,7 +10,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -28,12 +28,13 @@ LONGEST_STEP_S = 2.0  # between two looks; what is longer, this worker itself wa
 
 @contextmanager
 def job_process(
-    folder: JobFolder, device: DeviceLock, threads: int, descriptors: Sequence[int] = ()
+    folder: JobFolder, device: DeviceLock, threads: int, descriptor: int | None = None
 ) -> Iterator[subprocess.Popen[bytes]]:
     """A process at work in the folder, which shares the lock of its device; killed with its group at the end.
 
-    `descriptors`: its end of a channel to this worker; this process has it no more.
+    `descriptor`: its end of a channel to this worker; this process has it no more.
     """
+    descriptors = [] if descriptor is None else [descriptor]
     with folder.log.open("ab") as log:
         process = subprocess.Popen(
             [
@@ -52,7 +53,7 @@ def job_process(
             start_new_session=True,
             pass_fds=[device.fileno(), *descriptors],
         )
-    for descriptor in descriptors:
+    if descriptor is not None:
         os.close(descriptor)
     try:
         yield process
@@ -86,7 +87,6 @@ class Watchdog:
     """
 
     def __init__(self, pid: int, stall_timeout_s: float) -> None:
-        """`stall_timeout_s` 0: never."""
         self._pid, self._stall_timeout_s = pid, stall_timeout_s
         self._looked_at_s = time.monotonic()
         self._at_last_sign = Account()
