@@ -27,7 +27,7 @@ from ultragray import render
 from ultragray_studies.bench.kernel import BenchScene, bench_poses, bench_scenes
 from ultragray_studies.bench.report import measured
 from ultragray_studies.scaling import STUDIES, Outcome, Policy, SceneCosts, Storage, Workload, run
-from ultragray_workers.pool.scene_cache import SceneCache
+from ultragray_workers.pool.worker import SceneCache
 from ultragray_workers.scenes import resident_bytes
 
 SEEDS = 5

@@ -32,7 +32,7 @@ Integers = npt.NDArray[np.int64]
 GRPC, HTTP = 0, 1  # doors
 PATIENCE_S = 1.0  # the service refuses an interactive request that would wait longer (`max_queue_ms`)
 RECONNECTED_S = (0.2, 1.5)  # after its replica died, a stream is asked for again between these times
-MAX_SCENES = 256  # that a render process keeps loaded, see ultragray_workers.pool.scene_cache
+MAX_SCENES = 256  # that a render process keeps loaded, see ultragray_workers.pool.worker
 SETTLING_S, MEASURED_S = 60.0, 6.0  # in which the caches fill; in which figures are taken
 ALONE = -1  # the stream of a single request
 

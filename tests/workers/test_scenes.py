@@ -9,7 +9,7 @@ import pytest
 
 from ultragray.errors import SceneFileInvalid
 from ultragray_workers import SceneStore
-from ultragray_workers import scene_headers as headers
+from ultragray_workers import scene_shelf as headers
 from ultragray_workers.errors import SceneNotFound
 from ultragray_workers.scene_shelf import SceneShelf
 from ultragray_workers.scenes import resident_bytes

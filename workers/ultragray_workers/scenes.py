@@ -11,9 +11,8 @@ from ultragray.errors import SceneFileInvalid
 from ultragray.files import file_sha256
 from ultragray.scene.info import SceneHeader, SceneInfo, read_header, scene_file_invalid
 from ultragray_workers.errors import SceneNotFound, known_names
-from ultragray_workers.scene_headers import KeptHeaders, floats_per_gaussian
 from ultragray_workers.scene_names import SUFFIX, SceneReference, base_name, check_scene_name
-from ultragray_workers.scene_shelf import SceneShelf
+from ultragray_workers.scene_shelf import KeptHeaders, SceneShelf, floats_per_gaussian
 from ultragray_workers.storage.local import FileVersion, LocalStorage
 
 __all__ = ["SUFFIX", "SceneStore", "check_scene_file", "check_scene_name", "resident_bytes"]

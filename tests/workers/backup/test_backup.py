@@ -11,9 +11,8 @@ import sqlalchemy as sa
 from ultragray.samplers import AroundSampler
 from ultragray_workers.backup import backing_up, manifest
 from ultragray_workers.backup.backing_up import back_up, verify
-from ultragray_workers.backup.contents import Folders
+from ultragray_workers.backup.contents import Folders, Objects
 from ultragray_workers.backup.database_copy import Database
-from ultragray_workers.backup.objects import Objects
 from ultragray_workers.backup.restoring import restore
 from ultragray_workers.errors import BackupInvalid, RestoreRefused
 from ultragray_workers.jobs import queue

@@ -5,8 +5,8 @@ from __future__ import annotations
 import pytest
 
 from ultragray_workers.errors import ArtifactFolderUnavailable, StartupFailed, StorageUnavailable
+from ultragray_workers.jobs.database import KEY as FILE
 from ultragray_workers.jobs.database import JobDatabase
-from ultragray_workers.jobs.identity import KEY as FILE
 from ultragray_workers.jobs.progress import JobState
 from ultragray_workers.storage.local import LocalStorage
 

@@ -14,8 +14,8 @@ from ultragray_workers.jobs import queue
 from ultragray_workers.jobs.folder import WORK
 from ultragray_workers.jobs.progress import JobState
 from ultragray_workers.jobs.tables import JOBS
-from ultragray_workers.jobs.worker import housekeeping
-from ultragray_workers.jobs.worker.housekeeping import DAY_S, Housekeeper
+from ultragray_workers.jobs.worker import worker as housekeeping
+from ultragray_workers.jobs.worker.worker import DAY_S, Housekeeper
 from ultragray_workers.storage.local import LocalStorage
 
 from .conftest import train_job

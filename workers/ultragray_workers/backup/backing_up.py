@@ -20,10 +20,9 @@ from pathlib import Path
 
 import ultragray
 from ultragray_workers.backup import manifest as manifests
-from ultragray_workers.backup.contents import DATA, Folders, StoredFile, files_of, job_id_of
+from ultragray_workers.backup.contents import DATA, Folders, Objects, StoredFile, files_of, job_id_of
 from ultragray_workers.backup.database_copy import Database
 from ultragray_workers.backup.manifest import FileEntry, Manifest
-from ultragray_workers.backup.objects import Objects
 from ultragray_workers.errors import BackupInvalid, RestoreRefused
 from ultragray_workers.jobs.progress import JobState
 

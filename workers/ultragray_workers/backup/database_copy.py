@@ -18,8 +18,8 @@ import psycopg
 import sqlalchemy as sa
 from psycopg import sql
 
+from ultragray_workers.backup.contents import Objects
 from ultragray_workers.backup.manifest import DatabaseEntry, TableEntry
-from ultragray_workers.backup.objects import Objects
 from ultragray_workers.errors import BackupInvalid, RestoreRefused
 from ultragray_workers.jobs import queue, tables
 from ultragray_workers.jobs.database import checked_url

@@ -1,6 +1,6 @@
 """The demand of a job (device, memory, labels), the offer of a worker, and which jobs fit which worker.
 
-`jobs.queue` keeps the key of a demand with its job; `worker.gate` takes only jobs that the worker's offer fits.
+`jobs.queue` keeps the key of a demand with its job; `worker.device.Gate` takes only jobs that the worker's offer fits.
 """
 
 from __future__ import annotations

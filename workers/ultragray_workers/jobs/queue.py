@@ -7,8 +7,8 @@
 A worker holds a job as long as the row names it and its attempt, and the worker gives signs of life (see
 `jobs.workers`): `put_back_of_dead` lets others go on with the jobs of one that does not. Whatever a worker writes of a
 job holds for its own attempt alone, so that one that was cut off, and comes back, changes nothing any more. What
-demands fit which worker is decided by `worker.gate`; here a job is taken by the keys of demands. All functions block,
-and raise DatabaseUnavailable where the database is away. Free of torch.
+demands fit which worker is decided by `worker.device.Gate`; here a job is taken by the keys of demands. All functions
+block, and raise DatabaseUnavailable where the database is away. Free of torch.
 """
 
 from __future__ import annotations

@@ -102,7 +102,7 @@ WORKERS = sa.Table(
     sa.Column("job", sa.Text),
     sa.Column("wanted", sa.Text),  # by an administrator; NULL: that it takes jobs
 )
-STORE = sa.Table("store", TABLES, sa.Column("id", sa.Text, nullable=False))  # one row: see jobs.identity
+STORE = sa.Table("store", TABLES, sa.Column("id", sa.Text, nullable=False))  # one row: see jobs.database
 KEYS = sa.Table(  # API keys: rows stay when a key is revoked or has expired
     "keys",
     TABLES,

@@ -20,6 +20,7 @@ from ultragray_workers.pool.messages import (
     ForkWorker,
     LoadTask,
     PackTask,
+    PoolConfig,
     Rendered,
     SceneChangedError,
     Sought,
@@ -27,7 +28,7 @@ from ultragray_workers.pool.messages import (
     TaskPart,
     UnloadTask,
 )
-from ultragray_workers.pool.processes import Assignment, Command, Launcher, Patience, Slot
+from ultragray_workers.pool.processes import Assignment, Command, Launcher, Slot
 from ultragray_workers.pool.waiting import Part, Ticket, WaitingQueue
 from ultragray_workers.rounds import Rounds
 
@@ -41,11 +42,10 @@ logger = logging.getLogger(__name__)
 class Dispatcher:
     """The worker processes and the queue before them, in the event loop's thread."""
 
-    def __init__(self, launcher: Launcher, settings: ForkWorker, patience: Patience, waiting: WaitingQueue) -> None:
+    def __init__(self, launcher: Launcher, config: PoolConfig, waiting: WaitingQueue) -> None:
         self.slots: list[Slot] = []
         self._launcher = launcher
-        self._settings = settings
-        self._patience = patience
+        self._config = config
         self._watching: asyncio.TimerHandle | None = None
         self._looks = Rounds("the watch over render processes", logger)
         self._waiting = waiting
@@ -59,11 +59,11 @@ class Dispatcher:
         first = self._add_slot()
         self._watch()
         await first.start()
-        processes = self._settings.processes or max(1, first.gpus)
+        processes = self._config.processes or max(1, first.gpus)
         await _all([self._add_slot().start() for _ in range(1, processes)])
 
     def _add_slot(self) -> Slot:
-        slot = Slot(self._launcher, replace(self._settings, number=len(self.slots)), self._patience, self)
+        slot = Slot(self._launcher, ForkWorker(self._config, len(self.slots)), self)
         self.slots.append(slot)
         return slot
 

@@ -12,14 +12,58 @@ from typing import Any, Generic, Protocol
 
 from typing_extensions import TypeVar
 
+from ultragray.contract import Contract, described
 from ultragray.errors import UltragrayError
 from ultragray.geometry.probe import FloatArray
 from ultragray.learn.localization.settings import Localization, LocalizationSettings
 from ultragray.rendering.settings import Resolved
 from ultragray.rendering.volumes import SliceView
 from ultragray.scene.confidence import Extrapolation
+from ultragray_workers.pool.channel import MAX_DESCRIPTORS
 from ultragray_workers.pool.turns import UNKNOWN_CALLER, Caller
 from ultragray_workers.storage.local import FileVersion
+
+MAX_BATCH_POSES = MAX_DESCRIPTORS  # the memory of each part goes along with the task
+
+
+@dataclass(frozen=True)
+class PoolConfig(Contract):
+    """Sizes of a pool. Raises InvalidArgument for values that no pool can have."""
+
+    processes: int = described("0: one per GPU that renders; on the CPU one.", 0, low=0, high=1024)
+    threads_per_process: int = described(
+        "0: the cores this process may use, divided by the number of processes.", 0, low=0, high=1024
+    )
+    queue_limit_frames: int = described("Poses that may wait, for each priority.", 256, low=1, high=2**31)
+    client_limit_frames: int = described("Of one client, for each priority.", 256, low=1, high=2**31)
+    max_queue_ms: float = described(
+        "How long others may keep an interactive request waiting; one that would wait longer is refused at once.",
+        1000.0,
+        above=0.0,
+        high=3_600_000.0,
+    )
+    max_batch_poses: int = described(
+        "Poses rendered together; fewer for images of more than 512x512 pixels.", 16, low=1, high=MAX_BATCH_POSES
+    )
+    memory_budget_bytes: int = described(
+        "Of loaded scenes, per process, where they are rendered.", 4 * 2**30, low=1, high=2**63
+    )
+    max_footprint_pixels: int = described(
+        "Cost of a frame, see ultragray.rendering.limits.", 2**31, low=1, high=2**63 - 1
+    )
+    worker_grace_s: float = described(
+        "How long a process may leave a task untouched, or owe its answer after the deadline.",
+        5.0,
+        above=0.0,
+        high=3600.0,
+    )
+    worker_timeout_s: float = described(
+        "How long a process may take for what has no deadline, such as loading a scene.",
+        120.0,
+        above=0.0,
+        high=86_400.0,
+    )
+    backend: str = "auto"
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,12 +178,8 @@ class LocalizeResult:
 class ForkWorker:
     """To a template process: fork a worker that serves the channel sent along."""
 
-    backend: str
-    number: int  # of its place in the pool, from 0: tells which GPU it takes
-    processes: int  # in the pool; 0: one per GPU, or one
-    threads: int  # 0: the cores this process may use, divided by the number of processes
-    memory_budget_bytes: int
-    max_footprint_pixels: int  # of a frame
+    pool: PoolConfig
+    number: int = 0  # of its place in the pool: tells which GPU it takes
 
 
 @dataclass(frozen=True)

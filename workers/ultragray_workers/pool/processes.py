@@ -29,6 +29,7 @@ from ultragray_workers.pool.messages import (
     Hello,
     Loading,
     LoadTask,
+    PoolConfig,
     UnloadTask,
 )
 from ultragray_workers.pool.waiting import Part
@@ -227,17 +228,11 @@ class _Template:
 STUCK_AFTER_S = 5.0  # without a word from a worker that has work: whoever asks whether the service is ready is told
 
 
-@dataclass(frozen=True)
-class Patience:
-    grace_s: float  # to take up a task, and after the deadline of one
-    task_s: float  # for a task without a deadline, and to load a scene
-
-
 class Watch:
     """What is expected of a worker, in time.monotonic() seconds. It costs a task no timer: whoever watches asks."""
 
-    def __init__(self, patience: Patience) -> None:
-        self._patience = patience
+    def __init__(self, config: PoolConfig) -> None:
+        self._grace_s, self._timeout_s = config.worker_grace_s, config.worker_timeout_s
         self._begun = self._heard = 0.0
         self._deadline: float | None = None
         self._loading = False
@@ -260,15 +255,15 @@ class Watch:
 
     def complaint(self, taken: bool) -> str | None:
         """The reason to give up on the worker; None while there is none. `taken`: whether it has taken up its task."""
-        now, patience = time.monotonic(), self._patience
+        now = time.monotonic()
         if not taken:
-            late_s = now - self._begun - patience.grace_s
-            return f"it did not take up its task within {patience.grace_s:g} s" if late_s > 0 else None
+            late_s = now - self._begun - self._grace_s
+            return f"it did not take up its task within {self._grace_s:g} s" if late_s > 0 else None
         if self._loading or self._deadline is None:
-            late_s = now - self._heard - patience.task_s
-            return f"it told nothing for {patience.task_s:g} s" if late_s > 0 else None
-        late_s = now - max(self._deadline, self._heard) - patience.grace_s
-        return f"it owed an answer for {patience.grace_s:g} s after the deadline" if late_s > 0 else None
+            late_s = now - self._heard - self._timeout_s
+            return f"it told nothing for {self._timeout_s:g} s" if late_s > 0 else None
+        late_s = now - max(self._deadline, self._heard) - self._grace_s
+        return f"it owed an answer for {self._grace_s:g} s after the deadline" if late_s > 0 else None
 
 
 # One place in the pool: a worker process, what it is doing, and its replacement when it dies or hangs.
@@ -331,7 +326,7 @@ class SlotListener(Protocol):
 class Slot:
     """A worker process and what it is doing; started again whenever it dies, killed when it hangs."""
 
-    def __init__(self, launcher: Launcher, settings: ForkWorker, patience: Patience, listener: SlotListener) -> None:
+    def __init__(self, launcher: Launcher, settings: ForkWorker, listener: SlotListener) -> None:
         self.resident: tuple[str, ...] = ()  # scenes its worker holds
         self.commands: deque[Command] = deque()
         self.replacements = 0  # of workers that died
@@ -345,7 +340,7 @@ class Slot:
         self._assignment: Assignment | None = None
         self._board: Board  # of the process at work here
         self._tasks = 0  # given to it
-        self._watch = Watch(patience)
+        self._watch = Watch(settings.pool)
         self._hung = False  # it is being killed
         self._settled = asyncio.Event()  # it has once been ready, or could not be started
         self._failed_starts = 0

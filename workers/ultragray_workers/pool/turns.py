@@ -1,9 +1,14 @@
 """Turns between clients, and between the connections of each, by the workers' time that each has had.
 
-This is start-time fair queueing: every share has a virtual time, the seconds it was served, and the one that is
-furthest behind is next. One that comes, or comes back, starts where those are that wait, so that nobody saves up time;
-and one that has just been served long waits until the others have had as much. A client that opens more connections
-gets no more: they divide what it gets.
+This is start-time fair queueing (Goyal, Vin, Cheng 1996) on two levels. Every share i, a client or a connection of one,
+has a virtual time S_i: the seconds of workers that it was served. The queue has a clock V, the S of the share that was
+taken last. The next is the waiting share of the least S_i, of equal ones that with the fewest frames; taking work of
+w forecast seconds makes V = S_i, then S_i += w, and S_i += measured - w once it is known what it took. A share that
+begins to wait starts at max(S_i, V): nobody saves up time while away, and one that was just served long waits until the
+others have had as much. So any two shares that wait all the time get the same within the length of one part each. A
+client's connections have a clock of their own and divide what the client gets: opening more of them gains nothing. How
+long one more item of share i must wait follows: it is next when S_i has come to T = S_i + w_i, and until then every
+other share j is served min(w_j, T - S_j), at least a frame where it is behind (`_Share.before`).
 """
 
 from __future__ import annotations

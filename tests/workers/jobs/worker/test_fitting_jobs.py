@@ -10,8 +10,7 @@ from ultragray.installation import memory_bytes
 from ultragray_workers.jobs.demand import Demand, WorkerDevice
 from ultragray_workers.jobs.progress import JobState
 from ultragray_workers.jobs.queue import demands_waiting
-from ultragray_workers.jobs.worker.device import DeviceLock, HostDevice
-from ultragray_workers.jobs.worker.gate import Gate
+from ultragray_workers.jobs.worker.device import DeviceLock, Gate, HostDevice
 
 from ....waiting import wait_until
 from ..conftest import train_job

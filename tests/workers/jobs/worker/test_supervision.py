@@ -14,8 +14,7 @@ from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.progress import JobState, Outcome, Progress
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.worker import supervision
-from ultragray_workers.jobs.worker.device import DeviceLock, devices_of
-from ultragray_workers.jobs.worker.gate import Gate
+from ultragray_workers.jobs.worker.device import DeviceLock, Gate, devices_of
 from ultragray_workers.jobs.worker.supervision import Supervisor
 from ultragray_workers.scene_shelf import SceneShelf
 from ultragray_workers.storage.local import LocalStorage

@@ -16,7 +16,6 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ultragray_workers.jobs.folder import JobFolder
-from ultragray_workers.jobs.worker.device import DeviceLock
 
 STOP_WAIT_S = 10.0  # for the checkpoint of a training that is to stop
 _KILL_WAIT_S, _KILL_POLL_S = 5.0, 0.02
@@ -28,9 +27,9 @@ LONGEST_STEP_S = 2.0  # between two looks; what is longer, this worker itself wa
 
 @contextmanager
 def job_process(
-    folder: JobFolder, device: DeviceLock, threads: int, descriptor: int | None = None
+    folder: JobFolder, device_lock: int, threads: int, descriptor: int | None = None
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """A process at work in the folder, which shares the lock of its device; killed with its group at the end.
+    """A process at work in the folder, which inherits the lock of its device; killed with its group at the end.
 
     `descriptor`: its end of a channel to this worker; this process has it no more.
     """
@@ -51,7 +50,7 @@ def job_process(
                 "OPENBLAS_NUM_THREADS": str(threads),
             },
             start_new_session=True,
-            pass_fds=[device.fileno(), *descriptors],
+            pass_fds=[device_lock, *descriptors],
         )
     if descriptor is not None:
         os.close(descriptor)

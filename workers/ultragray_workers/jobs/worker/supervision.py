@@ -37,8 +37,7 @@ from ultragray_workers.jobs.progress import Outcome
 from ultragray_workers.jobs.record import Files, Row
 from ultragray_workers.jobs.shards.desk import BatchOver, ShardDesk
 from ultragray_workers.jobs.specification import has_checkpoints, is_in_shards
-from ultragray_workers.jobs.worker.device import DeviceLock
-from ultragray_workers.jobs.worker.gate import Gate
+from ultragray_workers.jobs.worker.device import DeviceLock, Gate
 from ultragray_workers.jobs.worker.process import (
     STOP_WAIT_S,
     Watchdog,
@@ -286,7 +285,7 @@ class _JobAtHand:
         supervisor, row, config = self._supervisor, self._row, self._config
         with (
             self._desk_of_batch() as desk,
-            job_process(self._folder, self._device, config.threads, desk and desk.descriptor) as process,
+            job_process(self._folder, self._device.fileno(), config.threads, desk and desk.descriptor) as process,
         ):
             watchdog = Watchdog(process.pid, config.stall_timeout_s)
             watched_at_s = float("-inf")
