@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from ultragray.files import atomic_path, remove_stale_temporaries
+from ultragray.files import atomic_path, remove_stale_temporaries, write_whole
 
 
 @pytest.fixture
@@ -78,3 +78,12 @@ def test_an_error_names_the_file_that_was_wanted(tmp_path: Path) -> None:
         tmp_path.read_bytes()
     assert other.value.filename == str(tmp_path)
     assert os.listdir(tmp_path) == []
+
+
+def test_who_reads_a_file_while_it_is_written_whole_keeps_what_was_there(tmp_path: Path) -> None:
+    path = tmp_path / "file"
+    write_whole(path, "before")
+    with path.open() as reader:
+        write_whole(path, "after")
+        assert reader.read() == "before"
+    assert path.read_text() == "after"

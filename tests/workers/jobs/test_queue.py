@@ -13,6 +13,7 @@ from ultragray_workers.errors import StartupFailed
 from ultragray_workers.jobs import queue, tables, workers
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.demand import Demand
+from ultragray_workers.jobs.owners import Kind, read_owners
 from ultragray_workers.jobs.progress import JobState, Outcome, Progress
 from ultragray_workers.jobs.record import Files, Piece, StoredFile
 from ultragray_workers.jobs.tables import SCHEMA_VERSION
@@ -149,6 +150,19 @@ def test_a_job_is_published_or_cancelled_whichever_comes_first(store, engine):
     assert not queue.publish(engine, row, Outcome(), Files())
     assert queue.tell(engine, row, Progress(step=7), FILES)  # a retry goes on from there
     assert store.submit(train_job("two"), owner="bob")[1]  # the name is free again
+
+
+@pytest.mark.parametrize("is_running", [False, True])
+def test_a_cancelled_job_gives_the_name_of_its_scene_back_at_once(store, engine, is_running):
+    """To ask for the name would also forget a claim of a job that is over: whoever lists owners asks for none."""
+    job, _ = store.submit(train_job("one"), owner="ann")
+    with engine.connect() as connection:
+        assert read_owners(connection).keys() == {(Kind.SCENE, "one")}
+    if is_running:
+        taken(engine, "one")
+    assert queue.cancel(engine, job.id)
+    with engine.connect() as connection:
+        assert read_owners(connection) == {}
 
 
 def test_jobs_of_the_dead_wait_again_and_those_of_the_living_do_not(store, engine, start, monkeypatch):
