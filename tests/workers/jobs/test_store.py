@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import re
-import shutil
 import subprocess
 import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
 import pytest
-import sqlalchemy as sa
 
 from ultragray.errors import InvalidArgument
 from ultragray.samplers import TrainingSampler
@@ -25,7 +22,6 @@ from ultragray_workers.errors import (
     SceneNotFound,
     StartupFailed,
 )
-from ultragray_workers.jobs.database import checked_url
 from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.progress import JobState
 from ultragray_workers.jobs.store import JobStore
@@ -205,26 +201,6 @@ def test_dataset_in_use(store):
     assert store.uses_dataset("tiny") is None
 
 
-def test_jobs_outlive_the_store(store, artifact_folder, database_url):
-    job, _ = store.submit(train_job("one"))
-    again = JobStore(artifact_folder, database_url)
-    assert again.get(job.id) == job
-    again.close()
-
-
-def test_rows_hold_no_pickles(store, artifact_folder, database_url):
-    store.submit(train_job("one"))
-    kept = []
-    engine = sa.create_engine(checked_url(database_url, artifact_folder), poolclass=sa.NullPool)
-    with engine.connect() as connection:
-        tables = sa.MetaData()
-        tables.reflect(connection, schema=None if database_url is None else "ultragray")
-        for table in tables.sorted_tables:
-            kept += [value for row in connection.execute(sa.select(table)) for value in row]
-    assert not any(isinstance(value, bytes) for value in kept)
-    assert any('"scene":"one"' in str(value).replace(" ", "") for value in kept)
-
-
 def test_database_that_cannot_be_reached_is_told_without_the_password(tmp_path):
     with pytest.raises(StartupFailed, match="database") as caught:
         JobStore(tmp_path, "postgresql://me:secret@127.0.0.1:1/jobs")
@@ -239,10 +215,3 @@ def test_importing_the_store_and_the_worker_needs_no_torch():
     )
     told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
     assert told.strip() == "False"
-
-
-def test_ids_are_the_names_of_folders(store, artifact_folder):
-    job, _ = store.submit(train_job("one"))
-    assert re.fullmatch(r"[0-9a-f]{24}", job.id)
-    shutil.rmtree(artifact_folder / "jobs", ignore_errors=True)
-    assert store.get(job.id).progress.step is None

@@ -29,7 +29,6 @@ from ultragray_workers.jobs.progress import JobState
 _SETTLE_S = 5.0  # a job that is just being deleted has lost its folder, and soon its row
 _SETTLE_POLL_S = 0.1
 _Known = dict[tuple[str, str], FileEntry]
-_States = Mapping[str, JobState]
 
 
 @dataclass(frozen=True)

@@ -5,7 +5,6 @@ The keys are the same below both, so that a service that is started with the oth
 
 from __future__ import annotations
 
-import hashlib
 import re
 import tempfile
 from collections.abc import Callable, Iterator
@@ -43,7 +42,8 @@ def copy_scenes(source: Storage, target: Storage, say: Callable[[str], None] = l
         with _file(source, key) as file:
             sha256 = file_sha256(file)
             is_new = target.entry(key) is None and target.upload(file, key, if_absent=True)
-            found = _sha256(target, key)
+            with _file(target, key) as copy:
+                found = file_sha256(copy)
             if found != sha256 and is_new:
                 raise StorageUnavailable(f"the copy of {key} in {target.location} has another SHA-256: copy again")
             if found != sha256:
@@ -65,21 +65,11 @@ def _file(storage: Storage, key: str) -> Iterator[Path]:
         return
     with tempfile.TemporaryDirectory(prefix="ultragray-copy-") as folder:
         path = Path(folder, "object")
-        storage.download(key, path)
+        try:
+            storage.download(key, path)
+        except NotThere as error:
+            raise StorageUnavailable(str(error)) from None
         yield path
-
-
-def _sha256(storage: Storage, key: str) -> str:
-    digest = hashlib.sha256()
-    try:
-        for chunk in storage.chunks(key):
-            digest.update(chunk)
-    except NotThere as error:
-        raise StorageUnavailable(str(error)) from None
-    return digest.hexdigest()
-
-
-# Copies the datasets of one storage into another, such as from a folder into a bucket.
 
 
 @dataclass(frozen=True)

@@ -86,7 +86,8 @@ class RemoteStorage:
 
     def entry(self, key: str) -> Entry | None:
         try:
-            return _entry(self._head(key))
+            with self._asking(key):
+                return _entry(self._obstore.head(self._store, check_key(key)))
         except NotThere:
             return None
 
@@ -104,22 +105,16 @@ class RemoteStorage:
         except _BeyondTheEnd:
             return b""
 
-    def write(self, key: str, data: bytes, *, if_absent: bool = False, if_version: str | None = None) -> bool:
+    def write(self, key: str, data: bytes, *, if_absent: bool = False) -> bool:
         mode: Any = "create" if if_absent else "overwrite"
-        if if_version is not None:
-            try:
-                found = self._head(key)
-            except NotThere:
-                return False
-            if found["e_tag"] != if_version:
-                return self._holds(key, data)
-            # Google's storage compares the version, the others the ETag.
-            mode = {name: found[name] for name in ("e_tag", "version") if found[name] is not None}
         try:
             with self._asking():
                 self._obstore.put(self._store, check_key(key), data, mode=mode, use_multipart=False)
         except self._conflicts:
-            return self._holds(key, data)
+            try:
+                return self.read(key) == data  # then a write whose answer was lost has succeeded
+            except NotThere:
+                return False
         return True
 
     def upload(self, path: Path, key: str, *, if_absent: bool = False) -> bool:
@@ -140,17 +135,24 @@ class RemoteStorage:
         return True
 
     def download(self, key: str, path: Path, *, version: str | None = None) -> Entry:
-        entry, chunks = self._get(key, version)
+        try:
+            with self._asking(key):
+                options = {} if version is None else {"if_match": version}
+                result = self._obstore.get(self._store, check_key(key), options=options)
+        except self._conflicts:
+            raise NotThere(f"{key} in {self.location} is no longer of the version {version}") from None
+        entry, pieces = _entry(result.meta), iter(result.stream(min_chunk_size=_PART_BYTES))
         with atomic_path(path) as temporary:
             with temporary.open("wb") as file:
-                for chunk in chunks:
-                    file.write(chunk)
+                while True:
+                    with self._asking(key):
+                        piece = next(pieces, None)
+                    if piece is None:
+                        break
+                    file.write(piece)
             if (got := temporary.stat().st_size) != entry.bytes:
                 raise StorageUnavailable(f"{self.location} sent {got} of the {entry.bytes} bytes of {key}")
         return entry
-
-    def chunks(self, key: str, *, version: str | None = None) -> Iterator[bytes]:
-        yield from self._get(key, version)[1]
 
     def delete(self, key: str) -> None:
         with contextlib.suppress(NotThere), self._asking(key):
@@ -207,34 +209,6 @@ class RemoteStorage:
 
     def free_bytes(self) -> int | None:
         return None
-
-    def _get(self, key: str, version: str | None) -> tuple[Entry, Iterator[bytes]]:
-        options = {} if version is None else {"if_match": version}
-        try:
-            with self._asking(key):
-                result = self._obstore.get(self._store, check_key(key), options=options)
-        except self._conflicts:
-            raise NotThere(f"{key} in {self.location} is no longer of the version {version}") from None
-        return _entry(result.meta), self._pieces(key, iter(result.stream(min_chunk_size=_PART_BYTES)))
-
-    def _pieces(self, key: str, stream: Iterator[Any]) -> Iterator[bytes]:
-        while True:
-            with self._asking(key):
-                piece = next(stream, None)
-            if piece is None:
-                return
-            yield bytes(piece)
-
-    def _head(self, key: str) -> Any:
-        with self._asking(key):
-            return self._obstore.head(self._store, check_key(key))
-
-    def _holds(self, key: str, data: bytes) -> bool:
-        """Whether an object is `data`: then a write whose answer was lost has succeeded."""
-        try:
-            return self.read(key) == data
-        except NotThere:
-            return False
 
     @contextlib.contextmanager
     def _asking(self, key: str | None = None) -> Iterator[None]:

@@ -89,12 +89,11 @@ class Storage(Protocol):
         Raises NotThere.
         """
 
-    def write(self, key: str, data: bytes, *, if_absent: bool = False, if_version: str | None = None) -> bool:
-        """Writes a small object, whole or not at all. False: the condition does not hold, and nothing changed.
+    def write(self, key: str, data: bytes, *, if_absent: bool = False) -> bool:
+        """Writes a small object, whole or not at all. False: `if_absent`, and there is one already.
 
-        `if_absent`: only where there is none; `if_version`: only over that version. An object that holds exactly `data`
-        counts as written, since an answer that was lost cannot be told from a success: where one writer must win, each
-        puts something of its own into `data`.
+        An object that holds exactly `data` counts as written, since an answer that was lost cannot be told from a
+        success: where one writer must win, each puts something of its own into `data`.
         """
 
     def upload(self, path: Path, key: str, *, if_absent: bool = False) -> bool:
@@ -109,9 +108,6 @@ class Storage(Protocol):
 
         Raises NotThere, OSError of the file.
         """
-
-    def chunks(self, key: str, *, version: str | None = None) -> Iterator[bytes]:
-        """The content piece by piece, of one version throughout. Raises NotThere before the first piece."""
 
     def delete(self, key: str) -> None:
         """Removes an object; nothing where it is absent."""

@@ -97,21 +97,6 @@ def test_who_waits_for_a_device_takes_no_job_and_another_host_does(store, start_
 
 
 @pytest.mark.long
-def test_a_job_that_asks_for_a_device_in_use_waits_in_the_queue(store, artifact_folder, start_worker, until):
-    """Nobody loses an attempt."""
-    held = DeviceLock(artifact_folder.resolve(), CPU, "somebody")
-    assert held.take()
-    start_worker("one")
-    job, _ = store.submit(train_job("one"))
-    time.sleep(3.0)
-    job = store.get(job.id)
-    assert (job.state, job.attempts) == (JobState.QUEUED, 0), job
-    held.release()
-    job = until(job)
-    assert (job.state, job.attempts) == (JobState.SUCCEEDED, 1), job
-
-
-@pytest.mark.long
 def test_a_stopped_worker_loses_its_job_and_its_device(store, start_worker, until):
     one = start_worker("one")
     job, _ = store.submit(train_job("one", steps=600))

@@ -285,7 +285,9 @@ class _JobAtHand:
         supervisor, row, config = self._supervisor, self._row, self._config
         with (
             self._desk_of_batch() as desk,
-            job_process(self._folder, self._device.fileno(), config.threads, desk and desk.descriptor) as process,
+            job_process(
+                self._folder, self._device.fileno(), config.threads, None if desk is None else desk.descriptor
+            ) as process,
         ):
             watchdog = Watchdog(process.pid, config.stall_timeout_s)
             watched_at_s = float("-inf")
@@ -417,7 +419,11 @@ class _JobAtHand:
 @contextmanager
 def _span(row: Row, worker: str) -> Iterator[trace.Span]:
     """A span for one attempt at a job, a part of the trace of the request that submitted it."""
-    attributes = {"ultragray.job": row.id, "ultragray.worker": worker, "ultragray.attempt": row.attempt}
+    attributes: dict[str, str | int] = {
+        "ultragray.job": row.id,
+        "ultragray.worker": worker,
+        "ultragray.attempt": row.attempt,
+    }
     context, kind = propagate.extract(row.trace), trace.SpanKind.CONSUMER
     tracer = trace.get_tracer("ultragray")
     with tracer.start_as_current_span(f"job {row.kind}", context, kind, attributes=attributes) as span:
