@@ -70,7 +70,7 @@ class Dispatcher:
     def submit(self, ticket: Ticket) -> None:
         """Queues a ticket; `ticket.done` tells when its frames lie in its memory. Raises QueueFull."""
         self._waiting.add(ticket)
-        self._dispatch()
+        self.dispatch()
 
     def discard(self, ticket: Ticket) -> None:
         """Forgets a ticket, rendered or not: drops what still waits and takes its memory back."""
@@ -105,10 +105,10 @@ class Dispatcher:
         commands = [Command(task, loop.create_future()) for _ in self.slots]
         for slot, command in zip(self.slots, commands, strict=True):
             slot.commands.append(command)
-        self._dispatch()
+        self.dispatch()
         await _all([command.done for command in commands])
 
-    def _dispatch(self) -> None:
+    def dispatch(self) -> None:
         """Gives every idle worker something to do: commands first, then what waits."""
         self._waiting.workers = max(1, sum(slot.alive for slot in self.slots))
         for slot in self.slots:
@@ -149,9 +149,6 @@ class Dispatcher:
             ticket.archive = self._memories.acquire()
         return ticket.archive
 
-    def on_idle(self) -> None:
-        self._dispatch()
-
     def on_answer(self, assignment: Assignment, answer: Answer) -> None:
         outcome = answer.outcome
         if (command := assignment.command) is not None:
@@ -191,7 +188,7 @@ class Dispatcher:
                 continue
             for again in reversed(step.for_retry(hung=hung)):
                 self._waiting.put_first(again)
-        self._dispatch()
+        self.dispatch()
 
     def _advance(self, ticket: Ticket, step: Part, outcome: Rendered) -> None:
         """Takes a step of a ticket as done; completes it after its last."""
@@ -206,7 +203,7 @@ class Dispatcher:
             self._fail_ticket(ticket, SceneChangedError())
         elif _is_archive(ticket):
             self._waiting.put_first(Part(ticket, 0, 0))
-            self._dispatch()
+            self.dispatch()
         else:
             ticket.done.set_result(_summary(ticket.rendered))
 

@@ -16,7 +16,7 @@ from collections import deque
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any
 
 from ultragray.errors import RenderFailed, UltragrayError
 from ultragray_workers.errors import Draining
@@ -33,6 +33,9 @@ from ultragray_workers.pool.messages import (
     UnloadTask,
 )
 from ultragray_workers.pool.waiting import Part
+
+if TYPE_CHECKING:
+    from ultragray_workers.pool.dispatcher import Dispatcher
 
 _STOP_TIMEOUT_S = 2.0
 _POLL_INTERVAL_S = 0.002
@@ -313,20 +316,10 @@ class Assignment:
         return max((d for d in deadlines if d is not None), default=None) if None not in deadlines else None
 
 
-class SlotListener(Protocol):
-    """The pool, as its slots see it."""
-
-    def on_answer(self, assignment: Assignment, answer: Answer) -> None: ...
-
-    def on_death(self, slot: Slot, assignment: Assignment, *, hung: bool) -> None: ...
-
-    def on_idle(self) -> None: ...
-
-
 class Slot:
     """A worker process and what it is doing; started again whenever it dies, killed when it hangs."""
 
-    def __init__(self, launcher: Launcher, settings: ForkWorker, listener: SlotListener) -> None:
+    def __init__(self, launcher: Launcher, settings: ForkWorker, dispatcher: Dispatcher) -> None:
         self.resident: tuple[str, ...] = ()  # scenes its worker holds
         self.commands: deque[Command] = deque()
         self.replacements = 0  # of workers that died
@@ -334,7 +327,7 @@ class Slot:
         self.gpus = 0  # that its worker found
         self._launcher = launcher
         self._settings = settings
-        self._listener = listener
+        self._dispatcher = dispatcher
         self._peer: Peer | None = None
         self.alive = False  # whether its worker has said Hello and works
         self._assignment: Assignment | None = None
@@ -428,7 +421,7 @@ class Slot:
             self.alive = True
             self._failed_starts = 0
             self._settled.set()
-            self._listener.on_idle()
+            self._dispatcher.dispatch()
             return
         if isinstance(message, Loading):
             self._watch.hear(message.begins)
@@ -441,9 +434,9 @@ class Slot:
         assert assignment is not None
         if message.last:
             self._assignment = None
-        self._listener.on_answer(assignment, message)
+        self._dispatcher.on_answer(assignment, message)
         if message.last:
-            self._listener.on_idle()
+            self._dispatcher.dispatch()
 
     def _on_gone(self) -> None:
         worked, self.alive = self.alive, False
@@ -461,7 +454,7 @@ class Slot:
         elif not self._closing:
             self._start_again_later()
         if assignment is not None:
-            self._listener.on_death(self, assignment, hung=hung)
+            self._dispatcher.on_death(self, assignment, hung=hung)
 
     def _start_again_later(self) -> None:
         self._failed_starts += 1

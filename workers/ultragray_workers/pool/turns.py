@@ -17,10 +17,12 @@ import time
 from collections import OrderedDict
 from collections.abc import Hashable, Iterator
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from itertools import zip_longest
+from typing import Any, Generic, TypeVar
 
 Item = TypeVar("Item")
 
+_NO_ITEM: Any = object()
 _MOST_IDLE = 256  # shares that are remembered beside those that wait
 
 
@@ -180,14 +182,8 @@ def _in_turn(client: _Client[Item]) -> Iterator[Item]:
 
 def _alternate(rows: list[Iterator[Item]]) -> Iterator[Item]:
     """One item of each row, then the next of each, until there are no more."""
-    while rows:
-        left = []
-        for items in rows:
-            for item in items:
-                yield item
-                left.append(items)
-                break
-        rows = left
+    for items in zip_longest(*rows, fillvalue=_NO_ITEM):
+        yield from (item for item in items if item is not _NO_ITEM)
 
 
 def _forget_idle(shares: dict[str, _Client[Item]] | dict[str, _Connection[Item]], clock_s: float) -> None:

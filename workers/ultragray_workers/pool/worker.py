@@ -1,6 +1,6 @@
 """The worker process: takes tasks from its channel one at a time, renders, encodes, answers. Imports torch.
 
-`_Worker.do` finds the work of a task by the kind of its settings (`_WORK`): frames, slices, a frame that is looked for.
+`_Worker._done` finds the work of a task by the kind of its settings: frames, slices, a frame that is looked for.
 Each part of a task has an answer of its own, as soon as its pixels lie in the memory of its request.
 """
 
@@ -131,14 +131,22 @@ class _Worker:
         self._board.taken[0] = self._tasks
         try:
             if isinstance(task, Task):
-                work = self._WORK[type(task.view)](self, task, memories)
-                for part, outcome in enumerate(work):
+                for part, outcome in enumerate(self._done(task, memories)):
                     self._answer(part, outcome, last=part == len(task.parts) - 1)
             else:
                 self._answer(0, _outcome(lambda: self._do_other(task, memories)), last=True)
         finally:
             for memory in memories:
                 os.close(memory)
+
+    def _done(self, task: Task[Any], memories: Sequence[int]) -> Iterator[Outcome]:
+        """The outcomes of a task's parts: frames are rendered together, all else is done part by part."""
+        if isinstance(task.view, Resolved):
+            yield from self._render_parts(task, memories)
+            return
+        work = partial(self._WORK[type(task.view)], self, task)
+        for part, memory in zip(task.parts, memories, strict=True):
+            yield _outcome(partial(work, part, memory))
 
     def _answer(self, part: int, outcome: Outcome, *, last: bool) -> None:
         self._channel.send(Answer(part=part, outcome=outcome, last=last, resident=self._scenes.names()))
@@ -260,11 +268,6 @@ class _Worker:
                 f"free memory of {self._device}; ask for fewer or smaller ones"
             ) from error
 
-    def _sample_parts(self, task: Task[SliceView], memories: Sequence[int]) -> Iterator[Outcome]:
-        """Slices, part by part."""
-        for part, memory in zip(task.parts, memories, strict=True):
-            yield _outcome(partial(self._sample, task, part, memory))
-
     def _sample(self, task: Task[SliceView], part: TaskPart[SliceView], memory: int) -> Rendered:
         loaded, view = self._scene_of(task), part.settings
         started, size = time.monotonic(), 0
@@ -276,11 +279,6 @@ class _Worker:
             write_at(memory, data.data.cast("B"), number * data.nbytes)
             size = part.total * data.nbytes
         return self._rendered(loaded, started, size=size, first=part.first)
-
-    def _search_parts(self, task: Task[Sought], memories: Sequence[int]) -> Iterator[Outcome]:
-        """A real frame, which lies in the memory, and is looked for about the one pose."""
-        for part, memory in zip(task.parts, memories, strict=True):
-            yield _outcome(partial(self._search, task, part, memory))
 
     def _search(self, task: Task[Sought], part: TaskPart[Sought], memory: int) -> Rendered:
         loaded, asked = self._scene_of(task), part.settings.settings
@@ -298,11 +296,7 @@ class _Worker:
         )
         return self._rendered(loaded, started, found=found)
 
-    _WORK: ClassVar[dict[type, Callable[..., Iterator[Outcome]]]] = {  # by the kind of settings
-        Resolved: _render_parts,
-        SliceView: _sample_parts,
-        Sought: _search_parts,
-    }
+    _WORK: ClassVar[dict[type, Callable[..., Rendered]]] = {SliceView: _sample, Sought: _search}  # on one part
 
 
 def example_probes() -> tuple[Probe, ...]:
