@@ -162,6 +162,16 @@ def until():
     return wait
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem):
+    """Asynchronous tests run in a loop of their own, with a limit: a lost request fails its test and hangs nothing."""
+    if not asyncio.iscoroutinefunction(pyfuncitem.obj):
+        return None
+    arguments = {name: pyfuncitem.funcargs[name] for name in pyfuncitem._fixtureinfo.argnames}
+    asyncio.run(asyncio.wait_for(pyfuncitem.obj(**arguments), TIME_LIMIT_S))
+    return True
+
+
 @pytest.fixture
 def run():
     """asyncio.run with a limit, so that a lost request fails its test instead of hanging it."""

@@ -21,85 +21,71 @@ LOAD_SECONDS = float(os.environ.get("ULTRAGRAY_FAULT_SECONDS", "5"))
 
 
 @pytest.mark.parametrize("priority", list(Priority))
-def test_a_worker_killed_with_work_is_replaced_and_the_work_done_again(
-    run, open_pool, random_poses, expect_frames, until, priority
+async def test_a_worker_killed_with_work_is_replaced_and_the_work_done_again(
+    open_pool, random_poses, expect_frames, until, priority
 ):
     requests = [
         asking("a", random_poses(1, seed=1), priority=priority),
         asking("a", random_poses(7, seed=2), priority=priority, encoding=Encoding.NPZ),
         asking("b", random_poses(1, seed=3), priority=priority, encoding=Encoding.PNG),
     ]
-
-    async def main():
-        async with open_pool(max_batch_poses=2) as pool:
-            (worker,) = pool.statistics().pids
-            os.kill(worker, signal.SIGSTOP)  # so that it surely dies with work in its hands
-            tasks = [asyncio.create_task(pool.render(request)) for request in requests]
-            await until(lambda: pool.statistics().busy == 1)
-            os.kill(worker, signal.SIGKILL)
-            results = await asyncio.gather(*tasks)
-            assert pool.statistics().restarts_total == 1
-            assert pool.statistics().pids != (worker,)
-            return results
-
-    for request, result in zip(requests, run(main()), strict=True):
+    async with open_pool(max_batch_poses=2) as pool:
+        (worker,) = pool.statistics().pids
+        os.kill(worker, signal.SIGSTOP)  # so that it surely dies with work in its hands
+        tasks = [asyncio.create_task(pool.render(request)) for request in requests]
+        await until(lambda: pool.statistics().busy == 1)
+        os.kill(worker, signal.SIGKILL)
+        results = await asyncio.gather(*tasks)
+        assert pool.statistics().restarts_total == 1
+        assert pool.statistics().pids != (worker,)
+        found = results
+    for request, result in zip(requests, found, strict=True):
         expect_frames(request, result)
 
 
-def test_a_worker_killed_in_the_middle_of_a_frame(run, open_pool, random_poses, expect_frames, until):
+async def test_a_worker_killed_in_the_middle_of_a_frame(open_pool, random_poses, expect_frames, until):
     request = asking("a", random_poses(2), height=400, width=400)  # a second or so for the reference
-
-    async def main():
-        async with open_pool(backend="reference") as pool:
-            await pool.load("a")
-            task = asyncio.create_task(pool.render(request))
-            await until(lambda: pool.statistics().busy == 1)
-            await asyncio.sleep(0.03)
-            assert not task.done()
-            os.kill(pool.statistics().pids[0], signal.SIGKILL)
-            result = await task
-            assert pool.statistics().restarts_total == 1
-            return result
-
-    result = run(main())
+    async with open_pool(backend="reference") as pool:
+        await pool.load("a")
+        task = asyncio.create_task(pool.render(request))
+        await until(lambda: pool.statistics().busy == 1)
+        await asyncio.sleep(0.03)
+        assert not task.done()
+        os.kill(pool.statistics().pids[0], signal.SIGKILL)
+        result = await task
+        assert pool.statistics().restarts_total == 1
+        result = result
     assert len(result.data) == 2 * 400 * 400
     assert result.renderer.endswith("reference")
 
 
-def test_a_request_that_kills_every_worker_fails_alone(run, open_pool, random_poses, until):
+async def test_a_request_that_kills_every_worker_fails_alone(open_pool, random_poses, until):
     slow = asking("a", random_poses(1), height=600, width=600)
-
-    async def main():
-        async with open_pool(backend="reference") as pool:
-            task = asyncio.create_task(pool.render(slow))
-            for deaths in range(1, 6):
-                await until(lambda: pool.statistics().busy == 1)
-                assert not task.done()
-                os.kill(pool.statistics().pids[0], signal.SIGKILL)
-                await until(lambda deaths=deaths: pool.statistics().restarts_total == deaths)
-            with pytest.raises(RenderFailed, match="died 5 times"):
-                await task
-            await pool.render(asking("b", random_poses(1)))
-
-    run(main())
+    async with open_pool(backend="reference") as pool:
+        task = asyncio.create_task(pool.render(slow))
+        for deaths in range(1, 6):
+            await until(lambda: pool.statistics().busy == 1)
+            assert not task.done()
+            os.kill(pool.statistics().pids[0], signal.SIGKILL)
+            await until(lambda deaths=deaths: pool.statistics().restarts_total == deaths)
+        with pytest.raises(RenderFailed, match="died 5 times"):
+            await task
+        await pool.render(asking("b", random_poses(1)))
 
 
 @pytest.mark.long
-def test_killed_templates_are_replaced(run, cold_templates, open_pool, random_poses, processes, until):
-    async def main():
-        async with open_pool() as pool:
-            for wanted in (1, 2):  # one template, then both at once
-                await until(lambda: list(processes().values()).count("ug-template") == 2)
-                templates = [pid for pid, name in processes().items() if name == "ug-template"]
-                threads = [len(os.listdir(f"/proc/{pid}/task")) for pid in templates]
-                assert threads == [1, 1]  # or forking them would not be safe
-                for pid in templates[:wanted]:
-                    os.kill(pid, signal.SIGKILL)
-                os.kill(pool.statistics().pids[0], signal.SIGKILL)
-                await pool.render(asking("a", random_poses(1)))
-            assert pool.statistics().restarts_total == 2
-
-    run(main())
+async def test_killed_templates_are_replaced(cold_templates, open_pool, random_poses, processes, until):
+    async with open_pool() as pool:
+        for wanted in (1, 2):  # one template, then both at once
+            await until(lambda: list(processes().values()).count("ug-template") == 2)
+            templates = [pid for pid, name in processes().items() if name == "ug-template"]
+            threads = [len(os.listdir(f"/proc/{pid}/task")) for pid in templates]
+            assert threads == [1, 1]  # or forking them would not be safe
+            for pid in templates[:wanted]:
+                os.kill(pid, signal.SIGKILL)
+            os.kill(pool.statistics().pids[0], signal.SIGKILL)
+            await pool.render(asking("a", random_poses(1)))
+        assert pool.statistics().restarts_total == 2
 
 
 def test_no_process_outlives_the_service(tmp_path):
