@@ -128,11 +128,11 @@ class SceneShelf:
 
     def has(self, name: str) -> bool:
         """Whether there is the scene, also one that another service has just added."""
-        return self._get(name) is not None
+        return is_scene_name(name) and self._get(name) is not None
 
     def knows(self, name: str) -> bool:
         """The same as it was found last."""
-        return self._near_file(name) is not None or self._known_as(name) is not None
+        return is_scene_name(name) and (self._near_file(name) is not None or self._known_as(name) is not None)
 
     def here(self, name: str) -> Path | None:
         """The file of the scene on this host; None where it has to be fetched first, or there is none."""

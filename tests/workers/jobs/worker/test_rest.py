@@ -19,8 +19,6 @@ from ultragray_workers.jobs.workers import Wanted, WorkerState
 from ....waiting import wait_until
 from ..conftest import train_job
 
-COMMAND = [sys.executable, "-c", "from ultragray_service.cli.app import app; app()", "workers"]
-
 
 def worker_of(store, name):
     return next((worker for worker in store.workers() if worker.name == name), None)
