@@ -16,7 +16,7 @@ from ultragray_workers import Priority
 
 from ..asking import asking
 
-KILLS = float(os.environ.get("ULTRAGRAY_FAULT_SECONDS", "5"))
+KILLS = int(os.environ.get("ULTRAGRAY_FAULT_SECONDS", "5"))
 
 
 @pytest.mark.parametrize("priority", list(Priority))
