@@ -74,7 +74,6 @@ def test_every_kind_of_job_demands_what_its_specification_says():
     )
     assert {Demand.of(to_dict(job)) for job in jobs} == {Demand("cuda", 8, LABELS)}
     assert Demand.of(to_dict(TrainJob("liver", "liver"))) == Demand()
-    assert Demand.of({"kind": "evaluate"}) == Demand()  # a job of a release before there were demands
 
 
 @pytest.mark.parametrize(

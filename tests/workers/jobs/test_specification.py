@@ -61,14 +61,6 @@ def test_long_names_are_cut():
     assert len(caught.value.detail) < 300
 
 
-def test_a_row_of_an_earlier_release_is_read():
-    row = {"kind": "render", "scene": "liver", "sampler": {"kind": "fan", "tilt_deg": 5.0, "step_deg": 2.5}}
-    row |= {"height": None, "width": 30, "outputs": ["echo"], "format": "tar", "dtype": None, "min_confidence": None}
-    assert from_dict(row) == RenderJob(
-        scene="liver", sampler=FanSampler(5.0, 2.5), width=30, outputs=("echo",), format="tar"
-    )
-
-
 def test_in_short_holds_no_poses():
     short = in_short(RenderJob(scene="liver", poses=POSES))
     assert short["pose_count"] == 3
