@@ -17,7 +17,7 @@ from ultragray.phantom.demo import DEMO_FILE
 from ultragray.rendering.frames import footprint_pixels
 from ultragray_workers import PoolConfig, Priority
 from ultragray_workers.errors import DeadlineExceeded
-from ultragray_workers.pool import processes as watchdog
+from ultragray_workers.pool import dispatcher
 
 from ..asking import HEIGHT, PROBE, WIDTH, asking
 
@@ -187,8 +187,8 @@ async def test_a_load_that_hangs_is_ended(open_pool, until):
 
 
 async def test_a_pool_whose_workers_are_stuck_is_not_ready(open_pool, random_poses, until, monkeypatch):
-    monkeypatch.setattr("ultragray_workers.pool.processes.STUCK_AFTER_S", 0.5)
-    assert watchdog.STUCK_AFTER_S <= 10.0
+    monkeypatch.setattr("ultragray_workers.pool.dispatcher.STUCK_AFTER_S", 0.5)
+    assert dispatcher.STUCK_AFTER_S <= 10.0
     async with open_pool(worker_grace_s=30.0) as pool:
         (worker,) = pool.statistics().pids
         assert pool.ready
