@@ -29,6 +29,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from functools import partial
 from typing import ClassVar
 
 
@@ -53,11 +54,7 @@ class UltragrayError(Exception):
         self.retry_after_s = retry_after_s
 
     def __reduce__(self) -> tuple[object, ...]:  # crosses the pipe from a worker unchanged
-        return _rebuild, (type(self), self.detail, self.field, self.retry_after_s)
-
-
-def _rebuild(cls: type[UltragrayError], detail: str, field: str | None, retry_after_s: float | None) -> UltragrayError:
-    return cls(detail, field=field, retry_after_s=retry_after_s)
+        return partial(type(self), field=self.field, retry_after_s=self.retry_after_s), (self.detail,)
 
 
 def error_classes(base: type[UltragrayError] = UltragrayError) -> Iterator[type[UltragrayError]]:
