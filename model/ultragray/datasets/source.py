@@ -53,6 +53,11 @@ class SourceOptions(Contract):
     image_size: str | None = described("Resize the frames: WIDTHxHEIGHT, such as 192x256.", None)
     image_topic: str | None = described("Topic of a recording to take images from, where there are several.", None)
     pose_topic: str | None = described("Topic of a recording to take poses from; /tf: from the transforms of tf.", None)
+    image_delay_ms: str | None = described(
+        "By how much images are stamped later than they were taken (negative: earlier): each gets the pose of that "
+        "much before its stamp.",
+        None,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -181,7 +186,7 @@ FORMATS: Mapping[str, DatasetFormat] = {
             is_source=lambda source: source.lower().endswith(PLUS_SUFFIXES),
             reader="ultragray.datasets.plus:read_plus_sweep",
             files=tuple(f"*{suffix}" for suffix in PLUS_SUFFIXES),
-            options=("frames", "device_set", "crop", "fan", "transform"),
+            options=("frames", "device_set", "crop", "fan", "transform", "image_delay_ms"),
             beside=(".raw", ".zraw", ".raw.gz"),
             companions={"device_set": "*.xml"},
         ),
@@ -192,7 +197,7 @@ FORMATS: Mapping[str, DatasetFormat] = {
             is_source=lambda source: source.lower().endswith(".dcm"),
             reader="ultragray.datasets.dicom:read_dicom_sweep",
             files=("*.dcm",),
-            options=("frames", "crop", "fan"),
+            options=("frames", "crop", "fan", "image_delay_ms"),
             beside=(".poses.npy", ".poses.json"),
         ),
         DatasetFormat(
@@ -203,7 +208,7 @@ FORMATS: Mapping[str, DatasetFormat] = {
             is_source=lambda source: source.lower().endswith(".mcap"),
             reader="ultragray.datasets.mcap:read_mcap_sweep",
             files=("*.mcap",),
-            options=("frames", "crop", "transform", "image_topic", "pose_topic"),
+            options=("frames", "crop", "transform", "image_topic", "pose_topic", "image_delay_ms"),
             beside=(".geometry.json",),
         ),
         DatasetFormat(  # the last: a word, no file

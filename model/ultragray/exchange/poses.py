@@ -48,6 +48,25 @@ def read_pose_array(path: str | Path) -> npt.NDArray[Any]:
         raise InvalidPose(f"{path}: {_reason(error)}", field="poses") from error
 
 
+def read_frame_poses(path: str | Path) -> npt.NDArray[Any]:
+    """As `read_pose_array`, where a frame may have no pose: `null` in JSON, NaN in an array. Those are NaN here."""
+    path = Path(path)
+    if path.suffix != ".json":
+        return read_pose_array(path)
+    try:
+        document = _read(path)
+        shape = next((np.shape(pose) for pose in document if pose is not None), (4, 4))
+        missing = np.full(shape, np.nan).tolist()
+        return _with_last_row([missing if pose is None else pose for pose in document])
+    except (OSError, ValueError, RecursionError, MemoryError) as error:
+        raise InvalidPose(f"{path}: {_reason(error)}", field="poses") from error
+
+
+def frames_with_pose(poses: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:  # [F, 4, 4] -> [F]
+    """Whether each frame has a pose: one of NaN alone is none."""
+    return ~np.isnan(poses[:, :3]).all(axis=(1, 2))
+
+
 def _read(path: Path) -> Any:
     if not path.is_file():  # a pipe or a device would never end
         raise FileNotFoundError

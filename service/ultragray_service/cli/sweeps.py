@@ -58,7 +58,7 @@ def warn_about_dataset(dataset: Dataset) -> None:
     """Say on stderr what `ultragray check` warns of."""
     from ultragray.datasets.checks import check_dataset
 
-    for text in check_dataset(dataset).labelled_warnings:
+    for text in check_dataset(dataset).warnings:
         warn(text)
 
 
@@ -117,10 +117,13 @@ def _print_report(report: DatasetReport) -> None:
             f"mm and up to {report.val_angle_max_deg:.2f}° from the nearest training frame",
             soft_wrap=True,
         )
-    warnings = report.labelled_warnings
-    for warning in warnings:
+    for link in report.chain.links:
+        console.print(escape(str(link)), soft_wrap=True, highlight=False)
+    if report.chain.left_out:
+        console.print(f"no part of it: {escape(', '.join(report.chain.left_out))}", soft_wrap=True, highlight=False)
+    for warning in report.warnings:
         console.print(f"[yellow]warning:[/] {escape(warning)}", soft_wrap=True)
-    if not warnings:
+    if not report.warnings:
         console.print("[green]nothing suspicious[/]")
 
 
@@ -137,7 +140,7 @@ def _describe(part: SweepReport) -> dict[str, str]:
         "largest turn in a step, °": f"{part.step_max_deg:.2f}",
         "largest angle between frames, °": f"{part.tilt_deg:.1f}",
         "tilt about lateral, elevation, axial, °": ", ".join(f"{angle:.1f}" for angle in part.tilt_range_deg),
-        f"crossed voxels of {part.voxel_mm:.3g} mm, mL": f"{part.swept_ml:.1f}",
+        "crossed voxels, mL (voxel, mm)": f"{part.swept_ml:.1f} ({part.voxel_mm:.3g})",
         "their share of the box around": f"{part.coverage:.0%}",
     }
 
