@@ -55,6 +55,27 @@ def test_poses_give_the_mounting_as_well(tmp_path: Path) -> None:
     assert "name one of them" in refused(*asked, *both)
 
 
+def test_samples_that_contradict_each_other_end_with_a_status_that_a_script_sees(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    base_to_scene, mounting = motion(rng), motion(rng)
+    flanges = np.stack([motion(rng) for _ in range(8)])
+    np.save(tmp_path / "flange.npy", flanges)
+    np.save(tmp_path / "probe.npy", (base_to_scene @ flanges @ mounting)[[0, 3, 2, 1, 4, 5, 6, 7]])
+    asked = ("calibrate", "poses", tmp_path / "flange.npy", tmp_path / "probe.npy", "-o", tmp_path / "robot.json")
+    result = run(*asked, "--find-mounting", "--json")
+    assert result.exit_code == 1
+    (told,) = json.loads(result.stdout)["warnings"]
+    assert told.startswith("the samples contradict each other: sample ")
+    assert "samples 1 and 3 are exchanged" in told
+    assert told in result.stderr
+    points = 50.0 * rng.normal(size=(6, 3))
+    np.save(tmp_path / "base.npy", points)
+    np.save(tmp_path / "scene.npy", (points @ base_to_scene[:3, :3].T)[[0, 1, 2, 4, 3, 5]])
+    result = run("calibrate", "points", tmp_path / "base.npy", tmp_path / "scene.npy", "-o", tmp_path / "points.json")
+    assert result.exit_code == 1
+    assert "samples 3 and 4 are exchanged" in result.stderr
+
+
 def test_frames_register_a_robot(tmp_path: Path) -> None:
     base_to_scene, poses = motion(np.random.default_rng(2)), demo_poses(5)[1:4]
     frames = render(load_demo_scene(), None, poses, height=96, width=96, outputs=("bmode",))["bmode"]
