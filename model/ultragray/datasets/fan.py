@@ -318,3 +318,38 @@ class FanLines:
         for image, out in zip(images, frames, strict=True):
             cv2.remap(np.ascontiguousarray(image), columns, rows, cv2.INTER_LINEAR, dst=out)
         return frames
+
+
+@dataclass(frozen=True)
+class ShownFrames:
+    """What of images is trained from: their crop, or the scan lines of their fan."""
+
+    frames: ByteArray  # [F, H, W]
+    poses: FloatArray  # [F, 4, 4]
+    probe: Probe
+    box: CropBox
+    notes: tuple[str, ...] = ()
+
+
+def shown_frames(
+    images: ByteArray,  # [F, rows, columns]
+    top_centres: FloatArray,  # [F, 4, 4] poses whose origin is the top centre of the box
+    linear: Probe,  # that spans the box
+    box: CropBox,
+    fan: FanGeometry | None,
+    pixel_mm: tuple[float, float],
+) -> ShownFrames:
+    """The pixels in a box, or of a fan, of which nothing beyond the box is seen. Raises InvalidArgument."""
+    inner = np.s_[:, box.top : box.bottom, box.left : box.right]
+    if fan is None:
+        return ShownFrames(np.ascontiguousarray(images[inner]), top_centres, linear, box)
+    size = images.shape[1], images.shape[2]
+    if (box.height, box.width) != size:
+        clipped = np.zeros_like(images)
+        clipped[inner] = images[inner]
+        images = clipped
+    poses = poses_of_fan(top_centres, fan, (box.left + box.right - 1) / 2, box.top - 0.5, pixel_mm)
+    lines = FanLines(fan, size, pixel_mm)
+    beyond = 1.0 - lines.share
+    notes = (f"{beyond:.1%} of the fan lies beyond the image and is black",) if beyond > 1e-3 else ()
+    return ShownFrames(lines.frames(images), poses, fan.probe(), lines.box, notes)

@@ -349,7 +349,10 @@ class TrackedPoses:
             twice += time_ns in found and not np.allclose(found[time_ns], pose, atol=SAME)
             found[time_ns] = pose
         if not found:
-            raise DatasetInvalid(f"{self._path}: none of the {len(stamped)} poses of {name} is one: {problems[0]}")
+            unit = " (millimetres where metres are expected?)" if "lie within" in problems[0] else ""
+            raise DatasetInvalid(
+                f"{self._path}: none of the {len(stamped)} poses of {name} is one: {problems[0]}{unit}"
+            )
         times = sorted(found)
         track = PoseTrack(np.array(times, np.int64), np.array([found[time_ns] for time_ns in times]))
         lost = len({time_ns for time_ns, *_ in stamped} - set(times))

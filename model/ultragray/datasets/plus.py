@@ -19,7 +19,6 @@ from ultragray.datasets.clocks import delay_note, parse_delay_ns, poses_before
 from ultragray.datasets.fan import (
     DeviceSet,
     FanGeometry,
-    FanLines,
     TransformName,
     clip_rectangles,
     fan_of_device_set,
@@ -27,8 +26,8 @@ from ultragray.datasets.fan import (
     find_path,
     parse_fan,
     parse_matrix,
-    poses_of_fan,
     read_device_set,
+    shown_frames,
     transform_name,
 )
 from ultragray.datasets.images import (
@@ -43,7 +42,7 @@ from ultragray.datasets.images import (
 from ultragray.datasets.plus_files import UNKNOWN, StoredSequence, orient_frames, read_meta_image, read_nrrd
 from ultragray.errors import DatasetInvalid, InvalidArgument, InvalidPose
 from ultragray.geometry.pose import check_poses
-from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.geometry.probe import FloatArray
 from ultragray.learn.sweep import Chain, Link, Sweep, frame_list, parse_frame_ranges
 
 _READERS = {".mha": read_meta_image, ".mhd": read_meta_image, ".nrrd": read_nrrd, ".nhdr": read_nrrd}
@@ -104,7 +103,6 @@ def read_plus_sweep(
         box, is_whole = clip or box, clip is None and fan_geometry is None
         notes += [*fan_notes, *clip_notes]
     poses, linear = poses_from_image_transforms(transforms, box, numbers, path)
-    probe: Probe = linear
     if delay_ns:
         poses, is_known = poses_before(poses, times_s, delay_ns, path)
         is_known &= np.isin(numbers, np.array(chosen))
@@ -113,31 +111,19 @@ def read_plus_sweep(
         left_out |= {int(number): "no pose" for number in set(numbers[~is_known]) & set(chosen)}
         numbers, poses = numbers[is_known], poses[is_known]
         times_s = None if times_s is None else times_s[is_known]
-    if fan_geometry is None:
-        shown = images[numbers, box.top : box.bottom, box.left : box.right]
-    else:
-        poses = poses_of_fan(poses, fan_geometry, (box.left + box.right - 1) / 2, box.top - 0.5, pixel_mm)
-        images = images[numbers]
-        if (box.width, box.height) != size[::-1]:  # what PLUS clips off
-            clipped = np.zeros_like(images)
-            inner = np.s_[:, box.top : box.bottom, box.left : box.right]
-            clipped[inner] = images[inner]
-            images = clipped
-        lines = FanLines(fan_geometry, size, pixel_mm)
-        shown, box, probe = lines.frames(images), lines.box, fan_geometry.probe()
-        if lines.share < 1.0 - 1e-3:
-            notes.append(f"{1.0 - lines.share:.1%} of the fan lies beyond the image and is black")
+    shown = shown_frames(images[numbers], poses, linear, box, fan_geometry, pixel_mm)
     sweep = Sweep(
-        images=np.ascontiguousarray(shown),
-        poses=poses,
-        probe=probe,
+        images=shown.frames,
+        poses=shown.poses,
+        probe=shown.probe,
         frame_numbers=numbers,
         source=str(path),
-        region=region_of(size, box, pixel_mm, calibration),
+        region=region_of(size, shown.box, pixel_mm, calibration),
         notes=(
             *stored.notes,
             *_notes(stored, numbers, orientation, size if is_whole else None, left_out),
             *notes,
+            *shown.notes,
             *delay_note(delay_ns),
         ),
         chain=way.chain,

@@ -196,6 +196,10 @@ def convert(
         Path | None,
         option("A scene trained from it: its corrected training poses are written.", metavar="SCENE", shown=False),
     ] = None,
+    anonymize: Annotated[
+        bool,
+        option("Leave out names: the source's, and text burnt into the pixels, which becomes black.", "--anonymize"),
+    ] = False,
     *,
     source: SourceOptions,
 ) -> None:
@@ -207,10 +211,16 @@ def convert(
     read = read_dataset(sweep, source)
     if header is not None:
         read = _with_poses_of(poses_of, header, read)
+    marks = 0
+    if anonymize:
+        from ultragray.datasets.checks import without_names
+
+        read, marks = without_names(read)
     write_released(read, output, replace=force)
     tell(
         f"wrote {output}: {len(read.train)} training and {len(read.val)} held-out frames of "
-        f"{read.train.width}x{read.train.height}, {read.probe}",
+        f"{read.train.width}x{read.train.height}, {read.probe}"
+        + (f"; {marks} marks in the pixels are black now: look at them" if anonymize else ""),
         {
             "output": str(output),
             "sha256": read.sha256,
@@ -218,6 +228,7 @@ def convert(
             "held_out_frames": len(read.val),
             "image_height": read.train.height,
             "image_width": read.train.width,
+            **({"blackened_marks": marks} if anonymize else {}),
         },
         as_json=json,
     )

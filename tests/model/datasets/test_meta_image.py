@@ -37,13 +37,16 @@ def test_colour_and_four_sizes(tmp_path: Path, plus_files: SimpleNamespace) -> N
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"ElementType": "MET_FLOAT"}, "MET_UCHAR, MET_USHORT, MET_SHORT.*MET_FLOAT"),
+        ({"ElementType": "MET_FLOAT"}, "MET_UCHAR, MET_UCHAR_ARRAY, MET_USHORT, MET_SHORT, got ElementType MET_FLOAT"),
         ({"BinaryData": "False"}, "must be binary"),
         ({"DimSize": "7 5"}, "columns x rows x frames, got 7 x 5"),
         ({"DimSize": "7 5 4 3"}, "columns x rows x frames"),
         ({"DimSize": "seven"}, "DimSize must be whole numbers"),
         ({"DimSize": "-7 5 3"}, "DimSize must be whole numbers"),
-        ({"DimSize": "0 5 3"}, "0 bytes of pixels|limit"),
+        ({"DimSize": "0 5 3"}, "it holds no images: a recording of the tracker alone, of 3 frames"),
+        ({"DimSize": "0 0 93", "ElementType": "MET_OTHER"}, "it holds no images: a recording of the tracker alone"),
+        ({"UltrasoundImageType": "RF_REAL"}, "images must be B-mode .* RF_REAL .RF data"),
+        ({"DimSize": "7 5 0"}, "the limit is 4 GiB"),
         ({"DimSize": "99999 99999 99"}, "the limit is 4 GiB"),
         ({"DimSize": "1 1 4000000000"}, "says 4000000000 frames, but has fields of 2 only"),
         ({"DimSize": "7 5 4"}, "truncated: .* 105 of 140|truncated: 105 bytes .*140"),

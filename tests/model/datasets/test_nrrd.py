@@ -46,7 +46,9 @@ def test_colour_and_four_sizes(tmp_path: Path, plus_files: SimpleNamespace) -> N
         ({"sizes": "1 1 4000000000"}, "says 4000000000 frames, but has fields of 0 only"),
         ({"sizes": "7 5 2"}, "more pixels"),
         ({"byte skip": "-1"}, "byte skip"),
-        ({"kinds": "list domain domain"}, "frames must be the last axis"),
+        ({"byte skip": "4"}, "a byte skip of compressed pixels"),
+        ({"kinds": "list domain list"}, "one axis must be that of the frames, got kinds 'list domain list'"),
+        ({"sizes": "0 0 93"}, "it holds no images: a recording of the tracker alone"),
     ],
 )
 def test_headers_that_cannot_be_are_refused(
@@ -61,5 +63,5 @@ def test_headers_that_cannot_be_are_refused(
 def test_foreign_files_are_refused(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "s.nrrd"
     path.write_bytes(content)
-    with pytest.raises(DatasetInvalid, match=r"s\.nrrd: (not an NRRD file|pixels must)"):
+    with pytest.raises(DatasetInvalid, match=r"s\.nrrd: (not an NRRD file|pixels must|sizes must)"):
         read_nrrd(path)
