@@ -161,7 +161,7 @@ def poses_from_image_transforms(
     cosines = np.abs((columns * rows).sum(axis=1)) / scales.prod(axis=1)
     changed = np.abs(scales / usual - 1.0).max(axis=1) > SCALE_TOLERANCE
     if changed.any():
-        others = ", ".join(f"{size[0]:.5g} x {size[1]:.5g}" for size in dict.fromkeys(map(tuple, scales[changed][:5])))
+        others = ", ".join(dict.fromkeys(f"{size[0]:.5g} x {size[1]:.5g}" for size in scales[changed][:5]))
         raise DatasetInvalid(
             f"{path}: frame {frame_list(frame_numbers[changed])}: a pixel is {others} mm, in other frames "
             f"({frame_list(frame_numbers[~changed])}) {usual[0]:.5g} x {usual[1]:.5g}: was the depth changed? Choose "

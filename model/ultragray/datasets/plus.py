@@ -259,23 +259,9 @@ def _values(stored: StoredSequence, name: TransformName) -> set[str]:
     return {" ".join(fields[key].split()) for fields in stored.frame_fields if key in fields}
 
 
-def _first(stored: StoredSequence, name: TransformName, fixed: Mapping[TransformName, FloatArray]) -> FloatArray | None:
-    """A transform in the first frame where it is valid; None where there is none."""
-    if name in fixed:
-        return fixed[name]
-    key = "To".join(name)
-    for fields in stored.frame_fields:
-        if key + _TRANSFORM in fields and fields.get(key + _STATUS, "OK").upper() == "OK":
-            try:
-                return parse_matrix(fields[key + _TRANSFORM], key)
-            except DatasetInvalid:
-                return None
-    return None
-
-
 def _difference(stored: StoredSequence, name: TransformName, matrix: FloatArray) -> str | None:
     """How far a transform of the sequence is from that of the device set, in words; None: they are the same."""
-    own = _first(stored, name, {})
+    own, *_ = _together(stored, [name], {}) or [None]
     if own is None or np.allclose(own, matrix, rtol=1e-5, atol=1e-5):
         return None
     (before, after), shift = (np.linalg.norm(one[:3, :2], axis=0) for one in (own, matrix)), own[:3, 3] - matrix[:3, 3]
@@ -295,8 +281,8 @@ def _pixel_frame(
     """
     others: dict[str, list[str]] = {}
     for name in sources:
-        if all(part.endswith(IMAGE) for part in name) and (matrix := _first(stored, name, fixed)) is not None:
-            in_plane = matrix.copy()
+        if all(part.endswith(IMAGE) for part in name) and (found := _together(stored, [name], fixed)) is not None:
+            in_plane = found[0].copy()
             in_plane[2, 2] = 1.0
             in_plane[[0, 1], [0, 1]] = 1.0
             in_plane[:2, 3] = 0.0
@@ -351,11 +337,11 @@ def _contradictions(
     fixed: Mapping[TransformName, FloatArray],
 ) -> list[str]:
     """Transforms that are not taken although they lead between two frames of the way, and lead elsewhere."""
-    used, notes = [name for name, _ in steps], []
-    for name in sorted(set(sources) - set(used)):
-        way = find_path(used, *name)
-        matrices = [_first(stored, one, fixed) for one in (name, *(step for step, _ in way or ()))]
-        if not way or any(matrix is None for matrix in matrices):
+    used, notes = {name for name, _ in steps}, []
+    for name in sorted(set(sources) - used):
+        way = find_path(set(sources) - {name}, *name) or []
+        names = [name, *(step for step, _ in way)]
+        if not used & {*names} or (matrices := _together(stored, names, fixed)) is None:
             continue
         product = np.eye(4)
         for (_, is_inverted), matrix in zip(way, matrices[1:], strict=True):
@@ -366,6 +352,26 @@ def _contradictions(
                 f"{'To'.join(name)} of {sources[name]} is left out: it is {apart:.3g} mm from the way that was taken"
             )
     return notes
+
+
+def _together(
+    stored: StoredSequence, names: list[TransformName], fixed: Mapping[TransformName, FloatArray]
+) -> list[FloatArray] | None:
+    """Transforms in the first frame in which all of them are valid; None where there is none."""
+    for fields in stored.frame_fields:
+        keys = ["To".join(name) for name in names]
+        if all(
+            name in fixed or (key + _TRANSFORM in fields and fields.get(key + _STATUS, "OK").upper() == "OK")
+            for name, key in zip(names, keys, strict=True)
+        ):
+            try:
+                return [
+                    fixed[name] if name in fixed else parse_matrix(fields[key + _TRANSFORM], key)
+                    for name, key in zip(names, keys, strict=True)
+                ]
+            except DatasetInvalid:
+                return None
+    return None
 
 
 def _counted(left_out: Mapping[int, str]) -> str:
@@ -410,7 +416,8 @@ def _clip_of(
     """The rectangle to which the device set clips the images of a volume, in stored pixels, and what is to be told."""
     found, notes = None, []
     for element, (left, top, width, height) in clip_rectangles(device_set) if device_set else ():
-        ends = (to_pixels @ [(left, left + width), (top, top + height), (0, 0), (1, 1)])[:2].round().astype(int)
+        edges = np.array([(left, left + width), (top, top + height), (0.5, 0.5), (1.5, 1.5)]) - 0.5
+        ends = ((to_pixels @ edges)[:2] + 0.5).round().astype(int)
         ends = np.sort(ends, axis=1).clip(0, [[size[1]], [size[0]]])
         box, words = CropBox(*map(int, ends.ravel())), f"{ends[0][0]}:{ends[0][1]},{ends[1][0]}:{ends[1][1]}"
         is_whole = (box.width, box.height) == size[::-1]

@@ -14,6 +14,7 @@ from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
 from ultragray.datasets.source import load_dataset
 from ultragray_service.cli.app import app
+from ultragray_workers.datasets.intake import check_files
 
 REAL_SETS = Path(__file__).resolve().parents[4] / "shared" / "data"
 
@@ -45,6 +46,37 @@ def test_check_prints_a_table_and_warnings(folder: Path) -> None:
     result = run("check", folder)
     assert result.exit_code == 0
     assert "warning: train: frame 4 lies 30.0 mm off" in result.output
+
+
+def test_a_sweep_of_any_size_is_described_and_its_warnings_are_the_same_at_every_door(folder: Path) -> None:
+    """Both parts have voxels of their own size where a volume is large: a row of the table says both."""
+    poses = np.load(folder / "poses_train.npy")
+    poses[4, :3, 3] = 600.0, 300.0, 1900.0
+    np.save(folder / "poses_train.npy", poses)
+    result = run("check", folder)
+    assert result.exit_code == 0, result.output
+    assert "crossed voxels, mL (voxel, mm)" in result.output
+    assert "Probe → Tracker: pose of poses_train.npy, tracked" in result.output
+    document = json.loads(run("check", folder, "--json").output)
+    assert any("frame 4 lies 20" in text and "a wrong pose?" in text for text in document["warnings"])
+    told = [line.removeprefix("warning: ") for line in result.output.splitlines() if line.startswith("warning: ")]
+    record = check_files(folder, "tiny", {}, folder.parent / "sheet.png")
+    assert told == document["warnings"] == list(record.warnings)
+    assert document["chain"]["links"][0]["transform"] == "pose"
+
+
+def test_convert_leaves_names_out(folder: Path) -> None:
+    for part in ("train", "val"):
+        images = np.load(folder / f"images_{part}.npy")
+        images[:, 2:5, 3:14] = 255
+        images[:, 1:6, 2:15][:, ::4] = 0
+        np.save(folder / f"images_{part}.npy", images)
+    output = folder.parent / "nobody"
+    result = run("convert", folder, "-o", output, "--anonymize", "--json")
+    assert result.exit_code == 0, result.output
+    assert json.loads(result.output)["blackened_marks"] == 1
+    assert json.loads((output / "conf.json").read_text())["_source"] == "anonymous"
+    assert np.load(output / "images_train.npy")[:, 2:5, 3:14].max() == 0
 
 
 def test_check_as_json(folder: Path) -> None:
