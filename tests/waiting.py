@@ -1,10 +1,7 @@
 """Waiting for what another process or thread does, and how long that may take."""
 
-from __future__ import annotations
-
 import os
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
@@ -14,17 +11,17 @@ Found = TypeVar("Found")
 class Deadline:
     """So many seconds from now, of a machine that has nothing else to do; later as long as others keep it busy."""
 
-    def __init__(self, seconds: float) -> None:
+    def __init__(self, seconds):
         self._began = time.monotonic()
         self._seconds = seconds
 
     @property
-    def passed(self) -> bool:
+    def passed(self):
         elapsed = time.monotonic() - self._began
         return elapsed > self._seconds and elapsed > at_this_load(self._seconds)
 
 
-def wait_until(condition: Callable[[], Found], *, within_s: float = 60, every_s: float = 0.01) -> Found:
+def wait_until(condition, *, within_s=60, every_s=0.01):
     """The first true answer of `condition`; an AssertionError where none comes before the Deadline of `within_s`."""
     deadline = Deadline(within_s)
     while not (found := condition()):
@@ -33,7 +30,7 @@ def wait_until(condition: Callable[[], Found], *, within_s: float = 60, every_s:
     return found
 
 
-def at_this_load(seconds: float) -> float:
+def at_this_load(seconds):
     """A limit of a machine that has nothing else to do, as it stands now: longer where others keep it busy."""
     average, _, _, running, _ = Path("/proc/loadavg").read_text(encoding="ascii").split()  # the first: of a minute
     now = int(running.partition("/")[0]) - 1  # without this process; the average lags behind

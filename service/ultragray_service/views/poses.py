@@ -1,0 +1,147 @@
+"""What a scene says of poses, and where it finds real frames, as all front doors ask for it and tell of it."""
+
+from __future__ import annotations
+
+import asyncio
+from dataclasses import dataclass
+
+from ultragray.contract import described
+from ultragray.errors import InvalidArgument, RenderFailed
+from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.learn.localization.settings import LocalizationSettings
+from ultragray.rendering.settings import Encoding, FrameSettings
+from ultragray.scene.confidence import Assessor, Extrapolation
+from ultragray.scene.info import SceneHeader
+from ultragray_service.access.audit import account
+from ultragray_service.access.principals import caller
+from ultragray_service.core.poses import MatrixRows
+from ultragray_service.core.registrations import Registrations
+from ultragray_service.core.rendering import Plan, Rendering
+from ultragray_service.core.scenes import SceneCatalog, scene_to_blame
+from ultragray_workers.pool.messages import LocalizeResult, Priority, RenderRequest, SceneChangedError, Sought
+from ultragray_workers.pool.pool import MAX_SCENE_CHANGES
+
+
+@dataclass(frozen=True)
+class Assessments:
+    """Of poses, in their order."""
+
+    extrapolations: list[Extrapolation] = described("supported_share is null: only a rendered frame tells it.")
+
+
+class Assessing:
+    """Assesses the poses of one caller at a time, beside the event loop."""
+
+    def __init__(self, catalog: SceneCatalog, registrations: Registrations) -> None:
+        self._catalog, self._registrations = catalog, registrations
+        self._turn = asyncio.Lock()
+
+    async def assess(
+        self,
+        scene: str,
+        poses: FloatArray,  # [C, 4, 4] mm, exact
+        probe: Probe | None,
+        registration: str | None,
+    ) -> Assessments:
+        """The extrapolation of each pose of a probe (None: the scene's own), led into the scene by a registration.
+
+        Raises SceneNotFound, SceneFileInvalid, RegistrationNotFound, and InvalidProbe where no probe is known.
+        """
+        header = await self._catalog.header(scene)
+        if registration is not None:
+            poses = (await self._registrations.of_scene(registration, scene)).probe_to_scene(poses)
+        async with self._turn:
+            return Assessments(await asyncio.to_thread(_assess, header, poses, probe))
+
+
+def _assess(header: SceneHeader, poses: FloatArray, probe: Probe | None) -> list[Extrapolation]:
+    return Assessor(header.info, header.training_poses).assess(poses, probe)
+
+
+FRAMES_OF_A_SEARCH = 100  # that a search counts as: it takes as long, at 512x512
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Located:
+    """Where a real frame was taken, and how certain that is."""
+
+    scene: str = described("Name.")
+    scene_sha256: str = described("Of the scene file.")
+    renderer: str = described("Name, version and backend of the renderer.")
+    pose: MatrixRows = described("Probe to scene, mm. Not to be used where is_found is false.")
+    flange_to_base: MatrixRows | None = described(
+        "The same as the pose of the registration, flange to base or marker to tracker, mm; null: none was named.", None
+    )
+    registration: str | None = described("That led the start into the scene; null: none, it was sent as it is.", None)
+    similarity: float = described("Correlation of the structures of the frame and of the scene there, -1 to 1.")
+    is_found: bool = described("Whether the similarity is as high as only the right place has it.")
+    position_std_mm: tuple[float, float, float] = described(
+        "Standard deviations along the probe's lateral, elevation and axial axis; they hold where is_found does."
+    )
+    angle_std_deg: tuple[float, float, float] = described("About these axes, through the middle of the image.")
+    shift_mm: float = described("Of the middle of the image, from the start.")
+    turn_deg: float = described("Of the image, from the start.")
+    queue_ms: float = described("Waiting time.")
+    search_ms: float = described("Time of the search.")
+
+    @classmethod
+    def of(cls, result: LocalizeResult, plan: Plan) -> Located:
+        found = result.found
+        in_base = None if plan.registration is None else plan.registration.flange_to_base(found.pose)
+        same = ("similarity", "is_found", "position_std_mm", "angle_std_deg", "shift_mm", "turn_deg")
+        return cls(
+            **{name: getattr(found, name) for name in same},
+            scene=result.scene,
+            scene_sha256=result.scene_sha256,
+            renderer=result.renderer,
+            pose=found.pose.tolist(),
+            flange_to_base=None if in_base is None else in_base.tolist(),
+            registration=plan.settings.registration,
+            queue_ms=round(result.queue_ms, 3),
+            search_ms=round(result.search_ms, 3),
+        )
+
+
+def sought_frame(image: bytes, height: int | None, width: int | None, settings: LocalizationSettings) -> Sought:
+    if (height is None) != (width is None):
+        raise InvalidArgument(
+            "image_height and image_width go together: both for grey pixels, neither for a PNG file",
+            field="image_height" if height is None else "image_width",
+        )
+    return Sought(image, None if height is None or width is None else (height, width), settings)
+
+
+async def locate(
+    rendering: Rendering,
+    scene: str,
+    sought: Sought,
+    start: FloatArray,  # [4, 4] mm, exact
+    deadline: float,
+    registration: str | None,
+) -> Located:
+    """Where in a scene a frame was taken, looked for about `start` until the `deadline` (time.monotonic(), s).
+
+    `registration` leads the start into the scene, and the found pose back.
+
+    It waits behind frames of interactive callers. Cancelling ends it. Raises what RenderPool.localize and
+    RequestPlanner.plan raise, and RateLimited.
+    """
+    rendering.life.require_serving()
+    account().target = scene
+    plan = await rendering.planner.plan(
+        scene, FrameSettings(probe=sought.settings.probe), Encoding.UINT8, registration=registration
+    )
+    await rendering.limits.take_frames(FRAMES_OF_A_SEARCH, deadline)
+    for _ in range(MAX_SCENE_CHANGES):
+        asked = RenderRequest(
+            plan.scene, sought, plan.placed(start)[None], Priority.BATCH, deadline, plan.version, caller()
+        )
+        try:
+            with scene_to_blame():
+                result = await rendering.pool.localize(asked)
+        except SceneChangedError:
+            await plan.renew()
+        else:
+            rendering.metrics.observe_search(result)
+            return Located.of(result, plan)
+    raise RenderFailed(f"scene {plan.scene!r} kept changing while the frame was looked for", field="scene")
