@@ -136,7 +136,9 @@ def estimate_delay(
     """The delay of images to the poses of their frames; None where the motion does not tell it."""
     span_s = float(times_s[-1] - times_s[0]) if len(times_s) else 0.0
     most_s = min(MAX_LAG_S, span_s / 5)
-    inner = np.flatnonzero((times_s >= times_s[0] + most_s) & (times_s <= times_s[-1] - most_s)) if span_s else []
+    if span_s <= 0:
+        return None
+    inner = np.flatnonzero((times_s >= times_s[0] + most_s) & (times_s <= times_s[-1] - most_s))
     if len(inner) < LEAST_FRAMES:
         return None
     inner = inner[np.linspace(0, len(inner) - 1, min(len(inner), MAX_FRAMES)).round().astype(int)]

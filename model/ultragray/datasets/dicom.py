@@ -407,8 +407,8 @@ def _read_jpeg(
 ) -> tuple[ByteArray, tuple[str, ...]]:
     """Frames of JPEG streams of 8 bits, whose own markers say what their colours are."""
     frames, places = np.empty((len(chosen), *shape[1:]), np.uint8), {int(one): at for at, one in enumerate(chosen)}
-    interpretation, notes = str(header.PhotometricInterpretation), ()
-    is_rgb = False
+    interpretation, is_rgb = str(header.PhotometricInterpretation), False
+    notes: tuple[str, ...] = ()
     with _in_our_words(path), path.open("rb") as file:
         import pydicom
         from pydicom.encaps import generate_frames
@@ -447,12 +447,10 @@ def _jpeg_colours(stream: bytes, interpretation: str) -> tuple[bool, tuple[str, 
     is_rgb = names in (b"RGB", b"rgb") if adobe is None else adobe[1] == b"\0"
     is_told = adobe is not None or b"JFIF\0" in begin[:32] or is_rgb
     if not is_told and len(sizes) == 1:
-        colours = {
-            ours: cv2.imdecode(np.frombuffer(one, np.uint8), cv2.IMREAD_COLOR)
-            for ours, one in ((False, stream), (True, _as_rgb(stream)))
-        }
-        if all(image is not None for image in colours.values()):
-            ybr, rgb = (float(np.ptp(colours[ours].astype(np.int16), axis=2).mean()) for ours in (False, True))
+        decoded = [cv2.imdecode(np.frombuffer(one, np.uint8), cv2.IMREAD_COLOR) for one in (stream, _as_rgb(stream))]
+        colours = [float(np.ptp(one.astype(np.int16), axis=2).mean()) for one in decoded if one is not None]
+        if len(colours) == 2:
+            ybr, rgb = colours
             is_rgb = interpretation in RGB if GREYER < (rgb + 1) / (ybr + 1) < 1 / GREYER else rgb < ybr
     is_other = not is_told and is_rgb != (interpretation in RGB)
     notes = (_other_colours(interpretation, "RGB" if is_rgb else "YBR_FULL"),) if is_other else ()

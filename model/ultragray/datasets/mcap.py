@@ -289,7 +289,8 @@ class TrackedPoses:
         way = find_path(names, start, goal)
         if way is None or all(name not in self._transforms for name, _ in way):
             raise DatasetInvalid(f"{self._path}: no tracked transforms of tf lead from {start} to {goal}")
-        tracks, notes, links = [], [], []
+        tracks, links = [], []
+        notes: list[str] = []
         for name, is_inverted in way:
             called, is_tracked = "To".join(name), name in self._transforms
             track, found = self._track((self._transforms if is_tracked else self._fixed)[name], called)
@@ -544,11 +545,6 @@ def _read_images(file: MessageFile, topic: str, numbers: IntArray) -> ByteArray:
         images[place] = image
     assert images is not None  # there are numbers
     return images
-
-    @property
-    def written_ns(self) -> int:
-        """How long after their stamps images were written, usually."""
-        return int(np.median(self.log_times_ns - self.times_ns))
 
 
 def _why_none(times: _ImageTimes, delay_ns: int, way: Way) -> str:

@@ -187,7 +187,7 @@ class _Way:
             if same is not None:
                 sources.pop(same)
                 fixed.pop(same, None)
-                if (found := _difference(stored, same, matrix if same == name else np.linalg.inv(matrix))) is not None:
+                if (found := _difference(stored, same, matrix if same == name else _inverse(matrix))) is not None:
                     notes.append(f"{'To'.join(same)} of the sequence is left out, {where} has another one: {found}")
             sources[name], fixed[name] = where, matrix
         pixels = _pixel_frame(stored, sources, fixed)
@@ -235,14 +235,13 @@ class _Way:
         """From `Image` to the stored pixels, which may be cropped."""
         ends = [name[0] if is_inverted else name[1] for name, is_inverted in self.steps]
         count = ends.index(IMAGE) + 1 if IMAGE in ends else 0
-        inverse: FloatArray = np.linalg.inv(self._product(number, self.steps[:count]))
-        return inverse
+        return _inverse(self._product(number, self.steps[:count]))
 
     def _product(self, number: int, steps: Iterable[tuple[TransformName, bool]]) -> FloatArray:  # [4, 4]
         product = np.eye(4)
         for name, is_inverted in steps:
             step = self.fixed[name] if name in self.fixed else _measured(self.stored, number, name)
-            product = (np.linalg.inv(step) if is_inverted else step) @ product
+            product = (_inverse(step) if is_inverted else step) @ product
         return product
 
     def _why_invalid(self, fields: Mapping[str, str]) -> str:
@@ -254,6 +253,11 @@ class _Way:
         return ", ".join(f"{key} {status[:20]}" for key, status in statuses.items() if status.upper() != "OK")
 
 
+def _inverse(matrix: FloatArray) -> FloatArray:  # [4, 4]
+    found: FloatArray = np.linalg.inv(matrix)
+    return found
+
+
 def _values(stored: StoredSequence, name: TransformName) -> set[str]:
     key = "To".join(name) + _TRANSFORM
     return {" ".join(fields[key].split()) for fields in stored.frame_fields if key in fields}
@@ -261,8 +265,8 @@ def _values(stored: StoredSequence, name: TransformName) -> set[str]:
 
 def _difference(stored: StoredSequence, name: TransformName, matrix: FloatArray) -> str | None:
     """How far a transform of the sequence is from that of the device set, in words; None: they are the same."""
-    own, *_ = _together(stored, [name], {}) or [None]
-    if own is None or np.allclose(own, matrix, rtol=1e-5, atol=1e-5):
+    own = (_together(stored, [name], {}) or [matrix])[0]
+    if np.allclose(own, matrix, rtol=1e-5, atol=1e-5):
         return None
     (before, after), shift = (np.linalg.norm(one[:3, :2], axis=0) for one in (own, matrix)), own[:3, 3] - matrix[:3, 3]
     return (
@@ -345,7 +349,7 @@ def _contradictions(
             continue
         product = np.eye(4)
         for (_, is_inverted), matrix in zip(way, matrices[1:], strict=True):
-            product = (np.linalg.inv(matrix) if is_inverted else matrix) @ product
+            product = (_inverse(matrix) if is_inverted else matrix) @ product
         apart = float(np.linalg.norm((product - matrices[0])[:3, 3]))
         if apart > SAME_MM or not np.allclose(product, matrices[0], rtol=1e-3, atol=1e-3 + SAME_MM):
             notes.append(

@@ -19,7 +19,7 @@ import cv2
 import numpy as np
 
 from ultragray.contract import Contract, described, from_dict
-from ultragray.datasets.clocks import NS_PER_S, PoseTrack, delay_note, parse_delay_ns
+from ultragray.datasets.clocks import NS_PER_S, BoolArray, PoseTrack, delay_note, parse_delay_ns
 from ultragray.datasets.fan import parse_fan, shown_frames
 from ultragray.datasets.images import (
     MAX_PIXEL_BYTES,
@@ -234,14 +234,14 @@ class _Table:
         return DatasetInvalid(f"{self.path}: it lacks columns of {what}, it has {', '.join(self.columns)[:200]}")
 
 
-def _poses(table: _Table, known: TableCalibration) -> tuple[FloatArray, np.ndarray]:  # [N, 4, 4], [N]
+def _poses(table: _Table, known: TableCalibration) -> tuple[FloatArray, BoolArray]:  # [N, 4, 4], [N]
     """The pose of each row, and whether it has one."""
     places, unit, _ = table.position(known)
     positions = table.values(places) * LENGTHS[unit]
     turn, poses = table.euler(known), np.tile(np.eye(4), (len(table.rows), 1, 1))
     columns = table.quaternion() if turn is None else turn[0]
     turns = table.values(columns or [])
-    has_pose = np.isfinite(positions).all(axis=1) & np.isfinite(turns).all(axis=1)
+    has_pose: BoolArray = np.isfinite(np.concatenate([positions, turns], axis=1)).all(axis=1)
     for number in np.flatnonzero(has_pose):
         x, y, z = positions[number].tolist()
         try:
@@ -270,10 +270,10 @@ def _matched(
     folder: Path,
     table: _Table,
     poses: FloatArray,
-    has_pose: np.ndarray,
+    has_pose: BoolArray,
     times_s: FloatArray | None,
     delay_ns: int,
-) -> tuple[list[Path], FloatArray, np.ndarray, FloatArray | None]:
+) -> tuple[list[Path], FloatArray, BoolArray, FloatArray | None]:
     """The pictures, the pose of each and whether it is known, and their times."""
     pictures = _pictures(folder)
     by_name = {path.name: path for path in pictures} | {str(path.relative_to(folder)): path for path in pictures}
@@ -327,7 +327,7 @@ def _read_pictures(paths: Sequence[Path]) -> ByteArray:  # [F, rows, columns]
         if found is None or found.dtype not in (np.uint8, np.uint16):
             raise DatasetInvalid(f"{path}: it cannot be read as a picture of 8 or 16 bits")
         if found.dtype == np.uint16:
-            found = (found >> 8).astype(np.uint8)
+            found = (found // 256).astype(np.uint8)
         if found.ndim == 3:
             found = found[:, :, 2::-1] if found.shape[2] >= 3 else found[:, :, :1]
         grey = grey_frames(found[None], str(path))[0]

@@ -125,13 +125,13 @@ def _read_scan(path: Path, frames: str | None) -> tuple[np.ndarray, FloatArray, 
                 raise DatasetInvalid(
                     f"{path}: tforms must be numbers [{count}, 4, 4], got {tforms.dtype} {list(tforms.shape)}"
                 )
-            chosen = np.s_[:] if frames is None else parse_frame_ranges(frames, count, option="frames")
-            share = 1.0 if frames is None else len(chosen) / max(count, 1)
-            if images.dtype != np.uint8 or images.size * share > MAX_PIXEL_BYTES:
+            numbers = range(count) if frames is None else parse_frame_ranges(frames, count, option="frames")
+            if images.dtype != np.uint8 or images.size * len(numbers) > MAX_PIXEL_BYTES * count:
                 raise DatasetInvalid(
                     f"{path}: frames must be uint8 of at most {MAX_PIXEL_BYTES >> 30} GiB, got {images.dtype} "
                     f"{list(images.shape)}: choose some with frames"
                 )
+            chosen = slice(None) if frames is None else numbers
             return images[chosen], np.asarray(tforms[chosen], np.float64), count
     except (OSError, RuntimeError, ValueError, KeyError) as error:
         if isinstance(error, (DatasetInvalid, InvalidArgument)):

@@ -64,7 +64,8 @@ def read_frame_poses(path: str | Path) -> npt.NDArray[Any]:
 
 def frames_with_pose(poses: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:  # [F, 4, 4] -> [F]
     """Whether each frame has a pose: one of NaN alone is none."""
-    return ~np.isnan(poses[:, :3]).all(axis=(1, 2))
+    found: npt.NDArray[np.bool_] = ~np.isnan(poses[:, :3]).all(axis=(1, 2))
+    return found
 
 
 def _read(path: Path) -> Any:

@@ -103,7 +103,7 @@ def _mistakes(given: _Given, worst_first: np.ndarray) -> Iterator[tuple[str, Map
             yield f"the position of {name} is in {unit}", {name: _scaled(samples, factor)}
     for name, samples in given.items():
         if samples.ndim == 3:
-            yield f"the poses of {name} are inverted", {name: np.linalg.inv(samples)}
+            yield f"the poses of {name} are inverted", {name: np.asarray(np.linalg.inv(samples), np.float64)}
     if len(one) > LEAST_TO_LEAVE_ONE_OUT:
         yield f"{one_name} is one sample late", {one_name: one[1:], other_name: other[:-1]}
         yield f"{one_name} is one sample early", {one_name: one[:-1], other_name: other[1:]}

@@ -376,8 +376,8 @@ def archive_of(source: Path, companions: Mapping[str, Path] | None = None) -> It
         with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED, compresslevel=1, strict_timestamps=False) as made:
             for path in files:
                 below = source if source.is_dir() else source.parent
-                name = path.relative_to(below) if path.is_relative_to(below) else Path(path.name)
-                made.write(path, name.as_posix())
+                inner = path.relative_to(below) if path.is_relative_to(below) else Path(path.name)
+                made.write(path, inner.as_posix())
         yield archive
 
 
