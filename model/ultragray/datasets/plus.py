@@ -238,7 +238,7 @@ class _Way:
         return _inverse(self._product(number, self.steps[:count]))
 
     def _product(self, number: int, steps: Iterable[tuple[TransformName, bool]]) -> FloatArray:  # [4, 4]
-        product = np.eye(4)
+        product: FloatArray = np.eye(4)
         for name, is_inverted in steps:
             step = self.fixed[name] if name in self.fixed else _measured(self.stored, number, name)
             product = (_inverse(step) if is_inverted else step) @ product
