@@ -25,6 +25,7 @@ from skimage.metrics import peak_signal_noise_ratio, structural_similarity
 from skimage.transform import resize_local_mean, warp
 from skimage.util import img_as_ubyte
 
+from bone_shadow import BoneShadow
 from figures import write
 from ultragray import ConvexProbe
 from ultragray.datasets.images import resize_frames
@@ -32,7 +33,7 @@ from ultragray.geometry.scan_conversion import interpolated, samples
 from ultragray.learn.evaluation.metrics import frame_metrics, ms_ssim_scales
 from ultragray.learn.sweep import Sweep
 from ultragray.learn.training.geometry import Shadows
-from ultragray.phantom.imaging import BoneShadow, simulate
+from ultragray.phantom.imaging import simulate
 from ultragray.phantom.sweeps import PHANTOM_IMAGE_SIDE, PHANTOM_PROBE, freehand_poses
 from ultragray.rendering.pixels import to_uint8
 from ultragray_studies.bench.report import measured

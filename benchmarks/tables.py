@@ -15,9 +15,9 @@ import localization
 import methods_tables
 import poses
 import results_tables
+from bone_shadow import SHADOW_DB
 from figures import Document, described
 from ultragray.learn.report.tables import METRICS, shown_value
-from ultragray.phantom.imaging import SHADOW_DB
 from ultragray_studies.comparison.tables import COST_HEADINGS
 from ultragray_studies.scaling import DECIDED
 

@@ -11,140 +11,120 @@ from ultragray.errors import UltragrayError
 class Unauthenticated(UltragrayError):
     """No API key, or an unknown one."""
 
-    reason = "UNAUTHENTICATED"
     title = "Authentication required"
 
 
 class IssuerUnavailable(UltragrayError):
     """The issuer of a token does not answer, so that the token cannot be checked; API keys work all the same; retry."""
 
-    reason = "ISSUER_UNAVAILABLE"
     title = "The issuer of the token does not answer"
 
 
 class PermissionDenied(UltragrayError):
     """A role that may not do what was asked, or something that belongs to somebody else."""
 
-    reason = "PERMISSION_DENIED"
     title = "Not allowed to this key"
 
 
 class RateLimited(UltragrayError):
     """More requests or frames in a second than the key may have; retry."""
 
-    reason = "RATE_LIMITED"
     title = "Too many in a second for this key"
 
 
 class LimitReached(UltragrayError):
     """As many streams, jobs, minutes of compute or bytes as the key may have; end or delete some, or wait."""
 
-    reason = "LIMIT_REACHED"
     title = "This key has as much as it may"
 
 
 class HostRefused(UltragrayError):
     """A `Host` that the service is not known as, where it asks for no key."""
 
-    reason = "HOST_REFUSED"
     title = "Unknown host name"
 
 
 class OriginRefused(UltragrayError):
     """A page of another site opens a stream, or asks for anything where no key is asked for."""
 
-    reason = "ORIGIN_REFUSED"
     title = "Pages of this origin are not allowed"
 
 
 class BodyTooLarge(UltragrayError):
     """A body over `ULTRAGRAY_MAX_BODY_BYTES`."""
 
-    reason = "BODY_TOO_LARGE"
     title = "Request body too large"
 
 
 class NotAcceptable(UltragrayError):
     """The Accept header allows no type that can hold the request."""
 
-    reason = "NOT_ACCEPTABLE"
     title = "Accept header cannot be satisfied"
 
 
 class UnsupportedMediaType(UltragrayError):
     """A body that is not JSON (of an upload: no archive and no form), or compressed."""
 
-    reason = "UNSUPPORTED_MEDIA_TYPE"
     title = "Unsupported media type"
 
 
 class HeadersTooLarge(UltragrayError):
     """The head of a request over `ULTRAGRAY_MAX_HEADER_BYTES`, or more headers than `ULTRAGRAY_MAX_HEADERS`."""
 
-    reason = "HEADERS_TOO_LARGE"
     title = "Request headers too large"
 
 
 class TargetTooLong(UltragrayError):
     """Path and query of a request over 16 KiB."""
 
-    reason = "TARGET_TOO_LONG"
     title = "Request target too long"
 
 
 class RequestMalformed(UltragrayError):
     """Bytes that are no HTTP request, or too many requests at once on one connection."""
 
-    reason = "REQUEST_MALFORMED"
     title = "Not an HTTP request"
 
 
 class RequestTooSlow(UltragrayError):
     """A head that took longer than `ULTRAGRAY_HEADER_TIMEOUT_S`, or a body below `ULTRAGRAY_MIN_BYTES_PER_S`."""
 
-    reason = "REQUEST_TOO_SLOW"
     title = "The request came too slowly"
 
 
 class TooManyConnections(UltragrayError):
     """Connections over `ULTRAGRAY_MAX_CONNECTIONS`, or of one address over the limit of those; retry."""
 
-    reason = "TOO_MANY_CONNECTIONS"
     title = "Too many connections"
 
 
 class IgtlMessageInvalid(UltragrayError):
     """An OpenIGTLink message whose header, checksum or content cannot be used."""
 
-    reason = "IGTL_MESSAGE_INVALID"
     title = "Invalid OpenIGTLink message"
 
 
 class RouteNotFound(UltragrayError):
     """No such path."""
 
-    reason = "ROUTE_NOT_FOUND"
     title = "No such route"
 
 
 class MethodNotAllowed(UltragrayError):
     """The path exists, the method does not."""
 
-    reason = "METHOD_NOT_ALLOWED"
     title = "Method not allowed"
 
 
 class StreamNotFound(UltragrayError):
     """No open stream of that id that the key may watch: it has ended, or is at another service of the same address."""
 
-    reason = "STREAM_NOT_FOUND"
     title = "No such open stream"
 
 
 class SceneReadOnly(UltragrayError):
     """A scene of the data folder cannot be deleted over HTTP."""
 
-    reason = "SCENE_READ_ONLY"
     title = "Scene cannot be deleted"
 
 
