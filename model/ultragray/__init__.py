@@ -41,11 +41,18 @@ if TYPE_CHECKING:
     from ultragray.scene.info import SceneInfo as SceneInfo
     from ultragray.scene.info import read_header as read_header
 
-_PROBES = ("ConvexProbe", "LinearProbe", "PhasedProbe", "Probe", "RadialProbe", "SteeredProbe")
 _MODULES = {
     "errors": ("UltragrayError",),
     "geometry.pose": ("check_poses", "pose_from_position_quaternion", "quaternion_from_pose"),
-    "geometry.probe": (*_PROBES, "ElevationBeam"),
+    "geometry.probe": (
+        "ConvexProbe",
+        "ElevationBeam",
+        "LinearProbe",
+        "PhasedProbe",
+        "Probe",
+        "RadialProbe",
+        "SteeredProbe",
+    ),
     "learn.localization.search": ("localize",),
     "learn.localization.settings": ("Localization",),
     "rendering.frames": ("Frames", "render"),

@@ -8,124 +8,84 @@ from ultragray.contract import described
 from ultragray.errors import UltragrayError
 
 
-class Unauthenticated(UltragrayError):
+class Unauthenticated(UltragrayError, title="Authentication required"):
     """No API key, or an unknown one."""
 
-    title = "Authentication required"
 
-
-class IssuerUnavailable(UltragrayError):
+class IssuerUnavailable(UltragrayError, title="The issuer of the token does not answer"):
     """The issuer of a token does not answer, so that the token cannot be checked; API keys work all the same; retry."""
 
-    title = "The issuer of the token does not answer"
 
-
-class PermissionDenied(UltragrayError):
+class PermissionDenied(UltragrayError, title="Not allowed to this key"):
     """A role that may not do what was asked, or something that belongs to somebody else."""
 
-    title = "Not allowed to this key"
 
-
-class RateLimited(UltragrayError):
+class RateLimited(UltragrayError, title="Too many in a second for this key"):
     """More requests or frames in a second than the key may have; retry."""
 
-    title = "Too many in a second for this key"
 
-
-class LimitReached(UltragrayError):
+class LimitReached(UltragrayError, title="This key has as much as it may"):
     """As many streams, jobs, minutes of compute or bytes as the key may have; end or delete some, or wait."""
 
-    title = "This key has as much as it may"
 
-
-class HostRefused(UltragrayError):
+class HostRefused(UltragrayError, title="Unknown host name"):
     """A `Host` that the service is not known as, where it asks for no key."""
 
-    title = "Unknown host name"
 
-
-class OriginRefused(UltragrayError):
+class OriginRefused(UltragrayError, title="Pages of this origin are not allowed"):
     """A page of another site opens a stream, or asks for anything where no key is asked for."""
 
-    title = "Pages of this origin are not allowed"
 
-
-class BodyTooLarge(UltragrayError):
+class BodyTooLarge(UltragrayError, title="Request body too large"):
     """A body over `ULTRAGRAY_MAX_BODY_BYTES`."""
 
-    title = "Request body too large"
 
-
-class NotAcceptable(UltragrayError):
+class NotAcceptable(UltragrayError, title="Accept header cannot be satisfied"):
     """The Accept header allows no type that can hold the request."""
 
-    title = "Accept header cannot be satisfied"
 
-
-class UnsupportedMediaType(UltragrayError):
+class UnsupportedMediaType(UltragrayError, title="Unsupported media type"):
     """A body that is not JSON (of an upload: no archive and no form), or compressed."""
 
-    title = "Unsupported media type"
 
-
-class HeadersTooLarge(UltragrayError):
+class HeadersTooLarge(UltragrayError, title="Request headers too large"):
     """The head of a request over `ULTRAGRAY_MAX_HEADER_BYTES`, or more headers than `ULTRAGRAY_MAX_HEADERS`."""
 
-    title = "Request headers too large"
 
-
-class TargetTooLong(UltragrayError):
+class TargetTooLong(UltragrayError, title="Request target too long"):
     """Path and query of a request over 16 KiB."""
 
-    title = "Request target too long"
 
-
-class RequestMalformed(UltragrayError):
+class RequestMalformed(UltragrayError, title="Not an HTTP request"):
     """Bytes that are no HTTP request, or too many requests at once on one connection."""
 
-    title = "Not an HTTP request"
 
-
-class RequestTooSlow(UltragrayError):
+class RequestTooSlow(UltragrayError, title="The request came too slowly"):
     """A head that took longer than `ULTRAGRAY_HEADER_TIMEOUT_S`, or a body below `ULTRAGRAY_MIN_BYTES_PER_S`."""
 
-    title = "The request came too slowly"
 
-
-class TooManyConnections(UltragrayError):
+class TooManyConnections(UltragrayError, title="Too many connections"):
     """Connections over `ULTRAGRAY_MAX_CONNECTIONS`, or of one address over the limit of those; retry."""
 
-    title = "Too many connections"
 
-
-class IgtlMessageInvalid(UltragrayError):
+class IgtlMessageInvalid(UltragrayError, title="Invalid OpenIGTLink message"):
     """An OpenIGTLink message whose header, checksum or content cannot be used."""
 
-    title = "Invalid OpenIGTLink message"
 
-
-class RouteNotFound(UltragrayError):
+class RouteNotFound(UltragrayError, title="No such route"):
     """No such path."""
 
-    title = "No such route"
 
-
-class MethodNotAllowed(UltragrayError):
+class MethodNotAllowed(UltragrayError, title="Method not allowed"):
     """The path exists, the method does not."""
 
-    title = "Method not allowed"
 
-
-class StreamNotFound(UltragrayError):
+class StreamNotFound(UltragrayError, title="No such open stream"):
     """No open stream of that id that the key may watch: it has ended, or is at another service of the same address."""
 
-    title = "No such open stream"
 
-
-class SceneReadOnly(UltragrayError):
+class SceneReadOnly(UltragrayError, title="Scene cannot be deleted"):
     """A scene of the data folder cannot be deleted over HTTP."""
-
-    title = "Scene cannot be deleted"
 
 
 @dataclass(frozen=True)

@@ -10,7 +10,8 @@ from typing import Any
 
 import pytest
 
-from ultragray_client import AsyncClient, Client
+from ultragray_client import AsyncClient, AsyncFrameStream, Client
+from ultragray_client.transport import Group
 
 from ..service.conftest import (
     RunningService,
@@ -77,7 +78,7 @@ class Blocking:
     def _as_ordinary(self, value: Any) -> Any:
         if inspect.iscoroutine(value):
             return self._as_ordinary(self._run(value))
-        own = type(value).__name__.startswith("Async") or inspect.isasyncgen(value)
+        own = isinstance(value, (Group, AsyncFrameStream)) or inspect.isasyncgen(value)
         return Blocking(value, self._loop) if own or inspect.ismethod(value) else value
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 from collections.abc import Callable
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -13,9 +13,9 @@ import numpy as np
 import pytest
 
 from ultragray_client import JobState, RenderJob, RenderSettings, errors
-from ultragray_client.calls import Deletion, Pause
-from ultragray_client.connection import Retries, Terms
+from ultragray_client.connection import Retries
 from ultragray_client.conversations import Watch, download_into
+from ultragray_client.transport import Connection, Deletion
 from ultragray_proto.v1 import jobs_pb2
 
 from ..service.conftest import RunningService
@@ -117,18 +117,18 @@ def test_a_log_is_not_told_twice() -> None:
     ],
 )
 def test_a_deletion_that_had_worked_is_no_error(failures: list[type[errors.ClientError]], is_refused: bool) -> None:
-    steps = Deletion("JobService.DeleteJob", None, None).steps(Terms("127.0.0.1:1", None, None, 60.0))
     left = list(failures)
 
-    def run() -> None:
-        step = next(steps)
-        with suppress(StopIteration):
-            while True:
-                is_through = isinstance(step, Pause) or not left
-                step = steps.send(None) if is_through else steps.throw(left.pop(0)("no"))
+    class Failing(Connection):
+        async def attempt(self, *_: Any) -> None:
+            if left:
+                raise left.pop(0)("no")
 
+        async def rest(self, seconds: float) -> None: ...
+
+    connection = Failing("127.0.0.1:1", None, None, 60.0)
     with pytest.raises(errors.ClientError) if is_refused else nullcontext():
-        run()
+        connection.answer(Deletion("JobService.DeleteJob", None, None))
     assert not left
 
 

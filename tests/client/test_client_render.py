@@ -120,7 +120,7 @@ def test_a_batch_takes_poses_as_it_goes(client: Any) -> None:
     assert not list(client.render_batch("demo", []))
 
 
-def test_both_clients_have_the_same_methods(client_service: RunningService) -> None:
+def test_both_clients_have_the_same_methods() -> None:
     def signatures(cls: type) -> dict[str, list[tuple[str, Any]]]:
         public = inspect.getmembers(cls, lambda value: inspect.isfunction(value))
         return {
@@ -130,8 +130,3 @@ def test_both_clients_have_the_same_methods(client_service: RunningService) -> N
         }
 
     assert signatures(Client) == signatures(AsyncClient)
-    with Client(client_service.grpc) as ordinary:
-        for group in ("scenes", "datasets", "jobs"):
-            cls = type(getattr(ordinary, group))
-            other = inspect.getmodule(AsyncClient)
-            assert signatures(cls) == signatures(getattr(other, f"Async{cls.__name__}"))

@@ -165,11 +165,8 @@ def _scene(metadata: str, vertices: Records, poses: Records | None) -> GaussianS
     rest = sum(name.startswith("f_rest_") for name in vertices.dtype.names or ())
 
     def columns(*chosen: str) -> Any:  # [N, len(chosen)]
-        return (
-            torch.from_numpy(np.stack([vertices[name] for name in chosen], axis=1))
-            if chosen
-            else torch.zeros((len(vertices), 0))
-        )
+        found = np.array([vertices[name] for name in chosen], np.float32)
+        return torch.from_numpy(found.reshape(len(chosen), len(vertices)).T.copy())
 
     splats = {
         "means": columns("x", "y", "z"),

@@ -322,10 +322,7 @@ class Shaft(Tool):
 
 @dataclass(frozen=True, kw_only=True)
 class Cylinder(Shaft):
-    """A solid cylinder with flat ends, thicker than the beam: its near side is seen. What is thinner is a needle.
-
-    Raises InvalidArgument for a hub at the tip.
-    """
+    """A solid cylinder with flat ends, thicker than the beam: its near side is seen. What is thinner is a needle."""
 
     kind: Literal["cylinder"] = kind_field("cylinder")
 
@@ -350,10 +347,7 @@ _LEAST_NEEDLE = 1e-12
 
 @dataclass(frozen=True, kw_only=True)
 class Needle(Shaft):
-    """A straight needle. Its echo lies on the line from tip to hub, so that the tip is where it is said to be.
-
-    Raises InvalidArgument for a hub at the tip.
-    """
+    """A straight needle. Its echo lies on the line from tip to hub, so that the tip is where it is said to be."""
 
     kind: Literal["needle"] = kind_field("needle")
 

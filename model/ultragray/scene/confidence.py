@@ -500,10 +500,11 @@ def require_confidence(
     """
     for number, one in enumerate(extrapolations, first):
         if min_confidence is not None and not is_confident(one, min_confidence):
-            field, away = name_pose(number), ""
+            field = name_pose(number)
+            detail = f"{field} has a confidence of {one.confidence or 0.0:.2f}, {min_confidence:g} is asked for"
             if one.distance_mm is not None and one.angle_deg is not None:
-                away = f": the nearest training views are {one.distance_mm:.1f} mm and {one.angle_deg:.1f} degrees away"
+                away = f"{one.distance_mm:.1f} mm and {one.angle_deg:.1f} degrees away"
+                detail = f"{detail}: the nearest training views are {away}"
             if one.supported_share is not None:
-                away = f"{away}; Gaussians support {one.supported_share:.0%} of its pixels"
-            detail = f"{field} has a confidence of {one.confidence or 0.0:.2f}, {min_confidence:g} is asked for{away}"
+                detail = f"{detail}; Gaussians support {one.supported_share:.0%} of its pixels"
             raise LowConfidence(detail, field=field)

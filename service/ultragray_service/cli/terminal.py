@@ -7,6 +7,8 @@ import json
 import math
 import os
 import signal
+import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -22,6 +24,7 @@ if TYPE_CHECKING:
 
 
 OUTPUT, COMPUTE = "Output", "Compute"
+Columns = Mapping[str, Callable[[Any], str]]
 
 Json = Annotated[
     bool, typer.Option("--json", help="One JSON document on standard output, for scripts.", rich_help_panel=OUTPUT)
@@ -33,14 +36,23 @@ SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.u
 
 
 def command_group(help: str | None = None) -> typer.Typer:
-    """A typer app for one command, or for a group of commands."""
     return typer.Typer(
         add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode="rich", help=help
     )
 
 
+def single(*lines: str, name: str | None = None) -> Callable[[Callable[..., Any]], typer.Typer]:
+    """A decorator that makes an app of one command, with these examples, of a function."""
+
+    def made(command: Callable[..., Any]) -> typer.Typer:
+        app = command_group()
+        app.command(name, epilog=examples(*lines))(command)
+        return app
+
+    return made
+
+
 def examples(*lines: str) -> str:
-    """The epilogue of a help: each line is a command that a shell takes as it stands, or a # comment."""
     return "\n\n".join(("[bold]Examples[/bold]", *(line.replace("[", r"\[") for line in lines)))
 
 
@@ -49,9 +61,8 @@ def option(help: str, *flags: str, shown: str | bool = True, panel: str | None =
     return typer.Option(*flags, help=help, show_default=shown, rich_help_panel=panel, **others)
 
 
-def argument(help: str, *, shown: str | bool = True, **others: Any) -> Any:
-    """An argument of a command."""
-    return typer.Argument(help=help, show_default=shown, **others)
+def argument(help: str, **others: Any) -> Any:
+    return typer.Argument(help=help, show_default=False, **others)
 
 
 def output_option(help: str, *, default: str | None = None) -> Any:
@@ -61,8 +72,22 @@ def output_option(help: str, *, default: str | None = None) -> Any:
 
 
 def tell(sentence: str, document: Any, *, as_json: bool) -> None:
-    """Print what a command did, as one sentence for a person or as a JSON document for a program."""
     typer.echo(to_json(document) if as_json else sentence)
+
+
+def tell_facts(document: dict[str, Any], *, as_json: bool) -> None:
+    if as_json:
+        typer.echo(to_json(document))
+    else:
+        print_facts(document)
+
+
+def tell_table(columns: Columns, documents: Sequence[Any], *, as_json: bool) -> None:
+    """A row for each document under the columns, each of which says what it holds of one; or the documents."""
+    if as_json:
+        typer.echo(to_json(documents))
+    else:
+        print_table([*columns], [[cell(one) for cell in columns.values()] for one in documents])
 
 
 def to_json(document: Any) -> str:
@@ -79,19 +104,19 @@ def _finite(value: Any) -> Any:
 
 
 def frames_in_words(count: int) -> str:
-    """Such as `1 frame` or `1,200 frames`."""
     return f"{count:,} frame{'' if count == 1 else 's'}"
 
 
+def minutes_and_seconds(seconds: float) -> str:
+    return "{}:{:02d}".format(*divmod(round(seconds), 60))
+
+
 def warn(text: str) -> None:
-    """A warning on stderr."""
     typer.secho(f"warning: {text}", fg=typer.colors.YELLOW, err=True)
 
 
-# Where a command writes: checked before the work starts. What exists is replaced only with --force.
-
-
 SCENE_SUFFIX = ".ugr"  # the service lists no other files
+_TOLD_EVERY_S = 10.0
 _PIPE_COLUMNS = 400  # where no terminal says how wide it is, nothing is cut
 OR_A_FOLDER = ", or be a folder for PNGs (a name without an ending)"
 _PICTURES = (".png", ".jpg", ".jpeg")
@@ -117,9 +142,12 @@ def check_file(path: Path, suffixes: Sequence[str] = (), *, force: bool) -> None
 
 
 def check_folder(path: Path, *, force: bool) -> None:
-    """Raise InvalidArgument where `path` is a file, or without `force` a folder that holds something."""
+    """Raise InvalidArgument where `path` is a file, cannot be written to, or without `force` holds something."""
     if path.exists() and not path.is_dir():
         raise InvalidArgument(f"output must be a folder, {path} is a file", field="output")
+    existing = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
+    if not os.access(existing, os.W_OK):
+        raise InvalidArgument(f"output must be a folder that can be written to, {existing} cannot", field="output")
     if path.is_dir() and not force and next(path.iterdir(), None) is not None:
         raise InvalidArgument(
             f"output must be a new or empty folder, {path} holds files: --force writes among them", field="output"
@@ -127,10 +155,7 @@ def check_folder(path: Path, *, force: bool) -> None:
 
 
 def check_ending(path: Path, suffixes: Sequence[str], *, otherwise: str = "") -> None:
-    """Raise InvalidArgument where a name ends in none of `suffixes`, with the one that was perhaps meant.
-
-    `otherwise`: what the output may be instead, for the message.
-    """
+    """Raise InvalidArgument where a name ends in none of `suffixes`; `otherwise`: what else it may be, in words."""
     if suffixes and not path.name.endswith(tuple(suffixes)):
         given = path.suffix.lower()
         similar = _SIMILAR.get(given)
@@ -142,12 +167,10 @@ def check_ending(path: Path, suffixes: Sequence[str], *, otherwise: str = "") ->
 
 
 def is_folder_name(path: Path) -> bool:
-    """Whether a name that no format claims stands for a folder: it has no ending, or it is one already."""
     return path.is_dir() or not path.suffix
 
 
 def print_facts(document: dict[str, Any]) -> None:
-    """A table of names and values for a person; what is unknown is left out."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -177,7 +200,6 @@ def _text(value: Any) -> str:
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print rows under their columns; the first column is never cut."""
     from rich.markup import escape
     from rich.table import Table
 
@@ -196,9 +218,6 @@ def wide_console() -> Console:
     if not console.is_terminal:
         console.width = _PIPE_COLUMNS
     return console
-
-
-# Progress of a command on standard error: a bar on a terminal, elsewhere nothing or a line a step.
 
 
 @contextlib.contextmanager
@@ -225,18 +244,26 @@ def progress_bars(*columns: str) -> Iterator[Progress]:
 
 @contextlib.contextmanager
 def counted(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A function that is told how many of `total` are done: a bar on a terminal, nothing elsewhere."""
+    """A function that is told how many of `total` are done: a bar on a terminal, elsewhere a line every 10 s."""
+    started = told = time.monotonic()
+
+    def tell_done(done: int) -> None:
+        nonlocal told
+        bars.update(task, completed=done)
+        now = time.monotonic()
+        if bars.disable and done and now - told >= _TOLD_EVERY_S:
+            told = now
+            minutes = (now - started) * (total - done) / done / 60.0
+            typer.echo(f"{what}: {done:,} of {total:,}, {minutes:.1f} min left", err=True)
+
     with progress_bars("{task.description}", "bar", "of", "left") as bars:
         task = bars.add_task(what, total=total)
-        yield lambda done: bars.update(task, completed=done)
+        yield tell_done
 
 
 @contextlib.contextmanager
 def transferred(what: str) -> Iterator[Callable[[int | None], Callable[[int], None]]]:
-    """A function that begins a transfer of so many bytes (None: nobody knows), and returns what is told of each block.
-
-    A bar with rate and time left on a terminal, nothing elsewhere.
-    """
+    """A function that begins a transfer of so many bytes (None: unknown), and returns what is told of each block."""
     with progress_bars("{task.description}", "bar", "bytes", "rate", "left") as bars:
 
         def begin(total: int | None) -> Callable[[int], None]:
@@ -260,7 +287,21 @@ def working(what: str) -> Iterator[None]:
         yield
 
 
-# Commands that end with something to go on from when Ctrl-C or SIGTERM asks them to stop.
+@contextlib.contextmanager
+def interrupted_by_sigterm() -> Iterator[None]:
+    """SIGTERM ends what is done as Ctrl-C does: half-written files are removed. For the main thread alone."""
+
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @contextlib.contextmanager

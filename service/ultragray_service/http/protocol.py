@@ -11,7 +11,6 @@ import contextlib
 import socket
 import ssl
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -32,7 +31,7 @@ from ultragray_service.listening import Acceptor, Connections, Patience, Place
 from ultragray_service.settings import Settings
 from ultragray_service.telemetry.logs import choose_request_id, request_id
 from ultragray_service.telemetry.metrics import Metrics
-from ultragray_service.tls.server import CertificateWatch
+from ultragray_service.tls import CertificateWatch
 
 HAND_OVER = "ultragray.hand_over"  # of an ASGI message with bytes: to return once the client has taken it
 _FRAGMENTS = 32  # of a message that is handed over
@@ -114,25 +113,13 @@ class PromptWebSocket(WebSocketsSansIOProtocol):
         self.transport.write(b"".join(self.conn.data_to_send()))
 
 
-# HTTP connections with bounds: on what is read before it is parsed, on time, and on requests that pile up.
-
-
 MAX_PIPELINED = 32
 MAX_TARGET_BYTES = 16 * 1024
 _MAX_UNWANTED_BYTES = 2**20  # of a body whose request was answered already: a longer one costs the connection
 _LINGER_S = 1.0  # in which a client that still sends can read its answer
 
 
-@dataclass(frozen=True)
-class HttpLimits:
-    """The bounds of each connection. `on_refused` is told of each refusal."""
-
-    max_header_bytes: int
-    max_headers: int
-    header_timeout_s: float
-    min_bytes_per_s: float
-    transfer_patience_s: float
-    on_refused: Callable[[UltragrayError], None]
+Refused = Callable[[UltragrayError], bytes]  # the answer to a refused request, which it counts
 
 
 class BoundedHttp(HttpToolsProtocol):
@@ -142,11 +129,10 @@ class BoundedHttp(HttpToolsProtocol):
     else brings neither a head to its end nor a body on. Trailers are bounded like a head, and thrown away.
     """
 
-    def __init__(self, *arguments: Any, limits: HttpLimits, place: Place, **options: Any) -> None:
+    def __init__(self, *arguments: Any, limits: Settings, refused: Refused, place: Place, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self.ws_protocol_class: Any = partial(_BoundedWebSocket, limits=limits, place=place)
-        self._limits = limits
-        self._place = place
+        self.ws_protocol_class: Any = partial(_BoundedWebSocket, limits=limits, refused=refused, place=place)
+        self._limits, self._refused, self._place = limits, refused, place
         self._in_head = True
         self._head_since: float | None = self.loop.time()
         self._looked_at = self.loop.time()
@@ -163,7 +149,7 @@ class BoundedHttp(HttpToolsProtocol):
         super().connection_made(_Closing(transport, self._linger))  # type: ignore[arg-type]  # it has all that a transport has
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._place.leave()
+        self._place.close()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
@@ -236,12 +222,15 @@ class BoundedHttp(HttpToolsProtocol):
         self._refused_for = error
         raise ValueError  # the parser hands over to `send_400_response`
 
+    def _should_upgrade(self) -> bool:
+        """A handshake has no body, and no request before it waits for an answer: else it is an ordinary request."""
+        is_alone = self.cycle is None or self.cycle.response_complete
+        return is_alone and not self.pipeline and not _has_body(self.headers) and super()._should_upgrade()
+
     def send_400_response(self, msg: str) -> None:
-        """Answers where the parser stopped."""
         self._refuse(self._refused_for or RequestMalformed("this is no HTTP request that can be read"))
 
     def look(self, now: float) -> None:
-        """Cuts the connection where the client has been too slow."""
         elapsed_s, self._looked_at = now - self._looked_at, now
         body_bytes, self._body_bytes = self._body_bytes, 0
         limits = self._limits
@@ -276,8 +265,7 @@ class BoundedHttp(HttpToolsProtocol):
             cycle.message_event.set()
         self.pipeline.clear()
         if can_answer:
-            self._limits.on_refused(error)
-            self.transport.write(refusal_bytes(error, self.server_state.default_headers))
+            self.transport.write(self._refused(error))
         self._end()
 
     def _linger(self) -> bool:
@@ -298,14 +286,10 @@ class BoundedHttp(HttpToolsProtocol):
 
 
 class _Closing:
-    """A transport that drops what is written once it closes: the answers under way hear of that a moment later.
-
-    It closes later where `linger` says so.
-    """
+    """A transport that drops what is written once it closes, and closes later where `linger` says so."""
 
     def __init__(self, transport: Any, linger: Callable[[], bool]) -> None:
-        self._transport = transport
-        self._linger = linger
+        self._transport, self._linger = transport, linger
         self._has_ended = False
 
     def __getattr__(self, name: str) -> Any:
@@ -328,17 +312,50 @@ class _Closing:
 
 
 class _BoundedWebSocket(PromptWebSocket):
-    """What a connection becomes by an upgrade."""
+    """One connection. `look` must be called every second or so.
 
-    def __init__(self, *arguments: Any, limits: HttpLimits, place: Place, **options: Any) -> None:
+    Frames that carry nothing are counted: pings, pongs that answer none of ours, empty fragments. Whoever sends more
+    than MAX_EMPTY_FRAMES at once, and EMPTY_FRAMES_PER_S in the long run, is closed with 1008 before the rest is read.
+    """
+
+    def __init__(self, *arguments: Any, limits: Settings, refused: Refused, place: Place, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self._place = place
-        self._limits = limits
+        self._refused, self._place = refused, place
         self._looked_at = self.loop.time()
         self._sending = _Sending(limits)
+        self._empty_frames, self._counted_at = 0.0, self._looked_at
+
+    def data_received(self, data: bytes) -> None:
+        for start in range(0, len(data), _PIECE_BYTES):
+            if self.transport.is_closing():
+                return
+            super().data_received(data[start : start + _PIECE_BYTES])
+
+    def handle_ping(self) -> None:
+        self._count_empty()
+        super().handle_ping()
+
+    def handle_pong(self, event: Frame) -> None:
+        if bytes(event.data) not in (self._ping_payload, self.pending_ping_payload):
+            self._count_empty()
+        super().handle_pong(event)
+
+    def handle_cont(self, event: Frame) -> None:
+        if not event.data:
+            self._count_empty()
+        super().handle_cont(event)
+
+    def _count_empty(self) -> None:
+        now = self.loop.time()
+        left = self._empty_frames - EMPTY_FRAMES_PER_S * (now - self._counted_at)
+        self._empty_frames, self._counted_at = max(0.0, left) + 1.0, now
+        if self._empty_frames > MAX_EMPTY_FRAMES and not self.transport.is_closing():
+            self.conn.fail(_POLICY_VIOLATION, "too many pings, pongs or empty frames")
+            self._write()
+            self.transport.close()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._place.leave()
+        self._place.close()
         super().connection_lost(exc)
 
     def handle_connect(self, event: Request) -> None:
@@ -347,33 +364,32 @@ class _BoundedWebSocket(PromptWebSocket):
         except InvalidHandshake:
             error = RequestMalformed("the headers are no handshake of a WebSocket of version 13 (RFC 6455)")
             self.handshake_initiated = self.handshake_complete = self.close_sent = True
-            self._limits.on_refused(error)
-            self.transport.write(refusal_bytes(error, self.default_headers))
+            self.transport.write(self._refused(error))
             self.transport.close()
         else:
             super().handle_connect(event)
 
     def look(self, now: float) -> None:
-        """Cuts the connection where the client does not take what is sent."""
         elapsed_s, self._looked_at = now - self._looked_at, now
         if self._sending.is_stalled(self.transport, elapsed_s):
             self.transport.abort()
 
 
 class _Sending:
-    """Whether a client takes what is sent."""
-
-    def __init__(self, limits: HttpLimits) -> None:
+    def __init__(self, limits: Settings) -> None:
         self._patience = Patience(limits.min_bytes_per_s, limits.transfer_patience_s)
         self._waiting_bytes = 0
 
     def is_stalled(self, transport: asyncio.Transport, elapsed_s: float) -> bool:
-        """Whether it has been too slow, `elapsed_s` after the last question."""
         before, self._waiting_bytes = self._waiting_bytes, transport.get_write_buffer_size()
         if not before or not self._waiting_bytes or self._waiting_bytes > before:  # more comes when there is room only
             self._patience.renew()
             return False
         return self._patience.is_over(before - self._waiting_bytes, elapsed_s)
+
+
+def _has_body(headers: list[tuple[bytes, bytes]]) -> bool:
+    return any(name == b"transfer-encoding" or (name == b"content-length" and value != b"0") for name, value in headers)
 
 
 def _may_be_long(headers: list[tuple[bytes, bytes]]) -> bool:
@@ -385,7 +401,6 @@ def _may_be_long(headers: list[tuple[bytes, bytes]]) -> bool:
 
 
 def refusal_bytes(error: UltragrayError, default_headers: list[tuple[bytes, bytes]]) -> bytes:
-    """The answer to a request that never reached the application."""
     token = request_id.set(choose_request_id(None))
     try:
         response = problem_response(error, {"Connection": "close", "X-Request-Id": request_id.get()})
@@ -396,8 +411,9 @@ def refusal_bytes(error: UltragrayError, default_headers: list[tuple[bytes, byte
     return b"".join([*lines, bytes(response.body)])
 
 
-# uvicorn, with connections of ours.
-
+MAX_EMPTY_FRAMES, EMPTY_FRAMES_PER_S = 100, 10.0  # of a WebSocket's client
+_PIECE_BYTES = 1024  # that are parsed before what they hold is counted
+_POLICY_VIOLATION = 1008
 
 MAX_STREAM_MESSAGE_BYTES = 2**16  # of a client, on a WebSocket
 _TICKS_PER_LOOK = 10  # of 0.1 s
@@ -409,7 +425,6 @@ class HttpServer(uvicorn.Server):
     def __init__(
         self, app: ASGIApp, settings: Settings, metrics: Metrics, certificates: CertificateWatch | None, flush_s: float
     ) -> None:
-        """`flush_s`: how long the last answers may take after a stop."""
         super().__init__(
             uvicorn.Config(
                 app,
@@ -426,37 +441,19 @@ class HttpServer(uvicorn.Server):
                 timeout_graceful_shutdown=int(flush_s),
             )
         )
-        self._settings = settings
-        self._metrics = metrics
-        self._certificates = certificates
-        self._limits = HttpLimits(
-            max_header_bytes=settings.max_header_bytes,
-            max_headers=settings.max_headers,
-            header_timeout_s=settings.header_timeout_s,
-            min_bytes_per_s=settings.min_bytes_per_s,
-            transfer_patience_s=settings.transfer_patience_s,
-            on_refused=self._count,
-        )
+        self._settings, self._metrics, self._certificates = settings, metrics, certificates
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Begins to accept. uvicorn's own would not know whom it accepts."""
-        connections = Connections(self._settings.max_connections, self._settings.max_connections_per_address)
-        servers: list[Any] = [
-            Acceptor(
-                listener,
-                connections,
-                self._protocol,
-                refusal=self._refusal,
-                send_patience_s=self._settings.transfer_patience_s,
-                tls=self._tls,
-            )
-            for listener in sockets or ()
-        ]
+        limits, refusal = self._settings, self._refusal
+        connections = Connections(limits.max_connections, limits.max_connections_per_address)
+        protocol = partial(BoundedHttp, self.config, self.server_state, {}, limits=limits, refused=refusal)
+        means: dict[str, Any] = {"refusal": refusal, "send_patience_s": limits.transfer_patience_s, "tls": self._tls}
+        servers: list[Any] = [Acceptor(one, connections, protocol, **means) for one in sockets or ()]
         self.servers = servers
         self.started = True
 
     async def on_tick(self, counter: int) -> bool:
-        """Every 0.1 s."""
         if counter % _TICKS_PER_LOOK == 0:
             now = asyncio.get_running_loop().time()
             connections: set[Any] = self.server_state.connections
@@ -471,12 +468,6 @@ class HttpServer(uvicorn.Server):
     def _tls(self) -> ssl.SSLContext | None:
         return None if self._certificates is None else self._certificates.current.http_context
 
-    def _protocol(self, place: Place) -> BoundedHttp:
-        return BoundedHttp(self.config, self.server_state, {}, limits=self._limits, place=place)
-
     def _refusal(self, error: UltragrayError) -> bytes:
-        self._count(error)
-        return refusal_bytes(error, self.server_state.default_headers)
-
-    def _count(self, error: UltragrayError) -> None:
         self._metrics.count_request("http", "refused", str(statuses_of(error).http), 0.0)
+        return refusal_bytes(error, self.server_state.default_headers)

@@ -9,7 +9,7 @@ import trustme
 from typer.testing import CliRunner, Result
 
 from ultragray_service.cli.app import USER_ERROR, app
-from ultragray_service.tls.client import exposes_key
+from ultragray_service.cli.connection import exposes_key
 
 from ...certificates import Mounted, write_client
 from ..conftest import RunningService, StartService

@@ -81,6 +81,9 @@ class Faulty:
     sequence, client_time, asks = 7, 1.5, True
     window = acknowledged = None
 
+    def mode(self) -> StreamMode:
+        return StreamMode.ORDERED
+
     def settings(self) -> Any:
         raise OverflowError("cannot convert float infinity to integer")
 
@@ -96,9 +99,6 @@ class FaultyTransport:
 
     async def receive(self) -> Any:
         return next(self.messages, None)
-
-    def mode(self, message: Any) -> StreamMode:
-        return StreamMode.ORDERED
 
     async def send(self, answered: StreamAnswer) -> None:
         self.answers.append(answered)

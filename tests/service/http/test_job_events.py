@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import sqlalchemy as sa
 
-from ultragray_service.core.jobs.log import TAIL_BYTES
+from ultragray_service.core.jobs import TAIL_BYTES
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.record import Files, Piece
 from ultragray_workers.jobs.tables import JOBS

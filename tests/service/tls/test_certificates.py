@@ -11,7 +11,7 @@ from cryptography.hazmat.primitives.asymmetric import ec
 
 from ultragray.errors import InvalidArgument
 from ultragray_service.settings import load_settings
-from ultragray_service.tls.server import CertificateFiles, CertificateWatch
+from ultragray_service.tls import CertificateFiles, CertificateWatch
 from ultragray_workers.errors import StartupFailed
 
 from ...certificates import AUTHORITY, KEY, RARE_CURVE, SERVER, Mounted

@@ -21,7 +21,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from websockets.sync.client import connect
 
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
-from ultragray_service.tls.server import HANDSHAKE_TIMEOUT_S
+from ultragray_service.tls import HANDSHAKE_TIMEOUT_S
 
 from ...certificates import KEY, RARE_CURVE, SERVER, Mounted
 from ...waiting import at_this_load, wait_until
