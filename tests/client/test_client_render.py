@@ -14,7 +14,7 @@ from ultragray_client import AsyncClient, Client, Encoding, LinearProbe, Placeme
 from ultragray_client.geometry import FloatArray
 
 from ..service.conftest import DEMO_PROBE, HEIGHT, WIDTH, RunningService
-from .conftest import KEY, MAX_POSES
+from .conftest import MAX_POSES
 
 
 def moved(x_mm: float) -> FloatArray:
@@ -87,12 +87,6 @@ def test_refusals_have_a_type_and_a_field(
     assert type(caught.value) is error
     assert (caught.value.field, caught.value.reason) == (field, error.reason)
     assert caught.value.detail in str(caught.value)
-
-
-def test_a_key_is_needed(make_client: Any, client_service: RunningService) -> None:
-    with pytest.raises(errors.Unauthenticated):
-        make_client(client_service.grpc).scenes.list()
-    assert make_client(client_service.grpc, api_key=KEY).scenes.list()
 
 
 def test_a_long_batch_is_split_into_calls_that_the_service_takes(client: Any) -> None:

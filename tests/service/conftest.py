@@ -101,6 +101,10 @@ class RunningService:
         lines = httpx.get(f"{self.http}/metrics", timeout=60).text.splitlines()
         return sum(float(line.rpartition(" ")[2]) for line in lines if line.startswith(name))
 
+    def stream_url(self, scene: str = "demo") -> str:
+        """The WebSocket of a scene."""
+        return f"{self.http.replace('http', 'ws', 1)}/v1/scenes/{scene}/stream"
+
     def resident_bytes(self) -> int:
         pages = int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1])
         return pages * os.sysconf("SC_PAGE_SIZE")
@@ -110,6 +114,13 @@ class RunningService:
 
 
 StartService = Callable[..., RunningService]
+
+
+def split(message: str | bytes) -> tuple[dict[str, Any], bytes]:
+    """What a WebSocket's frame tells about itself, and its pixels."""
+    assert isinstance(message, bytes), message
+    end = 4 + int.from_bytes(message[:4], "little")
+    return json.loads(message[4:end]), message[end:]
 
 
 def make_scene(gaussians: int = 400, *, probe: LinearProbe | None = None, seed: int = 0) -> GaussianScene:

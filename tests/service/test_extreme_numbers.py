@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import json
 import queue
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import MISSING
-from functools import partial
 from typing import Any, get_args, get_origin
 
-import grpc
 import httpx
 import numpy as np
 import pytest
@@ -19,8 +17,6 @@ from hypothesis import strategies as st
 from ultragray.contract import Contract, Family, annotated_fields, optional_of
 from ultragray.rendering.settings import RenderSettings
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2
-
-from .rpc.test_grpc_render import error_info
 
 TIMEOUT_S = 60.0
 MANY = settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -161,33 +157,3 @@ def pose_message(pose: dict[str, Any]) -> geometry_pb2.Pose:
     if "matrix" in pose:
         return geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=np.ravel(pose["matrix"])))
     return geometry_pb2.Pose(placement=geometry_pb2.Placement(**pose))
-
-
-def check_refusal(call: Callable[[], Any]) -> None:
-    """A call is answered, or refused with its field."""
-    refused = None
-    try:
-        call()
-    except grpc.RpcError as error:
-        refused = error
-    if refused is not None:
-        assert refused.code() is grpc.StatusCode.INVALID_ARGUMENT, refused
-        assert error_info(refused)[1], refused
-
-
-@pytest.mark.parametrize("number", [np.nan, np.inf, -np.inf, -0.0, 1e308, -1e308, 5e-324])
-def test_numbers_that_json_has_no_word_for(renders: Any, number: float) -> None:
-    """In each number of a pose and of a linear probe."""
-    plain = geometry_pb2.LinearProbe(width_mm=40, near_mm=0, far_mm=40)
-    for place in range(16):
-        values = np.eye(4).ravel()
-        values[place] = number
-        request = rendering_pb2.RenderRequest(settings=settings_message({}), pose=pose_message({"matrix": values}))
-        check_refusal(partial(renders.Render, request, timeout=TIMEOUT_S))
-    for field in plain.DESCRIPTOR.fields:
-        changed = geometry_pb2.LinearProbe.FromString(plain.SerializeToString())
-        setattr(changed, field.name, number)
-        settings = settings_message({})
-        settings.probe.linear.CopyFrom(changed)
-        request = rendering_pb2.RenderRequest(settings=settings, pose=pose_message(POSE))
-        check_refusal(partial(renders.Render, request, timeout=TIMEOUT_S))

@@ -87,12 +87,6 @@ def test_a_frame_past_its_deadline_frees_the_worker(start_service: StartService,
     assert service.metric("ultragray_watchdog_kills_total") == 0
 
 
-@pytest.fixture
-def slow(start_service: StartService, scenes: Path) -> RunningService:
-    """A service of some ten frames a second: capacity is soon exceeded."""
-    return start_service(data_folder=scenes, backend="reference", max_batch_poses=1, max_queue_ms=500.0)
-
-
 @pytest.mark.long
 def test_a_request_names_how_long_it_waits_to_begin(start_service: StartService, scenes: Path) -> None:
     service = start_service(data_folder=scenes, backend="reference", max_batch_poses=1, max_queue_ms=600_000)

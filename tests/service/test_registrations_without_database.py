@@ -12,13 +12,13 @@ import numpy as np
 import pytest
 import sqlalchemy as sa
 
-from ultragray_service.access.keys import INTERVAL_S
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.owners import tell_change
 from ultragray_workers.jobs.tables import REGISTRATIONS
 
 from ..postgres import PostgresServer
 from ..waiting import at_this_load, wait_until
+from ..warm import SHORT_WAITS
 from .conftest import StartService
 
 PATH = "/v1/registrations/robot"
@@ -53,7 +53,7 @@ def assert_unavailable(answer: httpx.Response) -> None:
     assert (answer.status_code, answer.json()["reason"]) == (503, "DATABASE_UNAVAILABLE"), answer.text
 
 
-@pytest.mark.parametrize("silent", [False, True], ids=["stopped", "silent"])
+@pytest.mark.parametrize("silent", [False, pytest.param(True, marks=pytest.mark.long)], ids=["stopped", "silent"])
 def test_frames_go_on_by_a_registration_that_was_read_while_the_database_is_away(
     start_service: StartService, postgres: PostgresServer, tmp_path: Path, pose_body: dict[str, Any], silent: bool
 ) -> None:
@@ -67,7 +67,8 @@ def test_frames_go_on_by_a_registration_that_was_read_while_the_database_is_away
         put(http, 3.0)
         assert_shifted(render(elsewhere, pose_body, "robot"), 3.0)
         put(http, 4.0)
-        time.sleep(at_this_load(2 * INTERVAL_S))  # an answer does not tell whether it is from the copy yet
+        # An answer does not tell whether it is from the copy yet.
+        time.sleep(at_this_load(2 * SHORT_WAITS["access.keys.INTERVAL_S"]))
         take_away()
         try:
             for _ in range(2):

@@ -17,10 +17,8 @@ import pytest
 from websockets.sync.client import connect
 
 from ultragray import LinearProbe
-from ultragray_service.igtl.contents import unpack_image
 
 from .conftest import RunningService, StartService, make_scene
-from .igtl.conftest import Peer, address_of
 
 SWAPS = 8
 BETWEEN_SWAPS_S = 0.25
@@ -113,21 +111,6 @@ def test_websocket(service: RunningService, changing: Changing) -> None:
     address = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/changing/stream"
     with connect(address, compression=None, max_size=None, close_timeout=0.2) as connection:
         check(changing, ask)
-
-
-def test_openigtlink(service: RunningService, changing: Changing) -> None:
-    peer = Peer(address_of(service))
-
-    def ask() -> Iterator[Seen]:
-        peer.send_pose(np.eye(4), "changing", version=2)
-        message = peer.receive()
-        assert message.type_name == "IMAGE", message
-        image = unpack_image(message.content)
-        far_mm = np.linalg.norm(image.matrix[:3, 1]) * image.pixels.shape[0]
-        yield message.metadata["scene_sha256"], round(float(far_mm), 3)
-
-    check(changing, ask)
-    peer.socket.close()
 
 
 def test_what_the_new_scene_cannot_give_is_told_and_the_stream_goes_on(

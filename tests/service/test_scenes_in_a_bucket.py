@@ -62,19 +62,6 @@ def render(service: RunningService, scene: str, accept: str = "application/octet
 
 
 @pytest.mark.long
-def test_frames_are_those_of_a_folder(
-    replicas: list[RunningService], start_service: StartService, data_folder: Path
-) -> None:
-    local = render(start_service(data_folder=data_folder), "demo")
-    assert local.status_code == 200
-    for replica in replicas:
-        answer = render(replica, "demo")
-        assert answer.status_code == 200, answer.text
-        assert answer.content == local.content
-        assert answer.headers["x-ultragray-scene-sha256"] == local.headers["x-ultragray-scene-sha256"]
-
-
-@pytest.mark.long
 def test_a_scene_is_imported_listed_pinned_and_deleted(
     replicas: list[RunningService], scene_file: Path, tmp_path: Path
 ) -> None:

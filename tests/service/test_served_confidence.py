@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import json
 import shutil
 from collections.abc import Callable, Iterator
@@ -14,7 +13,6 @@ import grpc
 import httpx
 import numpy as np
 import pytest
-from websockets.sync.client import connect
 
 from ultragray import GaussianScene, render
 from ultragray.scene.confidence import Assessor, ConfidenceModel
@@ -73,18 +71,6 @@ def test_a_frame_tells_what_the_library_says(client: httpx.Client, knowing: Gaus
     assert told == pytest.approx(vars(expected))
     assert 0 < told["supported_share"] < 1
     assert float(answer.headers["X-Ultragray-Confidence"]) == pytest.approx(told["confidence"], abs=6e-4)
-
-
-def test_archives_hold_it_for_every_pose(client: httpx.Client) -> None:
-    elevations = np.linspace(NEAR, FAR, 20)
-    answer = client.post("knowing/render", json=body(*elevations), headers={"Accept": "application/x-npz"})
-    with np.load(io.BytesIO(answer.content)) as archive:
-        assert {
-            name: archive[name].shape for name in ("distance_mm", "angle_deg", "confidence", "supported_share")
-        } == (dict.fromkeys(("distance_mm", "angle_deg", "confidence", "supported_share"), (20,)))
-        assert (np.diff(archive["confidence"][5:]) < 0).all()  # in the order of the poses
-        told = [float(text) for text in answer.headers["X-Ultragray-Confidence"].split(",")]
-        np.testing.assert_allclose(archive["confidence"], told, atol=6e-4)
 
 
 def test_a_scene_that_cannot_tell_says_so(client: httpx.Client) -> None:
@@ -171,15 +157,3 @@ def test_render_jobs(knowing_service: RunningService) -> None:
         ):
             assert (answer.json()["reason"], answer.json()["field"]) == (reason, field)
         assert ask("knowing", NEAR, NEAR).json()["specification"]["min_confidence"] == 0.5
-
-
-def test_websocket(knowing_service: RunningService) -> None:
-    address = f"{knowing_service.http.replace('http', 'ws', 1)}/v1/scenes/knowing/stream"
-    with connect(address, compression=None) as connection:
-        connection.send(json.dumps({"settings": {"min_confidence": 0.5}, **body(FAR)}))
-        assert json.loads(connection.recv())["error"]["reason"] == "LOW_CONFIDENCE"
-        connection.send(json.dumps(body(NEAR)))
-        message = connection.recv()
-    assert isinstance(message, bytes)
-    about = json.loads(message[4 : 4 + int.from_bytes(message[:4], "little")])
-    assert about["extrapolation"]["confidence"] > 0.5

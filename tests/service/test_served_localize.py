@@ -154,10 +154,6 @@ def test_a_picture_that_says_it_is_huge_takes_no_memory(http: httpx.Client, png:
     assert "damaged PNG" in damaged.json()["detail"]
 
 
-def test_a_scene_that_is_not_there_is_not_found(http: httpx.Client, png: bytes) -> None:
-    assert http.post("/v1/scenes/nowhere:localize", json=body(png)).status_code == 404
-
-
 def test_a_search_ends_at_its_deadline_and_with_its_caller(http: httpx.Client, png: bytes) -> None:
     late = http.post("/v1/scenes/spine:localize", json=body(png, timeout_ms=1))
     assert late.status_code == 504

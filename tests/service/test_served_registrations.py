@@ -180,15 +180,6 @@ def test_owners_alone_replace_and_delete_and_readers_use(start_service: StartSer
         client.close()
 
 
-def test_it_outlives_the_service(start_service: StartService, tmp_path: Path) -> None:
-    first = start_service(artifact_folder=tmp_path)
-    with Client(first.grpc, timeout_s=60.0) as client:
-        client.registrations.put("robot", "demo", BASE_TO_SCENE)
-    first.terminate()
-    with Client(start_service(artifact_folder=tmp_path).grpc, timeout_s=60.0) as client:
-        np.testing.assert_allclose(client.registrations.get("robot").base_to_scene, BASE_TO_SCENE, atol=1e-12)
-
-
 def flange_job(**changes: Any) -> RenderJob:
     asked = {**SIZE, "poses": [FLANGE], "registration": "robot", "dtype": "uint8", **changes}
     return RenderJob(scene="demo", **asked)

@@ -222,19 +222,6 @@ def test_openigtlink_has_the_thickness_of_its_setting(served: RunningService, sc
     np.testing.assert_allclose(pixels / 255.0, truth[0].numpy(), atol=1.0 / 255.0)  # the pose came as float32
 
 
-def test_where_the_pixels_lie(http: httpx.Client, renders: Any) -> None:
-    asked, _ = CASES["display"]
-    picture = DISPLAY.picture(FAN, HEIGHT, WIDTH)
-    over_http = json.loads(http.post("scenes/rich/render", json=body(asked)).headers["X-Ultragray-Picture"])
-    assert (over_http["first"], over_http["step"]) == (list(picture.first), [-0.9, 0.9])
-    over_grpc = renders.Render(rendering_pb2.RenderRequest(settings=message_of(asked), pose=pose_message())).picture
-    assert (over_grpc.first_column, over_grpc.first_row_mm) == picture.first
-    assert (over_grpc.column_step, over_grpc.row_step_mm, over_grpc.column_unit) == (-0.9, 0.9, "mm")
-    plain = renders.Render(rendering_pb2.RenderRequest(settings=message_of({}), pose=pose_message()))
-    assert not plain.HasField("display")
-    assert plain.picture.column_step == pytest.approx(DEMO_PROBE.width_mm / WIDTH)
-
-
 @pytest.mark.parametrize("count", [2, 9, 40])  # in one part, and in several that are packed together
 def test_archives_hold_every_pose(http: httpx.Client, scene: GaussianScene, count: int) -> None:
     asked = body({"tools": to_dict(TOOLS), "contact": "air", "outputs": ["bmode", "labels"]})
@@ -327,13 +314,6 @@ def test_a_scene_without_what_a_setting_needs_refuses_it(http: httpx.Client) -> 
     specification = {"scene": "poor", "poses": [POSE.tolist()], "contact": "air"}
     refused = http.post("jobs", json={"kind": "render", "specification": specification}).json()
     assert refused["field"] == "specification.contact"
-
-
-def test_render_jobs_take_all_of_them(http: httpx.Client) -> None:
-    asked = {"contact": "air", "slice_thickness_mm": 6.0, "tools": to_dict(TOOLS), "ghost": 0.25}
-    specification = {"scene": "rich", "poses": [POSE.tolist()], "outputs": ["bmode", "labels"], **asked}
-    taken = http.post("jobs", json={"kind": "render", "specification": specification}).json()
-    assert {key: taken["specification"][key] for key in asked} == asked
 
 
 def test_labels_are_numbers_in_every_form(http: httpx.Client, renders: Any, scene: GaussianScene) -> None:

@@ -11,7 +11,6 @@ from typing import Any
 import cv2
 import grpc
 import httpx
-import nibabel
 import numpy as np
 import numpy.typing as npt
 import pytest
@@ -197,24 +196,6 @@ def test_a_volume_is_made_by_a_job_of_the_client(client: Client, scene: Gaussian
         SimpleITK.GetArrayFromImage(image), np.concatenate(list(sample_volume(scene, "labels", grid)))
     )
     assert (done.progress.frames_done, done.progress.frames) == (grid.shape[2], grid.shape[2])
-
-
-def test_a_volume_is_made_by_a_job_over_http(http: httpx.Client, scene: GaussianScene, tmp_path: Path) -> None:
-    specification = {"scene": "labelled", "field": "attenuation", "spacing_mm": 1.5, "box_mm": "-10:10,-2:2,10:30"}
-    job = http.post("/v1/jobs", json={"kind": "voxelize", "specification": specification}).json()
-    with http.stream("GET", f"/v1/jobs/{job['id']}/events", timeout=120) as events:
-        events.read()
-    done = http.get(f"/v1/jobs/{job['id']}").json()
-    assert done["state"] == "succeeded", done
-    for name in ("attenuation.nii.gz", "volume.json"):
-        (tmp_path / name).write_bytes(http.get(f"/v1/jobs/{job['id']}/artifacts/{name}").content)
-    image: Any = nibabel.load(tmp_path / "attenuation.nii.gz")
-    grid = VolumeGrid.over_box((-10, -2, 10), (10, 2, 30), 1.5)
-    truth = np.concatenate(list(sample_volume(scene, "attenuation", grid)))
-    np.testing.assert_array_equal(np.asarray(image.dataobj), truth.T)
-    facts = json.loads((tmp_path / "volume.json").read_text())
-    np.testing.assert_allclose(facts["affine"], image.affine, atol=1e-5)
-    assert (facts["file"], facts["scene"], facts["shape"]) == ("attenuation.nii.gz", "labelled", list(image.shape))
 
 
 @pytest.mark.parametrize(

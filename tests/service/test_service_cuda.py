@@ -14,9 +14,6 @@ import numpy as np
 import pytest
 import torch
 
-import ultragray
-from ultragray import GaussianScene
-
 from .conftest import ROOT, SOURCE_FOLDERS, RunningService, StartService
 
 needs_triton = pytest.mark.skipif(
@@ -77,19 +74,6 @@ def run_render(data_folder: Path, output: Path, interpret: str) -> subprocess.Co
         capture_output=True,
         text=True,
     )
-
-
-@pytest.mark.long
-@pytest.mark.parametrize(("interpret", "renderer"), WHERE)
-def test_the_command_line_renders_what_the_cpu_renders(
-    data_folder: Path, demo_scene: GaussianScene, tmp_path: Path, interpret: str, renderer: str
-) -> None:
-    done = run_render(data_folder, tmp_path / "frames.npz", interpret)
-    assert done.returncode == 0, done.stderr
-    expected = ultragray.render(demo_scene, None, demo_scene.training_poses, height=32, width=24, backend="cpu").bmode
-    with np.load(tmp_path / "frames.npz") as archive:
-        np.testing.assert_allclose(archive["bmode"], expected, atol=5e-4)
-        assert f" {renderer}" in str(archive["renderer"])
 
 
 @pytest.mark.slow

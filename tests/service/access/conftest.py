@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -47,10 +46,10 @@ class Keyed:
         return self.http(who, "POST", "/v1/jobs", json=body)
 
 
-@contextmanager
-def open_keyed(start_service: StartService, folder: Path, database_url: str | None) -> Iterator[Keyed]:
-    """A service with keys; without a URL its database is a SQLite file in its artifact folder."""
-    database = JobDatabase(folder, database_url)
+@pytest.fixture(scope="module")
+def keyed(start_service: StartService, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Keyed]:
+    folder = tmp_path_factory.mktemp("artifacts")
+    database = JobDatabase(folder, None)
     store = KeyStore(database.engine)
     keys: dict[str, str | None] = {"nobody": None, "wrong": "ultragray_" + 43 * "0"}
     for name, role in {"expired": Role.ADMIN, "revoked": Role.ADMIN, **ROLES}.items():
@@ -59,15 +58,9 @@ def open_keyed(start_service: StartService, folder: Path, database_url: str | No
     with database.engine.begin() as connection:
         connection.execute(sa.update(KEYS).where(KEYS.c.name == "expired").values(expires_at_s=time.time()))
     database.close()
-    service = start_service(artifact_folder=folder, **({} if database_url is None else {"database_url": database_url}))
+    service = start_service(artifact_folder=folder)
     with httpx.Client(base_url=service.http, timeout=60) as client:
         yield Keyed(service, keys, client, folder)
-
-
-@pytest.fixture(scope="module")
-def keyed(start_service: StartService, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Keyed]:
-    with open_keyed(start_service, tmp_path_factory.mktemp("artifacts"), None) as keyed:
-        yield keyed
 
 
 @pytest.fixture(scope="session")

@@ -15,31 +15,14 @@ import sqlalchemy as sa
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.tables import OWNERS
 
-from ...postgres import PostgresServer
 from ...waiting import wait_until
-from ..conftest import DEMO_PROBE, StartService, make_scene
-from .conftest import Keyed, open_keyed
-
-
-@pytest.fixture(scope="module", params=["sqlite", "postgresql"])
-def database_url(request: pytest.FixtureRequest) -> str | None:
-    if request.param == "sqlite":
-        return None
-    server: PostgresServer = request.getfixturevalue("postgres")
-    return server.create_database()
+from ..conftest import DEMO_PROBE, make_scene
+from .conftest import Keyed
 
 
 @pytest.fixture(scope="module")
-def keyed(
-    start_service: StartService, tmp_path_factory: pytest.TempPathFactory, database_url: str | None
-) -> Iterator[Keyed]:
-    with open_keyed(start_service, tmp_path_factory.mktemp("artifacts"), database_url) as keyed:
-        yield keyed
-
-
-@pytest.fixture(scope="module")
-def database(keyed: Keyed, database_url: str | None) -> Iterator[JobDatabase]:
-    database = JobDatabase(keyed.artifact_folder, database_url)
+def database(keyed: Keyed) -> Iterator[JobDatabase]:
+    database = JobDatabase(keyed.artifact_folder, None)
     yield database
     database.close()
 

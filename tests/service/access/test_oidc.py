@@ -1,4 +1,4 @@
-"""Tokens of an OpenID Connect issuer, verified with the keys that a real issuer publishes over HTTP."""
+"""Tokens of an OpenID Connect issuer: verified with the keys that it publishes, and at the doors beside API keys."""
 
 from __future__ import annotations
 
@@ -6,27 +6,129 @@ import asyncio
 import base64
 import hmac
 import json
+import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+from pathlib import Path
 from typing import Any
 
+import grpc
+import httpx
 import jwt
 import pytest
-from cryptography.hazmat.primitives.asymmetric import rsa
+from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
-from jwt.algorithms import RSAAlgorithm
+from jwt.algorithms import ECAlgorithm, OKPAlgorithm, RSAAlgorithm
 
 from ultragray.errors import InvalidArgument, UltragrayError
+from ultragray_client import Client
+from ultragray_proto.v1 import scenes_pb2, scenes_pb2_grpc
 from ultragray_service.access import oidc as issuer_module
+from ultragray_service.access.keys import KeyStore
 from ultragray_service.access.oidc import LEEWAY_S, MAX_TOKEN_BYTES, OidcTokens, claim_at, parse_roles
 from ultragray_service.access.principals import Role
 from ultragray_service.errors import IssuerUnavailable
 from ultragray_service.settings import load_settings
 from ultragray_service.wiring import oidc_tokens
+from ultragray_workers.jobs.database import JobDatabase
 
-from ...waiting import Deadline
-from .identity_provider import IdentityProvider
+from ...waiting import Deadline, wait_until
+from ..conftest import RunningService, StartService
+from ..rpc.test_grpc_render import error_info
+from .conftest import MATRIX
+
+AUDIENCE = "ultragray"
+_KINDS: dict[str, tuple[Callable[[], Any], Any]] = {
+    "RS256": (lambda: rsa.generate_private_key(65537, 2048), RSAAlgorithm),
+    "ES256": (lambda: ec.generate_private_key(ec.SECP256R1()), ECAlgorithm),
+    "EdDSA": (ed25519.Ed25519PrivateKey.generate, OKPAlgorithm),
+}
+
+
+class IdentityProvider:
+    """Answers while it is `up`; counts how often its keys were asked for."""
+
+    def __init__(self) -> None:
+        self.up = True
+        self.fetches = 0
+        self.endpoints: dict[str, str] = {}  # of the sign-in, as it publishes them
+        self.published: list[dict[str, Any]] = []
+        self.keys: dict[str, tuple[str, Any]] = {}
+        provider = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self) -> None:
+                provider._answer(self)
+
+            def log_message(self, *_: object) -> None:
+                pass
+
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.url = f"http://127.0.0.1:{self._server.server_port}/realms/hospital"
+        self._thread = threading.Thread(target=self._server.serve_forever)
+        self._thread.start()
+
+    def close(self) -> None:
+        self._server.shutdown()
+        self._thread.join()
+        self._server.server_close()
+
+    def add_key(self, key_id: str, algorithm: str = "RS256", **published: Any) -> dict[str, Any]:
+        """A new key; what is published of it."""
+        make, kind = _KINDS[algorithm]
+        private = make()
+        public = kind.to_jwk(private.public_key(), as_dict=True) | {"kid": key_id, "use": "sig", "alg": algorithm}
+        self.keys[key_id] = algorithm, private
+        self.published.append(public | published)
+        return self.published[-1]
+
+    def remove_key(self, key_id: str) -> None:
+        self.published = [one for one in self.published if one["kid"] != key_id]
+
+    def settings(self) -> dict[str, str]:
+        """Settings of a service that takes its tokens."""
+        return {
+            "oidc_issuer": self.url,
+            "oidc_audience": AUDIENCE,
+            "oidc_role_claim": "realm_access.roles",
+            "oidc_roles": "ultragray-admin=admin,radiology=reader,research=operator",
+        }
+
+    def claims(self, **changed: Any) -> dict[str, Any]:
+        """Claims of a token that is good for an hour; `name=None` leaves one out."""
+        now = int(time.time())
+        claims = {
+            "iss": self.url,
+            "aud": AUDIENCE,
+            "sub": "alice",
+            "iat": now,
+            "exp": now + 3600,
+            "realm_access": {"roles": ["radiology", "offline_access"]},
+        } | changed
+        return {name: value for name, value in claims.items() if value is not None}
+
+    def token(self, key_id: str = "one", *, headers: dict[str, Any] | None = None, **changed: Any) -> str:
+        """A token that the key signed."""
+        algorithm, private = self.keys[key_id]
+        return jwt.encode(self.claims(**changed), private, algorithm, headers={"kid": key_id} | (headers or {}))
+
+    def _answer(self, request: BaseHTTPRequestHandler) -> None:
+        if not self.up:
+            request.send_error(503)
+            return
+        if request.path.endswith("/.well-known/openid-configuration"):
+            document: Any = {"issuer": self.url, "jwks_uri": f"{self.url}/certs", **self.endpoints}
+        else:
+            self.fetches += 1
+            document = {"keys": self.published}
+        content = json.dumps(document).encode()
+        request.send_response(200)
+        request.send_header("Content-Length", str(len(content)))
+        request.end_headers()
+        request.wfile.write(content)
 
 
 @pytest.fixture
@@ -56,7 +158,7 @@ async def until(condition: Callable[[], bool]) -> None:
         await asyncio.sleep(0.01)
 
 
-def with_tokens(provider: IdentityProvider, check: Callable[[OidcTokens], None], **settings: str) -> None:
+def with_tokens(provider: IdentityProvider, check: Callable[[OidcTokens], object], **settings: str) -> None:
     async def run() -> None:
         async with following(provider, **settings) as tokens:
             check(tokens)
@@ -204,7 +306,7 @@ def test_new_keys_are_fetched_when_a_token_names_them(
             fetches = provider.fetches
             for _ in range(100):
                 assert "does not have" in refusal(tokens, before)
-            await asyncio.sleep(0.5)
+            await asyncio.sleep(0.3)
             assert provider.fetches == fetches, "keys that the issuer does not have are not asked for again and again"
 
     asyncio.run(run())
@@ -234,26 +336,16 @@ def test_keys_that_sign_no_tokens_are_passed_over(provider: IdentityProvider) ->
         {"kty": "EC", "crv": "P-256", "x": "AA", "y": "AA", "kid": "broken"},
         {"kty": "new", "kid": "new"},
     ]
-    with_tokens(provider, lambda tokens: _keys_are(tokens, {"one", None}))
-
-
-def _keys_are(tokens: OidcTokens, expected: set[str | None]) -> None:
-    assert tokens.issuer.keys.keys() == expected
+    found: list[set[str | None]] = []
+    with_tokens(provider, lambda tokens: found.append(set(tokens.issuer.keys)))
+    assert found == [{"one", None}]
 
 
 def test_a_token_without_the_id_of_a_key_is_of_the_only_one(provider: IdentityProvider) -> None:
     token = jwt.encode(provider.claims(), provider.keys["one"][1], "RS256")
-    with_tokens(provider, lambda tokens: _principal_of(tokens, token))
+    with_tokens(provider, lambda tokens: tokens.authenticate(token))
     provider.add_key("two")
-    with_tokens(provider, lambda tokens: _refused(tokens, token))
-
-
-def _principal_of(tokens: OidcTokens, token: str) -> None:
-    assert tokens.authenticate(token)
-
-
-def _refused(tokens: OidcTokens, token: str) -> None:
-    assert refusal(tokens, token)
+    with_tokens(provider, lambda tokens: refusal(tokens, token))
 
 
 def test_an_issuer_that_is_away_leaves_the_keys_that_are_known(
@@ -278,13 +370,24 @@ def test_an_issuer_that_is_away_leaves_the_keys_that_are_known(
     asyncio.run(run())
 
 
-def test_an_issuer_of_another_name_is_not_believed(provider: IdentityProvider) -> None:
+@pytest.mark.parametrize(
+    ("end", "token_endpoint", "problem"),
+    [
+        ("/", "https://hospital.example", "calls itself"),
+        ("", "http://hospital.example", "token_endpoint must be a URL"),
+    ],
+)
+def test_an_issuer_of_another_name_or_without_encryption_is_not_believed(
+    provider: IdentityProvider, end: str, token_endpoint: str, problem: str
+) -> None:
+    provider.endpoints = {"authorization_endpoint": f"{provider.url}/auth", "token_endpoint": token_endpoint}
+
     async def run() -> None:
-        tokens = oidc_tokens(load_settings(**{**provider.settings(), "oidc_issuer": provider.url + "/"}))
+        tokens = oidc_tokens(load_settings(**{**provider.settings(), "oidc_issuer": provider.url + end}))
         assert tokens is not None
         task = asyncio.ensure_future(tokens.issuer.follow())
-        await until(lambda: "calls itself" in str(tokens.issuer.problem))
-        assert not tokens.issuer.keys
+        await until(lambda: problem in str(tokens.issuer.problem))
+        assert (tokens.issuer.keys, tokens.issuer.endpoints) == ({}, None)
         task.cancel()
 
     asyncio.run(run())
@@ -309,3 +412,138 @@ def test_settings_that_cannot_work(changed: dict[str, str | None], expected: str
 
 def test_roles_are_parsed() -> None:
     assert parse_roles(("a=admin", "CN=Radiology=reader")) == {"a": Role.ADMIN, "CN=Radiology": Role.READER}
+
+
+KEY = "0123456789abcdef-environment"
+
+
+@pytest.fixture(scope="module")
+def issuer() -> Iterator[IdentityProvider]:
+    found = IdentityProvider()
+    found.add_key("one")
+    yield found
+    found.close()
+
+
+@pytest.fixture(scope="module")
+def guarded(start_service: StartService, issuer: IdentityProvider) -> RunningService:
+    service = start_service(**issuer.settings(), api_keys=KEY)
+    wait_until(lambda: test_oidc(service) == "available")
+    return service
+
+
+def test_oidc(service: RunningService) -> str:
+    told: str = httpx.get(f"{service.http}/v1/health/ready", timeout=60).json()["test_oidc"]
+    return told
+
+
+def ask(service: RunningService, credential: str) -> httpx.Response:
+    return httpx.get(f"{service.http}/v1/scenes", headers={"Authorization": f"Bearer {credential}"}, timeout=60)
+
+
+def test_a_token_opens_both_doors(guarded: RunningService, issuer: IdentityProvider) -> None:
+    assert ask(guarded, issuer.token()).status_code == 200
+    given = iter([issuer.token(), issuer.token(exp=1)])
+    with Client(guarded.grpc, api_key=lambda: next(given), timeout_s=60.0) as client:
+        assert client.scenes.list()
+        with pytest.raises(Exception, match="UNAUTHENTICATED: the token has expired"):
+            client.scenes.list()
+
+
+def test_tokens_that_are_refused_say_why_at_the_doors(guarded: RunningService, issuer: IdentityProvider) -> None:
+    for token, status, reason in (
+        (issuer.token(aud="another"), 401, "UNAUTHENTICATED"),
+        (issuer.token(realm_access=None), 403, "PERMISSION_DENIED"),
+    ):
+        answer = ask(guarded, token)
+        assert (answer.status_code, answer.json()["reason"]) == (status, reason)
+        metadata = (("authorization", f"Bearer {token}"),)
+        with guarded.channel() as channel:
+            stub = scenes_pb2_grpc.SceneServiceStub(channel)
+            with pytest.raises(grpc.RpcError) as caught:
+                stub.ListScenes(scenes_pb2.ListScenesRequest(), metadata=metadata)
+        assert error_info(caught.value)[0].reason == reason
+    assert "eyJ" not in guarded.log_path.read_text(), "a token was logged"
+
+
+@pytest.mark.long
+def test_an_issuer_that_is_away_shuts_out_only_its_tokens(start_service: StartService) -> None:
+    issuer = IdentityProvider()
+    issuer.add_key("one")
+    issuer.up = False
+    try:
+        service = start_service(**issuer.settings(), api_keys=KEY)
+        assert ask(service, KEY).status_code == 200
+        refused = ask(service, issuer.token())
+        assert (refused.status_code, refused.json()["reason"]) == (503, "ISSUER_UNAVAILABLE")
+        assert int(refused.headers["retry-after"]) >= 1
+        assert test_oidc(service) == "unavailable"
+        wait_until(lambda: any("cannot be checked" in record["message"] for record in service.log()))
+        issuer.up = True
+        wait_until(lambda: ask(service, issuer.token()).status_code == 200)
+        assert test_oidc(service) == "available"
+    finally:
+        issuer.close()
+
+
+@pytest.mark.long
+def test_a_rotation_of_keys_leaves_sessions_and_their_revocation_alone(
+    start_service: StartService, tmp_path: Path
+) -> None:
+    issuer = IdentityProvider()
+    issuer.add_key("one")
+    database = JobDatabase(tmp_path, None)
+    store = KeyStore(database.engine)
+    _, bob = store.create("bob", Role.OPERATOR, None)
+    try:
+        service = start_service(**issuer.settings(), artifact_folder=tmp_path)
+        wait_until(lambda: test_oidc(service) == "available")
+        with ThreadPoolExecutor() as threads, httpx.Client(base_url=service.http, timeout=None) as client:
+            body = {"kind": "render", "specification": {"scene": "demo", "poses": [MATRIX]}}
+            job = client.post("/v1/jobs", json=body, headers={"X-API-Key": bob}).json()["id"]  # no worker takes it
+            opened: list[str] = []
+
+            def watch(credential: str) -> None:
+                headers = {"Authorization": f"Bearer {credential}"}
+                with client.stream("GET", f"/v1/jobs/{job}/events", headers=headers) as events:
+                    opened.append(credential)
+                    with pytest.raises(httpx.RemoteProtocolError):  # cut
+                        events.read()
+
+            of_token = threads.submit(watch, issuer.token("one"))
+            of_key = threads.submit(watch, bob)
+            wait_until(lambda: len(opened) == 2)
+            issuer.add_key("two")
+            issuer.remove_key("one")
+            wait_until(lambda: ask(service, issuer.token("two")).status_code == 200)
+            assert not of_key.done()
+            store.revoke("bob")
+            of_key.result(60)
+            of_token.result(60)  # its key is gone for good
+    finally:
+        database.close()
+        issuer.close()
+
+
+def test_the_page_is_told_where_people_sign_in(start_service: StartService) -> None:
+    issuer = IdentityProvider()
+    issuer.add_key("one")
+    issuer.endpoints = {
+        "authorization_endpoint": f"{issuer.url}/auth",
+        "token_endpoint": "https://tokens.hospital.example:8443/token",
+    }
+    try:
+        service = start_service(**issuer.settings(), oidc_client_id="console", oidc_scope="openid roles")
+        wait_until(lambda: test_oidc(service) == "available")
+        assert httpx.get(f"{service.http}/v1/sign-in", timeout=60).json() == {
+            "issuer": {**issuer.endpoints, "client_id": "console", "scope": "openid roles"}
+        }
+        policy = httpx.get(service.http, timeout=60).headers["content-security-policy"]
+        assert policy.endswith(" https://tokens.hospital.example:8443")
+    finally:
+        issuer.close()
+
+
+def test_without_a_client_id_people_sign_in_with_keys(guarded: RunningService) -> None:
+    assert httpx.get(f"{guarded.http}/v1/sign-in", timeout=60).json() == {"issuer": None}
+    assert "hospital" not in httpx.get(guarded.http, timeout=60).headers["content-security-policy"]

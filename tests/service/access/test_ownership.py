@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Iterator
 from functools import partial
 
 import grpc
 import pytest
+import sqlalchemy as sa
 
 from ultragray_proto.v1 import (
     geometry_pb2,
@@ -16,9 +19,12 @@ from ultragray_proto.v1 import (
     scenes_pb2,
     scenes_pb2_grpc,
 )
+from ultragray_workers.jobs.database import JobDatabase
+from ultragray_workers.jobs.tables import WORKERS
 
 from ...waiting import wait_until
 from .conftest import MATRIX, POSE, Keyed
+from .test_audit import entries
 
 
 @pytest.fixture(scope="module")
@@ -231,15 +237,6 @@ def test_a_request_id_of_a_deleted_job_shows_nobody_the_private_job_of_another(k
     assert keyed.http("alice", "POST", f"/v1/jobs/{second}:cancel").status_code == 200
 
 
-def test_a_request_id_that_is_used_again_may_be_private_this_time(keyed: Keyed) -> None:
-    first = keyed.submit("alice", request_id="twice").json()["id"]
-    assert keyed.http("bob", "GET", f"/v1/jobs/{first}").status_code == 200
-    assert keyed.http("alice", "POST", f"/v1/jobs/{first}:cancel").status_code == 200
-    assert keyed.http("alice", "DELETE", f"/v1/jobs/{first}").status_code == 204
-    second = keyed.submit("alice", request_id="twice", private=True).json()["id"]
-    assert keyed.http("bob", "GET", f"/v1/jobs/{second}").status_code == 404
-
-
 def test_a_request_id_with_another_private_asks_for_something_else(keyed: Keyed) -> None:
     for first in (False, True):
         assert keyed.submit("alice", request_id=f"changes {first}", private=first).status_code == 201
@@ -271,3 +268,122 @@ def test_a_retry_uses_nothing_that_the_owner_of_the_job_may_not_see(keyed: Keyed
     assert keyed.http("bob", "PUT", "/v1/datasets/swap", content=dataset_bytes).status_code == 201
     retried = keyed.http("admin", "POST", f"/v1/jobs/{job}:retry")
     assert (retried.status_code, retried.json()["owner"]) == (201, "bob")
+
+
+ARM = "/v1/registrations/alices-arm"
+
+
+def seen(keyed: Keyed) -> dict[str, tuple[int, bool]]:
+    """The status of asking for it, and whether it is in the list."""
+    return {
+        who: (keyed.http(who, "GET", ARM).status_code, "alices-arm" in names(keyed, who, "registrations"))
+        for who in ("alice", "admin", "bob", "reader")
+    }
+
+
+@pytest.mark.parametrize("private", ["true", "false"])
+def test_it_stays_private_when_its_scene_is_deleted_and_another_takes_the_name(
+    keyed: Keyed, scene_bytes: bytes, private: str
+) -> None:
+    scene = "/v1/scenes/patient-42"
+    assert keyed.http("alice", "PUT", f"{scene}?private=true", content=scene_bytes).status_code == 201
+    body = {"scene": "patient-42", "base_to_scene": MATRIX, "probe_to_flange": MATRIX}
+    assert keyed.http("alice", "PUT", ARM, json=body).status_code == 200
+    as_before = {"alice": (200, True), "admin": (200, True), "bob": (404, False), "reader": (404, False)}
+    assert seen(keyed) == as_before
+    assert keyed.http("alice", "DELETE", scene).status_code == 204
+    assert seen(keyed) == as_before
+    request = {"pose": {"matrix": MATRIX}, "registration": "alices-arm"}
+    refused = keyed.http("bob", "POST", "/v1/scenes/demo/render", json=request)
+    assert (refused.status_code, refused.json()["reason"]) == (404, "REGISTRATION_NOT_FOUND")
+    assert "patient-42" not in refused.text
+    assert keyed.http("bob", "PUT", f"{scene}?private={private}", content=scene_bytes).status_code == 201
+    assert seen(keyed) == as_before
+    if private == "false":
+        assert keyed.http("alice", "POST", f"{scene}/render", json=request).status_code == 200
+    refused = keyed.http("bob", "POST", f"{scene}/render", json=request)
+    assert (refused.status_code, refused.json()["reason"]) == (404, "REGISTRATION_NOT_FOUND")
+    assert keyed.http("alice", "DELETE", ARM).status_code == 204
+    assert keyed.http("bob", "DELETE", scene).status_code == 204
+
+
+def test_one_that_an_admin_puts_for_a_private_scene_is_for_its_owner_too(keyed: Keyed, scene_bytes: bytes) -> None:
+    scene = "/v1/scenes/patient-43"
+    assert keyed.http("alice", "PUT", f"{scene}?private=true", content=scene_bytes).status_code == 201
+    body = {"scene": "patient-43", "base_to_scene": MATRIX, "probe_to_flange": MATRIX}
+    assert keyed.http("admin", "PUT", ARM, json=body).status_code == 200
+    assert seen(keyed) == {"alice": (200, True), "admin": (200, True), "bob": (404, False), "reader": (404, False)}
+    assert keyed.http("admin", "DELETE", ARM).status_code == 204
+    assert keyed.http("alice", "DELETE", scene).status_code == 204
+
+
+def test_an_admin_who_replaces_one_for_a_private_scene_takes_it_from_its_first_owner(
+    keyed: Keyed, scene_bytes: bytes
+) -> None:
+    scene = "/v1/scenes/patient-44"
+    assert keyed.http("alice", "PUT", f"{scene}?private=true", content=scene_bytes).status_code == 201
+    body = {"scene": "demo", "base_to_scene": MATRIX, "probe_to_flange": MATRIX}
+    assert keyed.http("bob", "PUT", ARM, json=body).status_code == 200
+    assert keyed.http("admin", "PUT", ARM, json={**body, "scene": "patient-44"}).status_code == 200
+    assert seen(keyed) == {"alice": (200, True), "admin": (200, True), "bob": (404, False), "reader": (404, False)}
+    assert keyed.http("alice", "GET", ARM).json()["owner"] == "admin"
+    assert keyed.http("bob", "DELETE", ARM).status_code == 404
+    assert keyed.http("bob", "PUT", ARM, json=body).status_code == 403
+    assert keyed.http("admin", "DELETE", ARM).status_code == 204
+    assert keyed.http("alice", "DELETE", scene).status_code == 204
+
+
+@pytest.fixture
+def database(keyed: Keyed) -> Iterator[JobDatabase]:
+    opened = JobDatabase(keyed.artifact_folder, None)
+    yield opened
+    with opened.engine.begin() as connection:
+        connection.execute(sa.delete(WORKERS))
+    opened.close()
+
+
+def let_work(database: JobDatabase, name: str, job: str | None) -> None:
+    """A worker that goes on living, at work on a job, as its heartbeat would write it."""
+    with database.engine.begin() as connection:
+        facts = {"seen_at_s": time.time() + 3600.0, "host": "bench", "pid": 7, "device": "cpu", "version": "1"}
+        connection.execute(sa.insert(WORKERS).values(name=name, job=job, **facts))
+
+
+def told_workers(keyed: Keyed, who: str) -> dict[str, tuple[str, str | None]]:
+    answer = keyed.http(who, "GET", "/v1/workers").json()
+    return {worker["name"]: (worker["state"], worker["job"]) for worker in answer["workers"]}
+
+
+def test_of_a_private_job_others_see_only_that_a_worker_is_busy(keyed: Keyed, database: JobDatabase) -> None:
+    secret = keyed.submit("alice", private=True).json()["id"]
+    shared = keyed.submit("alice").json()["id"]
+    for name, job in {"one": secret, "two": shared, "three": None, "four": "0" * 24}.items():
+        let_work(database, name, job)
+    common = {"two": ("working", shared), "three": ("idle", None), "four": ("working", None)}
+    for who, seen in {"alice": secret, "admin": secret, "bob": None, "reader": None}.items():
+        assert told_workers(keyed, who) == {"one": ("working", seen), **common}, who
+
+
+def test_admins_pause_drain_and_resume_over_http(keyed: Keyed, database: JobDatabase) -> None:
+    let_work(database, "one", None)
+    for wish, state in (("pause", "paused"), ("drain", "drained"), ("resume", "idle")):
+        answer = keyed.http("admin", "POST", f"/v1/workers/one:{wish}")
+        assert (answer.status_code, answer.json()["state"]) == (200, state)
+        assert told_workers(keyed, "reader") == {"one": (state, None)}
+        refused = keyed.http("alice", "POST", f"/v1/workers/one:{wish}")
+        assert (refused.status_code, refused.json()["reason"]) == (403, "PERMISSION_DENIED")
+        assert f"worker.{wish} needs the role admin, and alice has operator" in refused.json()["detail"]
+        absent = keyed.http("admin", "POST", f"/v1/workers/absent:{wish}")
+        assert (absent.status_code, absent.json()["reason"]) == (404, "WORKER_NOT_FOUND")
+
+    def audited() -> set[tuple[object, ...]]:
+        found = entries(keyed.artifact_folder, "--what", "worker")
+        return {(one["who"], one["what"], one["target"], one["result"]) for one in found}
+
+    for wish in ("pause", "drain", "resume"):
+        expected = {
+            ("admin", f"worker.{wish}", "one", "OK"),
+            ("alice", f"worker.{wish}", "one", "PERMISSION_DENIED"),
+            ("admin", f"worker.{wish}", "absent", "WORKER_NOT_FOUND"),
+        }
+        wait_until(lambda expected=expected: expected <= audited())

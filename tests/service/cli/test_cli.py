@@ -83,15 +83,6 @@ def test_every_command_that_tells_something_tells_it_to_programs_too(command: st
             assert str(option.help)[-1] in ".)]", f"{command} {name}: {option.help}"
 
 
-def test_lists_of_commands_load_none_of_them() -> None:
-    program = (
-        "from ultragray_service.cli.app import app; app(standalone_mode=False); "
-        "print(sorted(name for name in sys.modules if name in ('numpy', 'pydantic', 'ultragray_service.cli.scenes')))"
-    )
-    answer = subprocess.run(python(program, "--help"), capture_output=True, text=True, check=True)
-    assert answer.stdout.splitlines()[-1] == "[]"
-
-
 def test_no_help_needs_torch() -> None:
     program = (
         "from typer.testing import CliRunner; from ultragray_service.cli.app import app\n"
@@ -127,13 +118,6 @@ def test_the_defaults_that_serve_names_are_those_of_the_settings() -> None:
             says_none = default is None or default is False  # a flag
             assert option.show_default == (False if says_none else str(default))
             assert f"ULTRAGRAY_{field.upper()}" in option.help
-
-
-def test_a_bad_scene_file_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "bad.ugr"
-    path.write_bytes(b"nonsense that is long enough")
-    for command in (["show", path], ["render", path, "-o", tmp_path / "f.npz"], ["serve", path]):
-        assert "bad.ugr: not a scene file" in refused(*command)
 
 
 def test_show_tells_what_the_file_says(scene_file: Path) -> None:
@@ -232,12 +216,6 @@ def test_given_scenes_are_linked_under_their_own_names(scene_file: Path, tmp_pat
         link_scenes([odd], folder)
     with pytest.raises(SceneFileInvalid, match="no such file"):
         link_scenes([tmp_path / "absent.ugr"], folder)
-
-
-def test_mistakes_of_serve_are_named(scene_file: Path, tmp_path: Path) -> None:
-    assert "cannot be given together" in refused("serve", scene_file, "--data-folder", tmp_path)
-    assert "http_port" in refused("serve", scene_file, "--http-port", 70_000)
-    assert "backend" in refused("serve", scene_file, "--backend", "gpu")
 
 
 def test_a_shared_queue_needs_a_shared_artifact_folder(scene_file: Path, monkeypatch: pytest.MonkeyPatch) -> None:

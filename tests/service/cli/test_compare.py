@@ -9,7 +9,6 @@ import signal
 import subprocess
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +17,6 @@ from ultragray import LinearProbe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import read_released, write_released
 from ultragray.learn.evaluation.baselines import evaluate_baselines
-from ultragray.learn.evaluation.methods import NAMES
 from ultragray.learn.training.trainer import JOURNAL_FILE
 
 from ...waiting import Deadline
@@ -89,19 +87,6 @@ def test_what_is_not_a_comparisons_is_not_replaced(sweep: Path, tmp_path: Path) 
     assert "holds no comparison" in refused("compare", sweep, *CLASSICAL, "-o", page, "--force")
     assert (tmp_path / "ball.html.run" / "thesis.txt").exists()
     assert "output must end in .html" in refused("compare", sweep, *CLASSICAL, "-o", tmp_path / "ball.pdf")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "sentence"),
-    [
-        (("--methods", "median,newest"), f"methods must be some of all, {', '.join(NAMES)}, got 'newest'"),
-        (("--budget", "half"), "budget must be one of equal, author, got 'half'"),
-        (("--times", 0), "times must be"),
-        (("--device", "tpu"), "device must be"),
-    ],
-)
-def test_mistakes_give_one_line(sweep: Path, arguments: tuple[Any, ...], sentence: str) -> None:
-    assert sentence in refused("compare", sweep, *arguments)
 
 
 @pytest.mark.long

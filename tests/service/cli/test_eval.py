@@ -89,18 +89,6 @@ def test_report_of_a_scene(dataset: Path, scene: Path, tmp_path: Path) -> None:
     assert "Ablations" not in page.read_text()
 
 
-def test_mistakes(dataset: Path, scene: Path, tmp_path: Path) -> None:
-    (tmp_path / "file").touch()
-    assert "file is a file" in refused("eval", scene, dataset, "-o", tmp_path / "file")
-    assert f"new or empty folder, {tmp_path} holds files" in refused("eval", scene, dataset, "-o", tmp_path)
-    assert "no such file" in refused("eval", tmp_path / "none.ugr", dataset)
-    assert "no such file or folder" in refused("compare", tmp_path / "none")
-    assert "is a folder" in refused("report", dataset, "-o", tmp_path)
-    assert "must end in .html, got 'page.pdf'" in refused("report", dataset, "-o", tmp_path / "page.pdf")
-    assert "preset must be" in refused("report", dataset, "-o", tmp_path / "page.html", "--preset", "slow")
-    assert not (tmp_path / "page.html").exists()
-
-
 def test_a_scene_of_another_probe_or_of_other_data(dataset: Path, scene: Path, tmp_path: Path) -> None:
     result = run("eval", scene, dataset, "--json", "--val-frames", "0:3")
     assert "warning: the scene was trained from other data than ball, or from another split of it" in result.stderr

@@ -10,7 +10,7 @@ import pytest
 
 from ultragray import GaussianScene, LinearProbe
 
-from .command_line import refused, run
+from .command_line import run
 
 
 @pytest.fixture
@@ -51,20 +51,3 @@ def test_what_the_released_format_cannot_hold_is_noted(make_file: Callable[..., 
     result = run("export", make_file(intensity="sigmoid"), "-o", tmp_path / "out" / "ckpt.pt")
     assert result.exit_code == 0
     assert result.stderr.startswith("note: its intensities are `sigmoid`")
-
-
-def test_mistakes_are_told_in_one_line(make_file: Callable[..., Path], tmp_path: Path) -> None:
-    scene = make_file()
-    assert "must end in .ply or .pt, got 'a.stl'" in refused("export", scene, "-o", tmp_path / "a.stl")
-    assert "does not" in refused("export", scene, "-o", tmp_path / "none" / "a.ply")
-    assert "does not" in refused("export", scene, "-o", tmp_path / "none" / "none" / "ckpt.pt")
-    assert "no such file" in refused("export", tmp_path / "none.ugr", "-o", tmp_path / "a.ply")
-    assert "no such file" in refused("import", tmp_path / "none.ply", "-o", tmp_path / "b.ugr")
-    assert "import reads .ply and .pt files" in refused("import", scene, "-o", tmp_path / "b.ugr")
-    scene.with_suffix(".ply").write_bytes(scene.read_bytes())
-    assert "must end in .ugr, got 'b.txt'" in refused("import", scene.with_suffix(".ply"), "-o", tmp_path / "b.txt")
-    assert "does not begin like a PLY" in refused("import", scene.with_suffix(".ply"), "-o", tmp_path / "b.ugr")
-    scene.with_suffix(".ply").unlink()
-    (tmp_path / "conf.json").write_text("{}")
-    assert "folder of its own" in refused("export", scene, "-o", tmp_path / "ckpt.pt")
-    assert sorted(path.name for path in tmp_path.iterdir()) == ["conf.json", "scene.ugr"]

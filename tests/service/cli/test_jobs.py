@@ -88,13 +88,6 @@ def test_a_job_that_no_worker_can_take_is_submitted_with_a_warning(server: Runni
     done(server, "cancel", job)
 
 
-@pytest.mark.parametrize("label", ["lab1", "site=", "site=lab 1"])
-def test_a_label_that_is_none_is_refused(server: RunningService, label: str) -> None:
-    result = run(server, "submit", "render", "demo", "--require", label)
-    assert result.exit_code == 2
-    assert "--require" in result.stderr or "worker_labels must be" in " ".join(result.stderr.split())
-
-
 def test_a_scene_is_trained_watched_and_served(server: RunningService, client: httpx.Client, tmp_path: Path) -> None:
     settings = ("--set", "steps=12", "--set", "max_gaussians=60", "--device", "cpu")
     options = (*settings, "--request-id", "first", "--wait")

@@ -14,7 +14,6 @@ from typer.testing import CliRunner, Result
 from ultragray import LinearProbe, read_header
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
-from ultragray.geometry.registration import Registration, rows, save_registration
 from ultragray_service.cli.app import app
 
 from ..conftest import HEIGHT, WIDTH, RunningService, StartService
@@ -97,28 +96,6 @@ def test_frames_of_poses_in_one_archive_are_those_that_are_rendered_here(
             np.testing.assert_allclose(there[name], here[name], atol=1e-5)
 
 
-def test_poses_of_a_flange_are_led_into_the_scene_by_a_registration(server: RunningService, tmp_path: Path) -> None:
-    to_scene, to_flange, in_scene = np.eye(4), np.eye(4), np.tile(np.eye(4), (2, 1, 1))
-    to_scene[:3, 3], to_flange[:3, 3] = [100.0, -20.0, 5.0], [0.0, 0.0, 80.0]
-    in_scene[:, 1, 3] = [1.0, 2.0]
-    registration = Registration(base_to_scene=rows(to_scene), probe_to_flange=rows(to_flange))
-    save_registration(tmp_path / "robot.json", registration)
-    done(server, "registrations", "upload", tmp_path / "robot.json", "--scene", "demo")
-    np.save(tmp_path / "flange.npy", np.linalg.inv(to_scene) @ in_scene @ np.linalg.inv(to_flange))
-    np.save(tmp_path / "probe.npy", in_scene)
-    asked = ("scenes", "render", "demo", "--height", 24, "--width", 20)
-    done(server, *asked, "--poses", tmp_path / "probe.npy", "-o", tmp_path / "probe.npz")
-    led = ("--poses", tmp_path / "flange.npy", "--registration", "robot")
-    done(server, *asked, *led, "-o", tmp_path / "flange.npz")
-    with np.load(tmp_path / "probe.npz") as probe, np.load(tmp_path / "flange.npz") as flange:
-        np.testing.assert_allclose(flange["poses"], in_scene, atol=1e-9)
-        np.testing.assert_allclose(flange["bmode"], probe["bmode"], atol=1e-4)
-        assert probe["bmode"].max() > 0.0
-    done(server, *asked, *led, "-o", tmp_path / "pictures")
-    assert len(list((tmp_path / "pictures").glob("*.png"))) == 2
-    assert "without --sampler" in refused(server, *asked, *led, "--sampler", "training", "-o", tmp_path / "more.npz")
-
-
 def test_a_sampler_makes_a_folder_of_pictures(server: RunningService, tmp_path: Path) -> None:
     folder = tmp_path / "pictures"
     sampled = ("--sampler", "training", "--height", 8, "--width", 8, "--outputs", "bmode,transmittance")
@@ -189,11 +166,6 @@ def test_what_is_no_sweep_is_not_sent(server: RunningService, tmp_path: Path) ->
     (tmp_path / "a.zip").write_bytes(b"no zip at all")
     assert refused(server, "datasets", "upload", tmp_path / "a.zip")
     assert json.loads(done(server, "datasets", "list", "--json")) == []
-
-
-def test_without_a_key_nothing_is_told(server: RunningService, sweep: Path) -> None:
-    for arguments in (("scenes", "list"), ("datasets", "list"), ("datasets", "upload", sweep)):
-        assert "API key" in refused(server, *arguments, key="wrong-key-0123456789")
 
 
 def test_a_large_upload_that_is_refused_at_once_tells_why(server: RunningService, tmp_path: Path) -> None:

@@ -14,11 +14,10 @@ import pytest
 import torch
 
 import ultragray
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, render
+from ultragray import GaussianScene, LinearProbe, render
 from ultragray.contract import to_dict
 from ultragray.datasets.plus import read_plus_sweep
 from ultragray.files import file_sha256
-from ultragray.geometry.scan_conversion import scan_convert
 from ultragray.rendering.backends import cpu
 from ultragray.rendering.settings import SettingsUsed
 from ultragray.rendering.tools import Needle, ToolFrame
@@ -28,8 +27,8 @@ from ultragray.scene.confidence import FIGURES, Assessor, ConfidenceModel, figur
 from .command_line import refused, run
 
 LINEAR = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
-CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=50.0)
-PHASED = PhasedProbe(opening_angle_deg=90.0, far_mm=50.0)
+
+
 ORIGIN = ("scene", "scene_sha256", "renderer", "probe", "slice_thickness_mm", "display", "picture")
 CONVEX_JSON = '{"kind": "convex", "opening_angle_deg": 60, "near_mm": 10, "far_mm": 50}'
 
@@ -161,14 +160,6 @@ def test_render_keeps_to_a_least_confidence(knowing_file: Path, scene_file: Path
     assert "needs a scene that knows" in refused("render", scene_file, *arguments[2:])
 
 
-def test_info_tells_how_well_a_scene_knows_its_confidence(knowing_file: Path, scene_file: Path) -> None:
-    document = json.loads(run("show", knowing_file, "--json").output)
-    assert (document["confidence"]["error"], document["confidence"]["fitted_on"]) == (0.04, 20)
-    assert "hardness" not in document["confidence"]
-    assert "error=0.04" in run("show", knowing_file).output
-    assert json.loads(run("show", scene_file, "--json").output)["confidence"] == {}
-
-
 def test_render_samples_poses_into_the_format_of_the_name(scene_file: Path, pose_file: Path, tmp_path: Path) -> None:
     sampler = ("--sampler", "fan", "--tilt-deg", 2, "--step-deg", 2, "--poses", pose_file)
     for name in ("f.npz", "f.igs.mha", "f.h5"):
@@ -184,52 +175,12 @@ def test_render_samples_poses_into_the_format_of_the_name(scene_file: Path, pose
             np.testing.assert_array_equal(file["bmode"], frames["bmode"])
 
 
-def test_render_with_another_probe_as_a_fan(scene_file: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "fan"
-    result = run("render", scene_file, "--probe", CONVEX_JSON, "--scan-convert", 0.5, "-o", folder)
-    assert result.exit_code == 0, result.output
-    picture = cv2.imread(str(folder / "frame_00000_bmode.png"), cv2.IMREAD_UNCHANGED)
-    scene = GaussianScene.load(scene_file)
-    frame = render(scene, CONVEX, scene.training_poses[:1], height=24, width=20).bmode
-    assert frame is not None
-    np.testing.assert_array_equal(picture, np.rint(scan_convert(frame[0].numpy(), CONVEX, 0.5) * 255))
-
-
 def test_threads_and_backend_are_used(scene_file: Path, tmp_path: Path) -> None:
     result = run("render", scene_file, "-o", tmp_path / "f.npz", "--threads", 3, "--backend", "reference")
     assert result.exit_code == 0
     assert torch.get_num_threads() == 3
     with np.load(tmp_path / "f.npz") as frames:
         assert str(frames["renderer"]).endswith(" reference")
-
-
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--outputs", ","], "at least one of bmode"),
-        (["--outputs", "bmode,labels"], "labels only for a scene whose Gaussians carry labels"),
-        (["--width", 100_000], "width must be an integer from 1"),
-        (["--probe", '{"kind": "linear", "width_mm": 40, "near_mm": 50, "far_mm": 50}'], "far_mm must be greater"),
-        (["--probe", '{"kind": "sector"}'], "kind must be one of convex, linear, phased"),
-        (["--tgc-db", "1,two"], "tgc_db[1] must be a finite number from -100 to 100, got 'two'"),
-        (["--gain-db", 1000], "gain_db must be a finite number from -100 to 100"),
-        (["--below-min-confidence", "hide"], "below_min_confidence must be one of refuse, mask"),
-        (["--scan-convert", 0.0, "--probe", CONVEX_JSON], "pixel_mm must be a finite number from"),
-        (["-o", "frames.png"], "end in .npz, .tar, .zarr.zip, .h5, .dcm, .igs.mha or .mcap, or be a folder for PNGs"),
-        (["-o", "frames.dcm", "--outputs", "echo"], "bmode alone in format dicom"),
-        (["--dtype", "uint8"], "--dtype must be left out for PNGs"),
-        (["--sampler", "around"], "count is required by kind around"),
-        (["--seed", 3], "--seed is of a sampler"),
-    ],
-)
-def test_mistakes_of_render_are_named(
-    scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[object], message: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    before = sorted(tmp_path.iterdir())
-    output = [] if "-o" in arguments else ["-o", "pictures"]
-    assert message in refused("render", scene_file, *output, *arguments)
-    assert sorted(tmp_path.iterdir()) == before
 
 
 def test_what_is_there_is_replaced_only_with_force(scene_file: Path, tmp_path: Path) -> None:

@@ -10,7 +10,7 @@ from ultragray.phantom.demo import copy_demo_scene
 from ultragray_workers.storage.location import open_storage
 
 from ...workers.jobs.conftest import store_dataset
-from .command_line import refused, run
+from .command_line import run
 
 
 def test_an_installation_goes_into_a_bucket(tmp_path: Path, new_bucket: Callable[[], str]) -> None:
@@ -24,8 +24,3 @@ def test_an_installation_goes_into_a_bucket(tmp_path: Path, new_bucket: Callable
     again = json.loads(run("storage", "copy", data, bucket, "--json").stdout)
     assert (again["scenes"], again["datasets"]) == (0, 0)
     assert (again["already_there"], again["datasets_already_there"]) == (1, 1)
-
-
-def test_a_folder_that_is_not_there_is_told(tmp_path: Path) -> None:
-    assert "FROM must be an existing folder" in refused("storage", "copy", tmp_path / "gone", tmp_path / "to")
-    assert not (tmp_path / "to").exists()

@@ -15,8 +15,6 @@ from ultragray.datasets.released import write_released
 from ultragray.datasets.source import load_dataset
 from ultragray_service.cli.app import app
 
-REAL_SETS = Path(__file__).resolve().parents[4] / "shared" / "data"
-
 
 def run(*arguments: object) -> Result:
     return CliRunner().invoke(app, list(map(str, arguments)))
@@ -88,21 +86,6 @@ def test_convert_writes_what_is_read_back(folder: Path) -> None:
     assert f"new or empty folder, {folder.parent / 'half'} holds files" in again.stderr
     assert run("convert", folder, "-o", folder.parent / "half", "--force").exit_code == 0
     assert load_dataset(folder.parent / "half").sha256 == load_dataset(folder).sha256
-
-
-def test_a_plus_sequence_by_the_documented_command(tmp_path: Path) -> None:
-    if not REAL_SETS.is_dir():
-        pytest.skip("../shared/data is not there: it holds real sweeps")
-    plus = REAL_SETS / "plus_original"
-    result = run(
-        *("convert", plus / "SpinePhantomFreehand.igs.mha", "-o", tmp_path / "spine"),
-        *("--device-set", plus / "PlusDeviceSet_SpinePhantomFreehandReconstructionOnly.xml"),
-        *("--crop", "188:632,12:600", "--image-size", "192x256"),
-    )
-    assert result.exit_code == 0, result.output
-    made, given = load_dataset(tmp_path / "spine"), load_dataset(REAL_SETS / "spine_phantom")
-    np.testing.assert_allclose(made.train.poses, given.train.poses, atol=1e-3)
-    np.testing.assert_allclose(made.val.poses, given.val.poses, atol=1e-3)
 
 
 def test_draw_draws_a_png(folder: Path) -> None:

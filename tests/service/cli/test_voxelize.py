@@ -9,7 +9,7 @@ import nibabel
 import numpy as np
 import pytest
 
-from .command_line import refused, run
+from .command_line import run
 
 
 @pytest.fixture(scope="module")
@@ -37,17 +37,6 @@ def test_a_slice_through_a_plane(demo: Path, tmp_path: Path) -> None:
     assert result.exit_code == 0, result.output
     assert "echo, 40 x 30 x 1 at 1 mm" in result.stdout
     assert np.load(tmp_path / "s.npy").shape == (30, 40)
-
-
-def test_mistakes_are_told_in_one_line(demo: Path, tmp_path: Path) -> None:
-    assert "must end in .nii.gz, .nii or .nrrd" in refused("voxelize", demo, "-o", tmp_path / "v.mha")
-    assert "is for a slice: give plane_mm and size_mm" in refused("voxelize", demo, "-o", tmp_path / "s.png")
-    assert "right and down are for a slice" in refused("voxelize", demo, "-o", tmp_path / "v.nii", "--right", "0,1,0")
-    nowhere = refused("voxelize", demo, "-o", tmp_path / "s.png", "--plane-mm", "0,0,nan", "--size-mm", "9,9")
-    assert "plane_mm must be 3 finite numbers" in nowhere
-    assert "a slice needs size_mm" in refused("voxelize", demo, "-o", tmp_path / "s.png", "--plane-mm", "0,0,0")
-    assert "the limit is" in refused("voxelize", demo, "-o", tmp_path / "v.nrrd", "--spacing-mm", 0.01)
-    assert not list(tmp_path.iterdir())
 
 
 def test_a_box_beyond_the_scene_is_warned_of(demo: Path, tmp_path: Path) -> None:

@@ -2,12 +2,8 @@
 
 from __future__ import annotations
 
-import os
-import signal
 import time
 from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -26,9 +22,9 @@ from ultragray_proto.v1 import datasets_pb2, datasets_pb2_grpc
 from ultragray_workers.helpers import PROGRESS_NAME
 from ultragray_workers.views import PICTURES
 
-from ...waiting import Deadline, wait_until
+from ...waiting import Deadline
 from ..conftest import RunningService, StartService, make_scene
-from .test_http_datasets import helper_process, zipped
+from .test_http_datasets import zipped
 
 RAW = {"Content-Type": "application/octet-stream"}
 PROBE = LinearProbe(40.0, 0.0, 40.0)
@@ -174,52 +170,6 @@ def test_nothing_stays_of_a_deleted_dataset(
     with service.channel() as channel:
         datasets_pb2_grpc.DatasetServiceStub(channel).DeleteDataset(datasets_pb2.DeleteDatasetRequest(dataset="same"))
     assert made_of(doomed, artifacts) == 0
-
-
-@pytest.mark.long
-def test_a_dataset_deleted_while_it_is_laid_out(
-    http: httpx.Client, service: RunningService, artifacts: Path, tmp_path: Path
-) -> None:
-    doomed = Dataset("doomed", sweep(4, 0.0), sweep(2, 0.5))
-    upload(http, "doomed", doomed, tmp_path / "doomed")
-    with ThreadPoolExecutor(1) as executor:
-        answer = executor.submit(http.get, "/v1/datasets/doomed/poses")
-        os.kill(wait_until(lambda: helper_process(service, "lay_out")), signal.SIGSTOP)
-        assert http.delete("/v1/datasets/doomed").status_code == 204
-        assert answer.result().json()["reason"] == "DATASET_NOT_FOUND"
-    assert made_of(doomed, artifacts) == len(list(artifacts.glob("dataset-views/.*"))) == 0
-
-
-@pytest.mark.long
-def test_a_service_that_stops_or_dies_while_it_lays_a_dataset_out(start_service: StartService, tmp_path: Path) -> None:
-    with ThreadPoolExecutor(1) as executor:
-
-        def begin() -> tuple[RunningService, Future[httpx.Response], int]:
-            service = start_service(artifact_folder=tmp_path / "artifacts")
-            if not (tmp_path / "tiny").is_dir():
-                with httpx.Client(base_url=service.http, timeout=60) as client:
-                    upload(client, "tiny", DATASET, tmp_path / "tiny")
-            asked = executor.submit(httpx.get, f"{service.http}/v1/datasets/tiny/poses", timeout=60)
-            helper = wait_until(lambda: helper_process(service, "lay_out"))
-            os.kill(helper, signal.SIGSTOP)
-            return service, asked, helper
-
-        def left() -> list[Path]:
-            return list((tmp_path / "artifacts" / "dataset-views").iterdir())
-
-        first, asked, _ = begin()
-        assert first.terminate() == 0
-        answer = asked.result()
-        assert (answer.status_code, answer.json()["reason"]) == (503, "DRAINING")
-        assert not left()
-        second, asked, helper = begin()
-        second.process.kill()
-        with suppress(ProcessLookupError):  # it was stopped before it had asked to end with its parent, or has ended
-            os.kill(helper, signal.SIGCONT)
-        assert isinstance(asked.exception(), httpx.HTTPError)
-        assert left()
-        start_service(artifact_folder=tmp_path / "artifacts")
-        assert not left()
 
 
 def test_what_was_made_of_the_demo_scene_outlives_a_restart(start_service: StartService, tmp_path: Path) -> None:

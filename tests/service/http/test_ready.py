@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
-import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -16,6 +14,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from ...postgres import PostgresServer
 from ...waiting import wait_until
 from ..conftest import RunningService, StartService
+from ..tls.test_healthcheck import check
 
 IN_ORDER = {"ready": True, "detail": None}
 NOT_SERVING, SERVING = health_pb2.HealthCheckResponse.NOT_SERVING, health_pb2.HealthCheckResponse.SERVING
@@ -63,26 +62,18 @@ def service(start_service: StartService, folder: Path) -> RunningService:
     return start_service(artifact_folder=folder)
 
 
-def test_every_part_of_a_service_in_order_is_told(service: RunningService) -> None:
-    parts = {"frames": IN_ORDER, "jobs": IN_ORDER, "artifacts": IN_ORDER, "scenes": IN_ORDER}
-    status, said = ready(service)
-    assert (status, said["status"], said["components"]) == (200, "ready", parts)
-
-
 def test_a_service_whose_sqlite_file_was_removed_is_not_ready_until_it_is_back(
     service: RunningService, folder: Path, tmp_path: Path, pose_body: dict[str, Any]
 ) -> None:
+    status, said = ready(service)
+    in_order = dict.fromkeys(("frames", "jobs", "artifacts", "scenes"), IN_ORDER)
+    assert (status, said["status"], said["components"]) == (200, "ready", in_order)
     (folder / FILE).rename(tmp_path / FILE)
     problem = wait_for(service, 503)
     assert problem["reason"] == "DATABASE_UNAVAILABLE"
     assert "removed or replaced" in problem["detail"]
-    jobs = {"ready": False, "detail": problem["detail"]}
-    assert problem["components"] == {
-        "frames": IN_ORDER,
-        "jobs": jobs,
-        "artifacts": IN_ORDER,
-        "scenes": IN_ORDER,
-    }
+    assert problem["components"] == {**in_order, "jobs": {"ready": False, "detail": problem["detail"]}}
+    assert check(service).returncode == 1, "the health check of containers follows"
     assert renders(service, pose_body) == 200
     wait_until(lambda: health(service, "") == NOT_SERVING)
     assert health(service, "ultragray.v1.JobService") == NOT_SERVING
@@ -92,6 +83,13 @@ def test_a_service_whose_sqlite_file_was_removed_is_not_ready_until_it_is_back(
     wait_for(service, 200)
     wait_until(lambda: health(service, "ultragray.v1.JobService") == SERVING)
     assert health(service, "") == SERVING
+    with service.channel() as channel:
+        asked = health_pb2.HealthCheckRequest(service="ultragray.v1.JobService")
+        watching = health_pb2_grpc.HealthStub(channel).Watch(asked, timeout=60)
+        while next(watching).status != SERVING:
+            pass
+        service.process.terminate()
+        assert next(watching).status == NOT_SERVING
 
 
 def test_a_service_whose_sqlite_file_is_read_only_is_not_ready(service: RunningService, folder: Path) -> None:
@@ -121,20 +119,6 @@ def test_a_service_that_only_renders_is_ready_without_jobs_and_tells(start_servi
     assert ready(service)[0] == 200
     wait_until(lambda: health(service, "ultragray.v1.JobService") == NOT_SERVING)
     assert health(service, "") == SERVING
-
-
-def test_the_health_check_of_containers_follows(service: RunningService, folder: Path) -> None:
-    port = service.http.rpartition(":")[2]
-
-    def check() -> int:
-        environment = {"ULTRAGRAY_HTTP_PORT": port, "PYTHONPATH": ":".join(sys.path)}
-        command = [sys.executable, "-m", "ultragray_service.healthcheck"]
-        return subprocess.run(command, env=environment, stderr=subprocess.DEVNULL, check=False).returncode
-
-    assert wait_until(lambda: check() == 0)
-    (folder / FILE).unlink()
-    wait_for(service, 503)
-    assert check() == 1
 
 
 Change = Callable[[PostgresServer, str], None]
@@ -173,14 +157,3 @@ def test_a_service_whose_server_is_away_or_read_only_is_not_ready_until_it_is_ba
     finally:
         give_back(postgres, url)
     wait_for(service, 200)
-
-
-def test_a_service_that_stops_says_so_of_every_part(service: RunningService) -> None:
-    with service.channel() as channel:
-        watching = health_pb2_grpc.HealthStub(channel).Watch(
-            health_pb2.HealthCheckRequest(service="ultragray.v1.JobService"), timeout=60
-        )
-        while next(watching).status != SERVING:
-            pass
-        service.process.terminate()
-        assert next(watching).status == NOT_SERVING

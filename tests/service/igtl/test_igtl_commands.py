@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import struct
-from collections.abc import Iterator
-from contextlib import contextmanager
 from typing import Any
 from xml.etree import ElementTree
 
@@ -84,13 +82,6 @@ class _CommandMessage(pyigtl.messages.MessageBase):  # type: ignore[misc]
         self.name, self.text = name.rstrip(b"\0").decode(), content[138 : 138 + length].decode()
 
 
-@contextmanager
-def commanding(service: RunningService, monkeypatch: pytest.MonkeyPatch) -> Iterator[pyigtl.OpenIGTLinkClient]:
-    monkeypatch.setitem(pyigtl.messages.message_type_to_class_constructor, "RTS_COMMAND", _CommandMessage)
-    with pyigtl_client(address_of(service)) as client:
-        yield client
-
-
 def test_pyigtl_sets_the_depth_by_a_string_and_gets_shorter_images(igtl_service: RunningService) -> None:
     with pyigtl_client(address_of(igtl_service)) as client:
         client.send_message(pyigtl.TransformMessage(np.eye(4), device_name="demo"))
@@ -106,24 +97,6 @@ def test_pyigtl_sets_the_depth_by_a_string_and_gets_shorter_images(igtl_service:
         cut = client.wait_for_message("Image_demo", timeout=60).image[0]
     assert len(cut) == round(len(whole) * 20 / (DEMO_PROBE.far_mm - DEMO_PROBE.near_mm))
     assert np.array_equal(cut, whole[: len(cut)])
-
-
-def test_pyigtl_sets_and_asks_by_commands_with_metadata(
-    igtl_service: RunningService, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with commanding(igtl_service, monkeypatch) as client:
-        for number, name, text in (
-            (41, "SetUsParameter", command("SetUsParameter", ("GainPercent", "60"), ("DynRangeDb", "45"))),
-            (42, "GetUsParameter", command("GetUsParameter", ("GainPercent",), ("DynRangeDb",))),
-        ):
-            message = _CommandMessage(device_name="Scanner")
-            message.number, message.name, message.text, message.message_id = number, name, text, 7
-            client.send_message(message)
-            reply = client.wait_for_message("Scanner", timeout=60)
-            assert (reply.message_type, reply.number, reply.name, reply.message_id) == ("RTS_COMMAND", number, name, 7)
-        assert reply.metadata == {"GainPercent": "60", "DynRangeDb": "45", "Status": "SUCCESS"}
-        parameters = {one.get("Name"): one.get("Value") for one in ElementTree.fromstring(reply.text)}
-        assert parameters == {"GainPercent": "60", "DynRangeDb": "45"}
 
 
 # Settings
@@ -190,13 +163,10 @@ def test_settings_are_those_of_one_connection(connect: Connect) -> None:
     [
         ("DepthMm", "deep", "must be a number, got 'deep'"),
         ("DepthMm", "-3", "DepthMm: depth_mm must be a finite number"),
-        ("DepthMm", "nan", "depth_mm must be a finite number"),
         ("GainPercent", "101", "from 0 to 100, got '101'"),
         ("DynRangeDb", "0", "from 1 to 200"),
         ("TimeGainCompensation", " ".join(["1"] * 17), "at most 16 values"),
-        ("TimeGainCompensation", "1 2 x", "must be a number, got 'x'"),
         ("Scene", "absent", "there is no scene 'absent'"),
-        ("Probe", "linear", "must be JSON"),
         ("Probe", '{"kind": "linear", "width_mm": -1}', "near_mm is required"),
         ("FrequencyMhz", "5", f"must be one of {', '.join(PARAMETERS)}, got 'FrequencyMhz'"),
     ],
@@ -219,7 +189,6 @@ BOMB = '<!DOCTYPE a [<!ENTITY b "xxxxxxxxxx"><!ENTITY c "&b;&b;&b;&b;">]><Comman
     ("text", "expected"),
     [
         ("", "must be XML"),
-        ("<Command", "must be XML"),
         (BOMB, "no DOCTYPE"),
         ('<Command Name="&c;"/>', "undefined entity"),
         ("<Other/>", "an element Command, got 'Other'"),
@@ -229,12 +198,8 @@ BOMB = '<!DOCTYPE a [<!ENTITY b "xxxxxxxxxx"><!ENTITY c "&b;&b;&b;&b;">]><Comman
         (command("GetUsParameter", ("DepthMm",)), "is not set"),
         (command("GetUsParameter", ("GainPercent",), ("GainPercent",)), "'GainPercent' twice"),
         ('<Command Name="SetUsParameter"><Depth/></Command>', "got 'Depth'"),
-        (
-            command("GetUsParameter", *[(f"P{number}",) for number in range(MAX_PARAMETERS + 1)]),
-            "at most 32 parameters",
-        ),
+        (command("GetUsParameter", *[("P",)] * (MAX_PARAMETERS + 1)), "at most 32 parameters"),
         (f"<Command>{' ' * MAX_COMMAND_BYTES}</Command>", "at most 4096 bytes"),
-        ("<a>" * 1300, "must be XML"),
     ],
 )
 def test_a_bad_command_gets_one_clear_reply(peer: Peer, text: str, expected: str) -> None:
@@ -259,7 +224,6 @@ def test_a_reply_is_xml_whatever_was_sent(peer: Peer) -> None:
     [
         ("STRING", "note", pack_string("hello"), "of a device called CMD_1 or the like, got 'note'"),
         ("STRING", "CMD_1", b"\0\3\0\5hell", "a text of 5 bytes must follow, got 4"),
-        ("STRING", "CMD_1", b"\0", "4 bytes or more, got 1"),
         ("STRING", "CMD_1", b"\0\3\0\1\xff", "ASCII or UTF-8"),
         ("COMMAND", "US", bytes(137), "138 bytes or more, got 137"),
         ("COMMAND", "US", bytes(134) + struct.pack(">I", 2**31), f"a text of {2**31} bytes must follow, got 0"),

@@ -73,7 +73,7 @@ def test_answers_of_the_client_are_heard_in_silence(peer: Peer) -> None:
 
 
 @pytest.mark.parametrize("type_name", ["TRANSFORM", "IMAGE"])
-@pytest.mark.parametrize("size", [2**60, 2**63, 2**64 - 1, MAX_SKIPPED_BYTES + 1])
+@pytest.mark.parametrize("size", [2**63, MAX_SKIPPED_BYTES + 1])
 def test_a_size_beyond_all_bounds_is_refused_without_memory(
     connect: Connect, igtl_service: RunningService, type_name: str, size: int
 ) -> None:
@@ -204,10 +204,7 @@ def test_more_connections_than_allowed_are_told_so(start_service: StartService) 
         wait_until(is_let_in)
 
 
-NUMBERS = (np.nan, np.inf, -np.inf, -0.0, 1e-45, -1e-38, 1e38, 3.4e38, -3.4e38)
-
-
-@pytest.mark.parametrize("number", NUMBERS)
+@pytest.mark.parametrize("number", [np.nan, -np.inf, 1e-45, 3.4e38])
 def test_numbers_at_the_edge_of_float32_are_answered_and_the_connection_goes_on(peer: Peer, number: float) -> None:
     plain = np.eye(3, 4, dtype=">f4")
     for place in np.ndindex(3, 4):

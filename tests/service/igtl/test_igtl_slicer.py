@@ -7,9 +7,7 @@ STATUS with metadata, so that headers of version 2 are understood, then the node
 from __future__ import annotations
 
 import json
-import re
 import struct
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -26,7 +24,7 @@ from ultragray.scene.info import read_header
 
 from ..cli.command_line import refused, run
 from ..conftest import DEMO_PROBE, HEIGHT, WIDTH, RunningService, make_scene
-from .conftest import Peer, address_of, moved, pyigtl_client
+from .conftest import address_of, moved, pyigtl_client
 from .test_igtl_commands import _CommandMessage, command
 from .test_igtl_server import over_grpc
 
@@ -71,22 +69,6 @@ def written(igtl_service: RunningService, igtl_folder: Path, tmp_path: Path) -> 
     document = json.loads(result.stdout)
     assert (document["device"], document["image"]) == ("ProbeTodemo", "Image_demo")
     return open_scene(tmp_path / "demo.mrml")
-
-
-def test_every_node_is_one_that_slicer_knows_and_refers_to_others(written: Opened) -> None:
-    classes = {
-        "LinearTransform": "LinearTransform",
-        "IGTLConnector": "IGTLConnector",
-        "VolumeDisplay": "ScalarVolumeDisplay",
-        "VolumeArchetypeStorage": "VolumeArchetypeStorage",
-        "Volume": "ScalarVolume",
-    }
-    for node_id, (tag, _) in written.nodes.items():
-        assert re.fullmatch(rf"vtkMRML{classes[tag]}Node\d+", node_id)
-        for ids in written.references(tag).values():
-            assert set(ids) <= written.nodes.keys()
-    assert written.references("IGTLConnector").keys() == {"outgoing"}
-    assert written.references("Volume").keys() == {"display", "storage"}
 
 
 def test_the_connector_resumes_and_pushes_the_pose_of_a_training_view(
@@ -153,21 +135,6 @@ def push(client: pyigtl.OpenIGTLinkClient, device: str, pose: npt.NDArray[Any]) 
     message = pyigtl.TransformMessage(pose, device_name=device)
     message.header_version = 2
     client.send_message(message)
-
-
-def test_the_queries_of_slicer_are_answered_in_their_order(peer: Peer, connect: Callable[..., Peer]) -> None:
-    """As its query nodes send them: GET_CAPABIL, GET_IMAGE, STT_TDATA, and STP_TDATA at the end."""
-    viewer = connect()
-    assert viewer.ask("GET_CAPABIL", "").type_name == "CAPABILITY"
-    peer.send_pose(np.eye(4), "ProbeTodemo")
-    peer.image()
-    assert viewer.ask("GET_IMAGE", "Image_demo").type_name == "IMAGE"
-    receipt = viewer.ask("STT_TDATA", "", struct.pack(">I32s", 50, b""))
-    assert (receipt.type_name, receipt.content) == ("RTS_TDATA", b"\0")
-    peer.send_pose(moved(1), "ProbeTodemo")
-    peer.image()
-    assert viewer.receive().type_name == "TDATA"
-    assert viewer.ask("STP_TDATA", "").type_name == "RTS_TDATA"
 
 
 def test_what_cannot_be_written_is_told_before_the_work(tmp_path: Path) -> None:

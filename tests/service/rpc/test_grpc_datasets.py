@@ -92,11 +92,6 @@ def test_what_is_refused(datasets: datasets_pb2_grpc.DatasetServiceStub, files: 
         assert detail in details
 
 
-def test_an_upload_needs_a_key(datasets: datasets_pb2_grpc.DatasetServiceStub) -> None:
-    code, reason, _ = refusal(datasets.UploadDataset, iter([header("a")]), timeout=60)
-    assert (code, reason) == (grpc.StatusCode.UNAUTHENTICATED, "UNAUTHENTICATED")
-
-
 @pytest.fixture
 def begun() -> Iterator[Iterator[Message]]:
     """The messages of an upload that comes to a halt until the test is over."""

@@ -1,16 +1,27 @@
+"""SceneService, health and reflection, and what holds for every call: its errors, its size, a caller who is gone."""
+
 from __future__ import annotations
 
+import asyncio
+import logging
+from pathlib import Path
 from typing import Any
 
 import grpc
+import httpx
 import pytest
+from google.protobuf.empty_pb2 import Empty
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
-from ultragray_proto.v1 import scenes_pb2, scenes_pb2_grpc
+from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc, scenes_pb2, scenes_pb2_grpc
+from ultragray_service.rpc.calls import CallContext, abort
+from ultragray_service.settings import load_settings
+from ultragray_service.wiring import make_service
+from ultragray_workers.errors import DeadlineExceeded
 
 from ...waiting import wait_until
-from ..conftest import RunningService
+from ..conftest import RunningService, StartService
 from .test_grpc_render import error_info
 
 Stub = scenes_pb2_grpc.SceneServiceStub
@@ -100,3 +111,77 @@ def test_bytes_that_are_no_message_are_refused_in_our_words(
     assert error_info(caught.value)[0].reason == "INVALID_ARGUMENT"
     assert "DecodeError" not in str(caught.value.details())
     assert "DecodeError" not in service.log_path.read_text()
+
+
+def test_one_setting_bounds_bodies_and_messages(
+    start_service: StartService, settings_message: rendering_pb2.RenderSettings, pose_message: geometry_pb2.Pose
+) -> None:
+    limit_bytes = 4 * 2**20
+    service = start_service(max_body_bytes=limit_bytes)
+    settings_message.height = settings_message.width = 8
+    request = rendering_pb2.RenderBatchRequest(settings=settings_message, poses=[pose_message])
+    with service.channel() as channel:
+        render = rendering_pb2_grpc.RenderServiceStub(channel).RenderBatch
+        request.MergeFromString(b"\xfa\x7f\x80\x80\xc0\x01" + bytes(3 * 2**20))  # a field that nobody knows, of 3 MiB
+        assert len(list(render(request, timeout=60))) == 1
+        request.MergeFromString(b"\xfa\x7f\x80\x80\x80\x01" + bytes(2 * 2**20))
+        with pytest.raises(grpc.RpcError) as refused:
+            list(render(request, timeout=60))
+    assert refused.value.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
+    answer = httpx.post(f"{service.http}/v1/scenes/demo/render", content=b" " * (limit_bytes + 1), timeout=60)
+    assert answer.json()["detail"] == f"the body must be at most {limit_bytes} bytes"
+
+
+METHOD = "/ultragray.v1.JobService/WatchJob"
+
+
+class Streaming(grpc.GenericRpcHandler):  # type: ignore[misc]
+    """A call that writes once more when its caller is gone, as if that was not known yet."""
+
+    def __init__(self) -> None:
+        self.ended = asyncio.Event()
+
+    def service(self, details: Any) -> Any:
+        return grpc.unary_stream_rpc_method_handler(self._stream, Empty.FromString, Empty.SerializeToString)
+
+    async def _stream(self, request: Any, context: Any) -> None:
+        await context.write(Empty())
+        try:
+            await asyncio.sleep(60)
+        except asyncio.CancelledError:
+            self.ended.set()
+            await context.write(Empty())
+
+
+async def vanish(folder: Path) -> None:
+    server = grpc.aio.server(interceptors=[CallContext(make_service(load_settings(data_folder=folder)))])
+    streaming = Streaming()
+    server.add_generic_rpc_handlers([streaming])
+    port = server.add_insecure_port("127.0.0.1:0")
+    await server.start()
+    async with grpc.aio.insecure_channel(f"127.0.0.1:{port}") as channel:
+        call = channel.unary_stream(METHOD, Empty.SerializeToString, Empty.FromString)(Empty())
+        await call.read()
+        call.cancel()
+    await asyncio.wait_for(streaming.ended.wait(), 60)  # the connection is closed, too
+    await server.stop(5)
+
+
+def test_a_write_to_a_caller_that_is_gone_is_a_cancelled_call(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.INFO):
+        asyncio.run(vanish(tmp_path))
+    (record,) = caplog.records
+    fields = vars(record)["fields"]
+    assert (record.getMessage(), fields["method"], fields["status"]) == ("request", METHOD, "CANCELLED")
+
+
+class Gone:
+    """A context as grpc leaves it for a moment when the caller's deadline passes: it cannot be provoked at will."""
+
+    async def abort(self, *_: Any) -> None:
+        raise grpc.aio.InternalError('Failed "execute_batch"')
+
+
+def test_an_error_for_a_caller_that_is_gone_is_a_cancelled_call() -> None:
+    with pytest.raises(asyncio.CancelledError):
+        asyncio.run(abort(Gone(), DeadlineExceeded("the deadline passed")))

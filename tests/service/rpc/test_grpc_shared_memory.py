@@ -13,14 +13,13 @@ import numpy as np
 import pytest
 
 from ultragray.errors import InvalidArgument
-from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
+from ultragray_proto.v1 import rendering_pb2
 from ultragray_service.rpc.calls import address_of
 from ultragray_service.rpc.shared_memory import FOLDER, SharedMemory
 from ultragray_workers.pool.messages import Place
 
 from ...file_sizes import files_of_at_most
-from ..access.test_addresses import own_address
-from ..conftest import RunningService, StartService
+from ..conftest import RunningService
 from .test_grpc_render import Conversation, Stub, error_info, moved
 
 SLOT_BYTES = 2**20
@@ -128,18 +127,12 @@ def refused(renders: Stub, message: rendering_pb2.SharedMemory) -> tuple[str, st
 BAD_MESSAGES: dict[str, tuple[dict[str, Any], str, str]] = {
     "no name": ({"name": ""}, "name", "hexadecimal"),
     "a path": ({"name": "/etc/passwd"}, "name", "hexadecimal"),
-    "a way out": ({"name": f"../{'0' * 32}"}, "name", "hexadecimal"),
-    "a name in capitals": ({"name": f"ultragray-{'A' * 32}"}, "name", "hexadecimal"),
     "a line after the name": ({"name": f"ultragray-{'0' * 32}\n"}, "name", "hexadecimal"),
     "a file that is not there": ({"name": f"ultragray-{'0' * 32}"}, "name", "No such file"),
-    "no token": ({"token": b""}, "token", "32 bytes, got 0"),
     "another token": ({"token": b"0" * 32}, "name", "begin with the token"),
-    "no slots": ({"slots": 0}, "slots", "from 1 to 64, got 0"),
     "many slots": ({"slots": 65}, "slots", "from 1 to 64, got 65"),
     "fewer slots": ({"slots": 2}, "name", "must have 2101248 bytes, got 3149824"),
-    "no size": ({"slot_bytes": 0}, "slot_bytes", "multiple of 4096"),
     "half a page": ({"slot_bytes": 2**20 + 2048}, "slot_bytes", "multiple of 4096"),
-    "another size": ({"slot_bytes": 2**21}, "name", "must have 6295552 bytes"),
     "a large slot": ({"slot_bytes": 2**24 + 4096}, "slot_bytes", "at most 16777216"),
     "a large size": ({"slot_bytes": 2**28 // 3 // 4096 * 4096 + 4096}, "slot_bytes", "at most 268435456 for all"),
 }
@@ -201,25 +194,6 @@ def test_a_file_is_opened_once(renders: Stub, memory: ClientMemory) -> None:
     assert refused(renders, memory.message)[0] == "shared_memory.name"
     memory.pixels(conversation.ask(2, pose=moved(0)))
     conversation.finish()
-
-
-def test_clients_by_another_address_than_loopback_are_refused(
-    start_service: StartService, memory: ClientMemory
-) -> None:
-    address = own_address()
-    if address is None:
-        pytest.skip("this machine has no address but loopback's to connect from")
-    service = start_service(host="0.0.0.0", insecure=True)
-    port = service.grpc.rpartition(":")[2]
-    with grpc.insecure_channel(f"{address}:{port}") as channel:
-        field, detail = refused(rendering_pb2_grpc.RenderServiceStub(channel), memory.message)
-    assert field == "shared_memory"
-    assert "loopback" in detail
-    assert address in detail
-    with grpc.insecure_channel(f"127.0.0.1:{port}") as channel:
-        conversation = opened(rendering_pb2_grpc.RenderServiceStub(channel), memory)
-        memory.pixels(conversation.ask(1, pose=moved(0)))
-        conversation.finish()
 
 
 def test_addresses_of_peers() -> None:

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 
 from ultragray.datasets.released import write_released
-from ultragray.errors import MemoryExceeded
 from ultragray_service.core.threads import HelperProcesses
 from ultragray_service.settings import Settings
 from ultragray_service.views import prepared
@@ -119,12 +118,6 @@ def test_a_service_that_dies_while_it_removes_leaves_no_half_folder(
     monkeypatch.setattr(claims, "UNLOCKED_S", 0.0)
     asyncio.run(views(tmp_path).remove_stale())
     assert names(tmp_path) == ["key"]
-
-
-def test_what_is_laid_out_takes_no_more_room_than_the_frames(tmp_path: Path, wanted: Wanted) -> None:
-    folder = asyncio.run(views(tmp_path).path("key", **wanted))
-    pixels = DATASET.train.images.size + DATASET.val.images.size
-    assert sum(path.stat().st_size for path in folder.glob("*.npy")) < pixels + 2 * 1024
 
 
 def test_what_fails_says_why_and_is_tried_again_later(
@@ -258,19 +251,6 @@ def test_one_helper_process_at_a_time(tmp_path: Path, wanted: Wanted, monkeypatc
 
     asyncio.run(ask())
     assert len(started) == 4
-
-
-@pytest.mark.long
-def test_memory_beyond_the_limit_is_one_clear_error(tmp_path: Path, wanted: Wanted) -> None:
-    (images,) = tmp_path.glob("dataset-files/*/files/images_train.npy")
-    with images.open("wb") as file:
-        shape = (2000, 512, 512)
-        np.lib.format.write_array_header_1_0(file, {"descr": "<f4", "fortran_order": False, "shape": shape})
-        file.truncate(file.tell() + 4 * 2000 * 512 * 512)  # a hole: nothing is written
-    limited = views(tmp_path, dataset_memory_mb=512)
-    with pytest.raises(MemoryExceeded) as caught:
-        asyncio.run(limited.path("key", **wanted))
-    assert "512 MiB" in caught.value.detail
 
 
 @pytest.mark.long

@@ -76,18 +76,6 @@ def test_the_curve_of_a_finished_training_and_of_other_jobs(http: httpx.Client) 
 
 
 @pytest.mark.long
-def test_a_training_keeps_a_picture_of_each_validation(http: httpx.Client) -> None:
-    job = train(http, "pictured", steps=30, max_gaussians=50, confidence=False)
-    artifacts = wait_until(lambda: (told := http.get(f"/v1/jobs/{job}").json())["state"] == "succeeded" and told)[
-        "artifacts"
-    ]
-    pictures = [name for name in artifacts if name.startswith("validation_")]
-    assert pictures == [*(f"validation_{step:08d}.png" for step in range(2, 31, 2)), "validation_truth.png"]
-    sizes = {http.get(f"/v1/jobs/{job}/artifacts/{name}").headers["content-type"] for name in pictures}
-    assert sizes == {"image/png"}
-
-
-@pytest.mark.long
 def test_the_phases_of_a_training_and_the_time_left_until_its_end(http: httpx.Client) -> None:
     job = train(http, "phased", steps=150, max_gaussians=50, confidence=False)
     told: dict[str, float | None] = {}
