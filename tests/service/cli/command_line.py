@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import sys
+from pathlib import Path
 
+import numpy as np
 from typer.testing import CliRunner, Result
 
+from ultragray import LinearProbe
+from ultragray.datasets import Dataset, Sweep
+from ultragray.datasets.released import write_released
 from ultragray_service.cli.app import app
 
 
@@ -21,6 +26,18 @@ def refused(*arguments: object) -> str:
     assert result.stderr.startswith("error: ")
     assert result.stderr.count("\n") == 1
     return result.stderr
+
+
+def noise_sweep(folder: Path, frames: int = 10) -> Path:
+    """A sweep of noise in the released layout, 20x16 pixels, a millimetre between frames; the last two are held out."""
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, 1, 3] = np.arange(frames)
+    images = np.random.default_rng(0).integers(0, 250, (frames, 20, 16), dtype=np.uint8)
+    sweep = Sweep(images, poses, LinearProbe(40.0, 0.0, 50.0), np.arange(frames), "sweep")
+    write_released(
+        Dataset(folder.name, sweep.select(range(frames - 2)), sweep.select([frames - 2, frames - 1])), folder
+    )
+    return folder
 
 
 def python(program: str, *arguments: object) -> list[str]:

@@ -1,14 +1,13 @@
-"""`ultragray jobs` against a real service with its worker."""
+"""`ultragray jobs`, `workers` and `worker` against a real service with its worker."""
 
 from __future__ import annotations
 
-import io
 import json
 import os
+import signal
 import subprocess
 import sys
 import tarfile
-import zipfile
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,14 +16,19 @@ import numpy as np
 import pytest
 from typer.testing import CliRunner, Result
 
-from ultragray import LinearProbe
-from ultragray.datasets import Dataset, Sweep
-from ultragray.datasets.released import write_released
 from ultragray.files import file_sha256
+from ultragray.samplers import AroundSampler
 from ultragray_service.cli.app import app
 from ultragray_service.cli.jobs import JOB_CANCELLED, JOB_FAILED, results
+from ultragray_workers.jobs.kinds import RenderJob
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.store import JobStore
+from ultragray_workers.scenes import SceneStore
 
+from ...waiting import wait_until
 from ..conftest import ROOT, SOURCE_FOLDERS, RunningService, StartService
+from ..http.test_http_datasets import zipped
+from .command_line import noise_sweep
 
 WAIT_S = 120.0
 KEY = "0123456789abcdef-jobs"
@@ -41,23 +45,6 @@ def done(server: RunningService, *arguments: object) -> str:
     return result.stdout
 
 
-def tiny_dataset(folder: Path) -> bytes:
-    """A zip of a sweep of 20x16 pixels: 8 frames to train from, 2 held out."""
-    images = np.random.default_rng(0).integers(0, 250, (10, 20, 16), dtype=np.uint8)
-    poses = np.tile(np.eye(4), (10, 1, 1))
-    poses[:, 1, 3] = np.arange(10)
-    parts = [
-        Sweep(images[part], poses[part], LinearProbe(40.0, 0.0, 50.0), np.arange(len(images[part])), "sweep")
-        for part in (slice(0, 8), slice(8, 10))
-    ]
-    write_released(Dataset("tiny", *parts), folder)
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w") as archive:
-        for path in folder.iterdir():
-            archive.write(path, path.name)
-    return packed.getvalue()
-
-
 @pytest.fixture(scope="module")
 def server(start_service: StartService, tmp_path_factory: pytest.TempPathFactory) -> RunningService:
     return start_service(
@@ -69,7 +56,8 @@ def server(start_service: StartService, tmp_path_factory: pytest.TempPathFactory
 def client(server: RunningService, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
     """Knows the service, which holds the dataset `tiny`."""
     with httpx.Client(base_url=server.http, headers={"X-API-Key": KEY}, timeout=WAIT_S) as client:
-        content = tiny_dataset(tmp_path_factory.mktemp("tiny"))
+        folder = noise_sweep(tmp_path_factory.mktemp("sweep") / "tiny")
+        content = zipped({path.name: path.read_bytes() for path in folder.iterdir()})
         stored = client.put("/v1/datasets/tiny", content=content, headers={"Content-Type": "application/zip"})
         assert stored.status_code == 201, stored.text
         yield client
@@ -183,12 +171,9 @@ def test_a_cancelled_job_has_its_own_exit_code_and_can_be_retried(server: Runnin
     [
         (("watch", "0" * 24), "there is no job"),
         (("list", "--api-key", "x" * 16), "API key"),
-        (("submit", "render", "demo", "--count", "3"), "--count is of a sampler: name it with --sampler"),
-        (("submit", "render", "demo", "--sampler", "fan", "--count", "3"), "kind fan takes tilt_deg, step_deg"),
         (("submit", "render", "demo", "--format", "dicom", "--outputs", "echo"), "bmode alone in format dicom"),
         (("submit", "render", "gone"), "no scene"),
         (("submit", "train", "tiny", "--scene", "new", "--set", "stepz=3"), "no setting stepz; it has steps, "),
-        (("download", "0" * 24, "name", "-o", "nowhere/name"), "output must lie in a folder that exists"),
     ],
 )
 def test_mistakes_give_one_line(server: RunningService, arguments: tuple[str, ...], told: str) -> None:
@@ -230,3 +215,50 @@ def test_many_metrics_stand_in_lines_of_their_own() -> None:
     first, *lines = results(many).split("\n")
     assert first == "; artifacts: comparison.html"
     assert lines == [f"  method_{number}_gms 0.5" for number in range(7)]
+
+
+def test_commands_list_pause_drain_and_resume(server: RunningService) -> None:
+    def asked(*arguments: str) -> Result:
+        environment = {"ULTRAGRAY_ADDRESS": server.http, "ULTRAGRAY_API_KEY": KEY}
+        return CliRunner().invoke(app, ["workers", *arguments], env=environment)
+
+    def told(*arguments: str) -> str:
+        result = asked(*arguments)
+        assert result.exit_code == 0, result.output
+        return result.stdout
+
+    def states() -> dict[str, str]:
+        return {worker["name"]: worker["state"] for worker in json.loads(told("list", "--json"))}
+
+    assert wait_until(lambda: "idle" in states().values())
+    (name,) = states()
+    for wish, state in (("pause", "paused"), ("drain", "drained"), ("resume", "idle")):
+        assert told(wish, name) == f"{name} {state}\n"
+        assert states() == {name: state}
+    assert told("list").splitlines()[0].split()[:3] == ["name", "state", "job"]
+    absent = asked("pause", "absent")
+    assert (absent.exit_code, "absent" in absent.stderr) == (2, True)
+
+
+WORKER = [sys.executable, "-c", "from ultragray_service.cli.app import app; app()", "worker"]
+
+
+@pytest.mark.slow
+def test_worker_command_does_a_job_and_stops(data_folder: Path, tmp_path: Path) -> None:
+    demo_store = JobStore(tmp_path / "artifacts", None, scenes=SceneStore(data_folder))
+    job, _ = demo_store.submit(RenderJob(scene="demo", sampler=AroundSampler(2), height=16, width=16))
+    options = ["--artifact-folder", str(tmp_path / "artifacts"), "--name", "mine", "--device", "cpu", "--threads", "1"]
+    process = subprocess.Popen([*WORKER, *options], stderr=subprocess.PIPE, text=True)
+    try:
+        wait_until(lambda: demo_store.get(job.id).state.is_final)
+        job = demo_store.get(job.id)
+        assert (job.state, job.worker) == (JobState.SUCCEEDED, "mine"), job
+    finally:
+        process.send_signal(signal.SIGTERM)
+        _, told = process.communicate(timeout=60)
+    assert process.returncode == 0, told
+    messages = [json.loads(line)["message"] for line in told.splitlines()]
+    assert "worker mine takes jobs" in messages
+    assert f"job {job.id} succeeded" in messages
+    assert messages[-1] == "worker mine stopped"
+    demo_store.close()

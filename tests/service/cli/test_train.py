@@ -1,4 +1,4 @@
-"""`ultragray train`: from a folder of frames to a scene file, with every way that a run may be stopped."""
+"""`ultragray train`, `eval`, `report` and `compare`: from frames to a scene, figures and pages; what is stopped goes on."""
 
 from __future__ import annotations
 
@@ -9,53 +9,34 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from typer.testing import CliRunner, Result
 
-from ultragray import GaussianScene, LinearProbe
+from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe
+from ultragray.datasets import Dataset, Sweep
+from ultragray.datasets.released import read_released, write_released
 from ultragray.datasets.source import load_dataset
 from ultragray.installation import install_advice
-from ultragray.learn.training import TrainingConfig, trainer
+from ultragray.learn.evaluation.baselines import evaluate_baselines
+from ultragray.learn.evaluation.scoring import evaluate, measure_reliability
+from ultragray.learn.training import TrainingConfig, train, trainer
 from ultragray.learn.training.geometry import Geometry
-from ultragray_service.cli.app import app
+from ultragray.learn.training.trainer import JOURNAL_FILE
 
 from ...waiting import Deadline
+from .command_line import python, refused, run
 
 SMALL = ("--steps", 24, "--max-gaussians", 60, "--threads", 1)
 
 
-@pytest.fixture
-def dataset(tmp_path: Path) -> Path:
-    """A folder in the released layout: a ball in noise, 9 training and 2 held-out frames."""
-    folder = tmp_path / "sweep"
-    folder.mkdir()
-    rng = np.random.default_rng(0)
-    x, z = np.meshgrid(np.linspace(-1, 1, 16), np.linspace(0, 1, 20))
-    ball = 140.0 * np.exp(-(x**2 + (z - 0.4) ** 2) / 0.1) + 50.0
-    for part, count in (("train", 9), ("val", 2)):
-        poses = np.tile(np.eye(4), (count, 1, 1))
-        poses[:, 1, 3] = np.linspace(-4.0, 4.0, count) + 0.1
-        np.save(folder / f"poses_{part}.npy", poses)
-        images = np.clip(ball + rng.normal(0.0, 4.0, (count, 20, 16)), 0, 255).astype(np.uint8)
-        np.save(folder / f"images_{part}.npy", images)
-    keys = {"ultrasound_near_plane": 0.0, "ultrasound_far_plane": 2.5, "ultrasound_opening_width": 2.0}
-    files = {f"{kind}_file_{part}": f"{kind}_{part}.npy" for kind in ("images", "poses") for part in ("train", "val")}
-    (folder / "conf.json").write_text(json.dumps({**files, **keys}))
-    return folder
-
-
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(app, ["train", *map(str, arguments)])
-
-
-def refused(*arguments: object) -> str:
+def refused_run(*arguments: object) -> str:
     """The one line that a mistake gives."""
-    result = run(*arguments)
+    result = run("train", *arguments)
     assert result.exit_code == 2, result.output
     errors = [line for line in result.stderr.splitlines() if not line.startswith("step ")]
     assert len(errors) == 1
@@ -65,7 +46,7 @@ def refused(*arguments: object) -> str:
 
 def test_trains_a_scene(dataset: Path, tmp_path: Path) -> None:
     output = tmp_path / "scene.ugr"
-    result = run(dataset, "-o", output, *SMALL)
+    result = run("train", dataset, "-o", output, *SMALL)
     assert result.exit_code == 0, result.output
     scene = GaussianScene.load(output)
     assert scene.gaussian_count == 60
@@ -80,7 +61,7 @@ def test_trains_a_scene(dataset: Path, tmp_path: Path) -> None:
     assert pictures[0] == "validation_00000002.png"
     assert pictures[-2:] == ["validation_00000024.png", "validation_truth.png"]
     assert len((folder / "metrics.jsonl").read_text().splitlines()) == 24
-    assert "the run is finished, all 24 steps are done" in refused(dataset, "-o", output, "--resume")
+    assert "the run is finished, all 24 steps are done" in refused_run(dataset, "-o", output, "--resume")
 
 
 def test_settings_come_from_file_set_and_options(dataset: Path, tmp_path: Path) -> None:
@@ -89,7 +70,7 @@ def test_settings_come_from_file_set_and_options(dataset: Path, tmp_path: Path) 
     file.write_text('preset = "paper"\nsteps = 3\nmax_gaussians = 40\nmeans_rate = 3e-4\nquats_rate = 1e-3\n')
     settings = ("--config", file, "--set", "steps=2", "--set", "quats_rate=2e-3", "--set", "start=informed")
     options = ("--seed", 5, "--steps", 1, "--no-transmittance", "--out-of-plane", 0, "--intensity", "sigmoid")
-    result = run(dataset, "-o", tmp_path / "scene.ugr", *settings, *options)
+    result = run("train", dataset, "-o", tmp_path / "scene.ugr", *settings, *options)
     assert result.exit_code == 0, result.output
     training = GaussianScene.load(tmp_path / "scene.ugr").info.training
     assert training.pop("step") == 1
@@ -106,12 +87,12 @@ def test_settings_come_from_file_set_and_options(dataset: Path, tmp_path: Path) 
         intensity="sigmoid",
     )
     assert TrainingConfig.from_dict(training) == expected.resolved(Geometry.of(load_dataset(dataset)))
-    assert run(dataset, "-o", tmp_path / "b.ugr", "--config", file, "--preset", "fast").exit_code == 0
+    assert run("train", dataset, "-o", tmp_path / "b.ugr", "--config", file, "--preset", "fast").exit_code == 0
     assert GaussianScene.load(tmp_path / "b.ugr").info.training["intensity"] == TrainingConfig().intensity
 
 
 def test_a_training_that_cannot_fit_into_its_memory_is_refused(dataset: Path, tmp_path: Path) -> None:
-    told = refused(dataset, "-o", tmp_path / "scene.ugr", *SMALL, "--set", "memory_gb=0.01")
+    told = refused_run(dataset, "-o", tmp_path / "scene.ugr", *SMALL, "--set", "memory_gb=0.01")
     assert "GiB: lower max_gaussians" in told
     assert not (tmp_path / "scene.ugr.run").exists()
 
@@ -122,7 +103,7 @@ def test_says_what_is_missing_without_a_gpu(
 ) -> None:
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
-    told = refused(dataset, "-o", tmp_path / "scene.ugr", *SMALL, *options)
+    told = refused_run(dataset, "-o", tmp_path / "scene.ugr", *SMALL, *options)
     assert "backend cuda needs an NVIDIA GPU and torch's CUDA build, but" in told
     assert not (tmp_path / "scene.ugr.run").exists()
 
@@ -141,12 +122,12 @@ def test_running_out_of_memory_leaves_the_last_good_scene(
 
     monkeypatch.setattr(trainer, "image_loss", loss_that_runs_out)
     output = tmp_path / "scene.ugr"
-    told = refused(dataset, "-o", output, *SMALL, "--checkpoint-every", 0)
+    told = refused_run(dataset, "-o", output, *SMALL, "--checkpoint-every", 0)
     assert "did not suffice after step 5 with 60 Gaussians" in told
     assert f"lower max_gaussians or batch_size; the last good checkpoint is kept in {output}.run" in told
     assert f"{output} is the scene after step 5" in told
     assert GaussianScene.load(output).info.training["step"] == 5
-    assert run(dataset, "-o", output, "--resume").exit_code == 0
+    assert run("train", dataset, "-o", output, "--resume").exit_code == 0
 
 
 def start(*arguments: object) -> subprocess.Popen[str]:
@@ -175,11 +156,11 @@ def test_stopped_run_leaves_a_scene_and_goes_on(dataset: Path, tmp_path: Path, n
     stopped_at = GaussianScene.load(output).info.training["step"]
     assert 5 <= stopped_at < 300
     assert f"stopped after step {stopped_at} of 300; wrote {output} as it is" in told
-    assert "unfinished run: --resume continues it, --force begins anew" in refused(dataset, "-o", output, *small)
-    assert "steps is 300 there, 50 here" in refused(dataset, "-o", output, "--resume", "--steps", 50)
-    resumed = run(dataset, "-o", output, "--resume")  # the settings are those of the run
+    assert "unfinished run: --resume continues it, --force begins anew" in refused_run(dataset, "-o", output, *small)
+    assert "steps is 300 there, 50 here" in refused_run(dataset, "-o", output, "--resume", "--steps", 50)
+    resumed = run("train", dataset, "-o", output, "--resume")  # the settings are those of the run
     assert resumed.exit_code == 0, resumed.output
-    assert run(dataset, "-o", tmp_path / "undisturbed.ugr", *small).exit_code == 0
+    assert run("train", dataset, "-o", tmp_path / "undisturbed.ugr", *small).exit_code == 0
     assert output.read_bytes() == (tmp_path / "undisturbed.ugr").read_bytes()
 
 
@@ -202,6 +183,192 @@ def test_further_signals_do_not_stop_the_scene_from_being_written(dataset: Path,
 
 def test_tensorboard_that_is_missing_is_said(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    told = refused(dataset, "-o", tmp_path / "scene.ugr", *SMALL, "--tensorboard")
+    told = refused_run(dataset, "-o", tmp_path / "scene.ugr", *SMALL, "--tensorboard")
     assert f"TensorBoard is not installed: {install_advice('tensorboard')}" in told
     assert not (tmp_path / "scene.ugr.run").exists()
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in the released layout: a ball in noise, 7 training and 2 held-out frames."""
+    poses = np.tile(np.eye(4), (9, 1, 1))
+    poses[:, 1, 3] = np.linspace(-4.0, 4.0, 9)
+    x, z = np.meshgrid(np.linspace(-1, 1, 16), np.linspace(0, 1, 20))
+    ball = 140.0 * np.exp(-(x**2 + (z - 0.4) ** 2) / 0.1) + 50.0
+    images = np.clip(ball + np.random.default_rng(0).normal(0.0, 4.0, (9, 20, 16)), 0, 255).astype(np.uint8)
+    sweep = Sweep(images, poses, LinearProbe(20.0, 0.0, 25.0), np.arange(9), "ball")
+    folder = tmp_path_factory.mktemp("sweeps") / "ball"
+    write_released(Dataset("ball", sweep.select([0, 1, 3, 4, 5, 7, 8]), sweep.select([2, 6])), folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def scene(dataset: Path) -> Path:
+    config = TrainingConfig.preset("fast", steps=5, max_gaussians=60)
+    train(read_released(dataset), config).save(dataset.parent / "ball.ugr")
+    return dataset.parent / "ball.ugr"
+
+
+def printed_json(*arguments: object) -> Any:
+    result = run(*arguments)
+    assert result.exit_code == 0, result.output
+    return json.loads(result.stdout)
+
+
+def test_eval_prints_what_the_library_measures(dataset: Path, scene: Path) -> None:
+    expected = evaluate(GaussianScene.load(scene), read_released(dataset).val)
+    reliability = measure_reliability(GaussianScene.load(scene), read_released(dataset).val)
+    assert reliability is not None
+    document = printed_json("eval", scene, dataset, "--json")
+    figures = {**expected.to_dict(), "uncertainty": json.loads(json.dumps(reliability.to_dict()))}
+    assert document == {"scene": str(scene), "dataset": "ball", "split": "val", **figures}
+    result = run("eval", scene, dataset)
+    assert result.exit_code == 0
+    mean, std = expected.mean, expected.std
+    assert f"{mean.psnr_db:.2f} ± {std.psnr_db:.2f}" in result.stdout
+    assert f"{mean.gmsd:.3f} ± {std.gmsd:.3f}" in result.stdout
+    assert "1 of its 5 scales" in result.stdout
+    assert f"{expected.speckle.histogram_distance:.4f}" in result.stdout
+    assert "true frames" in result.stdout
+    assert f"{reliability.within_2:.0%} within 2 deviations" in " ".join(result.stdout.split())
+
+
+def test_eval_of_the_training_frames_and_of_others(dataset: Path, scene: Path) -> None:
+    train_part = printed_json("eval", scene, dataset, "--json", "--split", "train")
+    assert train_part["split"] == "train"
+    assert len(train_part["frames"]) == 7
+    assert len(printed_json("eval", scene, dataset, "--json", "--val-frames", "0:3")["frames"]) == 3
+
+
+def test_eval_writes_pictures(dataset: Path, scene: Path, tmp_path: Path) -> None:
+    result = run("eval", scene, dataset, "-o", tmp_path / "pictures", "--json")
+    assert result.exit_code == 0
+    assert len(json.loads(result.stdout)["frames"]) == 2
+    assert len(list((tmp_path / "pictures").glob("frame_*.png"))) == 2
+    assert (tmp_path / "pictures" / "uncertainty.svg").read_text().startswith("<svg")
+
+
+def test_report_of_a_scene(dataset: Path, scene: Path, tmp_path: Path) -> None:
+    page = tmp_path / "page.html"
+    result = run("report", dataset, "-o", page, "--scene", scene, "--no-ablations", "--threads", 1)
+    assert result.exit_code == 0, result.output
+    assert result.stdout == f"wrote {page}\n"
+    mean = evaluate(GaussianScene.load(scene), read_released(dataset).val).mean
+    assert f"{mean.psnr_db:.2f} ±" in page.read_text()
+    assert "Ablations" not in page.read_text()
+
+
+def test_a_scene_of_another_probe_or_of_other_data(dataset: Path, scene: Path, tmp_path: Path) -> None:
+    result = run("eval", scene, dataset, "--json", "--val-frames", "0:3")
+    assert "warning: the scene was trained from other data than ball, or from another split of it" in result.stderr
+    assert run("eval", scene, dataset, "--json").stderr == ""
+    read = read_released(dataset)
+
+    def written(name: str, probe: Probe) -> Path:
+        parts = (replace(part, probe=probe) for part in (read.train, read.val))
+        write_released(Dataset(name, *parts), tmp_path / name)
+        return tmp_path / name
+
+    wide = run("eval", scene, written("wide", LinearProbe(30.0, 0.0, 25.0)), "--json")
+    assert "warning: the scene was trained with a linear probe (width 20 mm" in wide.stderr
+    convex = written("convex", ConvexProbe(60.0, 10.0, 35.0))
+    reported = ("report", convex, "-o", tmp_path / "page.html", "--scene", scene, "--no-ablations")
+    for arguments in (("eval", scene, convex), reported):
+        result = run(*arguments)
+        assert result.exit_code == 2
+        assert "error: convex: its probe is convex, the scene was trained with a linear one" in result.stderr
+
+
+def test_a_dataset_without_held_out_frames_is_refused(dataset: Path, scene: Path, tmp_path: Path) -> None:
+    sweep = read_released(dataset).train
+    write_released(Dataset("alone", sweep, sweep.select([])), tmp_path / "alone")
+    for arguments in (
+        ("eval", scene, tmp_path / "alone"),
+        ("compare", tmp_path / "alone"),
+        ("report", tmp_path / "alone", "-o", tmp_path / "page.html"),
+    ):
+        assert "no frames to measure with" in refused(*arguments)
+
+
+CLASSICAL = ("--methods", "median,linear,nearest")
+
+
+def test_the_table_has_what_the_library_measures(
+    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    expected = evaluate_baselines(read_released(dataset), ("median", "linear", "nearest"))
+    result = run("compare", dataset, *CLASSICAL)
+    assert result.exit_code == 0, result.output
+    assert "ball, 2 val frames" in result.stdout
+    for title, name in {"median compounding, 0.5 mm": "median", "linear between frames": "linear"}.items():
+        mean = expected[name].mean
+        figures = rf"{mean.psnr_db:.2f} +{mean.ms_ssim:.3f} +{mean.gms:.3f} +{mean.gmsd:.3f}"
+        assert re.search(rf"{title} +{figures} +– +\d+\.\d +\d+\.\d +\d+\.\d\d +\d\.\d\d\n", result.stdout), (
+            result.stdout
+        )
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_page_with_its_table_as_json_and_latex(dataset: Path, tmp_path: Path) -> None:
+    page = tmp_path / "ball.html"
+    result = run("compare", dataset, *CLASSICAL, "-o", page)
+    assert result.exit_code == 0, result.output
+    assert "linear between frames" in page.read_text()
+    assert len(json.loads((tmp_path / "ball.json").read_text())["results"]) == 3
+    assert r"\toprule" in (tmp_path / "ball.tex").read_text()
+    assert f"wrote {page}\n" in result.stdout
+
+
+def test_a_comparison_of_which_nothing_could_be_measured_ends_with_an_error(tmp_path: Path) -> None:
+    poses = np.tile(np.eye(4), (4, 1, 1))
+    poses[:, 1, 3] = [0.0, 10_000.0, 20_000.0, 30_000.0]  # mm: no volume of voxels holds that
+    poses[:, 0, 3] = [0.0, 9_000.0, -9_000.0, 18_000.0]
+    images = np.random.default_rng(0).integers(0, 255, (4, 16, 16), dtype=np.uint8)
+    frames = Sweep(images, poses, LinearProbe(20.0, 0.0, 25.0), np.arange(4), "wide")
+    write_released(Dataset("wide", frames.select([0, 1, 3]), frames.select([2])), tmp_path / "wide")
+    result = run("compare", tmp_path / "wide", "--methods", "median-0.25mm")
+    assert result.exit_code == 1
+    assert "voxel" in result.stdout
+    assert run("compare", tmp_path / "wide", "--methods", "median-0.25mm,nearest").exit_code == 0
+
+
+def test_what_is_not_a_comparisons_is_not_replaced(dataset: Path, tmp_path: Path) -> None:
+    page = tmp_path / "ball.html"
+    (tmp_path / "ball.tex").write_text("a paper")
+    assert f"{tmp_path / 'ball.tex'} exists: --force replaces it" in refused("compare", dataset, *CLASSICAL, "-o", page)
+    (tmp_path / "ball.tex").unlink()
+    (tmp_path / "ball.html.run").mkdir()
+    (tmp_path / "ball.html.run" / "thesis.txt").write_text("all of it")
+    assert "holds no comparison" in refused("compare", dataset, *CLASSICAL, "-o", page, "--force")
+    assert (tmp_path / "ball.html.run" / "thesis.txt").exists()
+    assert "output must end in .html" in refused("compare", dataset, *CLASSICAL, "-o", tmp_path / "ball.pdf")
+
+
+@pytest.mark.long
+def test_ctrl_c_stops_it_and_the_same_command_goes_on(dataset: Path, tmp_path: Path) -> None:
+    page = tmp_path / "ball.html"
+    arguments = ("compare", dataset, "--methods", "scene,nearest", "-o", page, "--threads", 1)
+    program = "from ultragray_service.cli.app import app; app()"
+    process = subprocess.Popen(
+        python(program, *arguments), stderr=subprocess.PIPE, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"}
+    )
+    journal, deadline = tmp_path / "ball.html.run" / "scene" / JOURNAL_FILE, Deadline(60)
+    while not journal.exists() or journal.read_bytes().count(b"\n") < 5:
+        assert process.poll() is None, "the comparison ended early"
+        assert not deadline.passed
+        time.sleep(0.005)
+    process.send_signal(signal.SIGINT)
+    _, told = process.communicate(timeout=60)
+    assert process.returncode == 130, told
+    stopped = re.search(
+        r"^stopped at scene, method 1 of 2, after step ([\d,]+) of [\d,]+; go on with the same command$", told, re.M
+    )
+    assert stopped, told
+    assert not page.exists()
+    step = int(stopped[1].replace(",", ""))
+    assert run(*arguments).exit_code == 0
+    steps = [json.loads(line)["step"] for line in journal.read_text().splitlines()]
+    assert steps == list(range(1, len(steps) + 1)), "steps were done twice"
+    assert len(steps) > step
+    assert "nearest training frame" in page.read_text()

@@ -11,12 +11,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from ultragray import LinearProbe
-from ultragray.datasets import Dataset, Sweep
-from ultragray.datasets.released import write_released
 from ultragray.phantom.demo import copy_demo_scene
 
-from .command_line import python, run
+from .command_line import noise_sweep, python, run
 
 SOURCES = str(Path(__file__).resolve().parents[3])
 NOBODY = "http://127.0.0.1:9"  # the port of `discard`, where nobody listens
@@ -200,11 +197,7 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder with a scene, a sweep, and files that are something else."""
     folder = tmp_path_factory.mktemp("place")
     copy_demo_scene(folder / "scene.ugr")
-    images = np.random.default_rng(0).integers(0, 250, (10, 20, 16), dtype=np.uint8)
-    poses = np.tile(np.eye(4), (10, 1, 1))
-    poses[:, 1, 3] = np.arange(10)
-    sweep = Sweep(images, poses, LinearProbe(40.0, 0.0, 50.0), np.arange(10), "sweep")
-    write_released(Dataset("sweep", sweep.select(range(8)), sweep.select([8, 9])), folder / "sweep")
+    noise_sweep(folder / "sweep")
     np.save(folder / "pose.npy", np.eye(4))
     for name in ("notes.txt", "notes.ugr", "notes.ply", "notes.pt", "kept.npz"):
         (folder / name).write_text("some notes, long enough to be looked at")
