@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import zipfile
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -85,14 +84,6 @@ def test_the_life_of_a_dataset(client: Any, folder: Path, name: str) -> None:
     client.datasets.delete(name)
     with pytest.raises(errors.DatasetNotFound):
         client.datasets.delete(name)
-
-
-def test_an_archive_is_a_dataset_too(client: Any, folder: Path, name: str, tmp_path: Path) -> None:
-    with zipfile.ZipFile(tmp_path / "tiny.zip", "w") as archive:
-        for path in folder.iterdir():
-            archive.write(path, path.name)
-    assert client.datasets.upload(name, tmp_path / "tiny.zip").train_frames == 8
-    client.datasets.delete(name)
 
 
 def test_uploads_that_are_refused(client: Any, folder: Path, name: str, tmp_path: Path) -> None:

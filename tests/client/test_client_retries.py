@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 import socket
-import threading
 from typing import Any
 
-import numpy as np
 import pytest
 
-from ultragray_client import RenderSettings, connection, errors
+from ultragray_client import connection, errors
 from ultragray_client.connection import Retries
-
-from ..service.conftest import RunningService, StartService
-from .test_client_render import moved
 
 
 def test_pauses_grow_after_the_delay_that_the_service_told() -> None:
@@ -91,63 +86,3 @@ def test_nobody_there_is_told_in_time(make_client: Any) -> None:
     client = make_client(f"127.0.0.1:{free_port()}")
     with pytest.raises(errors.Unreachable, match="no service answers at 127"):
         client.scenes.list(timeout_s=1.0)
-
-
-@pytest.mark.long
-def test_a_service_that_comes_late_is_found(make_client: Any, start_service: StartService) -> None:
-    port = free_port()
-    client = make_client(f"127.0.0.1:{port}", timeout_s=60.0)
-    service: list[RunningService] = []
-    starting = threading.Thread(target=lambda: service.append(start_service(grpc_port=port)))
-    starting.start()
-    assert client.render("demo", moved(0.0), RenderSettings(height=8, width=8))["bmode"].shape == (8, 8)
-    starting.join()
-    service[0].terminate()
-
-
-@pytest.mark.long
-def test_a_batch_goes_on_where_a_service_is_restarted(make_client: Any, start_service: StartService) -> None:
-    first = start_service()
-    port = int(first.grpc.rpartition(":")[2])
-    client = make_client(first.grpc, timeout_s=60.0)
-    shifts = np.linspace(-4, 4, 1500)
-    second: list[RunningService] = []
-
-    def restart() -> None:
-        first.terminate()
-        second.append(start_service(grpc_port=port))
-
-    restarting = threading.Thread(target=restart)
-    frames = []
-    for frame in client.render_batch("demo", map(moved, shifts), RenderSettings(height=150, width=150)):
-        frames.append(frame)
-        if len(frames) == 10:
-            restarting.start()
-    restarting.join()
-    second[0].terminate()
-    assert [frame.sequence for frame in frames] == list(range(1500))
-    assert [frame.pose[0, 3] for frame in frames] == shifts.tolist()
-    records = [record for record in second[0].log() if record.get("method", "").endswith("RenderBatch")]
-    assert records, "the first service must not have rendered them all"
-
-
-@pytest.mark.long
-def test_a_full_queue_is_asked_again(make_client: Any, start_service: StartService) -> None:
-    service = start_service(queue_limit_frames=1)
-    client = make_client(service.grpc, timeout_s=60.0)
-    results: list[Any] = []
-
-    def render() -> None:
-        results.append(
-            client.render("demo", moved(0.0), RenderSettings(height=600, width=600, outputs=("bmode", "echo")))
-        )
-
-    threads = [threading.Thread(target=render) for _ in range(5)]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    assert len(results) == 5
-    refused = [record for record in service.log() if record.get("status") == "RESOURCE_EXHAUSTED"]
-    assert refused, "the queue was never full"
-    service.terminate()

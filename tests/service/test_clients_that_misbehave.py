@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import json
 import threading
 import time
@@ -17,8 +16,7 @@ from websockets.sync.client import connect
 
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
 
-from ..waiting import wait_until
-from .conftest import RunningService, StartService
+from .conftest import RunningService
 
 IDENTITY = geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=np.eye(4).ravel().tolist()))
 LARGE = rendering_pb2.RenderSettings(
@@ -76,24 +74,6 @@ def test_a_stream_whose_reader_stops_waits_for_him(service: RunningService, rend
     assert until_calm(service) - frames_before < 100
     assert service.resident_bytes() - before < CALM_BYTES
     call.cancel()
-
-
-@pytest.mark.long
-def test_readers_that_stop_hold_little_and_give_it_back(start_service: StartService) -> None:
-    service = start_service()
-    large = {"height": 2048, "width": 2048, "encoding": "float32"}  # 16 MB a frame
-    address = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/demo/stream"
-    before = service.resident_bytes()
-    with contextlib.ExitStack() as opened:
-        for _ in range(3):
-            connection = opened.enter_context(
-                connect(address, compression=None, max_size=None, max_queue=1, close_timeout=0.2)
-            )
-            for _ in range(10):
-                connection.send(json.dumps({"settings": large, "pose": {"matrix": np.eye(4).tolist()}}))
-        until_calm(service)
-        assert service.resident_bytes() - before < 3 * 6 * 16 * 2**20  # two frames each, and the copies of one
-    wait_until(lambda: service.resident_bytes() - before <= 2 * 16 * 2**20, every_s=0.2)
 
 
 def test_many_mistakes_at_once_do_not_stop_a_stream(service: RunningService) -> None:

@@ -20,14 +20,12 @@ from ultragray_proto.v1 import (
     geometry_pb2,
     rendering_pb2,
     rendering_pb2_grpc,
-    scenes_pb2,
-    scenes_pb2_grpc,
 )
 
 from .conftest import HEIGHT, WIDTH, RunningService
 
 MODEL = ConfidenceModel((3.5, 1.2, 0.8, 0.1, 0.6), 0.06, (0.0,) * 5, 20, 0.04)
-NEAR, BESIDE, FAR = 2.0, 4.5, 20.0  # of the training views from 0 to 4 mm in elevation
+NEAR, FAR = 2.0, 20.0  # of the training views from 0 to 4 mm in elevation
 
 
 def at(y: float) -> Any:  # [4, 4] mm
@@ -94,25 +92,6 @@ def test_poses_below_the_limit_are_refused(client: httpx.Client) -> None:
     assert client.post("knowing/render", json=body(FAR, min_confidence=1.5)).json()["field"] == "min_confidence"
 
 
-def test_or_masked_and_stay_black_whatever_the_gain(client: httpx.Client, knowing: GaussianScene) -> None:
-    fields = {"outputs": ["bmode", "coverage"], "dtype": "float32", "min_confidence": 0.93}
-    masking = body(NEAR, BESIDE, FAR, below_min_confidence="mask", **fields)
-    answer = client.post("knowing/render", json=masking, headers={"Accept": "application/octet-stream"})
-    bmode, coverage = np.frombuffer(answer.content, "<f4").reshape(2, 3, HEIGHT, WIDTH)
-    confidences = [float(text) for text in answer.headers["X-Ultragray-Confidence"].split(",")]
-    assert confidences[0] > 0.93 > confidences[1]
-    frames = render(knowing, None, np.stack([at(NEAR), at(BESIDE), at(FAR)]), height=HEIGHT, width=WIDTH)
-    np.testing.assert_allclose(bmode[0], frames["bmode"][0].numpy(), atol=1e-6)
-    supported = coverage[1:] >= 0.3
-    assert 0.01 < supported[0].mean() < 0.99
-    assert (bmode[1:][~supported] == 0).all()
-    np.testing.assert_allclose(bmode[1:][supported], frames["bmode"][1:].numpy()[supported], atol=1e-6)
-    loud = client.post("knowing/render", json={**masking, "display": {"gain_db": 30.0, "flip": True}})
-    bmode, coverage = np.frombuffer(loud.content, "<f4").reshape(2, 3, HEIGHT, WIDTH)[:, 1]
-    assert (bmode[coverage < 0.3] == 0).all()
-    assert bmode[coverage >= 0.3].min() >= 0.5  # 30 dB above the darkest of 60 dB
-
-
 def test_grpc(knowing_service: RunningService) -> None:
     settings = rendering_pb2.RenderSettings(scene="knowing", min_confidence=0.5)
 
@@ -132,28 +111,3 @@ def test_grpc(knowing_service: RunningService) -> None:
         settings.below_min_confidence = 7
         with pytest.raises(grpc.RpcError, match="BELOW_CONFIDENCE_MASK"):
             stub.Render(rendering_pb2.RenderRequest(settings=settings, pose=pose(NEAR)))
-
-
-def test_a_scene_tells_how_well_it_knows(client: httpx.Client, knowing_service: RunningService) -> None:
-    assert client.get("knowing").json()["confidence"] == {"error": 0.04, "fitted_on": 20}
-    assert client.get("demo").json()["confidence"] is None
-    with knowing_service.channel() as channel:
-        stub = scenes_pb2_grpc.SceneServiceStub(channel)
-        scene = stub.GetScene(scenes_pb2.GetSceneRequest(scene="knowing"))
-        assert (scene.confidence.error, scene.confidence.fitted_on) == (0.04, 20)
-        assert not stub.GetScene(scenes_pb2.GetSceneRequest(scene="demo")).HasField("confidence")
-
-
-def test_render_jobs(knowing_service: RunningService) -> None:
-    def ask(scene: str, *elevations_mm: float) -> httpx.Response:
-        poses = [at(y).tolist() for y in elevations_mm]
-        specification = {"scene": scene, "min_confidence": 0.5, "poses": poses}
-        return http.post("/v1/jobs", json={"kind": "render", "specification": specification})
-
-    with httpx.Client(base_url=knowing_service.http, timeout=60) as http:
-        for answer, reason, field in (
-            (ask("knowing", NEAR, FAR), "LOW_CONFIDENCE", "specification.poses[1]"),
-            (ask("demo", NEAR), "INVALID_ARGUMENT", "specification.min_confidence"),
-        ):
-            assert (answer.json()["reason"], answer.json()["field"]) == (reason, field)
-        assert ask("knowing", NEAR, NEAR).json()["specification"]["min_confidence"] == 0.5

@@ -145,15 +145,6 @@ def test_each_mistake_gets_one_error(
     assert told in problem["detail"]
 
 
-def test_a_picture_that_says_it_is_huge_takes_no_memory(http: httpx.Client, png: bytes) -> None:
-    huge = png[:16] + (60_000).to_bytes(4, "big") * 2 + png[24:]
-    answer = http.post("/v1/scenes/spine:localize", json=body(huge))
-    assert answer.status_code == 422
-    assert "from 1 to 4096" in answer.json()["detail"]
-    damaged = http.post("/v1/scenes/spine:localize", json=body(png[:200]))
-    assert "damaged PNG" in damaged.json()["detail"]
-
-
 def test_a_search_ends_at_its_deadline_and_with_its_caller(http: httpx.Client, png: bytes) -> None:
     late = http.post("/v1/scenes/spine:localize", json=body(png, timeout_ms=1))
     assert late.status_code == 504

@@ -109,42 +109,6 @@ def test_a_slow_import_takes_no_training_over(
 
 
 @pytest.mark.long
-def test_a_training_takes_no_scene_over_that_is_being_imported(
-    keyed: Keyed, database: JobDatabase, dataset: str, scene_bytes: bytes
-) -> None:
-    answers: list[tuple[int, str]] = []
-    with ThreadPoolExecutor(1) as executor:
-        path = "/v1/scenes/knee?private=true"
-        importing = executor.submit(keyed.http, "bob", "PUT", path, content=scene_bytes)
-        wait_until(lambda: owner_of(database, "scene", "knee") == "bob")
-        answer = train(keyed, "alice", dataset, "knee", private=True)
-        answers.append((answer.status_code, answer.json().get("reason", "")))
-    assert importing.result().status_code == 201
-    assert answers == [(409, "SCENE_EXISTS")]
-    assert owner_of(database, "scene", "knee") == "bob"
-    assert keyed.http("bob", "GET", "/v1/scenes/knee").json()["private"] is True
-
-
-@pytest.mark.long
-def test_of_two_uploads_of_one_dataset_the_first_to_finish_owns_it(
-    keyed: Keyed, database: JobDatabase, dataset_bytes: bytes
-) -> None:
-    def put(who: str) -> httpx.Response:
-        url = f"{keyed.service.http}/v1/datasets/race?private=true"
-        return httpx.put(url, content=dataset_bytes, headers=keyed.headers(who), timeout=120)
-
-    with ThreadPoolExecutor(4) as executor:
-        answers = dict(zip("abcd", executor.map(put, ("alice", "bob", "alice", "bob")), strict=True))
-    statuses = sorted(answer.status_code for answer in answers.values())
-    assert statuses == [200, 201, 409, 409], [answer.text for answer in answers.values()]
-    (made,) = (answer.json() for answer in answers.values() if answer.status_code == 201)
-    assert owner_of(database, "dataset", "race") == made["owner"]
-    (other,) = {"alice", "bob"} - {made["owner"]}
-    assert keyed.http(made["owner"], "GET", "/v1/datasets/race").status_code == 200
-    assert keyed.http(other, "GET", "/v1/datasets/race").status_code == 404
-
-
-@pytest.mark.long
 def test_a_claim_that_a_dead_service_left_keeps_nobody_out(
     keyed: Keyed, database: JobDatabase, dataset: str, scene_bytes: bytes, dataset_bytes: bytes
 ) -> None:
@@ -176,19 +140,5 @@ def test_an_upload_that_fails_leaves_no_claim(keyed: Keyed, database: JobDatabas
     path = put_file(keyed, "broken")
     try:
         assert keyed.http("reader", "GET", "/v1/scenes/broken").status_code == 200
-    finally:
-        path.unlink()
-
-
-@pytest.mark.long
-def test_a_training_that_is_cancelled_leaves_no_claim(keyed: Keyed, database: JobDatabase, dataset: str) -> None:
-    job = train(keyed, "alice", dataset, "given-up", private=True).json()["id"]
-    assert owner_of(database, "scene", "given-up") == "alice"
-    path = put_file(keyed, "given-up")
-    try:
-        wait_until(lambda: keyed.http("reader", "GET", "/v1/scenes/given-up").status_code == 404)
-        assert keyed.http("alice", "POST", f"/v1/jobs/{job}:cancel").status_code == 200
-        assert owner_of(database, "scene", "given-up") is None
-        wait_until(lambda: keyed.http("reader", "GET", "/v1/scenes/given-up").status_code == 200)
     finally:
         path.unlink()

@@ -78,23 +78,6 @@ def test_a_frame_as_a_picture(server: RunningService, tmp_path: Path) -> None:
     assert picture.read_bytes() != before
 
 
-def test_frames_of_poses_in_one_archive_are_those_that_are_rendered_here(
-    server: RunningService, tmp_path: Path
-) -> None:
-    poses = np.tile(np.eye(4), (3, 1, 1))
-    poses[:, 1, 3] = [0.0, 1.5, 3.0]
-    np.save(tmp_path / "poses.npy", poses)
-    asked = ("--poses", tmp_path / "poses.npy", "--height", 24, "--width", 20, "--outputs", "bmode,echo")
-    done(server, "scenes", "render", "demo", "-o", tmp_path / "there.npz", *asked)
-    done(server, "scenes", "download", "demo", "-o", tmp_path / "demo.ugr")
-    done(server, "render", tmp_path / "demo.ugr", "-o", tmp_path / "here.npz", *asked)
-    with np.load(tmp_path / "there.npz") as there, np.load(tmp_path / "here.npz") as here:
-        assert there["bmode"].shape == (3, 24, 20)
-        np.testing.assert_array_equal(there["poses"], poses)
-        for name in ("bmode", "echo"):
-            np.testing.assert_allclose(there[name], here[name], atol=1e-5)
-
-
 def test_a_sampler_makes_a_folder_of_pictures(server: RunningService, tmp_path: Path) -> None:
     folder = tmp_path / "pictures"
     sampled = ("--sampler", "training", "--height", 8, "--width", 8, "--outputs", "bmode,transmittance")

@@ -54,13 +54,6 @@ def test_render_writes_an_npz_that_can_be_replayed(scene_file: Path, pose_file: 
             np.testing.assert_allclose(frames[name], getattr(again, name).numpy(), atol=1e-6)
 
 
-def test_shards_need_an_engine_that_exists(scene_file: Path, tmp_path: Path) -> None:
-    made = ("render", scene_file, "-o", tmp_path / "made", "--sampler", "around", "--count", 20)
-    assert "--shard-frames is of shards: name an engine with --on" in refused(*made, "--shard-frames", 5)
-    assert "on must be ray or ray://HEAD:PORT, got 'spark'" in refused(*made, "--on", "spark")
-    assert "count 100,001 is more than the 100,000 poses" in refused(*made[:-1], 100_001)
-
-
 def test_without_poses_the_training_views_are_rendered_as_trained(scene_file: Path, tmp_path: Path) -> None:
     assert run("render", scene_file, "-o", tmp_path / "f.npz").exit_code == 0
     with np.load(tmp_path / "f.npz") as frames:

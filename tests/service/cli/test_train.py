@@ -1,4 +1,4 @@
-"""`ultragray train`, `eval`, `report` and `compare`: from frames to a scene, figures and pages; what is stopped goes on."""
+"""`ultragray train`, `eval`, `report` and `compare`: a scene, figures and pages of frames; what is stopped goes on."""
 
 from __future__ import annotations
 
@@ -26,10 +26,9 @@ from ultragray.learn.evaluation.baselines import evaluate_baselines
 from ultragray.learn.evaluation.scoring import evaluate, measure_reliability
 from ultragray.learn.training import TrainingConfig, train, trainer
 from ultragray.learn.training.geometry import Geometry
-from ultragray.learn.training.trainer import JOURNAL_FILE
 
 from ...waiting import Deadline
-from .command_line import python, refused, run
+from .command_line import refused, run
 
 SMALL = ("--steps", 24, "--max-gaussians", 60, "--threads", 1)
 
@@ -343,32 +342,3 @@ def test_what_is_not_a_comparisons_is_not_replaced(dataset: Path, tmp_path: Path
     assert "holds no comparison" in refused("compare", dataset, *CLASSICAL, "-o", page, "--force")
     assert (tmp_path / "ball.html.run" / "thesis.txt").exists()
     assert "output must end in .html" in refused("compare", dataset, *CLASSICAL, "-o", tmp_path / "ball.pdf")
-
-
-@pytest.mark.long
-def test_ctrl_c_stops_it_and_the_same_command_goes_on(dataset: Path, tmp_path: Path) -> None:
-    page = tmp_path / "ball.html"
-    arguments = ("compare", dataset, "--methods", "scene,nearest", "-o", page, "--threads", 1)
-    program = "from ultragray_service.cli.app import app; app()"
-    process = subprocess.Popen(
-        python(program, *arguments), stderr=subprocess.PIPE, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"}
-    )
-    journal, deadline = tmp_path / "ball.html.run" / "scene" / JOURNAL_FILE, Deadline(60)
-    while not journal.exists() or journal.read_bytes().count(b"\n") < 5:
-        assert process.poll() is None, "the comparison ended early"
-        assert not deadline.passed
-        time.sleep(0.005)
-    process.send_signal(signal.SIGINT)
-    _, told = process.communicate(timeout=60)
-    assert process.returncode == 130, told
-    stopped = re.search(
-        r"^stopped at scene, method 1 of 2, after step ([\d,]+) of [\d,]+; go on with the same command$", told, re.M
-    )
-    assert stopped, told
-    assert not page.exists()
-    step = int(stopped[1].replace(",", ""))
-    assert run(*arguments).exit_code == 0
-    steps = [json.loads(line)["step"] for line in journal.read_text().splitlines()]
-    assert steps == list(range(1, len(steps) + 1)), "steps were done twice"
-    assert len(steps) > step
-    assert "nearest training frame" in page.read_text()

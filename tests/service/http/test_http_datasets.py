@@ -196,12 +196,6 @@ def test_separate_files_and_options(http: httpx.Client, files: dict[str, bytes])
     http.delete("/v1/datasets/parts")
 
 
-def test_what_cannot_be_used_is_refused_with_the_frame(http: httpx.Client, files: dict[str, bytes]) -> None:
-    answer = put(http, "bad", zipped(poisoned_files(files)))
-    assert_problem(answer, 422, "DATASET_INVALID", "folder/poses_train.npy: frame 5: its pose")
-    assert http.get("/v1/datasets").json() == {"datasets": [], "next_page_token": ""}
-
-
 def test_limits(http: httpx.Client) -> None:
     def chunks() -> Iterator[bytes]:
         for _ in range(LIMIT_BYTES // 1000 + 1):

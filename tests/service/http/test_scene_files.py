@@ -5,9 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import socket
-import time
 from collections.abc import Iterator
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -195,21 +193,6 @@ def test_what_did_not_change_is_not_sent_again(http: httpx.Client, artifacts: Pa
     for path in ("/v1/scenes/kept/gaussians", "/v1/scenes/kept/training-poses"):
         assert http.get(path, headers={"If-None-Match": first.headers["etag"]}).status_code == 200
     assert http.delete("/v1/scenes/kept").status_code == 204
-
-
-@pytest.mark.long
-def test_a_scene_deleted_during_its_first_frame_leaves_no_memory(http: httpx.Client, service: RunningService) -> None:
-    sent = make_scene(3000, probe=DEMO_PROBE, seed=7).to_bytes()
-    assert http.put("/v1/scenes/brief", content=sent, headers=RAW).status_code == 201
-    loaded = http.get("/v1/statistics").json()["loaded_scenes"]
-    large = {"pose": POSE, "height": 2048, "width": 2048, "outputs": ["bmode", "transmittance"]}
-    with ThreadPoolExecutor() as threads:
-        rendering = threads.submit(http.post, "/v1/scenes/brief/render", json=large)
-        wait_until(lambda: http.get("/v1/statistics").json()["busy_processes"])
-        time.sleep(0.05)  # the file is read, the frame is not rendered
-        assert http.delete("/v1/scenes/brief").status_code == 204
-        assert rendering.result().status_code == 200
-    assert http.get("/v1/statistics").json()["loaded_scenes"] == loaded
 
 
 def test_who_stops_during_the_check_gets_no_scene(service: RunningService, http: httpx.Client, artifacts: Path) -> None:

@@ -106,13 +106,6 @@ def begun() -> Iterator[Iterator[Message]]:
     is_over.set()
 
 
-def test_an_upload_that_comes_to_a_halt(
-    datasets: datasets_pb2_grpc.DatasetServiceStub, begun: Iterator[Message]
-) -> None:
-    code, reason, _ = refusal(datasets.UploadDataset, begun, metadata=METADATA, timeout=60)
-    assert (code, reason) == (grpc.StatusCode.DEADLINE_EXCEEDED, "DEADLINE_EXCEEDED")
-
-
 def test_a_client_that_goes_away(
     datasets: datasets_pb2_grpc.DatasetServiceStub, service: RunningService, artifacts: Path, begun: Iterator[Message]
 ) -> None:

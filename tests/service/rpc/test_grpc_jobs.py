@@ -120,18 +120,6 @@ def test_log_and_artifacts_of_a_job(start_service: StartService, tmp_path: Path)
         assert refusal(lambda: jobs.GetJobLog(log_request)) == ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "max_bytes")
 
 
-def test_a_watch_tells_every_state_and_ends_with_the_last(jobs: jobs_pb2_grpc.JobServiceStub) -> None:
-    job = jobs.SubmitJob(training_poses()).job
-    watch = jobs.WatchJob(jobs_pb2.WatchJobRequest(job=job.id), timeout=WAIT_S)
-    assert next(watch).job.state == jobs_pb2.JOB_STATE_QUEUED
-    jobs.CancelJob(jobs_pb2.CancelJobRequest(job=job.id))
-    assert [event.job.state for event in watch] == [jobs_pb2.JOB_STATE_CANCELLED]
-    again = jobs.WatchJob(jobs_pb2.WatchJobRequest(job=job.id), timeout=WAIT_S)
-    assert [event.job.state for event in again] == [jobs_pb2.JOB_STATE_CANCELLED]
-    gone = jobs_pb2.WatchJobRequest(job="0" * 24)
-    assert refusal(lambda: next(jobs.WatchJob(gone))) == ("NOT_FOUND", "JOB_NOT_FOUND", "job")
-
-
 def test_a_stopping_service_tells_its_watchers_to_come_again(start_service: StartService, tmp_path: Path) -> None:
     service = start_service(artifact_folder=tmp_path)
     with service.channel() as channel:

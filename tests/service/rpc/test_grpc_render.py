@@ -12,10 +12,9 @@ import pytest
 from google.rpc.error_details_pb2 import BadRequest, ErrorInfo
 from google.rpc.status_pb2 import Status
 
-from ultragray import GaussianScene, render
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
 
-from ..conftest import HEIGHT, WIDTH
+from ..conftest import HEIGHT
 
 Stub = rendering_pb2_grpc.RenderServiceStub
 TIMEOUT_S = 120
@@ -49,18 +48,6 @@ def matrix_pose(matrix: Any) -> geometry_pb2.Pose:
     return geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=np.asarray(matrix).ravel().tolist()))
 
 
-def expected(scene: GaussianScene, x_mm: float) -> Any:
-    pose = np.eye(4)
-    pose[0, 3] = x_mm
-    frames = render(scene, None, pose, height=HEIGHT, width=WIDTH, outputs=("bmode",))
-    assert frames.bmode is not None
-    return frames.bmode[0].numpy()
-
-
-def pixels(frame: rendering_pb2.Frame) -> Any:
-    return np.frombuffer(frame.data, np.uint8).reshape(frame.height, frame.width) / 255
-
-
 class Conversation:
     """A stream whose messages are sent one by one."""
 
@@ -87,18 +74,6 @@ def conversation(renders: Stub) -> Iterator[Conversation]:
     conversation = Conversation(renders)
     yield conversation
     conversation.finish()
-
-
-def test_a_stream_answers_in_order_and_echoes_sequences(
-    conversation: Conversation, demo_scene: GaussianScene, settings_message: Any
-) -> None:
-    sequences = [2**63 + k for k in range(50)]
-    conversation.send(settings=settings_message)
-    for k, sequence in enumerate(sequences):
-        conversation.send(sequence, pose=moved(k / 10))
-    frames = conversation.finish()
-    assert [frame.sequence for frame in frames] == sequences
-    assert np.abs(pixels(frames[30]) - expected(demo_scene, 3.0)).max() <= 1.001 / 255
 
 
 def test_a_stream_is_a_dialogue_whose_settings_may_change(conversation: Conversation, settings_message: Any) -> None:

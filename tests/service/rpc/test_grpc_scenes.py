@@ -27,17 +27,6 @@ from .test_grpc_render import error_info
 Stub = scenes_pb2_grpc.SceneServiceStub
 
 
-def test_list_pages_and_tells_bad_files(scenes: Stub) -> None:
-    first = scenes.ListScenes(scenes_pb2.ListScenesRequest(page_size=2))
-    rest = scenes.ListScenes(scenes_pb2.ListScenesRequest(page_token=first.next_page_token))
-    names = [entry.name for entry in (*first.scenes, *rest.scenes)]
-    assert names == ["demo", "empty", "foreign", "probeless", "second", "truncated"]
-    assert first.scenes[0].gaussian_count == 400
-    assert not first.scenes[0].HasField("error")
-    assert first.scenes[1].error.reason == "SCENE_FILE_INVALID"
-    assert rest.next_page_token == ""
-
-
 @pytest.mark.parametrize(
     ("scene", "code", "reason"),
     [

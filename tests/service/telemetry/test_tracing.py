@@ -15,7 +15,7 @@ from opentelemetry.proto.collector.trace.v1.trace_service_pb2 import ExportTrace
 from opentelemetry.proto.trace.v1.trace_pb2 import Span, Status
 
 from ultragray.errors import InvalidArgument
-from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
+from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 from ultragray_service.telemetry.logs import start_tracing
 
 from ...waiting import wait_until
@@ -93,21 +93,6 @@ def test_request_of_http_is_a_span_with_the_stages_of_the_pool_below(
     assert {name for name, span in found.items() if span.parent_span_id == door.span_id} == STAGES
     assert all(span.start_time_unix_nano <= span.end_time_unix_nano for span in found.values())
     assert [record["trace_id"] for record in traced.log() if record.get("request_id") == "scan-7"] == [TRACE]
-
-
-def test_call_of_grpc_is_a_span_with_the_stages_of_the_pool_below(
-    traced: RunningService,
-    collector: Collector,
-    settings_message: rendering_pb2.RenderSettings,
-    pose_message: geometry_pb2.Pose,
-) -> None:
-    with traced.channel() as channel:
-        request = rendering_pb2.RenderRequest(settings=settings_message, pose=pose_message)
-        rendering_pb2_grpc.RenderServiceStub(channel).Render(request, metadata=tuple(CALLER.items()), timeout=60)
-    found = wait_until(lambda: collector.whole_trace(len(STAGES) + 1))
-    door = found["ultragray.v1.RenderService/Render"]
-    assert door.parent_span_id.hex() == PARENT
-    assert {name for name, span in found.items() if span.parent_span_id == door.span_id} == STAGES
 
 
 def test_refused_request_is_a_span_that_failed(traced: RunningService, collector: Collector) -> None:

@@ -251,12 +251,3 @@ def test_one_helper_process_at_a_time(tmp_path: Path, wanted: Wanted, monkeypatc
 
     asyncio.run(ask())
     assert len(started) == 4
-
-
-@pytest.mark.long
-def test_another_service_may_be_quicker(tmp_path: Path, wanted: Wanted) -> None:
-    async def ask() -> list[Path]:
-        return await asyncio.gather(*(views(tmp_path).path("key", **wanted) for _ in range(2)))
-
-    assert asyncio.run(ask()) == [tmp_path / "views" / "key"] * 2
-    assert names(tmp_path) == ["key"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -22,7 +21,6 @@ from ..conftest import StartService
 from ..http.test_http_comparison import DATASET
 from ..http.test_http_datasets import zipped
 
-WAIT_S = 90.0
 STEPS = 40_000  # more than are done here
 
 
@@ -73,21 +71,6 @@ def test_the_curve_of_a_finished_training_and_of_other_jobs(http: httpx.Client) 
     assert http.get(f"/v1/jobs/{other}/curve").json() == {"points": [], "baselines": {}}
     assert http.get(f"/v1/jobs/{other}/preview").json()["reason"] == "ARTIFACT_NOT_FOUND"
     assert http.get("/v1/jobs/0123/curve").json()["reason"] == "JOB_NOT_FOUND"
-
-
-@pytest.mark.long
-def test_the_phases_of_a_training_and_the_time_left_until_its_end(http: httpx.Client) -> None:
-    job = train(http, "phased", steps=150, max_gaussians=50, confidence=False)
-    told: dict[str, float | None] = {}
-    with http.stream("GET", f"/v1/jobs/{job}/events") as answer:
-        for line in answer.iter_lines():
-            if line.startswith("data: {"):
-                progress = json.loads(line.removeprefix("data: "))["progress"]
-                told[progress["phase"]] = progress["seconds_left"]
-    assert told.keys() >= {"training", "report"}
-    assert told["report"] is not None  # it is not yet done when its steps are
-    assert told["report"] > 1.0
-    assert http.get(f"/v1/jobs/{job}").json()["progress"]["phase"] is None
 
 
 @pytest.mark.long
