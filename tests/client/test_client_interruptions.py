@@ -59,7 +59,7 @@ def test_a_watch_goes_on(far_client: Any, client: Any, proxy: Proxy) -> None:
     events = far_client.jobs.watch(job.id)
     assert next(events).job.id == job.id
     proxy.cut_after(0)
-    cancel = threading.Timer(1.5, client.jobs.cancel, (job.id,))
+    cancel = threading.Timer(0.5, client.jobs.cancel, (job.id,))
     cancel.start()
     assert [event.job.state for event in events if event.job][-1] is JobState.CANCELLED
     cancel.join()  # its answer may come after the event

@@ -104,13 +104,11 @@ def test_a_stream_with_shared_memory_goes_on_with_new_memory(far_client: Any, pr
         np.testing.assert_array_equal(frame["bmode"], pixels)
 
 
-@pytest.mark.parametrize("mode", ["ordered", "latest"])
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
+@pytest.mark.parametrize(("number", "mode"), [(signal.SIGKILL, "ordered"), (signal.SIGTERM, "latest")])
 def test_a_stream_goes_on_at_another_service(
     make_client: Callable[..., Any], start_service: StartService, number: signal.Signals, mode: str
 ) -> None:
     first, second = start_service(), start_service()
-    second_data = second.data_folder
     proxy = Proxy(first.grpc)
     client = make_client(proxy.address, timeout_s=60.0)
     with client.stream("demo", SMALL, mode=mode) as stream:
@@ -126,7 +124,6 @@ def test_a_stream_goes_on_at_another_service(
             frames.append(stream.receive())
         stream.send(moved(7.0))
         frames.append(stream.receive())
-    assert second_data == first.data_folder
     assert [frame.sequence for frame in frames] == list(range(6, 6 + len(frames)))
     assert [frame.pose[0, 3] for frame in frames] == [5.0, *[6.0] * (len(frames) - 2), 7.0]
     proxy.close()
@@ -136,7 +133,7 @@ def test_a_stream_goes_on_at_another_service(
 def test_patience_ends(make_client: Callable[..., Any], client_service: RunningService, mode: str) -> None:
     proxy = Proxy(client_service.grpc)
     client = make_client(proxy.address, api_key=KEY)
-    with client.stream("demo", SMALL, mode=mode, reconnect_s=1.0) as stream:
+    with client.stream("demo", SMALL, mode=mode, reconnect_s=0.5) as stream:
         stream.send(moved(0.0))
         assert stream.receive().sequence == 1
         proxy.close()

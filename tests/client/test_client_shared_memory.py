@@ -41,8 +41,7 @@ def folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
     return tmp_path
 
 
-@pytest.mark.parametrize("mode", ["ordered", "latest"])
-@pytest.mark.parametrize("encoding", ["uint8", "float32"])
+@pytest.mark.parametrize(("mode", "encoding"), [("ordered", "uint8"), ("latest", "float32")])
 def test_frames_are_those_of_an_ordinary_stream(client: Any, encoding: str, mode: str) -> None:
     settings = RenderSettings(outputs=("coverage", "bmode", "transmittance"), encoding=encoding)
     with (

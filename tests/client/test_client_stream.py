@@ -171,6 +171,7 @@ class ClientDoor:
         return time.monotonic() - float(frame.latency_ms) / 1000
 
 
+@pytest.mark.parametrize("make_client", ["sync"], indirect=True)
 def test_a_latest_stream_gives_no_old_frame(client: Any) -> None:
     with client.stream("demo", RenderSettings(height=128, width=128), mode="latest") as stream:
         check_fresh(ClientDoor(stream))

@@ -78,7 +78,7 @@ def test_a_stream_whose_reader_stops_waits_for_him(service: RunningService, rend
 
 def test_many_mistakes_at_once_do_not_stop_a_stream(service: RunningService) -> None:
     """More refusals wait than may be under way, while the client has yet to say that it has the first frame."""
-    address = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/demo/stream"
+    address = service.stream_url()
     pose = {"mode": "latest", "settings": {}, "pose": {"matrix": np.eye(4).tolist()}}
     with connect(address, compression=None, max_size=None, close_timeout=0.2) as connection:
         for sequence in range(3):
@@ -92,7 +92,7 @@ def test_many_mistakes_at_once_do_not_stop_a_stream(service: RunningService) -> 
 
 def test_a_flood_of_messages_leaves_others_their_turn(service: RunningService) -> None:
     """Settings and poses of a latest stream are never answered one by one: nothing slows the sender down."""
-    address = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/demo/stream"
+    address = service.stream_url()
     pose = json.dumps({"mode": "latest", "settings": {}, "pose": {"matrix": np.eye(4).tolist()}})
     over = threading.Event()
 

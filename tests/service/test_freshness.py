@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import queue
-import struct
 import time
 from collections.abc import Iterator
 from typing import Any
@@ -17,7 +16,7 @@ from websockets.sync.client import ClientConnection, connect
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2
 
 from ..freshness import check_fresh
-from .conftest import RunningService
+from .conftest import RunningService, split
 
 IDENTITY = geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=np.eye(4).ravel().tolist()))
 SMALL = {"height": 128, "width": 128, "encoding": "jpeg"}  # some KB: buffers hold hundreds of them
@@ -58,27 +57,18 @@ class GrpcDoor:
 
 
 class WebSocketDoor:
-    """A client that reads a WebSocket, and acknowledges its frames or not."""
+    """A client that reads a WebSocket."""
 
-    def __init__(self, connection: ClientConnection, settings: dict[str, Any], window: int | None) -> None:
+    def __init__(self, connection: ClientConnection, settings: dict[str, Any]) -> None:
         self._connection = connection
-        self._sequence = 0
-        self._acknowledges = window is not None
-        connection.send(json.dumps({"mode": "latest", "window": window, "settings": settings}))
+        connection.send(json.dumps({"mode": "latest", "settings": settings}))
 
     def send(self) -> None:
-        self._sequence += 1
         pose = {"matrix": np.eye(4).tolist()}
-        message = {"sequence": self._sequence, "pose": pose, "client_time_ms": 1000 * time.monotonic()}
-        self._connection.send(json.dumps(message))
+        self._connection.send(json.dumps({"pose": pose, "client_time_ms": 1000 * time.monotonic()}))
 
     def receive(self) -> float:
-        message = self._connection.recv(timeout=60)
-        assert isinstance(message, bytes), message
-        (length,) = struct.unpack_from("<I", message)
-        about = json.loads(message[4 : 4 + length])
-        if self._acknowledges:
-            self._connection.send(json.dumps({"acknowledged": about["sequence"]}))
+        about, _ = split(self._connection.recv(timeout=60))
         return float(about["client_time_ms"] / 1000)
 
 
@@ -100,14 +90,10 @@ def test_grpc(open_grpc: Any, settings: dict[str, Any]) -> None:
     check_fresh(open_grpc(settings))
 
 
-@pytest.mark.parametrize(
-    "window", [pytest.param(1, marks=pytest.mark.long), None], ids=["acknowledged", "unacknowledged"]
-)
 @pytest.mark.parametrize("settings", [SMALL, pytest.param(LARGE, marks=pytest.mark.long)], ids=["small", "large"])
-def test_websocket(service: RunningService, settings: dict[str, Any], window: int | None) -> None:
-    address = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/demo/stream"
-    with connect(address, compression=None, max_size=None, close_timeout=0.2) as connection:
-        check_fresh(WebSocketDoor(connection, settings, window))
+def test_websocket_without_acknowledgements(service: RunningService, settings: dict[str, Any]) -> None:
+    with connect(service.stream_url(), compression=None, max_size=None, close_timeout=0.2) as connection:
+        check_fresh(WebSocketDoor(connection, settings))
 
 
 def test_no_more_answers_come_than_the_window_has_room_for(open_grpc: Any, service: RunningService) -> None:

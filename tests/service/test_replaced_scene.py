@@ -5,7 +5,6 @@ from __future__ import annotations
 import hashlib
 import json
 import os
-import struct
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -18,10 +17,10 @@ from websockets.sync.client import connect
 
 from ultragray import LinearProbe
 
-from .conftest import RunningService, StartService, make_scene
+from .conftest import RunningService, StartService, make_scene, split
 
 SWAPS = 8
-BETWEEN_SWAPS_S = 0.25
+BETWEEN_SWAPS_S = 0.1
 
 Seen = tuple[str, float]  # SHA-256 of the scene, far_mm of the probe of a frame
 Ask = Callable[[], Iterator[Seen]]
@@ -58,7 +57,7 @@ def changing(folder: Path) -> Changing:
 
 @pytest.fixture(scope="module")
 def service(start_service: StartService, changing: Changing, folder: Path) -> RunningService:
-    return start_service(data_folder=folder, igtl_port=0, igtl_scene="changing")
+    return start_service(data_folder=folder)
 
 
 def check(changing: Changing, ask: Ask) -> None:
@@ -102,14 +101,10 @@ def test_websocket(service: RunningService, changing: Changing) -> None:
 
     def ask() -> Iterator[Seen]:
         connection.send(message)
-        answer = connection.recv(timeout=60)
-        assert isinstance(answer, bytes), answer
-        (length,) = struct.unpack_from("<I", answer)
-        about = json.loads(answer[4 : 4 + length])
+        about, _ = split(connection.recv(timeout=60))
         yield about["scene_sha256"], about["probe"]["far_mm"]
 
-    address = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/changing/stream"
-    with connect(address, compression=None, max_size=None, close_timeout=0.2) as connection:
+    with connect(service.stream_url("changing"), compression=None, max_size=None, close_timeout=0.2) as connection:
         check(changing, ask)
 
 
@@ -118,8 +113,7 @@ def test_what_the_new_scene_cannot_give_is_told_and_the_stream_goes_on(
 ) -> None:
     """A scene without a probe of its own takes the place of one with a probe, under a stream that names none."""
     message = json.dumps({"pose": {"matrix": np.eye(4).tolist()}})
-    address = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/changing/stream"
-    with connect(address, compression=None, max_size=None, close_timeout=0.2) as connection:
+    with connect(service.stream_url("changing"), compression=None, max_size=None, close_timeout=0.2) as connection:
         connection.send(message)
         assert isinstance(connection.recv(timeout=60), bytes)
         make_scene(20).save(changing.path)

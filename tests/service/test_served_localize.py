@@ -127,9 +127,7 @@ def test_a_frame_of_something_else_is_told_as_not_found(http: httpx.Client) -> N
     [
         ({"image": "no base64!"}, "image", "image must be base64"),
         ({"image": base64.b64encode(b"GIF89a").decode()}, "image", "image must be a PNG file"),
-        ({"image_height": 64}, "image_width", "go together"),
         ({"image_height": 64, "image_width": 64}, "image", "must hold image_height x image_width = 4096 bytes"),
-        ({"image_height": 5000, "image_width": 64}, "image_height", "from 1 to 4096"),
         ({"start": {"matrix": np.ones((4, 4)).tolist()}}, "start.matrix", "row 0 0 0 1"),
         ({"within_mm": 21}, "within_mm", "above 0 and at most 20"),
         ({"probe": {"kind": "linear", "width_mm": -1, "near_mm": 0, "far_mm": 40}}, "probe.width_mm", "above 0"),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import struct
 from collections.abc import Iterator
 from json import dumps, loads
 from pathlib import Path
@@ -20,7 +19,7 @@ from ultragray_service.access.keys import KeyStore
 from ultragray_service.access.principals import Role
 from ultragray_workers.jobs.database import JobDatabase
 
-from .conftest import RunningService, StartService
+from .conftest import RunningService, StartService, split
 
 SIZE = {"height": 16, "width": 12}
 ROLES = {"alice": Role.OPERATOR, "bob": Role.OPERATOR, "reader": Role.READER}
@@ -105,11 +104,10 @@ def test_http_and_websocket_take_it_too(kept: RunningService, http: httpx.Client
     poses = {"poses": [{"matrix": FLANGE.tolist()}], "registration": "robot"}
     assert http.post("/v1/scenes/demo:assess", json=poses).status_code == 200
     message = {"settings": {**SIZE, "registration": "robot"}, "pose": {"matrix": FLANGE.tolist()}}
-    with connect(f"{kept.http.replace('http', 'ws', 1)}/v1/scenes/demo/stream") as socket:
+    with connect(kept.stream_url()) as socket:
         socket.send(dumps(message))
         answered = socket.recv(timeout=60)
-    (length,) = struct.unpack_from("<I", answered)
-    np.testing.assert_allclose(loads(answered[4 : 4 + length])["pose"], POSE, atol=1e-9)
+    np.testing.assert_allclose(split(answered)[0]["pose"], POSE, atol=1e-9)
 
 
 def test_an_unknown_one_and_one_of_another_scene_are_told(client: Client, http: httpx.Client) -> None:
@@ -138,9 +136,7 @@ def test_a_replaced_registration_counts_at_once(client: Client) -> None:
     ("change", "status", "field"),
     [
         ({"base_to_scene": np.diag([1.0, 1.0, -1.0, 1.0]).tolist()}, 422, "base_to_scene"),
-        ({"base_to_scene": None}, 422, "base_to_scene"),
         ({"scene": "nowhere"}, 404, "scene"),
-        ({"probe_to_flange": [[1.0]]}, 422, "probe_to_flange[0][1]"),
         ({"residual_mm": -1.0}, 422, "residual_mm"),
         ({"colour": "red"}, 422, "colour"),
     ],

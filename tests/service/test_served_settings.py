@@ -41,7 +41,7 @@ from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc, scenes_pb2, scenes_pb2_grpc
 from ultragray_service.igtl.contents import unpack_image
 
-from .conftest import DEMO_PROBE, RunningService, StartService, make_scene
+from .conftest import DEMO_PROBE, RunningService, StartService, make_scene, split
 from .igtl.conftest import Peer, address_of
 
 HEIGHT, WIDTH = 40, 32
@@ -197,14 +197,12 @@ def test_the_other_doors_give_the_same(served: RunningService, renders: Any, sce
     for field in ("probe", "contact", "tools", "ghost", "display"):
         if field in asked:
             assert getattr(frame, field) == getattr(wanted, field)
-    with connect(f"{served.http.replace('http', 'ws', 1)}/v1/scenes/rich/stream", compression=None) as stream:
+    with connect(served.stream_url("rich"), compression=None) as stream:
         settings = {"height": HEIGHT, "width": WIDTH, "encoding": "float32", **asked}
         stream.send(json.dumps({"settings": settings, "pose": POSE_BODY}))
         answer = stream.recv(timeout=120)
-    assert isinstance(answer, bytes), answer
-    length = 4 + int.from_bytes(answer[:4], "little")
-    header = json.loads(answer[4:length])
-    assert answer[length:] == frame.data
+    header, pixels = split(answer)
+    assert pixels == frame.data
     assert {key: header[key] for key in asked} == asked
     assert (header["rendered_height"], header["rendered_width"]) == (HEIGHT, WIDTH)
 
@@ -264,19 +262,15 @@ def test_frames_asked_for_at_once_keep_their_own_tools(http: httpx.Client, scene
 
 REFUSALS: list[tuple[dict[str, Any], str, str]] = [
     ({"contact": "gel"}, "contact", "'air' or 'pressure'"),
-    ({"slice_thickness_mm": -1.0}, "slice_thickness_mm", "from 0"),
     ({"slice_thickness_mm": 101.0}, "slice_thickness_mm", "to 100"),
     ({"ghost": 1.5}, "ghost", "ghost"),
     ({"tools": [{"kind": "drill"}]}, "tools[0].kind", "must be one of box, cylinder, needle"),
     ({"tools": [{"kind": "needle", "tip_mm": [0, 0, 1]}]}, "tools[0].hub_mm", "is required"),
     ({"tools": [{"kind": "needle", "tip_mm": [0, 0, 1], "hub_mm": [0, 0, 1]}]}, "tools[0].hub_mm", "must differ"),
     ({"tools": [to_dict(NEEDLE)] * (MAX_TOOLS + 1)}, "tools", f"at most {MAX_TOOLS}"),
-    ({"tools": [None]}, "tools[0]", "tools[0]"),
     ({"probe": {"kind": "phased", "opening_angle_deg": 80.0, "far_mm": 0.0}}, "probe.far_mm", "far_mm"),
-    ({"display": {"gain_db": 1e6}}, "display.gain_db", "gain_db"),
     ({"display": {"tgc_db": [0.0, 1e6]}}, "display.tgc_db[1]", "tgc_db"),
     ({"display": {"pixel_mm": 0.001}}, "display.pixel_mm", "pixels of 0.001 mm"),
-    ({"display": {"brightness": 1.0}}, "display.brightness", "brightness"),
 ]
 
 
@@ -298,7 +292,7 @@ def test_the_other_doors_refuse_by_name(served: RunningService, renders: Any) ->
     settings = rendering_pb2.RenderSettings(scene="rich", tools=[same])
     with pytest.raises(grpc.RpcError, match=r"tools\[0\].*hub_mm must differ"):
         renders.Render(rendering_pb2.RenderRequest(settings=settings, pose=pose_message()))
-    with connect(f"{served.http.replace('http', 'ws', 1)}/v1/scenes/rich/stream") as stream:
+    with connect(served.stream_url("rich")) as stream:
         stream.send(json.dumps({"settings": {"display": {"flip": 1}}}))
         assert json.loads(stream.recv(timeout=60))["error"]["field"] == "settings.display.flip"
 

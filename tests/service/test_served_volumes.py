@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import Any
 
 import cv2
-import grpc
 import httpx
 import numpy as np
 import numpy.typing as npt
@@ -22,7 +21,6 @@ from ultragray.rendering.volume_fields import sample_slice, sample_volume
 from ultragray.rendering.volumes import VOLUME_FIELDS, VolumeGrid
 from ultragray_client import Client, SliceSettings, VoxelizeJob
 from ultragray_client.errors import InvalidArgument, SceneNotFound
-from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 
 from .conftest import DEMO_PROBE, RunningService, StartService, make_scene
 
@@ -122,13 +120,8 @@ def test_the_client_gets_a_slice_over_grpc(client: Client, scene: GaussianScene,
         ({"field": "labels", "scene": "plain"}, 422, "field", "this one's carry none"),
         ({"scene": "absent"}, 404, "scene", "absent"),
         ({"down": [1, 0, 0]}, 422, "down", "right angle"),
-        ({"right": [0, 0, 0]}, 422, "right", "direction"),
-        ({"right": [1, 0]}, 422, "right[2]", ""),
-        ({"size_mm": [30, -1]}, 422, "size_mm", "above 0"),
         ({"spacing_mm": 0.01}, 422, "spacing_mm", "at most 600 pixels on a side"),
-        ({"spacing_mm": 0}, 422, "spacing_mm", "0.001"),
         ({"size_mm": [250, 250]}, 422, "spacing_mm", "200000 in all"),
-        ({"origin_mm": None}, 422, "origin_mm", ""),
     ],
 )
 def test_a_slice_that_cannot_be_is_refused(
@@ -153,7 +146,7 @@ def test_other_types_of_answers_are_not_acceptable(http: httpx.Client) -> None:
     assert "image/png, application/x-npy, application/octet-stream" in answer.json()["detail"]
 
 
-def test_refusals_over_grpc_name_the_field(client: Client, volume_service: RunningService) -> None:
+def test_refusals_over_grpc_name_the_field(client: Client) -> None:
     with pytest.raises(SceneNotFound):
         client.render_slice("absent", SliceSettings(origin_mm=(0, 0, 0), size_mm=(10, 10)))
     for plane, field in (
@@ -164,15 +157,6 @@ def test_refusals_over_grpc_name_the_field(client: Client, volume_service: Runni
         with pytest.raises(InvalidArgument) as caught:
             client.render_slice("labelled", plane)
         assert caught.value.field == field
-    with volume_service.channel() as channel:
-        stub = rendering_pb2_grpc.RenderServiceStub(channel)
-        for request in (
-            rendering_pb2.RenderSliceRequest(scene="labelled"),
-            rendering_pb2.RenderSliceRequest(scene="labelled", slice=rendering_pb2.SliceSettings(spacing_mm=1)),
-        ):
-            with pytest.raises(grpc.RpcError) as refused:
-                stub.RenderSlice(request, timeout=60)
-            assert refused.value.code() is grpc.StatusCode.INVALID_ARGUMENT
 
 
 def test_a_slice_counts_as_a_frame(http: httpx.Client, volume_service: RunningService) -> None:
@@ -203,7 +187,6 @@ def test_a_volume_is_made_by_a_job_of_the_client(client: Client, scene: Gaussian
     [
         ({"field": "bmode"}, "specification.field", "one of echo"),
         ({"scene": "plain", "field": "labels"}, "specification.field", "carry none"),
-        ({"box_mm": "1:2"}, "specification.box_mm", "ranges of x, y and z"),
         ({"box_mm": "0:1,0:1,1:0"}, "specification.box_mm", "extend along each axis"),
         ({"spacing_mm": 0.001}, "specification.spacing_mm", "the limit is"),
         ({"format": "mha"}, "specification.format", "one of nii.gz, nii, nrrd"),

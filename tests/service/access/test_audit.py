@@ -191,7 +191,7 @@ def test_streams_and_watches_end_with_their_key(
     service = start_service(artifact_folder=tmp_path)
     body = {"kind": "render", "specification": {"scene": "demo", "poses": [MATRIX]}}
     job = httpx.post(f"{service.http}/v1/jobs", headers={"X-API-Key": key}, json=body, timeout=60).json()["id"]
-    address = f"{service.http.replace('http', 'ws')}/v1/scenes/demo/stream"
+    address = service.stream_url()
     with service.channel() as channel, connect(address, additional_headers={"X-API-Key": key}) as socket:
         stub = jobs_pb2_grpc.JobServiceStub(channel)
         watch = stub.WatchJob(jobs_pb2.WatchJobRequest(job=job), metadata=(("x-api-key", key),))

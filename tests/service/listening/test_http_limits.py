@@ -289,7 +289,7 @@ def test_connections_are_capped_in_all(limited: RunningService) -> None:
 
 def test_streams_count_as_connections(limited: RunningService) -> None:
     wait_until(lambda: connections(limited) == 0, within_s=TIMEOUT_S)
-    address = f"{limited.http.replace('http', 'ws', 1)}/v1/scenes/demo/stream"
+    address = limited.stream_url()
     with contextlib.ExitStack() as opened:
         for _ in range(PER_ADDRESS):
             opened.enter_context(connect(address, additional_headers={"X-API-Key": KEY}, close_timeout=0.2))

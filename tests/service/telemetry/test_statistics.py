@@ -85,7 +85,7 @@ def test_many_requests_are_sampled(statistics: Statistics) -> None:
 
 def test_only_what_the_service_could_not_do_is_an_error(start_service: StartService) -> None:
     service = start_service()
-    stream = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/demo/stream"
+    stream = service.stream_url()
     with httpx.Client(base_url=service.http, timeout=120) as http, connect(stream) as websocket:
 
         def errors() -> int:
