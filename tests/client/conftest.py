@@ -28,13 +28,11 @@ KEY = "0123456789abcdef-client"
 MAX_POSES = 40
 SETTINGS: dict[str, Any] = {"max_poses_per_request": MAX_POSES, "max_image_side": 600, "api_keys": KEY}
 
-# Of uploads and jobs, `make test` has those of the client for threads: both carry out the same descriptions.
-UPLOADS_AND_JOBS = {"test_client_recording.py", "test_client_resources.py"}
-
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Of uploads and jobs, `make test` has those of the client for threads: both carry out the same descriptions."""
     for item in items:
-        if item.path.name in UPLOADS_AND_JOBS and "[asyncio" in item.name:
+        if item.path.name == "test_client_resources.py" and "[asyncio" in item.name:
             item.add_marker(pytest.mark.long)
 
 

@@ -1,20 +1,48 @@
-"""Frames one by one and in batches."""
+"""The package, frames one by one and in batches, and where their pixels lie."""
 
 from __future__ import annotations
 
 import inspect
+import subprocess
+import sys
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 import pytest
 
+import ultragray_client
 from ultragray import GaussianScene, render
-from ultragray_client import AsyncClient, Client, Encoding, LinearProbe, Placement, Quaternion, RenderSettings, errors
+from ultragray_client import (
+    AsyncClient,
+    Client,
+    ConvexProbe,
+    Display,
+    Encoding,
+    LinearProbe,
+    Picture,
+    Placement,
+    Quaternion,
+    RenderSettings,
+    errors,
+)
 from ultragray_client.geometry import FloatArray
 
 from ..service.conftest import DEMO_PROBE, HEIGHT, WIDTH, RunningService
 from .conftest import MAX_POSES
+
+
+def test_an_import_takes_no_more_than_it_needs() -> None:
+    program = "import sys, ultragray_client; print(*{name.split('.')[0] for name in sys.modules})"
+    told = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True).stdout
+    assert {"ultragray_client", "ultragray_proto", "grpc", "numpy"} <= set(told.split())
+    assert not {"torch", "ultragray", "ultragray_service", "ultragray_workers", "pydantic"} & set(told.split())
+
+
+def test_exported_names_exist() -> None:
+    assert len(set(ultragray_client.__all__)) == len(ultragray_client.__all__)
+    for name in ultragray_client.__all__:
+        assert hasattr(ultragray_client, name)
 
 
 def moved(x_mm: float) -> FloatArray:
@@ -126,3 +154,36 @@ def test_both_clients_have_the_same_methods(client_service: RunningService) -> N
             cls = type(getattr(ordinary, group))
             other = inspect.getmodule(AsyncClient)
             assert signatures(cls) == signatures(getattr(other, f"Async{cls.__name__}"))
+
+
+FAN = ConvexProbe(opening_angle_deg=50.0, near_mm=20.0, far_mm=60.0)
+TILTED = Placement((1.0, 2.0, 3.0), Quaternion(w=0.8, x=0.36, y=0.48, z=0.0))
+
+
+def test_pixels_lie_where_the_probe_says(client: Any) -> None:
+    """The corners of a linear image, half a pixel from the probe's; k leaves the plane against elevation."""
+    frame = client.render("demo", TILTED)
+    column_mm, row_mm = DEMO_PROBE.width_mm / WIDTH, DEMO_PROBE.far_mm / HEIGHT
+    corners = np.array([[0, 0, 0, 1], [WIDTH - 1, 0, 0, 1], [0, HEIGHT - 1, 0, 1], [0, 0, 5, 1]], dtype=float)
+    x = (DEMO_PROBE.width_mm - column_mm) / 2
+    in_probe = [[-x, 0, row_mm / 2, 1], [x, 0, row_mm / 2, 1], [-x, 0, 40 - row_mm / 2, 1], [-x, -5, row_mm / 2, 1]]
+    matrix = frame.pixel_to_scene()
+    np.testing.assert_allclose(corners @ matrix.T, np.array(in_probe) @ frame.pose.T, atol=1e-9)
+    assert np.linalg.det(matrix[:3, :3]) > 0
+
+
+def test_a_fan_has_a_matrix_once_its_pixels_are_square(client: Any) -> None:
+    polar = client.render("demo", np.eye(4), RenderSettings(probe=FAN))
+    assert polar.picture.column_unit == "deg"
+    with pytest.raises(errors.InvalidArgument, match="pixel_mm") as caught:
+        polar.pixel_to_scene()
+    assert caught.value.field == "display.pixel_mm"
+    frame = client.render(
+        "demo", np.eye(4), RenderSettings(probe=FAN, display=Display(pixel_mm=0.5, flip=True), outputs=("coverage",))
+    )
+    height, width = frame["coverage"].shape
+    top_left = frame.pixel_to_scene() @ [0, 0, 0, 1]
+    half_angle = np.radians(25.0)
+    np.testing.assert_allclose(top_left[:3], [(width - 1) * 0.25, 0.0, 20.0 * np.cos(half_angle) + 0.25], atol=1e-9)
+    assert frame.picture == Picture("mm", top_left[0], top_left[2], -0.5, 0.5)
+    assert height == np.ceil((60.0 - 20.0 * np.cos(half_angle)) / 0.5)
