@@ -150,7 +150,7 @@ def test_what_the_document_allows_and_what_it_does_not(door: EnterDoor, well: Fu
         door("http documented").enter(st.one_of(inputs), attempt)
 
 
-def test_forms(door: EnterDoor, connection: Connection) -> None:
+def test_bodies(door: EnterDoor, connection: Connection) -> None:
     by_path = {path: [body for at, body in BODIES if at == path] for path, _ in BODIES}
     raw = {path: mutated_bytes([json.dumps(body).encode() for body in bodies]) for path, bodies in by_path.items()}
 

@@ -5,29 +5,133 @@ from __future__ import annotations
 import hashlib
 import io
 import json
+import os
+import subprocess
+import sys
 import tarfile
 import time
 import zipfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-import grpc
 import httpx
-import numpy as np
 import pytest
 
 from ultragray.datasets.released import write_released
 from ultragray.datasets.source import load_dataset
 from ultragray.learn.training import TrainingConfig, train
-from ultragray_proto.v1 import jobs_pb2, jobs_pb2_grpc
+from ultragray.phantom.demo import copy_demo_scene
 from ultragray_workers.storage.location import open_storage
 
 from ..object_storage import AWAY_S, FaultyProxy
+from ..postgres import PostgresServer
 from ..waiting import wait_until
 from ..workers.jobs.conftest import tiny_dataset
-from .host import Host
+
+_START_TIMEOUT_S = 180.0
+
+# Each process of ours imports this first: checkpoints and take-overs come as often as a short test needs them.
+_PATCHES = """
+import sys
+line = " ".join(sys.orig_argv)
+if "ultragray_workers.jobs.worker.run_job" in line:
+    from ultragray_workers.jobs.kinds import train_run
+    train_run.CHECKPOINT_INTERVAL_S = 0.3
+elif "worker" in line:
+    from ultragray_workers.jobs import queue
+    queue.DEAD_AFTER_S = 3.0
+"""
+_SERVE = [sys.executable, "-m", "ultragray_service"]
+_WORK = [sys.executable, "-c", "from ultragray_service.cli.app import app; app()", "worker", "--device", "cpu"]
+
+
+class Host:
+    """Sees nothing of other hosts but the bucket and the database; its data folder has the demo scene."""
+
+    def __init__(self, folder: Path, artifacts: str, database_url: str, **settings: str) -> None:
+        self.folder, self.data, self.cache = folder, folder / "data", folder / "cache"
+        for one in (self.data, self.cache, folder / "logs", folder / "patches"):
+            one.mkdir(parents=True)
+        copy_demo_scene(self.data / "demo.ugr")
+        (folder / "patches" / "sitecustomize.py").write_text(_PATCHES)
+        self._environment = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join([str(folder / "patches"), *filter(None, sys.path)]),
+            "OMP_NUM_THREADS": "1",
+            "ULTRAGRAY_DATA_FOLDER": str(self.data),
+            "ULTRAGRAY_ARTIFACT_FOLDER": artifacts,
+            "ULTRAGRAY_CACHE_FOLDER": str(self.cache),
+            "ULTRAGRAY_DATABASE_URL": database_url,
+            "ULTRAGRAY_EMBEDDED_WORKER": "false",
+            "ULTRAGRAY_HTTP_PORT": "0",
+            "ULTRAGRAY_GRPC_PORT": "0",
+            "ULTRAGRAY_THREADS_PER_PROCESS": "1",
+            "ULTRAGRAY_TRAINING_THREADS": "1",
+            "ULTRAGRAY_JOB_NICE": "0",
+            **settings,
+        }
+        self.processes: list[subprocess.Popen[bytes]] = []
+
+    def serve(self) -> tuple[str, str]:
+        """Starts a service; its addresses of HTTP and gRPC."""
+        process, log = self._spawn(_SERVE, "service")
+
+        def addresses() -> tuple[str, str] | None:
+            assert process.poll() is None, self.told()
+            for line in log.read_text().splitlines():
+                if '"grpc"' in line and line.endswith("}"):
+                    record = json.loads(line)
+                    return record["http"], record["grpc"]
+            return None
+
+        return wait_until(addresses, within_s=_START_TIMEOUT_S)
+
+    def work(self) -> subprocess.Popen[bytes]:
+        """Starts a worker."""
+        return self._spawn(_WORK, "worker")[0]
+
+    def kill_all(self) -> None:
+        """As a loss of power: the processes of jobs die with their workers."""
+        for process in self.processes:
+            process.kill()
+            process.wait()
+
+    def told(self) -> str:
+        """The ends of the logs, for the message of a test that fails."""
+        logs = sorted((self.folder / "logs").iterdir())
+        return "\n".join(f"--- {self.folder.name}/{log.name}\n{log.read_text()[-4000:]}" for log in logs)
+
+    def _spawn(self, command: list[str], kind: str) -> tuple[subprocess.Popen[bytes], Path]:
+        path = self.folder / "logs" / f"{kind}-{len(self.processes)}"
+        with path.open("ab") as log:
+            self.processes.append(subprocess.Popen(command, env=self._environment, stdout=log, stderr=log))
+        return self.processes[-1], path
+
+
+@pytest.fixture
+def bucket(new_bucket: Callable[[], str]) -> str:
+    """The URL of an empty bucket."""
+    return new_bucket()
+
+
+@pytest.fixture
+def new_host(
+    bucket: str, object_proxy: FaultyProxy, postgres: PostgresServer, tmp_path: Path
+) -> Iterator[Callable[[str], Host]]:
+    """Makes a host of that name, with a folder of its own."""
+    database_url = postgres.create_database()
+    hosts: list[Host] = []
+
+    def make(name: str) -> Host:
+        hosts.append(Host(tmp_path / name, f"{bucket}/artifacts", database_url))
+        return hosts[-1]
+
+    yield make
+    for host in hosts:
+        host.kill_all()
+
 
 STEPS, SEED = int(500 * AWAY_S), 3  # so many that the training outlasts the time without storage
 SETTINGS = {"steps": STEPS, "seed": SEED, "max_gaussians": 40, "batch_size": 2}
@@ -118,38 +222,6 @@ def test_a_training_goes_on_at_another_host_to_the_same_scene(
         journal = get(http, f"jobs/{job}/artifacts/metrics.jsonl").text.splitlines()
         assert [json.loads(line)["step"] for line in journal] == list(range(1, STEPS + 1))
         assert len(get(http, f"jobs/{job}/curve").json()["points"]) == 500
-
-
-@pytest.mark.long
-@pytest.mark.slow
-def test_a_rendering_is_made_on_one_host_and_downloaded_from_another(new_host: NewHost, bucket: str) -> None:
-    one, two = new_host("one"), new_host("two")
-    http, rpc = one.serve()
-    two.work()
-    poses = np.tile(np.eye(4), (5, 1, 1)).tolist()
-    specification = {"scene": "demo", "poses": poses, "height": 48, "width": 40, "format": "tar"}
-    body = {"kind": "render", "specification": specification}
-    job = httpx.post(f"{http}/v1/jobs", json=body, timeout=60).json()["id"]
-
-    def ended() -> dict[str, Any] | None:
-        found: dict[str, Any] = get(http, f"jobs/{job}").json()
-        return found if found["state"] in ("succeeded", "failed") else None
-
-    found = wait_until(ended, within_s=240, every_s=0.5)
-    assert (found["state"], found["progress"]["frames_done"]) == ("succeeded", 5), (found, one.told(), two.told())
-    whole = get(http, f"jobs/{job}/artifacts/frames.tar").content
-    with tarfile.open(fileobj=io.BytesIO(whole)) as archive:
-        assert len(archive.getnames()) == 10
-    with grpc.insecure_channel(rpc) as channel:
-        stub = jobs_pb2_grpc.JobServiceStub(channel)
-        asked = jobs_pb2.DownloadArtifactRequest(job=job, name="frames.tar", offset=1000)
-        assert b"".join(chunk.data for chunk in stub.DownloadArtifact(asked, timeout=60)) == whole[1000:]
-
-    storage = open_storage(f"{bucket}/artifacts")
-    assert [entry.key for entry in storage.entries(f"jobs/{job}") if entry.key.endswith("demo.ugr")]
-    assert httpx.delete(f"{http}/v1/jobs/{job}", timeout=60).status_code == 204
-    assert list(storage.entries(f"jobs/{job}")) == []
-    assert not list(two.cache.rglob(job)), "the host of the worker keeps nothing of it"
 
 
 @pytest.mark.long

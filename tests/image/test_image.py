@@ -1,18 +1,19 @@
-"""The image of docker/Dockerfile as it runs: read-only, without privileges, with the frames of this machine.
-
-ULTRAGRAY_TEST_IMAGE names it; `make test-image` builds it and sets that.
-"""
+"""The image of docker/Dockerfile as it runs: read-only, without privileges, with the frames of this machine."""
 
 from __future__ import annotations
 
 import json
 import os
 import re
+import shlex
 import socket
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib.metadata import version
-from typing import Any
+from pathlib import Path
+from typing import IO, Any
 
 import httpx
 import pytest
@@ -24,7 +25,79 @@ from ..service.conftest import StartService, service_starter
 from ..service.test_lifecycle import IDENTITY
 from ..waiting import wait_until
 from ..workers.jobs.conftest import tiny_dataset
-from .container import Container, container_of
+
+# The root is read-only. $1: the root, $2 … $4: where /data, the cache and /tmp are; the rest is the command.
+_ENTER = """
+set -eu
+root=$1 data=$2 cache=$3 temporary=$4; shift 4
+mount --make-rprivate /
+mount --bind "$root" "$root"
+mount -t proc proc "$root/proc"
+mount --rbind /dev "$root/dev"
+mount --bind /etc/hosts "$root/etc/hosts"
+mount --bind "$data" "$root/data"
+mount --bind "$cache" "$root/var/cache/ultragray"
+mount --bind "$temporary" "$root/tmp"
+mount -o remount,bind,ro "$root"
+cd /
+exec chroot "$root" "$@"
+"""
+
+
+@dataclass(frozen=True)
+class Container:
+    """One image, mounted, with its writable folders beside it."""
+
+    root: Path
+    folder: Path  # holds data, cache and tmp
+    configuration: Mapping[str, Any]  # what the image says: User, Env, Cmd, Healthcheck, Labels …
+
+    @property
+    def data(self) -> Path:
+        return self.folder / "data"
+
+    def command(self, *words: str, environment: Mapping[str, str] | None = None) -> list[str]:
+        """What starts `words` as the image's user, in its environment and working folder."""
+        user, _, group = self.configuration["User"].partition(":")
+        variables = [*self.configuration["Env"], *(f"{name}={value}" for name, value in (environment or {}).items())]
+        folders = [str(self.folder / name) for name in ("data", "cache", "tmp")]
+        inside = f"cd {shlex.quote(self.configuration['WorkingDir'])} && exec {shlex.join(words)}"
+        return [
+            *("unshare", "--mount", "sh", "-c", _ENTER, "sh", str(self.root), *folders),
+            *("/usr/bin/setpriv", "--reuid", user, "--regid", group or user, "--clear-groups"),
+            *("--no-new-privs", "--inh-caps=-all", "--bounding-set=-all"),
+            *("/usr/bin/env", "--ignore-environment", *variables, "/bin/sh", "-c", inside),
+        ]
+
+    def run(self, *words: str, environment: Mapping[str, str] | None = None) -> subprocess.CompletedProcess[str]:
+        command = self.command(*words, environment=environment)
+        return subprocess.run(command, capture_output=True, text=True, timeout=300)
+
+    def start(self, words: Sequence[str], environment: Mapping[str, str], log: IO[bytes]) -> subprocess.Popen[bytes]:
+        """The process that is returned is the one of `words` itself: signals reach it."""
+        return subprocess.Popen(self.command(*words, environment=environment), stderr=log, stdin=subprocess.DEVNULL)
+
+
+@contextmanager
+def container_of(image: str, folder: Path) -> Iterator[Container]:
+    """The container lives as long as the `with` block; `folder` keeps what it wrote."""
+    inspected = subprocess.run(["buildah", "inspect", "--type", "image", image], check=True, capture_output=True)
+    configuration = json.loads(inspected.stdout)["Docker"]["config"]
+    user, _, group = configuration["User"].partition(":")
+    for name in ("data", "cache", "tmp"):
+        (folder / name).mkdir()
+        subprocess.run(["chown", f"{user}:{group}", folder / name], check=True)
+    name = subprocess.run(
+        ["buildah", "from", "--pull-never", image], check=True, stdout=subprocess.PIPE, text=True
+    ).stdout.strip()
+    try:
+        mounted = subprocess.run(["buildah", "mount", name], check=True, stdout=subprocess.PIPE, text=True)
+        root = Path(mounted.stdout.strip())
+        (root / "etc" / "hosts").touch()  # engines make it
+        yield Container(root, folder, configuration)
+    finally:
+        subprocess.run(["buildah", "rm", name], check=True, stdout=subprocess.DEVNULL)
+
 
 IMAGE = os.environ.get("ULTRAGRAY_TEST_IMAGE", "")
 MAX_BYTES = 1_250_000_000
@@ -156,7 +229,7 @@ def test_nothing_is_left_of_what_built_it(container: Container, command: str) ->
     assert container.run("sh", "-c", f"command -v {command}").stdout == ""
 
 
-def test_image_says_what_it_is(container: Container) -> None:
+def container_says_what_it_is(container: Container) -> None:
     says = container.configuration
     assert says["User"] == "10001:10001"
     assert set(says["ExposedPorts"]) == {"8000/tcp", "50051/tcp", "18944/tcp"}
@@ -167,7 +240,7 @@ def test_image_says_what_it_is(container: Container) -> None:
     assert all(labels[name] for name in ("title", "description", "licenses", "base.name"))
 
 
-def test_image_is_of_a_bounded_size(container: Container) -> None:
+def container_is_of_a_bounded_size(container: Container) -> None:
     files = (path for path in container.root.rglob("*") if path.is_file() and not path.is_symlink())
     size = sum(path.stat().st_size for path in files)
     assert size < MAX_BYTES, f"{IMAGE} has {size / 1e6:.0f} MB"

@@ -428,12 +428,12 @@ def issuer() -> Iterator[IdentityProvider]:
 @pytest.fixture(scope="module")
 def guarded(start_service: StartService, issuer: IdentityProvider) -> RunningService:
     service = start_service(**issuer.settings(), api_keys=KEY)
-    wait_until(lambda: test_oidc(service) == "available")
+    wait_until(lambda: identity_provider(service) == "available")
     return service
 
 
-def test_oidc(service: RunningService) -> str:
-    told: str = httpx.get(f"{service.http}/v1/health/ready", timeout=60).json()["test_oidc"]
+def identity_provider(service: RunningService) -> str:
+    told: str = httpx.get(f"{service.http}/v1/health/ready", timeout=60).json()["identity_provider"]
     return told
 
 
@@ -477,11 +477,11 @@ def test_an_issuer_that_is_away_shuts_out_only_its_tokens(start_service: StartSe
         refused = ask(service, issuer.token())
         assert (refused.status_code, refused.json()["reason"]) == (503, "ISSUER_UNAVAILABLE")
         assert int(refused.headers["retry-after"]) >= 1
-        assert test_oidc(service) == "unavailable"
+        assert identity_provider(service) == "unavailable"
         wait_until(lambda: any("cannot be checked" in record["message"] for record in service.log()))
         issuer.up = True
         wait_until(lambda: ask(service, issuer.token()).status_code == 200)
-        assert test_oidc(service) == "available"
+        assert identity_provider(service) == "available"
     finally:
         issuer.close()
 
@@ -497,7 +497,7 @@ def test_a_rotation_of_keys_leaves_sessions_and_their_revocation_alone(
     _, bob = store.create("bob", Role.OPERATOR, None)
     try:
         service = start_service(**issuer.settings(), artifact_folder=tmp_path)
-        wait_until(lambda: test_oidc(service) == "available")
+        wait_until(lambda: identity_provider(service) == "available")
         with ThreadPoolExecutor() as threads, httpx.Client(base_url=service.http, timeout=None) as client:
             body = {"kind": "render", "specification": {"scene": "demo", "poses": [MATRIX]}}
             job = client.post("/v1/jobs", json=body, headers={"X-API-Key": bob}).json()["id"]  # no worker takes it
@@ -534,7 +534,7 @@ def test_the_page_is_told_where_people_sign_in(start_service: StartService) -> N
     }
     try:
         service = start_service(**issuer.settings(), oidc_client_id="console", oidc_scope="openid roles")
-        wait_until(lambda: test_oidc(service) == "available")
+        wait_until(lambda: identity_provider(service) == "available")
         assert httpx.get(f"{service.http}/v1/sign-in", timeout=60).json() == {
             "issuer": {**issuer.endpoints, "client_id": "console", "scope": "openid roles"}
         }
