@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import signal
-import socket
 import threading
 from collections.abc import Callable
 from concurrent import futures
@@ -23,7 +22,6 @@ from ultragray_client.exchange import Unanswered
 from ultragray_proto.v1 import jobs_pb2, rendering_pb2
 
 from ..service.conftest import RunningService, StartService
-from ..waiting import wait_until
 from .conftest import KEY
 from .proxy import Proxy
 from .test_client_render import moved
@@ -151,29 +149,6 @@ def test_patience_ends(make_client: Callable[..., Any], client_service: RunningS
         client.stream("demo", reconnect_s=-1.0)
 
 
-def test_a_stream_that_has_all_its_frames_asks_nobody(far_client: Any, proxy: Proxy) -> None:
-    with far_client.stream("demo", SMALL) as stream:
-        stream.send(moved(0.0))
-        stream.receive()
-        proxy.close()
-        stream.done_sending()
-        with pytest.raises(errors.StreamEnded):
-            stream.receive()
-        assert stream.reconnections == 0
-
-
-def test_a_sender_may_be_ahead_while_nobody_reads(far_client: Any, proxy: Proxy) -> None:
-    with far_client.stream("demo", SMALL) as stream:
-        stream.send(moved(0.0))
-        wait_until(lambda: stream.receive().sequence == 1)
-        proxy.cut_after(0)
-        for x in range(30):
-            stream.send(moved(x))
-        stream.done_sending()
-        assert [frame.pose[0, 3] for frame in stream] == list(range(30))
-        assert stream.reconnections == proxy.cuts == 1
-
-
 def test_a_pose_is_sent_again_with_what_is_left_of_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
     now = 1000.0
     monkeypatch.setattr("ultragray_client.exchange.time.monotonic", lambda: now)
@@ -285,14 +260,6 @@ def test_a_file_that_does_not_come_leaves_nothing(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_an_empty_file_is_a_file(tmp_path: Path) -> None:
-    with download_into("job", "file", tmp_path / "file") as download:
-        download.keep(jobs_pb2.ArtifactChunk(data=b"", file_bytes=0))
-        download.end_of_call()
-        assert download.request() is None
-    assert (tmp_path / "file").read_bytes() == b""
-
-
 def test_a_log_is_not_told_twice() -> None:
     watch, retries = Watch("job"), Retries(None, patience_s=60.0)
 
@@ -335,10 +302,3 @@ def test_a_deletion_that_had_worked_is_no_error(failures: list[type[errors.Clien
     with pytest.raises(errors.ClientError) if is_refused else nullcontext():
         run()
     assert not left
-
-
-def test_a_silent_peer_does_not_hold_a_call(make_client: Callable[..., Any]) -> None:
-    with socket.create_server(("127.0.0.1", 0)) as silent:
-        client = make_client(f"127.0.0.1:{silent.getsockname()[1]}")
-        with pytest.raises((errors.DeadlineExceeded, errors.Unreachable)):
-            client.scenes.list(timeout_s=0.5)

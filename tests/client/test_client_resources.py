@@ -34,7 +34,6 @@ from ultragray_client import (
     errors,
 )
 
-from ..file_sizes import files_of_at_most
 from ..service.conftest import RunningService
 from ..service.http.test_http_datasets import poisoned_files, released_files
 from ..waiting import wait_until
@@ -308,26 +307,6 @@ def test_an_interrupt_in_the_middle_of_writing_leaves_a_whole_file(
         assert len(counts) == 1
         assert counts.pop() > 0
     assert len(list(tmp_path.iterdir())) == 4
-
-
-def test_times_that_no_stamp_can_hold_are_refused(client: Any, tmp_path: Path) -> None:
-    frame = client.render("demo", POSES[0], RenderSettings(height=8, width=8))
-    with Recording(tmp_path / "times.mcap") as recording:
-        for time_ns in (-1, 2**31 * 1_000_000_000, 0.5, True):
-            with pytest.raises(errors.InvalidArgument, match="time_ns must be a whole number of nanoseconds"):
-                recording.add(frame, time_ns=time_ns)
-    assert not decoded(tmp_path / "times.mcap", "/ultragray/bmode")
-
-
-def test_a_file_that_cannot_grow_is_one_error_and_leaves_nothing(client: Any, tmp_path: Path) -> None:
-    frame = client.render("demo", POSES[0], RenderSettings(height=64, width=64))
-    with (
-        files_of_at_most(2000),
-        pytest.raises(OSError, match="File too large"),
-        Recording(tmp_path / "full.mcap") as recording,
-    ):
-        recording.add(frame)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_without_the_package_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

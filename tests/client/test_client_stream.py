@@ -90,13 +90,6 @@ def test_refused_settings_are_told_first(client: Any) -> None:
         client.stream("demo", mode="newest")
 
 
-def send_until_it_ends(stream: Any) -> None:
-    """Or 50 poses long: an ordered stream that nobody reads takes no more than 64."""
-    with suppress(errors.StreamEnded, errors.Unavailable):
-        for _ in range(50):
-            stream.send(moved(0.0))
-
-
 def test_a_stream_may_be_used_by_two_threads(client: Any) -> None:
     with client.stream("demo", RenderSettings(height=8, width=8)) as stream:
 
@@ -124,21 +117,6 @@ def test_a_service_that_stops_ends_a_stream_that_is_not_to_reconnect(
             stream.receive()
         with pytest.raises(errors.ClientError):
             stream.send(moved(0.0))
-
-
-def test_the_frames_before_the_end_of_a_stream_come(make_client: Any, start_service: StartService) -> None:
-    service = start_service()
-    stream = make_client(service.grpc).stream("demo", RenderSettings(height=8, width=8), reconnect_s=0.0)
-    for _ in range(5):
-        stream.send(moved(0.0))
-    wait_until(lambda: service.metric("ultragray_frames_total") >= 5)
-    service.terminate()
-    send_until_it_ends(stream)
-    sequences: list[int] = []
-    with pytest.raises(errors.Unavailable):
-        sequences.extend(frame.sequence for frame in stream)
-    assert sequences == list(range(1, len(sequences) + 1))
-    assert len(sequences) >= 5
 
 
 def test_what_was_dropped_before_an_error_is_told_with_the_next_frame() -> None:
@@ -272,17 +250,6 @@ def test_frames_that_a_latest_stream_skips_free_their_slots(client: Any) -> None
             assert is_shared(frame)
 
 
-def test_ordered_frames_may_be_read_late(client: Any) -> None:
-    """More of them than there are slots: the rest comes in messages."""
-    with client.stream("demo", SMALL, shared_memory=True) as stream:
-        for x in range(60):
-            stream.send(moved(x))
-        stream.done_sending()
-        frames = list(stream)
-    assert [frame.pose[0, 3] for frame in frames] == list(range(60))
-    assert sum(is_shared(frame) for frame in frames) == SLOTS
-
-
 def test_what_the_service_refuses_is_told(client: Any, folder: Path) -> None:
     for _ in range(10):  # a pose may be on its way when the refusal comes, or not yet, or have arrived
         with client.stream("demo", SMALL, shared_memory=True) as stream:
@@ -348,9 +315,3 @@ assert memory._map[32] == 1
 def test_a_child_process_does_not_free_what_its_parent_holds() -> None:
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(str(ROOT / name) for name in ("client", "proto"))}
     subprocess.run([sys.executable, "-c", FORKED], env=environment, check=True)
-
-
-def test_frames_of_another_slot_than_there_is_are_refused(folder: Path) -> None:
-    memory = SharedMemory()
-    with pytest.raises(ValueError, match="Buffer size too small"):
-        memory.taken(rendering_pb2.Frame(shared_data=rendering_pb2.SharedData(slot=SLOTS, bytes=100)))

@@ -124,11 +124,3 @@ def test_a_key_that_travels_openly_to_another_machine_is_told(address: str, make
         make_client(address, api_key="0123456789abcdef")
     make_client(address)
     make_client(address, api_key="0123456789abcdef", tls=Tls())
-
-
-def test_a_function_gives_the_key_of_each_call(client_service: RunningService, make_client: Any) -> None:
-    given = iter(["0123456789abcdef-client", "unknown-unknown-unknown"])
-    client = make_client(client_service.grpc, api_key=lambda: next(given), timeout_s=60.0)
-    assert client.scenes.list()
-    with pytest.raises(errors.Unauthenticated):
-        client.scenes.list()

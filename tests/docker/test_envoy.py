@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import threading
@@ -15,21 +14,17 @@ from typing import Any
 
 import grpc
 import httpx
-import numpy as np
 import pytest
 import yaml
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 
-from ultragray_client import Client
-
-from ..surroundings import ROOT
-from ..waiting import at_this_load
 from .envoy import FOLDER, Envoy, program, script
 
 pytestmark = pytest.mark.slow
 
 READY = "/v1/health/ready"
-RESUMES_WITHIN_S = 2.0
+
+
 SCENES = [f"scene{number}" for number in range(24)]
 
 
@@ -208,46 +203,6 @@ def test_what_changes_nothing_is_asked_of_another(start: StartEnvoy, path: str) 
         stub.breaks = True
     for _ in range(8):
         assert over_http(envoy, path, method) == stubs[-1].name
-
-
-@pytest.mark.parametrize("mode", ["ordered", "latest"])
-def test_streams_go_on_when_their_replica_is_killed(tmp_path: Path, mode: str) -> None:
-    program()
-    environment = {**os.environ, "PYTHONPATH": str(ROOT / "proto")}
-    replicas, processes = [], []
-    for _ in range(2):
-        command = [sys.executable, Path(__file__).with_name("echo_replica.py")]
-        processes.append(subprocess.Popen(command, env=environment, stdout=subprocess.PIPE, text=True))
-    try:
-        for process in processes:
-            assert process.stdout is not None
-            http_port, grpc_port = map(int, process.stdout.readline().split())
-            replicas.append(script().Replica("127.0.0.1", http_port, grpc_port))
-        with Envoy(tmp_path, replicas) as envoy, Client(envoy.grpc, timeout_s=60.0) as client:
-            envoy.wait_for()
-            streams = [client.stream(f"scene{number}", mode=mode) for number in range(8)]
-            for x in range(20):
-                if x == 10:
-                    processes[0].kill()  # of one of them
-                pose = np.eye(4)
-                pose[0, 3] = x
-                for stream in streams:
-                    stream.send(pose)
-                for stream in streams:
-                    frame = stream.receive()
-                    assert (frame.sequence, frame["bmode"][0, 0], frame.dropped) == (x + 1, x, 0)
-                    assert frame.latency_ms is not None
-                    assert frame.latency_ms < 1000 * at_this_load(RESUMES_WITHIN_S)
-            assert sum(stream.reconnections for stream in streams) > 0
-            for stream in streams:
-                stream.done_sending()
-                assert list(stream) == []
-    finally:
-        for process in processes:
-            process.kill()
-            process.wait()
-            assert process.stdout is not None
-            process.stdout.close()
 
 
 def test_the_file_is_valid_as_it_stands(tmp_path: Path) -> None:

@@ -26,7 +26,7 @@ from ultragray_proto.v1 import (
 )
 from ultragray_service.access.rules import GRPC_OPERATIONS, WEBSOCKET, HttpRules, Operation, require_all_methods
 from ultragray_service.http import app as http_app
-from ultragray_service.http.app import OWNED, ROLE, create_app
+from ultragray_service.http.app import create_app
 from ultragray_service.settings import Settings
 from ultragray_service.wiring import make_service
 
@@ -141,21 +141,6 @@ def call(channel: grpc.Channel, name: str, things: dict[str, str], metadata: Any
 def test_rules_and_routes_are_the_same(tmp_path: Path) -> None:
     create_app(make_service(Settings(data_folder=tmp_path)))  # which has a rule for each of its routes
     assert set(METHODS) == set(GRPC_OPERATIONS)
-
-
-def test_the_openapi_document_tells_the_rules(tmp_path: Path) -> None:
-    paths = create_app(make_service(Settings(data_folder=tmp_path))).openapi()["paths"]
-    told = {
-        (path, method.upper()): (operation.get(ROLE), operation.get(OWNED))
-        for path, operations in paths.items()
-        for method, operation in operations.items()
-    }
-    assert told["/v1/health/live", "GET"] == (None, None)
-    assert told["/v1/jobs", "POST"] == ("operator", False)
-    assert told["/v1/jobs/{job}", "DELETE"] == ("operator", True)
-    assert told["/v1/workers/{worker}:pause", "POST"] == ("admin", False)
-    rules = {(path, method): operation for method, path, operation in HttpRules().routes()}
-    assert all(role == (rules[one].role and rules[one].role.value) for one, (role, _) in told.items())
 
 
 def test_a_route_without_a_rule_stops_the_start(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

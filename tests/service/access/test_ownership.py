@@ -158,22 +158,6 @@ def test_a_private_job_that_is_in_the_way_is_not_named(keyed: Keyed, scene_bytes
         assert keyed.http("alice", "POST", f"/v1/jobs/{job}:cancel").status_code == 200
 
 
-def test_the_request_ids_of_two_owners_are_two(keyed: Keyed) -> None:
-    mine = keyed.submit("alice", request_id="same", private=True)
-    others = keyed.submit("bob", request_id="same")
-    assert (mine.status_code, others.status_code) == (201, 201)
-    assert mine.json()["id"] != others.json()["id"]
-    again = keyed.submit("alice", request_id="same", private=True)
-    assert (again.status_code, again.json()["id"]) == (200, mine.json()["id"])
-
-
-def test_the_owner_and_admins_see_and_render(keyed: Keyed, private: str) -> None:
-    for who in ("alice", "admin"):
-        assert keyed.http(who, "POST", "/v1/scenes/secret/render", json={"pose": POSE}).status_code == 200
-        assert keyed.http(who, "GET", "/v1/datasets/secret").json()["private"] is True
-        assert keyed.http(who, "GET", f"/v1/jobs/{private}").json()["owner"] == "alice"
-
-
 def test_over_grpc_too(keyed: Keyed, private: str) -> None:
     pose = geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=[float(one) for row in MATRIX for one in row]))
     asked = rendering_pb2.RenderStreamRequest(settings=rendering_pb2.RenderSettings(scene="secret"), pose=pose)

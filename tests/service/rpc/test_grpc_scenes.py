@@ -27,36 +27,6 @@ from .test_grpc_render import error_info
 Stub = scenes_pb2_grpc.SceneServiceStub
 
 
-@pytest.mark.parametrize(
-    ("scene", "code", "reason"),
-    [
-        ("nowhere", grpc.StatusCode.NOT_FOUND, "SCENE_NOT_FOUND"),
-        ("", grpc.StatusCode.NOT_FOUND, "SCENE_NOT_FOUND"),
-        ("foreign", grpc.StatusCode.FAILED_PRECONDITION, "SCENE_FILE_INVALID"),
-    ],
-)
-def test_scenes_that_cannot_be_read(scenes: Stub, scene: str, code: Any, reason: str) -> None:
-    calls = (
-        lambda: scenes.GetScene(scenes_pb2.GetSceneRequest(scene=scene)),
-        lambda: scenes.LoadScene(scenes_pb2.LoadSceneRequest(scene=scene)),
-    )
-    for call in calls:
-        with pytest.raises(grpc.RpcError) as caught:
-            call()
-        info, _ = error_info(caught.value)
-        assert (caught.value.code(), info.reason, info.metadata["field"]) == (code, reason, "scene")
-
-
-def test_bad_pages(scenes: Stub) -> None:
-    for request, field in (
-        (scenes_pb2.ListScenesRequest(page_size=-1), "page_size"),
-        (scenes_pb2.ListScenesRequest(page_token="*"), "page_token"),
-    ):
-        with pytest.raises(grpc.RpcError) as caught:
-            scenes.ListScenes(request)
-        assert error_info(caught.value)[0].metadata["field"] == field
-
-
 def test_health_and_reflection(channel: grpc.Channel) -> None:
     health = health_pb2_grpc.HealthStub(channel)
     for name in ("", "ultragray.v1.RenderService", "ultragray.v1.SceneService"):
