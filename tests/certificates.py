@@ -1,7 +1,5 @@
 """Certificate files as a hospital has them: an authority, what it signed, and their replacement in one step."""
 
-from __future__ import annotations
-
 import datetime
 import os
 import ssl
@@ -29,7 +27,7 @@ _number = count()
 class Mounted:
     """A folder of certificates that is replaced as Kubernetes does: `..data` is a link that is renamed into place."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder):
         self.folder = folder
         self.authority = trustme.CA()
         self.root = folder.parent / "root.pem"
@@ -38,9 +36,7 @@ class Mounted:
         for name in (SERVER, KEY, AUTHORITY):
             (folder / name).symlink_to(Path("..data", name))
 
-    def put(
-        self, server: trustme.LeafCert, *, clients: trustme.CA | None = None, key: bytes | None = None
-    ) -> trustme.LeafCert:
+    def put(self, server, *, clients=None, key=None):
         """Replaces all files in one step. `key` None: that of the certificate."""
         revision = self.folder / f"..{next(_number)}"
         revision.mkdir()
@@ -52,7 +48,7 @@ class Mounted:
         os.replace(link, self.folder / "..data")
         return server
 
-    def issue(self, *, from_days: float = -60.0, days: float = 30.0) -> trustme.LeafCert:
+    def issue(self, *, from_days=-60.0, days=30.0):
         """Signs a certificate for this machine, which is valid from and until so many days from now."""
         now = datetime.datetime.now(datetime.timezone.utc)
         return self.authority.issue_cert(
@@ -62,19 +58,19 @@ class Mounted:
             not_after=now + datetime.timedelta(days=days),
         )
 
-    def settings(self, *, mutual: bool = False) -> dict[str, Path]:
+    def settings(self, *, mutual=False):
         """Settings of a service."""
         found = {"tls_certificate": self.folder / SERVER, "tls_key": self.folder / KEY}
         return {**found, "tls_client_ca": self.folder / AUTHORITY} if mutual else found
 
-    def context(self, client: trustme.LeafCert | None = None) -> ssl.SSLContext:
+    def context(self, client=None):
         """What a client needs that speaks HTTP or WebSocket."""
         context = ssl.create_default_context(cadata=self.authority.cert_pem.bytes().decode())
         if client is not None:
             client.configure_cert(context)
         return context
 
-    def credentials(self, client: trustme.LeafCert | None = None) -> grpc.ChannelCredentials:
+    def credentials(self, client=None):
         """What a client needs that speaks gRPC."""
         root = self.authority.cert_pem.bytes()
         if client is None:
@@ -82,11 +78,11 @@ class Mounted:
         return grpc.ssl_channel_credentials(root, client.private_key_pem.bytes(), chain_of(client))
 
 
-def chain_of(leaf: trustme.LeafCert) -> bytes:
+def chain_of(leaf):
     return b"".join(pem.bytes() for pem in leaf.cert_chain_pems)
 
 
-def write_client(authority: trustme.CA, folder: Path) -> tuple[Path, Path]:
+def write_client(authority, folder):
     """A client's certificate and its key, in files."""
     folder.mkdir(exist_ok=True)
     leaf, certificate, key = (

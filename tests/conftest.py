@@ -7,10 +7,9 @@ import math
 import os
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import hypothesis
 import hypothesis.configuration
@@ -18,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray import ConvexProbe, Frames, GaussianScene, LinearProbe, Probe, SceneInfo
+from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, SceneInfo
 from ultragray.exchange.released_config import stretch_released_far
 from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.backends import cuda
@@ -56,7 +55,7 @@ SHARED = ROOT.parent / "shared"
 LARGEST_FLIP = 5e-3  # a threshold that flips moves a pixel by about 1/255
 
 
-def shared_folder(name: str) -> Path:
+def shared_folder(name):
     folder = SHARED / name
     if not folder.is_dir():
         pytest.skip(f"../shared/{name} is not there: it holds the released implementation's files")
@@ -64,7 +63,7 @@ def shared_folder(name: str) -> Path:
 
 
 @pytest.fixture(autouse=True)
-def one_torch_thread() -> Iterator[None]:
+def one_torch_thread():
     """Small tensors gain nothing from more, and threads of several processes that spin cost seconds."""
     before = torch.get_num_threads()
     torch.set_num_threads(1)
@@ -73,12 +72,12 @@ def one_torch_thread() -> Iterator[None]:
 
 
 @pytest.fixture
-def golden_folder() -> Path:
+def golden_folder():
     return shared_folder("golden")
 
 
 @pytest.fixture
-def data_folder() -> Path:
+def data_folder():
     return shared_folder("data")
 
 
@@ -94,19 +93,18 @@ class Golden:
     expected: Mapping[str, np.ndarray]  # by output, [C, H, W] float64
     stable: np.ndarray  # [C, H, W] bool
 
-    def scene(self, dtype: torch.dtype) -> GaussianScene:
+    def scene(self, dtype):
         return GaussianScene.from_splats({name: torch.from_numpy(self.arrays[name]).to(dtype) for name in PARAMETERS})
 
 
 @pytest.fixture
-def golden(golden_folder: Path) -> Callable[[str], Golden]:
-    def load(name: str) -> Golden:
+def golden(golden_folder):
+    def load(name):
         with np.load(golden_folder / f"{name}.npz") as file:
             arrays = dict(file)
         height, width = int(arrays["height"]), int(arrays["width"])
         near_cm = float(arrays["near_plane"])
         far_cm = stretch_released_far(near_cm, float(arrays["far_plane"]), height)
-        probe: Probe
         if "opening_width" in arrays:
             probe = LinearProbe(float(arrays["opening_width"]) * 10, near_cm * 10, far_cm * 10)
         else:
@@ -128,20 +126,20 @@ def golden(golden_folder: Path) -> Callable[[str], Golden]:
 
 
 @pytest.fixture(scope="session")
-def random_scene() -> Callable[..., GaussianScene]:
+def random_scene():
     def make(
-        count: int = 200,
+        count=200,
         *,
-        seed: int = 0,
-        extent_cm: tuple[float, float, float] = (3.0, 1.0, 4.0),
-        centre_cm: tuple[float, float, float] = (0.0, 0.0, 2.0),
-        sigma_cm: tuple[float, float] = (0.03, 0.2),  # each axis is drawn log-uniformly between these
-        sh_degree: int = 1,
-        intensity: str = "released",
-        transmittance_logit: tuple[float, float] = (0.0, 4.0),
-        dtype: torch.dtype = torch.float32,
-        info: Mapping[str, Any] | None = None,
-    ) -> GaussianScene:
+        seed=0,
+        extent_cm=(3.0, 1.0, 4.0),
+        centre_cm=(0.0, 0.0, 2.0),
+        sigma_cm=(0.03, 0.2),  # each axis is drawn log-uniformly between these
+        sh_degree=1,
+        intensity="released",
+        transmittance_logit=(0.0, 4.0),
+        dtype=torch.float32,
+        info=None,
+    ):
         rng = np.random.default_rng(seed)
         low, high = np.log(sigma_cm)
         splats = {
@@ -159,8 +157,8 @@ def random_scene() -> Callable[..., GaussianScene]:
 
 
 @pytest.fixture(scope="session")
-def random_poses() -> Callable[..., FloatArray]:
-    def make(count: int, *, seed: int = 0, tilt_deg: float = 20.0, shift_mm: float = 3.0) -> FloatArray:
+def random_poses():
+    def make(count, *, seed=0, tilt_deg=20.0, shift_mm=3.0):
         """[count, 4, 4]: rotations by up to `tilt_deg` about random axes, shifts by up to `shift_mm`."""
         rng = np.random.default_rng(seed)
         poses = np.tile(np.eye(4), (count, 1, 1))
@@ -182,7 +180,7 @@ _LONG_FOLDERS = {
 }
 
 
-def pytest_ignore_collect(collection_path: Path, config: pytest.Config) -> bool | None:
+def pytest_ignore_collect(collection_path, config):
     """Leaves out what `-m "not long"` would import and then deselect."""
     return True if collection_path in _LONG_FOLDERS and "not long" in config.option.markexpr else None
 
@@ -202,7 +200,7 @@ _STARTING = {
 
 
 @pytest.hookimpl(trylast=True)
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items):
     """Tests marked `gpu` are skipped where there is none; tests that start processes are `slow`.
 
     Files go to the test processes whole and in this order, which is that of pytest-randomly but for two things: those
@@ -219,15 +217,15 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items.sort(key=lambda item: (item.path not in lengthy, -tests_of[item.path]))
 
 
-def pytest_addoption(parser: pytest.Parser) -> None:
+def pytest_addoption(parser):
     parser.addoption("--record-in", type=Path, help="write when, at which commit and how this run ended to a JSON file")
     parser.addoption("--seed", type=int, help="of what is drawn at random by tests/fuzz; another one in every run")
 
 
 @pytest.hookimpl(trylast=True)
-def pytest_terminal_summary(terminalreporter: Any, exitstatus: int, config: pytest.Config) -> None:
+def pytest_terminal_summary(terminalreporter, exitstatus, config):
     """Writes the file of `--record-in`."""
-    path: Path | None = config.getoption("--record-in")
+    path = config.getoption("--record-in")
     if path is None:
         return
     counts = {kind: len(terminalreporter.stats.get(kind, ())) for kind in ("passed", "failed", "error", "skipped")}
@@ -245,10 +243,10 @@ def pytest_terminal_summary(terminalreporter: Any, exitstatus: int, config: pyte
 
 
 @pytest.fixture(scope="session")
-def on_device() -> Callable[[GaussianScene], GaussianScene]:
+def on_device():
     """A scene where the CUDA backend wants it: on the GPU, or as it is where the kernels are interpreted."""
 
-    def move(scene: GaussianScene) -> GaussianScene:
+    def move(scene):
         device = cuda.device()
         return scene if scene.means.device == device else scene.to(device)
 
@@ -256,12 +254,10 @@ def on_device() -> Callable[[GaussianScene], GaussianScene]:
 
 
 @pytest.fixture
-def assert_agrees() -> Callable[..., None]:
+def assert_agrees():
     """Within `tolerance` but for one stable pixel in 10,000, and that one within a flipped threshold."""
 
-    def check(
-        frames: Frames, expected: Mapping[str, Any], *, tolerance: float, stable: np.ndarray | None = None
-    ) -> None:
+    def check(frames, expected, *, tolerance, stable=None):
         for name in PLANES:
             got = getattr(frames, name)
             want = np.asarray(expected[name], dtype=np.float64)

@@ -1,13 +1,8 @@
 """DICOM cine loops with their poses, as pydicom and numpy write them."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
-from pydicom.uid import UID, ExplicitVRLittleEndian, UltrasoundMultiFrameImageStorage
+from pydicom.uid import ExplicitVRLittleEndian, UltrasoundMultiFrameImageStorage
 
 FRAMES = np.random.default_rng(3).integers(5, 250, (10, 24, 32), dtype=np.uint8)
 POSES = np.tile(np.eye(4), (10, 1, 1))
@@ -28,7 +23,7 @@ REGION = {
 }
 
 
-def region(**values: Any) -> Dataset:
+def region(**values):
     """Columns 4 to 23 and rows 2 to 21, 0.5 x 0.25 mm each; None leaves an attribute out."""
     made = Dataset()
     for name, value in {**REGION, **values}.items():
@@ -37,14 +32,7 @@ def region(**values: Any) -> Dataset:
     return made
 
 
-def write_cine(
-    folder: Path,
-    *,
-    syntax: UID = ExplicitVRLittleEndian,
-    poses: np.ndarray | None = POSES,
-    data: bytes | None = None,
-    **values: Any,
-) -> Path:
+def write_cine(folder, *, syntax=ExplicitVRLittleEndian, poses=POSES, data=None, **values):
     """Writes sweep.dcm and, unless they are None, sweep.poses.npy; None leaves an attribute out."""
     meta = FileMetaDataset()
     meta.MediaStorageSOPClassUID, meta.MediaStorageSOPInstanceUID = UltrasoundMultiFrameImageStorage, "1.2.3"

@@ -1,17 +1,14 @@
 """A limit to the size of files, in place of a disk that is full."""
 
-from __future__ import annotations
-
 import os
 import resource
 import sys
-from collections.abc import Iterator
 from contextlib import contextmanager
 from unittest.mock import patch
 
 
 @contextmanager
-def files_of_at_most(size_bytes: int) -> Iterator[None]:
+def files_of_at_most(size_bytes):
     """Within, no file of this process grows beyond that, nor one of a process that begins then.
 
     Python would leave compiled modules behind that end in the middle, and fail at every later import of them: it is

@@ -18,10 +18,10 @@ PAUSES_S = (*[0.0] * 20, *[0.05] * 5, *[0.3] * 2, 1.0, *[0.05] * 5)
 class Door(Protocol):
     """One client's latest stream."""
 
-    def send(self) -> None:
+    def send(self):
         """Sends a pose, with the time as it is."""
 
-    def receive(self) -> float:
+    def receive(self):
         """Takes a frame; the time.monotonic() of its pose."""
 
 
@@ -33,11 +33,11 @@ class Reading:
     age_s: float  # of its pose
 
 
-def read_slowly(door: Door) -> list[Reading]:
+def read_slowly(door):
     """The frames that a reader takes, with pauses, while poses come at 60 Hz."""
     stop = threading.Event()
 
-    def send() -> None:
+    def send():
         while not stop.wait(PERIOD_S):
             door.send()
 
@@ -59,7 +59,7 @@ def read_slowly(door: Door) -> list[Reading]:
         sender.join()
 
 
-def check_fresh(door: Door, pauses: int = 1) -> None:
+def check_fresh(door, pauses=1):
     """No frame is older than the reader's own pause, or so many of its last pauses, and 150 ms."""
     readings = read_slowly(door)
     spare_s = at_this_load(SPARE_S)

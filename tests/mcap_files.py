@@ -1,10 +1,6 @@
 """MCAP files as robots and drivers of ROS 2 record them, by MCAP's own writer and the messages' own definitions."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from mcap.writer import CompressionType
@@ -47,26 +43,26 @@ PROBE = LinearProbe(width_mm=32.0, near_mm=0.0, far_mm=24.0)
 GEOMETRY = json.dumps({"probe": to_dict(PROBE)})
 
 
-def moving_pose(seconds: float) -> np.ndarray:  # [4, 4] mm
+def moving_pose(seconds):  # [4, 4] mm
     """A probe that goes along y at 10 mm/s and turns about z by 0.5 rad/s, evenly."""
     turn = (np.cos(0.25 * seconds), 0.0, 0.0, np.sin(0.25 * seconds))
     return pose_from_position_quaternion((5.0, 10.0 * seconds, -3.0), turn)
 
 
-def image_at(number: int, height: int = 24, width: int = 32) -> np.ndarray:  # [H, W]
+def image_at(number, height=24, width=32):  # [H, W]
     """A smooth image that tells its number by its corner, which a JPEG keeps nearly."""
     image = np.add.outer(np.arange(height) * 2, np.arange(width)).astype(np.uint8)
     image[:8, :8] = (8 * number + 4) % 256
     return image
 
 
-def pose_message(pose: np.ndarray, time_ns: int, frame_id: str = "tracker") -> dict[str, Any]:
+def pose_message(pose, time_ns, frame_id="tracker"):
     message = ros.pose_message(pose, time_ns)
     message["header"]["frame_id"] = frame_id
     return message
 
 
-def image_message(image: np.ndarray, time_ns: int, *, encoding: str = "mono8", padding: int = 0) -> dict[str, Any]:
+def image_message(image, time_ns, *, encoding="mono8", padding=0):
     """An image [H, W] or [H, W, C], its rows padded with bytes of no meaning."""
     rows = np.ascontiguousarray(image).view(np.uint8).reshape(len(image), -1)
     padded = np.pad(rows, ((0, 0), (0, padding)), constant_values=77)
@@ -81,7 +77,7 @@ def image_message(image: np.ndarray, time_ns: int, *, encoding: str = "mono8", p
     }
 
 
-def transform_message(pose: np.ndarray, time_ns: int, parent: str, child: str) -> dict[str, Any]:
+def transform_message(pose, time_ns, parent, child):
     stamped = ros.pose_message(pose, time_ns)["pose"]
     return {
         "header": ros.header(time_ns, parent),
@@ -93,58 +89,54 @@ def transform_message(pose: np.ndarray, time_ns: int, parent: str, child: str) -
 class Bag:
     """A file that is written message by message; `finish` gives it its index."""
 
-    def __init__(
-        self, path: Path, compression: CompressionType = CompressionType.ZSTD, *, enable_crcs: bool = True
-    ) -> None:
+    def __init__(self, path, compression=CompressionType.ZSTD, *, enable_crcs=True):
         self.path = path
         self._file = path.open("wb")
         self._writer = Writer(self._file, chunk_size=4096, compression=compression, enable_crcs=enable_crcs)
-        self._schemas: dict[str, Any] = {}
+        self._schemas = {}
 
-    def write(self, topic: str, kind: str, message: dict[str, Any], time_ns: int) -> None:
+    def write(self, topic, kind, message, time_ns):
         """Write a message some milliseconds after its stamp, as recorders do."""
         if kind not in self._schemas:
             self._schemas[kind] = self._writer.register_msgdef(kind, DEFINITIONS[kind])
         self._writer.write_message(topic, self._schemas[kind], message, log_time=time_ns + 3_000_000)
 
-    def define(self, kind: str, fields: str) -> None:
+    def define(self, kind, fields):
         """From here on a kind of message has these fields."""
         self._schemas[kind] = self._writer.register_msgdef(kind, fields)
 
-    def poses(self, topic: str = "/tracker/pose", *, rate_hz: float = 50.0, seconds: float = 1.0) -> None:
+    def poses(self, topic="/tracker/pose", *, rate_hz=50.0, seconds=1.0):
         """Poses of `moving_pose` from START_NS on."""
         for number in range(int(seconds * rate_hz) + 1):
             time_ns = START_NS + round(number / rate_hz * SECOND)
             self.write(topic, ros.POSE, pose_message(moving_pose(number / rate_hz), time_ns), time_ns)
 
-    def images(
-        self, topic: str = "/us/image", *, count: int = 12, begin_s: float = 0.011, step_s: float = 0.07
-    ) -> None:
+    def images(self, topic="/us/image", *, count=12, begin_s=0.011, step_s=0.07):
         """Images of `image_at`, whose stamps are those of no pose."""
         for number in range(count):
             time_ns = image_time_ns(number, begin_s, step_s)
             self.write(topic, ros.IMAGE, image_message(image_at(number), time_ns), time_ns)
 
-    def geometry(self, text: str = GEOMETRY, topic: str = "/us/geometry", time_ns: int = START_NS) -> None:
+    def geometry(self, text=GEOMETRY, topic="/us/geometry", time_ns=START_NS):
         """A message of the geometry."""
         self.write(topic, ros.TEXT, {"data": text}, time_ns)
 
-    def finish(self) -> Path:
+    def finish(self):
         """Write the index."""
         self._writer.finish()
         return self.leave()
 
-    def leave(self) -> Path:
+    def leave(self):
         """Leave the file as a recorder that was killed does."""
         self._file.close()
         return self.path
 
 
-def image_time_ns(number: int, begin_s: float = 0.011, step_s: float = 0.07) -> int:
+def image_time_ns(number, begin_s=0.011, step_s=0.07):
     return START_NS + round((begin_s + number * step_s) * SECOND)
 
 
-def recorded(path: Path) -> Path:
+def recorded(path):
     """A sweep of 12 images at 14 Hz and poses at 50 Hz."""
     bag = Bag(path)
     bag.geometry()

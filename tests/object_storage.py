@@ -12,9 +12,7 @@ import threading
 import time
 import urllib.request
 from collections import deque
-from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
 
 import pytest
 
@@ -30,13 +28,13 @@ _SLOW_DOWN = (
 class ObjectServer:
     """moto's S3 on a free port of 127.0.0.1."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         """Skips the test where moto or obstore is not installed."""
         for needed in ("moto", "obstore"):
             pytest.importorskip(needed)
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
-            self.port: int = free.getsockname()[1]
+            self.port = free.getsockname()[1]
         self._process = subprocess.Popen(
             [sys.executable, "-m", "moto.server", "-H", "127.0.0.1", "-p", str(self.port)],
             stdout=subprocess.DEVNULL,
@@ -53,26 +51,26 @@ class ObjectServer:
                 assert not end.passed
                 time.sleep(0.1)
 
-    def create_bucket(self) -> str:
+    def create_bucket(self):
         """The name of a new, empty bucket."""
         self._buckets += 1
         name = f"bucket-{os.getpid()}-{self._buckets}"
         self._ask("PUT", name)
         return name
 
-    def pause(self) -> None:
+    def pause(self):
         """Whoever asks hears nothing any more."""
         self._process.send_signal(signal.SIGSTOP)
 
-    def resume(self) -> None:
+    def resume(self):
         """Answers again, what was asked meanwhile too."""
         self._process.send_signal(signal.SIGCONT)
 
-    def remove(self) -> None:
+    def remove(self):
         self._process.kill()
         self._process.wait(60)
 
-    def _ask(self, method: str, path: str) -> None:
+    def _ask(self, method, path):
         request = urllib.request.Request(f"http://127.0.0.1:{self.port}/{path}", method=method)
         urllib.request.build_opener(urllib.request.ProxyHandler({})).open(request, timeout=10).close()
 
@@ -94,29 +92,29 @@ class Fault:
 class FaultyProxy:
     """Passes requests on to a server, one a connection, but for the faults that are waiting."""
 
-    def __init__(self, port: int) -> None:
+    def __init__(self, port):
         self._upstream = ("127.0.0.1", port)
-        self.faults: deque[Fault] = deque()
-        self.requests: list[str] = []  # the first line of each
+        self.faults = deque()
+        self.requests = []  # the first line of each
         self.away = False  # every connection ends at once
-        self._held: list[socket.socket] = []
+        self._held = []
         self._listener = socket.create_server(("127.0.0.1", 0), backlog=128)
-        self.port: int = self._listener.getsockname()[1]
+        self.port = self._listener.getsockname()[1]
         threading.Thread(target=self._accept, daemon=True).start()
 
-    def close(self) -> None:
+    def close(self):
         self._listener.shutdown(socket.SHUT_RDWR)
         self._listener.close()
         for one in self._held:
             one.close()
 
-    def _accept(self) -> None:
+    def _accept(self):
         with contextlib.suppress(OSError):
             while True:
                 client, _ = self._listener.accept()
                 threading.Thread(target=self._serve, args=(client,), daemon=True).start()
 
-    def _serve(self, client: socket.socket) -> None:
+    def _serve(self, client):
         if self.away:
             client.close()
             return
@@ -140,7 +138,7 @@ class FaultyProxy:
         if client not in self._held:
             client.close()
 
-    def _pass_on(self, client: socket.socket, head: list[bytes], body: bytes, fault: Fault | None) -> None:
+    def _pass_on(self, client, head, body, fault):
         kept = [line for line in head if not line.lower().startswith(b"connection:")]
         with socket.create_connection(self._upstream) as server:
             request = b"".join([*kept, b"Connection: close\r\n\r\n", body])
@@ -158,7 +156,7 @@ class FaultyProxy:
                     if left <= 0:
                         return
 
-    def _next_fault(self, method: str) -> Fault | None:
+    def _next_fault(self, method):
         for fault in list(self.faults):
             if fault.method in (None, method):
                 self.faults.remove(fault)
@@ -167,7 +165,7 @@ class FaultyProxy:
 
 
 @pytest.fixture(scope="session")
-def object_server() -> Iterator[ObjectServer]:
+def object_server():
     """One S3 server for all tests: they make buckets of their own in it."""
     server = ObjectServer()
     yield server
@@ -175,7 +173,7 @@ def object_server() -> Iterator[ObjectServer]:
 
 
 @pytest.fixture
-def object_proxy(object_server: ObjectServer, monkeypatch: pytest.MonkeyPatch) -> Iterator[FaultyProxy]:
+def object_proxy(object_server, monkeypatch):
     """The proxy through which this process, and those that it starts, ask the S3 server."""
     proxy = FaultyProxy(object_server.port)
     for name, value in credentials(proxy.port).items():
@@ -185,12 +183,12 @@ def object_proxy(object_server: ObjectServer, monkeypatch: pytest.MonkeyPatch) -
 
 
 @pytest.fixture
-def new_bucket(object_server: ObjectServer, object_proxy: FaultyProxy) -> Callable[[], str]:
+def new_bucket(object_server, object_proxy):
     """Makes the URL of an empty bucket."""
     return lambda: f"s3://{object_server.create_bucket()}/of/tests"
 
 
-def credentials(port: int) -> dict[str, Any]:
+def credentials(port):
     """The environment variables by which obstore finds the S3 server at a port of this machine."""
     return {
         "AWS_ENDPOINT_URL": f"http://127.0.0.1:{port}",

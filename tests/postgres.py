@@ -1,7 +1,5 @@
 """A PostgreSQL server of Debian's package, started by the tests that need one and ended with them."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import shutil
@@ -10,14 +8,13 @@ import socket
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from urllib.parse import quote
 
 import psycopg
 import pytest
 from psycopg import sql
-from typing_extensions import LiteralString
 
 from .waiting import Deadline
 
@@ -31,7 +28,7 @@ _UNPRIVILEGED = "nobody"  # PostgreSQL refuses to run as root
 class PostgresServer:
     """A server on a free port of 127.0.0.1, with the role `postgres`, which has a password."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         """Skips the test where PostgreSQL is not installed."""
         self._programs = _program_folder()
         self._numbers = itertools.count()
@@ -42,7 +39,7 @@ class PostgresServer:
         password = self._folder / "password"
         password.write_text(PASSWORD)
         self._log = self._folder / "log"
-        self._process: subprocess.Popen[bytes] | None = None
+        self._process = None
         options = ["--no-sync", "--no-locale", "--encoding=UTF8", "--username=postgres", "--auth=scram-sha-256"]
         with self._log.open("ab") as log:
             subprocess.run(
@@ -55,10 +52,10 @@ class PostgresServer:
             )
         with socket.socket() as free:
             free.bind(("127.0.0.1", 0))
-            self.port: int = free.getsockname()[1]
+            self.port = free.getsockname()[1]
         self.start()
 
-    def start(self) -> None:
+    def start(self):
         """Returns once connections are answered."""
         settings = [
             f"port={self.port}",
@@ -85,33 +82,31 @@ class PostgresServer:
                 assert not end.passed, self._log.read_text()
                 time.sleep(0.05)
 
-    def stop(self) -> None:
+    def stop(self):
         """Ends all connections, as a restart of the server does."""
-        assert self._process is not None
         self._process.send_signal(signal.SIGINT)
         self._process.wait(60)
 
-    def pause(self) -> None:
+    def pause(self):
         """Whoever is connected hears nothing any more, and is not told why."""
         self._signal_all(signal.SIGSTOP)
 
-    def resume(self) -> None:
+    def resume(self):
         """Goes on as if nothing had been."""
         self._signal_all(signal.SIGCONT)
 
-    def _signal_all(self, number: signal.Signals) -> None:
-        assert self._process is not None
+    def _signal_all(self, number):
         os.kill(self._process.pid, number)  # first: then there are no new children
         children = Path(f"/proc/{self._process.pid}/task/{self._process.pid}/children").read_text()
         for pid in children.split():
             os.kill(int(pid), number)
 
-    def execute(self, statement: LiteralString) -> None:
+    def execute(self, statement):
         """Runs one statement as the server's owner."""
         with self._connect() as connection:
             connection.execute(statement)
 
-    def set_read_only(self, url: str, value: bool) -> None:
+    def set_read_only(self, url, value):
         """Lets the transactions of a database change nothing, as those of a standby, or change what they like again."""
         name = url.rpartition("/")[2]
         statement = sql.SQL("ALTER DATABASE {} SET default_transaction_read_only = {}")
@@ -120,24 +115,24 @@ class PostgresServer:
             # Connections take it when they are made.
             connection.execute("SELECT pg_terminate_backend(pid) FROM pg_stat_activity WHERE datname = %s", [name])
 
-    def create_database(self) -> str:
+    def create_database(self):
         """The URL of a new database."""
         name = f"jobs_{next(self._numbers)}"
         with self._connect() as connection:
             connection.execute(sql.SQL("CREATE DATABASE {}").format(sql.Identifier(name)))
         return self.url(name)
 
-    def url(self, database: str, *, user: str = "postgres", password: str = PASSWORD) -> str:
+    def url(self, database, *, user="postgres", password=PASSWORD):
         """As an operator writes it."""
         return f"postgresql://{user}:{quote(password, safe='')}@127.0.0.1:{self.port}/{database}"
 
-    def remove(self) -> None:
+    def remove(self):
         """Nothing is left of it."""
         if self._process is not None and self._process.poll() is None:
             self.stop()
         shutil.rmtree(self._folder)
 
-    def _connect(self) -> psycopg.Connection:
+    def _connect(self):
         return psycopg.connect(
             host="127.0.0.1",
             port=self.port,
@@ -150,7 +145,7 @@ class PostgresServer:
 
 
 @pytest.fixture(scope="session")
-def postgres() -> Iterator[PostgresServer]:
+def postgres():
     """One server for all tests: they make databases of their own in it."""
     server = PostgresServer()
     yield server
@@ -158,15 +153,15 @@ def postgres() -> Iterator[PostgresServer]:
 
 
 @pytest.fixture(params=["sqlite", "postgresql"])
-def new_database(request: pytest.FixtureRequest) -> NewDatabase:
+def new_database(request):
     """Makes the URL of an empty database; None: a SQLite file in the artifact folder."""
     if request.param == "sqlite":
         return lambda: None
-    server: PostgresServer = request.getfixturevalue("postgres")
+    server = request.getfixturevalue("postgres")
     return server.create_database
 
 
-def _program_folder() -> Path:
+def _program_folder():
     """Debian keeps the server's programs out of PATH."""
     found = shutil.which("initdb")
     candidates = [*Path("/usr/lib/postgresql").glob("*/bin/initdb"), *([Path(found)] if found else [])]

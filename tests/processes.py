@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import statistics
-from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -23,7 +22,7 @@ class Taken:
     descriptors: int
 
 
-def taken_by(pid: int) -> Taken:
+def taken_by(pid):
     """Raises FileNotFoundError or ProcessLookupError where there is no such process."""
     folder = Path(f"/proc/{pid}")
     return Taken(
@@ -33,7 +32,7 @@ def taken_by(pid: int) -> Taken:
     )
 
 
-def _role(folder: Path) -> str:
+def _role(folder):
     """The name that a process of the pool gives itself; else its module; else that it is a helper."""
     name = (folder / "comm").read_text().strip()
     if name.startswith("ug-"):
@@ -42,9 +41,9 @@ def _role(folder: Path) -> str:
     return arguments[arguments.index("-m") + 1] if "-m" in arguments else HELPER
 
 
-def family(pid: int) -> dict[int, Taken]:
+def family(pid):
     """A process and its descendants, by process id."""
-    children: dict[int, list[int]] = {}
+    children = {}
     for folder in Path("/proc").iterdir():
         if folder.name.isdigit():
             with contextlib.suppress(*_GONE):
@@ -66,26 +65,26 @@ class Growth:
     last: float
 
     @classmethod
-    def of(cls, series: Sequence[float], parts: int) -> Growth:
+    def of(cls, series, parts):
         """Compares the second of `parts` equal parts, after the warm-up, with the last."""
         size = max(1, len(series) // parts)
         return cls(statistics.median(series[size : 2 * size] or series), statistics.median(series[-size:]))
 
     @property
-    def absolute(self) -> float:
+    def absolute(self):
         return self.last - self.earlier
 
     @property
-    def share(self) -> float:
+    def share(self):
         """1.0: twice as much."""
         return self.absolute / self.earlier if self.earlier else 0.0
 
 
-def by_role(samples: Iterable[dict[int, Taken]]) -> dict[str, list[dict[str, int]]]:
+def by_role(samples):
     """Samples of families as series by role: memory and descriptors of all processes that have it together."""
-    series: dict[str, list[dict[str, int]]] = {}
+    series = {}
     for sample in samples:
-        totals: dict[str, dict[str, int]] = {}
+        totals = {}
         for taken in sample.values():
             total = totals.setdefault(taken.role, {"resident_bytes": 0, "descriptors": 0})
             total["resident_bytes"] += taken.resident_bytes

@@ -1,9 +1,6 @@
 """Surroundings of their own for the tests: what the user's folders and environment hold changes nothing."""
 
-from __future__ import annotations
-
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -41,7 +38,7 @@ _FOREIGN = {
 }
 
 
-def forget_the_users_environment() -> None:
+def forget_the_users_environment():
     """Take out of this process's environment whatever could change what a test sees."""
     for name in list(os.environ):
         if name.startswith(_SWITCHES_OF_TESTS):
@@ -51,7 +48,7 @@ def forget_the_users_environment() -> None:
 
 
 @pytest.fixture(scope="session", autouse=True)
-def home_of_the_tests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path]:
+def home_of_the_tests(tmp_path_factory):
     """An empty home for this process and all that it starts, and a working folder that is not the checkout."""
     home = tmp_path_factory.mktemp("home")
     with pytest.MonkeyPatch.context() as patch:
@@ -61,7 +58,7 @@ def home_of_the_tests(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Path
 
 
 @pytest.fixture(autouse=True)
-def working_folder(tmp_path_factory: pytest.TempPathFactory, monkeypatch: pytest.MonkeyPatch) -> Path:
+def working_folder(tmp_path_factory, monkeypatch):
     """An empty working folder for each test."""
     folder = tmp_path_factory.mktemp("working")
     monkeypatch.chdir(folder)

@@ -1,7 +1,5 @@
 """The architecture as the source tree has it: no import circles, storeys, no probe kinds in the open."""
 
-from __future__ import annotations
-
 import ast
 from functools import cache
 from graphlib import CycleError, TopologicalSorter
@@ -39,7 +37,7 @@ SERVICE_ROOMS = (  # each may import those before it
 
 
 @cache
-def modules() -> dict[str, Path]:
+def modules():
     """Every module of the product by its name; those compiled by their stubs."""
     found = {}
     for root in SOURCE_ROOTS:
@@ -51,12 +49,12 @@ def modules() -> dict[str, Path]:
 
 
 @cache
-def tree(name: str) -> ast.Module:
+def tree(name):
     return ast.parse(modules()[name].read_text(encoding="utf-8"))
 
 
 @cache
-def imports_of(name: str) -> set[str]:
+def imports_of(name):
     """The product's modules that a module names in imports, wherever they stand: in functions and for types too."""
     is_package = modules()[name].stem == "__init__"
     found = set()
@@ -71,7 +69,7 @@ def imports_of(name: str) -> set[str]:
     return (found & modules().keys()) - {name}
 
 
-def test_no_module_imports_itself_by_way_of_others() -> None:
+def test_no_module_imports_itself_by_way_of_others():
     try:
         TopologicalSorter({name: imports_of(name) for name in modules()}).prepare()
     except CycleError as error:
@@ -79,7 +77,7 @@ def test_no_module_imports_itself_by_way_of_others() -> None:
 
 
 @pytest.mark.parametrize("package", MAY_IMPORT)
-def test_distributions_import_only_those_below_them(package: str) -> None:
+def test_distributions_import_only_those_below_them(package):
     wrong = {
         (name, other)
         for name in modules()
@@ -90,7 +88,7 @@ def test_distributions_import_only_those_below_them(package: str) -> None:
     assert wrong == set()
 
 
-def test_rooms_of_the_library_import_only_those_below_them() -> None:
+def test_rooms_of_the_library_import_only_those_below_them():
     inside = {name: (*name.split("."), "")[1] for name in modules() if name.partition(".")[0] == "ultragray"}
     wrong = {
         (name, other)
@@ -101,7 +99,7 @@ def test_rooms_of_the_library_import_only_those_below_them() -> None:
     assert wrong == set()
 
 
-def test_rooms_of_the_service_import_only_those_before_them() -> None:
+def test_rooms_of_the_service_import_only_those_before_them():
     places = {
         name: SERVICE_ROOMS.index((*name.split("."), "")[1])
         for name in modules()
@@ -116,12 +114,12 @@ def test_rooms_of_the_service_import_only_those_before_them() -> None:
     assert wrong == set()
 
 
-def test_every_module_says_what_it_is_for() -> None:
+def test_every_module_says_what_it_is_for():
     written = {name for name, path in modules().items() if path.suffix == ".py" and "_pb2" not in name}
     assert {name for name in written if not ast.get_docstring(tree(name))} == set()
 
 
-def test_nobody_outside_its_module_asks_for_the_kind_of_a_probe() -> None:
+def test_nobody_outside_its_module_asks_for_the_kind_of_a_probe():
     found = [
         f"{name}:{node.lineno}"
         for name in modules()
@@ -133,7 +131,7 @@ def test_nobody_outside_its_module_asks_for_the_kind_of_a_probe() -> None:
     assert {"LinearProbe", "RadialProbe"} <= kinds_of_probes()
 
 
-def asks_for_a_kind(node: ast.Call | ast.Compare) -> bool:
+def asks_for_a_kind(node):
     """`isinstance(probe, LinearProbe)`, or `probe.kind == "linear"`."""
     if isinstance(node, ast.Call):
         is_check = ast.unparse(node.func) in ("isinstance", "issubclass")
@@ -143,7 +141,7 @@ def asks_for_a_kind(node: ast.Call | ast.Compare) -> bool:
 
 
 @cache
-def kinds_of_probes() -> set[str]:
+def kinds_of_probes():
     """The classes of the probe module that define a `kind` of their own."""
     return {
         node.name

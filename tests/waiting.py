@@ -1,11 +1,8 @@
 """Waiting for what another process or thread does, and how long that may take."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import time
-from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
@@ -15,17 +12,17 @@ Found = TypeVar("Found")
 class Deadline:
     """So many seconds from now, of a machine that has nothing else to do; later as long as others keep it busy."""
 
-    def __init__(self, seconds: float) -> None:
+    def __init__(self, seconds):
         self._began = time.monotonic()
         self._seconds = seconds
 
     @property
-    def passed(self) -> bool:
+    def passed(self):
         elapsed = time.monotonic() - self._began
         return elapsed > self._seconds and elapsed > at_this_load(self._seconds)
 
 
-def wait_until(condition: Callable[[], Found], *, within_s: float = 60, every_s: float = 0.01) -> Found:
+def wait_until(condition, *, within_s=60, every_s=0.01):
     """The first true answer of `condition`; an AssertionError where none comes before the Deadline of `within_s`."""
     deadline = Deadline(within_s)
     while not (found := condition()):
@@ -39,17 +36,17 @@ class SkippingLoop(asyncio.SelectorEventLoop):
 
     now = 1000.0
 
-    def time(self) -> float:
+    def time(self):
         return self.now
 
-    def _run_once(self) -> None:
+    def _run_once(self):
         self.now += 1e-6  # no clock stands still while there is something to do
-        if not self._ready and self._scheduled:  # type: ignore[attr-defined]
-            self.now = max(self.now, self._scheduled[0].when())  # type: ignore[attr-defined]
-        super()._run_once()  # type: ignore[misc]
+        if not self._ready and self._scheduled:
+            self.now = max(self.now, self._scheduled[0].when())
+        super()._run_once()
 
 
-def at_this_load(seconds: float) -> float:
+def at_this_load(seconds):
     """A limit of a machine that has nothing else to do, as it stands now: longer where others keep it busy."""
     average, _, _, running, _ = Path("/proc/loadavg").read_text(encoding="ascii").split()  # the first: of a minute
     now = int(running.partition("/")[0]) - 1  # without this process; the average lags behind

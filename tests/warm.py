@@ -5,8 +5,6 @@ A fork begins as the program would after its imports: with the folder, the envir
 Tests about starting itself use real processes.
 """
 
-from __future__ import annotations
-
 import atexit
 import contextlib
 import gc
@@ -21,7 +19,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Mapping
 from pathlib import Path
 
 SOURCE_FOLDERS = ("model", "proto", "workers", "service", "client", "studies")
@@ -33,17 +30,17 @@ _START_TIMEOUT_S = 120.0
 class WarmProcess:
     """A process forked for us, with the methods of subprocess.Popen that the tests use."""
 
-    def __init__(self, pid: int, connection: socket.socket) -> None:
+    def __init__(self, pid, connection):
         self.pid = pid
-        self.returncode: int | None = None
+        self.returncode = None
         self._connection = connection  # its end brings the exit code
 
-    def poll(self) -> int | None:
+    def poll(self):
         with contextlib.suppress(subprocess.TimeoutExpired):
             self.wait(0)
         return self.returncode
 
-    def wait(self, timeout: float | None = None) -> int:
+    def wait(self, timeout=None):
         if self.returncode is None:
             self._connection.settimeout(timeout)
             try:
@@ -54,25 +51,25 @@ class WarmProcess:
             self.returncode = int(told) if told else -signal.SIGKILL  # the process that forks was ended with it
         return self.returncode
 
-    def send_signal(self, number: int) -> None:
+    def send_signal(self, number):
         if self.poll() is None:
             os.kill(self.pid, number)
 
-    def terminate(self) -> None:
+    def terminate(self):
         self.send_signal(signal.SIGTERM)
 
-    def kill(self) -> None:
+    def kill(self):
         self.send_signal(signal.SIGKILL)
 
 
 class WarmServer:
     """Starts the process that forks when it is first asked, and ends it with the tests."""
 
-    def __init__(self, *modules: str) -> None:
+    def __init__(self, *modules):
         self._modules = modules
-        self._folder: Path | None = None
+        self._folder = None
 
-    def path(self) -> Path:
+    def path(self):
         """Where the process listens."""
         if self._folder is None:
             self._folder = Path(tempfile.mkdtemp(prefix="ultragray-warm-"))
@@ -94,20 +91,12 @@ class WarmServer:
         return self._folder / "socket"
 
     @staticmethod
-    def _stop(process: subprocess.Popen[bytes], folder: Path) -> None:
+    def _stop(process, folder):
         process.communicate()
         shutil.rmtree(folder)
 
 
-def fork(
-    path: Path,
-    function: str,
-    arguments: list[object],
-    *,
-    environment: Mapping[str, str],
-    folder: Path,
-    files: tuple[int, ...],
-) -> WarmProcess:
+def fork(path, function, arguments, *, environment, folder, files):
     """Has the process that listens at `path` fork one that calls `function` of this module.
 
     `files` are descriptors: stdin, stdout, stderr, and more, which the function gets after its `arguments`.
@@ -122,14 +111,14 @@ def fork(
 WARM_TEMPLATES = WarmServer("torch", "ultragray_workers.pool.worker")
 
 
-def start_template(path: Path, descriptor: int) -> WarmProcess:
+def start_template(path, descriptor):
     """As ultragray_workers.pool.processes.start_template."""
     with open(os.devnull, "r+b") as null:
         files = (null.fileno(), 1, 2, descriptor)
         return fork(path, "template", [], environment=os.environ, folder=Path.cwd(), files=files)
 
 
-def template(descriptor: int) -> int:
+def template(descriptor):
     """The template process of a pool."""
     from ultragray_workers.pool.template import main
 
@@ -152,7 +141,7 @@ SHORT_WAITS = {
 }
 
 
-def service(templates: str) -> int:
+def service(templates):
     """The service, whose pool has its template forked as well."""
     from ultragray_service.__main__ import main
     from ultragray_workers.pool import processes as launcher
@@ -162,16 +151,16 @@ def service(templates: str) -> int:
         owner = importlib.import_module(f"ultragray_service.{module}")
         assert isinstance(getattr(owner, name), float), place
         setattr(owner, name, seconds)
-    launcher.start_template = lambda descriptor: start_template(Path(templates), descriptor)  # type: ignore[assignment,return-value]
+    launcher.start_template = lambda descriptor: start_template(Path(templates), descriptor)
     return main()
 
 
-FUNCTIONS: dict[str, Callable[..., int]] = {"template": template, "service": service}
+FUNCTIONS = {"template": template, "service": service}
 
 
-def serve(path: str) -> int:
+def serve(path):
     """Forks for whoever connects, until stdin ends. In a fork, the exit code of what it was forked for."""
-    running: dict[int, socket.socket] = {}
+    running = {}
     ended, wake = socket.socketpair()
     wake.setblocking(False)
     signal.set_wakeup_fd(wake.fileno(), warn_on_full_buffer=False)
@@ -205,18 +194,18 @@ def serve(path: str) -> int:
             return 0
 
 
-def begin(request: dict[str, object], files: list[int]) -> int:
+def begin(request, files):
     """What a fork does: takes over the state of a fresh process, then calls the function."""
     signal.set_wakeup_fd(-1)
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.default_int_handler)
     os.environ.clear()
-    os.environ.update(request["environment"])  # type: ignore[call-overload]
+    os.environ.update(request["environment"])
     os.chdir(str(request["folder"]))
     for number, file in enumerate(files[:_STANDARD_FILES]):
         os.dup2(file, number)
         os.close(file)
-    return FUNCTIONS[str(request["function"])](*request["arguments"], *files[_STANDARD_FILES:])  # type: ignore[misc]
+    return FUNCTIONS[str(request["function"])](*request["arguments"], *files[_STANDARD_FILES:])
 
 
 if __name__ == "__main__":

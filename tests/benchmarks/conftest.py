@@ -26,16 +26,16 @@ class Repository:
 
     path: Path
 
-    def git(self, *words: str) -> str:
+    def git(self, *words):
         command = ["git", *COMMITTER, "-C", str(self.path), *words]
         return subprocess.run(command, capture_output=True, text=True, check=True).stdout.strip()
 
     @property
-    def commit(self) -> str:
+    def commit(self):
         return self.git("rev-parse", "--short=12", "HEAD")
 
 
-def adopt(monkeypatch: pytest.MonkeyPatch, root: Path) -> None:
+def adopt(monkeypatch, root):
     """Let the scripts take a folder for the root of their checkout."""
     for module in (benchmark("figures"), report):
         monkeypatch.setattr(module, "ROOT", root)
@@ -43,7 +43,7 @@ def adopt(monkeypatch: pytest.MonkeyPatch, root: Path) -> None:
 
 
 @pytest.fixture
-def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Repository:
+def repository(tmp_path, monkeypatch):
     """A repository that the scripts take for their own."""
     if shutil.which("git") is None:
         pytest.skip("git is not installed")
@@ -59,7 +59,7 @@ def repository(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Repository:
 
 
 @pytest.fixture
-def data(tmp_path: Path) -> Path:
+def data(tmp_path):
     """A folder of data with one sweep in it, `ball`: six training and two held-out frames of noise, 1 mm apart."""
     rng = np.random.default_rng(0)
     poses = np.tile(np.eye(4), (8, 1, 1))

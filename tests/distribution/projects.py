@@ -1,10 +1,6 @@
 """The five projects of this repository, as their pyproject.toml say."""
 
-from __future__ import annotations
-
 import subprocess
-from pathlib import Path
-from typing import Any
 
 import tomllib
 from packaging.requirements import Requirement
@@ -21,16 +17,15 @@ FOLDERS = {
 }
 
 
-def pyproject(name: str) -> dict[str, Any]:
+def pyproject(name):
     return tomllib.loads((FOLDERS[name] / "pyproject.toml").read_text(encoding="utf-8"))
 
 
-def project(name: str) -> dict[str, Any]:
-    found: dict[str, Any] = pyproject(name)["project"]
-    return found
+def project(name):
+    return pyproject(name)["project"]
 
 
-def packages(name: str) -> list[str]:
+def packages(name):
     """The import packages that the wheel of a project holds."""
     tool = pyproject(name)["tool"]
     folders = (
@@ -41,7 +36,7 @@ def packages(name: str) -> list[str]:
     return [folder.rpartition("/")[2] for folder in folders]
 
 
-def unpacked(sdist: Path, folder: Path) -> Path:
+def unpacked(sdist, folder):
     """The one folder that an sdist holds. By `tar`: the filters and warnings of tarfile depend on Python's version."""
     folder.mkdir()
     subprocess.run(["tar", "-xf", str(sdist), "-C", str(folder)], check=True)
@@ -49,6 +44,6 @@ def unpacked(sdist: Path, folder: Path) -> Path:
     return source
 
 
-def names_of(requirements: list[str]) -> set[str]:
+def names_of(requirements):
     """The canonical names of the distributions that requirements name."""
     return {canonicalize_name(Requirement(text).name) for text in requirements}

@@ -1,14 +1,10 @@
 """Every module that is imported comes with the core's dependencies or with an extra that errors name."""
 
-from __future__ import annotations
-
 import ast
 import re
 import subprocess
 import sys
-from collections.abc import Iterator, Mapping, Sequence
 from importlib import metadata
-from pathlib import Path
 
 import pytest
 from packaging.utils import canonicalize_name
@@ -31,9 +27,9 @@ NO_FEATURES = {"all", "dev", "docs", "envoy", "notebooks"}
 NOT_IN_ALL = {"ray"}  # 260 MB, for those who have a cluster
 
 
-def imported() -> dict[str, Path]:
+def imported():
     """Modules of others that the packages of `ultragray` import anywhere, and one file that does."""
-    found: dict[str, Path] = {}
+    found = {}
     for folder in pyproject("ultragray")["tool"]["scikit-build"]["wheel"]["packages"]:
         for path in sorted((ROOT / folder).rglob("*.py")):
             for name in imports_of(path):
@@ -42,7 +38,7 @@ def imported() -> dict[str, Path]:
     return found
 
 
-def imports_of(path: Path) -> Iterator[str]:
+def imports_of(path):
     for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
         if isinstance(node, ast.Import):
             yield from (alias.name for alias in node.names)
@@ -50,13 +46,13 @@ def imports_of(path: Path) -> Iterator[str]:
             yield node.module
 
 
-def owners(module: str, holders: Mapping[str, Sequence[str]]) -> set[str]:
+def owners(module, holders):
     """The canonical names of the distributions that may hold a module: those that do, or of its own name."""
     top = module.partition(".")[0]
     return {canonicalize_name(name) for name in (BROUGHT_BY.get(top, top), *holders.get(top, ()))}
 
 
-def test_every_imported_module_is_brought_by_what_the_table_says() -> None:
+def test_every_imported_module_is_brought_by_what_the_table_says():
     own, holders = project("ultragray"), metadata.packages_distributions()
     brought = {None: names_of(own["dependencies"])}
     brought |= {extra: names_of(own["optional-dependencies"][extra]) for extra in MODULES_OF_EXTRAS}
@@ -66,16 +62,16 @@ def test_every_imported_module_is_brought_by_what_the_table_says() -> None:
             assert owners(module, holders) & brought[extra], f"{path} imports {module}; the table: {extra or 'core'}"
 
 
-def test_the_table_names_the_extras_that_there_are() -> None:
+def test_the_table_names_the_extras_that_there_are():
     assert set(MODULES_OF_EXTRAS) == set(project("ultragray")["optional-dependencies"]) - NO_FEATURES
 
 
-def test_all_holds_every_extra_but_those_for_few() -> None:
+def test_all_holds_every_extra_but_those_for_few():
     (everything,) = project("ultragray")["optional-dependencies"]["all"]
     assert set(re.findall(r"\w+", everything)) - {"ultragray"} == set(MODULES_OF_EXTRAS) - NOT_IN_ALL
 
 
-def test_no_sentence_names_an_extra_by_hand() -> None:
+def test_no_sentence_names_an_extra_by_hand():
     """Those that do grow old; `install_advice` knows how this installation was made."""
     for folder in ("model", "workers", "service", "client"):
         for path in (ROOT / folder).rglob("*.py"):
@@ -85,7 +81,7 @@ def test_no_sentence_names_an_extra_by_hand() -> None:
 
 
 @pytest.mark.parametrize("extra", MODULES_OF_EXTRAS)
-def test_advice_fits_the_installation(extra: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_advice_fits_the_installation(extra, tmp_path, monkeypatch):
     monkeypatch.setattr(sys, "version_info", (3, 11, 0))
     monkeypatch.setattr(installation, "_CHECKOUT", tmp_path)
     assert install_advice(extra) == f"pip install 'ultragray[{extra}]'"
@@ -97,13 +93,7 @@ def test_advice_fits_the_installation(extra: str, tmp_path: Path, monkeypatch: p
     assert install_advice(extra) == f".venv/bin/pip install {stubs}'ultragray[{extra}]'"
 
 
-def test_advice_on_a_python_that_is_too_old(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(sys, "version_info", (3, 10, 13))
-    assert "Python 3.11" in install_advice("serve")
-    assert "pip install" in install_advice("hdf5")
-
-
-def test_a_module_of_nobody_is_no_missing_extra() -> None:
+def test_a_module_of_nobody_is_no_missing_extra():
     with pytest.raises(ModuleNotFoundError):
         missing_extra(ModuleNotFoundError("no module", name="ultragray.renderring"), "it")
     told = missing_extra(ModuleNotFoundError("no module", name="opentelemetry.sdk"), "it")
@@ -126,12 +116,12 @@ app()
 """
 
 
-def core_alone(*arguments: str) -> subprocess.CompletedProcess[str]:
+def core_alone(*arguments):
     return subprocess.run([sys.executable, "-c", CORE_ALONE, *arguments], capture_output=True, text=True, timeout=120)
 
 
 @pytest.mark.long
-def test_the_core_renders_without_any_extra(working_folder: Path) -> None:
+def test_the_core_renders_without_any_extra(working_folder):
     for arguments in (
         ("demo", "-o", "demo.ugr"),
         ("render", "demo.ugr", "--height", "16", "--width", "16", "-o", "frames.npz"),
@@ -147,7 +137,7 @@ def test_the_core_renders_without_any_extra(working_folder: Path) -> None:
     ("command", "extra"),
     [("serve", "serve"), ("worker", "serve"), ("keys list", "serve"), ("report absent -o r.html", "train")],
 )
-def test_a_command_without_its_extra_says_what_to_install(command: str, extra: str) -> None:
+def test_a_command_without_its_extra_says_what_to_install(command, extra):
     done = core_alone(*command.split())
     assert done.returncode == 2
     *_, last = done.stderr.splitlines()

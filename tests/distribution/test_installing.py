@@ -3,8 +3,6 @@
 What they need of others is borrowed from the environment of the tests instead of downloaded.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -14,7 +12,6 @@ import sys
 import urllib.request
 import venv
 import zipfile
-from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -36,21 +33,21 @@ with Client(sys.argv[1]) as client:
 """
 
 
-def run(command: list[object], cwd: Path, **environment: str) -> subprocess.CompletedProcess[str]:
+def run(command, cwd, **environment):
     shown = [str(part) for part in command]
     return subprocess.run(
         shown, cwd=cwd, env={**os.environ, **environment}, capture_output=True, text=True, timeout=900
     )
 
 
-def succeeds(command: list[object], cwd: Path, **environment: str) -> str:
+def succeeds(command, cwd, **environment):
     done = run(command, cwd, **environment)
     assert done.returncode == 0, done.stdout + done.stderr
     return done.stdout
 
 
 @pytest.fixture(scope="module")
-def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def built(tmp_path_factory):
     """A folder with the sdists and wheels of all four projects, each wheel built from its sdist."""
     if not (ROOT / CONSOLE_PAGE).is_file():
         pytest.skip("a wheel holds the console, and that is not built: make console")
@@ -60,13 +57,13 @@ def built(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return output
 
 
-def wheel_of(built: Path, name: str) -> Path:
+def wheel_of(built, name):
     (found,) = built.glob(f"{name.replace('-', '_')}-*.whl")
     return found
 
 
 @pytest.fixture(scope="session")
-def libraries(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def libraries(tmp_path_factory):
     """A folder with links to all that is installed beside torch, but for what is ours."""
     folder = tmp_path_factory.mktemp("libraries")
     for path in Path(torch.__file__).parents[1].iterdir():
@@ -78,32 +75,32 @@ def libraries(tmp_path_factory: pytest.TempPathFactory) -> Path:
 class Environment:
     """A virtual environment that sees `libraries`, and has pip from there."""
 
-    def __init__(self, folder: Path, libraries: Path) -> None:
+    def __init__(self, folder, libraries):
         venv.create(folder, with_pip=False, symlinks=True)
         self.folder, self.python = folder, folder / "bin" / "python"
         (self.site,) = folder.glob("lib/python3*/site-packages")
         (self.site / "libraries.pth").write_text(f"{libraries}\n")
 
-    def pip(self, *arguments: object) -> None:
+    def pip(self, *arguments):
         succeeds([self.python, "-m", "pip", *arguments], self.folder)
 
-    def install(self, *wheels: Path) -> None:
+    def install(self, *wheels):
         self.pip("install", "--no-deps", "--no-index", *wheels)
 
-    def uninstall(self, name: str) -> None:
+    def uninstall(self, name):
         self.pip("uninstall", "--yes", name)
 
-    def ours(self) -> set[str]:
+    def ours(self):
         return {path.name for path in self.site.glob("ultragray*") if not path.name.endswith(".dist-info")}
 
 
 @pytest.fixture
-def environment(tmp_path: Path, libraries: Path) -> Environment:
+def environment(tmp_path, libraries):
     return Environment(tmp_path / "environment", libraries)
 
 
 @contextmanager
-def serving(environment: Environment, folder: Path) -> Iterator[tuple[str, str]]:
+def serving(environment, folder):
     """`ultragray serve` in an empty folder, with a PATH on which there is no compiler; its HTTP and gRPC addresses."""
     command = [environment.folder / "bin" / "ultragray", "serve", "--http-port", "0", "--grpc-port", "0"]
     surroundings = {**os.environ, "PATH": str(environment.folder / "bin")}
@@ -125,7 +122,7 @@ def serving(environment: Environment, folder: Path) -> Iterator[tuple[str, str]]
             service.terminate()
 
 
-def test_a_wheel_holds_its_packages_the_kernel_and_the_console(built: Path) -> None:
+def test_a_wheel_holds_its_packages_the_kernel_and_the_console(built):
     with zipfile.ZipFile(wheel_of(built, "ultragray")) as wheel:
         names = wheel.namelist()
     assert {name.partition("/")[0] for name in names if ".dist-info/" not in name} == set(packages("ultragray"))
@@ -137,7 +134,7 @@ def test_a_wheel_holds_its_packages_the_kernel_and_the_console(built: Path) -> N
         assert sources <= set(names)
 
 
-def test_an_sdist_without_the_console_builds_nothing(built: Path, tmp_path: Path) -> None:
+def test_an_sdist_without_the_console_builds_nothing(built, tmp_path):
     (sdist,) = built.glob("ultragray-*.tar.gz")
     source = unpacked(sdist, tmp_path / "source")
     shutil.rmtree((source / CONSOLE_PAGE).parent)
@@ -150,15 +147,13 @@ def test_an_sdist_without_the_console_builds_nothing(built: Path, tmp_path: Path
     assert not (tmp_path / "dist").exists()
 
 
-def test_the_core_alone_renders_a_frame(built: Path, environment: Environment, tmp_path: Path) -> None:
+def test_the_core_alone_renders_a_frame(built, environment, tmp_path):
     environment.install(wheel_of(built, "ultragray"))
     said = succeeds([environment.python, ROOT / "distribution/render_a_frame.py"], tmp_path, PATH=str(tmp_path))
     assert "its first frame rendered" in said
 
 
-def test_a_service_of_wheels_shows_console_and_demo_scene(
-    built: Path, environment: Environment, libraries: Path, tmp_path: Path, working_folder: Path
-) -> None:
+def test_a_service_of_wheels_shows_console_and_demo_scene(built, environment, libraries, tmp_path, working_folder):
     environment.install(wheel_of(built, "ultragray"), wheel_of(built, "ultragray-proto"))
     client = Environment(tmp_path / "client", libraries)
     client.install(wheel_of(built, "ultragray-client"), wheel_of(built, "ultragray-proto"))
@@ -170,9 +165,7 @@ def test_a_service_of_wheels_shows_console_and_demo_scene(
         assert succeeds([client.python, "-c", RENDERING, grpc], tmp_path) == "(256, 256)\n"
 
 
-def test_removing_one_leaves_the_other_working(
-    built: Path, environment: Environment, libraries: Path, tmp_path: Path, working_folder: Path
-) -> None:
+def test_removing_one_leaves_the_other_working(built, environment, libraries, tmp_path, working_folder):
     wheels = [wheel_of(built, name) for name in FOLDERS]
     environment.install(*wheels)
     environment.uninstall("ultragray-client")
@@ -185,6 +178,6 @@ def test_removing_one_leaves_the_other_working(
         assert succeeds([client.python, "-c", RENDERING, grpc], tmp_path) == "(256, 256)\n"
 
 
-def _packages_without(removed: str) -> set[str]:
+def _packages_without(removed):
     """The import packages of all distributions but one."""
     return {package for name in FOLDERS if name != removed for package in packages(name)}

@@ -1,7 +1,5 @@
 """The wheels and sdists of client, messages, node and studies: each holds its own package, and what ROS looks for."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import tarfile
@@ -26,19 +24,19 @@ FOR_ROS = {
 }
 
 
-def sources(folder: Path) -> set[str]:
+def sources(folder):
     files = (path for path in folder.rglob("*") if path.is_file() and "__pycache__" not in path.parts)
     return {path.relative_to(folder.parent).as_posix() for path in files}
 
 
-def build(folder: Path, target: str, output: Path) -> Path:
+def build(folder, target, output):
     command = [sys.executable, "-m", "hatchling", "build", "-t", target, "-d", str(output)]
     subprocess.run(command, cwd=folder, check=True, capture_output=True)
     return next(output.iterdir())
 
 
 @pytest.mark.parametrize("project", PACKAGES)
-def test_a_wheel_holds_its_package_and_the_licence(project: str, tmp_path: Path) -> None:
+def test_a_wheel_holds_its_package_and_the_licence(project, tmp_path):
     with zipfile.ZipFile(build(ROOT / project, "wheel", tmp_path)) as wheel:
         about = {name for name in wheel.namelist() if ".dist-info/" in name or ".data/data/" in name}
         (licence,) = (wheel.read(name) for name in about if name.endswith("/licenses/LICENSE"))
@@ -47,7 +45,7 @@ def test_a_wheel_holds_its_package_and_the_licence(project: str, tmp_path: Path)
 
 
 @pytest.mark.parametrize("project", PACKAGES)
-def test_a_wheel_of_the_sdist_is_the_same(project: str, tmp_path: Path) -> None:
+def test_a_wheel_of_the_sdist_is_the_same(project, tmp_path):
     source = unpacked(build(ROOT / project, "sdist", tmp_path / "sdist"), tmp_path / "source")
     with zipfile.ZipFile(build(source, "wheel", tmp_path / "wheel")) as wheel:
         files = {name for name in wheel.namelist() if ".dist-info/" not in name and ".data/data/" not in name}
@@ -55,13 +53,13 @@ def test_a_wheel_of_the_sdist_is_the_same(project: str, tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("project", PACKAGES)
-def test_the_wheel_of_the_node_holds_what_ros_looks_for(project: str, tmp_path: Path) -> None:
+def test_the_wheel_of_the_node_holds_what_ros_looks_for(project, tmp_path):
     with zipfile.ZipFile(build(ROOT / project, "wheel", tmp_path)) as wheel:
         installed = {name.partition(".data/data/")[2] for name in wheel.namelist() if ".data/data/" in name}
     assert installed == (FOR_ROS if project == "ros" else set())
 
 
-def test_the_sdist_of_the_messages_has_what_other_languages_generate_stubs_from(tmp_path: Path) -> None:
+def test_the_sdist_of_the_messages_has_what_other_languages_generate_stubs_from(tmp_path):
     with tarfile.open(build(ROOT / "proto", "sdist", tmp_path)) as sdist:
         held = {Path(name).name for name in sdist.getnames()}
     assert {path.name for path in (ROOT / "proto/ultragray/v1").glob("*.proto")} <= held

@@ -32,11 +32,11 @@ class Block:
     prepare: tuple[str, ...] = ()  # commands that run before it
     serves: bool = False
 
-    def script(self) -> str:
+    def script(self):
         """The commands of a shell block, for bash. A console block's output is left out."""
         if self.language == "bash":
             return self.code
-        commands: list[str] = []
+        commands = []
         for line in self.code.splitlines():
             if commands and _goes_on(commands[-1]):
                 commands[-1] += f"\n{line}"
@@ -45,7 +45,7 @@ class Block:
         return "\n".join(commands) + "\n"
 
 
-def _goes_on(command: str) -> bool:
+def _goes_on(command):
     """Whether the next line belongs to a command: after a backslash, or in quotes that are still open."""
     if command.endswith("\\"):
         return True
@@ -65,7 +65,7 @@ class Page:
     blocks: tuple[Block, ...]
 
     @property
-    def runs(self) -> list[Block]:
+    def runs(self):
         return [block for block in self.blocks if block.language not in INERT]
 
 
@@ -78,7 +78,7 @@ class _Steering:
     serves: bool = False
 
 
-def read_page(path: Path) -> Page:
+def read_page(path):
     """The page of a Markdown file. Raises PageInvalid for a block without a language that we know."""
     text = path.read_text(encoding="utf-8")
     needs, blocks, steering = [], [], _Steering()

@@ -1,9 +1,7 @@
 """The generator of the site, and the run of a page."""
 
-from __future__ import annotations
-
 import shutil
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from importlib import import_module
 from pathlib import Path
 from types import ModuleType
@@ -13,7 +11,7 @@ import pytest
 from ultragray.phantom.demo import copy_demo_scene
 
 from ..scripts import loaded_package
-from ..service.conftest import StartService, service_starter
+from ..service.conftest import service_starter
 from ..surroundings import ROOT
 from .blocks import read_page
 from .running import PageRun
@@ -22,30 +20,29 @@ DEMO_SERVICE = "demo service"
 TUTORIAL = ROOT / "docs" / "tutorial.md"
 
 Generator = Callable[[str], ModuleType]
-SharedPorts = Callable[[], dict[str, int]]
 RunPage = Callable[[Path], None]
 
 
 @pytest.fixture(scope="session")
-def generator() -> Generator:
+def generator():
     """A module of docs/generator by its name."""
     package = loaded_package(ROOT / "docs" / "generator")
     return lambda name: import_module(f"{package.__name__}.{name}")
 
 
 @pytest.fixture(scope="module")
-def start_service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StartService]:
+def start_service(tmp_path_factory):
     folder = tmp_path_factory.mktemp("demo")
     copy_demo_scene(folder / "demo.ugr")
     yield from service_starter(tmp_path_factory, folder)
 
 
 @pytest.fixture(scope="module")
-def shared_ports(start_service: StartService) -> SharedPorts:
+def shared_ports(start_service):
     """The ports of the service that the pages share, which is started by the first page that needs it."""
-    found: dict[str, int] = {}
+    found = {}
 
-    def ports() -> dict[str, int]:
+    def ports():
         if not found:
             service = start_service(igtl_port=0, igtl_scene="demo", embedded_worker=True)
             (record,) = (record for record in service.log() if "grpc" in record)
@@ -56,10 +53,10 @@ def shared_ports(start_service: StartService) -> SharedPorts:
 
 
 @pytest.fixture
-def run_page(shared_ports: SharedPorts, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> RunPage:
+def run_page(shared_ports, tmp_path, monkeypatch):
     """Runs a page in a folder of its own."""
 
-    def run(path: Path) -> None:
+    def run(path):
         page = read_page(path)
         for need in set(page.needs) - {DEMO_SERVICE}:
             if shutil.which(need) is None:

@@ -1,7 +1,5 @@
 """Runs the blocks of a page in a folder, one after another."""
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import doctest
@@ -15,14 +13,12 @@ import sys
 import tempfile
 import time
 import urllib.request
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
 import yaml
 
 from ..waiting import Deadline
-from .blocks import SHELL, Block, Page
+from .blocks import SHELL
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -39,19 +35,19 @@ _PARSERS = {"json": json.loads, "toml": tomllib.loads, "yaml": yaml.safe_load}
 class PageRun:
     """The run of a page: its folder, the names of its Python blocks, and the service that it started."""
 
-    def __init__(self, page: Page, folder: Path, ports: Mapping[str, int] | None) -> None:
+    def __init__(self, page, folder, ports):
         """`ports`: those of the shared service by door, where the page needs it."""
         self.page, self.folder, self.ports = page, folder, ports
-        self.names: dict[str, Any] = {"__name__": "__main__"}
-        self.served: subprocess.Popen[bytes] | None = None
+        self.names = {"__name__": "__main__"}
+        self.served = None
 
-    def __enter__(self) -> PageRun:
+    def __enter__(self):
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         self._stop_serving()
 
-    def run(self, block: Block) -> None:
+    def run(self, block):
         for command in block.prepare:
             self._shell(command, block)
         code = self._with_ports(block.code)
@@ -65,7 +61,7 @@ class PageRun:
             else:
                 self._shell(self._with_ports(block.script()), block)
 
-    def environment(self) -> dict[str, str]:
+    def environment(self):
         """That of the commands. A service that a page starts gets ports of its own from it."""
         path = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))
         found = {**os.environ, "PATH": path, "COLUMNS": "120", "ULTRAGRAY_THREADS_PER_PROCESS": "1"}
@@ -73,14 +69,14 @@ class PageRun:
             found["ULTRAGRAY_ADDRESS"] = f"http://127.0.0.1:{self.ports['http']}"
         return found
 
-    def _with_ports(self, text: str) -> str:
+    def _with_ports(self, text):
         ports = self.ports
         return text if ports is None else _ADDRESS.sub(lambda match: f"{match[1]}{ports[PORTS[match[2]]]}", text)
 
-    def _place(self, block: Block) -> str:
+    def _place(self, block):
         return f"{self.page.path}:{block.line}"
 
-    def _python(self, code: str, block: Block) -> None:
+    def _python(self, code, block):
         if code.startswith(">>>"):
             if block.not_run is None:
                 self._doctest(code, block)
@@ -91,16 +87,16 @@ class PageRun:
         if block.not_run is None:
             exec(compiled, self.names)
 
-    def _doctest(self, code: str, block: Block) -> None:
+    def _doctest(self, code, block):
         path = str(self.page.path)
         test = doctest.DocTestParser().get_doctest(code, self.names, path, path, block.line - 1)
-        told: list[str] = []
+        told = []
         runner = doctest.DocTestRunner(optionflags=doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE)
         runner.run(test, out=told.append, clear_globs=False)
         self.names.update(test.globs)
         assert not runner.failures, f"{self._place(block)}: " + "".join(told)
 
-    def _shell(self, script: str, block: Block) -> None:
+    def _shell(self, script, block):
         with tempfile.TemporaryFile() as output:  # no pipe: a process left in the background would keep it open
             done = subprocess.run(
                 ["bash", "-e", "-o", "pipefail", "-c", script],
@@ -115,7 +111,7 @@ class PageRun:
             told = output.read().decode(errors="replace")
         assert done.returncode == 0, f"{self._place(block)}: exit code {done.returncode}\n{script}\n{told[-4000:]}"
 
-    def _serve(self, block: Block) -> None:
+    def _serve(self, block):
         """Runs the block in the background, with the ports of a service of its own."""
         self._stop_serving()
         self.ports = {door: _free_port() for door in PORTS.values()}
@@ -138,7 +134,7 @@ class PageRun:
             assert not end.passed, f"{self._place(block)}: not ready after {START_TIMEOUT_S} s\n{told}"
             time.sleep(0.1)
 
-    def _stop_serving(self) -> None:
+    def _stop_serving(self):
         if self.served is not None and self.served.poll() is None:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self.served.pid, signal.SIGTERM)
@@ -150,14 +146,13 @@ class PageRun:
                 raise
 
 
-def _free_port() -> int:
+def _free_port():
     with socket.socket() as free:
         free.bind(("127.0.0.1", 0))
-        port: int = free.getsockname()[1]
-    return port
+        return free.getsockname()[1]
 
 
-def _answers(port: int) -> bool:
+def _answers(port):
     """Whether a service at a port is ready. One that speaks TLS cuts this off, and is taken for ready."""
     try:
         with urllib.request.urlopen(f"http://127.0.0.1:{port}/v1/health/ready", timeout=10) as answer:

@@ -32,7 +32,7 @@ MOST_FILES = {  # by hand, tests and what is generated apart
 }
 CONCERNED = (
     *("tests/proto", "tests/client/test_client_generated.py", "tests/documents/test_snapshots.py"),
-    *("tests/service/test_settings_used.py", "tests/model/test_outputs.py", "tests/model/probe"),
+    *("tests/service/test_settings_used.py", "tests/model/test_outputs.py", "tests/model/test_probe.py"),
 )
 
 _BLOCK = re.compile(r"<!-- (file|in): (\S+?)(?:; (before|after): (.*?))? -->\n```python\n(.*?)```\n", flags=re.DOTALL)
@@ -60,7 +60,7 @@ class Step:
     line: str
     code: str
 
-    def apply(self, tree: Path) -> None:
+    def apply(self, tree):
         """Do what the page says to a tree."""
         target = tree / self.path
         if self.beside is None:
@@ -75,7 +75,7 @@ class Step:
         target.write_text("".join([*lines[:place], self.code, *lines[place:]]), encoding="utf-8")
 
 
-def steps() -> list[Step]:
+def steps():
     found = []
     for section in re.split(r"^## ", PAGE.read_text(encoding="utf-8"), flags=re.MULTILINE)[1:]:
         title, _, text = section.partition("\n")
@@ -89,13 +89,13 @@ STEPS = steps()
 
 
 @pytest.mark.parametrize("section", MOST_FILES)
-def test_an_addition_touches_few_files(section: str) -> None:
+def test_an_addition_touches_few_files(section):
     touched = {step.path for step in STEPS if step.section == section}
     assert 1 <= len({path for path in touched if not path.startswith("tests/")}) <= MOST_FILES[section]
     assert any(path.startswith("tests/") for path in touched), "the section has no test"
 
 
-def run(tree: Path, *arguments: str) -> None:
+def run(tree, *arguments):
     roots = [str(tree / root) for root in ROOTS]
     program = _RUN.format(roots=[str(tree), *roots], arguments=list(arguments))
     process = subprocess.run([sys.executable, "-c", program], cwd=tree, capture_output=True, text=True, check=False)
@@ -103,7 +103,7 @@ def run(tree: Path, *arguments: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def tree(tmp_path_factory):
     """A copy of the tracked files, with the compiled kernel."""
     copy = tmp_path_factory.mktemp("copy")
     listed = subprocess.run(
@@ -123,7 +123,7 @@ def tree(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.long
-def test_the_page_is_true(tree: Path) -> None:
+def test_the_page_is_true(tree):
     for step in STEPS:
         step.apply(tree)
     own = [step.path for step in STEPS if step.beside is None and step.path.startswith("tests/")]

@@ -1,10 +1,7 @@
 """Formats of files and messages are those that people describe in the reference: contracts, told in words."""
 
-from __future__ import annotations
-
 import io
 import json
-from pathlib import Path
 
 import numpy as np
 import torch
@@ -23,14 +20,13 @@ from ultragray_service.igtl.contents import CAPABILITY
 from ultragray_service.rpc import calls as status
 from ultragray_workers.pool import pixels
 
-from .conftest import Generator
 from .tables import code, rows
 
 LABELS = torch.ones(5, dtype=torch.uint8)
 SPLATS = {name: torch.ones(shape) for name, shape in scene_info.expected_shapes(5, 1).items()}
 
 
-def test_scene_file(tmp_path: Path) -> None:
+def test_scene_file(tmp_path):
     poses = np.tile(np.eye(4), (2, 1, 1))
     scene = GaussianScene.from_splats(SPLATS, training_poses=poses, labels=LABELS, pose_corrections=poses)
     scene.save(tmp_path / "scene.ugr")
@@ -46,7 +42,7 @@ def test_scene_file(tmp_path: Path) -> None:
     assert documented == found
 
 
-def test_ply_file(tmp_path: Path) -> None:
+def test_ply_file(tmp_path):
     ply.write_ply(GaussianScene.from_splats(SPLATS, labels=LABELS), tmp_path / "scene.ply")
     header = (tmp_path / "scene.ply").read_bytes().split(b"end_header")[0].decode()
     element, found = "", []
@@ -64,7 +60,7 @@ def test_ply_file(tmp_path: Path) -> None:
     assert documented == found
 
 
-def test_exported_checkpoint(tmp_path: Path) -> None:
+def test_exported_checkpoint(tmp_path):
     scene = GaussianScene.from_splats(SPLATS, info=SceneInfo(probe=PhasedProbe(60, 50)), training_poses=np.eye(4)[None])
     written = checkpoint_export.export_checkpoint(scene, tmp_path / "ckpt_29999.pt").files
     documented = {code(name)[0]: code(holds) for name, holds in rows("scene-file.md", "Exported checkpoint")}
@@ -74,7 +70,7 @@ def test_exported_checkpoint(tmp_path: Path) -> None:
     assert set(documented["conf.json"]) == keys
 
 
-def test_npz(generator: Generator) -> None:
+def test_npz(generator):
     file = io.BytesIO()
     frames = {name: np.zeros((2, 3, 5), np.float32) for name in OUTPUTS}
     told = [Extrapolation(None, None, None, None)] * 2
@@ -86,7 +82,7 @@ def test_npz(generator: Generator) -> None:
     assert {code(line)[0] for line in table.splitlines()[2:]} == found
 
 
-def test_encodings() -> None:
+def test_encodings():
     documented = {code(name)[0]: code(kind)[0] for name, kind, _ in rows("frames.md", "Encodings")}
     assert set(documented) == {encoding.value for encoding in Encoding}
     for name, media_type in documented.items():
@@ -96,11 +92,11 @@ def test_encodings() -> None:
     assert [code(cells[0])[0] for cells in accepted] == list(accept.MEDIA_TYPES)
 
 
-def test_details_of_grpc_errors() -> None:
+def test_details_of_grpc_errors():
     told = [status.status_of(cls("no", field="x")) for cls in error_classes()]
     found = {detail.type_url.rpartition("/")[2] for one in told for detail in one.details}
     assert {code(cells[0])[0] for cells in rows("grpc.md", "Errors")} == found
 
 
-def test_messages_of_openigtlink() -> None:
+def test_messages_of_openigtlink():
     assert sorted(code(cells[0])[0] for cells in rows("openigtlink.md", "Messages")) == sorted(CAPABILITY)

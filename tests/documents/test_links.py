@@ -1,9 +1,6 @@
 """Every link of a document leads to a file that is there, and to a heading that it has, in the repository too."""
 
-from __future__ import annotations
-
 import re
-from pathlib import Path
 
 import pytest
 
@@ -18,17 +15,17 @@ LINK = re.compile(r"\]\(([^)\s]+)\)")
 CODE = re.compile(r"^```.*?^```|`[^`\n]*`", re.MULTILINE | re.DOTALL)
 
 
-def anchor_of(heading: str) -> str:
+def anchor_of(heading):
     """The name that a page gives a heading: its words in lower case, without marks, joined by hyphens."""
     return re.sub(r"[^\w\- ]", "", heading.strip().lower()).replace(" ", "-")
 
 
-def headings_of(document: Path) -> set[str]:
+def headings_of(document):
     return {anchor_of(found) for found in re.findall(r"^#+ (.*)$", document.read_text(encoding="utf-8"), re.MULTILINE)}
 
 
 @pytest.mark.parametrize("document", DOCUMENTS, ids=lambda path: str(path.relative_to(ROOT)))
-def test_every_link_leads_somewhere(document: Path) -> None:
+def test_every_link_leads_somewhere(document):
     links = LINK.findall(CODE.sub("", document.read_text(encoding="utf-8")))
     for link in links:
         if "://" in link:

@@ -1,13 +1,9 @@
 """The HTTP interface is what the committed document says: `make generate`, and read the difference."""
 
-from __future__ import annotations
-
 from difflib import unified_diff
 
-from .conftest import Generator
 
-
-def test_the_openapi_document_is_current(generator: Generator) -> None:
+def test_the_openapi_document_is_current(generator):
     snapshots = generator("snapshots")
     before, now = snapshots.OPENAPI.read_text(encoding="utf-8"), snapshots.openapi()
     assert not "".join(unified_diff(before.splitlines(True), now.splitlines(True), "committed", "the code", n=0))

@@ -1,25 +1,20 @@
 """The dataset of simulated frames behind loaders of any number of workers."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
-from collections.abc import Callable
-from types import ModuleType
 
 import pytest
 import torch
 
-from ..service.conftest import RunningService
 from .conftest import EXAMPLES
 
 
 @pytest.fixture(scope="module")
-def augment(load_example: Callable[[str], ModuleType]) -> ModuleType:
+def augment(load_example):
     return load_example("augment_pytorch")
 
 
-def test_an_epoch_is_the_same_whoever_loads_it(augment: ModuleType, demo_service: RunningService) -> None:
+def test_an_epoch_is_the_same_whoever_loads_it(augment, demo_service):
     frames = augment.SimulatedFrames(demo_service.grpc, "demo", 5, labels=False, seed=3)
     first, again = list(frames), list(frames)
     assert len(first) == 5
@@ -33,7 +28,7 @@ def test_an_epoch_is_the_same_whoever_loads_it(augment: ModuleType, demo_service
     assert not torch.equal(next(iter(frames))["pose"], first[0]["pose"])
 
 
-def test_labels_come_along_if_asked_for(augment: ModuleType, demo_service: RunningService) -> None:
+def test_labels_come_along_if_asked_for(augment, demo_service):
     sample = next(iter(augment.SimulatedFrames(demo_service.grpc, "demo", 1, labels=True, seed=0)))
     assert sample["labels"].shape == (256, 256)
     assert sample["labels"].dtype == torch.int64
@@ -42,7 +37,7 @@ def test_labels_come_along_if_asked_for(augment: ModuleType, demo_service: Runni
 
 @pytest.mark.long
 @pytest.mark.parametrize("workers", ["0", pytest.param("2", marks=pytest.mark.long)])
-def test_as_a_program(demo_service: RunningService, workers: str) -> None:
+def test_as_a_program(demo_service, workers):
     command = [sys.executable, EXAMPLES / "augment_pytorch.py", "--address", demo_service.grpc]
     options = ["--frames", "24", "--batch-size", "8", "--workers", workers]
     told = subprocess.run([*command, *options], check=True, capture_output=True, text=True, timeout=120).stdout

@@ -1,11 +1,7 @@
 """The climbing agent finds the plane from nearby, and is told nothing of the goal but its reward."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
-from collections.abc import Callable
-from types import ModuleType
 
 import gymnasium
 import numpy as np
@@ -18,11 +14,11 @@ from .conftest import EXAMPLES
 
 
 @pytest.fixture(scope="module")
-def example(load_example: Callable[[str], ModuleType]) -> ModuleType:
+def example(load_example):
     return load_example("standard_plane")
 
 
-def test_the_agent_takes_back_what_did_not_help(example: ModuleType) -> None:
+def test_the_agent_takes_back_what_did_not_help(example):
     agent = example.Climber(np.random.default_rng(0))
     agent.act(-1.0)
     agent.last = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
@@ -33,7 +29,7 @@ def test_the_agent_takes_back_what_did_not_help(example: ModuleType) -> None:
 
 
 @pytest.mark.slow
-def test_it_comes_nearer_to_the_plane(example: ModuleType) -> None:
+def test_it_comes_nearer_to_the_plane(example):
     env = gymnasium.make(STANDARD_PLANE, scene=DEMO_FILE, height=64, width=64, start_mm=4.0, start_deg=4.0)
     episodes = [example.scan(env, seed) for seed in range(4)]
     first, last = (np.mean([getattr(one, when)["similarity"] for one in episodes]) for when in ("first", "last"))
@@ -44,7 +40,7 @@ def test_it_comes_nearer_to_the_plane(example: ModuleType) -> None:
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_as_a_program() -> None:
+def test_as_a_program():
     command = [sys.executable, EXAMPLES / "standard_plane.py", "--episodes", "1", "--start-mm", "2", "--start-deg", "2"]
     told = subprocess.run(command, check=True, capture_output=True, text=True, timeout=120).stdout
     assert "off the goal, similarity" in told

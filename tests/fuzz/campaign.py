@@ -7,14 +7,12 @@ import time
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
 
 import hypothesis
 from hypothesis import HealthCheck, Phase
 from hypothesis.errors import HypothesisWarning
 
 from ..surroundings import ROOT
-from .mutations import Strategy
 
 INPUTS = int(os.environ.get("ULTRAGRAY_FUZZ_INPUTS", "2000"))
 SHARES = {  # of the inputs, by door: about as many as each takes in its part of the time
@@ -22,7 +20,6 @@ SHARES = {  # of the inputs, by door: about as many as each takes in its part of
     "http bodies": 0.10,
     "http paths": 0.07,
     "http bytes": 0.05,
-    "uploads": 0.001,
     "websocket": 0.18,
     "websocket paths": 0.01,
     "grpc messages": 0.08,
@@ -53,17 +50,17 @@ class Door:
     tried: int = 0
 
     @property
-    def wanted(self) -> int:
+    def wanted(self):
         return max(1, round(SHARES[self.name] * INPUTS))
 
-    def enter(self, inputs: Strategy, attempt: Callable[[Any], None], *, share: float = 1.0, group: int = 1) -> None:
+    def enter(self, inputs, attempt, *, share=1.0, group=1):
         """Tries `share` of the wanted inputs, of which `inputs` makes `group` at a time; they follow from the seed.
 
         What `attempt` raises is told with the smallest input that still does it.
         """
         began, before = time.monotonic(), self.tried
         wanted = max(1, round(share * self.wanted))
-        last: Any = None  # hypothesis tries the smallest input that fails last
+        last = None  # hypothesis tries the smallest input that fails last
 
         @hypothesis.seed(self.seed)
         @hypothesis.settings(
@@ -76,7 +73,7 @@ class Door:
             suppress_health_check=list(HealthCheck),
         )
         @hypothesis.given(inputs)
-        def try_one(value: Any) -> None:
+        def try_one(value):
             nonlocal last
             last = value
             self.tried += group
@@ -93,7 +90,7 @@ class Door:
             self.record(self.name, self.tried - before, time.monotonic() - began)
         assert self.tried - before >= wanted, f"{self.name}: only {self.tried - before} of {wanted} inputs"
 
-    def _told(self, value: Any) -> str:
+    def _told(self, value):
         """Keeps the input in a file and says how to come to it again."""
         FAILED_FOLDER.mkdir(parents=True, exist_ok=True)
         path = FAILED_FOLDER / f"{self.name.replace(' ', '_')}-{self.seed}"

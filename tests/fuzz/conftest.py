@@ -1,16 +1,12 @@
 """Fuzzing: a seed and a number of inputs for each door, and a table of what was tried."""
 
-from __future__ import annotations
-
 import random
 import shutil
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
+from collections.abc import Callable
 
 import pytest
 
-from ..service.conftest import StartService, data_folder, demo_scene, service_starter
+from ..service.conftest import data_folder, demo_scene, service_starter
 from .campaign import Door
 from .fuzzed import CONTROL_SCENE, FuzzedService
 
@@ -21,26 +17,24 @@ _TRIED = "fuzz_inputs"
 
 
 @pytest.fixture(scope="session")
-def seed(request: pytest.FixtureRequest) -> int:
+def seed(request):
     """That of the command line; else another one in every run."""
     return int(request.config.getoption("--seed"))
 
 
 @pytest.fixture
-def door(seed: int, record_property: Callable[[str, object], None]) -> EnterDoor:
+def door(seed, record_property):
     """Opens a door by its name; how many inputs it gets is told at the end."""
     return lambda name: Door(name, seed, lambda *tried: record_property(_TRIED, tried))
 
 
 @pytest.fixture(scope="module")
-def start_service(tmp_path_factory: pytest.TempPathFactory, data_folder: Path) -> Iterator[StartService]:
+def start_service(tmp_path_factory, data_folder):
     yield from service_starter(tmp_path_factory, data_folder)
 
 
 @pytest.fixture(scope="module")
-def fuzzed(
-    start_service: StartService, data_folder: Path, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[FuzzedService]:
+def fuzzed(start_service, data_folder, tmp_path_factory):
     """A service with a scene that no input names; checked at the end of each test, for which see `well`."""
     folder = tmp_path_factory.mktemp("fuzzed")
     for scene in ("demo", "second", "probeless"):
@@ -52,18 +46,18 @@ def fuzzed(
 
 
 @pytest.fixture
-def well(fuzzed: FuzzedService) -> Iterator[FuzzedService]:
+def well(fuzzed):
     """The service, which is as well after the test as before it."""
     yield fuzzed
     fuzzed.check()
 
 
-def pytest_configure(config: pytest.Config) -> None:
+def pytest_configure(config):
     if config.getoption("--seed") is None:  # before the processes are started that run the tests: all have the same
         config.option.seed = random.SystemRandom().randrange(2**32)
 
 
-def pytest_terminal_summary(terminalreporter: Any, config: pytest.Config) -> None:
+def pytest_terminal_summary(terminalreporter, config):
     """The table of doors and inputs."""
     reports = [report for kind in ("passed", "failed") for report in terminalreporter.stats.get(kind, ())]
     rows = [value for report in reports for name, value in report.user_properties if name == _TRIED]

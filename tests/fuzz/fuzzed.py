@@ -1,17 +1,13 @@
 """The service that is fuzzed: what it may answer, what it may log, what it may take."""
 
-from __future__ import annotations
-
 import threading
-from pathlib import Path
 
 import grpc
 import numpy as np
 
 from ultragray_client import Client, RenderSettings
 
-from ..processes import Growth, Taken, family
-from ..service.conftest import RunningService, StartService
+from ..processes import Growth, family
 from ..waiting import at_this_load, wait_until
 
 CONTROL_SCENE = "control"  # which no input names
@@ -31,7 +27,7 @@ EXPECTED_CODES = {  # gRPC's of a service that is well; INTERNAL, UNKNOWN, UNAVA
 class FuzzedService:
     """A service of a folder, started again where an input ended it, so that the next one finds it alive."""
 
-    def __init__(self, start: StartService, data_folder: Path, artifact_folder: Path) -> None:
+    def __init__(self, start, data_folder, artifact_folder):
         self._start = lambda: start(
             cold=True,
             data_folder=data_folder,
@@ -44,25 +40,25 @@ class FuzzedService:
             job_queue_limit=20,
             default_timeout_s=10,
         )
-        self.running: RunningService = self._start()
-        self._whole_logs: list[str] = []
-        self._samples: list[dict[int, Taken]] = []
+        self.running = self._start()
+        self._whole_logs = []
+        self._samples = []
         self._over = threading.Event()
         self._sampler = threading.Thread(target=self._sample, daemon=True)
         self._frame = self._render()
         self._sampler.start()
 
     @property
-    def address(self) -> tuple[str, int]:
+    def address(self):
         """Of HTTP."""
         host, _, port = self.running.http.removeprefix("http://").rpartition(":")
         return host, int(port)
 
-    def igtl(self) -> tuple[str, int]:
+    def igtl(self):
         host, _, port = next(str(record["igtl"]) for record in self.running.log() if "igtl" in record).rpartition(":")
         return host, int(port)
 
-    def require_alive(self) -> None:
+    def require_alive(self):
         """Starts it again and raises AssertionError where an input has ended it."""
         if self.running.process.poll() is None:
             return
@@ -71,7 +67,7 @@ class FuzzedService:
         self._samples.clear()
         raise AssertionError(f"the service has ended with status {status}: {said[-4000:]}")
 
-    def check(self) -> None:
+    def check(self):
         """Asserts that it is as well as at the beginning."""
         self.require_alive()
         assert np.array_equal(self._render(), self._frame), "the frame at the end is not the one of the beginning"
@@ -82,16 +78,16 @@ class FuzzedService:
         wait_until(self._has_settled, within_s=at_this_load(SETTLE_S), every_s=SAMPLE_EVERY_S)
         self._check_memory()
 
-    def end(self) -> None:
+    def end(self):
         self._over.set()
         self._sampler.join()
 
-    def _sample(self) -> None:
+    def _sample(self):
         self._samples.append(family(self.running.process.pid))  # a short test needs one, too
         while not self._over.wait(SAMPLE_EVERY_S):
             self._samples.append(family(self.running.process.pid))
 
-    def _has_settled(self) -> bool:
+    def _has_settled(self):
         """Whether no more descriptors are open than at the beginning."""
         first, last = self._samples[0], self._samples[-1]
         return all(
@@ -100,14 +96,14 @@ class FuzzedService:
             if pid in first
         )
 
-    def _check_memory(self) -> None:
+    def _check_memory(self):
         samples = list(self._samples)
         for pid in samples[0].keys() & samples[-1].keys():  # not the helpers of uploads, which come and go
             growth = Growth.of([sample[pid].resident_bytes for sample in samples if pid in sample], parts=5)
             name, grown_mib = samples[-1][pid].role, growth.absolute / 2**20
             assert growth.absolute < MOST_GROWTH_BYTES, f"{name} has grown by {grown_mib:.0f} MiB"
 
-    def _render(self) -> np.ndarray:
+    def _render(self):
         with Client(self.running.grpc) as client:
             pose = np.eye(4)
             frame = client.render(CONTROL_SCENE, pose, RenderSettings(height=64, width=48))["bmode"]

@@ -1,16 +1,12 @@
 """Messages of a descriptor, field by field, as hypothesis strategies."""
 
-from __future__ import annotations
-
 import struct
-from typing import Any
 
-from google.protobuf.descriptor import Descriptor, FieldDescriptor
-from google.protobuf.message import Message
+from google.protobuf.descriptor import FieldDescriptor
 from google.protobuf.message_factory import GetMessageClass
 from hypothesis import strategies as st
 
-from .mutations import NUMBERS, REALS, TEXTS, Strategy
+from .mutations import NUMBERS, REALS, TEXTS
 
 MOST_REPEATED = 4
 MOST_DEEP = 5
@@ -24,17 +20,17 @@ _RANGES = {
 }
 
 
-def messages(descriptor: Descriptor, depth: int = 0) -> Strategy:
+def messages(descriptor, depth=0):
     """Any message of the type; fields are often absent."""
     fields = {field.name: _field(field, depth) for field in descriptor.fields if depth < MOST_DEEP}
     chosen = st.fixed_dictionaries({}, optional=fields)
     return chosen.map(lambda values: _made(descriptor, values))
 
 
-def near(valid: Message, depth: int = 0) -> Strategy:
+def near(valid, depth=0):
     """A message like a valid one, in which some fields, at any depth, are others or are gone."""
 
-    def apply(changes: dict[str, Any]) -> Message:
+    def apply(changes):
         changed = type(valid)()
         changed.CopyFrom(valid)
         for name, value in changes.items():
@@ -52,14 +48,14 @@ def near(valid: Message, depth: int = 0) -> Strategy:
     return names.flatmap(lambda chosen: st.fixed_dictionaries({name: fields[name] for name in chosen})).map(apply)
 
 
-def _made(descriptor: Descriptor, values: dict[str, Any]) -> Message:
+def _made(descriptor, values):
     message = GetMessageClass(descriptor)()
     for name, value in values.items():
         _set(message, name, value)
     return message
 
 
-def _set(message: Message, name: str, value: Any) -> None:
+def _set(message, name, value):
     field = message.DESCRIPTOR.fields_by_name[name]
     if value is None:
         return
@@ -78,12 +74,12 @@ def _set(message: Message, name: str, value: Any) -> None:
         setattr(message, name, value)
 
 
-def _field(field: FieldDescriptor, depth: int) -> Strategy:
+def _field(field, depth):
     one = _value(field, depth)
     return st.lists(one, max_size=MOST_REPEATED) if field.is_repeated else one
 
 
-def _value(field: FieldDescriptor, depth: int) -> Strategy:
+def _value(field, depth):
     match field.cpp_type:
         case FieldDescriptor.CPPTYPE_MESSAGE:
             return st.deferred(lambda: messages(field.message_type, depth + 1))

@@ -4,14 +4,11 @@ A line of JSON comes in, `{"reader": NAME, "path": PATH}`, and one goes out: `{"
 or refused in words, `{"fault": TRACEBACK}` where the reader raised anything else.
 """
 
-from __future__ import annotations
-
 import json
 import resource
 import sys
 import tempfile
 import traceback
-from collections.abc import Callable
 from pathlib import Path
 
 import torch
@@ -33,42 +30,42 @@ UNPACKED_BYTES = 1 << 20
 _PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=40.0)
 
 
-def read_scene(path: Path) -> None:
+def read_scene(path):
     read_header(path)
     scene = GaussianScene.load(path)
     render(scene, _PROBE, torch.eye(4)[None].numpy(), height=16, width=16, backend="cpu")
 
 
-def read_point_cloud(path: Path) -> None:
+def read_point_cloud(path):
     read_ply(path)
 
 
-def read_released_checkpoint(path: Path) -> None:
+def read_released_checkpoint(path):
     import_checkpoint(path / "ckpt.pt", config=path / "conf.json", poses=path / "poses_train.npy")
 
 
-def read_training_state(path: Path) -> None:
+def read_training_state(path):
     check_tensors(path, *read_checkpoint(path), frame_count=10, pose_count=0)
 
 
-def read_poses(path: Path) -> None:
+def read_poses(path):
     load_poses(path)
 
 
-def read_folder(path: Path) -> None:
+def read_folder(path):
     """As an upload is read."""
     source = find_source(path)
     source.format.check_upload(source.path, path)
     check_dataset(source.load({}))
 
 
-def read_sequence(path: Path) -> None:
+def read_sequence(path):
     device_set = next(path.glob("*.xml"))
     (sequence,) = (file for file in path.iterdir() if file.suffix in (".mha", ".nrrd"))
     check_dataset(load_dataset(sequence, SourceOptions(device_set=device_set, crop="2:14,1:19")))
 
 
-def read_archive(path: Path) -> None:
+def read_archive(path):
     with tempfile.TemporaryDirectory() as folder:
         inner = Path(folder) / "unpacked"
         inner.mkdir()
@@ -79,7 +76,7 @@ def read_archive(path: Path) -> None:
             assert not any(entry.is_symlink() for entry in inner.rglob("*")), "it made a link"
 
 
-READERS: dict[str, Callable[[Path], None]] = {
+READERS = {
     "scene": read_scene,
     "ply": read_point_cloud,
     "checkpoint": read_released_checkpoint,
@@ -91,7 +88,7 @@ READERS: dict[str, Callable[[Path], None]] = {
 }
 
 
-def answer(request: dict[str, str]) -> dict[str, str]:
+def answer(request):
     try:
         READERS[request["reader"]](Path(request["path"]))
     except UltragrayError as error:
@@ -103,7 +100,7 @@ def answer(request: dict[str, str]) -> dict[str, str]:
     return {"outcome": "read"}
 
 
-def main() -> None:
+def main():
     resource.setrlimit(resource.RLIMIT_AS, (ADDRESS_SPACE_BYTES, ADDRESS_SPACE_BYTES))
     torch.set_num_threads(1)
     replies = sys.stdout

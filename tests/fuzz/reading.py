@@ -1,14 +1,11 @@
 """The process that reads files for the tests, started again where an input ended it."""
 
-from __future__ import annotations
-
 import json
 import os
 import select
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Mapping
 from pathlib import Path
 
 from ..processes import Growth, taken_by
@@ -26,21 +23,21 @@ LEAST_OUTCOMES = 200
 class ReaderProcess:
     """Reads mutated files with one of the readers of reader.py, each of which is written into `folder` first."""
 
-    def __init__(self, reader: str, folder: Path) -> None:
+    def __init__(self, reader, folder):
         self._reader = reader
         self._folder = folder
         self._log = folder / "log"
-        self._outcomes: Counter[str] = Counter()
-        self._resident_bytes: list[int] = []
-        self._process: subprocess.Popen[str] | None = None
+        self._outcomes = Counter()
+        self._resident_bytes = []
+        self._process = None
 
-    def read_file(self, name: str, data: bytes) -> None:
+    def read_file(self, name, data):
         """Raises AssertionError where the reader neither reads the file nor refuses it in words."""
         path = self._folder / name
         path.write_bytes(data)
         self._read(path)
 
-    def read_files(self, files: Mapping[str, bytes]) -> None:
+    def read_files(self, files):
         """The same with a folder of files."""
         inputs = self._folder / "inputs"
         inputs.mkdir(exist_ok=True)
@@ -48,7 +45,7 @@ class ReaderProcess:
             (inputs / name).write_bytes(data)
         self._read(inputs)
 
-    def close(self) -> None:
+    def close(self):
         """Asserts that the process has not grown, and that enough of the inputs were read to their end."""
         if self._process is not None:
             self._process.communicate()
@@ -58,10 +55,8 @@ class ReaderProcess:
         if self._outcomes.total() >= LEAST_OUTCOMES:
             assert self._outcomes["read"] >= LEAST_READ * self._outcomes.total(), self._outcomes
 
-    def _read(self, path: Path) -> None:
+    def _read(self, path):
         process = self._started()
-        assert process.stdin is not None
-        assert process.stdout is not None
         process.stdin.write(json.dumps({"reader": self._reader, "path": str(path)}) + "\n")
         process.stdin.flush()
         if not select.select([process.stdout], [], [], at_this_load(READ_TIMEOUT_S))[0]:
@@ -76,7 +71,7 @@ class ReaderProcess:
         if self._outcomes.total() % SAMPLE_EVERY == 1:
             self._resident_bytes.append(taken_by(process.pid).resident_bytes)
 
-    def _started(self) -> subprocess.Popen[str]:
+    def _started(self):
         if self._process is None or self._process.poll() is not None:
             self._resident_bytes.clear()
             with self._log.open("w") as log:

@@ -1,7 +1,5 @@
 """Every file format that is read: a damaged file is read or refused in words, in little time and memory."""
 
-from __future__ import annotations
-
 import contextlib
 import io
 import json
@@ -9,9 +7,6 @@ import struct
 import tarfile
 import warnings
 import zipfile
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pydicom
@@ -20,7 +15,6 @@ import torch
 from hypothesis import strategies as st
 from mcap.writer import CompressionType
 
-from ultragray import GaussianScene
 from ultragray.datasets import Dataset
 from ultragray.datasets.released import write_released
 from ultragray.exchange.ply import write_ply
@@ -40,15 +34,13 @@ from ..model.datasets.conftest import (
     write_nrrd,
 )
 from ..model.learn.conftest import make_tiny_config, make_tiny_dataset
-from .conftest import EnterDoor
-from .mutations import Strategy, as_json, chosen_parts, mutated_bytes, mutated_json, mutated_lines, places
+from .mutations import as_json, chosen_parts, mutated_bytes, mutated_json, mutated_lines, places
 from .reading import ReaderProcess
 
 __all__ = ["make_sweep"]
 
 pytestmark = pytest.mark.long
 
-OpenReader = Callable[[str], ReaderProcess]
 _LENGTH_BYTES = 8
 HOSTILE_NAMES = (
     "../up.npy",
@@ -63,10 +55,10 @@ HOSTILE_NAMES = (
 
 
 @pytest.fixture
-def open_reader(tmp_path: Path) -> Iterator[OpenReader]:
-    opened: list[ReaderProcess] = []
+def open_reader(tmp_path):
+    opened = []
 
-    def open_(name: str) -> ReaderProcess:
+    def open_(name):
         folder = tmp_path / f"reader-{len(opened)}"
         folder.mkdir()
         opened.append(ReaderProcess(name, folder))
@@ -77,16 +69,16 @@ def open_reader(tmp_path: Path) -> Iterator[OpenReader]:
         reader.close()
 
 
-def mutated_bundle(data: bytes) -> Strategy:
+def mutated_bundle(data):
     """A safetensors bundle whose header is another document, or whose bytes are changed."""
     length = int.from_bytes(data[:_LENGTH_BYTES], "little")
     header, tensors = json.loads(data[_LENGTH_BYTES : _LENGTH_BYTES + length]), data[_LENGTH_BYTES + length :]
 
-    def pack(document: Any) -> bytes:
+    def pack(document):
         text = as_json(document)
         return len(text).to_bytes(_LENGTH_BYTES, "little") + text + tensors
 
-    def with_metadata(metadata: Any) -> bytes:
+    def with_metadata(metadata):
         (key,) = header["__metadata__"]
         return pack({**header, "__metadata__": {key: json.dumps(metadata)}})
 
@@ -101,14 +93,14 @@ def mutated_bundle(data: bytes) -> Strategy:
     )
 
 
-def test_scenes(door: EnterDoor, open_reader: OpenReader, demo_scene: GaussianScene, tmp_path: Path) -> None:
+def test_scenes(door, open_reader, demo_scene, tmp_path):
     demo_scene.save(tmp_path / "whole.ugr")
     reader = open_reader("scene")
     inputs = mutated_bundle((tmp_path / "whole.ugr").read_bytes())
     door("scene files").enter(inputs, lambda data: reader.read_file("scene.ugr", data))
 
 
-def test_ply(door: EnterDoor, open_reader: OpenReader, demo_scene: GaussianScene, tmp_path: Path) -> None:
+def test_ply(door, open_reader, demo_scene, tmp_path):
     write_ply(demo_scene, tmp_path / "whole.ply")
     data = (tmp_path / "whole.ply").read_bytes()
     head, mark, tail = data.partition(b"end_header\n")
@@ -120,17 +112,17 @@ def test_ply(door: EnterDoor, open_reader: OpenReader, demo_scene: GaussianScene
 
 
 @pytest.fixture
-def released(make_sweep: Callable[..., Any], tmp_path: Path) -> dict[str, bytes]:
+def released(make_sweep, tmp_path):
     """The files of a folder in the released layout."""
     write_released(Dataset("tiny", make_sweep(8), make_sweep(2)), tmp_path / "released")
     return {path.name: path.read_bytes() for path in (tmp_path / "released").iterdir()}
 
 
-def mutated_array(data: bytes) -> Strategy:
+def mutated_array(data):
     """An .npy file with another header, other numbers, or other bytes."""
     array = np.load(io.BytesIO(data))
 
-    def with_header(document: str) -> bytes:
+    def with_header(document):
         text = document.encode("utf-8", "surrogatepass")
         return b"\x93NUMPY\x01\x00" + struct.pack("<H", len(text) % 2**16) + text + array.tobytes()
 
@@ -150,19 +142,19 @@ def mutated_array(data: bytes) -> Strategy:
     return st.one_of(header.map(with_header), numbers_changed, mutated_bytes([data]))
 
 
-def mutated_released(files: dict[str, bytes]) -> Strategy:
+def mutated_released(files):
     conf = json.loads(files["conf.json"])
     parts = {name: mutated_array(data) for name, data in files.items() if name.endswith(".npy")}
     parts["conf.json"] = st.one_of(mutated_json([conf]).map(as_json), mutated_bytes([files["conf.json"]]))
     return chosen_parts(files, parts)
 
 
-def test_released_folders(door: EnterDoor, open_reader: OpenReader, released: dict[str, bytes]) -> None:
+def test_released_folders(door, open_reader, released):
     reader = open_reader("folder")
     door("released folders").enter(mutated_released(released), reader.read_files)
 
 
-def test_pose_files(door: EnterDoor, open_reader: OpenReader, released: dict[str, bytes]) -> None:
+def test_pose_files(door, open_reader, released):
     reader, opened = open_reader("poses"), door("pose files")
     poses = np.load(io.BytesIO(released["poses_train.npy"]))
     opened.enter(
@@ -174,7 +166,7 @@ def test_pose_files(door: EnterDoor, open_reader: OpenReader, released: dict[str
     opened.enter(mutated_bytes([text]), lambda data: reader.read_file("poses.json", data), share=0.1)
 
 
-def stored_again(data: bytes, name: str, content: bytes) -> bytes:
+def stored_again(data, name, content):
     """An archive as torch writes it, with other bytes in one of its entries."""
     packed = io.BytesIO()
     with zipfile.ZipFile(io.BytesIO(data)) as old, zipfile.ZipFile(packed, "w", zipfile.ZIP_STORED) as new:
@@ -183,9 +175,7 @@ def stored_again(data: bytes, name: str, content: bytes) -> bytes:
     return packed.getvalue()
 
 
-def test_released_checkpoints(
-    door: EnterDoor, open_reader: OpenReader, demo_scene: GaussianScene, released: dict[str, bytes], tmp_path: Path
-) -> None:
+def test_released_checkpoints(door, open_reader, demo_scene, released, tmp_path):
     packed = io.BytesIO()
     torch.save({"step": 3, "splats": demo_scene.splats}, packed)
     data = packed.getvalue()
@@ -202,14 +192,14 @@ def test_released_checkpoints(
     door("checkpoints").enter(chosen_parts(files, parts), reader.read_files)
 
 
-def test_training_states(door: EnterDoor, open_reader: OpenReader, tmp_path: Path) -> None:
+def test_training_states(door, open_reader, tmp_path):
     train(make_tiny_dataset(), make_tiny_config(), folder=tmp_path / "run", should_stop=lambda: True)
     inputs = mutated_bundle((tmp_path / "run" / CHECKPOINT_FILE).read_bytes())
     reader = open_reader("training state")
     door("training states").enter(inputs, lambda data: reader.read_file("state", data))
 
 
-def test_sequences(door: EnterDoor, open_reader: OpenReader, tmp_path: Path) -> None:
+def test_sequences(door, open_reader, tmp_path):
     stored, fields = speckle(6, 20, 16), {"UltrasoundImageOrientation": "MF", **tracked_fields(6)}
     device_set = DEVICE_SET.format(matrix=numbers(IMAGE_TO_PROBE)).encode()
     written = [
@@ -232,7 +222,7 @@ def test_sequences(door: EnterDoor, open_reader: OpenReader, tmp_path: Path) -> 
         opened.enter(chosen_parts(whole, parts), reader.read_files, share=1 / len(written))
 
 
-def mutated_cine(path: Path) -> Strategy:
+def mutated_cine(path):
     """A DICOM file with other values of its elements, or other bytes."""
     data = path.read_bytes()
     values = st.one_of(
@@ -242,7 +232,7 @@ def mutated_cine(path: Path) -> Strategy:
         st.integers(-1, 2**31),
     )
 
-    def with_elements(changes: list[tuple[float, Any]]) -> bytes:
+    def with_elements(changes):
         dataset = pydicom.dcmread(io.BytesIO(data))
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -263,7 +253,7 @@ def mutated_cine(path: Path) -> Strategy:
     return st.one_of(changes.map(with_elements), header, mutated_bytes([data]))
 
 
-def test_dicom(door: EnterDoor, open_reader: OpenReader, tmp_path: Path) -> None:
+def test_dicom(door, open_reader, tmp_path):
     path = write_cine(tmp_path)
     poses = (tmp_path / "sweep.poses.npy").read_bytes()
     whole = {"sweep.dcm": path.read_bytes(), "sweep.poses.npy": poses}
@@ -272,7 +262,7 @@ def test_dicom(door: EnterDoor, open_reader: OpenReader, tmp_path: Path) -> None
     door("dicom").enter(chosen_parts(whole, parts), reader.read_files)
 
 
-def test_mcap(door: EnterDoor, open_reader: OpenReader, tmp_path: Path) -> None:
+def test_mcap(door, open_reader, tmp_path):
     """Uncompressed chunks without checksums: changed bytes get as far as the messages."""
     bag = Bag(tmp_path / "sweep.mcap", CompressionType.NONE, enable_crcs=False)
     bag.geometry()
@@ -283,7 +273,7 @@ def test_mcap(door: EnterDoor, open_reader: OpenReader, tmp_path: Path) -> None:
     door("mcap").enter(mutated_bytes([whole["sweep.mcap"]]).map(lambda data: {"sweep.mcap": data}), reader.read_files)
 
 
-def packed(entries: list[tuple[str, bytes]], kind: str) -> bytes:
+def packed(entries, kind):
     """An archive of these entries, whatever their names."""
     target = io.BytesIO()
     if kind == "zip":
@@ -303,7 +293,7 @@ def packed(entries: list[tuple[str, bytes]], kind: str) -> bytes:
     return target.getvalue()
 
 
-def test_archives(door: EnterDoor, open_reader: OpenReader, released: dict[str, bytes]) -> None:
+def test_archives(door, open_reader, released):
     names = st.one_of(st.sampled_from([*HOSTILE_NAMES, *released]), st.text(max_size=30).filter(str.isprintable))
     entries = st.lists(
         st.tuples(names, st.one_of(st.sampled_from(list(released.values())), st.binary(max_size=9))), max_size=5
@@ -313,7 +303,7 @@ def test_archives(door: EnterDoor, open_reader: OpenReader, released: dict[str, 
     reader = open_reader("archive")
     inputs = st.one_of(st.builds(packed, entries, kinds), mutated_bytes(whole), mutated_bytes(whole))
 
-    def read(data: bytes) -> None:
+    def read(data):
         reader.read_file("upload", data)
 
     door("archives").enter(inputs, read)

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 import pkgutil
-from collections.abc import Iterator
 from dataclasses import dataclass
 from importlib import import_module
 from pathlib import Path
-from typing import Any
 
 import grpc
 import pytest
@@ -18,10 +16,9 @@ from hypothesis import strategies as st
 from ultragray_proto import v1
 from ultragray_proto.v1 import datasets_pb2, geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2, workers_pb2
 
-from .conftest import EnterDoor
-from .fuzzed import EXPECTED_CODES, UNEXPECTED_REASONS, FuzzedService
+from .fuzzed import EXPECTED_CODES, UNEXPECTED_REASONS
 from .grpc_messages import messages, near
-from .mutations import Strategy, mutated_bytes
+from .mutations import mutated_bytes
 
 pytestmark = pytest.mark.long
 
@@ -45,7 +42,7 @@ SETTINGS = rendering_pb2.RenderSettings(
 )
 SHARED = rendering_pb2.SharedMemory(name=f"ultragray-{'f' * 32}", token=bytes(range(32)), slots=2, slot_bytes=4096)
 SHARED_FILE = Path("/dev/shm", SHARED.name)
-VALID: tuple[Message, ...] = (
+VALID = (
     rendering_pb2.RenderRequest(settings=SETTINGS, pose=POSE),
     rendering_pb2.RenderBatchRequest(settings=SETTINGS, poses=[POSE, MATRIX]),
     rendering_pb2.RenderStreamRequest(sequence=1, settings=SETTINGS, pose=POSE, timeout_ms=5000, client_time_ns=7),
@@ -78,7 +75,7 @@ class Method:
     client_streams: bool
     server_streams: bool
 
-    def call(self, channel: grpc.Channel, requests: list[bytes]) -> list[bytes]:
+    def call(self, channel, requests):
         """The answers. Raises grpc.RpcError."""
         name = self.path.rpartition("/")[2]
         timeout_s = ENDLESS_TIMEOUT_S if name in ENDLESS else TIMEOUT_S
@@ -88,7 +85,7 @@ class Method:
         return list(answer) if self.server_streams else [answer]
 
 
-def all_methods() -> list[Method]:
+def all_methods():
     modules = [name for _, name, _ in pkgutil.iter_modules(v1.__path__) if name.endswith("_pb2")]
     services = (
         service
@@ -112,12 +109,12 @@ RENDERING = [method for method in METHODS if "RenderService" in method.path]
 
 
 @pytest.fixture(autouse=True)
-def no_file_stays() -> Iterator[None]:
+def no_file_stays():
     yield
     SHARED_FILE.unlink(missing_ok=True)
 
 
-def offer_shared_file() -> None:
+def offer_shared_file():
     """Makes the file that SHARED tells of, which a service that takes it removes."""
     if not SHARED_FILE.exists():
         SHARED_FILE.touch(0o600)
@@ -127,17 +124,17 @@ def offer_shared_file() -> None:
 
 
 @pytest.fixture
-def channel(well: FuzzedService) -> Iterator[grpc.Channel]:
+def channel(well):
     options = [("grpc.max_receive_message_length", -1), ("grpc.initial_reconnect_backoff_ms", 100)]
     with grpc.insecure_channel(well.running.grpc, options=options) as opened:
         yield opened
 
 
-def calls(of: Any) -> Strategy:
+def calls(of):
     """A method, and the messages it is called with, whose strategy `of` gives by the method."""
     methods = st.sampled_from([*METHODS, *RENDERING * 4])
 
-    def with_messages(method: Method) -> Strategy:
+    def with_messages(method):
         one = of(method)
         several = st.lists(one, min_size=1, max_size=MOST_MESSAGES if method.client_streams else 1)
         return st.tuples(st.just(method), several)
@@ -145,11 +142,11 @@ def calls(of: Any) -> Strategy:
     return methods.flatmap(with_messages)
 
 
-def asked(well: FuzzedService, channel: grpc.Channel, method: Method, requests: list[bytes]) -> None:
+def asked(well, channel, method, requests):
     well.require_alive()
     if method.path.endswith("RenderStream"):
         offer_shared_file()
-    answers: list[bytes] = []
+    answers = []
     told = "OK"
     try:
         answers = method.call(channel, requests)
@@ -162,16 +159,16 @@ def asked(well: FuzzedService, channel: grpc.Channel, method: Method, requests: 
         assert not reasons & UNEXPECTED_REASONS, reasons
 
 
-def test_messages_of_the_descriptors(door: EnterDoor, well: FuzzedService, channel: grpc.Channel) -> None:
-    def of(method: Method) -> Strategy:
+def test_messages_of_the_descriptors(door, well, channel):
+    def of(method):
         known = [near(message) for message in VALID if isinstance(message, method.takes)]
         return st.one_of(*known, *known, messages(method.takes.DESCRIPTOR)).map(lambda made: made.SerializeToString())
 
     door("grpc messages").enter(calls(of), lambda call: asked(well, channel, *call))
 
 
-def test_bytes(door: EnterDoor, well: FuzzedService, channel: grpc.Channel) -> None:
-    def of(method: Method) -> Strategy:
+def test_bytes(door, well, channel):
+    def of(method):
         valid = [message.SerializeToString() for message in VALID if isinstance(message, method.takes)]
         return mutated_bytes(valid or [message.SerializeToString() for message in VALID])
 

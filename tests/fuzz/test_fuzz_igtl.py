@@ -1,7 +1,5 @@
 """OpenIGTLink: well-formed messages with contents of all kinds, and bytes that are no messages."""
 
-from __future__ import annotations
-
 import contextlib
 import socket
 import struct
@@ -14,9 +12,7 @@ from ultragray_service.igtl.commands import Command, pack_command
 from ultragray_service.igtl.contents import Instrument, pack_instruments, pack_position, pack_transform
 from ultragray_service.igtl.messages import HEADER_BYTES, Message, pack_message, unpack_header
 
-from .conftest import EnterDoor
-from .fuzzed import FuzzedService
-from .mutations import REALS, TEXTS, Strategy, mutated_bytes
+from .mutations import REALS, TEXTS, mutated_bytes
 
 pytestmark = pytest.mark.long
 
@@ -54,13 +50,13 @@ DEVICES = (
 )
 
 
-def messages() -> Strategy:
+def messages():
     """A whole message, whose header and checksum are right."""
     content = {name: mutated_bytes([data]) if data else st.binary(max_size=60) for name, data in VALID}
     matrix = st.lists(st.one_of(st.sampled_from(REALS), st.floats(-2, 2)), min_size=12, max_size=12)
     numbers = matrix.map(lambda values: np.array(values, np.float64).astype(">f4").tobytes())
 
-    def of(name: str) -> Strategy:
+    def of(name):
         contents = [st.just(dict(VALID)[name]), content[name]]
         contents += [numbers] if name == "TRANSFORM" else []
         return st.builds(
@@ -86,7 +82,7 @@ def messages() -> Strategy:
     return st.one_of(plain, plain, with_metadata).map(pack_message)
 
 
-def talk(address: tuple[str, int], data: bytes) -> None:
+def talk(address, data):
     """Sends, asks for the state, and waits for its answer or for the end of the connection."""
     with socket.create_connection(address, timeout=TIMEOUT_S) as peer, contextlib.suppress(ConnectionError):
         peer.sendall(data + pack_message(Message("GET_STATUS", "", timestamp=LAST)))
@@ -101,18 +97,18 @@ def talk(address: tuple[str, int], data: bytes) -> None:
     raise ConnectionResetError
 
 
-def test_messages(door: EnterDoor, well: FuzzedService) -> None:
-    def attempt(group: list[bytes]) -> None:
+def test_messages(door, well):
+    def attempt(group):
         well.require_alive()
         talk(well.igtl(), b"".join(group))
 
     door("igtl messages").enter(st.lists(messages(), min_size=GROUP, max_size=GROUP), attempt, group=GROUP)
 
 
-def test_bytes(door: EnterDoor, well: FuzzedService) -> None:
+def test_bytes(door, well):
     whole = [pack_message(Message(name, "demo", data, version=version)) for name, data in VALID for version in (1, 2)]
 
-    def attempt(data: bytes) -> None:
+    def attempt(data):
         well.require_alive()
         with socket.create_connection(well.igtl(), timeout=TIMEOUT_S) as peer, contextlib.suppress(ConnectionError):
             peer.sendall(data)

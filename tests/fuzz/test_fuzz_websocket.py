@@ -2,19 +2,15 @@
 the rules of the protocol.
 """
 
-from __future__ import annotations
-
 import json
-from typing import Any
 
 import pytest
 from hypothesis import strategies as st
 from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
 
-from .conftest import EnterDoor
-from .fuzzed import UNEXPECTED_REASONS, FuzzedService
-from .mutations import Strategy, as_json, mutated_bytes, mutated_json
+from .fuzzed import UNEXPECTED_REASONS
+from .mutations import as_json, mutated_bytes, mutated_json
 
 pytestmark = pytest.mark.long
 
@@ -23,7 +19,7 @@ LAST = 2**40  # the sequence of the message that must be answered after them
 TIMEOUT_S = 60.0
 POSE = {"position_mm": {"x": 1.0, "y": 0.0, "z": 0.0}, "quaternion": {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}}
 MATRIX = {"matrix": [[1.0, 0, 0, 0], [0, 1.0, 0, 0], [0, 0, 1.0, 0], [0, 0, 0, 1.0]]}
-SETTINGS: dict[str, Any] = {
+SETTINGS = {
     "height": 16,
     "width": 12,
     "outputs": ["bmode"],
@@ -44,7 +40,7 @@ MESSAGES = (
 _INTERNAL_ERROR = 1011
 
 
-def messages() -> Strategy:
+def messages():
     """Text or bytes, as a client may send them."""
     text = mutated_json(MESSAGES).map(lambda document: as_json(document).decode())
     raw = mutated_bytes([json.dumps(message).encode() for message in MESSAGES])
@@ -53,8 +49,8 @@ def messages() -> Strategy:
     return st.one_of(text, text, text, as_text, raw, first)
 
 
-def test_messages(door: EnterDoor, well: FuzzedService) -> None:
-    def attempt(group: list[str | bytes]) -> None:
+def test_messages(door, well):
+    def attempt(group):
         well.require_alive()
         host, port = well.address
         address = f"ws://{host}:{port}/v1/scenes/demo/stream"
@@ -72,7 +68,7 @@ def test_messages(door: EnterDoor, well: FuzzedService) -> None:
     door("websocket").enter(st.lists(messages(), min_size=GROUP, max_size=GROUP), attempt, group=GROUP)
 
 
-def wait_for_the_last(stream: ClientConnection) -> None:
+def wait_for_the_last(stream):
     while True:
         answer = stream.recv(timeout=TIMEOUT_S)
         if isinstance(answer, bytes):
@@ -84,8 +80,8 @@ def wait_for_the_last(stream: ClientConnection) -> None:
             return
 
 
-def test_paths_of_streams(door: EnterDoor, well: FuzzedService) -> None:
-    def attempt(scene: str) -> None:
+def test_paths_of_streams(door, well):
+    def attempt(scene):
         well.require_alive()
         host, port = well.address
         status = 101
@@ -100,6 +96,6 @@ def test_paths_of_streams(door: EnterDoor, well: FuzzedService) -> None:
     door("websocket paths").enter(names.map(lambda name: name.decode("ascii", "ignore")).filter(_plain), attempt)
 
 
-def _plain(name: str) -> bool:
+def _plain(name):
     """Whether it can stand in a URL at all."""
     return all(33 <= ord(character) < 127 and character not in '/?#[]\\<>"{}|^`' for character in name)

@@ -1,44 +1,31 @@
-"""Outputs, as asked for."""
-
-from __future__ import annotations
-
-from pathlib import Path
-from typing import Any
+"""Outputs, as asked for; the share of the beam that ends in each pixel."""
 
 import numpy as np
 import pytest
 import torch
 
-from ultragray import SceneInfo
+from ultragray import GaussianScene, LinearProbe, render
 from ultragray.errors import UnknownOutput
 from ultragray.exchange.exports.exporter import stored_pixels
-from ultragray.rendering.outputs import OUTPUTS, Output, check_available, check_outputs
+from ultragray.rendering.outputs import OUTPUTS, SPENT_BEAM, Output, check_outputs
 from ultragray.rendering.pixels import to_uint8
 from ultragray_workers.pool.pixels import render_to_host, round_to_uint8
 
 
-def test_outputs_keep_their_order_without_repetitions() -> None:
+def test_outputs_keep_their_order_without_repetitions():
     assert check_outputs(["coverage", "bmode", "coverage"]) == ("coverage", "bmode")
     assert check_outputs("echo") == ("echo",)
     assert check_outputs(tuple(OUTPUTS)) == tuple(OUTPUTS)
 
 
 @pytest.mark.parametrize("outputs", [[], ["bmod"], "b-mode", ["bmode", ""], [None]])
-def test_other_outputs_are_refused(outputs: Any) -> None:
+def test_other_outputs_are_refused(outputs):
     with pytest.raises(UnknownOutput, match=", ".join(OUTPUTS)) as caught:
         check_outputs(outputs)
     assert caught.value.field == "outputs"
 
 
-def test_labels_need_a_scene_that_has_them() -> None:
-    check_available(("bmode", "labels"), SceneInfo(label_names={3: "fat"}))
-    check_available(("bmode",), SceneInfo())
-    with pytest.raises(UnknownOutput, match="only for a scene whose Gaussians carry labels") as caught:
-        check_available(("bmode", "labels"), SceneInfo())
-    assert caught.value.field == "outputs"
-
-
-def test_eight_bits_hold_the_shares_of_a_scale(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_eight_bits_hold_the_shares_of_a_scale(tmp_path, monkeypatch):
     level = Output(
         "level", "echo in dB", ("echo",), lambda drawing: drawing.plane("echo"), unit="dB", scale=(-60.0, 0.0)
     )
@@ -60,3 +47,48 @@ def test_eight_bits_hold_the_shares_of_a_scale(tmp_path: Path, monkeypatch: pyte
     shares = np.ones((1, 1, 2), np.float32)
     assert OUTPUTS["bmode"].shares(shares) is shares
     assert OUTPUTS["labels"].range_in_words == "whole numbers"
+
+
+PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_what_each_pixel_takes_leaves_the_transmittance(random_scene, random_poses, backend):
+    scene = random_scene(60, seed=3, sigma_cm=(0.2, 0.6))
+    frames = render(
+        scene,
+        PROBE,
+        random_poses(2, seed=1),
+        height=48,
+        width=40,
+        outputs=("attenuation", "transmittance"),
+        backend=backend,
+    )
+    attenuation, transmittance = frames["attenuation"], frames["transmittance"]
+    assert 0.0 <= attenuation.min() <= attenuation.max() <= 1.0
+    assert attenuation.max() > 0.05, "something absorbs"
+    left = torch.cumprod(1.0 - attenuation, dim=1)
+    falls = torch.cummin(transmittance, dim=1).values  # at the rim of a footprint T may rise by a threshold
+    reached = (falls > SPENT_BEAM) & (transmittance <= falls + 1e-6)
+    assert reached.float().mean() > 0.8
+    assert (left - transmittance)[reached].abs().max() < 0.02
+
+
+def test_a_spent_beam_has_nothing_to_lose(random_scene):
+    scene = random_scene(400, seed=1, sigma_cm=(0.5, 0.9))
+    scene = GaussianScene.from_splats({**scene.splats, "transmittances": torch.full((400,), -9.0)})
+    frames = render(scene, PROBE, np.eye(4), height=64, width=16, outputs=("attenuation", "transmittance"))
+    spent = frames["transmittance"].roll(1, dims=1)[:, 1:] < SPENT_BEAM
+    assert spent.any()
+    assert (frames["attenuation"][:, 1:][spent] == 0.0).all()
+
+
+def test_gradients_pass_through_it(random_scene):
+    scene = random_scene(20, seed=2, dtype=torch.float64)
+    leaves = {name: tensor.clone().requires_grad_() for name, tensor in scene.splats.items()}
+    frames = render(GaussianScene.from_splats(leaves), PROBE, np.eye(4), height=24, width=16, outputs=("attenuation",))
+    frames["attenuation"].sum().backward()
+    gradient = leaves["transmittances"].grad
+    assert gradient is not None
+    assert torch.isfinite(gradient).all()
+    assert (gradient < 0.0).any(), "a more transparent Gaussian takes less"

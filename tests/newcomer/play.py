@@ -4,8 +4,6 @@ Each step is told with its time; the first that fails ends the play. The times g
 50051 must be free: a newcomer takes the ones that the documents name.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
@@ -16,7 +14,6 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -31,17 +28,17 @@ environment = {name: value for name, value in os.environ.items() if not name.sta
 environment["PATH"] = ":".join(
     part for part in environment["PATH"].split(":") if not Path(part).is_relative_to(ROOT / ".venv")
 )
-times_s: dict[str, float] = {}
+times_s = {}
 
 
-def note(name: str, taken_s: float) -> None:
+def note(name, taken_s):
     times_s[name] = round(taken_s, 3)
     goal = f" (goal {GOALS[name]:g} s)" if name in GOALS else ""
     sys.stdout.write(f"{name}: {taken_s:.2f} s{goal}\n")
     sys.stdout.flush()
 
 
-def run(clone: Path, *command: object, expect: int = 0) -> str:
+def run(clone, *command, expect=0):
     """What a command in the clone prints, both streams."""
     shown = [str(part) for part in command]
     done = subprocess.run(
@@ -52,7 +49,7 @@ def run(clone: Path, *command: object, expect: int = 0) -> str:
     return done.stdout
 
 
-def timed(name: str, clone: Path, *command: object, expect: int = 0, repeats: int = 1) -> None:
+def timed(name, clone, *command, expect=0, repeats=1):
     """Tell the time of a command, the median of some repetitions."""
     taken_s = []
     for _ in range(repeats):
@@ -63,7 +60,7 @@ def timed(name: str, clone: Path, *command: object, expect: int = 0, repeats: in
 
 
 @contextlib.contextmanager
-def serving(clone: Path, name: str, began: float) -> Iterator[None]:
+def serving(clone, name, began):
     """`make serve` until Ctrl-C, from the first frame on the console on."""
     log = clone.parent / "serve.log"
     command = ["make", "serve", f"PYTHON={PYTHON}"]
@@ -81,7 +78,7 @@ def serving(clone: Path, name: str, began: float) -> Iterator[None]:
         sys.exit(f"error: the service ended with {code}\n{said[-6000:]}")
 
 
-def play(folder: Path) -> None:
+def play(folder):
     """Every step of a newcomer's first hour."""
     clone, python = folder / "ultragray", ".venv/bin/python"
     began = time.time()
@@ -98,7 +95,7 @@ def play(folder: Path) -> None:
     timed("wheels", clone, ".venv/bin/pytest", "-m", "long", "tests/distribution")
 
 
-def main() -> None:
+def main():
     RECORD.parent.mkdir(exist_ok=True)
     folder = Path(tempfile.mkdtemp(prefix="ultragray-newcomer-"))
     try:

@@ -3,8 +3,6 @@
 With the Python of the checkout, which holds what `make serve` installed and no more.
 """
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path
@@ -13,7 +11,7 @@ from ..documents.blocks import read_page
 from ..documents.running import PORTS, PageRun
 
 
-def main(page: Path, folder: Path) -> None:
+def main(page, folder):
     folder.mkdir()
     os.chdir(folder)
     with PageRun(read_page(page), folder, {door: int(port) for port, door in PORTS.items()}) as run:

@@ -2,18 +2,17 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field, fields
-from enum import Enum
-from typing import Any, ClassVar, Literal, TypeAlias
+from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 import pytest
-from google.protobuf.descriptor import Descriptor
 
-from ultragray.geometry.probe import Probe
+from ultragray.geometry.probe import LinearProbe, PhasedProbe, Probe
 from ultragray.rendering.display import Display
 from ultragray.rendering.outputs import OUTPUTS
-from ultragray.rendering.settings import FRAME_ENCODINGS, RenderSettings
+from ultragray.rendering.settings import FRAME_ENCODINGS, Encoding, RenderSettings
+from ultragray.samplers import AroundSampler, CoveredSampler
 from ultragray.samplers import Sampler as PoseSampler
 from ultragray.scene.confidence import Extrapolation
 from ultragray_proto.codec import MessageInvalid, from_message, to_message, words
@@ -27,7 +26,7 @@ from ultragray_workers.jobs.progress import Progress
 from ultragray_workers.jobs.record import Job
 
 # A dataclass and its message, and the fields that stand on one side only, for a reason.
-PAIRS: list[tuple[type[Any], type[Any], set[str]]] = [
+PAIRS = [
     *(
         (Probe.members[one.name], one.message_type._concrete_class, set())
         for one in geometry_pb2.Probe.DESCRIPTOR.fields
@@ -64,7 +63,7 @@ PAIRS: list[tuple[type[Any], type[Any], set[str]]] = [
 ]
 
 
-def names_of_message(descriptor: Descriptor) -> set[str]:
+def names_of_message(descriptor):
     """The fields; those of a oneof by its one name."""
     return {
         one.containing_oneof.name
@@ -75,12 +74,12 @@ def names_of_message(descriptor: Descriptor) -> set[str]:
 
 
 @pytest.mark.parametrize(("cls", "message", "alone"), PAIRS, ids=lambda one: getattr(one, "__name__", ""))
-def test_fields_stand_on_both_sides(cls: type[Any], message: type[Any], alone: set[str]) -> None:
+def test_fields_stand_on_both_sides(cls, message, alone):
     given = {one.name for one in fields(cls) if one.init and one.name != "kind"}
     assert given ^ (names_of_message(message.DESCRIPTOR) - {"kind"}) == alone
 
 
-def test_every_kind_has_a_message() -> None:
+def test_every_kind_has_a_message():
     """And every word its number."""
     assert {one.name for one in geometry_pb2.Probe.DESCRIPTOR.fields} == set(Probe.members)
     (specification,) = jobs_pb2.SubmitJobRequest.DESCRIPTOR.oneofs
@@ -90,54 +89,6 @@ def test_every_kind_has_a_message() -> None:
     assert set(words(rendering_pb2.Encoding.DESCRIPTOR).values()) == set(FRAME_ENCODINGS)
     numbers = {item.name for member in PoseSampler.members.values() for item in fields(member)}
     assert numbers == {one.name for one in jobs_pb2.PoseSampler.DESCRIPTOR.fields}
-
-
-@dataclass(frozen=True)
-class Linear:
-    width_mm: float
-    near_mm: float
-    far_mm: float
-    kind: Literal["linear"] = field(default="linear", repr=False, kw_only=True)
-
-    def __post_init__(self) -> None:
-        if not self.near_mm < self.far_mm:
-            raise ValueError("far_mm must be beyond near_mm")
-
-
-@dataclass(frozen=True)
-class Phased:
-    opening_angle_deg: float
-    far_mm: float
-    kind: Literal["phased"] = field(default="phased", repr=False, kw_only=True)
-
-
-AnyProbe: TypeAlias = Linear | Phased
-
-
-class Pixels(Enum):
-    UINT8 = "uint8"
-    PNG = "png"
-
-
-@dataclass(frozen=True)
-class Shown:
-    gain_db: float = 0.0
-    dynamic_range_db: float = 60.0
-    tgc_db: tuple[float, ...] = ()
-    depth_mm: float | None = None
-    flip: bool = False
-    pixel_mm: float | None = None
-
-
-@dataclass(frozen=True)
-class Settings:
-    scene: str
-    height: int | None = None
-    outputs: tuple[str, ...] = ("bmode",)
-    encoding: Pixels = Pixels.UINT8
-    probe: AnyProbe | None = None
-    display: Shown = Shown()
-    below_min_confidence: Literal["refuse", "mask"] = "refuse"
 
 
 Point = tuple[float, float, float]
@@ -153,7 +104,7 @@ class Trained:
 @dataclass(frozen=True)
 class Scene:
     name: str
-    probe: AnyProbe | None
+    probe: Probe | None
     image_height: int | None
     metrics: dict[str, float]
     label_names: dict[int, str]
@@ -162,41 +113,15 @@ class Scene:
 
 
 @dataclass(frozen=True)
-class Train:
-    dataset: str
-    scene: str
-    preset: str = "fast"
-    settings: dict[str, Any] = field(default_factory=dict)
-    kind: Literal["train"] = field(default="train", kw_only=True)
-
-
-@dataclass(frozen=True)
-class Around:
-    count: int
-    translation_mm: float = 2.0
-    kind: Literal["around"] = field(default="around", kw_only=True)
-
-
-@dataclass(frozen=True)
-class Covered:
-    count: int
-    kind: Literal["covered"] = field(default="covered", kw_only=True)
-
-
-class Sampler:
-    members: ClassVar[dict[str, type[Any]]] = {"around": Around, "covered": Covered}
-
-
-@dataclass(frozen=True)
 class Render:
     scene: str
-    sampler: Sampler | None = None
+    sampler: PoseSampler | None = None
     kind: Literal["render"] = field(default="render", kw_only=True)
 
 
 @dataclass(frozen=True)
 class Submitted:
-    specification: Train | Render
+    specification: TrainJob | Render
     priority: int = 0
 
 
@@ -207,27 +132,31 @@ class Uploaded:
     options: dict[str, str]
 
 
-TOLD: list[tuple[Any, Any]] = [
-    (Settings("liver"), rendering_pb2.RenderSettings),
-    (Settings("liver", 0, ("echo", "labels"), Pixels.PNG, Linear(1.0, 0.0, 2.0)), rendering_pb2.RenderSettings),
-    (Settings("", display=Shown(3.0, tgc_db=(1.0, 2.0), depth_mm=0.0)), rendering_pb2.RenderSettings),
+LINEAR = LinearProbe(1.0, 0.0, 2.0)
+TOLD = [
+    (RenderSettings(), rendering_pb2.RenderSettings),
     (
-        Submitted(Train("a", "b", settings={"steps": 7, "rate": 0.5, "fast": True, "x": None})),
+        RenderSettings(height=7, width=9, outputs=("echo",), encoding=Encoding.PNG, probe=LINEAR),
+        rendering_pb2.RenderSettings,
+    ),
+    (RenderSettings(display=Display(3.0, tgc_db=(1.0, 2.0), depth_mm=5.0)), rendering_pb2.RenderSettings),
+    (
+        Submitted(TrainJob("a", "b", settings={"steps": 7, "sh0_rate": 0.5, "transmittance": True, "memory_gb": None})),
         jobs_pb2.SubmitJobRequest,
     ),
-    (Submitted(Render("a", Around(3, 0.0)), priority=-3), jobs_pb2.SubmitJobRequest),
-    (Render("a", Covered(3)), jobs_pb2.RenderJob),
+    (Submitted(Render("a", AroundSampler(3, 0.0)), priority=-3), jobs_pb2.SubmitJobRequest),
+    (Render("a", CoveredSampler(3)), jobs_pb2.RenderJob),
     (Uploaded("a", ("dark", "short"), {"crop": "1:2,3:4"}), datasets_pb2.Dataset),
 ]
 
 
 @pytest.mark.parametrize(("value", "cls"), TOLD)
-def test_there_and_back(value: Any, cls: Any) -> None:
+def test_there_and_back(value, cls):
     message = cls.FromString(to_message(value, cls).SerializeToString())
     assert from_message(message, type(value)) == value
 
 
-def test_scene() -> None:
+def test_scene():
     pose = np.arange(16.0).reshape(4, 4)
     scene = Scene("liver", None, None, {"psnr_db": 30.5}, {1: "bone"}, Trained(7, (1.0, 2.0, 3.0), pose))
     message = to_message(scene, scenes_pb2.Scene)
@@ -240,96 +169,86 @@ def test_scene() -> None:
     assert (again.training_poses.first == pose).all()
 
 
-def test_arrays_are_points() -> None:
-    message = to_message(Trained(1, np.array([1.0, 2.0, 3.0], np.float32), None), scenes_pb2.TrainingPoses)  # type: ignore[arg-type]
+def test_arrays_are_points():
+    message = to_message(Trained(1, np.array([1.0, 2.0, 3.0], np.float32), None), scenes_pb2.TrainingPoses)
     assert message.position_min_mm == geometry_pb2.Position(x=1.0, y=2.0, z=3.0)
 
 
-def test_members_of_a_family_by_themselves() -> None:
+def test_members_of_a_family_by_themselves():
     probe = geometry_pb2.Probe(phased=geometry_pb2.PhasedProbe(opening_angle_deg=60.0, far_mm=50.0))
-    assert from_message(probe, AnyProbe) == Phased(60.0, 50.0)
-    assert from_message(jobs_pb2.PoseSampler(kind="covered", count=3), Sampler) == Covered(3)
+    assert from_message(probe, Probe) == PhasedProbe(60.0, 50.0)
+    assert from_message(jobs_pb2.PoseSampler(kind="covered", count=3), PoseSampler) == CoveredSampler(3)
 
 
-def test_defaults_are_left_out() -> None:
-    assert to_message(Settings("a"), rendering_pb2.RenderSettings) == rendering_pb2.RenderSettings(
+def test_defaults_are_left_out():
+    assert to_message(RenderSettings(), rendering_pb2.RenderSettings, scene="a") == rendering_pb2.RenderSettings(
         scene="a", outputs=["OUTPUT_BMODE"], encoding="ENCODING_UINT8", below_min_confidence="BELOW_CONFIDENCE_REFUSE"
     )
-    assert from_message(rendering_pb2.RenderSettings(scene="a"), Settings) == Settings("a")
+    assert from_message(rendering_pb2.RenderSettings(scene="a"), RenderSettings) == RenderSettings()
 
 
-def test_fields_beside_the_value() -> None:
-    message = to_message(Shown(3.0), rendering_pb2.Display, flip=True)
+def test_fields_beside_the_value():
+    message = to_message(Display(3.0), rendering_pb2.Display, flip=True)
     assert (message.gain_db, message.flip) == (3.0, True)
-    assert from_message(message, Shown, flip=False) == Shown(3.0)
+    assert from_message(message, Display, flip=False) == Display(3.0)
 
 
-REFUSED: list[tuple[Any, Any, str, str]] = [
-    (geometry_pb2.Probe(), AnyProbe, "kind", "kind must be one of linear, phased, got none"),
-    (
-        geometry_pb2.Probe(convex=geometry_pb2.ConvexProbe()),
-        AnyProbe,
-        "kind",
-        "kind must be one of linear, phased, got convex",
-    ),
+KINDS = ", ".join(Probe.members)
+REFUSED = [
+    (geometry_pb2.Probe(), Probe, "kind", f"kind must be one of {KINDS}, got none"),
     (
         rendering_pb2.RenderSettings(probe=geometry_pb2.Probe()),
-        Settings,
+        RenderSettings,
         "probe.kind",
-        "probe.kind must be one of linear, phased, got none",
+        "probe.kind must be one of",
     ),
     (
         rendering_pb2.RenderSettings(outputs=[1, 77]),
-        Settings,
+        RenderSettings,
         "outputs",
         f"outputs must be some of {', '.join(rendering_pb2.Output.keys()[1:])}, got number 77",
     ),
-    (rendering_pb2.RenderSettings(outputs=[0]), Settings, "outputs", "got number 0"),
-    (
-        rendering_pb2.RenderSettings(encoding=2),
-        Settings,
-        "encoding",
-        "must be one of ENCODING_UINT8, ENCODING_PNG, got number 2",
-    ),
+    (rendering_pb2.RenderSettings(outputs=[0]), RenderSettings, "outputs", "got number 0"),
+    (rendering_pb2.RenderSettings(encoding=99), RenderSettings, "encoding", "must be one of ENCODING_UINT8"),
     (scenes_pb2.Scene(), Scene, "training_poses", "training_poses is required"),
     (jobs_pb2.SubmitJobRequest(), Submitted, "specification", "must be one of train, render, got none"),
     (
-        jobs_pb2.SubmitJobRequest(render=jobs_pb2.RenderJob(sampler=jobs_pb2.PoseSampler(kind="covered", seed=3))),
+        jobs_pb2.SubmitJobRequest(render=jobs_pb2.RenderJob(sampler=jobs_pb2.PoseSampler(kind="fan", seed=3))),
         Submitted,
         "render.sampler.seed",
-        "render.sampler.seed must be left out: kind covered does not take it",
+        "render.sampler.seed must be left out: kind fan does not take it",
     ),
     (
-        jobs_pb2.RenderJob(sampler=jobs_pb2.PoseSampler(kind="training")),
+        jobs_pb2.RenderJob(sampler=jobs_pb2.PoseSampler(kind="odd")),
         Render,
         "sampler.kind",
-        "sampler.kind must be one of around, covered, got 'training'",
+        f"sampler.kind must be one of {', '.join(PoseSampler.members)}, got 'odd'",
     ),
 ]
 
 
 @pytest.mark.parametrize(("message", "cls", "path", "detail"), REFUSED)
-def test_refused(message: Any, cls: Any, path: str, detail: str) -> None:
+def test_refused(message, cls, path, detail):
     with pytest.raises(MessageInvalid) as raised:
         from_message(message, cls)
     assert raised.value.field == path
     assert detail in str(raised.value)
 
 
-def test_infinite_settings_are_refused() -> None:
+def test_infinite_settings_are_refused():
     message = jobs_pb2.TrainJob()
     message.settings.update({"rate": math.inf})
     with pytest.raises(MessageInvalid, match=r"settings\.rate must be a finite number, got inf"):
-        from_message(message, Train)
+        from_message(message, TrainJob)
 
 
-def test_the_error_of_a_dataclass_is_kept() -> None:
+def test_the_error_of_a_dataclass_is_kept():
     probe = geometry_pb2.Probe(linear=geometry_pb2.LinearProbe(width_mm=1.0, near_mm=3.0, far_mm=2.0))
     with pytest.raises(MessageInvalid) as raised:
-        from_message(rendering_pb2.RenderSettings(probe=probe), Settings)
+        from_message(rendering_pb2.RenderSettings(probe=probe), RenderSettings)
     assert raised.value.field == "probe.linear"
-    assert str(raised.value.original) == "far_mm must be beyond near_mm"
+    assert "far_mm must be" in str(raised.value.original)
 
 
-def test_words() -> None:
+def test_words():
     assert words(rendering_pb2.BelowConfidence.DESCRIPTOR) == {1: "refuse", 2: "mask"}

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from enum import Enum
 from pathlib import Path
-from types import ModuleType
 from typing import Any, ClassVar
 
 import pytest
@@ -19,16 +18,16 @@ VERSION_LINE = "# Protobuf Python Version: "
 
 
 @pytest.fixture(scope="module")
-def generator() -> ModuleType:
+def generator():
     return loaded(PROTO / "generate.py")
 
 
-def protoc_version(folder: Path) -> str:
+def protoc_version(folder):
     lines = (folder / "ultragray_proto" / "v1" / "rendering_pb2.py").read_text().splitlines()
     return next(line for line in lines if line.startswith(VERSION_LINE))
 
 
-def test_what_is_committed_is_current(generator: ModuleType, tmp_path: Path) -> None:
+def test_what_is_committed_is_current(generator, tmp_path):
     written = [path.relative_to(tmp_path) for path in generator.generate(tmp_path)]
     is_other_protoc = protoc_version(tmp_path) != protoc_version(PROTO)
     compared = [path for path in written if not (is_other_protoc and "_pb2" in path.name)]
@@ -40,7 +39,7 @@ def test_what_is_committed_is_current(generator: ModuleType, tmp_path: Path) -> 
     assert {path for path in there - set(written) if path.name != "__init__.py"} == set()
 
 
-def test_stubs_do_not_import_the_model_library() -> None:
+def test_stubs_do_not_import_the_model_library():
     for path in (PROTO / "ultragray_proto" / "v1").glob("*_pb2*"):
         assert "from ultragray." not in path.read_text()
 
@@ -87,11 +86,11 @@ LOCKED = [
 ]
 
 
-def declarations(text: str) -> list[str]:
+def declarations(text):
     return [line.strip() for line in text.splitlines() if line.strip().endswith(";")]
 
 
-def test_a_new_field_takes_the_next_number_and_the_form_of_its_annotation(generator: ModuleType) -> None:
+def test_a_new_field_takes_the_next_number_and_the_form_of_its_annotation(generator):
     assert declarations(generator.proto_text(TEMPLATE, generator.Lock(LOCKED))) == [
         "string scene = 1;",
         "optional int32 side = 4;",
@@ -109,20 +108,20 @@ def test_a_new_field_takes_the_next_number_and_the_form_of_its_annotation(genera
     ]
 
 
-def test_a_comment_says_meaning_limits_and_default(generator: ModuleType) -> None:
+def test_a_comment_says_meaning_limits_and_default(generator):
     text = generator.proto_text(TEMPLATE, generator.Lock(LOCKED))
     assert "  // Added. From 0 to 3.\n  double gain_db" in text
     assert "  // Of all. Absent: 7.\n" in text
 
 
 @pytest.mark.parametrize("form", ["string", "repeated double"])
-def test_a_form_that_cannot_hold_the_annotation_is_refused(generator: ModuleType, form: str) -> None:
+def test_a_form_that_cannot_hold_the_annotation_is_refused(generator, form):
     lock = generator.Lock([*LOCKED, f"ultragray.v1.Settings.gain_db = 5: {form}"])
     with pytest.raises(generator.ContractError, match=r"Settings\.gain_db is .* on the wire, which cannot hold float"):
         generator.proto_text(TEMPLATE, lock)
 
 
-def test_the_lock_only_grows(generator: ModuleType) -> None:
+def test_the_lock_only_grows(generator):
     lock = generator.Lock(LOCKED)
     assert lock.grown([LOCKED[0], "ultragray.v1.Settings.new = 7: bool"]) == [
         *LOCKED,
@@ -132,7 +131,7 @@ def test_the_lock_only_grows(generator: ModuleType) -> None:
         lock.grown(["ultragray.v1.Settings.scene = 2: string"])
 
 
-def test_a_method_keeps_its_messages(generator: ModuleType) -> None:
+def test_a_method_keeps_its_messages(generator):
     lock = generator.Lock(["ultragray.v1.Render.Frame(ultragray.v1.A) returns (ultragray.v1.B)"])
     with pytest.raises(generator.ContractError, match="returns"):
         lock.grown(["ultragray.v1.Render.Frame(ultragray.v1.A) returns (stream ultragray.v1.B)"])

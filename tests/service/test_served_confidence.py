@@ -15,7 +15,8 @@ import numpy as np
 import pytest
 
 from ultragray import GaussianScene, render
-from ultragray.scene.confidence import Assessor, ConfidenceModel
+from ultragray.rendering.confidence import supported_shares
+from ultragray.scene.confidence import Assessor, ConfidenceModel, Support
 from ultragray_proto.v1 import (
     geometry_pb2,
     rendering_pb2,
@@ -50,6 +51,10 @@ def knowing_service(
 ) -> RunningService:
     folder = tmp_path_factory.mktemp("knowing")
     knowing.save(folder / "knowing.ugr")
+    coverage = render(knowing, None, at(NEAR), height=HEIGHT, width=WIDTH, outputs=("coverage",))["coverage"]
+    gain = 0.35 / float(supported_shares(coverage))
+    thin = replace(MODEL, support=Support(gain, share=1.0 / gain, reach_mm=10.0))
+    replace(knowing, info=replace(knowing.info, confidence=thin.to_dict())).save(folder / "thin.ugr")
     shutil.copy(data_folder / "demo.ugr", folder)
     return start_service(data_folder=folder, artifact_folder=tmp_path_factory.mktemp("artifacts"))
 
@@ -90,6 +95,21 @@ def test_poses_below_the_limit_are_refused(client: httpx.Client) -> None:
     many = client.post("knowing/render", json=body(NEAR, NEAR, FAR, min_confidence=0.5)).json()
     assert (many["reason"], many["field"]) == ("LOW_CONFIDENCE", "poses[2]")
     assert client.post("knowing/render", json=body(FAR, min_confidence=1.5)).json()["field"] == "min_confidence"
+
+
+def test_so_are_frames_that_turn_out_below_it(client: httpx.Client) -> None:
+    """The pose alone suffices; the Gaussians support too little of its frame."""
+    told = client.post("thin/render", json=body(NEAR, min_confidence=0.3))
+    confidence = float(told.headers["X-Ultragray-Confidence"])
+    assert 0.3 < confidence < 0.5
+    answer = client.post("thin/render", json=body(NEAR, NEAR, min_confidence=0.5))
+    assert (answer.status_code, answer.json()["reason"], answer.json()["field"]) == (422, "LOW_CONFIDENCE", "poses[0]")
+    assert "Gaussians support" in answer.json()["detail"]
+    fields = {"outputs": ["bmode", "coverage"], "dtype": "float32", "min_confidence": 0.5}
+    masked = client.post("thin/render", json=body(NEAR, below_min_confidence="mask", **fields))
+    bmode, coverage = np.frombuffer(masked.content, "<f4").reshape(2, HEIGHT, WIDTH)
+    assert 0.0 < (coverage < 0.3).mean() < 1.0
+    assert (bmode[coverage < 0.3] == 0).all()
 
 
 def test_grpc(knowing_service: RunningService) -> None:

@@ -1,10 +1,6 @@
 """`ultragray bench --backend cuda`: the whole command on the interpreter, and what is said without a GPU."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
-from typing import Any
 
 import pytest
 import torch
@@ -18,15 +14,13 @@ from ultragray_studies.bench.served import FrontDoor, Served
 
 TINY = BenchScene(40, 0.2, height=24, width=20)
 
-Benched = tuple[str, dict[str, Any], dict[str, Any]]
 
-
-def served(bench: BenchScene, repeats: int, backend: str) -> Served:
+def served(bench, repeats, backend):
     return Served([FrontDoor(f"HTTP of {backend}", [2.0, 4.0], 9.0)], worker_memory_mb=1.0)
 
 
 @pytest.fixture(scope="module")
-def benched(tmp_path_factory: pytest.TempPathFactory) -> Benched:
+def benched(tmp_path_factory):
     """What the command printed, and its two documents."""
     if not cuda.available():
         pytest.skip("there is no GPU, and Triton is not installed, which could interpret the kernels")
@@ -54,7 +48,7 @@ def benched(tmp_path_factory: pytest.TempPathFactory) -> Benched:
 
 
 @pytest.mark.long
-def test_rates_stand_beside_the_limits(benched: Benched) -> None:
+def test_rates_stand_beside_the_limits(benched):
     printed, document, _ = benched
     *rendered, door = document["rows"]
     work, limits = document["work_per_frame"]["40"], document["limits"]
@@ -81,7 +75,7 @@ def test_rates_stand_beside_the_limits(benched: Benched) -> None:
 
 
 @pytest.mark.long
-def test_training_step(benched: Benched) -> None:
+def test_training_step(benched):
     printed, _, document = benched
     (row,) = document["rows"]
     assert row["images"] == "2 of 24x20"
@@ -92,18 +86,7 @@ def test_training_step(benched: Benched) -> None:
     assert f"{row['step_ms']:.2f}" in printed
 
 
-def test_limits_are_those_of_multiply_adds() -> None:
-    if not cuda.available():
-        pytest.skip("there is no GPU, and Triton is not installed, which could interpret the kernel")
-    from ultragray_studies.bench.cuda import LANES, multiply_add
-
-    sums = torch.empty(2 * LANES, device=cuda.device())
-    multiply_add[(2,)](sums, 0.5, 0.25, 3, LANES=LANES)
-    begin = torch.arange(4.0)[:, None] + torch.arange(2 * LANES) * 1e-6
-    torch.testing.assert_close(sums.cpu(), ((begin - 0.5) / 8.0 + 0.5).sum(dim=0))  # each time half as far from 0.5
-
-
-def refused(*arguments: str) -> str:
+def refused(*arguments):
     result = CliRunner().invoke(app, ["bench", *arguments])
     assert result.exit_code == 2, result.output
     (line,) = result.stderr.splitlines()
@@ -111,9 +94,7 @@ def refused(*arguments: str) -> str:
 
 
 @pytest.mark.parametrize("options", [(), ("--train",)])
-def test_says_what_is_missing_without_a_gpu(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, ...]
-) -> None:
+def test_says_what_is_missing_without_a_gpu(tmp_path, monkeypatch, options):
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     output = tmp_path / "cuda.json"
@@ -122,10 +103,10 @@ def test_says_what_is_missing_without_a_gpu(
     assert not output.exists()
 
 
-def test_other_backends_are_refused() -> None:
+def test_other_backends_are_refused():
     assert refused("--backend", "reference") == "error: backend must be cpu or cuda, got 'reference'"
 
 
-def test_choices_that_do_not_go_together() -> None:
+def test_choices_that_do_not_go_together():
     assert "give one of --train, --jobs, --clients and --kernel-details" in refused("--train", "--clients")
     assert "--jobs goes without --backend" in refused("--jobs", "--backend", "cuda")

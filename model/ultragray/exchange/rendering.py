@@ -15,15 +15,56 @@ from ultragray.exchange.exports.archives import export_pngs
 from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation.scoring import frames_at_once
 from ultragray.rendering.backends.registry import renderer_name
-from ultragray.rendering.confidence import SupportWatch
-from ultragray.rendering.frames import render_shown
+from ultragray.rendering.confidence import SupportWatch, supported_shares
+from ultragray.rendering.frames import render, render_shown
 from ultragray.rendering.limits import UNLIMITED, Limits
 from ultragray.rendering.pixels import PixelArray
 from ultragray.rendering.settings import Resolved
-from ultragray.scene.confidence import Assessor, Extrapolation
+from ultragray.samplers import Assess
+from ultragray.scene.confidence import Assessor, Extrapolation, is_confident, require_confidence
 from ultragray.scene.gaussians import GaussianScene
 
-__all__ = ["render_portions", "render_to_file"]
+__all__ = ["assess_by_rendering", "render_portions", "render_to_file"]
+
+
+def assess_by_rendering(
+    scene: GaussianScene, settings: Resolved, assess: Assess, *, backend: str = "auto", limits: Limits = UNLIMITED
+) -> Assess:
+    """`assess` with the confidence that frames of `settings` will have, so that a sampler keeps to frames, not poses.
+
+    The support of a frame is known when it is rendered: here its coverage alone is, where the pose has the least
+    confidence of the settings. Without one, poses are assessed as before.
+    """
+    least = settings.least_confidence
+    if least is None:
+        return assess
+    assessor = Assessor(scene.info, scene.training_poses)
+    portion = frames_at_once(settings.height, settings.width)
+
+    def assess_frames(poses: FloatArray) -> list[Extrapolation]:  # [C, 4, 4] -> [C]
+        found = list(assess(poses))
+        able = [place for place, one in enumerate(found) if is_confident(one, least)]
+        for first in range(0, len(able), portion):
+            places = able[first : first + portion]
+            with torch.no_grad():
+                coverage = render(
+                    scene,
+                    settings.probe,
+                    poses[places],
+                    height=settings.height,
+                    width=settings.width,
+                    outputs=("coverage",),
+                    backend=backend,
+                    limits=limits,
+                    beam=settings.beam,
+                    contact=settings.contact,
+                )["coverage"]
+            shares = supported_shares(coverage).tolist()
+            for place, one in zip(places, assessor.with_support([found[i] for i in places], shares), strict=True):
+                found[place] = one
+        return found
+
+    return assess_frames
 
 
 def render_to_file(
@@ -84,7 +125,8 @@ def render_portions(
     """The frames of many poses as they are shown, a portion at a time, with all figures of each.
 
     `before_portion` is told how many frames are done, at last all of them; to stop, it raises. `assessor`: the scene's,
-    where the caller has one. Raises what `render` raises.
+    where the caller has one. Raises what `render` raises, and LowConfidence for a frame that turns out to be below the
+    least confidence of the settings.
     """
     support = SupportWatch(assessor or Assessor(scene.info, scene.training_poses), extrapolations, settings)
     portion = frames_at_once(settings.height, settings.width)
@@ -95,6 +137,7 @@ def render_portions(
         with torch.no_grad():
             shown = render_shown(scene, settings, some, backend=backend, limits=limits.after(first), support=support)
         figures = support.completed(first, first + len(some))
+        require_confidence(figures, settings.least_confidence, first=first)
         yield {name: pixels.cpu().numpy() for name, pixels in shown.items()}, figures
     if before_portion is not None:
         before_portion(len(poses))

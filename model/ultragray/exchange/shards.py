@@ -20,7 +20,7 @@ from ultragray.errors import InvalidArgument
 from ultragray.exchange.batches import BatchPlan, ShardEntry
 from ultragray.exchange.exports import ExportHeader
 from ultragray.exchange.exports.exporter import stored_pixels
-from ultragray.exchange.rendering import render_portions, written_behind
+from ultragray.exchange.rendering import assess_by_rendering, render_portions, written_behind
 from ultragray.files import file_sha256
 from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.backends.registry import renderer_name
@@ -160,6 +160,8 @@ class ShardRenderer:
         """
         plan, settings, numbers = self.plan, self._settings, self.plan.frames_of(shard)
         assess: Assess = partial(self._assess, before_portion)
+        if plan.sampler is not None:
+            assess = assess_by_rendering(self._scene, settings, assess, backend=self._backend, limits=self._limits)
         poses, extrapolations = plan.poses_of(shard, self._header.training_poses, settings.probe, assess)
         header = ExportHeader(settings, plan.dtype, poses, plan.scene, plan.scene_sha256, self.renderer)
         done = 0

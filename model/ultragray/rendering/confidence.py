@@ -30,8 +30,7 @@ class SupportWatch:
 
     def __init__(self, assessor: Assessor, extrapolations: Sequence[Extrapolation], settings: Resolved) -> None:
         """`extrapolations`: of all poses, from the poses alone."""
-        limit = settings.min_confidence if settings.below_min_confidence is Below.MASK else None
-        self._masked = [limit is not None and not is_confident(one, limit) for one in extrapolations]
+        self._mask_below = settings.min_confidence if settings.below_min_confidence is Below.MASK else None
         self._assessor, self._extrapolations = assessor, extrapolations
         self._shares: list[Tensor] = []
         self._contacts: list[FloatArray] = []
@@ -41,9 +40,13 @@ class SupportWatch:
         """A mask of the pixels of the next C poses that are to be black; None where none are."""
         if touch is not None:
             self._contacts.append(touch.shares)
-        masked = self._masked[self._count : self._count + len(coverage)]
-        self._count += len(coverage)
-        self._shares.append(_supported_shares(coverage))
+        first, self._count = self._count, self._count + len(coverage)
+        shares = supported_shares(coverage)
+        self._shares.append(shares)
+        if self._mask_below is None:
+            return None
+        found = self._assessor.with_support(self._extrapolations[first : self._count], shares.tolist())
+        masked = [not is_confident(one, self._mask_below) for one in found]
         if not any(masked):
             return None
         return torch.tensor(masked, device=coverage.device)[:, None, None] & (coverage < SUPPORT_COVERAGE)
@@ -58,7 +61,8 @@ class SupportWatch:
         return [replace(one, contact_share=contact) for one, contact in zip(found, contacts, strict=True)]
 
 
-def _supported_shares(coverage: Tensor) -> Tensor:  # [C, H, W] -> [C]
+def supported_shares(coverage: Tensor) -> Tensor:  # [C, H, W] -> [C]
+    """The share of each frame's pixels that Gaussians support."""
     if coverage.is_cuda:
         return (coverage >= SUPPORT_COVERAGE).flatten(1).float().mean(dim=1)
     supported = coverage.numpy() >= SUPPORT_COVERAGE  # numpy: torch's threads would fight with the kernel's

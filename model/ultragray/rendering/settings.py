@@ -61,6 +61,11 @@ class Contact(str, Enum):
     PRESSURE = "pressure"
 
 
+def _least_confidence(settings: FrameSettings | Additions) -> float | None:
+    """The confidence without which frames are refused, or left out by a sampler; None: any."""
+    return settings.min_confidence if settings.below_min_confidence is Below.REFUSE else None
+
+
 @dataclass(frozen=True, kw_only=True)
 class FrameSettings(Contract):
     """Settings of what is rendered, but for the scene and the poses. None: as the scene has it.
@@ -110,10 +115,7 @@ class FrameSettings(Contract):
         super().__post_init__()
         object.__setattr__(self, "outputs", check_outputs(self.outputs))
 
-    @property
-    def least_confidence(self) -> float | None:
-        """The confidence without which poses are refused, or left out by a sampler; None: any."""
-        return self.min_confidence if self.below_min_confidence is Below.REFUSE else None
+    least_confidence = property(_least_confidence)
 
     def resolved(self, info: SceneInfo, encoding: Encoding, *, max_image_side: int = MAX_IMAGE_SIDE) -> Resolved:
         """The settings for a scene, with nothing left open.
@@ -187,6 +189,7 @@ class Additions:
     tools: tuple[Tool, ...] = described("As used.", ())
     ghost: float = described("As used; 0: none.", 0.0)
     registration: str | None = described("That led the pose into the scene; null: none, it was sent as it is.", None)
+    least_confidence = property(_least_confidence)
 
 
 @dataclass(frozen=True)

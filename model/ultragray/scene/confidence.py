@@ -555,6 +555,8 @@ def _low_confidence(extrapolation: Extrapolation, min_confidence: float, field: 
     if extrapolation.distance_mm is not None and extrapolation.angle_deg is not None:
         away = f"{extrapolation.distance_mm:.1f} mm and {extrapolation.angle_deg:.1f} degrees away"
         detail = f"{detail}: the nearest training views are {away}"
+    if extrapolation.supported_share is not None:
+        detail = f"{detail}; Gaussians support {extrapolation.supported_share:.0%} of its pixels"
     return LowConfidence(detail, field=field)
 
 
@@ -565,7 +567,8 @@ def require_confidence(
     first: int = 0,
     name_pose: Callable[[int], str] = "poses[{}]".format,
 ) -> None:
-    """Raises LowConfidence for the first of many poses that does not have the least confidence (None: any will do).
+    """Raises LowConfidence for the first of many poses, or frames, that does not have the least confidence (None: any
+    will do). That of a rendered frame is at most that of its pose.
 
     `first`: the number that they begin with; `name_pose`: how the caller names the pose of a number.
     """

@@ -8,10 +8,10 @@ from __future__ import annotations
 import contextlib
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 
@@ -47,6 +47,9 @@ from ultragray_service.cli.terminal import (
     output_option,
     tell,
 )
+
+if TYPE_CHECKING:
+    from ultragray.scene.gaussians import GaussianScene
 
 SHARDS = "Shards"
 SUFFIXES = tuple(one.suffix for one in FORMATS.values())
@@ -146,6 +149,8 @@ class Task:
 
     scene_file: Path
     settings: Resolved
+    sampler: Sampler | None
+    base: FloatArray  # [P, 4, 4] mm, of which the sampler makes poses
     poses: FloatArray  # [C, 4, 4] mm
     extrapolations: Sequence[Extrapolation]  # [C]
 
@@ -162,7 +167,20 @@ class Task:
         if sampler is None and given_poses is None:
             sampler = TrainingSampler()
         assess = partial(Assessor(header.info, header.training_poses).assess, probe=settings.probe)
-        return cls(scene_file, settings, *assessed_poses(sampler, base, settings.probe, assess, asked.least_confidence))
+        found = assessed_poses(sampler, base, settings.probe, assess, settings.least_confidence)
+        return cls(scene_file, settings, sampler, base, *found)
+
+    def with_frames_assessed(self, scene: GaussianScene, backend: str) -> Task:
+        """The same, whose sampler keeps to frames that have the least confidence, where poses alone were looked at."""
+        from ultragray.exchange.rendering import assess_by_rendering
+
+        if self.sampler is None or self.settings.least_confidence is None:
+            return self
+        probe = self.settings.probe
+        assess = partial(Assessor(scene.info, scene.training_poses).assess, probe=probe)
+        seen = assess_by_rendering(scene, self.settings, assess, backend=backend)
+        poses, found = assessed_poses(self.sampler, self.base, probe, seen, self.settings.least_confidence)
+        return replace(self, poses=poses, extrapolations=found)
 
 
 def render_frames(
@@ -178,15 +196,16 @@ def render_frames(
     from ultragray.rendering.backends.registry import render_device
     from ultragray.scene.gaussians import GaussianScene
 
-    scene = GaussianScene.load(task.scene_file)
+    scene = GaussianScene.load(task.scene_file).to(render_device(backend))
     if threads:
         torch.set_num_threads(threads)
     started = time.perf_counter()
+    task = task.with_frames_assessed(scene, backend)
     with counted("rendering", len(task.poses)) as report:
         found = render_to_file(
             output,
             format,
-            scene.to(render_device(backend)),
+            scene,
             task.settings,
             task.poses,
             task.extrapolations,

@@ -67,7 +67,7 @@ def _best_ms(device: torch.device, work: Callable[[], object]) -> float:
 
 
 @triton.jit  # type: ignore[untyped-decorator]
-def multiply_add(out: Any, factor: Any, term: Any, rounds: Any, LANES: tl.constexpr) -> None:  # noqa: N803
+def multiply_add(out, factor, term, rounds, LANES: tl.constexpr):  # type: ignore[no-untyped-def]  # noqa: N803
     """out[i]: the sum of four chains of x ← x·factor + term, `rounds` long, which begin at 0, 1, 2 and 3 + i·1e-6."""
     places = tl.program_id(0) * LANES + tl.arange(0, LANES)
     a = places * 1e-6

@@ -1,15 +1,10 @@
 """The second echo: beyond a strong interface lies the mirror image of what lies before it."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
-from ultragray import GaussianScene, LinearProbe, RadialProbe, render
+from ultragray import LinearProbe, RadialProbe, render
 from ultragray.rendering.overlays import LEAST_DEPTH_MM, add_ghosts
 from ultragray.rendering.tools import Needle
 
@@ -18,7 +13,7 @@ SIDE = 100  # rows of half a millimetre
 INTERFACE, TARGET = 40, 25
 
 
-def tissue(interface: float = 0.8) -> dict[str, Tensor]:
+def tissue(interface=0.8):
     """Grey tissue with a bright target above a bright interface, behind which half of the beam is left."""
     echo, transmittance = torch.full((1, SIDE, SIDE), 0.2), torch.ones(1, SIDE, SIDE)
     echo[:, TARGET, 40:60] = 0.5
@@ -28,7 +23,7 @@ def tissue(interface: float = 0.8) -> dict[str, Tensor]:
 
 
 @pytest.mark.parametrize("share", [0.25, 0.5, 1.0])
-def test_the_ghost_of_a_target_is_as_far_beyond_the_interface_as_the_target_is_before_it(share: float) -> None:
+def test_the_ghost_of_a_target_is_as_far_beyond_the_interface_as_the_target_is_before_it(share):
     planes, before = tissue(), tissue()
     add_ghosts(planes, PROBE, share)
     ghost = 2 * INTERFACE - TARGET
@@ -41,14 +36,14 @@ def test_the_ghost_of_a_target_is_as_far_beyond_the_interface_as_the_target_is_b
         assert torch.equal(plane[:, 2 * INTERFACE + 1 :], before[name][:, 2 * INTERFACE + 1 :])
 
 
-def test_a_weak_interface_mirrors_nothing() -> None:
+def test_a_weak_interface_mirrors_nothing():
     planes, before = tissue(interface=0.55), tissue(interface=0.55)
     add_ghosts(planes, PROBE, 0.5)
     for name, plane in planes.items():
         assert torch.equal(plane, before[name])
 
 
-def test_bright_lines_at_the_face_mirror_nothing() -> None:
+def test_bright_lines_at_the_face_mirror_nothing():
     planes, before = tissue(interface=0.2), tissue(interface=0.2)
     for one in (planes, before):
         rows = PROBE.depths_mm(SIDE) < LEAST_DEPTH_MM
@@ -58,7 +53,7 @@ def test_bright_lines_at_the_face_mirror_nothing() -> None:
         assert torch.equal(plane, before[name])
 
 
-def test_an_interface_runs_on_through_its_gaps() -> None:
+def test_an_interface_runs_on_through_its_gaps():
     planes, whole = tissue(), tissue()
     planes["echo"][:, INTERFACE, 30] = planes["bmode"][:, INTERFACE, 30] = 0.2
     add_ghosts(planes, PROBE, 0.5)
@@ -67,7 +62,7 @@ def test_an_interface_runs_on_through_its_gaps() -> None:
 
 
 @pytest.mark.parametrize(("bright_lines", "mirrors"), [(3, False), (6, True)])
-def test_lines_that_go_all_the_way_round_have_no_outermost_one(bright_lines: int, mirrors: bool) -> None:
+def test_lines_that_go_all_the_way_round_have_no_outermost_one(bright_lines, mirrors):
     turned = []
     for first in (0, 50, 97):
         planes = tissue(interface=0.2)
@@ -81,9 +76,7 @@ def test_lines_that_go_all_the_way_round_have_no_outermost_one(bright_lines: int
     assert bool((turned[0][0, 2 * INTERFACE - TARGET] > 0.2).any()) is mirrors
 
 
-def test_a_needle_has_a_ghost_below_bone_and_the_frame_without_ghosts_is_as_it_was(
-    random_scene: Callable[..., GaussianScene],
-) -> None:
+def test_a_needle_has_a_ghost_below_bone_and_the_frame_without_ghosts_is_as_it_was(random_scene):
     scene = random_scene(1, centre_cm=(0.0, 0.0, -500.0))
     plate = Needle(tip_mm=(30.0, 0.0, 25.0), hub_mm=(-30.0, 0.0, 25.0), diameter_mm=0.5, reverberation=0.0)
     above = Needle(tip_mm=(5.0, 0.0, 15.0), hub_mm=(-5.0, 0.0, 15.0), brightness=0.5, opacity=0.0, reverberation=0.0)

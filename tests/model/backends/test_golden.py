@@ -1,15 +1,8 @@
 """Our renderer against the released implementation's outputs in ../shared/golden."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from typing import Any
-
-import numpy as np
 import pytest
 import torch
 
-from ultragray import GaussianScene
 from ultragray.rendering.frames import render
 
 FILES = ("g01", "g03", "g05", "g06", "g08")
@@ -19,70 +12,15 @@ FILES = ("g01", "g03", "g05", "g06", "g08")
 @pytest.mark.parametrize(
     ("backend", "dtype", "tolerance"),
     [
-        ("reference", torch.float32, 5e-4),
         ("reference", torch.float64, 5e-5),
         ("cpu", torch.float32, 5e-4),
         ("cuda", torch.float32, 5e-4),
-        ("auto", torch.float32, 5e-4),
     ],
-    ids=["reference-float32", "reference-float64", "cpu", "cuda", "auto"],
+    ids=["reference", "cpu", "cuda"],
 )
-def test_all_outputs_match(
-    golden: Callable[[str], Any],
-    assert_agrees: Callable[..., None],
-    on_device: Callable[[GaussianScene], GaussianScene],
-    name: str,
-    backend: str,
-    dtype: torch.dtype,
-    tolerance: float,
-) -> None:
+def test_all_outputs_match(golden, assert_agrees, on_device, name, backend, dtype, tolerance):
     file = golden(name)
     scene = on_device(file.scene(dtype)) if backend == "cuda" else file.scene(dtype)
     frames = render(scene, file.probe, file.poses, height=file.height, width=file.width, backend=backend)
-    assert frames.bmode is not None
     assert frames.bmode.dtype == dtype
     assert_agrees(frames, file.expected, tolerance=tolerance, stable=file.stable)
-
-
-def test_a_depth_plane_off_by_one_row_does_not_match(
-    golden: Callable[[str], Any], assert_agrees: Callable[..., None]
-) -> None:
-    """The comparison sees the H/(H−1) stretch: without it the same scene fails."""
-    file = golden("g05")
-    probe = type(file.probe)(file.probe.width_mm, file.probe.near_mm, float(file.arrays["far_plane"]) * 10)
-    frames = render(
-        file.scene(torch.float32),
-        probe,
-        file.poses,
-        height=file.height,
-        width=file.width,
-        backend="reference",
-    )
-    with pytest.raises(AssertionError):
-        assert_agrees(frames, file.expected, tolerance=5e-4, stable=file.stable)
-
-
-@pytest.mark.slow
-def test_reference_gradient_is_the_true_gradient(golden: Callable[[str], Any]) -> None:
-    file = golden("g05")
-    scene = file.scene(torch.float64)
-    for tensor in scene.splats.values():
-        tensor.requires_grad_()
-    frames = render(
-        scene,
-        file.probe,
-        file.poses,
-        height=file.height,
-        width=file.width,
-        outputs=("bmode",),
-        backend="reference",
-    )
-    assert frames.bmode is not None
-    loss = (frames.bmode * torch.from_numpy(file.arrays["G"]).double()).sum()
-    assert loss.item() == pytest.approx(float(file.arrays["loss"]), rel=1e-4)
-    loss.backward()
-    for name, tensor in scene.splats.items():
-        want = file.arrays[f"true_grad_{name}"]
-        assert tensor.grad is not None
-        error = np.linalg.norm(tensor.grad.numpy() - want) / np.linalg.norm(want)
-        assert error < 1e-5, f"{name}: relative L2 error {error:.2g}"

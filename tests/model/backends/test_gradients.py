@@ -1,201 +1,192 @@
-"""One suite of gradients for every backend and instruction set: of every output, by every parameter, the true one."""
-
-from __future__ import annotations
-
-from collections.abc import Callable, Mapping
-from typing import Any
+"""One suite of gradients for every backend and instruction set: by parameters, poses and beam, the true ones."""
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, Probe, RadialProbe, SteeredProbe, render
-from ultragray.rendering.backends import cpu, cuda
+from ultragray import ConvexProbe, ElevationBeam, GaussianScene, PhasedProbe, RadialProbe, render
 from ultragray.rendering.outputs import PLANES
 
-LINEAR = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
-CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=60.0)
-HEIGHT, WIDTH = 37, 53
-KERNELS = ("cuda", *cpu.INSTRUCTION_SETS)
+from .conftest import CONVEX, HEIGHT, KERNELS, LINEAR, RADIAL, STEERED, WIDTH, drawn
 
-SCENES: dict[str, tuple[Mapping[str, Any], Probe]] = {
-    "linear": ({}, LINEAR),
-    "convex": ({}, CONVEX),
-    "phased": ({"centre_cm": (0, 0, 1.5)}, PhasedProbe(opening_angle_deg=90.0, far_mm=50.0)),
-    "wide fan": ({}, ConvexProbe(opening_angle_deg=150.0, near_mm=5.0, far_mm=50.0)),
-    "radial": ({"centre_cm": (0, 0, 0)}, RadialProbe(near_mm=1.0, far_mm=30.0)),
+PHASED = PhasedProbe(opening_angle_deg=90.0, far_mm=50.0)
+BEFORE_IT = {"centre_cm": (0, 0, 1.5)}
+AROUND = {"centre_cm": (0, 0, 0)}
+ABSORBING = {"count": 400, "transmittance_logit": (-6, 0), "sigma_cm": (0.1, 0.3)}
+FOCUSED = ElevationBeam(thickness_mm=2.0, focus_mm=15.0, depth_of_field_mm=12.0)
+
+CASES = {
+    "linear": ({}, LINEAR, None),
+    "convex": ({}, CONVEX, None),
+    "phased": (BEFORE_IT, PHASED, None),
+    "wide fan": ({}, ConvexProbe(opening_angle_deg=150.0, near_mm=5.0, far_mm=50.0), None),
+    "radial": (AROUND, RADIAL, None),
     "radial about the centre": (
-        {"centre_cm": (0, 0, 0), "extent_cm": (1, 1, 1), "sigma_cm": (0.05, 0.4)},
+        {**AROUND, "extent_cm": (1, 1, 1), "sigma_cm": (0.05, 0.4)},
         RadialProbe(near_mm=0.0, far_mm=20.0),
+        None,
     ),
-    "steered": ({}, SteeredProbe(width_mm=40.0, steering_deg=-30.0, near_mm=0.0, far_mm=50.0)),
-    "one Gaussian": ({"count": 1, "extent_cm": (0.1, 0.01, 0.1), "sigma_cm": (0.2, 0.3)}, LINEAR),
-    "shadows": ({"count": 400, "transmittance_logit": (-6, 0), "sigma_cm": (0.1, 0.3)}, LINEAR),
-    "shadows in a fan": ({"count": 400, "transmittance_logit": (-6, 0), "sigma_cm": (0.1, 0.3)}, CONVEX),
-    "saturated": ({"count": 40, "sigma_cm": (1.0, 3.0), "transmittance_logit": (2.0, 5.0)}, LINEAR),
-    "at the face": ({"centre_cm": (0, 0, 0.02), "extent_cm": (3, 0.2, 0.3), "sigma_cm": (0.02, 0.3)}, LINEAR),
-    "needles": ({"sigma_cm": (0.01, 1.0)}, LINEAR),
-    "transparent": ({"transmittance_logit": (10.0, 16.0)}, CONVEX),
-    "degree 0": ({"sh_degree": 0}, LINEAR),
-    "degree 2": ({"sh_degree": 2}, CONVEX),
-    "degree 3": ({"sh_degree": 3}, LINEAR),
-    "sigmoid": ({"intensity": "sigmoid", "sh_degree": 3}, LINEAR),
+    "steered": ({}, STEERED, None),
+    "off centre": ({"info": {"centre_mm": (5.0, -3.0, 8.0)}}, LINEAR, None),
+    "one Gaussian": ({"count": 1, "extent_cm": (0.1, 0.01, 0.1), "sigma_cm": (0.2, 0.3)}, LINEAR, None),
+    "shadows": (ABSORBING, LINEAR, None),
+    "shadows in a fan": (ABSORBING, CONVEX, None),
+    "saturated": ({"count": 40, "sigma_cm": (1.0, 3.0), "transmittance_logit": (2.0, 5.0)}, LINEAR, None),
+    "at the face": ({"centre_cm": (0, 0, 0.02), "extent_cm": (3, 0.2, 0.3), "sigma_cm": (0.02, 0.3)}, LINEAR, None),
+    "needles": ({"sigma_cm": (0.01, 1.0)}, LINEAR, None),
+    "transparent": ({"transmittance_logit": (10.0, 16.0)}, CONVEX, None),
+    "degree 0": ({"sh_degree": 0}, LINEAR, None),
+    "degree 2": ({"sh_degree": 2}, CONVEX, None),
+    "degree 3": ({"sh_degree": 3}, LINEAR, None),
+    "sigmoid": ({"intensity": "sigmoid", "sh_degree": 3}, LINEAR, None),
+    "linear, constant": ({}, LINEAR, ElevationBeam(thickness_mm=3.0)),
+    "convex, focused": ({}, CONVEX, FOCUSED),
+    "phased, focused": (BEFORE_IT, PHASED, FOCUSED),
+    "radial, focused": (AROUND, RADIAL, FOCUSED),
+    "steered, focused": ({}, STEERED, FOCUSED),
+    "needles, focused": ({"sigma_cm": (0.01, 1.0)}, LINEAR, FOCUSED),
+    "shadows, focused": (ABSORBING, LINEAR, FOCUSED),
+    "much thicker than the Gaussians": ({"count": 400}, LINEAR, ElevationBeam(thickness_mm=20.0)),
 }
 
 
-def gradients(
-    scene: GaussianScene, weights: Mapping[str, Tensor], draw: Callable[[GaussianScene], Mapping[str, Tensor]]
-) -> dict[str, np.ndarray]:
-    """Of the weighted sum of the outputs, by raw parameter."""
-    leaves = {name: tensor.clone().requires_grad_() for name, tensor in scene.splats.items()}
-    frames = draw(GaussianScene.from_splats(leaves, info=scene.info))
-    loss = torch.stack([(frames[name] * weight.to(frames[name])).sum() for name, weight in weights.items()]).sum()
-    loss.backward()
-    return {
-        name: np.zeros(tuple(leaf.shape)) if leaf.grad is None else leaf.grad.cpu().double().numpy()
-        for name, leaf in leaves.items()
-    }
-
-
-def by_reference(probe: Probe, poses: Any) -> Callable[[GaussianScene], Mapping[str, Tensor]]:
-    return lambda scene: render(scene, probe, poses, height=HEIGHT, width=WIDTH, backend="reference")
-
-
-def by_kernel(
-    probe: Probe, poses: Any, kernel: str, height: int = HEIGHT, width: int = WIDTH
-) -> Callable[[GaussianScene], Mapping[str, Tensor]]:
-    """The CUDA backend, which takes the scene's tensors to its device, or an instruction set of the CPU's."""
-    if kernel == "cuda":
-
-        def draw(scene: GaussianScene) -> Mapping[str, Tensor]:
-            there = scene.to(cuda.device())
-            return cuda.render_outputs(there, probe, there.poses_to_scene_cm(poses), height, width, PLANES)
-
-        return draw
-    return lambda scene: cpu.render_outputs(
-        scene, probe, scene.poses_to_scene_cm(poses), height, width, PLANES, instruction_set=kernel
-    )
+def gradients(kernel, scene, probe, poses, beam, weights):
+    """Of the weighted sum of the outputs: by raw parameter, turn and place of the poses, and numbers of the beam."""
+    splats = {name: tensor.clone().requires_grad_() for name, tensor in scene.splats.items()}
+    leaves = {**splats, "poses": torch.tensor(poses, dtype=torch.float64, requires_grad=True)}
+    if beam is not None:
+        leaves["beam"] = torch.tensor(beam.numbers, dtype=torch.float64, requires_grad=True)
+    copied = GaussianScene.from_splats(splats, info=scene.info)
+    planes = drawn(kernel, copied, probe, leaves["poses"], leaves.get("beam"), outputs=tuple(weights))
+    torch.stack([(planes[name] * weight.to(planes[name])).sum() for name, weight in weights.items()]).sum().backward()
+    found = {name: np.zeros(leaf.shape) if leaf.grad is None else leaf.grad.numpy() for name, leaf in leaves.items()}
+    by_poses = found.pop("poses")
+    assert not by_poses[:, 3].any()
+    return {**found, "turns": by_poses[:, :3, :3], "places": by_poses[:, :3, 3]}
 
 
 @pytest.fixture(scope="session")
-def expected(
-    random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any]
-) -> Callable[[str, tuple[str, ...]], Any]:
-    """By scene and outputs: what the backends are to be given, and the reference's gradient in float64."""
-    done: dict[tuple[str, tuple[str, ...]], Any] = {}
+def expected(random_scene, random_poses):
+    """By case and outputs: what the backends are to be given, and the reference's gradient in float64."""
+    done = {}
 
-    def prepare(name: str, outputs: tuple[str, ...]) -> Any:
+    def prepare(name, outputs=PLANES):
         if (name, outputs) not in done:
-            options, probe = SCENES[name]
-            scene, poses = random_scene(**{"seed": 3, "count": 120, **options}), random_poses(3, seed=5)
+            options, probe, beam = CASES[name]
+            scene, poses = random_scene(**{"seed": 3, "count": 120, **options}), random_poses(2, seed=5)
+            poses[:, :3, 3] += scene.info.centre_mm
             with torch.no_grad():
-                exact, single = (by_reference(probe, poses)(scene.to(t)) for t in (torch.float64, torch.float32))
-            generator = torch.Generator().manual_seed(1)
-            weights = {}
+                exact, single = (
+                    drawn("reference", scene.to(dtype), probe, poses, beam, outputs=outputs)
+                    for dtype in (torch.float64, torch.float32)
+                )
+            generator, weights = torch.Generator().manual_seed(1), {}
             for output in outputs:  # pixels where a threshold flips between float32 and float64 are left out
                 stable = (exact[output] - single[output]).abs() < 2e-5
                 weights[output] = torch.randn(stable.shape, generator=generator) * stable
-            want = gradients(scene.to(torch.float64), weights, by_reference(probe, poses))
-            done[name, outputs] = (scene, probe, poses, weights, want)
+            view = (probe, poses, beam, weights)
+            done[name, outputs] = scene, view, gradients("reference", scene.to(torch.float64), *view)
         return done[name, outputs]
 
     return prepare
 
 
-def assert_same_direction_and_length(got: Mapping[str, np.ndarray], want: Mapping[str, np.ndarray]) -> None:
+def assert_are_those(got, want, tolerance=1e-3):
     assert got.keys() == want.keys()
     for name, exact in want.items():
         size = np.linalg.norm(exact)
         if exact.size and size > 1e-6:
             error = np.linalg.norm(got[name] - exact) / size
-            assert error < 1e-3, f"{name}: relative L2 error {error:.2g}"
+            assert error < tolerance, f"{name}: relative L2 error {error:.2g}"
         else:
             assert np.abs(got[name]).max(initial=0.0) < 1e-6
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
-@pytest.mark.parametrize("name", SCENES)
-def test_all_outputs_together(name: str, kernel: str, expected: Callable[..., Any]) -> None:
-    scene, probe, poses, weights, want = expected(name, PLANES)
-    assert_same_direction_and_length(gradients(scene, weights, by_kernel(probe, poses, kernel)), want)
+@pytest.mark.parametrize("name", CASES)
+def test_gradients_are_those_of_the_reference_in_float64(name, kernel, expected):
+    scene, view, want = expected(name)
+    assert_are_those(gradients(kernel, scene, *view), want)
 
 
 @pytest.mark.parametrize("kernel", ["cuda", "auto"])
 @pytest.mark.parametrize("output", PLANES)
-@pytest.mark.parametrize("name", ["linear", "convex", "shadows"])
-def test_each_output_alone(name: str, output: str, kernel: str, expected: Callable[..., Any]) -> None:
-    scene, probe, poses, weights, want = expected(name, (output,))
-    assert_same_direction_and_length(gradients(scene, weights, by_kernel(probe, poses, kernel)), want)
+def test_each_output_alone(output, kernel, expected):
+    scene, view, want = expected("convex", (output,))
+    assert_are_those(gradients(kernel, scene, *view), want)
 
 
-@pytest.mark.parametrize("kernel", KERNELS)
-def test_golden_gradient(golden: Callable[[str], Any], kernel: str) -> None:
+@pytest.mark.parametrize("kernel", ["reference", *KERNELS])
+def test_golden_gradient(golden, kernel):
     file = golden("g05")
-    scene = file.scene(torch.float32)
-    draw = by_kernel(file.probe, file.poses, kernel, file.height, file.width)
-    got = gradients(scene, {"bmode": torch.from_numpy(file.arrays["G"])}, draw)
-    for name, gradient in got.items():
-        want = file.arrays[f"true_grad_{name}"]
-        error = np.linalg.norm(gradient - want) / np.linalg.norm(want)
-        assert error < 1e-4, f"{name}: relative L2 error {error:.2g}"
+    is_exact = kernel == "reference"
+    leaves = file.scene(torch.float64 if is_exact else torch.float32).splats
+    scene = GaussianScene.from_splats({name: tensor.requires_grad_() for name, tensor in leaves.items()})
+    size = (file.height, file.width)
+    bmode = drawn(kernel, scene, file.probe, file.poses, size=size, outputs=("bmode",))["bmode"]
+    loss = (bmode * torch.from_numpy(file.arrays["G"]).to(bmode)).sum()
+    assert loss.item() == pytest.approx(float(file.arrays["loss"]), rel=1e-4)
+    loss.backward()
+    got = {name: tensor.grad.numpy() for name, tensor in leaves.items()}
+    assert_are_those(got, {name: file.arrays[f"true_grad_{name}"] for name in got}, 1e-5 if is_exact else 1e-4)
 
 
-@pytest.mark.parametrize("probe", [LINEAR, CONVEX], ids=["linear", "convex"])
-def test_the_reference_by_finite_differences(
-    random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any], probe: Probe
-) -> None:
-    scene = random_scene(8, seed=2, sigma_cm=(0.3, 0.9), dtype=torch.float64)
-    pose = random_poses(1, seed=4)
+@pytest.mark.parametrize(
+    ("probe", "intensity"), [(LINEAR, "released"), (CONVEX, "sigmoid"), (STEERED, "released")], ids=str
+)
+def test_the_reference_by_finite_differences(random_scene, random_poses, probe, intensity):
+    """By six ways to move a rigid body, the beam and all parameters."""
+    scene = random_scene(3, seed=5, sigma_cm=(0.3, 0.9), intensity=intensity, dtype=torch.float64)
+    scene.sh0.fill_(-0.4)  # away from the clamps of `released`, where it has no derivative
+    pose = torch.from_numpy(random_poses(1, seed=4)[0])
 
-    def outputs(*splats: Tensor) -> tuple[Tensor, ...]:
-        moved = GaussianScene.from_splats(dict(zip(scene.splats, splats, strict=True)), info=scene.info)
-        frames = render(moved, probe, pose, height=5, width=4, backend="reference")
+    def outputs(twist, beam, *splats):  # [6] turn in rad, shift in mm; [3]
+        x, y, z, *shift = twist.unbind()
+        zero = torch.zeros_like(x)
+        rows = [[zero, -z, y, shift[0]], [z, zero, -x, shift[1]], [-y, x, zero, shift[2]], [zero] * 4]
+        moved = torch.linalg.matrix_exp(torch.stack([torch.stack(row) for row in rows])) @ pose
+        other = GaussianScene.from_splats(dict(zip(scene.splats, splats, strict=True)), info=scene.info)
+        frames = render(other, probe, moved, height=4, width=3, backend="reference", beam=beam)
         return tuple(frames[name] for name in PLANES)
 
-    leaves = tuple(tensor.clone().requires_grad_() for tensor in scene.splats.values())
-    assert torch.autograd.gradcheck(outputs, leaves, eps=1e-7, atol=1e-6, rtol=1e-4)
+    leaves = torch.zeros(6, dtype=torch.float64), torch.tensor(FOCUSED.numbers, dtype=torch.float64)
+    inputs = tuple(tensor.clone().requires_grad_() for tensor in (*leaves, *scene.splats.values()))
+    assert torch.autograd.gradcheck(outputs, inputs, eps=1e-7, atol=1e-6, rtol=1e-4)
 
 
-def test_the_thread_count_does_not_change_a_bit(
-    random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any]
-) -> None:
+def test_the_thread_count_does_not_change_a_bit(random_scene, random_poses):
     scene, poses = random_scene(9000, sigma_cm=(0.02, 0.1)), random_poses(3)
     weights = {"bmode": torch.randn(3, HEIGHT, WIDTH, generator=torch.Generator().manual_seed(0))}
-    before = torch.get_num_threads()
-    try:
-        found = []
-        for threads in (1, 3):
-            torch.set_num_threads(threads)
-            found.append(gradients(scene, weights, by_kernel(LINEAR, poses, "auto")))
-    finally:
-        torch.set_num_threads(before)
+    found = []
+    for threads in (1, 3):
+        torch.set_num_threads(threads)
+        found.append(gradients("auto", scene, LINEAR, poses, None, weights))
     for name, gradient in found[0].items():
         assert np.array_equal(gradient, found[1][name]), name
 
 
-def test_strided_parameters_and_gradients(
-    random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any]
-) -> None:
+def test_strided_parameters_and_gradients(random_scene, random_poses):
     scene, poses = random_scene(50), random_poses(2)
-    weights = {"bmode": torch.ones(1).expand(2, HEIGHT, WIDTH)}
-    packed = gradients(scene, weights, by_kernel(LINEAR, poses, "auto"))
+    packed = gradients("auto", scene, LINEAR, poses, None, {"bmode": torch.ones(1).expand(2, HEIGHT, WIDTH)})
     means = scene.means.t().contiguous().t().requires_grad_()
     strided = GaussianScene.from_splats({**scene.splats, "means": means}, info=scene.info)
-    by_kernel(LINEAR, poses, "auto")(strided)["bmode"].sum().backward()
-    assert means.grad is not None
-    assert np.array_equal(means.grad.double().numpy(), packed["means"])
+    drawn("auto", strided, LINEAR, poses)["bmode"].sum().backward()
+    assert np.array_equal(means.grad.numpy(), packed["means"])
 
 
-def test_no_poses_give_zero_gradients(random_scene: Callable[..., GaussianScene]) -> None:
-    scene = random_scene(5)
+def test_no_poses_and_no_gaussians(random_scene):
+    scene, none = random_scene(5), torch.zeros((0, 4, 4), dtype=torch.float64, requires_grad=True)
     for tensor in scene.splats.values():
         tensor.requires_grad_()
-    render(scene, LINEAR, np.zeros((0, 4, 4)), height=4, width=4).bmode.sum().backward()
+    render(scene, LINEAR, none, height=4, width=4)["bmode"].sum().backward()
+    assert none.grad.shape == (0, 4, 4)
     assert all(tensor.grad is not None and not tensor.grad.any() for tensor in scene.splats.values())
+    pose = torch.eye(4, dtype=torch.float64, requires_grad=True)
+    render(random_scene(0), LINEAR, pose, height=4, width=4)["transmittance"].sum().backward()
+    assert not pose.grad.any()
 
 
-def test_the_graph_may_be_used_twice(random_scene: Callable[..., GaussianScene]) -> None:
+def test_the_graph_may_be_used_twice(random_scene):
     scene = random_scene(30)
     scene.sh0.requires_grad_()
     bmode = render(scene, LINEAR, np.eye(4), height=8, width=8).bmode
@@ -203,3 +194,41 @@ def test_the_graph_may_be_used_twice(random_scene: Callable[..., GaussianScene])
     (second,) = torch.autograd.grad(bmode.sum(), scene.sh0)
     assert first.any()
     assert torch.equal(first, second)
+
+
+@pytest.mark.parametrize("backend", ["reference", "cpu"])
+def test_only_what_moves_a_rotation_comes_back(random_scene, random_poses, backend):
+    """A matrix that is no rotation has no frame: RᵀG is antisymmetric."""
+    poses = random_poses(2)
+    leaf = torch.tensor(poses, requires_grad=True)
+    render(random_scene(50), LINEAR, leaf, height=9, width=7, backend=backend)["bmode"].sum().backward()
+    by_turn = poses[:, :3, :3].transpose(0, 2, 1) @ leaf.grad.numpy()[:, :3, :3]
+    assert np.abs(by_turn).max() > 1e-3
+    np.testing.assert_allclose(by_turn, -by_turn.transpose(0, 2, 1), atol=1e-9)
+
+
+def test_one_pose_in_float32_gets_its_gradient_in_kind_and_labels_none(random_scene):
+    scene = GaussianScene.from_splats(random_scene(50).splats, labels=torch.ones(50, dtype=torch.uint8))
+    pose = torch.eye(4, requires_grad=True)
+    frames = render(scene, LINEAR, pose, height=9, width=7, outputs=("bmode", "labels"))
+    assert frames["labels"].any()
+    assert not frames["labels"].requires_grad
+    frames["bmode"].sum().backward()
+    assert (pose.grad.shape, pose.grad.dtype) == ((4, 4), torch.float32)
+    assert pose.grad.any()
+
+
+def test_no_gradient_depends_on_another_being_asked_for(random_scene, random_poses):
+    scene, poses, beam = random_scene(80), random_poses(3), torch.tensor(FOCUSED.numbers, dtype=torch.float64)
+    leaves = [torch.tensor(poses), beam, *scene.splats.values()]
+
+    def found(*wanted):
+        for place, leaf in enumerate(leaves):
+            leaf.requires_grad_(place in wanted)
+        bmode = render(scene, LINEAR, leaves[0], height=9, width=7, beam=beam)["bmode"]
+        return torch.autograd.grad(bmode.sum(), [leaves[place] for place in wanted])
+
+    together = found(*range(len(leaves)))
+    for alone in ((0,), (1,), tuple(range(2, len(leaves)))):
+        for place, gradient in zip(alone, found(*alone), strict=True):
+            assert torch.equal(gradient, together[place]), place

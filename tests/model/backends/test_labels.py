@@ -1,22 +1,12 @@
 """Labels: what each backend says lies at a pixel, against sums over all Gaussians in float64; files that carry them."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
 
 from ultragray import (
-    ConvexProbe,
-    Frames,
     GaussianScene,
     LinearProbe,
-    PhasedProbe,
-    Probe,
     SceneInfo,
     read_header,
     render,
@@ -24,27 +14,21 @@ from ultragray import (
 from ultragray.errors import InvalidArgument, SceneFileInvalid, UnknownOutput
 from ultragray.exchange.checkpoint import export_checkpoint
 from ultragray.exchange.ply import read_ply, write_ply
-from ultragray.geometry.probe import FloatArray
 from ultragray.learn.sweep import pixel_positions_mm
 
-PROBES = {
-    "linear": LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0),
-    "convex": ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=60.0),
-    "phased": PhasedProbe(opening_angle_deg=90.0, far_mm=60.0),
-}
+from .conftest import CONVEX, HEIGHT, LINEAR, PHASED, WIDTH
+
+PROBES = {"linear": LINEAR, "convex": CONVEX, "phased": PHASED}
 BACKENDS = ("reference", "cpu", "cuda")
 NAMES = {1: "bone", 2: "muscle", 9: "vessel"}
-HEIGHT, WIDTH = 37, 53
 SEEN = 1.0 / 255.0
-
-Renderer = Callable[..., Frames]
 
 
 @pytest.fixture
-def labelled(random_scene: Callable[..., GaussianScene]) -> Callable[..., GaussianScene]:
+def labelled(random_scene):
     """A random scene whose Gaussians carry 0, 1, 2 or 9."""
 
-    def make(count: int = 200, *, names: dict[int, str] | None = None, **options: Any) -> GaussianScene:
+    def make(count=200, *, names=None, **options):
         scene = random_scene(count, **options)
         values = np.random.default_rng(5).choice([0, 1, 2, 9], count).astype(np.uint8)
         info = SceneInfo(intensity=scene.info.intensity, label_names=NAMES if names is None else names)
@@ -54,20 +38,18 @@ def labelled(random_scene: Callable[..., GaussianScene]) -> Callable[..., Gaussi
 
 
 @pytest.fixture(params=BACKENDS)
-def renderer(request: pytest.FixtureRequest, on_device: Callable[[GaussianScene], GaussianScene]) -> Renderer:
+def renderer(request, on_device):
     if request.param == "cuda":
         return lambda scene, *view, **size: render(on_device(scene), *view, backend="cuda", **size)
     return lambda scene, *view, **size: render(scene, *view, backend=request.param, **size)
 
 
-def label_frames(frames: Frames) -> np.ndarray:  # [C, H, W]
-    assert frames.labels is not None
+def label_frames(frames):  # [C, H, W]
     assert frames.labels.dtype == torch.uint8
-    found: np.ndarray = frames.labels.cpu().numpy()
-    return found
+    return frames.labels.cpu().numpy()
 
 
-def weights(scene: GaussianScene, probe: Probe, pose: FloatArray) -> FloatArray:  # [4, N] -> [N, H·W]
+def weights(scene, probe, pose):  # [4, N] -> [N, H·W]
     """w of every Gaussian at every pixel, where it is not culled: its value in space, from its covariance."""
     means, scales, quats = (scene.splats[name].double().numpy() for name in ("means", "scales", "quats"))
     w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
@@ -80,7 +62,7 @@ def weights(scene: GaussianScene, probe: Probe, pose: FloatArray) -> FloatArray:
     ).transpose(2, 0, 1)  # [N, 3, 3]
     points = (pixel_positions_mm(probe, HEIGHT, WIDTH) @ pose[:3, :3].T + pose[:3, 3]) / 10.0
     inside = np.einsum("nij,nip->njp", axes, points.T[None] - means[:, :, None]) / np.exp(scales)[:, :, None]
-    found: FloatArray = np.exp(-0.5 * (inside**2).sum(axis=1))
+    found = np.exp(-0.5 * (inside**2).sum(axis=1))
     own = (10.0 * means - pose[:3, 3]) @ pose[:3, :3]  # mm, probe frame
     depth = own[:, 2] if isinstance(probe, LinearProbe) else np.hypot(own[:, 0], own[:, 2])
     seen = (depth >= probe.near_mm) & (depth <= probe.cull_far_mm(HEIGHT)) & (own[:, 2] >= 0)
@@ -88,12 +70,9 @@ def weights(scene: GaussianScene, probe: Probe, pose: FloatArray) -> FloatArray:
 
 
 @pytest.mark.parametrize("name", PROBES)
-def test_the_label_that_weighs_most_is_shown(
-    name: str, renderer: Renderer, labelled: Callable[..., GaussianScene], random_poses: Callable[..., FloatArray]
-) -> None:
+def test_the_label_that_weighs_most_is_shown(name, renderer, labelled, random_poses):
     scene, poses, probe = labelled(), random_poses(3), PROBES[name]
     found = label_frames(renderer(scene, probe, poses, height=HEIGHT, width=WIDTH, outputs=("labels",)))
-    assert scene.labels is not None
     values = np.array([0, 1, 2, 9], np.uint8)
     decided = []
     for pose, frame in zip(poses, found, strict=True):
@@ -117,7 +96,7 @@ def test_the_label_that_weighs_most_is_shown(
     assert np.mean(decided) > 0.8
 
 
-def test_many_gaussians_in_one_place_are_counted_where_coverage_is_full(renderer: Renderer) -> None:
+def test_many_gaussians_in_one_place_are_counted_where_coverage_is_full(renderer):
     """30 of label 2 weigh more than 25 of label 1, though both cover the pixel as far as float32 can tell."""
     count = 55
     scene = GaussianScene.from_splats(
@@ -131,12 +110,11 @@ def test_many_gaussians_in_one_place_are_counted_where_coverage_is_full(renderer
         labels=torch.tensor([1] * 25 + [2] * 30, dtype=torch.uint8),
     )
     frames = renderer(scene, PROBES["linear"], np.eye(4), height=11, width=11, outputs=("labels", "coverage"))
-    assert frames.coverage is not None
     assert frames.coverage[0, 4, 5] == 1.0
     assert label_frames(frames)[0, 4, 5] == 2
 
 
-def test_of_equal_labels_the_smallest_is_taken(renderer: Renderer, random_scene: Callable[..., GaussianScene]) -> None:
+def test_of_equal_labels_the_smallest_is_taken(renderer, random_scene):
     once = random_scene(60)
     twice = {name: torch.cat([tensor, tensor]) for name, tensor in once.splats.items()}
     labels = torch.tensor([7] * 60 + [3] * 60, dtype=torch.uint8)
@@ -145,9 +123,7 @@ def test_of_equal_labels_the_smallest_is_taken(renderer: Renderer, random_scene:
     assert {*np.unique(found)} == {0, 3}
 
 
-def test_other_outputs_do_not_change_and_none_is_made_in_vain(
-    renderer: Renderer, labelled: Callable[..., GaussianScene]
-) -> None:
+def test_other_outputs_do_not_change_and_none_is_made_in_vain(renderer, labelled):
     scene, view = labelled(), (PROBES["linear"], np.eye(4)[None])
     plain = GaussianScene.from_splats(scene.splats)
     both = renderer(scene, *view, height=20, width=30, outputs=("labels", "bmode"))
@@ -160,16 +136,16 @@ def test_other_outputs_do_not_change_and_none_is_made_in_vain(
     assert renderer(scene, *view, height=20, width=30).labels is None  # by default: what every scene has
 
 
-def test_no_poses_and_no_gaussians_give_nothing(renderer: Renderer, labelled: Callable[..., GaussianScene]) -> None:
+def test_no_poses_and_no_gaussians_give_nothing(renderer, labelled):
     none = renderer(labelled(), PROBES["linear"], np.zeros((0, 4, 4)), height=9, width=7, outputs=("labels",))
     assert label_frames(none).shape == (0, 9, 7)
     empty = renderer(labelled(0), PROBES["linear"], np.eye(4), height=9, width=7, outputs=("labels",))
     np.testing.assert_array_equal(label_frames(empty), np.zeros((1, 9, 7)))
 
 
-def test_changed_labels_and_parameters_are_noticed(renderer: Renderer, labelled: Callable[..., GaussianScene]) -> None:
+def test_changed_labels_and_parameters_are_noticed(renderer, labelled):
     scene = labelled()
-    size: dict[str, Any] = {"height": 20, "width": 30, "outputs": ("labels",)}
+    size = {"height": 20, "width": 30, "outputs": ("labels",)}
     before = label_frames(renderer(scene, PROBES["linear"], np.eye(4), **size))
     assert scene.labels is not None
     scene.labels[scene.labels == 9] = 4
@@ -179,19 +155,7 @@ def test_changed_labels_and_parameters_are_noticed(renderer: Renderer, labelled:
     assert not label_frames(renderer(scene, PROBES["linear"], np.eye(4), **size)).any()
 
 
-def test_labels_have_no_gradient_and_leave_that_of_the_others_alone(labelled: Callable[..., GaussianScene]) -> None:
-    scene = labelled()
-    scene.sh0.requires_grad_()
-    frames = render(scene, PROBES["linear"], np.eye(4), height=20, width=30, outputs=("bmode", "labels"))
-    assert frames.bmode is not None
-    assert frames.labels is not None
-    assert not frames.labels.requires_grad
-    frames.bmode.sum().backward()
-    assert scene.sh0.grad is not None
-    assert scene.sh0.grad.any()
-
-
-def test_a_scene_without_labels_refuses_them(random_scene: Callable[..., GaussianScene]) -> None:
+def test_a_scene_without_labels_refuses_them(random_scene):
     with pytest.raises(UnknownOutput, match="labels only for a scene whose Gaussians carry labels") as caught:
         render(random_scene(5), PROBES["linear"], np.eye(4), height=4, width=4, outputs=("bmode", "labels"))
     assert caught.value.field == "outputs"
@@ -207,27 +171,19 @@ def test_a_scene_without_labels_refuses_them(random_scene: Callable[..., Gaussia
         (None, {1: "bone"}, "labels must be given where info.label_names names some: bone"),
     ],
 )
-def test_labels_that_do_not_fit_are_refused(
-    random_scene: Callable[..., GaussianScene], labels: Any, names: dict[int, str], match: str
-) -> None:
+def test_labels_that_do_not_fit_are_refused(random_scene, labels, names, match):
     with pytest.raises(InvalidArgument, match=match) as caught:
         GaussianScene.from_splats(random_scene(5).splats, info=SceneInfo(label_names=names), labels=labels)
     assert caught.value.field == "labels"
 
 
 @pytest.mark.parametrize("names", [{0: "nothing"}, {256: "bone"}, {1: ""}, {1: 2}, {"bone": 1}, ["bone"], None])
-def test_names_that_are_none_are_refused(names: Any) -> None:
+def test_names_that_are_none_are_refused(names):
     with pytest.raises(InvalidArgument, match="label_names must give labels from 1 to 255 a name each"):
         SceneInfo(label_names=names)
 
 
-def test_labels_without_a_name_are_called_after_their_number(labelled: Callable[..., GaussianScene]) -> None:
-    assert labelled(names={2: "muscle"}).info.label_names == {1: "label 1", 2: "muscle", 9: "label 9"}
-
-
-def test_files_keep_labels_and_a_scene_without_is_written_as_before(
-    labelled: Callable[..., GaussianScene], tmp_path: Path
-) -> None:
+def test_files_keep_labels_and_a_scene_without_is_written_as_before(labelled, tmp_path):
     scene = labelled(sh_degree=2)
     assert scene.labels is not None
     scene.save(tmp_path / "a.ugr")
@@ -244,7 +200,7 @@ def test_files_keep_labels_and_a_scene_without_is_written_as_before(
     assert b"label" not in (tmp_path / "plain.ply").read_bytes()
 
 
-def test_a_file_whose_labels_are_gone_is_refused(labelled: Callable[..., GaussianScene], tmp_path: Path) -> None:
+def test_a_file_whose_labels_are_gone_is_refused(labelled, tmp_path):
     scene = labelled()
     scene.labels = None
     scene.save(tmp_path / "a.ugr")
@@ -252,6 +208,6 @@ def test_a_file_whose_labels_are_gone_is_refused(labelled: Callable[..., Gaussia
         GaussianScene.load(tmp_path / "a.ugr")
 
 
-def test_the_released_format_drops_labels_and_says_so(labelled: Callable[..., GaussianScene], tmp_path: Path) -> None:
+def test_the_released_format_drops_labels_and_says_so(labelled, tmp_path):
     export = export_checkpoint(labelled(), tmp_path / "out" / "ckpt.pt")
     assert "its labels are left out: the released format has none" in export.notes

@@ -1,39 +1,29 @@
 """The cost of a frame is told before it is drawn, and a flag ends a rendering in the middle, on every backend."""
 
-from __future__ import annotations
-
 import threading
-from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, Probe, RadialProbe, render
+from ultragray import GaussianScene, render
 from ultragray.errors import FrameTooCostly
 from ultragray.rendering.backends import reference
 from ultragray.rendering.frames import footprint_pixels
 from ultragray.rendering.limits import GivenUp, Limits
 
-LINEAR = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
-PROBES = [
-    LINEAR,
-    ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=60.0),
-    PhasedProbe(opening_angle_deg=90.0, far_mm=60.0),
-    RadialProbe(near_mm=1.0, far_mm=30.0),
-]
+from .conftest import CONVEX, HEIGHT, LINEAR, PHASED, RADIAL, WIDTH
+
+PROBES = [LINEAR, CONVEX, PHASED, RADIAL]
 BACKENDS = ["reference", "cpu", pytest.param("cuda", marks=pytest.mark.slow)]
-SIZE = {"height": 37, "width": 53}
-
-SceneMaker = Callable[..., GaussianScene]
+SIZE = {"height": HEIGHT, "width": WIDTH}
 
 
-def placed(scene: GaussianScene, backend: str, on_device: Callable[[GaussianScene], GaussianScene]) -> GaussianScene:
+def placed(scene, backend, on_device):
     return on_device(scene) if backend == "cuda" else scene
 
 
-def wide_scene(count: int, log_scale: float) -> GaussianScene:
+def wide_scene(count, log_scale):
     """Gaussians of e^log_scale cm before the probe."""
     random = torch.Generator().manual_seed(0)
     means = torch.rand(count, 3, generator=random) * torch.tensor([4.0, 1.0, 4.0]) + torch.tensor([-2.0, -0.5, 0.5])
@@ -48,7 +38,7 @@ def wide_scene(count: int, log_scale: float) -> GaussianScene:
 
 
 @pytest.mark.parametrize("probe", PROBES, ids=lambda probe: probe.kind)
-def test_no_footprint_is_counted_too_small(probe: Probe, random_scene: SceneMaker, random_poses: Any) -> None:
+def test_no_footprint_is_counted_too_small(probe, random_scene, random_poses):
     """Against the pixels where the reference finds a weight or an absorption, Gaussian by Gaussian."""
     scene, poses = random_scene(30, sigma_cm=(0.02, 0.5)), random_poses(4)
     touched = np.zeros(len(poses))
@@ -63,7 +53,7 @@ def test_no_footprint_is_counted_too_small(probe: Probe, random_scene: SceneMake
 
 
 @pytest.mark.parametrize("probe", PROBES, ids=lambda probe: probe.kind)
-def test_wider_gaussians_cost_more_until_they_fill_the_frame(probe: Probe) -> None:
+def test_wider_gaussians_cost_more_until_they_fill_the_frame(probe):
     pose = np.eye(4)
     costs = [footprint_pixels(wide_scene(100, scale), probe, pose, **SIZE)[0] for scale in (-5.0, -2.0, 0.0, 5.0, 88.0)]
     assert sorted(costs) == costs
@@ -73,9 +63,7 @@ def test_wider_gaussians_cost_more_until_they_fill_the_frame(probe: Probe) -> No
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_frame_over_the_limit_is_refused_and_names_both(
-    backend: str, on_device: Callable[[GaussianScene], GaussianScene]
-) -> None:
+def test_a_frame_over_the_limit_is_refused_and_names_both(backend, on_device):
     scene = placed(wide_scene(100, 5.0), backend, on_device)
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:2, 2, 3] = 1e4  # nothing is before the probe there
@@ -88,9 +76,7 @@ def test_a_frame_over_the_limit_is_refused_and_names_both(
 
 
 @pytest.mark.slow
-def test_backends_agree_on_the_cost(
-    random_scene: SceneMaker, on_device: Callable[[GaussianScene], GaussianScene]
-) -> None:
+def test_backends_agree_on_the_cost(random_scene, on_device):
     """Each refuses what the CPU's count says is three times its limit, and draws what is a third of it."""
     scene = on_device(random_scene(50))
     for probe in PROBES:
@@ -101,7 +87,7 @@ def test_backends_agree_on_the_cost(
             render(scene, probe, np.eye(4), backend="cuda", limits=Limits(cost // 3), **SIZE)
 
 
-def test_hostile_scenes_are_refused_before_they_are_drawn() -> None:
+def test_hostile_scenes_are_refused_before_they_are_drawn():
     """Gaussians of 148 cm and of e^88 cm, which would take minutes."""
     for log_scale in (5.0, 88.0):
         scene = wide_scene(50_000, log_scale)
@@ -110,9 +96,7 @@ def test_hostile_scenes_are_refused_before_they_are_drawn() -> None:
 
 
 @pytest.mark.parametrize("backend", BACKENDS)
-def test_a_raised_flag_ends_a_rendering_before_it_begins(
-    backend: str, random_scene: SceneMaker, on_device: Callable[[GaussianScene], GaussianScene]
-) -> None:
+def test_a_raised_flag_ends_a_rendering_before_it_begins(backend, random_scene, on_device):
     scene = placed(random_scene(20), backend, on_device)
     flag = np.zeros(1, np.int64)
     limits = Limits(flag=flag, number=7)
@@ -125,7 +109,7 @@ def test_a_raised_flag_ends_a_rendering_before_it_begins(
 
 
 @pytest.mark.parametrize("backend", ["reference", "cpu"])
-def test_a_flag_raised_in_the_middle_ends_a_frame_of_minutes(backend: str) -> None:
+def test_a_flag_raised_in_the_middle_ends_a_frame_of_minutes(backend):
     scene = wide_scene(200_000, 2.0)
     render(scene, LINEAR, np.eye(4), backend="cpu", height=1, width=1)  # sorts it
     flag = np.zeros(1, np.int64)

@@ -1,16 +1,12 @@
 """The reference against docs/physics.md §2 and §3 written out a second time: scalars in Python, pixel by pixel."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable, Mapping
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, SceneInfo, render
+from ultragray import ConvexProbe, GaussianScene, LinearProbe, SceneInfo, render
 from ultragray.rendering.backends.reference import spherical_harmonics
 from ultragray.rendering.outputs import PLANES
 
@@ -18,17 +14,17 @@ LINEAR = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=30.0)
 CONVEX = ConvexProbe(opening_angle_deg=50.0, near_mm=10.0, far_mm=40.0)
 
 
-def sigmoid(x: float) -> float:
+def sigmoid(x):
     return 1.0 / (1.0 + math.exp(-x))
 
 
-def rotation_of(quaternion: np.ndarray) -> np.ndarray:
+def rotation_of(quaternion):
     w, x, y, z = quaternion / np.linalg.norm(quaternion)
     cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
     return np.eye(3) + 2 * w * cross + 2 * cross @ cross
 
 
-def harmonics(v: np.ndarray, degree: int) -> list[float]:
+def harmonics(v, degree):
     """The coefficients as 3D Gaussian Splatting lists them, as numbers."""
     x, y, z = v
     values = [0.28209479177387814]
@@ -48,13 +44,13 @@ def harmonics(v: np.ndarray, degree: int) -> list[float]:
 
 
 def pixel(
-    splats: Mapping[str, np.ndarray],
-    activation: str,
-    probe: Probe,
-    pose: np.ndarray,  # [4, 4] mm
-    index: tuple[int, int],
-    size: tuple[int, int],
-) -> dict[str, float]:
+    splats,
+    activation,
+    probe,
+    pose,  # [4, 4] mm
+    index,
+    size,
+):
     """All outputs at one pixel, in the scene's world axes (the renderer works in the probe's)."""
     (i, j), (height, width) = index, size
     near, far = probe.near_mm / 10, probe.far_mm / 10
@@ -85,7 +81,7 @@ def pixel(
         a, b, c = d @ precision @ d, d @ precision @ delta, delta @ precision @ delta
         peak, sigma, m2 = -b / a, 1 / math.sqrt(a), c - b * b / a
 
-        def density(t: float, m2: float = m2, peak: float = peak, sigma: float = sigma) -> float:
+        def density(t, m2=m2, peak=peak, sigma=sigma):
             return math.exp(-0.5 * m2) * math.exp(-0.5 * ((t - peak) / sigma) ** 2)
 
         weight = min(0.999, density(s))
@@ -120,7 +116,7 @@ def pixel(
     return {"bmode": echo * transmittance, "echo": echo, "transmittance": transmittance, "coverage": coverage}
 
 
-def compare(scene: GaussianScene, probe: Probe, poses: np.ndarray, size: tuple[int, int]) -> np.ndarray:
+def compare(scene, probe, poses, size):
     """Renders in float64 and compares every pixel; returns coverage [C, H, W] so that a test can ask what it saw."""
     height, width = size
     frames = render(scene.to(torch.float64), probe, poses, height=height, width=width, backend="reference")
@@ -130,18 +126,17 @@ def compare(scene: GaussianScene, probe: Probe, poses: np.ndarray, size: tuple[i
             want = pixel(splats, scene.info.intensity, probe, pose, index, size)
             got = {name: float(getattr(frames, name)[(c, *index)]) for name in PLANES}
             assert got == pytest.approx(want, abs=1e-9), (c, index)
-    assert frames.coverage is not None
     return frames.coverage.numpy()
 
 
 def one_gaussian(
-    mean_cm: tuple[float, float, float],
-    sigma_cm: tuple[float, float, float] = (0.2, 0.2, 0.2),
-    quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0),
-    transmittance_logit: float = 0.0,
-    sh: tuple[float, ...] = (0.5,),
-    intensity: str = "released",
-) -> GaussianScene:
+    mean_cm,
+    sigma_cm=(0.2, 0.2, 0.2),
+    quaternion=(1.0, 0.0, 0.0, 0.0),
+    transmittance_logit=0.0,
+    sh=(0.5,),
+    intensity="released",
+):
     splats = {
         "means": torch.tensor([mean_cm], dtype=torch.float64),
         "scales": torch.tensor([sigma_cm], dtype=torch.float64).log(),
@@ -168,12 +163,12 @@ HERE = np.eye(4)[None]
         ((0.0, 0.0, 1.5), (0.9, 0.4, 0.02)),  # a plate across the beam
     ],
 )
-def test_one_gaussian(probe: Probe, mean_cm: tuple[float, float, float], sigma_cm: tuple[float, float, float]) -> None:
+def test_one_gaussian(probe, mean_cm, sigma_cm):
     scene = one_gaussian(mean_cm, sigma_cm, quaternion=(0.9, 0.1, -0.2, 0.3))
     compare(scene, probe, HERE, (15, 11))
 
 
-def test_the_worked_value_in_the_middle_of_a_gaussian() -> None:
+def test_the_worked_value_in_the_middle_of_a_gaussian():
     """At its centre w = S = 0.999 (clamped), and a fully crossed one has ψ = 1.153·√(2π)·σ (docs/physics.md §3)."""
     scene = one_gaussian((0.0, 0.0, 1.5), (0.1, 0.1, 0.1), transmittance_logit=0.0, sh=(0.0,))
     probe = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=30.0)
@@ -188,7 +183,7 @@ def test_the_worked_value_in_the_middle_of_a_gaussian() -> None:
     assert values["bmode"][1].item() == pytest.approx(product, abs=1e-12)
 
 
-def test_the_skip_rule_needs_both_below_a_255th() -> None:
+def test_the_skip_rule_needs_both_below_a_255th():
     """Behind a strong Gaussian its own tail counts under 1/255 too; behind a faint one it does not."""
     probe = LinearProbe(width_mm=2.0, near_mm=0.0, far_mm=30.0)
     tails = []
@@ -200,7 +195,7 @@ def test_the_skip_rule_needs_both_below_a_255th() -> None:
     assert len(tails[1]) == 0
 
 
-def test_a_ray_far_shorter_than_the_gaussian_is_degenerate() -> None:
+def test_a_ray_far_shorter_than_the_gaussian_is_degenerate():
     scene = one_gaussian((0.0, 0.0, 2e-4), (50.0, 50.0, 50.0))
     probe = LinearProbe(width_mm=1.0, near_mm=0.0, far_mm=0.06)
     compare(scene, probe, HERE, (4, 2))  # a·s² from 1e-10 to 1e-8
@@ -208,9 +203,7 @@ def test_a_ray_far_shorter_than_the_gaussian_is_degenerate() -> None:
 
 @pytest.mark.parametrize("intensity", ["released", "sigmoid"])
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_random_scenes_of_each_degree(
-    random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any], degree: int, intensity: str
-) -> None:
+def test_random_scenes_of_each_degree(random_scene, random_poses, degree, intensity):
     scene = random_scene(
         12,
         sh_degree=degree,
@@ -227,7 +220,7 @@ def test_random_scenes_of_each_degree(
         assert (compare(scene, probe, poses, (7, 9)) > 0.05).mean() > 0.1
 
 
-def test_the_intensity_is_clamped_at_both_ends() -> None:
+def test_the_intensity_is_clamped_at_both_ends():
     echoes = []
     for coefficient in (-9.0, -0.5, 9.0):
         scene = one_gaussian((0.0, 0.0, 1.5), (5.0, 5.0, 5.0), sh=(coefficient,))
@@ -238,7 +231,7 @@ def test_the_intensity_is_clamped_at_both_ends() -> None:
     assert echoes == pytest.approx([0.5, 1 - 0.5 * 0.28209479, 0.999], abs=1e-7)
 
 
-def test_harmonics_are_orthonormal() -> None:
+def test_harmonics_are_orthonormal():
     """∫ Y_a Y_b over the sphere is 1 for a = b and 0 else, by a product rule exact to degree 6."""
     z, weights = np.polynomial.legendre.leggauss(8)
     phi = 2 * np.pi * np.arange(16) / 16
@@ -252,7 +245,7 @@ def test_harmonics_are_orthonormal() -> None:
     np.testing.assert_allclose(basis, [harmonics(v, 3) for v in points], atol=1e-9)
 
 
-def test_a_gaussian_at_the_probe_has_no_direction() -> None:
+def test_a_gaussian_at_the_probe_has_no_direction():
     scene = one_gaussian((0.0, 0.0, 0.0), sh=(0.1, 5.0, 5.0, 5.0))
     frames = render(scene, LINEAR, HERE, height=5, width=3, backend="reference")
     assert all(torch.isfinite(getattr(frames, name)).all() for name in PLANES)
@@ -271,44 +264,12 @@ def test_a_gaussian_at_the_probe_has_no_direction() -> None:
         ((1.5, 0.0, 3.6), False),  # range 3.9 > 3.7, the top of the last of ten rows; z is not
     ],
 )
-def test_a_convex_probe_culls_by_range_in_the_plane(mean_cm: tuple[float, float, float], visible: bool) -> None:
+def test_a_convex_probe_culls_by_range_in_the_plane(mean_cm, visible):
     scene = one_gaussian(mean_cm, (3.0, 3.0, 3.0))
     assert compare(scene, CONVEX, HERE, (10, 5)).any() == visible
 
 
-@pytest.mark.parametrize("dtype", [torch.float32, torch.float64])
-def test_the_dtype_of_the_scene_is_kept(random_scene: Callable[..., GaussianScene], dtype: torch.dtype) -> None:
-    frames = render(random_scene(3, dtype=dtype), LINEAR, HERE, height=4, width=4, backend="reference")
-    assert {getattr(frames, name).dtype for name in PLANES} == {dtype}
-
-
-def test_only_the_outputs_asked_for_come_back(random_scene: Callable[..., GaussianScene]) -> None:
+def test_only_the_outputs_asked_for_come_back(random_scene):
     frames = render(random_scene(3), LINEAR, HERE, height=4, width=5, outputs=["echo"], backend="reference")
-    assert frames.echo is not None
     assert frames.echo.shape == (1, 4, 5)
     assert frames.bmode is frames.transmittance is frames.coverage is None
-
-
-@pytest.mark.parametrize("intensity", ["released", "sigmoid"])
-@pytest.mark.parametrize("probe", [LINEAR, CONVEX], ids=["linear", "convex"])
-def test_gradients_are_those_of_finite_differences(
-    random_scene: Callable[..., GaussianScene], probe: Probe, intensity: str
-) -> None:
-    scene = random_scene(
-        3,
-        seed=5,
-        extent_cm=(0.6, 0.2, 1.0),
-        centre_cm=(0, 0, 2.0),
-        sigma_cm=(0.3, 0.6),
-        intensity=intensity,
-        dtype=torch.float64,
-    )
-    scene.sh0.fill_(-0.4)  # away from the clamps of `released`, where it has no derivative
-
-    def outputs(*tensors: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        moved = GaussianScene(*tensors, info=scene.info, training_poses=scene.training_poses)
-        frames = render(moved, probe, HERE, height=3, width=4, backend="reference")
-        return tuple(getattr(frames, name) for name in PLANES)
-
-    inputs = tuple(tensor.clone().requires_grad_() for tensor in scene.splats.values())
-    assert torch.autograd.gradcheck(outputs, inputs, eps=1e-6, atol=1e-7, rtol=1e-5)

@@ -1,33 +1,23 @@
 """Sums over weighted Gaussians: their meaning by the reference, the same by every kernel, their gradients."""
 
-from __future__ import annotations
-
-from collections.abc import Callable, Mapping
-from typing import Any
-
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, RadialProbe, SceneInfo, render
+from ultragray import GaussianScene, SceneInfo, render
 from ultragray.errors import BackendUnavailable
 from ultragray.rendering.backends import cpu, cuda
 from ultragray.rendering.backends.inputs import scene_poses
 from ultragray.rendering.backends.registry import WeightedSums, weighted_sums
 from ultragray.rendering.outputs import SUMS
 
-HEIGHT, WIDTH = 37, 53
-KERNELS = ("cuda", *cpu.INSTRUCTION_SETS)
-PROBES: Mapping[str, Probe] = {
-    "linear": LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0),
-    "convex": ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=60.0),
-    "radial": RadialProbe(near_mm=1.0, far_mm=30.0),
-}
+from .conftest import CONVEX, HEIGHT, KERNELS, LINEAR, RADIAL, WIDTH
+
+PROBES = {"linear": LINEAR, "convex": CONVEX, "radial": RADIAL}
 WEIGHTS = {"transmittance_logit": (-4.0, 4.0), "intensity": "sigmoid", "sh_degree": 0, "sigma_cm": (0.05, 0.4)}
 
 
-def sums(kernel: str, scene: GaussianScene, probe: Probe, poses: Any) -> WeightedSums:
+def sums(kernel, scene, probe, poses):
     inside = scene_poses(scene, poses)
     if kernel == "reference":
         return weighted_sums(scene, probe, inside, HEIGHT, WIDTH, "reference")
@@ -38,19 +28,17 @@ def sums(kernel: str, scene: GaussianScene, probe: Probe, poses: Any) -> Weighte
     return WeightedSums(*planes.values())
 
 
-def gradients(kernel: str, scene: GaussianScene, probe: Probe, poses: Any, weights: Tensor) -> dict[str, np.ndarray]:
+def gradients(kernel, scene, probe, poses, weights):
     """Of the sums, weighted [2, C, H, W], by raw parameter."""
     leaves = {name: tensor.clone().requires_grad_() for name, tensor in scene.splats.items()}
     drawn = torch.stack(sums(kernel, GaussianScene.from_splats(leaves, info=scene.info), probe, poses))
-    (drawn * weights.to(drawn)).sum().backward()  # type: ignore[no-untyped-call]
+    (drawn * weights.to(drawn)).sum().backward()
     return {name: leaf.grad.cpu().double().numpy() for name, leaf in leaves.items() if leaf.grad is not None}
 
 
 @pytest.mark.parametrize("kernel", KERNELS)
 @pytest.mark.parametrize("name", PROBES)
-def test_sums_and_gradients_are_those_of_the_reference_in_float64(
-    name: str, kernel: str, random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any]
-) -> None:
+def test_sums_and_gradients_are_those_of_the_reference_in_float64(name, kernel, random_scene, random_poses):
     scene, poses = random_scene(150, seed=3, centre_cm=(0, 0, 2), **WEIGHTS), random_poses(2, seed=5)
     exact_scene = scene.to(torch.float64)
     exact = torch.stack(sums("reference", exact_scene, PROBES[name], poses))
@@ -66,7 +54,7 @@ def test_sums_and_gradients_are_those_of_the_reference_in_float64(
         assert error < 1e-3, f"{parameter}: relative L2 error {error:.2g}"
 
 
-def one_gaussian(weight: float) -> GaussianScene:
+def one_gaussian(weight):
     splats = {
         "means": torch.tensor([[0.0, 0.0, 2.5]]),
         "scales": torch.full((1, 3), 0.3).log(),
@@ -78,7 +66,7 @@ def one_gaussian(weight: float) -> GaussianScene:
 
 
 @pytest.mark.parametrize("kernel", ["reference", *KERNELS])
-def test_a_weight_scales_what_a_gaussian_adds(kernel: str) -> None:
+def test_a_weight_scales_what_a_gaussian_adds(kernel):
     pose = np.eye(4)[None]
     whole, some = (sums(kernel, one_gaussian(w), PROBES["linear"], pose) for w in (0.99999, 0.25))
     bright = some.weight > 1.01 / 255.0  # below, the weaker one is skipped
@@ -88,7 +76,7 @@ def test_a_weight_scales_what_a_gaussian_adds(kernel: str) -> None:
 
 
 @pytest.mark.parametrize("kernel", ["reference", *KERNELS])
-def test_weighted_gaussians_cast_no_tail_below_themselves(kernel: str) -> None:
+def test_weighted_gaussians_cast_no_tail_below_themselves(kernel):
     """An absorbing Gaussian counts below itself, where its weight has fallen under 1/255; a weighted one does not."""
     scene, pose = one_gaussian(0.9), np.eye(4)[None]
     drawn = sums(kernel, scene, PROBES["linear"], pose).weight
@@ -96,9 +84,7 @@ def test_weighted_gaussians_cast_no_tail_below_themselves(kernel: str) -> None:
 
 
 @pytest.mark.parametrize("kernel", ["reference", *KERNELS])
-def test_weights_of_one_give_the_echo_of_a_scene_over_its_coverage(
-    kernel: str, random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any]
-) -> None:
+def test_weights_of_one_give_the_echo_of_a_scene_over_its_coverage(kernel, random_scene, random_poses):
     scene = random_scene(150, seed=3, sigma_cm=(0.05, 0.2), sh_degree=0, intensity="sigmoid")
     poses = random_poses(2, seed=5)
     ordinary = render(scene, PROBES["linear"], poses, height=HEIGHT, width=WIDTH, outputs=("echo", "coverage"))
@@ -110,9 +96,7 @@ def test_weights_of_one_give_the_echo_of_a_scene_over_its_coverage(
 
 
 @pytest.mark.parametrize("kernel", ["cuda", "auto"])
-def test_what_is_prepared_of_weights_is_kept_apart(
-    kernel: str, random_scene: Callable[..., GaussianScene], on_device: Callable[[GaussianScene], GaussianScene]
-) -> None:
+def test_what_is_prepared_of_weights_is_kept_apart(kernel, random_scene, on_device):
     """A scene that was drawn as absorbing Gaussians before gives the same sums as one that was not."""
     scene, pose = random_scene(50, **WEIGHTS), np.eye(4)[None]
     fresh = sums(kernel, random_scene(50, **WEIGHTS), PROBES["linear"], pose)
@@ -121,6 +105,6 @@ def test_what_is_prepared_of_weights_is_kept_apart(
     assert torch.equal(sums(kernel, there, PROBES["linear"], pose).weight, fresh.weight)
 
 
-def test_an_unknown_backend_is_refused(random_scene: Callable[..., GaussianScene]) -> None:
+def test_an_unknown_backend_is_refused(random_scene):
     with pytest.raises(BackendUnavailable, match="one of reference, cpu, cuda, got 'magic'"):
         weighted_sums(random_scene(3), PROBES["linear"], np.eye(4)[None], HEIGHT, WIDTH, "magic")

@@ -1,21 +1,16 @@
 """Import of released checkpoints: place, scale and depth grid come out right, everything wrong is named."""
 
-from __future__ import annotations
-
 import json
 import math
 import os
 import pickle
 import zipfile
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, render
+from ultragray import GaussianScene, LinearProbe, render
 from ultragray.errors import CheckpointInvalid, InvalidArgument, InvalidPose
 from ultragray.exchange.checkpoint import import_checkpoint
 from ultragray.exchange.poses import load_poses
@@ -35,9 +30,7 @@ HEIGHT, WIDTH = 9, 7
 class Dataset:
     """A dataset in the released layout, under tmp/data/set, and a checkpoint beside it."""
 
-    def __init__(
-        self, root: Path, random_poses: Callable[..., Any], random_scene: Callable[..., GaussianScene]
-    ) -> None:
+    def __init__(self, root, random_poses, random_scene):
         self.folder = root / "data" / "set"
         self.folder.mkdir(parents=True)
         self.config = self.folder / "conf.json"
@@ -51,23 +44,23 @@ class Dataset:
         np.save(self.poses, self.pose_array)
         torch.save({"step": 29999, "global_tic": 1.5, "splats": self.splats}, self.checkpoint)
 
-    def write_config(self, **changes: Any) -> None:
+    def write_config(self, **changes):
         document = {**LINEAR_CONF, **changes}
         self.config.write_text(json.dumps({k: v for k, v in document.items() if v is not None}))
 
-    def import_it(self, **options: Any) -> GaussianScene:
+    def import_it(self, **options):
         if not {"poses", "center_mm", "centered"} & set(options):
             options["poses"] = self.poses
         return import_checkpoint(self.checkpoint, config=self.config, **options)
 
 
 @pytest.fixture
-def dataset(tmp_path: Path, random_poses: Callable[..., Any], random_scene: Callable[..., GaussianScene]) -> Dataset:
+def dataset(tmp_path, random_poses, random_scene):
     return Dataset(tmp_path, random_poses, random_scene)
 
 
 @pytest.mark.parametrize("name", ["g06_ckpt_29999.pt", "g06_ckpt_29999_cuda0.pt"])
-def test_both_released_forms_hold_the_golden_scene(golden_folder: Path, dataset: Dataset, name: str) -> None:
+def test_both_released_forms_hold_the_golden_scene(golden_folder, dataset, name):
     dataset.checkpoint = golden_folder / name
     scene = dataset.import_it()
     with np.load(golden_folder / "g06.npz") as arrays:
@@ -79,7 +72,7 @@ def test_both_released_forms_hold_the_golden_scene(golden_folder: Path, dataset:
 
 
 @pytest.mark.parametrize("name", ["spine_phantom", "liver_convex", "ultranerf_liver", "nwire_phantom"])
-def test_the_real_datasets_place_a_checkpoint(golden_folder: Path, data_folder: Path, name: str) -> None:
+def test_the_real_datasets_place_a_checkpoint(golden_folder, data_folder, name):
     folder = data_folder / name
     scene = import_checkpoint(
         golden_folder / "g06_ckpt_29999.pt", config=folder / "conf.json", poses=folder / "poses_train.npy"
@@ -101,13 +94,12 @@ def test_the_real_datasets_place_a_checkpoint(golden_folder: Path, data_folder: 
     height, width = np.load(folder / "images_train.npy", mmap_mode="r").shape[1:]
     assert (scene.info.image_height, scene.info.image_width) == (height, width)
     assert scene.info.dataset_name == name
-    assert scene.info.probe is not None
     assert scene.info.probe.near_mm == pytest.approx(near)
     assert scene.info.probe.far_mm == pytest.approx(near + (far - near) * height / (height - 1))
     assert len(scene.training_poses) == len(poses)
 
 
-def test_a_tracker_pose_shows_what_the_released_view_shows(dataset: Dataset) -> None:
+def test_a_tracker_pose_shows_what_the_released_view_shows(dataset):
     """A pose in mm in the tracker's frame equals the released pose: cm, minus the centre, on the released grid."""
     scene = dataset.import_it()
     assert scene.info.probe is not None
@@ -122,15 +114,7 @@ def test_a_tracker_pose_shows_what_the_released_view_shows(dataset: Dataset) -> 
     torch.testing.assert_close(ours, released, atol=1e-5, rtol=0)
 
 
-def test_an_imported_scene_survives_its_file(dataset: Dataset, tmp_path: Path) -> None:
-    scene = dataset.import_it()
-    scene.save(tmp_path / "a.ugr")
-    back = GaussianScene.load(tmp_path / "a.ugr")
-    assert back.info == scene.info
-    np.testing.assert_allclose(back.training_poses, dataset.pose_array, atol=1e-9)
-
-
-def test_a_bare_splats_dictionary_and_other_dtypes_load(dataset: Dataset) -> None:
+def test_a_bare_splats_dictionary_and_other_dtypes_load(dataset):
     torch.save({name: t.double() for name, t in dataset.splats.items()}, dataset.checkpoint)
     scene = dataset.import_it()
     assert scene.means.dtype == torch.float32
@@ -138,12 +122,12 @@ def test_a_bare_splats_dictionary_and_other_dtypes_load(dataset: Dataset) -> Non
     assert "step" not in scene.info.training
 
 
-def test_the_old_torch_format_loads(dataset: Dataset) -> None:
+def test_the_old_torch_format_loads(dataset):
     torch.save({"step": 7, "splats": dataset.splats}, dataset.checkpoint, _use_new_zipfile_serialization=False)
     assert dataset.import_it().info.training["step"] == 7
 
 
-def test_a_center_or_centered_instead_of_poses(dataset: Dataset) -> None:
+def test_a_center_or_centered_instead_of_poses(dataset):
     scene = dataset.import_it(center_mm=(1.0, -2.0, 3.5))
     assert scene.info.centre_mm == (1.0, -2.0, 3.5)
     assert len(scene.training_poses) == 0
@@ -154,18 +138,18 @@ def test_a_center_or_centered_instead_of_poses(dataset: Dataset) -> None:
     "options",
     [{"poses": None}, {"poses": "p.npy", "centered": True}, {"center_mm": (0, 0, 0), "centered": True}],
 )
-def test_exactly_one_place_must_be_given(dataset: Dataset, options: dict[str, Any]) -> None:
+def test_exactly_one_place_must_be_given(dataset, options):
     with pytest.raises(InvalidArgument, match=r"exactly one of poses .* center_mm .* centered"):
         dataset.import_it(**options)
 
 
 @pytest.mark.parametrize("center", [(0, 0), (0, 0, math.nan), ("a", 0, 0), 5.0])
-def test_a_center_that_is_no_point_is_refused(dataset: Dataset, center: Any) -> None:
+def test_a_center_that_is_no_point_is_refused(dataset, center):
     with pytest.raises(InvalidArgument, match="center_mm must be"):
         dataset.import_it(center_mm=center)
 
 
-def test_images_are_found_beside_the_config_and_from_the_folder_of_data(dataset: Dataset) -> None:
+def test_images_are_found_beside_the_config_and_from_the_folder_of_data(dataset):
     assert dataset.import_it().info.image_height == HEIGHT
     dataset.write_config(images_file_train="elsewhere/on/another/machine/images_train.npy")
     assert dataset.import_it().info.image_height == HEIGHT
@@ -175,47 +159,26 @@ def test_images_are_found_beside_the_config_and_from_the_folder_of_data(dataset:
     assert dataset.import_it().info.image_width == WIDTH
 
 
-def test_the_image_height_can_be_given(dataset: Dataset) -> None:
+def test_the_image_height_can_be_given(dataset):
     dataset.images.unlink()
     with pytest.raises(InvalidArgument, match=r"image_height must be given.*images_train\.npy.*not found"):
         dataset.import_it()
     scene = dataset.import_it(image_height=101)
     assert (scene.info.image_height, scene.info.image_width) == (101, None)
-    assert scene.info.probe is not None
     assert scene.info.probe.far_mm == pytest.approx(5 + 40 * 101 / 100)
     dataset.write_config(images_file_train=None)
     with pytest.raises(InvalidArgument, match=r"image_height must be given.*names no images_file_train"):
         dataset.import_it()
 
 
-def test_a_config_may_name_the_image_size_itself(dataset: Dataset) -> None:
+def test_a_config_may_name_the_image_size_itself(dataset):
     dataset.write_config(image_height=101, image_width=1)
     scene = dataset.import_it()
     assert (scene.info.image_height, scene.info.image_width) == (101, 1)
-    assert scene.info.probe is not None
     assert scene.info.probe.far_mm == pytest.approx(5 + 40 * 101 / 100)
     assert dataset.import_it(image_height=51).info.image_height == 51
     dataset.images.unlink()
     assert dataset.import_it().info == scene.info
-
-
-@pytest.mark.parametrize("height", [1, 0, -5, 2.5, True])
-def test_an_image_height_that_no_grid_has_is_refused(dataset: Dataset, height: Any) -> None:
-    with pytest.raises(InvalidArgument, match="image_height must be an integer of at least 2"):
-        dataset.import_it(image_height=height)
-
-
-def test_a_convex_config(dataset: Dataset) -> None:
-    dataset.write_config(ultrasound_opening_width=None, ultrasound_opening_angle=60.0)
-    far_mm = 5.0 + 40.0 * HEIGHT / (HEIGHT - 1)
-    assert dataset.import_it().info.probe == ConvexProbe(opening_angle_deg=60.0, near_mm=5.0, far_mm=far_mm)
-
-
-def test_poses_that_are_not_the_training_poses_are_noticed(dataset: Dataset, caplog: pytest.LogCaptureFixture) -> None:
-    np.save(dataset.poses, dataset.pose_array[:3])
-    dataset.import_it()
-    assert "3 poses" in caplog.text
-    assert "5 images" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -227,20 +190,12 @@ def test_poses_that_are_not_the_training_poses_are_noticed(dataset: Dataset, cap
         ({"ultrasound_far_plane": None}, "lacks ultrasound_far_plane"),
         ({"ultrasound_far_plane": 0.25}, "far_mm must be greater"),
         ({"ultrasound_far_plane": "4.5"}, "ultrasound_far_plane must be a finite number"),
-        ({"ultrasound_far_plane": math.nan}, "ultrasound_far_plane must be a finite number"),
-        ({"ultrasound_far_plane": 10**400}, "ultrasound_far_plane must be a finite number"),
-        ({"ultrasound_near_plane": True}, "ultrasound_near_plane must be a finite number"),
-        ({"ultrasound_near_plane": -1.0}, "near_mm must be"),
-        ({"ultrasound_opening_width": [3]}, "ultrasound_opening_width must be a finite number"),
-        ({"ultrasound_opening_width": 0}, "width_mm must be"),
         ({"images_file_train": 5}, "images_file_train must be a path"),
         ({"image_height": 1}, "image_height must be an integer of at least 2, got 1"),
         ({"image_width": 0}, "image_width must be an integer of at least 1, got 0"),
-        ({"image_height": "256"}, "image_height must be an integer"),
-        ({"image_width": True}, "image_width must be an integer"),
     ],
 )
-def test_a_wrong_config_is_named(dataset: Dataset, changes: dict[str, Any], message: str) -> None:
+def test_a_wrong_config_is_named(dataset, changes, message):
     dataset.write_config(**changes)
     with pytest.raises(CheckpointInvalid, match=rf"conf\.json: .*{message}"):
         dataset.import_it()
@@ -251,13 +206,12 @@ def test_a_wrong_config_is_named(dataset: Dataset, changes: dict[str, Any], mess
     [
         (b"", "not JSON"),
         (b"{", "not JSON"),
-        (b"\xff\xfe", "not JSON"),
         (b"[]", "JSON object"),
         (b"[" * 200_000, "nests too deeply"),
         (b" " * (1 << 21), "too large"),
     ],
 )
-def test_a_hostile_config_is_named(dataset: Dataset, content: bytes, message: str) -> None:
+def test_a_hostile_config_is_named(dataset, content, message):
     dataset.config.write_bytes(content)
     with pytest.raises(CheckpointInvalid, match=rf"conf\.json: .*{message}"):
         dataset.import_it()
@@ -267,7 +221,7 @@ def test_a_hostile_config_is_named(dataset: Dataset, content: bytes, message: st
 
 
 @pytest.mark.parametrize("named", ["/dev/zero", "x" * 5000, "a\0b", "", "."])
-def test_a_config_cannot_make_the_importer_read_anything_odd(dataset: Dataset, named: str) -> None:
+def test_a_config_cannot_make_the_importer_read_anything_odd(dataset, named):
     dataset.write_config(images_file_train=named)
     with pytest.raises(InvalidArgument, match="image_height must be given"):
         dataset.import_it()
@@ -277,20 +231,17 @@ def test_a_config_cannot_make_the_importer_read_anything_odd(dataset: Dataset, n
     "write",
     [
         lambda path: np.save(path, np.zeros((5, 9), np.uint8)),
-        lambda path: np.save(path, np.zeros((5, 0, 9), np.uint8)),
         lambda path: np.save(path, np.array([{}]), allow_pickle=True),
         lambda path: path.write_bytes(b"\x93NUMPY truncated"),
-        lambda path: path.write_bytes(b""),
-        lambda path: path.write_bytes(pickle.dumps([1])),
     ],
 )
-def test_bad_images_are_named(dataset: Dataset, write: Callable[[Path], Any]) -> None:
+def test_bad_images_are_named(dataset, write):
     write(dataset.images)
     with pytest.raises(CheckpointInvalid, match=r"images_train\.npy: "):
         dataset.import_it()
 
 
-def test_poses_may_be_rows_of_three_or_json(dataset: Dataset, tmp_path: Path) -> None:
+def test_poses_may_be_rows_of_three_or_json(dataset, tmp_path):
     expected = dataset.import_it()
     np.save(dataset.poses, dataset.pose_array[:, :3].astype(np.float32))
     np.testing.assert_allclose(dataset.import_it().info.centre_mm, expected.info.centre_mm, atol=1e-4)
@@ -305,20 +256,16 @@ def test_poses_may_be_rows_of_three_or_json(dataset: Dataset, tmp_path: Path) ->
     ("name", "content", "message"),
     [
         ("p.npy", b"", "not a file of poses"),
-        ("p.npy", b"\x93NUMPY", "not a file of poses"),
         ("p.npy", pickle.dumps([1]), "not a file of poses"),
         ("p.json", b"[[1, 2]]", "shape"),
         ("p.json", b'{"poses": []}', r"must hold a list of lists of numbers, .* not \{\"poses\": \[\]\}"),
         ("p.json", b"[" * 200_000, "nests too deeply"),
-        ("p.json", b"[]", "poses must have shape"),
         ("p.txt", b"1 0 0 0", r"\.npy, \.json and \.mcap"),
         ("p.npy", np.zeros((0, 4, 4)), "no poses"),
-        ("p.npy", np.full((2, 4, 4), np.nan), r"poses\[0\] must be finite"),
         ("p.npy", np.stack([np.eye(4), np.diag([1.0, 1, -1, 1])]), r"poses\[1\] .*mirrored"),
-        ("p.npy", np.stack([np.eye(4), np.diag([2.0, 2, 2, 1])]), r"poses\[1\] .*rotation"),
     ],
 )
-def test_bad_poses_are_named(dataset: Dataset, tmp_path: Path, name: str, content: Any, message: str) -> None:
+def test_bad_poses_are_named(dataset, tmp_path, name, content, message):
     path = tmp_path / name
     if isinstance(content, bytes):
         path.write_bytes(content)
@@ -330,24 +277,18 @@ def test_bad_poses_are_named(dataset: Dataset, tmp_path: Path, name: str, conten
         load_poses(path)
 
 
-def test_missing_poses_are_named(dataset: Dataset) -> None:
-    dataset.poses.unlink()
-    with pytest.raises(CheckpointInvalid, match=r"poses_train\.npy: no such file"):
-        dataset.import_it()
-
-
 class Hostile:
-    def __reduce__(self) -> tuple[object, ...]:
+    def __reduce__(self):
         return os.system, ("touch pwned",)
 
 
-def views_that_claim(count: int) -> dict[str, torch.Tensor]:
+def views_that_claim(count):
     """Tensors of `count` Gaussians over one number each."""
     shapes = {"means": (3,), "scales": (3,), "quats": (4,), "transmittances": (), "sh0": (1, 1), "shN": (3, 1)}
     return {name: torch.ones(1).expand(count, *shape) for name, shape in shapes.items()}
 
 
-BAD_DOCUMENTS: dict[str, tuple[Any, str]] = {
+BAD_DOCUMENTS = {
     "code": ({"splats": Hostile()}, "refused.*could run code.*system"),
     "code_beside": ({"splats": torch.zeros(1), "x": Hostile()}, "refused.*could run code"),
     "list": ([1, 2], "holds a list"),
@@ -359,9 +300,7 @@ BAD_DOCUMENTS: dict[str, tuple[Any, str]] = {
 
 
 @pytest.mark.parametrize("name", BAD_DOCUMENTS)
-def test_checkpoints_of_something_else(
-    dataset: Dataset, name: str, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_checkpoints_of_something_else(dataset, name, monkeypatch, tmp_path):
     monkeypatch.chdir(tmp_path)
     document, message = BAD_DOCUMENTS[name]
     torch.save(document, dataset.checkpoint)
@@ -374,33 +313,28 @@ def test_checkpoints_of_something_else(
     [
         ("quats", None, "lack quats"),
         ("means", torch.zeros(20, 2), r"\[20, 3\]"),
-        ("scales", torch.zeros(19, 3), r"\[20, 3\]"),
-        ("shN", torch.zeros(20, 4, 1), "0, 3, 8, 15"),
-        ("transmittances", torch.full((20,), math.nan), "finite"),
         ("means", torch.full((20, 3), 1e300, dtype=torch.float64), "finite"),
         ("sh0", [1.0], "sh0 must be a floating tensor, got list"),
-        ("means", torch.zeros(20, 3, dtype=torch.int64), "int64"),
         ("means", torch.zeros(20, 3).to_sparse(), "plain dense tensor"),
         ("means", torch.zeros(20, 3, device="meta"), "plain dense tensor"),
-        ("quats", torch.zeros(20, 4), "zero"),
     ],
 )
-def test_splats_that_do_not_fit(dataset: Dataset, name: str, value: Any, message: str) -> None:
-    splats: dict[str, Any] = {**dataset.splats, name: value}
+def test_splats_that_do_not_fit(dataset, name, value, message):
+    splats = {**dataset.splats, name: value}
     if value is None:
         del splats[name]
     torch.save({"splats": splats}, dataset.checkpoint)
     refused(dataset, message)
 
 
-def refused(dataset: Dataset, message: str) -> None:
+def refused(dataset, message):
     with pytest.raises(CheckpointInvalid, match=rf"ckpt_29999\.pt: .*{message}") as caught:
         dataset.import_it()
     assert "\n" not in caught.value.detail
     assert len(caught.value.detail) < 500
 
 
-def test_files_that_are_no_checkpoints(dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_files_that_are_no_checkpoints(dataset, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     whole = dataset.checkpoint.read_bytes()
     for content in (b"", b"text", whole[:100], whole[: len(whole) // 2], whole[:-30], whole[200:]):

@@ -1,23 +1,15 @@
 """PLY: a scene comes back to the bit; whatever is no such file is named."""
 
-from __future__ import annotations
-
-import contextlib
 import os
 import re
 import struct
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
-from ultragray import ConvexProbe, ElevationBeam, GaussianScene, LinearProbe
+from ultragray import ElevationBeam, GaussianScene, LinearProbe
 from ultragray.errors import SceneFileInvalid
 from ultragray.exchange import ply
 from ultragray.exchange.ply import read_ply, write_ply
@@ -36,10 +28,8 @@ INFO = {
 
 
 @pytest.fixture
-def make_scene(
-    random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any]
-) -> Callable[..., GaussianScene]:
-    def make(count: int = 7, *, poses: int = 3, **options: Any) -> GaussianScene:
+def make_scene(random_scene, random_poses):
+    def make(count=7, *, poses=3, **options):
         made = random_scene(count, **{"info": INFO, **options})
         return GaussianScene.from_splats(made.splats, info=made.info, training_poses=random_poses(poses))
 
@@ -47,19 +37,19 @@ def make_scene(
 
 
 @pytest.fixture
-def file(tmp_path: Path, make_scene: Callable[..., GaussianScene]) -> Path:
+def file(tmp_path, make_scene):
     path = tmp_path / "scene.ply"
     write_ply(make_scene(), path)
     return path
 
 
-def change(path: Path, old: bytes, new: bytes) -> None:
+def change(path, old, new):
     content = path.read_bytes()
     assert old in content
     path.write_bytes(content.replace(old, new, 1))
 
 
-def refused(path: Path, message: str) -> None:
+def refused(path, message):
     with pytest.raises(SceneFileInvalid, match=rf"{re.escape(str(path))}: .*{message}") as caught:
         read_ply(path)
     assert "\n" not in caught.value.detail
@@ -68,9 +58,7 @@ def refused(path: Path, message: str) -> None:
 
 @pytest.mark.parametrize("sh_degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("intensity", ["released", "sigmoid"])
-def test_a_scene_comes_back_to_the_bit(
-    tmp_path: Path, make_scene: Callable[..., GaussianScene], sh_degree: int, intensity: str
-) -> None:
+def test_a_scene_comes_back_to_the_bit(tmp_path, make_scene, sh_degree, intensity):
     scene = make_scene(sh_degree=sh_degree, intensity=intensity)
     scene = replace(scene, info=replace(scene.info, beam=ElevationBeam(2.5, 30.0, 20.0)))
     write_ply(scene, tmp_path / "a.ply")
@@ -79,24 +67,13 @@ def test_a_scene_comes_back_to_the_bit(
     assert back.to_bytes() == scene.to_bytes()
 
 
-def test_odd_numbers_come_back_to_the_bit(tmp_path: Path, make_scene: Callable[..., GaussianScene]) -> None:
-    scene = make_scene(poses=0, info={**INFO, "probe": ConvexProbe(60.56, 50.8, 228.0)})
-    scene.means[0] = torch.tensor([-0.0, 1e-45, 3.14159274])
-    scene.transmittances[1] = -3.4e38
-    write_ply(scene, tmp_path / "a.ply")
-    back = read_ply(tmp_path / "a.ply")
-    for name in PARAMETERS:
-        assert back.splats[name].numpy().tobytes() == scene.splats[name].numpy().tobytes()
-    assert back.training_poses.shape == (0, 4, 4)
-
-
-def test_a_scene_without_gaussians(tmp_path: Path, make_scene: Callable[..., GaussianScene]) -> None:
+def test_a_scene_without_gaussians(tmp_path, make_scene):
     scene = make_scene(0, poses=2)
     write_ply(scene, tmp_path / "a.ply")
     assert read_ply(tmp_path / "a.ply").to_bytes() == scene.to_bytes()
 
 
-def test_what_other_tools_find(tmp_path: Path, make_scene: Callable[..., GaussianScene]) -> None:
+def test_what_other_tools_find(tmp_path, make_scene):
     """Read as any reader of PLY would: by the types and names of the header alone."""
     scene = make_scene()
     write_ply(scene, tmp_path / "a.ply")
@@ -114,7 +91,7 @@ def test_what_other_tools_find(tmp_path: Path, make_scene: Callable[..., Gaussia
     np.testing.assert_array_equal(pose, scene.training_poses[0])
 
 
-def test_a_tool_may_reorder_and_take_gaussians_away(tmp_path: Path, make_scene: Callable[..., GaussianScene]) -> None:
+def test_a_tool_may_reorder_and_take_gaussians_away(tmp_path, make_scene):
     scene = make_scene()
     write_ply(scene, tmp_path / "a.ply")
     header, _, body = (tmp_path / "a.ply").read_bytes().partition(b"end_header\n")
@@ -135,38 +112,24 @@ def test_a_tool_may_reorder_and_take_gaussians_away(tmp_path: Path, make_scene: 
     [
         (b"ply\n", b"PLY\n", "does not begin like a PLY file"),
         (b"binary_little_endian", b"ascii", "its format is ascii 1.0, expected binary_little_endian 1.0"),
-        (b"binary_little_endian", b"binary_big_endian", "its format is binary_big_endian 1.0"),
         (b"format binary_little_endian 1.0\n", b"", "its format is missing"),
         (b"property float transmittance\n", b"", "its vertex lacks transmittance"),
-        (b"property float transmittance\n", b"property float opacity\n", "its vertex lacks transmittance"),
         (b"property float opacity\n", b"property float opacity\nproperty float x\n", "its vertex has a property twice"),
         (b"property float opacity\n", b"property float opacity\nproperty float nx\n", "its vertex has nx"),
-        (b"property float f_rest_2\n", b"", "its vertex has f_rest_0, f_rest_1"),
         (b"property float x\n", b"property double x\n", "its vertex property x is double, expected float"),
-        (b"property double m00\n", b"property float m00\n", "its training_pose property m00 is float"),
         (b"property float x\n", b"property list uchar int x\n", "a line that it cannot have"),
         (b"element vertex 7\n", b"", "a line that it cannot have|lacks"),
         (b"element vertex 7\n", b"element vertex 8\n", "it is truncated"),
-        (b"element vertex 7\n", b"element vertex 999999999999999\n", "it is truncated"),
-        (b"element vertex 7\n", b"element vertex -1\n", "a line that it cannot have"),
         (b"element vertex 7\n", b"element vertex " + b"9" * 5000 + b"\n", "a line that it cannot have"),
         (b"element vertex 7\n", b"element face 9\nelement vertex 7\n", "it has an element 'face'"),
         (b"element vertex 7\n", b"element vertex 6\n", "longer than its header says"),
         (b"end_header\n", b"", "its header has no end"),
         (b"comment ultragray", b"comment somebody", "not a PLY scene that can be read"),
-        (b'"intensity":"sigmoid"', b'"intensity":"unknown"', "intensity must be one of"),
         (b'"format_version":1', b'"format_version":9', "format_version is 9"),
         (b'"centre_mm":[12.5', b'"centre_mm":[1' + b"0" * 400, "."),
     ],
 )
-def test_a_wrong_header_is_named(
-    tmp_path: Path,
-    make_scene: Callable[..., GaussianScene],
-    monkeypatch: pytest.MonkeyPatch,
-    old: bytes,
-    new: bytes,
-    message: str,
-) -> None:
+def test_a_wrong_header_is_named(tmp_path, make_scene, monkeypatch, old, new, message):
     path = tmp_path / "scene.ply"
     monkeypatch.setattr(ply, "COMMENT_CHARACTERS", 10_000)
     write_ply(make_scene(intensity="sigmoid"), path)
@@ -174,7 +137,7 @@ def test_a_wrong_header_is_named(
     refused(path, message)
 
 
-def test_a_ply_of_something_else_is_named(tmp_path: Path) -> None:
+def test_a_ply_of_something_else_is_named(tmp_path):
     path = tmp_path / "scene.ply"
     path.write_bytes(b"ply\nformat binary_little_endian 1.0\nelement vertex 0\nproperty float x\nend_header\n")
     refused(path, "no comments `ultragray")
@@ -182,7 +145,7 @@ def test_a_ply_of_something_else_is_named(tmp_path: Path) -> None:
     refused(path, "lacks|elements are|nests too deeply")
 
 
-def test_values_that_cannot_be_are_named(file: Path) -> None:
+def test_values_that_cannot_be_are_named(file):
     content = file.read_bytes()
     body = content.index(b"end_header\n") + len(b"end_header\n")
     file.write_bytes(content[:body] + struct.pack("<f", float("nan")) + content[body + 4 :])
@@ -191,44 +154,8 @@ def test_values_that_cannot_be_are_named(file: Path) -> None:
     refused(file, r"training_poses\[2\] must end in the row 0 0 0 1")
 
 
-def test_files_that_are_not_there(tmp_path: Path) -> None:
+def test_files_that_are_not_there(tmp_path):
     refused(tmp_path / "none.ply", "no such file")
     refused(tmp_path, "no such file")
     os.mkfifo(tmp_path / "pipe.ply")
     refused(tmp_path / "pipe.ply", "no such file")
-
-
-@settings(max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
-@given(data=st.data())
-def test_no_file_does_anything_but_load_or_be_refused(file: Path, data: st.DataObject) -> None:
-    content = bytearray(file.read_bytes())
-    header = content.index(b"end_header\n")
-    hostile = file.with_name("hostile.ply")
-    words = [
-        b"0",
-        b"18446744073709551616",
-        b"-1",
-        b"element vertex 9\n",
-        b"property list a b c\n",
-        b"\0",
-        b"\xff",
-        b"{",
-    ]
-    for _ in range(data.draw(st.integers(1, 3))):
-        at = data.draw(st.integers(0, header + 12))
-        if data.draw(st.booleans()):
-            content[at : at + data.draw(st.integers(0, 40))] = data.draw(st.sampled_from(words))
-        else:
-            content = content[: data.draw(st.integers(0, len(content)))] + content[at : at + 30]
-    hostile.write_bytes(content)
-    with contextlib.suppress(SceneFileInvalid):  # any other error fails
-        read_ply(hostile)
-
-
-def test_a_file_that_cannot_be_written_leaves_nothing(tmp_path: Path, make_scene: Callable[..., GaussianScene]) -> None:
-    with pytest.raises(OSError, match="no_such_folder"):
-        write_ply(make_scene(), tmp_path / "no_such_folder" / "a.ply")
-    (tmp_path / "taken.ply").mkdir()
-    with pytest.raises(OSError, match="taken"):
-        write_ply(make_scene(), tmp_path / "taken.ply")
-    assert [path.name for path in tmp_path.iterdir()] == ["taken.ply"]

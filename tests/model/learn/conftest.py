@@ -1,14 +1,9 @@
 """A sweep small enough to train from in a second."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from typing import Any
-
 import numpy as np
 import pytest
 
-from ultragray import ConvexProbe, LinearProbe, Probe
+from ultragray import ConvexProbe, LinearProbe
 from ultragray.learn.sweep import Dataset, Sweep
 from ultragray.learn.training import TrainingConfig
 
@@ -16,9 +11,7 @@ LINEAR = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=25.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0)
 
 
-def make_tiny_dataset(
-    *, frames: int = 10, height: int = 20, width: int = 16, spacing_mm: float = 0.8, probe: Probe = LINEAR
-) -> Dataset:
+def make_tiny_dataset(*, frames=10, height=20, width=16, spacing_mm=0.8, probe=LINEAR):
     """A bright ball in grey noise, seen by a probe that moves along elevation; every fourth frame is held out."""
     poses = np.tile(np.eye(4), (frames, 1, 1))
     poses[:, :3, 3] = (30.0, -20.0, 10.0)
@@ -31,28 +24,34 @@ def make_tiny_dataset(
     numbers = np.arange(frames)
     held_out = numbers % 4 == 2
 
-    def part(chosen: np.ndarray) -> Sweep:
+    def part(chosen):
         return Sweep(images[chosen], poses[chosen], probe, numbers[chosen], "tiny")
 
     return Dataset("tiny", part(~held_out), part(held_out))
 
 
-def make_tiny_config(**settings: Any) -> TrainingConfig:
-    values = {"steps": 24, "max_gaussians": 60, "batch_size": 3, "sh_start": 0.25, "refinements": 3}
-    return TrainingConfig.preset("fast", **{**values, **settings})
+def make_tiny_config(**settings):
+    values = {
+        "steps": 24,
+        "max_gaussians": 60,
+        "batch_size": 3,
+        "sh_start": 0.25,
+        "refinements": 3,
+        "confidence": False,
+    }
+    return TrainingConfig.preset("fast", **{**values, "confidence": False, **settings})
 
 
 @pytest.fixture
-def tiny_dataset() -> Callable[..., Dataset]:
+def tiny_dataset():
     return make_tiny_dataset
 
 
 @pytest.fixture
-def tiny_config() -> Callable[..., TrainingConfig]:
+def tiny_config():
     return make_tiny_config
 
 
 @pytest.fixture(params=[LINEAR, CONVEX], ids=["linear", "convex"])
-def probe(request: pytest.FixtureRequest) -> Probe:
-    chosen: Probe = request.param
-    return chosen
+def probe(request):
+    return request.param

@@ -1,11 +1,6 @@
 """The phantom as a dataset: which poses it is scanned from, and that these are the frames it holds."""
 
-from __future__ import annotations
-
-from typing import Any
-
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from ultragray.errors import InvalidArgument
@@ -13,12 +8,12 @@ from ultragray.geometry.pose import check_poses
 from ultragray.phantom import PHANTOM_PROBE, freehand_poses, load_phantom, sweeps
 
 
-def tilts_deg(poses: npt.NDArray[np.float64]) -> npt.NDArray[np.float64]:
+def tilts_deg(poses):
     """Angle of each beam from the depth axis along the spine."""
     return np.degrees(np.arctan2(-poses[:, 1, 2], poses[:, 2, 2]))
 
 
-def test_the_straight_sweep_is_rigid_even_and_centred() -> None:
+def test_the_straight_sweep_is_rigid_even_and_centred():
     poses = freehand_poses(91)
     np.testing.assert_allclose(check_poses(poses), poses, atol=1e-12)
     np.testing.assert_allclose(np.diff(poses[:, 1, 3]), 72.0 / 90, atol=1e-9)
@@ -26,7 +21,7 @@ def test_the_straight_sweep_is_rigid_even_and_centred() -> None:
     assert np.abs(tilts_deg(poses)).max() < 5.0
 
 
-def test_tilt_and_offset_are_what_was_asked_for() -> None:
+def test_tilt_and_offset_are_what_was_asked_for():
     poses = freehand_poses(61, tilt_deg=9.0, offset_mm=2.0)
     assert tilts_deg(poses).mean() == pytest.approx(9.0, abs=0.5)
     assert poses[:, 0, 3].mean() == pytest.approx(2.0, abs=0.1)
@@ -34,14 +29,14 @@ def test_tilt_and_offset_are_what_was_asked_for() -> None:
     assert np.abs(swayed - poses).max() > 0.5
 
 
-def test_counts() -> None:
+def test_counts():
     assert [freehand_poses(count).shape for count in (0, 1, 8)] == [(0, 4, 4), (1, 4, 4), (8, 4, 4)]
     with pytest.raises(InvalidArgument, match="count"):
         freehand_poses(-1)
 
 
-def test_load_phantom_holds_out_a_sweep_at_a_tilt_of_its_own(monkeypatch: pytest.MonkeyPatch) -> None:
-    def numbered(poses: npt.NDArray[np.float64], *, height: int, width: int, **_: Any) -> npt.NDArray[np.uint8]:
+def test_load_phantom_holds_out_a_sweep_at_a_tilt_of_its_own(monkeypatch):
+    def numbered(poses, *, height, width, **_):
         frames = np.zeros((len(poses), height, width), dtype=np.uint8)
         frames[:, 0, 0] = 1 + np.arange(len(poses)) % 255
         return frames

@@ -8,23 +8,21 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
-from torch import Tensor
 
 from ultragray import LinearProbe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.errors import MemoryExceeded
-from ultragray.geometry.probe import FloatArray, Probe
 from ultragray_studies.comparison.run import EQUAL_TIME
 from ultragray_studies.methods.classical import Compounding, FromFrames
 from ultragray_studies.methods.gaussians import SceneMethod
-from ultragray_studies.methods.learner import Learned, LearnedMethod, Learner
-from ultragray_studies.methods.method import Budget, Description, FitRun, Fitted, Method, Pace, Paces
+from ultragray_studies.methods.learner import LearnedMethod, Learner
+from ultragray_studies.methods.method import Description, Method, Pace, Paces
 
 FRAMES, SIDE = 12, 16
 
 
 @pytest.fixture
-def dataset() -> Dataset:
+def dataset():
     """A ball in noise; every third frame is held out, at growing distances from the training frames."""
     poses = np.tile(np.eye(4), (FRAMES, 1, 1))
     poses[:, 1, 3] = 0.5 * np.arange(FRAMES) + 0.03 * np.arange(FRAMES) ** 2
@@ -41,17 +39,17 @@ def dataset() -> Dataset:
 class OneLevel(Learner):
     """A single grey level for all pixels of all frames."""
 
-    def __init__(self, dataset: Dataset, seed: int, device: torch.device) -> None:
+    def __init__(self, dataset, seed, device):
         super().__init__(dataset, seed, device)
         self.level = torch.nn.Parameter(torch.zeros(1, device=device))
         self.module = torch.nn.ParameterList([self.level])
         self.optimizers = {"level": torch.optim.Adam(self.module.parameters(), lr=0.02)}
 
-    def loss(self, step: int, steps: int) -> Tensor:
+    def loss(self, step, steps):
         place = torch.randint(len(self.images), (1,), generator=self.generator)
         return (self.image(int(place)) - self.level).square().mean()
 
-    def frame(self, probe: Probe, pose: FloatArray, height: int, width: int) -> Tensor:
+    def frame(self, probe, pose, height, width):
         return self.level.detach().expand(height, width)
 
 
@@ -62,13 +60,13 @@ class LevelMethod(LearnedMethod):
     name: str = "level"
     fits: list[Path | None] = field(default_factory=list, compare=False)
 
-    def describe(self) -> Description:
+    def describe(self):
         return Description("one level", "a test & no paper", "Grey.", ("B = g_0",), ("g from 0.",), 1_000)
 
-    def learner(self, dataset: Dataset, budget: Budget, seed: int, device: torch.device) -> Learner:
+    def learner(self, dataset, budget, seed, device):
         return OneLevel(dataset, seed, device)
 
-    def fit(self, dataset: Dataset, budget: Budget, run: FitRun | None = None) -> Learned | None:
+    def fit(self, dataset, budget, run=None):
         self.fits.append(None if run is None else run.folder)
         return super().fit(dataset, budget, run)
 
@@ -78,31 +76,31 @@ class FailingMethod(Method):
 
     name = "failing"
 
-    def describe(self) -> Description:
+    def describe(self):
         return Description("one that fails", "a test", "Nothing.")
 
-    def fit(self, dataset: Dataset, budget: Budget, run: FitRun | None = None) -> Fitted:
+    def fit(self, dataset, budget, run=None):
         raise MemoryExceeded("it needs 9 GB & more")
 
 
 @pytest.fixture
-def scene_method() -> SceneMethod:
+def scene_method():
     return SceneMethod(settings={"steps": 4, "max_gaussians": 40, "batch_size": 2})
 
 
 @pytest.fixture
-def level() -> LevelMethod:
+def level():
     return LevelMethod()
 
 
 @pytest.fixture
-def methods(scene_method: SceneMethod, level: LevelMethod) -> dict[str, Method]:
+def methods(scene_method, level):
     found = (scene_method, Compounding("median"), FromFrames("nearest"), level, FailingMethod())
     return {method.name: method for method in found}
 
 
 @pytest.fixture
-def paces() -> Paces:
+def paces():
     """A machine on which the equal time holds 40 steps of the learned method, whatever the clock says."""
     paces = Paces()
     paces.keep(EQUAL_TIME, Pace(2.0, 0.0))

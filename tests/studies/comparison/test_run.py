@@ -1,43 +1,34 @@
 """A comparison as a whole: the same table from the same call, and nothing done twice."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from ultragray.datasets import Dataset
 from ultragray.errors import DatasetInvalid, InvalidArgument, TrainingStateInvalid
 from ultragray.learn.evaluation.methods import ComparisonSettings
 from ultragray.learn.evaluation.scoring import evaluate_frames
-from ultragray_studies.comparison.result import Comparison
-from ultragray_studies.comparison.run import EQUAL_TIME, ComparisonProgress, compare_methods, default_paces, frames_of
+from ultragray.learn.sweep import Distances
+from ultragray_studies.comparison.run import EQUAL_TIME, compare_methods, default_paces, frames_of
 from ultragray_studies.methods.classical import FromFrames
-from ultragray_studies.methods.method import Method, Pace, Paces
+from ultragray_studies.methods.method import Pace, Paces
 from ultragray_studies.methods.registry import chosen_methods
 
 from .conftest import LevelMethod
 
 
-def table(comparison: Comparison | None) -> list[dict[str, Any]]:
+def table(comparison):
     """All of the rows but their timings."""
-    assert comparison is not None
     rows = [row.to_dict() for row in comparison.results]
     return [{key: value for key, value in row.items() if key not in ("seconds", "frame_ms")} for row in rows]
 
 
-def test_each_method_is_a_row_and_one_that_fails_says_why(
-    dataset: Dataset, methods: dict[str, Method], paces: Paces, tmp_path: Path
-) -> None:
-    seen: list[ComparisonProgress] = []
+def test_each_method_is_a_row_and_one_that_fails_says_why(dataset, methods, paces, tmp_path):
+    seen = []
     found = compare_methods(
         dataset, methods, ComparisonSettings(), folder=tmp_path / "run", paces=paces, report=seen.append
     )
-    assert found is not None
     assert [row.name for row in found.results] == list(methods)
     assert found.failures == {"failing": "it needs 9 GB & more"}
     assert list(found.measured) == ["scene", "median", "nearest", "level"]
@@ -53,27 +44,12 @@ def test_each_method_is_a_row_and_one_that_fails_says_why(
         assert again.mean.psnr_db == pytest.approx(evaluation.mean.psnr_db, abs=0.1)  # bytes, rounded
 
 
-def test_two_runs_give_the_same_table(
-    dataset: Dataset, methods: dict[str, Method], paces: Paces, tmp_path: Path
-) -> None:
-    settings = ComparisonSettings(seed=7)
-    runs = [compare_methods(dataset, methods, settings, folder=tmp_path / name, paces=paces) for name in ("one", "two")]
-    assert table(runs[0]) == table(runs[1])
-
-
-@pytest.mark.parametrize("stop_at", [("scene", 2), ("level", 1), ("level", 25)])
-def test_a_killed_comparison_goes_on_and_repeats_nothing(
-    stop_at: tuple[str, int],
-    dataset: Dataset,
-    methods: dict[str, Method],
-    level: LevelMethod,
-    paces: Paces,
-    tmp_path: Path,
-) -> None:
+@pytest.mark.parametrize("stop_at", [("scene", 2), ("level", 25)])
+def test_a_killed_comparison_goes_on_and_repeats_nothing(stop_at, dataset, methods, level, paces, tmp_path):
     class Killed(BaseException):
         pass
 
-    def kill(state: ComparisonProgress) -> None:
+    def kill(state):
         if state.fit is not None and (state.method, state.fit.step) == stop_at:
             raise Killed
 
@@ -83,7 +59,7 @@ def test_a_killed_comparison_goes_on_and_repeats_nothing(
     folder = tmp_path / "killed"
     with pytest.raises(Killed):
         compare_methods(dataset, methods, settings, folder=folder, paces=paces, report=kill)
-    seen: list[ComparisonProgress] = []
+    seen = []
     found = compare_methods(dataset, methods, settings, folder=folder, paces=paces, report=seen.append)
     assert table(found) == table(undisturbed)
     done = list(methods)[: list(methods).index(stop_at[0])]
@@ -91,30 +67,10 @@ def test_a_killed_comparison_goes_on_and_repeats_nothing(
     fits = len(level.fits)
     again = compare_methods(dataset, methods, settings, folder=folder, paces=paces)
     assert len(level.fits) == fits
-    assert again is not None
-    assert found is not None
     assert [row.seconds for row in again.results] == [row.seconds for row in found.results]
 
 
-@pytest.mark.slow
-def test_a_comparison_that_is_told_to_stop_leaves_a_checkpoint_to_go_on_from(
-    dataset: Dataset, methods: dict[str, Method], paces: Paces, tmp_path: Path
-) -> None:
-    seen: list[ComparisonProgress] = []
-    options: dict[str, Any] = {"folder": tmp_path, "paces": paces, "report": seen.append}
-    settings = ComparisonSettings()
-    stopped = compare_methods(
-        dataset, methods, settings, should_stop=lambda: sum(one.method == "level" for one in seen) == 11, **options
-    )
-    assert stopped is None
-    seen.clear()
-    assert compare_methods(dataset, methods, settings, **options) is not None
-    assert [one.fit.step for one in seen if one.method == "level" and one.fit] == list(range(11, 41))
-
-
-def test_a_folder_of_another_comparison_is_refused(
-    dataset: Dataset, methods: dict[str, Method], paces: Paces, tmp_path: Path
-) -> None:
+def test_a_folder_of_another_comparison_is_refused(dataset, methods, paces, tmp_path):
     few = {"median": methods["median"]}
     settings = ComparisonSettings()
     assert compare_methods(dataset, few, settings, folder=tmp_path, paces=paces) is not None
@@ -131,22 +87,8 @@ def test_a_folder_of_another_comparison_is_refused(
         compare_methods(dataset, few, settings, folder=tmp_path, paces=paces)
 
 
-def test_methods_may_be_added_to_a_comparison_later(
-    dataset: Dataset, methods: dict[str, Method], level: LevelMethod, paces: Paces, tmp_path: Path
-) -> None:
-    settings = ComparisonSettings()
-    compare_methods(dataset, {"level": level}, settings, folder=tmp_path, paces=paces)
-    both = {"nearest": FromFrames("nearest"), "level": level}
-    found = compare_methods(dataset, both, settings, folder=tmp_path, paces=paces)
-    assert found is not None
-    assert [row.name for row in found.results] == ["nearest", "level"]
-    assert len(level.fits) == 1
-
-
 @pytest.mark.slow
-def test_the_scene_is_fitted_where_the_equal_time_is_not_known_and_only_there(
-    dataset: Dataset, level: LevelMethod, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_scene_is_fitted_where_the_equal_time_is_not_known_and_only_there(dataset, level, tmp_path, monkeypatch):
     from ultragray_studies.comparison import run
     from ultragray_studies.methods.gaussians import SceneMethod
 
@@ -156,7 +98,6 @@ def test_the_scene_is_fitted_where_the_equal_time_is_not_known_and_only_there(
     paces = Paces()
     settings = ComparisonSettings(times=0.5)
     first = compare_methods(dataset, {"level": level}, settings, folder=tmp_path / "one", paces=paces)
-    assert first is not None
     assert [row.name for row in first.results] == ["level"], "the scene is no row: nobody asked for it"
     assert (tmp_path / "one" / "scene" / "scene.ugr").exists()
     assert first.budget_s is not None
@@ -169,17 +110,16 @@ def test_the_scene_is_fitted_where_the_equal_time_is_not_known_and_only_there(
     assert table(same_folder) == table(first)
 
 
-def test_where_the_scene_fails_there_is_no_equal_time(dataset: Dataset, level: LevelMethod, tmp_path: Path) -> None:
+def test_where_the_scene_fails_there_is_no_equal_time(dataset, level, tmp_path):
     from ultragray.errors import TrainingDiverged
     from ultragray_studies.methods.gaussians import SceneMethod
 
     class Diverging(SceneMethod):
-        def fit(self, *arguments: Any, **options: Any) -> Any:
+        def fit(self, *arguments, **options):
             raise TrainingDiverged("the loss is nan")
 
     methods = {"scene": Diverging(), "nearest": FromFrames("nearest"), "level": level}
     found = compare_methods(dataset, methods, ComparisonSettings(), folder=tmp_path, paces=Paces())
-    assert found is not None
     assert found.failures == {
         "scene": "the loss is nan",
         "level": "there is no equal time, since the scene failed",
@@ -187,37 +127,33 @@ def test_where_the_scene_fails_there_is_no_equal_time(dataset: Dataset, level: L
     assert list(found.measured) == ["nearest"]
 
 
-def test_classical_methods_need_no_scene(dataset: Dataset, tmp_path: Path) -> None:
+def test_classical_methods_need_no_scene(dataset, tmp_path):
     chosen = chosen_methods(("nearest", "median"))
     found = compare_methods(dataset, chosen, ComparisonSettings(), folder=tmp_path)
-    assert found is not None
     assert [row.name for row in found.results] == ["median", "nearest"]
     assert found.budget_s is None
 
 
-def test_the_authors_steps_are_those_of_the_author(dataset: Dataset, level: LevelMethod, tmp_path: Path) -> None:
+def test_the_authors_steps_are_those_of_the_author(dataset, level, tmp_path):
     found = compare_methods(dataset, {"level": level}, ComparisonSettings(budget="author"), folder=tmp_path)
-    assert found is not None
     assert (found.results[0].steps, found.results[0].title, found.budget_s) == (1_000, "one level", None)
 
 
-def test_without_held_out_frames_nothing_begins(dataset: Dataset, tmp_path: Path) -> None:
+def test_without_held_out_frames_nothing_begins(dataset, tmp_path):
     nothing = replace(dataset, val=dataset.val.select([]))
     with pytest.raises(DatasetInvalid, match="no frames to measure with"):
         compare_methods(nothing, chosen_methods(("all",)), ComparisonSettings(), folder=tmp_path / "none")
     assert not (tmp_path / "none").exists()
 
 
-def test_settings_refuse_what_is_not_there() -> None:
+def test_settings_refuse_what_is_not_there():
     with pytest.raises(InvalidArgument, match=r"methods must be some of all, scene, .* got 'nerf'"):
         ComparisonSettings(methods=("scene", "nerf"))
     with pytest.raises(InvalidArgument, match="budget must be one of equal, author, got 'none'"):
         ComparisonSettings(budget="none")
 
 
-def test_paces_are_kept_for_later_and_a_place_that_cannot_be_written_is_no_error(
-    dataset: Dataset, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_paces_are_kept_for_later_and_a_place_that_cannot_be_written_is_no_error(dataset, tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     default_paces(dataset).keep(EQUAL_TIME, Pace(3.0, 0.0))
     assert default_paces(dataset).known(EQUAL_TIME) == Pace(3.0, 0.0)
@@ -229,3 +165,10 @@ def test_paces_are_kept_for_later_and_a_place_that_cannot_be_written_is_no_error
     paces = default_paces(dataset)
     paces.keep(EQUAL_TIME, Pace(3.0, 0.0))
     assert paces.known(EQUAL_TIME) == Pace(3.0, 0.0)
+
+
+def test_distances_are_those_to_the_nearest_training_frame(dataset):
+    found = Distances.of(dataset)
+    places = dataset.val.poses[:, 1, 3][:, None] - dataset.train.poses[:, 1, 3][None]
+    np.testing.assert_allclose(found.mm, np.abs(places).min(axis=1), atol=1e-12)
+    np.testing.assert_allclose(found.deg, 0.0, atol=1e-6)

@@ -1,36 +1,30 @@
 """The environment by gymnasium's own checker, what it shows and rewards, and its seeds."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import gymnasium
 import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, render
+from ultragray import ConvexProbe, LinearProbe, render
 from ultragray.errors import InvalidArgument, InvalidPose, InvalidProbe
 from ultragray.rendering.contact import Skin, Touch
 from ultragray.rendering.pixels import to_uint8
 from ultragray.rendering.settings import Contact
 from ultragray_studies.gym import STANDARD_PLANE, StandardPlaneEnv
-from ultragray_studies.gym.standard_plane import StandardPlaneSettings, moved
+from ultragray_studies.gym.standard_plane import moved
 
 LINEAR = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 CONVEX = ConvexProbe(opening_angle_deg=50.0, near_mm=20.0, far_mm=60.0)
 SMALL = {"height": 24, "width": 20, "start_mm": 4.0, "start_deg": 5.0}
-GOAL = 4  # of nine training views
 FAR_AWAY = np.eye(4)
 FAR_AWAY[1, 3] = 5000.0
 
 
 @pytest.fixture(scope="module", params=[LINEAR, CONVEX], ids=["linear", "convex"])
-def scene(request: pytest.FixtureRequest, random_scene: Callable[..., GaussianScene]) -> GaussianScene:
-    probe: Probe = request.param
+def scene(request, random_scene):
+    probe = request.param
     views = np.stack([np.eye(4)] * 9)
     views[:, 1, 3] = np.linspace(-8.0, 8.0, 9)
     views[:, 2, 3] = -probe.face_depth_mm
@@ -38,13 +32,13 @@ def scene(request: pytest.FixtureRequest, random_scene: Callable[..., GaussianSc
 
 
 @pytest.fixture
-def env(scene: GaussianScene) -> StandardPlaneEnv:
+def env(scene):
     return StandardPlaneEnv(scene, **SMALL)
 
 
 @pytest.mark.parametrize("with_pose", [False, True])
 @pytest.mark.parametrize("contact", [None, *Contact])
-def test_gymnasiums_checker_is_content(scene: GaussianScene, with_pose: bool, contact: Contact | None) -> None:
+def test_gymnasiums_checker_is_content(scene, with_pose, contact):
     """And warns of nothing: warnings are errors here."""
     made = gymnasium.make(
         STANDARD_PLANE, scene=scene, render_mode="rgb_array", with_pose=with_pose, contact=contact, **SMALL
@@ -52,10 +46,10 @@ def test_gymnasiums_checker_is_content(scene: GaussianScene, with_pose: bool, co
     check_env(made.unwrapped)
 
 
-def test_it_is_made_by_name_from_a_file(scene: GaussianScene, tmp_path: Path) -> None:
+def test_it_is_made_by_name_from_a_file(scene, tmp_path):
     scene.save(tmp_path / "scene.ugr")
     made = gymnasium.make(STANDARD_PLANE, scene=tmp_path / "scene.ugr", goal=2, contact="air", **SMALL)
-    unwrapped: Any = made.unwrapped
+    unwrapped = made.unwrapped
     np.testing.assert_array_equal(unwrapped.goal, scene.training_poses[2])
     observation, _ = made.reset(seed=1)
     assert observation.shape == (24, 20, 1)
@@ -63,8 +57,8 @@ def test_it_is_made_by_name_from_a_file(scene: GaussianScene, tmp_path: Path) ->
     assert ends == [False] * 199 + [True]
 
 
-def test_the_same_seed_is_the_same_episode(scene: GaussianScene) -> None:
-    def episode(seed: int) -> tuple[list[np.ndarray], list[float]]:
+def test_the_same_seed_is_the_same_episode(scene):
+    def episode(seed):
         made = StandardPlaneEnv(scene, **SMALL)
         made.action_space.seed(seed)
         frames, rewards = [made.reset(seed=seed)[0]], []
@@ -81,7 +75,7 @@ def test_the_same_seed_is_the_same_episode(scene: GaussianScene) -> None:
     assert not np.array_equal(frames[0], episode(4)[0][0])
 
 
-def test_starts_lie_around_the_goal_and_touch_the_skin(env: StandardPlaneEnv, scene: GaussianScene) -> None:
+def test_starts_lie_around_the_goal_and_touch_the_skin(env, scene):
     skin, probe = Skin.under(scene.training_poses, scene.info.probe), scene.info.probe_or(None)
     infos = [env.reset(seed=seed)[1] for seed in range(40)]
     assert max(info["distance_mm"] for info in infos) <= 4.0 + 1e-9
@@ -92,13 +86,13 @@ def test_starts_lie_around_the_goal_and_touch_the_skin(env: StandardPlaneEnv, sc
         assert info["contact_share"] == Touch.of(skin, probe, info["pose"], 20).shares[0] >= 0.5
 
 
-def test_the_frame_is_the_librarys(env: StandardPlaneEnv, scene: GaussianScene) -> None:
+def test_the_frame_is_the_librarys(env, scene):
     frame, info = env.reset(seed=0)
     expected = render(scene, None, info["pose"], height=24, width=20, outputs=("bmode",), contact=Contact.AIR)
     np.testing.assert_array_equal(frame[..., 0], to_uint8(expected["bmode"][0].numpy()))
 
 
-def test_an_action_moves_the_face_in_the_probes_frame(scene: GaussianScene) -> None:
+def test_an_action_moves_the_face_in_the_probes_frame(scene):
     env = StandardPlaneEnv(scene, step_mm=2.0, step_deg=3.0, **SMALL)
     pivot = scene.info.probe_or(None).pivot_depth_mm
     _, info = env.reset(seed=5)
@@ -115,7 +109,7 @@ def test_an_action_moves_the_face_in_the_probes_frame(scene: GaussianScene) -> N
     np.testing.assert_allclose(before[:3, :3].T @ (clipped - before)[:3, 3], [2.0, 0.0, 0.0], atol=1e-6)
 
 
-def test_the_goal_is_the_best_place_and_ends_the_episode(env: StandardPlaneEnv) -> None:
+def test_the_goal_is_the_best_place_and_ends_the_episode(env):
     away = moved(env.goal, np.array([0.0, 3.0, 0.0]), np.zeros(3), 0.0)
     _, info = env.reset(options={"pose": away})
     assert info["distance_mm"] == pytest.approx(3.0)
@@ -131,7 +125,7 @@ def test_the_goal_is_the_best_place_and_ends_the_episode(env: StandardPlaneEnv) 
     assert ends == [False, True]
 
 
-def test_the_goal_is_not_reached_in_the_air(scene: GaussianScene) -> None:
+def test_the_goal_is_not_reached_in_the_air(scene):
     env = StandardPlaneEnv(scene, reached_mm=5.0, **SMALL)
     still = np.zeros(6)
     env.reset(options={"pose": moved(env.goal, np.array([0.0, 0.0, -3.0]), np.zeros(3), 0.0)})
@@ -140,22 +134,14 @@ def test_the_goal_is_not_reached_in_the_air(scene: GaussianScene) -> None:
     assert env.step(still)[2]
 
 
-def test_lost_contact_costs(env: StandardPlaneEnv) -> None:
-    env.reset(options={"pose": moved(env.goal, np.array([0.0, 0.0, -9.0]), np.zeros(3), 0.0)})
-    frame, reward, _, _, info = env.step(np.zeros(6))
-    assert info["contact_share"] == 0.0
-    assert frame.max() == 0
-    assert reward == pytest.approx(-2.0)
-
-
-def test_the_probe_stays_around_the_goal(env: StandardPlaneEnv) -> None:
+def test_the_probe_stays_around_the_goal(env):
     env.reset(seed=0)
     for _ in range(40):
         info = env.step(np.array([0.0, 2.0, 0.0, 0.0, 0.0, 0.0]))[4]
     assert 2 * 4.0 + 10.0 - 2.0 < info["distance_mm"] <= 2 * 4.0 + 10.0
 
 
-def test_the_pose_is_told_from_the_start_on(scene: GaussianScene) -> None:
+def test_the_pose_is_told_from_the_start_on(scene):
     made = StandardPlaneEnv(scene, with_pose=True, **SMALL)
     observation, info = made.reset(seed=2)
     np.testing.assert_allclose(observation["pose"], [0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1], atol=1e-6)
@@ -166,30 +152,19 @@ def test_the_pose_is_told_from_the_start_on(scene: GaussianScene) -> None:
     np.testing.assert_allclose(observation["pose"][3:].reshape(3, 3), relative[:3, :3], atol=1e-5)
 
 
-def test_pictures_show_frame_and_goal(scene: GaussianScene) -> None:
+def test_pictures_show_frame_and_goal(scene):
     made = StandardPlaneEnv(scene, render_mode="rgb_array", **SMALL)
     frame, _ = made.reset(seed=0)
     picture = made.render()
-    assert picture is not None
     assert picture.shape == (24, 40, 3)
     np.testing.assert_array_equal(picture[:, :20, 1], frame[..., 0])
     made.reset(options={"pose": made.goal})
     again = made.render()
-    assert again is not None
     np.testing.assert_array_equal(again[:, :20], again[:, 20:])
     assert StandardPlaneEnv(scene, **SMALL).render() is None
 
 
-def test_many_at_once(scene: GaussianScene) -> None:
-    many = gymnasium.make_vec(STANDARD_PLANE, num_envs=3, vectorization_mode="sync", scene=scene, **SMALL)
-    frames, _ = many.reset(seed=7)
-    assert frames.shape == (3, 24, 20, 1)
-    frames, rewards, *_ = many.step(many.action_space.sample())
-    assert rewards.shape == (3,)
-    many.close()
-
-
-def test_a_scene_without_skin_is_scanned_with_assumed_contact(random_scene: Callable[..., GaussianScene]) -> None:
+def test_a_scene_without_skin_is_scanned_with_assumed_contact(random_scene):
     bare = random_scene(50, info={"probe": LINEAR})
     with pytest.raises(InvalidArgument, match="contact needs a scene"):
         StandardPlaneEnv(bare, np.eye(4), **SMALL).reset(seed=0)
@@ -202,29 +177,26 @@ def test_a_scene_without_skin_is_scanned_with_assumed_contact(random_scene: Call
     [
         ({"goal": 9}, InvalidArgument, "0 to 8, got 9"),
         ({"goal": np.eye(3)}, InvalidPose, "goal must have shape"),
-        ({"goal": "middle"}, InvalidPose, "goal must hold real numbers"),
-        ({"goal": True}, InvalidPose, "goal must hold real numbers, got bool"),
         ({"goal": FAR_AWAY}, InvalidArgument, "goal must be a pose, in mm, from which the scene shows something"),
         ({"probe": {"kind": "linear"}}, InvalidProbe, "probe must be a Probe, such as LinearProbe"),
         ({"render_mode": "human"}, InvalidArgument, "render_mode must be rgb_array or None, got 'human'"),
-        ({"step_mm": 0.0}, InvalidArgument, "step_mm must be a finite number above 0"),
         ({"contact": "gel"}, InvalidArgument, "contact must be one of air, pressure, got 'gel'"),
         ({"colour": True}, TypeError, "colour"),
     ],
 )
-def test_mistakes_are_told(scene: GaussianScene, given: dict[str, Any], error: type[Exception], match: str) -> None:
+def test_mistakes_are_told(scene, given, error, match):
     with pytest.raises(error, match=match):
         StandardPlaneEnv(scene, **{**SMALL, **given})
 
 
-def test_an_action_must_be_six_numbers(env: StandardPlaneEnv) -> None:
+def test_an_action_must_be_six_numbers(env):
     env.reset(seed=0)
     for action in (np.zeros(5), np.full(6, np.nan), "up", ["a"] * 6, [[0, 0, 0], [0, 0]], None):
         with pytest.raises(InvalidArgument, match="an action must be 6 finite numbers"):
             env.step(action)
 
 
-def test_a_start_must_be_one_from_which_the_goal_can_be_reached(env: StandardPlaneEnv) -> None:
+def test_a_start_must_be_one_from_which_the_goal_can_be_reached(env):
     with pytest.raises(
         InvalidArgument, match=r"options\.pose must be within 18 mm and 20° of the goal, got 5000\.0 mm"
     ):
@@ -233,13 +205,3 @@ def test_a_start_must_be_one_from_which_the_goal_can_be_reached(env: StandardPla
         env.reset(options={"pose": "here"})
     with pytest.raises(InvalidArgument, match="options may hold pose alone, got poes"):
         env.reset(options={"poes": env.goal})
-
-
-def test_a_scene_without_a_probe_needs_one(random_scene: Callable[..., GaussianScene]) -> None:
-    with pytest.raises(InvalidProbe):
-        StandardPlaneEnv(random_scene(20), np.eye(4), **SMALL)
-
-
-def test_the_settings_say_how_far_it_gets() -> None:
-    settings = StandardPlaneSettings(start_mm=5.0, start_deg=85.0)
-    assert (settings.reach_mm, settings.reach_deg) == (20.0, 180.0)

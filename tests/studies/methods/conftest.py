@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import pytest
 import torch
-from torch import Tensor, nn
+from torch import nn
 
 from ultragray import LinearProbe
-from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.sweep import Dataset, Sweep
 from ultragray_studies.methods.learner import LearnedMethod, Learner
-from ultragray_studies.methods.method import Budget, Description
+from ultragray_studies.methods.method import Description
 
 SIDE = 32
 PROBE = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=20.0)
@@ -23,20 +21,19 @@ PROBE = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=20.0)
 class _Image(Learner):
     """The mean of the frames, learned pixel by pixel with a little noise, so that the generator matters."""
 
-    def __init__(self, dataset: Dataset, seed: int, device: torch.device) -> None:
+    def __init__(self, dataset, seed, device):
         super().__init__(dataset, seed, device)
         start = torch.rand(self.images.shape[1:], generator=self.generator)
         self.module = nn.ParameterDict({"image": nn.Parameter(start.to(device))})
         self.optimizers = {"adam": torch.optim.Adam(self.module.parameters(), lr=0.05)}
 
-    def loss(self, step: int, steps: int) -> Tensor:
+    def loss(self, step, steps):
         place = int(torch.randint(len(self.images), (), generator=self.generator))
         noise = 0.01 * torch.rand(self.images.shape[1:], generator=self.generator)
         return (self.module["image"] + noise - self.image(place)).square().mean()
 
-    def frame(self, probe: Probe, pose: FloatArray, height: int, width: int) -> Tensor:
-        image: Tensor = self.module["image"]
-        return image
+    def frame(self, probe, pose, height, width):
+        return self.module["image"]
 
 
 @dataclass(frozen=True)
@@ -45,23 +42,23 @@ class MeanImage(LearnedMethod):
 
     name: str = "mean-image"
 
-    def describe(self) -> Description:
+    def describe(self):
         return Description("Mean image", "these tests", "One image for all poses.", published_steps=200)
 
-    def learner(self, dataset: Dataset, budget: Budget, seed: int, device: torch.device) -> _Image:
+    def learner(self, dataset, budget, seed, device):
         return _Image(dataset, seed, device)
 
 
 @pytest.fixture
-def mean_image() -> MeanImage:
+def mean_image():
     return MeanImage()
 
 
 @pytest.fixture
-def make_dataset() -> Callable[..., Dataset]:
+def make_dataset():
     """A sweep along elevation through a ball in grey noise; every fourth frame is held out."""
 
-    def make(frames: int = 8, side: int = SIDE) -> Dataset:
+    def make(frames=8, side=SIDE):
         poses = np.tile(np.eye(4), (frames, 1, 1))
         poses[:, 1, 3] = 0.8 * np.arange(frames)
         x, z = np.meshgrid(np.linspace(-1, 1, side), np.linspace(0, 1, side))
@@ -70,7 +67,7 @@ def make_dataset() -> Callable[..., Dataset]:
         images = np.clip(ball + noise, 0, 255).astype(np.uint8)
         held_out = np.arange(frames) % 4 == 2
 
-        def part(chosen: np.ndarray) -> Sweep:
+        def part(chosen):
             return Sweep(images[chosen], poses[chosen], PROBE, np.arange(frames)[chosen], "tiny")
 
         return Dataset("tiny", part(~held_out), part(held_out))

@@ -1,39 +1,31 @@
-"""Fits of learned methods: interrupted ones end as undisturbed ones, folders of others are refused."""
-
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
+"""Fits of learned methods within their budgets: interrupted ones end as undisturbed ones."""
 
 import numpy as np
 import pytest
 import torch
 
-from ultragray.errors import TrainingDiverged, TrainingStateInvalid
-from ultragray.learn.sweep import Dataset
-from ultragray_studies.methods.learner import MODEL_FILE, STATE_FILE
-from ultragray_studies.methods.method import Budget, FitProgress, FitRun, Pace
+from ultragray.errors import InvalidArgument, TrainingDiverged, TrainingStateInvalid
+from ultragray_studies.methods.learner import MODEL_FILE, STATE_FILE, without_subnormals
+from ultragray_studies.methods.method import Budget, FitRun, Pace, Paces
 
-from .conftest import SIDE, MeanImage
+from .conftest import SIDE
 
 AUTHOR = Budget.author()
 
 
-def frames_of(method: MeanImage, dataset: Dataset, run: FitRun | None = None) -> np.ndarray:
+def frames_of(method, dataset, run=None):
     fitted = method.fit(dataset, AUTHOR, run)
-    assert fitted is not None
     return fitted.render(dataset.probe, dataset.val.poses, SIDE, SIDE)
 
 
-def stopping_after(steps: int, told: list[FitProgress], **options: object) -> FitRun:
-    return FitRun(report=told.append, should_stop=lambda: len(told) == steps, **options)  # type: ignore[arg-type]
+def stopping_after(steps, told, **options):
+    return FitRun(report=told.append, should_stop=lambda: len(told) == steps, **options)
 
 
-def test_a_fit_learns_and_tells_its_cost(mean_image: MeanImage, make_dataset: Callable[..., Dataset]) -> None:
+def test_a_fit_learns_and_tells_its_cost(mean_image, make_dataset):
     dataset = make_dataset()
-    told: list[FitProgress] = []
+    told = []
     fitted = mean_image.fit(dataset, AUTHOR, FitRun(report=told.append))
-    assert fitted is not None
     assert (fitted.cost.steps, fitted.cost.of_steps, fitted.cost.is_short) == (200, 200, False)
     assert fitted.cost.model_bytes == 4 * SIDE * SIDE
     assert fitted.cost.seconds > 0.0
@@ -45,18 +37,7 @@ def test_a_fit_learns_and_tells_its_cost(mean_image: MeanImage, make_dataset: Ca
     assert np.abs(frames[0] - dataset.train.images.mean(axis=0) / 255.0).mean() < 0.02
 
 
-def test_a_fit_takes_no_time_over_subnormal_numbers(
-    mean_image: MeanImage, make_dataset: Callable[..., Dataset]
-) -> None:
-    smallest, halves = torch.tensor(torch.finfo(torch.float32).tiny), []
-    mean_image.fit(make_dataset(), AUTHOR, FitRun(report=lambda _: halves.append((smallest * 0.5).view(torch.int32))))
-    assert halves
-    assert not any(halves)
-
-
-def test_a_stopped_fit_ends_in_the_model_of_an_undisturbed_one(
-    mean_image: MeanImage, make_dataset: Callable[..., Dataset], tmp_path: Path
-) -> None:
+def test_a_stopped_fit_ends_in_the_model_of_an_undisturbed_one(mean_image, make_dataset, tmp_path):
     dataset = make_dataset()
     for stop in (30, 90):
         assert mean_image.fit(dataset, AUTHOR, stopping_after(stop, [], folder=tmp_path)) is None
@@ -66,15 +47,11 @@ def test_a_stopped_fit_ends_in_the_model_of_an_undisturbed_one(
     np.testing.assert_array_equal(ended, frames_of(mean_image, dataset))
 
 
-def test_a_finished_fit_is_found_in_its_folder(
-    mean_image: MeanImage, make_dataset: Callable[..., Dataset], tmp_path: Path
-) -> None:
+def test_a_finished_fit_is_found_in_its_folder(mean_image, make_dataset, tmp_path):
     dataset = make_dataset()
     first = mean_image.fit(dataset, AUTHOR, FitRun(folder=tmp_path))
-    told: list[FitProgress] = []
+    told = []
     again = mean_image.fit(dataset, AUTHOR, FitRun(folder=tmp_path, report=told.append))
-    assert first is not None
-    assert again is not None
     assert not told
     assert again.cost == first.cost
     poses = dataset.val.poses
@@ -84,21 +61,17 @@ def test_a_finished_fit_is_found_in_its_folder(
 
 
 @pytest.mark.parametrize("folder", [None, "fit"])
-def test_a_fit_that_was_timed_in_a_busy_moment_gets_its_time(
-    folder: str | None, mean_image: MeanImage, make_dataset: Callable[..., Dataset], tmp_path: Path
-) -> None:
+def test_a_fit_that_was_timed_in_a_busy_moment_gets_its_time(folder, mean_image, make_dataset, tmp_path):
     budget = Budget.equal(0.5)
     budget.paces.keep(mean_image.name, Pace(0.0, 0.1, is_confirmed=False))  # it takes a thousandth of that
     run = FitRun(folder=None if folder is None else tmp_path / folder)
     fitted = mean_image.fit(make_dataset(), budget, run)
-    assert fitted is not None
     assert fitted.cost.steps > 10
     again = mean_image.fit(make_dataset(), budget)
-    assert again is not None
     assert again.cost.steps == fitted.cost.steps
 
 
-def test_the_seed_decides_what_is_drawn(mean_image: MeanImage, make_dataset: Callable[..., Dataset]) -> None:
+def test_the_seed_decides_what_is_drawn(mean_image, make_dataset):
     dataset = make_dataset()
     torch.manual_seed(1)  # of others: it changes nothing
     one = frames_of(mean_image, dataset, FitRun(seed=1))
@@ -106,9 +79,7 @@ def test_the_seed_decides_what_is_drawn(mean_image: MeanImage, make_dataset: Cal
     assert np.abs(one - frames_of(mean_image, dataset, FitRun(seed=2))).max() > 0.0
 
 
-def test_the_folder_of_another_fit_is_refused(
-    mean_image: MeanImage, make_dataset: Callable[..., Dataset], tmp_path: Path
-) -> None:
+def test_the_folder_of_another_fit_is_refused(mean_image, make_dataset, tmp_path):
     dataset = make_dataset()
     mean_image.fit(dataset, AUTHOR, stopping_after(3, [], folder=tmp_path))
     for other, run in ((make_dataset(frames=9), FitRun(folder=tmp_path)), (dataset, FitRun(folder=tmp_path, seed=7))):
@@ -117,9 +88,7 @@ def test_the_folder_of_another_fit_is_refused(
 
 
 @pytest.mark.parametrize("damage", [b"", b"\x00" * 100, None])
-def test_a_damaged_state_is_refused_with_its_name(
-    mean_image: MeanImage, make_dataset: Callable[..., Dataset], tmp_path: Path, damage: bytes | None
-) -> None:
+def test_a_damaged_state_is_refused_with_its_name(mean_image, make_dataset, tmp_path, damage):
     dataset = make_dataset()
     mean_image.fit(dataset, AUTHOR, stopping_after(3, [], folder=tmp_path))
     path = tmp_path / STATE_FILE
@@ -128,8 +97,83 @@ def test_a_damaged_state_is_refused_with_its_name(
         mean_image.fit(dataset, AUTHOR, FitRun(folder=tmp_path))
 
 
-def test_a_fit_that_diverges_says_in_which_step(mean_image: MeanImage, make_dataset: Callable[..., Dataset]) -> None:
+def test_a_fit_that_diverges_says_in_which_step(mean_image, make_dataset):
     learner = mean_image.learner(make_dataset(), AUTHOR, 0, torch.device("cpu"))
     learner.module.get_parameter("image").data.fill_(float("inf"))
     with pytest.raises(TrainingDiverged, match="step 5: the loss is"):
         learner.take_step(4, 10)
+
+
+def never():
+    raise AssertionError("it was measured again")
+
+
+def test_an_author_gets_the_published_steps():
+    assert Budget.author().steps("any", 200_000, never) == 200_000
+
+
+def test_an_equal_time_holds_the_start_and_the_steps():
+    assert Budget.equal(10.0).steps("any", 200_000, lambda: Pace(start_s=1.0, step_s=0.09)) == 100
+
+
+def test_a_time_that_is_too_short_still_holds_a_step():
+    assert Budget.equal(0.5).steps("any", 10, lambda: Pace(start_s=1.0, step_s=3.0)) == 1
+
+
+@pytest.mark.parametrize("seconds", [0.0, -1.0, float("nan"), float("inf")])
+def test_a_time_that_is_none_is_refused(seconds):
+    with pytest.raises(InvalidArgument, match="must be positive"):
+        Budget.equal(seconds)
+
+
+def test_a_pace_is_measured_once_on_a_machine(tmp_path):
+    path = tmp_path / "cache" / "paces.json"
+    here = {"processor": "one", "threads": 2}
+    first = Budget.equal(10.0, Paces(path, here)).steps("any", 9, lambda: Pace(0.0, 0.1))
+    assert Budget.equal(10.0, Paces(path, here)).steps("any", 9, never) == first == 100
+    assert Budget.equal(10.0, Paces(path, here)).steps("another", 9, lambda: Pace(0.0, 1.0)) == 10
+    elsewhere = {"processor": "another", "threads": 2}
+    assert Budget.equal(10.0, Paces(path, elsewhere)).steps("any", 9, lambda: Pace(0.0, 0.2)) == 50
+
+
+def test_a_fit_that_used_a_part_of_its_time_shows_its_pace():
+    budget = Budget.equal(10.0)
+    budget.steps("any", 9, lambda: Pace(1.0, 0.9, is_confirmed=False))
+    assert budget.shown_pace("any", 10, 9.0) is None  # as promised
+    assert budget.shown_pace("any", 10, 4.0) == Pace(1.0, 0.3, is_confirmed=False)
+    budget.paces.confirm("any")
+    assert budget.shown_pace("any", 10, 4.0) is None  # the table stays
+    assert Budget.author().shown_pace("any", 10, 4.0) is None
+
+
+@pytest.mark.parametrize("content", ["", "[]", '{"{}": {"any": ["x", 1, true]}}', '{"{}": {"any": [1]}}', '{"{}": 3}'])
+def test_a_damaged_file_of_paces_is_measured_again(tmp_path, content):
+    path = tmp_path / "paces.json"
+    path.write_text(content)
+    assert Paces(path).get("any", lambda: Pace(1.0, 2.0)) == Pace(1.0, 2.0)
+    assert Paces(path).get("any", never) == Pace(1.0, 2.0)
+
+
+LARGE = 4_000_000  # values: torch takes all its threads
+
+
+def halves_that_stay():
+    """How many of many smallest normal numbers are not 0 when they are halved."""
+    smallest = torch.full((LARGE,), torch.finfo(torch.float32).tiny)
+    return int((smallest * 0.5).view(torch.int32).count_nonzero())  # as bits: to compare is arithmetic too
+
+
+def test_they_are_zero_in_every_thread_and_none_elsewhere():
+    threads = torch.get_num_threads()
+    try:
+        torch.set_num_threads(2)
+        assert halves_that_stay() == LARGE  # and torch has its helpers
+        assert without_subnormals(halves_that_stay) == 0
+        assert halves_that_stay() == LARGE
+    finally:
+        torch.set_num_threads(threads)
+
+
+def test_an_error_comes_through():
+    with pytest.raises(ZeroDivisionError):
+        without_subnormals(lambda: 1 // 0)

@@ -1,12 +1,10 @@
 """Tri-planes: their size, a value by hand, and fits that end where they must."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch
 
-from ultragray_studies.methods.rapidvol import RapidVol, TriPlaneLearner, TriPlanes
+from ultragray_studies.methods.rapidvol import TriPlaneLearner, TriPlanes
 
 from .volumes import along_elevation, one_frame, seen
 
@@ -14,22 +12,22 @@ CPU = torch.device("cpu")
 SMALL = seen(along_elevation(np.arange(3.0)), (12, 8))
 
 
-def new_planes(seed: int = 0) -> TriPlanes:
+def new_planes(seed=0):
     return TriPlanes(torch.Generator().manual_seed(seed))
 
 
-def count(module: torch.nn.Module) -> int:
+def count(module):
     return sum(parameter.numel() for parameter in module.parameters())
 
 
-def test_the_planes_and_the_decoder_have_so_many_parameters() -> None:
+def test_the_planes_and_the_decoder_have_so_many_parameters():
     field = new_planes()
     assert field.planes.numel() == 3 * 16 * 128 * 128
     assert count(field.decoder) == (16 * 64 + 64) + (64 * 64 + 64) + (64 + 1)
     assert count(field) == 786_432 + 5_313
 
 
-def test_a_product_is_that_of_the_three_planes_by_hand() -> None:
+def test_a_product_is_that_of_the_three_planes_by_hand():
     field = new_planes()
     node = 2.0 / 127.0  # between two nodes
     with torch.no_grad():
@@ -46,13 +44,13 @@ def test_a_product_is_that_of_the_three_planes_by_hand() -> None:
     assert (found[4:] == 0).all()
 
 
-def test_beyond_the_box_the_value_at_its_end_goes_on() -> None:
+def test_beyond_the_box_the_value_at_its_end_goes_on():
     field = new_planes()
     points = torch.tensor([[[1.0, 0.2, -1.0], [1.5, 0.2, -3.0]]])
     torch.testing.assert_close(field(points)[0, 0], field(points)[0, 1])
 
 
-def test_each_axis_of_the_box_is_scaled_by_its_own_half() -> None:
+def test_each_axis_of_the_box_is_scaled_by_its_own_half():
     learner = TriPlaneLearner(SMALL, 0, CPU)
     np.testing.assert_allclose(learner.half_mm, [10.0, 1.0, 12.5])
     points = torch.cat([learner.training_points(place) for place in range(3)]).reshape(-1, 3)
@@ -61,28 +59,23 @@ def test_each_axis_of_the_box_is_scaled_by_its_own_half() -> None:
     assert points.abs().max() < 1.0 + 1e-5
 
 
-def test_a_sweep_of_one_plane_has_a_box_all_the_same() -> None:
+def test_a_sweep_of_one_plane_has_a_box_all_the_same():
     learner = TriPlaneLearner(one_frame(12, 8), 0, CPU)
     assert learner.half_mm[1] == 1.0
     assert np.isfinite(learner.render(SMALL.probe, SMALL.train.poses, 12, 8)).all()
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_a_field_begins_above_0_everywhere_without_products_near_0(seed: int) -> None:
+def test_a_field_begins_above_0_everywhere_without_products_near_0(seed):
     field = new_planes(seed)
     points = 2.0 * torch.rand((40, 40, 3), generator=torch.Generator().manual_seed(seed)) - 1.0
     assert field.products(points).abs().min() > 0.7
     assert (field(points) - 0.5).abs().max() < 0.2
 
 
-def test_rates_fall_to_1_percent() -> None:
+def test_rates_fall_to_1_percent():
     learner = TriPlaneLearner(SMALL, 0, CPU)
     learner.set_rates(0, 100)
     assert [one.param_groups[0]["lr"] for one in learner.optimizers.values()] == [1e-2, 1e-3]
     learner.set_rates(50, 100)
     assert [one.param_groups[0]["lr"] for one in learner.optimizers.values()] == pytest.approx([1e-3, 1e-4])
-
-
-def test_the_recipe_is_5_000_epochs_and_says_that_it_is_ours() -> None:
-    assert RapidVol().published_steps(SMALL) == 5_000 * 3
-    assert any("This project's: 5,000 epochs" in choice for choice in RapidVol().describe().choices)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 import torch
 
+from ultragray.rendering.backends import cuda
 from ultragray.rendering.pixels import in_type, to_uint8
 from ultragray.rendering.settings import Encoding
 from ultragray_workers.pool.pixels import CHUNK_POSES, render_to_host, round_to_uint8
@@ -34,7 +35,7 @@ def render_on(device, sizes):
 
     def render(poses):
         sizes.append(len(poses))
-        level = torch.from_numpy(brightness(poses)).to(device, torch.float32)
+        level = cuda.upload(torch.from_numpy(brightness(poses)).float(), torch.device(device))
         bmode = level[:, None, None].expand(-1, 5, 7).contiguous()
         return {"bmode": bmode, "echo": 1.0 - bmode, "labels": (bmode * 200.0).to(torch.uint8)}
 

@@ -32,7 +32,7 @@ from ultragray.rendering.confidence import SupportWatch
 from ultragray.rendering.frames import render_shown
 from ultragray.rendering.limits import UNLIMITED, GivenUp, Limits
 from ultragray.rendering.pixels import encoded_image, in_type
-from ultragray.rendering.settings import Below, Encoding, Resolved
+from ultragray.rendering.settings import Encoding, Resolved
 from ultragray.rendering.volume_fields import as_grey, sample_slice
 from ultragray.rendering.volumes import SliceView
 from ultragray.scene.confidence import require_confidence
@@ -201,8 +201,7 @@ class _Worker:
             return
         frames = None
         try:
-            if task.view.below_min_confidence is Below.REFUSE:
-                require_confidence(extrapolations, task.view.min_confidence, name_pose=first.name_pose)
+            require_confidence(extrapolations, task.view.least_confidence, name_pose=first.name_pose)
             support = SupportWatch(loaded.assessor, extrapolations, task.view)
             started = time.monotonic()
             frames = self._render(loaded.scene, task.view, poses, wanted, support, self._limits(first.name_pose))
@@ -318,12 +317,16 @@ def _write_part(
 ) -> Rendered:
     """Encodes a part into its request's memory: an image file, or its share of the pixels, output after output.
 
-    An .npz is made of these when all parts are there (`_pack`). Raises DeadlineExceeded where nobody waits any more.
+    An .npz is made of these when all parts are there (`_pack`). Raises DeadlineExceeded where nobody waits any more,
+    LowConfidence for a frame that has, once it is rendered, less than the least confidence.
     """
     if part.deadline is not None and time.monotonic() >= part.deadline:
         raise DeadlineExceeded("the deadline passed before the frames were written")
-    started, waited_ms = time.monotonic(), frames.waited_ms
     outputs, encoding, end = part.settings.outputs, part.settings.encoding, begin + len(part.poses)
+    least = part.settings.least_confidence
+    if least is not None:
+        require_confidence(support.completed(begin, end), least, name_pose=part.name_pose)
+    started, waited_ms = time.monotonic(), frames.waited_ms
     pixel_type = encoding.pixel_type
     if encoding.is_image_file:
         image = encoded_image(frames.take(outputs[0], pixel_type, begin, end)[0], encoding)

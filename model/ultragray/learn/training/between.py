@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections import defaultdict
 from dataclasses import dataclass, replace
+from functools import cached_property, lru_cache
 from typing import NamedTuple
 
 import numpy as np
@@ -40,7 +41,7 @@ class Neighbours:
         """The gaps alone."""
         return replace(self, ends=self.ends[:0], outward=self.outward[:0])
 
-    @property
+    @cached_property
     def weights(self) -> FloatArray:  # [E + K], their sum 1
         """The share of each gap and each end in the space around the frames.
 
@@ -174,17 +175,22 @@ def _projected(
 ) -> tuple[Tensor, Tensor, Tensor]:  # three of [P, H, W]
     """Where each pixel of an image falls on another one: row and column, from 0 to 1, and its distance (mm)."""
     height, width = like.shape[-2:]
-    shares = [(np.arange(size) + 0.5) / size for size in (height, width)]
-    x, _, z = np.moveaxis(probe.points_mm(*np.meshgrid(*shares, indexing="ij")), -1, 0)
     turns = np.einsum("pji,pjk->pik", onto[:, :3, :3], poses[:, :3, :3])
     shifts = np.einsum("pji,pj->pi", onto[:, :3, :3], poses[:, :3, 3] - onto[:, :3, 3])
     affine = np.stack([turns[:, :, 0], turns[:, :, 2], shifts], axis=-1)  # [P, 3, 3]: of x, of z, and the shift
-    places = torch.from_numpy(np.stack([x, z, np.ones_like(x)]).reshape(3, -1)).float()
-    local = cuda.upload(torch.from_numpy(affine).float(), like.device) @ cuda.upload(places, like.device)
+    local = cuda.upload(torch.from_numpy(affine).float(), like.device) @ _pixels(probe, height, width, like.device)
     x, y, z = local.reshape(-1, 3, height, width).unbind(1)
     depth, across = _on_lines(probe.lines, x, z)
     rows = (depth - probe.near_mm) / probe.scan_line_length_mm
     return rows, (across - probe.lines.start) / probe.lines.span, y.abs()
+
+
+@lru_cache(maxsize=4)
+def _pixels(probe: Probe, height: int, width: int, device: torch.device) -> Tensor:  # [3, H·W]
+    """x and z of each pixel of an image in its own frame (mm), and ones."""
+    shares = [(np.arange(size) + 0.5) / size for size in (height, width)]
+    x, _, z = np.moveaxis(probe.points_mm(*np.meshgrid(*shares, indexing="ij")), -1, 0)
+    return torch.from_numpy(np.stack([x, z, np.ones_like(x)]).reshape(3, -1)).float().to(device)
 
 
 def _on_lines(lines: Lines, x: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
@@ -273,28 +279,35 @@ class ViewsBetween:
     def draw(self, count: int, generator: torch.Generator) -> Views:
         """`count` views at places drawn by `draw_places`."""
         places = draw_places(self._neighbours, count, generator)
-        blend = self._blend(places)
-        differences = _smooth(blend.differences)
+        poses = places.poses(self._sweep)
+        blend = self._blend(places, poses)
+        differences = smoothed_sizes(blend.differences)
         usual = differences.mean(dim=(1, 2), keepdim=True).clamp(min=EXACT)  # the farther the frames, the more
         weights = blend.is_seen / (1.0 + (differences / (DOUBTFUL * usual)).square())
-        return Views(places, places.poses(self._sweep), blend.images, weights)
+        return Views(places, poses, blend.images, weights)
 
-    def _blend(self, places: Places) -> Blend:
+    def _blend(self, places: Places, poses: FloatArray) -> Blend:
         frames = cuda.upload(torch.from_numpy(places.frames), self._images.device)
         images = self._images[frames].float().div_(255.0)  # [V, 2, H, W]
         if self.follow_probe:
             return blend_by_pixel(images, places.shares)
         sweep = self._sweep
-        return blend_in_space(images, sweep.poses[places.frames], places.poses(sweep), sweep.probe)
+        return blend_in_space(images, sweep.poses[places.frames], poses, sweep.probe)
 
 
-def _smooth(differences: Tensor) -> Tensor:  # [V, H, W] -> [V, H, W]
-    """Size of the differences without speckle, which always differs."""
-    half = SMOOTHED // 2
-    down = functional.avg_pool2d(
-        differences[:, None], (SMOOTHED, 1), stride=1, padding=(half, 0), count_include_pad=False
-    )
-    return functional.avg_pool2d(down, (1, SMOOTHED), stride=1, padding=(0, half), count_include_pad=False)[:, 0].abs()
+def smoothed_sizes(differences: Tensor) -> Tensor:  # [V, H, W] -> [V, H, W]
+    """Sizes of the differences without speckle, which always differs: averaged over squares that end with the image."""
+    return _running_mean(_running_mean(differences, dim=1), dim=2).abs()
+
+
+def _running_mean(values: Tensor, dim: int) -> Tensor:
+    """Over SMOOTHED places of a dimension, by sums from its beginning: faster than torch's pooling on a CPU."""
+    size, half = values.shape[dim], SMOOTHED // 2
+    places = torch.arange(size, device=values.device)
+    first, stop = (places - half).clamp(min=0), (places + half + 1).clamp(max=size)
+    sums = functional.pad(values.cumsum(dim), (0, 0, 1, 0) if dim == 1 else (1, 0))
+    shape = (-1, 1) if dim == 1 else (-1,)
+    return (sums.index_select(dim, stop) - sums.index_select(dim, first)) / (stop - first).view(shape)
 
 
 def features_follow_probe(sweep: Sweep, neighbours: Neighbours) -> bool:

@@ -55,6 +55,7 @@ def machine_in_words(device: str = "cpu") -> str:
 def forget_peak_memory(device: torch.device) -> None:
     """Start the count of `peak_memory_mb` anew."""
     if device.type == "cuda":
+        torch.cuda.init()  # type: ignore[no-untyped-call]  # there is nothing to reset before
         torch.cuda.reset_peak_memory_stats(device)
 
 

@@ -1,17 +1,12 @@
 """The DICOM file, checked against the attributes that PS3.3 requires of an Ultrasound Multi-frame Image (A.7)."""
 
-from __future__ import annotations
-
 import dataclasses
 import json
-from collections.abc import Iterator
-from pathlib import Path
 
 import numpy as np
 import pydicom
 import pytest
 import torch
-from pydicom.dataset import Dataset, FileDataset
 from pydicom.uid import ExplicitVRLittleEndian, UltrasoundMultiFrameImageStorage
 
 from ultragray import ConvexProbe, LinearProbe
@@ -73,20 +68,20 @@ OF_A_REGION = (
 
 
 @pytest.fixture(autouse=True)
-def strict_reading(monkeypatch: pytest.MonkeyPatch) -> Iterator[None]:
+def strict_reading(monkeypatch):
     before = pydicom.config.settings.reading_validation_mode
     pydicom.config.settings.reading_validation_mode = pydicom.config.RAISE
     yield
     pydicom.config.settings.reading_validation_mode = before
 
 
-def header(**changes: object) -> ExportHeader:
-    settings = Resolved(probe=changes.pop("probe", LINEAR), height=21, width=19)  # type: ignore[arg-type]
+def header(**changes):
+    settings = Resolved(probe=changes.pop("probe", LINEAR), height=21, width=19)
     one = ExportHeader(FORMATS["dicom"].shown(settings), "uint8", POSES, "one", "0" * 64, "ultragray/0 cpu")
-    return dataclasses.replace(one, **changes)  # type: ignore[arg-type]
+    return dataclasses.replace(one, **changes)
 
 
-def export(path: Path, header: ExportHeader) -> FileDataset:
+def export(path, header):
     with export_to(path, "dicom", header) as add:
         shown = show({"bmode": torch.from_numpy(FRAMES)}, header.settings.probe, header.settings.display)[
             "bmode"
@@ -100,7 +95,7 @@ def export(path: Path, header: ExportHeader) -> FileDataset:
 
 
 @pytest.mark.parametrize("probe", [LINEAR, CONVEX])
-def test_all_that_the_standard_requires_is_there(tmp_path: Path, probe: LinearProbe | ConvexProbe) -> None:
+def test_all_that_the_standard_requires_is_there(tmp_path, probe):
     data = export(tmp_path / "frames.dcm", header(probe=probe))
     assert data.file_meta.MediaStorageSOPClassUID == data.SOPClassUID == UltrasoundMultiFrameImageStorage
     assert data.file_meta.MediaStorageSOPInstanceUID == data.SOPInstanceUID
@@ -135,14 +130,14 @@ def test_all_that_the_standard_requires_is_there(tmp_path: Path, probe: LinearPr
         assert len(uid) <= 64
 
 
-def position_cm(region: Dataset, column: int, row: int) -> tuple[float, float]:
+def position_cm(region, column, row):
     """Lateral and depth of a pixel, as C.8.5.5.1.4 has it."""
     x = region.ReferencePixelPhysicalValueX + (column - region.ReferencePixelX0) * region.PhysicalDeltaX
     y = region.ReferencePixelPhysicalValueY + (row - region.ReferencePixelY0) * region.PhysicalDeltaY
     return x, y
 
 
-def test_pixels_and_their_places_of_a_linear_probe(tmp_path: Path) -> None:
+def test_pixels_and_their_places_of_a_linear_probe(tmp_path):
     data = export(tmp_path / "frames.dcm", header())
     np.testing.assert_array_equal(data.pixel_array, np.rint(FRAMES * 255))
     [region] = data.SequenceOfUltrasoundRegions
@@ -154,7 +149,7 @@ def test_pixels_and_their_places_of_a_linear_probe(tmp_path: Path) -> None:
     assert (tmp_path / "frames.dcm").stat().st_size % 2 == 0
 
 
-def test_pixels_and_their_places_of_a_convex_probe(tmp_path: Path) -> None:
+def test_pixels_and_their_places_of_a_convex_probe(tmp_path):
     data = export(tmp_path / "frames.dcm", header(probe=CONVEX))
     [region] = data.SequenceOfUltrasoundRegions
     pixel_cm = 4.0 / 21
@@ -171,13 +166,7 @@ def test_pixels_and_their_places_of_a_convex_probe(tmp_path: Path) -> None:
     assert (data.pixel_array[2][~inside] == 0).all()
 
 
-def test_odd_numbers_of_pixels_are_padded(tmp_path: Path) -> None:
-    data = export(tmp_path / "frames.dcm", header())
-    assert 5 * 21 * 19 % 2 == 1
-    assert len(data.PixelData) == 5 * 21 * 19 + 1
-
-
-def test_poses_are_in_the_file_and_uids_follow_what_was_rendered(tmp_path: Path) -> None:
+def test_poses_are_in_the_file_and_uids_follow_what_was_rendered(tmp_path):
     one = export(tmp_path / "one.dcm", header())
     poses = np.frombuffer(one.private_block(0x0019, "ULTRAGRAY")[0x01].value, "<f8").reshape(-1, 4, 4)
     np.testing.assert_array_equal(poses, POSES)
@@ -191,7 +180,7 @@ def test_poses_are_in_the_file_and_uids_follow_what_was_rendered(tmp_path: Path)
     assert one.SOPInstanceUID != one.SeriesInstanceUID
 
 
-def test_figures_of_each_frame_are_beside_the_poses(tmp_path: Path) -> None:
+def test_figures_of_each_frame_are_beside_the_poses(tmp_path):
     data = export(tmp_path / "frames.dcm", header())
     element = data.private_block(0x0019, "ULTRAGRAY")[0x02]
     assert element.VR == "OF"
@@ -200,7 +189,7 @@ def test_figures_of_each_frame_are_beside_the_poses(tmp_path: Path) -> None:
     np.testing.assert_array_equal(data.pixel_array, np.rint(FRAMES * 255))
 
 
-def test_the_origin_is_beside_the_poses(tmp_path: Path) -> None:
+def test_the_origin_is_beside_the_poses(tmp_path):
     asked = header(probe=CONVEX)
     data = export(tmp_path / "frames.dcm", asked)
     origin = json.loads(data.private_block(0x0019, "ULTRAGRAY")[0x03].value)
@@ -208,12 +197,7 @@ def test_the_origin_is_beside_the_poses(tmp_path: Path) -> None:
     assert origin["display"]["pixel_mm"] == asked.settings.display.pixel_mm
 
 
-def test_any_name_of_a_scene(tmp_path: Path) -> None:
-    data = export(tmp_path / "frames.dcm", header(scene="Leber\\é " + "x" * 100))
-    assert data.StudyDescription == "Leber/é " + "x" * 55
-
-
-def test_more_than_an_element_holds_is_refused(tmp_path: Path) -> None:
+def test_more_than_an_element_holds_is_refused(tmp_path):
     many = np.broadcast_to(np.eye(4), (20_000, 4, 4))
     with (
         pytest.raises(InvalidArgument, match="at most") as caught,

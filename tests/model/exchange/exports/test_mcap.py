@@ -1,10 +1,6 @@
 """MCAP as its own reader reads it, by the definitions in the file."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -15,7 +11,6 @@ from ultragray import LinearProbe
 from ultragray.contract import to_dict
 from ultragray.exchange.exports import ExportHeader, export_to
 from ultragray.exchange.poses import load_poses
-from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.settings import Resolved
 from ultragray.scene.confidence import FIGURES, Extrapolation
 
@@ -23,14 +18,14 @@ PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 FRAMES = 3
 
 
-def header(poses: FloatArray, dtype: str) -> ExportHeader:
+def header(poses, dtype):
     settings = Resolved(PROBE, 6, 7, ("bmode", "labels"))
     return ExportHeader(settings, dtype, poses, "one", "0" * 64, "ultragray/0 cpu")
 
 
-def written(path: Path, poses: FloatArray, dtype: str) -> dict[str, np.ndarray]:
+def written(path, poses, dtype):
     random = np.random.default_rng(3)
-    frames: dict[str, Any] = {
+    frames = {
         "bmode": random.random((FRAMES, 6, 7), np.float32),
         "labels": random.integers(0, 5, (FRAMES, 6, 7), np.uint8),
     }
@@ -40,16 +35,14 @@ def written(path: Path, poses: FloatArray, dtype: str) -> dict[str, np.ndarray]:
     return frames
 
 
-def messages(path: Path, topic: str) -> list[Any]:
+def messages(path, topic):
     with path.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         return [found.decoded_message for found in reader.iter_decoded_messages(topics=[topic])]
 
 
 @pytest.mark.parametrize(("dtype", "encoding"), [("uint8", "mono8"), ("float32", "32FC1")])
-def test_images_come_back_with_the_stamps_of_their_poses(
-    tmp_path: Path, random_poses: Any, dtype: str, encoding: str
-) -> None:
+def test_images_come_back_with_the_stamps_of_their_poses(tmp_path, random_poses, dtype, encoding):
     path = tmp_path / "frames.mcap"
     frames = written(path, random_poses(FRAMES), dtype)
     images = messages(path, "/ultragray/bmode")
@@ -68,7 +61,7 @@ def test_images_come_back_with_the_stamps_of_their_poses(
     assert stamps == [[(0, 0), (0, 40_000_000), (0, 80_000_000)]] * 3
 
 
-def test_poses_are_metres_in_the_file_and_come_back_as_they_were(tmp_path: Path, random_poses: Any) -> None:
+def test_poses_are_metres_in_the_file_and_come_back_as_they_were(tmp_path, random_poses):
     path = tmp_path / "frames.mcap"
     poses = random_poses(FRAMES, tilt_deg=170.0, shift_mm=200.0)
     written(path, poses, "uint8")
@@ -79,7 +72,7 @@ def test_poses_are_metres_in_the_file_and_come_back_as_they_were(tmp_path: Path,
     np.testing.assert_allclose(load_poses(path), poses, atol=1e-9)
 
 
-def test_figures_and_origin_are_in_the_file(tmp_path: Path, random_poses: Any) -> None:
+def test_figures_and_origin_are_in_the_file(tmp_path, random_poses):
     path = tmp_path / "frames.mcap"
     written(path, random_poses(FRAMES), "uint8")
     told = [one.status[0] for one in messages(path, "/ultragray/confidence")]

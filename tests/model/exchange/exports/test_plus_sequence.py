@@ -1,8 +1,5 @@
-from __future__ import annotations
-
 import dataclasses
 import re
-from pathlib import Path
 
 import cv2
 import numpy as np
@@ -16,7 +13,6 @@ from ultragray.datasets.plus_files import read_meta_image
 from ultragray.errors import DatasetInvalid
 from ultragray.exchange.exports import FORMATS, ExportHeader, export_to
 from ultragray.geometry.pose import pose_from_position_quaternion
-from ultragray.geometry.probe import Probe
 from ultragray.geometry.scan_conversion import scan_convert
 from ultragray.rendering.display import Display
 from ultragray.rendering.frames import show
@@ -27,7 +23,7 @@ FRAMES = np.random.default_rng(0).random((12, 20, 16), np.float32)
 TOLD = [Extrapolation(number / 3.0, 1234.5, None, 1e-4 * number) for number in range(12)]
 
 
-def poses(count: int) -> np.ndarray:
+def poses(count):
     random = np.random.default_rng(1)
     made = []
     for _ in range(count):
@@ -38,7 +34,7 @@ def poses(count: int) -> np.ndarray:
     return np.stack(made)
 
 
-def export(path: Path, probe: Probe) -> ExportHeader:
+def export(path, probe):
     settings = FORMATS["plus"].shown(Resolved(probe, 20, 16))
     header = ExportHeader(settings, "uint8", poses(12), "one", "0" * 64, "ultragray/0 cpu")
     shown = show({"bmode": torch.from_numpy(FRAMES)}, probe, settings.display)["bmode"].numpy()
@@ -48,7 +44,7 @@ def export(path: Path, probe: Probe) -> ExportHeader:
     return header
 
 
-def test_our_reader_gives_back_the_same_frames_and_poses(tmp_path: Path) -> None:
+def test_our_reader_gives_back_the_same_frames_and_poses(tmp_path):
     probe = LinearProbe(width_mm=38.1, near_mm=0.0, far_mm=51.7)
     header = export(tmp_path / "sweep.igs.mha", probe)
     sweep, count = read_plus_sweep(tmp_path / "sweep.igs.mha")
@@ -59,14 +55,14 @@ def test_our_reader_gives_back_the_same_frames_and_poses(tmp_path: Path) -> None
     assert [note for note in sweep.notes if "no crop" not in note] == []
 
 
-def test_a_near_plane_moves_the_poses_to_the_top_of_the_image(tmp_path: Path) -> None:
+def test_a_near_plane_moves_the_poses_to_the_top_of_the_image(tmp_path):
     header = export(tmp_path / "sweep.igs.mha", LinearProbe(width_mm=40.0, near_mm=5.0, far_mm=50.0))
     sweep, _ = read_plus_sweep(tmp_path / "sweep.igs.mha")
     np.testing.assert_allclose(sweep.poses @ [0, 0, -5.0, 1], header.poses[:, :, 3], atol=1e-9)
     assert sweep.probe == LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=45.0)
 
 
-def test_every_frame_has_its_fields(tmp_path: Path) -> None:
+def test_every_frame_has_its_fields(tmp_path):
     header = export(tmp_path / "sweep.igs.mha", LinearProbe(40.0, 0.0, 50.0))
     stored = read_meta_image(tmp_path / "sweep.igs.mha")
     assert stored.fields["UltrasoundImageOrientation"] == "MF"
@@ -98,7 +94,7 @@ def test_every_frame_has_its_fields(tmp_path: Path) -> None:
         np.testing.assert_allclose(image @ [15, 19, 0, 1], [18.75, 0, 48.75, 1])
 
 
-def test_a_fan_is_scan_converted(tmp_path: Path) -> None:
+def test_a_fan_is_scan_converted(tmp_path):
     probe = ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0)
     export(tmp_path / "sweep.igs.mha", probe)
     stored = read_meta_image(tmp_path / "sweep.igs.mha")
@@ -120,7 +116,7 @@ def test_a_fan_is_scan_converted(tmp_path: Path) -> None:
         (ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0), Display(depth_mm=30.0, flip=True)),
     ],
 )
-def test_our_reader_brings_a_fan_back_to_scan_lines(tmp_path: Path, probe: Probe, display: Display) -> None:
+def test_our_reader_brings_a_fan_back_to_scan_lines(tmp_path, probe, display):
     """Probe and poses are those of the export; the frames are the same but for two resamplings of a smooth image."""
     height, width = 200, 160
     rows, lines = np.meshgrid(np.linspace(0.2, 0.9, height), np.linspace(0.3, 1.0, width), indexing="ij")
@@ -145,7 +141,7 @@ def test_our_reader_brings_a_fan_back_to_scan_lines(tmp_path: Path, probe: Probe
     assert cropped.images.shape == (12, 50, 50)
 
 
-def test_a_calibration_that_does_not_go_with_the_probe_is_refused(tmp_path: Path) -> None:
+def test_a_calibration_that_does_not_go_with_the_probe_is_refused(tmp_path):
     path = tmp_path / "sweep.igs.mha"
     export(path, ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0))
     turned = b"ImageToProbeTransform = 0 2 0 0 0 0 1 0 2 0 0 0 0 0 0 1"
@@ -154,15 +150,7 @@ def test_a_calibration_that_does_not_go_with_the_probe_is_refused(tmp_path: Path
         read_plus_sweep(path)
 
 
-def test_a_probe_of_an_export_that_cannot_be_is_named(tmp_path: Path) -> None:
-    path = tmp_path / "sweep.igs.mha"
-    export(path, ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0))
-    path.write_bytes(path.read_bytes().replace(b'"opening_angle_deg": 60.0', b'"opening_angle_deg": -9.0'))
-    with pytest.raises(DatasetInvalid, match=r"sweep\.igs\.mha: its UltraGRayProbe or UltraGRayDisplay cannot be read"):
-        read_plus_sweep(path)
-
-
-def test_ten_thousand_frames_keep_their_order(tmp_path: Path) -> None:
+def test_ten_thousand_frames_keep_their_order(tmp_path):
     many = np.tile(np.eye(4), (10_050, 1, 1))
     many[:, 1, 3] = np.arange(10_050)
     header = export(tmp_path / "few.igs.mha", LinearProbe(40.0, 0.0, 50.0))

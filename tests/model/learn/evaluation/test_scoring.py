@@ -1,38 +1,38 @@
-"""A scene measured on its own frames, in numbers that a script can read."""
-
-from __future__ import annotations
+"""A scene measured on its own frames, and expected against actual errors."""
 
 import json
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
 import pytest
-import torch
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe, render
+from ultragray import ConvexProbe, LinearProbe, render
 from ultragray.datasets import Sweep
 from ultragray.errors import DatasetInvalid, InvalidArgument
-from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation import scoring as evaluation
-from ultragray.learn.evaluation.metrics import FrameMetrics, frame_metrics
-from ultragray.learn.evaluation.scoring import evaluate, evaluate_frames, render_sweep
+from ultragray.learn.evaluation.metrics import frame_metrics
+from ultragray.learn.evaluation.scoring import (
+    compare_deviations,
+    evaluate,
+    evaluate_frames,
+    measure_reliability,
+    render_sweep,
+)
+from ultragray.scene.confidence import DEPTHS, VARIANCE_TERMS, ConfidenceModel, DepthBands, Uncertainty
 
 
 @pytest.fixture(params=[LinearProbe(30.0, 0.0, 40.0), ConvexProbe(60.0, 10.0, 50.0)], ids=["linear", "convex"])
-def probe(request: pytest.FixtureRequest) -> Probe:
-    chosen: Probe = request.param
-    return chosen
+def probe(request):
+    return request.param
 
 
 @pytest.fixture
-def scene(random_scene: Callable[..., GaussianScene]) -> GaussianScene:
-    made: GaussianScene = random_scene(80)
-    return made
+def scene(random_scene):
+    return random_scene(80)
 
 
 @pytest.fixture
-def sweep(scene: GaussianScene, probe: Probe, random_poses: Callable[..., FloatArray]) -> Sweep:
+def sweep(scene, probe, random_poses):
     """What the scene itself shows, in 8 bits."""
     poses = random_poses(5)
     frames = render(scene, probe, poses, height=24, width=20, outputs=("bmode",)).bmode
@@ -40,14 +40,14 @@ def sweep(scene: GaussianScene, probe: Probe, random_poses: Callable[..., FloatA
     return Sweep((frames * 255).round().byte().numpy(), poses, probe, np.array([3, 7, 8, 20, 21]), "rendered")
 
 
-def test_a_scene_meets_its_own_frames_up_to_their_8_bits(scene: GaussianScene, sweep: Sweep) -> None:
+def test_a_scene_meets_its_own_frames_up_to_their_8_bits(scene, sweep):
     reached = evaluate(scene, sweep)
     assert min(frame.psnr_db for frame in reached.frames) > 57.0
     assert reached.mean.ms_ssim > 0.999
     assert evaluate(scene, sweep, backend="reference").mean.psnr_db > 57.0
 
 
-def test_frames_are_kept_apart_and_in_order(scene: GaussianScene, sweep: Sweep) -> None:
+def test_frames_are_kept_apart_and_in_order(scene, sweep):
     images = sweep.images.copy()
     images[3] = np.clip(images[3].astype(int) + 20, 0, 255)
     reached = evaluate(scene, replace(sweep, images=images))
@@ -56,7 +56,7 @@ def test_frames_are_kept_apart_and_in_order(scene: GaussianScene, sweep: Sweep) 
     assert reached.std.psnr_db == pytest.approx(np.std([frame.psnr_db for frame in reached.frames]))
 
 
-def test_as_json(scene: GaussianScene, sweep: Sweep) -> None:
+def test_as_json(scene, sweep):
     reached = evaluate(scene, sweep)
     document = json.loads(json.dumps(reached.to_dict(), allow_nan=False))
     assert document["mean"] == reached.mean.to_dict()
@@ -66,24 +66,12 @@ def test_as_json(scene: GaussianScene, sweep: Sweep) -> None:
     assert document["frames"] == [frame.to_dict() for frame in reached.frames]
 
 
-def test_frames_rendered_in_chunks_are_the_same(
-    scene: GaussianScene, sweep: Sweep, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    whole = {output: render_sweep(scene, sweep, output=output) for output in ("bmode", "transmittance")}
-    monkeypatch.setattr(evaluation, "CHUNK_PIXELS", 2 * 24 * 20)
-    for output, frames in whole.items():
-        np.testing.assert_array_equal(render_sweep(scene, sweep, output=output), frames)
-    assert np.abs(whole["bmode"] - whole["transmittance"]).max() > 0.1
-
-
-def test_frames_are_rendered_and_measured_a_few_at_a_time(
-    scene: GaussianScene, sweep: Sweep, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_are_rendered_and_measured_a_few_at_a_time(scene, sweep, monkeypatch):
     whole = evaluate(scene, sweep)
     predicted = render_sweep(scene, sweep)
-    at_once: list[int] = []
+    at_once = []
 
-    def counted(rendered: torch.Tensor, truth: torch.Tensor) -> list[FrameMetrics]:
+    def counted(rendered, truth):
         at_once.append(len(rendered))
         return frame_metrics(rendered, truth)
 
@@ -95,17 +83,62 @@ def test_frames_are_rendered_and_measured_a_few_at_a_time(
     assert at_once == [2, 2, 1] * 2
 
 
-def test_a_prediction_of_another_size_is_refused(sweep: Sweep) -> None:
+def test_a_prediction_of_another_size_is_refused(sweep):
     with pytest.raises(InvalidArgument, match=r"be \[5, 24, 20\] like those of rendered, got \[6, 24, 20\]"):
         evaluate_frames(np.zeros((6, 24, 20), np.float32), sweep)
 
 
-def test_any_prediction_is_measured_alike(sweep: Sweep) -> None:
-    predicted = np.full(sweep.images.shape, 0.3, np.float32)
-    expected = frame_metrics(torch.from_numpy(predicted), torch.from_numpy(sweep.images) / 255.0)
-    assert evaluate_frames(predicted, sweep).frames == expected
-
-
-def test_nothing_to_measure_with(scene: GaussianScene, sweep: Sweep) -> None:
+def test_nothing_to_measure_with(scene, sweep):
     with pytest.raises(DatasetInvalid, match="rendered: it holds no frames to measure with"):
         evaluate(scene, sweep.select([]))
+
+
+PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
+POSES = np.tile(np.eye(4), (4, 1, 1))
+
+
+def drawn(spread):
+    """Deviations of 100,000 pixels, and normal errors that are `spread` times as large."""
+    rng = np.random.default_rng(0)
+    deviations = rng.choice([0.015, 0.05, 0.2], 100_000).astype(np.float32)
+    return (spread * deviations * rng.normal(size=100_000)).astype(np.float32), deviations
+
+
+def test_what_holds():
+    found = compare_deviations(*drawn(1.0))
+    assert (found.within_1, found.within_2) == pytest.approx((0.683, 0.954), abs=0.01)
+    assert found.actual == pytest.approx(found.expected, rel=0.02)
+    assert [one.expected for one in found.bins] == pytest.approx([0.015, 0.05, 0.2])
+    assert [one.actual for one in found.bins] == pytest.approx([0.015, 0.05, 0.2], rel=0.03)
+    assert sum(one.share for one in found.bins) == pytest.approx(1.0)
+    json.dumps(found.to_dict(), allow_nan=False)
+
+
+def test_what_is_too_sure():
+    found = compare_deviations(*drawn(2.0))
+    assert found.within_1 == pytest.approx(0.383, abs=0.01)
+    assert found.actual == pytest.approx(2.0 * found.expected, rel=0.02)
+
+
+def test_of_a_scene(random_scene):
+    floor = tuple(0.4 if name == "floor" else 0.0 for name in VARIANCE_TERMS)  # a variance of 0.4 times 0.001
+    confidence = ConfidenceModel(
+        (3.5, 1.2, 0.8, 0.1, 0.6),
+        0.06,
+        (0.0,) * 4,
+        20,
+        0.04,
+        uncertainty=Uncertainty(floor, DepthBands((0.3,) * DEPTHS, (0.1,) * DEPTHS)),
+    )
+    made = random_scene(100, info={"probe": PROBE, "confidence": confidence.to_dict()})
+    scene = replace(made, training_poses=POSES)
+    frames = render(scene, PROBE, POSES, height=32, width=32)["bmode"].numpy()
+    noise = np.random.default_rng(0).normal(0.0, 0.02, frames.shape)
+    images = (255.0 * np.clip(frames + noise, 0.0, 1.0)).round().astype(np.uint8)
+    sweep = Sweep(images, POSES, PROBE, np.arange(4), "noisy")
+    found = measure_reliability(scene, sweep)
+    assert found.expected == pytest.approx(0.02, rel=1e-3)
+    assert found.actual == pytest.approx(0.02, rel=0.3)  # black pixels lose half of it
+    assert measure_reliability(random_scene(20), sweep) is None
+    with pytest.raises(DatasetInvalid, match="no frames to measure with"):
+        measure_reliability(scene, sweep.select([]))

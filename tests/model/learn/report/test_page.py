@@ -1,20 +1,15 @@
 """The page of a trained scene: complete, self-contained, and safe with any name."""
 
-from __future__ import annotations
-
 import re
-from collections.abc import Callable
 from dataclasses import replace
 from html.parser import HTMLParser
-from pathlib import Path
 
 import pytest
 
-from ultragray.datasets import Dataset
 from ultragray.learn.evaluation.scoring import evaluate
 from ultragray.learn.report.page import THIS_SCENE, Prediction, ScenePage, render_page
 from ultragray.learn.report.plots import write_training_curve
-from ultragray.learn.training import Progress, TrainingConfig, train
+from ultragray.learn.training import train
 from ultragray.learn.training.progress import Course
 from ultragray.learn.training.trainer import JOURNAL_FILE
 
@@ -22,34 +17,35 @@ VOID = {"meta", "img", "link", "br"}
 
 
 class Checked(HTMLParser):
-    """Tags that are closed in order, and every address that the page refers to."""
+    """Tags that are closed in order, ids, and every address that the page refers to."""
 
-    def __init__(self, text: str) -> None:
+    def __init__(self, text):
         super().__init__()
-        self.open_tags: list[str] = []
-        self.addresses: list[str] = []
+        self.open_tags = []
+        self.addresses, self.ids = [], set()
         self.feed(text)
 
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_starttag(self, tag, attrs):
+        self.ids |= {value or "" for name, value in attrs if name == "id"}
         self.addresses += [value or "" for name, value in attrs if name in ("src", "href", "xlink:href")]
         if tag not in VOID:
             self.open_tags.append(tag)
 
-    def handle_startendtag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
+    def handle_startendtag(self, tag, attrs):
         self.handle_starttag(tag, attrs)
         if tag not in VOID:
             self.open_tags.pop()
 
-    def handle_endtag(self, tag: str) -> None:
+    def handle_endtag(self, tag):
         assert self.open_tags.pop() == tag
 
 
 @pytest.fixture
-def page(tiny_dataset: Callable[..., Dataset], tiny_config: Callable[..., TrainingConfig], tmp_path: Path) -> ScenePage:
+def page(tiny_dataset, tiny_config, tmp_path):
     """The page of a training, whose course is that of the journal of its run."""
     dataset = replace(tiny_dataset(), name="tiny <sweep>")
-    seen: list[Progress] = []
-    scene = train(dataset, tiny_config(steps=6, confidence=False), folder=tmp_path, report=seen.append)
+    seen = []
+    scene = train(dataset, tiny_config(steps=6), folder=tmp_path, report=seen.append)
     course = Course.of_journal(tmp_path / JOURNAL_FILE)
     assert course.losses == [progress.loss for progress in seen]
     assert course.val_psnr_db == {one.val_step: one.val_psnr_db for one in seen if one.val_step is not None}
@@ -59,7 +55,7 @@ def page(tiny_dataset: Callable[..., Dataset], tiny_config: Callable[..., Traini
     return ScenePage(dataset, scene, predictions, "a machine", scene_name="ball & <noise>", spread=2, course=course)
 
 
-def test_the_page_of_a_scene_alone_with_frames_from_end_to_end(page: ScenePage, tmp_path: Path) -> None:
+def test_the_page_of_a_scene_alone_with_frames_from_end_to_end(page, tmp_path):
     text = render_page(page)
     checked = Checked(text)
     assert checked.open_tags == []

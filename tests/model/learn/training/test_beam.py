@@ -1,9 +1,6 @@
 """Training with a beam: a given one makes slices thin again, and one that nobody gave is found."""
 
-from __future__ import annotations
-
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -23,7 +20,7 @@ PLANE = ElevationBeam(thickness_mm=0.0)
 LEARNING = TrainingConfig(steps=500, confidence=False, learn_beam=True)
 
 
-def phantom() -> GaussianScene:
+def phantom():
     """Points and speckle: Gaussians much smaller than the beams."""
     rng = np.random.default_rng(1)
     count = POINTS + 3000
@@ -39,7 +36,7 @@ def phantom() -> GaussianScene:
     return GaussianScene.from_splats(tensors, info=SceneInfo(intensity="sigmoid"))
 
 
-def turned(axis: int, angle_deg: float) -> np.ndarray:  # [4, 4]: about an axis through the middle of the image
+def turned(axis, angle_deg):  # [4, 4]: about an axis through the middle of the image
     cosine, sine = np.cos(np.radians(angle_deg)), np.sin(np.radians(angle_deg))
     turn, i, j = np.eye(4), (axis + 1) % 3, (axis + 2) % 3
     turn[[i, j], [i, j]], turn[i, j], turn[j, i] = cosine, -sine, sine
@@ -48,7 +45,7 @@ def turned(axis: int, angle_deg: float) -> np.ndarray:  # [4, 4]: about an axis 
     return there @ turn @ back
 
 
-def sweep_poses(turn: np.ndarray, count: int = 20, spacing_mm: float = 0.9) -> np.ndarray:  # [count, 4, 4]
+def sweep_poses(turn, count=20, spacing_mm=0.9):  # [count, 4, 4]
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, 1, 3] = (np.arange(count) - (count - 1) / 2) * spacing_mm
     return turn @ poses
@@ -60,25 +57,17 @@ SWEEPS = {
 }
 
 
-def frames(scene: GaussianScene, poses: np.ndarray, beam: ElevationBeam) -> np.ndarray:  # [C, H, W]
+def frames(scene, poses, beam):  # [C, H, W]
     return render(scene, PROBE, poses, height=SIDE, width=SIDE, outputs=("bmode",), beam=beam)["bmode"].numpy()
 
 
-def imaged(scene: GaussianScene, poses: np.ndarray, beam: ElevationBeam) -> Dataset:
+def imaged(scene, poses, beam):
     images = np.round(255.0 * frames(scene, poses, beam)).astype(np.uint8)
     whole = Sweep(images=images, poses=poses, probe=PROBE, frame_numbers=np.arange(len(poses)), source="phantom")
     return Dataset("phantom", whole, whole.select([]))
 
 
-@pytest.fixture(autouse=True)
-def one_thread() -> object:
-    before = torch.get_num_threads()
-    torch.set_num_threads(1)
-    yield
-    torch.set_num_threads(before)
-
-
-def width_across_mm(scene: GaussianScene, beam: ElevationBeam, places_mm: np.ndarray) -> float:
+def width_across_mm(scene, beam, places_mm):
     """Full width at half maximum of points across elevation: the median over those well inside the volume."""
     across = np.arange(-6.0, 6.01, 0.25)
     poses = np.tile(np.eye(4), (len(across), 1, 1))
@@ -105,9 +94,8 @@ def width_across_mm(scene: GaussianScene, beam: ElevationBeam, places_mm: np.nda
         ("tilted", CONSTANT),
     ],
 )
-def test_a_beam_that_nobody_gave_is_found(sweeps: str, beam: ElevationBeam) -> None:
+def test_a_beam_that_nobody_gave_is_found(sweeps, beam):
     found = train(imaged(phantom(), SWEEPS[sweeps], beam), LEARNING).info.beam
-    assert found is not None
     for depth_mm in (4.0, 8.0, 12.0, 16.0, 20.0):
         assert found.thickness_at_mm(depth_mm) == pytest.approx(beam.thickness_at_mm(depth_mm), rel=0.15)
 
@@ -115,15 +103,14 @@ def test_a_beam_that_nobody_gave_is_found(sweeps: str, beam: ElevationBeam) -> N
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("start_mm", [0.5, 8.0])
-def test_wherever_the_search_starts(start_mm: float) -> None:
+def test_wherever_the_search_starts(start_mm):
     config = replace(LEARNING, slice_thickness_mm=start_mm)
     found = train(imaged(phantom(), SWEEPS["crossing"], FOCUSED), config).info.beam
-    assert found is not None
     assert found.thickness_at_mm(12.0) == pytest.approx(2.0, rel=0.15)
 
 
 @pytest.mark.long
-def test_thin_slices_of_a_scene_trained_from_thick_ones_are_sharper_across_elevation() -> None:
+def test_thin_slices_of_a_scene_trained_from_thick_ones_are_sharper_across_elevation():
     truth = phantom()
     points = replace(truth, **{name: raw[:POINTS] for name, raw in truth.splats.items()})
     places_mm = 10.0 * points.means.numpy()
@@ -135,7 +122,7 @@ def test_thin_slices_of_a_scene_trained_from_thick_ones_are_sharper_across_eleva
     assert thin < thick / 2.0
 
 
-def test_a_resumed_run_ends_in_the_same_beam(tmp_path: Path) -> None:
+def test_a_resumed_run_ends_in_the_same_beam(tmp_path):
     dataset = imaged(phantom(), SWEEPS["crossing"][::4], FOCUSED)
     config = TrainingConfig(steps=12, max_gaussians=400, confidence=False, learn_beam=True, slice_thickness_mm=3.0)
     whole = train(dataset, config)
@@ -145,14 +132,14 @@ def test_a_resumed_run_ends_in_the_same_beam(tmp_path: Path) -> None:
     assert resumed.info.beam == whole.info.beam != CONSTANT
 
 
-def test_without_a_beam_a_scene_has_none_and_keeps_its_file() -> None:
+def test_without_a_beam_a_scene_has_none_and_keeps_its_file():
     dataset = imaged(phantom(), SWEEPS["crossing"][::4], CONSTANT)
     scene = train(dataset, TrainingConfig(steps=2, max_gaussians=50, confidence=False))
     assert scene.info.beam is None
     assert TrainedBeam(TrainingConfig(), PROBE).numbers is None
 
 
-def test_a_beam_thinner_than_the_gaps_is_doubtful() -> None:
+def test_a_beam_thinner_than_the_gaps_is_doubtful():
     thin, given = (
         TrainedBeam(TrainingConfig(slice_thickness_mm=0.4, learn_beam=learned), PROBE) for learned in (True, False)
     )
@@ -164,6 +151,6 @@ def test_a_beam_thinner_than_the_gaps_is_doubtful() -> None:
 @pytest.mark.parametrize(
     "shape", [{"slice_focus_mm": 9.0}, {"slice_thickness_mm": 2.0, "slice_depth_of_field_mm": 9.0}]
 )
-def test_half_a_beam_is_refused(shape: dict[str, float]) -> None:
+def test_half_a_beam_is_refused(shape):
     with pytest.raises(InvalidArgument, match="must be given together"):
         TrainingConfig(**shape)

@@ -1,19 +1,11 @@
 """TrainingConfig: presets, overrides, and one sentence for what cannot be."""
 
-from __future__ import annotations
-
 import json
-import subprocess
-import sys
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 
 from ultragray.errors import InvalidArgument
-from ultragray.learn.sweep import Dataset
 from ultragray.learn.training.config import (
     VIEWS_BETWEEN,
     TrainingConfig,
@@ -24,7 +16,7 @@ from ultragray.learn.training.config import (
 from ultragray.learn.training.geometry import Geometry
 
 
-def test_presets() -> None:
+def test_presets():
     paper = TrainingConfig.preset("paper")
     assert (paper.steps, paper.max_gaussians, paper.initial_gaussians) == (30_000, 500_000, 500_000)
     assert (paper.intensity, paper.start, paper.out_of_plane_mm) == ("released", "random", 2.0)
@@ -33,7 +25,7 @@ def test_presets() -> None:
         TrainingConfig.preset("slow")
 
 
-def test_more_effort_is_more_steps_and_gaussians_unless_they_are_given(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_more_effort_is_more_steps_and_gaussians_unless_they_are_given(tiny_dataset):
     geometry = Geometry.of(tiny_dataset())
     usual, thrice = (TrainingConfig(effort=effort).resolved(geometry) for effort in (1.0, 3.0))
     assert (thrice.steps, thrice.max_gaussians) == (3 * (usual.steps or 0), 3 * (usual.max_gaussians or 0))
@@ -42,20 +34,18 @@ def test_more_effort_is_more_steps_and_gaussians_unless_they_are_given(tiny_data
     assert TrainingConfig.preset("best").resolved(geometry) == usual  # the effort is chosen before, see test_effort.py
 
 
-def test_half_of_the_gaussians_start_where_only_the_end_is_given(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_half_of_the_gaussians_start_where_only_the_end_is_given(tiny_dataset):
     geometry = Geometry.of(tiny_dataset())
     assert TrainingConfig.preset("paper", max_gaussians=60_000).resolved(geometry).initial_gaussians == 30_000
     assert TrainingConfig.preset("paper", max_gaussians=60_000, initial_gaussians=7).initial_gaussians == 7
 
 
-def test_frames_however_far_apart_shift_a_batch_by_at_most_ten_centimetres(
-    tiny_dataset: Callable[..., Dataset],
-) -> None:
+def test_frames_however_far_apart_shift_a_batch_by_at_most_ten_centimetres(tiny_dataset):
     geometry = replace(Geometry.of(tiny_dataset()), out_of_plane_mm=500.0)
     assert TrainingConfig().resolved(geometry).out_of_plane_mm == 100.0
 
 
-def test_what_is_left_open_follows_from_the_data(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_what_is_left_open_follows_from_the_data(tiny_dataset):
     geometry = Geometry.of(tiny_dataset())
     config = TrainingConfig().resolved(geometry)
     assert config.steps == geometry.steps(VIEWS_BETWEEN)
@@ -70,7 +60,7 @@ def test_what_is_left_open_follows_from_the_data(tiny_dataset: Callable[..., Dat
     assert resolved.resolved(geometry) == resolved
 
 
-def test_a_step_has_whole_views_between_frames_and_one_frame_at_least(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_a_step_has_whole_views_between_frames_and_one_frame_at_least(tiny_dataset):
     geometry = Geometry.of(tiny_dataset())
     for batch_size, asked, found in ((8, 0.75, 0.75), (1, 0.75, 0.0), (8, 1.0, 0.875), (4, 0.1, 0.0)):
         config = TrainingConfig(batch_size=batch_size, views_between=asked).resolved(geometry)
@@ -78,7 +68,7 @@ def test_a_step_has_whole_views_between_frames_and_one_frame_at_least(tiny_datas
         assert config.steps == geometry.steps(found)
 
 
-def test_an_unknown_setting_is_refused_with_the_known_ones() -> None:
+def test_an_unknown_setting_is_refused_with_the_known_ones():
     with pytest.raises(
         InvalidArgument, match=r"no setting stepz; it has steps, effort, batch_size, .*, memory_gb"
     ) as caught:
@@ -86,18 +76,7 @@ def test_an_unknown_setting_is_refused_with_the_known_ones() -> None:
     assert caught.value.field == "stepz"
 
 
-@pytest.mark.slow
-def test_a_configuration_needs_no_torch() -> None:
-    program = (
-        f"import sys; sys.path[:] = {sys.path!r}; from ultragray.learn.training import TrainingConfig; "
-        "TrainingConfig.preset('fast', steps=3); print('torch' in sys.modules); "
-        "from ultragray.learn.training import train; print('torch' in sys.modules)"
-    )
-    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    assert told.split() == ["False", "True"]
-
-
-def test_survives_json() -> None:
+def test_survives_json():
     config = TrainingConfig.preset("paper", steps=7, out_of_plane_mm=0)
     assert TrainingConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
 
@@ -106,27 +85,22 @@ def test_survives_json() -> None:
     ("settings", "sentence"),
     [
         ({"steps": 0}, "steps must be an integer from 1 to 10000000, got 0"),
-        ({"steps": 2.5}, "steps must be an integer from 1 to 10000000, got 2.5"),
-        ({"steps": True}, "steps must be an integer from 1 to 10000000, got true"),
         ({"batch_size": None}, "batch_size must be an integer from 1 to 1024, got null"),
         ({"means_rate": float("nan")}, "means_rate must be a finite number from 0 to 1, got nan"),
         ({"out_of_plane_mm": "wide"}, "out_of_plane_mm must be a finite number from 0 to 100, got 'wide'"),
-        ({"transmittance": 0}, "transmittance must be true or false, got 0"),
         ({"intensity": "linear"}, "intensity must be one of released, sigmoid, got 'linear'"),
-        ({"start": "warm"}, "start must be one of informed, random, got 'warm'"),
         ({"max_gaussians": 5, "initial_gaussians": 6}, "initial_gaussians must be at most max_gaussians (5), got 6"),
-        ({"max_gaussians": "many"}, "max_gaussians must be an integer from 1 to 100000000, got 'many'"),
         ({"sh_degree": 4}, "sh_degree must be an integer from 0 to 3, got 4"),
     ],
 )
-def test_refuses(settings: dict[str, Any], sentence: str) -> None:
+def test_refuses(settings, sentence):
     with pytest.raises(InvalidArgument) as caught:
         TrainingConfig.preset("fast", **settings)
     assert caught.value.detail == sentence
     assert caught.value.field in sentence
 
 
-def test_file(tmp_path: Path) -> None:
+def test_file(tmp_path):
     path = tmp_path / "run.toml"
     path.write_text('preset = "paper"\nsteps = 100\nmeans_rate = 1e-4\n')
     assert read_config_file(path) == {"preset": "paper", "steps": 100, "means_rate": 1e-4}
@@ -138,11 +112,11 @@ def test_file(tmp_path: Path) -> None:
         read_config_file(path)
 
 
-def test_values() -> None:
+def test_values():
     values = [parse_value(text) for text in ("3", "1e-4", "true", "random", '"random"', "")]
     assert values == [3, 1e-4, True, "random", "random", ""]
 
 
 @pytest.mark.parametrize(("steps", "rate"), [(60_000, 5e-4), (30_000, 5e-4), (3_000, 5e-3), (500, 2e-2)])
-def test_short_runs_of_the_released_recipe_let_shadows_form(steps: int, rate: float) -> None:
+def test_short_runs_of_the_released_recipe_let_shadows_form(steps, rate):
     assert scaled_transmittance_rate(steps) == pytest.approx(rate)

@@ -1,46 +1,35 @@
 """Training on the CUDA backend: what the CPU learns, resumed and repeated bit for bit."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ultragray import GaussianScene
-from ultragray.learn.sweep import Dataset
-from ultragray.learn.training import Progress, TrainingConfig, train
+from ultragray.learn.training import TrainingConfig, train
 from ultragray.rendering.backends import cuda
-
-Datasets = Callable[..., Dataset]
-Configs = Callable[..., TrainingConfig]
 
 
 @pytest.fixture
-def dataset(tiny_dataset: Datasets) -> Dataset:
+def dataset(tiny_dataset):
     return tiny_dataset(frames=5, height=16, width=12)
 
 
 @pytest.fixture
-def config(tiny_config: Configs) -> TrainingConfig:
+def config(tiny_config):
     if not cuda.available():
         pytest.skip("there is no GPU, and Triton is not installed, which could interpret the kernels")
     return tiny_config(steps=6, max_gaussians=30, batch_size=2, refinements=1)
 
 
-def learned(
-    dataset: Dataset, config: TrainingConfig, device: str, backend: str
-) -> tuple[GaussianScene, list[Progress]]:
-    seen: list[Progress] = []
+def learned(dataset, config, device, backend):
+    seen = []
     return train(dataset, config, report=seen.append, device=device, backend=backend), seen
 
 
 @pytest.mark.long
 @pytest.mark.slow
-def test_learns_what_the_cpu_learns(dataset: Dataset, config: TrainingConfig) -> None:
+def test_learns_what_the_cpu_learns(dataset, config):
     config = replace(config, refinements=0)  # whose random halves turn with quaternions that nothing decides yet
     expected, by_cpu = learned(dataset, config, "cpu", "cpu")
     found, by_cuda = learned(dataset, config, "cuda", "cuda")
@@ -53,7 +42,7 @@ def test_learns_what_the_cpu_learns(dataset: Dataset, config: TrainingConfig) ->
 
 
 @pytest.mark.long
-def test_resumed_run_ends_in_the_same_scene(dataset: Dataset, config: TrainingConfig, tmp_path: Path) -> None:
+def test_resumed_run_ends_in_the_same_scene(dataset, config, tmp_path):
     expected = train(dataset, config, device="cuda", backend="cuda").to_bytes()
     steps = iter(range(100))
     for resume in (False, True):
@@ -73,7 +62,7 @@ def test_resumed_run_ends_in_the_same_scene(dataset: Dataset, config: TrainingCo
 
 
 @pytest.mark.gpu
-def test_a_gpu_reaches_what_the_cpu_reaches(tiny_dataset: Datasets) -> None:
+def test_a_gpu_reaches_what_the_cpu_reaches(tiny_dataset):
     dataset = tiny_dataset(frames=40, height=96, width=80, spacing_mm=0.2)
     config = TrainingConfig.preset("fast", steps=250, max_gaussians=2_000, refinements=2)
     by_cpu, by_gpu = (learned(dataset, config, device, "auto") for device in ("cpu", "cuda"))

@@ -1,26 +1,20 @@
 """The effort of a training that leaves it open: chosen on frames left out, once, whatever interrupts the choice."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
 from ultragray.errors import MemoryExceeded
 from ultragray.learn.evaluation.metrics import FrameMetrics
-from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import Progress, TrainingConfig, train
 from ultragray.learn.training.checkpointing import read_checkpoint_header
 from ultragray.learn.training.run import EFFORTS_FILE, FITTING, choose_effort
 from ultragray.learn.training.trainer import CHECKPOINT_FILE
 
-Datasets = Callable[..., Dataset]
 OPEN = TrainingConfig(effort=None, max_gaussians=60, batch_size=3)
 
 
-def metrics(rank: float) -> FrameMetrics:
+def metrics(rank):
     """Better in everything for a higher rank."""
     return FrameMetrics(psnr_db=20.0 + rank, ms_ssim=0.8 + rank / 100, gms=0.9 + rank / 100, gmsd=0.15 - rank / 100)
 
@@ -28,10 +22,10 @@ def metrics(rank: float) -> FrameMetrics:
 class TryOut:
     """Scores by effort, of a training that is not done; keeps what was asked for."""
 
-    def __init__(self, ranks: dict[float, float]) -> None:
+    def __init__(self, ranks):
         self.ranks, self.asked = ranks, list[float]()
 
-    def __call__(self, part: Dataset, config: TrainingConfig) -> FrameMetrics:
+    def __call__(self, part, config):
         assert len(part.train)
         assert len(part.val) >= 3
         assert not config.confidence
@@ -50,28 +44,26 @@ class TryOut:
         ({1.0: 0.0, 2.0: 0.0, 0.5: 0.0}, 1.0, [1.0, 2.0, 0.5]),
     ],
 )
-def test_the_best_effort_is_looked_for_upwards_then_downwards(
-    tiny_dataset: Datasets, ranks: dict[float, float], chosen: float, asked: list[float]
-) -> None:
+def test_the_best_effort_is_looked_for_upwards_then_downwards(tiny_dataset, ranks, chosen, asked):
     try_out = TryOut(ranks)
     assert choose_effort(tiny_dataset(frames=40), OPEN, try_out, None) == chosen
     assert try_out.asked == asked
 
 
 @pytest.mark.parametrize("name", ["psnr_db", "ms_ssim", "gms", "gmsd"])
-def test_an_effort_that_is_worse_in_one_metric_is_not_better(name: str) -> None:
+def test_an_effort_that_is_worse_in_one_metric_is_not_better(name):
     better = metrics(1.0)
     assert better.is_better_than(metrics(0.0))
     assert not replace(better, **{name: getattr(metrics(-1.0), name)}).is_better_than(metrics(0.0))
     assert not better.is_better_than(better)
 
 
-def test_what_was_found_is_not_tried_again_in_the_same_run(tiny_dataset: Datasets, tmp_path: Path) -> None:
+def test_what_was_found_is_not_tried_again_in_the_same_run(tiny_dataset, tmp_path):
     dataset, folder = tiny_dataset(frames=40), tmp_path / "run"
     ranks = {1.0: 0.0, 2.0: 1.0, 3.0: 0.5}
     interrupted = TryOut(ranks)
 
-    def try_out(part: Dataset, config: TrainingConfig) -> FrameMetrics | None:
+    def try_out(part, config):
         return None if len(interrupted.asked) > 1 else interrupted(part, config)
 
     assert choose_effort(dataset, OPEN, try_out, folder) is None
@@ -87,12 +79,10 @@ def test_what_was_found_is_not_tried_again_in_the_same_run(tiny_dataset: Dataset
     assert damaged.asked == [1.0, 2.0, 3.0]
 
 
-def test_an_effort_that_the_memory_does_not_allow_is_not_chosen(
-    tiny_dataset: Datasets, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_an_effort_that_the_memory_does_not_allow_is_not_chosen(tiny_dataset, caplog):
     usual = TryOut({1.0: 0.0, 0.5: -1.0})
 
-    def try_out(part: Dataset, config: TrainingConfig) -> FrameMetrics:
+    def try_out(part, config):
         if config.effort == 2.0:
             raise MemoryExceeded("too many Gaussians")
         return usual(part, config)
@@ -101,16 +91,12 @@ def test_an_effort_that_the_memory_does_not_allow_is_not_chosen(
     assert "effort 2 cannot be tried: too many Gaussians" in caplog.text
 
 
-def test_few_frames_are_trained_with_the_usual_effort(tiny_dataset: Datasets) -> None:
-    assert choose_effort(tiny_dataset(frames=6), OPEN, TryOut({}), None) == 1.0
-
-
-def trying(effort: float) -> str:
+def trying(effort):
     return f"trying effort {effort:g} on a part of the frames"
 
 
 @pytest.mark.long
-def test_a_run_chooses_first_and_says_so(tiny_dataset: Datasets, tmp_path: Path) -> None:
+def test_a_run_chooses_first_and_says_so(tiny_dataset, tmp_path):
     dataset, seen = tiny_dataset(frames=40), list[Progress]()
     config = TrainingConfig(effort=None, steps=12, batch_size=3)
     scene = train(dataset, config, folder=tmp_path, report=seen.append)
@@ -123,7 +109,7 @@ def test_a_run_chooses_first_and_says_so(tiny_dataset: Datasets, tmp_path: Path)
     assert scene.to_bytes() == train(dataset, replace(config, effort=chosen)).to_bytes()
 
 
-def test_a_run_whose_choice_is_stopped_goes_on_with_it(tiny_dataset: Datasets, tmp_path: Path) -> None:
+def test_a_run_whose_choice_is_stopped_goes_on_with_it(tiny_dataset, tmp_path):
     dataset, seen = tiny_dataset(frames=40), list[Progress]()
     config = TrainingConfig(effort=None, steps=12, batch_size=3, confidence=False)
     stopped = train(
@@ -137,10 +123,3 @@ def test_a_run_whose_choice_is_stopped_goes_on_with_it(tiny_dataset: Datasets, t
     effort = read_checkpoint_header(tmp_path / CHECKPOINT_FILE).config.effort
     whole = train(dataset, config, folder=tmp_path, resume=True)
     assert whole.to_bytes() == train(dataset, replace(config, effort=effort)).to_bytes()
-
-
-def test_nothing_is_chosen_where_the_effort_changes_nothing(tiny_dataset: Datasets) -> None:
-    seen: list[Progress] = []
-    config = TrainingConfig(effort=None, steps=3, max_gaussians=40, batch_size=3, confidence=False)
-    train(tiny_dataset(frames=40), config, report=seen.append)
-    assert [progress.beside for progress in seen] == [None] * 3

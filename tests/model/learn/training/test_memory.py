@@ -1,31 +1,27 @@
-"""A training that would not fit is refused before it starts."""
-
-from __future__ import annotations
+"""The device of a training; one that would not fit is refused before it starts."""
 
 import os
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
-from ultragray.errors import MemoryExceeded
-from ultragray.learn.sweep import Dataset
+from ultragray.errors import BackendUnavailable, MemoryExceeded
 from ultragray.learn.training import TrainingConfig, memory, train
 from ultragray.learn.training import alignment as overlap
 from ultragray.learn.training.geometry import Geometry
+from ultragray.learn.training.memory import training_device
 
 
-def test_names_what_to_lower(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_names_what_to_lower(tiny_dataset):
     config = TrainingConfig.preset("fast", max_gaussians=50_000_000, memory_gb=4.0)
     with pytest.raises(MemoryExceeded, match=r"50,000,000 Gaussians .* memory_gb allows 4\.0 GiB: lower max_gaussians"):
         train(tiny_dataset(), config)
 
 
-def test_uses_what_is_free(tiny_dataset: Callable[..., Dataset], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_uses_what_is_free(tiny_dataset, monkeypatch):
     dataset, config = tiny_dataset(), TrainingConfig(max_gaussians=1000)
     needed = memory.required_bytes(dataset, config)
     monkeypatch.setattr(memory, "available_bytes", lambda: needed)
@@ -35,9 +31,7 @@ def test_uses_what_is_free(tiny_dataset: Callable[..., Dataset], monkeypatch: py
         memory.check_memory(dataset, config, torch.device("cpu"))
 
 
-def test_a_gpu_is_asked_for_its_own_memory(
-    tiny_dataset: Callable[..., Dataset], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_gpu_is_asked_for_its_own_memory(tiny_dataset, monkeypatch):
     dataset, device = tiny_dataset(), torch.device("cuda", 1)
     config = TrainingConfig(max_gaussians=1000)
     needed = memory.required_device_bytes(dataset, config)
@@ -56,10 +50,10 @@ def test_a_gpu_is_asked_for_its_own_memory(
         memory.check_memory(dataset, TrainingConfig(max_gaussians=1000, memory_gb=0.1), device)
 
 
-def test_a_gpu_keeps_a_slice_of_each_gaussian_for_each_frame(tiny_dataset: Callable[..., Dataset]) -> None:
+def test_a_gpu_keeps_a_slice_of_each_gaussian_for_each_frame(tiny_dataset):
     dataset = tiny_dataset(frames=90)
 
-    def needed(batch_size: int, gaussians: int) -> int:
+    def needed(batch_size, gaussians):
         return memory.required_device_bytes(dataset, TrainingConfig(max_gaussians=gaussians, batch_size=batch_size))
 
     per_frame = (needed(64, 500_000) - needed(32, 500_000)) / 32
@@ -67,44 +61,7 @@ def test_a_gpu_keeps_a_slice_of_each_gaussian_for_each_frame(tiny_dataset: Calla
     assert needed(8, 500_000) < 2 << 30  # the training of the paper fits every GPU that is in use
 
 
-def test_grows_with_gaussians_and_pixels(tiny_dataset: Callable[..., Dataset]) -> None:
-    def needed(dataset: Dataset, **settings: int) -> int:
-        return memory.required_bytes(dataset, TrainingConfig.preset("fast", **{"max_gaussians": 1000, **settings}))
-
-    small = tiny_dataset()
-    per_gaussian = (needed(small, max_gaussians=200_000) - needed(small, max_gaussians=100_000)) / 100_000
-    assert 4 * 15 * 5 < per_gaussian < 2_000  # parameters, gradients, moments and a copy at least
-    assert needed(tiny_dataset(height=200, width=200)) > needed(small)
-    assert needed(small, sh_degree=3) > needed(small)
-
-
-def test_batches_take_room_for_the_slices_of_all_gaussians(tiny_dataset: Callable[..., Dataset]) -> None:
-    dataset = tiny_dataset(frames=90)
-
-    def needed(batch_size: int) -> int:
-        return memory.required_bytes(dataset, TrainingConfig(max_gaussians=150_000, batch_size=batch_size))
-
-    per_frame = (needed(64) - needed(32)) / 32
-    assert 72 * 150_000 < per_frame < 72 * 150_000 * 1.2
-
-
-def test_held_out_frames_take_bounded_room(
-    tiny_dataset: Callable[..., Dataset], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    dataset, config = tiny_dataset(frames=400), TrainingConfig(max_gaussians=1000, batch_size=1)
-    monkeypatch.setattr(memory, "CHUNK_PIXELS", 20 * 20 * 16)
-
-    def needed(held_out: int) -> int:
-        val = dataset.val.select(np.arange(held_out))
-        return memory.required_bytes(Dataset("some", dataset.train.select([0, 1]), val), config)
-
-    assert needed(20) - needed(10) > 10 * 20 * 16 * 200  # what measuring takes of each pixel
-    assert needed(80) - needed(20) == 60 * 20 * 16  # the frames themselves
-
-
-def test_frames_that_cannot_be_compared_are_refused_before_they_are(
-    tiny_dataset: Callable[..., Dataset], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_frames_that_cannot_be_compared_are_refused_before_they_are(tiny_dataset, monkeypatch):
     dataset, config = tiny_dataset(), TrainingConfig(max_gaussians=1000)
     monkeypatch.setattr(memory, "available_bytes", lambda: memory.comparison_bytes(dataset, config) - 1)
     monkeypatch.setattr(Geometry, "of", lambda dataset: pytest.fail("the frames were compared"))
@@ -112,18 +69,7 @@ def test_frames_that_cannot_be_compared_are_refused_before_they_are(
         train(dataset, config)
 
 
-def test_comparing_frames_grows_with_their_square(tiny_dataset: Callable[..., Dataset]) -> None:
-    datasets = [tiny_dataset(frames=frames) for frames in (40, 80, 120)]  # 30, 60 and 90 to train from
-    config = TrainingConfig(max_gaussians=1000)
-    first, second, third = (memory.comparison_bytes(dataset, config) for dataset in datasets)
-    assert (third - second) - (second - first) == 2 * 8 * 30**2
-    small, large = (memory.required_bytes(dataset, config) for dataset in datasets[:2])
-    assert large - small > second - first
-
-
-def test_the_registration_of_sweeps_takes_a_bounded_share(
-    tiny_dataset: Callable[..., Dataset], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_registration_of_sweeps_takes_a_bounded_share(tiny_dataset, monkeypatch):
     plain, refined = (TrainingConfig(max_gaussians=1000, refine_poses=mode) for mode in ("none", "sweeps"))
     dataset = tiny_dataset(height=500, width=500, frames=8)  # 6 to train from
     assert memory.comparison_bytes(dataset, refined) == memory.REGISTERED_BYTES * 6 * 500**2
@@ -139,9 +85,7 @@ def test_the_registration_of_sweeps_takes_a_bounded_share(
         ("memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
     ],
 )
-def test_file_caches_of_a_control_group_are_free(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, folder: str, limit: str, used: str, entry: str
-) -> None:
+def test_file_caches_of_a_control_group_are_free(tmp_path, monkeypatch, folder, limit, used, entry):
     group = tmp_path / folder
     group.mkdir(exist_ok=True)
     (group / limit).write_text("1000000\n")
@@ -152,11 +96,6 @@ def test_file_caches_of_a_control_group_are_free(
     (group / limit).write_text("max\n")
     available = memory.available_bytes()
     assert available is None or available > 1_000_000
-
-
-def test_finds_out_what_is_available() -> None:
-    available = memory.available_bytes()
-    assert available is None or available > 0
 
 
 PROGRAM = """
@@ -185,10 +124,63 @@ print(int(peak[1]) * 1024, memory.required_bytes(dataset, config))
     ],
     ids=["gaussians", "slices", "held-out"],
 )
-def test_what_is_said_is_an_upper_bound(tmp_path: Path, data: dict[str, float], settings: dict[str, int]) -> None:
+def test_what_is_said_is_an_upper_bound(tmp_path, data, settings):
     conftest = str(Path(__file__).parents[1] / "conftest.py")
     program = PROGRAM.format(path=sys.path, conftest=conftest, folder=str(tmp_path), data=data, settings=settings)
     environment = {**os.environ, "OMP_NUM_THREADS": "1"}
     found = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True, env=environment)
     used, said = map(int, found.stdout.split())
     assert 0.5 * said < used < said
+
+
+@pytest.fixture
+def one_gpu(monkeypatch):
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 1)
+
+
+@pytest.fixture
+def no_gpu(monkeypatch):
+    monkeypatch.delenv("TRITON_INTERPRET", raising=False)
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
+
+
+@pytest.mark.parametrize("backend", ["auto", "cuda", "reference"])
+@pytest.mark.usefixtures("one_gpu")
+def test_gpus_by_number(backend):
+    assert training_device("cuda", backend) == torch.device("cuda", 0)
+    assert training_device("cuda:0", backend) == torch.device("cuda", 0)
+    with pytest.raises(BackendUnavailable, match="CUDA device 7 was asked for, but there are 1"):
+        training_device("cuda:7", backend)
+
+
+@pytest.mark.usefixtures("one_gpu")
+def test_a_backend_that_renders_elsewhere_is_refused():
+    with pytest.raises(
+        BackendUnavailable, match="backend cuda renders on a GPU, but the device is cpu: give device cu"
+    ):
+        training_device("cpu", "cuda")
+    with pytest.raises(BackendUnavailable, match="backend cpu renders on the CPU, but the device is cuda:0: give devi"):
+        training_device("cuda:0", "cpu")
+
+
+@pytest.mark.usefixtures("no_gpu")
+def test_says_what_is_missing_without_a_gpu():
+    for device, backend in (("cuda", "auto"), ("cuda:7", "auto"), ("cpu", "cuda"), ("cuda", "cpu")):
+        with pytest.raises(BackendUnavailable, match="backend cuda needs an NVIDIA GPU and torch's CUDA build, but"):
+            training_device(device, backend)
+    assert training_device("cpu", "auto") == torch.device("cpu")
+
+
+@pytest.mark.usefixtures("one_gpu")
+@pytest.mark.parametrize("name", ["", "warp", "cuda:", "cuda:x", "cuda:-1", "cuda:²", "cudaX", "cpu:1", "meta", "mps"])
+def test_other_names_are_refused(name):
+    with pytest.raises(BackendUnavailable, match="device must be cpu, cuda or cuda:N, got"):
+        training_device(name, "auto")
+
+
+def test_kernels_that_are_interpreted_train_on_the_cpu(monkeypatch):
+    pytest.importorskip("triton")
+    monkeypatch.setenv("TRITON_INTERPRET", "1")
+    assert training_device("cuda", "cuda") == torch.device("cpu") == training_device("cpu", "cuda")

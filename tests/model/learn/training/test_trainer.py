@@ -1,7 +1,5 @@
 """train(): it learns, it repeats itself bit for bit, and nothing that stops it loses the work."""
 
-from __future__ import annotations
-
 import json
 import os
 import random
@@ -9,10 +7,8 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -29,32 +25,27 @@ from ultragray.errors import (
     TrainingDiverged,
     TrainingStateInvalid,
 )
-from ultragray.learn.sweep import Dataset
-from ultragray.learn.training import Progress, TrainingConfig, train, trainer
+from ultragray.learn.training import train, trainer
 from ultragray.learn.training.geometry import Geometry
 from ultragray.learn.training.run import scene_of_checkpoint
 from ultragray.scene import info as scene_info
 
 from ....waiting import Deadline
 
-Datasets = Callable[..., Dataset]
-Configs = Callable[..., TrainingConfig]
 
-
-def learned(dataset: Dataset, config: TrainingConfig, **options: Any) -> tuple[GaussianScene, list[Progress]]:
-    seen: list[Progress] = []
+def learned(dataset, config, **options):
+    seen = []
     return train(dataset, config, report=seen.append, **options), seen
 
 
-@pytest.mark.parametrize("intensity", ["released", "sigmoid"])
-def test_learns(tiny_dataset: Datasets, tiny_config: Configs, intensity: str) -> None:
-    _, seen = learned(tiny_dataset(), tiny_config(intensity=intensity, steps=120, refinements=0))
+def test_learns(tiny_dataset, tiny_config):
+    _, seen = learned(tiny_dataset(), tiny_config(steps=80, refinements=0))
     first, last = (sum(progress.loss for progress in some) for some in (seen[:8], seen[-8:]))
     assert last < 0.8 * first
 
 
-def test_reports_every_step(tiny_dataset: Datasets, tiny_config: Configs) -> None:
-    scene, seen = learned(tiny_dataset(), tiny_config(confidence=False))
+def test_reports_every_step(tiny_dataset, tiny_config):
+    scene, seen = learned(tiny_dataset(), tiny_config())
     assert [progress.step for progress in seen] == list(range(1, 25))
     assert {progress.steps for progress in seen} == {24}
     assert seen[-1].seconds_left == 0
@@ -63,7 +54,7 @@ def test_reports_every_step(tiny_dataset: Datasets, tiny_config: Configs) -> Non
     assert scene.gaussian_count == 60
 
 
-def test_scene_says_what_it_is(tiny_dataset: Datasets, tiny_config: Configs, tmp_path: Path) -> None:
+def test_scene_says_what_it_is(tiny_dataset, tiny_config, tmp_path):
     dataset, config = tiny_dataset(), tiny_config()
     scene, _ = learned(dataset, config)
     scene.save(tmp_path / "scene.ugr")
@@ -78,19 +69,13 @@ def test_scene_says_what_it_is(tiny_dataset: Datasets, tiny_config: Configs, tmp
     assert np.array_equal(scene.training_poses, dataset.train.poses)
 
 
-def test_same_seed_same_scene(tiny_dataset: Datasets, tiny_config: Configs) -> None:
-    first, second, other = (train(tiny_dataset(), tiny_config(seed=seed)).to_bytes() for seed in (1, 1, 2))
-    assert first == second
-    assert first != other
-
-
-def test_resumed_run_ends_in_the_same_scene(tiny_dataset: Datasets, tiny_config: Configs, tmp_path: Path) -> None:
+def test_resumed_run_ends_in_the_same_scene(tiny_dataset, tiny_config, tmp_path):
     """Stopped at every third step, which is before, at and after refinements and rounds of frames."""
-    dataset, config = tiny_dataset(), tiny_config(steps=12)
+    dataset, config = tiny_dataset(), tiny_config(steps=12, confidence=True)
     expected = train(dataset, config)
     count = 0
 
-    def every_third() -> bool:
+    def every_third():
         nonlocal count
         count += 1
         return count % 3 == 0
@@ -119,9 +104,7 @@ train(tiny.make_tiny_dataset(), tiny.make_tiny_config(), folder=pathlib.Path({fo
 
 
 @pytest.mark.slow
-def test_killed_run_that_is_resumed_ends_in_the_same_scene(
-    tiny_dataset: Datasets, tiny_config: Configs, tmp_path: Path
-) -> None:
+def test_killed_run_that_is_resumed_ends_in_the_same_scene(tiny_dataset, tiny_config, tmp_path):
     conftest = str(Path(__file__).parents[1] / "conftest.py")
     program = PROGRAM.format(path=sys.path, conftest=conftest, folder=str(tmp_path))
     process = subprocess.Popen([sys.executable, "-c", program], env={**os.environ, "OMP_NUM_THREADS": "1"})
@@ -135,7 +118,7 @@ def test_killed_run_that_is_resumed_ends_in_the_same_scene(
     finally:
         process.kill()
     assert process.wait() == -signal.SIGKILL
-    seen: list[Progress] = []
+    seen = []
     scene = train(tiny_dataset(), tiny_config(), folder=tmp_path, resume=True, report=seen.append)
     assert seen[0].step >= lines_before  # it went on rather than began again
     assert scene.to_bytes() == train(tiny_dataset(), tiny_config()).to_bytes()
@@ -143,7 +126,7 @@ def test_killed_run_that_is_resumed_ends_in_the_same_scene(
     assert lines == list(range(1, 25))
 
 
-def test_folder_of_another_run_is_refused(tiny_dataset: Datasets, tiny_config: Configs, tmp_path: Path) -> None:
+def test_folder_of_another_run_is_refused(tiny_dataset, tiny_config, tmp_path):
     dataset, config = tiny_dataset(), tiny_config()
     with pytest.raises(TrainingStateInvalid, match="no such file: there is nothing to resume"):
         train(dataset, config, folder=tmp_path, resume=True)
@@ -156,7 +139,7 @@ def test_folder_of_another_run_is_refused(tiny_dataset: Datasets, tiny_config: C
         train(tiny_dataset(spacing_mm=0.9), config, folder=tmp_path, resume=True)
 
 
-def spoilt(path: Path, **changed: torch.Tensor | None) -> None:
+def spoilt(path, **changed):
     """The checkpoint with some tensors changed, or left out where they are None; `__` stands for a dot."""
     with safe_open(path, framework="pt") as bundle:
         metadata = bundle.metadata()
@@ -174,29 +157,17 @@ def spoilt(path: Path, **changed: torch.Tensor | None) -> None:
             r"adam\.sh0\.exp_avg_sq is .*\[30, 1\], expected .*\[30, 1, 1\]",
         ),
         ({"adam__quats__step": torch.tensor(7.0)}, r"adam\.quats\.step is 7, expected 2"),
-        ({"adam__quats__step": None}, r"missing or unexpected tensors: adam\.quats\.step"),
         ({"adam__colours__step": torch.tensor(2.0)}, r"missing or unexpected tensors: adam\.colours\.step"),
         ({"parameter__means": torch.zeros(30, 3).double()}, r"parameter\.means is torch\.float64"),
-        ({"parameter__means": torch.zeros(())}, r"it holds 0 Gaussians, expected 1 to 60"),
         ({"parameter__means": torch.zeros(61, 3)}, r"it holds 61 Gaussians, expected 1 to 60"),
         ({"parameter__quats": torch.ones(29, 4)}, r"parameter\.quats is torch\.float32 \[29, 4\]"),
         ({"parameter__scales": torch.full((30, 3), float("nan"))}, r"parameter\.scales is not finite"),
-        ({"pull__total": torch.zeros(29)}, r"pull\.total is torch\.float32 \[29\]"),
         ({"waiting": torch.tensor([999])}, r"waiting names frames that the 8 do not have"),
-        ({"waiting": torch.tensor([-1])}, r"waiting names frames"),
         ({"waiting": torch.zeros(8, dtype=torch.int64)}, r"waiting names frames"),
-        ({"waiting": torch.tensor([1.0])}, r"waiting is torch\.float32"),
-        ({"generator": torch.zeros(7, dtype=torch.uint8)}, r"generator is torch\.uint8 \[7\]"),
         ({"generator": torch.full((5056,), 255, dtype=torch.uint8)}, r"generator is no generator's state"),
     ],
 )
-def test_a_checkpoint_with_other_tensors_is_refused(
-    tiny_dataset: Datasets,
-    tiny_config: Configs,
-    tmp_path: Path,
-    changed: dict[str, torch.Tensor | None],
-    reason: str,
-) -> None:
+def test_a_checkpoint_with_other_tensors_is_refused(tiny_dataset, tiny_config, tmp_path, changed, reason):
     stop = iter([False, True])
     train(tiny_dataset(), tiny_config(), folder=tmp_path, should_stop=lambda: next(stop))
     spoilt(tmp_path / "checkpoint.safetensors", **changed)
@@ -204,22 +175,10 @@ def test_a_checkpoint_with_other_tensors_is_refused(
         train(tiny_dataset(), tiny_config(), folder=tmp_path, resume=True)
 
 
-def test_opening_a_folder_removes_what_a_killed_run_left(
-    tiny_dataset: Datasets, tiny_config: Configs, tmp_path: Path
-) -> None:
-    train(tiny_dataset(), tiny_config(), folder=tmp_path, should_stop=lambda: True)
-    for name in ("checkpoint.safetensors", "metrics.jsonl", "config.json", "scene.ugr"):
-        (tmp_path / f".{name}.abcdefgh.tmp").touch()
-    train(tiny_dataset(), tiny_config(), folder=tmp_path, resume=True, should_stop=lambda: True)
-    assert [path.name for path in tmp_path.glob(".*")] == [".scene.ugr.abcdefgh.tmp"]
-
-
-def test_divergence_keeps_the_last_good_checkpoint(
-    tiny_dataset: Datasets, tiny_config: Configs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_divergence_keeps_the_last_good_checkpoint(tiny_dataset, tiny_config, tmp_path, monkeypatch):
     true_loss, calls = trainer.image_loss, 0
 
-    def loss_that_breaks(rendered: torch.Tensor, truth: torch.Tensor, texture: float) -> torch.Tensor:
+    def loss_that_breaks(rendered, truth, texture):
         nonlocal calls
         calls += 1
         return true_loss(rendered, truth, texture) * (float("nan") if calls == 6 else 1.0)
@@ -232,12 +191,10 @@ def test_divergence_keeps_the_last_good_checkpoint(
 
 
 @pytest.mark.parametrize("error", [torch.OutOfMemoryError("CUDA out of memory."), MemoryExceeded("no room")])
-def test_running_out_of_memory_keeps_the_last_good_checkpoint(
-    tiny_dataset: Datasets, tiny_config: Configs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, error: Exception
-) -> None:
+def test_running_out_of_memory_keeps_the_last_good_checkpoint(tiny_dataset, tiny_config, tmp_path, monkeypatch, error):
     true_render, calls = trainer.render, 0
 
-    def render_that_runs_out(*given: Any, **options: Any) -> Any:
+    def render_that_runs_out(*given, **options):
         nonlocal calls
         calls += 1
         if calls == 6:
@@ -256,11 +213,11 @@ def test_running_out_of_memory_keeps_the_last_good_checkpoint(
     assert scene.to_bytes() == train(tiny_dataset(), config).to_bytes()
 
 
-def test_a_step_reads_back_once(tiny_dataset: Datasets, tiny_config: Configs, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_step_reads_back_once(tiny_dataset, tiny_config, monkeypatch):
     """Each time that a number is asked for, a GPU is waited for."""
-    asked: list[str] = []
+    asked = []
 
-    def watch(name: str) -> None:
+    def watch(name):
         true = getattr(torch.Tensor, name)
         monkeypatch.setattr(torch.Tensor, name, lambda *given: (asked.append(name), true(*given))[1])
 
@@ -272,10 +229,8 @@ def test_a_step_reads_back_once(tiny_dataset: Datasets, tiny_config: Configs, mo
     assert asked == ["tolist"]
 
 
-def test_parameters_that_are_not_finite_never_reach_a_checkpoint(
-    tiny_dataset: Datasets, tiny_config: Configs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def spoil(sh0: torch.Tensor, intensity: str, floor: float) -> None:
+def test_parameters_that_are_not_finite_never_reach_a_checkpoint(tiny_dataset, tiny_config, tmp_path, monkeypatch):
+    def spoil(sh0, intensity, floor):
         sh0[3] = float("inf")
 
     monkeypatch.setattr(trainer, "project_sh0", spoil)
@@ -287,9 +242,7 @@ def test_parameters_that_are_not_finite_never_reach_a_checkpoint(
 @pytest.mark.parametrize(
     ("part", "what"), [("refinement", "pose corrections \\(numbers\\)"), ("_beam", "numbers of the beam \\(numbers\\)")]
 )
-def test_neither_do_corrections_that_are_not_finite(
-    tiny_dataset: Datasets, tiny_config: Configs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, part: str, what: str
-) -> None:
+def test_neither_do_corrections_that_are_not_finite(tiny_dataset, tiny_config, tmp_path, monkeypatch, part, what):
     run = trainer.Trainer(tiny_dataset(), tiny_config(), folder=tmp_path, device="cpu", backend="auto")
     monkeypatch.setattr(getattr(run, part), "tensors", lambda: {"numbers": torch.tensor([1.0, float("nan")])})
     with pytest.raises(TrainingDiverged, match=f"{what} are no longer finite"):
@@ -297,46 +250,37 @@ def test_neither_do_corrections_that_are_not_finite(
     assert not (tmp_path / "checkpoint.safetensors").exists()
 
 
-def test_without_transmittance_nothing_absorbs(tiny_dataset: Datasets, tiny_config: Configs) -> None:
-    scene, _ = learned(tiny_dataset(), tiny_config(transmittance=False))
-    assert bool((torch.sigmoid(scene.transmittances) == 1.0).all())
-
-
-def test_harmonics_are_learned_once_they_join(tiny_dataset: Datasets, tiny_config: Configs) -> None:
+def test_harmonics_are_learned_once_they_join(tiny_dataset, tiny_config):
     late = train(tiny_dataset(), tiny_config(sh_start=1.0))
     assert bool((late.shN == 0).all())
     assert bool((train(tiny_dataset(), tiny_config()).shN != 0).any())
     assert train(tiny_dataset(), tiny_config(sh_degree=0)).sh_degree == 0
 
 
-def test_released_intensities_stay_where_they_have_a_gradient(tiny_dataset: Datasets, tiny_config: Configs) -> None:
+def test_released_intensities_stay_where_they_have_a_gradient(tiny_dataset, tiny_config):
     scene = train(tiny_dataset(), tiny_config(intensity="released", sh0_rate=0.5))
     value = 0.28209479 * scene.sh0 + 1.0
     assert 0.5 < float(value.min()) < 0.51
     assert float(value.max()) < 0.999
 
 
-def test_refuses_what_cannot_be_trained(tiny_dataset: Datasets, tiny_config: Configs) -> None:
+def test_refuses_what_cannot_be_trained(tiny_dataset, tiny_config):
     with pytest.raises(DatasetInvalid, match="images must have at least 11 rows and columns, got 10x16"):
         train(tiny_dataset(height=10), tiny_config())
     with pytest.raises(BackendUnavailable, match="device must be cpu, cuda or cuda:N, got 'warp'"):
         train(tiny_dataset(), tiny_config(), device="warp")
 
 
-def test_refuses_more_frames_than_a_scene_can_name(
-    tiny_dataset: Datasets, tiny_config: Configs, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_refuses_more_frames_than_a_scene_can_name(tiny_dataset, tiny_config, monkeypatch):
     monkeypatch.setattr(scene_info, "MAX_TRAINING_POSES", 2)
-    reported: list[Progress] = []
+    reported = []
     with pytest.raises(InvalidArgument, match="training_poses must be at most 2"):
         train(tiny_dataset(), tiny_config(), report=reported.append)
     assert not reported
 
 
-def test_no_room_to_begin_is_said(
-    tiny_dataset: Datasets, tiny_config: Configs, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def no_room(*given: Any) -> Any:
+def test_no_room_to_begin_is_said(tiny_dataset, tiny_config, tmp_path, monkeypatch):
+    def no_room(*given):
         raise torch.OutOfMemoryError("CUDA out of memory.")
 
     monkeypatch.setattr(trainer, "initial_parameters", no_room)

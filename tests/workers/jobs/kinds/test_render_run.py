@@ -23,7 +23,7 @@ from ultragray.rendering.frames import show
 from ultragray.rendering.settings import Below
 from ultragray.rendering.tools import Cylinder, Needle, ToolFrame
 from ultragray.samplers import AroundSampler, CoveredSampler, FanSampler, SplineSampler, TrainingSampler
-from ultragray.scene.confidence import Assessor, ConfidenceModel, figure_arrays
+from ultragray.scene.confidence import Assessor, ConfidenceModel, Support, figure_arrays
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.kinds import RenderJob, render_run
 from ultragray_workers.jobs.specification import from_dict, to_dict
@@ -35,6 +35,10 @@ PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 TRAINING = np.tile(np.eye(4), (6, 1, 1))
 TRAINING[:, 1, 3] = np.arange(6)
 MODEL = ConfidenceModel((3.5, 1.2, 0.8, 0.1, 0.6), 0.06, (0.0,) * 6, 20, 0.04).to_dict()
+# A frame must have 2.3% of support for a confidence of 0.6: one in four about the training poses does.
+OF_SUPPORT = ConfidenceModel(
+    (3.5, 1.2, 0.8, 0.1, 0.6), 0.06, (0.0,) * 6, 20, 0.04, Support(25.0, share=0.04, reach_mm=20.0)
+).to_dict()
 
 
 @pytest.fixture(autouse=True)
@@ -130,7 +134,7 @@ def test_messages_of_ros_whose_poses_are_read_back(work: Callable[..., JobRun]) 
 
 def test_figures_of_each_frame_are_in_the_archive(work: Callable[..., JobRun], monkeypatch: pytest.MonkeyPatch) -> None:
     job = RenderJob(scene="one", sampler=AroundSampler(40, translation_mm=8.0), min_confidence=0.6, outputs=("echo",))
-    asked = work(job, confidence=MODEL)
+    asked = work(job, confidence=OF_SUPPORT)
     monkeypatch.setattr(rendering, "frames_at_once", lambda height, width: 7)
     monkeypatch.setattr(render_run, "ASSESSED_AT_ONCE", 60)
     render_run.run(asked, job)

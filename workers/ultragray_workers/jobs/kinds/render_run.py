@@ -6,7 +6,7 @@ import shutil
 import sys
 import time
 
-from ultragray.exchange.rendering import render_to_file
+from ultragray.exchange.rendering import assess_by_rendering, render_to_file
 from ultragray.files import file_sha256
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.training.memory import training_device
@@ -37,11 +37,14 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
     path = job_run.folder.path / f"{job.scene}{SUFFIX}"
     described = read_header(path)
     settings = job.resolved(described.info, Encoding.FLOAT32)
+    limits = Limits(job_run.request.max_footprint_pixels)
+    scene = GaussianScene.load(path).to(device)
     assess = _assessing(job_run, described, settings.probe)
+    if job.sampler is not None:
+        assess = assess_by_rendering(scene, settings, assess, limits=limits)
     poses, extrapolations = job.assessed_poses(described.training_poses, settings.probe, assess)
     free = shutil.disk_usage(job_run.folder.path).free
     job.check_room(len(poses), job.file_format.shown(settings).picture, free)
-    scene = GaussianScene.load(path).to(device)
     size = f"{settings.height}x{settings.width}"
     sys.stderr.write(f"rendering {len(poses):,} frames of {size} of {job.scene} on {device}\n")
     started = time.monotonic()
@@ -65,7 +68,7 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
             dtype=job.dtype,
             scene_name=job.scene,
             scene_sha256=file_sha256(path),
-            limits=Limits(job_run.request.max_footprint_pixels),
+            limits=limits,
             before_portion=before_portion,
         )
     return Outcome(artifacts=job_run.folder.artifact_names())

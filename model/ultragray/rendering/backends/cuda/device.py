@@ -68,7 +68,9 @@ def supports(scene: GaussianScene) -> bool:
 
 def upload(tensor: Tensor, device: torch.device) -> Tensor:
     """A tensor of the CPU on the device, without waiting for what the device still has to do."""
-    return tensor.pin_memory().to(device, non_blocking=True) if device.type == "cuda" else tensor
+    if device.type != "cuda":
+        return tensor
+    return tensor.contiguous().pin_memory().to(device, non_blocking=True)  # an expanded tensor has no memory to copy to
 
 
 def renderer(device: torch.device) -> str:

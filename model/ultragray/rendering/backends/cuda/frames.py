@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import threading
+from collections import OrderedDict
 from collections.abc import Iterator, Sequence
 from dataclasses import fields
 from typing import Any
@@ -14,6 +16,7 @@ from torch.autograd.function import once_differentiable
 from ultragray.errors import MemoryExceeded, TooManyPoses
 from ultragray.geometry.probe import Probe
 from ultragray.rendering.backends.cuda.device import upload
+from ultragray.rendering.backends.cuda.kernels.common import VIEW
 from ultragray.rendering.backends.cuda.launch import (
     MAX_POSES,
     Gaussians,
@@ -42,6 +45,7 @@ from ultragray.scene.gaussians import PARAMETERS, GaussianScene
 
 _SLICES = len(fields(Slices))
 WORKSPACE_BYTES = 1 << 30  # of slices and planes; poses beyond it are rendered in a further round
+GRAPHS = 4  # kept with a scene: each holds the slices and planes of a frame
 
 
 def render_frames(
@@ -58,11 +62,16 @@ def render_frames(
     """See `ultragray.rendering.backends.cuda.render_outputs`."""
     geometry, device = Geometry.of(probe, height, width, beam), scene.means.device
     with _on_device(device, f"{len(poses_cm)} frames of {height}x{width} pixels from {len(scene.means):,} Gaussians"):
-        views = upload(torch.from_numpy(view_table(probe, as_array(poses_cm), height, beam)), device)
+        table = torch.from_numpy(view_table(probe, as_array(poses_cm), height, beam))
         varied = [*scene.splats.values(), *([] if beam is None else [beam])]
         by_scene = torch.is_grad_enabled() and any(tensor.requires_grad for tensor in varied)
         if not by_scene and not want_gradient(poses_cm):
-            return _render(sorted_gaussians(scene, weighted), geometry, views, outputs, limits)
+            gaussians = sorted_gaussians(scene, weighted)
+            if device.type == "cuda" and len(table) == 1:
+                graphs = scene.prepared(gaussians.kind.place("cuda, single frames"), lambda: _SingleFrames(gaussians))
+                return graphs.render(geometry, table, tuple(outputs), limits)
+            return _render(gaussians, geometry, upload(table, device), outputs, limits)
+        views = upload(table, device)
         if len(views) > MAX_POSES:
             raise TooManyPoses(
                 f"at most {MAX_POSES:,} poses can be differentiated together, got {len(views):,}", field="poses"
@@ -108,6 +117,68 @@ def _render(
         those = {name: frame[some] for name, frame in frames.items()}
         draw(slices, geometry, those, keep=False, absorbs=not gaussians.kind.weighted)
     return frames
+
+
+class _SingleFrames:
+    """Frames of one pose at a time, as robots and pages ask for them.
+
+    The host needs longer for a frame's launches than the device for the frame. So those of a frame that is asked for
+    again, of the same probe, size and outputs, are recorded as a CUDA graph, which only the pose is copied into.
+    """
+
+    def __init__(self, gaussians: Gaussians) -> None:
+        self._gaussians = gaussians
+        self._graphs: OrderedDict[tuple[Any, ...], _Graph | None] = OrderedDict()  # the one used last at the end
+        self._lock = threading.Lock()  # a graph's pose and frames are in one place for all who replay it
+
+    def render(
+        self, geometry: Geometry, table: Tensor, outputs: tuple[str, ...], limits: Limits
+    ) -> dict[str, Tensor]:  # [1, H, W] each
+        """Frames of the view that `table` [1, VIEW] holds, on the current stream."""
+        device = self._gaussians.means.device
+        key = geometry, outputs, torch.cuda.current_stream(device).cuda_stream
+        with self._lock:
+            is_new = key not in self._graphs
+            graph = None if is_new else self._graphs[key] or _Graph(self._gaussians, geometry, outputs)
+            self._graphs[key] = graph
+            self._graphs.move_to_end(key)
+            if len(self._graphs) > GRAPHS:
+                self._graphs.popitem(last=False)
+            if graph is not None:
+                limits.check_flag()
+                frames, footprints = graph.replay(table)
+        if graph is None:
+            return _render(self._gaussians, geometry, upload(table, device), outputs, limits)
+        if limits.footprint_pixels is not None:
+            limits.check_costs([int(footprints)])
+        return frames
+
+
+class _Graph:
+    """The launches of one frame, recorded."""
+
+    def __init__(self, gaussians: Gaussians, geometry: Geometry, outputs: Sequence[str]) -> None:
+        device = gaussians.means.device
+        self._views = torch.zeros((1, VIEW.value), dtype=torch.float64, device=device)
+        self._graph = torch.cuda.CUDAGraph()
+        stream = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]  # the default one cannot be recorded
+        stream.wait_stream(torch.cuda.current_stream(device))
+        with torch.cuda.stream(stream):
+            self._graph.capture_begin(capture_error_mode="thread_local")
+            try:
+                slices = cut(gaussians, self._views, geometry, record=False)
+                self._frames = empty_frames(outputs, 1, geometry, device)
+                draw(slices, geometry, self._frames, keep=False, absorbs=not gaussians.kind.weighted)
+                self._footprints = slices.footprints.sum()
+            finally:
+                self._graph.capture_end()
+        torch.cuda.current_stream(device).wait_stream(stream)
+
+    def replay(self, table: Tensor) -> tuple[dict[str, Tensor], Tensor]:
+        """The frames of a view, and the sum of their footprint pixels, in tensors of their own."""
+        self._views.copy_(table.pin_memory(), non_blocking=True)
+        self._graph.replay()
+        return {name: frame.clone() for name, frame in self._frames.items()}, self._footprints.clone()
 
 
 class _Render(torch.autograd.Function):
