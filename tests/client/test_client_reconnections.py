@@ -1,14 +1,9 @@
 """Connections that break off: streams, batches, downloads and watches go on, each pose with one frame."""
 
-from __future__ import annotations
-
 import signal
 import threading
-from collections.abc import Callable
 from concurrent import futures
 from contextlib import nullcontext, suppress
-from pathlib import Path
-from typing import Any
 
 import grpc
 import numpy as np
@@ -21,7 +16,6 @@ from ultragray_client.conversations import Watch, download_into
 from ultragray_client.exchange import Unanswered
 from ultragray_proto.v1 import jobs_pb2, rendering_pb2
 
-from ..service.conftest import RunningService, StartService
 from .conftest import KEY
 from .proxy import Proxy
 from .test_client_render import moved
@@ -30,12 +24,12 @@ from .test_client_stream import is_shared
 SMALL = RenderSettings(height=16, width=16)
 
 
-def test_an_ordered_stream_gets_the_frame_of_each_pose_once(far_client: Any, proxy: Proxy) -> None:
+def test_an_ordered_stream_gets_the_frame_of_each_pose_once(far_client, proxy):
     shifts = np.linspace(-4, 4, 300)
     with far_client.stream("demo", SMALL) as stream:
         proxy.cut_after(3000, 10_000, 10_000)  # somewhere in a frame; the 300 have 76,800 pixels
 
-        def send() -> None:
+        def send():
             for x in shifts:
                 stream.send(moved(x))
             stream.done_sending()
@@ -50,8 +44,8 @@ def test_an_ordered_stream_gets_the_frame_of_each_pose_once(far_client: Any, pro
     assert stream.reconnections == proxy.cuts == 3
 
 
-def test_a_latest_stream_goes_on_with_the_newest_pose(far_client: Any, proxy: Proxy) -> None:
-    frames: list[Any] = []
+def test_a_latest_stream_goes_on_with_the_newest_pose(far_client, proxy):
+    frames = []
     with far_client.stream("demo", SMALL, mode="latest") as stream:
         for number, x in enumerate(np.linspace(-4, 4, 300), start=1):
             stream.send(moved(x))
@@ -70,8 +64,8 @@ def test_a_latest_stream_goes_on_with_the_newest_pose(far_client: Any, proxy: Pr
     assert stream.reconnections == proxy.cuts == 2
 
 
-def test_errors_in_place_of_frames_come_once(far_client: Any, proxy: Proxy) -> None:
-    told: list[tuple[int, str]] = []
+def test_errors_in_place_of_frames_come_once(far_client, proxy):
+    told = []
     with far_client.stream("demo", SMALL) as stream:
         proxy.cut_after(6000)  # before the first pose: answers may come while others are sent
         for number in range(1, 41):
@@ -89,8 +83,8 @@ def test_errors_in_place_of_frames_come_once(far_client: Any, proxy: Proxy) -> N
 
 
 @pytest.mark.parametrize("mode", ["ordered", "latest"])
-def test_a_stream_with_shared_memory_goes_on_with_new_memory(far_client: Any, proxy: Proxy, mode: str) -> None:
-    def frame_of(stream: Any, x: float) -> Any:
+def test_a_stream_with_shared_memory_goes_on_with_new_memory(far_client, proxy, mode):
+    def frame_of(stream, x):
         stream.send(moved(x))
         return stream.receive()
 
@@ -109,9 +103,7 @@ def test_a_stream_with_shared_memory_goes_on_with_new_memory(far_client: Any, pr
 
 
 @pytest.mark.parametrize(("number", "mode"), [(signal.SIGKILL, "ordered"), (signal.SIGTERM, "latest")])
-def test_a_stream_goes_on_at_another_service(
-    make_client: Callable[..., Any], start_service: StartService, number: signal.Signals, mode: str
-) -> None:
+def test_a_stream_goes_on_at_another_service(make_client, start_service, number, mode):
     first, second = start_service(), start_service()
     proxy = Proxy(first.grpc)
     client = make_client(proxy.address, timeout_s=60.0)
@@ -134,7 +126,7 @@ def test_a_stream_goes_on_at_another_service(
 
 
 @pytest.mark.parametrize("mode", ["ordered", "latest"])
-def test_patience_ends(make_client: Callable[..., Any], client_service: RunningService, mode: str) -> None:
+def test_patience_ends(make_client, client_service, mode):
     proxy = Proxy(client_service.grpc)
     client = make_client(proxy.address, api_key=KEY)
     with client.stream("demo", SMALL, mode=mode, reconnect_s=0.5) as stream:
@@ -149,7 +141,7 @@ def test_patience_ends(make_client: Callable[..., Any], client_service: RunningS
         client.stream("demo", reconnect_s=-1.0)
 
 
-def test_a_pose_is_sent_again_with_what_is_left_of_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_pose_is_sent_again_with_what_is_left_of_its_time(monkeypatch):
     now = 1000.0
     monkeypatch.setattr("ultragray_client.exchange.time.monotonic", lambda: now)
     unanswered = Unanswered(newest_alone=False)
@@ -165,19 +157,19 @@ def test_a_pose_is_sent_again_with_what_is_left_of_its_time(monkeypatch: pytest.
     assert [message.sequence for message in unanswered.again()] == [1, 3]
 
 
-class _Recorder(grpc.GenericRpcHandler):  # type: ignore[misc]
+class _Recorder(grpc.GenericRpcHandler):
     """Notes the metadata of every call, and refuses it."""
 
-    def __init__(self) -> None:
-        self.scenes: dict[str, list[str]] = {}
+    def __init__(self):
+        self.scenes = {}
 
-    def service(self, details: Any) -> Any:
+    def service(self, details):
         named = [value for key, value in details.invocation_metadata if key == "x-ultragray-scene"]
         self.scenes.setdefault(details.method.rpartition("/")[2], []).extend(named)
         return None
 
 
-def test_every_call_about_a_scene_names_it_to_proxies(make_client: Callable[..., Any]) -> None:
+def test_every_call_about_a_scene_names_it_to_proxies(make_client):
     recorder = _Recorder()
     server = grpc.server(futures.ThreadPoolExecutor(2), handlers=[recorder])
     client = make_client(f"127.0.0.1:{server.add_insecure_port('127.0.0.1:0')}")
@@ -203,12 +195,12 @@ def test_every_call_about_a_scene_names_it_to_proxies(make_client: Callable[...,
 
 
 @pytest.fixture(scope="module")
-def client_service(working_service: RunningService) -> RunningService:
+def client_service(working_service):
     """One with a worker."""
     return working_service
 
 
-def test_a_batch_goes_on(far_client: Any, proxy: Proxy) -> None:
+def test_a_batch_goes_on(far_client, proxy):
     poses = np.tile(np.eye(4), (120, 1, 1))
     poses[:, 0, 3] = np.linspace(-4, 4, 120)
     batch = far_client.render_batch("demo", poses, RenderSettings(height=64, width=64))
@@ -220,7 +212,7 @@ def test_a_batch_goes_on(far_client: Any, proxy: Proxy) -> None:
     assert [frame.pose[0, 3] for frame in frames] == poses[:, 0, 3].tolist()
 
 
-def test_a_download_goes_on_and_is_whole(far_client: Any, client: Any, proxy: Proxy, tmp_path: Path) -> None:
+def test_a_download_goes_on_and_is_whole(far_client, client, proxy, tmp_path):
     poses = np.tile(np.eye(4), (60, 1, 1))
     job = client.jobs.submit(
         RenderJob(scene="demo", poses=poses, height=200, width=200, dtype="float32", outputs=("bmode", "echo"))
@@ -234,7 +226,7 @@ def test_a_download_goes_on_and_is_whole(far_client: Any, client: Any, proxy: Pr
     assert {path.name for path in tmp_path.iterdir()} == {"straight.npz", "broken.npz"}
 
 
-def test_a_watch_goes_on(far_client: Any, client: Any, proxy: Proxy) -> None:
+def test_a_watch_goes_on(far_client, client, proxy):
     job = client.jobs.submit(RenderJob(scene="demo", poses=np.tile(np.eye(4), (20_000, 1, 1)), height=300, width=300))
     events = far_client.jobs.watch(job.id)
     assert next(events).job.id == job.id
@@ -246,8 +238,8 @@ def test_a_watch_goes_on(far_client: Any, client: Any, proxy: Proxy) -> None:
     assert proxy.cuts == 1
 
 
-def test_a_file_that_does_not_come_leaves_nothing(tmp_path: Path) -> None:
-    def half() -> None:
+def test_a_file_that_does_not_come_leaves_nothing(tmp_path):
+    def half():
         with download_into("job", "file", tmp_path / "file") as download:
             download.keep(jobs_pb2.ArtifactChunk(data=b"half", file_bytes=8))
             request = download.request()
@@ -260,13 +252,13 @@ def test_a_file_that_does_not_come_leaves_nothing(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_log_is_not_told_twice() -> None:
+def test_a_log_is_not_told_twice():
     watch, retries = Watch("job"), Retries(None, patience_s=60.0)
 
-    def new(log: str) -> str:
+    def new(log):
         return watch.take(jobs_pb2.JobEvent(log=log)).log
 
-    def break_off() -> None:
+    def break_off():
         watch.pause_s(errors.Unreachable("gone"), retries)
 
     assert new("one\ntwo\n") == "one\ntwo\n"
@@ -288,11 +280,11 @@ def test_a_log_is_not_told_twice() -> None:
         ([errors.Unreachable], False),
     ],
 )
-def test_a_deletion_that_had_worked_is_no_error(failures: list[type[errors.ClientError]], is_refused: bool) -> None:
+def test_a_deletion_that_had_worked_is_no_error(failures, is_refused):
     steps = Deletion("JobService.DeleteJob", None, None).steps(Terms("127.0.0.1:1", None, None, 60.0))
     left = list(failures)
 
-    def run() -> None:
+    def run():
         step = next(steps)
         with suppress(StopIteration):
             while True:

@@ -1,18 +1,14 @@
 """The package, frames one by one and in batches, and where their pixels lie."""
 
-from __future__ import annotations
-
 import inspect
 import subprocess
 import sys
-from collections.abc import Iterator
-from typing import Any
 
 import numpy as np
 import pytest
 
 import ultragray_client
-from ultragray import GaussianScene, render
+from ultragray import render
 from ultragray_client import (
     AsyncClient,
     Client,
@@ -26,32 +22,31 @@ from ultragray_client import (
     RenderSettings,
     errors,
 )
-from ultragray_client.geometry import FloatArray
 
-from ..service.conftest import DEMO_PROBE, HEIGHT, WIDTH, RunningService
+from ..service.conftest import DEMO_PROBE, HEIGHT, WIDTH
 from .conftest import MAX_POSES
 
 
-def test_an_import_takes_no_more_than_it_needs() -> None:
+def test_an_import_takes_no_more_than_it_needs():
     program = "import sys, ultragray_client; print(*{name.split('.')[0] for name in sys.modules})"
     told = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True).stdout
     assert {"ultragray_client", "ultragray_proto", "grpc", "numpy"} <= set(told.split())
     assert not {"torch", "ultragray", "ultragray_service", "ultragray_workers", "pydantic"} & set(told.split())
 
 
-def test_exported_names_exist() -> None:
+def test_exported_names_exist():
     assert len(set(ultragray_client.__all__)) == len(ultragray_client.__all__)
     for name in ultragray_client.__all__:
         assert hasattr(ultragray_client, name)
 
 
-def moved(x_mm: float) -> FloatArray:
+def moved(x_mm):
     pose = np.eye(4)
     pose[0, 3] = x_mm
     return pose
 
 
-def test_a_frame_is_what_the_library_renders(client: Any, demo_scene: GaussianScene) -> None:
+def test_a_frame_is_what_the_library_renders(client, demo_scene):
     frame = client.render(
         "demo", moved(2.0), RenderSettings(outputs=("transmittance", "bmode"), encoding=Encoding.FLOAT32)
     )
@@ -69,7 +64,7 @@ def test_a_frame_is_what_the_library_renders(client: Any, demo_scene: GaussianSc
     assert frame.latency_ms is None
 
 
-def test_poses_and_probes_may_be_written_in_words(client: Any) -> None:
+def test_poses_and_probes_may_be_written_in_words(client):
     half = 0.5**0.5
     placement = Placement((1.0, 2.0, 3.0), Quaternion(w=half, x=0.0, y=0.0, z=half))
     probe = LinearProbe(width_mm=20.0, near_mm=1.0, far_mm=30.0)
@@ -79,7 +74,7 @@ def test_poses_and_probes_may_be_written_in_words(client: Any) -> None:
     assert (frame.probe, frame["bmode"].shape) == (probe, (16, 8))
 
 
-def given(**settings: Any) -> dict[str, Any]:
+def given(**settings):
     return {"settings": RenderSettings(**settings)}
 
 
@@ -96,9 +91,7 @@ def given(**settings: Any) -> dict[str, Any]:
         ({"timeout_s": 0.0}, errors.InvalidArgument, "timeout_s"),
     ],
 )
-def test_refusals_have_a_type_and_a_field(
-    client: Any, arguments: dict[str, Any], error: type[errors.ClientError], field: str
-) -> None:
+def test_refusals_have_a_type_and_a_field(client, arguments, error, field):
     with pytest.raises(error) as caught:
         client.render(**{"scene": "demo", "pose": np.eye(4), **arguments})
     assert type(caught.value) is error
@@ -106,7 +99,7 @@ def test_refusals_have_a_type_and_a_field(
     assert caught.value.detail in str(caught.value)
 
 
-def test_a_long_batch_is_split_into_calls_that_the_service_takes(client: Any) -> None:
+def test_a_long_batch_is_split_into_calls_that_the_service_takes(client):
     shifts = np.linspace(-4, 4, 3 * MAX_POSES + 7)
     frames = list(client.render_batch("demo", (moved(x) for x in shifts), RenderSettings(height=8, width=8)))
     assert [frame.sequence for frame in frames] == list(range(len(shifts)))
@@ -115,10 +108,10 @@ def test_a_long_batch_is_split_into_calls_that_the_service_takes(client: Any) ->
     np.testing.assert_array_equal(frames[-1]["bmode"], alone["bmode"])
 
 
-def test_a_batch_takes_poses_as_it_goes(client: Any) -> None:
+def test_a_batch_takes_poses_as_it_goes(client):
     taken = 0
 
-    def endless() -> Iterator[FloatArray]:
+    def endless():
         nonlocal taken
         while True:
             taken += 1
@@ -131,8 +124,8 @@ def test_a_batch_takes_poses_as_it_goes(client: Any) -> None:
     assert not list(client.render_batch("demo", []))
 
 
-def test_both_clients_have_the_same_methods(client_service: RunningService) -> None:
-    def signatures(cls: type) -> dict[str, list[tuple[str, Any]]]:
+def test_both_clients_have_the_same_methods(client_service):
+    def signatures(cls):
         public = inspect.getmembers(cls, lambda value: inspect.isfunction(value))
         return {
             name: [(parameter.name, parameter.default) for parameter in inspect.signature(method).parameters.values()]
@@ -152,7 +145,7 @@ FAN = ConvexProbe(opening_angle_deg=50.0, near_mm=20.0, far_mm=60.0)
 TILTED = Placement((1.0, 2.0, 3.0), Quaternion(w=0.8, x=0.36, y=0.48, z=0.0))
 
 
-def test_pixels_lie_where_the_probe_says(client: Any) -> None:
+def test_pixels_lie_where_the_probe_says(client):
     """The corners of a linear image, half a pixel from the probe's; k leaves the plane against elevation."""
     frame = client.render("demo", TILTED)
     column_mm, row_mm = DEMO_PROBE.width_mm / WIDTH, DEMO_PROBE.far_mm / HEIGHT
@@ -164,7 +157,7 @@ def test_pixels_lie_where_the_probe_says(client: Any) -> None:
     assert np.linalg.det(matrix[:3, :3]) > 0
 
 
-def test_a_fan_has_a_matrix_once_its_pixels_are_square(client: Any) -> None:
+def test_a_fan_has_a_matrix_once_its_pixels_are_square(client):
     polar = client.render("demo", np.eye(4), RenderSettings(probe=FAN))
     assert polar.picture.column_unit == "deg"
     with pytest.raises(errors.InvalidArgument, match="pixel_mm") as caught:

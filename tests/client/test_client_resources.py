@@ -1,14 +1,10 @@
 """Scenes, datasets, jobs and workers, and recordings of frames beside the files of jobs."""
 
-from __future__ import annotations
-
 import json
 import signal
 import subprocess
 import sys
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -34,7 +30,6 @@ from ultragray_client import (
     errors,
 )
 
-from ..service.conftest import RunningService
 from ..service.http.test_http_datasets import poisoned_files, released_files
 from ..waiting import wait_until
 from .conftest import KEY
@@ -44,24 +39,24 @@ TRAINING = {"steps": 20, "max_gaussians": 40, "batch_size": 2}
 
 
 @pytest.fixture(scope="module")
-def client_service(working_service: RunningService) -> RunningService:
+def client_service(working_service):
     """One with a worker."""
     return working_service
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     released_files(tmp_path / "tiny")
     return tmp_path / "tiny"
 
 
 @pytest.fixture
-def name(request: pytest.FixtureRequest) -> str:
+def name(request):
     """Of its own for each test."""
     return str(request.node.name).translate(str.maketrans("[]", "--"))
 
 
-def test_scenes(client: Any) -> None:
+def test_scenes(client):
     entries = {entry.name: entry for entry in client.scenes.list()}
     assert {"demo", "second", "probeless", "truncated", "foreign", "empty"} <= set(entries)
     assert entries["demo"].error is None
@@ -80,7 +75,7 @@ def test_scenes(client: Any) -> None:
         client.scenes.get("gone")
 
 
-def test_the_life_of_a_dataset(client: Any, folder: Path, name: str) -> None:
+def test_the_life_of_a_dataset(client, folder, name):
     made = client.datasets.upload(name, folder, options=DatasetOptions(train_frames="0:6"))
     assert (made.name, made.kind, made.train_frames, made.val_frames) == (name, "released", 6, 3)
     assert (made.probe, made.options) == (LinearProbe(40.0, 0.0, 50.0), {"train_frames": "0:6"})
@@ -95,7 +90,7 @@ def test_the_life_of_a_dataset(client: Any, folder: Path, name: str) -> None:
         client.datasets.delete(name)
 
 
-def test_uploads_that_are_refused(client: Any, folder: Path, name: str, tmp_path: Path) -> None:
+def test_uploads_that_are_refused(client, folder, name, tmp_path):
     for path in (tmp_path / "gone", folder / "conf.json"):
         with pytest.raises(errors.InvalidArgument, match="folder or an archive"):
             client.datasets.upload(name, path)
@@ -105,7 +100,7 @@ def test_uploads_that_are_refused(client: Any, folder: Path, name: str, tmp_path
         client.datasets.upload(name, folder)
 
 
-def test_the_life_of_a_training(client: Any, folder: Path, name: str, tmp_path: Path) -> None:
+def test_the_life_of_a_training(client, folder, name, tmp_path):
     client.datasets.upload(name, folder)
     job = client.jobs.submit(TrainJob(name, f"{name}.scene", settings=TRAINING, device="cpu"), request_id=name)
     assert (job.kind, job.specification.settings, job.request_id) == ("train", TRAINING, name)
@@ -139,7 +134,7 @@ def test_the_life_of_a_training(client: Any, folder: Path, name: str, tmp_path: 
         client.jobs.get(job.id)
 
 
-def test_a_batch_of_frames_as_a_job(client: Any, tmp_path: Path) -> None:
+def test_a_batch_of_frames_as_a_job(client, tmp_path):
     poses = np.tile(np.eye(4), (3, 1, 1))
     job = client.jobs.submit(
         RenderJob(scene="demo", poses=poses, height=8, width=6, outputs=("bmode", "echo"), dtype="uint8")
@@ -175,7 +170,7 @@ def test_a_batch_of_frames_as_a_job(client: Any, tmp_path: Path) -> None:
         client.jobs.list(state="lost")
 
 
-def test_cancel_and_retry(client: Any) -> None:
+def test_cancel_and_retry(client):
     poses = np.tile(np.eye(4), (20_000, 1, 1))
     job = client.jobs.submit(RenderJob(scene="demo", poses=poses, height=300, width=300), priority=-5)
     cancelled = client.jobs.cancel(job.id)
@@ -189,7 +184,7 @@ def test_cancel_and_retry(client: Any) -> None:
     client.jobs.wait(again.id)
 
 
-def test_workers_rest_and_resume(client: Any) -> None:
+def test_workers_rest_and_resume(client):
     (worker,) = wait_until(lambda: [one for one in client.workers.list() if one.state is WorkerState.IDLE])
     assert (worker.pid > 0, worker.device) == (True, "auto")
     try:
@@ -209,7 +204,7 @@ COUNT = 30
 POSES = np.stack([moved(x) for x in np.linspace(-4.0, 4.0, COUNT)])
 
 
-def decoded(path: Path, topic: str) -> list[Any]:
+def decoded(path, topic):
     with path.open("rb") as file:
         reader = make_reader(file, decoder_factories=[DecoderFactory()])
         return [found.decoded_message for found in reader.iter_decoded_messages(topics=[topic])]
@@ -217,8 +212,8 @@ def decoded(path: Path, topic: str) -> list[Any]:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("make_client", ["sync"], indirect=True)
-def test_a_recording_is_the_file_of_the_job_that_renders_the_same(client: Any, tmp_path: Path) -> None:
-    settings: dict[str, Any] = {
+def test_a_recording_is_the_file_of_the_job_that_renders_the_same(client, tmp_path):
+    settings = {
         "height": 24,
         "width": 20,
         "outputs": ("bmode", "transmittance"),
@@ -237,7 +232,7 @@ def test_a_recording_is_the_file_of_the_job_that_renders_the_same(client: Any, t
     assert sorted(path.name for path in tmp_path.iterdir()) == ["job.mcap", "recorded.mcap"]
 
 
-def test_a_stream_is_recorded_with_its_own_times_and_changes_of_geometry(client: Any, tmp_path: Path) -> None:
+def test_a_stream_is_recorded_with_its_own_times_and_changes_of_geometry(client, tmp_path):
     path = tmp_path / "stream.mcap"
     now_ns = 1_900_000_000_123_456_789
     with Recording(path) as recording:
@@ -256,13 +251,13 @@ def test_a_stream_is_recorded_with_its_own_times_and_changes_of_geometry(client:
     np.testing.assert_allclose(1000.0 * place[:3], (frame.picture.pixel_to_probe() @ [0, 0, 0, 1])[:3])
 
 
-def test_what_came_before_an_error_is_kept(client: Any, tmp_path: Path) -> None:
+def test_what_came_before_an_error_is_kept(client, tmp_path):
     path = tmp_path / "kept.mcap"
     path.write_bytes(b"an older file")
     frame = client.render("demo", POSES[0], RenderSettings(height=8, width=8))
     recording = Recording(path)
 
-    def interrupted() -> None:
+    def interrupted():
         with recording:
             recording.add(frame)
             assert path.read_bytes() == b"an older file"
@@ -293,9 +288,7 @@ with Client(address, api_key=key) as client:
 
 
 @pytest.mark.slow
-def test_an_interrupt_in_the_middle_of_writing_leaves_a_whole_file(
-    client_service: RunningService, tmp_path: Path
-) -> None:
+def test_an_interrupt_in_the_middle_of_writing_leaves_a_whole_file(client_service, tmp_path):
     for number in range(4):  # where it strikes is chance
         path = tmp_path / f"{number}.mcap"
         command = [sys.executable, "-c", INTERRUPTED, client_service.grpc, KEY, str(path)]
@@ -309,7 +302,7 @@ def test_an_interrupt_in_the_middle_of_writing_leaves_a_whole_file(
     assert len(list(tmp_path.iterdir())) == 4
 
 
-def test_without_the_package_the_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_package_the_extra_is_named(tmp_path, monkeypatch):
     monkeypatch.delitem(sys.modules, "ultragray_client.recording.writer", raising=False)
     monkeypatch.setitem(sys.modules, "mcap_ros2.writer", None)
     with pytest.raises(errors.ExtraMissing, match=r"a recording needs mcap.*pip install 'ultragray-client\[mcap\]'"):

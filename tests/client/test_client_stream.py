@@ -1,7 +1,5 @@
 """Streams of poses, whose frames may come through memory that is shared with the service."""
 
-from __future__ import annotations
-
 import ctypes
 import gc
 import os
@@ -11,24 +9,23 @@ import threading
 import time
 from contextlib import suppress
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 
-from ultragray_client import Frame, RenderSettings, errors
+from ultragray_client import RenderSettings, errors
 from ultragray_client import exchange as shared_memory
 from ultragray_client.exchange import SLOTS, PoseExchange, SharedMemory
 from ultragray_client.frames import settings_message
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2
 
 from ..freshness import check_fresh
-from ..service.conftest import ROOT, RunningService, StartService
+from ..service.conftest import ROOT
 from ..waiting import Deadline, wait_until
 from .test_client_render import moved
 
 
-def test_an_ordered_stream_answers_every_pose(client: Any) -> None:
+def test_an_ordered_stream_answers_every_pose(client):
     shifts = np.linspace(-4, 4, 120)
     with client.stream("demo", RenderSettings(height=16, width=16)) as stream:
         sequences = [stream.send(moved(x)) for x in shifts[:60]]
@@ -46,7 +43,7 @@ def test_an_ordered_stream_answers_every_pose(client: Any) -> None:
     assert all(0.0 < frame.timings.render_ms < frame.latency_ms < 60_000 for frame in frames)
 
 
-def test_a_latest_stream_counts_what_it_drops(client: Any) -> None:
+def test_a_latest_stream_counts_what_it_drops(client):
     with client.stream(
         "demo", RenderSettings(height=600, width=600, outputs=("bmode", "echo")), mode="latest"
     ) as stream:
@@ -60,13 +57,13 @@ def test_a_latest_stream_counts_what_it_drops(client: Any) -> None:
     assert frames[-1].pose[0, 3] == 4.0
 
 
-def test_latency_counts_from_the_measurement(client: Any) -> None:
+def test_latency_counts_from_the_measurement(client):
     with client.stream("demo", RenderSettings(height=8, width=8)) as stream:
         stream.send(moved(0.0), measured_ns=time.monotonic_ns() - 5_000_000_000)
         assert stream.receive().latency_ms > 5000.0
 
 
-def test_a_pose_that_gets_no_frame_does_not_end_a_stream(client: Any) -> None:
+def test_a_pose_that_gets_no_frame_does_not_end_a_stream(client):
     with client.stream("demo", RenderSettings(height=8, width=8)) as stream:
         stream.send(moved(0.0))
         bad = stream.send(2 * np.eye(4))
@@ -81,7 +78,7 @@ def test_a_pose_that_gets_no_frame_does_not_end_a_stream(client: Any) -> None:
         assert stream.receive().pose[0, 3] == 1.0
 
 
-def test_refused_settings_are_told_first(client: Any) -> None:
+def test_refused_settings_are_told_first(client):
     with client.stream("gone") as stream:
         stream.send(moved(0.0))
         with pytest.raises(errors.SceneNotFound):
@@ -90,10 +87,10 @@ def test_refused_settings_are_told_first(client: Any) -> None:
         client.stream("demo", mode="newest")
 
 
-def test_a_stream_may_be_used_by_two_threads(client: Any) -> None:
+def test_a_stream_may_be_used_by_two_threads(client):
     with client.stream("demo", RenderSettings(height=8, width=8)) as stream:
 
-        def send() -> None:
+        def send():
             for _ in range(300):
                 stream.send(moved(0.0))
             stream.done_sending()
@@ -104,9 +101,7 @@ def test_a_stream_may_be_used_by_two_threads(client: Any) -> None:
         sender.join()
 
 
-def test_a_service_that_stops_ends_a_stream_that_is_not_to_reconnect(
-    make_client: Any, start_service: StartService
-) -> None:
+def test_a_service_that_stops_ends_a_stream_that_is_not_to_reconnect(make_client, start_service):
     service = start_service()
     client = make_client(service.grpc)
     with client.stream("demo", RenderSettings(height=8, width=8), reconnect_s=0.0) as stream:
@@ -119,7 +114,7 @@ def test_a_service_that_stops_ends_a_stream_that_is_not_to_reconnect(
             stream.send(moved(0.0))
 
 
-def test_what_was_dropped_before_an_error_is_told_with_the_next_frame() -> None:
+def test_what_was_dropped_before_an_error_is_told_with_the_next_frame():
     exchange = PoseExchange(settings_message("demo", None), "latest")
     error = scenes_pb2.Error(reason="DEADLINE_EXCEEDED", detail="late")
     with pytest.raises(errors.DeadlineExceeded):
@@ -145,26 +140,26 @@ def test_what_was_dropped_before_an_error_is_told_with_the_next_frame() -> None:
 class ClientDoor:
     """A latest stream of either client."""
 
-    def __init__(self, stream: Any) -> None:
+    def __init__(self, stream):
         self._stream = stream
 
-    def send(self) -> None:
+    def send(self):
         self._stream.send(moved(0.0))
 
-    def receive(self) -> float:
+    def receive(self):
         frame = self._stream.receive()
         return time.monotonic() - float(frame.latency_ms) / 1000
 
 
 @pytest.mark.parametrize("make_client", ["sync"], indirect=True)
-def test_a_latest_stream_gives_no_old_frame(client: Any) -> None:
+def test_a_latest_stream_gives_no_old_frame(client):
     with client.stream("demo", RenderSettings(height=128, width=128), mode="latest") as stream:
         check_fresh(ClientDoor(stream))
 
 
-def test_a_latest_stream_may_be_read_before_anything_is_sent(client: Any) -> None:
+def test_a_latest_stream_may_be_read_before_anything_is_sent(client):
     with client.stream("demo", RenderSettings(height=8, width=8), mode="latest") as stream:
-        frames: list[Any] = []
+        frames = []
         reader = threading.Thread(target=lambda: frames.append(stream.receive()))
         reader.start()
         stream.send(moved(0.0))
@@ -175,23 +170,23 @@ def test_a_latest_stream_may_be_read_before_anything_is_sent(client: Any) -> Non
 SMALL = RenderSettings(height=16, width=16)
 
 
-def is_shared(frame: Frame) -> bool:
+def is_shared(frame):
     """Whether the pixels lie in shared memory, rather than in a message."""
-    owner: Any = next(iter(frame.arrays.values()))
+    owner = next(iter(frame.arrays.values()))
     while isinstance(owner, np.ndarray):
         owner = owner.base
     return isinstance(getattr(owner, "obj", owner), ctypes.Array)
 
 
 @pytest.fixture
-def folder(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> Path:
+def folder(monkeypatch, tmp_path):
     """A folder in place of /dev/shm, so that nobody else makes files there; the service does not look there."""
     monkeypatch.setattr(shared_memory, "_FOLDER", tmp_path)
     return tmp_path
 
 
 @pytest.mark.parametrize(("mode", "encoding"), [("ordered", "uint8"), ("latest", "float32")])
-def test_frames_are_those_of_an_ordinary_stream(client: Any, encoding: str, mode: str) -> None:
+def test_frames_are_those_of_an_ordinary_stream(client, encoding, mode):
     settings = RenderSettings(outputs=("coverage", "bmode", "transmittance"), encoding=encoding)
     with (
         client.stream("demo", settings) as ordinary,
@@ -209,17 +204,17 @@ def test_frames_are_those_of_an_ordinary_stream(client: Any, encoding: str, mode
             assert (other.sequence, other.scene_sha256, other.picture) == (x + 1, one.scene_sha256, one.picture)
 
 
-def frame_at(stream: Any, x_mm: float) -> Frame:
+def frame_at(stream, x_mm):
     stream.send(moved(x_mm))
-    frame: Frame = stream.receive()
+    frame = stream.receive()
     return frame
 
 
-def test_frames_that_are_held_are_not_overwritten(client: Any) -> None:
+def test_frames_that_are_held_are_not_overwritten(client):
     with client.stream("demo", SMALL) as stream:
         expected = [frame_at(stream, x)["bmode"] for x in range(SLOTS + 4)]
     with client.stream("demo", SMALL, shared_memory=True) as stream:
-        held: list[Any] = []
+        held = []
         shared = []
         for x in range(SLOTS + 4):
             frame = frame_at(stream, x)
@@ -237,7 +232,7 @@ def test_frames_that_are_held_are_not_overwritten(client: Any) -> None:
     np.testing.assert_array_equal(held[5], expected[6][2:, 3:])
 
 
-def test_frames_that_a_latest_stream_skips_free_their_slots(client: Any) -> None:
+def test_frames_that_a_latest_stream_skips_free_their_slots(client):
     skipped = 0
     end = Deadline(60)
     with client.stream("demo", SMALL, mode="latest", shared_memory=True) as stream:
@@ -250,7 +245,7 @@ def test_frames_that_a_latest_stream_skips_free_their_slots(client: Any) -> None
             assert is_shared(frame)
 
 
-def test_what_the_service_refuses_is_told(client: Any, folder: Path) -> None:
+def test_what_the_service_refuses_is_told(client, folder):
     for _ in range(10):  # a pose may be on its way when the refusal comes, or not yet, or have arrived
         with client.stream("demo", SMALL, shared_memory=True) as stream:
             with suppress(errors.StreamEnded, errors.InvalidArgument):
@@ -262,14 +257,14 @@ def test_what_the_service_refuses_is_told(client: Any, folder: Path) -> None:
     assert list(folder.iterdir()) == []
 
 
-def test_a_system_without_such_memory_is_told(client: Any, monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_a_system_without_such_memory_is_told(client, monkeypatch, tmp_path):
     monkeypatch.setattr(shared_memory, "_FOLDER", tmp_path / "absent")
     with pytest.raises(errors.InvalidArgument, match="shared_memory cannot be had on this system") as refused:
         client.stream("demo", shared_memory=True)
     assert refused.value.field == "shared_memory"
 
 
-def test_a_memory_that_is_not_used_leaves_no_file(folder: Path) -> None:
+def test_a_memory_that_is_not_used_leaves_no_file(folder):
     memory = SharedMemory()
     (file,) = folder.iterdir()
     assert file.stat().st_mode & 0o777 == 0o600
@@ -279,8 +274,8 @@ def test_a_memory_that_is_not_used_leaves_no_file(folder: Path) -> None:
     assert list(folder.iterdir()) == []
 
 
-def test_the_memory_of_a_stream_goes_with_its_last_frame(client: Any, client_service: RunningService) -> None:
-    def mapped() -> int:
+def test_the_memory_of_a_stream_goes_with_its_last_frame(client, client_service):
+    def mapped():
         gc.collect()
         return Path("/proc/self/maps").read_text().count("/dev/shm/ultragray-")
 
@@ -312,6 +307,6 @@ assert memory._map[32] == 1
 """
 
 
-def test_a_child_process_does_not_free_what_its_parent_holds() -> None:
+def test_a_child_process_does_not_free_what_its_parent_holds():
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(str(ROOT / name) for name in ("client", "proto"))}
     subprocess.run([sys.executable, "-c", FORKED], env=environment, check=True)

@@ -1,7 +1,5 @@
 """Dockerfile, compose files and units of systemd as their programs read them: what they name is there."""
 
-from __future__ import annotations
-
 import configparser
 import json
 import os
@@ -11,7 +9,6 @@ import subprocess
 import sys
 from functools import cache
 from pathlib import Path, PurePosixPath
-from typing import Any
 
 import pytest
 import typer
@@ -32,25 +29,25 @@ DOCKERFILE = (ROOT / "docker" / "Dockerfile").read_text()
 IGNORED = (ROOT / ".dockerignore").read_text().splitlines()
 
 
-def copied() -> set[str]:
+def copied():
     """What the build takes out of the checkout."""
     lines = [line.split()[1:-1] for line in DOCKERFILE.splitlines() if re.match(r"COPY (?!--from)", line)]
     return {source for sources in lines for source in sources}
 
 
-def test_what_is_copied_is_there_and_reaches_the_build() -> None:
+def test_what_is_copied_is_there_and_reaches_the_build():
     assert all((ROOT / source).exists() for source in copied())
     let_through = {line.removeprefix("!/") for line in IGNORED if line.startswith("!")}
     assert {PurePosixPath(source).parts[0] for source in copied() - {"."}} == let_through
 
 
-def test_extras_are_those_of_the_project() -> None:
+def test_extras_are_those_of_the_project():
     wanted = re.search(r"'\.\[([a-z,]+)\]'", DOCKERFILE)
     assert wanted is not None
     assert set(wanted[1].split(",")) <= set(pyproject("ultragray")["project"]["optional-dependencies"])
 
 
-def test_torch_is_one_that_the_project_takes() -> None:
+def test_torch_is_one_that_the_project_takes():
     (torch,) = (
         Requirement(one) for one in pyproject("ultragray")["project"]["dependencies"] if one.startswith("torch")
     )
@@ -69,7 +66,7 @@ SECRETS = dict.fromkeys((*OTHER_VARIABLES, "GRAFANA_PASSWORD"), "a-secret")
 OWN_IMAGES = ("ultragray:cpu", "ultragray:cuda")
 
 
-def compose(*files: str, **environment: str) -> subprocess.CompletedProcess[str]:
+def compose(*files, **environment):
     """`docker compose config` of these files: it asks no engine."""
     path = os.pathsep.join((str(Path(sys.executable).parent), os.environ["PATH"]))
     program = shutil.which("docker-compose", path=path)
@@ -81,22 +78,22 @@ def compose(*files: str, **environment: str) -> subprocess.CompletedProcess[str]
 
 
 @cache
-def services_of(name: str) -> dict[str, dict[str, Any]]:
+def services_of(name):
     done = compose(*SETS[name], **SECRETS)
     assert (done.returncode, done.stderr) == (0, "")
-    services: dict[str, dict[str, Any]] = json.loads(done.stdout)["services"]
+    services = json.loads(done.stdout)["services"]
     return services
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_compose_takes_the_files_and_settings_are_those_that_there_are(name: str) -> None:
+def test_compose_takes_the_files_and_settings_are_those_that_there_are(name):
     services = services_of(name).values()
     given = {key for one in services for key in one.get("environment", {}) if key.startswith(ENVIRONMENT_PREFIX)}
     assert given <= {ENVIRONMENT_PREFIX + item.name.upper() for item, _ in annotated_fields(Settings)}
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_files_that_are_mounted_are_there(name: str) -> None:
+def test_files_that_are_mounted_are_there(name):
     mounts = [
         mount for one in services_of(name).values() for mount in one.get("volumes", ()) if mount["type"] == "bind"
     ]
@@ -104,7 +101,7 @@ def test_files_that_are_mounted_are_there(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_own_containers_have_a_read_only_root_and_no_privileges(name: str) -> None:
+def test_own_containers_have_a_read_only_root_and_no_privileges(name):
     own = {key: one for key, one in services_of(name).items() if one["image"] in OWN_IMAGES}
     assert own
     for key, service in own.items():
@@ -116,7 +113,7 @@ def test_own_containers_have_a_read_only_root_and_no_privileges(name: str) -> No
 
 
 @pytest.mark.parametrize("name", SETS)
-def test_ports_are_open_to_this_machine_alone_and_published_once(name: str) -> None:
+def test_ports_are_open_to_this_machine_alone_and_published_once(name):
     services = dict(services_of(name))
     if name != "alone":
         del services["ultragray-cuda"]  # instead of the other, in a profile of its own
@@ -130,14 +127,14 @@ def test_ports_are_open_to_this_machine_alone_and_published_once(name: str) -> N
 
 
 @pytest.mark.parametrize(("name", "missing"), [("operation", "DATABASE"), ("cluster", "STORAGE")])
-def test_a_secret_that_is_not_given_is_asked_for(name: str, missing: str) -> None:
+def test_a_secret_that_is_not_given_is_asked_for(name, missing):
     left = {key: value for key, value in SECRETS.items() if missing not in key}
     done = compose(*SETS[name], **left)
     assert done.returncode != 0
     assert f"ULTRAGRAY_{missing}_PASSWORD" in done.stderr
 
 
-def test_services_of_the_cluster_share_storage_database_and_envoy() -> None:
+def test_services_of_the_cluster_share_storage_database_and_envoy():
     services = services_of("cluster")
     service, worker = services["ultragray"], services["worker"]
     for name in ("ULTRAGRAY_DATA_FOLDER", "ULTRAGRAY_ARTIFACT_FOLDER", "ULTRAGRAY_DATABASE_URL", "AWS_ENDPOINT_URL"):
@@ -153,14 +150,14 @@ PROGRAM = "/opt/ultragray/bin/ultragray"
 SERVICES = sorted(UNITS.glob("*.service"))
 
 
-def section(unit: Path, name: str) -> configparser.SectionProxy:
+def section(unit, name):
     parser = configparser.ConfigParser(interpolation=None, strict=False, delimiters="=", comment_prefixes="#")
-    parser.optionxform = str  # type: ignore[assignment,method-assign]
+    parser.optionxform = str
     parser.read_string(unit.read_text())
     return parser[name]
 
 
-def test_systemd_understands_every_unit(tmp_path: Path) -> None:
+def test_systemd_understands_every_unit(tmp_path):
     analyze = shutil.which("systemd-analyze")
     if analyze is None:
         pytest.skip("systemd is not installed: on Debian, apt-get install systemd")
@@ -177,7 +174,7 @@ def test_systemd_understands_every_unit(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("unit", SERVICES, ids=lambda unit: unit.name)
-def test_commands_options_and_settings_are_there(unit: Path) -> None:
+def test_commands_options_and_settings_are_there(unit):
     service = section(unit, "Service")
     program, command, *given = service["ExecStart"].split()
     assert program == PROGRAM
@@ -188,22 +185,22 @@ def test_commands_options_and_settings_are_there(unit: Path) -> None:
     assert named <= known
 
 
-def _commands() -> dict[str, typer.core.TyperCommand]:
-    commands: dict[str, typer.core.TyperCommand] = typer.main.get_command(command_line).commands  # type: ignore[attr-defined]
+def _commands():
+    commands = typer.main.get_command(command_line).commands
     return commands
 
 
-def test_service_may_take_its_time_to_stop() -> None:
+def test_service_may_take_its_time_to_stop():
     longest = Settings().drain_timeout_s
     assert int(section(UNITS / "ultragray.service", "Service")["TimeoutStopSec"]) > 2 * longest
 
 
-def test_document_names_every_file() -> None:
+def test_document_names_every_file():
     document = (UNITS.parents[1] / "docs" / "operation.md").read_text()
     assert [path.name for path in sorted(UNITS.iterdir()) if path.name not in document] == []
 
 
-def test_rings_have_the_decided_size_and_bound() -> None:
+def test_rings_have_the_decided_size_and_bound():
     document = yaml.safe_load((FOLDER / "envoy.yaml").read_text(encoding="utf-8"))
     rings = [one for one in document["static_resources"]["clusters"] if one["lb_policy"] == "RING_HASH"]
     assert len(rings) == 2
@@ -213,6 +210,6 @@ def test_rings_have_the_decided_size_and_bound() -> None:
         assert bound == {"hash_balance_factor": DECIDED.hash_balance_factor}
 
 
-def test_replicas_are_added_at_the_decided_wait() -> None:
+def test_replicas_are_added_at_the_decided_wait():
     values = yaml.safe_load((ROOT / "docker/helm/values.yaml").read_text(encoding="utf-8"))
     assert values["service"]["autoscaling"]["queueDelaySeconds"] == DECIDED.queue_p95_ms / 1000

@@ -1,7 +1,5 @@
 """Datasets and jobs of several hosts over a bucket: each host sees all of them, and a job goes on elsewhere."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json
@@ -11,10 +9,8 @@ import sys
 import tarfile
 import time
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
@@ -25,8 +21,7 @@ from ultragray.learn.training import TrainingConfig, train
 from ultragray.phantom.demo import copy_demo_scene
 from ultragray_workers.storage.location import open_storage
 
-from ..object_storage import AWAY_S, FaultyProxy
-from ..postgres import PostgresServer
+from ..object_storage import AWAY_S
 from ..waiting import wait_until
 from ..workers.jobs.conftest import tiny_dataset
 
@@ -50,7 +45,7 @@ _WORK = [sys.executable, "-c", "from ultragray_service.cli.app import app; app()
 class Host:
     """Sees nothing of other hosts but the bucket and the database; its data folder has the demo scene."""
 
-    def __init__(self, folder: Path, artifacts: str, database_url: str, **settings: str) -> None:
+    def __init__(self, folder, artifacts, database_url, **settings):
         self.folder, self.data, self.cache = folder, folder / "data", folder / "cache"
         for one in (self.data, self.cache, folder / "logs", folder / "patches"):
             one.mkdir(parents=True)
@@ -72,13 +67,13 @@ class Host:
             "ULTRAGRAY_JOB_NICE": "0",
             **settings,
         }
-        self.processes: list[subprocess.Popen[bytes]] = []
+        self.processes = []
 
-    def serve(self) -> tuple[str, str]:
+    def serve(self):
         """Starts a service; its addresses of HTTP and gRPC."""
         process, log = self._spawn(_SERVE, "service")
 
-        def addresses() -> tuple[str, str] | None:
+        def addresses():
             assert process.poll() is None, self.told()
             for line in log.read_text().splitlines():
                 if '"grpc"' in line and line.endswith("}"):
@@ -88,22 +83,22 @@ class Host:
 
         return wait_until(addresses, within_s=_START_TIMEOUT_S)
 
-    def work(self) -> subprocess.Popen[bytes]:
+    def work(self):
         """Starts a worker."""
         return self._spawn(_WORK, "worker")[0]
 
-    def kill_all(self) -> None:
+    def kill_all(self):
         """As a loss of power: the processes of jobs die with their workers."""
         for process in self.processes:
             process.kill()
             process.wait()
 
-    def told(self) -> str:
+    def told(self):
         """The ends of the logs, for the message of a test that fails."""
         logs = sorted((self.folder / "logs").iterdir())
         return "\n".join(f"--- {self.folder.name}/{log.name}\n{log.read_text()[-4000:]}" for log in logs)
 
-    def _spawn(self, command: list[str], kind: str) -> tuple[subprocess.Popen[bytes], Path]:
+    def _spawn(self, command, kind):
         path = self.folder / "logs" / f"{kind}-{len(self.processes)}"
         with path.open("ab") as log:
             self.processes.append(subprocess.Popen(command, env=self._environment, stdout=log, stderr=log))
@@ -111,20 +106,18 @@ class Host:
 
 
 @pytest.fixture
-def bucket(new_bucket: Callable[[], str]) -> str:
+def bucket(new_bucket):
     """The URL of an empty bucket."""
     return new_bucket()
 
 
 @pytest.fixture
-def new_host(
-    bucket: str, object_proxy: FaultyProxy, postgres: PostgresServer, tmp_path: Path
-) -> Iterator[Callable[[str], Host]]:
+def new_host(bucket, object_proxy, postgres, tmp_path):
     """Makes a host of that name, with a folder of its own."""
     database_url = postgres.create_database()
-    hosts: list[Host] = []
+    hosts = []
 
-    def make(name: str) -> Host:
+    def make(name):
         hosts.append(Host(tmp_path / name, f"{bucket}/artifacts", database_url))
         return hosts[-1]
 
@@ -139,7 +132,7 @@ SETTINGS = {"steps": STEPS, "seed": SEED, "max_gaussians": 40, "batch_size": 2}
 NewHost = Callable[[str], Host]
 
 
-def released(folder: Path) -> bytes:
+def released(folder):
     """The tiny dataset as an archive."""
     write_released(tiny_dataset(), folder)
     packed = io.BytesIO()
@@ -150,24 +143,22 @@ def released(folder: Path) -> bytes:
     return packed.getvalue()
 
 
-def put_dataset(http: str, content: bytes) -> httpx.Response:
+def put_dataset(http, content):
     return httpx.put(
         f"{http}/v1/datasets/tiny", content=content, headers={"Content-Type": "application/zip"}, timeout=300
     )
 
 
-def get(http: str, path: str, **options: Any) -> httpx.Response:
+def get(http, path, **options):
     return httpx.get(f"{http}/v1/{path}", timeout=60, **options)
 
 
 @pytest.mark.long
-def test_a_training_goes_on_at_another_host_to_the_same_scene(
-    new_host: NewHost, object_proxy: FaultyProxy, tmp_path: Path
-) -> None:
+def test_a_training_goes_on_at_another_host_to_the_same_scene(new_host, object_proxy, tmp_path):
     one, two = new_host("one"), new_host("two")
     (a, _), (b, _) = one.serve(), two.serve()
 
-    def told() -> str:
+    def told():
         return one.told() + two.told()
 
     content = released(tmp_path / "released")
@@ -184,7 +175,7 @@ def test_a_training_goes_on_at_another_host_to_the_same_scene(
     }
     job = httpx.post(f"{b}/v1/jobs", json=body, timeout=60).json()["id"]
 
-    def progress(http: str = b) -> int:
+    def progress(http=b):
         return get(http, f"jobs/{job}").json()["progress"]["step"] or 0
 
     wait_until(lambda: progress() > STEPS // 20, within_s=240, every_s=0.5)
@@ -225,7 +216,7 @@ def test_a_training_goes_on_at_another_host_to_the_same_scene(
 
 
 @pytest.mark.long
-def test_hosts_make_the_shards_of_a_batch_together(new_host: NewHost, bucket: str, object_proxy: FaultyProxy) -> None:
+def test_hosts_make_the_shards_of_a_batch_together(new_host, bucket, object_proxy):
     one, two = new_host("one"), new_host("two")
     http, _ = one.serve()
     workers = [one.work(), two.work()]
@@ -234,10 +225,10 @@ def test_hosts_make_the_shards_of_a_batch_together(new_host: NewHost, bucket: st
     job = httpx.post(f"{http}/v1/jobs", json={"kind": "render", "specification": specification}, timeout=60).json()
     job = job["id"]
 
-    def told() -> str:
+    def told():
         return one.told() + two.told()
 
-    def found() -> dict[str, Any]:
+    def found():
         return dict(get(http, f"jobs/{job}").json())
 
     wait_until(lambda: found()["progress"]["frames_done"], within_s=240, every_s=0.2)
@@ -249,7 +240,7 @@ def test_hosts_make_the_shards_of_a_batch_together(new_host: NewHost, bucket: st
     assert ended["state"] == "succeeded", (ended, told())
     manifest = get(http, f"jobs/{job}/artifacts/manifest.json").json()
     assert sum(shard["frames"] for shard in manifest["shards"]) == 6_000
-    keys: list[str] = []
+    keys = []
     for shard in manifest["shards"]:
         content = get(http, f"jobs/{job}/artifacts/{shard['file']}").content
         assert hashlib.sha256(content).hexdigest() == shard["sha256"]

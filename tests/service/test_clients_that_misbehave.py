@@ -1,12 +1,8 @@
 """Slow, idle and vanishing clients of the streams: bounded memory, and nobody else loses a frame."""
 
-from __future__ import annotations
-
 import json
 import threading
 import time
-from collections.abc import Iterator
-from typing import Any
 
 import grpc
 import httpx
@@ -16,8 +12,6 @@ from websockets.sync.client import connect
 
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
 
-from .conftest import RunningService
-
 IDENTITY = geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=np.eye(4).ravel().tolist()))
 LARGE = rendering_pb2.RenderSettings(
     scene="demo", height=600, width=600, encoding=rendering_pb2.ENCODING_FLOAT32, outputs=[1, 2]
@@ -26,11 +20,11 @@ CALM_BYTES = 64 * 2**20
 TIMEOUT_S = 120.0
 
 
-def rendered(service: RunningService) -> float:
+def rendered(service):
     return service.metric("ultragray_frames_total")
 
 
-def until_calm(service: RunningService) -> float:
+def until_calm(service):
     """Frames rendered in all, once that does not grow for half a second."""
     end = time.monotonic() + TIMEOUT_S
     count = rendered(service)
@@ -43,14 +37,14 @@ def until_calm(service: RunningService) -> float:
 
 
 @pytest.fixture
-def renders(service: RunningService) -> Iterator[rendering_pb2_grpc.RenderServiceStub]:
+def renders(service):
     """Over a connection whose window stays as it is: gRPC lets that of a busy machine grow to 100 MB and more."""
     options = [("grpc.http2.bdp_probe", 0), ("grpc.max_receive_message_length", -1)]
     with grpc.insecure_channel(service.grpc, options=options) as channel:
         yield rendering_pb2_grpc.RenderServiceStub(channel)
 
 
-def test_a_batch_whose_reader_stops_waits_for_him(service: RunningService, renders: Any) -> None:
+def test_a_batch_whose_reader_stops_waits_for_him(service, renders):
     before, frames_before = service.resident_bytes(), rendered(service)
     call = renders.RenderBatch(rendering_pb2.RenderBatchRequest(settings=LARGE, poses=[IDENTITY] * 40))
     next(call)
@@ -62,8 +56,8 @@ def test_a_batch_whose_reader_stops_waits_for_him(service: RunningService, rende
     assert len(list(call)) == 39
 
 
-def test_a_stream_whose_reader_stops_waits_for_him(service: RunningService, renders: Any) -> None:
-    def messages() -> Iterator[rendering_pb2.RenderStreamRequest]:
+def test_a_stream_whose_reader_stops_waits_for_him(service, renders):
+    def messages():
         yield rendering_pb2.RenderStreamRequest(settings=LARGE, mode=rendering_pb2.STREAM_MODE_LATEST)
         for sequence in range(5000):
             yield rendering_pb2.RenderStreamRequest(sequence=sequence, pose=IDENTITY)
@@ -76,7 +70,7 @@ def test_a_stream_whose_reader_stops_waits_for_him(service: RunningService, rend
     call.cancel()
 
 
-def test_many_mistakes_at_once_do_not_stop_a_stream(service: RunningService) -> None:
+def test_many_mistakes_at_once_do_not_stop_a_stream(service):
     """More refusals wait than may be under way, while the client has yet to say that it has the first frame."""
     address = service.stream_url()
     pose = {"mode": "latest", "settings": {}, "pose": {"matrix": np.eye(4).tolist()}}
@@ -90,13 +84,13 @@ def test_many_mistakes_at_once_do_not_stop_a_stream(service: RunningService) -> 
             pass
 
 
-def test_a_flood_of_messages_leaves_others_their_turn(service: RunningService) -> None:
+def test_a_flood_of_messages_leaves_others_their_turn(service):
     """Settings and poses of a latest stream are never answered one by one: nothing slows the sender down."""
     address = service.stream_url()
     pose = json.dumps({"mode": "latest", "settings": {}, "pose": {"matrix": np.eye(4).tolist()}})
     over = threading.Event()
 
-    def flood() -> None:
+    def flood():
         while not over.is_set():
             connection.send(pose)
 

@@ -1,7 +1,5 @@
 """What a service says to whom has started it."""
 
-from __future__ import annotations
-
 import logging
 import os
 import pty
@@ -22,13 +20,13 @@ from ..waiting import at_this_load
 from .cli.command_line import python
 
 
-def record(level: int, message: str, **fields: object) -> logging.LogRecord:
+def record(level, message, **fields):
     made = logging.LogRecord("ultragray.service", level, "", 0, message, (), None)
     made.fields = fields
     return made
 
 
-def test_a_banner_has_the_addresses_and_how_to_stop() -> None:
+def test_a_banner_has_the_addresses_and_how_to_stop():
     doors = Doors.of(Settings(data_folder=Path("scenes")), 8000, 50051, "127.0.0.1:18944")
     lines = dict(line.split(maxsplit=1) for line in doors.banner(False).splitlines() if line.startswith("  "))
     assert lines["console"] == "http://127.0.0.1:8000/"
@@ -41,14 +39,14 @@ def test_a_banner_has_the_addresses_and_how_to_stop() -> None:
 
 
 @pytest.mark.parametrize("host", ["0.0.0.0", "::"])
-def test_a_banner_names_an_address_that_a_browser_opens(host: str) -> None:
+def test_a_banner_names_an_address_that_a_browser_opens(host):
     doors = Doors.of(Settings(host=host, tls_certificate=Path("c.pem"), tls_key=Path("k.pem")), 80, 50051, None)
     assert "console     https://localhost:80/" in doors.banner(True)
     assert "OpenIGTLink" not in doors.banner(True)
     assert "NOT NEEDED BY ANYBODY" in doors.banner(False)
 
 
-def test_a_line_for_people_is_time_level_and_sentence() -> None:
+def test_a_line_for_people_is_time_level_and_sentence():
     plain = HumanFormatter(in_colour=False)
     assert re.fullmatch(r"\d\d:\d\d:\d\d stopped", plain.format(record(logging.INFO, "stopped")))
     assert plain.format(record(logging.WARNING, "no space"))[9:] == "warning: no space"
@@ -61,7 +59,7 @@ def test_a_line_for_people_is_time_level_and_sentence() -> None:
     assert "\x1b[31merror: \x1b[0m" in HumanFormatter(in_colour=True).format(record(logging.ERROR, "lost"))
 
 
-def read_until(terminal: int, wanted: str, process: subprocess.Popen[bytes]) -> str:
+def read_until(terminal, wanted, process):
     """What a process wrote to its terminal, up to `wanted`."""
     said, end = "", time.monotonic() + at_this_load(60)
     while wanted not in said:
@@ -75,7 +73,7 @@ def read_until(terminal: int, wanted: str, process: subprocess.Popen[bytes]) -> 
 
 
 @pytest.mark.long
-def test_on_a_terminal_it_speaks_to_people(tmp_path: Path) -> None:
+def test_on_a_terminal_it_speaks_to_people(tmp_path):
     ours, theirs = pty.openpty()
     program = "from ultragray_service.cli.app import app; app()"
     command = python(program, "serve", "--http-port", 0, "--grpc-port", 0, "--threads", 1)

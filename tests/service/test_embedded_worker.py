@@ -1,13 +1,10 @@
 """The worker of `ultragray serve`, as a process that takes no jobs: what becomes of it, not what it does."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import signal
 import sys
 import time
-from collections.abc import Awaitable, Callable
 from pathlib import Path
 
 import pytest
@@ -21,8 +18,8 @@ from ..waiting import at_this_load
 OBEDIENT, DEAF = "", "signal.signal(signal.SIGTERM, signal.SIG_IGN)"
 
 
-def run(folder: Path, work: Callable[[EmbeddedWorker], Awaitable[None]], *, wanted: bool = True) -> None:
-    async def all_of_it() -> None:
+def run(folder, work, *, wanted=True):
+    async def all_of_it():
         worker = EmbeddedWorker(Settings(data_folder=folder, embedded_worker=wanted))
         worker.start()
         try:
@@ -34,10 +31,10 @@ def run(folder: Path, work: Callable[[EmbeddedWorker], Awaitable[None]], *, want
 
 
 @pytest.fixture
-def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], Path]:
+def program(tmp_path, monkeypatch):
     """What runs in place of the worker; returns the file to which each of them adds its process id."""
 
-    def use(source: str) -> Path:
+    def use(source):
         started, script = tmp_path / "started", tmp_path / "python"
         tell = f"import os; open({str(started)!r}, 'a').write(f'{{os.getpid()}}\\n')"
         script.write_text(f"#!{sys.executable}\nimport signal, time\n{source}\n{tell}\ntime.sleep(60)\n")
@@ -48,23 +45,21 @@ def program(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Callable[[str], 
     return use
 
 
-async def pids(started: Path, count: int) -> list[int]:
+async def pids(started, count):
     while not started.exists() or len(found := started.read_text().split()) < count:
         await asyncio.sleep(0.02)
     return [int(pid) for pid in found]
 
 
-def is_alive(pid: int) -> bool:
+def is_alive(pid):
     return Path(f"/proc/{pid}").exists()
 
 
-def test_started_again_when_it_dies_and_ended_with_the_service(
-    program: Callable[[str], Path], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_started_again_when_it_dies_and_ended_with_the_service(program, tmp_path, monkeypatch, caplog):
     monkeypatch.setattr(embedded_worker, "_FIRST_WAIT_S", 0.05)
     started = program(OBEDIENT)
 
-    async def kill_one(worker: EmbeddedWorker) -> None:
+    async def kill_one(worker):
         (first,) = await pids(started, 1)
         os.kill(first, signal.SIGKILL)
         _, second = await pids(started, 2)
@@ -77,10 +72,10 @@ def test_started_again_when_it_dies_and_ended_with_the_service(
     ]
 
 
-def test_killed_where_nobody_waits_for_its_end(program: Callable[[str], Path], tmp_path: Path) -> None:
+def test_killed_where_nobody_waits_for_its_end(program, tmp_path):
     started = program(DEAF)
 
-    async def give_up(worker: EmbeddedWorker) -> None:
+    async def give_up(worker):
         (pid,) = await pids(started, 1)
         began = time.monotonic()
         with pytest.raises(asyncio.TimeoutError):
@@ -92,7 +87,7 @@ def test_killed_where_nobody_waits_for_its_end(program: Callable[[str], Path], t
     run(tmp_path, give_up)
 
 
-def test_none_where_none_is_wanted(program: Callable[[str], Path], tmp_path: Path) -> None:
+def test_none_where_none_is_wanted(program, tmp_path):
     started = program(OBEDIENT)
     run(tmp_path, lambda worker: asyncio.sleep(0.3), wanted=False)
     assert not started.exists()

@@ -1,10 +1,6 @@
 """Strings that PostgreSQL, UTF-8 or a file system cannot hold, in every field of text: refused, never a fault."""
 
-from __future__ import annotations
-
 import json
-from pathlib import Path
-from typing import Any
 from urllib.parse import quote
 
 import grpc
@@ -14,24 +10,20 @@ import pytest
 
 from ultragray_proto.v1 import datasets_pb2, datasets_pb2_grpc, jobs_pb2, jobs_pb2_grpc, scenes_pb2, scenes_pb2_grpc
 
-from ..postgres import PostgresServer
 from ..workers.jobs.conftest import store_dataset
-from .conftest import RunningService, StartService
 
 UNSTORABLE = {"nul": "a\0b", "surrogate": "a\ud800b", "long": "x" * 10_000}
 POSES = [np.eye(4).tolist()]
 
 
 @pytest.fixture(scope="module")
-def stored(
-    start_service: StartService, postgres: PostgresServer, tmp_path_factory: pytest.TempPathFactory
-) -> RunningService:
-    folder: Path = tmp_path_factory.mktemp("artifacts")
+def stored(start_service, postgres, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("artifacts")
     store_dataset(folder, "tiny")
     return start_service(artifact_folder=folder, database_url=postgres.create_database())
 
 
-def bodies(text: str) -> list[dict[str, Any]]:
+def bodies(text):
     render = {"scene": "demo", "poses": POSES, "height": 8, "width": 8}
     train = {"dataset": "tiny", "scene": "new", "settings": {"steps": 1}}
     evaluate = {"dataset": "tiny", "scene": "demo"}
@@ -45,7 +37,7 @@ def bodies(text: str) -> list[dict[str, Any]]:
 
 
 @pytest.mark.parametrize("text", UNSTORABLE.values(), ids=UNSTORABLE)
-def test_http(stored: RunningService, text: str) -> None:
+def test_http(stored, text):
     with httpx.Client(base_url=stored.http, timeout=60) as http:
         for body in bodies(text):
             answer = http.post("/v1/jobs", content=json.dumps(body))
@@ -65,12 +57,12 @@ def test_http(stored: RunningService, text: str) -> None:
 
 
 @pytest.mark.parametrize("text", [UNSTORABLE["nul"], UNSTORABLE["long"]], ids=["nul", "long"])  # protobuf has no others
-def test_grpc(stored: RunningService, text: str) -> None:
+def test_grpc(stored, text):
     render = {"scene": "demo", "height": 8, "width": 8}
     with stored.channel() as channel:
         jobs, scenes = jobs_pb2_grpc.JobServiceStub(channel), scenes_pb2_grpc.SceneServiceStub(channel)
         datasets = datasets_pb2_grpc.DatasetServiceStub(channel)
-        calls: list[tuple[Any, Any]] = [
+        calls = [
             (jobs.SubmitJob, jobs_pb2.SubmitJobRequest(render=jobs_pb2.RenderJob(**{**render, name: text})))
             for name in ("scene", "format", "dtype", "device")
             if name in jobs_pb2.RenderJob.DESCRIPTOR.fields_by_name
@@ -98,5 +90,5 @@ def test_grpc(stored: RunningService, text: str) -> None:
             assert refused.value.code() in codes, (request, refused.value.details())
 
 
-def test_the_log_has_no_fault(stored: RunningService) -> None:
+def test_the_log_has_no_fault(stored):
     assert not [record for record in stored.log() if record["level"] == "error"]

@@ -1,14 +1,11 @@
 """A scene whose file is replaced while frames of it are asked for: no frame mixes the old one with the new one."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
 import threading
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import httpx
 import numpy as np
@@ -17,7 +14,7 @@ from websockets.sync.client import connect
 
 from ultragray import LinearProbe
 
-from .conftest import RunningService, StartService, make_scene, split
+from .conftest import make_scene, split
 
 SWAPS = 8
 BETWEEN_SWAPS_S = 0.1
@@ -29,16 +26,16 @@ Ask = Callable[[], Iterator[Seen]]
 class Changing:
     """A scene that is replaced by one with another probe, and back."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder):
         self.path = folder / "changing.ugr"
         self._contents = []
-        self.known: set[Seen] = set()
+        self.known = set()
         for far_mm, gaussians in ((40.0, 400), (60.0, 500)):
             make_scene(gaussians, probe=LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=far_mm)).save(self.path)
             self._contents.append(self.path.read_bytes())
             self.known.add((hashlib.sha256(self._contents[-1]).hexdigest(), far_mm))
 
-    def swap(self) -> None:
+    def swap(self):
         self._contents.reverse()
         other = self.path.with_suffix(".new")
         other.write_bytes(self._contents[0])
@@ -46,26 +43,26 @@ class Changing:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("changing")
 
 
 @pytest.fixture(scope="module")
-def changing(folder: Path) -> Changing:
+def changing(folder):
     return Changing(folder)
 
 
 @pytest.fixture(scope="module")
-def service(start_service: StartService, changing: Changing, folder: Path) -> RunningService:
+def service(start_service, changing, folder):
     return start_service(data_folder=folder)
 
 
-def check(changing: Changing, ask: Ask) -> None:
+def check(changing, ask):
     """Both contents are seen while they are swapped, each with its own probe only."""
-    seen: set[Seen] = set()
+    seen = set()
     done = threading.Event()
 
-    def swap() -> None:
+    def swap():
         for _ in range(SWAPS):
             time.sleep(BETWEEN_SWAPS_S)
             changing.swap()
@@ -83,10 +80,10 @@ def check(changing: Changing, ask: Ask) -> None:
         swapping.join()
 
 
-def test_http(service: RunningService, changing: Changing) -> None:
+def test_http(service, changing):
     body = {"poses": [{"matrix": np.eye(4).tolist()}] * 3, "dtype": "uint8"}
 
-    def ask() -> Iterator[Seen]:
+    def ask():
         answer = client.post("/v1/scenes/changing/render", json=body, headers={"Accept": "application/octet-stream"})
         assert answer.status_code == 200, answer.text
         probe = json.loads(answer.headers["X-Ultragray-Probe"])
@@ -96,10 +93,10 @@ def test_http(service: RunningService, changing: Changing) -> None:
         check(changing, ask)
 
 
-def test_websocket(service: RunningService, changing: Changing) -> None:
+def test_websocket(service, changing):
     message = json.dumps({"pose": {"matrix": np.eye(4).tolist()}})
 
-    def ask() -> Iterator[Seen]:
+    def ask():
         connection.send(message)
         about, _ = split(connection.recv(timeout=60))
         yield about["scene_sha256"], about["probe"]["far_mm"]
@@ -108,9 +105,7 @@ def test_websocket(service: RunningService, changing: Changing) -> None:
         check(changing, ask)
 
 
-def test_what_the_new_scene_cannot_give_is_told_and_the_stream_goes_on(
-    service: RunningService, changing: Changing
-) -> None:
+def test_what_the_new_scene_cannot_give_is_told_and_the_stream_goes_on(service, changing):
     """A scene without a probe of its own takes the place of one with a probe, under a stream that names none."""
     message = json.dumps({"pose": {"matrix": np.eye(4).tolist()}})
     with connect(service.stream_url("changing"), compression=None, max_size=None, close_timeout=0.2) as connection:

@@ -1,54 +1,43 @@
 """What frames tell of their extrapolation, and what is done with those far away, through each front door."""
 
-from __future__ import annotations
-
 import json
 import shutil
-from collections.abc import Callable, Iterator
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import grpc
 import httpx
 import numpy as np
 import pytest
 
-from ultragray import GaussianScene, render
+from ultragray import render
 from ultragray.rendering.confidence import supported_shares
 from ultragray.scene.confidence import Assessor, ConfidenceModel, Support
-from ultragray_proto.v1 import (
-    geometry_pb2,
-    rendering_pb2,
-    rendering_pb2_grpc,
-)
+from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
 
-from .conftest import HEIGHT, WIDTH, RunningService
+from .conftest import HEIGHT, WIDTH
 
 MODEL = ConfidenceModel((3.5, 1.2, 0.8, 0.1, 0.6), 0.06, (0.0,) * 5, 20, 0.04)
 NEAR, FAR = 2.0, 20.0  # of the training views from 0 to 4 mm in elevation
 
 
-def at(y: float) -> Any:  # [4, 4] mm
+def at(y):  # [4, 4] mm
     pose = np.eye(4)
     pose[1, 3] = y
     return pose
 
 
-def body(*elevations_mm: float, **fields: Any) -> dict[str, Any]:
+def body(*elevations_mm, **fields):
     poses = [{"matrix": at(y).tolist()} for y in elevations_mm]
     return {"pose": poses[0], **fields} if len(poses) == 1 else {"poses": poses, **fields}
 
 
 @pytest.fixture(scope="module")
-def knowing(demo_scene: GaussianScene) -> GaussianScene:
+def knowing(demo_scene):
     return replace(demo_scene, info=replace(demo_scene.info, confidence=MODEL.to_dict()))
 
 
 @pytest.fixture(scope="module")
-def knowing_service(
-    start_service: Callable[..., RunningService], knowing: GaussianScene, data_folder: Path, tmp_path_factory: Any
-) -> RunningService:
+def knowing_service(start_service, knowing, data_folder, tmp_path_factory):
     folder = tmp_path_factory.mktemp("knowing")
     knowing.save(folder / "knowing.ugr")
     coverage = render(knowing, None, at(NEAR), height=HEIGHT, width=WIDTH, outputs=("coverage",))["coverage"]
@@ -60,12 +49,12 @@ def knowing_service(
 
 
 @pytest.fixture(scope="module")
-def client(knowing_service: RunningService) -> Iterator[httpx.Client]:
+def client(knowing_service):
     with httpx.Client(base_url=f"{knowing_service.http}/v1/scenes/", timeout=60) as client:
         yield client
 
 
-def test_a_frame_tells_what_the_library_says(client: httpx.Client, knowing: GaussianScene) -> None:
+def test_a_frame_tells_what_the_library_says(client, knowing):
     answer = client.post("knowing/render", json=body(NEAR))
     told = json.loads(answer.headers["X-Ultragray-Extrapolation"])
     coverage = render(knowing, None, at(NEAR), height=HEIGHT, width=WIDTH, outputs=("coverage",)).coverage
@@ -76,7 +65,7 @@ def test_a_frame_tells_what_the_library_says(client: httpx.Client, knowing: Gaus
     assert float(answer.headers["X-Ultragray-Confidence"]) == pytest.approx(told["confidence"], abs=6e-4)
 
 
-def test_a_scene_that_cannot_tell_says_so(client: httpx.Client) -> None:
+def test_a_scene_that_cannot_tell_says_so(client):
     answer = client.post("demo/render", json=body(NEAR))
     told = json.loads(answer.headers["X-Ultragray-Extrapolation"])
     assert told["confidence"] is None
@@ -86,7 +75,7 @@ def test_a_scene_that_cannot_tell_says_so(client: httpx.Client) -> None:
     assert (refusal["reason"], refusal["field"]) == ("INVALID_ARGUMENT", "min_confidence")
 
 
-def test_poses_below_the_limit_are_refused(client: httpx.Client) -> None:
+def test_poses_below_the_limit_are_refused(client):
     assert client.post("knowing/render", json=body(NEAR, min_confidence=0.5)).status_code == 200
     answer = client.post("knowing/render", json=body(FAR, min_confidence=0.5))
     assert answer.status_code == 422
@@ -97,7 +86,7 @@ def test_poses_below_the_limit_are_refused(client: httpx.Client) -> None:
     assert client.post("knowing/render", json=body(FAR, min_confidence=1.5)).json()["field"] == "min_confidence"
 
 
-def test_so_are_frames_that_turn_out_below_it(client: httpx.Client) -> None:
+def test_so_are_frames_that_turn_out_below_it(client):
     """The pose alone suffices; the Gaussians support too little of its frame."""
     told = client.post("thin/render", json=body(NEAR, min_confidence=0.3))
     confidence = float(told.headers["X-Ultragray-Confidence"])
@@ -112,10 +101,10 @@ def test_so_are_frames_that_turn_out_below_it(client: httpx.Client) -> None:
     assert (bmode[coverage < 0.3] == 0).all()
 
 
-def test_grpc(knowing_service: RunningService) -> None:
+def test_grpc(knowing_service):
     settings = rendering_pb2.RenderSettings(scene="knowing", min_confidence=0.5)
 
-    def pose(y: float) -> geometry_pb2.Pose:
+    def pose(y):
         return geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=at(y).ravel().tolist()))
 
     with knowing_service.channel() as channel:

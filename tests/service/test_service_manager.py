@@ -1,24 +1,18 @@
 """What systemd hears of the service, on a socket as systemd has one."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket
-from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import pytest
 
 from ultragray_service.server import ALIVE, READY, STOPPING, ServiceManager
 
-from .conftest import RunningService
-
 WAIT_S = 60.0
 
 
 @pytest.fixture
-def listener(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket.socket]:
+def listener(tmp_path, monkeypatch):
     with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as listening:
         listening.bind(str(tmp_path / "notify"))
         listening.settimeout(WAIT_S)
@@ -26,9 +20,7 @@ def listener(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[socket
         yield listening
 
 
-def test_service_tells_when_it_is_ready_alive_and_stopping(
-    listener: socket.socket, start_service: Callable[..., RunningService], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_service_tells_when_it_is_ready_alive_and_stopping(listener, start_service, monkeypatch):
     monkeypatch.setenv("WATCHDOG_USEC", "600000")
     service = start_service(wait=False)
     told = [listener.recv(100).decode()]
@@ -44,16 +36,14 @@ def test_service_tells_when_it_is_ready_alive_and_stopping(
     assert service.terminate() == 0
 
 
-def test_process_that_nobody_manages_tells_nobody(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_process_that_nobody_manages_tells_nobody(monkeypatch):
     monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
     manager = ServiceManager()
     manager.tell(READY)
     assert manager.alive_every_s is None
 
 
-def test_processes_that_it_starts_do_not_inherit_the_socket(
-    listener: socket.socket, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_processes_that_it_starts_do_not_inherit_the_socket(listener, monkeypatch):
     monkeypatch.setenv("WATCHDOG_USEC", "30000000")
     monkeypatch.setenv("WATCHDOG_PID", str(os.getpid()))
     manager = ServiceManager()
@@ -63,9 +53,7 @@ def test_processes_that_it_starts_do_not_inherit_the_socket(
     assert listener.recv(100).decode() == ALIVE
 
 
-def test_manager_that_is_gone_or_busy_holds_nobody_up(
-    listener: socket.socket, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
-) -> None:
+def test_manager_that_is_gone_or_busy_holds_nobody_up(listener, monkeypatch, tmp_path):
     manager = ServiceManager()
     for _ in range(10_000):  # nobody listens
         manager.tell(ALIVE)

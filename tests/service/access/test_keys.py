@@ -1,14 +1,10 @@
 """Keys: made and revoked by the command line while a service runs, sent in one way, and whose they are."""
 
-from __future__ import annotations
-
 import base64
 import json
 import socket
 import time
-from collections.abc import Iterator
 from functools import partial
-from pathlib import Path
 from urllib.parse import urlsplit
 
 import grpc
@@ -16,7 +12,6 @@ import httpx
 import pytest
 import sqlalchemy as sa
 from grpc_health.v1 import health_pb2, health_pb2_grpc
-from typer.testing import Result
 
 from ultragray.errors import InvalidArgument
 from ultragray_proto.v1 import access_pb2, access_pb2_grpc
@@ -28,10 +23,8 @@ from ultragray_workers.errors import DatabaseUnavailable
 from ultragray_workers.jobs import tables
 from ultragray_workers.jobs.database import JobDatabase
 
-from ...postgres import NewDatabase, PostgresServer
 from ...waiting import wait_until
 from ..cli.command_line import run
-from ..conftest import RunningService, StartService
 
 FIXED_KEY = "0123456789abcdef"
 
@@ -39,18 +32,18 @@ FIXED_KEY = "0123456789abcdef"
 class Listed:
     """A source that knows what it is told."""
 
-    def __init__(self, **principals: Principal) -> None:
+    def __init__(self, **principals):
         self.principals = principals
 
     @property
-    def is_used(self) -> bool:
+    def is_used(self):
         return bool(self.principals)
 
-    def authenticate(self, credential: str) -> Principal | None:
+    def authenticate(self, credential):
         return self.principals.get(credential)
 
 
-def test_roles_include_those_before_them() -> None:
+def test_roles_include_those_before_them():
     assert [[one.includes(other) for other in Role] for one in Role] == [
         [True, False, False],
         [True, True, False],
@@ -58,11 +51,11 @@ def test_roles_include_those_before_them() -> None:
     ]
 
 
-def test_without_a_source_everybody_is_local() -> None:
+def test_without_a_source_everybody_is_local():
     assert Guard([EnvironmentKeys(())]).authenticate(None) is LOCAL
 
 
-def test_the_first_source_that_knows_a_credential_says_whose_it_is() -> None:
+def test_the_first_source_that_knows_a_credential_says_whose_it_is():
     alice = Principal("alice", Role.READER, "0badcafe")
     guard = Guard([Listed(alpha=alice), EnvironmentKeys([FIXED_KEY])])
     assert guard.authenticate("alpha") is alice
@@ -70,13 +63,13 @@ def test_the_first_source_that_knows_a_credential_says_whose_it_is() -> None:
 
 
 @pytest.mark.parametrize("credential", [None, "", FIXED_KEY[:-1], FIXED_KEY + "0", "ключ"])
-def test_nobody_passes_without_a_known_credential(credential: str | None) -> None:
+def test_nobody_passes_without_a_known_credential(credential):
     with pytest.raises(Unauthenticated):
         Guard([EnvironmentKeys([FIXED_KEY])]).authenticate(credential)
 
 
-def test_a_credential_counts_until_it_expires() -> None:
-    def guard(expires_at_s: float) -> Guard:
+def test_a_credential_counts_until_it_expires():
+    def guard(expires_at_s):
         return Guard([Listed(alpha=Principal("alice", Role.READER, "0badcafe", expires_at_s))])
 
     assert guard(time.time() + 60).authenticate("alpha").name == "alice"
@@ -84,7 +77,7 @@ def test_a_credential_counts_until_it_expires() -> None:
         guard(time.time()).authenticate("alpha")
 
 
-def test_a_source_that_lost_its_credentials_opens_no_door() -> None:
+def test_a_source_that_lost_its_credentials_opens_no_door():
     source = Listed(alpha=Principal("alice", Role.READER, "0badcafe"))
     guard = Guard([source])
     guard.authenticate("alpha")
@@ -98,7 +91,7 @@ KEY, OTHER = "0123456789abcdef-one", "0123456789abcdef-two"
 
 
 @pytest.fixture(scope="module")
-def guarded(start_service: StartService) -> RunningService:
+def guarded(start_service):
     return start_service(api_keys=f"{KEY},{OTHER}")
 
 
@@ -120,7 +113,7 @@ def guarded(start_service: StartService) -> RunningService:
         ([], False),
     ],
 )
-def test_both_doors_take_the_same(guarded: RunningService, headers: list[tuple[str, str]], is_known: bool) -> None:
+def test_both_doors_take_the_same(guarded, headers, is_known):
     status = httpx.get(f"{guarded.http}/v1/me", headers=headers, timeout=60).status_code
     assert status == (200 if is_known else 401)
     with guarded.channel() as channel:
@@ -138,9 +131,7 @@ def test_both_doors_take_the_same(guarded: RunningService, headers: list[tuple[s
         (b"ultragray.v1, ultragray.key.%s, ultragray.key.%s" % (2 * (base64.urlsafe_b64encode(KEY.encode()),)), 400),
     ],
 )
-def test_subprotocols_that_are_none_are_refused_with_a_problem(
-    guarded: RunningService, offered: bytes, status: int
-) -> None:
+def test_subprotocols_that_are_none_are_refused_with_a_problem(guarded, offered, status):
     parts = urlsplit(guarded.http)
     with socket.create_connection((parts.hostname, parts.port), timeout=60) as connection:
         connection.sendall(
@@ -156,11 +147,11 @@ def test_subprotocols_that_are_none_are_refused_with_a_problem(
     assert b"content-type: application/problem+json" in head
 
 
-def test_health_lists_every_service_without_a_key(guarded: RunningService) -> None:
+def test_health_lists_every_service_without_a_key(guarded):
     with guarded.channel() as channel:
         stub = health_pb2_grpc.HealthStub(channel)
 
-        def is_serving(name: str) -> bool:
+        def is_serving(name):
             statuses = stub.List(health_pb2.HealthListRequest(), timeout=60).statuses
             return bool(statuses[name].status == health_pb2.HealthCheckResponse.SERVING)
 
@@ -173,7 +164,7 @@ def test_health_lists_every_service_without_a_key(guarded: RunningService) -> No
     assert "Traceback" not in guarded.log_path.read_text()
 
 
-def test_refusals_say_how_to_authenticate_and_health_and_documentation_stay_open(guarded: RunningService) -> None:
+def test_refusals_say_how_to_authenticate_and_health_and_documentation_stay_open(guarded):
     for path in ("/v1/scenes", "/metrics", "/v1/nothing"):
         answer = httpx.get(f"{guarded.http}{path}", timeout=60)
         assert (answer.status_code, answer.json()["reason"]) == (401, "UNAUTHENTICATED")
@@ -186,22 +177,22 @@ def test_refusals_say_how_to_authenticate_and_health_and_documentation_stay_open
 
 
 @pytest.fixture
-def database_url(new_database: NewDatabase) -> str | None:
+def database_url(new_database):
     return new_database()
 
 
 @pytest.fixture
-def database(tmp_path: Path, database_url: str | None) -> Iterator[JobDatabase]:
+def database(tmp_path, database_url):
     opened = JobDatabase(tmp_path, database_url)
     yield opened
     opened.close()
 
 
-def keys(folder: Path, *arguments: object) -> Result:
+def keys(folder, *arguments):
     return run("keys", *arguments, "--artifact-folder", folder)
 
 
-def test_a_key_is_known_by_its_secret_which_is_nowhere_kept(database: JobDatabase) -> None:
+def test_a_key_is_known_by_its_secret_which_is_nowhere_kept(database):
     store, known = KeyStore(database.engine), KnownKeys()
     key, secret = store.create("alice", Role.OPERATOR, 90.0)
     known.replace(store.keys())
@@ -214,7 +205,7 @@ def test_a_key_is_known_by_its_secret_which_is_nowhere_kept(database: JobDatabas
     assert row.expires_at_s - row.created_at_s == pytest.approx(90 * 86400)
 
 
-def test_revoking_a_name_revokes_all_its_keys_and_an_id_one(database: JobDatabase) -> None:
+def test_revoking_a_name_revokes_all_its_keys_and_an_id_one(database):
     store = KeyStore(database.engine)
     first, _ = store.create("alice", Role.READER, None)
     second, secret = store.create("alice", Role.ADMIN, None)
@@ -232,12 +223,12 @@ def test_revoking_a_name_revokes_all_its_keys_and_an_id_one(database: JobDatabas
 
 
 @pytest.mark.parametrize("name", ["", "oidc:alice", "a b", "-", "x" * 65, "local:"])
-def test_names_that_other_sources_may_give_are_refused(database: JobDatabase, name: str) -> None:
+def test_names_that_other_sources_may_give_are_refused(database, name):
     with pytest.raises(InvalidArgument, match="name must be"):
         KeyStore(database.engine).create(name, Role.READER, None)
 
 
-def test_a_snapshot_follows_the_keys_and_writes_when_they_were_used(database: JobDatabase) -> None:
+def test_a_snapshot_follows_the_keys_and_writes_when_they_were_used(database):
     store, known = KeyStore(database.engine), KnownKeys()
     snapshot = Snapshot(database.engine, known, ())
     try:
@@ -252,7 +243,7 @@ def test_a_snapshot_follows_the_keys_and_writes_when_they_were_used(database: Jo
         snapshot.close()
 
 
-def test_a_snapshot_outlives_the_database(tmp_path: Path, postgres: PostgresServer) -> None:
+def test_a_snapshot_outlives_the_database(tmp_path, postgres):
     database = JobDatabase(tmp_path, postgres.create_database())
     store, known = KeyStore(database.engine), KnownKeys()
     _, secret = store.create("alice", Role.READER, None)
@@ -267,7 +258,7 @@ def test_a_snapshot_outlives_the_database(tmp_path: Path, postgres: PostgresServ
             postgres.start()
         store.revoke("alice")
 
-        def is_revoked() -> bool:
+        def is_revoked():
             try:
                 return known.authenticate(secret) is None
             except Unauthenticated:
@@ -279,7 +270,7 @@ def test_a_snapshot_outlives_the_database(tmp_path: Path, postgres: PostgresServ
         database.close()
 
 
-def test_keys_are_made_and_revoked_without_a_restart(start_service: StartService, tmp_path: Path) -> None:
+def test_keys_are_made_and_revoked_without_a_restart(start_service, tmp_path):
     service = start_service(artifact_folder=tmp_path)
     routes = f"{service.http}/v1/scenes"
     assert httpx.get(routes, timeout=60).status_code == 200

@@ -1,16 +1,12 @@
 """Limits of keys: what they are, how they are counted, and that every door of a real service keeps them."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from datetime import datetime, timezone
-from pathlib import Path
-from typing import Any
 
 import grpc
 import httpx
@@ -20,7 +16,7 @@ import sqlalchemy as sa
 from google.rpc.error_details_pb2 import RetryInfo
 from google.rpc.status_pb2 import Status
 from websockets.exceptions import InvalidStatus
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
 
 from ultragray.errors import InvalidArgument
 from ultragray_proto.v1 import access_pb2, access_pb2_grpc, jobs_pb2, jobs_pb2_grpc, rendering_pb2, rendering_pb2_grpc
@@ -33,17 +29,17 @@ from ultragray_workers.jobs.tables import USAGE
 
 from ...waiting import SkippingLoop, wait_until
 from ..cli.command_line import run
-from ..conftest import RunningService, StartService, split
+from ..conftest import RunningService, split
 from ..igtl.conftest import Peer, address_of
 from ..rpc.test_grpc_render import error_info, moved
 from .conftest import MATRIX, POSE
 
 
-def test_nothing_is_limited_unless_a_setting_says_so() -> None:
+def test_nothing_is_limited_unless_a_setting_says_so():
     assert Settings().allowance == Allowance() == Allowance(**dict.fromkeys(NAMES))
 
 
-def test_settings_limit_every_key(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_settings_limit_every_key(monkeypatch):
     monkeypatch.setenv("ULTRAGRAY_KEY_FRAMES_PER_S", "30")
     assert load_settings(key_stored_gb=0.5).allowance == Allowance(frames_per_s=30, stored_gb=0.5)
 
@@ -51,12 +47,12 @@ def test_settings_limit_every_key(monkeypatch: pytest.MonkeyPatch) -> None:
 @pytest.mark.parametrize(
     "text", ["frames_per_s", "frames=3", "=3", "frames_per_s=0", "frames_per_s=often", "streams=-1"]
 )
-def test_a_limit_that_cannot_be_is_refused_with_what_was_given(text: str) -> None:
+def test_a_limit_that_cannot_be_is_refused_with_what_was_given(text):
     with pytest.raises(InvalidArgument, match=r"frames_per_s|streams"):
         read_limits([text])
 
 
-def test_a_key_keeps_limits_of_its_own(tmp_path: Path) -> None:
+def test_a_key_keeps_limits_of_its_own(tmp_path):
     where = ("--artifact-folder", tmp_path)
     limits = ("--limit", "frames_per_s=30", "--limit", "stored_gb=1.5", "--limit", "streams=none")
     made = run("keys", "create", "robot", "--role", "reader", *limits, *where)
@@ -72,7 +68,7 @@ def test_a_key_keeps_limits_of_its_own(tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[SkippingLoop]:
+def clock(monkeypatch):
     """An event loop whose time is everybody's."""
     loop = SkippingLoop()
     for name in ("time", "monotonic"):
@@ -81,7 +77,7 @@ def clock(monkeypatch: pytest.MonkeyPatch) -> Iterator[SkippingLoop]:
     loop.close()
 
 
-def test_a_client_has_so_many_in_any_second_and_is_told_when_there_are_more(clock: SkippingLoop) -> None:
+def test_a_client_has_so_many_in_any_second_and_is_told_when_there_are_more(clock):
     rate = Rate()
     assert [rate.take("alice", 2), rate.take("alice", 2), rate.take("bob", 2)] == [0.0, 0.0, 0.0]
     wait_s = rate.take("alice", 2)
@@ -90,7 +86,7 @@ def test_a_client_has_so_many_in_any_second_and_is_told_when_there_are_more(cloc
     assert rate.take("alice", 2) == 0.0
 
 
-def test_several_at_once_are_taken_together_or_not_at_all(clock: SkippingLoop) -> None:
+def test_several_at_once_are_taken_together_or_not_at_all(clock):
     rate = Rate()
     assert rate.take("alice", 4, 3) == 0.0
     wait_s = rate.take("alice", 4, 3)
@@ -100,11 +96,11 @@ def test_several_at_once_are_taken_together_or_not_at_all(clock: SkippingLoop) -
     assert rate.take("alice", 4, 4) == 0.0
 
 
-def test_those_who_wait_are_served_in_the_order_in_which_they_came(clock: SkippingLoop) -> None:
-    async def main() -> list[int]:
+def test_those_who_wait_are_served_in_the_order_in_which_they_came(clock):
+    async def main():
         rate, served = Rate(), list[int]()
 
-        async def client(number: int) -> None:
+        async def client(number):
             assert await rate.wait("alice", 2, until=None) == 0.0
             served.append(number)
 
@@ -116,8 +112,8 @@ def test_those_who_wait_are_served_in_the_order_in_which_they_came(clock: Skippi
     assert clock.now - began >= 2 * WINDOW_S
 
 
-def test_nobody_waits_for_what_would_come_too_late(clock: SkippingLoop) -> None:
-    async def main() -> float:
+def test_nobody_waits_for_what_would_come_too_late(clock):
+    async def main():
         rate = Rate()
         rate.take("alice", 1)
         began = time.monotonic()
@@ -127,7 +123,7 @@ def test_nobody_waits_for_what_would_come_too_late(clock: SkippingLoop) -> None:
     assert clock.run_until_complete(main()) < WINDOW_S
 
 
-def test_a_clock_that_is_set_back_keeps_nobody_out(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_clock_that_is_set_back_keeps_nobody_out(monkeypatch):
     rate, now_s = Rate(), time.time()
     monkeypatch.setattr(time, "time", lambda: now_s + 3600.0)
     assert rate.take("alice", 1) == 0.0
@@ -169,20 +165,20 @@ class Limited:
     channel: grpc.Channel
     database: JobDatabase
 
-    def http(self, who: str, method: str, path: str, **options: Any) -> httpx.Response:
+    def http(self, who, method, path, **options):
         return self.client.request(method, path, headers={"x-api-key": self.keys[who]}, **options)
 
-    def render(self, who: str, **body: Any) -> httpx.Response:
+    def render(self, who, **body):
         poses = {} if "poses" in body else {"pose": POSE}
         return self.http(who, "POST", "/v1/scenes/demo/render", json={**SMALL, **poses, **body})
 
-    def metadata(self, who: str) -> tuple[tuple[str, str], ...]:
+    def metadata(self, who):
         return (("x-api-key", self.keys[who]),)
 
-    def renders(self) -> rendering_pb2_grpc.RenderServiceStub:
+    def renders(self):
         return rendering_pb2_grpc.RenderServiceStub(self.channel)
 
-    def refusals(self, limit: str, role: str = "operator") -> float:
+    def refusals(self, limit, role="operator"):
         """How often a limit refused somebody, by the metrics."""
         headers = {"x-api-key": self.keys["unlimited"]}
         lines = self.client.get("/metrics", headers=headers).text.splitlines()
@@ -191,7 +187,7 @@ class Limited:
 
 
 @pytest.fixture(scope="module")
-def limited(start_service: StartService, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Limited]:
+def limited(start_service, tmp_path_factory):
     folder = tmp_path_factory.mktemp("artifacts")
     database = JobDatabase(folder, None)
     store = KeyStore(database.engine)
@@ -202,15 +198,15 @@ def limited(start_service: StartService, tmp_path_factory: pytest.TempPathFactor
     database.close()
 
 
-def render_request() -> rendering_pb2.RenderRequest:
+def render_request():
     return rendering_pb2.RenderRequest(settings=render_settings(), pose=moved(0))
 
 
-def render_settings() -> rendering_pb2.RenderSettings:
+def render_settings():
     return rendering_pb2.RenderSettings(scene="demo", **SMALL)
 
 
-def retry_after_s(error: grpc.RpcError, reason: str) -> float | None:
+def retry_after_s(error, reason):
     """The delay of RetryInfo, where there is one, of a call that a limit refused."""
     assert error.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
     assert error_info(error)[0].reason == reason
@@ -226,23 +222,23 @@ def retry_after_s(error: grpc.RpcError, reason: str) -> float | None:
 DAY_S = 86_400
 
 
-def submit(limited: Limited, who: str, **more: Any) -> httpx.Response:
+def submit(limited, who, **more):
     body = {"kind": "render", "specification": {"scene": "demo", "poses": [MATRIX]}, **more}
     return limited.http(who, "POST", "/v1/jobs", json=body)
 
 
-def is_limit(answer: httpx.Response, name: str) -> bool:
+def is_limit(answer, name):
     return (answer.status_code, answer.json()["reason"]) == (429, "LIMIT_REACHED") and name in answer.json()["detail"]
 
 
-def ran(limited: Limited, device: str) -> None:
+def ran(limited, device):
     """Half a minute on a device, of a job that has been deleted."""
     with limited.database.engine.begin() as connection:
         values = {"owner": "minutes", "device": device, "day": datetime.now(timezone.utc).date(), "run_s": 30.0}
         connection.execute(sa.insert(USAGE).values(values))
 
 
-def test_only_so_many_jobs_of_a_key_wait_or_run(limited: Limited) -> None:
+def test_only_so_many_jobs_of_a_key_wait_or_run(limited):
     first, second = (submit(limited, "jobs", request_id=name) for name in ("one", "two"))
     assert (first.status_code, second.status_code) == (201, 201)
     beyond = submit(limited, "jobs")
@@ -257,7 +253,7 @@ def test_only_so_many_jobs_of_a_key_wait_or_run(limited: Limited) -> None:
     assert limited.refusals("unfinished_jobs") >= 2
 
 
-def test_jobs_of_grpc_count_likewise(limited: Limited) -> None:
+def test_jobs_of_grpc_count_likewise(limited):
     jobs = jobs_pb2_grpc.JobServiceStub(limited.channel)
     request = jobs_pb2.SubmitJobRequest(render=jobs_pb2.RenderJob(scene="demo", poses=[moved(0)]))
     metadata = limited.metadata("rpc-jobs")
@@ -272,7 +268,7 @@ def test_jobs_of_grpc_count_likewise(limited: Limited) -> None:
     assert retry_after_s(caught.value, "LIMIT_REACHED") is None
 
 
-def test_the_minutes_of_a_day_end_at_midnight(limited: Limited) -> None:
+def test_the_minutes_of_a_day_end_at_midnight(limited):
     ran(limited, "cpu")
     assert submit(limited, "minutes").status_code == 201
     ran(limited, "gpu")
@@ -283,8 +279,8 @@ def test_the_minutes_of_a_day_end_at_midnight(limited: Limited) -> None:
 
 
 @pytest.mark.long
-def test_uploads_end_where_the_bytes_of_a_key_end(limited: Limited, scene_bytes: bytes, dataset_bytes: bytes) -> None:
-    def put(who: str, path: str, content: bytes) -> httpx.Response:
+def test_uploads_end_where_the_bytes_of_a_key_end(limited, scene_bytes, dataset_bytes):
+    def put(who, path, content):
         return limited.http(who, "PUT", f"/v1/{path}", content=content)
 
     assert is_limit(put("bytes", "datasets/packed", dataset_bytes), "stored_gb")
@@ -301,8 +297,8 @@ def test_uploads_end_where_the_bytes_of_a_key_end(limited: Limited, scene_bytes:
     assert is_limit(submit(limited, "full"), "stored_gb")
 
 
-def test_a_key_keeps_only_so_many_registrations(limited: Limited) -> None:
-    def put(who: str, name: str) -> httpx.Response:
+def test_a_key_keeps_only_so_many_registrations(limited):
+    def put(who, name):
         body = {"scene": "demo", "base_to_scene": MATRIX}
         return limited.http(who, "PUT", f"/v1/registrations/{name}", json=body)
 
@@ -317,18 +313,18 @@ def test_a_key_keeps_only_so_many_registrations(limited: Limited) -> None:
 BUSY = 6  # of OpenIGTLink
 
 
-def refused(ask: Callable[[], httpx.Response]) -> httpx.Response:
+def refused(ask):
     """The first answer that is a refusal: a busy machine may be too slow to exceed a limit with the second."""
 
-    def answer() -> httpx.Response | None:
+    def answer():
         response = ask()
         return None if response.status_code == 200 else response
 
     return wait_until(answer, every_s=0.0)
 
 
-def refused_call(ask: Callable[[], object]) -> grpc.RpcError:
-    def error() -> grpc.RpcError | None:
+def refused_call(ask):
+    def error():
         try:
             ask()
         except grpc.RpcError as error:
@@ -339,23 +335,23 @@ def refused_call(ask: Callable[[], object]) -> grpc.RpcError:
 
 
 @contextmanager
-def stream(limited: Limited, who: str) -> Iterator[ClientConnection]:
+def stream(limited, who):
     with connect(
         limited.service.stream_url(), additional_headers={"x-api-key": limited.keys[who]}, max_size=None
     ) as connection:
         yield connection
 
 
-def send(connection: ClientConnection, sequence: int, **more: Any) -> None:
+def send(connection, sequence, **more):
     connection.send(json.dumps({"sequence": sequence, "pose": POSE, **more}))
 
 
-def receive(connection: ClientConnection) -> dict[str, Any]:
+def receive(connection):
     message = connection.recv(timeout=120)
-    return json.loads(message) if isinstance(message, str) else split(message)[0]  # type: ignore[no-any-return]
+    return json.loads(message) if isinstance(message, str) else split(message)[0]
 
 
-def test_requests_beyond_the_rate_are_refused_and_pass_after_the_time_that_is_told(limited: Limited) -> None:
+def test_requests_beyond_the_rate_are_refused_and_pass_after_the_time_that_is_told(limited):
     answer = refused(lambda: limited.http("requests", "GET", "/v1/scenes"))
     assert (answer.status_code, answer.json()["reason"]) == (429, "RATE_LIMITED")
     assert "1 requests a second (requests_per_s)" in answer.json()["detail"]
@@ -365,10 +361,10 @@ def test_requests_beyond_the_rate_are_refused_and_pass_after_the_time_that_is_to
     assert limited.http("requests", "GET", "/v1/scenes").status_code == 200
 
 
-def test_calls_of_grpc_count_as_requests(limited: Limited) -> None:
+def test_calls_of_grpc_count_as_requests(limited):
     stub = access_pb2_grpc.AccessServiceStub(limited.channel)
 
-    def ask() -> object:
+    def ask():
         return stub.WhoAmI(access_pb2.WhoAmIRequest(), metadata=limited.metadata("calls"), timeout=60)
 
     delay_s = retry_after_s(refused_call(ask), "RATE_LIMITED")
@@ -378,13 +374,13 @@ def test_calls_of_grpc_count_as_requests(limited: Limited) -> None:
     ask()
 
 
-def test_frames_beyond_the_rate_are_refused_and_pass_after_the_time_that_is_told(limited: Limited) -> None:
+def test_frames_beyond_the_rate_are_refused_and_pass_after_the_time_that_is_told(limited):
     answer = refused(lambda: limited.render("frames"))
     assert (answer.status_code, answer.json()["reason"]) == (429, "RATE_LIMITED")
     time.sleep(int(answer.headers["Retry-After"]))
     assert limited.render("frames").status_code == 200
 
-    def ask() -> object:
+    def ask():
         return limited.renders().Render(render_request(), metadata=limited.metadata("rpc-frames"), timeout=60)
 
     delay_s = retry_after_s(refused_call(ask), "RATE_LIMITED")
@@ -393,7 +389,7 @@ def test_frames_beyond_the_rate_are_refused_and_pass_after_the_time_that_is_told
     ask()
 
 
-def test_every_frame_of_a_batch_counts_and_the_batch_takes_the_seconds_that_it_needs(limited: Limited) -> None:
+def test_every_frame_of_a_batch_counts_and_the_batch_takes_the_seconds_that_it_needs(limited):
     began = time.monotonic()
     assert limited.render("poses", poses=[POSE] * 6).status_code == 200
     assert time.monotonic() - began >= 1.0
@@ -406,7 +402,7 @@ def test_every_frame_of_a_batch_counts_and_the_batch_takes_the_seconds_that_it_n
     assert time.monotonic() - began >= 1.0
 
 
-def test_an_ordered_stream_waits_for_each_frame(limited: Limited) -> None:
+def test_an_ordered_stream_waits_for_each_frame(limited):
     with stream(limited, "ordered") as connection:
         connection.send(json.dumps({"settings": SMALL}))
         began = time.monotonic()
@@ -418,7 +414,7 @@ def test_an_ordered_stream_waits_for_each_frame(limited: Limited) -> None:
     assert not any("error" in answer for answer in answers)
 
 
-def test_a_latest_stream_renders_the_newest_pose_whenever_it_may(limited: Limited) -> None:
+def test_a_latest_stream_renders_the_newest_pose_whenever_it_may(limited):
     with stream(limited, "latest") as connection:
         connection.send(json.dumps({"settings": SMALL, "mode": "latest"}))
         send(connection, 0)
@@ -433,12 +429,12 @@ def test_a_latest_stream_renders_the_newest_pose_whenever_it_may(limited: Limite
     assert len(answers) + sum(answer["dropped"] for answer in answers) == 31
 
 
-def test_streams_at_once_are_limited_over_all_doors(limited: Limited) -> None:
-    def open_one() -> None:
+def test_streams_at_once_are_limited_over_all_doors(limited):
+    def open_one():
         with stream(limited, "streams"):
             pass
 
-    def call() -> list[rendering_pb2.Frame]:
+    def call():
         request = rendering_pb2.RenderStreamRequest(settings=render_settings(), pose=moved(0))
         metadata = limited.metadata("streams")
         return list(limited.renders().RenderStream(iter([request]), metadata=metadata, timeout=60))
@@ -459,7 +455,7 @@ def test_streams_at_once_are_limited_over_all_doors(limited: Limited) -> None:
     assert limited.refusals("streams") >= 2
 
 
-def _works(open_stream: Callable[[], object]) -> bool:
+def _works(open_stream):
     """Whether a stream opens: that of before ends on its own time."""
     try:
         open_stream()
@@ -469,15 +465,15 @@ def _works(open_stream: Callable[[], object]) -> bool:
 
 
 @pytest.fixture(scope="module")
-def by_address(start_service: StartService) -> RunningService:
+def by_address(start_service):
     """Without keys: each address has limits of its own."""
     return start_service(igtl_port=0, igtl_scene="demo", key_streams=1, key_frames_per_s=2)
 
 
-def test_without_keys_every_address_has_the_limits_of_a_key(by_address: RunningService) -> None:
+def test_without_keys_every_address_has_the_limits_of_a_key(by_address):
     body = {"pose": POSE, **SMALL}
 
-    def client(source: str) -> httpx.Client:
+    def client(source):
         return httpx.Client(base_url=by_address.http, transport=httpx.HTTPTransport(local_address=source), timeout=60)
 
     with client("127.0.0.4") as greedy, client("127.0.0.5") as polite:
@@ -485,7 +481,7 @@ def test_without_keys_every_address_has_the_limits_of_a_key(by_address: RunningS
         assert polite.post("/v1/scenes/demo/render", json=body).status_code == 200
 
 
-def test_openigtlink_is_limited_by_address(by_address: RunningService) -> None:
+def test_openigtlink_is_limited_by_address(by_address):
     address = address_of(by_address)
     peer = Peer(address, source="127.0.0.2")
     second = Peer(address, source="127.0.0.2")

@@ -1,19 +1,14 @@
 """Tokens of an OpenID Connect issuer: verified with the keys that it publishes, and at the doors beside API keys."""
 
-from __future__ import annotations
-
 import asyncio
 import base64
 import hmac
 import json
 import threading
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
-from typing import Any
 
 import httpx
 import jwt
@@ -26,7 +21,7 @@ from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray_client import Client
 from ultragray_service.access import oidc as issuer_module
 from ultragray_service.access.keys import KeyStore
-from ultragray_service.access.oidc import LEEWAY_S, MAX_TOKEN_BYTES, OidcTokens, claim_at, parse_roles
+from ultragray_service.access.oidc import LEEWAY_S, MAX_TOKEN_BYTES, claim_at, parse_roles
 from ultragray_service.access.principals import Role
 from ultragray_service.errors import IssuerUnavailable
 from ultragray_service.settings import load_settings
@@ -34,11 +29,10 @@ from ultragray_service.wiring import oidc_tokens
 from ultragray_workers.jobs.database import JobDatabase
 
 from ...waiting import Deadline, wait_until
-from ..conftest import RunningService, StartService
 from .conftest import MATRIX
 
 AUDIENCE = "ultragray"
-_KINDS: dict[str, tuple[Callable[[], Any], Any]] = {
+_KINDS = {
     "RS256": (lambda: rsa.generate_private_key(65537, 2048), RSAAlgorithm),
     "ES256": (lambda: ec.generate_private_key(ec.SECP256R1()), ECAlgorithm),
     "EdDSA": (ed25519.Ed25519PrivateKey.generate, OKPAlgorithm),
@@ -48,19 +42,19 @@ _KINDS: dict[str, tuple[Callable[[], Any], Any]] = {
 class IdentityProvider:
     """Answers while it is `up`; counts how often its keys were asked for."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.up = True
         self.fetches = 0
-        self.endpoints: dict[str, str] = {}  # of the sign-in, as it publishes them
-        self.published: list[dict[str, Any]] = []
-        self.keys: dict[str, tuple[str, Any]] = {}
+        self.endpoints = {}  # of the sign-in, as it publishes them
+        self.published = []
+        self.keys = {}
         provider = self
 
         class Handler(BaseHTTPRequestHandler):
-            def do_GET(self) -> None:
+            def do_GET(self):
                 provider._answer(self)
 
-            def log_message(self, *_: object) -> None:
+            def log_message(self, *_):
                 pass
 
         self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
@@ -68,12 +62,12 @@ class IdentityProvider:
         self._thread = threading.Thread(target=self._server.serve_forever)
         self._thread.start()
 
-    def close(self) -> None:
+    def close(self):
         self._server.shutdown()
         self._thread.join()
         self._server.server_close()
 
-    def add_key(self, key_id: str, algorithm: str = "RS256", **published: Any) -> dict[str, Any]:
+    def add_key(self, key_id, algorithm="RS256", **published):
         """A new key; what is published of it."""
         make, kind = _KINDS[algorithm]
         private = make()
@@ -82,10 +76,10 @@ class IdentityProvider:
         self.published.append(public | published)
         return self.published[-1]
 
-    def remove_key(self, key_id: str) -> None:
+    def remove_key(self, key_id):
         self.published = [one for one in self.published if one["kid"] != key_id]
 
-    def settings(self) -> dict[str, str]:
+    def settings(self):
         """Settings of a service that takes its tokens."""
         return {
             "oidc_issuer": self.url,
@@ -94,7 +88,7 @@ class IdentityProvider:
             "oidc_roles": "ultragray-admin=admin,radiology=reader,research=operator",
         }
 
-    def claims(self, **changed: Any) -> dict[str, Any]:
+    def claims(self, **changed):
         """Claims of a token that is good for an hour; `name=None` leaves one out."""
         now = int(time.time())
         claims = {
@@ -107,17 +101,17 @@ class IdentityProvider:
         } | changed
         return {name: value for name, value in claims.items() if value is not None}
 
-    def token(self, key_id: str = "one", *, headers: dict[str, Any] | None = None, **changed: Any) -> str:
+    def token(self, key_id="one", *, headers=None, **changed):
         """A token that the key signed."""
         algorithm, private = self.keys[key_id]
         return jwt.encode(self.claims(**changed), private, algorithm, headers={"kid": key_id} | (headers or {}))
 
-    def _answer(self, request: BaseHTTPRequestHandler) -> None:
+    def _answer(self, request):
         if not self.up:
             request.send_error(503)
             return
         if request.path.endswith("/.well-known/openid-configuration"):
-            document: Any = {"issuer": self.url, "jwks_uri": f"{self.url}/certs", **self.endpoints}
+            document = {"issuer": self.url, "jwks_uri": f"{self.url}/certs", **self.endpoints}
         else:
             self.fetches += 1
             document = {"keys": self.published}
@@ -129,7 +123,7 @@ class IdentityProvider:
 
 
 @pytest.fixture
-def provider() -> Iterator[IdentityProvider]:
+def provider():
     found = IdentityProvider()
     found.add_key("one")
     yield found
@@ -137,7 +131,7 @@ def provider() -> Iterator[IdentityProvider]:
 
 
 @asynccontextmanager
-async def following(provider: IdentityProvider, **settings: str) -> AsyncIterator[OidcTokens]:
+async def following(provider, **settings):
     tokens = oidc_tokens(load_settings(**{**provider.settings(), **settings}))
     assert tokens is not None
     task = asyncio.ensure_future(tokens.issuer.follow())
@@ -148,27 +142,27 @@ async def following(provider: IdentityProvider, **settings: str) -> AsyncIterato
         task.cancel()
 
 
-async def until(condition: Callable[[], bool]) -> None:
+async def until(condition):
     end = Deadline(60)
     while not condition():
         assert not end.passed
         await asyncio.sleep(0.01)
 
 
-def with_tokens(provider: IdentityProvider, check: Callable[[OidcTokens], object], **settings: str) -> None:
-    async def run() -> None:
+def with_tokens(provider, check, **settings):
+    async def run():
         async with following(provider, **settings) as tokens:
             check(tokens)
 
     asyncio.run(run())
 
 
-def unsigned(header: dict[str, Any], claims: dict[str, Any], signature: bytes = b"") -> str:
+def unsigned(header, claims, signature=b""):
     parts = (json.dumps(header).encode(), json.dumps(claims).encode(), signature)
     return ".".join(base64.urlsafe_b64encode(part).rstrip(b"=").decode() for part in parts)
 
 
-def signed_with_the_public_key(provider: IdentityProvider) -> str:
+def signed_with_the_public_key(provider):
     """As if the public key, which everybody knows, were the shared secret of HS256."""
     public = provider.keys["one"][1].public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
     content = unsigned({"alg": "HS256", "typ": "JWT", "kid": "one"}, provider.claims())[:-1]
@@ -176,17 +170,17 @@ def signed_with_the_public_key(provider: IdentityProvider) -> str:
     return f"{content}.{base64.urlsafe_b64encode(signature).rstrip(b'=').decode()}"
 
 
-def refusal(tokens: OidcTokens, token: str) -> str:
+def refusal(tokens, token):
     with pytest.raises(UltragrayError) as caught:
         tokens.authenticate(token)
     return f"{type(caught.value).__name__}: {caught.value.detail}"
 
 
 @pytest.mark.parametrize("algorithm", ["RS256", "ES256", "EdDSA"])
-def test_a_token_becomes_a_principal(provider: IdentityProvider, algorithm: str) -> None:
+def test_a_token_becomes_a_principal(provider, algorithm):
     provider.add_key("two", algorithm)
 
-    def check(tokens: OidcTokens) -> None:
+    def check(tokens):
         principal = tokens.authenticate(token)
         assert principal is not None
         assert (principal.name, principal.role, principal.source) == ("oidc:alice", Role.READER, "oidc")
@@ -197,15 +191,15 @@ def test_a_token_becomes_a_principal(provider: IdentityProvider, algorithm: str)
     with_tokens(provider, check)
 
 
-def test_what_is_no_token_is_left_to_other_sources(provider: IdentityProvider) -> None:
-    def check(tokens: OidcTokens) -> None:
+def test_what_is_no_token_is_left_to_other_sources(provider):
+    def check(tokens):
         for credential in ("", "ultragray_abcdefgh", "a.b", "a.b.c.d", "ä.b.c", "a.b.c\n", "." * 50_000):
             assert tokens.authenticate(credential) is None
 
     with_tokens(provider, check)
 
 
-def test_tokens_that_are_refused_say_why(provider: IdentityProvider) -> None:
+def test_tokens_that_are_refused_say_why(provider):
     now = time.time()
     foreign = rsa.generate_private_key(65537, 2048)
     algorithm = "names an algorithm that its key does not allow"
@@ -232,25 +226,25 @@ def test_tokens_that_are_refused_say_why(provider: IdentityProvider) -> None:
         provider.token(realm_access={"roles": [{}, None, 7]}): "PermissionDenied: ",
     }
 
-    def check(tokens: OidcTokens) -> None:
+    def check(tokens):
         for token, expected in refusals.items():
             assert expected in refusal(tokens, token)
 
     with_tokens(provider, check)
 
 
-def test_clocks_may_differ_a_little(provider: IdentityProvider) -> None:
+def test_clocks_may_differ_a_little(provider):
     now = int(time.time())
 
-    def check(tokens: OidcTokens) -> None:
+    def check(tokens):
         assert tokens.authenticate(provider.token(exp=now - 5))
         assert tokens.authenticate(provider.token(nbf=now + 5, iat=now + 5))
 
     with_tokens(provider, check)
 
 
-def test_numbers_that_no_clock_holds_are_refused_or_bounded(provider: IdentityProvider) -> None:
-    def check(tokens: OidcTokens) -> None:
+def test_numbers_that_no_clock_holds_are_refused_or_bounded(provider):
+    def check(tokens):
         principal = tokens.authenticate(provider.token(exp=10**300))
         assert principal is not None
         assert principal.expires_at_s is not None
@@ -263,11 +257,11 @@ def test_numbers_that_no_clock_holds_are_refused_or_bounded(provider: IdentityPr
     with_tokens(provider, check)
 
 
-def test_the_highest_role_counts_wherever_the_claim_lies(provider: IdentityProvider) -> None:
-    def roles_of(claim: str, **claims: Any) -> Role:
-        found: list[Role] = []
+def test_the_highest_role_counts_wherever_the_claim_lies(provider):
+    def roles_of(claim, **claims):
+        found = []
 
-        def check(tokens: OidcTokens) -> None:
+        def check(tokens):
             principal = tokens.authenticate(provider.token(**claims))
             assert principal is not None
             found.append(principal.role)
@@ -283,12 +277,10 @@ def test_the_highest_role_counts_wherever_the_claim_lies(provider: IdentityProvi
     assert claim_at({"a": "text"}, "a.b.c") is None
 
 
-def test_new_keys_are_fetched_when_a_token_names_them(
-    provider: IdentityProvider, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_new_keys_are_fetched_when_a_token_names_them(provider, monkeypatch):
     monkeypatch.setattr(issuer_module, "LEAST_INTERVAL_S", 0.2)
 
-    async def run() -> None:
+    async def run():
         async with following(provider) as tokens:
             before = provider.token("one")
             assert tokens.authenticate(before)
@@ -309,10 +301,10 @@ def test_new_keys_are_fetched_when_a_token_names_them(
     asyncio.run(run())
 
 
-def test_many_unknown_keys_are_one_fetch(provider: IdentityProvider, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_unknown_keys_are_one_fetch(provider, monkeypatch):
     monkeypatch.setattr(issuer_module, "LEAST_INTERVAL_S", 0.5)
 
-    async def run() -> None:
+    async def run():
         async with following(provider) as tokens:
             fetches = provider.fetches
             for number in range(300):
@@ -323,7 +315,7 @@ def test_many_unknown_keys_are_one_fetch(provider: IdentityProvider, monkeypatch
     asyncio.run(run())
 
 
-def test_keys_that_sign_no_tokens_are_passed_over(provider: IdentityProvider) -> None:
+def test_keys_that_sign_no_tokens_are_passed_over(provider):
     provider.add_key("encryption", use="enc")
     provider.add_key("other", alg="RSA-OAEP")
     small = RSAAlgorithm.to_jwk(rsa.generate_private_key(65537, 1024).public_key(), as_dict=True)
@@ -333,26 +325,24 @@ def test_keys_that_sign_no_tokens_are_passed_over(provider: IdentityProvider) ->
         {"kty": "EC", "crv": "P-256", "x": "AA", "y": "AA", "kid": "broken"},
         {"kty": "new", "kid": "new"},
     ]
-    found: list[set[str | None]] = []
+    found = []
     with_tokens(provider, lambda tokens: found.append(set(tokens.issuer.keys)))
     assert found == [{"one", None}]
 
 
-def test_a_token_without_the_id_of_a_key_is_of_the_only_one(provider: IdentityProvider) -> None:
+def test_a_token_without_the_id_of_a_key_is_of_the_only_one(provider):
     token = jwt.encode(provider.claims(), provider.keys["one"][1], "RS256")
     with_tokens(provider, lambda tokens: tokens.authenticate(token))
     provider.add_key("two")
     with_tokens(provider, lambda tokens: refusal(tokens, token))
 
 
-def test_an_issuer_that_is_away_leaves_the_keys_that_are_known(
-    provider: IdentityProvider, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_issuer_that_is_away_leaves_the_keys_that_are_known(provider, monkeypatch):
     monkeypatch.setattr(issuer_module, "LEAST_INTERVAL_S", 0.05)
     monkeypatch.setattr(issuer_module, "REFRESH_S", 0.1)
     monkeypatch.setattr(issuer_module, "RETRY_S", 0.1)
 
-    async def run() -> None:
+    async def run():
         async with following(provider) as tokens:
             provider.up = False
             await until(lambda: tokens.issuer.problem is not None)
@@ -374,12 +364,10 @@ def test_an_issuer_that_is_away_leaves_the_keys_that_are_known(
         ("", "http://hospital.example", "token_endpoint must be a URL"),
     ],
 )
-def test_an_issuer_of_another_name_or_without_encryption_is_not_believed(
-    provider: IdentityProvider, end: str, token_endpoint: str, problem: str
-) -> None:
+def test_an_issuer_of_another_name_or_without_encryption_is_not_believed(provider, end, token_endpoint, problem):
     provider.endpoints = {"authorization_endpoint": f"{provider.url}/auth", "token_endpoint": token_endpoint}
 
-    async def run() -> None:
+    async def run():
         tokens = oidc_tokens(load_settings(**{**provider.settings(), "oidc_issuer": provider.url + end}))
         assert tokens is not None
         task = asyncio.ensure_future(tokens.issuer.follow())
@@ -401,13 +389,13 @@ def test_an_issuer_of_another_name_or_without_encryption_is_not_believed(
         ({"oidc_roles": "radiology=chief"}, "reader, operator, admin, got 'radiology=chief'"),
     ],
 )
-def test_settings_that_cannot_work(changed: dict[str, str | None], expected: str) -> None:
+def test_settings_that_cannot_work(changed, expected):
     given = {"oidc_issuer": "https://login.example", "oidc_audience": "ultragray", "oidc_roles": "a=admin", **changed}
     with pytest.raises(InvalidArgument, match=expected):
         load_settings(**{name: value for name, value in given.items() if value is not None})
 
 
-def test_roles_are_parsed() -> None:
+def test_roles_are_parsed():
     assert parse_roles(("a=admin", "CN=Radiology=reader")) == {"a": Role.ADMIN, "CN=Radiology": Role.READER}
 
 
@@ -415,7 +403,7 @@ KEY = "0123456789abcdef-environment"
 
 
 @pytest.fixture(scope="module")
-def issuer() -> Iterator[IdentityProvider]:
+def issuer():
     found = IdentityProvider()
     found.add_key("one")
     yield found
@@ -423,22 +411,22 @@ def issuer() -> Iterator[IdentityProvider]:
 
 
 @pytest.fixture(scope="module")
-def guarded(start_service: StartService, issuer: IdentityProvider) -> RunningService:
+def guarded(start_service, issuer):
     service = start_service(**issuer.settings(), api_keys=KEY)
     wait_until(lambda: identity_provider(service) == "available")
     return service
 
 
-def identity_provider(service: RunningService) -> str:
-    told: str = httpx.get(f"{service.http}/v1/health/ready", timeout=60).json()["identity_provider"]
+def identity_provider(service):
+    told = httpx.get(f"{service.http}/v1/health/ready", timeout=60).json()["identity_provider"]
     return told
 
 
-def ask(service: RunningService, credential: str) -> httpx.Response:
+def ask(service, credential):
     return httpx.get(f"{service.http}/v1/scenes", headers={"Authorization": f"Bearer {credential}"}, timeout=60)
 
 
-def test_a_token_opens_both_doors(guarded: RunningService, issuer: IdentityProvider) -> None:
+def test_a_token_opens_both_doors(guarded, issuer):
     assert ask(guarded, issuer.token()).status_code == 200
     given = iter([issuer.token(), issuer.token(exp=1)])
     with Client(guarded.grpc, api_key=lambda: next(given), timeout_s=60.0) as client:
@@ -448,7 +436,7 @@ def test_a_token_opens_both_doors(guarded: RunningService, issuer: IdentityProvi
 
 
 @pytest.mark.long
-def test_an_issuer_that_is_away_shuts_out_only_its_tokens(start_service: StartService) -> None:
+def test_an_issuer_that_is_away_shuts_out_only_its_tokens(start_service):
     issuer = IdentityProvider()
     issuer.add_key("one")
     issuer.up = False
@@ -468,9 +456,7 @@ def test_an_issuer_that_is_away_shuts_out_only_its_tokens(start_service: StartSe
 
 
 @pytest.mark.long
-def test_a_rotation_of_keys_leaves_sessions_and_their_revocation_alone(
-    start_service: StartService, tmp_path: Path
-) -> None:
+def test_a_rotation_of_keys_leaves_sessions_and_their_revocation_alone(start_service, tmp_path):
     issuer = IdentityProvider()
     issuer.add_key("one")
     database = JobDatabase(tmp_path, None)
@@ -482,9 +468,9 @@ def test_a_rotation_of_keys_leaves_sessions_and_their_revocation_alone(
         with ThreadPoolExecutor() as threads, httpx.Client(base_url=service.http, timeout=None) as client:
             body = {"kind": "render", "specification": {"scene": "demo", "poses": [MATRIX]}}
             job = client.post("/v1/jobs", json=body, headers={"X-API-Key": bob}).json()["id"]  # no worker takes it
-            opened: list[str] = []
+            opened = []
 
-            def watch(credential: str) -> None:
+            def watch(credential):
                 headers = {"Authorization": f"Bearer {credential}"}
                 with client.stream("GET", f"/v1/jobs/{job}/events", headers=headers) as events:
                     opened.append(credential)
@@ -506,7 +492,7 @@ def test_a_rotation_of_keys_leaves_sessions_and_their_revocation_alone(
         issuer.close()
 
 
-def test_the_page_is_told_where_people_sign_in(start_service: StartService) -> None:
+def test_the_page_is_told_where_people_sign_in(start_service):
     issuer = IdentityProvider()
     issuer.add_key("one")
     issuer.endpoints = {
@@ -525,6 +511,6 @@ def test_the_page_is_told_where_people_sign_in(start_service: StartService) -> N
         issuer.close()
 
 
-def test_without_a_client_id_people_sign_in_with_keys(guarded: RunningService) -> None:
+def test_without_a_client_id_people_sign_in_with_keys(guarded):
     assert httpx.get(f"{guarded.http}/v1/sign-in", timeout=60).json() == {"issuer": None}
     assert "hospital" not in httpx.get(guarded.http, timeout=60).headers["content-security-policy"]

@@ -1,12 +1,9 @@
 """The command line in this process, or as a fresh one."""
 
-from __future__ import annotations
-
 import sys
-from pathlib import Path
 
 import numpy as np
-from typer.testing import CliRunner, Result
+from typer.testing import CliRunner
 
 from ultragray import LinearProbe
 from ultragray.datasets import Dataset, Sweep
@@ -14,11 +11,11 @@ from ultragray.datasets.released import write_released
 from ultragray_service.cli.app import app
 
 
-def run(*arguments: object) -> Result:
+def run(*arguments):
     return CliRunner().invoke(app, [str(argument) for argument in arguments])
 
 
-def refused(*arguments: object) -> str:
+def refused(*arguments):
     """The one line that a mistake gives."""
     result = run(*arguments)
     assert result.exit_code == 2, result.output
@@ -28,7 +25,7 @@ def refused(*arguments: object) -> str:
     return result.stderr
 
 
-def noise_sweep(folder: Path, frames: int = 10) -> Path:
+def noise_sweep(folder, frames=10):
     """A sweep of noise in the released layout, 20x16 pixels, a millimetre between frames; the last two are held out."""
     poses = np.tile(np.eye(4), (frames, 1, 1))
     poses[:, 1, 3] = np.arange(frames)
@@ -40,6 +37,6 @@ def noise_sweep(folder: Path, frames: int = 10) -> Path:
     return folder
 
 
-def python(program: str, *arguments: object) -> list[str]:
+def python(program, *arguments):
     """A command for a fresh process that finds the packages as this one does."""
     return [sys.executable, "-c", f"import sys; sys.path[:0] = {sys.path!r}; {program}", *map(str, arguments)]

@@ -1,11 +1,6 @@
 """Commands that make files of files: `export`, `import`, `check`, `convert`, `voxelize`, `localize`, `calibrate` …"""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import cv2
 import nibabel
@@ -14,7 +9,6 @@ import pytest
 
 from ultragray import GaussianScene, LinearProbe, phantom, render
 from ultragray.datasets.source import load_dataset
-from ultragray.geometry.probe import FloatArray
 from ultragray.geometry.registration import load_registration
 from ultragray.phantom.demo import DEMO_FILE, copy_demo_scene, demo_poses, load_demo_scene
 from ultragray.rendering.pixels import image_file
@@ -25,8 +19,8 @@ from .command_line import noise_sweep, refused, run
 
 
 @pytest.fixture
-def make_file(tmp_path: Path, random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any]) -> Any:
-    def make(**options: Any) -> Path:
+def make_file(tmp_path, random_scene, random_poses):
+    def make(**options):
         info = {"probe": LinearProbe(30.0, 0.0, 40.0), "image_height": 24, "image_width": 20}
         made = random_scene(60, info=info, **options)
         path = tmp_path / "scene.ugr"
@@ -36,7 +30,7 @@ def make_file(tmp_path: Path, random_scene: Callable[..., GaussianScene], random
     return make
 
 
-def test_a_ply_and_back_is_the_same_file(make_file: Callable[..., Path], tmp_path: Path) -> None:
+def test_a_ply_and_back_is_the_same_file(make_file, tmp_path):
     scene = make_file(intensity="sigmoid")
     result = run("export", scene, "-o", tmp_path / "a.ply")
     assert (result.exit_code, result.stderr) == (0, "")
@@ -45,7 +39,7 @@ def test_a_ply_and_back_is_the_same_file(make_file: Callable[..., Path], tmp_pat
     assert (tmp_path / "b.ugr").read_bytes() == scene.read_bytes()
 
 
-def test_a_checkpoint_and_back_by_the_documented_commands(make_file: Callable[..., Path], tmp_path: Path) -> None:
+def test_a_checkpoint_and_back_by_the_documented_commands(make_file, tmp_path):
     folder = tmp_path / "released"
     result = run("export", make_file(), "-o", folder / "ckpt_0.pt")
     assert (result.exit_code, result.stderr) == (0, "")
@@ -58,18 +52,18 @@ def test_a_checkpoint_and_back_by_the_documented_commands(make_file: Callable[..
     assert "60 Gaussians" in back.stdout
 
 
-def test_what_the_released_format_cannot_hold_is_noted(make_file: Callable[..., Path], tmp_path: Path) -> None:
+def test_what_the_released_format_cannot_hold_is_noted(make_file, tmp_path):
     result = run("export", make_file(intensity="sigmoid"), "-o", tmp_path / "out" / "ckpt.pt")
     assert result.exit_code == 0
     assert result.stderr.startswith("note: its intensities are `sigmoid`")
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     return noise_sweep(tmp_path / "tiny", 12)
 
 
-def test_check_prints_a_table_and_warnings(folder: Path) -> None:
+def test_check_prints_a_table_and_warnings(folder):
     result = run("check", folder, "--train-frames", "0:4,8:10")
     assert result.exit_code == 0, result.output
     assert "tiny: linear probe (width 40 mm, near 0 mm, far 50 mm)" in result.output
@@ -84,7 +78,7 @@ def test_check_prints_a_table_and_warnings(folder: Path) -> None:
     assert "warning: train: frame 4 lies 30.0 mm off" in result.output
 
 
-def test_check_as_json(folder: Path) -> None:
+def test_check_as_json(folder):
     result = run("check", folder, "--json")
     document = json.loads(result.output)
     assert document["name"] == "tiny"
@@ -94,7 +88,7 @@ def test_check_as_json(folder: Path) -> None:
     assert document["warnings"] == []
 
 
-def test_bad_data_is_one_line_and_exit_code_two(folder: Path) -> None:
+def test_bad_data_is_one_line_and_exit_code_two(folder):
     images = np.load(folder / "images_train.npy")
     images[3] = 0
     np.save(folder / "images_train.npy", images)
@@ -103,7 +97,7 @@ def test_bad_data_is_one_line_and_exit_code_two(folder: Path) -> None:
     assert sorted(path.name for path in folder.parent.iterdir()) == ["tiny"]
 
 
-def test_says_that_the_phantom_takes_time(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_says_that_the_phantom_takes_time(folder, monkeypatch):
     monkeypatch.setattr(phantom, "load_phantom", lambda: load_dataset(folder))
     result = run("check", "phantom", "--json")
     assert result.stderr == "simulating the phantom …\n"
@@ -111,7 +105,7 @@ def test_says_that_the_phantom_takes_time(folder: Path, monkeypatch: pytest.Monk
     assert run("check", folder).stderr == ""
 
 
-def test_convert_writes_what_is_read_back(folder: Path) -> None:
+def test_convert_writes_what_is_read_back(folder):
     result = run("convert", folder, "-o", folder.parent / "half", "--image-size", "8x10", "--val-frames", "0:2")
     assert result.exit_code == 0, result.output
     assert "8 training and 2 held-out frames of 8x10" in result.output
@@ -121,7 +115,7 @@ def test_convert_writes_what_is_read_back(folder: Path) -> None:
     assert load_dataset(folder.parent / "half").sha256 == load_dataset(folder).sha256
 
 
-def test_draw_draws_a_png(folder: Path) -> None:
+def test_draw_draws_a_png(folder):
     picture = folder.parent / "sweep.png"
     result = run("draw", folder, "-o", picture)
     assert result.exit_code == 0, result.output
@@ -129,13 +123,13 @@ def test_draw_draws_a_png(folder: Path) -> None:
 
 
 @pytest.fixture(scope="module")
-def demo(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def demo(tmp_path_factory):
     path = tmp_path_factory.mktemp("demo") / "demo.ugr"
     assert run("demo", "-o", path).exit_code == 0
     return path
 
 
-def test_a_scene_becomes_a_volume_over_its_bounds(demo: Path, tmp_path: Path) -> None:
+def test_a_scene_becomes_a_volume_over_its_bounds(demo, tmp_path):
     result = run("voxelize", demo, "-o", tmp_path / "v.nii.gz", "--spacing-mm", 3, "--field", "labels", "--json")
     assert result.exit_code == 0, result.output
     document = json.loads(result.stdout)
@@ -147,7 +141,7 @@ def test_a_scene_becomes_a_volume_over_its_bounds(demo: Path, tmp_path: Path) ->
     assert present <= set(document["label_names"])
 
 
-def test_a_slice_through_a_plane(demo: Path, tmp_path: Path) -> None:
+def test_a_slice_through_a_plane(demo, tmp_path):
     plane = ("--plane-mm=-20,0,5", "--right", "1,0,0", "--down", "0,0.2,1", "--size-mm", "40,30", "--spacing-mm", 1)
     result = run("voxelize", demo, "-o", tmp_path / "s.npy", *plane)
     assert result.exit_code == 0, result.output
@@ -155,7 +149,7 @@ def test_a_slice_through_a_plane(demo: Path, tmp_path: Path) -> None:
     assert np.load(tmp_path / "s.npy").shape == (30, 40)
 
 
-def test_a_box_beyond_the_scene_is_warned_of(demo: Path, tmp_path: Path) -> None:
+def test_a_box_beyond_the_scene_is_warned_of(demo, tmp_path):
     box = ("--box-mm", "5000:5010,0:10,0:10", "--spacing-mm", 5)
     result = run("voxelize", demo, "-o", tmp_path / "v.nii", *box)
     assert result.exit_code == 0, result.output
@@ -164,9 +158,9 @@ def test_a_box_beyond_the_scene_is_warned_of(demo: Path, tmp_path: Path) -> None
 
 
 @pytest.fixture
-def frame(tmp_path: Path) -> tuple[Path, FloatArray]:
+def frame(tmp_path):
     """A picture of the demo scene, and its pose; `start.npy` beside it is a few millimetres off."""
-    pose: FloatArray = demo_poses(3)[1]
+    pose = demo_poses(3)[1]
     pixels = render(load_demo_scene(), None, pose, height=192, width=192, outputs=("bmode",))["bmode"][0]
     path = tmp_path / "frame.png"
     path.write_bytes(image_file(pixels.detach().numpy(), ".png").tobytes())
@@ -176,7 +170,7 @@ def frame(tmp_path: Path) -> tuple[Path, FloatArray]:
     return path, pose
 
 
-def test_the_pose_is_found_and_written(frame: tuple[Path, FloatArray], tmp_path: Path) -> None:
+def test_the_pose_is_found_and_written(frame, tmp_path):
     path, pose = frame
     found = tmp_path / "found.npy"
     result = run("localize", DEMO_FILE, path, "--start", tmp_path / "start.npy", "-o", found, "--json")
@@ -187,7 +181,7 @@ def test_the_pose_is_found_and_written(frame: tuple[Path, FloatArray], tmp_path:
     np.testing.assert_array_equal(np.load(found), document["pose"])
 
 
-def test_a_frame_of_something_else_is_not_found(tmp_path: Path) -> None:
+def test_a_frame_of_something_else_is_not_found(tmp_path):
     np.save(tmp_path / "noise.npy", np.random.default_rng(0).integers(0, 256, (96, 96), dtype=np.uint8))
     np.save(tmp_path / "start.npy", demo_poses(3)[1])
     found = tmp_path / "found.npy"
@@ -197,7 +191,7 @@ def test_a_frame_of_something_else_is_not_found(tmp_path: Path) -> None:
     assert not found.exists()
 
 
-def test_mistakes_of_localize_are_told_in_one_line(tmp_path: Path) -> None:
+def test_mistakes_of_localize_are_told_in_one_line(tmp_path):
     start = tmp_path / "start.npy"
     np.save(start, demo_poses(3))
     (tmp_path / "text.png").write_text("no picture")
@@ -211,14 +205,14 @@ def test_mistakes_of_localize_are_told_in_one_line(tmp_path: Path) -> None:
     assert "in [0, 1], or uint8, got float64 from 200 to 200" in told
 
 
-def motion(rng: np.random.Generator) -> FloatArray:
+def motion(rng):
     pose = np.eye(4)
     pose[:3, :3] = cv2.Rodrigues(rng.normal(size=3))[0]
     pose[:3, 3] = 100.0 * rng.normal(size=3)
     return pose
 
 
-def test_points_are_registered_and_residuals_told(tmp_path: Path) -> None:
+def test_points_are_registered_and_residuals_told(tmp_path):
     rng = np.random.default_rng(0)
     true, points = motion(rng), 50.0 * rng.normal(size=(5, 3))
     np.savetxt(tmp_path / "base.csv", points, delimiter=",")
@@ -234,7 +228,7 @@ def test_points_are_registered_and_residuals_told(tmp_path: Path) -> None:
     )
 
 
-def test_poses_give_the_mounting_as_well(tmp_path: Path) -> None:
+def test_poses_give_the_mounting_as_well(tmp_path):
     rng = np.random.default_rng(1)
     base_to_scene, mounting = motion(rng), motion(rng)
     flanges = np.stack([motion(rng) for _ in range(5)])
@@ -250,7 +244,7 @@ def test_poses_give_the_mounting_as_well(tmp_path: Path) -> None:
     assert "name one of them" in refused(*asked, *both)
 
 
-def test_frames_register_a_robot(tmp_path: Path) -> None:
+def test_frames_register_a_robot(tmp_path):
     base_to_scene, poses = motion(np.random.default_rng(2)), demo_poses(5)[1:4]
     frames = render(load_demo_scene(), None, poses, height=96, width=96, outputs=("bmode",))["bmode"]
     np.save(tmp_path / "frames.npy", frames.detach().numpy())
@@ -267,7 +261,7 @@ def test_frames_register_a_robot(tmp_path: Path) -> None:
     np.testing.assert_allclose(found, poses, atol=0.3)
 
 
-def test_mistakes_of_calibrate_are_told_in_one_line(tmp_path: Path) -> None:
+def test_mistakes_of_calibrate_are_told_in_one_line(tmp_path):
     np.save(tmp_path / "line.npy", np.outer(np.arange(4.0), np.ones(3)))
     output = ("-o", tmp_path / "robot.json")
     line = refused("calibrate", "points", tmp_path / "line.npy", tmp_path / "line.npy", *output)
@@ -275,7 +269,7 @@ def test_mistakes_of_calibrate_are_told_in_one_line(tmp_path: Path) -> None:
     assert not (tmp_path / "robot.json").exists()
 
 
-def test_an_installation_goes_into_a_bucket(tmp_path: Path, new_bucket: Callable[[], str]) -> None:
+def test_an_installation_goes_into_a_bucket(tmp_path, new_bucket):
     data, bucket = tmp_path / "data", new_bucket()
     store_dataset(data / "artifacts", "tiny")
     copy_demo_scene(data / "demo.ugr")

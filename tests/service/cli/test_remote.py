@@ -1,42 +1,38 @@
 """`ultragray scenes` and `ultragray datasets` against a real service."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Iterator
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import CliRunner
 
 from ultragray import read_header
 from ultragray_service.cli.app import app
 
-from ..conftest import HEIGHT, WIDTH, RunningService, StartService
+from ..conftest import HEIGHT, WIDTH
 from .command_line import noise_sweep
 
 KEY = "0123456789abcdef-remote"
 
 
 @pytest.fixture(scope="module")
-def server(start_service: StartService, tmp_path_factory: pytest.TempPathFactory) -> RunningService:
+def server(start_service, tmp_path_factory):
     return start_service(artifact_folder=tmp_path_factory.mktemp("artifacts"), api_keys=KEY)
 
 
-def run(server: RunningService, *arguments: object, key: str = KEY) -> Result:
+def run(server, *arguments, key=KEY):
     environment = {"ULTRAGRAY_ADDRESS": server.http, "ULTRAGRAY_API_KEY": key}
     return CliRunner().invoke(app, list(map(str, arguments)), env=environment)
 
 
-def done(server: RunningService, *arguments: object) -> str:
+def done(server, *arguments):
     result = run(server, *arguments)
     assert result.exit_code == 0, result.output
     return result.stdout
 
 
-def refused(server: RunningService, *arguments: object, key: str = KEY) -> str:
+def refused(server, *arguments, key=KEY):
     result = run(server, *arguments, key=key)
     assert result.exit_code == 2, result.output
     assert result.stderr.startswith("error: ")
@@ -45,14 +41,14 @@ def refused(server: RunningService, *arguments: object, key: str = KEY) -> str:
 
 
 @pytest.fixture
-def scene(server: RunningService, tmp_path: Path) -> Iterator[str]:
+def scene(server, tmp_path):
     """The name of a scene that was uploaded."""
     done(server, "scenes", "download", "demo", "-o", tmp_path / "demo.ugr")
     yield done(server, "scenes", "upload", tmp_path / "demo.ugr", "--name", "mine", "--json") and "mine"
     done(server, "scenes", "delete", "mine")
 
 
-def test_a_scene_goes_down_and_up_again(server: RunningService, scene: str, tmp_path: Path) -> None:
+def test_a_scene_goes_down_and_up_again(server, scene, tmp_path):
     assert read_header(tmp_path / "demo.ugr").info.gaussian_count == 400
     listed = json.loads(done(server, "scenes", "list", "--json"))
     assert {"demo", scene} <= {one["name"] for one in listed}
@@ -68,7 +64,7 @@ def test_a_scene_goes_down_and_up_again(server: RunningService, scene: str, tmp_
     assert not (tmp_path / "none.ugr").exists()
 
 
-def test_a_frame_as_a_picture(server: RunningService, tmp_path: Path) -> None:
+def test_a_frame_as_a_picture(server, tmp_path):
     picture = tmp_path / "frame.png"
     assert f"wrote {picture}: 1 frame of {HEIGHT}x{WIDTH}" in done(server, "scenes", "render", "demo", "-o", picture)
     assert cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE).shape == (HEIGHT, WIDTH)
@@ -78,7 +74,7 @@ def test_a_frame_as_a_picture(server: RunningService, tmp_path: Path) -> None:
     assert picture.read_bytes() != before
 
 
-def test_a_sampler_makes_a_folder_of_pictures(server: RunningService, tmp_path: Path) -> None:
+def test_a_sampler_makes_a_folder_of_pictures(server, tmp_path):
     folder = tmp_path / "pictures"
     sampled = ("--sampler", "training", "--height", 8, "--width", 8, "--outputs", "bmode,transmittance")
     document = json.loads(done(server, "scenes", "render", "demo", "-o", folder, *sampled, "--json"))
@@ -97,25 +93,19 @@ def test_a_sampler_makes_a_folder_of_pictures(server: RunningService, tmp_path: 
         (("-o", "pictures", "--outputs", "labels"), "labels"),
     ],
 )
-def test_mistakes_leave_nothing(
-    server: RunningService,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    arguments: tuple[object, ...],
-    told: str,
-) -> None:
+def test_mistakes_leave_nothing(server, tmp_path, monkeypatch, arguments, told):
     monkeypatch.chdir(tmp_path)
     assert told in refused(server, "scenes", "render", "demo", *arguments)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.fixture
-def sweep(tmp_path: Path) -> Path:
+def sweep(tmp_path):
     return noise_sweep(tmp_path / "tiny")
 
 
 @pytest.mark.long
-def test_a_folder_becomes_a_dataset(server: RunningService, sweep: Path) -> None:
+def test_a_folder_becomes_a_dataset(server, sweep):
     assert "uploaded tiny: 8 training and 2 held-out frames of 16x20" in done(server, "datasets", "upload", sweep)
     assert "tiny is there already, the same" in done(server, "datasets", "upload", sweep / "conf.json")
     record = json.loads(done(server, "datasets", "show", "tiny", "--json"))
@@ -130,7 +120,7 @@ def test_a_folder_becomes_a_dataset(server: RunningService, sweep: Path) -> None
     assert "tiny" in refused(server, "datasets", "show", "tiny")
 
 
-def test_what_is_no_sweep_is_not_sent(server: RunningService, tmp_path: Path) -> None:
+def test_what_is_no_sweep_is_not_sent(server, tmp_path):
     (tmp_path / "notes.txt").write_text("nothing")
     assert "no sweep lies in this folder" in refused(server, "datasets", "upload", tmp_path)
     (tmp_path / "a.zip").write_bytes(b"no zip at all")
@@ -138,14 +128,14 @@ def test_what_is_no_sweep_is_not_sent(server: RunningService, tmp_path: Path) ->
     assert json.loads(done(server, "datasets", "list", "--json")) == []
 
 
-def test_a_large_upload_that_is_refused_at_once_tells_why(server: RunningService, tmp_path: Path) -> None:
+def test_a_large_upload_that_is_refused_at_once_tells_why(server, tmp_path):
     large = tmp_path / "large.zip"
     with large.open("wb") as file:
         file.truncate(2**27)
     assert "API key" in refused(server, "datasets", "upload", large, key="wrong-key-0123456789")
 
 
-def test_a_registration_goes_up_and_is_listed_shown_and_deleted(server: RunningService, tmp_path: Path) -> None:
+def test_a_registration_goes_up_and_is_listed_shown_and_deleted(server, tmp_path):
     base_to_scene = np.eye(4)
     base_to_scene[:3, 3] = (1.0, 2.0, 3.0)
     np.save(tmp_path / "flange.npy", np.eye(4)[None])

@@ -1,11 +1,7 @@
 """`ultragray render`: real files in, real files out; a mistake gives one line and exit code 2."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
 from dataclasses import fields, replace
-from pathlib import Path
 
 import cv2
 import h5py
@@ -33,7 +29,7 @@ ORIGIN = ("scene", "scene_sha256", "renderer", "probe", "slice_thickness_mm", "d
 CONVEX_JSON = '{"kind": "convex", "opening_angle_deg": 60, "near_mm": 10, "far_mm": 50}'
 
 
-def test_render_writes_an_npz_that_can_be_replayed(scene_file: Path, pose_file: Path, tmp_path: Path) -> None:
+def test_render_writes_an_npz_that_can_be_replayed(scene_file, pose_file, tmp_path):
     output = tmp_path / "frames.npz"
     result = run(
         *("render", scene_file, "--poses", pose_file, "--height", 16, "--width", 12),
@@ -54,13 +50,13 @@ def test_render_writes_an_npz_that_can_be_replayed(scene_file: Path, pose_file: 
             np.testing.assert_allclose(frames[name], getattr(again, name).numpy(), atol=1e-6)
 
 
-def test_without_poses_the_training_views_are_rendered_as_trained(scene_file: Path, tmp_path: Path) -> None:
+def test_without_poses_the_training_views_are_rendered_as_trained(scene_file, tmp_path):
     assert run("render", scene_file, "-o", tmp_path / "f.npz").exit_code == 0
     with np.load(tmp_path / "f.npz") as frames:
         assert frames["bmode"].shape == (5, 24, 20)
 
 
-def test_render_writes_pngs(scene_file: Path, tmp_path: Path) -> None:
+def test_render_writes_pngs(scene_file, tmp_path):
     folder, npz = tmp_path / "pictures", tmp_path / "f.npz"
     arguments = ("render", scene_file, "--outputs", "bmode,coverage", "-o")
     assert run(*arguments, folder).exit_code == 0
@@ -75,7 +71,7 @@ def test_render_writes_pngs(scene_file: Path, tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def knowing_file(scene_file: Path, tmp_path: Path) -> Path:
+def knowing_file(scene_file, tmp_path):
     """The scene with a model of its confidence."""
     scene = GaussianScene.load(scene_file)
     model = ConfidenceModel((3.5, 1.2, 0.8, 0.1, 0.6), 0.06, (0.125,) * 5, 20, 0.04)
@@ -83,9 +79,7 @@ def knowing_file(scene_file: Path, tmp_path: Path) -> Path:
     return tmp_path / "knowing.ugr"
 
 
-def test_render_tells_and_stores_how_far_frames_extrapolate(
-    knowing_file: Path, scene_file: Path, tmp_path: Path
-) -> None:
+def test_render_tells_and_stores_how_far_frames_extrapolate(knowing_file, scene_file, tmp_path):
     scene = GaussianScene.load(knowing_file)
     coverage = render(scene, None, scene.training_poses, height=24, width=20, outputs=("coverage",)).coverage
     assert coverage is not None
@@ -109,7 +103,7 @@ def test_render_tells_and_stores_how_far_frames_extrapolate(
         assert np.isnan(frames["confidence"]).all()
 
 
-def test_render_draws_the_tools_of_a_file(scene_file: Path, tmp_path: Path) -> None:
+def test_render_draws_the_tools_of_a_file(scene_file, tmp_path):
     scene = GaussianScene.load(scene_file)
     needle = Needle(tip_mm=(5.0, 0.0, 25.0), hub_mm=(-12.0, 0.0, 8.0), frame=ToolFrame.PROBE)
     file, output = tmp_path / "tools.json", tmp_path / "f.npz"
@@ -129,7 +123,7 @@ def test_render_draws_the_tools_of_a_file(scene_file: Path, tmp_path: Path) -> N
     assert "tools must be a list of at most 8 values, got 9" in refused(*arguments, "--force")
 
 
-def test_render_keeps_to_a_least_confidence(knowing_file: Path, scene_file: Path, tmp_path: Path) -> None:
+def test_render_keeps_to_a_least_confidence(knowing_file, scene_file, tmp_path):
     scene = GaussianScene.load(knowing_file)
     arguments = ("render", knowing_file, "-o", tmp_path / "f.npz", "--force", "--min-confidence", 0.5)
     assert run(*arguments, "--sampler", "around", "--count", 30, "--translation-mm", 8).exit_code == 0
@@ -153,7 +147,7 @@ def test_render_keeps_to_a_least_confidence(knowing_file: Path, scene_file: Path
     assert "needs a scene that knows" in refused("render", scene_file, *arguments[2:])
 
 
-def test_render_samples_poses_into_the_format_of_the_name(scene_file: Path, pose_file: Path, tmp_path: Path) -> None:
+def test_render_samples_poses_into_the_format_of_the_name(scene_file, pose_file, tmp_path):
     sampler = ("--sampler", "fan", "--tilt-deg", 2, "--step-deg", 2, "--poses", pose_file)
     for name in ("f.npz", "f.igs.mha", "f.h5"):
         result = run("render", scene_file, *sampler, "--dtype", "uint8", "-o", tmp_path / name)
@@ -168,7 +162,7 @@ def test_render_samples_poses_into_the_format_of_the_name(scene_file: Path, pose
             np.testing.assert_array_equal(file["bmode"], frames["bmode"])
 
 
-def test_threads_and_backend_are_used(scene_file: Path, tmp_path: Path) -> None:
+def test_threads_and_backend_are_used(scene_file, tmp_path):
     result = run("render", scene_file, "-o", tmp_path / "f.npz", "--threads", 3, "--backend", "reference")
     assert result.exit_code == 0
     assert torch.get_num_threads() == 3
@@ -176,7 +170,7 @@ def test_threads_and_backend_are_used(scene_file: Path, tmp_path: Path) -> None:
         assert str(frames["renderer"]).endswith(" reference")
 
 
-def test_what_is_there_is_replaced_only_with_force(scene_file: Path, tmp_path: Path) -> None:
+def test_what_is_there_is_replaced_only_with_force(scene_file, tmp_path):
     file, folder = tmp_path / "f.npz", tmp_path / "pictures"
     file.write_text("mine")
     folder.mkdir()
@@ -192,7 +186,7 @@ def test_what_is_there_is_replaced_only_with_force(scene_file: Path, tmp_path: P
     assert (folder / "notes.txt").exists()
 
 
-def test_a_sentence_for_people_is_a_document_for_programs(scene_file: Path, tmp_path: Path) -> None:
+def test_a_sentence_for_people_is_a_document_for_programs(scene_file, tmp_path):
     output = tmp_path / "f.npz"
     result = run("render", scene_file, "-o", output, "--json", "--height", 8, "--width", 8)
     document = json.loads(result.stdout)
@@ -200,9 +194,7 @@ def test_a_sentence_for_people_is_a_document_for_programs(scene_file: Path, tmp_
     assert document["confidence_min"] is None
 
 
-def test_a_scene_that_knows_no_probe_or_poses_asks_for_them(
-    tmp_path: Path, random_scene: Callable[..., GaussianScene]
-) -> None:
+def test_a_scene_that_knows_no_probe_or_poses_asks_for_them(tmp_path, random_scene):
     path = tmp_path / "bare.ugr"
     random_scene(3).save(path)
     assert "--probe must be given" in refused("render", path, "-o", tmp_path / "f.npz")

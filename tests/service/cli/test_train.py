@@ -1,7 +1,5 @@
 """`ultragray train`, `eval`, `report` and `compare`: a scene, figures and pages of frames; what is stopped goes on."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -10,14 +8,12 @@ import subprocess
 import sys
 import time
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import torch
 
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, Probe
+from ultragray import ConvexProbe, GaussianScene, LinearProbe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import read_released, write_released
 from ultragray.datasets.source import load_dataset
@@ -33,7 +29,7 @@ from .command_line import refused, run
 SMALL = ("--steps", 24, "--max-gaussians", 60, "--threads", 1)
 
 
-def refused_run(*arguments: object) -> str:
+def refused_run(*arguments):
     """The one line that a mistake gives."""
     result = run("train", *arguments)
     assert result.exit_code == 2, result.output
@@ -43,7 +39,7 @@ def refused_run(*arguments: object) -> str:
     return errors[0]
 
 
-def test_trains_a_scene(dataset: Path, tmp_path: Path) -> None:
+def test_trains_a_scene(dataset, tmp_path):
     output = tmp_path / "scene.ugr"
     result = run("train", dataset, "-o", output, *SMALL)
     assert result.exit_code == 0, result.output
@@ -63,7 +59,7 @@ def test_trains_a_scene(dataset: Path, tmp_path: Path) -> None:
     assert "the run is finished, all 24 steps are done" in refused_run(dataset, "-o", output, "--resume")
 
 
-def test_settings_come_from_file_set_and_options(dataset: Path, tmp_path: Path) -> None:
+def test_settings_come_from_file_set_and_options(dataset, tmp_path):
     """What stands nearer to the command goes first: options, --set, the file, the preset."""
     file = tmp_path / "run.toml"
     file.write_text('preset = "paper"\nsteps = 3\nmax_gaussians = 40\nmeans_rate = 3e-4\nquats_rate = 1e-3\n')
@@ -90,16 +86,14 @@ def test_settings_come_from_file_set_and_options(dataset: Path, tmp_path: Path) 
     assert GaussianScene.load(tmp_path / "b.ugr").info.training["intensity"] == TrainingConfig().intensity
 
 
-def test_a_training_that_cannot_fit_into_its_memory_is_refused(dataset: Path, tmp_path: Path) -> None:
+def test_a_training_that_cannot_fit_into_its_memory_is_refused(dataset, tmp_path):
     told = refused_run(dataset, "-o", tmp_path / "scene.ugr", *SMALL, "--set", "memory_gb=0.01")
     assert "GiB: lower max_gaussians" in told
     assert not (tmp_path / "scene.ugr.run").exists()
 
 
 @pytest.mark.parametrize("options", [("--device", "cuda"), ("--backend", "cuda"), ("--device", "cuda:7")])
-def test_says_what_is_missing_without_a_gpu(
-    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, options: tuple[str, str]
-) -> None:
+def test_says_what_is_missing_without_a_gpu(dataset, tmp_path, monkeypatch, options):
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
     monkeypatch.setattr(torch.cuda, "is_available", lambda: False)
     told = refused_run(dataset, "-o", tmp_path / "scene.ugr", *SMALL, *options)
@@ -107,12 +101,10 @@ def test_says_what_is_missing_without_a_gpu(
     assert not (tmp_path / "scene.ugr.run").exists()
 
 
-def test_running_out_of_memory_leaves_the_last_good_scene(
-    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_running_out_of_memory_leaves_the_last_good_scene(dataset, tmp_path, monkeypatch):
     true_loss, calls = trainer.image_loss, 0
 
-    def loss_that_runs_out(rendered: torch.Tensor, truth: torch.Tensor, texture: float) -> Any:
+    def loss_that_runs_out(rendered, truth, texture):
         nonlocal calls
         calls += 1
         if calls == 6:
@@ -129,13 +121,13 @@ def test_running_out_of_memory_leaves_the_last_good_scene(
     assert run("train", dataset, "-o", output, "--resume").exit_code == 0
 
 
-def start(*arguments: object) -> subprocess.Popen[str]:
+def start(*arguments):
     program = f"import sys; sys.path[:0] = {sys.path!r}; from ultragray_service.cli.app import app; app()"
     command = [sys.executable, "-c", program, "train", *map(str, arguments)]
     return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
 
 
-def wait_for_lines(path: Path, count: int, process: subprocess.Popen[str]) -> None:
+def wait_for_lines(path, count, process):
     deadline = Deadline(60)
     while not path.exists() or path.read_bytes().count(b"\n") < count:
         assert process.poll() is None, "the training ended early"
@@ -145,7 +137,7 @@ def wait_for_lines(path: Path, count: int, process: subprocess.Popen[str]) -> No
 
 @pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_stopped_run_leaves_a_scene_and_goes_on(dataset: Path, tmp_path: Path, number: signal.Signals) -> None:
+def test_stopped_run_leaves_a_scene_and_goes_on(dataset, tmp_path, number):
     output, small = tmp_path / "scene.ugr", ("--steps", 300, "--max-gaussians", 60, "--threads", 1)
     process = start(dataset, "-o", output, *small)
     wait_for_lines(tmp_path / "scene.ugr.run" / "metrics.jsonl", 5, process)
@@ -164,7 +156,7 @@ def test_stopped_run_leaves_a_scene_and_goes_on(dataset: Path, tmp_path: Path, n
 
 
 @pytest.mark.long
-def test_further_signals_do_not_stop_the_scene_from_being_written(dataset: Path, tmp_path: Path) -> None:
+def test_further_signals_do_not_stop_the_scene_from_being_written(dataset, tmp_path):
     output = tmp_path / "scene.ugr"
     process = start(dataset, "-o", output, "--steps", 3000, "--max-gaussians", 60, "--threads", 1)
     wait_for_lines(tmp_path / "scene.ugr.run" / "metrics.jsonl", 5, process)
@@ -180,7 +172,7 @@ def test_further_signals_do_not_stop_the_scene_from_being_written(dataset: Path,
     assert GaussianScene.load(output).info.training["step"] < 3000
 
 
-def test_tensorboard_that_is_missing_is_said(dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_tensorboard_that_is_missing_is_said(dataset, tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
     told = refused_run(dataset, "-o", tmp_path / "scene.ugr", *SMALL, "--tensorboard")
     assert f"TensorBoard is not installed: {install_advice('tensorboard')}" in told
@@ -188,7 +180,7 @@ def test_tensorboard_that_is_missing_is_said(dataset: Path, tmp_path: Path, monk
 
 
 @pytest.fixture(scope="module")
-def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def dataset(tmp_path_factory):
     """A folder in the released layout: a ball in noise, 7 training and 2 held-out frames."""
     poses = np.tile(np.eye(4), (9, 1, 1))
     poses[:, 1, 3] = np.linspace(-4.0, 4.0, 9)
@@ -202,19 +194,19 @@ def dataset(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def scene(dataset: Path) -> Path:
+def scene(dataset):
     config = TrainingConfig.preset("fast", steps=5, max_gaussians=60)
     train(read_released(dataset), config).save(dataset.parent / "ball.ugr")
     return dataset.parent / "ball.ugr"
 
 
-def printed_json(*arguments: object) -> Any:
+def printed_json(*arguments):
     result = run(*arguments)
     assert result.exit_code == 0, result.output
     return json.loads(result.stdout)
 
 
-def test_eval_prints_what_the_library_measures(dataset: Path, scene: Path) -> None:
+def test_eval_prints_what_the_library_measures(dataset, scene):
     expected = evaluate(GaussianScene.load(scene), read_released(dataset).val)
     reliability = measure_reliability(GaussianScene.load(scene), read_released(dataset).val)
     assert reliability is not None
@@ -232,14 +224,14 @@ def test_eval_prints_what_the_library_measures(dataset: Path, scene: Path) -> No
     assert f"{reliability.within_2:.0%} within 2 deviations" in " ".join(result.stdout.split())
 
 
-def test_eval_of_the_training_frames_and_of_others(dataset: Path, scene: Path) -> None:
+def test_eval_of_the_training_frames_and_of_others(dataset, scene):
     train_part = printed_json("eval", scene, dataset, "--json", "--split", "train")
     assert train_part["split"] == "train"
     assert len(train_part["frames"]) == 7
     assert len(printed_json("eval", scene, dataset, "--json", "--val-frames", "0:3")["frames"]) == 3
 
 
-def test_eval_writes_pictures(dataset: Path, scene: Path, tmp_path: Path) -> None:
+def test_eval_writes_pictures(dataset, scene, tmp_path):
     result = run("eval", scene, dataset, "-o", tmp_path / "pictures", "--json")
     assert result.exit_code == 0
     assert len(json.loads(result.stdout)["frames"]) == 2
@@ -247,7 +239,7 @@ def test_eval_writes_pictures(dataset: Path, scene: Path, tmp_path: Path) -> Non
     assert (tmp_path / "pictures" / "uncertainty.svg").read_text().startswith("<svg")
 
 
-def test_report_of_a_scene(dataset: Path, scene: Path, tmp_path: Path) -> None:
+def test_report_of_a_scene(dataset, scene, tmp_path):
     page = tmp_path / "page.html"
     result = run("report", dataset, "-o", page, "--scene", scene, "--no-ablations", "--threads", 1)
     assert result.exit_code == 0, result.output
@@ -257,13 +249,13 @@ def test_report_of_a_scene(dataset: Path, scene: Path, tmp_path: Path) -> None:
     assert "Ablations" not in page.read_text()
 
 
-def test_a_scene_of_another_probe_or_of_other_data(dataset: Path, scene: Path, tmp_path: Path) -> None:
+def test_a_scene_of_another_probe_or_of_other_data(dataset, scene, tmp_path):
     result = run("eval", scene, dataset, "--json", "--val-frames", "0:3")
     assert "warning: the scene was trained from other data than ball, or from another split of it" in result.stderr
     assert run("eval", scene, dataset, "--json").stderr == ""
     read = read_released(dataset)
 
-    def written(name: str, probe: Probe) -> Path:
+    def written(name, probe):
         parts = (replace(part, probe=probe) for part in (read.train, read.val))
         write_released(Dataset(name, *parts), tmp_path / name)
         return tmp_path / name
@@ -278,7 +270,7 @@ def test_a_scene_of_another_probe_or_of_other_data(dataset: Path, scene: Path, t
         assert "error: convex: its probe is convex, the scene was trained with a linear one" in result.stderr
 
 
-def test_a_dataset_without_held_out_frames_is_refused(dataset: Path, scene: Path, tmp_path: Path) -> None:
+def test_a_dataset_without_held_out_frames_is_refused(dataset, scene, tmp_path):
     sweep = read_released(dataset).train
     write_released(Dataset("alone", sweep, sweep.select([])), tmp_path / "alone")
     for arguments in (
@@ -292,9 +284,7 @@ def test_a_dataset_without_held_out_frames_is_refused(dataset: Path, scene: Path
 CLASSICAL = ("--methods", "median,linear,nearest")
 
 
-def test_the_table_has_what_the_library_measures(
-    dataset: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_table_has_what_the_library_measures(dataset, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     expected = evaluate_baselines(read_released(dataset), ("median", "linear", "nearest"))
     result = run("compare", dataset, *CLASSICAL)
@@ -309,7 +299,7 @@ def test_the_table_has_what_the_library_measures(
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_page_with_its_table_as_json_and_latex(dataset: Path, tmp_path: Path) -> None:
+def test_a_page_with_its_table_as_json_and_latex(dataset, tmp_path):
     page = tmp_path / "ball.html"
     result = run("compare", dataset, *CLASSICAL, "-o", page)
     assert result.exit_code == 0, result.output
@@ -319,7 +309,7 @@ def test_a_page_with_its_table_as_json_and_latex(dataset: Path, tmp_path: Path) 
     assert f"wrote {page}\n" in result.stdout
 
 
-def test_a_comparison_of_which_nothing_could_be_measured_ends_with_an_error(tmp_path: Path) -> None:
+def test_a_comparison_of_which_nothing_could_be_measured_ends_with_an_error(tmp_path):
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, 1, 3] = [0.0, 10_000.0, 20_000.0, 30_000.0]  # mm: no volume of voxels holds that
     poses[:, 0, 3] = [0.0, 9_000.0, -9_000.0, 18_000.0]
@@ -332,7 +322,7 @@ def test_a_comparison_of_which_nothing_could_be_measured_ends_with_an_error(tmp_
     assert run("compare", tmp_path / "wide", "--methods", "median-0.25mm,nearest").exit_code == 0
 
 
-def test_what_is_not_a_comparisons_is_not_replaced(dataset: Path, tmp_path: Path) -> None:
+def test_what_is_not_a_comparisons_is_not_replaced(dataset, tmp_path):
     page = tmp_path / "ball.html"
     (tmp_path / "ball.tex").write_text("a paper")
     assert f"{tmp_path / 'ball.tex'} exists: --force replaces it" in refused("compare", dataset, *CLASSICAL, "-o", page)

@@ -1,11 +1,8 @@
 """Wrong command lines, one a row: exit code 2, one line that says what is wrong, and nothing is written."""
 
-from __future__ import annotations
-
 import os
 import socket
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -193,7 +190,7 @@ AS_PROCESSES = (  # the start of a process and its end are real here
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def place(tmp_path_factory):
     """A folder with a scene, a sweep, and files that are something else."""
     folder = tmp_path_factory.mktemp("place")
     copy_demo_scene(folder / "scene.ugr")
@@ -205,16 +202,16 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def busy_port() -> Iterator[int]:
+def busy_port():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         yield taken.getsockname()[1]
 
 
-def contents(folder: Path) -> dict[str, bytes | None]:
+def contents(folder):
     return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
 
 
-def check(line: str, code: int, stdout: str, stderr: str) -> None:
+def check(line, code, stdout, stderr):
     assert code == 2, stderr
     assert stdout == ""
     (told,) = [one for one in stderr.splitlines() if not one.startswith(("simulating", "warning: "))]
@@ -225,7 +222,7 @@ def check(line: str, code: int, stdout: str, stderr: str) -> None:
 
 
 @pytest.mark.parametrize("line", [line for line in WRONG if line not in AS_PROCESSES])
-def test_one_line_tells_a_mistake(line: str, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_line_tells_a_mistake(line, place, monkeypatch):
     monkeypatch.chdir(place)
     before = contents(place)
     result = run(*line.split())
@@ -235,7 +232,7 @@ def test_one_line_tells_a_mistake(line: str, place: Path, monkeypatch: pytest.Mo
 
 @pytest.mark.long
 @pytest.mark.parametrize("line", AS_PROCESSES)
-def test_a_process_ends_with_one_line(line: str, place: Path, busy_port: int) -> None:
+def test_a_process_ends_with_one_line(line, place, busy_port):
     before = contents(place)
     arguments = line.replace("BUSY", str(busy_port)).split()
     program = "from ultragray_service.cli.app import app; app()"
@@ -247,11 +244,11 @@ def test_a_process_ends_with_one_line(line: str, place: Path, busy_port: int) ->
     assert contents(place) == before
 
 
-def clean_environment() -> dict[str, str]:
+def clean_environment():
     return {name: value for name, value in os.environ.items() if not name.startswith("ULTRAGRAY_")}
 
 
-def test_a_mistake_is_told_before_torch_is_imported(place: Path) -> None:
+def test_a_mistake_is_told_before_torch_is_imported(place):
     lines = [
         line for line in WRONG if line.split()[0] in ("render", "train", "eval", "check", "scenes", "jobs", "show")
     ]
@@ -273,7 +270,7 @@ def test_a_mistake_is_told_before_torch_is_imported(place: Path) -> None:
         ("ULTRAGRAY_SERVER", ""),  # the beginning that all share makes it like none of them
     ],
 )
-def test_a_misspelt_variable_is_told(variable: str, meant: str, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_misspelt_variable_is_told(variable, meant, place, monkeypatch):
     monkeypatch.setenv(variable, "1")
     result = run("show", place / "scene.ugr", "--json")
     assert result.exit_code == 0

@@ -1,9 +1,6 @@
 """Open streams and their watchers, without a door."""
 
-from __future__ import annotations
-
 import asyncio
-from typing import Any
 
 import pytest
 
@@ -16,16 +13,16 @@ ALICE, BOB = (Principal(name, Role.READER, "key") for name in ("alice", "bob"))
 ADMIN = Principal("root", Role.ADMIN, "key")
 
 
-def refusal(sequence: int, **others: Any) -> StreamAnswer:
+def refusal(sequence, **others):
     return StreamAnswer(sequence, None, UltragrayError("not this one"), **others)
 
 
-def act(principal: Principal) -> None:
+def act(principal):
     act_as(principal, address="10.0.0.7", connection="ipv4:10.0.0.7:5000")
 
 
-def test_a_slow_watcher_gets_the_newest_answer_alone_and_then_the_end() -> None:
-    async def main() -> list[int]:
+def test_a_slow_watcher_gets_the_newest_answer_alone_and_then_the_end():
+    async def main():
         stream, taken = OpenStream(), []
         with stream.watched() as watcher:
             for sequence in range(5):
@@ -38,8 +35,8 @@ def test_a_slow_watcher_gets_the_newest_answer_alone_and_then_the_end() -> None:
     assert asyncio.run(main()) == [4]
 
 
-def test_a_watcher_that_has_gone_is_told_nothing() -> None:
-    async def main() -> None:
+def test_a_watcher_that_has_gone_is_told_nothing():
+    async def main():
         stream = OpenStream()
         with stream.watched():
             assert stream.summary().watchers == 1
@@ -49,7 +46,7 @@ def test_a_watcher_that_has_gone_is_told_nothing() -> None:
     asyncio.run(main())
 
 
-def test_a_summary_counts_what_came_and_what_was_answered() -> None:
+def test_a_summary_counts_what_came_and_what_was_answered():
     stream = OpenStream(name="UR5 \n" + "x" * 200)
     for sequence in range(3):
         stream.count_pose()
@@ -62,8 +59,8 @@ def test_a_summary_counts_what_came_and_what_was_answered() -> None:
     assert len(told.name) == MAX_NAME
 
 
-def test_streams_are_seen_by_their_owner_and_by_admins() -> None:
-    async def main() -> None:
+def test_streams_are_seen_by_their_owner_and_by_admins():
+    async def main():
         streams = OpenStreams()
         act(ALICE)
         with streams.opened("grpc", "robot") as stream:

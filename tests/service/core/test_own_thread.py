@@ -1,7 +1,5 @@
 """Long waits in a thread of their own."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
 
@@ -10,11 +8,11 @@ import pytest
 from ultragray_service.core.threads import in_own_thread
 
 
-def test_results_and_errors_come_back() -> None:
-    def fail() -> None:
+def test_results_and_errors_come_back():
+    def fail():
         raise KeyError("no")
 
-    async def run() -> None:
+    async def run():
         assert await in_own_thread(lambda: threading.current_thread().daemon) is True
         with pytest.raises(KeyError):
             await in_own_thread(fail)
@@ -22,10 +20,10 @@ def test_results_and_errors_come_back() -> None:
     asyncio.run(run())
 
 
-def test_many_may_wait_and_none_keeps_the_loop_from_ending() -> None:
+def test_many_may_wait_and_none_keeps_the_loop_from_ending():
     never = threading.Event()
 
-    async def run() -> int:
+    async def run():
         waiting = [asyncio.ensure_future(in_own_thread(never.wait)) for _ in range(50)]
         result = await in_own_thread(lambda: 7)
         assert not any(task.done() for task in waiting)

@@ -1,13 +1,8 @@
 """Jobs over HTTP against a real service without a worker: they stay queued; progress is told as a worker would."""
 
-from __future__ import annotations
-
 import json
 import threading
-from collections.abc import Iterator
 from dataclasses import dataclass, fields
-from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
@@ -23,43 +18,42 @@ from ultragray_workers.jobs.tables import JOBS
 from ultragray_workers.storage.local import LocalStorage
 
 from ...waiting import wait_until
-from ..conftest import RunningService, StartService
 
 RENDER = {"kind": "render", "specification": {"scene": "demo", "sampler": {"kind": "training"}}}
 WAIT_S = 120.0
 
 
 @pytest.fixture(scope="module")
-def artifacts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def artifacts(tmp_path_factory):
     return tmp_path_factory.mktemp("artifacts")
 
 
 @pytest.fixture(scope="module")
-def jobs_service(start_service: StartService, artifacts: Path) -> RunningService:
+def jobs_service(start_service, artifacts):
     """A service without a worker: what is submitted waits."""
     return start_service(artifact_folder=artifacts)
 
 
 @pytest.fixture(scope="module")
-def client(jobs_service: RunningService) -> Iterator[httpx.Client]:
+def client(jobs_service):
     with httpx.Client(base_url=jobs_service.http, timeout=120) as client:
         yield client
 
 
-def submit(client: httpx.Client, **changes: Any) -> dict[str, Any]:
+def submit(client, **changes):
     answer = client.post("/v1/jobs", json=RENDER | changes)
     assert answer.status_code == 201, answer.text
-    job: dict[str, Any] = answer.json()
+    job = answer.json()
     return job
 
 
-def problem(answer: httpx.Response) -> tuple[int, str, str | None]:
+def problem(answer):
     document = answer.json()
     assert answer.headers["content-type"] == "application/problem+json"
     return answer.status_code, document["reason"], document["field"]
 
 
-def test_a_submitted_job_waits_and_tells_what_it_is(client: httpx.Client) -> None:
+def test_a_submitted_job_waits_and_tells_what_it_is(client):
     job = submit(client, priority=3)
     assert (job["state"], job["kind"], job["priority"], job["attempts"]) == ("queued", "render", 3, 0)
     assert job["specification"]["scene"] == "demo"
@@ -71,7 +65,7 @@ def test_a_submitted_job_waits_and_tells_what_it_is(client: httpx.Client) -> Non
     assert client.get(f"/v1/jobs/{job['id']}").json() == job
 
 
-def test_a_render_job_is_estimated_and_not_submitted(client: httpx.Client) -> None:
+def test_a_render_job_is_estimated_and_not_submitted(client):
     before = client.get("/v1/jobs").json()["jobs"]
     sampler = {"kind": "around", "count": 300}
     asked = {"scene": "demo", "sampler": sampler, "height": 32, "width": 16, "outputs": ["bmode", "echo"]}
@@ -85,7 +79,7 @@ def test_a_render_job_is_estimated_and_not_submitted(client: httpx.Client) -> No
     assert client.get("/v1/jobs").json()["jobs"] == before
 
 
-def test_the_estimate_of_a_batch_in_shards_counts_its_files(client: httpx.Client) -> None:
+def test_the_estimate_of_a_batch_in_shards_counts_its_files(client):
     sampler = {"kind": "around", "count": 250_000}
     asked = {"scene": "demo", "sampler": sampler, "height": 16, "width": 16}
     told = client.post("/v1/jobs:estimate", json={"kind": "render", "specification": asked}).json()
@@ -105,13 +99,11 @@ def test_the_estimate_of_a_batch_in_shards_counts_its_files(client: httpx.Client
         ),
     ],
 )
-def test_what_cannot_be_estimated(
-    client: httpx.Client, kind: str, specification: dict[str, Any], expected: tuple[int, str, str]
-) -> None:
+def test_what_cannot_be_estimated(client, kind, specification, expected):
     assert problem(client.post("/v1/jobs:estimate", json={"kind": kind, "specification": specification})) == expected
 
 
-def test_the_same_request_id_gives_the_same_job_and_another_body_a_conflict(client: httpx.Client) -> None:
+def test_the_same_request_id_gives_the_same_job_and_another_body_a_conflict(client):
     body = RENDER | {"request_id": "mine/1"}
     first, again = client.post("/v1/jobs", json=body), client.post("/v1/jobs", json=body)
     assert (first.status_code, again.status_code) == (201, 200)
@@ -148,9 +140,7 @@ def test_the_same_request_id_gives_the_same_job_and_another_body_a_conflict(clie
         ),
     ],
 )
-def test_what_cannot_be_run_is_refused_by_name(
-    client: httpx.Client, body: dict[str, Any], status: int, reason: str, field: str
-) -> None:
+def test_what_cannot_be_run_is_refused_by_name(client, body, status, reason, field):
     assert problem(client.post("/v1/jobs", json=body)) == (status, reason, field)
 
 
@@ -166,15 +156,15 @@ def test_what_cannot_be_run_is_refused_by_name(
         ("GET", "/artifacts/a"),
     ],
 )
-def test_every_route_says_that_there_is_no_such_job(client: httpx.Client, method: str, route: str) -> None:
+def test_every_route_says_that_there_is_no_such_job(client, method, route):
     for name in ("0" * 24, "..", "%2e%2e%2f", "x" * 300):
         assert client.request(method, f"/v1/jobs/{name}{route}").status_code == 404
     assert problem(client.request(method, f"/v1/jobs/{'0' * 24}{route}")) == (404, "JOB_NOT_FOUND", "job")
 
 
-def test_pages_join_to_the_whole_list_newest_first(client: httpx.Client) -> None:
+def test_pages_join_to_the_whole_list_newest_first(client):
     made = [submit(client)["id"] for _ in range(5)]
-    found: list[str] = []
+    found = []
     token = ""
     while True:
         page = client.get("/v1/jobs", params={"page_size": 2, "page_token": token, "state": "queued"}).json()
@@ -191,7 +181,7 @@ def test_pages_join_to_the_whole_list_newest_first(client: httpx.Client) -> None
     assert problem(client.get("/v1/jobs", params={"state": "asleep"}))[1:] == ("INVALID_ARGUMENT", "state")
 
 
-def test_cancel_is_idempotent_and_retry_makes_a_successor(client: httpx.Client) -> None:
+def test_cancel_is_idempotent_and_retry_makes_a_successor(client):
     job = submit(client)
     assert problem(client.post(f"/v1/jobs/{job['id']}:retry")) == (409, "JOB_NOT_FINISHED", "job")
     for _ in range(2):
@@ -205,7 +195,7 @@ def test_cancel_is_idempotent_and_retry_makes_a_successor(client: httpx.Client) 
     assert retried.json()["id"] != job["id"]
 
 
-def test_a_finished_job_is_deleted_and_others_are_not(client: httpx.Client) -> None:
+def test_a_finished_job_is_deleted_and_others_are_not(client):
     route = f"/v1/jobs/{submit(client)['id']}"
     assert problem(client.delete(route)) == (409, "JOB_IN_USE", "job")
     client.post(f"{route}:cancel")
@@ -215,14 +205,14 @@ def test_a_finished_job_is_deleted_and_others_are_not(client: httpx.Client) -> N
         assert problem(answer) == (404, "JOB_NOT_FOUND", "job")
 
 
-def test_jobs_are_counted_for_prometheus(client: httpx.Client, jobs_service: RunningService) -> None:
+def test_jobs_are_counted_for_prometheus(client, jobs_service):
     before = len(client.get("/v1/jobs", params={"state": "queued", "page_size": 1000}).json()["jobs"])
     submit(client)
     wait_until(lambda: jobs_service.metric('ultragray_jobs{state="queued"}') == before + 1)
     assert jobs_service.metric('ultragray_jobs{state="failed"}') == 0
 
 
-def test_a_job_that_waits_has_an_empty_log_and_no_artifacts(client: httpx.Client) -> None:
+def test_a_job_that_waits_has_an_empty_log_and_no_artifacts(client):
     job = submit(client)
     log = client.get(f"/v1/jobs/{job['id']}/log")
     assert (log.status_code, log.text) == (200, "")
@@ -232,7 +222,7 @@ def test_a_job_that_waits_has_an_empty_log_and_no_artifacts(client: httpx.Client
     assert problem(answer) == (404, "ARTIFACT_NOT_FOUND", "name")
 
 
-def test_each_kind_has_a_documented_specification() -> None:
+def test_each_kind_has_a_documented_specification():
     for model, (kind, taken) in zip(SPECIFICATIONS, Specification.members.items(), strict=True):
         assert model.__name__ == f"{kind.title()}Specification"
         schema = TypeAdapter(model).json_schema()
@@ -240,9 +230,7 @@ def test_each_kind_has_a_documented_specification() -> None:
         assert set(schema["required"]) == {"dataset", "scene"} & set(schema["properties"])
 
 
-def test_a_full_queue_refuses_and_a_stopping_service_ends_the_events_at_once(
-    start_service: StartService, tmp_path: Path
-) -> None:
+def test_a_full_queue_refuses_and_a_stopping_service_ends_the_events_at_once(start_service, tmp_path):
     service = start_service(artifact_folder=tmp_path, job_queue_limit=1)
     with httpx.Client(base_url=service.http, timeout=WAIT_S) as client:
         job = submit(client, request_id="kept")
@@ -264,8 +252,8 @@ class Event:
     data: str
 
 
-def read_events(lines: Iterator[str]) -> Iterator[Event]:
-    fields: dict[str, list[str]] = {}
+def read_events(lines):
+    fields = {}
     for line in lines:
         name, _, value = line.partition(": ")
         if line:
@@ -279,12 +267,12 @@ def read_events(lines: Iterator[str]) -> Iterator[Event]:
 class ToldLog:
     """The log of a job, as a worker tells it."""
 
-    def __init__(self, folder: Path, job: str) -> None:
+    def __init__(self, folder, job):
         self._folder, self._job = folder, job
         self._storage, self._pieces = LocalStorage(folder), list[Piece]()
         self.text = ""
 
-    def write(self, text: str) -> None:
+    def write(self, text):
         piece = Piece(f"jobs/{self._job}/1-1/log-{len(self._pieces):05d}", len(text.encode()))
         self._storage.write(piece.key, text.encode())
         self._pieces.append(piece)
@@ -297,19 +285,19 @@ class ToldLog:
 
 
 @pytest.fixture
-def job(client: httpx.Client) -> str:
+def job(client):
     return str(submit(client)["id"])
 
 
 @pytest.fixture
-def log(artifacts: Path, job: str) -> ToldLog:
+def log(artifacts, job):
     return ToldLog(artifacts, job)
 
 
-def follow(client: httpx.Client, job: str, last: str, wanted: int | None = None) -> list[Event]:
+def follow(client, job, last, wanted=None):
     """The events after `last`, until the job ends, or until `wanted` came and the connection is cut."""
     headers = {"Last-Event-ID": last} if last else {}
-    told: list[Event] = []
+    told = []
     with client.stream("GET", f"/v1/jobs/{job}/events", headers=headers) as answer:
         assert answer.status_code == 200
         for event in read_events(answer.iter_lines()):
@@ -319,15 +307,13 @@ def follow(client: httpx.Client, job: str, last: str, wanted: int | None = None)
     return told
 
 
-def log_of(events: list[Event]) -> str:
+def log_of(events):
     return "".join(f"{event.data}\n" for event in events if event.name == "log")
 
 
-def test_a_client_that_comes_back_again_and_again_has_every_line_once(
-    client: httpx.Client, job: str, log: ToldLog
-) -> None:
+def test_a_client_that_comes_back_again_and_again_has_every_line_once(client, job, log):
 
-    def write() -> None:
+    def write():
         for begin in range(0, 40_000, 2000):
             log.write("".join(f"step {begin + number:06d}: ähnlich wie vorher\n" for number in range(2000)))
             stop.wait(0.1)
@@ -351,9 +337,7 @@ def test_a_client_that_comes_back_again_and_again_has_every_line_once(
     assert follow(client, job, told[-1].id) == []
 
 
-def test_who_names_no_event_or_an_unknown_one_begins_with_the_job_and_the_last_lines(
-    client: httpx.Client, job: str, log: ToldLog
-) -> None:
+def test_who_names_no_event_or_an_unknown_one_begins_with_the_job_and_the_last_lines(client, job, log):
     log.write("".join(f"line {number}\n" for number in range(5000)))
     for last in ("", "7", "of another service", "9" * 40 + "-", "-1-"):
         told = follow(client, job, last, wanted=2)
@@ -363,8 +347,8 @@ def test_who_names_no_event_or_an_unknown_one_begins_with_the_job_and_the_last_l
         assert TAIL_BYTES - 20 < len(lines) <= TAIL_BYTES
 
 
-def test_a_slow_reader_loses_no_line(client: httpx.Client, job: str, log: ToldLog) -> None:
-    told: list[Event] = []
+def test_a_slow_reader_loses_no_line(client, job, log):
+    told = []
     with client.stream("GET", f"/v1/jobs/{job}/events") as answer:
         events = read_events(answer.iter_lines())
         told.append(next(events))
@@ -372,10 +356,10 @@ def test_a_slow_reader_loses_no_line(client: httpx.Client, job: str, log: ToldLo
         client.post(f"/v1/jobs/{job}:cancel")
         told += events
     assert log_of(told) == log.text
-    final: dict[str, Any] = json.loads(told[-1].data)
+    final = json.loads(told[-1].data)
     assert final["state"] == "cancelled"
 
 
-def test_lines_that_end_with_a_carriage_return_are_told_as_lines(client: httpx.Client, job: str, log: ToldLog) -> None:
+def test_lines_that_end_with_a_carriage_return_are_told_as_lines(client, job, log):
     log.write("one\r\ntwo\r\n\r\nthree 1 %\rthree 2 %\r\n")
     assert log_of(follow(client, job, "", wanted=1)) == "one\ntwo\n\nthree 1 %\nthree 2 %\n"

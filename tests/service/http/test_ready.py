@@ -1,10 +1,6 @@
 """Ready means: frames are rendered, and jobs are taken. Who cannot write down a job is not ready for it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import httpx
 import numpy as np
@@ -13,7 +9,6 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from ...postgres import PostgresServer
 from ...waiting import wait_until
-from ..conftest import RunningService, StartService
 from ..tls.test_healthcheck import check
 
 IN_ORDER = {"ready": True, "detail": None}
@@ -22,27 +17,27 @@ FILE = "jobs.sqlite"
 _WRITE_VERSION, _CHANGE_COUNTER = 18, slice(24, 28)  # of the header of a SQLite file
 
 
-def ready(service: RunningService) -> tuple[int, dict[str, Any]]:
+def ready(service):
     answer = httpx.get(f"{service.http}/v1/health/ready", timeout=60)
     return answer.status_code, answer.json()
 
 
-def wait_for(service: RunningService, status: int) -> dict[str, Any]:
+def wait_for(service, status):
     return wait_until(lambda: (said := ready(service))[0] == status and said[1], every_s=0.2) or {}
 
 
-def health(service: RunningService, name: str) -> int:
+def health(service, name):
     with service.channel() as channel:
         stub = health_pb2_grpc.HealthStub(channel)
         return int(stub.Check(health_pb2.HealthCheckRequest(service=name), timeout=60).status)
 
 
-def renders(service: RunningService, pose_body: dict[str, Any]) -> int:
+def renders(service, pose_body):
     body = {"poses": [pose_body], "height": 16, "width": 16}
     return httpx.post(f"{service.http}/v1/scenes/demo/render", json=body, timeout=60).status_code
 
 
-def make_read_only(file: Path) -> None:
+def make_read_only(file):
     """Marks a SQLite file as one of a later format, which may be read and not written: modes do not bind root."""
     header = bytearray(file.read_bytes()[:100])
     header[_WRITE_VERSION] = 3
@@ -53,18 +48,16 @@ def make_read_only(file: Path) -> None:
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     return tmp_path / "artifacts"
 
 
 @pytest.fixture
-def service(start_service: StartService, folder: Path) -> RunningService:
+def service(start_service, folder):
     return start_service(artifact_folder=folder)
 
 
-def test_a_service_whose_sqlite_file_was_removed_is_not_ready_until_it_is_back(
-    service: RunningService, folder: Path, tmp_path: Path, pose_body: dict[str, Any]
-) -> None:
+def test_a_service_whose_sqlite_file_was_removed_is_not_ready_until_it_is_back(service, folder, tmp_path, pose_body):
     status, said = ready(service)
     in_order = dict.fromkeys(("frames", "jobs", "artifacts", "scenes"), IN_ORDER)
     assert (status, said["status"], said["components"]) == (200, "ready", in_order)
@@ -92,7 +85,7 @@ def test_a_service_whose_sqlite_file_was_removed_is_not_ready_until_it_is_back(
         assert next(watching).status == NOT_SERVING
 
 
-def test_a_service_whose_sqlite_file_is_read_only_is_not_ready(service: RunningService, folder: Path) -> None:
+def test_a_service_whose_sqlite_file_is_read_only_is_not_ready(service, folder):
     make_read_only(folder / FILE)
     problem = wait_for(service, 503)
     assert (problem["reason"], problem["components"]["artifacts"]) == ("DATABASE_UNAVAILABLE", IN_ORDER)
@@ -103,7 +96,7 @@ def test_a_service_whose_sqlite_file_is_read_only_is_not_ready(service: RunningS
     assert (refused.status_code, refused.json()["reason"]) == (503, "DATABASE_UNAVAILABLE"), refused.text
 
 
-def test_a_service_without_its_share_is_not_ready(service: RunningService, folder: Path, tmp_path: Path) -> None:
+def test_a_service_without_its_share_is_not_ready(service, folder, tmp_path):
     folder.rename(tmp_path / "unmounted")
     folder.mkdir()
     components = wait_for(service, 503)["components"]
@@ -112,7 +105,7 @@ def test_a_service_without_its_share_is_not_ready(service: RunningService, folde
     assert str(tmp_path) not in str(ready(service))
 
 
-def test_a_service_that_only_renders_is_ready_without_jobs_and_tells(start_service: StartService, folder: Path) -> None:
+def test_a_service_that_only_renders_is_ready_without_jobs_and_tells(start_service, folder):
     service = start_service(artifact_folder=folder, ready_without_jobs=True)
     (folder / FILE).unlink()
     wait_until(lambda: not ready(service)[1]["components"]["jobs"]["ready"], every_s=0.2)
@@ -139,13 +132,8 @@ Change = Callable[[PostgresServer, str], None]
     ],
 )
 def test_a_service_whose_server_is_away_or_read_only_is_not_ready_until_it_is_back(
-    start_service: StartService,
-    postgres: PostgresServer,
-    folder: Path,
-    take_away: Change,
-    give_back: Change,
-    said: str,
-) -> None:
+    start_service, postgres, folder, take_away, give_back, said
+):
     url = postgres.create_database()
     service = start_service(artifact_folder=folder, database_url=url)
     assert ready(service)[0] == 200

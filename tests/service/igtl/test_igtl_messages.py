@@ -1,14 +1,10 @@
 """OpenIGTLink without a service: messages, what they hold, their names, and poses that wait for their frames."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import math
 import struct
-from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -23,7 +19,6 @@ from pyigtl.messages import MessageBase
 from ultragray import ConvexProbe, LinearProbe
 from ultragray.errors import InvalidPose, UltragrayError
 from ultragray.geometry.pose import check_poses
-from ultragray.geometry.probe import Probe
 from ultragray.geometry.registration import Registration, rows
 from ultragray.geometry.scan_conversion import scan_convert
 from ultragray.rendering.display import true_to_scale
@@ -51,7 +46,7 @@ from ultragray_service.igtl.contents import (
     unpack_status,
     unpack_transform,
 )
-from ultragray_service.igtl.frames import MAX_WAITING_DEVICES, Feed, PoseMessage, Underway, WaitingPoses, image_of
+from ultragray_service.igtl.frames import MAX_WAITING_DEVICES, Feed, PoseMessage, WaitingPoses, image_of
 from ultragray_service.igtl.messages import (
     DEVICE_NAME_BYTES,
     HEADER_BYTES,
@@ -71,14 +66,14 @@ from ...waiting import SkippingLoop
 from .conftest import FAN, random_pose
 
 IMAGE = np.arange(12, dtype=np.uint8).reshape(1, 3, 4)
-THEIRS: dict[str, Any] = {
+THEIRS = {
     "TRANSFORM": lambda: pyigtl.TransformMessage(np.diag([1.0, -1, -1, 1]), device_name="Probe", timestamp=2.5),
     "IMAGE": lambda: pyigtl.ImageMessage(IMAGE, device_name="Probe", timestamp=2.5),
     "STRING": lambda: pyigtl.StringMessage("hello", device_name="Probe", timestamp=2.5),
 }
 
 
-def unpacked(data: bytes) -> Message:
+def unpacked(data):
     header = unpack_header(data[:HEADER_BYTES])
     assert header.body_bytes == len(data) - HEADER_BYTES
     return unpack_message(header, data[HEADER_BYTES:])
@@ -86,7 +81,7 @@ def unpacked(data: bytes) -> Message:
 
 @pytest.mark.parametrize("type_name", THEIRS)
 @pytest.mark.parametrize("version", [1, 2])
-def test_what_pyigtl_packs_we_read(type_name: str, version: int) -> None:
+def test_what_pyigtl_packs_we_read(type_name, version):
     theirs = THEIRS[type_name]()
     theirs.header_version = version
     if version == 2:
@@ -101,7 +96,7 @@ def test_what_pyigtl_packs_we_read(type_name: str, version: int) -> None:
 
 
 @pytest.mark.parametrize("version", [1, 2])
-def test_what_we_pack_pyigtl_reads(version: int) -> None:
+def test_what_we_pack_pyigtl_reads(version):
     metadata = {"scene": "demo", "renderer": "x"} if version == 2 else {}
     content = pyigtl.TransformMessage(np.eye(4))._pack_content()
     packed = pack_message(Message("TRANSFORM", "Probe", content, 5 << 32, version, 7 * (version - 1), metadata))
@@ -124,9 +119,7 @@ texts = st.text(st.characters(exclude_categories=("C", "Z")), max_size=12)
     st.integers(0, 2**32 - 1),
     st.dictionaries(texts, texts, max_size=3),
 )
-def test_round_trip(
-    type_name: str, device_name: str, content: bytes, timestamp: int, message_id: int, metadata: dict[str, str]
-) -> None:
+def test_round_trip(type_name, device_name, content, timestamp, message_id, metadata):
     for message in (
         Message(type_name, device_name, content, timestamp),
         Message(type_name, device_name, content, timestamp, 2, message_id, metadata),
@@ -135,19 +128,19 @@ def test_round_trip(
 
 
 @given(st.binary(min_size=HEADER_BYTES, max_size=HEADER_BYTES))
-def test_any_bytes_are_a_header_or_refused(data: bytes) -> None:
+def test_any_bytes_are_a_header_or_refused(data):
     with contextlib.suppress(IgtlMessageInvalid):
         assert unpack_header(data).version in (1, 2)
 
 
 @given(st.binary(max_size=80))
-def test_any_bytes_are_a_body_or_refused(body: bytes) -> None:
+def test_any_bytes_are_a_body_or_refused(body):
     header = Header(2, "TRANSFORM", "Probe", 0, len(body), crc64.ecma_182(body))
     with contextlib.suppress(IgtlMessageInvalid):
         assert len(unpack_message(header, body).content) <= len(body) - 12
 
 
-def test_a_wrong_checksum_is_refused() -> None:
+def test_a_wrong_checksum_is_refused():
     data = bytearray(pack_message(Message("TRANSFORM", "Probe", bytes(48))))
     data[-1] ^= 1
     with pytest.raises(IgtlMessageInvalid, match="CRC-64") as caught:
@@ -155,7 +148,7 @@ def test_a_wrong_checksum_is_refused() -> None:
     assert caught.value.field == "crc"
 
 
-def test_metadata_that_reaches_beyond_the_body_is_refused() -> None:
+def test_metadata_that_reaches_beyond_the_body_is_refused():
     data = bytearray(pack_message(Message("TRANSFORM", "Probe", b"", version=2, metadata={"key": "value"})))
     body = data[HEADER_BYTES:]
     body[14:16] = (200).to_bytes(2, "big")  # the size of the key
@@ -164,7 +157,7 @@ def test_metadata_that_reaches_beyond_the_body_is_refused() -> None:
         unpack_message(header, bytes(body))
 
 
-def test_names_are_cut_between_characters() -> None:
+def test_names_are_cut_between_characters():
     assert pack_text("Sonde für Leber, rechts", 20) == "Sonde für Leber, re".encode()
     assert pack_text("ü" * 11, 20) == ("ü" * 10).encode()
     assert pack_text("ü" * 11, 19) == ("ü" * 9).encode()
@@ -174,7 +167,7 @@ QUARTER_TURN = np.array([[0.0, -1, 0, 1], [1, 0, 0, 2], [0, 0, 1, 3], [0, 0, 0, 
 HALF = 0.5**0.5
 
 
-def test_a_transform_is_written_column_by_column() -> None:
+def test_a_transform_is_written_column_by_column():
     content = pack_transform(QUARTER_TURN)
     assert struct.unpack(">12f", content) == (0, 1, 0, -1, 0, 0, 0, 0, 1, 1, 2, 3)
     assert content == pyigtl.TransformMessage(QUARTER_TURN)._pack_content()
@@ -182,7 +175,7 @@ def test_a_transform_is_written_column_by_column() -> None:
 
 
 @given(st.integers(0, 2**32))
-def test_transforms_round_trip(seed: int) -> None:
+def test_transforms_round_trip(seed):
     pose = random_pose(seed)
     assert np.array_equal(unpack_transform(pack_transform(pose)), check_poses(pose)[0])
 
@@ -196,13 +189,13 @@ def test_transforms_round_trip(seed: int) -> None:
         ((1, 2, 3, 0, 0, -HALF, -HALF), QUARTER_TURN),
     ],
 )
-def test_the_forms_of_a_position(numbers: tuple[float, ...], expected: np.ndarray) -> None:
+def test_the_forms_of_a_position(numbers, expected):
     pose = unpack_position(struct.pack(f">{len(numbers)}f", *numbers))
     assert pose == pytest.approx(expected, abs=1e-7)
 
 
 @given(st.integers(0, 2**32))
-def test_positions_and_tools_round_trip(seed: int) -> None:
+def test_positions_and_tools_round_trip(seed):
     pose, other = check_poses(random_pose(seed))[0], check_poses(random_pose(seed + 1))[0]
     assert unpack_position(pack_position(pose)) == pytest.approx(pose, abs=1e-5)
     for type_name, element in (("TDATA", 70), ("QTDATA", 50)):
@@ -214,14 +207,14 @@ def test_positions_and_tools_round_trip(seed: int) -> None:
         assert tools[1].pose == pytest.approx(other, abs=1e-5)
 
 
-def test_tools_without_orientation_are_left_out() -> None:
+def test_tools_without_orientation_are_left_out():
     content = bytearray(pack_instruments("QTDATA", [Instrument("Tip", np.eye(4)), Instrument("Probe", np.eye(4))]))
     content[20] = 3  # a 3D instrument
     assert [tool.name for tool in unpack_instruments("QTDATA", bytes(content))] == ["Probe"]
 
 
 @pytest.mark.parametrize("lost", [0.0, float("nan")])
-def test_a_tool_that_the_tracker_lost_costs_the_probe_nothing(lost: float) -> None:
+def test_a_tool_that_the_tracker_lost_costs_the_probe_nothing(lost):
     content = pack_instruments("TDATA", [Instrument("Probe", np.eye(4))])
     content += struct.pack(">20sBB12f", b"Needle", 2, 0, *[lost] * 12)
     assert [one.name for one in unpack_instruments("TDATA", content, lambda name: name == "Needle")] == ["Probe"]
@@ -229,7 +222,7 @@ def test_a_tool_that_the_tracker_lost_costs_the_probe_nothing(lost: float) -> No
         unpack_instruments("TDATA", content)
 
 
-def test_what_is_no_pose_is_refused() -> None:
+def test_what_is_no_pose_is_refused():
     mirror = np.diag([1.0, 1, -1, 1])
     with pytest.raises(InvalidPose, match="TRANSFORM must hold a rotation"):
         unpack_transform(pack_transform(mirror))
@@ -243,7 +236,7 @@ def test_what_is_no_pose_is_refused() -> None:
         unpack_instruments("QTDATA", struct.pack(">20sBB7f", b"Probe", 2, 0, *[0.0] * 7))
 
 
-UNPACKERS: list[Callable[[bytes], object]] = [
+UNPACKERS = [
     unpack_transform,
     unpack_position,
     lambda content: unpack_instruments("TDATA", content),
@@ -256,18 +249,18 @@ UNPACKERS: list[Callable[[bytes], object]] = [
 
 @pytest.mark.parametrize("unpack", UNPACKERS)
 @given(content=st.binary(max_size=160))
-def test_any_content_is_read_or_refused(unpack: Callable[[bytes], object], content: bytes) -> None:
+def test_any_content_is_read_or_refused(unpack, content):
     with contextlib.suppress(UltragrayError):
         unpack(content)
 
 
 @pytest.mark.parametrize("unpack", UNPACKERS)
-def test_sizes_that_cannot_be_are_told(unpack: Callable[[bytes], object]) -> None:
+def test_sizes_that_cannot_be_are_told(unpack):
     with pytest.raises(IgtlMessageInvalid, match="got 3"):
         unpack(bytes(3))
 
 
-def test_an_image_is_as_pyigtl_writes_it() -> None:
+def test_an_image_is_as_pyigtl_writes_it():
     pixels = np.random.default_rng(0).integers(0, 256, (5, 8), np.uint8)
     matrix = QUARTER_TURN @ np.diag([0.5, 0.25, 1.0, 1.0])
     content = pack_image(Image(pixels, matrix))
@@ -277,7 +270,7 @@ def test_an_image_is_as_pyigtl_writes_it() -> None:
     assert image.matrix == pytest.approx(matrix)
 
 
-def test_an_image_that_is_not_one_slice_of_bytes_is_refused() -> None:
+def test_an_image_that_is_not_one_slice_of_bytes_is_refused():
     for array in (np.zeros((2, 3, 4), np.uint8), np.zeros((1, 3, 4), np.uint16), np.zeros((1, 3, 4, 3), np.uint8)):
         with pytest.raises(IgtlMessageInvalid, match="8-bit"):
             unpack_image(pyigtl.ImageMessage(array)._pack_content())
@@ -285,7 +278,7 @@ def test_an_image_that_is_not_one_slice_of_bytes_is_refused() -> None:
         unpack_image(pyigtl.ImageMessage(np.zeros((1, 3, 4), np.uint8))._pack_content()[:-1])
 
 
-def test_status_and_capability() -> None:
+def test_status_and_capability():
     status = Status(12, 400, "IGTL_MESSAGE_INVALID", "no")
     content = pack_status(status)
     assert struct.unpack_from(">Hq", content) == (12, 400)
@@ -293,12 +286,12 @@ def test_status_and_capability() -> None:
     assert pack_capability(["TRANSFORM", "STT_TRANSFOR"]) == b"TRANSFORM\0\0\0STT_TRANSFOR"
 
 
-def test_intervals() -> None:
+def test_intervals():
     assert unpack_interval_s(b"") == 0.0
     assert unpack_interval_s(struct.pack(">I32s", 50, b"Reference")) == 0.05
 
 
-def result_of(frame: Any, probe: Probe, pose: Any, max_side: int = 2048) -> RenderResult:
+def result_of(frame, probe, pose, max_side=2048):
     """As the pool answers it."""
     display = true_to_scale(probe, frame.shape[0], max_side)
     shown = show({"bmode": torch.from_numpy(frame[None])}, probe, display)["bmode"][0].numpy()
@@ -317,21 +310,21 @@ def result_of(frame: Any, probe: Probe, pose: Any, max_side: int = 2048) -> Rend
     )
 
 
-def spot(shape: tuple[int, int], row: int, column: int) -> Any:
+def spot(shape, row, column):
     frame = np.zeros(shape, np.uint8)
     frame[row - 1 : row + 2, column - 1 : column + 2] = 100
     frame[row, column] = 255
     return frame
 
 
-def place_of_brightest(image: Any) -> Any:
+def place_of_brightest(image):
     j, i = np.unravel_index(int(np.argmax(image.pixels)), image.pixels.shape)
     return (image.matrix @ (i, j, 0, 1))[:3]
 
 
 @pytest.mark.parametrize("probe", [LinearProbe(38.0, 5.0, 50.0), FAN])
 @pytest.mark.parametrize(("row", "column"), [(20, 10), (50, 90), (90, 50)])
-def test_a_spot_is_where_the_probe_says(probe: Probe, row: int, column: int) -> None:
+def test_a_spot_is_where_the_probe_says(probe, row, column):
     pose = random_pose(3)
     image = image_of(result_of(spot((100, 100), row, column), probe, pose))
     origins, directions = probe.scan_lines(100)
@@ -340,7 +333,7 @@ def test_a_spot_is_where_the_probe_says(probe: Probe, row: int, column: int) -> 
     assert np.linalg.norm(place_of_brightest(image) - expected) < 0.4  # a pixel's diagonal
 
 
-def test_a_linear_frame_is_sent_as_it_is() -> None:
+def test_a_linear_frame_is_sent_as_it_is():
     frame = np.random.default_rng(0).integers(0, 256, (30, 20), np.uint8)
     image = image_of(result_of(frame, LinearProbe(40.0, 0.0, 60.0), np.eye(4)))
     assert np.array_equal(image.pixels, frame)
@@ -349,7 +342,7 @@ def test_a_linear_frame_is_sent_as_it_is() -> None:
     assert np.linalg.det(image.matrix[:3, :3]) > 0
 
 
-def test_a_fan_is_scan_converted() -> None:
+def test_a_fan_is_scan_converted():
     frame = np.random.default_rng(0).integers(0, 256, (80, 60), np.uint8)
     image = image_of(result_of(frame, FAN, np.eye(4)))
     expected = scan_convert(frame, FAN, 0.5)  # 40 mm in 80 samples
@@ -361,7 +354,7 @@ def test_a_fan_is_scan_converted() -> None:
     assert image.matrix[2, 3] == pytest.approx(top_mm + 0.25)
 
 
-def test_a_fan_that_would_be_too_large_gets_larger_pixels() -> None:
+def test_a_fan_that_would_be_too_large_gets_larger_pixels():
     probe = ConvexProbe(opening_angle_deg=170.0, near_mm=9990.0, far_mm=10_000.0)
     image = image_of(result_of(np.full((64, 64), 200, np.uint8), probe, np.eye(4), 300))
     assert max(image.pixels.shape) in (299, 300)
@@ -382,7 +375,7 @@ def test_a_fan_that_would_be_too_large_gets_larger_pixels() -> None:
         ("abcdefghijklmnopqrst", "abcdefghijklmnopqrst", "Image_abcdefghijklmn"),
     ],
 )
-def test_names(device: str, frame: str, image: str) -> None:
+def test_names(device, frame, image):
     assert (frame_of(device), image_name(device)) == (frame, image)
 
 
@@ -397,19 +390,19 @@ def test_names(device: str, frame: str, image: str) -> None:
         ("a-name-of-twenty-one-b", "ProbeToReference"),
     ],
 )
-def test_a_scene_has_a_device_that_names_it(scene: str, device: str) -> None:
+def test_a_scene_has_a_device_that_names_it(scene, device):
     assert device_of(scene) == device
     assert device == "ProbeToReference" or scene in (device, frame_of(device))
 
 
-def chooser(folder: Path, *names: str, default: str | None = None) -> SceneChooser:
+def chooser(folder, *names, default=None):
     for name in names:
         (folder / f"{name}.ugr").touch()
     return SceneChooser(SceneCatalog(SceneStore(folder)), default)
 
 
-def test_the_device_chooses_else_the_default_else_the_only_one(tmp_path: Path) -> None:
-    async def choices(one: SceneChooser, *devices: str) -> list[str]:
+def test_the_device_chooses_else_the_default_else_the_only_one(tmp_path):
+    async def choices(one, *devices):
         return [await one.choose(device) for device in devices]
 
     only = chooser(tmp_path, "liver")
@@ -421,8 +414,8 @@ def test_the_device_chooses_else_the_default_else_the_only_one(tmp_path: Path) -
         asyncio.run(choices(chooser(tmp_path), "ProbeToReference"))
 
 
-def test_scenes_that_come_later_are_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    async def before_and_after() -> list[str | None]:
+def test_scenes_that_come_later_are_found(tmp_path, monkeypatch):
+    async def before_and_after():
         one = chooser(tmp_path, "liver")
         found = [await one.named("spine")]
         (tmp_path / "spine.ugr").touch()
@@ -442,36 +435,36 @@ class FakeTurn:
 
     poses: Any = None
 
-    def give_to(self, poses: Any, deadline: float) -> bool:
+    def give_to(self, poses, deadline):
         self.poses = poses
         return True
 
 
-def waits_in_the_pool(underway: Underway) -> FakeTurn:
-    underway.turn, underway.setup = (turn := FakeTurn()), SETUP  # type: ignore[assignment]
+def waits_in_the_pool(underway):
+    underway.turn, underway.setup = (turn := FakeTurn()), SETUP
     return turn
 
 
-def posed(device_name: str, x_mm: float = 0.0) -> PoseMessage:
+def posed(device_name, x_mm=0.0):
     pose = np.eye(4)
     pose[0, 3] = x_mm
     return PoseMessage(Message("TRANSFORM", device_name), pose, 0.0)
 
 
-async def taken(waiting: WaitingPoses) -> Underway:
+async def taken(waiting):
     await waiting.come()
     return waiting.take()
 
 
-def with_poses(work: Callable[[WaitingPoses], Awaitable[None]]) -> None:
-    async def main() -> None:
+def with_poses(work):
+    async def main():
         await work(WaitingPoses())
 
     asyncio.run(main())
 
 
-def test_each_device_has_its_turn_with_its_newest_pose() -> None:
-    async def work(waiting: WaitingPoses) -> None:
+def test_each_device_has_its_turn_with_its_newest_pose():
+    async def work(waiting):
         replaced = [
             waiting.put(posed(name, x_mm), 0.0, SETUP) for name, x_mm in (("a", 1), ("b", 2), ("a", 3), ("a", 4))
         ]
@@ -483,8 +476,8 @@ def test_each_device_has_its_turn_with_its_newest_pose() -> None:
     with_poses(work)
 
 
-def test_a_newer_pose_takes_the_turn_of_one_that_waits_in_the_pool() -> None:
-    async def work(waiting: WaitingPoses) -> None:
+def test_a_newer_pose_takes_the_turn_of_one_that_waits_in_the_pool():
+    async def work(waiting):
         waiting.put(posed("a", 1), 0.0, SETUP)
         underway = await taken(waiting)
         assert not waiting.put(posed("a", 2), 0.0, SETUP)  # it is being rendered
@@ -502,8 +495,8 @@ def test_a_newer_pose_takes_the_turn_of_one_that_waits_in_the_pool() -> None:
     with_poses(work)
 
 
-def test_a_pose_does_not_take_the_turn_of_one_with_another_setup() -> None:
-    async def work(waiting: WaitingPoses) -> None:
+def test_a_pose_does_not_take_the_turn_of_one_with_another_setup():
+    async def work(waiting):
         waiting.put(posed("a", 1), 0.0, SETUP)
         underway = await taken(waiting)
         turn = waits_in_the_pool(underway)
@@ -520,8 +513,8 @@ def test_a_pose_does_not_take_the_turn_of_one_with_another_setup() -> None:
     with_poses(work)
 
 
-def test_a_pose_that_takes_a_turn_is_led_as_the_one_before() -> None:
-    async def work(waiting: WaitingPoses) -> None:
+def test_a_pose_that_takes_a_turn_is_led_as_the_one_before():
+    async def work(waiting):
         waiting.put(posed("a", 1), 0.0, SETUP)
         underway = await taken(waiting)
         turn = waits_in_the_pool(underway)
@@ -533,8 +526,8 @@ def test_a_pose_that_takes_a_turn_is_led_as_the_one_before() -> None:
     with_poses(work)
 
 
-def test_devices_without_end_are_refused() -> None:
-    async def work(waiting: WaitingPoses) -> None:
+def test_devices_without_end_are_refused():
+    async def work(waiting):
         for number in range(MAX_WAITING_DEVICES):
             waiting.put(posed(str(number)), 0.0, SETUP)
         assert waiting.put(posed("0"), 0.0, SETUP)
@@ -544,8 +537,8 @@ def test_devices_without_end_are_refused() -> None:
     with_poses(work)
 
 
-def test_settled_is_when_nothing_waits_and_nothing_is_under_way() -> None:
-    async def work(waiting: WaitingPoses) -> None:
+def test_settled_is_when_nothing_waits_and_nothing_is_under_way():
+    async def work(waiting):
         await waiting.settled()
         waiting.put(posed("a"), 0.0, SETUP)
         await taken(waiting)
@@ -562,27 +555,27 @@ def test_settled_is_when_nothing_waits_and_nothing_is_under_way() -> None:
 class _FrameOf:
     """A frame that goes by any name."""
 
-    def goes_by(self, name: str) -> bool:
+    def goes_by(self, name):
         return True
 
-    def message(self, kind: str, version: int) -> Message:
+    def message(self, kind, version):
         return Message(kind, "robot", version=version)
 
 
-def test_a_subscriber_is_told_at_most_as_often_as_it_asks(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_subscriber_is_told_at_most_as_often_as_it_asks(monkeypatch):
     loop = SkippingLoop()
     monkeypatch.setattr("ultragray_service.igtl.frames.time.monotonic", loop.time)
-    told: list[float] = []
+    told = []
 
-    async def send(message: Message) -> None:
+    async def send(message):
         told.append(loop.time())
 
-    async def work() -> None:
+    async def work():
         feed = Feed(contextlib.nullcontext, send)
         feed.start("QTDATA", "", 0.3, 1)
         running = asyncio.ensure_future(feed.run())
         for _ in range(100):
-            feed.offer(_FrameOf(), is_own=True)  # type: ignore[arg-type]
+            feed.offer(_FrameOf(), is_own=True)
             await asyncio.sleep(0.01)
         feed.stop("QTDATA")
         await asyncio.sleep(1.0)

@@ -4,17 +4,12 @@
 STATUS with metadata, so that headers of version 2 are understood, then the nodes to push, then commands.
 """
 
-from __future__ import annotations
-
 import json
 import struct
 from dataclasses import dataclass
-from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
-import numpy.typing as npt
 import pyigtl
 import pytest
 
@@ -22,7 +17,7 @@ from ultragray.geometry.pose import check_poses
 from ultragray.scene.info import read_header
 
 from ..cli.command_line import refused, run
-from ..conftest import DEMO_PROBE, HEIGHT, WIDTH, RunningService, make_scene
+from ..conftest import DEMO_PROBE, HEIGHT, WIDTH, make_scene
 from .conftest import address_of, moved, pyigtl_client
 from .test_igtl_commands import _CommandMessage, command
 from .test_igtl_server import over_grpc
@@ -34,24 +29,24 @@ class Opened:
 
     nodes: dict[str, tuple[str, dict[str, str]]]
 
-    def node(self, tag: str) -> dict[str, str]:
+    def node(self, tag):
         [found] = [values for name, values in self.nodes.values() if name == tag]
         return found
 
-    def references(self, tag: str) -> dict[str, list[str]]:
+    def references(self, tag):
         text = self.node(tag).get("references", "")
         return {role: ids.split() for role, ids in (one.split(":") for one in text.split(";") if one)}
 
-    def attributes(self, tag: str) -> dict[str, str]:
+    def attributes(self, tag):
         return dict(one.split(":", 1) for one in self.node(tag)["attributes"].split(";"))
 
     @property
-    def pose(self) -> npt.NDArray[np.float64]:
+    def pose(self):
         numbers = self.node("LinearTransform")["matrixTransformToParent"].split()
         return np.array(numbers, np.float64).reshape(4, 4)
 
 
-def open_scene(path: Path) -> Opened:
+def open_scene(path):
     root = ElementTree.fromstring(path.read_text(encoding="utf-8"))
     assert root.tag == "MRML"
     nodes = {node.get("id", ""): (node.tag, dict(node.attrib)) for node in root}
@@ -60,7 +55,7 @@ def open_scene(path: Path) -> Opened:
 
 
 @pytest.fixture
-def written(igtl_service: RunningService, igtl_folder: Path, tmp_path: Path) -> Opened:
+def written(igtl_service, igtl_folder, tmp_path):
     """What `ultragray slicer` writes for the scene `demo` and the running service."""
     arguments = ("slicer", igtl_folder / "demo.ugr", "-o", tmp_path / "demo.mrml", "--spacing-mm", 2)
     result = run(*arguments, "--igtl-address", address_of(igtl_service), "--json")
@@ -70,9 +65,7 @@ def written(igtl_service: RunningService, igtl_folder: Path, tmp_path: Path) -> 
     return open_scene(tmp_path / "demo.mrml")
 
 
-def test_the_connector_resumes_and_pushes_the_pose_of_a_training_view(
-    written: Opened, igtl_service: RunningService, igtl_folder: Path
-) -> None:
+def test_the_connector_resumes_and_pushes_the_pose_of_a_training_view(written, igtl_service, igtl_folder):
     connector = written.node("IGTLConnector")
     assert (connector["connectorType"], connector["persistent"], connector["state"]) == ("CLIENT", "1", "1")
     assert f"{connector['serverHostname']}:{connector['serverPort']}" == address_of(igtl_service)
@@ -81,21 +74,19 @@ def test_the_connector_resumes_and_pushes_the_pose_of_a_training_view(
     np.testing.assert_array_equal(written.pose, poses[len(poses) // 2])
 
 
-class _Plain(pyigtl.messages.MessageBase):  # type: ignore[misc]
+class _Plain(pyigtl.messages.MessageBase):
     """A message of a type that pyigtl has no class for."""
 
-    def __init__(self, type_name: str, device_name: str, content: bytes = b"", **metadata: str) -> None:
+    def __init__(self, type_name, device_name, content=b"", **metadata):
         super().__init__(device_name=device_name)
         self._message_type, self._content, self._valid_message = type_name, content, True
         self.metadata, self.header_version = metadata, 2 if metadata else 1
 
-    def _pack_content(self) -> bytes:
+    def _pack_content(self):
         return self._content
 
 
-def test_a_connector_of_slicer_sees_the_scene_live(
-    written: Opened, monkeypatch: pytest.MonkeyPatch, igtl_service: RunningService
-) -> None:
+def test_a_connector_of_slicer_sees_the_scene_live(written, monkeypatch, igtl_service):
     monkeypatch.setitem(pyigtl.messages.message_type_to_class_constructor, "RTS_COMMAND", _CommandMessage)
     connector, device = written.node("IGTLConnector"), written.node("LinearTransform")["name"]
     with pyigtl_client(f"{connector['serverHostname']}:{connector['serverPort']}") as client:
@@ -122,13 +113,13 @@ def test_a_connector_of_slicer_sees_the_scene_live(
         assert len(client.wait_for_message("Image_demo", timeout=60).image[0]) == HEIGHT // 2
 
 
-def push(client: pyigtl.OpenIGTLinkClient, device: str, pose: npt.NDArray[Any]) -> None:
+def push(client, device, pose):
     message = pyigtl.TransformMessage(pose, device_name=device)
     message.header_version = 2
     client.send_message(message)
 
 
-def test_what_cannot_be_written_is_told_before_the_work(tmp_path: Path) -> None:
+def test_what_cannot_be_written_is_told_before_the_work(tmp_path):
     make_scene(20).save(tmp_path / "one.ugr")
     scene, output = tmp_path / "one.ugr", tmp_path / "one.mrml"
     assert "must end in .mrml" in refused("slicer", scene, "-o", tmp_path / "one.xml")

@@ -1,13 +1,9 @@
 """One client, without a key or with one, cannot hold up the HTTP port: not by size, not by time, not by number."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import socket
 import time
-from collections.abc import Iterator
-from typing import Any
 from urllib.parse import urlsplit
 
 import httpx
@@ -16,7 +12,6 @@ import pytest
 from websockets.sync.client import connect
 
 from ...waiting import wait_until
-from ..conftest import RunningService, StartService
 
 MEBIBYTE = 2**20
 HEADER_BYTES = 64 * 1024
@@ -28,7 +23,7 @@ TIMEOUT_S = 60.0
 
 
 @pytest.fixture(scope="module")
-def limited(start_service: StartService) -> RunningService:
+def limited(start_service):
     """A service with limits that a test reaches in moments."""
     return start_service(
         api_keys=KEY,
@@ -43,7 +38,7 @@ def limited(start_service: StartService) -> RunningService:
 
 
 @pytest.fixture(autouse=True)
-def _others_are_answered(limited: RunningService) -> Iterator[None]:
+def _others_are_answered(limited):
     """Whatever one address does, another is answered at once."""
     yield
     with open_socket(limited, "127.0.0.9") as other:
@@ -51,7 +46,7 @@ def _others_are_answered(limited: RunningService) -> Iterator[None]:
         assert status_of(answer(other)) == 200
 
 
-def open_socket(service: RunningService, source: str = "127.0.0.1", **options: int) -> socket.socket:
+def open_socket(service, source="127.0.0.1", **options):
     parts = urlsplit(service.http)
     opened = socket.socket()
     for option, value in options.items():
@@ -62,7 +57,7 @@ def open_socket(service: RunningService, source: str = "127.0.0.1", **options: i
     return opened
 
 
-def answer(opened: socket.socket) -> bytes:
+def answer(opened):
     """Head and body of one answer; empty where the server closed without one."""
     data = b""
     while b"\r\n\r\n" not in data:
@@ -76,21 +71,21 @@ def answer(opened: socket.socket) -> bytes:
     return head + b"\r\n\r\n" + body
 
 
-def status_of(data: bytes) -> int:
+def status_of(data):
     return int(data.split(b" ", 2)[1])
 
 
-def problem_of(data: bytes) -> dict[str, Any]:
+def problem_of(data):
     head, _, body = data.partition(b"\r\n\r\n")
     assert b"content-type: application/problem+json" in head.lower()
     assert b"connection: close" in head.lower()
-    problem: dict[str, Any] = json.loads(body)
+    problem = json.loads(body)
     assert problem["status"] == status_of(data)
     assert problem["request_id"]
     return problem
 
 
-def is_closed(opened: socket.socket) -> bool:
+def is_closed(opened):
     try:
         while opened.recv(65536):
             pass
@@ -99,7 +94,7 @@ def is_closed(opened: socket.socket) -> bool:
     return True
 
 
-def send_until_refused(opened: socket.socket, data: bytes) -> None:
+def send_until_refused(opened, data):
     with contextlib.suppress(ConnectionError):
         opened.sendall(data)
 
@@ -116,9 +111,7 @@ def send_until_refused(opened: socket.socket, data: bytes) -> None:
     ],
     ids=["request line", "header", "header name", "headers", "empty lines", "method"],
 )
-def test_a_head_without_end_is_refused_while_it_comes(
-    limited: RunningService, start: bytes, filling: bytes, status: int, reason: str
-) -> None:
+def test_a_head_without_end_is_refused_while_it_comes(limited, start, filling, status, reason):
     before = limited.resident_bytes()
     with open_socket(limited) as opened:
         opened.sendall(start)
@@ -132,13 +125,13 @@ def test_a_head_without_end_is_refused_while_it_comes(
     assert limited.resident_bytes() - before < 30 * MEBIBYTE
 
 
-def test_a_head_within_the_limits_is_answered(limited: RunningService) -> None:
+def test_a_head_within_the_limits_is_answered(limited):
     with open_socket(limited) as opened:
         opened.sendall(REQUEST + b"X-Long: " + b"a" * 30_000 + b"\r\n" + b"X-Many: 1\r\n" * 100 + b"\r\n")
         assert status_of(answer(opened)) == 200
 
 
-def test_more_headers_than_allowed_are_refused(limited: RunningService) -> None:
+def test_more_headers_than_allowed_are_refused(limited):
     with open_socket(limited) as opened:
         opened.sendall(REQUEST + b"a:\r\n" * 1000 + b"\r\n")
         problem = problem_of(answer(opened))
@@ -147,13 +140,13 @@ def test_more_headers_than_allowed_are_refused(limited: RunningService) -> None:
 
 
 @pytest.mark.parametrize("trailers", [b"X-A: " + b"b" * 150_000 + b"\r\n", b"X-A: b\r\n" * 20_000])
-def test_trailers_are_bounded_like_headers(limited: RunningService, trailers: bytes) -> None:
+def test_trailers_are_bounded_like_headers(limited, trailers):
     with open_socket(limited) as opened:
         opened.sendall(CHUNKED + f"X-API-Key: {KEY}\r\n\r\n0\r\n".encode() + trailers + b"\r\n")
         assert status_of(answer(opened)) == 431
 
 
-def test_trailers_are_no_headers(limited: RunningService) -> None:
+def test_trailers_are_no_headers(limited):
     with open_socket(limited) as opened:
         opened.sendall(CHUNKED + f"\r\n0\r\nX-API-Key: {KEY}\r\n\r\n".encode())
         assert status_of(answer(opened)) == 401
@@ -161,7 +154,7 @@ def test_trailers_are_no_headers(limited: RunningService) -> None:
         assert status_of(answer(opened)) == 200
 
 
-def test_requests_piled_up_on_one_connection_are_refused(limited: RunningService) -> None:
+def test_requests_piled_up_on_one_connection_are_refused(limited):
     with open_socket(limited) as opened:
         opened.sendall((REQUEST + b"\r\n") * 20)
         assert [status_of(answer(opened)) for _ in range(1)] == [200]
@@ -173,7 +166,7 @@ def test_requests_piled_up_on_one_connection_are_refused(limited: RunningService
 
 
 @pytest.mark.parametrize("sent", [b"", b"GET / HTTP/1.1\r\n", REQUEST + b"\r\n" + REQUEST])
-def test_a_head_that_does_not_end_in_time_is_cut(limited: RunningService, sent: bytes) -> None:
+def test_a_head_that_does_not_end_in_time_is_cut(limited, sent):
     with open_socket(limited) as opened:
         opened.sendall(sent)
         if sent.count(b"\r\n\r\n"):
@@ -183,7 +176,7 @@ def test_a_head_that_does_not_end_in_time_is_cut(limited: RunningService, sent: 
         assert is_closed(opened)
 
 
-def test_a_body_that_trickles_is_cut(limited: RunningService) -> None:
+def test_a_body_that_trickles_is_cut(limited):
     head = b"POST /v1/scenes/demo/render HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100000\r\nX-API-Key: "
     with open_socket(limited) as opened:
         opened.sendall(head + KEY.encode() + b"\r\n\r\n")
@@ -193,7 +186,7 @@ def test_a_body_that_trickles_is_cut(limited: RunningService) -> None:
                 time.sleep(0.1)
 
 
-def test_a_body_at_the_least_rate_is_taken(limited: RunningService) -> None:
+def test_a_body_at_the_least_rate_is_taken(limited):
     body = json.dumps({"pose": {"matrix": np.eye(4).tolist()}, "height": 8, "width": 8}).encode().ljust(6000)
     head = f"POST /v1/scenes/demo/render HTTP/1.1\r\nHost: localhost\r\nContent-Length: {len(body)}\r\nX-API-Key: {KEY}"
     with open_socket(limited) as opened:
@@ -205,9 +198,7 @@ def test_a_body_at_the_least_rate_is_taken(limited: RunningService) -> None:
 
 
 @pytest.mark.parametrize("length", [b"Transfer-Encoding: chunked", b"Content-Length: %d" % 2**30])
-def test_an_answer_before_the_end_of_a_long_body_says_that_it_ends_the_connection(
-    limited: RunningService, length: bytes
-) -> None:
+def test_an_answer_before_the_end_of_a_long_body_says_that_it_ends_the_connection(limited, length):
     with open_socket(limited) as opened:
         opened.sendall(b"POST /v1/scenes/demo/render HTTP/1.1\r\nHost: localhost\r\n" + length + b"\r\n\r\n")
         opened.sendall(b"10000\r\n" + b" " * 2**16 + b"\r\n")  # without a key: refused whatever the body is
@@ -215,7 +206,7 @@ def test_an_answer_before_the_end_of_a_long_body_says_that_it_ends_the_connectio
         assert is_closed(opened)
 
 
-def test_an_answer_before_the_end_of_a_short_body_keeps_the_connection(limited: RunningService) -> None:
+def test_an_answer_before_the_end_of_a_short_body_keeps_the_connection(limited):
     with open_socket(limited) as opened:
         opened.sendall(b"POST /v1/scenes/demo/render HTTP/1.1\r\nHost: localhost\r\nContent-Length: 100000\r\n\r\n")
         early = answer(opened)
@@ -224,14 +215,14 @@ def test_an_answer_before_the_end_of_a_short_body_keeps_the_connection(limited: 
         assert status_of(answer(opened)) == 200
 
 
-def test_an_idle_connection_is_closed(limited: RunningService) -> None:
+def test_an_idle_connection_is_closed(limited):
     with open_socket(limited) as opened:
         opened.sendall(REQUEST + b"\r\n")
         assert status_of(answer(opened)) == 200
         assert is_closed(opened)
 
 
-def test_a_client_that_does_not_take_its_answer_is_cut(limited: RunningService) -> None:
+def test_a_client_that_does_not_take_its_answer_is_cut(limited):
     body = {"pose": {"matrix": np.eye(4).tolist()}, "height": 2048, "width": 2048, "dtype": "float32"}
     content = json.dumps(body).encode()
     head = f"POST /v1/scenes/demo/render HTTP/1.1\r\nHost: localhost\r\nContent-Length: {len(content)}\r\nX-API-Key: "
@@ -244,7 +235,7 @@ def test_a_client_that_does_not_take_its_answer_is_cut(limited: RunningService) 
         wait_until(lambda: connections(limited) == 0, within_s=3 * TIMEOUT_S, every_s=0.2)
 
 
-def connections(service: RunningService) -> int:
+def connections(service):
     """Connections to the HTTP port that the service holds; those of the question are among them."""
     port = f":{urlsplit(service.http).port:04X}"
     with open("/proc/net/tcp") as table:
@@ -252,7 +243,7 @@ def connections(service: RunningService) -> int:
     return sum(row[1].endswith(port) and row[3] == "01" for row in rows)
 
 
-def test_a_full_address_leaves_room_for_others(limited: RunningService) -> None:
+def test_a_full_address_leaves_room_for_others(limited):
     wait_until(lambda: connections(limited) == 0, within_s=TIMEOUT_S)
     with contextlib.ExitStack() as opened:
         mine = [opened.enter_context(open_socket(limited, "127.0.0.2")) for _ in range(PER_ADDRESS + 1)]
@@ -267,7 +258,7 @@ def test_a_full_address_leaves_room_for_others(limited: RunningService) -> None:
         assert status_of(answer(again)) == 200
 
 
-def test_connections_are_capped_in_all(limited: RunningService) -> None:
+def test_connections_are_capped_in_all(limited):
     wait_until(lambda: connections(limited) == 0, within_s=TIMEOUT_S)
     with contextlib.ExitStack() as opened:
         for number in range(TOTAL):
@@ -277,7 +268,7 @@ def test_connections_are_capped_in_all(limited: RunningService) -> None:
     wait_until(lambda: connections(limited) == 0, within_s=TIMEOUT_S)
 
 
-def test_streams_count_as_connections(limited: RunningService) -> None:
+def test_streams_count_as_connections(limited):
     wait_until(lambda: connections(limited) == 0, within_s=TIMEOUT_S)
     address = limited.stream_url()
     with contextlib.ExitStack() as opened:
@@ -289,7 +280,7 @@ def test_streams_count_as_connections(limited: RunningService) -> None:
 
 
 @pytest.mark.parametrize("asked", [REQUEST + b"\r\n", REQUEST + b"\r\n" + b"no request\r\n\r\n"])
-def test_answers_to_a_client_that_has_said_its_last_word_are_no_faults(limited: RunningService, asked: bytes) -> None:
+def test_answers_to_a_client_that_has_said_its_last_word_are_no_faults(limited, asked):
     """The connection closes while the first of its requests is being answered, and the next ones wait."""
     for count in range(100):
         with open_socket(limited) as client, contextlib.suppress(ConnectionError):

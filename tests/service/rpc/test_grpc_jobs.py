@@ -1,11 +1,6 @@
 """JobService against a real service without a worker: what is submitted waits."""
 
-from __future__ import annotations
-
 import threading
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
 
 import grpc
 import pytest
@@ -14,29 +9,28 @@ from ultragray_proto.v1 import geometry_pb2, jobs_pb2, jobs_pb2_grpc
 from ultragray_service.rpc.messages import read_specification
 from ultragray_workers.jobs.kinds import TrainJob
 
-from ..conftest import RunningService, StartService
 from .test_grpc_render import error_info
 
 WAIT_S = 120.0
 
 
 @pytest.fixture(scope="module")
-def jobs_service(start_service: StartService, tmp_path_factory: pytest.TempPathFactory) -> RunningService:
+def jobs_service(start_service, tmp_path_factory):
     return start_service(artifact_folder=tmp_path_factory.mktemp("artifacts"), embedded_worker=False)
 
 
 @pytest.fixture(scope="module")
-def jobs(jobs_service: RunningService) -> Iterator[jobs_pb2_grpc.JobServiceStub]:
+def jobs(jobs_service):
     with jobs_service.channel() as channel:
         yield jobs_pb2_grpc.JobServiceStub(channel)
 
 
-def training_poses(**changes: Any) -> jobs_pb2.SubmitJobRequest:
+def training_poses(**changes):
     render = jobs_pb2.RenderJob(scene="demo", sampler=jobs_pb2.PoseSampler(kind="training"))
     return jobs_pb2.SubmitJobRequest(render=render, **changes)
 
 
-def refusal(call: Callable[[], Any]) -> tuple[str, str, str]:
+def refusal(call):
     """Status, reason and field of a call that fails."""
     with pytest.raises(grpc.RpcError) as caught:
         call()
@@ -44,7 +38,7 @@ def refusal(call: Callable[[], Any]) -> tuple[str, str, str]:
     return caught.value.code().name, info.reason, info.metadata["field"]
 
 
-def test_a_render_job_is_estimated_and_not_submitted(jobs: jobs_pb2_grpc.JobServiceStub) -> None:
+def test_a_render_job_is_estimated_and_not_submitted(jobs):
     before = len(jobs.ListJobs(jobs_pb2.ListJobsRequest()).jobs)
     asked = training_poses()
     asked.render.height = asked.render.width = 16
@@ -76,15 +70,11 @@ def test_a_render_job_is_estimated_and_not_submitted(jobs: jobs_pb2_grpc.JobServ
         (training_poses(priority=-1001), ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "priority")),
     ],
 )
-def test_what_cannot_be_run_is_refused_by_name(
-    jobs: jobs_pb2_grpc.JobServiceStub,
-    request_message: jobs_pb2.SubmitJobRequest,
-    expected: tuple[str, str, str],
-) -> None:
+def test_what_cannot_be_run_is_refused_by_name(jobs, request_message, expected):
     assert refusal(lambda: jobs.SubmitJob(request_message)) == expected
 
 
-def test_log_and_artifacts_of_a_job(start_service: StartService, tmp_path: Path) -> None:
+def test_log_and_artifacts_of_a_job(start_service, tmp_path):
     service = start_service(artifact_folder=tmp_path, embedded_worker=True, training_threads=1)
     with service.channel() as channel:
         jobs = jobs_pb2_grpc.JobServiceStub(channel)
@@ -108,7 +98,7 @@ def test_log_and_artifacts_of_a_job(start_service: StartService, tmp_path: Path)
             rest = jobs_pb2.DownloadArtifactRequest(job=job.id, name="frames.npz", offset=offset)
             assert [chunk.data for chunk in jobs.DownloadArtifact(rest)] == [content[offset:]]
 
-        def refused(**changes: Any) -> tuple[str, str, str]:
+        def refused(**changes):
             asked = {"job": job.id, "name": "frames.npz"} | changes
             return refusal(lambda: list(jobs.DownloadArtifact(jobs_pb2.DownloadArtifactRequest(**asked))))
 
@@ -120,7 +110,7 @@ def test_log_and_artifacts_of_a_job(start_service: StartService, tmp_path: Path)
         assert refusal(lambda: jobs.GetJobLog(log_request)) == ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "max_bytes")
 
 
-def test_a_stopping_service_tells_its_watchers_to_come_again(start_service: StartService, tmp_path: Path) -> None:
+def test_a_stopping_service_tells_its_watchers_to_come_again(start_service, tmp_path):
     service = start_service(artifact_folder=tmp_path)
     with service.channel() as channel:
         jobs = jobs_pb2_grpc.JobServiceStub(channel)
@@ -133,7 +123,7 @@ def test_a_stopping_service_tells_its_watchers_to_come_again(start_service: Star
         assert service.process.returncode == 0
 
 
-def test_whole_numbers_of_settings_are_integers() -> None:
+def test_whole_numbers_of_settings_are_integers():
     train = jobs_pb2.TrainJob(dataset="sweep", scene="new")
     given = {"steps": 250, "prune_above": 0.5, "transmittance": False, "memory_gb": None, "start": "random"}
     train.settings.update(given)

@@ -1,10 +1,6 @@
 """RenderService against a real service: framing, errors and streams. What messages hold is the codec's to test."""
 
-from __future__ import annotations
-
 import queue
-from collections.abc import Callable, Iterator
-from typing import Any
 
 import grpc
 import numpy as np
@@ -20,7 +16,7 @@ Stub = rendering_pb2_grpc.RenderServiceStub
 TIMEOUT_S = 120
 
 
-def error_info(error: grpc.RpcError) -> tuple[ErrorInfo, BadRequest | None]:
+def error_info(error):
     """What grpc-status-details-bin says, after checking that it agrees with the status itself."""
     trailers = dict(error.trailing_metadata())
     status = Status.FromString(trailers["grpc-status-details-bin"])
@@ -37,46 +33,46 @@ def error_info(error: grpc.RpcError) -> tuple[ErrorInfo, BadRequest | None]:
     return info, violation
 
 
-def moved(x_mm: float) -> geometry_pb2.Pose:
+def moved(x_mm):
     position = geometry_pb2.Position(x=x_mm)
     return geometry_pb2.Pose(
         placement=geometry_pb2.Placement(position_mm=position, quaternion=geometry_pb2.Quaternion(w=1.0))
     )
 
 
-def matrix_pose(matrix: Any) -> geometry_pb2.Pose:
+def matrix_pose(matrix):
     return geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=np.asarray(matrix).ravel().tolist()))
 
 
 class Conversation:
     """A stream whose messages are sent one by one."""
 
-    def __init__(self, stub: Stub) -> None:
-        self._outgoing: queue.Queue[Any] = queue.Queue()
+    def __init__(self, stub):
+        self._outgoing = queue.Queue()
         self.call = stub.RenderStream(iter(self._outgoing.get, None), timeout=TIMEOUT_S)
 
-    def send(self, sequence: int = 0, **fields: Any) -> None:
+    def send(self, sequence=0, **fields):
         self._outgoing.put(rendering_pb2.RenderStreamRequest(sequence=sequence, **fields))
 
-    def ask(self, sequence: int, **fields: Any) -> rendering_pb2.Frame:
+    def ask(self, sequence, **fields):
         self.send(sequence, **fields)
         frame = next(self.call)
         assert frame.sequence == sequence
         return frame
 
-    def finish(self) -> list[rendering_pb2.Frame]:
+    def finish(self):
         self._outgoing.put(None)
         return list(self.call)
 
 
 @pytest.fixture
-def conversation(renders: Stub) -> Iterator[Conversation]:
+def conversation(renders):
     conversation = Conversation(renders)
     yield conversation
     conversation.finish()
 
 
-def test_a_stream_is_a_dialogue_whose_settings_may_change(conversation: Conversation, settings_message: Any) -> None:
+def test_a_stream_is_a_dialogue_whose_settings_may_change(conversation, settings_message):
     first = conversation.ask(1, settings=settings_message, pose=moved(0))
     small = rendering_pb2.RenderSettings(scene="second", height=10, width=12)
     second = conversation.ask(2, settings=small, pose=moved(0))
@@ -86,21 +82,21 @@ def test_a_stream_is_a_dialogue_whose_settings_may_change(conversation: Conversa
         assert (frame.scene, frame.height, frame.width) == ("second", 10, 12)
 
 
-def test_an_unknown_mode_ends_the_stream(renders: Stub, settings_message: Any) -> None:
+def test_an_unknown_mode_ends_the_stream(renders, settings_message):
     conversation = Conversation(renders)
     conversation.send(settings=settings_message, mode=9)
     with pytest.raises(grpc.RpcError, match="StreamMode"):
         next(conversation.call)
 
 
-def test_bad_messages_do_not_end_a_stream(conversation: Conversation, settings_message: Any) -> None:
-    def ask(sequence: int, **fields: Any) -> tuple[str, str]:
+def test_bad_messages_do_not_end_a_stream(conversation, settings_message):
+    def ask(sequence, **fields):
         frame = conversation.ask(sequence, **fields)
         assert not frame.data
         assert frame.error.detail
         return frame.error.reason, frame.error.field
 
-    def settings(**fields: Any) -> rendering_pb2.RenderSettings:
+    def settings(**fields):
         return rendering_pb2.RenderSettings(**{"scene": "demo", **fields})
 
     assert ask(1, pose=moved(0)) == ("INVALID_ARGUMENT", "settings")
@@ -115,7 +111,7 @@ def test_bad_messages_do_not_end_a_stream(conversation: Conversation, settings_m
     assert frame.scene == "demo"
 
 
-def test_bytes_that_are_no_message_do_not_end_a_stream(channel: grpc.Channel, settings_message: Any) -> None:
+def test_bytes_that_are_no_message_do_not_end_a_stream(channel, settings_message):
     whole = rendering_pb2.RenderStreamRequest(
         sequence=7, settings=settings_message, pose=moved(1.0)
     ).SerializeToString()
@@ -127,8 +123,8 @@ def test_bytes_that_are_no_message_do_not_end_a_stream(channel: grpc.Channel, se
     assert {frame.sequence for frame in frames if frame.data} == {7}
 
 
-def bad(**fields: Any) -> Callable[[], rendering_pb2.RenderRequest]:
-    def make() -> rendering_pb2.RenderRequest:
+def bad(**fields):
+    def make():
         pose = fields.get("pose", moved(0))
         settings = {"scene": "demo", **{key: value for key, value in fields.items() if key != "pose"}}
         return rendering_pb2.RenderRequest(settings=rendering_pb2.RenderSettings(**settings), pose=pose)
@@ -136,7 +132,7 @@ def bad(**fields: Any) -> Callable[[], rendering_pb2.RenderRequest]:
     return make
 
 
-def quaternion(w: float) -> geometry_pb2.Pose:
+def quaternion(w):
     return geometry_pb2.Pose(
         placement=geometry_pb2.Placement(position_mm=geometry_pb2.Position(), quaternion=geometry_pb2.Quaternion(w=w))
     )
@@ -149,7 +145,7 @@ INVALID, CONDITION, PNG = (
 )
 FLAT = geometry_pb2.Probe(linear=geometry_pb2.LinearProbe(width_mm=1, near_mm=2, far_mm=2))
 
-BAD_REQUESTS: dict[str, tuple[Any, grpc.StatusCode, str, str]] = {
+BAD_REQUESTS = {
     "norm": (bad(pose=quaternion(3.0)), INVALID, "INVALID_POSE", "pose.placement.quaternion"),
     "no pose": (bad(pose=None), INVALID, "INVALID_ARGUMENT", "pose"),
     "no settings": (rendering_pb2.RenderRequest, INVALID, "INVALID_ARGUMENT", "settings"),
@@ -162,7 +158,7 @@ BAD_REQUESTS: dict[str, tuple[Any, grpc.StatusCode, str, str]] = {
 
 
 @pytest.mark.parametrize("case", BAD_REQUESTS)
-def test_bad_request(renders: Stub, settings_message: Any, case: str) -> None:
+def test_bad_request(renders, settings_message, case):
     make, code, reason, field = BAD_REQUESTS[case]
     with pytest.raises(grpc.RpcError) as caught:
         renders.Render(make(), timeout=TIMEOUT_S)
@@ -176,7 +172,7 @@ def test_bad_request(renders: Stub, settings_message: Any, case: str) -> None:
 
 
 @pytest.mark.parametrize(("count", "reason"), [(0, "INVALID_ARGUMENT"), (41, "TOO_MANY_POSES")])
-def test_batches_of_no_or_too_many_poses(renders: Stub, settings_message: Any, count: int, reason: str) -> None:
+def test_batches_of_no_or_too_many_poses(renders, settings_message, count, reason):
     request = rendering_pb2.RenderBatchRequest(settings=settings_message, poses=[moved(0)] * count)
     with pytest.raises(grpc.RpcError) as caught:
         list(renders.RenderBatch(request, timeout=TIMEOUT_S))
@@ -184,7 +180,7 @@ def test_batches_of_no_or_too_many_poses(renders: Stub, settings_message: Any, c
     assert (info.reason, info.metadata["field"]) == (reason, "poses")
 
 
-def test_one_bad_pose_refuses_a_batch_before_its_first_frame(renders: Stub, settings_message: Any) -> None:
+def test_one_bad_pose_refuses_a_batch_before_its_first_frame(renders, settings_message):
     poses = [moved(0), moved(0), quaternion(0.5)]
     request = rendering_pb2.RenderBatchRequest(settings=settings_message, poses=poses)
     with pytest.raises(grpc.RpcError) as caught:

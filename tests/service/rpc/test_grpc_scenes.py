@@ -1,11 +1,7 @@
 """SceneService, health and reflection, and what holds for every call: its errors, its size, a caller who is gone."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
-from pathlib import Path
-from typing import Any
 
 import grpc
 import httpx
@@ -14,25 +10,24 @@ from google.protobuf.empty_pb2 import Empty
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
-from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc, scenes_pb2, scenes_pb2_grpc
+from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc, scenes_pb2, scenes_pb2_grpc
 from ultragray_service.rpc.calls import CallContext, abort
 from ultragray_service.settings import load_settings
 from ultragray_service.wiring import make_service
 from ultragray_workers.errors import DeadlineExceeded
 
 from ...waiting import wait_until
-from ..conftest import RunningService, StartService
 from .test_grpc_render import error_info
 
 Stub = scenes_pb2_grpc.SceneServiceStub
 
 
-def test_health_and_reflection(channel: grpc.Channel) -> None:
+def test_health_and_reflection(channel):
     health = health_pb2_grpc.HealthStub(channel)
     for name in ("", "ultragray.v1.RenderService", "ultragray.v1.SceneService"):
         request = health_pb2.HealthCheckRequest(service=name)
 
-        def is_serving(request: health_pb2.HealthCheckRequest = request) -> bool:
+        def is_serving(request=request):
             status = health.Check(request, timeout=120).status
             return bool(status == health_pb2.HealthCheckResponse.SERVING)
 
@@ -44,7 +39,7 @@ def test_health_and_reflection(channel: grpc.Channel) -> None:
     assert {"ultragray.v1.RenderService", "ultragray.v1.SceneService", "grpc.health.v1.Health"} <= names
 
 
-def test_request_id_is_echoed(scenes: Stub) -> None:
+def test_request_id_is_echoed(scenes):
     call = scenes.GetScene.with_call(scenes_pb2.GetSceneRequest(scene="demo"), metadata=(("x-request-id", "robot-1"),))[
         1
     ]
@@ -59,9 +54,7 @@ def test_request_id_is_echoed(scenes: Stub) -> None:
         ("stream_unary", "DatasetService/UploadDataset"),
     ],
 )
-def test_bytes_that_are_no_message_are_refused_in_our_words(
-    service: RunningService, channel: grpc.Channel, kind: str, method: str
-) -> None:
+def test_bytes_that_are_no_message_are_refused_in_our_words(service, channel, kind, method):
     garbage = b"\x0a\x05ab"  # a text of five bytes, of which two are there
     call = getattr(channel, kind)(f"/ultragray.v1.{method}")
     with pytest.raises(grpc.RpcError) as caught:
@@ -72,9 +65,7 @@ def test_bytes_that_are_no_message_are_refused_in_our_words(
     assert "DecodeError" not in service.log_path.read_text()
 
 
-def test_one_setting_bounds_bodies_and_messages(
-    start_service: StartService, settings_message: rendering_pb2.RenderSettings, pose_message: geometry_pb2.Pose
-) -> None:
+def test_one_setting_bounds_bodies_and_messages(start_service, settings_message, pose_message):
     limit_bytes = 4 * 2**20
     service = start_service(max_body_bytes=limit_bytes)
     settings_message.height = settings_message.width = 8
@@ -94,16 +85,16 @@ def test_one_setting_bounds_bodies_and_messages(
 METHOD = "/ultragray.v1.JobService/WatchJob"
 
 
-class Streaming(grpc.GenericRpcHandler):  # type: ignore[misc]
+class Streaming(grpc.GenericRpcHandler):
     """A call that writes once more when its caller is gone, as if that was not known yet."""
 
-    def __init__(self) -> None:
+    def __init__(self):
         self.ended = asyncio.Event()
 
-    def service(self, details: Any) -> Any:
+    def service(self, details):
         return grpc.unary_stream_rpc_method_handler(self._stream, Empty.FromString, Empty.SerializeToString)
 
-    async def _stream(self, request: Any, context: Any) -> None:
+    async def _stream(self, request, context):
         await context.write(Empty())
         try:
             await asyncio.sleep(60)
@@ -112,7 +103,7 @@ class Streaming(grpc.GenericRpcHandler):  # type: ignore[misc]
             await context.write(Empty())
 
 
-async def vanish(folder: Path) -> None:
+async def vanish(folder):
     server = grpc.aio.server(interceptors=[CallContext(make_service(load_settings(data_folder=folder)))])
     streaming = Streaming()
     server.add_generic_rpc_handlers([streaming])
@@ -126,7 +117,7 @@ async def vanish(folder: Path) -> None:
     await server.stop(5)
 
 
-def test_a_write_to_a_caller_that_is_gone_is_a_cancelled_call(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+def test_a_write_to_a_caller_that_is_gone_is_a_cancelled_call(tmp_path, caplog):
     with caplog.at_level(logging.INFO):
         asyncio.run(vanish(tmp_path))
     (record,) = caplog.records
@@ -137,10 +128,10 @@ def test_a_write_to_a_caller_that_is_gone_is_a_cancelled_call(tmp_path: Path, ca
 class Gone:
     """A context as grpc leaves it for a moment when the caller's deadline passes: it cannot be provoked at will."""
 
-    async def abort(self, *_: Any) -> None:
+    async def abort(self, *_):
         raise grpc.aio.InternalError('Failed "execute_batch"')
 
 
-def test_an_error_for_a_caller_that_is_gone_is_a_cancelled_call() -> None:
+def test_an_error_for_a_caller_that_is_gone_is_a_cancelled_call():
     with pytest.raises(asyncio.CancelledError):
         asyncio.run(abort(Gone(), DeadlineExceeded("the deadline passed")))

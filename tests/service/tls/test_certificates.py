@@ -1,9 +1,6 @@
 """Certificate files, and what is said of those that cannot be used."""
 
-from __future__ import annotations
-
 import os
-from pathlib import Path
 
 import pytest
 from cryptography.hazmat.primitives import serialization
@@ -18,26 +15,24 @@ from ...certificates import AUTHORITY, KEY, RARE_CURVE, SERVER, Mounted
 
 
 @pytest.fixture
-def mounted(tmp_path: Path) -> Mounted:
+def mounted(tmp_path):
     found = Mounted(tmp_path / "tls")
     found.put(found.issue())
     return found
 
 
-def load(mounted: Mounted) -> None:
+def load(mounted):
     files = CertificateFiles(mounted.folder / SERVER, mounted.folder / KEY, mounted.folder / AUTHORITY)
     files.load(files.read())
 
 
-def encrypted_key() -> bytes:
+def encrypted_key():
     return ec.generate_private_key(ec.SECP256R1()).private_bytes(
-        serialization.Encoding.PEM,
-        serialization.PrivateFormat.PKCS8,
-        serialization.BestAvailableEncryption(b"secret"),
+        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.BestAvailableEncryption(b"secret")
     )
 
 
-def test_good_files_are_loaded(mounted: Mounted) -> None:
+def test_good_files_are_loaded(mounted):
     load(mounted)
     found = CertificateWatch.of(load_settings(**mounted.settings(mutual=True)))
     assert found is not None
@@ -60,7 +55,7 @@ def test_good_files_are_loaded(mounted: Mounted) -> None:
         (KEY, b"x" * (2**20 + 1), "tls_key cannot be used: .*server.key is larger than"),
     ],
 )
-def test_bad_files_are_one_clear_sentence(mounted: Mounted, name: str, content: bytes | None, expected: str) -> None:
+def test_bad_files_are_one_clear_sentence(mounted, name, content, expected):
     path = mounted.folder / name
     path.unlink()
     if content is not None:
@@ -70,7 +65,7 @@ def test_bad_files_are_one_clear_sentence(mounted: Mounted, name: str, content: 
     assert caught.value.field in str(caught.value)
 
 
-def test_a_key_that_goes_after_it_was_read(mounted: Mounted) -> None:
+def test_a_key_that_goes_after_it_was_read(mounted):
     files = CertificateFiles(mounted.folder / SERVER, mounted.folder / KEY, None)
     content = files.read()
     (mounted.folder / KEY).unlink()
@@ -78,13 +73,13 @@ def test_a_key_that_goes_after_it_was_read(mounted: Mounted) -> None:
         files.load(content)
 
 
-def test_a_key_of_another_certificate(mounted: Mounted) -> None:
+def test_a_key_of_another_certificate(mounted):
     mounted.put(mounted.issue(), key=mounted.issue().private_key_pem.bytes())
     with pytest.raises(StartupFailed, match=r"server.key is not the key of the certificate in .*server.pem"):
         load(mounted)
 
 
-def test_certificates_out_of_their_time(mounted: Mounted) -> None:
+def test_certificates_out_of_their_time(mounted):
     mounted.put(mounted.issue(days=-1))
     with pytest.raises(StartupFailed, match=r"server.pem expired at"):
         load(mounted)
@@ -94,7 +89,7 @@ def test_certificates_out_of_their_time(mounted: Mounted) -> None:
 
 
 @pytest.mark.skipif(os.geteuid() == 0, reason="root may read every file")
-def test_a_key_that_may_not_be_read(mounted: Mounted) -> None:
+def test_a_key_that_may_not_be_read(mounted):
     (mounted.folder / KEY).resolve().chmod(0)
     with pytest.raises(StartupFailed, match=r"server.key cannot be read: Permission denied"):
         load(mounted)
@@ -108,7 +103,7 @@ def test_a_key_that_may_not_be_read(mounted: Mounted) -> None:
         ({"tls_client_ca": "a"}, "tls_client_ca"),
     ],
 )
-def test_settings_that_belong_together(given: dict[str, str], missing: str) -> None:
+def test_settings_that_belong_together(given, missing):
     with pytest.raises(InvalidArgument, match=f"ULTRAGRAY_{missing.upper()}") as caught:
         load_settings(**given)
     assert caught.value.field == missing

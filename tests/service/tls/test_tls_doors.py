@@ -1,15 +1,11 @@
 """TLS on both doors of a real service, while its certificate files are replaced."""
 
-from __future__ import annotations
-
 import base64
 import re
 import socket
 import ssl
 from contextlib import ExitStack
 from functools import partial
-from pathlib import Path
-from typing import Any
 
 import grpc
 import httpx
@@ -19,33 +15,32 @@ from cryptography import x509
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from websockets.sync.client import connect
 
-from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
+from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 
 from ...certificates import KEY, SERVER, Mounted
 from ...waiting import wait_until
-from ..conftest import RunningService, StartService
 
 LIVE = "/v1/health/live"
 
 
 @pytest.fixture
-def mounted(tmp_path: Path) -> Mounted:
+def mounted(tmp_path):
     found = Mounted(tmp_path / "tls")
     found.put(found.issue())
     return found
 
 
 @pytest.fixture
-def serving(start_service: StartService, mounted: Mounted) -> RunningService:
+def serving(start_service, mounted):
     return start_service(**mounted.settings())
 
 
-def address_of(url: str) -> tuple[str, int]:
+def address_of(url):
     host, _, port = url.rpartition("/")[2].partition(":")
     return host, int(port)
 
 
-def serial_offered(address: tuple[str, int], context: ssl.SSLContext) -> int:
+def serial_offered(address, context):
     """The number of the certificate that a door shows to a client that gives no server name."""
     with (
         socket.create_connection(address, timeout=60) as plain,
@@ -56,25 +51,23 @@ def serial_offered(address: tuple[str, int], context: ssl.SSLContext) -> int:
         return x509.load_der_x509_certificate(shown).serial_number
 
 
-def shows(address: tuple[str, int], context: ssl.SSLContext, leaf: trustme.LeafCert) -> bool:
+def shows(address, context, leaf):
     expected = x509.load_pem_x509_certificate(leaf.cert_chain_pems[0].bytes())
     return serial_offered(address, context) == expected.serial_number
 
 
-def check_health(service: RunningService, credentials: grpc.ChannelCredentials) -> None:
+def check_health(service, credentials):
     """Raises grpc.RpcError. Each call has a connection of its own."""
     options = [("grpc.use_local_subchannel_pool", 1)]
     with grpc.secure_channel(service.grpc, credentials, options=options) as channel:
         health_pb2_grpc.HealthStub(channel).Check(health_pb2.HealthCheckRequest(), timeout=120)
 
 
-def errors_in(service: RunningService) -> list[str]:
+def errors_in(service):
     return [record["message"] for record in service.log() if record["level"] == "error"]
 
 
-def test_both_doors_speak_tls_and_nothing_else(
-    serving: RunningService, mounted: Mounted, pose_body: dict[str, Any], pose_message: geometry_pb2.Pose
-) -> None:
+def test_both_doors_speak_tls_and_nothing_else(serving, mounted, pose_body, pose_message):
     assert serving.http.startswith("https://")
     with httpx.Client(base_url=serving.http, verify=mounted.context(), timeout=60) as client:
         assert client.post("/v1/scenes/demo/render", json={"pose": pose_body}).status_code == 200
@@ -97,7 +90,7 @@ def test_both_doors_speak_tls_and_nothing_else(
         health_pb2_grpc.HealthStub(plain).Check(health_pb2.HealthCheckRequest(), timeout=60)
 
 
-def test_versions_before_1_2_are_refused(serving: RunningService, mounted: Mounted) -> None:
+def test_versions_before_1_2_are_refused(serving, mounted):
     for address in (address_of(serving.http), address_of(serving.grpc)):
         assert serial_offered(address, mounted.context())
         old = mounted.context()
@@ -108,7 +101,7 @@ def test_versions_before_1_2_are_refused(serving: RunningService, mounted: Mount
             serial_offered(address, old)
 
 
-def test_mutual_tls_lets_in_only_clients_of_the_authority(start_service: StartService, mounted: Mounted) -> None:
+def test_mutual_tls_lets_in_only_clients_of_the_authority(start_service, mounted):
     serving = start_service(**mounted.settings(mutual=True))
     client = mounted.authority.issue_cert("robot@hospital.example")
     stranger = trustme.CA().issue_cert("robot@hospital.example")
@@ -122,7 +115,7 @@ def test_mutual_tls_lets_in_only_clients_of_the_authority(start_service: StartSe
         assert caught.value.code() is grpc.StatusCode.UNAVAILABLE
 
 
-def test_replaced_files_are_used_by_new_connections(serving: RunningService, mounted: Mounted) -> None:
+def test_replaced_files_are_used_by_new_connections(serving, mounted):
     doors = (address_of(serving.http), address_of(serving.grpc))
     with httpx.Client(base_url=serving.http, verify=mounted.context(), timeout=60) as open_before:
         assert open_before.get(LIVE).status_code == 200
@@ -134,11 +127,11 @@ def test_replaced_files_are_used_by_new_connections(serving: RunningService, mou
     check_health(serving, mounted.credentials())
 
 
-def test_files_that_cannot_be_used_leave_the_old_ones(serving: RunningService, mounted: Mounted) -> None:
+def test_files_that_cannot_be_used_leave_the_old_ones(serving, mounted):
     doors = (address_of(serving.http), address_of(serving.grpc))
     good = serial_offered(doors[0], mounted.context())
 
-    def stays(complaint: str) -> None:
+    def stays(complaint):
         wait_until(lambda: any(complaint in message for message in errors_in(serving)))
         for door in doors:
             assert serial_offered(door, mounted.context()) == good
@@ -153,9 +146,7 @@ def test_files_that_cannot_be_used_leave_the_old_ones(serving: RunningService, m
         wait_until(partial(shows, door, mounted.context(), new))
 
 
-def test_another_authority_shuts_out_the_clients_of_the_one_before(
-    start_service: StartService, mounted: Mounted
-) -> None:
+def test_another_authority_shuts_out_the_clients_of_the_one_before(start_service, mounted):
     serving = start_service(**mounted.settings(mutual=True))
     before = mounted.authority.issue_cert("robot@hospital.example")
     after_authority = trustme.CA()
@@ -172,9 +163,7 @@ def test_another_authority_shuts_out_the_clients_of_the_one_before(
         check_health(serving, mounted.credentials(before))
 
 
-def test_a_client_that_stalls_in_its_handshake_is_cut_off_and_holds_up_nobody(
-    serving: RunningService, mounted: Mounted
-) -> None:
+def test_a_client_that_stalls_in_its_handshake_is_cut_off_and_holds_up_nobody(serving, mounted):
     with ExitStack() as opened:
         doors = (address_of(serving.http), address_of(serving.grpc))
         stalled = [opened.enter_context(socket.create_connection(door, timeout=60)) for door in doors for _ in range(4)]
@@ -185,7 +174,7 @@ def test_a_client_that_stalls_in_its_handshake_is_cut_off_and_holds_up_nobody(
         assert [one.recv(4096) for one in stalled] == [b""] * 8
 
 
-def test_files_that_cannot_be_used_stop_the_start(start_service: StartService, mounted: Mounted) -> None:
+def test_files_that_cannot_be_used_stop_the_start(start_service, mounted):
     mounted.put(mounted.issue(), key=b"nothing")
     service = start_service(wait=False, **mounted.settings())
     assert service.process.wait(60) == 1

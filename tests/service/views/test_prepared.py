@@ -1,7 +1,5 @@
 """Folders that helper processes make: once, whole, and the oldest go."""
 
-from __future__ import annotations
-
 import asyncio
 import fcntl
 import json
@@ -9,8 +7,6 @@ import os
 import shutil
 import subprocess
 import time
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,7 +15,7 @@ from ultragray.datasets.released import write_released
 from ultragray_service.core.threads import HelperProcesses
 from ultragray_service.settings import Settings
 from ultragray_service.views import prepared
-from ultragray_service.views.prepared import Preparation, Prepared
+from ultragray_service.views.prepared import Prepared
 from ultragray_workers import claims
 from ultragray_workers.datasets.intake import check_files
 from ultragray_workers.datasets.store import DatasetStore, write_manifest
@@ -33,7 +29,7 @@ Wanted = dict[str, str]
 
 
 @pytest.fixture
-def wanted(tmp_path: Path) -> Wanted:
+def wanted(tmp_path):
     """A dataset `tiny` in the artifact folder, as it is asked for."""
     folder = DatasetStore(tmp_path).folder / "tiny"
     (folder / "files").mkdir(parents=True)
@@ -51,19 +47,17 @@ class Others(Views):
     name = "others"
 
 
-def views(
-    tmp_path: Path, kind: type[Views] = Views, processes: HelperProcesses | None = None, **settings: Any
-) -> Views:
+def views(tmp_path, kind=Views, processes=None, **settings):
     chosen = Settings(data_folder=tmp_path, artifact_folder=tmp_path, **settings)
     return kind(chosen, processes or HelperProcesses(chosen.dataset_memory_mb << 20))
 
 
-def names(tmp_path: Path) -> list[str]:
+def names(tmp_path):
     return sorted(path.name for path in (tmp_path / "views").iterdir())
 
 
-def test_who_asks_at_the_same_time_gets_the_same_folder(tmp_path: Path, wanted: Wanted) -> None:
-    async def ask() -> list[Path]:
+def test_who_asks_at_the_same_time_gets_the_same_folder(tmp_path, wanted):
+    async def ask():
         made = views(tmp_path)
         return await asyncio.gather(*(made.path("key", **wanted) for _ in range(3)))
 
@@ -74,7 +68,7 @@ def test_who_asks_at_the_same_time_gets_the_same_folder(tmp_path: Path, wanted: 
     assert names(tmp_path) == ["key"]
 
 
-def aged(tmp_path: Path, name: str, age_s: float, size_bytes: int = 0) -> Path:
+def aged(tmp_path, name, age_s, size_bytes=0):
     folder = tmp_path / "views" / name
     folder.mkdir(parents=True)
     (folder / "train.npy").write_bytes(b"\0" * size_bytes)
@@ -84,18 +78,12 @@ def aged(tmp_path: Path, name: str, age_s: float, size_bytes: int = 0) -> Path:
 
 @pytest.mark.long
 @pytest.mark.parametrize(("kept_folders", "size_bytes"), [(2, 0), (32, 600)], ids=["by number", "by bytes"])
-def test_the_folder_not_asked_for_the_longest_goes(
-    tmp_path: Path,
-    wanted: Wanted,
-    monkeypatch: pytest.MonkeyPatch,
-    kept_folders: int,
-    size_bytes: int,
-) -> None:
+def test_the_folder_not_asked_for_the_longest_goes(tmp_path, wanted, monkeypatch, kept_folders, size_bytes):
     monkeypatch.setattr(prepared, "KEPT_FOLDERS", kept_folders)
     aged(tmp_path, "old", 300, size_bytes)
     aged(tmp_path, "older-but-used", 200, size_bytes)
 
-    async def ask() -> None:
+    async def ask():
         made = views(tmp_path, max_dataset_bytes=1024)
         assert (await made.prepare("older-but-used", **wanted)).state == "ready"
         await made.path("key", **wanted)
@@ -104,9 +92,7 @@ def test_the_folder_not_asked_for_the_longest_goes(
     assert names(tmp_path) == ["key", "older-but-used"]
 
 
-def test_a_service_that_dies_while_it_removes_leaves_no_half_folder(
-    tmp_path: Path, wanted: Wanted, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_service_that_dies_while_it_removes_leaves_no_half_folder(tmp_path, wanted, monkeypatch):
     monkeypatch.setattr(prepared, "KEPT_FOLDERS", 1)
     aged(tmp_path, "old", 300)
     with monkeypatch.context() as dying:
@@ -120,10 +106,8 @@ def test_a_service_that_dies_while_it_removes_leaves_no_half_folder(
     assert names(tmp_path) == ["key"]
 
 
-def test_what_fails_says_why_and_is_tried_again_later(
-    tmp_path: Path, wanted: Wanted, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    async def ask() -> None:
+def test_what_fails_says_why_and_is_tried_again_later(tmp_path, wanted, monkeypatch):
+    async def ask():
         made = views(tmp_path)
         with monkeypatch.context() as slow:
             slow.setattr(prepared, "TIMEOUT_S", 0.0)
@@ -142,8 +126,8 @@ def test_what_fails_says_why_and_is_tried_again_later(
     assert names(tmp_path) == ["key"]
 
 
-def test_that_a_name_is_gone_says_nothing_of_the_content(tmp_path: Path, wanted: Wanted) -> None:
-    async def ask() -> None:
+def test_that_a_name_is_gone_says_nothing_of_the_content(tmp_path, wanted):
+    async def ask():
         made = views(tmp_path)
         with pytest.raises(DatasetNotFound):
             await made.path("key", dataset="gone")
@@ -153,8 +137,8 @@ def test_that_a_name_is_gone_says_nothing_of_the_content(tmp_path: Path, wanted:
 
 
 @pytest.mark.long
-def test_who_waits_for_what_is_being_made_sees_its_end(tmp_path: Path, wanted: Wanted) -> None:
-    async def ask() -> None:
+def test_who_waits_for_what_is_being_made_sees_its_end(tmp_path, wanted):
+    async def ask():
         made = views(tmp_path)
         asking = asyncio.ensure_future(made.path("job-1", **wanted))
         while not (tmp_path / "views").is_dir():
@@ -168,15 +152,13 @@ def test_who_waits_for_what_is_being_made_sees_its_end(tmp_path: Path, wanted: W
     asyncio.run(ask())
 
 
-async def end_of(made: Prepared, wanted: Wanted) -> Preparation:
+async def end_of(made, wanted):
     while (found := await made.prepare("key", **wanted)).state == "running":
         await asyncio.sleep(0.01)
     return found
 
 
-def test_what_no_one_foresaw_is_a_failure_as_well(
-    tmp_path: Path, wanted: Wanted, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_what_no_one_foresaw_is_a_failure_as_well(tmp_path, wanted, caplog):
     (tmp_path / "views").symlink_to(tmp_path / "nowhere")
     failed = asyncio.run(asyncio.wait_for(end_of(views(tmp_path), wanted), 10))
     assert failed.state == "failed"
@@ -185,7 +167,7 @@ def test_what_no_one_foresaw_is_a_failure_as_well(
     assert "FileExistsError" in caplog.text
 
 
-def test_a_disk_without_room_is_told(tmp_path: Path, wanted: Wanted) -> None:
+def test_a_disk_without_room_is_told(tmp_path, wanted):
     with files_of_at_most(DATASET.train.images.size):
         failed = asyncio.run(asyncio.wait_for(end_of(views(tmp_path), wanted), 30))
     assert isinstance(failed.error, StorageFull)
@@ -193,8 +175,8 @@ def test_a_disk_without_room_is_told(tmp_path: Path, wanted: Wanted) -> None:
 
 
 @pytest.mark.parametrize("stop", ["end", "remove"])
-def test_what_is_stopped_leaves_nothing(tmp_path: Path, wanted: Wanted, stop: str) -> None:
-    async def ask() -> None:
+def test_what_is_stopped_leaves_nothing(tmp_path, wanted, stop):
+    async def ask():
         made = views(tmp_path)
         asking = asyncio.ensure_future(made.path("key", **wanted))
         while not (tmp_path / "views").is_dir() or not names(tmp_path):
@@ -212,14 +194,14 @@ def test_what_is_stopped_leaves_nothing(tmp_path: Path, wanted: Wanted, stop: st
     assert names(tmp_path) == []
 
 
-def test_what_is_doomed_goes(tmp_path: Path) -> None:
+def test_what_is_doomed_goes(tmp_path):
     for name in ("here", "gone", ".making-now"):
         aged(tmp_path, name, 0)
     asyncio.run(views(tmp_path).forget(lambda key: key != "here"))
     assert names(tmp_path) == [".making-now", "here"]
 
 
-def test_what_dead_services_left_is_removed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_dead_services_left_is_removed(tmp_path, monkeypatch):
     aged(tmp_path, "kept", 9999)
     aged(tmp_path, ".making-being-claimed", 9999)
     (aged(tmp_path, ".making-dead", 1) / "lock").touch()
@@ -233,18 +215,18 @@ def test_what_dead_services_left_is_removed(tmp_path: Path, monkeypatch: pytest.
 
 
 @pytest.mark.long
-def test_one_helper_process_at_a_time(tmp_path: Path, wanted: Wanted, monkeypatch: pytest.MonkeyPatch) -> None:
-    started: list[subprocess.Popen[bytes]] = []
+def test_one_helper_process_at_a_time(tmp_path, wanted, monkeypatch):
+    started = []
 
     class Watched(subprocess.Popen[bytes]):
-        def __init__(self, *arguments: Any, **options: Any) -> None:
+        def __init__(self, *arguments, **options):
             assert all(process.returncode is not None for process in started)
             super().__init__(*arguments, **options)
             started.append(self)
 
     monkeypatch.setattr(subprocess, "Popen", Watched)
 
-    async def ask() -> None:
+    async def ask():
         processes = HelperProcesses(4 << 30)
         made, others = (views(tmp_path, kind, processes) for kind in (Views, Others))
         await asyncio.gather(*(each.path(key, **wanted) for each in (made, others) for key in ("a", "b")))
