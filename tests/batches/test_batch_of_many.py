@@ -125,14 +125,12 @@ def kernel_rate(scene):
         for _ in range(WORKERS)
     ]
     for process in running:  # each has loaded its scene
-        assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
     return sum(float(process.communicate()[0]) for process in _started(running))
 
 
 def _started(processes):
     for process in processes:
-        assert process.stdin is not None
         process.stdin.write("go\n")
         process.stdin.flush()
     return processes

@@ -293,7 +293,6 @@ def test_an_interrupt_in_the_middle_of_writing_leaves_a_whole_file(client_servic
         path = tmp_path / f"{number}.mcap"
         command = [sys.executable, "-c", INTERRUPTED, client_service.grpc, KEY, str(path)]
         with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL) as process:
-            assert process.stdout is not None
             assert process.stdout.readline() == b"begun\n"
             process.send_signal(signal.SIGINT)
         counts = {len(decoded(path, f"/ultragray/{topic}")) for topic in ("bmode", "probe_pose", "confidence")}

@@ -206,8 +206,7 @@ def test_frames_are_those_of_an_ordinary_stream(client, encoding, mode):
 
 def frame_at(stream, x_mm):
     stream.send(moved(x_mm))
-    frame = stream.receive()
-    return frame
+    return stream.receive()
 
 
 def test_frames_that_are_held_are_not_overwritten(client):

@@ -3,7 +3,6 @@
 import re
 import shutil
 import subprocess
-from typing import Any
 
 import pytest
 import yaml
@@ -40,8 +39,6 @@ ON_A_VOLUME = {
 CASES = {"least": LEAST, "all": ALL, "volume": ON_A_VOLUME}
 KUBERNETES = ("1.29", "1.37")  # the oldest that Chart.yaml names, and the newest whose schemas there are
 OF_OTHERS = ("keda.sh/v1alpha1", "monitoring.coreos.com/v1")  # kinds that operators bring
-
-Manifest = dict[str, Any]
 
 
 def rendered(values, name=NAME):

@@ -3,7 +3,6 @@
 import subprocess
 import sys
 import threading
-from collections.abc import Callable
 from concurrent import futures
 from contextlib import ExitStack
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -94,9 +93,6 @@ class Stub(grpc.GenericRpcHandler):
                 """Nothing."""
 
         return Handler
-
-
-StartEnvoy = Callable[..., tuple[Envoy, list[Stub]]]
 
 
 @pytest.fixture

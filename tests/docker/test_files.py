@@ -43,7 +43,6 @@ def test_what_is_copied_is_there_and_reaches_the_build():
 
 def test_extras_are_those_of_the_project():
     wanted = re.search(r"'\.\[([a-z,]+)\]'", DOCKERFILE)
-    assert wanted is not None
     assert set(wanted[1].split(",")) <= set(pyproject("ultragray")["project"]["optional-dependencies"])
 
 
@@ -52,7 +51,6 @@ def test_torch_is_one_that_the_project_takes():
         Requirement(one) for one in pyproject("ultragray")["project"]["dependencies"] if one.startswith("torch")
     )
     wanted = re.search(r"^ARG TORCH_VERSION=(.+)$", DOCKERFILE, re.MULTILINE)
-    assert wanted is not None
     assert wanted[1] in torch.specifier
 
 
@@ -81,8 +79,7 @@ def compose(*files, **environment):
 def services_of(name):
     done = compose(*SETS[name], **SECRETS)
     assert (done.returncode, done.stderr) == (0, "")
-    services = json.loads(done.stdout)["services"]
-    return services
+    return json.loads(done.stdout)["services"]
 
 
 @pytest.mark.parametrize("name", SETS)
@@ -186,8 +183,7 @@ def test_commands_options_and_settings_are_there(unit):
 
 
 def _commands():
-    commands = typer.main.get_command(command_line).commands
-    return commands
+    return typer.main.get_command(command_line).commands
 
 
 def test_service_may_take_its_time_to_stop():

@@ -152,8 +152,7 @@ def test_service_that_was_lost_at_work_goes_on_elsewhere(machines, new_database,
         def submit(body):
             answer = client.post("/v1/jobs", json=body)
             assert answer.status_code == 201, answer.text
-            job_id = answer.json()["id"]
-            return job_id
+            return answer.json()["id"]
 
         def is_done(job_id):
             machine.tend()

@@ -9,7 +9,6 @@ import sys
 import tarfile
 import time
 import zipfile
-from collections.abc import Callable
 from dataclasses import replace
 
 import httpx
@@ -128,8 +127,6 @@ def new_host(bucket, object_proxy, postgres, tmp_path):
 
 STEPS, SEED = int(500 * AWAY_S), 3  # so many that the training outlasts the time without storage
 SETTINGS = {"steps": STEPS, "seed": SEED, "max_gaussians": 40, "batch_size": 2}
-
-NewHost = Callable[[str], Host]
 
 
 def released(folder):

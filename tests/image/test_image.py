@@ -225,7 +225,7 @@ def test_nothing_is_left_of_what_built_it(container, command):
     assert container.run("sh", "-c", f"command -v {command}").stdout == ""
 
 
-def container_says_what_it_is(container):
+def test_image_says_what_it_is(container):
     says = container.configuration
     assert says["User"] == "10001:10001"
     assert set(says["ExposedPorts"]) == {"8000/tcp", "50051/tcp", "18944/tcp"}
@@ -236,7 +236,7 @@ def container_says_what_it_is(container):
     assert all(labels[name] for name in ("title", "description", "licenses", "base.name"))
 
 
-def container_is_of_a_bounded_size(container):
+def test_image_is_of_a_bounded_size(container):
     files = (path for path in container.root.rglob("*") if path.is_file() and not path.is_symlink())
     size = sum(path.stat().st_size for path in files)
     assert size < MAX_BYTES, f"{IMAGE} has {size / 1e6:.0f} MB"

@@ -7,9 +7,7 @@ import json
 import os
 import time
 from collections import Counter
-from collections.abc import Awaitable, Callable
 from dataclasses import dataclass, field, replace
-from typing import Any, Protocol
 
 import grpc
 import numpy as np
@@ -22,7 +20,7 @@ from ultragray_service.igtl.contents import pack_transform, unpack_status
 from ultragray_service.igtl.messages import HEADER_BYTES, Message, pack_message, unpack_header, unpack_message
 from ultragray_studies.bench.report import measured
 
-from ..service.conftest import DEMO_PROBE, RunningService, make_scene, service_starter
+from ..service.conftest import DEMO_PROBE, make_scene, service_starter
 from ..service.igtl.conftest import address_of
 from ..surroundings import ROOT
 from ..waiting import at_this_load
@@ -30,19 +28,6 @@ from ..waiting import at_this_load
 
 class Refused(Exception):
     """The service has refused a request, for this reason."""
-
-
-class Connection(Protocol):
-    """One connection of a client."""
-
-    async def ask(self):
-        """One pose, one frame. Raises Refused."""
-
-    async def pour(self, rate, until, seen):
-        """Sends poses at a rate until a time of `time.monotonic()`, whatever comes back; 0: as fast as frames come."""
-
-    async def close(self):
-        """Ends it."""
 
 
 @dataclass
@@ -288,7 +273,6 @@ class Igtl(_Stream):
             await self._writer.wait_closed()
 
 
-Open = Callable[[RunningService, Place], Awaitable[Any]]
 DOORS = {
     "http": Http.open,
     "grpc": GrpcUnary.open,

@@ -3,7 +3,6 @@
 import io
 import json
 import re
-from collections.abc import Callable
 from xml.etree import ElementTree
 
 import numpy as np
@@ -14,12 +13,10 @@ from ultragray_client import Client, Display, RenderSettings
 
 from ..surroundings import ROOT
 from ..waiting import wait_until
-from .conftest import RunningNode
 
 pytestmark = pytest.mark.slow
 
 CONFIGURE, CLEANUP, ACTIVATE, DEACTIVATE = 1, 2, 3, 4
-Start = Callable[..., RunningNode]
 
 
 def pixels(image):

@@ -6,7 +6,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
 from pathlib import Path
 
@@ -108,9 +107,6 @@ class RunningService:
 
     def channel(self):
         return grpc.insecure_channel(self.grpc, options=[("grpc.max_receive_message_length", -1)])
-
-
-StartService = Callable[..., RunningService]
 
 
 def split(message):

@@ -3,12 +3,9 @@
 import json
 from urllib.parse import quote
 
-import grpc
 import httpx
 import numpy as np
 import pytest
-
-from ultragray_proto.v1 import datasets_pb2, datasets_pb2_grpc, jobs_pb2, jobs_pb2_grpc, scenes_pb2, scenes_pb2_grpc
 
 from ..workers.jobs.conftest import store_dataset
 
@@ -54,40 +51,6 @@ def test_http(stored, text):
         for path in (f"/v1/datasets/{name}", f"/v1/scenes/{name}"):
             assert 400 <= http.put(path, content=b"x").status_code < 500
             assert 400 <= http.delete(path).status_code < 500
-
-
-@pytest.mark.parametrize("text", [UNSTORABLE["nul"], UNSTORABLE["long"]], ids=["nul", "long"])  # protobuf has no others
-def test_grpc(stored, text):
-    render = {"scene": "demo", "height": 8, "width": 8}
-    with stored.channel() as channel:
-        jobs, scenes = jobs_pb2_grpc.JobServiceStub(channel), scenes_pb2_grpc.SceneServiceStub(channel)
-        datasets = datasets_pb2_grpc.DatasetServiceStub(channel)
-        calls = [
-            (jobs.SubmitJob, jobs_pb2.SubmitJobRequest(render=jobs_pb2.RenderJob(**{**render, name: text})))
-            for name in ("scene", "format", "dtype", "device")
-            if name in jobs_pb2.RenderJob.DESCRIPTOR.fields_by_name
-        ]
-        train = {"dataset": "tiny", "scene": "new"}
-        calls += [
-            (jobs.SubmitJob, jobs_pb2.SubmitJobRequest(train=jobs_pb2.TrainJob(**{**train, name: text})))
-            for name in ("dataset", "scene", "preset", "device")
-        ]
-        whole = jobs_pb2.TrainJob(dataset="tiny", scene="new")
-        calls += [
-            (jobs.SubmitJob, jobs_pb2.SubmitJobRequest(train=whole, request_id=text)),
-            (jobs.GetJob, jobs_pb2.GetJobRequest(job=text)),
-            (jobs.CancelJob, jobs_pb2.CancelJobRequest(job=text)),
-            (jobs.ListJobs, jobs_pb2.ListJobsRequest(page_token=text)),
-            (scenes.GetScene, scenes_pb2.GetSceneRequest(scene=text)),
-            (scenes.ListScenes, scenes_pb2.ListScenesRequest(page_token=text)),
-            (datasets.GetDataset, datasets_pb2.GetDatasetRequest(dataset=text)),
-            (datasets.DeleteDataset, datasets_pb2.DeleteDatasetRequest(dataset=text)),
-        ]
-        for call, request in calls:
-            with pytest.raises(grpc.RpcError) as refused:
-                call(request, timeout=60)
-            codes = (grpc.StatusCode.INVALID_ARGUMENT, grpc.StatusCode.NOT_FOUND)
-            assert refused.value.code() in codes, (request, refused.value.details())
 
 
 def test_the_log_has_no_fault(stored):

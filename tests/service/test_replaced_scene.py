@@ -5,7 +5,6 @@ import json
 import os
 import threading
 import time
-from collections.abc import Callable, Iterator
 
 import httpx
 import numpy as np
@@ -14,13 +13,10 @@ from websockets.sync.client import connect
 
 from ultragray import LinearProbe
 
-from .conftest import make_scene, split
+from .conftest import make_scene
 
 SWAPS = 8
 BETWEEN_SWAPS_S = 0.1
-
-Seen = tuple[str, float]  # SHA-256 of the scene, far_mm of the probe of a frame
-Ask = Callable[[], Iterator[Seen]]
 
 
 class Changing:
@@ -90,18 +86,6 @@ def test_http(service, changing):
         yield answer.headers["X-Ultragray-Scene-Sha256"], probe["far_mm"]
 
     with httpx.Client(base_url=service.http, timeout=60) as client:
-        check(changing, ask)
-
-
-def test_websocket(service, changing):
-    message = json.dumps({"pose": {"matrix": np.eye(4).tolist()}})
-
-    def ask():
-        connection.send(message)
-        about, _ = split(connection.recv(timeout=60))
-        yield about["scene_sha256"], about["probe"]["far_mm"]
-
-    with connect(service.stream_url("changing"), compression=None, max_size=None, close_timeout=0.2) as connection:
         check(changing, ask)
 
 

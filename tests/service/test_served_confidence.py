@@ -58,7 +58,6 @@ def test_a_frame_tells_what_the_library_says(client, knowing):
     answer = client.post("knowing/render", json=body(NEAR))
     told = json.loads(answer.headers["X-Ultragray-Extrapolation"])
     coverage = render(knowing, None, at(NEAR), height=HEIGHT, width=WIDTH, outputs=("coverage",)).coverage
-    assert coverage is not None
     (expected,) = Assessor(knowing.info, knowing.training_poses).assess(at(NEAR), coverage=coverage.numpy())
     assert told == pytest.approx(vars(expected))
     assert 0 < told["supported_share"] < 1

@@ -87,8 +87,7 @@ def test_start_and_answer_are_in_the_frame_of_a_registration(phantom, http, pixe
     mounting[:3, 3] = (0, 0, 142)
 
     def in_base(pose):
-        flange = np.linalg.inv(base_to_scene) @ pose @ np.linalg.inv(mounting)
-        return flange
+        return np.linalg.inv(base_to_scene) @ pose @ np.linalg.inv(mounting)
 
     with Client(phantom.grpc, timeout_s=120.0) as client:
         client.registrations.put("robot", "spine", base_to_scene, mounting)

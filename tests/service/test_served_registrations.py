@@ -114,18 +114,6 @@ def test_an_unknown_one_and_one_of_another_scene_are_told(client, http):
     assert http.delete("/v1/registrations/nobody").status_code == 404
 
 
-def test_a_replaced_registration_counts_at_once(client):
-    settings = RenderSettings(**SIZE, registration="moving")
-    for z_mm in (0.0, 1.0):
-        pose = np.eye(4)
-        pose[2, 3] = z_mm
-        client.registrations.put("moving", "demo", pose)
-        np.testing.assert_allclose(client.render("demo", np.eye(4), settings).pose, pose)
-    client.registrations.delete("moving")
-    with pytest.raises(errors.RegistrationNotFound):
-        client.render("demo", np.eye(4), settings)
-
-
 @pytest.mark.parametrize(
     ("change", "status", "field"),
     [

@@ -90,8 +90,7 @@ def http(settings):
 
 def websocket(settings):
     message = frame_bytes(StreamAnswer(1, None, result(settings)))
-    told = json.loads(message[4 : 4 + int.from_bytes(message[:4], "little")])
-    return told
+    return json.loads(message[4 : 4 + int.from_bytes(message[:4], "little")])
 
 
 def grpc(settings):

@@ -48,8 +48,7 @@ class Place:
 def frames_of(path):
     """The frames of POSES as they must be, [P, H, W]."""
     rendered = render(GaussianScene.load(path), None, POSES, height=HEIGHT, width=WIDTH).bmode.numpy()
-    pixels = np.round(np.clip(rendered, 0, 1) * np.float32(255)).astype(np.uint8)
-    return pixels
+    return np.round(np.clip(rendered, 0, 1) * np.float32(255)).astype(np.uint8)
 
 
 def make_scenes(data_folder, versions_folder):

@@ -19,11 +19,11 @@ from websockets.exceptions import InvalidStatus
 from websockets.sync.client import connect
 
 from ultragray.errors import InvalidArgument
-from ultragray_proto.v1 import access_pb2, access_pb2_grpc, jobs_pb2, jobs_pb2_grpc, rendering_pb2, rendering_pb2_grpc
+from ultragray_proto.v1 import access_pb2, access_pb2_grpc, rendering_pb2, rendering_pb2_grpc
 from ultragray_service.access.keys import KeyStore
 from ultragray_service.access.limits import WINDOW_S, Rate
-from ultragray_service.access.principals import NAMES, Allowance, Role, read_limits
-from ultragray_service.settings import Settings, load_settings
+from ultragray_service.access.principals import Allowance, Role, read_limits
+from ultragray_service.settings import load_settings
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.tables import USAGE
 
@@ -33,10 +33,6 @@ from ..conftest import RunningService, split
 from ..igtl.conftest import Peer, address_of
 from ..rpc.test_grpc_render import error_info, moved
 from .conftest import MATRIX, POSE
-
-
-def test_nothing_is_limited_unless_a_setting_says_so():
-    assert Settings().allowance == Allowance() == Allowance(**dict.fromkeys(NAMES))
 
 
 def test_settings_limit_every_key(monkeypatch):
@@ -135,17 +131,14 @@ LIMITS = {  # by the name of the key
     "requests": "requests_per_s=1",
     "calls": "requests_per_s=1",
     "frames": "frames_per_s=1",
-    "rpc-frames": "frames_per_s=1",
     "poses": "frames_per_s=4",
     "batch": "frames_per_s=4",
     "ordered": "frames_per_s=4",
     "latest": "frames_per_s=2",
-    "rpc-latest": "frames_per_s=2",
     "streams": "streams=1",
     "polite": "requests_per_s=none",
     "unlimited": "streams=none",
     "jobs": "unfinished_jobs=2",
-    "rpc-jobs": "unfinished_jobs=1",
     "minutes": "compute_minutes_per_day=1",
     "bytes": "stored_gb=0.000004",
     "unpacked": "stored_gb=0.000005",
@@ -198,10 +191,6 @@ def limited(start_service, tmp_path_factory):
     database.close()
 
 
-def render_request():
-    return rendering_pb2.RenderRequest(settings=render_settings(), pose=moved(0))
-
-
 def render_settings():
     return rendering_pb2.RenderSettings(scene="demo", **SMALL)
 
@@ -251,21 +240,6 @@ def test_only_so_many_jobs_of_a_key_wait_or_run(limited):
     assert limited.http("jobs", "POST", f"{job}:retry").status_code == 201
     assert is_limit(submit(limited, "jobs"), "unfinished_jobs")
     assert limited.refusals("unfinished_jobs") >= 2
-
-
-def test_jobs_of_grpc_count_likewise(limited):
-    jobs = jobs_pb2_grpc.JobServiceStub(limited.channel)
-    request = jobs_pb2.SubmitJobRequest(render=jobs_pb2.RenderJob(scene="demo", poses=[moved(0)]))
-    metadata = limited.metadata("rpc-jobs")
-    job = jobs.SubmitJob(request, metadata=metadata, timeout=60).job
-    with pytest.raises(grpc.RpcError) as caught:
-        jobs.SubmitJob(request, metadata=metadata, timeout=60)
-    assert retry_after_s(caught.value, "LIMIT_REACHED") is None
-    jobs.CancelJob(jobs_pb2.CancelJobRequest(job=job.id), metadata=metadata, timeout=60)
-    jobs.SubmitJob(request, metadata=metadata, timeout=60)
-    with pytest.raises(grpc.RpcError) as caught:
-        jobs.RetryJob(jobs_pb2.RetryJobRequest(job=job.id), metadata=metadata, timeout=60)
-    assert retry_after_s(caught.value, "LIMIT_REACHED") is None
 
 
 def test_the_minutes_of_a_day_end_at_midnight(limited):
@@ -368,7 +342,6 @@ def test_calls_of_grpc_count_as_requests(limited):
         return stub.WhoAmI(access_pb2.WhoAmIRequest(), metadata=limited.metadata("calls"), timeout=60)
 
     delay_s = retry_after_s(refused_call(ask), "RATE_LIMITED")
-    assert delay_s is not None
     assert 0.0 < delay_s < 1.1
     time.sleep(delay_s)
     ask()
@@ -379,14 +352,6 @@ def test_frames_beyond_the_rate_are_refused_and_pass_after_the_time_that_is_told
     assert (answer.status_code, answer.json()["reason"]) == (429, "RATE_LIMITED")
     time.sleep(int(answer.headers["Retry-After"]))
     assert limited.render("frames").status_code == 200
-
-    def ask():
-        return limited.renders().Render(render_request(), metadata=limited.metadata("rpc-frames"), timeout=60)
-
-    delay_s = retry_after_s(refused_call(ask), "RATE_LIMITED")
-    assert delay_s is not None
-    time.sleep(delay_s)
-    ask()
 
 
 def test_every_frame_of_a_batch_counts_and_the_batch_takes_the_seconds_that_it_needs(limited):

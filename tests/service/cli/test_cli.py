@@ -193,12 +193,6 @@ def test_a_data_folder_without_scenes_gets_the_demo(tmp_path, capsys):
     assert capsys.readouterr().err == ""
 
 
-def test_a_data_folder_with_scenes_is_left_alone(scene_file):
-    before = sorted(scene_file.parent.iterdir())
-    ensure_scenes(scene_file.parent)
-    assert sorted(scene_file.parent.iterdir()) == before
-
-
 def test_given_scenes_are_linked_under_their_own_names(scene_file, tmp_path):
     folder = tmp_path / "links"
     folder.mkdir()
@@ -258,9 +252,3 @@ def test_serve_serves_the_given_file_alone_until_sigterm(scene_file, used_folder
     assert "Traceback" not in said
     assert scene_file.exists()
     assert sorted(used_folder.rglob("*")) == before
-
-
-@pytest.mark.long
-def test_serve_serves_the_scenes_of_a_named_artifact_folder_too(scene_file, used_folder):
-    with served(used_folder, scene_file, "--artifact-folder", "data/artifacts") as (_, address):
-        assert names_of_scenes(address) == ["liver", "scene"]

@@ -190,7 +190,6 @@ def test_a_watch_outlives_a_restart_of_the_service(start_service, tmp_path):
         text=True,
     )
     try:
-        assert watching.stderr is not None
         assert watching.stderr.readline() == f"{job} queued waits for a worker: none is running\n"
         first.process.kill()
         first.process.wait(WAIT_S)

@@ -164,7 +164,6 @@ def test_further_signals_do_not_stop_the_scene_from_being_written(dataset, tmp_p
         for number in (signal.SIGINT, signal.SIGTERM):
             process.send_signal(number)
         time.sleep(0.003)
-    assert process.stderr is not None
     told = process.stderr.read()
     process.stderr.close()
     assert process.returncode == 130, told
@@ -209,7 +208,6 @@ def printed_json(*arguments):
 def test_eval_prints_what_the_library_measures(dataset, scene):
     expected = evaluate(GaussianScene.load(scene), read_released(dataset).val)
     reliability = measure_reliability(GaussianScene.load(scene), read_released(dataset).val)
-    assert reliability is not None
     document = printed_json("eval", scene, dataset, "--json")
     figures = {**expected.to_dict(), "uncertainty": json.loads(json.dumps(reliability.to_dict()))}
     assert document == {"scene": str(scene), "dataset": "ball", "split": "val", **figures}
@@ -222,13 +220,6 @@ def test_eval_prints_what_the_library_measures(dataset, scene):
     assert f"{expected.speckle.histogram_distance:.4f}" in result.stdout
     assert "true frames" in result.stdout
     assert f"{reliability.within_2:.0%} within 2 deviations" in " ".join(result.stdout.split())
-
-
-def test_eval_of_the_training_frames_and_of_others(dataset, scene):
-    train_part = printed_json("eval", scene, dataset, "--json", "--split", "train")
-    assert train_part["split"] == "train"
-    assert len(train_part["frames"]) == 7
-    assert len(printed_json("eval", scene, dataset, "--json", "--val-frames", "0:3")["frames"]) == 3
 
 
 def test_eval_writes_pictures(dataset, scene, tmp_path):

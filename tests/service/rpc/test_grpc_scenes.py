@@ -10,7 +10,7 @@ from google.protobuf.empty_pb2 import Empty
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 
-from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc, scenes_pb2, scenes_pb2_grpc
+from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc, scenes_pb2
 from ultragray_service.rpc.calls import CallContext, abort
 from ultragray_service.settings import load_settings
 from ultragray_service.wiring import make_service
@@ -18,8 +18,6 @@ from ultragray_workers.errors import DeadlineExceeded
 
 from ...waiting import wait_until
 from .test_grpc_render import error_info
-
-Stub = scenes_pb2_grpc.SceneServiceStub
 
 
 def test_health_and_reflection(channel):

@@ -74,7 +74,6 @@ def test_many_requests_are_sampled(statistics):
         statistics.observe(1, 1.0, float(place % 100), 2.0)
     summary = statistics.summaries()[-1]
     assert summary.requests == 5000
-    assert summary.p50_ms is not None
     assert 35 < summary.p50_ms.render < 65
 
 

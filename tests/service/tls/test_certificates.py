@@ -35,7 +35,6 @@ def encrypted_key():
 def test_good_files_are_loaded(mounted):
     load(mounted)
     found = CertificateWatch.of(load_settings(**mounted.settings(mutual=True)))
-    assert found is not None
     assert found.current.names == "localhost, 127.0.0.1"
     assert mounted.issue().private_key_pem.bytes().decode() not in repr(found.current)
     assert CertificateWatch.of(load_settings()) is None

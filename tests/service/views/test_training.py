@@ -38,8 +38,7 @@ def train(http, scene, **settings):
     body = {"kind": "train", "specification": {"dataset": "tiny", "scene": scene, "settings": settings}}
     answer = http.post("/v1/jobs", json=body)
     assert answer.status_code == 201, answer.text
-    job = answer.json()["id"]
-    return job
+    return answer.json()["id"]
 
 
 def test_the_names_of_the_files_of_a_run():
@@ -71,8 +70,7 @@ def test_a_training_is_seen_while_it_runs(http, artifacts):
     assert (missing["reason"], missing["field"]) == ("ARTIFACT_NOT_FOUND", "job")
 
     def curve():
-        points = http.get(f"/v1/jobs/{job}/curve").json()["points"]
-        return points
+        return http.get(f"/v1/jobs/{job}/curve").json()["points"]
 
     before = wait_until(curve)
     after = wait_until(lambda: (found := curve())[-1]["step"] > before[-1]["step"] + 600 and found)
