@@ -15,10 +15,7 @@ def files_of_at_most(size_bytes):
     told to write none.
     """
     before = resource.getrlimit(resource.RLIMIT_FSIZE)
-    with (
-        patch.object(sys, "dont_write_bytecode", True),
-        patch.dict(os.environ, {"PYTHONDONTWRITEBYTECODE": "1"}),
-    ):
+    with patch.object(sys, "dont_write_bytecode", True), patch.dict(os.environ, {"PYTHONDONTWRITEBYTECODE": "1"}):
         resource.setrlimit(resource.RLIMIT_FSIZE, (size_bytes, before[1]))
         try:
             yield

@@ -29,7 +29,6 @@ ROOMS = {
     **{storey: {*BENEATH, *STOREYS[:place]} for place, storey in enumerate(STOREYS)},
     **{plugin: {*BENEATH, *STOREYS, *PLUGINS} for plugin in PLUGINS},
 }
-# The storeys of `ultragray`, each of which imports those before it; plug-ins stand beside them and import storeys.
 SERVICE_ROOMS = (  # each may import those before it
     *("", "errors", "environment", "access", "settings", "misspelt", "tls", "telemetry", "listening", "core", "views"),
     *("doors", "service", "wiring", "http", "rpc", "igtl", "server", "healthcheck", "cli", "__main__"),

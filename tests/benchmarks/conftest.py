@@ -7,14 +7,12 @@ import subprocess
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from ultragray import LinearProbe
-from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
 from ultragray_studies.bench import report
 
+from ..model.learn.conftest import make_tiny_dataset
 from ..scripts import benchmark
 
 COMMITTER = ("-c", "user.name=tests", "-c", "user.email=tests@example.org", "-c", "commit.gpgsign=false")
@@ -60,11 +58,6 @@ def repository(tmp_path, monkeypatch):
 
 @pytest.fixture
 def data(tmp_path):
-    """A folder of data with one sweep in it, `ball`: six training and two held-out frames of noise, 1 mm apart."""
-    rng = np.random.default_rng(0)
-    poses = np.tile(np.eye(4), (8, 1, 1))
-    poses[:, 1, 3] = range(8)
-    images = rng.integers(0, 200, (8, 16, 14), dtype=np.uint8)
-    sweep = Sweep(images, poses, LinearProbe(20.0, 0.0, 25.0), np.arange(8), "ball")
-    write_released(Dataset("ball", sweep.select(range(6)), sweep.select([6, 7])), tmp_path / "ball")
+    """A folder of data with one sweep in it, `ball`: six training and two held-out frames, 1 mm apart."""
+    write_released(make_tiny_dataset(frames=8, height=16, width=14, spacing_mm=1.0), tmp_path / "ball")
     return tmp_path

@@ -1,6 +1,7 @@
 """The five projects of this repository, as their pyproject.toml say."""
 
 import subprocess
+from functools import cache
 
 import tomllib
 from packaging.requirements import Requirement
@@ -17,6 +18,7 @@ FOLDERS = {
 }
 
 
+@cache
 def pyproject(name):
     return tomllib.loads((FOLDERS[name] / "pyproject.toml").read_text(encoding="utf-8"))
 

@@ -36,12 +36,14 @@ def build(folder, target, output):
 
 
 @pytest.mark.parametrize("project", PACKAGES)
-def test_a_wheel_holds_its_package_and_the_licence(project, tmp_path):
+def test_a_wheel_holds_its_package_the_licence_and_what_ros_looks_for(project, tmp_path):
     with zipfile.ZipFile(build(ROOT / project, "wheel", tmp_path)) as wheel:
         about = {name for name in wheel.namelist() if ".dist-info/" in name or ".data/data/" in name}
         (licence,) = (wheel.read(name) for name in about if name.endswith("/licenses/LICENSE"))
         assert set(wheel.namelist()) - about == sources(ROOT / project / PACKAGES[project])
     assert licence == (ROOT / "LICENSE").read_bytes()
+    installed = {name.partition(".data/data/")[2] for name in about if ".data/data/" in name}
+    assert installed == (FOR_ROS if project == "ros" else set())
 
 
 @pytest.mark.parametrize("project", PACKAGES)
@@ -50,13 +52,6 @@ def test_a_wheel_of_the_sdist_is_the_same(project, tmp_path):
     with zipfile.ZipFile(build(source, "wheel", tmp_path / "wheel")) as wheel:
         files = {name for name in wheel.namelist() if ".dist-info/" not in name and ".data/data/" not in name}
     assert files == sources(ROOT / project / PACKAGES[project])
-
-
-@pytest.mark.parametrize("project", PACKAGES)
-def test_the_wheel_of_the_node_holds_what_ros_looks_for(project, tmp_path):
-    with zipfile.ZipFile(build(ROOT / project, "wheel", tmp_path)) as wheel:
-        installed = {name.partition(".data/data/")[2] for name in wheel.namelist() if ".data/data/" in name}
-    assert installed == (FOR_ROS if project == "ros" else set())
 
 
 def test_the_sdist_of_the_messages_has_what_other_languages_generate_stubs_from(tmp_path):

@@ -76,6 +76,7 @@ def test_the_robot_converges_and_follows(servo, demo_service):
     assert f"in {len(record.errors_mm)} frames" in record.tell()
 
 
+@pytest.mark.long
 def test_as_a_program(demo_service):
     command = [sys.executable, EXAMPLES / "robot_servo.py", "--address", demo_service.grpc, "--seconds", "2.5"]
     told = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout

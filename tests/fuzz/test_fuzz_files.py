@@ -86,10 +86,7 @@ def mutated_bundle(data):
     numbers_changed = mutated_bytes([tensors]).map(lambda changed: data[: -len(tensors)] + changed)
     same_size = numbers_changed.map(lambda changed: changed[: len(data)].ljust(len(data), b"\0"))
     return st.one_of(
-        mutated_json([metadata]).map(with_metadata),
-        mutated_json([header]).map(pack),
-        same_size,
-        mutated_bytes([data]),
+        mutated_json([metadata]).map(with_metadata), mutated_json([header]).map(pack), same_size, mutated_bytes([data])
     )
 
 
@@ -183,8 +180,7 @@ def test_released_checkpoints(door, open_reader, demo_scene, released, tmp_path)
         pickled = next(name for name in archive.namelist() if name.endswith("data.pkl"))
         program = archive.read(pickled)
     checkpoints = st.one_of(
-        mutated_bytes([program]).map(lambda changed: stored_again(data, pickled, changed)),
-        mutated_bytes([data]),
+        mutated_bytes([program]).map(lambda changed: stored_again(data, pickled, changed)), mutated_bytes([data])
     )
     files = {name: released[name] for name in ("conf.json", "poses_train.npy", "images_train.npy")} | {"ckpt.pt": data}
     parts = {"ckpt.pt": checkpoints, "conf.json": mutated_released(released).map(lambda changed: changed["conf.json"])}

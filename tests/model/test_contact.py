@@ -175,11 +175,7 @@ def test_the_gap_is_measured_along_the_scan_line():
     probe = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
     angle = np.radians(10.0)
     pose = placed(probe, y=20.0)
-    pose[:3, :3] = [
-        [np.cos(angle), 0.0, -np.sin(angle)],
-        [0.0, 1.0, 0.0],
-        [np.sin(angle), 0.0, np.cos(angle)],
-    ]
+    pose[:3, :3] = [[np.cos(angle), 0.0, -np.sin(angle)], [0.0, 1.0, 0.0], [np.sin(angle), 0.0, np.cos(angle)]]
     touch = Touch.of(Skin.under(swept(probe), probe), probe, pose, WIDTH)
     x = probe.lines.across(WIDTH)
     np.testing.assert_allclose(touch.gaps_mm[0], -x * np.tan(angle), atol=1e-3)

@@ -154,20 +154,6 @@ def test_corners():
     np.testing.assert_allclose(np.degrees(np.arctan2(corners[:, 0], corners[:, 2])), [-30, 0, 30] * 2, atol=1e-12)
 
 
-def test_a_phased_array_fans_out_from_the_centre_of_its_face():
-    assert (PHASED.kind, PHASED.near_mm, PHASED.scan_line_length_mm) == ("phased", 0.0, 120.0)
-    np.testing.assert_allclose(PHASED.depths_mm(3), [20.0, 60.0, 100.0])
-    assert PHASED.cull_far_mm(3) == pytest.approx(80.0)
-    origins, directions = PHASED.scan_lines(3)
-    assert not origins.any()
-    np.testing.assert_allclose(np.degrees(np.arctan2(directions[:, 0], directions[:, 2])), [-30, 0, 30], atol=1e-12)
-    np.testing.assert_allclose(PHASED.lines.across(3), [-30, 0, 30], atol=1e-12)
-    corners = PHASED.corners_mm()
-    assert not corners[:3].any()
-    side = 120.0 * math.sqrt(0.5)
-    np.testing.assert_allclose(corners[3:], [[-side, 0, side], [0, 0, 120], [side, 0, side]], atol=1e-12)
-
-
 @pytest.mark.parametrize(
     ("make", "field"),
     [
@@ -194,8 +180,6 @@ def test_integers_become_floats_and_the_repr_is_what_one_writes():
     assert repr(LinearProbe(width_mm=40, near_mm=0, far_mm=50)) == (
         "LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)"
     )
-    assert eval(repr(CONVEX)) == CONVEX
-    assert repr(PHASED) == "PhasedProbe(opening_angle_deg=90.0, far_mm=120.0)"
 
 
 @pytest.mark.parametrize(

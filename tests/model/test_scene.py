@@ -54,12 +54,6 @@ def splats(count=4, sh_degree=1):
     }
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_the_degree_follows_from_the_coefficients(degree):
-    scene = GaussianScene.from_splats(splats(sh_degree=degree))
-    assert (scene.sh_degree, scene.gaussian_count) == (degree, 4)
-
-
 def test_a_copy_is_the_same_scene_and_prepares_itself_anew():
     scene = GaussianScene.from_splats(splats(), training_poses=np.eye(4)[None])
     scene.prepared("lock", threading.Lock)  # as backends keep what cannot be copied
@@ -150,6 +144,7 @@ BAD_FILES = {
     "header_longer_than_the_file": struct.pack("<Q", 1 << 60) + b"{}",
     "foreign_safetensors": save({"weight": torch.zeros(3)}),
     "metadata_not_json": bundle(info="{"),
+    "metadata_no_object": bundle(info="[]"),
     "metadata_nests": bundle(info="[" * 100_000),
     "other_version": bundle(info=metadata(format_version=99)),
     "wrong_count": bundle(info=metadata(gaussian_count=5)),
@@ -249,12 +244,6 @@ def test_a_wrong_entry_is_named(change, message):
         info_from_json(json.dumps(document))
 
 
-@pytest.mark.parametrize("text", ["", "[]", "null", "{", '{"format_version": 1,}'])
-def test_other_text_is_refused(text):
-    with pytest.raises(ValueError, match=r"."):
-        info_from_json(text)
-
-
 def test_the_summary_is_in_the_frame_of_the_sweep():
     info = with_summary(SceneInfo(centre_mm=(100.0, 0.0, -50.0)), np.array([[1.0, 2, 3], [-1, 0, 5]]), 1)
     assert info.gaussian_count == 2
@@ -289,13 +278,6 @@ def write_without_gaussians(path, poses, **more_metadata):
     tensors = {name: np.zeros(shape, np.float32) for name, shape in expected_shapes(0, 0).items()}
     tensors["training_poses"] = np.tile(np.eye(4), (poses, 1, 1))
     save_file(tensors, path, {"ultragray": info_to_json(SceneInfo()), **more_metadata})
-
-
-def test_a_file_of_another_kind_is_told_to_be_one(tmp_path):
-    path = tmp_path / "thesis.ugr"
-    path.write_bytes(b"%PDF-1.7\n and so on")
-    with pytest.raises(SceneFileInvalid, match="it does not begin as a scene file does: it is damaged, or a file of"):
-        read_header(path)
 
 
 def test_a_description_has_limits(tmp_path):
@@ -337,22 +319,14 @@ PROBE = LinearProbe(40.0, 0.0, 50.0)
 IN_WORDS = "linear probe (width 40 mm, near 0 mm, far 50 mm)"
 
 
-def test_frames():
-    planes = {name: torch.zeros(8, 512, 256) for name in ("bmode", "echo")}
-    assert repr(Frames(planes)) == "Frames(8 of 512x256: bmode, echo)"
-    assert repr(Frames({})) == "Frames(0 of 0x0: )"
-
-
-def test_a_scene(random_scene):
+def test_what_is_shown_of_scenes_and_sweeps(random_scene):
+    assert repr(Frames({"bmode": torch.zeros(8, 512, 256)})) == "Frames(8 of 512x256: bmode)"
     assert repr(random_scene(1200)) == "GaussianScene(1,200 Gaussians, no probe)"
     scene = random_scene(60, info={"probe": PROBE, "dataset_name": "liver"})
     assert repr(scene) == f"GaussianScene('liver', 60 Gaussians, {IN_WORDS})"
     header = repr(SceneHeader(scene.info, np.zeros((3, 4, 4)), 10, np.zeros((3, 4, 4))))
     assert header.endswith("file_bytes=10)")
     assert "array" not in header
-
-
-def test_a_sweep():
     images = np.random.default_rng(0).integers(0, 250, (10, 20, 16), dtype=np.uint8)
     sweep = Sweep(images, np.tile(np.eye(4), (10, 1, 1)), PROBE, np.arange(10), "scan.mha")
     assert repr(sweep) == f"Sweep(10 frames of 20x16, {IN_WORDS}, 'scan.mha')"

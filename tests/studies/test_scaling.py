@@ -91,12 +91,6 @@ def test_a_pose_takes_the_place_of_the_one_of_its_stream_that_waits():
     assert begun[[0, 2, 3]].tolist() == [0.0, 4.0, 8.0]
 
 
-def test_what_would_wait_longer_than_the_patience_is_refused():
-    begun = begins(np.array([0.0, 0.1, 0.2]), np.array([2.0, 1.0, 1.0]), np.full(3, ALONE), 1.85)
-    assert begun[[0, 2]].tolist() == [0.0, 2.0]
-    assert math.isnan(begun[1])
-
-
 def test_a_scene_is_fetched_once_and_loaded_again_after_it_was_dropped():
     sizes = CacheSizes(memory=2 * SMALL.resident_bytes, folder=10 * SMALL.file_bytes)
     cache = ReplicaCache(sizes, [SMALL] * 4, Storage(first_byte_s=0.5, bytes_per_s=math.inf))

@@ -11,11 +11,7 @@ FILES = ("g01", "g03", "g05", "g06", "g08")
 @pytest.mark.parametrize("name", FILES)
 @pytest.mark.parametrize(
     ("backend", "dtype", "tolerance"),
-    [
-        ("reference", torch.float64, 5e-5),
-        ("cpu", torch.float32, 5e-4),
-        ("cuda", torch.float32, 5e-4),
-    ],
+    [("reference", torch.float64, 5e-5), ("cpu", torch.float32, 5e-4), ("cuda", torch.float32, 5e-4)],
     ids=["reference", "cpu", "cuda"],
 )
 def test_all_outputs_match(golden, assert_agrees, on_device, name, backend, dtype, tolerance):

@@ -4,13 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray import (
-    GaussianScene,
-    LinearProbe,
-    SceneInfo,
-    read_header,
-    render,
-)
+from ultragray import GaussianScene, LinearProbe, SceneInfo, read_header, render
 from ultragray.errors import InvalidArgument, SceneFileInvalid, UnknownOutput
 from ultragray.exchange.checkpoint import export_checkpoint
 from ultragray.exchange.ply import read_ply, write_ply

@@ -267,9 +267,3 @@ def test_a_gaussian_at_the_probe_has_no_direction():
 def test_a_convex_probe_culls_by_range_in_the_plane(mean_cm, visible):
     scene = one_gaussian(mean_cm, (3.0, 3.0, 3.0))
     assert compare(scene, CONVEX, HERE, (10, 5)).any() == visible
-
-
-def test_only_the_outputs_asked_for_come_back(random_scene):
-    frames = render(random_scene(3), LINEAR, HERE, height=4, width=5, outputs=["echo"], backend="reference")
-    assert frames.echo.shape == (1, 4, 5)
-    assert frames.bmode is frames.transmittance is frames.coverage is None

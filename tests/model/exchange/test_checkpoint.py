@@ -135,8 +135,7 @@ def test_a_center_or_centered_instead_of_poses(dataset):
 
 
 @pytest.mark.parametrize(
-    "options",
-    [{"poses": None}, {"poses": "p.npy", "centered": True}, {"center_mm": (0, 0, 0), "centered": True}],
+    "options", [{"poses": None}, {"poses": "p.npy", "centered": True}, {"center_mm": (0, 0, 0), "centered": True}]
 )
 def test_exactly_one_place_must_be_given(dataset, options):
     with pytest.raises(InvalidArgument, match=r"exactly one of poses .* center_mm .* centered"):

@@ -31,14 +31,7 @@ def make_tiny_dataset(*, frames=10, height=20, width=16, spacing_mm=0.8, probe=L
 
 
 def make_tiny_config(**settings):
-    values = {
-        "steps": 24,
-        "max_gaussians": 60,
-        "batch_size": 3,
-        "sh_start": 0.25,
-        "refinements": 3,
-        "confidence": False,
-    }
+    values = {"steps": 24, "max_gaussians": 60, "batch_size": 3, "sh_start": 0.25, "refinements": 3}
     return TrainingConfig.preset("fast", **{**values, "confidence": False, **settings})
 
 

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 import torch
 
-from ultragray import LinearProbe
-from ultragray.datasets import Dataset, Sweep
 from ultragray.errors import MemoryExceeded
 from ultragray_studies.comparison.run import EQUAL_TIME
 from ultragray_studies.methods.classical import Compounding, FromFrames
@@ -18,22 +15,12 @@ from ultragray_studies.methods.gaussians import SceneMethod
 from ultragray_studies.methods.learner import LearnedMethod, Learner
 from ultragray_studies.methods.method import Description, Method, Pace, Paces
 
-FRAMES, SIDE = 12, 16
+from ...model.learn.conftest import make_tiny_dataset
 
 
 @pytest.fixture
 def dataset():
-    """A ball in noise; every third frame is held out, at growing distances from the training frames."""
-    poses = np.tile(np.eye(4), (FRAMES, 1, 1))
-    poses[:, 1, 3] = 0.5 * np.arange(FRAMES) + 0.03 * np.arange(FRAMES) ** 2
-    x, z = np.meshgrid(np.linspace(-1, 1, SIDE), np.linspace(0, 1, SIDE))
-    ball = 140.0 * np.exp(-((x - 0.1) ** 2 + (z - 0.4) ** 2) / 0.1)
-    noise = np.random.default_rng(0).normal(50.0, 4.0, (FRAMES, SIDE, SIDE))
-    sweep = Sweep(
-        np.clip(ball + noise, 0, 255).astype(np.uint8), poses, LinearProbe(20.0, 0.0, 25.0), np.arange(FRAMES), "tiny"
-    )
-    held_out = np.arange(FRAMES) % 3 == 1
-    return Dataset("50 % of <tiny>", sweep.select(np.flatnonzero(~held_out)), sweep.select(np.flatnonzero(held_out)))
+    return replace(make_tiny_dataset(frames=16, height=16, width=16), name="50 % of <tiny>")
 
 
 class OneLevel(Learner):

@@ -120,18 +120,8 @@ def test_where_the_scene_fails_there_is_no_equal_time(dataset, level, tmp_path):
 
     methods = {"scene": Diverging(), "nearest": FromFrames("nearest"), "level": level}
     found = compare_methods(dataset, methods, ComparisonSettings(), folder=tmp_path, paces=Paces())
-    assert found.failures == {
-        "scene": "the loss is nan",
-        "level": "there is no equal time, since the scene failed",
-    }
+    assert found.failures == {"scene": "the loss is nan", "level": "there is no equal time, since the scene failed"}
     assert list(found.measured) == ["nearest"]
-
-
-def test_classical_methods_need_no_scene(dataset, tmp_path):
-    chosen = chosen_methods(("nearest", "median"))
-    found = compare_methods(dataset, chosen, ComparisonSettings(), folder=tmp_path)
-    assert [row.name for row in found.results] == ["median", "nearest"]
-    assert found.budget_s is None
 
 
 def test_the_authors_steps_are_those_of_the_author(dataset, level, tmp_path):

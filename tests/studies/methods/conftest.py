@@ -4,18 +4,16 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numpy as np
 import pytest
 import torch
 from torch import nn
 
-from ultragray import LinearProbe
-from ultragray.learn.sweep import Dataset, Sweep
 from ultragray_studies.methods.learner import LearnedMethod, Learner
 from ultragray_studies.methods.method import Description
 
+from ...model.learn.conftest import make_tiny_dataset
+
 SIDE = 32
-PROBE = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=20.0)
 
 
 class _Image(Learner):
@@ -56,20 +54,4 @@ def mean_image():
 
 @pytest.fixture
 def make_dataset():
-    """A sweep along elevation through a ball in grey noise; every fourth frame is held out."""
-
-    def make(frames=8, side=SIDE):
-        poses = np.tile(np.eye(4), (frames, 1, 1))
-        poses[:, 1, 3] = 0.8 * np.arange(frames)
-        x, z = np.meshgrid(np.linspace(-1, 1, side), np.linspace(0, 1, side))
-        ball = 140.0 * np.exp(-((x - 0.1) ** 2 + (z - 0.4) ** 2) / 0.1)
-        noise = np.random.default_rng(0).normal(50.0, 4.0, (frames, side, side))
-        images = np.clip(ball + noise, 0, 255).astype(np.uint8)
-        held_out = np.arange(frames) % 4 == 2
-
-        def part(chosen):
-            return Sweep(images[chosen], poses[chosen], PROBE, np.arange(frames)[chosen], "tiny")
-
-        return Dataset("tiny", part(~held_out), part(held_out))
-
-    return make
+    return lambda frames=8: make_tiny_dataset(frames=frames, height=SIDE, width=SIDE)

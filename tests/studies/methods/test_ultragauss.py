@@ -27,6 +27,7 @@ from ultragray_studies.methods.ultragauss import (
     wide_start,
 )
 
+from ...model.learn.conftest import make_tiny_dataset
 from .volumes import steps_of
 
 LINEAR = LinearProbe(width_mm=20.0, near_mm=5.0, far_mm=25.0)
@@ -166,22 +167,7 @@ def test_every_hundredth_step_of_the_first_half_is_due():
     assert [done for done in range(1, 601) if is_due(done, 600)] == [100, 200, 300]
 
 
-FACE_PROBE = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=25.0)
 VARIANTS = ("ultragauss", "ultragauss-shadow")
-
-
-def ball(frames, height, width, probe=FACE_PROBE):
-    """A bright ball in grey noise, with a shadow below it, in frames 0.8 mm apart."""
-    poses = np.tile(np.eye(4), (frames, 1, 1))
-    poses[:, :3, 3] = (30.0, -20.0, 10.0)
-    poses[:, 1, 3] += 0.8 * np.arange(frames)
-    x, z = np.meshgrid(np.linspace(-1, 1, width), np.linspace(0, 1, height))
-    y = np.linspace(-1, 1, frames)[:, None, None]
-    bright = np.exp(-((x - 0.3 * y) ** 2 + (z - 0.4) ** 2 + 0.2 * y**2) / 0.1)
-    noise = np.random.default_rng(0).normal(0.0, 4.0, (frames, height, width))
-    images = np.clip((140.0 * bright + 60.0) * np.where((np.abs(x) < 0.3) & (z > 0.6), 0.3, 1.0) + noise, 0, 255)
-    sweep = Sweep(images.astype(np.uint8), poses, probe, np.arange(frames), "ball")
-    return Dataset("ball", sweep, sweep.select([]))
 
 
 def small_learner(dataset, variant, count=300):
@@ -196,7 +182,7 @@ def psnr_db(got, want):
 @pytest.mark.long
 @pytest.mark.parametrize("variant", VARIANTS)
 def test_frames_are_learned_above_30_db(variant):
-    dataset = ball(2, 40, 32)
+    dataset = make_tiny_dataset(frames=2, height=40, width=32)
     learner = small_learner(dataset, variant, count=600)
     for step in range(600):
         learner.take_step(step, 600)
@@ -211,7 +197,7 @@ def test_a_killed_fit_ends_in_the_model_of_an_undisturbed_one(variant, tmp_path,
     """Killed between two resamplings, each of which finds Gaussians to replace."""
     monkeypatch.setattr("ultragray_studies.methods.ultragauss.LEAST_WEIGHT", 0.6)
     monkeypatch.setattr("ultragray.learn.training.geometry.MIN_GAUSSIANS", 300)
-    dataset, method = ball(4, 20, 16, CONVEX), METHODS[variant]
+    dataset, method = make_tiny_dataset(frames=4, probe=CONVEX), METHODS[variant]
     budget, seen = steps_of(method, 420), []
 
     def note(progress):
@@ -230,7 +216,7 @@ def test_a_killed_fit_ends_in_the_model_of_an_undisturbed_one(variant, tmp_path,
 
 
 def test_everything_learned_gets_a_gradient():
-    learner = small_learner(ball(2, 20, 16), "ultragauss-shadow")
+    learner = small_learner(make_tiny_dataset(frames=2), "ultragauss-shadow")
     learner.loss(0, 10).backward()
     for name, parameter in learner.module.named_parameters():
         assert parameter.grad is not None, name
@@ -239,15 +225,15 @@ def test_everything_learned_gets_a_gradient():
 
 def test_the_shadow_begins_faint():
     """The first image's last row has an optical depth of 0.1 on average."""
-    dataset = ball(2, 20, 16)
+    dataset = make_tiny_dataset(frames=2)
     plain, shadowed = (small_learner(dataset, variant) for variant in VARIANTS)
     pose = dataset.train.poses[0]
     with torch.no_grad():
-        left = shadowed.frame(FACE_PROBE, pose, 20, 16) / plain.frame(FACE_PROBE, pose, 20, 16)
+        left = shadowed.frame(dataset.probe, pose, 20, 16) / plain.frame(dataset.probe, pose, 20, 16)
     assert abs(float(-left[-1].log().mean()) - 0.1) < 1e-4
     assert 0.99 < float(left[0].mean()) < 1.0
 
 
 def test_images_smaller_than_the_window_of_ssim_are_refused():
     with pytest.raises(DatasetInvalid, match="at least 11 rows and columns, got 10x16"):
-        small_learner(ball(2, 10, 16), "ultragauss")
+        small_learner(make_tiny_dataset(frames=2, height=10), "ultragauss")

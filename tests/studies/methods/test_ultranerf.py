@@ -145,21 +145,12 @@ def test_drawn_probabilities_get_no_gradient_and_expected_ones_do():
     assert (expected.abs().amax(dim=(0, 1)) > 0.0).all()
 
 
-def test_the_expected_frame_has_the_gradients_of_its_formula():
-    raw = raw_numbers(4, 3).requires_grad_()
-    assert torch.autograd.gradcheck(_expected_of_raw, (raw,))
-
-
 def test_a_border_that_returns_everything_leaves_finite_gradients():
     raw = raw_numbers().float()
     raw[3, :, 1:3] = 200.0  # β and ρ_b are exactly 1
     raw.requires_grad_()
     (gradient,) = torch.autograd.grad(expected_frame(Tissue.of(raw), SPACING).sum(), raw)
     assert gradient.isfinite().all()
-
-
-def _expected_of_raw(raw):
-    return expected_frame(Tissue.of(raw), SPACING)
 
 
 SIDE = 24

@@ -86,13 +86,7 @@ def width_across_mm(scene, beam, places_mm):
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    ("sweeps", "beam"),
-    [
-        ("crossing", FOCUSED),
-        ("crossing", CONSTANT),
-        ("tilted", FOCUSED),
-        ("tilted", CONSTANT),
-    ],
+    ("sweeps", "beam"), [("crossing", FOCUSED), ("crossing", CONSTANT), ("tilted", FOCUSED), ("tilted", CONSTANT)]
 )
 def test_a_beam_that_nobody_gave_is_found(sweeps, beam):
     found = train(imaged(phantom(), SWEEPS[sweeps], beam), LEARNING).info.beam

@@ -151,8 +151,7 @@ def test_beyond_an_end_the_last_frame_goes_on(tiny_dataset):
     last = poses[:, 1, 3] > sweep.poses[-1, 1, 3]
     assert last.sum() > 3
     assert torch.equal(
-        images[torch.from_numpy(last)],
-        (torch.tensor(sweep.images[-1]).float() / 255.0).expand(int(last.sum()), -1, -1),
+        images[torch.from_numpy(last)], (torch.tensor(sweep.images[-1]).float() / 255.0).expand(int(last.sum()), -1, -1)
     )
 
 

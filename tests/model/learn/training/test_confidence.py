@@ -74,23 +74,13 @@ def ranks(values):
     return values.argsort().argsort().astype(np.float64)
 
 
-def told_and_actual():
+@pytest.mark.long
+def test_it_tells_what_frames_will_reach():
     scene, (_, val) = trained(), phantom()
     actual = np.array([frame.ms_ssim for frame in evaluate(scene, val).frames])
     told = np.array([frame.confidence for frame in Assessor(scene.info, scene.training_poses).assess(val.poses)])
-    return told, actual
-
-
-@pytest.mark.long
-def test_frames_that_will_reach_more_are_told_more():
-    told, actual = told_and_actual()
     assert actual.std() > 0.1
     assert np.corrcoef(ranks(told), ranks(actual))[0, 1] > 0.8
-
-
-@pytest.mark.long
-def test_it_tells_what_frames_will_reach():
-    told, actual = told_and_actual()
     assert np.abs(told - actual).mean() < 0.1
 
 
@@ -154,20 +144,6 @@ def test_the_time_left_holds_the_fit_and_the_fit_is_told(tiny_dataset, tiny_conf
 
 def test_too_few_frames_give_none(tiny_dataset, tiny_config):
     assert train(tiny_dataset(frames=6), tiny_config(confidence=True)).info.confidence == {}
-
-
-def test_a_stop_while_it_is_calibrated_leaves_the_scene(tiny_dataset, tiny_config):
-    asked = 0
-
-    def after_the_last_step():
-        nonlocal asked
-        asked += 1
-        return asked > 24 + 3
-
-    scene = train(tiny_dataset(frames=40), tiny_config(confidence=True), should_stop=after_the_last_step)
-    assert asked == 24 + 4
-    assert scene.info.training["step"] == 24
-    assert scene.info.confidence == {}
 
 
 def test_a_calibration_that_diverges_costs_no_scene(tiny_dataset, tiny_config, monkeypatch, caplog):

@@ -3,8 +3,10 @@
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
 import torch
 
@@ -29,6 +31,11 @@ def test_uses_what_is_free(tiny_dataset, monkeypatch):
     monkeypatch.setattr(memory, "available_bytes", lambda: needed - 1)
     with pytest.raises(MemoryExceeded, match="this machine has free"):
         memory.check_memory(dataset, config, torch.device("cpu"))
+    batches = [
+        memory.required_bytes(tiny_dataset(height=500, width=500), replace(config, batch_size=size))
+        for size in (100, 200)
+    ]
+    assert np.diff(batches) > 4 * 20 * 100 * 500 * 500, "outputs, and what the backward pass keeps of them"
 
 
 def test_a_gpu_is_asked_for_its_own_memory(tiny_dataset, monkeypatch):

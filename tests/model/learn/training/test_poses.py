@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from ultragray import GaussianScene, LinearProbe
+from ultragray import GaussianScene, LinearProbe, render
 from ultragray.geometry.rotations import rotations_of
 from ultragray.learn.report.sizes import CorrectionSizes
 from ultragray.learn.sweep import Dataset, Sweep
@@ -165,6 +165,9 @@ def test_whole_sweeps_are_trained_but_for_the_first():
         (found - true).square().sum().backward()
         corrections.step(0.5)
     motions = corrections.all_motions()
+    (corrections.corrected(torch.arange(12), sweep.poses) ** 2).sum().backward()
+    corrections.step(1.0)
+    np.testing.assert_array_equal(corrections.all_motions(), motions, "at the end of a run nothing moves any more")
     np.testing.assert_array_equal(motions[:6], np.tile(np.eye(4), (6, 1, 1)))
     np.testing.assert_array_equal(motions[7:], np.broadcast_to(motions[6], (5, 4, 4)))
     left = (motions @ sweep.poses)[6:, :3, 3] - true[6:].numpy()
@@ -213,17 +216,38 @@ def test_a_resumed_run_gives_the_same_corrections(tiny_dataset, tiny_config, tmp
     assert torch.equal(resumed.means, whole.means)
 
 
-def test_a_frame_that_is_off_is_scored_by_the_half_that_did_not_move_it(tiny_dataset, tiny_config):
+def test_a_frame_that_is_off_is_scored_by_the_half_that_did_not_move_it(random_scene):
     """Registered on one half it scores better on the other; a frame in place gains little."""
-    dataset = tiny_dataset(frames=16, height=40, width=40)
-    scene = train(dataset, tiny_config(steps=120, max_gaussians=400, refinements=0))
-    moved = dataset.val.poses.copy()
+    scene, poses = random_scene(200, extent_cm=(4.0, 2.0, 5.0), sigma_cm=(0.1, 0.4)), freehand_path(3)
+    images = render(scene, PROBE, poses, height=40, width=40, outputs=("bmode",))["bmode"]
+    frames = Sweep((255.0 * images.numpy()).round().astype(np.uint8), poses, PROBE, np.arange(3), "rendered")
+    moved = poses.copy()
     moved[:, 0, 3] += 2.0
-    off = score_halves(scene, replace(dataset.val, poses=moved))
+    off = score_halves(scene, replace(frames, poses=moved))
     assert off.registered_psnr_db > off.as_given_psnr_db + 0.5
     assert 0.5 < off.moved_mm < 4.0
-    in_place = score_halves(scene, dataset.val)
+    in_place = score_halves(scene, frames)
     assert in_place.registered_psnr_db - in_place.as_given_psnr_db < off.registered_psnr_db - off.as_given_psnr_db
+
+
+def test_a_half_is_scored_as_the_other_moved_it(tiny_dataset, random_scene, monkeypatch):
+    """The left half asks for a shift that does nothing but make the right one better."""
+    sweep = tiny_dataset(frames=16, height=40, width=40).val
+    given = torch.from_numpy(sweep.poses)
+
+    def fitted(scene, frames, truth, columns, backend):
+        return given + (5.0 if columns.start == 0 else 0.0) * torch.from_numpy(np.eye(4, k=3))
+
+    def rendered(scene, frames, poses, backend):
+        found = torch.from_numpy(frames.images).float() / 255.0 + 0.1
+        found[..., 20:] -= 0.0 if torch.equal(poses, given) else 0.09
+        return found
+
+    monkeypatch.setattr(trained, "_fitted", fitted)
+    monkeypatch.setattr(trained, "_rendered", rendered)
+    score = score_halves(random_scene(3), sweep)
+    assert score.registered_psnr_db == pytest.approx(score.as_given_psnr_db + 10.0, abs=0.1)
+    assert score.moved_mm == pytest.approx(2.5)
 
 
 def test_the_sizes_of_corrections():
