@@ -4,12 +4,10 @@ import os
 import subprocess
 import sys
 
-import pytest
-
 from ultragray_service.healthcheck import DEFAULT_HTTP_PORT, ready_url
 from ultragray_service.settings import Settings
 
-from ...certificates import Mounted, write_client
+from ...certificates import write_client
 from ..conftest import ROOT
 
 
@@ -18,13 +16,6 @@ def check(service, **environment):
     port = {"ULTRAGRAY_HTTP_PORT": service.http.rpartition(":")[2], "PYTHONPATH": str(ROOT / "service")}
     command = [sys.executable, "-m", "ultragray_service.healthcheck"]
     return subprocess.run(command, env={**os.environ, **port, **given}, capture_output=True, text=True, check=False)
-
-
-@pytest.fixture
-def mounted(tmp_path):
-    found = Mounted(tmp_path / "tls")
-    found.put(found.issue())
-    return found
 
 
 def test_with_and_without_tls(service, start_service, mounted):
