@@ -17,7 +17,7 @@ _START_TIMEOUT_S = 180.0
 _STOP_TIMEOUT_S = 30.0
 
 # Each process of ours imports this first: checkpoints and take-overs come as often as the kills do.
-_PATCHES = f"""
+PATCHES = f"""
 import sys
 line = " ".join(sys.orig_argv)
 if "ultragray_workers.jobs.worker.run_job" in line:
@@ -27,7 +27,7 @@ elif "worker" in line:
     from ultragray_workers.jobs import queue
     queue.DEAD_AFTER_S = {DEAD_AFTER_S}
 """
-_SERVE = [sys.executable, "-m", "ultragray_service"]
+SERVE = [sys.executable, "-m", "ultragray_service"]
 WORK = [sys.executable, "-c", "from ultragray_service.cli.app import app; app()", "worker", "--device", "cpu"]
 
 
@@ -44,7 +44,7 @@ class Machine:
         self.data.mkdir()
         patches = folder / "patches"
         patches.mkdir()
-        (patches / "sitecustomize.py").write_text(_PATCHES)
+        (patches / "sitecustomize.py").write_text(PATCHES)
         self._environment = {
             **os.environ,
             "PYTHONPATH": os.pathsep.join([str(patches), *filter(None, sys.path)]),
@@ -79,7 +79,7 @@ class Machine:
         if not self._servers or self._servers[-1].poll() is not None:
             self.http = self.grpc = None
             embedded = {"ULTRAGRAY_EMBEDDEDWORKER": str(self._with_workers)}
-            self._servers.append(self._spawn(_SERVE, f"server-{len(self._servers)}", embedded))
+            self._servers.append(self._spawn(SERVE, f"server-{len(self._servers)}", embedded))
         if self._with_workers and (not self._workers or self._workers[-1].poll() is not None):
             self._workers.append(self._spawn(WORK, f"worker-{len(self._workers)}", {}))
         if self.http is None:

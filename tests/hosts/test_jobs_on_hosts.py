@@ -20,25 +20,12 @@ from ultragray.learn.training import TrainingConfig, train
 from ultragray.phantom.demo import copy_demo_scene
 from ultragray_workers.storage.location import open_storage
 
+from ..faults.machine import PATCHES, SERVE, WORK
 from ..object_storage import AWAY_S
 from ..waiting import wait_until
 from ..workers.jobs.conftest import tiny_dataset
 
 _START_TIMEOUT_S = 180.0
-
-# Each process of ours imports this first: checkpoints and take-overs come as often as a short test needs them.
-_PATCHES = """
-import sys
-line = " ".join(sys.orig_argv)
-if "ultragray_workers.jobs.worker.run_job" in line:
-    from ultragray_workers.jobs.kinds import train_run
-    train_run.CHECKPOINT_INTERVAL_S = 0.3
-elif "worker" in line:
-    from ultragray_workers.jobs import queue
-    queue.DEAD_AFTER_S = 3.0
-"""
-_SERVE = [sys.executable, "-m", "ultragray_service"]
-_WORK = [sys.executable, "-c", "from ultragray_service.cli.app import app; app()", "worker", "--device", "cpu"]
 
 
 class Host:
@@ -49,7 +36,7 @@ class Host:
         for one in (self.data, self.cache, folder / "logs", folder / "patches"):
             one.mkdir(parents=True)
         copy_demo_scene(self.data / "demo.ugr")
-        (folder / "patches" / "sitecustomize.py").write_text(_PATCHES)
+        (folder / "patches" / "sitecustomize.py").write_text(PATCHES)
         self._environment = {
             **os.environ,
             "PYTHONPATH": os.pathsep.join([str(folder / "patches"), *filter(None, sys.path)]),
@@ -70,7 +57,7 @@ class Host:
 
     def serve(self):
         """Starts a service; its addresses of HTTP and gRPC."""
-        process, log = self._spawn(_SERVE, "service")
+        process, log = self._spawn(SERVE, "service")
 
         def addresses():
             assert process.poll() is None, self.told()
@@ -84,7 +71,7 @@ class Host:
 
     def work(self):
         """Starts a worker."""
-        return self._spawn(_WORK, "worker")[0]
+        return self._spawn(WORK, "worker")[0]
 
     def kill_all(self):
         """As a loss of power: the processes of jobs die with their workers."""

@@ -197,6 +197,7 @@ def test_mistakes_of_localize_are_told_in_one_line(tmp_path):
     (tmp_path / "text.png").write_text("no picture")
     assert "must hold one pose, got 3" in refused("localize", DEMO_FILE, tmp_path / "text.png", "--start", start)
     np.save(start, demo_poses(1))
+    assert "No such file" in refused("localize", DEMO_FILE, tmp_path / "none.png", "--start", start)
     assert "image must be a PNG file" in refused("localize", DEMO_FILE, tmp_path / "text.png", "--start", start)
     np.save(tmp_path / "objects.npy", np.array([{}], dtype=object), allow_pickle=True)
     assert "it holds Python objects" in refused("localize", DEMO_FILE, tmp_path / "objects.npy", "--start", start)

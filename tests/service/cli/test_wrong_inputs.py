@@ -120,7 +120,6 @@ WRONG = {  # the command line, and a part of the line that it gives
     "datasets upload none": "none: no such file or folder",
     "datasets upload notes.txt": "an upload is an archive",
     "localize scene.ugr notes.txt --start pose.npy": "must end in .png or .npy",
-    "localize scene.ugr none.png --start pose.npy": "No such file",
     "calibrate points notes.txt pose.npy -o a.json": "must end in .npy or .csv",
     "storage copy none to": "FROM must be an existing folder",
     "worker --data-folder none": "artifact_folder must be an existing folder",
