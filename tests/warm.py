@@ -131,13 +131,13 @@ SHORT_WAITS = {
     "access.credentials.LOOK_INTERVAL_S": 0.2,
     "access.keys.INTERVAL_S": 0.25,
     "access.owners.SPREAD_S": 0.5,  # two of the interval before
-    "core.jobs.hub.READ_INTERVAL_S": 0.1,
-    "core.jobs.jobs.COUNT_INTERVAL_S": 0.5,
+    "core.jobs.READ_INTERVAL_S": 0.1,
+    "core.jobs.COUNT_INTERVAL_S": 0.5,
     "core.readiness.CHECK_INTERVAL_S": 0.5,
     "core.uploads._POLL_INTERVAL_S": 0.05,
     "listening.HANDSHAKE_TIMEOUT_S": 2.0,
     "rpc.server.HANDSHAKE_TIMEOUT_S": 2.0,
-    "tls.server._POLL_S": 0.2,
+    "tls._POLL_S": 0.2,
 }
 
 

@@ -3,6 +3,9 @@
 
 ClientError
 ├── InvalidArgument
+│   ├── RequestMalformed
+│   ├── UploadTooLarge
+│   ├── TargetTooLong
 │   ├── InvalidPose
 │   ├── InvalidProbe
 │   ├── InvalidImageSize
@@ -10,26 +13,11 @@ ClientError
 │   ├── LowConfidence
 │   ├── FrameTooCostly
 │   ├── TooManyPoses
-│   ├── HeadersTooLarge
-│   ├── TargetTooLong
-│   ├── RequestMalformed
 │   ├── DatasetInvalid
-│   └── UploadTooLarge
+│   └── HeadersTooLarge
 ├── Unauthenticated
-├── Unavailable
-│   ├── IssuerUnavailable
-│   ├── TooManyConnections
-│   ├── StorageUnavailable
-│   ├── DatabaseUnavailable
-│   ├── ArtifactFolderUnavailable
-│   ├── NotReady
-│   ├── Draining
-│   └── Unreachable
 ├── PermissionDenied
 │   └── HostRefused
-├── DeadlineExceeded
-│   ├── RequestTooSlow
-│   └── JobTimeExceeded
 ├── NotFound
 │   ├── SceneNotFound
 │   ├── RegistrationNotFound
@@ -37,31 +25,43 @@ ClientError
 │   ├── JobNotFound
 │   ├── WorkerNotFound
 │   └── ArtifactNotFound
-├── FailedPrecondition
-│   ├── SceneFileInvalid
-│   ├── DatasetInUse
-│   ├── JobFinished
-│   ├── JobNotFinished
-│   └── JobInUse
+├── DeadlineExceeded
+│   ├── RequestTooSlow
+│   └── JobTimeExceeded
 ├── AlreadyExists
 │   ├── DatasetExists
 │   ├── SceneExists
 │   └── RequestIdConflict
+├── FailedPrecondition
+│   ├── DatasetInUse
+│   ├── JobFinished
+│   ├── JobNotFinished
+│   ├── JobInUse
+│   └── SceneFileInvalid
 ├── ResourceExhausted
-│   ├── StorageFull
-│   ├── MemoryExceeded
-│   ├── JobQueueFull
-│   ├── SceneTooLarge
 │   ├── QueueFull
 │   ├── RateLimited
-│   └── LimitReached
+│   ├── JobQueueFull
+│   ├── LimitReached
+│   ├── StorageFull
+│   ├── MemoryExceeded
+│   └── SceneTooLarge
 ├── JobStalled
-├── Unimplemented
-│   ├── BackendUnavailable
-│   └── ExtraMissing
 ├── BackupInvalid
 ├── RestoreRefused
 ├── RenderFailed
+├── Unimplemented
+│   ├── BackendUnavailable
+│   └── ExtraMissing
+├── Unavailable
+│   ├── TooManyConnections
+│   ├── NotReady
+│   ├── Draining
+│   ├── IssuerUnavailable
+│   ├── StorageUnavailable
+│   ├── DatabaseUnavailable
+│   ├── ArtifactFolderUnavailable
+│   └── Unreachable
 ├── TlsFailed
 └── StreamEnded
 
@@ -78,6 +78,24 @@ class InvalidArgument(ClientError, ValueError):
 
     reason = "INVALID_ARGUMENT"
     grpc_status = "INVALID_ARGUMENT"
+
+
+class RequestMalformed(InvalidArgument):
+    """Bytes that are no HTTP request, or too many requests at once on one connection."""
+
+    reason = "REQUEST_MALFORMED"
+
+
+class UploadTooLarge(InvalidArgument):
+    """An upload over `ULTRAGRAY_MAX_DATASET_BYTES`, packed or unpacked, or of too many files."""
+
+    reason = "UPLOAD_TOO_LARGE"
+
+
+class TargetTooLong(InvalidArgument):
+    """Path and query of a request over 16 KiB."""
+
+    reason = "TARGET_TOO_LONG"
 
 
 class InvalidPose(InvalidArgument):
@@ -122,34 +140,16 @@ class TooManyPoses(InvalidArgument):
     reason = "TOO_MANY_POSES"
 
 
-class HeadersTooLarge(InvalidArgument):
-    """The head of a request over `ULTRAGRAY_MAX_HEADER_BYTES`, or more headers than `ULTRAGRAY_MAX_HEADERS`."""
-
-    reason = "HEADERS_TOO_LARGE"
-
-
-class TargetTooLong(InvalidArgument):
-    """Path and query of a request over 16 KiB."""
-
-    reason = "TARGET_TOO_LONG"
-
-
-class RequestMalformed(InvalidArgument):
-    """Bytes that are no HTTP request, or too many requests at once on one connection."""
-
-    reason = "REQUEST_MALFORMED"
-
-
 class DatasetInvalid(InvalidArgument):
     """A tracked sweep that cannot be used; names the file, the frame and the reason."""
 
     reason = "DATASET_INVALID"
 
 
-class UploadTooLarge(InvalidArgument):
-    """An upload over `ULTRAGRAY_MAX_DATASET_BYTES`, packed or unpacked, or of too many files."""
+class HeadersTooLarge(InvalidArgument):
+    """The head of a request over `ULTRAGRAY_MAX_HEADER_BYTES`, or more headers than `ULTRAGRAY_MAX_HEADERS`."""
 
-    reason = "UPLOAD_TOO_LARGE"
+    reason = "HEADERS_TOO_LARGE"
 
 
 class Unauthenticated(ClientError):
@@ -157,61 +157,6 @@ class Unauthenticated(ClientError):
 
     reason = "UNAUTHENTICATED"
     grpc_status = "UNAUTHENTICATED"
-
-
-class Unavailable(ClientError):
-    """Base of the errors whose gRPC status is UNAVAILABLE."""
-
-    reason = "UNAVAILABLE"
-    grpc_status = "UNAVAILABLE"
-
-
-class IssuerUnavailable(Unavailable):
-    """The issuer of a token does not answer, so that the token cannot be checked; API keys work all the same; retry."""
-
-    reason = "ISSUER_UNAVAILABLE"
-
-
-class TooManyConnections(Unavailable):
-    """Connections over `ULTRAGRAY_MAX_CONNECTIONS`, or of one address over the limit of those; retry."""
-
-    reason = "TOO_MANY_CONNECTIONS"
-
-
-class StorageUnavailable(Unavailable):
-    """The object storage does not answer, or refuses its credentials; what is cached is served all the same; retry."""
-
-    reason = "STORAGE_UNAVAILABLE"
-
-
-class DatabaseUnavailable(Unavailable):
-    """The database of the jobs is away or takes no changes; scenes are rendered all the same; retry."""
-
-    reason = "DATABASE_UNAVAILABLE"
-
-
-class ArtifactFolderUnavailable(Unavailable):
-    """The artifact folder is gone, or not the one that the jobs belong to: its share is not mounted; retry."""
-
-    reason = "ARTIFACT_FOLDER_UNAVAILABLE"
-
-
-class NotReady(Unavailable):
-    """The service is starting, or cannot render at the moment; retry."""
-
-    reason = "NOT_READY"
-
-
-class Draining(Unavailable):
-    """The service is stopping; retry elsewhere."""
-
-    reason = "DRAINING"
-
-
-class Unreachable(Unavailable):
-    """Nobody answers at the address, or the connection broke."""
-
-    reason = "UNREACHABLE"
 
 
 class PermissionDenied(ClientError):
@@ -225,25 +170,6 @@ class HostRefused(PermissionDenied):
     """A `Host` that the service is not known as, where it asks for no key."""
 
     reason = "HOST_REFUSED"
-
-
-class DeadlineExceeded(ClientError, TimeoutError):
-    """The deadline passed first."""
-
-    reason = "DEADLINE_EXCEEDED"
-    grpc_status = "DEADLINE_EXCEEDED"
-
-
-class RequestTooSlow(DeadlineExceeded):
-    """A head that took longer than `ULTRAGRAY_HEADER_TIMEOUT_S`, or a body below `ULTRAGRAY_MIN_BYTES_PER_S`."""
-
-    reason = "REQUEST_TOO_SLOW"
-
-
-class JobTimeExceeded(DeadlineExceeded):
-    """A job ran longer than its `max_run_s`, or `ULTRAGRAY_JOB_MAX_RUN_S`, and was ended."""
-
-    reason = "JOB_TIME_EXCEEDED"
 
 
 class NotFound(ClientError):
@@ -289,41 +215,23 @@ class ArtifactNotFound(NotFound):
     reason = "ARTIFACT_NOT_FOUND"
 
 
-class FailedPrecondition(ClientError):
-    """Base of the errors whose gRPC status is FAILED_PRECONDITION."""
+class DeadlineExceeded(ClientError, TimeoutError):
+    """The deadline passed first."""
 
-    reason = "FAILED_PRECONDITION"
-    grpc_status = "FAILED_PRECONDITION"
-
-
-class SceneFileInvalid(FailedPrecondition):
-    """A scene file that is truncated, foreign or inconsistent."""
-
-    reason = "SCENE_FILE_INVALID"
+    reason = "DEADLINE_EXCEEDED"
+    grpc_status = "DEADLINE_EXCEEDED"
 
 
-class DatasetInUse(FailedPrecondition):
-    """A job needs the dataset."""
+class RequestTooSlow(DeadlineExceeded):
+    """A head that took longer than `ULTRAGRAY_HEADER_TIMEOUT_S`, or a body below `ULTRAGRAY_MIN_BYTES_PER_S`."""
 
-    reason = "DATASET_IN_USE"
-
-
-class JobFinished(FailedPrecondition):
-    """A job that succeeded or failed cannot be cancelled."""
-
-    reason = "JOB_FINISHED"
+    reason = "REQUEST_TOO_SLOW"
 
 
-class JobNotFinished(FailedPrecondition):
-    """Only a failed or cancelled job can be retried."""
+class JobTimeExceeded(DeadlineExceeded):
+    """A job ran longer than its `max_run_s`, or `ULTRAGRAY_JOB_MAX_RUN_S`, and was ended."""
 
-    reason = "JOB_NOT_FINISHED"
-
-
-class JobInUse(FailedPrecondition):
-    """A job that waits or runs, or that another of those goes on from, cannot be deleted."""
-
-    reason = "JOB_IN_USE"
+    reason = "JOB_TIME_EXCEEDED"
 
 
 class AlreadyExists(ClientError):
@@ -351,11 +259,72 @@ class RequestIdConflict(AlreadyExists):
     reason = "REQUEST_ID_CONFLICT"
 
 
+class FailedPrecondition(ClientError):
+    """Base of the errors whose gRPC status is FAILED_PRECONDITION."""
+
+    reason = "FAILED_PRECONDITION"
+    grpc_status = "FAILED_PRECONDITION"
+
+
+class DatasetInUse(FailedPrecondition):
+    """A job needs the dataset."""
+
+    reason = "DATASET_IN_USE"
+
+
+class JobFinished(FailedPrecondition):
+    """A job that succeeded or failed cannot be cancelled."""
+
+    reason = "JOB_FINISHED"
+
+
+class JobNotFinished(FailedPrecondition):
+    """Only a failed or cancelled job can be retried."""
+
+    reason = "JOB_NOT_FINISHED"
+
+
+class JobInUse(FailedPrecondition):
+    """A job that waits or runs, or that another of those goes on from, cannot be deleted."""
+
+    reason = "JOB_IN_USE"
+
+
+class SceneFileInvalid(FailedPrecondition):
+    """A scene file that is truncated, foreign or inconsistent."""
+
+    reason = "SCENE_FILE_INVALID"
+
+
 class ResourceExhausted(ClientError):
     """Base of the errors whose gRPC status is RESOURCE_EXHAUSTED."""
 
     reason = "RESOURCE_EXHAUSTED"
     grpc_status = "RESOURCE_EXHAUSTED"
+
+
+class QueueFull(ResourceExhausted):
+    """Too many frames wait, or too many uploads are under way; retry."""
+
+    reason = "QUEUE_FULL"
+
+
+class RateLimited(ResourceExhausted):
+    """More requests or frames in a second than the key may have; retry."""
+
+    reason = "RATE_LIMITED"
+
+
+class JobQueueFull(ResourceExhausted):
+    """Too many jobs wait; retry."""
+
+    reason = "JOB_QUEUE_FULL"
+
+
+class LimitReached(ResourceExhausted):
+    """As many streams, jobs, minutes of compute or bytes as the key may have; end or delete some, or wait."""
+
+    reason = "LIMIT_REACHED"
 
 
 class StorageFull(ResourceExhausted):
@@ -372,40 +341,34 @@ class MemoryExceeded(ResourceExhausted):
     reason = "MEMORY_EXCEEDED"
 
 
-class JobQueueFull(ResourceExhausted):
-    """Too many jobs wait; retry."""
-
-    reason = "JOB_QUEUE_FULL"
-
-
 class SceneTooLarge(ResourceExhausted):
     """A scene that does not fit `ULTRAGRAY_MEMORY_BUDGET_MB` at all."""
 
     reason = "SCENE_TOO_LARGE"
 
 
-class QueueFull(ResourceExhausted):
-    """Too many frames wait, or too many uploads are under way; retry."""
-
-    reason = "QUEUE_FULL"
-
-
-class RateLimited(ResourceExhausted):
-    """More requests or frames in a second than the key may have; retry."""
-
-    reason = "RATE_LIMITED"
-
-
-class LimitReached(ResourceExhausted):
-    """As many streams, jobs, minutes of compute or bytes as the key may have; end or delete some, or wait."""
-
-    reason = "LIMIT_REACHED"
-
-
 class JobStalled(ClientError):
     """The process of a job neither computed nor read nor wrote for `ULTRAGRAY_JOB_STALL_TIMEOUT_S`, and was ended."""
 
     reason = "JOB_STALLED"
+
+
+class BackupInvalid(ClientError):
+    """A backup that is not there, damaged, or made by a newer release (command line)."""
+
+    reason = "BACKUP_INVALID"
+
+
+class RestoreRefused(ClientError):
+    """A backup or restore into a place that holds something else, or where somebody is at work (command line)."""
+
+    reason = "RESTORE_REFUSED"
+
+
+class RenderFailed(ClientError):
+    """A worker could not render the frame."""
+
+    reason = "RENDER_FAILED"
 
 
 class Unimplemented(ClientError):
@@ -429,22 +392,59 @@ class ExtraMissing(Unimplemented):
     reason = "EXTRA_MISSING"
 
 
-class BackupInvalid(ClientError):
-    """A backup that is not there, damaged, or made by a newer release (command line)."""
+class Unavailable(ClientError):
+    """Base of the errors whose gRPC status is UNAVAILABLE."""
 
-    reason = "BACKUP_INVALID"
-
-
-class RestoreRefused(ClientError):
-    """A backup or restore into a place that holds something else, or where somebody is at work (command line)."""
-
-    reason = "RESTORE_REFUSED"
+    reason = "UNAVAILABLE"
+    grpc_status = "UNAVAILABLE"
 
 
-class RenderFailed(ClientError):
-    """A worker could not render the frame."""
+class TooManyConnections(Unavailable):
+    """Connections over `ULTRAGRAY_MAX_CONNECTIONS`, or of one address over the limit of those; retry."""
 
-    reason = "RENDER_FAILED"
+    reason = "TOO_MANY_CONNECTIONS"
+
+
+class NotReady(Unavailable):
+    """The service is starting, or cannot render at the moment; retry."""
+
+    reason = "NOT_READY"
+
+
+class Draining(Unavailable):
+    """The service is stopping; retry elsewhere."""
+
+    reason = "DRAINING"
+
+
+class IssuerUnavailable(Unavailable):
+    """The issuer of a token does not answer, so that the token cannot be checked; API keys work all the same; retry."""
+
+    reason = "ISSUER_UNAVAILABLE"
+
+
+class StorageUnavailable(Unavailable):
+    """The object storage does not answer, or refuses its credentials; what is cached is served all the same; retry."""
+
+    reason = "STORAGE_UNAVAILABLE"
+
+
+class DatabaseUnavailable(Unavailable):
+    """The database of the jobs is away or takes no changes; scenes are rendered all the same; retry."""
+
+    reason = "DATABASE_UNAVAILABLE"
+
+
+class ArtifactFolderUnavailable(Unavailable):
+    """The artifact folder is gone, or not the one that the jobs belong to: its share is not mounted; retry."""
+
+    reason = "ARTIFACT_FOLDER_UNAVAILABLE"
+
+
+class Unreachable(Unavailable):
+    """Nobody answers at the address, or the connection broke."""
+
+    reason = "UNREACHABLE"
 
 
 class TlsFailed(ClientError):
@@ -462,6 +462,9 @@ class StreamEnded(ClientError):
 ERRORS = (
     ClientError,
     InvalidArgument,
+    RequestMalformed,
+    UploadTooLarge,
+    TargetTooLong,
     InvalidPose,
     InvalidProbe,
     InvalidImageSize,
@@ -469,26 +472,11 @@ ERRORS = (
     LowConfidence,
     FrameTooCostly,
     TooManyPoses,
-    HeadersTooLarge,
-    TargetTooLong,
-    RequestMalformed,
     DatasetInvalid,
-    UploadTooLarge,
+    HeadersTooLarge,
     Unauthenticated,
-    Unavailable,
-    IssuerUnavailable,
-    TooManyConnections,
-    StorageUnavailable,
-    DatabaseUnavailable,
-    ArtifactFolderUnavailable,
-    NotReady,
-    Draining,
-    Unreachable,
     PermissionDenied,
     HostRefused,
-    DeadlineExceeded,
-    RequestTooSlow,
-    JobTimeExceeded,
     NotFound,
     SceneNotFound,
     RegistrationNotFound,
@@ -496,31 +484,43 @@ ERRORS = (
     JobNotFound,
     WorkerNotFound,
     ArtifactNotFound,
-    FailedPrecondition,
-    SceneFileInvalid,
-    DatasetInUse,
-    JobFinished,
-    JobNotFinished,
-    JobInUse,
+    DeadlineExceeded,
+    RequestTooSlow,
+    JobTimeExceeded,
     AlreadyExists,
     DatasetExists,
     SceneExists,
     RequestIdConflict,
+    FailedPrecondition,
+    DatasetInUse,
+    JobFinished,
+    JobNotFinished,
+    JobInUse,
+    SceneFileInvalid,
     ResourceExhausted,
-    StorageFull,
-    MemoryExceeded,
-    JobQueueFull,
-    SceneTooLarge,
     QueueFull,
     RateLimited,
+    JobQueueFull,
     LimitReached,
+    StorageFull,
+    MemoryExceeded,
+    SceneTooLarge,
     JobStalled,
-    Unimplemented,
-    BackendUnavailable,
-    ExtraMissing,
     BackupInvalid,
     RestoreRefused,
     RenderFailed,
+    Unimplemented,
+    BackendUnavailable,
+    ExtraMissing,
+    Unavailable,
+    TooManyConnections,
+    NotReady,
+    Draining,
+    IssuerUnavailable,
+    StorageUnavailable,
+    DatabaseUnavailable,
+    ArtifactFolderUnavailable,
+    Unreachable,
     TlsFailed,
     StreamEnded,
 )

@@ -36,7 +36,7 @@ from ultragray_service.rpc import server as grpc_server
 from ultragray_service.rpc import shared_memory
 from ultragray_service.service import Service
 from ultragray_service.settings import ENVIRONMENT_PREFIX, LEAST_KEY_LENGTH, Settings
-from ultragray_service.tls.server import HANDSHAKE_TIMEOUT_S
+from ultragray_service.tls import HANDSHAKE_TIMEOUT_S
 from ultragray_studies.methods.registry import METHODS
 from ultragray_workers import errors as workers_errors
 from ultragray_workers import scene_names

@@ -22,13 +22,17 @@ UltragrayError
 └── those of the front doors: ultragray_service.errors
 
 Each class carries a `reason` that never changes: clients match on it, and the service looks up the statuses that its
-front doors answer with. The first paragraph of its docstring is its line in docs/reference/errors.md.
+front doors answer with. It is the class's name in capitals, where the class does not say otherwise. The first
+paragraph of its docstring is its line in docs/reference/errors.md.
 """
 
 from __future__ import annotations
 
+import re
 from collections.abc import Iterator
 from typing import ClassVar
+
+_WORD = re.compile(r"(?<!^)(?=[A-Z])")  # where a word of a class's name begins
 
 
 class UltragrayError(Exception):
@@ -39,6 +43,10 @@ class UltragrayError(Exception):
 
     reason: ClassVar[str] = "INTERNAL"
     title: ClassVar[str] = "Internal error"
+
+    def __init_subclass__(cls) -> None:
+        if "reason" not in vars(cls):
+            cls.reason = _WORD.sub("_", cls.__name__).upper()
 
     def __init__(self, detail: str, *, field: str | None = None, retry_after_s: float | None = None) -> None:
         """`retry_after_s`: when the same request may succeed, where the one who raises it knows."""
@@ -65,91 +73,78 @@ def error_classes(base: type[UltragrayError] = UltragrayError) -> Iterator[type[
 class InvalidArgument(UltragrayError, ValueError):
     """A value that cannot be used; `field` names it as the caller wrote it."""
 
-    reason = "INVALID_ARGUMENT"
     title = "Invalid argument"
 
 
 class InvalidPose(InvalidArgument):
     """Not a rigid probe→scene transform."""
 
-    reason = "INVALID_POSE"
     title = "Not a rigid probe-to-scene transform"
 
 
 class InvalidProbe(InvalidArgument):
     """A probe that no transducer could have, such as far ≤ near."""
 
-    reason = "INVALID_PROBE"
     title = "Invalid probe"
 
 
 class InvalidImageSize(InvalidArgument):
     """Height or width outside the limits."""
 
-    reason = "INVALID_IMAGE_SIZE"
     title = "Invalid image size"
 
 
 class UnknownOutput(InvalidArgument):
     """An output that does not exist, none at all, or one that the scene does not have."""
 
-    reason = "UNKNOWN_OUTPUT"
     title = "Unknown output"
 
 
 class LowConfidence(InvalidArgument):
     """A pose below the `min_confidence` that was asked for."""
 
-    reason = "LOW_CONFIDENCE"
     title = "The confidence is too low"
 
 
 class FrameTooCostly(InvalidArgument):
     """A frame whose Gaussians cover more pixels than `ULTRAGRAY_MAX_FOOTPRINT_PIXELS` allows; ask for a smaller one."""
 
-    reason = "FRAME_TOO_COSTLY"
     title = "The frame would take too long"
 
 
 class TooManyPoses(InvalidArgument):
     """More poses, or pixels, than one request may have; send several."""
 
-    reason = "TOO_MANY_POSES"
     title = "Too many poses"
 
 
 class SceneFileInvalid(UltragrayError):
     """A scene file that is truncated, foreign or inconsistent."""
 
-    reason = "SCENE_FILE_INVALID"
     title = "Invalid scene file"
 
 
 class CheckpointInvalid(UltragrayError):
     """A checkpoint, conf.json or pose file that cannot be imported (command line, library)."""
 
-    reason = "CHECKPOINT_INVALID"
     title = "Invalid checkpoint"
 
 
 class DatasetInvalid(UltragrayError):
     """A tracked sweep that cannot be used; names the file, the frame and the reason."""
 
-    reason = "DATASET_INVALID"
     title = "Invalid dataset"
 
 
 class TrainingDiverged(UltragrayError):
     """Loss or parameters of a training are no longer finite, or no method of a comparison came to its end."""
 
-    reason = "TRAINING_DIVERGED"
     title = "Training diverged"
 
 
 class TrainingStateInvalid(UltragrayError):
     """A training folder that cannot be resumed from."""
 
-    reason = "TRAINING_STATE_INVALID"
     title = "Training cannot be resumed"
 
 
@@ -158,14 +153,12 @@ class MemoryExceeded(UltragrayError):
     into memory; also where the machine has none left.
     """
 
-    reason = "MEMORY_EXCEEDED"
     title = "Memory exceeded"
 
 
 class BackendUnavailable(UltragrayError):
     """A backend that cannot run here."""
 
-    reason = "BACKEND_UNAVAILABLE"
     title = "Render backend unavailable"
 
 
@@ -174,12 +167,10 @@ class ExtraMissing(UltragrayError):
     jobs, command line, library).
     """
 
-    reason = "EXTRA_MISSING"
     title = "Optional package not installed"
 
 
 class RenderFailed(UltragrayError):
     """A worker could not render the frame."""
 
-    reason = "RENDER_FAILED"
     title = "Rendering failed"

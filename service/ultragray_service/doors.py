@@ -37,7 +37,6 @@ class Doors:
 
     @classmethod
     def of(cls, settings: Settings, http_port: int, grpc_port: int, igtl: str | None) -> Doors:
-        """The doors of a service on these ports; `igtl` is an address."""
         scheme = "https" if settings.tls_certificate is not None else "http"
         http = f"{scheme}://{authority(settings.host, http_port)}"
         return cls(settings, http, authority(settings.host, grpc_port), igtl)
@@ -54,19 +53,16 @@ class Doors:
         )
 
     def fields(self) -> dict[str, str]:
-        """The addresses for a program."""
         found = {"http": self.http, "grpc": self.grpc, "docs": f"{self.http}/docs"}
         found["data_folder"] = str(self.settings.data_folder)
         return found if self.igtl is None else {**found, "igtl": self.igtl}
 
     def in_words(self) -> str:
-        """One sentence for a log."""
         tls = " with TLS" if self.settings.tls_certificate is not None else ""
         sentence = f"serving HTTP on {self.http} (docs at {self.http}/docs) and gRPC on {self.grpc}{tls}"
         return sentence if self.igtl is None else f"{sentence}, OpenIGTLink on {self.igtl}"
 
     def banner(self, asks_for_keys: bool) -> str:
-        """A few lines for who has started the service on a terminal."""
         host = self.settings.host
         scheme, port = self.http.partition(":")[0], self.http.rpartition(":")[2]
         http = f"{scheme}://localhost:{port}" if host in _ANY else self.http

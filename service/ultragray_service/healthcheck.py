@@ -19,7 +19,6 @@ _EVERYWHERE = ("", "0.0.0.0", "::")
 
 
 def ready_url(environment: Mapping[str, str]) -> str:
-    """Where the service says whether it is ready."""
     host = environment.get("ULTRAGRAY_HOST", "")
     host = "127.0.0.1" if host in _EVERYWHERE else f"[{host}]" if ":" in host else host
     scheme = "https" if environment.get("ULTRAGRAY_TLS_CERTIFICATE") else "http"
@@ -27,7 +26,6 @@ def ready_url(environment: Mapping[str, str]) -> str:
 
 
 def main() -> int:
-    """The exit code: 0 where the service is ready; else 1, and the reason on stderr."""
     context = ssl.create_default_context()
     context.check_hostname, context.verify_mode = False, ssl.CERT_NONE
     url = ready_url(os.environ)

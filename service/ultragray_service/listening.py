@@ -22,24 +22,23 @@ from ipaddress import IPv6Address, ip_address
 
 from ultragray_service.errors import TooManyConnections
 from ultragray_service.settings import ENVIRONMENT_PREFIX
-from ultragray_service.tls.server import HANDSHAKE_TIMEOUT_S
+from ultragray_service.tls import HANDSHAKE_TIMEOUT_S
 from ultragray_workers.errors import StartupFailed
 from ultragray_workers.rounds import Rounds
 
 _IPV6_NETWORK_BITS = 64  # what one subscriber has
 
 
-class Connections:
-    """The connections of one door. Each takes a place, and gives it back once."""
+Place = contextlib.ExitStack  # of one connection; closing it, the first time, gives the place back
 
+
+class Connections:
     def __init__(self, total: int, per_address: int) -> None:
-        self._total = total
-        self._per_address = per_address
+        self._total, self._per_address = total, per_address
         self._by_address: Counter[str] = Counter()
         self._count = 0
 
     def enter(self, host: str) -> Place:
-        """A place for a connection from `host`. Raises TooManyConnections."""
         address = address_of(host)
         if self._by_address[address] >= self._per_address:
             raise TooManyConnections(f"at most {self._per_address} connections of one address may be open")
@@ -47,29 +46,15 @@ class Connections:
             raise TooManyConnections(f"at most {self._total} connections may be open")
         self._count += 1
         self._by_address[address] += 1
-        return Place(self, address)
+        place = Place()
+        place.callback(self._leave, address)
+        return place
 
-    def leave(self, address: str) -> None:
-        """Gives back a place; `Place.leave` calls it."""
+    def _leave(self, address: str) -> None:
         self._count -= 1
         self._by_address[address] -= 1
         if not self._by_address[address]:
             del self._by_address[address]
-
-
-class Place:
-    """The place of one connection."""
-
-    def __init__(self, connections: Connections, address: str) -> None:
-        self._connections = connections
-        self._address = address
-        self._is_taken = True
-
-    def leave(self) -> None:
-        """Gives the place back, if that was not done before."""
-        if self._is_taken:
-            self._is_taken = False
-            self._connections.leave(self._address)
 
 
 def address_of(host: str) -> str:
@@ -82,37 +67,25 @@ def address_of(host: str) -> str:
     return str(int(address) >> (128 - _IPV6_NETWORK_BITS))
 
 
-# Accepting connections, each of which has a place before anything of it is read.
-
-
 _RETRY_S = 0.1  # where there is no file descriptor for another connection
 
 _log = logging.getLogger("ultragray.service")
 
 
 class Acceptor:
-    """Accepts from a socket that listens, until it is closed."""
-
     def __init__(
         self,
         listener: socket.socket,
         connections: Connections,
-        protocol: Callable[[Place], asyncio.Protocol],
+        protocol: Callable[..., asyncio.Protocol],
         *,
         refusal: Callable[[TooManyConnections], bytes],
         send_patience_s: float,
         tls: Callable[[], ssl.SSLContext | None],
     ) -> None:
-        """`protocol` serves a connection and gives its place back; `refusal` is sent to one that gets none.
-
-        `tls` is asked for each connection, so that new ones get a new certificate.
-        """
-        self._listener = listener
-        self._connections = connections
-        self._protocol = protocol
-        self._refusal = refusal
-        self._send_patience_s = send_patience_s
-        self._tls = tls
+        """`protocol` serves a connection, `refusal` is sent to one without a place, `tls` is asked for each of them."""
+        self._listener, self._connections, self._protocol = listener, connections, protocol
+        self._refusal, self._send_patience_s, self._tls = refusal, send_patience_s, tls
         self._serving: set[asyncio.Task[None]] = set()
         self._task = asyncio.ensure_future(self._accept())
 
@@ -121,7 +94,6 @@ class Acceptor:
         self._task.cancel()
 
     async def wait_closed(self) -> None:
-        """Returns when nothing is being accepted any more."""
         await asyncio.wait({self._task})
 
     async def _accept(self) -> None:
@@ -159,38 +131,31 @@ class Acceptor:
         try:
             give_up_on_silent_peers(connection, self._send_patience_s)
             await asyncio.get_running_loop().connect_accepted_socket(
-                lambda: self._protocol(place), connection, ssl=tls, ssl_handshake_timeout=timeout_s
+                lambda: self._protocol(place=place), connection, ssl=tls, ssl_handshake_timeout=timeout_s
             )
             is_served = True
         except OSError:
             pass  # the peer has gone, or its TLS handshake failed
         finally:
             if not is_served:
-                place.leave()
+                place.close()
                 connection.close()
 
 
 # A cap by address on connections that a library accepts by itself, as gRPC does.
-#
 # This process finds its own sockets among its open files, and shuts down those of an address that has too many: the
 # library sees them end as if the peer had hung up. Connections that are known stay; new ones go.
-
-
 INTERVAL_S = 0.25
 _OPEN_FILES = "/dev/fd"
 
 
 class OpenSockets:
-    """The connections to one port of this process."""
-
     def __init__(self, port: int, connections: Connections) -> None:
-        self._port = port
-        self._connections = connections
+        self._port, self._connections = port, connections
         self._others: set[int] = set()  # sockets that are no connections to the port, by inode
         self._places: dict[int, Place] = {}  # the connections, by inode
 
     async def run(self) -> None:
-        """Look again and again, until cancelled."""
         rounds = Rounds(f"the watch over connections to port {self._port}", _log)
         while True:
             with rounds.round():
@@ -212,11 +177,10 @@ class OpenSockets:
                     refused += not self._let_in(file, status.st_ino)
         self._others &= inodes
         for inode in self._places.keys() - inodes:
-            self._places.pop(inode).leave()
+            self._places.pop(inode).close()
         return refused
 
     def _let_in(self, file: int, inode: int) -> bool:
-        """Notes a socket that is new. Raises OSError where it has gone."""
         with socket.socket(fileno=os.dup(file)) as found:
             if os.fstat(found.fileno()).st_ino != inode:
                 return True  # another has its number by now, and is seen the next time
@@ -241,14 +205,10 @@ class OpenSockets:
             return None
 
 
-# Sockets as this service sets them up.
-
-
 _BACKLOG = 2048
 
 
 def listen(host: str, port: int, what: str, field: str) -> socket.socket:
-    """A socket that listens. Raises StartupFailed, naming the setting `field`, where the port cannot be had."""
     listener = socket.socket(socket.AF_INET6 if ":" in host else socket.AF_INET, socket.SOCK_STREAM)
     listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
     try:
@@ -270,7 +230,6 @@ def check_port_is_free(host: str, port: int, what: str, field: str) -> None:
 
 
 def _remedy(error: OSError, field: str) -> str:
-    """Why a port cannot be had, and what to give instead."""
     if error.errno == errno.EADDRINUSE:
         return f"the port is in use; give another one with {_named(field)}"
     reason = (error.strerror or str(error)).lower()
@@ -282,7 +241,6 @@ def _named(field: str) -> str:
 
 
 def authority(host: str, port: int) -> str:
-    """Host and port as a URL has them."""
     return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
@@ -294,7 +252,6 @@ def give_up_on_silent_peers(connection: socket.socket, patience_s: float) -> Non
 
 
 def raise_open_files_limit(wanted: int) -> None:
-    """Raise the limit of open files to `wanted`, or as far as the hard limit allows, and warn where that is less."""
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     possible = wanted if hard == resource.RLIM_INFINITY else min(wanted, hard)
     if soft != resource.RLIM_INFINITY and soft < possible:
@@ -306,9 +263,6 @@ def raise_open_files_limit(wanted: int) -> None:
         )
 
 
-# How long a transfer may lag behind the least rate.
-
-
 class Patience:
     """An allowance of seconds: time uses it up, bytes refill it, up to where it began.
 
@@ -316,12 +270,10 @@ class Patience:
     """
 
     def __init__(self, min_bytes_per_s: float, limit_s: float) -> None:
-        self._min_bytes_per_s = min_bytes_per_s
-        self._limit_s = limit_s
+        self._min_bytes_per_s, self._limit_s = min_bytes_per_s, limit_s
         self._left_s = limit_s
 
     def renew(self) -> None:
-        """Begin again: another transfer, or one that does not wait for the peer."""
         self._left_s = self._limit_s
 
     def is_over(self, moved_bytes: int, elapsed_s: float) -> bool:

@@ -23,7 +23,6 @@ def unknown_variables() -> Iterator[str]:
 
 
 def known_variables() -> tuple[str, ...]:
-    """Every variable that is read, those of the settings included."""
     from ultragray.contract import annotated_fields
     from ultragray_service.settings import Settings
 

@@ -38,7 +38,7 @@ from ultragray_service.rpc.server import GrpcServer
 from ultragray_service.service import Service
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings
 from ultragray_service.telemetry.logs import configure_logging, is_for_people
-from ultragray_service.tls.server import CertificateWatch
+from ultragray_service.tls import CertificateWatch
 from ultragray_service.wiring import make_service
 from ultragray_workers.errors import StartupFailed
 from ultragray_workers.rounds import Rounds
@@ -75,12 +75,10 @@ class EmbeddedWorker:
         self._thread = ThreadPoolExecutor(1, "embedded-worker")  # not the loop's, which others need
 
     def start(self) -> None:
-        """Starts the worker and returns at once; nothing where the settings want none."""
         if self._settings.embedded_worker:
             self._task = asyncio.create_task(self._keep_alive())
 
     async def stop(self) -> None:
-        """Ends the worker, which puts the job at hand back into the queue."""
         self._stop.set()
         if self._process is not None and self._process.poll() is None:
             self._process.terminate()
@@ -123,18 +121,13 @@ class EmbeddedWorker:
 
 
 # The words that systemd understands: the process is ready, still alive, stopping. Without systemd they go nowhere.
-#
 # A unit of `Type=notify` names a socket in NOTIFY_SOCKET; one with `WatchdogSec` expects a word within that time, and
 # restarts a process from which it hears none.
-
-
 READY, ALIVE, STOPPING = "READY=1", "WATCHDOG=1", "STOPPING=1"
 _WORDS_WITHIN_TIMEOUT = 3
 
 
 class ServiceManager:
-    """The service manager that started this process, if one did."""
-
     def __init__(self) -> None:
         """Takes its variables out of the environment: they are not for processes that this one starts."""
         address = os.environ.pop("NOTIFY_SOCKET", "")
@@ -151,13 +144,9 @@ class ServiceManager:
                 sender.sendto(word.encode(), self._address)
 
     async def tell_alive(self) -> None:
-        """Tells for as long as the event loop turns that it does."""
         while self.alive_every_s is not None:
             self.tell(ALIVE)
             await asyncio.sleep(self.alive_every_s)
-
-
-# Both servers in one process on one event loop, from start to a clean stop.
 
 
 _HEALTH_POLL_S = 0.2
@@ -171,7 +160,6 @@ _OTHER_FILES = 1024
 
 
 def run(settings: Settings) -> None:
-    """Serve until SIGTERM or SIGINT. Raises StartupFailed where it cannot start."""
     configure_logging(settings.log_level, settings.log_format)
     for sentence in unknown_variables():
         _log.warning(sentence)
@@ -207,16 +195,17 @@ async def serve(settings: Settings) -> None:
         await grpc_server.start()
         http_task = asyncio.ensure_future(http_server.serve([http_socket]))
         alive_task = asyncio.ensure_future(manager.tell_alive())
+        cap = Connections(settings.max_connections, settings.max_connections_per_address)  # gRPC accepts by itself
         watching = [
             asyncio.ensure_future(_mirror_health(service, grpc_server)),
-            asyncio.ensure_future(_cap_grpc(settings, grpc_port)),
+            asyncio.ensure_future(OpenSockets(grpc_port, cap).run()),
         ]
         if certificates is not None:
             watching.append(asyncio.ensure_future(certificates.follow()))
         _log.info(f"starting to serve the scenes of {settings.data_folder}")
         worker = EmbeddedWorker(settings)
         try:
-            if await signals.unless_stopped(service.start()):
+            if await _unless(signals.stop, service.start()):
                 worker.start()
                 gc.freeze()  # what lives this long is never garbage: shorter pauses
                 _tell_where(service.doors, service.guard.asks)
@@ -226,7 +215,7 @@ async def serve(settings: Settings) -> None:
             if settings.drain_delay_s:
                 service.life.begin_leaving()
                 _log.info(f"not ready any more; stopping in {settings.drain_delay_s:g} s")
-                await signals.unless_forced(asyncio.sleep(settings.drain_delay_s))
+                await _unless(signals.force, asyncio.sleep(settings.drain_delay_s))
             _log.info("stopping: frames that wait are answered first; Ctrl-C again stops at once")
         finally:
             for task in watching:
@@ -234,14 +223,14 @@ async def serve(settings: Settings) -> None:
             service.begin_draining()
             worker_stop = asyncio.ensure_future(worker.stop())
             await grpc_server.tell_health(service.readiness)
-            await signals.unless_forced(service.pool.drain(settings.drain_timeout_s))
+            await _unless(signals.force, service.pool.drain(settings.drain_timeout_s))
             await service.pool.close()
             http_server.should_exit = True
             http_server.force_exit = signals.force.is_set()
-            await signals.unless_forced(
-                asyncio.gather(grpc_server.stop(_FLUSH_S), igtl_server.stop(_FLUSH_S), http_task)
+            await _unless(
+                signals.force, asyncio.gather(grpc_server.stop(_FLUSH_S), igtl_server.stop(_FLUSH_S), http_task)
             )
-            await signals.unless_forced(worker_stop)
+            await _unless(signals.force, worker_stop)
             await service.close()
             alive_task.cancel()
     _log.info("stopped")
@@ -274,16 +263,9 @@ class _StopSignals:
     def _received(self) -> None:
         (self.force if self.stop.is_set() else self.stop).set()
 
-    async def unless_stopped(self, work: Awaitable[Any]) -> bool:
-        """Await `work` and return True; False where the first signal cancelled it."""
-        return await _unless(self.stop, work)
-
-    async def unless_forced(self, work: Awaitable[Any]) -> bool:
-        """Await `work` and return True; False where the second signal cancelled it."""
-        return await _unless(self.force, work)
-
 
 async def _unless(event: asyncio.Event, work: Awaitable[Any]) -> bool:
+    """Await `work` and return True; False where the event came first and cancelled it."""
     task = asyncio.ensure_future(work)
     waiting = asyncio.ensure_future(event.wait())
     try:
@@ -310,13 +292,7 @@ def _bind_grpc(server: GrpcServer, settings: Settings, certificates: Certificate
         ) from error
 
 
-async def _cap_grpc(settings: Settings, port: int) -> None:
-    """Keeps the connections of each address to gRPC, which accepts by itself, below the cap."""
-    await OpenSockets(port, Connections(settings.max_connections, settings.max_connections_per_address)).run()
-
-
 async def _start_igtl(server: IgtlServer, settings: Settings, sockets: contextlib.ExitStack) -> str | None:
-    """Begins to answer and returns the address; None where it has no port."""
     if settings.igtl_port is None:
         return None
     host = _LOOPBACK if server.is_local and not is_loopback(settings.host) else settings.host
@@ -327,7 +303,6 @@ async def _start_igtl(server: IgtlServer, settings: Settings, sockets: contextli
 
 
 async def _mirror_health(service: Service, server: GrpcServer) -> None:
-    """Keep the health of gRPC equal to the readiness of HTTP."""
     rounds = Rounds("the health of gRPC", _log)
     while True:
         with rounds.round():

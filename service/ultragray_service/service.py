@@ -10,17 +10,16 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ultragray.errors import UltragrayError
-from ultragray_service.access.admission import Admission
 from ultragray_service.access.audit import AuditLog
 from ultragray_service.access.credentials import Guard, Sessions
 from ultragray_service.access.keys import KnownKeys, Snapshot
 from ultragray_service.access.limits import Limits
 from ultragray_service.access.oidc import OidcTokens
 from ultragray_service.access.origins import Origins
-from ultragray_service.access.owners import Owners
+from ultragray_service.access.owners import Admission, Owners
 from ultragray_service.access.principals import is_loopback
 from ultragray_service.core.datasets import Datasets
-from ultragray_service.core.jobs.jobs import Jobs
+from ultragray_service.core.jobs import Jobs
 from ultragray_service.core.life import Life
 from ultragray_service.core.open_streams import OpenStreams
 from ultragray_service.core.readiness import Readiness
@@ -32,7 +31,7 @@ from ultragray_service.doors import Doors
 from ultragray_service.settings import Settings
 from ultragray_service.telemetry.logs import Tracing
 from ultragray_service.telemetry.metrics import Metrics
-from ultragray_service.views.assessments import Assessing
+from ultragray_service.views.poses import Assessing
 from ultragray_service.views.prepared import Comparisons, DatasetViews, TrainingViews, simulated_sha256
 from ultragray_workers.errors import StartupFailed
 from ultragray_workers.jobs.store import JobStore
@@ -42,8 +41,6 @@ from ultragray_workers.scenes import SceneStore
 
 @dataclass(eq=False, kw_only=True)
 class Service:
-    """All that the front doors share."""
-
     settings: Settings
     life: Life
     doors: Doors  # as they will be, until they are open
@@ -87,10 +84,7 @@ class Service:
         self._snapshot: Snapshot | None = None
 
     async def open(self) -> None:
-        """Opens the jobs' database, and reads keys, owners and registrations; before any door opens.
-
-        Raises StartupFailed.
-        """
+        """Opens database and copies of keys, owners and registrations, before any door opens. Raises StartupFailed."""
         await self.places.open()
         await self.jobs.open()
         engine = self.jobs.database.engine
@@ -113,10 +107,7 @@ class Service:
             )
 
     async def start(self) -> None:
-        """Starts the pool, loads the scenes to preload, clears what dead uploads left.
-
-        Raises StartupFailed.
-        """
+        """Starts the pool, loads the scenes to preload, clears what dead uploads left. Raises StartupFailed."""
         await self.uploads.remove_stale()
         await self.imports.remove_stale()
         for prepared in self._prepared:
@@ -142,7 +133,6 @@ class Service:
             prepared.end()
 
     async def close(self) -> None:
-        """Closes what `open` opened, and sends the last traces."""
         for task in self._following:
             task.cancel()
         if self._snapshot is not None:
@@ -155,13 +145,11 @@ class Service:
             await asyncio.to_thread(self.tracing.stop)
 
     async def delete_dataset(self, name: str) -> None:
-        """Deletes a dataset, and all that was made of it to be looked at. Raises DatasetNotFound, DatasetInUse."""
         gone = await self.datasets.delete(name, self.jobs.uses_dataset)
         if gone is not None:
             await self._forget(lambda key: key.endswith(gone))
 
     async def delete_job(self, job_id: str) -> None:
-        """Deletes a finished job and its files. Raises JobNotFound, JobInUse, DatabaseUnavailable."""
         await self.jobs.do(JobStore.delete, job_id)
         await self.training_views.forget_job(job_id)
 

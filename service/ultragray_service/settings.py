@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import os
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -13,10 +13,10 @@ from ultragray.errors import InvalidArgument
 from ultragray.geometry.image_size import MAX_IMAGE_SIDE
 from ultragray.geometry.probe import MAX_THICKNESS_MM
 from ultragray_service.access.oidc import check_url, parse_roles
-from ultragray_service.access.principals import NAMES, Allowance, of_key, parse_allowed
+from ultragray_service.access.principals import NAMES, Allowance, parse_allowed
 from ultragray_service.environment import PREFIX
 from ultragray_workers.jobs.kinds.base import MAX_RUN_S
-from ultragray_workers.pool.pool import MAX_BATCH_POSES
+from ultragray_workers.pool.pool import PoolConfig
 from ultragray_workers.storage.location import Location, StorageUrl, parse_location
 
 ENVIRONMENT_PREFIX = PREFIX
@@ -25,6 +25,12 @@ LOG_FORMATS = ("auto", "human", "json")
 ADDRESSES, TLS, INSTALLATION, COMPUTE, LOGS = "Addresses", "TLS", "Installation", "Compute", "Logs"  # topics
 _MAX_MB = 16_777_216
 _HOUR_S = 3600.0
+
+
+def like(cls: type[Contract], name: str, **changes: Any) -> Any:
+    """A setting that means what the field `name` of another contract does."""
+    (item,) = (item for item, _ in annotated_fields(cls) if item.name == name)
+    return field(**{"default": item.default, "metadata": item.metadata, **changes})
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -88,44 +94,18 @@ class Settings(Contract):
     )
     preload: tuple[str, ...] = described("Scenes that are loaded before the service is ready.", ())
 
-    processes: int = described(
-        "Render processes; 0: one per GPU, on the CPU one. More than there are GPUs share them.",
-        0,
-        low=0,
-        high=256,
-        topic=COMPUTE,
-    )
-    threads_per_process: int = described(
-        "Render threads of each; 0: cores // processes.", 0, low=0, high=1024, topic=COMPUTE
-    )
+    processes: int = like(PoolConfig, "processes")
+    threads_per_process: int = like(PoolConfig, "threads_per_process")
     backend: str = described(
         "Render backend; auto: cuda where there is a GPU, else cpu.",
         "auto",
         choices=("auto", "cpu", "cuda", "reference"),
         topic=COMPUTE,
     )
-    queue_limit_frames: int = described(
-        "Frames that may wait, interactive and batch frames each; beyond: QUEUE_FULL.", 256, low=1, high=100_000
-    )
-    client_limit_frames: int = described(
-        "Of those, frames of one client: of one name where keys are asked for, else of one address.",
-        128,
-        low=1,
-        high=100_000,
-    )
-    max_queue_ms: float = described(
-        "How long frames of others may keep an interactive request waiting; one that would wait longer is refused at "
-        "once (QUEUE_FULL), and told when to try again.",
-        1000.0,
-        above=0.0,
-        high=3_600_000.0,
-    )
-    max_batch_poses: int = described(
-        "Waiting poses of one scene that are rendered together; fewer above 512x512 pixels.",
-        16,
-        low=1,
-        high=MAX_BATCH_POSES,
-    )
+    queue_limit_frames: int = like(PoolConfig, "queue_limit_frames")
+    client_limit_frames: int = like(PoolConfig, "client_limit_frames", default=128)
+    max_queue_ms: float = like(PoolConfig, "max_queue_ms")
+    max_batch_poses: int = like(PoolConfig, "max_batch_poses")
     memory_budget_mb: int = described(
         "MiB of scenes that each process keeps, on its GPU if it has one; the least recently used goes.",
         4096,
@@ -138,13 +118,7 @@ class Settings(Contract):
     max_request_pixels: int = described(
         "Pixels that one answer may hold: poses x height x width x outputs.", 2**26, low=1, high=2**28
     )
-    max_footprint_pixels: int = described(
-        "Cost of one frame: pixels in the footprints of the Gaussians that it cuts, about 3e7 of 500,000 usual ones at "
-        "512x512; beyond: FRAME_TOO_COSTLY.",
-        2**31,
-        low=1,
-        high=2**62,
-    )
+    max_footprint_pixels: int = like(PoolConfig, "max_footprint_pixels")
     max_body_bytes: int = described(
         "Largest HTTP request body and gRPC message; of gRPC at least 2 MiB, for the chunks of uploads.",
         8 * 2**20,
@@ -251,19 +225,8 @@ class Settings(Contract):
     )
 
     default_timeout_s: float = described("Deadline of a request that names none.", 30.0, above=0.0, high=_HOUR_S)
-    worker_grace_s: float = described(
-        "How long a render process may leave a task untouched, or owe an answer past its deadline, before it is killed "
-        "and replaced, and its frames are rendered again.",
-        5.0,
-        above=0.0,
-        high=_HOUR_S,
-    )
-    worker_timeout_s: float = described(
-        "How long a render process may take to load a scene before it is killed and replaced.",
-        120.0,
-        above=0.0,
-        high=24 * _HOUR_S,
-    )
+    worker_grace_s: float = like(PoolConfig, "worker_grace_s")
+    worker_timeout_s: float = like(PoolConfig, "worker_timeout_s")
     drain_delay_s: float = described(
         "How long a service that is told to stop goes on as before but for its readiness: behind a proxy, longer than "
         "that takes to notice and to send what is new elsewhere.",
@@ -280,8 +243,7 @@ class Settings(Contract):
         repr=False,
     )
     oidc_issuer: str | None = described(
-        "URL of an OpenID Connect issuer, as tokens name it: they are taken beside API keys; none: no tokens.",
-        None,
+        "URL of an OpenID Connect issuer, as tokens name it: they are taken beside API keys; none: no tokens.", None
     )
     oidc_audience: str | None = described("Audience that tokens must be for, usually this service's client id.", None)
     oidc_role_claim: str = described("Claim that gives roles; dots lead inwards: realm_access.roles.", "roles")
@@ -299,14 +261,14 @@ class Settings(Contract):
     oidc_ca: Path | None = described(
         "PEM file of authorities that sign the issuer's certificate; none: those that the system trusts.", None
     )
-    key_requests_per_s: int | None = of_key("requests_per_s")
-    key_frames_per_s: int | None = of_key("frames_per_s")
-    key_streams: int | None = of_key("streams")
-    key_unfinished_jobs: int | None = of_key("unfinished_jobs")
-    key_running_jobs: int | None = of_key("running_jobs")
-    key_compute_minutes_per_day: float | None = of_key("compute_minutes_per_day")
-    key_stored_gb: float | None = of_key("stored_gb")
-    key_registrations: int | None = of_key("registrations")
+    key_requests_per_s: int | None = like(Allowance, "requests_per_s")
+    key_frames_per_s: int | None = like(Allowance, "frames_per_s")
+    key_streams: int | None = like(Allowance, "streams")
+    key_unfinished_jobs: int | None = like(Allowance, "unfinished_jobs")
+    key_running_jobs: int | None = like(Allowance, "running_jobs")
+    key_compute_minutes_per_day: float | None = like(Allowance, "compute_minutes_per_day")
+    key_stored_gb: float | None = like(Allowance, "stored_gb")
+    key_registrations: int | None = like(Allowance, "registrations")
     insecure: bool = described(
         "Whether other machines are served even without any API key: whoever reaches the address is an admin.",
         False,
@@ -364,7 +326,6 @@ class Settings(Contract):
 
     @property
     def allowance(self) -> Allowance:
-        """How much a key may take that has no limits of its own."""
         return Allowance(**{name: getattr(self, f"key_{name}") for name in NAMES})
 
     @property
@@ -383,12 +344,10 @@ class Settings(Contract):
 
     @property
     def is_there(self) -> bool:
-        """Whether a folder of scenes or of artifacts is there; of a bucket that is not asked."""
         return any(not isinstance(one, Path) or one.is_dir() for one in (self.artifacts, self.data_folder))
 
     @property
     def cache(self) -> Path:
-        """The folder of this host for what is fetched from buckets."""
         if self.cache_folder is not None:
             return self.cache_folder
         return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "ultragray"

@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import fields
 from functools import partial
 from typing import Any
 
-from ultragray_service.access.admission import Admission
 from ultragray_service.access.audit import AuditLog
 from ultragray_service.access.credentials import EnvironmentKeys, Guard, Sessions
 from ultragray_service.access.keys import KnownKeys
 from ultragray_service.access.limits import Limits
 from ultragray_service.access.oidc import Issuer, OidcTokens, parse_roles
 from ultragray_service.access.origins import Origins
-from ultragray_service.access.owners import Owners, Permissions
+from ultragray_service.access.owners import Admission, Owners
 from ultragray_service.core.datasets import Datasets
-from ultragray_service.core.jobs.jobs import Jobs
+from ultragray_service.core.jobs import Jobs
 from ultragray_service.core.life import Life
 from ultragray_service.core.open_streams import OpenStreams
 from ultragray_service.core.readiness import Readiness
@@ -22,13 +22,13 @@ from ultragray_service.core.registrations import Registrations
 from ultragray_service.core.rendering import Rendering, RequestPlanner
 from ultragray_service.core.scenes import SceneCatalog, ScenePlaces, Scenes
 from ultragray_service.core.threads import HelperProcesses
-from ultragray_service.core.uploads import DatasetUploads, Quotas, SceneImports
+from ultragray_service.core.uploads import DatasetUploads, Means, Quotas, SceneImports
 from ultragray_service.doors import Doors
 from ultragray_service.service import Service
 from ultragray_service.settings import Settings
 from ultragray_service.telemetry.logs import Tracing, start_tracing
 from ultragray_service.telemetry.metrics import Metrics
-from ultragray_service.views.assessments import Assessing
+from ultragray_service.views.poses import Assessing
 from ultragray_service.views.prepared import Comparisons, DatasetViews, TrainingViews
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.jobs.owners import Kind
@@ -40,7 +40,6 @@ from ultragray_workers.storage.location import open_storage
 
 
 def make_service(settings: Settings) -> Service:
-    """A service that is not open yet. Raises StartupFailed for a data folder that does not exist, InvalidArgument."""
     life, metrics, tracing = Life(), Metrics(), start_tracing("service")
 
     keys, tokens = KnownKeys(), oidc_tokens(settings)
@@ -66,13 +65,17 @@ def make_service(settings: Settings) -> Service:
     rendering = Rendering(pool, planner, life, owners, limits, metrics)
     metrics.read(pool, lambda: jobs.overview, places)
 
-    permissions = Permissions(
+    admission = Admission(
+        audit,
+        limits,
+        sessions,
         owners,
         {Kind.JOB: lambda job: jobs.do(JobStore.ownership, job), Kind.REGISTRATION: registrations.ownership},
         {Kind.SCENE: scenes.require, Kind.DATASET: datasets.get},
     )
     # Each process may take all the memory that settings allow to one: one checks at a time, and one makes pictures.
     checks, pictures = (HelperProcesses(settings.dataset_memory_mb << 20) for _ in range(2))
+    means = Means(settings, jobs, life.draining, checks, owners, quotas)
     return Service(
         settings=settings,
         life=life,
@@ -85,7 +88,7 @@ def make_service(settings: Settings) -> Service:
         owners=owners,
         limits=limits,
         audit=audit,
-        admission=Admission(audit, limits, sessions, permissions),
+        admission=admission,
         places=places,
         scene_store=scenes,
         catalog=catalog,
@@ -93,8 +96,8 @@ def make_service(settings: Settings) -> Service:
         datasets=Datasets(datasets, owners),
         registrations=registrations,
         jobs=jobs,
-        uploads=DatasetUploads(datasets, settings, jobs, life.draining, checks, owners, quotas),
-        imports=SceneImports(scenes, places.made, settings, jobs, checks, owners, quotas),
+        uploads=DatasetUploads(datasets, means),
+        imports=SceneImports(scenes, places.made, means),
         pool=pool,
         planner=planner,
         rendering=rendering,
@@ -116,20 +119,8 @@ def make_service(settings: Settings) -> Service:
 
 
 def _pool(settings: Settings, places: ScenePlaces, metrics: Metrics, tracing: Tracing | None) -> RenderPool:
-    """The render processes; each result is counted and traced."""
-    config = PoolConfig(
-        processes=settings.processes,
-        threads_per_process=settings.threads_per_process,
-        queue_limit_frames=settings.queue_limit_frames,
-        client_limit_frames=settings.client_limit_frames,
-        max_queue_ms=settings.max_queue_ms,
-        max_batch_poses=settings.max_batch_poses,
-        memory_budget_bytes=settings.memory_budget_mb * 2**20,
-        max_footprint_pixels=settings.max_footprint_pixels,
-        worker_grace_s=settings.worker_grace_s,
-        worker_timeout_s=settings.worker_timeout_s,
-        backend=settings.backend,
-    )
+    same = {item.name: getattr(settings, item.name) for item in fields(PoolConfig) if hasattr(settings, item.name)}
+    config = PoolConfig(**same, memory_budget_bytes=settings.memory_budget_mb * 2**20)
 
     def observe(result: RenderResult[Any]) -> None:
         metrics.observe_result(result)
@@ -141,7 +132,6 @@ def _pool(settings: Settings, places: ScenePlaces, metrics: Metrics, tracing: Tr
 
 
 def oidc_tokens(settings: Settings) -> OidcTokens | None:
-    """The tokens of the settings; None: they name no issuer."""
     if settings.oidc_issuer is None:
         return None
     return OidcTokens(

@@ -18,7 +18,7 @@ from ultragray.scene.confidence import Extrapolation
 from ultragray_proto.codec import MessageInvalid, from_message, to_message, words
 from ultragray_proto.v1 import datasets_pb2, geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2
 from ultragray_service.core import scenes
-from ultragray_service.core.frames import FrameHeader
+from ultragray_service.core.poses import FrameHeader
 from ultragray_service.errors import Refusal
 from ultragray_workers.datasets.store import DatasetRecord
 from ultragray_workers.jobs.kinds import RenderJob, Specification, TrainJob

@@ -12,98 +12,84 @@ _NAMES_IN_MESSAGE = 5
 class SceneNotFound(UltragrayError):
     """No scene of that name."""
 
-    reason = "SCENE_NOT_FOUND"
     title = "No such scene"
 
 
 class RegistrationNotFound(UltragrayError):
     """No registration of that name."""
 
-    reason = "REGISTRATION_NOT_FOUND"
     title = "No such registration"
 
 
 class DatasetNotFound(UltragrayError):
     """No dataset of that name."""
 
-    reason = "DATASET_NOT_FOUND"
     title = "No such dataset"
 
 
 class DatasetExists(UltragrayError):
     """A dataset of that name has another content or other options; delete it first."""
 
-    reason = "DATASET_EXISTS"
     title = "Another dataset has that name"
 
 
 class DatasetInUse(UltragrayError):
     """A job needs the dataset."""
 
-    reason = "DATASET_IN_USE"
     title = "Dataset in use"
 
 
 class UploadTooLarge(UltragrayError):
     """An upload over `ULTRAGRAY_MAX_DATASET_BYTES`, packed or unpacked, or of too many files."""
 
-    reason = "UPLOAD_TOO_LARGE"
     title = "Upload too large"
 
 
 class StorageFull(UltragrayError):
     """The artifact folder has no room, or a render job would write more than it has room for."""
 
-    reason = "STORAGE_FULL"
     title = "No room on the disk"
 
 
 class StorageUnavailable(UltragrayError):
     """The object storage does not answer, or refuses its credentials; what is cached is served all the same; retry."""
 
-    reason = "STORAGE_UNAVAILABLE"
     title = "The object storage cannot be used"
 
 
 class SceneExists(UltragrayError):
     """A scene of that name is there, or a job is making it."""
 
-    reason = "SCENE_EXISTS"
     title = "Scene already exists"
 
 
 class DatabaseUnavailable(UltragrayError):
     """The database of the jobs is away or takes no changes; scenes are rendered all the same; retry."""
 
-    reason = "DATABASE_UNAVAILABLE"
     title = "The database of the jobs cannot be used"
 
 
 class ArtifactFolderUnavailable(UltragrayError):
     """The artifact folder is gone, or not the one that the jobs belong to: its share is not mounted; retry."""
 
-    reason = "ARTIFACT_FOLDER_UNAVAILABLE"
     title = "The artifact folder is not there"
 
 
 class JobStalled(UltragrayError):
     """The process of a job neither computed nor read nor wrote for `ULTRAGRAY_JOB_STALL_TIMEOUT_S`, and was ended."""
 
-    reason = "JOB_STALLED"
     title = "The job got stuck"
 
 
 class JobTimeExceeded(UltragrayError):
     """A job ran longer than its `max_run_s`, or `ULTRAGRAY_JOB_MAX_RUN_S`, and was ended."""
 
-    reason = "JOB_TIME_EXCEEDED"
     title = "The job took too long"
 
 
 class JobNotFound(UltragrayError):
     """No job of that id."""
 
-    reason = "JOB_NOT_FOUND"
     title = "No such job"
 
 
@@ -117,98 +103,84 @@ class JobConflict(UltragrayError):
 class JobFinished(UltragrayError):
     """A job that succeeded or failed cannot be cancelled."""
 
-    reason = "JOB_FINISHED"
     title = "Job is finished"
 
 
 class JobNotFinished(UltragrayError):
     """Only a failed or cancelled job can be retried."""
 
-    reason = "JOB_NOT_FINISHED"
     title = "Job cannot be retried"
 
 
 class JobInUse(UltragrayError):
     """A job that waits or runs, or that another of those goes on from, cannot be deleted."""
 
-    reason = "JOB_IN_USE"
     title = "Job in use"
 
 
 class JobQueueFull(UltragrayError):
     """Too many jobs wait; retry."""
 
-    reason = "JOB_QUEUE_FULL"
     title = "Too many jobs are waiting"
 
 
 class WorkerNotFound(UltragrayError):
     """No worker of that name."""
 
-    reason = "WORKER_NOT_FOUND"
     title = "No such worker"
 
 
 class ArtifactNotFound(UltragrayError):
     """The job has no file of that name."""
 
-    reason = "ARTIFACT_NOT_FOUND"
     title = "No such artifact"
 
 
 class SceneTooLarge(UltragrayError):
     """A scene that does not fit `ULTRAGRAY_MEMORY_BUDGET_MB` at all."""
 
-    reason = "SCENE_TOO_LARGE"
     title = "Scene exceeds the memory budget"
 
 
 class QueueFull(UltragrayError):
     """Too many frames wait, or too many uploads are under way; retry."""
 
-    reason = "QUEUE_FULL"
     title = "Too much is waiting"
 
 
 class DeadlineExceeded(UltragrayError):
     """The deadline passed first."""
 
-    reason = "DEADLINE_EXCEEDED"
     title = "Deadline exceeded"
 
 
 class NotReady(UltragrayError):
     """The service is starting, or cannot render at the moment; retry."""
 
-    reason = "NOT_READY"
     title = "Service is not ready"
 
 
 class Draining(UltragrayError):
     """The service is stopping; retry elsewhere."""
 
-    reason = "DRAINING"
     title = "Service is stopping"
 
 
 class BackupInvalid(UltragrayError):
     """A backup that is not there, damaged, or made by a newer release (command line)."""
 
-    reason = "BACKUP_INVALID"
     title = "Backup cannot be used"
 
 
 class RestoreRefused(UltragrayError):
     """A backup or restore into a place that holds something else, or where somebody is at work (command line)."""
 
-    reason = "RESTORE_REFUSED"
     title = "Place of the backup or restore cannot be used"
 
 
 class StartupFailed(UltragrayError):
     """The service cannot start, such as on a port in use (command line)."""
 
-    reason = "STARTUP_FAILED"
     title = "Service cannot start"
 
 

@@ -22,7 +22,9 @@ from typing import Any
 import sqlalchemy as sa
 from sqlalchemy.exc import SQLAlchemyError
 
-from ultragray.errors import UltragrayError
+from ultragray.contract import described
+from ultragray.errors import InvalidArgument, UltragrayError
+from ultragray_service.access.principals import iso_time
 from ultragray_service.access.rules import Operation
 from ultragray_service.errors import LimitReached, PermissionDenied, RateLimited, Unauthenticated
 from ultragray_workers.jobs.tables import AUDIT
@@ -45,8 +47,6 @@ _log = logging.getLogger("ultragray.audit")
 
 @dataclass(frozen=True)
 class Entry:
-    """One line of the log."""
-
     who: str
     address: str
     what: str  # an operation of access/rules.py
@@ -73,6 +73,28 @@ def account() -> Account:
     return _account.get() or Account()
 
 
+class AskedDatabase:
+    """Tells the log once that a database is away, and once that it is back."""
+
+    def __init__(self, away: str, back: str, log: logging.Logger) -> None:
+        self._away, self._back, self._log = away, back, log
+        self._is_away = False
+
+    @contextmanager
+    def asked(self) -> Iterator[None]:
+        """The body asks; it may fail, and is to be tried again."""
+        try:
+            yield
+        except (UltragrayError, SQLAlchemyError) as error:
+            if not self._is_away:
+                self._log.warning(f"{self._away}: {str(error).splitlines()[0]}")
+            self._is_away = True
+        else:
+            if self._is_away:
+                self._log.warning(self._back)
+            self._is_away = False
+
+
 class AuditLog:
     """Takes entries on the thread of the event loop, and writes them in a thread of its own."""
 
@@ -81,13 +103,12 @@ class AuditLog:
         self._tallies: dict[Entry, int] = {}
         self._different: Counter[str] = Counter()  # tallies by callers
         self._lost = 0
-        self._is_away = False
+        self._database = AskedDatabase("the audit log waits in memory", "the audit log is written again", _log)
         self._engine: sa.Engine | None = None
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="audit", daemon=True)
 
     def open(self, engine: sa.Engine) -> None:
-        """Begins to write."""
         self._engine = engine
         self._thread.start()
 
@@ -98,17 +119,13 @@ class AuditLog:
             self._thread.join()
 
     def tell(self, entry: Entry) -> None:
-        """Writes one entry."""
         if len(self._waiting) >= MAX_WAITING:
             self._lost += 1
         else:
             self._waiting.append(entry)
 
     def count(self, entry: Entry) -> None:
-        """Counts something that happens often; a refusal is told the first time.
-
-        What a caller without a name asked for is left out: each could be told once.
-        """
+        """Counts something that happens often; a refusal is told the first time; of nobody without its target."""
         if entry.who == NOBODY:
             entry = replace(entry, target="")
         seen = self._tallies.get(entry)
@@ -125,7 +142,6 @@ class AuditLog:
 
     @contextmanager
     def refusals(self, who: str, address: str, operation: Operation, target: str) -> Iterator[None]:
-        """Counts what the body refuses, before there is anything to tell of."""
         try:
             yield
         except UltragrayError as error:
@@ -151,9 +167,8 @@ class AuditLog:
             _account.reset(before)
             entry = Entry(who, address, operation.name, mine.target, mine.result)
             if operation.lasts:
-                self.tell(
-                    replace(entry, facts={"frames": mine.frames, "seconds": round(time.monotonic() - began_s, 1)})
-                )
+                seconds = round(time.monotonic() - began_s, 1)
+                self.tell(replace(entry, facts={"frames": mine.frames, "seconds": seconds}))
             elif operation.changes and mine.result not in _COUNTED:
                 self.tell(entry)
             else:
@@ -169,19 +184,8 @@ class AuditLog:
                 if stopping or time.monotonic() - tallied_s >= TALLY_INTERVAL_S:
                     tallied_s = time.monotonic()
                     self._tell_tallies()
-                self._try_to_write()
-
-    def _try_to_write(self) -> None:
-        try:
-            self._write()
-        except (UltragrayError, SQLAlchemyError) as error:
-            if not self._is_away:
-                _log.warning(f"the audit log waits in memory: {str(error).splitlines()[0]}")
-            self._is_away = True
-        else:
-            if self._is_away:
-                _log.warning("the audit log is written again")
-            self._is_away = False
+                with self._database.asked():
+                    self._write()
 
     def _tell_tallies(self) -> None:
         tallies, self._tallies = self._tallies, {}
@@ -217,7 +221,6 @@ def _row(entry: Entry) -> dict[str, Any]:
 
 
 def _kept(text: str) -> str:
-    """Text as every database takes it."""
     return text[:_LONGEST].encode("utf-8", "replace").decode().replace("\0", "�")
 
 
@@ -237,3 +240,46 @@ def read_audit(
         Entry(row.who, row.address, row.what, row.target, row.result, json.loads(row.facts), row.at_s)
         for row in reversed(found)
     ]
+
+
+DEFAULT_HOURS = 24.0
+DEFAULT_ENTRIES = 1000
+MAX_HOURS = 24.0 * 366
+MAX_ENTRIES = 10_000
+_HOUR_S = 3600.0
+
+
+@dataclass(frozen=True)
+class AuditEntry:
+    """One line of the audit log."""
+
+    at: str = described("ISO 8601, UTC.")
+    who: str = described("The name of the key; -: without a known one.")
+    address: str = described("That connected.")
+    what: str = described("The operation, such as scene.delete.")
+    target: str = described("The scene, dataset or job; empty: none.")
+    result: str = described("OK, or the reason of the refusal.")
+    facts: Mapping[str, Any] = described("Such as count or frames.", factory=dict)
+
+    @classmethod
+    def of(cls, entry: Entry) -> AuditEntry:
+        return cls(iso_time(entry.at_s), entry.who, entry.address, entry.what, entry.target, entry.result, entry.facts)
+
+
+@dataclass(frozen=True)
+class AuditEntries:
+    """The last lines of the audit log."""
+
+    entries: list[AuditEntry] = described("Oldest first.")
+
+
+async def audit_entries(
+    engine: sa.Engine, *, since_hours: float, who: str | None, what: str | None, limit: int
+) -> AuditEntries:
+    if not 0.0 < since_hours <= MAX_HOURS:
+        raise InvalidArgument(f"since_hours must be above 0 and at most {MAX_HOURS:g}", field="since_hours")
+    if not 1 <= limit <= MAX_ENTRIES:
+        raise InvalidArgument(f"limit must be an integer from 1 to {MAX_ENTRIES}, got {limit}", field="limit")
+    since_s = time.time() - since_hours * _HOUR_S
+    found = await asyncio.to_thread(read_audit, engine, since_s=since_s, who=who, what=what, limit=limit)
+    return AuditEntries([AuditEntry.of(entry) for entry in found])

@@ -50,9 +50,6 @@ def _decoded(coded: str) -> str:
         return ""
 
 
-# From credentials to principals: the sources that vouch for them, asked one after another.
-
-
 class Authenticator(Protocol):
     """One source of principals: the key store, keys of the environment, an identity provider."""
 
@@ -113,8 +110,7 @@ class Guard:
             return LOCAL
         if credential is None:
             raise Unauthenticated(
-                "an API key is required: send Authorization: Bearer KEY, or X-API-Key: KEY",
-                field="Authorization",
+                "an API key is required: send Authorization: Bearer KEY, or X-API-Key: KEY", field="Authorization"
             )
         for source in self._authenticators:
             principal = source.authenticate(credential)
@@ -123,9 +119,6 @@ class Guard:
                     raise Unauthenticated(f"the credential of {principal.name} has expired", field="Authorization")
                 return principal
         raise Unauthenticated("the API key is not known", field="Authorization")
-
-
-# What is under way, so that it ends when its key is revoked or expires.
 
 
 LOOK_INTERVAL_S = 1.0

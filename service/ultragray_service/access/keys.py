@@ -9,14 +9,14 @@ import secrets
 import threading
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from types import MappingProxyType
 
 import sqlalchemy as sa
-from sqlalchemy.exc import SQLAlchemyError
 
 from ultragray.contract import described
-from ultragray.errors import InvalidArgument, UltragrayError
+from ultragray.errors import InvalidArgument
+from ultragray_service.access.audit import AskedDatabase
 from ultragray_service.access.credentials import digest_of
 from ultragray_service.access.principals import Number, Principal, Role
 from ultragray_service.errors import Unauthenticated
@@ -46,7 +46,6 @@ class Key:
     limits: Mapping[str, Number | None] = described("Its own, in place of those of all keys.", factory=dict)
 
     def is_valid(self, now_s: float) -> bool:
-        """Whether it opens the doors."""
         return self.revoked_at_s is None and (self.expires_at_s is None or now_s < self.expires_at_s)
 
 
@@ -79,26 +78,15 @@ class KeyStore:
             expires_at_s=expires_at_s,
             limits=dict(limits),
         )
+        row = {**asdict(key), "digest": digest_of(secret).hex(), "role": role.value}
+        row["limits"] = json.dumps(key.limits) if limits else None
         with self._engine.begin() as connection:
-            connection.execute(
-                sa.insert(KEYS).values(
-                    id=key.id,
-                    digest=digest_of(secret).hex(),
-                    name=name,
-                    role=role.value,
-                    created_at_s=now_s,
-                    expires_at_s=expires_at_s,
-                    limits=json.dumps(key.limits) if limits else None,
-                )
-            )
+            connection.execute(sa.insert(KEYS).values(row))
             tell_change(connection)
         return key, secret
 
     def revoke(self, name_or_id: str) -> list[Key]:
-        """Revokes the key of an id, or all keys of a name; the keys that opened doors until now.
-
-        Raises InvalidArgument where there is none of that name.
-        """
+        """Revokes the key of an id, or all of a name; those that were valid. Raises InvalidArgument for none."""
         now_s = time.time()
         found = [key for key in self.keys().values() if name_or_id in (key.id, key.name)]
         if not found:
@@ -116,7 +104,6 @@ class KeyStore:
             return read_keys(connection)
 
     def note_uses(self, last_used_at_s: Mapping[str, float]) -> None:
-        """Writes when keys were used last, by their ids."""
         if last_used_at_s:
             with self._engine.begin() as connection:
                 connection.execute(
@@ -126,22 +113,12 @@ class KeyStore:
 
 
 def read_keys(connection: sa.Connection) -> dict[bytes, Key]:
-    """As KeyStore.keys."""
-    columns = KEYS.c
-    rows = connection.execute(sa.select(KEYS).order_by(columns.created_at_s, columns.id))
-    return {
-        bytes.fromhex(row.digest): Key(
-            id=row.id,
-            name=row.name,
-            role=Role(row.role),
-            created_at_s=row.created_at_s,
-            expires_at_s=row.expires_at_s,
-            revoked_at_s=row.revoked_at_s,
-            last_used_at_s=row.last_used_at_s,
-            limits=json.loads(row.limits or "{}"),
-        )
-        for row in rows
-    }
+    found = {}
+    for row in connection.execute(sa.select(KEYS).order_by(KEYS.c.created_at_s, KEYS.c.id)).mappings():
+        values = {**row, "role": Role(row["role"]), "limits": json.loads(row["limits"] or "{}")}
+        digest = bytes.fromhex(values.pop("digest"))
+        found[digest] = Key(**values)
+    return found
 
 
 class KnownKeys:
@@ -181,11 +158,8 @@ class KnownKeys:
 
 
 # The copy in memory of what the jobs' database knows of keys, owners and registrations, a second or two old.
-#
 # Requests are checked against the copy: no frame waits for the database. While the database is away the last copy
 # holds, and so do the times at which keys expire.
-
-
 INTERVAL_S = 1.0
 _USES_EVERY = 30  # intervals
 _COPIED = "keys, owners and registrations"
@@ -197,13 +171,10 @@ class Snapshot:
     """Reads what is copied again whenever something of it changed, in a thread of its own."""
 
     def __init__(self, engine: sa.Engine, keys: KnownKeys, copies: Sequence[Callable[[sa.Connection], None]]) -> None:
-        """Fills `keys`, and calls `copies` to be filled: the first copy is there when this returns.
-
-        Raises DatabaseUnavailable.
-        """
+        """Fills `keys` and calls `copies`; the first copy is there when this returns. Raises DatabaseUnavailable."""
         self._engine, self._keys, self._copies = engine, keys, copies
         self._number: int | None = None
-        self._is_away = False
+        self._database = AskedDatabase(f"{_COPIED} stay as they are for now", f"{_COPIED} are read again", _log)
         self._stop = threading.Event()
         self.refresh()
         self._thread = threading.Thread(target=self._run, name="access", daemon=True)
@@ -220,7 +191,6 @@ class Snapshot:
                 self._number = number
 
     def close(self) -> None:
-        """Ends the thread."""
         self._stop.set()
         self._thread.join()
 
@@ -228,19 +198,7 @@ class Snapshot:
         rounds, round_number = Rounds(f"the watch over {_COPIED}", _log), 0
         while not self._stop.wait(INTERVAL_S):
             round_number += 1
-            with rounds.round():
-                self._look(notes_uses=round_number % _USES_EVERY == 0)
-
-    def _look(self, *, notes_uses: bool) -> None:
-        try:
-            self.refresh()
-            if notes_uses:
-                KeyStore(self._engine).note_uses(self._keys.take_uses())
-        except (UltragrayError, SQLAlchemyError) as error:
-            if not self._is_away:
-                _log.warning(f"{_COPIED} stay as they are for now: {str(error).splitlines()[0]}")
-            self._is_away = True
-        else:
-            if self._is_away:
-                _log.warning(f"{_COPIED} are read again")
-            self._is_away = False
+            with rounds.round(), self._database.asked():
+                self.refresh()
+                if round_number % _USES_EVERY == 0:
+                    KeyStore(self._engine).note_uses(self._keys.take_uses())

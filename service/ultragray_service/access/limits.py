@@ -61,9 +61,6 @@ class Rate:
         return 0.0
 
 
-# So many of something at once on this service, whoever asks, and room left for others.
-
-
 class Slots:
     """Half of them are the most that one client has. Its methods belong to one event loop."""
 
@@ -88,9 +85,6 @@ class Slots:
             self._taken += Counter()  # without those that have none
 
 
-# The limits of whoever the running code works for: what goes beyond them is refused, or waits for its turn.
-
-
 class Limits:
     """What every client takes of this service. Its methods belong to one event loop."""
 
@@ -101,18 +95,15 @@ class Limits:
         def allowance(own: tuple[tuple[str, Number | None], ...]) -> Allowance:
             return replace(default, **dict(own))  # type: ignore[arg-type]  # checked when the key was made
 
-        self._allowance = allowance
-        self._on_refused = on_refused
+        self._allowance, self._on_refused = allowance, on_refused
         self._requests, self._frames = Rate(), Rate()
         self._streams: Counter[str] = Counter()
 
     @property
     def mine(self) -> Allowance:
-        """The allowance of whoever the running code works for."""
         return self._allowance(acting().limits)
 
     def take_request(self) -> None:
-        """Counts a request. Raises RateLimited."""
         per_s = self.mine.requests_per_s
         if per_s is not None and (wait_s := self._requests.take(caller().client, per_s)):
             raise self.refused("requests_per_s", _too_fast("requests", per_s, wait_s))
@@ -142,16 +133,12 @@ class Limits:
             await self._wait_for_frames(per_s, min(per_s, count - first), deadline)
 
     async def frame_turn(self, deadline: float | None) -> None:
-        """Counts a frame of a batch or a stream, once there may be one more.
-
-        Raises RateLimited where that would be after the `deadline` (time.monotonic(), s).
-        """
+        """Counts a frame of a batch or stream in turn. Raises RateLimited after `deadline` (time.monotonic())."""
         if (per_s := self.mine.frames_per_s) is not None:
             await self._wait_for_frames(per_s, 1, deadline)
 
     @contextmanager
     def stream(self) -> Iterator[None]:
-        """Counts a stream for as long as the body runs. Raises LimitReached."""
         client, most = caller().client, self.mine.streams
         if most is not None and self._streams[client] >= most:
             error = LimitReached(f"this key may have {most} streams at once (streams): end another one first")
@@ -165,7 +152,6 @@ class Limits:
                 del self._streams[client]
 
     def refused(self, limit: str, error: UltragrayError) -> UltragrayError:
-        """The error, which a limit is the reason of; it is counted."""
         self._on_refused(limit)
         return error
 

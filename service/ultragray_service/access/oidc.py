@@ -39,7 +39,6 @@ def check_url(url: str, field: str) -> str:
 
 
 def parse_roles(mapping: Sequence[str]) -> dict[str, Role]:
-    """Roles by the values of a claim, from `VALUE=ROLE`. Raises InvalidArgument."""
     roles = {}
     for item in mapping:
         value, equals, role = item.rpartition("=")
@@ -67,9 +66,6 @@ def highest_role(values: Any, roles: Mapping[str, Role]) -> Role | None:
     listed = values.split() if isinstance(values, str) else values if isinstance(values, list) else []
     given = [roles[value] for value in listed if isinstance(value, str) and value in roles]
     return max(given, key=list(Role).index, default=None)
-
-
-# The public keys of an OpenID Connect issuer, fetched in the background and kept while it is away.
 
 
 DISCOVERY_PATH = "/.well-known/openid-configuration"
@@ -102,8 +98,6 @@ class SigningKey:
 
 @dataclass(frozen=True)
 class Endpoints:
-    """Where browsers sign people in, and get their tokens."""
-
     authorization: str
     token: str
 
@@ -132,10 +126,7 @@ class Issuer:
         self.problem: str | None = "its keys were not fetched yet"  # for the log alone: it may name addresses
 
     def key(self, key_id: str | None) -> SigningKey:
-        """The key of an id; None: the only one there is.
-
-        Raises Unauthenticated where the issuer has none of that id, IssuerUnavailable where that is not known yet.
-        """
+        """The key of an id; None: the only one. Raises Unauthenticated, IssuerUnavailable where it is not known yet."""
         found = self.keys.get(key_id)
         if found is not None:
             return found
@@ -151,7 +142,6 @@ class Issuer:
         )
 
     async def follow(self) -> None:
-        """Fetches the keys, again after a while and when tokens name others, for ever."""
         rounds = Rounds("the watch over the issuer's keys", _log)
         while True:
             with rounds.round():
@@ -234,9 +224,6 @@ def _usable(published: Any) -> tuple[str | None, SigningKey] | None:
     return published.get("kid"), SigningKey(key, algorithms)
 
 
-# Tokens of an OpenID Connect issuer: verified with its keys, their claims mapped to a role.
-
-
 MAX_TOKEN_BYTES = 16_384
 LEEWAY_S = 30.0  # by which clocks may differ
 _MAX_VERIFIED = 4096
@@ -261,12 +248,8 @@ class OidcTokens:
     def __init__(
         self, issuer: Issuer, *, audience: str | None, role_claim: str, name_claim: str, roles: Mapping[str, Role]
     ) -> None:
-        """`roles`: by the values of `role_claim`."""
-        self.issuer = issuer
-        self._audience = audience
-        self._role_claim = role_claim
-        self._name_claim = name_claim
-        self._roles = roles
+        self.issuer, self._audience, self._role_claim = issuer, audience, role_claim
+        self._name_claim, self._roles = name_claim, roles
         self._verified: dict[bytes, Principal] = {}
         self._verified_with: Mapping[str | None, SigningKey] = {}
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 import ipaddress
 import re
 from collections.abc import Sequence
-from functools import lru_cache
 from urllib.parse import urlsplit
 
 from ultragray_service.access.principals import is_loopback
@@ -30,11 +29,9 @@ class Origins:
         # An address is not a name that anybody could point here. It is checked all the same where only this machine is
         # served, which no other address can be the right one of.
         self._any_address = not is_loopback(host)
-        self._is_allowed_host = lru_cache(maxsize=256)(self._allows_host)
 
     def require_host(self, host: str | None) -> None:
-        """Raises HostRefused for a name that is not known as one of this service."""
-        if host is not None and not self._is_allowed_host(host):
+        if host is not None and not self._allows(host):
             raise HostRefused(
                 f"this service is not known as {host[:128]!r}: allow the name with ULTRAGRAY_ALLOWED_HOSTS, or give the"
                 " service API keys",
@@ -44,10 +41,7 @@ class Origins:
     def require_page(
         self, *, origin: str | None, host: str | None, fetch_site: str | None = None, is_link: bool = False
     ) -> None:
-        """Raises OriginRefused for a request of another site's page, by the headers that browsers send.
-
-        `is_link`: whether it fetches a whole page, as whoever follows a link does.
-        """
+        """Raises OriginRefused for a request of another site's page; `is_link`: whether it follows a link to a page."""
         if origin is not None:
             self._require_origin(origin, host)
         elif fetch_site == "cross-site" and not is_link:
@@ -66,7 +60,7 @@ class Origins:
                 field="Origin",
             )
 
-    def _allows_host(self, host: str) -> bool:
+    def _allows(self, host: str) -> bool:
         if _ANY in self._hosts:
             return True
         match = _HOST.fullmatch(host)

@@ -1,4 +1,4 @@
-"""Whose datasets, scenes and jobs are, and who may see and change them: the copy in memory, and what changes it."""
+"""Whose datasets, scenes and jobs are, and who may see and change them; and the admission of what callers ask for."""
 
 from __future__ import annotations
 
@@ -12,20 +12,14 @@ from typing import TypeVar
 
 import sqlalchemy as sa
 
-from ultragray.errors import UltragrayError
-from ultragray_service.access.principals import Principal, Role, acting
+from ultragray_service.access.audit import AuditLog
+from ultragray_service.access.credentials import Sessions
+from ultragray_service.access.limits import Limits
+from ultragray_service.access.principals import Principal, Role, act_as, acting
 from ultragray_service.access.rules import Operation
 from ultragray_service.errors import PermissionDenied
 from ultragray_workers.errors import job_not_found
-from ultragray_workers.jobs.owners import (
-    NOBODYS,
-    Kind,
-    Ownership,
-    add_owner,
-    forget_owner,
-    read_owner,
-    read_owners,
-)
+from ultragray_workers.jobs.owners import NOBODYS, Kind, Ownership, add_owner, forget_owner, read_owner, read_owners
 from ultragray_workers.scene_names import base_name
 
 SPREAD_S = 2.0  # in which every service has read who owns what again, see `snapshot`
@@ -43,7 +37,6 @@ class Owners:
         self._threads: Executor | None = None
 
     def open(self, engine: sa.Engine, threads: Executor) -> None:
-        """From now on changes are written by `engine`, in `threads`."""
         self._engine, self._threads = engine, threads
 
     def read(self, connection: sa.Connection) -> None:
@@ -56,7 +49,6 @@ class Owners:
         return self._known.get((kind, base_name(name) if kind is Kind.SCENE else name), NOBODYS)
 
     def owned(self, kind: Kind, owner: str) -> list[str]:
-        """The datasets or scenes of an owner. May be called from any thread."""
         with self._changing:
             return [name for (one, name), whose in self._known.items() if one is kind and whose.owner == owner]
 
@@ -103,7 +95,6 @@ class Owners:
 
     @asynccontextmanager
     async def removing(self, kind: Kind, name: str) -> AsyncIterator[None]:
-        """Forgets whose the dataset or scene was that the body removes. Raises DatabaseUnavailable."""
         ownership = await self._write(lambda connection: read_owner(connection, kind, name))
         yield
         await self.forget(kind, name, ownership)
@@ -128,7 +119,6 @@ class Claim:
     """A dataset or scene that the caller is about to make."""
 
     def __init__(self, owners: Owners, kind: Kind, name: str, token: str, *, private: bool) -> None:
-        """`token`: no other claim has it."""
         self._owners, self._kind, self._name = owners, kind, name
         self._ownership = Ownership(acting().name, private, token)
         self._taken_at_s: float | None = None
@@ -156,44 +146,57 @@ class Claim:
 
 
 def may_see(principal: Principal, ownership: Ownership) -> bool:
-    """Whether something is there at all, as a principal sees it."""
     return not ownership.private or may_change(principal, ownership)
 
 
 def may_change(principal: Principal, ownership: Ownership) -> bool:
-    """Whether a principal may delete, cancel or retry something."""
     return principal.role is Role.ADMIN or principal.name == ownership.owner
 
 
-def require_role(principal: Principal, operation: Operation) -> None:
-    """Raises PermissionDenied, which names the role."""
-    if operation.role is not None and not principal.role.includes(operation.role):
-        raise PermissionDenied(
-            f"{operation.name} needs the role {operation.role.value}, and {principal.name} has {principal.role.value}"
-        )
-
-
-class Permissions:
-    """Whether a principal may do an operation on something."""
+class Admission:
+    """Counts, audits and permits what callers ask for, whichever door it came through."""
 
     def __init__(
         self,
+        audit: AuditLog,
+        limits: Limits,
+        sessions: Sessions,
         owners: Owners,
         kept_with_rows: Mapping[Kind, Callable[[str], Awaitable[Ownership]]],
         find: Mapping[Kind, Callable[[str], object]],
     ) -> None:
-        """`kept_with_rows`: reads the owner of a job or registration. Raises JobNotFound, RegistrationNotFound.
+        """`kept_with_rows` reads owners of jobs and registrations; `find` blocks, and raises for what is not there."""
+        self._audit, self._limits, self._sessions, self._owners = audit, limits, sessions, owners
+        self._kept_with_rows, self._find = kept_with_rows, find
 
-        `find`: raises DatasetNotFound or SceneNotFound where there is no such thing; it blocks.
+    @asynccontextmanager
+    async def permitted(
+        self,
+        principal: Principal,
+        credential: str | None,
+        operation: Operation,
+        target: str,
+        *,
+        address: str,
+        connection: str,
+    ) -> AsyncIterator[None]:
+        """What a caller may do runs within: counted, audited, and cut off when the credential counts no more.
+
+        `connection`: the caller's address with the port. Raises RateLimited, PermissionDenied and JobNotFound.
         """
-        self._owners, self._kept_with_rows, self._find = owners, kept_with_rows, find
+        act_as(principal, address=address, connection=connection)
+        caller = principal.name, address, operation, target
+        with self._audit.refusals(*caller):
+            self._limits.take_request()
+        with self._audit.request(*caller), self._sessions.held(principal, credential):
+            await self._require(principal, operation, target)
+            yield
 
-    async def require(self, principal: Principal, operation: Operation, name: str) -> None:
-        """Raises PermissionDenied; JobNotFound for a job that is private to somebody else.
-
-        Scenes and datasets that are private to somebody else are found by nobody else, see `Owners.hides`.
-        """
-        require_role(principal, operation)
+    async def _require(self, principal: Principal, operation: Operation, name: str) -> None:
+        """Raises PermissionDenied, and JobNotFound for another's private job; see also `Owners.hides`."""
+        if operation.role is not None and not principal.role.includes(operation.role):
+            needed, has = operation.role.value, principal.role.value
+            raise PermissionDenied(f"{operation.name} needs the role {needed}, and {principal.name} has {has}")
         about = operation.about
         if about is None or principal.role is Role.ADMIN or not (operation.owned or about is Kind.JOB):
             return
@@ -204,15 +207,9 @@ class Permissions:
         if operation.owned and not may_change(principal, ownership):
             if about in self._find:  # something that is not there, or hidden, is nobody's
                 await asyncio.to_thread(self._find[about], name)
-            raise _not_own(operation, name, ownership.owner)
-
-
-def _not_own(operation: Operation, name: str, owner: str | None) -> UltragrayError:
-    """The error at something that belongs to somebody else."""
-    assert operation.about is not None
-    whose = "nobody's" if owner is None else f"{owner}'s"
-    return PermissionDenied(
-        f"{operation.name} needs the role {Role.ADMIN.value}, or to be the owner's: the {operation.about.value} "
-        f"{name[:128]!r} is {whose}",
-        field=operation.about.value,
-    )
+            whose = "nobody's" if ownership.owner is None else f"{ownership.owner}'s"
+            raise PermissionDenied(
+                f"{operation.name} needs the role {Role.ADMIN.value}, or to be the owner's: the {about.value} "
+                f"{name[:128]!r} is {whose}",
+                field=about.value,
+            )

@@ -5,7 +5,7 @@ from __future__ import annotations
 import ipaddress
 from collections.abc import Sequence
 from contextvars import ContextVar
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from datetime import datetime, timezone
 from enum import Enum
 from typing import Any
@@ -25,10 +25,7 @@ class Allowance(Contract):
     """How much one name may take, with however many keys; None: no limit."""
 
     requests_per_s: int | None = described(
-        "Requests and calls of one key in any second; a stream is one; none: any number.",
-        None,
-        low=1,
-        high=1_000_000,
+        "Requests and calls of one key in any second; a stream is one; none: any number.", None, low=1, high=1_000_000
     )
     frames_per_s: int | None = described(
         "Frames of one key in any second, asked for one by one, in batches and in streams; none: any number.",
@@ -70,12 +67,6 @@ class Allowance(Contract):
     )
 
 
-def of_key(name: str) -> Any:
-    """The setting of the service that limits every key as the field `name` of an Allowance says."""
-    (item,) = (item for item, _ in annotated_fields(Allowance) if item.name == name)
-    return field(default=item.default, metadata=item.metadata)
-
-
 NAMES = tuple(item.name for item, _ in annotated_fields(Allowance))
 
 
@@ -95,9 +86,6 @@ def read_limits(texts: Sequence[str]) -> dict[str, Number | None]:
     return found
 
 
-# Roles and principals: who a request comes from, once its credential was checked.
-
-
 class Role(str, Enum):
     """The roles, least first: each may do all that those before it may."""
 
@@ -106,7 +94,6 @@ class Role(str, Enum):
     ADMIN = "admin"  # and may do everything to everyone's
 
     def includes(self, other: Role) -> bool:
-        """Whether this role may do what `other` may."""
         return _RANK[self] >= _RANK[other]
 
 
@@ -162,18 +149,13 @@ class Me:
 
 
 def me(key_required: bool) -> Me:
-    """Whoever the running code works for."""
     principal = acting()
     at_s = principal.expires_at_s
     return Me(principal.name, principal.role, None if at_s is None else iso_time(at_s), key_required)
 
 
 def iso_time(at_s: float) -> str:
-    """A time.time() as ISO 8601, UTC."""
     return datetime.fromtimestamp(at_s, timezone.utc).isoformat(timespec="seconds")
-
-
-# Addresses of this machine; and roles by address, for OpenIGTLink, whose clients have no key to show.
 
 
 _SOURCE = "igtl"
@@ -183,7 +165,6 @@ _Network = ipaddress.IPv4Network | ipaddress.IPv6Network
 
 
 def is_loopback(host: str) -> bool:
-    """Whether an address or name is that of this machine to itself."""
     if host.lower() == _LOCALHOST:
         return True
     try:
@@ -193,7 +174,6 @@ def is_loopback(host: str) -> bool:
 
 
 def parse_allowed(entries: Sequence[str]) -> tuple[tuple[_Network, Role], ...]:
-    """The networks of `10.0.0.7=reader` or `10.0.0.0/24=operator`, in their order. Raises InvalidArgument."""
     found = []
     for entry in entries:
         address, _, role = entry.partition("=")
@@ -216,7 +196,6 @@ class AddressRoles:
 
     @property
     def is_local(self) -> bool:
-        """Whether nobody but this machine may."""
         return not self._allowed
 
     def principal_of(self, address: str, *, asks: bool) -> Principal | None:

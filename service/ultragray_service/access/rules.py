@@ -28,8 +28,8 @@ class Operation:
 
     name: str
     role: Role | None
-    http: tuple[str, ...] = ()  # "METHOD /path"
-    grpc: tuple[str, ...] = ()  # "Service/Method" of ultragray.v1
+    http: tuple[str, ...] = ()
+    grpc: tuple[str, ...] = ()  # of ultragray.v1
     about: Kind | None = None
     owned: bool = False
 
@@ -44,138 +44,121 @@ class Operation:
 
 
 _READER, _OPERATOR, _ADMIN = Role.READER, Role.OPERATOR, Role.ADMIN
-_SCENE, _DATASET, _JOB, _WORKER = Kind.SCENE, Kind.DATASET, Kind.JOB, Kind.WORKER
-_REGISTRATION = Kind.REGISTRATION
+
+
+def _operation(name: str, role: Role | None, *doors: str, about: Kind | None = None, owned: bool = False) -> Operation:
+    """An operation by its doors: routes of HTTP, "METHOD /path", and methods of gRPC, "Service/Method".
+
+    `about`: of one without a route, which would name it.
+    """
+    http = tuple(door for door in doors if " " in door)
+    for kind in Kind:
+        about = kind if any(f"{{{kind.value}}}" in route for route in http) else about
+    return Operation(name, role, http, tuple(door for door in doors if " " not in door), about, owned)
+
 
 OPERATIONS = (
     # Frames come first: their route is the one that must be found fast.
-    Operation("render", _READER, ("POST /v1/scenes/{scene}/render",), ("RenderService/Render",), _SCENE),
-    Operation("slice", _READER, ("POST /v1/scenes/{scene}:slice",), ("RenderService/RenderSlice",), _SCENE),
-    Operation("render.batch", _READER, (), ("RenderService/RenderBatch",), _SCENE),
-    Operation("scene.localize", _READER, ("POST /v1/scenes/{scene}:localize",), ("RenderService/Localize",), _SCENE),
-    Operation(STREAM, _READER, (f"{WEBSOCKET} /v1/scenes/{{scene}}/stream",), ("RenderService/RenderStream",), _SCENE),
-    Operation("stream.list", _READER, ("GET /v1/streams",)),
-    Operation(WATCH, _READER, (f"{WEBSOCKET} /v1/streams/{{stream}}/watch",)),
-    Operation("probe.plane", _READER, ("POST /v1/probes:plane",)),
-    Operation("scene.list", _READER, ("GET /v1/scenes",), ("SceneService/ListScenes",)),
-    Operation(
+    _operation("render", _READER, "POST /v1/scenes/{scene}/render", "RenderService/Render"),
+    _operation("slice", _READER, "POST /v1/scenes/{scene}:slice", "RenderService/RenderSlice"),
+    _operation("render.batch", _READER, "RenderService/RenderBatch", about=Kind.SCENE),
+    _operation("scene.localize", _READER, "POST /v1/scenes/{scene}:localize", "RenderService/Localize"),
+    _operation(STREAM, _READER, f"{WEBSOCKET} /v1/scenes/{{scene}}/stream", "RenderService/RenderStream"),
+    _operation("stream.list", _READER, "GET /v1/streams"),
+    _operation(WATCH, _READER, f"{WEBSOCKET} /v1/streams/{{stream}}/watch"),
+    _operation("probe.plane", _READER, "POST /v1/probes:plane"),
+    _operation("scene.list", _READER, "GET /v1/scenes", "SceneService/ListScenes"),
+    _operation(
         "scene.get",
         _READER,
-        (
-            "GET /v1/scenes/{scene}",
-            "GET /v1/scenes/{scene}/gaussians",
-            "GET /v1/scenes/{scene}/training-poses",
-            "POST /v1/scenes/{scene}:assess",
-            "GET /v1/scenes/{scene}/comparison",
-            "GET /v1/scenes/{scene}/comparison/{index}/{what}.png",
-        ),
-        ("SceneService/GetScene", "RenderService/AssessPoses"),
-        _SCENE,
+        "GET /v1/scenes/{scene}",
+        "GET /v1/scenes/{scene}/gaussians",
+        "GET /v1/scenes/{scene}/training-poses",
+        "POST /v1/scenes/{scene}:assess",
+        "GET /v1/scenes/{scene}/comparison",
+        "GET /v1/scenes/{scene}/comparison/{index}/{what}.png",
+        "SceneService/GetScene",
+        "RenderService/AssessPoses",
     ),
-    Operation("scene.download", _READER, ("GET /v1/scenes/{scene}/file",), (), _SCENE),
-    Operation("scene.load", _OPERATOR, ("POST /v1/scenes/{scene}:load",), ("SceneService/LoadScene",), _SCENE),
-    Operation("scene.unload", _OPERATOR, ("POST /v1/scenes/{scene}:unload",), ("SceneService/UnloadScene",), _SCENE),
-    Operation("scene.import", _OPERATOR, ("PUT /v1/scenes/{scene}",), (), _SCENE),
-    Operation("scene.delete", _OPERATOR, ("DELETE /v1/scenes/{scene}",), (), _SCENE, owned=True),
-    Operation("registration.list", _READER, ("GET /v1/registrations",), ("RegistrationService/ListRegistrations",)),
-    Operation(
-        "registration.get",
-        _READER,
-        ("GET /v1/registrations/{registration}",),
-        ("RegistrationService/GetRegistration",),
-        _REGISTRATION,
+    _operation("scene.download", _READER, "GET /v1/scenes/{scene}/file"),
+    _operation("scene.load", _OPERATOR, "POST /v1/scenes/{scene}:load", "SceneService/LoadScene"),
+    _operation("scene.unload", _OPERATOR, "POST /v1/scenes/{scene}:unload", "SceneService/UnloadScene"),
+    _operation("scene.import", _OPERATOR, "PUT /v1/scenes/{scene}"),
+    _operation("scene.delete", _OPERATOR, "DELETE /v1/scenes/{scene}", owned=True),
+    _operation("registration.list", _READER, "GET /v1/registrations", "RegistrationService/ListRegistrations"),
+    _operation(
+        "registration.get", _READER, "GET /v1/registrations/{registration}", "RegistrationService/GetRegistration"
     ),
-    Operation(
-        "registration.put",
-        _OPERATOR,
-        ("PUT /v1/registrations/{registration}",),
-        ("RegistrationService/PutRegistration",),
-        _REGISTRATION,
+    _operation(
+        "registration.put", _OPERATOR, "PUT /v1/registrations/{registration}", "RegistrationService/PutRegistration"
     ),
-    Operation(
+    _operation(
         "registration.delete",
         _OPERATOR,
-        ("DELETE /v1/registrations/{registration}",),
-        ("RegistrationService/DeleteRegistration",),
-        _REGISTRATION,
+        "DELETE /v1/registrations/{registration}",
+        "RegistrationService/DeleteRegistration",
         owned=True,
     ),
-    Operation("dataset.list", _READER, ("GET /v1/datasets",), ("DatasetService/ListDatasets",)),
-    Operation(
+    _operation("dataset.list", _READER, "GET /v1/datasets", "DatasetService/ListDatasets"),
+    _operation(
         "dataset.get",
         _READER,
-        (
-            "GET /v1/datasets/{dataset}",
-            "GET /v1/datasets/{dataset}/contact-sheet",
-            "GET /v1/datasets/{dataset}/poses",
-            "GET /v1/datasets/{dataset}/frames/{part}/{index}",
-        ),
-        ("DatasetService/GetDataset", "DatasetService/GetContactSheet"),
-        _DATASET,
+        "GET /v1/datasets/{dataset}",
+        "GET /v1/datasets/{dataset}/contact-sheet",
+        "GET /v1/datasets/{dataset}/poses",
+        "GET /v1/datasets/{dataset}/frames/{part}/{index}",
+        "DatasetService/GetDataset",
+        "DatasetService/GetContactSheet",
     ),
-    Operation(
-        "dataset.upload", _OPERATOR, ("PUT /v1/datasets/{dataset}",), ("DatasetService/UploadDataset",), _DATASET
+    _operation("dataset.upload", _OPERATOR, "PUT /v1/datasets/{dataset}", "DatasetService/UploadDataset"),
+    _operation(
+        "dataset.delete", _OPERATOR, "DELETE /v1/datasets/{dataset}", "DatasetService/DeleteDataset", owned=True
     ),
-    Operation(
-        "dataset.delete",
-        _OPERATOR,
-        ("DELETE /v1/datasets/{dataset}",),
-        ("DatasetService/DeleteDataset",),
-        _DATASET,
-        owned=True,
-    ),
-    Operation("job.list", _READER, ("GET /v1/jobs",), ("JobService/ListJobs",)),
-    Operation(
+    _operation("job.list", _READER, "GET /v1/jobs", "JobService/ListJobs"),
+    _operation(
         "job.get",
         _READER,
-        (
-            "GET /v1/jobs/{job}",
-            "GET /v1/jobs/{job}/log",
-            "GET /v1/jobs/{job}/curve",
-            "GET /v1/jobs/{job}/preview",
-            "GET /v1/jobs/{job}/events",
-        ),
-        ("JobService/GetJob", "JobService/GetJobLog", "JobService/WatchJob"),
-        _JOB,
+        "GET /v1/jobs/{job}",
+        "GET /v1/jobs/{job}/log",
+        "GET /v1/jobs/{job}/curve",
+        "GET /v1/jobs/{job}/preview",
+        "GET /v1/jobs/{job}/events",
+        "JobService/GetJob",
+        "JobService/GetJobLog",
+        "JobService/WatchJob",
     ),
-    Operation(
-        "job.download", _READER, ("GET /v1/jobs/{job}/artifacts/{name}",), ("JobService/DownloadArtifact",), _JOB
-    ),
-    Operation("job.estimate", _READER, ("POST /v1/jobs:estimate",), ("JobService/EstimateJob",)),
-    Operation("job.submit", _OPERATOR, ("POST /v1/jobs",), ("JobService/SubmitJob",)),
-    Operation("job.cancel", _OPERATOR, ("POST /v1/jobs/{job}:cancel",), ("JobService/CancelJob",), _JOB, owned=True),
-    Operation("job.retry", _OPERATOR, ("POST /v1/jobs/{job}:retry",), ("JobService/RetryJob",), _JOB, owned=True),
-    Operation("job.delete", _OPERATOR, ("DELETE /v1/jobs/{job}",), ("JobService/DeleteJob",), _JOB, owned=True),
-    Operation("worker.list", _READER, ("GET /v1/workers",), ("WorkerService/ListWorkers",)),
-    Operation("worker.pause", _ADMIN, ("POST /v1/workers/{worker}:pause",), ("WorkerService/PauseWorker",), _WORKER),
-    Operation("worker.drain", _ADMIN, ("POST /v1/workers/{worker}:drain",), ("WorkerService/DrainWorker",), _WORKER),
-    Operation("worker.resume", _ADMIN, ("POST /v1/workers/{worker}:resume",), ("WorkerService/ResumeWorker",), _WORKER),
-    Operation("service.watch", _READER, ("GET /v1/statistics", "GET /metrics")),
-    Operation("service.get", _READER, ("GET /v1/service",)),
-    Operation("me", _READER, ("GET /v1/me",), ("AccessService/WhoAmI",)),
-    Operation("audit.list", _ADMIN, ("GET /v1/audit",), ("AccessService/ListAuditEntries",)),
-    Operation(
+    _operation("job.download", _READER, "GET /v1/jobs/{job}/artifacts/{name}", "JobService/DownloadArtifact"),
+    _operation("job.estimate", _READER, "POST /v1/jobs:estimate", "JobService/EstimateJob"),
+    _operation("job.submit", _OPERATOR, "POST /v1/jobs", "JobService/SubmitJob"),
+    _operation("job.cancel", _OPERATOR, "POST /v1/jobs/{job}:cancel", "JobService/CancelJob", owned=True),
+    _operation("job.retry", _OPERATOR, "POST /v1/jobs/{job}:retry", "JobService/RetryJob", owned=True),
+    _operation("job.delete", _OPERATOR, "DELETE /v1/jobs/{job}", "JobService/DeleteJob", owned=True),
+    _operation("worker.list", _READER, "GET /v1/workers", "WorkerService/ListWorkers"),
+    _operation("worker.pause", _ADMIN, "POST /v1/workers/{worker}:pause", "WorkerService/PauseWorker"),
+    _operation("worker.drain", _ADMIN, "POST /v1/workers/{worker}:drain", "WorkerService/DrainWorker"),
+    _operation("worker.resume", _ADMIN, "POST /v1/workers/{worker}:resume", "WorkerService/ResumeWorker"),
+    _operation("service.watch", _READER, "GET /v1/statistics", "GET /metrics"),
+    _operation("service.get", _READER, "GET /v1/service"),
+    _operation("me", _READER, "GET /v1/me", "AccessService/WhoAmI"),
+    _operation("audit.list", _ADMIN, "GET /v1/audit", "AccessService/ListAuditEntries"),
+    _operation(
         "public",
         None,
-        (
-            "GET /v1/health/live",
-            "GET /v1/health/ready",
-            "GET /v1/sign-in",
-            "GET /docs",
-            "GET /docs/static/{path:path}",
-            "GET /openapi.json",
-            "GET /",
-            "GET /favicon.svg",
-            "GET /licences.txt",
-            "GET /assets/{path:path}",
-        ),
+        "GET /v1/health/live",
+        "GET /v1/health/ready",
+        "GET /v1/sign-in",
+        "GET /docs",
+        "GET /docs/static/{path:path}",
+        "GET /openapi.json",
+        "GET /",
+        "GET /favicon.svg",
+        "GET /licences.txt",
+        "GET /assets/{path:path}",
     ),
 )
 
 
 class HttpRules:
-    """The operation of a request."""
-
     def __init__(self, operations: Iterable[Operation] = OPERATIONS) -> None:
         self._routes: dict[str, list[tuple[str, Operation]]] = {}
         for operation in operations:
@@ -188,24 +171,19 @@ class HttpRules:
         }
 
     def find(self, method: str, path: str) -> tuple[Operation, str] | None:
-        """The operation, and the name of what it is about; None where no route is known.
-
-        A path goes to the first route that it matches, as in the application.
-        """
+        """The operation, by the first route that matches, and the name of what it is about; None: no route is known."""
         for pattern, operation in self._compiled.get("GET" if method == "HEAD" else method, ()):
             if (match := pattern.match(path)) is not None:
                 return operation, "" if operation.about is None else match[operation.about.value]
         return None
 
     def require_all(self, routes: Iterable[tuple[str, str]]) -> None:
-        """Raises LookupError for a method and path that no rule names."""
         known = {(method, path) for method, found in self._routes.items() for path, _ in found}
         missing = sorted({(method, path) for method, path in routes if method not in ("HEAD", "OPTIONS")} - known)
         if missing:
             raise LookupError(f"access/rules.py does not say who may ask for {missing}")
 
     def routes(self) -> Iterator[tuple[str, str, Operation]]:
-        """Each method and path that there is a rule for."""
         for method, found in self._routes.items():
             for path, operation in found:
                 yield method, path, operation
@@ -221,6 +199,5 @@ IGTL = Operation(STREAM, _READER)
 
 
 def require_all_methods(methods: Iterable[str]) -> None:
-    """Raises LookupError for a method of gRPC ("/package.Service/Method") that no rule names."""
     if missing := sorted(set(methods) - GRPC_OPERATIONS.keys()):
         raise LookupError(f"access/rules.py does not say who may call {missing}")

@@ -6,8 +6,10 @@ import json as json_text
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, astuple
 from datetime import datetime, timezone
+from functools import partial
+from operator import itemgetter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -16,7 +18,18 @@ import typer
 from ultragray.errors import InvalidArgument
 from ultragray_service.access.principals import NAMES, Role, read_limits
 from ultragray_service.cli.options import FieldsOf, with_options
-from ultragray_service.cli.terminal import Json, argument, command_group, examples, option, print_table, tell, to_json
+from ultragray_service.cli.terminal import (
+    Columns,
+    Json,
+    argument,
+    command_group,
+    examples,
+    option,
+    single,
+    tell,
+    tell_table,
+    to_json,
+)
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from ultragray_workers.errors import BackupInvalid
 
@@ -28,15 +41,13 @@ if TYPE_CHECKING:
 
 
 Where = Annotated[
-    dict[str, Any],
-    FieldsOf(Settings, "data_folder", "artifact_folder", "database_url", environment=ENVIRONMENT_PREFIX),
+    dict[str, Any], FieldsOf(Settings, "data_folder", "artifact_folder", "database_url", environment=ENVIRONMENT_PREFIX)
 ]
 
 
 @contextmanager
 def opened_database(where: dict[str, Any]) -> Iterator[JobDatabase]:
     """The database that the options name. Raises InvalidArgument where there is no such installation, StartupFailed."""
-
     from ultragray_workers.jobs.database import JobDatabase
     from ultragray_workers.storage.location import open_storage
 
@@ -54,12 +65,19 @@ def opened_database(where: dict[str, Any]) -> Iterator[JobDatabase]:
         database.close()
 
 
-# `ultragray keys …`: the named API keys of a service, in the database of its jobs.
-
-
 keys_app = command_group("They live in the installation's database; changes count within two seconds.")
 
-_KEY_COLUMNS = ("id", "name", "role", "state", "created", "expires", "last used", "limits")
+_KEY_COLUMNS: Columns = {
+    **{name: itemgetter(name) for name in ("id", "name")},
+    "role": lambda key: str(key["role"].value),
+    "state": itemgetter("state"),
+    "created": lambda key: _time(key["created_at_s"], ""),
+    "expires": lambda key: _time(key["expires_at_s"], "never"),
+    "last used": lambda key: _time(key["last_used_at_s"], "never"),
+    "limits": lambda key: " ".join(
+        f"{name}={'none' if value is None else f'{value:g}'}" for name, value in key["limits"].items()
+    ),
+}
 
 
 @keys_app.command(
@@ -70,7 +88,7 @@ _KEY_COLUMNS = ("id", "name", "role", "state", "created", "expires", "last used"
 )
 @with_options
 def create(
-    name: Annotated[str, argument("Whose it is: a person, a machine or a program.", shown=False)],
+    name: Annotated[str, argument("Whose it is: a person, a machine or a program.")],
     *,
     role: Annotated[
         Role, option("reader: sees, renders, streams; operator: and has jobs, datasets and scenes; admin: everything.")
@@ -107,28 +125,15 @@ def create(
 
 @keys_app.command("list", epilog=examples("ultragray keys list", "ultragray keys list --json"))
 @with_options
-def list_keys(
-    *,
-    json: Json = False,
-    where: Where,
-) -> None:
+def list_keys(*, json: Json = False, where: Where) -> None:
     """List the keys, oldest first, also those that count no more; no secrets."""
     with _key_store(where) as store:
-        keys = list(store.keys().values())
-    if json:
-        typer.echo(to_json([_document(key) for key in keys]))
-        return
-    print_table(_KEY_COLUMNS, [_row(key) for key in keys])
+        tell_table(_KEY_COLUMNS, [_document(key) for key in store.keys().values()], as_json=json)
 
 
 @keys_app.command(epilog=examples("ultragray keys revoke alice"))
 @with_options
-def revoke(
-    name: Annotated[str, argument("Name, or id of one key.", shown=False)],
-    *,
-    json: Json = False,
-    where: Where,
-) -> None:
+def revoke(name: Annotated[str, argument("Name, or id of one key.")], *, json: Json = False, where: Where) -> None:
     """Revoke all keys of a name, or the one of an id. What runs on them is cut within two seconds."""
     with _key_store(where) as store:
         revoked = store.revoke(name)
@@ -148,26 +153,8 @@ def _key_store(where: dict[str, Any]) -> Iterator[KeyStore]:
 
 
 def _document(key: Key) -> dict[str, Any]:
-    return {**asdict(key), "state": _state(key)}
-
-
-def _row(key: Key) -> tuple[str, ...]:
-    return (
-        key.id,
-        key.name,
-        key.role.value,
-        _state(key),
-        _time(key.created_at_s, ""),
-        _time(key.expires_at_s, "never"),
-        _time(key.last_used_at_s, "never"),
-        " ".join(f"{name}={'none' if value is None else f'{value:g}'}" for name, value in key.limits.items()),
-    )
-
-
-def _state(key: Key) -> str:
-    if key.revoked_at_s is not None:
-        return "revoked"
-    return "valid" if key.is_valid(time.time()) else "expired"
+    expired = "valid" if key.is_valid(time.time()) else "expired"
+    return {**asdict(key), "state": expired if key.revoked_at_s is None else "revoked"}
 
 
 def _time(at_s: float | None, otherwise: str) -> str:
@@ -176,19 +163,14 @@ def _time(at_s: float | None, otherwise: str) -> str:
     return datetime.fromtimestamp(at_s, timezone.utc).isoformat(sep=" ", timespec="minutes")
 
 
-# `ultragray audit`: who did what on a service, from the database of its jobs.
-
-
-_AUDIT_COLUMNS = ("time", "who", "address", "what", "target", "result", "facts")
+_AUDIT_COLUMNS: Columns = {
+    **{name: itemgetter(name) for name in ("time", "who", "address", "what", "target", "result")},
+    "facts": lambda entry: json_text.dumps(entry["facts"]),
+}
 _HOUR_S = 3600.0
 
 
-audit_app = command_group()
-
-
-@audit_app.command(
-    epilog=examples("ultragray audit --since-hours 168 --who console", "ultragray audit --what scene.delete --json")
-)
+@single("ultragray audit --since-hours 168 --who console", "ultragray audit --what scene.delete --json")
 @with_options
 def audit(
     *,
@@ -205,33 +187,19 @@ def audit(
     since_s = time.time() - since_hours * _HOUR_S
     with opened_database(where) as database:
         entries = read_audit(database.engine, since_s=since_s, who=who, what=what, limit=limit)
-    if json:
-        typer.echo(to_json([{**asdict(entry), "time": _timestamp(entry.at_s)} for entry in entries]))
-        return
-    rows = [
-        (_timestamp(one.at_s), one.who, one.address, one.what, one.target, one.result, json_text.dumps(one.facts))
-        for one in entries
-    ]
-    print_table(_AUDIT_COLUMNS, rows)
+    documents = [{**asdict(entry), "time": _timestamp(entry.at_s)} for entry in entries]
+    tell_table(_AUDIT_COLUMNS, documents, as_json=json)
 
 
 def _timestamp(at_s: float) -> str:
     return datetime.fromtimestamp(at_s, timezone.utc).isoformat(timespec="milliseconds")
 
 
-# `ultragray backup`: a whole installation into a folder.
-
-
-BackupFolder = Annotated[Path, argument("Folder of backups, on another disk than the data.", shown=False)]
+BackupFolder = Annotated[Path, argument("Folder of backups, on another disk than the data.")]
 _SHOWN = 3
-backup_app = command_group()
 
 
-@backup_app.command(
-    epilog=examples(
-        "ultragray backup /mnt/backups --keep 14", "ultragray backup /mnt/backups --verify  # reads every byte"
-    )
-)
+@single("ultragray backup /mnt/backups --keep 14", "ultragray backup /mnt/backups --verify  # reads every byte")
 @with_options
 def backup(
     folder: BackupFolder,
@@ -259,13 +227,8 @@ def backup(
     lines = [in_words(report.manifest), f"new: {report.new_files:,} files, {megabytes(report.new_bytes)}"]
     if report.removed_backups:
         lines.append(f"removed: {report.removed_backups} older backups, {megabytes(report.removed_bytes)}")
-    document = {
-        **document_of(report.manifest),
-        "new_files": report.new_files,
-        "new_bytes": report.new_bytes,
-        "removed_backups": report.removed_backups,
-        "removed_bytes": report.removed_bytes,
-    }
+    counts = ("new_files", "new_bytes", "removed_backups", "removed_bytes")
+    document = {**document_of(report.manifest), **{name: getattr(report, name) for name in counts}}
     tell("\n".join(lines), document, as_json=json)
 
 
@@ -292,7 +255,6 @@ def _verify(folder: Path, *, as_json: bool) -> None:
 
 
 def folders_of(settings: Settings) -> Folders:
-    """The folders that a backup saves. Raises InvalidArgument where they are in a bucket."""
     from ultragray_workers.backup.contents import Folders
 
     data, artifacts = settings.data_folder, settings.artifacts
@@ -306,32 +268,21 @@ def folders_of(settings: Settings) -> Folders:
 
 
 def in_words(manifest: Manifest) -> str:
-    """A backup in one sentence."""
     counts = ", ".join(f"{count:,} {what}" for what, count in manifest.counts.items())
     return f"backup {manifest.name}: {counts}; {len(manifest.files):,} files, {megabytes(manifest.bytes)}"
 
 
 def document_of(manifest: Manifest) -> dict[str, Any]:
-    """The same for a program."""
     return {"backup": manifest.name, **manifest.counts, "files": len(manifest.files), "bytes": manifest.bytes}
 
 
 def megabytes(size: int) -> str:
-    """A size for a person, in 10^6 bytes."""
     return f"{size / 1e6:,.1f} MB"
 
 
-# `ultragray restore`: an installation as it was at a backup.
-
-
-restore_app = command_group()
-
-
-@restore_app.command(
-    epilog=examples(
-        "ultragray restore /mnt/backups --data-folder /srv/ultragray/data",
-        "ultragray restore /mnt/backups --backup 20261122T070301.123Z --force",
-    )
+@single(
+    "ultragray restore /mnt/backups --data-folder /srv/ultragray/data",
+    "ultragray restore /mnt/backups --backup 20261122T070301.123Z --force",
 )
 @with_options
 def restore(
@@ -356,12 +307,9 @@ def restore(
         settings.database_url,
         name=backup,
         overwrite=force,
-        say=lambda sentence: typer.echo(sentence, err=True),
+        say=partial(typer.echo, err=True),
     )
     tell(f"restored {in_words(manifest)}", document_of(manifest), as_json=json)
-
-
-# `ultragray storage …`: the places in which an installation keeps its scenes and datasets.
 
 
 storage_app = command_group("A place is a folder, or a bucket: s3://BUCKET/PREFIX, gs://, az://.")
@@ -380,8 +328,8 @@ def places() -> None:
 )
 @with_options
 def copy(
-    source: Annotated[str, argument("Data or artifact folder, or its URL.", metavar="FROM", shown=False)],
-    target: Annotated[str, argument("Where its scenes and datasets go.", metavar="TO", shown=False)],
+    source: Annotated[str, argument("Data or artifact folder, or its URL.", metavar="FROM")],
+    target: Annotated[str, argument("Where its scenes and datasets go.", metavar="TO")],
     *,
     json: Json = False,
 ) -> None:
@@ -392,19 +340,14 @@ def copy(
     from ultragray_workers.backup.copying import ARTIFACTS, CopiedDatasets, copy_datasets, copy_scenes
     from ultragray_workers.storage.location import below, open_storage, parse_location
 
-    def say(sentence: str) -> None:
-        typer.echo(sentence, err=True)
-
+    say = partial(typer.echo, err=True)
     here, there = parse_location(source, "FROM"), parse_location(target, "TO")
     if isinstance(here, Path) and not here.is_dir():
         raise InvalidArgument(f"FROM must be an existing folder or the URL of a bucket, got {source!r}", field="FROM")
     done = copy_scenes(open_storage(here), open_storage(there), say)
-    datasets = copy_datasets(open_storage(here), open_storage(there), say)
-    below_data = copy_datasets(open_storage(below(here, ARTIFACTS)), open_storage(below(there, ARTIFACTS)), say)
-    datasets = CopiedDatasets(
-        datasets.datasets + below_data.datasets,
-        datasets.datasets_already_there + below_data.datasets_already_there,
-    )
+    in_data = copy_datasets(open_storage(here), open_storage(there), say)
+    in_artifacts = copy_datasets(open_storage(below(here, ARTIFACTS)), open_storage(below(there, ARTIFACTS)), say)
+    datasets = CopiedDatasets(*map(sum, zip(astuple(in_data), astuple(in_artifacts), strict=True)))
     line = (
         f"scene files: {done.scenes:,} copied ({megabytes(done.bytes)}), {done.already_there:,} already there; "
         f"datasets: {datasets.datasets:,} copied, {datasets.datasets_already_there:,} already there"

@@ -5,15 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from difflib import get_close_matches
-from functools import cached_property
+from functools import cache
 from importlib import import_module
-from importlib.metadata import EntryPoint, entry_points
+from importlib.metadata import entry_points
 from typing import Annotated, Any
 
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from ultragray_service.cli.terminal import examples, option
+from ultragray_service.cli.terminal import examples, option, warn
 
 USER_ERROR = 2  # the exit code of a mistake that the caller can mend
 INTERRUPTED = 130  # the exit code of a command that Ctrl-C or SIGTERM stopped
@@ -21,15 +21,12 @@ INTERRUPTED = 130  # the exit code of a command that Ctrl-C or SIGTERM stopped
 
 @dataclass(frozen=True)
 class Entry:
-    """A command of the group that is not loaded yet."""
-
     name: str
     app: str  # "module:name" of the typer app of the command, or of the group of commands; .module: of this package
     panel: str
     summary: str  # the first line of its help
 
     def load(self) -> Any:
-        """The command, or the group of commands, with its whole help. Imports its module."""
         module, _, name = self.app.partition(":")
         command = typer.main.get_command(getattr(import_module(module, __package__), name))
         command.name = self.name
@@ -37,79 +34,106 @@ class Entry:
         command.rich_help_panel = self.panel  # type: ignore[attr-defined]
         return command
 
-    def described(self) -> TyperCommand:
-        """A command that has a name and a line of help, for lists, and cannot be run."""
-        return TyperCommand(self.name, help=self.summary, rich_help_panel=self.panel)
+
+_PLUGINS = "ultragray.commands"  # group of the entry points of other packages, each a tuple of entries
+_COMMANDS = {  # by the panels of the help
+    "Serve": {
+        "serve": (".serve:serve", "Serve scenes over HTTP and gRPC, until Ctrl-C or SIGTERM."),
+        "worker": (".worker:worker", "Take jobs from the queue, one at a time, until Ctrl-C."),
+    },
+    "Scenes and frames": {
+        "demo": (".scenes:demo", "Write the built-in demo scene."),
+        "show": (".scenes:show", "Print what a scene file or a sweep says about itself."),
+        "render": (".render:render", "Render frames from poses into one file or a folder of PNGs."),
+        "export": (".scenes:export", "Write a scene as PLY or as a checkpoint of the released code."),
+        "localize": (".register:localize", "Find the pose of a real frame in a scene."),
+        "calibrate": (".register:calibrate_app", "Register a robot or tracker to a scene."),
+        "voxelize": (".scenes:voxelize", "Sample a scene on a grid: a NIfTI or NRRD volume, or a slice."),
+        "slicer": (".scenes:slicer", "Write a scene file of 3D Slicer that shows a served scene live."),
+        "import": (".scenes:import_scene", "Turn a PLY file or a released checkpoint into a scene file."),
+    },
+    "Sweeps and training": {
+        "check": (".sweeps:check_app", "Tell what is in a sweep, and what looks wrong."),
+        "draw": (".sweeps:draw", "Draw the image planes in space and a contact sheet of the frames."),
+        "convert": (".sweeps:convert", "Write a sweep in the layout of the released trainer."),
+        "train": (".train:train", "Train a scene from a tracked sweep."),
+        "eval": (".evaluate:evaluate", "Measure a scene on the held-out frames of a sweep."),
+    },
+    "A running service (--address)": {
+        "scenes": (".remote:scenes_app", "List, upload, download, delete and render scenes."),
+        "datasets": (".remote:datasets_app", "List, upload and delete the sweeps that trainings use."),
+        "registrations": (".remote:registrations_app", "List, upload and delete registrations of robots."),
+        "jobs": (".jobs:command_app", "Submit, watch and fetch trainings, evaluations and batch renderings."),
+        "workers": (".remote:workers_app", "List the workers of the jobs; pause, drain and resume them."),
+    },
+    "An installation's folders": {
+        "keys": (".administration:keys_app", "Make, list and revoke API keys."),
+        "backup": (".administration:backup", "Save scenes, datasets, jobs and their database."),
+        "restore": (".administration:restore", "Make an installation what it was at a backup."),
+        "storage": (".administration:storage_app", "Copy scenes into a bucket, or out of it."),
+        "audit": (".administration:audit", "Print who did what: the audit log."),
+    },
+}
+
+
+@cache
+def _own() -> dict[str, Entry]:
+    found = _COMMANDS.items()
+    return {name: Entry(name, app, panel, text) for panel, of in found for name, (app, text) in of.items()}
+
+
+@cache
+def _all() -> dict[str, Entry]:
+    """The own entries, then those of other packages; to find these takes some hundredths of a second."""
+    found = dict(_own())
+    for point in entry_points(group=_PLUGINS):
+        try:
+            for entry in point.load():
+                found.setdefault(entry.name, entry)
+        except ImportError as error:
+            warn(f"the commands of {point.value} are left out: {error}")
+    return found
+
+
+def _entry(name: str) -> Entry | None:
+    return _own().get(name) or _all().get(name)
 
 
 class _Loaded(Mapping[str, Any]):
-    """Commands of a group by name, each loaded when it is asked for."""
-
-    def __init__(self, group: LazyGroup) -> None:
-        self._group = group
+    """Commands by name, each loaded when it is asked for."""
 
     def __getitem__(self, name: str) -> Any:
-        if (entry := self._group.entry(name)) is None:
-            raise KeyError(name)
-        return entry.load()
+        return _all()[name].load()
 
     def __iter__(self) -> Iterator[str]:
-        return iter(self._group.list_commands(None))
+        return iter(_all())
 
     def __len__(self) -> int:
-        return len(self._group.list_commands(None))
+        return len(_all())
 
 
-def _entries_of(point: EntryPoint) -> tuple[Entry, ...]:
-    """The entries of another package; none, and a warning, where it cannot be imported."""
-    try:
-        return tuple(point.load())
-    except ImportError as error:
-        typer.secho(f"warning: the commands of {point.value} are left out: {error}", fg=typer.colors.YELLOW, err=True)
-        return ()
-
-
-class LazyGroup(TyperGroup):
+class _Commands(TyperGroup):
     """A group whose commands are loaded when they run; lists of them need only the entries.
 
     Mistakes end the process with one line on stderr, `error: …`, and exit code 2. So do the errors of the project and
     of the file system.
     """
 
-    entries: tuple[Entry, ...] = ()
-    plugins: str | None = None  # group of the entry points of other packages, each a tuple of entries
-
     def __init__(self, **attributes: Any) -> None:
         super().__init__(**attributes)
-        self.commands = _Loaded(self)  # type: ignore[assignment]  # nobody adds to it
-
-    @cached_property
-    def _own(self) -> dict[str, Entry]:
-        return {entry.name: entry for entry in self.entries}
-
-    @cached_property
-    def _all(self) -> dict[str, Entry]:
-        """The own entries, and those of other packages; to find these takes some hundredths of a second."""
-        found = [] if self.plugins is None else entry_points(group=self.plugins)
-        return {**{entry.name: entry for point in found for entry in _entries_of(point)}, **self._own}
-
-    def entry(self, name: str) -> Entry | None:
-        """The entry of a command; None: there is none of that name."""
-        return self._own.get(name) or self._all.get(name)
+        self.commands = _Loaded()  # type: ignore[assignment]  # nobody adds to it
 
     def list_commands(self, ctx: Any) -> list[str]:
-        """The names, the own ones first, in the order of the entries."""
-        return [*self._own, *(name for name in self._all if name not in self._own)]
+        return [*_all()]
 
     def get_command(self, ctx: Any, cmd_name: str) -> Any:
         """A command as lists show it; what runs comes from `resolve_command`."""
-        entry = self.entry(cmd_name)
-        return None if entry is None else entry.described()
+        entry = _entry(cmd_name)
+        return None if entry is None else TyperCommand(entry.name, help=entry.summary, rich_help_panel=entry.panel)
 
     def resolve_command(self, ctx: Any, args: list[str]) -> Any:
-        """The command that the arguments begin with, loaded."""
         name, found, rest = super().resolve_command(ctx, args)
-        entry = self.entry(name or "")
+        entry = _entry(name or "")
         return name, found if entry is None else entry.load(), rest
 
     def main(
@@ -121,12 +145,11 @@ class LazyGroup(TyperGroup):
         windows_expand_args: bool = True,
         **extra: Any,
     ) -> Any:
-        """Run the command line; in standalone mode the process ends with its exit code."""
-        prog_name = prog_name or "ultragray"  # also by `python -m` and the like
+        as_asked = (args, prog_name or "ultragray", complete_var, False, windows_expand_args)  # also by `python -m`
         if not standalone_mode:
-            return super().main(args, prog_name, complete_var, False, windows_expand_args, **extra)
+            return super().main(*as_asked, **extra)
         try:
-            code = super().main(args, prog_name, complete_var, False, windows_expand_args, **extra)
+            code = super().main(*as_asked, **extra)
         except typer.TyperException as error:
             if type(error).__name__ != "NoArgsIsHelpError":  # the help has been printed
                 _say_error(_in_one_line(error))
@@ -136,7 +159,6 @@ class LazyGroup(TyperGroup):
         raise SystemExit(code if isinstance(code, int) else 0)
 
     def invoke(self, ctx: Any) -> Any:
-        """Run the command; errors of the project and of the file system become a line and exit code 2."""
         from ultragray.errors import UltragrayError
         from ultragray.installation import missing_extra
 
@@ -159,11 +181,13 @@ def _say_error(message: str) -> None:
 
 
 def _in_one_line(error: typer.TyperException) -> str:
-    """The sentence of a mistake in the command line, with what was perhaps meant, and where the help is."""
     context = getattr(error, "ctx", None)
     option = getattr(error, "option_name", None)
     if option is not None and type(error).__name__ == "NoSuchOption":
-        sentence = f"no such option: {option}{_perhaps(option, _options_of(context))}"
+        parameters = [] if context is None else context.command.get_params(context)
+        known = [name for one in parameters for name in one.opts if name.startswith("--")]
+        near = get_close_matches(option, known, n=2)
+        sentence = f"no such option: {option}" + (f"; did you mean {' or '.join(near)}?" if near else "")
     else:
         sentence = _about_value(error) or " ".join(error.format_message().split()).rstrip(".")
         sentence = sentence[:1].lower() + sentence[1:]
@@ -183,80 +207,6 @@ def _about_value(error: typer.TyperException) -> str | None:
         expected = message.partition(",")[0].replace("Input should be", "must be")
     name = parameter.opts[0] if parameter.param_type_name == "option" else parameter.display_name_raw.upper()
     return f"{name} {expected}, got {reason['input']!r}" if "must be" in expected else None
-
-
-def _options_of(context: Any) -> list[str]:
-    if context is None:
-        return []
-    return [name for parameter in context.command.get_params(context) for name in parameter.opts if name[:2] == "--"]
-
-
-def _perhaps(word: str, known: list[str]) -> str:
-    found = get_close_matches(word, known, n=2)
-    return f"; did you mean {' or '.join(found)}?" if found else ""
-
-
-# The command line `ultragray`. Its commands stand in one table here; each is imported when it is used.
-
-
-_SERVING, _SCENES, _SWEEPS = "Serve", "Scenes and frames", "Sweeps and training"
-_REMOTE, _INSTALLATION = "A running service (--address)", "An installation's folders"
-
-
-class _Commands(LazyGroup):
-    plugins = "ultragray.commands"
-    entries = (
-        Entry("serve", ".serve:command_app", _SERVING, "Serve scenes over HTTP and gRPC, until Ctrl-C or SIGTERM."),
-        Entry("worker", ".worker:command_app", _SERVING, "Take jobs from the queue, one at a time, until Ctrl-C."),
-        Entry("demo", ".scenes:demo_app", _SCENES, "Write the built-in demo scene."),
-        Entry("show", ".scenes:show_app", _SCENES, "Print what a scene file or a sweep says about itself."),
-        Entry("render", ".render:command_app", _SCENES, "Render frames from poses into one file or a folder of PNGs."),
-        Entry("export", ".scenes:export_app", _SCENES, "Write a scene as PLY or as a checkpoint of the released code."),
-        Entry("localize", ".register:localize_app", _SCENES, "Find the pose of a real frame in a scene."),
-        Entry("calibrate", ".register:calibrate_app", _SCENES, "Register a robot or tracker to a scene."),
-        Entry(
-            "voxelize", ".scenes:voxelize_app", _SCENES, "Sample a scene on a grid: a NIfTI or NRRD volume, or a slice."
-        ),
-        Entry(
-            "slicer", ".scenes:slicer_app", _SCENES, "Write a scene file of 3D Slicer that shows a served scene live."
-        ),
-        Entry("import", ".scenes:import_app", _SCENES, "Turn a PLY file or a released checkpoint into a scene file."),
-        Entry("check", ".sweeps:check_app", _SWEEPS, "Tell what is in a sweep, and what looks wrong."),
-        Entry("draw", ".sweeps:draw_app", _SWEEPS, "Draw the image planes in space and a contact sheet of the frames."),
-        Entry("convert", ".sweeps:convert_app", _SWEEPS, "Write a sweep in the layout of the released trainer."),
-        Entry("train", ".train:command_app", _SWEEPS, "Train a scene from a tracked sweep."),
-        Entry("eval", ".evaluate:command_app", _SWEEPS, "Measure a scene on the held-out frames of a sweep."),
-        Entry("scenes", ".remote:scenes_app", _REMOTE, "List, upload, download, delete and render scenes."),
-        Entry(
-            "datasets",
-            ".remote:datasets_app",
-            _REMOTE,
-            "List, upload and delete the sweeps that trainings use.",
-        ),
-        Entry(
-            "registrations",
-            ".remote:registrations_app",
-            _REMOTE,
-            "List, upload and delete registrations of robots.",
-        ),
-        Entry(
-            "jobs",
-            ".jobs:command_app",
-            _REMOTE,
-            "Submit, watch and fetch trainings, evaluations and batch renderings.",
-        ),
-        Entry(
-            "workers",
-            ".remote:workers_app",
-            _REMOTE,
-            "List the workers of the jobs; pause, drain and resume them.",
-        ),
-        Entry("keys", ".administration:keys_app", _INSTALLATION, "Make, list and revoke API keys."),
-        Entry("backup", ".administration:backup_app", _INSTALLATION, "Save scenes, datasets, jobs and their database."),
-        Entry("restore", ".administration:restore_app", _INSTALLATION, "Make an installation what it was at a backup."),
-        Entry("storage", ".administration:storage_app", _INSTALLATION, "Copy scenes into a bucket, or out of it."),
-        Entry("audit", ".administration:audit_app", _INSTALLATION, "Print who did what: the audit log."),
-    )
 
 
 app = typer.Typer(
@@ -289,7 +239,6 @@ def main(
     version: Annotated[bool, option("Print the version.", "--version", callback=_print_version, is_eager=True)] = False,
 ) -> None:
     """Look for environment variables that are misspelt, whatever the command; a service logs them itself."""
-    from ultragray_service.cli.terminal import warn
     from ultragray_service.misspelt import unknown_variables
 
     if context.invoked_subcommand != "serve":

@@ -1,7 +1,7 @@
-"""The connection of commands to a running service: the options that find it, and requests over HTTP.
+"""The connection of commands to a running service: the options that find it, requests over HTTP, and TLS.
 
 The commands ask over HTTP, not over gRPC as the Python client does: what users have is the URL of the service, often of
-a proxy that lets nothing else through; scene files, pictures and the documents that `--json` prints are HTTP's alone;
+a proxy that lets nothing else through; scene files, pictures and the documents that --json prints are HTTP's alone;
 and these commands are of the core, which needs no gRPC. The standard library is enough for them.
 """
 
@@ -9,26 +9,82 @@ from __future__ import annotations
 
 import contextlib
 import http.client
-import inspect
+import ipaddress
 import json
 import ssl
-import urllib.error
-import urllib.request
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
 from functools import wraps
 from pathlib import Path
-from typing import IO, Annotated, Any, get_type_hints
+from typing import IO, Annotated, Any
 from urllib.parse import quote, urlencode, urlsplit
 
 import typer
 
 from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray.files import atomic_path
-from ultragray_service.cli.options import keyword, with_parameters
-from ultragray_service.cli.terminal import warn
+from ultragray_service.cli.options import parameters_in, with_parameters
+from ultragray_service.cli.terminal import Columns, Json, argument, examples, tell, tell_facts, tell_table, warn
 from ultragray_service.environment import ADDRESS, API_KEY, CA, CLIENT_CERTIFICATE, CLIENT_KEY
-from ultragray_service.tls.client import client_context, cut_off_hint, exposes_key, tls_problem
 from ultragray_workers.errors import NotReady
+
+
+def client_context(ca: Path | None, certificate: Path | None, key: Path | None) -> ssl.SSLContext:
+    """The certificates of a client; `ca` None: the system's. Raises InvalidArgument for files that cannot be used."""
+    if (certificate is None) is not (key is None):
+        raise InvalidArgument("--client-certificate and --client-key must be given together", field="client_key")
+    try:
+        context = ssl.create_default_context(cafile=ca)
+    except OSError as error:
+        raise InvalidArgument(f"--ca: {ca} holds no certificates ({_words(error)})", field="ca") from None
+    if certificate is not None:
+        try:
+            context.load_cert_chain(certificate, key, password="")
+        except OSError as error:
+            raise InvalidArgument(
+                f"--client-certificate: {certificate} and {key} are no certificate and its key ({_words(error)})",
+                field="client_certificate",
+            ) from None
+    return context
+
+
+def tls_problem(server: str, error: object) -> str | None:
+    """The words for a connection that TLS prevented; None: for another reason."""
+    if isinstance(error, ssl.SSLCertVerificationError):
+        return (
+            f"{server} shows a certificate that is not to be trusted ({error.verify_message}): name its authority with "
+            "--ca, and the service by a name of its certificate"
+        )
+    if isinstance(error, ssl.SSLError) and error.reason == "WRONG_VERSION_NUMBER":
+        return f"{server} does not speak TLS: name it with http://"
+    if isinstance(error, ssl.SSLError) and "ALERT" in (error.reason or ""):
+        return f"{server} refuses the client's certificate, or its absence ({_words(error)}): see --client-certificate"
+    return None
+
+
+def cut_off_hint(server: str, error: object) -> str:
+    """What may be behind a connection that a service cut off: it says no more where it misses TLS or a certificate."""
+    if not isinstance(error, (http.client.BadStatusLine, ConnectionResetError)):
+        return ""
+    if server.startswith("https://"):
+        return "; if it asks for a client's certificate, see --client-certificate"
+    return "; if it speaks TLS, name it with https://"
+
+
+def exposes_key(server: str) -> bool:
+    """Whether others on the way to the URL can read a key that is sent there."""
+    parts = urlsplit(server)
+    if parts.scheme == "https" or parts.hostname == "localhost":
+        return False
+    try:
+        return not ipaddress.ip_address(parts.hostname or "").is_loopback
+    except ValueError:
+        return True
+
+
+def _words(error: OSError) -> str:
+    return (error.reason if isinstance(error, ssl.SSLError) else error.strerror) or str(error)
+
 
 JSON = "application/json"
 _TIMEOUT_S = 60.0  # without a byte; event streams send a comment every 15 s
@@ -43,36 +99,28 @@ class Connection:
     """Asks the service at an address. What it refuses is raised as UltragrayError with its sentence.
 
     Raises NotReady where nobody answers, and where the service is starting or stopping. `tls` None: the certificates
-    that the system trusts.
+    that the system trusts. A key goes to the address that it was given for: redirections and proxies are not followed.
     """
 
     def __init__(self, address: str, api_key: str | None = None, tls: ssl.SSLContext | None = None) -> None:
-        """Connects to nothing yet. Raises InvalidArgument for an address that is not a URL."""
-        parts = urlsplit(address)
-        if parts.scheme not in ("http", "https") or not parts.netloc:
+        self._parts = urlsplit(address)
+        if self._parts.scheme not in ("http", "https") or not self._parts.netloc:
             raise InvalidArgument(
                 f"--address must be a URL such as http://127.0.0.1:8000, got {address!r}", field="address"
             )
         self.address = address.rstrip("/")
         self._tls = tls
-        # A key goes to the address that it was given for: not on to where that redirects, nor by way of a proxy.
-        self._opener = urllib.request.build_opener(
-            urllib.request.ProxyHandler({}), _NoRedirect, urllib.request.HTTPSHandler(context=tls)
-        )
-        self._headers = {} if api_key is None else {"X-API-Key": api_key}
+        self._headers = {"Connection": "close"} | ({} if api_key is None else {"X-API-Key": api_key})
 
     def json(self, method: str, route: str, body: Mapping[str, Any] | None = None) -> Any:
-        """The JSON of an answer; None where it has none."""
         with self.open(method, route, body) as answer:
             return self._document(self.whole(answer))
 
     def text(self, route: str) -> str:
-        """An answer that is text."""
         with self.open("GET", route, accept="*/*") as answer:
             return self.whole(answer).decode("utf-8", "replace")
 
     def whole(self, answer: http.client.HTTPResponse) -> bytes:
-        """All that is left of an answer. Raises NotReady where it breaks off."""
         try:
             return answer.read()
         except (OSError, http.client.HTTPException) as error:
@@ -96,18 +144,9 @@ class Connection:
     def open(
         self, method: str, route: str, body: Mapping[str, Any] | None = None, accept: str = JSON
     ) -> http.client.HTTPResponse:
-        """An answer that is still to be read."""
         content = None if body is None else json.dumps(body, default=str).encode()
-        headers = self._headers | {"Accept": accept} | ({} if content is None else {"Content-Type": JSON})
-        request = urllib.request.Request(self.address + route, content, headers, method=method)
-        try:
-            answer: http.client.HTTPResponse = self._opener.open(request, timeout=_TIMEOUT_S)
-        except urllib.error.HTTPError as error:
-            with error:
-                raise self._refusal(error.code, error.read(), error.headers.get("Location")) from None
-        except (OSError, http.client.HTTPException) as error:
-            raise self._unreachable(error.reason if isinstance(error, urllib.error.URLError) else error) from error
-        return answer
+        headers = {"Accept": accept} | ({} if content is None else {"Content-Type": JSON})
+        return self._ask(method, route, content, headers, _TIMEOUT_S)
 
     def events(self, route: str, name: str) -> Iterator[Any]:
         """The JSON of the events of that name; ends with the stream, or where the service goes away."""
@@ -122,10 +161,7 @@ class Connection:
                         yield json.loads(value)
 
     def download(self, route: str, path: Path, progress: Callable[[int | None], Count]) -> int:
-        """Write an answer to `path`, whole or not at all, and return its size in bytes.
-
-        `progress` is given the size that the service announces, and returns what is told of each block.
-        """
+        """Write an answer to `path`, whole or not at all; its bytes. `progress`: of the size, then of blocks."""
         with self.open("GET", route, accept="*/*") as answer, atomic_path(path) as temporary:
             announced = answer.headers.get("Content-Length")
             size = None if announced is None else int(announced)
@@ -141,36 +177,43 @@ class Connection:
         return written
 
     def upload(self, route: str, path: Path, count: Count) -> tuple[Any, bool]:
-        """The JSON of the answer to a PUT of a file, and whether something new was made of it.
-
-        A service that has seen enough answers before the file is sent: its refusal is raised all the same.
-        """
-        parts = urlsplit(self.address)
-        secure = parts.scheme == "https"
-        if secure:
-            connection: http.client.HTTPConnection = http.client.HTTPSConnection(
-                parts.netloc, timeout=_CHECK_TIMEOUT_S, context=self._tls
-            )
-        else:
-            connection = http.client.HTTPConnection(parts.netloc, timeout=_CHECK_TIMEOUT_S, blocksize=_BLOCK_BYTES)
+        """The JSON of the answer to a PUT of a file, which may come early, and whether something new was made of it."""
         headers = {"Content-Type": "application/octet-stream", "Content-Length": str(path.stat().st_size)}
-        with path.open("rb") as file, contextlib.closing(connection):
-            body = _Counted(file, count)
-            try:
+        with path.open("rb") as file:
+            body = _Counted(file, path.name, count)
+            with self._ask("PUT", route, body, headers, _CHECK_TIMEOUT_S) as answer:
+                return self._document(self.whole(answer)), answer.status == 201
+
+    def _ask(
+        self, method: str, route: str, body: bytes | _Counted | None, headers: Mapping[str, str], timeout_s: float
+    ) -> http.client.HTTPResponse:
+        sent = body if isinstance(body, _Counted) else None
+        try:
+            where = self._parts.netloc
+            connection = (
+                http.client.HTTPSConnection(where, timeout=timeout_s, context=self._tls)
+                if self._parts.scheme == "https"
+                else http.client.HTTPConnection(where, timeout=timeout_s, blocksize=_BLOCK_BYTES)
+            )
+            with contextlib.ExitStack() as unless_answered:
+                unless_answered.callback(connection.close)
                 try:
-                    connection.request("PUT", parts.path + route, body, headers=self._headers | headers)
+                    connection.request(method, self._parts.path.rstrip("/") + route, body, {**self._headers, **headers})
                 except (BrokenPipeError, ConnectionResetError, ssl.SSLError):
-                    if not body.is_begun:
+                    if sent is None or not sent.is_begun:
                         raise
                 answer = connection.getresponse()
-                content = answer.read()
-            except (OSError, http.client.HTTPException) as error:
-                if body.is_begun:
-                    raise NotReady(f"{self.address} closed the connection while {path.name} was sent") from error
-                raise self._unreachable(error) from error
+                unless_answered.pop_all()
+            if connection.sock is not None:  # the answer has it
+                connection.sock.close()
+        except (OSError, http.client.HTTPException) as error:
+            if sent is not None and sent.is_begun:
+                raise NotReady(f"{self.address} closed the connection while {sent.name} was sent") from error
+            raise self._unreachable(error) from error
         if answer.status >= 300:
-            raise self._refusal(answer.status, content, answer.headers.get("Location"))
-        return self._document(content), answer.status == 201
+            with answer:
+                raise self._refusal(answer.status, self.whole(answer), answer.headers.get("Location"))
+        return answer
 
     def _document(self, content: bytes) -> Any:
         try:
@@ -202,18 +245,11 @@ class Connection:
         return (NotReady if status == 503 else UltragrayError)(detail, field=field)
 
 
-class _NoRedirect(urllib.request.HTTPRedirectHandler):
-    """Takes a redirection for the refusal that it is to us."""
-
-    def redirect_request(self, *_: object) -> None:
-        return None
-
-
 class _Counted:
     """A file that tells how much of it was read."""
 
-    def __init__(self, file: IO[bytes], count: Count) -> None:
-        self._file, self._count = file, count
+    def __init__(self, file: IO[bytes], name: str, count: Count) -> None:
+        self._file, self.name, self._count = file, name, count
         self.is_begun = False
 
     def read(self, size: int = -1) -> bytes:
@@ -229,7 +265,6 @@ def route(*parts: str, suffix: str = "") -> str:
 
 
 def _in_words(reason: object) -> str:
-    """Why a connection failed, without the number of the error."""
     if isinstance(reason, OSError) and reason.strerror:
         return reason.strerror.lower()
     return str(reason) or type(reason).__name__
@@ -238,63 +273,84 @@ def _in_words(reason: object) -> str:
 CONNECTION, TLS = "Connection", "TLS"
 
 
-def _option(help: str, envvar: str, panel: str, show_default: str | bool) -> Any:
+def _option(help: str, envvar: str, panel: str, show_default: str | bool = False) -> Any:
     return typer.Option(help=help, envvar=envvar, rich_help_panel=panel, show_default=show_default)
 
 
-_OPTIONS = [
-    keyword(
-        "address",
-        Annotated[str, _option("URL of the service.", ADDRESS, CONNECTION, True)],
-        "http://127.0.0.1:8000",
-    ),
-    keyword(
-        "api_key", Annotated[str | None, _option("Where the service asks for one.", API_KEY, CONNECTION, False)], None
-    ),
-    keyword(
-        "ca",
-        Annotated[
-            Path | None,
-            _option("Authorities (PEM) that sign the service's certificate.", CA, TLS, "the system's"),
-        ],
-        None,
-    ),
-    keyword(
-        "client_certificate",
-        Annotated[
-            Path | None,
-            _option("Certificate (PEM) of the client, where the service asks for one.", CLIENT_CERTIFICATE, TLS, False),
-        ],
-        None,
-    ),
-    keyword(
-        "client_key", Annotated[Path | None, _option("Its key (PEM), not encrypted.", CLIENT_KEY, TLS, False)], None
-    ),
-]
+def _connected(
+    address: Annotated[str, _option("URL of the service.", ADDRESS, CONNECTION, True)] = "http://127.0.0.1:8000",
+    api_key: Annotated[str | None, _option("Where the service asks for one.", API_KEY, CONNECTION)] = None,
+    ca: Annotated[
+        Path | None, _option("Authorities (PEM) that sign the service's certificate.", CA, TLS, "the system's")
+    ] = None,
+    client_certificate: Annotated[
+        Path | None,
+        _option("Certificate (PEM) of the client, where the service asks for one.", CLIENT_CERTIFICATE, TLS),
+    ] = None,
+    client_key: Annotated[Path | None, _option("Its key (PEM), not encrypted.", CLIENT_KEY, TLS)] = None,
+) -> Connection:
+    connection = Connection(address, api_key, client_context(ca, client_certificate, client_key))
+    if api_key is not None and exposes_key(address):
+        warn(f"the API key travels unencrypted to {address}, and whoever is on the way can read it")
+    return connection
 
 
 def with_connection(command: Callable[..., None]) -> Callable[..., None]:
     """Make a command of a function that takes a `connection` first: with the options of the connection."""
-    hints = get_type_hints(command, include_extras=True)
-    own = [
-        parameter.replace(annotation=hints[name], kind=parameter.KEYWORD_ONLY)
-        for name, parameter in inspect.signature(command).parameters.items()
-        if name != "connection"
-    ]
+    options = parameters_in(_connected)
 
     @wraps(command)
-    def run(
-        *,
-        address: str,
-        api_key: str | None,
-        ca: Path | None,
-        client_certificate: Path | None,
-        client_key: Path | None,
-        **given: Any,
-    ) -> None:
-        connection = Connection(address, api_key, client_context(ca, client_certificate, client_key))
-        if api_key is not None and exposes_key(address):
-            warn(f"the API key travels unencrypted to {address}, and whoever is on the way can read it")
+    def run(**given: Any) -> None:
+        connection = _connected(**{one.name: given.pop(one.name) for one in options})
         command(connection, **given)
 
-    return with_parameters(run, [*own, *_OPTIONS])
+    return with_parameters(run, [*(one for one in parameters_in(command) if one.name != "connection"), *options])
+
+
+@dataclass(frozen=True)
+class Resource:
+    """A kind of things that a service keeps, and the commands that such kinds have alike."""
+
+    app: typer.Typer
+    kind: str  # plural: the command, the route, and the key of a list
+    example: str  # of a name
+    columns: Columns = field(default_factory=dict)
+    metavar: str = "NAME"
+    meaning: str = "Name of the {thing}."
+
+    def add_list(self, meaning: str, *more: str) -> None:
+        line = f"ultragray {self.kind} list"
+
+        @self.app.command("list", help=meaning, epilog=examples(line, *more or (f"{line} --json | jq '.[].name'",)))
+        @with_connection
+        def list_all(connection: Connection, json: Json = False) -> None:
+            found = connection.listed(f"/v1/{self.kind}", self.kind)
+            tell_table(self.columns, found, as_json=json)
+
+    def add_show(self, meaning: str, *more: str) -> None:
+        def show(connection: Connection, name: str, json: Json = False) -> None:
+            tell_facts(connection.json("GET", route(self.kind, name)), as_json=json)
+
+        self._add("show", show, meaning, *more)
+
+    def add_delete(self, meaning: str) -> None:
+        def delete(connection: Connection, name: str, json: Json = False) -> None:
+            connection.json("DELETE", route(self.kind, name))
+            tell(f"{name} deleted", {"deleted": name}, as_json=json)
+
+        self._add("delete", delete, meaning)
+
+    def add_action(self, action: str, meaning: str, in_words: Callable[[dict[str, Any]], str]) -> None:
+        """A command that has the service do something with one, and tells `in_words` what came of it."""
+
+        def act(connection: Connection, name: str, json: Json = False) -> None:
+            changed = connection.json("POST", route(self.kind, name, suffix=f":{action}"))
+            tell(in_words(changed), changed, as_json=json)
+
+        self._add(action, act, meaning)
+
+    def _add(self, name: str, command: Callable[..., None], meaning: str, *more: str) -> None:
+        thing = self.meaning.format(thing=self.kind.removesuffix("s"))
+        command.__annotations__["name"] = Annotated[str, argument(thing, metavar=self.metavar)]
+        line = f"ultragray {self.kind} {name} {self.example}"
+        self.app.command(name, help=meaning, epilog=examples(line, *more))(with_connection(command))

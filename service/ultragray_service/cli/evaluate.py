@@ -20,10 +20,9 @@ from ultragray_service.cli.terminal import (
     Json,
     SceneFile,
     check_folder,
-    command_group,
-    examples,
     option,
     output_option,
+    single,
     to_json,
     wide_console,
     working,
@@ -35,23 +34,16 @@ if TYPE_CHECKING:
     from ultragray.scene.gaussians import GaussianScene
 
 
-command_app = command_group()
-
-
 class Split(str, enum.Enum):
-    """The frames of a dataset to measure on."""
-
     VAL = "val"
     TRAIN = "train"
 
 
-@command_app.command(
-    "eval",
-    epilog=examples(
-        "ultragray eval liver.ugr sweep/",
-        "ultragray eval liver.ugr sweep/ -o pictures/  # truth beside rendering, frame by frame",
-        "ultragray eval liver.ugr sweep/ --json | jq .mean",
-    ),
+@single(
+    "ultragray eval liver.ugr sweep/",
+    "ultragray eval liver.ugr sweep/ -o pictures/  # truth beside rendering, frame by frame",
+    "ultragray eval liver.ugr sweep/ --json | jq .mean",
+    name="eval",
 )
 @with_options
 def evaluate(
@@ -123,7 +115,6 @@ def evaluate(
 
 
 def _pose_figures(scene: GaussianScene, registered: Sweep | None, backend: str) -> dict[str, Any]:
-    """How far a scene's training poses were corrected, and the scores of registered frames, by their key in JSON."""
     from ultragray.learn.report.sizes import CorrectionSizes
     from ultragray.learn.training.poses import score_halves
 
@@ -142,11 +133,7 @@ def _in_words(reliability: Reliability) -> str:
     )
 
 
-# Tables of what was measured on held-out frames, one row a scene or a method.
-
-
 def print_metrics(title: str, evaluations: Mapping[str, Evaluation]) -> None:
-    """A table of mean ± standard deviation over the frames, one row a name."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -170,7 +157,6 @@ def print_metrics(title: str, evaluations: Mapping[str, Evaluation]) -> None:
 
 
 def print_speckle(evaluations: Mapping[str, Evaluation]) -> None:
-    """A table of the statistics of speckle, means over the frames: the true frames, then one row a name."""
     from rich.markup import escape
     from rich.table import Table
 

@@ -8,7 +8,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Annotated, Any, get_type_hints
+from typing import Annotated, Any
 
 import numpy as np
 import typer
@@ -17,9 +17,10 @@ from ultragray.contract import to_dict
 from ultragray.exchange.batches import names_in
 from ultragray.samplers import TrainingSampler
 from ultragray_service.cli.app import INTERRUPTED
-from ultragray_service.cli.connection import Connection, route, with_connection
-from ultragray_service.cli.options import parameters_of, values_of, with_parameters
+from ultragray_service.cli.connection import Connection, Resource, route, with_connection
+from ultragray_service.cli.options import parameters_in, parameters_of, values_of, with_parameters
 from ultragray_service.cli.terminal import (
+    Columns,
     Force,
     Json,
     argument,
@@ -27,12 +28,12 @@ from ultragray_service.cli.terminal import (
     command_group,
     counted,
     examples,
+    minutes_and_seconds,
     option,
     output_option,
-    print_facts,
-    print_table,
     progress_bars,
     tell,
+    tell_table,
     to_json,
     transferred,
     warn,
@@ -44,7 +45,6 @@ command_app = command_group("Work in the background, on a running service: it go
 submit_app = command_group("Put a job into the queue; its id is printed.")
 command_app.add_typer(submit_app, name="submit")
 
-JobArgument = Annotated[str, argument("Id of the job.", shown=False)]
 QUEUE = "Queue"
 _SUBMITS = {
     "train": (
@@ -66,7 +66,18 @@ _METRICS_IN_A_LINE = 6
 _RETRY_S = 1.0
 _HELD_S = 5.0  # a connection that lasted so long was one to a service that works
 _GONE_S = 60.0  # a service that comes back within this time is asked again
-_COLUMNS = ("id", "kind", "state", "scene or dataset", "progress", "created", "reason")
+_COLUMNS: Columns = {
+    "id": lambda job: str(job["id"]),
+    "kind": lambda job: str(job["kind"]),
+    "state": lambda job: str(job["state"]),
+    "scene or dataset": lambda job: str(job["specification"].get("scene", job["specification"].get("dataset", ""))),
+    "progress": lambda job: amount(job),
+    "created": lambda job: str(job["created_at"])[:19].replace("T", " "),
+    "reason": lambda job: job["reason"] or "",
+}
+
+_jobs = Resource(command_app, "jobs", "7f3c2a", _COLUMNS, "JOB", "Id of the job.")
+JobArgument = Annotated[str, argument("Id of the job.")]
 
 
 @command_app.command(
@@ -81,59 +92,26 @@ def list_jobs(
     json: Json = False,
 ) -> None:
     """List the jobs, newest first."""
-
-    jobs = connection.listed("/v1/jobs", "jobs", limit, state=state, kind=kind)
-    if json:
-        typer.echo(to_json(jobs))
-    else:
-        _print_jobs(jobs)
+    tell_table(_COLUMNS, connection.listed("/v1/jobs", "jobs", limit, state=state, kind=kind), as_json=json)
 
 
-@command_app.command(epilog=examples("ultragray jobs show 7f3c2a", "ultragray jobs show 7f3c2a --json | jq .metrics"))
-@with_connection
-def show(connection: Connection, job: JobArgument, json: Json = False) -> None:
-    """Print all that is known about a job."""
-
-    found = connection.json("GET", route("jobs", job))
-    if json:
-        typer.echo(to_json(found))
-    else:
-        print_facts(found)
+_jobs.add_show("Print all that is known about a job.", "ultragray jobs show 7f3c2a --json | jq .metrics")
 
 
 @command_app.command(epilog=examples("ultragray jobs watch 7f3c2a"))
 @with_connection
 def watch(connection: Connection, job: JobArgument, json: Json = False) -> None:
     """Follow a job to its end. Exit code 0: it succeeded, 3: it failed, 4: it was cancelled."""
-
     follow(connection, job, as_json=json)
 
 
-@command_app.command(epilog=examples("ultragray jobs cancel 7f3c2a"))
-@with_connection
-def cancel(connection: Connection, job: JobArgument, json: Json = False) -> None:
-    """Stop a job."""
-
-    cancelled = connection.json("POST", route("jobs", job, suffix=":cancel"))
-    tell(f"{cancelled['id']} {cancelled['state']}", cancelled, as_json=json)
-
-
-@command_app.command(epilog=examples("ultragray jobs retry 7f3c2a"))
-@with_connection
-def retry(connection: Connection, job: JobArgument, json: Json = False) -> None:
-    """Put a new job in place of a failed or cancelled one; it goes on from the last checkpoint."""
-
-    again = connection.json("POST", route("jobs", job, suffix=":retry"))
-    tell(again["id"], again, as_json=json)
-
-
-@command_app.command(epilog=examples("ultragray jobs delete 7f3c2a"))
-@with_connection
-def delete(connection: Connection, job: JobArgument, json: Json = False) -> None:
-    """Remove a finished job and its files; the scene that it trained stays."""
-
-    connection.json("DELETE", route("jobs", job))
-    tell(f"{job} deleted", {"deleted": job}, as_json=json)
+_jobs.add_action("cancel", "Stop a job.", lambda job: f"{job['id']} {job['state']}")
+_jobs.add_action(
+    "retry",
+    "Put a new job in place of a failed or cancelled one; it goes on from the last checkpoint.",
+    lambda job: str(job["id"]),
+)
+_jobs.add_delete("Remove a finished job and its files; the scene that it trained stays.")
 
 
 @command_app.command(epilog=examples("ultragray jobs logs 7f3c2a --bytes 4096"))
@@ -145,7 +123,6 @@ def logs(
     json: Json = False,
 ) -> None:
     """Print the end of a job's log."""
-
     log = connection.text(route("jobs", job, suffix=f"/log?max_bytes={max_bytes}"))
     if json:
         typer.echo(to_json({"job": job, "log": log}))
@@ -163,13 +140,12 @@ def logs(
 def download(
     connection: Connection,
     job: JobArgument,
-    name: Annotated[str, argument("One of the job's artifacts, or a range of them.", shown=False)],
+    name: Annotated[str, argument("One of the job's artifacts, or a range of them.")],
     output: Annotated[Path | None, output_option("File to write; of a range the folder.", default="NAME, here")] = None,
     force: Force = False,
     json: Json = False,
 ) -> None:
     """Download a file that a job made."""
-
     if len(names := list(names_in(name))) > 1:
         _download_all(connection, job, names, Path() if output is None else output, as_json=json, force=force)
         return
@@ -183,7 +159,6 @@ def download(
 def _download_all(
     connection: Connection, job: str, names: list[str], folder: Path, *, as_json: bool, force: bool
 ) -> None:
-    """Downloads the files that are not in the folder yet, whole each."""
     folder.mkdir(parents=True, exist_ok=True)
     missing = [name for name in names if force or not (folder / Path(name).name).exists()]
     size = 0
@@ -224,13 +199,7 @@ def _submit(
 
 
 def _add_submit_command(kind: str, cls: type[Specification]) -> None:
-    """`jobs submit KIND`, with an option for each field of the specification."""
-    hints = get_type_hints(_submit, include_extras=True)
-    common = [
-        parameter.replace(annotation=hints[parameter.name])
-        for parameter in inspect.signature(_submit).parameters.values()
-        if parameter.kind is parameter.KEYWORD_ONLY
-    ]
+    common = [one for one in parameters_in(_submit) if one.name not in ("connection", "kind", "specification")]
 
     def submit(connection: Connection, **given: Any) -> None:
         values = values_of(cls, given)
@@ -252,22 +221,8 @@ for _kind, _class in Specification.members.items():
     _add_submit_command(_kind, _class)
 
 
-def _print_jobs(jobs: list[dict[str, Any]]) -> None:
-
-    print_table(_COLUMNS, [_row(job, amount(job)) for job in jobs])
-
-
-def _row(job: dict[str, Any], progress: str) -> tuple[str, ...]:
-    created = str(job["created_at"])[:19].replace("T", " ")
-    about = str(job["specification"].get("scene", job["specification"].get("dataset", "")))
-    return (job["id"], job["kind"], job["state"], about, progress, created, job["reason"] or "")
-
-
 def follow(connection: Connection, job_id: str, *, as_json: bool = False) -> None:
-    """Return when the job has succeeded; exit with 3 where it failed, 4 where it was cancelled, 130 at Ctrl-C.
-
-    Raises UltragrayError: no such job, or a service that stays away.
-    """
+    """Return when the job has succeeded; exit with 3 where it failed, 4 where it was cancelled, 130 at Ctrl-C."""
     try:
         with _display(job_id) as show:
             job = _watched(connection, job_id, show)
@@ -342,25 +297,17 @@ def amount(job: dict[str, Any]) -> str:
 
 
 def figures(job: dict[str, Any]) -> str:
-    """The figures of the progress that are known, in short."""
+    shown: dict[str, Callable[[Any], str]] = {
+        "waits_for": "waits for {}".format,
+        "method": lambda method: f"{method}, method {progress['method_number']} of {progress['methods']}",
+        "loss": "loss {:.4f}".format,
+        "gaussians": "{:,} Gaussians".format,
+        "rate_per_s": "{:.1f}/s".format,
+        "seconds_left": lambda left_s: f"{minutes_and_seconds(left_s)} left",
+        "val_psnr_db": "held out {:.2f} dB".format,
+    }
     progress = job["progress"]
-    parts = []
-    if progress["waits_for"] is not None:
-        parts.append(f"waits for {progress['waits_for']}")
-    if progress["method"] is not None:
-        parts.append(f"{progress['method']}, method {progress['method_number']} of {progress['methods']}")
-    if progress["loss"] is not None:
-        parts.append(f"loss {progress['loss']:.4f}")
-    if progress["gaussians"] is not None:
-        parts.append(f"{progress['gaussians']:,} Gaussians")
-    if progress["rate_per_s"] is not None:
-        parts.append(f"{progress['rate_per_s']:.1f}/s")
-    if progress["seconds_left"] is not None:
-        minutes, seconds = divmod(round(progress["seconds_left"]), 60)
-        parts.append(f"{minutes}:{seconds:02d} left")
-    if progress["val_psnr_db"] is not None:
-        parts.append(f"held out {progress['val_psnr_db']:.2f} dB")
-    return " · ".join(parts)
+    return " · ".join(words(progress[name]) for name, words in shown.items() if progress[name] is not None)
 
 
 def results(job: dict[str, Any]) -> str:

@@ -59,11 +59,10 @@ class FieldsOf:
 
 def with_options(command: Callable[..., Any]) -> Callable[..., Any]:
     """Make a command of typer out of a function that takes contract dataclasses."""
-    hints = get_type_hints(command, include_extras=True)
     contracts: dict[str, Any] = {}
-    parameters: list[inspect.Parameter] = []
-    for name, parameter in inspect.signature(command).parameters.items():
-        cls, _ = optional_of(hints[name])
+    own, parameters = parameters_in(command), list[inspect.Parameter]()
+    for parameter in own:
+        name, (cls, _) = parameter.name, optional_of(parameter.annotation)
         if isinstance(asked := getattr(cls, "__metadata__", (None,))[0], FieldsOf):
             contracts[name] = asked
             parameters += _chosen_parameters(asked)
@@ -71,12 +70,12 @@ def with_options(command: Callable[..., Any]) -> Callable[..., Any]:
             contracts[name] = cls
             parameters += parameters_of(cls, name)
         else:
-            parameters.append(parameter.replace(annotation=hints[name], kind=parameter.KEYWORD_ONLY))
+            parameters.append(parameter)
 
     @wraps(command)
     def run(**given: Any) -> Any:
         made = {name: _made(cls, name, given) for name, cls in contracts.items()}
-        return command(**{name: made[name] if name in made else given[name] for name in hints if name != "return"})
+        return command(**{one.name: made[one.name] if one.name in made else given[one.name] for one in own})
 
     return with_parameters(run, parameters)
 
@@ -88,17 +87,19 @@ def _made(cls: Any, name: str, given: Mapping[str, Any]) -> Any:
 
 
 def with_parameters(command: Callable[..., Any], parameters: list[inspect.Parameter]) -> Callable[..., Any]:
-    """The command, as typer sees it, with these parameters."""
     command.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
     command.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return command
 
 
-def parameters_of(cls: Any, name: str = "") -> list[inspect.Parameter]:
-    """The options of a contract dataclass, or of a family under a name, each in the panel of its topic.
+def parameters_in(function: Callable[..., Any]) -> list[inspect.Parameter]:
+    hints = get_type_hints(function, include_extras=True)
+    found = inspect.signature(function).parameters.items()
+    return [one.replace(annotation=hints[name], kind=inspect.Parameter.KEYWORD_ONLY) for name, one in found]
 
-    The first required field is an argument.
-    """
+
+def parameters_of(cls: Any, name: str = "") -> list[inspect.Parameter]:
+    """The options of a contract dataclass or family, in panels of their topics; the first required is an argument."""
     if issubclass(cls, _WITH_AN_OPTION_A_FIELD):
         return [*_family_parameters(cls, name)]
     argument = next((item for item, _ in _fields(cls) if _is_required(item)), None)
@@ -123,10 +124,7 @@ def _chosen_parameters(asked: FieldsOf) -> Iterator[inspect.Parameter]:
 
 
 def values_of(cls: Any, given: Mapping[str, Any]) -> dict[str, Any]:
-    """The fields of a contract dataclass that options gave, as Python has them.
-
-    Raises InvalidArgument and its kind, naming the option for what cannot be read.
-    """
+    """The fields that options gave, as Python has them. Raises InvalidArgument, naming the option."""
     found = {}
     for item, kind in _fields(cls):
         if kind is bool:
@@ -147,7 +145,6 @@ def _fields(cls: Any) -> Iterator[tuple[Field[Any], Any]]:
 
 
 def _is_within(kind: Any) -> bool:
-    """Tell whether the fields of this type have options of their own."""
     is_contract = isinstance(kind, type) and issubclass(kind, Contract)
     return is_contract and (not issubclass(kind, Family) or kind in _WITH_AN_OPTION_A_FIELD)
 
@@ -166,10 +163,7 @@ def _family_parameters(family: Any, name: str) -> Iterator[inspect.Parameter]:
 def _parameter(
     item: Field[Any], kind: Any, *, topic: str | None, is_argument: bool = False, takers: Sequence[str] = ()
 ) -> inspect.Parameter:
-    """The option of a field, in the panel of its own topic, else of `topic`.
-
-    `takers`: the kinds of a family that take it, each in its own right.
-    """
+    """The option of a field, in the panel of its own topic, else of `topic`; `takers`: the kinds that take it."""
     meaning = str(item.metadata["description"])
     if takers:
         meaning = f"{', '.join(takers)}: {meaning[:1].lower()}{meaning[1:]}"
@@ -214,12 +208,10 @@ def poses_option(*, default: str) -> Any:
 
 
 def _signature(member: Any) -> str:
-    """A member of a family as JSON without its values."""
     return "{" + ", ".join([f'"kind": "{member.kind}"', *(f'"{item.name}": …' for item, _ in _fields(member))]) + "}"
 
 
 def keyword(name: str, annotation: Any, default: Any = inspect.Parameter.empty) -> inspect.Parameter:
-    """A parameter of a command, as typer annotates it."""
     return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
 
 
@@ -250,7 +242,6 @@ def _part(cls: Any, name: str, given: Mapping[str, Any]) -> Any:
 
 
 def _read(value: Any, kind: Any, name: str) -> Any:
-    """The value of an option in the type of its field."""
     if name in _FILES:
         return load_poses(value) if name == "poses" else load_tools(value)
     if get_origin(kind) is tuple:
@@ -277,7 +268,6 @@ def parse_settings(settings: list[str]) -> dict[str, Any]:
 
 
 def pairs_of(texts: list[str], flag: str) -> dict[str, str]:
-    """NAME=VALUE pairs as they were written. Raises InvalidArgument, naming the option."""
     found = {}
     for text in texts:
         name, equals, value = text.partition("=")

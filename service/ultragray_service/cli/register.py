@@ -26,6 +26,7 @@ from ultragray_service.cli.terminal import (
     examples,
     option,
     output_option,
+    single,
     tell,
     working,
 )
@@ -37,22 +38,16 @@ if TYPE_CHECKING:
 
 
 POSE_SUFFIXES = (".npy",)
-localize_app = command_group()
 
 
-@localize_app.command(
-    epilog=examples(
-        "ultragray localize liver.ugr frame.png --start pose.npy",
-        "ultragray localize liver.ugr frame.npy --start pose.json --within-mm 10 -o found.npy",
-    )
+@single(
+    "ultragray localize liver.ugr frame.png --start pose.npy",
+    "ultragray localize liver.ugr frame.npy --start pose.json --within-mm 10 -o found.npy",
 )
 def localize(
     scene: SceneFile,
     image: Annotated[
-        Path,
-        argument(
-            "The frame, .png or .npy: rows along depth, columns across scan lines, not scan-converted.", shown=False
-        ),
+        Path, argument("The frame, .png or .npy: rows along depth, columns across scan lines, not scan-converted.")
     ],
     start: Annotated[Path, option("A pose that is about right: .npy or .json, 4x4 or 3x4, in mm; .mcap.", shown=False)],
     within_mm: Annotated[float, option("How far the start may be off.")] = 3.0,
@@ -115,9 +110,6 @@ def _in_words(found: Localization, output: Path | None) -> str:
     )
 
 
-# `ultragray calibrate …`: the frame of a robot or tracker registered to a scene.
-
-
 SUFFIXES = (".json",)
 calibrate_app = command_group(
     "What leads a robot's poses into a scene: probe→scene = base→scene · flange→base · probe→flange. For a tracked "
@@ -125,14 +117,14 @@ calibrate_app = command_group(
 )
 
 Output = Annotated[Path, output_option("The registration, .json.")]
-FlangePoses = Annotated[Path, argument("Poses flange→base, mm: .npy or .json.", metavar="FLANGE", shown=False)]
+FlangePoses = Annotated[Path, argument("Poses flange→base, mm: .npy or .json.", metavar="FLANGE")]
 Mounting = Annotated[Path | None, option("Pose probe→flange, mm: .npy or .json.", shown="the frames are the same")]
 
 
 @calibrate_app.command(epilog=examples("ultragray calibrate points in_base.npy in_scene.npy -o robot.json"))
 def points(
-    in_base: Annotated[Path, argument("Points in the base, [N, 3] mm: .npy, .csv.", shown=False)],
-    in_scene: Annotated[Path, argument("The same ones in the scene.", shown=False)],
+    in_base: Annotated[Path, argument("Points in the base, [N, 3] mm: .npy, .csv.")],
+    in_scene: Annotated[Path, argument("The same ones in the scene.")],
     output: Output,
     probe_to_flange: Mounting = None,
     force: Force = False,
@@ -164,7 +156,7 @@ def points(
 )
 def poses(
     flange: FlangePoses,
-    probe: Annotated[Path, argument("The poses probe→scene at the same times: .npy or .json.", shown=False)],
+    probe: Annotated[Path, argument("The poses probe→scene at the same times: .npy or .json.")],
     output: Output,
     probe_to_flange: Mounting = None,
     find_mounting: Annotated[
@@ -200,8 +192,7 @@ def frames(
     scene: SceneFile,
     flange: FlangePoses,
     images: Annotated[
-        list[Path],
-        argument("The real frames at these poses: .png each, or one .npy [N, H, W]; not scan-converted.", shown=False),
+        list[Path], argument("The real frames at these poses: .png each, or one .npy [N, H, W]; not scan-converted.")
     ],
     start: Annotated[Path, option("A pose base→scene that is about right: .npy or .json.")],
     output: Output,

@@ -1,103 +1,171 @@
-"""`ultragray scenes …`, `datasets …`, `registrations …` and `workers …`: what a running service keeps, over HTTP.
-
-All have `list`; all but workers have `show` and `delete`, which `_Resource` makes.
-"""
+"""What a running service keeps, over HTTP: commands of scenes, datasets, registrations and workers."""
 
 from __future__ import annotations
 
 import contextlib
+import json
 import tempfile
 import zipfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from http.client import HTTPMessage
 from pathlib import Path
 from typing import Annotated, Any
 from urllib.parse import urlencode
 
-import typer
+import numpy as np
 
-from ultragray.contract import to_dict
+from ultragray.contract import from_dict, to_dict
 from ultragray.datasets.source import UPLOAD_OPTIONS, UPLOADED_FORMATS, SourceOptions
 from ultragray.errors import DatasetInvalid, InvalidArgument
+from ultragray.exchange.poses import load_poses
+from ultragray.files import write_whole
+from ultragray.geometry.pose import check_poses
+from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.rendering.settings import FrameSettings, RenderSettings
 from ultragray.samplers import Sampler
 from ultragray.scene.info import read_header
-from ultragray_service.cli.connection import Connection, route, with_connection
+from ultragray_service.cli.connection import Connection, Resource, route, with_connection
 from ultragray_service.cli.options import FieldsOf, poses_option, with_options
-from ultragray_service.cli.remote_frames import SUFFIXES, RenderRequest, checked_kind
 from ultragray_service.cli.sweeps import SWEEP_MEANING
 from ultragray_service.cli.terminal import (
+    OR_A_FOLDER,
     SCENE_SUFFIX,
     Force,
     Json,
     argument,
+    check_ending,
     check_file,
+    check_folder,
     command_group,
+    counted,
     examples,
     frames_in_words,
+    is_folder_name,
     option,
     output_option,
-    print_facts,
-    print_table,
     tell,
-    to_json,
     transferred,
     warn,
 )
 from ultragray_workers.jobs.demand import GB
 
-ARCHIVE_SUFFIXES = (".zip", ".tar", ".tar.gz", ".tgz")
+MEDIA_TYPES = {".png": "image/png", ".jpg": "image/jpeg", ".npz": "application/x-npz"}
+SUFFIXES = tuple(MEDIA_TYPES)
+FRAMES_FILE = "frames.json"
 
 
 @dataclass(frozen=True)
-class _Resource:
-    """A kind of things that a service keeps by name, and the commands that all such kinds have."""
+class RenderRequest:
+    scene: str
+    output: Path
+    suffix: str | None  # of SUFFIXES; None: a folder of PNGs
+    poses: FloatArray | None  # [C, 4, 4] mm, of a file
+    sampler: Sampler | None
+    registration: str | None  # that leads these poses into the scene
+    settings: FrameSettings
 
-    app: typer.Typer
-    kind: str  # plural: the command, the route, and the key of a list
-    thing: str
-    columns: tuple[str, ...]
-    row: Callable[[dict[str, Any]], tuple[str, ...]]
 
-    def add_list(self, meaning: str, *more: str) -> None:
-        """`list`: a table, or the documents of all."""
-        line = f"ultragray {self.kind} list"
+def checked_kind(output: Path, settings: FrameSettings, *, force: bool) -> str | None:
+    """The ending of the output, of SUFFIXES; None: a folder. Raises InvalidArgument where it cannot be written."""
+    if is_folder_name(output):
+        check_folder(output, force=force)
+        return None
+    check_ending(output, SUFFIXES, otherwise=OR_A_FOLDER)
+    check_file(output, force=force)
+    if output.suffix != ".npz" and len(settings.outputs) != 1:
+        raise InvalidArgument(
+            f"a picture holds one output, got {', '.join(settings.outputs)}: write a .npz file or a folder",
+            field="outputs",
+        )
+    return output.suffix
 
-        @self.app.command("list", help=meaning, epilog=examples(line, *more or (f"{line} --json | jq '.[].name'",)))
-        @with_connection
-        def list_all(connection: Connection, json: Json = False) -> None:
-            found = connection.listed(f"/v1/{self.kind}", self.kind)
-            if json:
-                typer.echo(to_json(found))
-            else:
-                print_table(self.columns, map(self.row, found))
 
-    def add_show(self, example: str, meaning: str, *more: str) -> None:
-        """`show`: the facts of one."""
+def render_remotely(connection: Connection, request: RenderRequest) -> dict[str, Any]:
+    if request.registration is not None and (request.poses is None or request.sampler is not None):
+        raise InvalidArgument(
+            "a registration leads the poses of a file, which must be given with --poses and without --sampler; "
+            "ultragray jobs submit render samples about such poses",
+            field="registration",
+        )
+    poses = _poses(connection, request)
+    settings = to_dict(request.settings, with_none=False)
+    if request.registration is not None:
+        settings["registration"] = request.registration
+    if request.suffix is None:
+        shape = _write_folder(connection, request, settings, poses)
+    else:
+        if request.suffix != ".npz" and len(poses) != 1:
+            raise InvalidArgument(
+                f"a picture holds one frame, there are {len(poses)} poses: write a .npz file or a folder",
+                field="output",
+            )
+        body = {**settings, **({"pose": _pose(poses[0])} if len(poses) == 1 else {"poses": list(map(_pose, poses))})}
+        data, headers = _rendered(connection, request.scene, body, MEDIA_TYPES[request.suffix])
+        write_whole(request.output, data)
+        shape = headers["x-ultragray-shape"]
+    _, _, height, width = map(int, shape.split(","))
+    return {
+        "output": str(request.output),
+        "scene": request.scene,
+        "frames": len(poses),
+        "height": height,
+        "width": width,
+        "outputs": list(request.settings.outputs),
+    }
 
-        def show(connection: Connection, name: str, json: Json = False) -> None:
-            found = connection.json("GET", route(self.kind, name))
-            if json:
-                typer.echo(to_json(found))
-            else:
-                print_facts(found)
 
-        self._add("show", show, meaning, f"ultragray {self.kind} show {example}", *more)
+def _poses(connection: Connection, request: RenderRequest) -> FloatArray:  # [C, 4, 4] mm
+    """The poses of a file, or those that a sampler makes; without either the middle training pose."""
+    base = request.poses
+    if request.sampler is None and base is not None:
+        return base
+    if base is None:  # at most 10,000 training poses
+        found = connection.json("GET", route("scenes", request.scene, "training-poses"))
+        base = check_poses(np.array(found["poses"], np.float64).reshape(-1, 4, 4))
+    if not len(base):
+        raise InvalidArgument("--poses must be given: the scene holds no training poses", field="poses")
+    if request.sampler is None:
+        middle: FloatArray = base[len(base) // 2][None]
+        return middle
+    probe = request.settings.probe
+    if probe is None:
+        document = connection.json("GET", route("scenes", request.scene))["probe"]
+        if document is None:
+            raise InvalidArgument("--probe must be given: the scene does not know its own", field="probe")
+        probe = from_dict(Probe, document)
+    return request.sampler.poses(base, probe)
 
-    def add_delete(self, example: str, meaning: str) -> None:
-        """`delete`."""
 
-        def delete(connection: Connection, name: str, json: Json = False) -> None:
-            connection.json("DELETE", route(self.kind, name))
-            tell(f"{name} deleted", {"deleted": name}, as_json=json)
+def _write_folder(connection: Connection, request: RenderRequest, settings: dict[str, Any], poses: FloatArray) -> str:
+    """A PNG for each pose and output, and a file that describes the frames; their shape as a header tells it."""
+    shape, documents = "", []
+    with counted("rendering", len(poses)) as report:
+        for number, pose in enumerate(poses):
+            for output in request.settings.outputs:
+                body = {**settings, "outputs": [output], "pose": _pose(pose)}
+                data, headers = _rendered(connection, request.scene, body, MEDIA_TYPES[".png"])
+                request.output.mkdir(parents=True, exist_ok=True)  # only now: a refusal leaves no folder
+                write_whole(request.output / f"frame_{number:05d}_{output}.png", data)
+            shape = headers["x-ultragray-shape"]
+            about = {name: json.loads(headers[f"x-ultragray-{name}"]) for name in ("pose", "extrapolation")}
+            documents.append({"frame": number, "pose": about["pose"], **about["extrapolation"]})
+            report(number + 1)
+    write_whole(request.output / FRAMES_FILE, json.dumps(documents))
+    return shape
 
-        self._add("delete", delete, meaning, f"ultragray {self.kind} delete {example}")
 
-    def _add(self, name: str, command: Callable[..., None], meaning: str, *lines: str) -> None:
-        """Adds a command that takes the name of one."""
-        argument = typer.Argument(metavar="NAME", help=f"Name of the {self.thing}.", show_default=False)
-        command.__annotations__["name"] = Annotated[str, argument]
-        self.app.command(name, help=meaning, epilog=examples(*lines))(with_connection(command))
+def _rendered(connection: Connection, scene: str, body: dict[str, Any], media_type: str) -> tuple[bytes, HTTPMessage]:
+    """Frames as the service encoded them, and what its headers say about them."""
+    with connection.open("POST", route("scenes", scene, "render"), body, accept=media_type) as answer:
+        return connection.whole(answer), answer.headers
+
+
+def _pose(pose: FloatArray) -> dict[str, Any]:  # [4, 4] mm
+    return {"matrix": pose.tolist()}
+
+
+ARCHIVE_SUFFIXES = (".zip", ".tar", ".tar.gz", ".tgz")
 
 
 def _time(text: str | None) -> str:
@@ -108,29 +176,40 @@ def _owner(found: dict[str, Any]) -> str:
     return f"{found.get('owner') or ''}{' (private)' if found.get('private') else ''}"
 
 
-# Scenes.
+def _text_of(key: str) -> Callable[[dict[str, Any]], str]:
+    return lambda found: str(found[key] or "")
 
 
-def _scene_row(scene: dict[str, Any]) -> tuple[str, ...]:
-    count, size, height = scene.get("gaussian_count"), scene.get("file_bytes"), scene.get("image_height")
-    return (
-        scene["name"],
-        "" if count is None else f"{count:,}",
-        "" if height is None else f"{scene['image_width']}x{height}",
-        "" if size is None else f"{size / 1e6:,.1f}",
-        "yes" if scene["loaded"] else "no",
-        _owner(scene),
-        scene["error"]["detail"] if "error" in scene else "",
-    )
+def _number_of(key: str, layout: str, unit: float | None = None) -> Callable[[dict[str, Any]], str]:
+    def shown(found: dict[str, Any]) -> str:
+        value = found.get(key)
+        return "" if value is None else format(value if unit is None else value / unit, layout)
+
+    return shown
 
 
+def _size(found: dict[str, Any]) -> str:
+    return "" if found.get("image_height") is None else f"{found['image_width']}x{found['image_height']}"
+
+
+NameArgument = Annotated[str, argument("Name of the scene.", metavar="NAME")]
 scenes_app = command_group("The service renders them for clients; `ultragray render` does without a service.")
-_scenes = _Resource(
-    scenes_app, "scenes", "scene", ("name", "Gaussians", "image", "MB", "loaded", "owner", "error"), _scene_row
+_scenes = Resource(
+    scenes_app,
+    "scenes",
+    "liver",
+    {
+        "name": _text_of("name"),
+        "Gaussians": _number_of("gaussian_count", ","),
+        "image": _size,
+        "MB": _number_of("file_bytes", ",.1f", 1e6),
+        "loaded": lambda scene: "yes" if scene["loaded"] else "no",
+        "owner": _owner,
+        "error": lambda scene: scene["error"]["detail"] if "error" in scene else "",
+    },
 )
 _scenes.add_list("List the scenes by name.")
 _scenes.add_show(
-    "demo",
     "Print probe, place, training poses and metrics of a scene; mm, in the frame of the training sweep.",
     "ultragray scenes show demo --json | jq .probe",
 )
@@ -142,7 +221,7 @@ _scenes.add_show(
 @with_connection
 def upload_scene(
     connection: Connection,
-    file: Annotated[Path, argument("Scene file (.ugr).", shown=False)],
+    file: Annotated[Path, argument("Scene file (.ugr).")],
     name: Annotated[str | None, option("Name of the scene.", shown="that of the file")] = None,
     private: Annotated[bool, option("Others do not see it.", "--private")] = False,
     json: Json = False,
@@ -160,7 +239,7 @@ def upload_scene(
 @with_connection
 def download_scene(
     connection: Connection,
-    name: Annotated[str, argument("Name of the scene.", metavar="NAME", shown=False)],
+    name: NameArgument,
     output: Annotated[Path | None, output_option("Scene file to write (.ugr).", default="NAME.ugr, here")] = None,
     force: Force = False,
     json: Json = False,
@@ -173,7 +252,7 @@ def download_scene(
     tell(f"wrote {path}: {size:,} bytes", {"output": str(path), "bytes": size}, as_json=json)
 
 
-_scenes.add_delete("liver", "Delete a scene that was uploaded or trained there; scenes of the data folder stay.")
+_scenes.add_delete("Delete a scene that was uploaded or trained there; scenes of the data folder stay.")
 
 
 @scenes_app.command(
@@ -189,7 +268,7 @@ _scenes.add_delete("liver", "Delete a scene that was uploaded or trained there; 
 @with_connection
 def render_scene(
     connection: Connection,
-    name: Annotated[str, argument("Name of the scene.", metavar="NAME", shown=False)],
+    name: NameArgument,
     output: Annotated[Path, output_option(f"A file ({', '.join(SUFFIXES)}), or a folder for PNGs.")],
     force: Force = False,
     json: Json = False,
@@ -200,10 +279,11 @@ def render_scene(
     of_poses: Annotated[dict[str, Any], FieldsOf(RenderSettings, "registration")],
 ) -> None:
     """Have the service render a frame or some frames. Many thousands are a job: `ultragray jobs submit render`."""
-    from ultragray_service.cli.remote_frames import render_remotely
+    from ultragray_service.cli.remote import render_remotely
 
     suffix = checked_kind(output, settings, force=force)
-    request = RenderRequest(name, output, suffix, poses, sampler, of_poses.get("registration"), settings)
+    given = None if poses is None else load_poses(poses)
+    request = RenderRequest(name, output, suffix, given, sampler, of_poses.get("registration"), settings)
     document = render_remotely(connection, request)
     size = f"{document['height']}x{document['width']}"
     tell(
@@ -213,32 +293,24 @@ def render_scene(
     )
 
 
-# Datasets.
-
-
-def _dataset_row(record: dict[str, Any]) -> tuple[str, ...]:
-    return (
-        record["name"],
-        record["kind"],
-        str(record["train_frames"]),
-        str(record["val_frames"]),
-        f"{record['width']}x{record['height']}",
-        f"{record['bytes'] / 1e6:,.1f}",
-        _time(str(record["created_at"])),
-        _owner(record),
-    )
-
-
 datasets_app = command_group("They are checked when they arrive; `ultragray jobs submit train NAME` trains from one.")
-_datasets = _Resource(
+_datasets = Resource(
     datasets_app,
     "datasets",
-    "dataset",
-    ("name", "format", "training", "held out", "pixels", "MB", "created", "owner"),
-    _dataset_row,
+    "liver",
+    {
+        "name": _text_of("name"),
+        "format": _text_of("kind"),
+        "training": _number_of("train_frames", ""),
+        "held out": _number_of("val_frames", ""),
+        "pixels": lambda record: f"{record['width']}x{record['height']}",
+        "MB": _number_of("bytes", ",.1f", 1e6),
+        "created": lambda record: _time(record["created_at"]),
+        "owner": _owner,
+    },
 )
 _datasets.add_list("List the datasets by name.")
-_datasets.add_show("liver", "Print size, probe and split of a dataset, and what its check warned of.")
+_datasets.add_show("Print size, probe and split of a dataset, and what its check warned of.")
 
 
 @datasets_app.command(
@@ -253,7 +325,7 @@ _datasets.add_show("liver", "Print size, probe and split of a dataset, and what 
 @with_connection
 def upload_dataset(
     connection: Connection,
-    sweep: Annotated[Path, argument(f"An archive (.zip, .tar), or {SWEEP_MEANING}.", metavar="SWEEP", shown=False)],
+    sweep: Annotated[Path, argument(f"An archive (.zip, .tar), or {SWEEP_MEANING}.", metavar="SWEEP")],
     name: Annotated[str | None, option("Name of the dataset.", shown="that of the file or folder")] = None,
     private: Annotated[bool, option("Others do not see it.", "--private")] = False,
     json: Json = False,
@@ -274,7 +346,7 @@ def upload_dataset(
     tell(f"{was}: {frames} of {record['width']}x{record['height']}", record, as_json=json)
 
 
-_datasets.add_delete("liver", "Delete a dataset that no job needs.")
+_datasets.add_delete("Delete a dataset that no job needs.")
 
 
 def _name_of(sweep: Path) -> str:
@@ -333,30 +405,21 @@ def _is_hidden(path: Path, folder: Path) -> bool:
     return any(part.startswith(".") for part in path.relative_to(folder).parts)
 
 
-# Registrations.
-
-
-def _registration_row(found: dict[str, Any]) -> tuple[str, ...]:
-    residual_mm = found["residual_mm"]
-    return (
-        found["name"],
-        found["scene"],
-        "" if residual_mm is None else f"{residual_mm:.2g}",
-        _time(str(found["changed_at"])),
-        found["owner"] or "",
-    )
-
-
 registrations_app = command_group("Requests that name one have poses in the robot's or tracker's own frame.")
-_registrations = _Resource(
+_registrations = Resource(
     registrations_app,
     "registrations",
-    "registration",
-    ("name", "scene", "residual mm", "changed", "owner"),
-    _registration_row,
+    "robot",
+    {
+        "name": _text_of("name"),
+        "scene": _text_of("scene"),
+        "residual mm": _number_of("residual_mm", ".2g"),
+        "changed": lambda found: _time(found["changed_at"]),
+        "owner": _text_of("owner"),
+    },
 )
 _registrations.add_list("List the registrations by name.")
-_registrations.add_show("robot", "Print both links of a registration, mm, and how exact it is.")
+_registrations.add_show("Print both links of a registration, mm, and how exact it is.")
 
 
 @registrations_app.command(
@@ -369,7 +432,7 @@ _registrations.add_show("robot", "Print both links of a registration, mm, and ho
 @with_connection
 def upload_registration(
     connection: Connection,
-    file: Annotated[Path, argument("File of `ultragray calibrate` (.json).", shown=False)],
+    file: Annotated[Path, argument("File of `ultragray calibrate` (.json).")],
     scene: Annotated[str, option("Name of the scene that it leads into.", shown=False)],
     name: Annotated[str | None, option("Name of the registration.", shown="that of the file")] = None,
     json: Json = False,
@@ -383,54 +446,38 @@ def upload_registration(
     tell(f"uploaded {called}, of the scene {kept['scene']}", kept, as_json=json)
 
 
-_registrations.add_delete("robot", "Forget a registration. Jobs that were accepted with it keep it.")
+_registrations.add_delete("Forget a registration. Jobs that were accepted with it keep it.")
 
 
-# Workers.
-
-
-def _worker_row(worker: dict[str, Any]) -> tuple[str, ...]:
-    beat_s = worker["seconds_since_beat"]
-    return (
-        worker["name"],
-        worker["state"],
-        worker["job"] or "",
-        worker["host"],
-        str(worker["pid"]),
-        ", ".join(f"{device['name']} {device['memory_bytes'] / GB:.0f} GB" for device in worker["devices"]),
-        " ".join(f"{name}={value}" for name, value in worker["labels"].items()),
-        worker["version"],
-        _time(worker["started_at"]),
-        "" if beat_s is None else f"{beat_s:.0f} s ago",
-    )
+def _worker_in_words(worker: dict[str, Any]) -> str:
+    return f"{worker['name']} {worker['state']}" + (f", at the job {worker['job']}" if worker["job"] else "")
 
 
 workers_app = command_group("They obey within two seconds; `ultragray worker` starts one.")
-_workers = _Resource(
+_workers = Resource(
     workers_app,
     "workers",
-    "worker",
-    ("name", "state", "job", "host", "pid", "devices", "labels", "version", "started", "last sign"),
-    _worker_row,
+    "gpu-1",
+    {
+        **{key: _text_of(key) for key in ("name", "state", "job", "host", "pid")},
+        "devices": lambda worker: ", ".join(
+            f"{device['name']} {device['memory_bytes'] / GB:.0f} GB" for device in worker["devices"]
+        ),
+        "labels": lambda worker: " ".join(f"{name}={value}" for name, value in worker["labels"].items()),
+        "version": _text_of("version"),
+        "started": lambda worker: _time(worker["started_at"]),
+        "last sign": lambda worker: "" if (beat_s := worker["seconds_since_beat"]) is None else f"{beat_s:.0f} s ago",
+    },
 )
 _workers.add_list("List the workers, also those that were lost within a day.", "ultragray workers list --json")
-
-
-def _add_wish(wish: str, meaning: str) -> None:
-    @workers_app.command(wish, help=meaning, epilog=examples(f"ultragray workers {wish} gpu-1"))
-    @with_connection
-    def command(
-        connection: Connection,
-        name: Annotated[str, argument("Name of the worker.", shown=False)],
-        json: Json = False,
-    ) -> None:
-        worker = connection.json("POST", route("workers", name, suffix=f":{wish}"))
-        at_hand = f", at the job {worker['job']}" if worker["job"] else ""
-        tell(f"{worker['name']} {worker['state']}{at_hand}", worker, as_json=json)
-
-
-_add_wish("pause", "Let a worker take no more jobs; it ends the one at hand. Holds until resume, restarts included.")
-_add_wish(
-    "drain", "As pause, but a training at hand goes back into the queue at once, and on elsewhere from its checkpoint."
+_workers.add_action(
+    "pause",
+    "Let a worker take no more jobs; it ends the one at hand. Holds until resume, restarts included.",
+    _worker_in_words,
 )
-_add_wish("resume", "Let a worker take jobs again.")
+_workers.add_action(
+    "drain",
+    "As pause, but a training at hand goes back into the queue at once, and on elsewhere from its checkpoint.",
+    _worker_in_words,
+)
+_workers.add_action("resume", "Let a worker take jobs again.", _worker_in_words)

@@ -7,11 +7,10 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from collections.abc import Iterator
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -20,11 +19,10 @@ from ultragray.exchange.batches import MANIFEST_FILE, SHARD_FRAMES, BatchPlan
 from ultragray.exchange.exports.formats import DTYPES, FORMATS, check_format, exporter_class, format_of
 from ultragray.exchange.poses import load_poses
 from ultragray.files import file_sha256
-from ultragray.geometry.probe import FloatArray
-from ultragray.rendering.settings import Encoding, FrameSettings, Resolved
+from ultragray.rendering.settings import Encoding, FrameSettings
 from ultragray.samplers import Sampler, TrainingSampler, assessed_poses
 from ultragray.samplers.confident import require_drawn
-from ultragray.scene.confidence import CONTACT_SHARE, Assessor, Extrapolation, figure_arrays
+from ultragray.scene.confidence import CONTACT_SHARE, Assessor, figure_arrays
 from ultragray.scene.info import read_header
 from ultragray_service.cli.options import poses_option, with_options
 from ultragray_service.cli.terminal import (
@@ -38,32 +36,25 @@ from ultragray_service.cli.terminal import (
     check_ending,
     check_file,
     check_folder,
-    command_group,
     counted,
-    examples,
     frames_in_words,
     is_folder_name,
     option,
     output_option,
+    single,
     tell,
 )
 
-if TYPE_CHECKING:
-    from ultragray.scene.gaussians import GaussianScene
-
 SHARDS = "Shards"
 SUFFIXES = tuple(one.suffix for one in FORMATS.values())
-command_app = command_group()
 
 
-@command_app.command(
-    epilog=examples(
-        "ultragray render liver.ugr -o frames.npz  # the training poses",
-        "ultragray render liver.ugr -o pictures/ --poses path.npy  # a folder of PNGs",
-        "ultragray render liver.ugr -o augmented.tar --sampler around --count 500 --translation-mm 3",
-        "ultragray render liver.ugr -o labels.h5 --outputs bmode,labels --min-confidence 0.8",
-        "ultragray render liver.ugr -o s3://frames/liver --sampler around --count 10000000 --on ray://head:10001",
-    )
+@single(
+    "ultragray render liver.ugr -o frames.npz  # the training poses",
+    "ultragray render liver.ugr -o pictures/ --poses path.npy  # a folder of PNGs",
+    "ultragray render liver.ugr -o augmented.tar --sampler around --count 500 --translation-mm 3",
+    "ultragray render liver.ugr -o labels.h5 --outputs bmode,labels --min-confidence 0.8",
+    "ultragray render liver.ugr -o s3://frames/liver --sampler around --count 10000000 --on ray://head:10001",
 )
 @with_options
 def render(
@@ -109,14 +100,14 @@ def render(
         raise InvalidArgument("--shard-frames is of shards: name an engine with --on", field="shard_frames")
     path = Path(output)
     format = checked_format(path, settings, dtype, force=force)
-    task = Task.prepared(scene, poses, sampler, settings)
-    sentence, document = render_frames(task, path, format, dtype=dtype, backend=backend, threads=threads)
+    sentence, document = render_frames(
+        scene, poses, sampler, settings, path, format=format, dtype=dtype, backend=backend, threads=threads
+    )
     tell(sentence, document, as_json=json)
 
 
 @contextlib.contextmanager
 def _probe_as_an_option() -> Iterator[None]:
-    """Tells of a probe as the command line calls it."""
     try:
         yield
     except InvalidProbe as error:
@@ -124,11 +115,7 @@ def _probe_as_an_option() -> Iterator[None]:
 
 
 def checked_format(output: Path, settings: FrameSettings, dtype: str | None, *, force: bool) -> str | None:
-    """The format that the name of the output stands for; None for a folder of PNGs.
-
-    Raises InvalidArgument for an output that cannot or may not be written, ExtraMissing where the format's package is
-    not installed.
-    """
+    """The format of the output's name; None: a folder of PNGs. Raises InvalidArgument, ExtraMissing."""
     format = format_of(output.name)
     if format is None and not is_folder_name(output):
         check_ending(output, SUFFIXES, otherwise=OR_A_FOLDER)
@@ -143,101 +130,79 @@ def checked_format(output: Path, settings: FrameSettings, dtype: str | None, *, 
     return format
 
 
-@dataclass(frozen=True)
-class Task:
-    """Frames that are to be rendered, checked without a renderer."""
-
-    scene_file: Path
-    settings: Resolved
-    sampler: Sampler | None
-    base: FloatArray  # [P, 4, 4] mm, of which the sampler makes poses
-    poses: FloatArray  # [C, 4, 4] mm
-    extrapolations: Sequence[Extrapolation]  # [C]
-
-    @classmethod
-    def prepared(cls, scene_file: Path, pose_file: Path | None, sampler: Sampler | None, asked: FrameSettings) -> Task:
-        """The task of a command line. Raises InvalidArgument and its kind, SceneFileInvalid."""
-        given_poses = None if pose_file is None else load_poses(pose_file)
-        header = read_header(scene_file)
-        with _probe_as_an_option():
-            settings = asked.resolved(header.info, Encoding.FLOAT32)
-        base = header.training_poses if given_poses is None else given_poses
-        if not len(base):
-            raise InvalidArgument("--poses must be given: the scene holds no training poses", field="poses")
-        if sampler is None and given_poses is None:
-            sampler = TrainingSampler()
-        assess = partial(Assessor(header.info, header.training_poses).assess, probe=settings.probe)
-        found = assessed_poses(sampler, base, settings.probe, assess, settings.least_confidence)
-        return cls(scene_file, settings, sampler, base, *found)
-
-    def with_frames_assessed(self, scene: GaussianScene, backend: str) -> Task:
-        """The same, whose sampler keeps to frames that have the least confidence, where poses alone were looked at."""
-        from ultragray.exchange.rendering import assess_by_rendering
-
-        if self.sampler is None or self.settings.least_confidence is None:
-            return self
-        probe = self.settings.probe
-        assess = partial(Assessor(scene.info, scene.training_poses).assess, probe=probe)
-        seen = assess_by_rendering(scene, self.settings, assess, backend=backend)
-        poses, found = assessed_poses(self.sampler, self.base, probe, seen, self.settings.least_confidence)
-        return replace(self, poses=poses, extrapolations=found)
-
-
 def render_frames(
-    task: Task, output: Path, format: str | None, *, dtype: str | None, backend: str, threads: int
+    scene_file: Path,
+    pose_file: Path | None,
+    sampler: Sampler | None,
+    asked: FrameSettings,
+    output: Path,
+    *,
+    format: str | None,
+    dtype: str | None,
+    backend: str,
+    threads: int,
 ) -> tuple[str, dict[str, Any]]:
-    """Render and write; `format` None writes a folder of PNGs. What was written: a sentence, and a document.
+    """Render and write, None: a folder of PNGs; a sentence and a document of it. At an error no file is written."""
+    given_poses = None if pose_file is None else load_poses(pose_file)
+    header = read_header(scene_file)
+    with _probe_as_an_option():
+        settings = asked.resolved(header.info, Encoding.FLOAT32)
+    base = header.training_poses if given_poses is None else given_poses
+    if not len(base):
+        raise InvalidArgument("--poses must be given: the scene holds no training poses", field="poses")
+    if sampler is None and given_poses is None:
+        sampler = TrainingSampler()
+    assess = partial(Assessor(header.info, header.training_poses).assess, probe=settings.probe)
+    poses, extrapolations = assessed_poses(sampler, base, settings.probe, assess, settings.least_confidence)
 
-    Raises InvalidArgument, SceneFileInvalid, BackendUnavailable, MemoryExceeded, OSError; a file is then not written.
-    """
-    import torch
+    import torch  # everything that can be wrong was found before
 
-    from ultragray.exchange.rendering import render_to_file
+    from ultragray.exchange.rendering import assess_by_rendering, render_to_file
     from ultragray.rendering.backends.registry import render_device
     from ultragray.scene.gaussians import GaussianScene
 
-    scene = GaussianScene.load(task.scene_file).to(render_device(backend))
+    scene = GaussianScene.load(scene_file).to(render_device(backend))
     if threads:
         torch.set_num_threads(threads)
     started = time.perf_counter()
-    task = task.with_frames_assessed(scene, backend)
-    with counted("rendering", len(task.poses)) as report:
+    if sampler is not None and settings.least_confidence is not None:  # until now poses alone were looked at
+        seen = assess_by_rendering(scene, settings, assess, backend=backend)
+        poses, extrapolations = assessed_poses(sampler, base, settings.probe, seen, settings.least_confidence)
+    with counted("rendering", len(poses)) as report:
         found = render_to_file(
             output,
             format,
             scene,
-            task.settings,
-            task.poses,
-            task.extrapolations,
+            settings,
+            poses,
+            extrapolations,
             dtype=dtype,
-            scene_name=task.scene_file.stem,
-            scene_sha256=file_sha256(task.scene_file),
+            scene_name=scene_file.stem,
+            scene_sha256=file_sha256(scene_file),
             backend=backend,
             before_portion=report,
         )
     seconds = time.perf_counter() - started
     figures = figure_arrays(found)
     confidence, supported = figures["confidence"], float(figures["supported_share"].mean())
-    trust = [f"Gaussians support {supported:.0%} of the pixels"]
+    knows = bool(np.isfinite(confidence).all())  # its confidence
+    trust = [f"confidence {confidence.min():.2f} to {confidence.max():.2f}"] if knows else []
+    trust.append(f"Gaussians support {supported:.0%} of the pixels")
     document = {
         "output": str(output),
         "frames": len(found),
-        "height": task.settings.height,
-        "width": task.settings.width,
-        "outputs": list(task.settings.outputs),
+        "height": settings.height,
+        "width": settings.width,
+        "outputs": list(settings.outputs),
         "seconds": round(seconds, 3),
-        "confidence_min": None,  # of a scene that does not know it
-        "confidence_max": None,
+        "confidence_min": float(confidence.min()) if knows else None,
+        "confidence_max": float(confidence.max()) if knows else None,
         "supported_share": supported,
     }
     if CONTACT_SHARE in figures:
         document[CONTACT_SHARE] = float(figures[CONTACT_SHARE].mean())
         trust.append(f"{document[CONTACT_SHARE]:.0%} of the scan lines have contact")
-    if np.isfinite(confidence).all():
-        document |= {"confidence_min": float(confidence.min()), "confidence_max": float(confidence.max())}
-        trust.insert(0, f"confidence {confidence.min():.2f} to {confidence.max():.2f}")
-    size = f"{task.settings.height}x{task.settings.width}"
-    what = f"{frames_in_words(len(found))} of {size}, {', '.join(task.settings.outputs)}"
+    what = f"{frames_in_words(len(found))} of {settings.height}x{settings.width}, {', '.join(settings.outputs)}"
     return f"wrote {output}: {what}, in {seconds:.1f} s; {', '.join(trust)}", document
 
 
@@ -250,7 +215,6 @@ def plan_of_shards(
     dtype: str | None,
     shard_frames: int | None,
 ) -> BatchPlan:
-    """The batch of a command line. Raises InvalidArgument and its kind, SceneFileInvalid."""
     poses = None if pose_file is None else load_poses(pose_file)
     header = read_header(scene_file)
     if settings.least_confidence is not None and sampler is not None:
@@ -271,10 +235,7 @@ def plan_of_shards(
 def render_shards(
     plan: BatchPlan, scene_file: Path, output: str, on: str, *, backend: str, threads: int
 ) -> tuple[str, dict[str, Any]]:
-    """Render what is missing of a batch on a cluster, and write its manifest. A sentence and a document tell of it.
-
-    Raises InvalidArgument for an output that is no folder or holds something else, and what `RayBatch.render` raises.
-    """
+    """Render what is missing of a batch on a cluster, and write its manifest; a sentence and a document of it."""
     from ultragray_workers.batches.on_ray import RayBatch, check_address
     from ultragray_workers.storage.location import open_storage
 

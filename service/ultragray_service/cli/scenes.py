@@ -27,11 +27,10 @@ from ultragray_service.cli.terminal import (
     argument,
     check_ending,
     check_file,
-    command_group,
-    examples,
     option,
     output_option,
     print_facts,
+    single,
     tell,
     to_json,
     warn,
@@ -39,13 +38,10 @@ from ultragray_service.cli.terminal import (
 )
 
 if TYPE_CHECKING:
-    from ultragray import GaussianScene
+    pass
 
 
-demo_app = command_group()
-
-
-@demo_app.command(epilog=examples("ultragray demo -o demo.ugr", "ultragray serve demo.ugr"))
+@single("ultragray demo -o demo.ugr", "ultragray serve demo.ugr")
 def demo(
     output: Annotated[Path, output_option("Scene file to write (.ugr).", default="demo.ugr")] = Path("demo.ugr"),
     force: Force = False,
@@ -65,22 +61,14 @@ def demo(
     )
 
 
-# `ultragray show`: the description of a scene file or of a sweep, as a table or as JSON.
-
-
-show_app = command_group()
-
-
-@show_app.command(
-    epilog=examples(
-        "ultragray show liver.ugr",
-        "ultragray show liver.ugr --json | jq .metrics",
-        "ultragray show sweep/  # see also: ultragray check",
-    )
+@single(
+    "ultragray show liver.ugr",
+    "ultragray show liver.ugr --json | jq .metrics",
+    "ultragray show sweep/  # see also: ultragray check",
 )
 @with_options
 def show(
-    file: Annotated[str, argument(f"A scene file (.ugr), or a sweep: {SWEEP_MEANING}.", metavar="FILE", shown=False)],
+    file: Annotated[str, argument(f"A scene file (.ugr), or a sweep: {SWEEP_MEANING}.", metavar="FILE")],
     json: Json = False,
     *,
     source: SourceOptions,
@@ -102,7 +90,6 @@ def show(
 
 
 def describe_scene(path: Path) -> dict[str, Any]:
-    """The fields of SceneInfo without hardness, the file, and a summary of the poses. Raises SceneFileInvalid."""
     from ultragray.files import file_sha256
     from ultragray.scene.info import read_header
 
@@ -140,18 +127,11 @@ def _describe_sweep(source: str, options: SourceOptions) -> dict[str, Any]:
     }
 
 
-# `ultragray export`: a scene for other programs.
-
-
 EXCHANGED = (".ply", ".pt")
-export_app = command_group()
 
 
-@export_app.command(
-    epilog=examples(
-        "ultragray export liver.ugr -o liver.ply",
-        "ultragray export liver.ugr -o released/ckpt.pt  # a folder of its own",
-    )
+@single(
+    "ultragray export liver.ugr -o liver.ply", "ultragray export liver.ugr -o released/ckpt.pt  # a folder of its own"
 )
 def export(
     scene: SceneFile,
@@ -174,60 +154,36 @@ def export(
     from ultragray import GaussianScene
 
     loaded = GaussianScene.load(scene)
-    written = _write_ply(loaded, output) if output.suffix == ".ply" else _write_checkpoint(loaded, output, force)
-    for note in written["notes"]:
+    facts: dict[str, Any] = {"gaussian_count": loaded.gaussian_count, "files": [str(output)], "notes": []}
+    if output.suffix == ".ply":
+        from ultragray.exchange.ply import write_ply
+
+        write_ply(loaded, output)
+        facts["training_poses"] = len(loaded.training_poses)
+        place = f", {facts['training_poses']} training poses"
+    else:
+        from ultragray.exchange.checkpoint import export_checkpoint
+
+        written = export_checkpoint(loaded, output, replace=force)
+        x, y, z = written.centre_mm
+        facts |= {"files": [*map(str, written.files)], "centre_mm": [*map(float, (x, y, z))], "notes": [*written.notes]}
+        place = f" about ({x:.2f}, {y:.2f}, {z:.2f}) mm"
+    for note in facts["notes"]:
         typer.secho(f"note: {note}", fg=typer.colors.YELLOW, err=True)
-    tell(f"wrote {', '.join(written['files'])}: {written.pop('sentence')}", written, as_json=json)
-
-
-def _write_ply(scene: GaussianScene, output: Path) -> dict[str, Any]:
-    from ultragray.exchange.ply import write_ply
-
-    write_ply(scene, output)
-    poses = len(scene.training_poses)
-    return {
-        "sentence": f"{scene.gaussian_count:,} Gaussians, {poses} training poses",
-        "files": [str(output)],
-        "gaussian_count": scene.gaussian_count,
-        "training_poses": poses,
-        "notes": [],
-    }
-
-
-def _write_checkpoint(scene: GaussianScene, output: Path, replace: bool) -> dict[str, Any]:
-    from ultragray.exchange.checkpoint import export_checkpoint
-
-    written = export_checkpoint(scene, output, replace=replace)
-    x, y, z = written.centre_mm
-    return {
-        "sentence": f"{scene.gaussian_count:,} Gaussians about ({x:.2f}, {y:.2f}, {z:.2f}) mm",
-        "files": [str(path) for path in written.files],
-        "gaussian_count": scene.gaussian_count,
-        "centre_mm": [float(one) for one in written.centre_mm],
-        "notes": list(written.notes),
-    }
-
-
-# `ultragray import`: a scene file out of what other programs wrote, told apart by the name's ending.
+    tell(f"wrote {', '.join(facts['files'])}: {loaded.gaussian_count:,} Gaussians{place}", facts, as_json=json)
 
 
 _CHECKPOINT = "Checkpoint (.pt)"
-import_app = command_group()
 
 
-@import_app.command(
-    "import",
-    epilog=examples(
-        "ultragray import liver.ply -o liver.ugr",
-        "ultragray import ckpt.pt --config conf.json --poses poses_train.npy -o liver.ugr",
-    ),
+@single(
+    "ultragray import liver.ply -o liver.ugr",
+    "ultragray import ckpt.pt --config conf.json --poses poses_train.npy -o liver.ugr",
+    name="import",
 )
 def import_scene(
     file: Annotated[
-        Path,
-        argument(
-            "A .ply file that `ultragray export` wrote, or a .pt checkpoint of the released trainer.", shown=False
-        ),
+        Path, argument("A .ply file that `ultragray export` wrote, or a .pt checkpoint of the released trainer.")
     ],
     output: Annotated[Path, output_option("Scene file to write (.ugr).")],
     force: Force = False,
@@ -304,19 +260,13 @@ def import_scene(
     tell(f"wrote {output}: {scene.gaussian_count:,} Gaussians, {place}", document, as_json=json)
 
 
-# `ultragray voxelize`: a scene's fields as a volume, or as a slice.
-
-
 RIGHT, DOWN = "1,0,0", "0,0,1"
-voxelize_app = command_group()
 
 
-@voxelize_app.command(
-    epilog=examples(
-        "ultragray voxelize liver.ugr -o liver.nii.gz --spacing-mm 0.5",
-        "ultragray voxelize liver.ugr -o bone.nrrd --field attenuation --box-mm=-20:20,-30:30,0:60",
-        "ultragray voxelize liver.ugr -o cut.png --plane-mm=-20,0,0 --right 1,0,0 --down 0,0,1 --size-mm 40,60",
-    )
+@single(
+    "ultragray voxelize liver.ugr -o liver.nii.gz --spacing-mm 0.5",
+    "ultragray voxelize liver.ugr -o bone.nrrd --field attenuation --box-mm=-20:20,-30:30,0:60",
+    "ultragray voxelize liver.ugr -o cut.png --plane-mm=-20,0,0 --right 1,0,0 --down 0,0,1 --size-mm 40,60",
 )
 def voxelize(
     scene: SceneFile,
@@ -380,23 +330,15 @@ def voxelize(
 
 
 def _is_beyond(info: SceneInfo, low: Sequence[float], high: Sequence[float]) -> bool:  # [3] mm both
-    """Whether a box lies beyond the centres of all Gaussians."""
     return any(map(lt, high, info.bounds_min_mm)) or any(map(gt, low, info.bounds_max_mm))
 
-
-# `ultragray slicer`: a scene file of 3D Slicer, connected to the service that serves a scene.
-
-
-slicer_app = command_group()
 
 SUFFIX, VOLUME_SUFFIX = ".mrml", "-echo.nii.gz"
 
 
-@slicer_app.command(
-    epilog=examples(
-        "ultragray slicer scenes/liver.ugr -o liver.mrml",
-        "ultragray slicer scenes/liver.ugr -o liver.mrml --igtl-address 10.0.0.5:18944",
-    )
+@single(
+    "ultragray slicer scenes/liver.ugr -o liver.mrml",
+    "ultragray slicer scenes/liver.ugr -o liver.mrml --igtl-address 10.0.0.5:18944",
 )
 def slicer(
     scene: SceneFile,

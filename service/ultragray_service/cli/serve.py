@@ -13,26 +13,23 @@ from ultragray.errors import InvalidArgument
 from ultragray.phantom.demo import copy_demo_scene
 from ultragray.scene.info import read_header
 from ultragray_service.cli.options import FieldsOf, with_options
-from ultragray_service.cli.terminal import argument, command_group, examples
+from ultragray_service.cli.terminal import argument, single
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from ultragray_workers.scenes import SUFFIX, SceneStore
 
 DEMO_NAME = "demo"
-command_app = command_group()
 
 
-@command_app.command(
-    epilog=examples(
-        "ultragray serve  # the scenes of ./data; the demo scene where there are none",
-        "ultragray serve liver.ugr spine.ugr --http-port 8080",
-        "ultragray keys create alice --role admin > alice.key",
-        "ultragray serve --host 0.0.0.0 --tls-certificate tls.crt --tls-key tls.key",
-    )
+@single(
+    "ultragray serve  # the scenes of ./data; the demo scene where there are none",
+    "ultragray serve liver.ugr spine.ugr --http-port 8080",
+    "ultragray keys create alice --role admin > alice.key",
+    "ultragray serve --host 0.0.0.0 --tls-certificate tls.crt --tls-key tls.key",
 )
 @with_options
 def serve(
     scenes: Annotated[
-        list[Path] | None, argument("Scene files to serve alone, without those of a data folder.", shown=False)
+        list[Path] | None, argument("Scene files to serve alone, without those of a data folder.")
     ] = None,
     *,
     options: Annotated[
@@ -95,10 +92,7 @@ def _run(settings: Settings) -> None:
 
 
 def ensure_scenes(folder: Path) -> None:
-    """Put the demo scene into a data folder that holds no scene, and say so on stderr.
-
-    Raises InvalidArgument where there is no such folder.
-    """
+    """Put the demo scene into a data folder without scenes, and say so. Raises InvalidArgument for no such folder."""
     if not folder.is_dir():
         raise InvalidArgument(f"data_folder must be an existing folder, got {str(folder)!r}", field="data_folder")
     if SceneStore(folder).names():
@@ -112,7 +106,6 @@ def ensure_scenes(folder: Path) -> None:
 
 
 def link_scenes(files: Iterable[Path], folder: Path) -> None:
-    """Link scene files into `folder`; refuse what could not be served under its own name."""
     for file in files:
         read_header(file)
         link = folder / f"{file.stem}{SUFFIX}"

@@ -23,6 +23,7 @@ from ultragray_service.cli.terminal import (
     examples,
     option,
     output_option,
+    single,
     tell,
     to_json,
     warn,
@@ -36,7 +37,7 @@ if TYPE_CHECKING:
 
 
 SWEEP_MEANING = "; ".join(one.meaning for one in FORMATS.values())
-SweepArgument = Annotated[str, argument(f"One of: {SWEEP_MEANING}.", metavar="SWEEP", shown=False)]
+SweepArgument = Annotated[str, argument(f"One of: {SWEEP_MEANING}.", metavar="SWEEP")]
 
 
 def check_source(source: str) -> None:
@@ -45,7 +46,6 @@ def check_source(source: str) -> None:
 
 
 def read_dataset(source: str, options: SourceOptions) -> Dataset:
-    """The dataset that a command's argument and options name. Raises DatasetInvalid and InvalidArgument."""
     if source == PHANTOM:
         typer.echo("simulating the phantom …", err=True)
         return load_dataset(source, options)
@@ -55,7 +55,6 @@ def read_dataset(source: str, options: SourceOptions) -> Dataset:
 
 
 def warn_about_dataset(dataset: Dataset) -> None:
-    """Say on stderr what `ultragray check` warns of."""
     from ultragray.datasets.checks import check_dataset
 
     for text in check_dataset(dataset).labelled_warnings:
@@ -68,9 +67,6 @@ def check_scene_fits(info: SceneInfo, dataset: Dataset) -> None:
 
     for text in check_same_origin(info, dataset):
         warn(text)
-
-
-# `ultragray check`: what is in a sweep, and what looks wrong about it.
 
 
 check_app = command_group()
@@ -146,13 +142,7 @@ def _range(part: SweepReport, axis: int) -> str:
     return f"{part.extent_min_mm[axis]:.1f} … {part.extent_max_mm[axis]:.1f}"
 
 
-# `ultragray draw`: the image planes of a sweep in space, and a contact sheet of its frames.
-
-
-draw_app = command_group()
-
-
-@draw_app.command(epilog=examples("ultragray draw sweep/ -o sweep.png"))
+@single("ultragray draw sweep/ -o sweep.png")
 @with_options
 def draw(
     sweep: SweepArgument,
@@ -171,17 +161,9 @@ def draw(
     tell(f"wrote {output}", {"output": str(output)}, as_json=json)
 
 
-# `ultragray convert`: a sweep in the layout of the released trainer.
-
-
-convert_app = command_group()
-
-
-@convert_app.command(
-    epilog=examples(
-        "ultragray convert scan.igs.mha --device-set plus.xml -o sweep/",
-        "ultragray convert sweep/ --poses-of liver.ugr -o corrected/  # with the poses that the training corrected",
-    )
+@single(
+    "ultragray convert scan.igs.mha --device-set plus.xml -o sweep/",
+    "ultragray convert sweep/ --poses-of liver.ugr -o corrected/  # with the poses that the training corrected",
 )
 @with_options
 def convert(
@@ -221,7 +203,6 @@ def convert(
 
 
 def _with_poses_of(path: Path | None, header: SceneHeader, dataset: Dataset) -> Dataset:
-    """The dataset with a scene's corrected training poses."""
     if header.info.dataset_sha256 != dataset.sha256:
         raise InvalidArgument(
             f"{path} was trained from {header.info.dataset_name or 'other data'}, not from {dataset.name} split as "

@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 
 
 OUTPUT, COMPUTE = "Output", "Compute"
+Columns = Mapping[str, Callable[[Any], str]]
 
 Json = Annotated[
     bool, typer.Option("--json", help="One JSON document on standard output, for scripts.", rich_help_panel=OUTPUT)
@@ -33,14 +34,23 @@ SceneFile = Annotated[Path, typer.Argument(metavar="SCENE", help="Scene file (.u
 
 
 def command_group(help: str | None = None) -> typer.Typer:
-    """A typer app for one command, or for a group of commands."""
     return typer.Typer(
         add_completion=False, no_args_is_help=True, pretty_exceptions_enable=False, rich_markup_mode="rich", help=help
     )
 
 
+def single(*lines: str, name: str | None = None) -> Callable[[Callable[..., Any]], typer.Typer]:
+    """A decorator that makes an app of one command, with these examples, of a function."""
+
+    def made(command: Callable[..., Any]) -> typer.Typer:
+        app = command_group()
+        app.command(name, epilog=examples(*lines))(command)
+        return app
+
+    return made
+
+
 def examples(*lines: str) -> str:
-    """The epilogue of a help: each line is a command that a shell takes as it stands, or a # comment."""
     return "\n\n".join(("[bold]Examples[/bold]", *(line.replace("[", r"\[") for line in lines)))
 
 
@@ -49,9 +59,8 @@ def option(help: str, *flags: str, shown: str | bool = True, panel: str | None =
     return typer.Option(*flags, help=help, show_default=shown, rich_help_panel=panel, **others)
 
 
-def argument(help: str, *, shown: str | bool = True, **others: Any) -> Any:
-    """An argument of a command."""
-    return typer.Argument(help=help, show_default=shown, **others)
+def argument(help: str, **others: Any) -> Any:
+    return typer.Argument(help=help, show_default=False, **others)
 
 
 def output_option(help: str, *, default: str | None = None) -> Any:
@@ -61,8 +70,22 @@ def output_option(help: str, *, default: str | None = None) -> Any:
 
 
 def tell(sentence: str, document: Any, *, as_json: bool) -> None:
-    """Print what a command did, as one sentence for a person or as a JSON document for a program."""
     typer.echo(to_json(document) if as_json else sentence)
+
+
+def tell_facts(document: dict[str, Any], *, as_json: bool) -> None:
+    if as_json:
+        typer.echo(to_json(document))
+    else:
+        print_facts(document)
+
+
+def tell_table(columns: Columns, documents: Sequence[Any], *, as_json: bool) -> None:
+    """A row for each document under the columns, each of which says what it holds of one; or the documents."""
+    if as_json:
+        typer.echo(to_json(documents))
+    else:
+        print_table([*columns], [[cell(one) for cell in columns.values()] for one in documents])
 
 
 def to_json(document: Any) -> str:
@@ -79,16 +102,15 @@ def _finite(value: Any) -> Any:
 
 
 def frames_in_words(count: int) -> str:
-    """Such as `1 frame` or `1,200 frames`."""
     return f"{count:,} frame{'' if count == 1 else 's'}"
 
 
+def minutes_and_seconds(seconds: float) -> str:
+    return "{}:{:02d}".format(*divmod(round(seconds), 60))
+
+
 def warn(text: str) -> None:
-    """A warning on stderr."""
     typer.secho(f"warning: {text}", fg=typer.colors.YELLOW, err=True)
-
-
-# Where a command writes: checked before the work starts. What exists is replaced only with --force.
 
 
 SCENE_SUFFIX = ".ugr"  # the service lists no other files
@@ -127,10 +149,7 @@ def check_folder(path: Path, *, force: bool) -> None:
 
 
 def check_ending(path: Path, suffixes: Sequence[str], *, otherwise: str = "") -> None:
-    """Raise InvalidArgument where a name ends in none of `suffixes`, with the one that was perhaps meant.
-
-    `otherwise`: what the output may be instead, for the message.
-    """
+    """Raise InvalidArgument where a name ends in none of `suffixes`; `otherwise`: what else it may be, in words."""
     if suffixes and not path.name.endswith(tuple(suffixes)):
         given = path.suffix.lower()
         similar = _SIMILAR.get(given)
@@ -142,12 +161,10 @@ def check_ending(path: Path, suffixes: Sequence[str], *, otherwise: str = "") ->
 
 
 def is_folder_name(path: Path) -> bool:
-    """Whether a name that no format claims stands for a folder: it has no ending, or it is one already."""
     return path.is_dir() or not path.suffix
 
 
 def print_facts(document: dict[str, Any]) -> None:
-    """A table of names and values for a person; what is unknown is left out."""
     from rich.console import Console
     from rich.markup import escape
     from rich.table import Table
@@ -177,7 +194,6 @@ def _text(value: Any) -> str:
 
 
 def print_table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
-    """Print rows under their columns; the first column is never cut."""
     from rich.markup import escape
     from rich.table import Table
 
@@ -196,9 +212,6 @@ def wide_console() -> Console:
     if not console.is_terminal:
         console.width = _PIPE_COLUMNS
     return console
-
-
-# Progress of a command on standard error: a bar on a terminal, elsewhere nothing or a line a step.
 
 
 @contextlib.contextmanager
@@ -233,10 +246,7 @@ def counted(what: str, total: int) -> Iterator[Callable[[int], None]]:
 
 @contextlib.contextmanager
 def transferred(what: str) -> Iterator[Callable[[int | None], Callable[[int], None]]]:
-    """A function that begins a transfer of so many bytes (None: nobody knows), and returns what is told of each block.
-
-    A bar with rate and time left on a terminal, nothing elsewhere.
-    """
+    """A function that begins a transfer of so many bytes (None: unknown), and returns what is told of each block."""
     with progress_bars("{task.description}", "bar", "bytes", "rate", "left") as bars:
 
         def begin(total: int | None) -> Callable[[int], None]:
@@ -258,9 +268,6 @@ def working(what: str) -> Iterator[None]:
             yield
     else:
         yield
-
-
-# Commands that end with something to go on from when Ctrl-C or SIGTERM asks them to stop.
 
 
 @contextlib.contextmanager

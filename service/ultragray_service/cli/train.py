@@ -27,11 +27,11 @@ from ultragray_service.cli.terminal import (
     Json,
     Threads,
     check_file,
-    command_group,
-    examples,
+    minutes_and_seconds,
     option,
     output_option,
     progress_bars,
+    single,
     stop_on_signal,
     tell,
 )
@@ -46,16 +46,11 @@ MEASURING = "measuring what was reached"
 METRIC_NAMES = {"psnr_db": "PSNR, dB", "ms_ssim": "MS-SSIM", "gms": "GMS", "gmsd": "GMSD"}
 
 
-command_app = command_group()
-
-
-@command_app.command(
-    epilog=examples(
-        "ultragray train sweep/ -o liver.ugr",
-        "ultragray train sweep/ -o liver.ugr --preset best --threads 8",
-        "ultragray train scan.igs.mha --device-set plus.xml -o liver.ugr --set steps=4000 --set sh_degree=2",
-        "ultragray train sweep/ -o liver.ugr --resume  # after Ctrl-C",
-    )
+@single(
+    "ultragray train sweep/ -o liver.ugr",
+    "ultragray train sweep/ -o liver.ugr --preset best --threads 8",
+    "ultragray train scan.igs.mha --device-set plus.xml -o liver.ugr --set steps=4000 --set sh_degree=2",
+    "ultragray train sweep/ -o liver.ugr --resume  # after Ctrl-C",
 )
 @with_options
 def train(
@@ -105,8 +100,10 @@ def train(
     )
     if resume:
         _check_resumable(run)
-    else:
-        _check_no_run(run, force=force)
+    elif not force and run.checkpoint is not None:
+        raise TrainingStateInvalid(
+            f"{run.folder}: there is an unfinished run: --resume continues it, --force begins anew"
+        )
     check_file(output, [SCENE_SUFFIX], force=force or resume)
     chosen = _config_of(run, given)
 
@@ -119,15 +116,13 @@ def train(
         torch.set_num_threads(threads)
     read = read_dataset(sweep, source)
     warn_about_dataset(read)
-    if not resume:
-        _forget_run(run)
+    if not resume and run.checkpoint is not None:
+        run.checkpoint.unlink()
     _train(read, chosen, run, as_json=json)
 
 
 @dataclass(frozen=True)
 class RunOptions:
-    """The place and the means of a run; none of it changes the scene on one thread."""
-
     output: Path
     folder: Path
     resume: bool
@@ -136,34 +131,23 @@ class RunOptions:
     device: str
     backend: str
 
+    @property
+    def checkpoint(self) -> Path | None:
+        """The file to go on from; None: there is none."""
+        if not self.folder.is_dir():
+            return None
+        from ultragray.learn.training.trainer import CHECKPOINT_FILE
 
-def _check_no_run(run: RunOptions, *, force: bool) -> None:
-    """Raise TrainingStateInvalid where the folder of the run holds one that was stopped, and is not to be replaced."""
-    if not run.folder.is_dir() or force:
-        return
-    from ultragray.learn.training.trainer import CHECKPOINT_FILE
-
-    if (run.folder / CHECKPOINT_FILE).exists():
-        raise TrainingStateInvalid(
-            f"{run.folder}: there is an unfinished run: --resume continues it, --force begins anew"
-        )
-
-
-def _forget_run(run: RunOptions) -> None:
-    """Remove the checkpoint of a run that is begun anew."""
-    from ultragray.learn.training.trainer import CHECKPOINT_FILE
-
-    (run.folder / CHECKPOINT_FILE).unlink(missing_ok=True)
+        return path if (path := self.folder / CHECKPOINT_FILE).exists() else None
 
 
 def _check_resumable(run: RunOptions) -> None:
-    """Raise TrainingStateInvalid, with the reason, where the folder of the run holds no checkpoint."""
     if not run.folder.is_dir():
         raise TrainingStateInvalid(f"{run.folder}: no such folder, so there is no checkpoint to resume from")
-    from ultragray.learn.training.trainer import CHECKPOINT_FILE, CONFIG_FILE, JOURNAL_FILE
-
-    if (run.folder / CHECKPOINT_FILE).exists():
+    if run.checkpoint is not None:
         return
+    from ultragray.learn.training.trainer import CONFIG_FILE, JOURNAL_FILE
+
     steps = last_step = None
     with contextlib.suppress(OSError, ValueError, LookupError, TypeError):  # whatever is there is no finished run
         steps = json_text.loads((run.folder / CONFIG_FILE).read_text(encoding="utf-8"))["steps"]
@@ -178,11 +162,10 @@ def _config_of(run: RunOptions, given: Mapping[str, Any]) -> TrainingConfig:
     """The preset with what was given; of a resumed run the one it was begun with, and what was given again."""
     values = dict(given)
     preset = values.pop("preset", None)
-    if run.resume and preset is None:
+    if run.resume and preset is None and run.checkpoint is not None:
         from ultragray.learn.training.checkpointing import read_checkpoint_header
-        from ultragray.learn.training.trainer import CHECKPOINT_FILE
 
-        stored = read_checkpoint_header(run.folder / CHECKPOINT_FILE).config
+        stored = read_checkpoint_header(run.checkpoint).config
         return TrainingConfig.from_dict({**stored.to_dict(), **values})
     return TrainingConfig.preset(preset or "fast", **values)
 
@@ -190,7 +173,6 @@ def _config_of(run: RunOptions, given: Mapping[str, Any]) -> TrainingConfig:
 def _train(dataset: Any, config: TrainingConfig, run: RunOptions, *, as_json: bool) -> None:
     from ultragray.learn.training import train as train_scene
     from ultragray.learn.training.run import scene_of_checkpoint
-    from ultragray.learn.training.trainer import CHECKPOINT_FILE
 
     started = time.monotonic()
     last: Progress | None = None
@@ -216,7 +198,7 @@ def _train(dataset: Any, config: TrainingConfig, run: RunOptions, *, as_json: bo
                     tensorboard=run.tensorboard,
                 )
         except (TrainingDiverged, MemoryExceeded) as error:
-            if not (run.folder / CHECKPOINT_FILE).exists():
+            if run.checkpoint is None:
                 raise
             scene = scene_of_checkpoint(dataset, run.folder)
             scene.save(run.output)
@@ -227,24 +209,27 @@ def _train(dataset: Any, config: TrainingConfig, run: RunOptions, *, as_json: bo
         scene.save(run.output)
     elapsed_s = time.monotonic() - started
     done, steps = scene.info.training["step"], scene.info.training["steps"]
-    if not done:
-        typer.echo(
-            f"stopped before the first step, while the effort was chosen; wrote {run.output} as it starts; the same "
-            "command with --force goes on with the choice",
-            err=True,
-        )
-        raise typer.Exit(INTERRUPTED)
     if done < steps:
-        typer.echo(
-            f"stopped after step {done:,} of {steps:,}; wrote {run.output} as it is; go on with the same "
-            "command and --resume",
-            err=True,
-        )
+        if done:
+            sentence = (
+                f"stopped after step {done:,} of {steps:,}; wrote {run.output} as it is; go on with the same command "
+                "and --resume"
+            )
+        else:
+            sentence = (
+                f"stopped before the first step, while the effort was chosen; wrote {run.output} as it starts; the "
+                "same command with --force goes on with the choice"
+            )
+        typer.echo(sentence, err=True)
         raise typer.Exit(INTERRUPTED)
-    (run.folder / CHECKPOINT_FILE).unlink()
+    if (checkpoint := run.checkpoint) is not None:
+        checkpoint.unlink()
     if not as_json:
         _print_metrics(scene)
-    cost = "" if last is None else f" ({_cost(last)})"
+    cost = ""
+    if last is not None:
+        memory = "" if last.peak_memory_mb is None else f", at most {last.peak_memory_mb:,.0f} MB of the GPU"
+        cost = f" ({1000.0 / last.steps_per_s:.1f} ms a step{memory})"
     effort = f"chose effort {scene.info.training['effort']:g}, " if config.effort is None else ""
     tell(
         f"{effort}wrote {run.output}: {scene.gaussian_count:,} Gaussians, {done:,} steps, {elapsed_s:.0f} s{cost}",
@@ -259,12 +244,6 @@ def _train(dataset: Any, config: TrainingConfig, run: RunOptions, *, as_json: bo
         },
         as_json=as_json,
     )
-
-
-def _cost(state: Progress) -> str:
-    """The time of a step at the end, and the most memory of a GPU that was in use."""
-    step = f"{1000.0 / state.steps_per_s:.1f} ms a step"
-    return step if state.peak_memory_mb is None else f"{step}, at most {state.peak_memory_mb:,.0f} MB of the GPU"
 
 
 @contextlib.contextmanager
@@ -294,10 +273,9 @@ def _progress_bar() -> Iterator[Callable[[Any], None]]:
 
 def _figures(state: Any) -> str:
     held_out = "" if state.val_psnr_db is None else f" · held out {state.val_psnr_db:.2f} dB"
-    minutes, seconds = divmod(round(state.seconds_left), 60)
     return (
         f"loss {state.loss:.4f} · {state.gaussian_count:,} Gaussians · {state.steps_per_s:.1f} steps/s · "
-        f"{minutes}:{seconds:02d} left{held_out}"
+        f"{minutes_and_seconds(state.seconds_left)} left{held_out}"
     )
 
 

@@ -12,20 +12,16 @@ from typing import Annotated, Any
 
 from ultragray.errors import UltragrayError
 from ultragray_service.cli.options import FieldsOf, pairs_of, with_options
-from ultragray_service.cli.terminal import command_group, examples, option
+from ultragray_service.cli.terminal import option, single
 from ultragray_service.server import ALIVE, READY, ServiceManager
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from ultragray_workers.errors import StartupFailed
 from ultragray_workers.processes import end_with_parent, let_frames_go_first
 
-command_app = command_group()
 
-
-@command_app.command(
-    epilog=examples(
-        "ultragray worker --artifact-folder /srv/ultragray/artifacts",
-        "ultragray worker --device cuda:1 --name gpu-1 --label site=lab1 --label rack=4",
-    )
+@single(
+    "ultragray worker --artifact-folder /srv/ultragray/artifacts",
+    "ultragray worker --device cuda:1 --name gpu-1 --label site=lab1 --label rack=4",
 )
 @with_options
 def worker(
@@ -60,10 +56,7 @@ def run_worker(
     device: str = "auto",
     labels: Mapping[str, str] = MappingProxyType({}),
 ) -> None:
-    """Do jobs until SIGTERM or SIGINT, then end the process; a second signal ends the drain at once.
-
-    Raises StartupFailed, InvalidArgument.
-    """
+    """Do jobs until SIGTERM or SIGINT, then end the process; a second signal ends the drain at once."""
     from opentelemetry import trace
 
     from ultragray_service.telemetry.logs import configure_logging, start_tracing

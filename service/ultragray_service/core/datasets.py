@@ -25,18 +25,14 @@ class DatasetPage:
 
 
 class Datasets:
-    """The datasets of the service, with whose they are."""
-
     def __init__(self, store: DatasetStore, owners: Owners) -> None:
         self._store, self._owners = store, owners
 
     def with_owner(self, record: DatasetRecord) -> DatasetRecord:
-        """A dataset with whose it is."""
         ownership = self._owners.known(Kind.DATASET, record.name)
         return replace(record, owner=ownership.owner, private=ownership.private)
 
     async def get(self, name: str) -> DatasetRecord:
-        """One dataset. Raises DatasetNotFound, DatasetInvalid."""
         return self.with_owner(await asyncio.to_thread(self._store.get, name))
 
     async def page(self, page_size: int, page_token: str) -> DatasetPage:
@@ -53,8 +49,6 @@ class Datasets:
         return await asyncio.to_thread(read)
 
     async def contact_sheet(self, name: str) -> bytes:
-        """The PNG of a dataset. Raises DatasetNotFound."""
-
         def read() -> bytes:
             try:
                 return self._store.contact_sheet(name)
@@ -64,15 +58,11 @@ class Datasets:
         return await asyncio.to_thread(read)
 
     async def delete(self, name: str, in_use: Callable[[str], str | None]) -> str | None:
-        """Deletes a dataset; its SHA-256, if no other one has the same content.
-
-        Raises DatasetNotFound, and DatasetInUse where `in_use` names in words who needs it.
-        """
+        """Deletes a dataset; its SHA-256 if no other has it. Raises DatasetNotFound, DatasetInUse."""
         deleted = (await asyncio.to_thread(self._store.get, name)).sha256
         async with self._owners.removing(Kind.DATASET, name):
             await asyncio.to_thread(self._store.delete, name, in_use)
         return None if deleted in await self.contents() else deleted
 
     async def contents(self) -> Set[str]:
-        """The SHA-256 of all that there are."""
         return (await asyncio.to_thread(self._store.names_by_content)).keys()

@@ -9,8 +9,6 @@ from ultragray_workers.errors import Draining, NotReady
 
 
 class Phase(Enum):
-    """The phases of the service's life."""
-
     STARTING = "starting"
     SERVING = "serving"
     LEAVING = "leaving"  # serves, and is not ready: proxies send what is new elsewhere
@@ -18,14 +16,11 @@ class Phase(Enum):
 
 
 class Life:
-    """The phase that the service is in. Belongs to one event loop."""
-
     def __init__(self) -> None:
         self.phase = Phase.STARTING
         self.draining = asyncio.Event()
 
     def begin_serving(self) -> None:
-        """The start is over, unless the stop has begun."""
         if self.phase is Phase.STARTING:
             self.phase = Phase.SERVING
 
@@ -34,12 +29,10 @@ class Life:
         self.phase = Phase.LEAVING
 
     def begin_draining(self) -> None:
-        """From now on nothing new is taken."""
         self.phase = Phase.DRAINING
         self.draining.set()
 
     def require_serving(self) -> None:
-        """Raises NotReady or Draining."""
         if self.phase is Phase.STARTING:
             raise NotReady("the service is starting")
         if self.phase is Phase.DRAINING:

@@ -31,12 +31,8 @@ class StreamAnswer:
 
 
 # The streams that are open at this service, and who watches them.
-#
 # client ── poses ──► stream ── frames ──► client │ note ▼ OpenStream ── the newest answer ──► watchers
-#
 # A watcher holds at most one answer, the newest: one that is slow misses some, and never delays the stream.
-
-
 Door = Literal["websocket", "grpc", "openigtlink"]
 
 MAX_NAME = 100  # characters
@@ -67,8 +63,6 @@ class StreamSummary:
 
 
 class _Rate:
-    """Events of the last seconds."""
-
     def __init__(self) -> None:
         self._times: deque[float] = deque()
 
@@ -95,12 +89,10 @@ class Watcher:
         self._changed = asyncio.Event()
 
     def offer(self, answer: StreamAnswer) -> None:
-        """An answer of the stream, which takes the place of one that was not taken."""
         self._newest = answer
         self._changed.set()
 
     def end(self) -> None:
-        """The stream has ended."""
         self._ended = True
         self._changed.set()
 
@@ -115,14 +107,10 @@ class Watcher:
 
 
 class OpenStream:
-    """One stream: what its client asked for, and what it got."""
-
     def __init__(self, door: Door = "websocket", name: str = "", owner: str = "", client: str = "") -> None:
         self.id = secrets.token_hex(8)
         self.name = "".join(letter for letter in name if letter.isprintable())[:MAX_NAME]
-        self.owner = owner
-        self._door = door
-        self._client = client
+        self.owner, self._door, self._client = owner, door, client
         self._opened_at = datetime.now(timezone.utc)
         self._opened = self._asked_at = time.monotonic()
         self._poses = self._frames = self._refused = self._dropped = 0
@@ -131,13 +119,11 @@ class OpenStream:
         self._watchers: set[Watcher] = set()
 
     def count_pose(self) -> None:
-        """A pose has come."""
         self._poses += 1
         self._asked_at = time.monotonic()
         self._pose_rate.count()
 
     def note(self, answer: StreamAnswer) -> None:
-        """An answer is about to be sent."""
         self._dropped += answer.dropped
         if isinstance(answer.outcome, UltragrayError):
             self._refused += 1
@@ -149,7 +135,6 @@ class OpenStream:
             watcher.offer(answer)
 
     def summary(self) -> StreamSummary:
-        """The stream as it is now."""
         now = time.monotonic()
         return StreamSummary(
             id=self.id,
@@ -173,7 +158,6 @@ class OpenStream:
 
     @contextmanager
     def watched(self) -> Iterator[Watcher]:
-        """A watcher of the stream for as long as the body runs."""
         watcher = Watcher()
         self._watchers.add(watcher)
         try:
@@ -182,7 +166,6 @@ class OpenStream:
             self._watchers.discard(watcher)
 
     def end(self) -> None:
-        """Tells its watchers that it has ended."""
         for watcher in self._watchers:
             watcher.end()
 
@@ -195,7 +178,6 @@ class OpenStreams:
 
     @contextmanager
     def opened(self, door: Door, name: str) -> Iterator[OpenStream]:
-        """A stream of the caller for as long as the body runs."""
         stream = OpenStream(door, name, acting().name, _address_and_port(caller().connection))
         self._streams[stream.id] = stream
         try:
@@ -210,7 +192,6 @@ class OpenStreams:
         return [one for one in summaries if scene is None or one.scene == scene]
 
     def get(self, stream_id: str) -> OpenStream:
-        """A stream that the caller may watch. Raises StreamNotFound."""
         stream = self._streams.get(stream_id)
         if stream is None or not _may_watch(acting(), stream):
             raise StreamNotFound(f"there is no open stream {stream_id[:MAX_NAME]!r}", field="stream")
@@ -222,5 +203,4 @@ def _may_watch(principal: Principal, stream: OpenStream) -> bool:
 
 
 def _address_and_port(connection: str) -> str:
-    """The connection of a caller without the scheme that gRPC puts before it."""
     return connection.removeprefix("ipv4:").removeprefix("ipv6:").replace("%5B", "[").replace("%5D", "]")

@@ -1,4 +1,4 @@
-"""Poses as the front doors take and tell them."""
+"""Poses and frames as the front doors take and tell them: what renders a frame again, and what it cost."""
 
 from __future__ import annotations
 
@@ -9,11 +9,16 @@ from typing import Annotated, Any
 
 import numpy as np
 from pydantic import Field
+from typing_extensions import Self
 
-from ultragray.contract import Contract
+from ultragray.contract import Contract, described
 from ultragray.errors import InvalidArgument, InvalidPose, TooManyPoses
 from ultragray.geometry.pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
 from ultragray.geometry.probe import FloatArray
+from ultragray.rendering.settings import Encoding, SettingsUsed
+from ultragray.rendering.volumes import SliceView
+from ultragray.scene.confidence import Extrapolation
+from ultragray_workers.pool.messages import RenderResult
 
 _CHECKED_INLINE = 16  # more go to a thread, so that the loop keeps answering
 
@@ -33,7 +38,6 @@ class Position:
 
     @classmethod
     def of(cls, point: Any) -> Position:  # [3] mm
-        """The point of three numbers."""
         x, y, z = (float(value) for value in point)
         return cls(x, y, z)
 
@@ -88,7 +92,6 @@ class PoseInBothForms:
 
     @classmethod
     def of(cls, pose: FloatArray) -> PoseInBothForms:  # [4, 4] mm
-        """The forms of a pose."""
         return cls(pose.tolist(), Position.of(pose[:3, 3]), Quaternion(*quaternion_from_pose(pose)))
 
     def __array__(self, dtype: Any = None, copy: bool | None = None) -> FloatArray:  # [4, 4] mm
@@ -96,7 +99,6 @@ class PoseInBothForms:
 
 
 def exact_pose(matrix: Any, path: str) -> FloatArray:  # [4, 4] mm
-    """The exact pose of a 4x4 matrix. Raises InvalidPose."""
     pose: FloatArray = check_poses(matrix, field=path)[0]
     return pose
 
@@ -111,8 +113,82 @@ async def exact_poses(count: int, pose: Callable[[int], FloatArray]) -> FloatArr
 
 
 def check_pose_count(count: int, limit: int) -> None:
-    """Raises TooManyPoses above `limit`, InvalidArgument for none."""
     if count > limit:
         raise TooManyPoses(f"poses must be at most {limit}, got {count}", field="poses")
     if count == 0:
         raise InvalidArgument("poses must hold at least one pose, got none", field="poses")
+
+
+def _timings(result: RenderResult[Any]) -> dict[str, float]:
+    return {name: round(getattr(result, name), 3) for name in ("queue_ms", "render_ms", "encode_ms")}
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FrameFacts:
+    """The facts of one frame beside its settings: its origin, its pose, and what it cost."""
+
+    scene: str = described("Name.")
+    scene_sha256: str = described("Of the scene file.")
+    renderer: str = described("Name, version and backend of the renderer.")
+    pose: MatrixRows = described("Matrix as used.")
+    extrapolation: Extrapolation = described("How far the frame lies from the training views.")
+    queue_ms: float = described("Waiting time.")
+    render_ms: float = described("Of the batch that it was rendered in.")
+    encode_ms: float = described("Encoding time.")
+
+    @classmethod
+    def of(cls, result: RenderResult, **others: Any) -> Self:
+        return cls(
+            scene=result.scene,
+            scene_sha256=result.scene_sha256,
+            renderer=result.renderer,
+            pose=result.poses[0].tolist(),
+            extrapolation=result.extrapolations[0],
+            **_timings(result),
+            **others,
+        )
+
+    @property
+    def timings(self) -> FrameFacts:
+        """Itself: gRPC has the three times in a message of their own."""
+        return self
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class FrameHeader(SettingsUsed, FrameFacts):
+    """All that is needed to render a frame again, and what it cost."""
+
+
+@dataclass(frozen=True, eq=False, kw_only=True)
+class SliceFacts:
+    """A slice but for its pixels."""
+
+    scene: str
+    scene_sha256: str
+    field: str
+    height: int
+    width: int
+    encoding: Encoding
+    pixel_to_scene: FloatArray  # [4, 4] mm
+    queue_ms: float
+    render_ms: float
+    encode_ms: float
+
+    @classmethod
+    def of(cls, result: RenderResult[SliceView]) -> SliceFacts:
+        view = result.settings
+        return cls(
+            scene=result.scene,
+            scene_sha256=result.scene_sha256,
+            field=view.field,
+            height=view.height,
+            width=view.width,
+            encoding=view.encoding,
+            pixel_to_scene=view.grid(result.poses[0]).affine,
+            **_timings(result),
+        )
+
+    @property
+    def timings(self) -> SliceFacts:
+        """Itself: gRPC has the three times in a message of their own."""
+        return self

@@ -32,7 +32,6 @@ class WatchedPart:
         self.problem: UltragrayError | None = NotReady("the service is starting")
 
     async def run(self) -> None:
-        """Checks until it is cancelled."""
         rounds = Rounds(f"the watch over {self._name}", _log)
         while True:
             with rounds.round():
@@ -63,9 +62,6 @@ class WatchedPart:
             _log.warning(f"{self._name} is in order again")
 
 
-# Whether the service is ready, part by part.
-
-
 @dataclass(frozen=True)
 class Component:
     """A part of the service."""
@@ -75,7 +71,6 @@ class Component:
 
     @classmethod
     def of(cls, problem: UltragrayError | None) -> Component:
-        """A part with that problem."""
         return cls(problem is None, None if problem is None else problem.detail)
 
 
@@ -103,13 +98,9 @@ class Readiness:
         scenes: ScenePlaces,
         without_jobs: bool,
     ) -> None:
-        """`require_serving`, `require_frames`: raise what keeps everything, and frames, from being answered.
-
-        `without_jobs`: whether the service is ready as soon as frames are.
-        """
+        """`require_…`: raise what keeps everything, and frames, away. `without_jobs`: ready as soon as frames are."""
         self._require_serving, self._require_frames = require_serving, require_frames
-        self._scenes = scenes
-        self._without_jobs = without_jobs
+        self._scenes, self._without_jobs = scenes, without_jobs
         self._jobs = WatchedPart("the database of the jobs", lambda: database().check(), DatabaseUnavailable)
         self._artifacts = WatchedPart(
             "the artifact folder", lambda: database().identity.check_writable(), ArtifactFolderUnavailable
@@ -117,24 +108,20 @@ class Readiness:
         self._tasks: list[asyncio.Task[None]] = []
 
     async def start(self) -> None:
-        """Checks every part once, and from now on at an interval."""
         parts = (self._jobs, self._artifacts)
         await asyncio.gather(*(part.look() for part in parts))
         self._tasks = [asyncio.ensure_future(part.run()) for part in parts]
 
     def close(self) -> None:
-        """Ends the checks."""
         for task in self._tasks:
             task.cancel()
 
     @property
     def components(self) -> Components:
-        """Every part as it was found last."""
         return Components(*(Component.of(problem) for problem in self._problems()))
 
     @property
     def problem(self) -> UltragrayError | None:
-        """Why the service is not ready; None: it is."""
         frames, jobs, artifacts, _ = self._problems()
         frames = frames or self._scenes.stale_problem
         return frames if self._without_jobs else frames or jobs or artifacts

@@ -22,7 +22,7 @@ from ultragray.geometry.registration import Registration
 from ultragray_service.access.limits import Limits
 from ultragray_service.access.owners import Owners, may_change
 from ultragray_service.access.principals import Principal, Role, acting, iso_time
-from ultragray_service.core.jobs.database_threads import DatabaseThreads
+from ultragray_service.core.jobs import DatabaseThreads
 from ultragray_service.core.scenes import SceneCatalog, page_of_names
 from ultragray_service.errors import LimitReached, PermissionDenied
 from ultragray_workers.errors import RegistrationNotFound
@@ -49,9 +49,6 @@ class RegistrationPage:
     next_page_token: str = described("Empty on the last page.")
 
 
-# The table of registrations. Its functions block; those that take an engine are one transaction each.
-
-
 _log = logging.getLogger("ultragray.service")
 _COLUMNS = REGISTRATIONS.c
 
@@ -65,14 +62,12 @@ class Kept:
 
 
 def read_registration(engine: sa.Engine, name: str) -> Kept | None:
-    """The registration of a name; None where there is none."""
     with engine.connect() as connection:
         row = connection.execute(sa.select(REGISTRATIONS).where(_COLUMNS.name == name)).one_or_none()
     return None if row is None else _kept(*row)
 
 
 def read_registrations(connection: sa.Connection) -> dict[str, Kept]:
-    """All registrations that can be read, by name."""
     found = {}
     for row in connection.execute(sa.select(REGISTRATIONS)):
         try:
@@ -120,7 +115,6 @@ def write_registration(
 
 
 def delete_registration(engine: sa.Engine, name: str, remover: Principal) -> bool:
-    """Whether it was there and the remover's to delete."""
     with engine.begin() as connection:
         gone = sa.delete(REGISTRATIONS).where(_COLUMNS.name == name, _may_change(remover))
         if not connection.execute(gone).rowcount:
@@ -130,7 +124,6 @@ def delete_registration(engine: sa.Engine, name: str, remover: Principal) -> boo
 
 
 def _require_room(connection: sa.Connection, name: str, writer: Principal, most: int) -> None:
-    """Raises LimitReached where the writer has `most` registrations, and none is there of that name."""
     if connection.execute(sa.select(_COLUMNS.name).where(_COLUMNS.name == name)).one_or_none() is not None:
         return
     owned = sa.select(sa.func.count()).select_from(REGISTRATIONS).where(_COLUMNS.owner == writer.name)
@@ -144,12 +137,8 @@ def _may_change(principal: Principal) -> sa.ColumnElement[bool]:
 
 @lru_cache(maxsize=4096)  # they are read again whenever one of them, a key or an owner changes
 def _kept(name: str, scene: str, owner: str, changed_at_s: float, document: str, private_to: str | None) -> Kept:
-    """The registration of a row, by its columns. Raises InvalidArgument, InvalidPose, ValueError."""
     facts: dict[str, Any] = {"name": name, "scene": scene, "owner": owner, "changed_at": iso_time(changed_at_s)}
     return Kept(NamedRegistration(**to_dict(from_dict(Registration, json.loads(document))), **facts), private_to)
-
-
-# Registrations by name: kept, listed, deleted, and found for the requests that name one.
 
 
 NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
@@ -175,7 +164,6 @@ class Registrations:
         self._threads: DatabaseThreads | None = None
 
     def open(self, engine: sa.Engine, threads: DatabaseThreads) -> None:
-        """From now on they are read and written by `engine`, in `threads`."""
         self._engine, self._threads = engine, threads
 
     def read(self, connection: sa.Connection) -> None:
@@ -188,12 +176,10 @@ class Registrations:
                     return
 
     async def get(self, name: str) -> NamedRegistration:
-        """A registration as it is kept now. Raises RegistrationNotFound, DatabaseUnavailable."""
         kept = await self._do(read_registration, name)
         return await asyncio.to_thread(self._seen, name, kept)
 
     async def ownership(self, name: str) -> Ownership:
-        """Whose a registration is. Raises RegistrationNotFound, DatabaseUnavailable."""
         return Ownership((await self.get(name)).owner)
 
     async def of_scene(self, name: str, scene: str) -> Registration:
@@ -217,18 +203,13 @@ class Registrations:
         return _of_scene(self._seen(name, read_registration(self._opened, name)), scene)
 
     async def page(self, page_size: int, page_token: str) -> RegistrationPage:
-        """One page by name. Raises InvalidArgument, DatabaseUnavailable."""
         kept, there = await self._do(_read_all), set(await self._catalog.names())
         seen = {name: one.registration for name, one in kept.items() if _is_seen(one, there.__contains__)}
         names, next_page_token = page_of_names(sorted(seen), page_size, page_token)
         return RegistrationPage([seen[name] for name in names], next_page_token)
 
     async def put(self, name: str, scene: str, registration: Registration) -> NamedRegistration:
-        """Keeps a registration, in place of one of the name that is the caller's.
-
-        Raises InvalidArgument for a name, SceneNotFound, SceneFileInvalid, PermissionDenied, LimitReached,
-        DatabaseUnavailable.
-        """
+        """Keeps a registration, in place of one of the name that is the caller's; else PermissionDenied is raised."""
         if NAME.fullmatch(name) is None:
             raise InvalidArgument(
                 "registration must be 1 to 128 letters, digits, '.', '_' and '-', the first a letter or digit, got "
@@ -253,8 +234,6 @@ class Registrations:
             raise self._limits.refused("registrations", error) from None
 
     async def delete(self, name: str) -> None:
-        """Forgets a registration. Raises RegistrationNotFound, PermissionDenied, DatabaseUnavailable."""
-
         def forget(engine: sa.Engine) -> None:
             with self._writing:
                 if not delete_registration(engine, name, acting()):
@@ -294,7 +273,6 @@ def _read_all(engine: sa.Engine) -> dict[str, Kept]:
 
 
 def _is_seen(kept: Kept, sees_scene: Callable[[str], bool]) -> bool:
-    """Whether the caller sees a registration; `sees_scene`: whether the caller sees a scene, by its name."""
     if kept.private_to is not None:
         return _is_own(kept.private_to)
     return _is_own(kept.registration.owner) or sees_scene(kept.registration.scene)

@@ -61,13 +61,9 @@ class Plan(Generic[S]):
         """`path`: the place of the settings in the client's message, for errors. To be renewed before it is used."""
         self.scene = base_name(scene)
         self._reference = scene
-        self._catalog = catalog
-        self._resolve = resolve
-        self._path = path
-        self.registration = registration
+        self._catalog, self._resolve, self._path, self.registration = catalog, resolve, path, registration
 
     def placed(self, poses: FloatArray) -> FloatArray:  # [..., 4, 4] mm, exact, both
-        """The poses probe→scene of those that the client sent."""
         return poses if self.registration is None else self.registration.probe_to_scene(poses)
 
     async def renew(self) -> None:
@@ -78,27 +74,17 @@ class Plan(Generic[S]):
 
 
 def as_resolved(settings: Resolved) -> Resolved:
-    """The settings as they are."""
     return settings
 
 
 class RequestPlanner:
-    """Checks requests against the scenes and the limits of the service."""
-
     def __init__(
-        self,
-        settings: Settings,
-        catalog: SceneCatalog,
-        registration: Callable[[str, str], Awaitable[Registration]],
+        self, settings: Settings, catalog: SceneCatalog, registration: Callable[[str, str], Awaitable[Registration]]
     ) -> None:
-        """`registration`: finds that of a name, for a scene."""
-        self._settings = settings
-        self._catalog = catalog
-        self._registration = registration
+        self._settings, self._catalog, self._registration = settings, catalog, registration
 
     @property
     def max_poses(self) -> int:
-        """Poses that one call may carry."""
         return self._settings.max_poses_per_request
 
     @property
@@ -137,10 +123,7 @@ class RequestPlanner:
     async def plan_slice(
         self, scene: str, request: SliceSettings, encoding: Encoding, *, path: str = ""
     ) -> Plan[SliceView]:
-        """The settings of a slice for a scene; `path` is their place in the client's message.
-
-        Raises SceneNotFound, SceneFileInvalid; InvalidArgument for labels of a scene without them, InvalidImageSize.
-        """
+        """The settings of a slice; `path`: their place in the message. Raises SceneNotFound, InvalidArgument."""
         view = request.view(encoding)
         side, pixels = max(view.height, view.width), view.height * view.width
         if side > self._settings.max_image_side or pixels > self._settings.max_request_pixels:
@@ -190,8 +173,6 @@ class RequestPlanner:
 
 
 class Rendering:
-    """Frames for plans, from the pool: what every door asks for, whether once or in a stream."""
-
     def __init__(
         self, pool: RenderPool, planner: RequestPlanner, life: Life, owners: Owners, limits: Limits, metrics: Metrics
     ) -> None:
@@ -199,7 +180,6 @@ class Rendering:
         self._owners = owners
 
     def require_frames(self) -> None:
-        """Raises NotReady or Draining, saying why no frame would be rendered now."""
         self.life.require_serving()
         if not self.pool.ready:
             raise NotReady("no render process is alive and gets on with its work at the moment")
@@ -215,10 +195,7 @@ class Rendering:
         begin_by: float | None = None,  # time.monotonic() in seconds; else it is refused
         destination: Destination | None = None,
     ) -> RenderResult[S]:
-        """Renders, with the settings as they are for the scene that is there when it is rendered.
-
-        Raises what RenderPool.render and Plan.renew raise; cancelling drops a request that still waits.
-        """
+        """Renders for the scene that is there by then. Raises what RenderPool.render and Plan.renew raise."""
         self.life.require_serving()
         mine = account()
         mine.target = plan.scene

@@ -13,7 +13,7 @@ from contextlib import contextmanager, suppress
 from contextvars import copy_context
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
@@ -53,7 +53,6 @@ class ScenePlaces(Collector):
     """`data`, whose scenes are the operator's, and `made`, whose scenes were imported or made by jobs."""
 
     def __init__(self, settings: Settings) -> None:
-        """Raises StartupFailed for a data folder that does not exist, ExtraMissing, InvalidArgument."""
         if isinstance(settings.data_folder, Path) and not settings.data_folder.is_dir():
             raise StartupFailed(
                 f"data_folder must be an existing folder, got {str(settings.data_folder)!r}", field="data_folder"
@@ -65,12 +64,10 @@ class ScenePlaces(Collector):
 
     @property
     def buckets(self) -> tuple[BucketShelf, ...]:
-        """Those of the two that are in a bucket."""
-        return tuple(self._buckets())
+        return tuple(one for one in (self.data, self.made) if isinstance(one, BucketShelf))
 
     @property
     def problem(self) -> StorageUnavailable | None:
-        """What keeps a list of scenes from being read; None: nothing does."""
         return next((one.index.problem for one in self.buckets if one.index.problem is not None), None)
 
     @property
@@ -79,7 +76,6 @@ class ScenePlaces(Collector):
         return next((one.index.problem for one in self.buckets if not one.index.is_usable), None)
 
     def collect(self) -> Iterator[Metric]:
-        """What Prometheus shows of the cache and the buckets."""
         buckets, counts = self.buckets, self.cache.counts
         counter, gauge = CounterMetricFamily, GaugeMetricFamily
         yield counter("ultragray_scene_cache_hits", "Requests whose scene was cached.", counts.hits)
@@ -94,14 +90,12 @@ class ScenePlaces(Collector):
         yield gauge("ultragray_scene_list_age_seconds", "Age of the oldest list of the scenes of a bucket.", age)
 
     async def open(self) -> None:
-        """Reads the lists of scenes, and follows their changes."""
         for bucket in self.buckets:
             with suppress(StorageUnavailable):  # told by health, and read as soon as it can be
                 await asyncio.to_thread(bucket.index.read)
             bucket.follow()
 
     async def close(self) -> None:
-        """Follows them no more."""
         for bucket in self.buckets:
             await asyncio.to_thread(bucket.close)
 
@@ -111,14 +105,6 @@ class ScenePlaces(Collector):
         storage = open_storage(location, patience_s=PATIENCE_S)
         index = SceneIndex(storage, folder, self._settings.scene_list_max_age_s)
         return BucketShelf(index, self.cache, self._settings.working_folder / SCENES_FOLDER)
-
-    def _buckets(self) -> Iterator[BucketShelf]:
-        for shelf in (self.data, self.made):
-            if isinstance(shelf, BucketShelf):
-                yield shelf
-
-
-# Facts about scenes, read from their files without blocking the event loop.
 
 
 T = TypeVar("T")
@@ -140,8 +126,6 @@ class CatalogEntry:
 
 
 class SceneCatalog:
-    """Headers, pages of scene names, and Gaussians as points."""
-
     def __init__(self, store: SceneStore) -> None:
         self._store = store
         self._reading_points = asyncio.Lock()
@@ -153,21 +137,15 @@ class SceneCatalog:
             return cached[1] if cached is not None else await _fetched(self._store.header, name)
 
     async def versioned_header(self, name: str) -> tuple[FileVersion, SceneHeader]:
-        """The same, with the version of the file that it is of."""
         with scene_to_blame():
             cached = self._store.cached_versioned_header(name)
             return cached if cached is not None else await _fetched(self._store.versioned_header, name)
 
     async def version(self, name: str) -> FileVersion:
-        """The version of the content that the file of a scene has now. Raises SceneNotFound, SceneFileInvalid."""
         with scene_to_blame():
             return await asyncio.to_thread(self._store.version, name)
 
     async def points(self, name: str, limit: int, fields: Sequence[str]) -> bytes:
-        """At most `limit` Gaussians of a scene, as `point_message`.
-
-        Raises SceneNotFound, SceneFileInvalid, InvalidArgument for fields that there are not.
-        """
         header = await self.header(name)
         with scene_to_blame():
             path = await asyncio.to_thread(self._store.path, name)
@@ -175,7 +153,6 @@ class SceneCatalog:
                 return await in_own_thread(lambda: point_message(path, header.info, limit, fields))
 
     async def names(self) -> list[str]:
-        """The names of the scenes that the caller may see, sorted."""
         return await asyncio.to_thread(self.shown_names)
 
     def shown_names(self) -> list[str]:
@@ -183,10 +160,7 @@ class SceneCatalog:
         return self._store.shown_names()
 
     async def page(self, page_size: int, page_token: str) -> tuple[list[CatalogEntry], str]:
-        """One page of scenes by name and the token of the next (empty on the last).
-
-        Raises InvalidArgument for a page_size outside 1 to 1000 and for a token that no page gave.
-        """
+        """One page by name, and the token of the next (empty on the last). Raises InvalidArgument."""
         chosen, next_page_token = page_of_names(await self.names(), page_size, page_token)
         at_once = asyncio.Semaphore(_READ_AT_ONCE)
 
@@ -215,17 +189,23 @@ async def _fetched(read: Callable[[str], T], name: str) -> T:
 
 
 def page_of_names(names: list[str], page_size: int, page_token: str) -> tuple[list[str], str]:
-    """The names of one page of the sorted `names`, and the token of the next page (empty on the last).
-
-    Raises InvalidArgument for a page_size outside 1 to 1000 and for a token that no page gave.
-    """
+    """The names of one page of the sorted `names`, and the token of the next (empty on the last)."""
     if not 1 <= page_size <= MAX_PAGE_SIZE:
         raise InvalidArgument(
             f"page_size must be an integer from 1 to {MAX_PAGE_SIZE}, got {page_size}", field="page_size"
         )
-    start = bisect_right(names, _name_of_token(page_token)) if page_token else 0
+    start = 0
+    if page_token:
+        try:
+            after = base64.b64decode(page_token + "=" * (-len(page_token) % 4), altchars=b"-_", validate=True)
+            start = bisect_right(names, after.decode())
+        except (binascii.Error, ValueError):
+            raise InvalidArgument(
+                "page_token must be a next_page_token that an earlier page gave", field="page_token"
+            ) from None
     chosen = names[start : start + page_size]
-    return chosen, _token_of_name(chosen[-1]) if start + page_size < len(names) else ""
+    is_last = start + page_size >= len(names)
+    return chosen, "" if is_last else base64.urlsafe_b64encode(chosen[-1].encode()).decode().rstrip("=")
 
 
 @contextmanager
@@ -239,30 +219,12 @@ def scene_to_blame() -> Iterator[None]:
 
 def finite_metrics(header: SceneHeader) -> dict[str, float]:
     """The scene's metrics that are numbers (a file may claim anything)."""
-    return {name: float(value) for name, value in header.info.metrics.items() if _is_number(value)}
-
-
-def _is_number(value: Any) -> bool:
-    try:
-        return isinstance(value, (int, float)) and math.isfinite(value)
-    except OverflowError:  # an integer beyond all floats
-        return False
-
-
-def _token_of_name(name: str) -> str:
-    return base64.urlsafe_b64encode(name.encode()).decode().rstrip("=")
-
-
-def _name_of_token(token: str) -> str:
-    try:
-        return base64.b64decode(token + "=" * (-len(token) % 4), altchars=b"-_", validate=True).decode()
-    except (binascii.Error, ValueError):
-        raise InvalidArgument(
-            "page_token must be a next_page_token that an earlier page gave", field="page_token"
-        ) from None
-
-
-# Scenes as all front doors tell them.
+    found = {}
+    for name, value in header.info.metrics.items():
+        with suppress(OverflowError):  # an integer beyond all floats
+            if isinstance(value, (int, float)) and math.isfinite(value):
+                found[name] = float(value)
+    return found
 
 
 @dataclass(frozen=True)
@@ -313,7 +275,6 @@ class TrainingPoses:
 
     @classmethod
     def of(cls, header: SceneHeader) -> TrainingPoses:
-        """The training poses of a scene, in short."""
         poses = header.training_poses
         if not len(poses):
             return cls(count=0)
@@ -373,7 +334,6 @@ class Scene:
 
     @classmethod
     def of(cls, name: str, header: SceneHeader, loaded_processes: int, ownership: Ownership) -> Scene:
-        """The scene of a header, which so many render processes hold."""
         info, model = header.info, read_model(header.info.confidence, len(header.training_poses))
         return cls(
             name=name,
@@ -411,13 +371,10 @@ class SceneLoaded:
 
     @classmethod
     def of(cls, scene: str, loaded_processes: int) -> SceneLoaded:
-        """The scene, which so many render processes hold."""
         return cls(base_name(scene), loaded_processes > 0, loaded_processes)
 
 
 class Scenes:
-    """The scenes of the service as all front doors tell them: read, listed, and loaded into the render processes."""
-
     def __init__(
         self,
         catalog: SceneCatalog,
@@ -431,12 +388,10 @@ class Scenes:
         self._pool, self._owners, self._life = pool, owners, life
 
     async def get(self, name: str) -> Scene:
-        """All about one scene. Raises SceneNotFound, SceneFileInvalid."""
         header, name = await self._catalog.header(name), base_name(name)
         return Scene.of(name, header, self._pool.loaded().get(name, 0), self._owners.known(Kind.SCENE, name))
 
     async def page(self, page_size: int, page_token: str) -> ScenePage:
-        """One page of scenes by name. Raises InvalidArgument."""
         entries, next_page_token = await self._catalog.page(page_size, page_token)
         loaded, removable = self._pool.loaded(), await asyncio.to_thread(self._store.names_of, self._places.made)
         rows = [
@@ -446,11 +401,9 @@ class Scenes:
         return ScenePage(rows, next_page_token)
 
     async def load(self, scene: str) -> SceneLoaded:
-        """Loads a scene into every process. Raises SceneNotFound, SceneFileInvalid, SceneTooLarge."""
         return await self._changed(self._pool.load, scene)
 
     async def unload(self, scene: str) -> SceneLoaded:
-        """Frees a scene. Raises SceneNotFound."""
         return await self._changed(self._pool.unload, scene)
 
     async def _changed(self, change: Callable[[str], Awaitable[None]], scene: str) -> SceneLoaded:

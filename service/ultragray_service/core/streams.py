@@ -55,8 +55,6 @@ class _Underway:
 
 
 class _Room:
-    """For answers under way: a few, and of large frames fewer."""
-
     def __init__(self) -> None:
         self._count = self._bytes = 0
         self._left = asyncio.Event()
@@ -70,7 +68,6 @@ class _Room:
         self._bytes += size
 
     def leave(self, size: int) -> None:
-        """The answer is sent."""
         self._count -= 1
         self._bytes -= size
         self._left.set()
@@ -89,7 +86,6 @@ class _Window:
         self._entered: deque[int] = deque()  # sequences, in the order of the answers
 
     def open(self, size: int) -> None:
-        """The client acknowledges from now on."""
         self._size = size
 
     @property
@@ -101,11 +97,9 @@ class _Window:
         return len(self._entered) < (1 if self._size is None else self._size)
 
     def enter(self, sequence: int) -> None:
-        """An answer is ready to be sent."""
         self._entered.append(sequence)
 
     def sent(self) -> None:
-        """The transport has done with the oldest answer."""
         if self._size is None:
             self._entered.popleft()
 
@@ -117,10 +111,7 @@ class _Window:
 
 
 class PoseStream:
-    """One stream of one client."""
-
     def __init__(self, rendering: Rendering, record: OpenStream | None = None) -> None:
-        """`record`: where others may see what is asked and answered."""
         self.mode = StreamMode.ORDERED  # to be set before the first pose, likewise:
         self.destination: Destination | None = None  # of its frames
         self._rendering = rendering
@@ -187,11 +178,9 @@ class PoseStream:
         self._advance()
 
     def open_window(self, size: int) -> None:
-        """The client of a latest stream acknowledges answers, and wants so many of them ahead."""
         self._window.open(size)
 
     def acknowledge(self, sequence: int) -> None:
-        """The client has taken the answer of that sequence."""
         self._window.acknowledge(sequence)
         self._advance()
 
@@ -308,43 +297,37 @@ def _cancel(task: asyncio.Task[None], _: asyncio.Future[bool]) -> None:
     task.cancel()
 
 
-# A stream of one client: its messages in their order, whatever they come through.
-
-
 MAX_TIMEOUT_MS = 3_600_000.0
 
 SceneSettings = tuple[str, RenderSettings]
 
 
-class Message(Protocol):
-    """A message of the client. What cannot be used is raised, as InvalidArgument, by the method that would give it."""
+def nothing() -> None:
+    """What a message says that leaves something out."""
 
-    @property
-    def sequence(self) -> int: ...
 
-    @property
-    def client_time(self) -> float | None: ...
+@dataclass(frozen=True, eq=False, kw_only=True)
+class Message:
+    """A message of the client. What cannot be used is raised, as InvalidArgument, by the call that would give it."""
 
-    @property
-    def window(self) -> int | None:
-        """Answers of a latest stream that may wait to be acknowledged; of the first message. None: none ever is."""
+    sequence: int = 0
+    client_time: float | None = None
+    mode: Callable[[], StreamMode | None] = nothing  # asked of the first; None: it cannot be read, the next one may
+    window: int | None = None  # of the first: answers of a latest stream that may wait to be acknowledged; None: none
+    acknowledged: int | None = None  # the sequence of the newest answer that the client has taken
+    settings: Callable[[], SceneSettings | None] = nothing  # from now on; None: as before
+    asks: bool = True  # for a frame
+    pose: Callable[[], FloatArray]  # [4, 4] mm, exact
+    timeout_s: Callable[[], float | None] = nothing  # that the pose may wait; None: the default of the service
 
-    @property
-    def acknowledged(self) -> int | None:
-        """The sequence of the newest answer that the client has taken; None: no news."""
 
-    def settings(self) -> SceneSettings | None:
-        """The scene and what to render of it from now on; None: as before."""
+def unreadable(error: UltragrayError, *, of_settings: bool = False, **numbers: Any) -> Message:
+    """A message that could not be read: it has its numbers, as far as these can, and raises why."""
 
-    @property
-    def asks(self) -> bool:
-        """Whether it asks for a frame."""
+    def refuse() -> Any:
+        raise error
 
-    def pose(self) -> FloatArray:  # [4, 4] mm, exact
-        """The pose to render, of a message that asks."""
-
-    def timeout_s(self) -> float | None:
-        """The time that the pose may wait; None: the default of the service."""
+    return Message(**numbers, settings=refuse if of_settings else nothing, pose=refuse)
 
 
 class Transport(Protocol):
@@ -352,13 +335,10 @@ class Transport(Protocol):
 
     @property
     def destination(self) -> Destination | None:
-        """Where frames are put, of a transport whose mode was asked for; None: into the answers."""
+        """Where frames are put, once the mode was asked for; None: into the answers."""
 
     async def receive(self) -> Message | None:
         """The next message; None after the last."""
-
-    def mode(self, message: Message) -> StreamMode | None:
-        """The mode that the first message asks for; None where it cannot be read: then the next one may."""
 
     async def send(self, answer: StreamAnswer) -> None:
         """Sends a frame, or why there is none."""
@@ -380,23 +360,18 @@ class FrameStream:
         unset: SceneSettings | None = None,
         record: OpenStream | None = None,
     ) -> None:
-        self._rendering = rendering
-        self._transport = transport
-        self._unset = unset
+        self._rendering, self._transport, self._unset = rendering, transport, unset
         self._plan: Plan | None = None
         self._poses = PoseStream(rendering, record)
 
     async def run(self) -> None:
-        """Answers until the client has sent its last message and got its last frame.
-
-        Raises Draining when the service stops, and what the transport raises.
-        """
+        """Until the client has sent its last message and got its last frame. Raises Draining when the service stops."""
         await self._poses.run(self._read, self._transport.send, self._transport.hand_over)
 
     async def _read(self) -> None:
         mode = None
         while (message := await self._transport.receive()) is not None:
-            if mode is None and (mode := self._transport.mode(message)) is not None:
+            if mode is None and (mode := message.mode()) is not None:
                 self._poses.mode, self._poses.destination = mode, self._transport.destination
                 if message.window is not None:
                     self._poses.open_window(message.window)
@@ -442,7 +417,6 @@ class FrameStream:
 
 
 def checked_s(name: str, milliseconds: float) -> float:
-    """The seconds of a time that a client gave as the field `name`. Raises InvalidArgument."""
     if not 0.0 < milliseconds <= MAX_TIMEOUT_MS:
         raise InvalidArgument(
             f"{name} must be above 0 and at most {MAX_TIMEOUT_MS:g}, got {milliseconds:g}", field=name

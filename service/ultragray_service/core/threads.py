@@ -52,9 +52,6 @@ async def to_its_end(work: Callable[[], T]) -> T:
         await asyncio.wait({working})
 
 
-# Work in helper processes (`ultragray_workers.helpers`), awaited without blocking the event loop.
-
-
 _log = logging.getLogger("ultragray.service")
 PATIENCE_S = 3600.0  # of a request that waits for the processes of others
 

@@ -20,9 +20,6 @@ def hold_little(transport: asyncio.BaseTransport) -> None:
         endpoint.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_BYTES)
 
 
-# Bytes that a client has not read yet, as the kernel of the service knows them of a TCP connection.
-
-
 _POLL_S = 0.004
 _QUIET_S = 0.25  # a client that sends nothing tells nothing about its window
 _LONGEST_S = 5.0  # for a client whose window shrank for good
@@ -68,7 +65,6 @@ class Unread:
                 self._socket.setsockopt(socket.IPPROTO_TCP, getattr(socket, option), value)
 
     def write(self, message: bytes) -> None:
-        """Gives a message to the transport, which must not gather what it is given."""
         if (state := self._state()) is not None:
             self._window_bytes = max(self._window_bytes, state.window_bytes)
         self._message_bytes = len(message)
@@ -78,33 +74,28 @@ class Unread:
 
     async def none(self) -> None:
         """Waits until the client has read the last message, as far as can be known, or for a few seconds."""
-        loop = asyncio.get_running_loop()
-        latest = loop.time() + _LONGEST_S
-        while (state := self._state()) is not None and not self._transport.is_closing():
-            if state.unacknowledged_bytes == 0:
-                if state.window_bytes >= self._window_bytes - self._message_bytes // 4:
-                    self._is_ahead = False
-                    return
-                if state.quiet_s > _QUIET_S and not self._is_ahead:
-                    self._is_ahead = True
-                    return
-                if loop.time() > latest:
-                    self._window_bytes = state.window_bytes
-                    return
-            await asyncio.sleep(_POLL_S)
+        is_ahead = await self._wait(self._message_bytes // 4, trusts_silence=not self._is_ahead)
+        self._is_ahead = self._is_ahead if is_ahead is None else is_ahead
 
     async def all_but_one(self) -> None:
         """Waits until the client has read all messages before the last one, as `none` does."""
+        await self._wait(self._message_bytes * 3 // 2, trusts_silence=False)
+
+    async def _wait(self, unread_bytes: int, *, trusts_silence: bool) -> bool | None:
+        """Whether silence alone says that no more bytes than these are unread; None: that is not known."""
         loop = asyncio.get_running_loop()
         latest = loop.time() + _LONGEST_S
         while (state := self._state()) is not None and not self._transport.is_closing():
             if state.unacknowledged_bytes == 0:
-                if state.window_bytes >= self._window_bytes - self._message_bytes * 3 // 2:
-                    return
+                if state.window_bytes >= self._window_bytes - unread_bytes:
+                    return False
+                if trusts_silence and state.quiet_s > _QUIET_S:
+                    return True
                 if loop.time() > latest:
                     self._window_bytes = state.window_bytes
-                    return
+                    return None
             await asyncio.sleep(_POLL_S)
+        return None
 
     def _state(self) -> _State | None:
         """None where the system does not tell."""

@@ -5,9 +5,10 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import logging
-from collections.abc import AsyncIterator, Awaitable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from contextlib import asynccontextmanager, contextmanager, suppress
 from contextvars import copy_context
+from dataclasses import dataclass
 from datetime import datetime, time, timedelta, timezone
 from functools import partial
 from pathlib import Path
@@ -22,7 +23,7 @@ from ultragray_service.access.audit import account
 from ultragray_service.access.limits import Limits, Slots
 from ultragray_service.access.owners import Claim, Owners
 from ultragray_service.access.principals import GB, acting
-from ultragray_service.core.jobs.jobs import Jobs
+from ultragray_service.core.jobs import Jobs
 from ultragray_service.core.threads import HelperProcesses, in_own_thread, to_its_end
 from ultragray_service.errors import LimitReached, SceneReadOnly
 from ultragray_service.settings import Settings
@@ -40,51 +41,34 @@ from ultragray_workers.shelves.shelf import Shelf
 T = TypeVar("T")
 
 
-async def arrival(arriving: Awaitable[T], idle_timeout_s: float, stopping: asyncio.Future[Any]) -> T:
-    """The result of `arriving`.
-
-    Raises DeadlineExceeded where it does not come in time, Draining once `stopping` is done.
-    """
-    work = asyncio.ensure_future(arriving)
-    either: set[asyncio.Future[Any]] = {work, stopping}
-    try:
-        await asyncio.wait(either, timeout=idle_timeout_s, return_when=asyncio.FIRST_COMPLETED)
-        if stopping.done():
-            raise Draining("the service is stopping; send it again")
-        if not work.done():
-            raise DeadlineExceeded(f"the upload sent nothing for {idle_timeout_s:g} s")
-        return work.result()
-    finally:
-        work.cancel()
+Next = Callable[[Awaitable[T]], Awaitable[T]]
 
 
-# Limits of what the owners of jobs, datasets and scenes have, on all services of the database together.
+@contextmanager
+def arrivals(draining: asyncio.Event, idle_timeout_s: float) -> Iterator[Next[Any]]:
+    """A function that awaits the next part of what a client sends; it raises DeadlineExceeded and Draining."""
+    stopping = asyncio.ensure_future(draining.wait())
 
-
-class Room:
-    """The bytes that an upload may still store, of those that its key may."""
-
-    def __init__(self, limits: Limits, left_bytes: int | None) -> None:
-        self._limits, self._left_bytes = limits, left_bytes
-
-    def at_most(self, max_bytes: int) -> int:
-        """The largest upload, where any may have `max_bytes`."""
-        return max_bytes if self._left_bytes is None else min(max_bytes, self._left_bytes)
-
-    @contextmanager
-    def to_blame(self, max_bytes: int) -> Iterator[None]:
-        """Raises LimitReached where the body finds an upload too large that other keys might store."""
+    async def arrival(arriving: Awaitable[T]) -> T:
+        work = asyncio.ensure_future(arriving)
+        either: set[asyncio.Future[Any]] = {work, stopping}
         try:
-            yield
-        except UploadTooLarge:
-            if self.at_most(max_bytes) == max_bytes:
-                raise
-            raise self._limits.refused("stored_gb", _too_many_bytes(self._limits.mine.stored_gb)) from None
+            await asyncio.wait(either, timeout=idle_timeout_s, return_when=asyncio.FIRST_COMPLETED)
+            if stopping.done():
+                raise Draining("the service is stopping; send it again")
+            if not work.done():
+                raise DeadlineExceeded(f"the upload sent nothing for {idle_timeout_s:g} s")
+            return work.result()
+        finally:
+            work.cancel()
+
+    try:
+        yield arrival
+    finally:
+        stopping.cancel()
 
 
 class Quotas:
-    """What whoever the running code works for has, and whether there may be more."""
-
     def __init__(self, limits: Limits, owners: Owners, datasets: DatasetStore, scenes: SceneStore) -> None:
         self._limits, self._owners = limits, owners
         self._datasets, self._scenes = datasets, scenes
@@ -114,11 +98,20 @@ class Quotas:
         self._left_bytes(jobs)
         return mine.running_jobs
 
-    async def room(self, jobs: Jobs) -> Room:
-        """The room for an upload. Raises LimitReached where there is none."""
-        if self._limits.mine.stored_gb is None:
-            return Room(self._limits, None)
-        return Room(self._limits, await jobs.do(self._left_bytes))
+    @asynccontextmanager
+    async def room(self, jobs: Jobs, most: int) -> AsyncIterator[int]:
+        """The bytes that an upload may have, where any may have `most`.
+
+        Raises LimitReached where there may be none, and where the body finds too large what other keys might store.
+        """
+        left_bytes = None if self._limits.mine.stored_gb is None else await jobs.do(self._left_bytes)
+        allowed = most if left_bytes is None else min(most, left_bytes)
+        try:
+            yield allowed
+        except UploadTooLarge:
+            if allowed == most:
+                raise
+            raise self._limits.refused("stored_gb", _too_many_bytes(self._limits.mine.stored_gb)) from None
 
     def _left_bytes(self, jobs: JobStore) -> int | None:
         """The bytes that there may still be; None: any number. Raises LimitReached where there may be none."""
@@ -151,9 +144,6 @@ def _next_day(now: datetime) -> datetime:
     return datetime.combine(now.date() + timedelta(days=1), time(), timezone.utc)
 
 
-# Uploads of datasets, from either front door: to the disk as they come, then checked in a process of their own.
-
-
 MAX_UPLOADS = 8
 DATASET_CHECK_TIMEOUT_S = 1800.0
 _BLOCK_BYTES = 1 << 20
@@ -162,106 +152,77 @@ _POLL_INTERVAL_S = 0.25
 _log = logging.getLogger("ultragray.service")
 
 
+@dataclass(frozen=True, eq=False)
+class Means:
+    """What uploads of both kinds need."""
+
+    settings: Settings
+    jobs: Jobs
+    draining: asyncio.Event
+    checks: HelperProcesses
+    owners: Owners
+    quotas: Quotas
+
+
 class DatasetUploads:
     """The uploads under way. A few at a time are received, and wait for their turn in `checks`."""
 
-    def __init__(
-        self,
-        store: DatasetStore,
-        settings: Settings,
-        jobs: Jobs,
-        draining: asyncio.Event,
-        checks: HelperProcesses,
-        owners: Owners,
-        quotas: Quotas,
-    ) -> None:
-        self._jobs = jobs
-        self._store = store
-        self._quotas = quotas
-        self._owners = owners
-        self._settings = settings
-        self._draining = draining
-        self._checks = checks
+    def __init__(self, store: DatasetStore, means: Means) -> None:
+        self._store, self._means = store, means
         self._slots = Slots(MAX_UPLOADS, "uploads of datasets")
 
     @asynccontextmanager
     async def receive(self, name: str, options: dict[str, str], *, private: bool) -> AsyncIterator[DatasetUpload]:
-        """An upload; what has not become a dataset at the end is removed.
-
-        Raises InvalidArgument for a bad name or option, QueueFull, LimitReached, Draining, StorageFull.
-        """
+        """An upload; what is no dataset at the end goes. Raises InvalidArgument, QueueFull, LimitReached, Draining."""
         check_dataset_name(name)
         account().target = name
         from_dict(SourceOptions, options)
-        if self._draining.is_set():
+        means, settings = self._means, self._means.settings
+        if means.draining.is_set():
             raise Draining("the service is stopping")
-        with self._slots.one():
-            stopping: asyncio.Future[Any] = asyncio.ensure_future(self._draining.wait())
-            try:
-                room, most = await self._quotas.room(self._jobs), self._settings.max_dataset_bytes
-                incoming = await asyncio.to_thread(IncomingDataset, self._store, room.at_most(most))
-                claim = Claim(self._owners, Kind.DATASET, name, incoming.folder.name, private=private)
-                upload = DatasetUpload(
-                    incoming, name, options, self._settings, stopping, self._checks, claim, room.at_most(most)
-                )
+        with self._slots.one(), arrivals(means.draining, settings.upload_idle_timeout_s) as arrival:
+            async with means.quotas.room(means.jobs, settings.max_dataset_bytes) as max_bytes:
+                incoming = await asyncio.to_thread(IncomingDataset, self._store, max_bytes)
+                claim = Claim(means.owners, Kind.DATASET, name, incoming.folder.name, private=private)
+                upload = DatasetUpload(incoming, name, options, means.checks, claim, max_bytes, arrival)
                 try:
-                    with room.to_blame(most):
-                        yield upload
+                    yield upload
                 finally:
                     await upload.ended()
                     await asyncio.shield(asyncio.to_thread(incoming.discard))
-            finally:
-                stopping.cancel()
 
     async def remove_stale(self) -> None:
-        """Removes what uploads of dead services left."""
         if removed := await asyncio.to_thread(remove_stale, self._store):
             _log.info(f"removed {removed} uploads and deletions that were not finished")
 
 
 class DatasetUpload:
-    """One upload: files or an archive, a block at a time, then the check."""
+    """`next`: awaits the next part of what the client sends, see `arrivals`."""
 
     def __init__(
         self,
         incoming: IncomingDataset,
         name: str,
         options: dict[str, str],
-        settings: Settings,
-        stopping: asyncio.Future[Any],
         checks: HelperProcesses,
         claim: Claim,
         max_bytes: int,
+        arrival: Next[Any],
     ) -> None:
-        self._max_bytes = max_bytes
-        self._incoming = incoming
-        self._claim = claim
-        self._name = name
-        self._options = options
-        self._settings = settings
-        self._stopping = stopping
-        self._checks = checks
+        self.next = arrival
+        self._incoming, self._name, self._options = incoming, name, options
+        self._checks, self._claim, self._max_bytes = checks, claim, max_bytes
         self._block = bytearray()
         self._finishing = asyncio.Lock()
 
-    async def next(self, arriving: Awaitable[T]) -> T:
-        """The next part of what the client sends.
-
-        Raises DeadlineExceeded where it sends nothing for too long, Draining where the service stops.
-        """
-        return await arrival(arriving, self._settings.upload_idle_timeout_s, self._stopping)
-
     async def begin_file(self, name: str) -> None:
-        """Begin the file `name`. Raises DatasetInvalid, UploadTooLarge, StorageFull."""
         await self._flush()
         await asyncio.to_thread(self._incoming.begin_file, name)
 
     async def begin_archive(self) -> None:
-        """Begin the one archive. Raises StorageFull."""
         await asyncio.to_thread(self._incoming.begin_archive)
 
     async def write(self, data: bytes) -> None:
-        """Raises UploadTooLarge, StorageFull, DatasetInvalid."""
         self._block += data
         if len(self._block) >= _BLOCK_BYTES:
             await self._flush()
@@ -272,11 +233,7 @@ class DatasetUpload:
             await asyncio.to_thread(self._incoming.write, block)
 
     async def finish(self) -> tuple[DatasetRecord, bool]:
-        """Checks what was sent and makes it a dataset; its record, and whether it is new.
-
-        Raises DatasetInvalid with the file and the frame, InvalidArgument for an option, DatasetExists, UploadTooLarge,
-        MemoryExceeded, StorageFull, DeadlineExceeded.
-        """
+        """Checks what was sent and makes it a dataset; its record, and whether it is new. Raises DatasetInvalid."""
         async with self._finishing, self._claim.held():
             await self._flush()
             await asyncio.to_thread(self._incoming.finish)
@@ -317,70 +274,44 @@ class DatasetUpload:
             pass
 
 
-# Scenes that clients send and delete: they lie beside those that jobs make.
-
-
 SCENE_CHECK_TIMEOUT_S = 600.0
 MAX_IMPORTS = 4
 
 
 class SceneImports:
-    """Takes scene files in, whole or not at all, and removes them."""
+    """Takes scene files in, whole or not at all, onto a shelf of the store; and removes them."""
 
-    def __init__(
-        self,
-        store: SceneStore,
-        shelf: Shelf,
-        settings: Settings,
-        jobs: Jobs,
-        checks: HelperProcesses,
-        owners: Owners,
-        quotas: Quotas,
-    ) -> None:
-        """`shelf`: of the store, for what is imported."""
-        self._store = store
-        self._settings = settings
-        self._jobs = jobs
-        self._checks = checks
-        self._owners = owners
-        self._quotas = quotas
-        self._shelf = shelf
+    def __init__(self, store: SceneStore, shelf: Shelf, means: Means) -> None:
+        self._store, self._shelf, self._means = store, shelf, means
         self._slots = Slots(MAX_IMPORTS, "imports of scenes")
 
-    @contextlib.asynccontextmanager
+    @asynccontextmanager
     async def receive(self, name: str, blocks: AsyncIterator[bytes]) -> AsyncIterator[Path]:
-        """Writes what arrives into a file, to be given to `accept` within this context; it is removed at the end.
-
-        Raises InvalidArgument for a name that no scene can have, SceneExists, UploadTooLarge, QueueFull, LimitReached,
-        StorageFull.
-        """
+        """Writes what arrives into a file, to be given to `accept` within this context; it is removed at the end."""
         check_scene_name(name)
         await self._require_free(name)
+        most = self._means.settings.max_dataset_bytes
         with self._slots.one():
             claim = contextlib.ExitStack()
             try:
-                room, most = await self._quotas.room(self._jobs), self._settings.max_dataset_bytes
-                with storage_full("the scene"), room.to_blame(most):
-                    folder = await to_its_end(lambda: claim.enter_context(self._shelf.making()))
-                    received = folder / f"{name}{SUFFIX}"
-                    await self._write(received, blocks, room.at_most(most))
-                    yield received
+                async with self._means.quotas.room(self._means.jobs, most) as max_bytes:
+                    with storage_full("the scene"):
+                        folder = await to_its_end(lambda: claim.enter_context(self._shelf.making()))
+                        received = folder / f"{name}{SUFFIX}"
+                        await self._write(received, blocks, max_bytes)
+                        yield received
             finally:
                 await to_its_end(claim.close)
 
     async def accept(self, received: Path, name: str, *, private: bool) -> SceneHeader:
-        """Checks a file that was received and serves it as the scene `name`.
-
-        Cancelling it ends the check. Raises SceneFileInvalid, SceneExists, StorageFull, MemoryExceeded,
-        DeadlineExceeded.
-        """
+        """Checks a file that was received and serves it as the scene `name`; cancelling ends the check."""
         await self._require_free(name)
-        claim = Claim(self._owners, Kind.SCENE, name, received.parent.name, private=private)
+        claim = Claim(self._means.owners, Kind.SCENE, name, received.parent.name, private=private)
         async with claim.held():
             if not await claim.take(partial(self._is_there, name)):
                 await self._require_free(name)
                 raise SceneExists(f"another import makes a scene {name!r}: choose another name", field="scene")
-            await self._checks.run(
+            await self._means.checks.run(
                 check_scene_file,
                 {"path": str(received)},
                 what="checking the scene",
@@ -394,14 +325,11 @@ class SceneImports:
         return header
 
     async def delete(self, name: str) -> None:
-        """Removes the file of a scene. Raises SceneNotFound, and SceneReadOnly for one of the data folder."""
         await asyncio.to_thread(self._store.require, name)
-        async with self._owners.removing(Kind.SCENE, name):
+        async with self._means.owners.removing(Kind.SCENE, name):
             await asyncio.to_thread(self._delete, name)
 
     async def remove_stale(self) -> None:
-        """Removes what services that died during an import left."""
-
         await asyncio.to_thread(self._shelf.remove_abandoned)
 
     async def _write(self, path: Path, blocks: AsyncIterator[bytes], max_bytes: int) -> None:
@@ -426,14 +354,14 @@ class SceneImports:
         """Whether the scene of a claim is there, or is being made: in this order it is not missed."""
         if claim is not None and await asyncio.to_thread(self._shelf.is_making, claim):
             return True
-        if await self._jobs.makes_scene(name) is not None:
+        if await self._means.jobs.makes_scene(name) is not None:
             return True
         return await asyncio.to_thread(self._store.shelf_of, name) is not None
 
     async def _require_free(self, name: str) -> None:
         if await asyncio.to_thread(self._store.shelf_of, name) is not None:
             raise await asyncio.to_thread(self._exists, name)
-        if (maker := await self._jobs.makes_scene(name)) is not None:
+        if (maker := await self._means.jobs.makes_scene(name)) is not None:
             raise SceneExists(f"{maker} makes a scene {name!r}: choose another name", field="scene")
 
     def _exists(self, name: str) -> SceneExists:

@@ -90,7 +90,6 @@ def choose(accept: str, *, frames: int, outputs: int, dtype: str | None, lossles
 
 
 def choose_of_slice(accept: str) -> str:
-    """The media type of a slice: PNG, npy or raw numbers. Raises NotAcceptable."""
     return _best(accept, SLICE_TYPES, "a slice")[0]
 
 
@@ -99,8 +98,7 @@ def _best(accept: str, able: tuple[str, ...], what: str) -> tuple[str, MediaRang
     best = _liked(accept, able)
     if best is None:
         raise NotAcceptable(
-            f"Accept must allow a type that can hold {what}: {', '.join(able)}; got {accept!r}",
-            field="Accept",
+            f"Accept must allow a type that can hold {what}: {', '.join(able)}; got {accept!r}", field="Accept"
         )
     return best
 

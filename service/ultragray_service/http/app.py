@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import partial
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -56,7 +57,6 @@ _STATIC_PATH = f"{DOCS_PATH}/static"
 
 
 def add_docs(app: FastAPI) -> None:
-    """Serves the pages under /docs."""
     app.mount(_STATIC_PATH, StaticFiles(packages=[("fastapi_offline", "static")]))
     page = get_swagger_ui_html(
         openapi_url=str(app.openapi_url),
@@ -71,9 +71,6 @@ def add_docs(app: FastAPI) -> None:
     @app.get(DOCS_PATH, include_in_schema=False)
     async def docs() -> HTMLResponse:
         return page
-
-
-# The console: the page that a browser gets at /, from the files that `make console` built.
 
 
 CONSOLE_FOLDER = Path(__file__).resolve().parents[1] / "console"
@@ -141,12 +138,8 @@ def add_console(
 
 
 async def _file(request: Request, path: Path, media_type: str, token_origin: str | None) -> Response:
-    """Raises FileNotFoundError."""
-
-    async def whole() -> Response:
-        return Response(await asyncio.to_thread(path.read_bytes), media_type=media_type)
-
-    response = await revalidated(request, FileVersion.of(path).tag, whole)
+    content = partial(asyncio.to_thread, path.read_bytes)
+    response = await revalidated(request, FileVersion.of(path).tag, content, media_type)
     response.headers.update(_headers(request, token_origin))
     return response
 
@@ -172,9 +165,6 @@ class _Assets(StaticFiles):
         return response
 
 
-# The FastAPI application.
-
-
 _DESCRIPTION = """B-mode frames from trained 3D-Gaussian ultrasound scenes.
 
 Lengths are millimetres, angles degrees, quaternions w, x, y, z. Poses are rigid probe-to-scene transforms in
@@ -196,16 +186,13 @@ _SECURITY_SCHEMES = {
 # render comes first: its route is the one that must be found fast
 _ROUTERS = (
     rendering.router,
-    rendering.slices_router,
     streams.router,
     scenes.router,
-    scenes.files_router,
     geometry.router,
     geometry.registrations_router,
     datasets.router,
     datasets.comparison_router,
     jobs.router,
-    jobs.training_router,
     jobs.workers_router,
     streams.streams_router,
     health.statistics_router,
@@ -230,7 +217,6 @@ _WRITTEN: tuple[Any, ...] = (problems.Problem, FrameMessage, RefusalMessage)
 
 
 def create_app(service: Service) -> FastAPI:
-    """The application of one service."""
     app = _Application(
         title="UltraG-Ray",
         version=__version__,
@@ -268,7 +254,6 @@ def create_app(service: Service) -> FastAPI:
 
 
 def _token_origin(service: Service) -> str | None:
-    """Where the console gets people's tokens; None: they sign in with keys alone."""
     endpoints = None if service.tokens is None else service.tokens.issuer.endpoints
     if service.settings.oidc_client_id is None or endpoints is None:
         return None
@@ -277,7 +262,6 @@ def _token_origin(service: Service) -> str | None:
 
 
 def _asked_for(routes: Iterable[BaseRoute]) -> Iterator[tuple[str, str]]:
-    """The method and path of every route."""
     for route in routes:
         match route:
             case WebSocketRoute():
@@ -289,7 +273,6 @@ def _asked_for(routes: Iterable[BaseRoute]) -> Iterator[tuple[str, str]]:
 
 
 def _telemetry(tracing: Tracing | None) -> TelemetryConfig:
-    """A span for each request and stream of a service that is traced; Prometheus has the metrics."""
     config = TelemetryConfig(tracing=False, metrics=False, logs=False, operation_spans=False, auto_configure=False)
     if tracing is not None:
         config["tracing"] = True
@@ -299,8 +282,6 @@ def _telemetry(tracing: Tracing | None) -> TelemetryConfig:
 
 
 class _Application(FastAPI):
-    """FastAPI, with the schemas of what the routes read and answer by themselves."""
-
     def openapi(self) -> dict[str, Any]:
         if self.openapi_schema is None:
             document = super().openapi()

@@ -27,6 +27,7 @@ from ultragray.rendering.settings import FrameSettings, RenderSettings, registra
 from ultragray_service.core.poses import Pose, check_pose_count
 from ultragray_service.core.streams import MAX_TIMEOUT_MS, MAX_WINDOW, StreamMode
 from ultragray_service.errors import BodyTooLarge, UnsupportedMediaType
+from ultragray_service.http.dependencies import require_uncompressed
 from ultragray_service.http.problems import invalid_argument
 from ultragray_workers.jobs.kinds import KINDS, Specification
 from ultragray_workers.jobs.record import MAX_PRIORITY
@@ -57,7 +58,6 @@ class Apart:
 
 
 async def read_large(body: bytes, cls: type[T], apart: Apart | None, read_small: ReadSmall) -> T:
-    """The body, checked as a small one would be. Raises BodyTooLarge, InvalidArgument and what the classes raise."""
     if apart is not None and len(body) > apart.max_bytes:
         raise BodyTooLarge(f"this body must be at most {apart.max_bytes} bytes, got {len(body)}", field="body")
     return await asyncio.get_running_loop().run_in_executor(_READER, _read, body, cls, apart, read_small)
@@ -110,7 +110,6 @@ def _element(apart: Apart, index: int, value: Any, read_small: ReadSmall) -> Any
 
 
 def _is_small(value: Any, most: int) -> bool:
-    """Whether a value holds at most `most` others, and no long text."""
     waiting, values, characters = [value], 0, 0
     while waiting and values <= most and characters <= INLINE_BYTES:
         one = waiting.pop()
@@ -124,12 +123,8 @@ def _is_small(value: Any, most: int) -> bool:
     return not waiting and values <= most and characters <= INLINE_BYTES
 
 
-# JSON bodies, read as the classes of the contract.
-
-
 @cache
 def adapter_of(cls: Any) -> TypeAdapter[Any]:
-    """The reader and writer of a class's JSON."""
     return TypeAdapter(cls)
 
 
@@ -142,22 +137,17 @@ def body_schema(cls: Any, examples: dict[str, Any] | None = None) -> dict[str, A
 
 
 async def read_json_body(request: Request, cls: type[T], apart: Apart | None = None) -> T:
-    """The body, checked; `apart` says which part of it may be large.
-
-    Raises UnsupportedMediaType, BodyTooLarge, InvalidArgument and what the class raises.
-    """
+    """The body, checked; `apart` says which part of it may be large. Raises UnsupportedMediaType, BodyTooLarge."""
     content_type = request.headers.get("content-type", "application/json")
     media_type = content_type.partition(";")[0].strip().lower()
     if media_type != "application/json" and not media_type.endswith("+json"):
         raise UnsupportedMediaType(f"Content-Type must be application/json, got {content_type!r}", field="Content-Type")
-    if request.headers.get("content-encoding", "identity").lower() != "identity":
-        raise UnsupportedMediaType("the body must not be compressed", field="Content-Encoding")
+    require_uncompressed(request)
     body = await request.body()
     return read_json(body, cls) if len(body) <= INLINE_BYTES else await read_large(body, cls, apart, read_json)
 
 
 def read_json(text: str | bytes, cls: type[T]) -> T:
-    """The value of a JSON text. Raises InvalidArgument, and what the class raises."""
     try:
         kind: Any = cls
         value: T = adapter_of(kind).validate_json(text)
@@ -166,14 +156,10 @@ def read_json(text: str | bytes, cls: type[T]) -> T:
     return value
 
 
-# Bodies of HTTP and messages over a WebSocket: the contract's settings, with poses and the times of a request.
-
-
 _POSE_BYTES = 1024  # with room for indentation
 
 
 def _many_poses(limit: int) -> Apart:
-    """The part of a body that may be large."""
     return Apart(
         "poses",
         list,
@@ -202,7 +188,7 @@ class LocalizeBody(LocalizationSettings):
 
     image: str = described(
         "The frame in base64, rows along depth, columns across scan lines, not scan-converted: a PNG file, or, with "
-        "image_height and image_width, grey pixels of 8 bits, row by row.",
+        "image_height and image_width, grey pixels of 8 bits, row by row."
     )
     image_height: int | None = described("Of grey pixels.", None, low=1, high=MAX_IMAGE_SIDE, error=InvalidImageSize)
     image_width: int | None = described("Of grey pixels.", None, low=1, high=MAX_IMAGE_SIDE, error=InvalidImageSize)
@@ -298,7 +284,6 @@ def _again(item: Field[Any]) -> Any:
 
 
 def _without_arrays(annotation: Any) -> Any:
-    """An annotation without the arrays that it allows beside lists."""
     kinds = [one for one in get_args(annotation) if getattr(one, "__origin__", None) is not np.ndarray]
     if len(kinds) == len(get_args(annotation)):
         return annotation
@@ -333,14 +318,8 @@ class JobBody(Contract):
     private: bool = described("Whether others may not see it, nor the scene that it makes.", False)
 
 
-# The files of a multipart/form-data body, as they come.
-
-
 class FileParts:
-    """Turns blocks of the body into the names and the bytes of its files."""
-
     def __init__(self, content_type: str) -> None:
-        """Raises InvalidArgument for a Content-Type without a boundary."""
         _, parameters = parse_options_header(content_type)
         boundary = parameters.get(b"boundary", b"")
         self._events: list[str | bytes] = []
@@ -351,12 +330,11 @@ class FileParts:
             self._parser = MultipartParser(
                 boundary,
                 {
-                    "on_part_begin": self._begin_part,
-                    "on_header_field": self._take_header_name,
-                    "on_header_value": self._take_header_value,
+                    "on_header_field": lambda data, start, end: self._header_name.extend(data[start:end]),
+                    "on_header_value": lambda data, start, end: self._header_value.extend(data[start:end]),
                     "on_header_end": self._end_header,
                     "on_headers_finished": self._end_headers,
-                    "on_part_data": self._take_data,
+                    "on_part_data": lambda data, start, end: self._events.append(data[start:end]),
                     "on_end": self._end,
                 },
             )
@@ -366,10 +344,7 @@ class FileParts:
             raise InvalidArgument("Content-Type multipart/form-data must have a boundary", field="Content-Type")
 
     def feed(self, block: bytes) -> list[str | bytes]:
-        """The content of the block, in order: the name of each file (str), then its bytes.
-
-        Raises InvalidArgument for a damaged body and for a part that is no file.
-        """
+        """The names of files (str) and their bytes in the block. Raises InvalidArgument for a damaged body."""
         try:
             self._parser.write(block)
         except FormParserError as error:
@@ -378,18 +353,8 @@ class FileParts:
         return events
 
     def finish(self) -> None:
-        """Raises InvalidArgument where the body ended too early."""
         if not self._complete:
             raise InvalidArgument("the body is truncated: its last boundary is missing", field="body")
-
-    def _begin_part(self) -> None:
-        self._disposition = b""
-
-    def _take_header_name(self, data: bytes, start: int, end: int) -> None:
-        self._header_name += data[start:end]
-
-    def _take_header_value(self, data: bytes, start: int, end: int) -> None:
-        self._header_value += data[start:end]
 
     def _end_header(self) -> None:
         if self._header_name.lower() == b"content-disposition":
@@ -399,6 +364,7 @@ class FileParts:
 
     def _end_headers(self) -> None:
         _, parameters = parse_options_header(self._disposition)
+        self._disposition = b""
         name = parameters.get(b"filename")
         if name is None:
             field = parameters.get(b"name", b"").decode(errors="replace")[:80]
@@ -407,9 +373,6 @@ class FileParts:
                 field="body",
             )
         self._events.append(name.decode(errors="replace"))
-
-    def _take_data(self, data: bytes, start: int, end: int) -> None:
-        self._events.append(data[start:end])
 
     def _end(self) -> None:
         self._complete = True

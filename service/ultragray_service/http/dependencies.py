@@ -4,17 +4,20 @@ from __future__ import annotations
 
 import asyncio
 import time
-from collections.abc import Awaitable, Callable, Coroutine, Mapping
+from collections.abc import AsyncIterator, Awaitable, Callable, Coroutine, Mapping
 from typing import Annotated, Any, TypeVar
 
-from fastapi import Depends, Path
+import numpy as np
+from fastapi import Depends, Path, Query
 from starlette.requests import ClientDisconnect, HTTPConnection, Request
 from starlette.responses import Response
 from starlette.types import Receive
 
+from ultragray_service.core.uploads import Next
+from ultragray_service.errors import UnsupportedMediaType
 from ultragray_service.http.problems import PROBLEM_TYPE, Problem
 from ultragray_service.service import Service
-from ultragray_workers.errors import DeadlineExceeded
+from ultragray_workers.errors import DeadlineExceeded, UploadTooLarge
 
 
 async def _service(connection: HTTPConnection) -> Service:  # async: FastAPI runs plain functions in a thread
@@ -34,10 +37,7 @@ SCENE_NAME = {"description": _NAME_MEANS, "schema": {"type": "string", "title": 
 
 
 def problems(*statuses: int, members: Mapping[str, type] | None = None) -> dict[int | str, dict[str, Any]]:
-    """The documentation of error answers, for `responses=`; `members`: of the document, beside those of Problem.
-
-    Whoever needs a key (401) has limits (429).
-    """
+    """The documentation of error answers; `members`: more of the document. Who needs a key (401) has limits (429)."""
     statuses = tuple(sorted({*statuses, 429})) if 401 in statuses else statuses
     schema: dict[str, Any] = {"$ref": _REFERENCE.format(Problem.__name__)}
     if members:
@@ -71,9 +71,6 @@ _MEANINGS = {
 }
 
 
-# Work that is abandoned when its client goes away or its time is up.
-
-
 T = TypeVar("T")
 
 
@@ -98,31 +95,60 @@ async def finish_or_abandon(work: Coroutine[Any, Any, T], receive: Receive, dead
         leaving.cancel()
 
 
+async def blocks_of(request: Request, arrival: Next[Any]) -> AsyncIterator[bytes]:
+    """The body as it comes. Raises ClientDisconnect, and what `arrival` raises, see `arrivals`."""
+    more = True
+    while more:
+        message = await arrival(request.receive())
+        if message["type"] == "http.disconnect":
+            raise ClientDisconnect
+        more = message.get("more_body", False)
+        yield message.get("body", b"")
+
+
+def check_upload(request: Request, limit_bytes: int, what: str) -> None:
+    """Raise UploadTooLarge where an upload announces too many bytes, UnsupportedMediaType where it is compressed."""
+    require_uncompressed(request)
+    announced = request.headers.get("content-length", "")
+    if announced.isdigit() and int(announced) > limit_bytes:
+        raise UploadTooLarge(f"{what} may have at most {limit_bytes} bytes, {announced} were announced", field="body")
+
+
+def require_uncompressed(request: Request) -> None:
+    if request.headers.get("content-encoding", "identity").lower() != "identity":
+        raise UnsupportedMediaType("the body must not be compressed", field="Content-Encoding")
+
+
 async def _disconnected(receive: Receive) -> None:
     while (await receive())["type"] != "http.disconnect":
         pass
 
 
-# Answers that a client keeps and asks about: sent again only where they changed.
+Answers = dict[int | str, dict[str, Any]]
+BINARY = {"schema": {"type": "string", "format": "binary"}}
+NOT_MODIFIED: Answers = {304: {"description": "It is as the client has it (If-None-Match)."}}
+PageToken = Annotated[str, Query(description="next_page_token of the page before.")]
 
 
-NOT_MODIFIED = "It is as the client has it (If-None-Match)."
+def answer(description: str, *media_types: str, headers: Mapping[str, str] | None = None) -> Answers:
+    """The documentation of an answer of bytes, with its headers and their meanings."""
+    document: dict[str, Any] = {"description": description, "content": dict.fromkeys(media_types, BINARY)}
+    if headers is not None:
+        document["headers"] = {
+            name: {"description": text, "schema": {"type": "string"}} for name, text in headers.items()
+        }
+    return {200: document}
 
 
-async def revalidated(request: Request, version: str, make: Callable[[], Awaitable[Response]]) -> Response:
-    """What `make` answers, with `version` as its ETag; 304 without asking it where the client has that version.
-
-    `version` names the content: letters, digits and '-'. A Cache-Control of the answer stays.
-    """
+async def revalidated(
+    request: Request, version: str, make: Callable[[], Awaitable[bytes]], media_type: str
+) -> Response:
+    """What `make` gives, with `version` (letters, digits, '-') as ETag; 304 where the client has that version."""
     tag = f'"{version}"'
     known = [known.strip().removeprefix("W/") for known in request.headers.get("if-none-match", "").split(",")]
-    answer = Response(status_code=304) if tag in known else await make()
-    answer.headers["ETag"] = tag
-    answer.headers.setdefault("Cache-Control", "private, no-cache")
-    return answer
-
-
-# The examples of the documentation. They work when pasted against the demo scene.
+    response = Response(status_code=304) if tag in known else Response(await make(), media_type=media_type)
+    response.headers.update({"ETag": tag, "Cache-Control": "private, no-cache"})
+    return response
 
 
 DEMO_SCENE = "demo"
@@ -132,35 +158,15 @@ DEMO_QUATERNION = {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
 _POSE = {"position_mm": DEMO_POSITION_MM, "quaternion": DEMO_QUATERNION}
 
 RENDER_EXAMPLES: dict[str, Any] = {
-    "one frame": {
-        "summary": "One frame, by position and quaternion (image/png by default)",
-        "value": {"pose": _POSE},
-    },
+    "one frame": {"summary": "One frame, by position and quaternion (image/png by default)", "value": {"pose": _POSE}},
     "matrix": {
         "summary": "One small frame, by matrix",
-        "value": {
-            "pose": {
-                "matrix": [
-                    [1.0, 0.0, 0.0, DEMO_POSITION_MM["x"]],
-                    [0.0, 1.0, 0.0, DEMO_POSITION_MM["y"]],
-                    [0.0, 0.0, 1.0, DEMO_POSITION_MM["z"]],
-                    [0.0, 0.0, 0.0, 1.0],
-                ]
-            },
-            "height": 256,
-            "width": 256,
-        },
+        "value": {"pose": {"matrix": np.eye(4).tolist()}, "height": 256, "width": 256},
     },
     "batch": {
         "summary": "Two poses 2 mm apart, two outputs (application/x-npz by default)",
         "value": {
-            "poses": [
-                _POSE,
-                {
-                    "position_mm": {**DEMO_POSITION_MM, "y": DEMO_POSITION_MM["y"] + 2.0},
-                    "quaternion": DEMO_QUATERNION,
-                },
-            ],
+            "poses": [_POSE, {**_POSE, "position_mm": {**DEMO_POSITION_MM, "y": 2.0}}],
             "outputs": ["bmode", "transmittance"],
         },
     },
@@ -199,5 +205,5 @@ SLICE_EXAMPLES: dict[str, Any] = {
     "a plane parallel to the skin": {
         "summary": "10 mm deep, 50 x 40 mm (image/png by default)",
         "value": {"origin_mm": [-25, -20, 10], "right": [1, 0, 0], "down": [0, 1, 0], "size_mm": [50, 40]},
-    },
+    }
 }

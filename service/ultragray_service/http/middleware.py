@@ -34,8 +34,7 @@ class RequestContext:
     """Outermost: gives each request its id, logs and counts the answer, and answers what nobody caught."""
 
     def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
-        self._app = app
-        self._metrics = metrics
+        self._app, self._metrics = app, metrics
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] == "websocket":
@@ -87,9 +86,7 @@ class CheckOrigin:
     """Keeps pages of other sites away: from everything where no key is asked for, else from WebSockets."""
 
     def __init__(self, app: ASGIApp, guard: Guard, origins: Origins) -> None:
-        self._app = app
-        self._guard = guard
-        self._origins = origins
+        self._app, self._guard, self._origins = app, guard, origins
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         try:
@@ -113,15 +110,10 @@ class CheckOrigin:
 
 
 class Authorize:
-    """Finds out who asks, and whether they may, and not too often; keeps account of it.
-
-    Ends what goes on when its key counts no more.
-    """
+    """Finds out who asks and whether they may, keeps account of it, and ends it when the key counts no more."""
 
     def __init__(self, app: ASGIApp, service: Service, rules: HttpRules) -> None:
-        self._app = app
-        self._service = service
-        self._rules = rules
+        self._app, self._service, self._rules = app, service, rules
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         method = WEBSOCKET if scope["type"] == "websocket" else scope["method"]
@@ -145,7 +137,6 @@ class Authorize:
                 await send({"type": "websocket.close", "code": _POLICY_VIOLATION, "reason": error.reason})
 
     async def _permitted(self, operation: Operation, target: str, scope: Scope, receive: Receive, send: Send) -> None:
-        """Raises Unauthenticated, RateLimited, PermissionDenied, JobNotFound."""
         service, headers = self._service, Headers(scope=scope)
         address, port = scope.get("client") or ("", 0)
         keys = [*headers.getlist("x-api-key"), *credentials_of_subprotocols(scope.get("subprotocols", ()))]
@@ -160,14 +151,10 @@ class Authorize:
 
 
 class LimitBody:
-    """Refuses bodies over the limit, whether they announce their length or come in chunks.
-
-    Uploads go straight to a disk and count for themselves.
-    """
+    """Refuses bodies over the limit, announced or not; uploads go straight to a disk and count for themselves."""
 
     def __init__(self, app: ASGIApp, limit_bytes: int) -> None:
-        self._app = app
-        self._limit_bytes = limit_bytes
+        self._app, self._limit_bytes = app, limit_bytes
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         if scope["type"] != "http" or (scope["method"] == "PUT" and scope["path"].startswith(_UPLOAD_PATHS)):

@@ -62,13 +62,11 @@ def problem_response(
 
 
 async def answer_ultragray_error(request: Request, error: Exception) -> Response:
-    """Exception handler of UltragrayError."""
     assert isinstance(error, UltragrayError)
     return problem_response(error)
 
 
 async def answer_http_exception(request: Request, error: Exception) -> Response:
-    """Exception handler of what the framework raises: unknown routes and methods."""
     assert isinstance(error, HTTPException)
     if error.status_code == 405:
         allowed = ", ".join(_methods_of_path(request))
@@ -90,7 +88,6 @@ def _methods_of_path(request: Request) -> list[str]:
 
 
 async def answer_validation_error(request: Request, error: Exception) -> Response:
-    """Exception handler of parameters that the framework checks."""
     assert isinstance(error, RequestValidationError)
     first = error.errors()[0]
     return problem_response(invalid_argument({**first, "loc": first["loc"][1:]}))  # without "query" or "path"

@@ -11,7 +11,6 @@ import contextlib
 import socket
 import ssl
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
@@ -32,7 +31,7 @@ from ultragray_service.listening import Acceptor, Connections, Patience, Place
 from ultragray_service.settings import Settings
 from ultragray_service.telemetry.logs import choose_request_id, request_id
 from ultragray_service.telemetry.metrics import Metrics
-from ultragray_service.tls.server import CertificateWatch
+from ultragray_service.tls import CertificateWatch
 
 HAND_OVER = "ultragray.hand_over"  # of an ASGI message with bytes: to return once the client has taken it
 _FRAGMENTS = 32  # of a message that is handed over
@@ -114,25 +113,13 @@ class PromptWebSocket(WebSocketsSansIOProtocol):
         self.transport.write(b"".join(self.conn.data_to_send()))
 
 
-# HTTP connections with bounds: on what is read before it is parsed, on time, and on requests that pile up.
-
-
 MAX_PIPELINED = 32
 MAX_TARGET_BYTES = 16 * 1024
 _MAX_UNWANTED_BYTES = 2**20  # of a body whose request was answered already: a longer one costs the connection
 _LINGER_S = 1.0  # in which a client that still sends can read its answer
 
 
-@dataclass(frozen=True)
-class HttpLimits:
-    """The bounds of each connection. `on_refused` is told of each refusal."""
-
-    max_header_bytes: int
-    max_headers: int
-    header_timeout_s: float
-    min_bytes_per_s: float
-    transfer_patience_s: float
-    on_refused: Callable[[UltragrayError], None]
+Refused = Callable[[UltragrayError], bytes]  # the answer to a refused request, which it counts
 
 
 class BoundedHttp(HttpToolsProtocol):
@@ -142,11 +129,10 @@ class BoundedHttp(HttpToolsProtocol):
     else brings neither a head to its end nor a body on. Trailers are bounded like a head, and thrown away.
     """
 
-    def __init__(self, *arguments: Any, limits: HttpLimits, place: Place, **options: Any) -> None:
+    def __init__(self, *arguments: Any, limits: Settings, refused: Refused, place: Place, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self.ws_protocol_class: Any = partial(_BoundedWebSocket, limits=limits, place=place)
-        self._limits = limits
-        self._place = place
+        self.ws_protocol_class: Any = partial(_BoundedWebSocket, limits=limits, refused=refused, place=place)
+        self._limits, self._refused, self._place = limits, refused, place
         self._in_head = True
         self._head_since: float | None = self.loop.time()
         self._looked_at = self.loop.time()
@@ -163,7 +149,7 @@ class BoundedHttp(HttpToolsProtocol):
         super().connection_made(_Closing(transport, self._linger))  # type: ignore[arg-type]  # it has all that a transport has
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._place.leave()
+        self._place.close()
         super().connection_lost(exc)
 
     def data_received(self, data: bytes) -> None:
@@ -237,11 +223,9 @@ class BoundedHttp(HttpToolsProtocol):
         raise ValueError  # the parser hands over to `send_400_response`
 
     def send_400_response(self, msg: str) -> None:
-        """Answers where the parser stopped."""
         self._refuse(self._refused_for or RequestMalformed("this is no HTTP request that can be read"))
 
     def look(self, now: float) -> None:
-        """Cuts the connection where the client has been too slow."""
         elapsed_s, self._looked_at = now - self._looked_at, now
         body_bytes, self._body_bytes = self._body_bytes, 0
         limits = self._limits
@@ -276,8 +260,7 @@ class BoundedHttp(HttpToolsProtocol):
             cycle.message_event.set()
         self.pipeline.clear()
         if can_answer:
-            self._limits.on_refused(error)
-            self.transport.write(refusal_bytes(error, self.server_state.default_headers))
+            self.transport.write(self._refused(error))
         self._end()
 
     def _linger(self) -> bool:
@@ -298,14 +281,10 @@ class BoundedHttp(HttpToolsProtocol):
 
 
 class _Closing:
-    """A transport that drops what is written once it closes: the answers under way hear of that a moment later.
-
-    It closes later where `linger` says so.
-    """
+    """A transport that drops what is written once it closes, and closes later where `linger` says so."""
 
     def __init__(self, transport: Any, linger: Callable[[], bool]) -> None:
-        self._transport = transport
-        self._linger = linger
+        self._transport, self._linger = transport, linger
         self._has_ended = False
 
     def __getattr__(self, name: str) -> Any:
@@ -328,17 +307,14 @@ class _Closing:
 
 
 class _BoundedWebSocket(PromptWebSocket):
-    """What a connection becomes by an upgrade."""
-
-    def __init__(self, *arguments: Any, limits: HttpLimits, place: Place, **options: Any) -> None:
+    def __init__(self, *arguments: Any, limits: Settings, refused: Refused, place: Place, **options: Any) -> None:
         super().__init__(*arguments, **options)
-        self._place = place
-        self._limits = limits
+        self._refused, self._place = refused, place
         self._looked_at = self.loop.time()
         self._sending = _Sending(limits)
 
     def connection_lost(self, exc: Exception | None) -> None:
-        self._place.leave()
+        self._place.close()
         super().connection_lost(exc)
 
     def handle_connect(self, event: Request) -> None:
@@ -347,28 +323,23 @@ class _BoundedWebSocket(PromptWebSocket):
         except InvalidHandshake:
             error = RequestMalformed("the headers are no handshake of a WebSocket of version 13 (RFC 6455)")
             self.handshake_initiated = self.handshake_complete = self.close_sent = True
-            self._limits.on_refused(error)
-            self.transport.write(refusal_bytes(error, self.default_headers))
+            self.transport.write(self._refused(error))
             self.transport.close()
         else:
             super().handle_connect(event)
 
     def look(self, now: float) -> None:
-        """Cuts the connection where the client does not take what is sent."""
         elapsed_s, self._looked_at = now - self._looked_at, now
         if self._sending.is_stalled(self.transport, elapsed_s):
             self.transport.abort()
 
 
 class _Sending:
-    """Whether a client takes what is sent."""
-
-    def __init__(self, limits: HttpLimits) -> None:
+    def __init__(self, limits: Settings) -> None:
         self._patience = Patience(limits.min_bytes_per_s, limits.transfer_patience_s)
         self._waiting_bytes = 0
 
     def is_stalled(self, transport: asyncio.Transport, elapsed_s: float) -> bool:
-        """Whether it has been too slow, `elapsed_s` after the last question."""
         before, self._waiting_bytes = self._waiting_bytes, transport.get_write_buffer_size()
         if not before or not self._waiting_bytes or self._waiting_bytes > before:  # more comes when there is room only
             self._patience.renew()
@@ -385,7 +356,6 @@ def _may_be_long(headers: list[tuple[bytes, bytes]]) -> bool:
 
 
 def refusal_bytes(error: UltragrayError, default_headers: list[tuple[bytes, bytes]]) -> bytes:
-    """The answer to a request that never reached the application."""
     token = request_id.set(choose_request_id(None))
     try:
         response = problem_response(error, {"Connection": "close", "X-Request-Id": request_id.get()})
@@ -394,9 +364,6 @@ def refusal_bytes(error: UltragrayError, default_headers: list[tuple[bytes, byte
     headers = [*default_headers, *response.raw_headers]
     lines = [STATUS_LINE[response.status_code], *(b"%s: %s\r\n" % header for header in headers), b"\r\n"]
     return b"".join([*lines, bytes(response.body)])
-
-
-# uvicorn, with connections of ours.
 
 
 MAX_STREAM_MESSAGE_BYTES = 2**16  # of a client, on a WebSocket
@@ -409,7 +376,6 @@ class HttpServer(uvicorn.Server):
     def __init__(
         self, app: ASGIApp, settings: Settings, metrics: Metrics, certificates: CertificateWatch | None, flush_s: float
     ) -> None:
-        """`flush_s`: how long the last answers may take after a stop."""
         super().__init__(
             uvicorn.Config(
                 app,
@@ -426,37 +392,19 @@ class HttpServer(uvicorn.Server):
                 timeout_graceful_shutdown=int(flush_s),
             )
         )
-        self._settings = settings
-        self._metrics = metrics
-        self._certificates = certificates
-        self._limits = HttpLimits(
-            max_header_bytes=settings.max_header_bytes,
-            max_headers=settings.max_headers,
-            header_timeout_s=settings.header_timeout_s,
-            min_bytes_per_s=settings.min_bytes_per_s,
-            transfer_patience_s=settings.transfer_patience_s,
-            on_refused=self._count,
-        )
+        self._settings, self._metrics, self._certificates = settings, metrics, certificates
 
     async def startup(self, sockets: list[socket.socket] | None = None) -> None:
         """Begins to accept. uvicorn's own would not know whom it accepts."""
-        connections = Connections(self._settings.max_connections, self._settings.max_connections_per_address)
-        servers: list[Any] = [
-            Acceptor(
-                listener,
-                connections,
-                self._protocol,
-                refusal=self._refusal,
-                send_patience_s=self._settings.transfer_patience_s,
-                tls=self._tls,
-            )
-            for listener in sockets or ()
-        ]
+        limits, refusal = self._settings, self._refusal
+        connections = Connections(limits.max_connections, limits.max_connections_per_address)
+        protocol = partial(BoundedHttp, self.config, self.server_state, {}, limits=limits, refused=refusal)
+        means: dict[str, Any] = {"refusal": refusal, "send_patience_s": limits.transfer_patience_s, "tls": self._tls}
+        servers: list[Any] = [Acceptor(one, connections, protocol, **means) for one in sockets or ()]
         self.servers = servers
         self.started = True
 
     async def on_tick(self, counter: int) -> bool:
-        """Every 0.1 s."""
         if counter % _TICKS_PER_LOOK == 0:
             now = asyncio.get_running_loop().time()
             connections: set[Any] = self.server_state.connections
@@ -471,12 +419,6 @@ class HttpServer(uvicorn.Server):
     def _tls(self) -> ssl.SSLContext | None:
         return None if self._certificates is None else self._certificates.current.http_context
 
-    def _protocol(self, place: Place) -> BoundedHttp:
-        return BoundedHttp(self.config, self.server_state, {}, limits=self._limits, place=place)
-
     def _refusal(self, error: UltragrayError) -> bytes:
-        self._count(error)
-        return refusal_bytes(error, self.server_state.default_headers)
-
-    def _count(self, error: UltragrayError) -> None:
         self._metrics.count_request("http", "refused", str(statuses_of(error).http), 0.0)
+        return refusal_bytes(error, self.server_state.default_headers)

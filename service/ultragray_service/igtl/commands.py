@@ -52,7 +52,6 @@ def pack_command(command: Command) -> bytes:
 
 
 def unpack_string(content: bytes) -> str:
-    """The text of a STRING. Raises IgtlMessageInvalid."""
     if len(content) < _STRING.size:
         raise IgtlMessageInvalid(f"STRING must hold {_STRING.size} bytes or more, got {len(content)}", field="body")
     _, length = _STRING.unpack_from(content)
@@ -75,72 +74,47 @@ def _text(type_name: str, data: bytes, length: int) -> str:
 
 
 # The XML of commands and replies, as PLUS has it.
-#
 # <Command Name="SetUsParameter"><Parameter Name="DepthMm" Value="40"/></Command> <CommandReply Name="SetUsParameter"
 # Status="SUCCESS" Message="…"><Parameter Name="DepthMm" Success="true"/>…
-
-
 MAX_COMMAND_BYTES = 4096
 MAX_PARAMETERS = 32  # of one command
 
 
 @dataclass(frozen=True)
-class Request:
-    """A command: its name, and its parameters with the values that they are given."""
-
-    name: str
-    parameters: Mapping[str, str | None]
-
-
-@dataclass(frozen=True)
-class Outcome:
-    """The end of one parameter: an error, or else the value that was asked for."""
-
-    parameter: str
-    error: str = ""
-    value: str | None = None
-
-
-@dataclass(frozen=True)
 class Reply:
-    """The reply to a command. It failed where it has an error, or where a parameter has one."""
+    """The reply to a command, which failed where it has an error, or where a parameter has one."""
 
     name: str
-    message: str = ""
     error: str = ""
-    outcomes: tuple[Outcome, ...] = ()
+    outcomes: tuple[tuple[str, str, str | None], ...] = ()  # parameters, errors, else the values that were asked for
 
     @property
     def errors(self) -> str:
-        """Every error, in one text; empty: success."""
-        return "; ".join(filter(None, [self.error, *(outcome.error for outcome in self.outcomes)]))
-
-    @property
-    def status(self) -> str:
-        return "FAIL" if self.errors else "SUCCESS"
+        return "; ".join(filter(None, [self.error, *(error for _, error, _ in self.outcomes)]))
 
     @property
     def xml(self) -> str:
-        root = ElementTree.Element("CommandReply", Name=_plain(self.name), Status=self.status)
-        root.set("Message", _plain(self.errors or self.message))
-        if self.errors:
-            root.set("Error", _plain(self.errors))
-        for outcome in self.outcomes:
-            found = ElementTree.SubElement(root, "Parameter", Name=outcome.parameter)
-            found.set("Success", "false" if outcome.error else "true")
-            if outcome.value is not None:
-                found.set("Value", _plain(outcome.value))
+        errors = self.errors
+        root = ElementTree.Element("CommandReply", Name=_plain(self.name), Status="FAIL" if errors else "SUCCESS")
+        root.set("Message", _plain(errors or f"{self.name} completed"))
+        if errors:
+            root.set("Error", _plain(errors))
+        for parameter, error, value in self.outcomes:
+            found = ElementTree.SubElement(root, "Parameter", Name=parameter)
+            found.set("Success", "false" if error else "true")
+            if value is not None:
+                found.set("Value", _plain(value))
         return ElementTree.tostring(root, encoding="unicode")
 
     @property
     def metadata(self) -> dict[str, str]:
         """The reply as messages of version 2 carry it beside the XML."""
-        found = {one.parameter: "FAIL" if one.error else one.value or "SUCCESS" for one in self.outcomes}
-        return {**found, "Status": self.status, **({"Error": self.errors} if self.errors else {})}
+        found = {parameter: "FAIL" if error else value or "SUCCESS" for parameter, error, value in self.outcomes}
+        return {**found, **({"Status": "FAIL", "Error": self.errors} if self.errors else {"Status": "SUCCESS"})}
 
 
-def read_request(name: str, text: str) -> Request:
-    """The command in an XML text. `name` is its name as the message has it; empty: the text has it.
+def read_request(name: str, text: str) -> tuple[str, Mapping[str, str | None]]:
+    """The command of an XML text: its name, which the message may have told, and the values of its parameters.
 
     Raises IgtlMessageInvalid for a text that is none. It may define no entities, which could grow without bounds.
     """
@@ -158,7 +132,7 @@ def read_request(name: str, text: str) -> Request:
         if parameter in parameters:
             raise _invalid(f"each parameter may be named once, got {shown(parameter)} twice")
         parameters[parameter] = element.get("Value")
-    return Request(name or own_name, parameters)
+    return name or own_name, parameters
 
 
 def _root(text: str) -> ElementTree.Element:
@@ -185,34 +159,25 @@ def _plain(text: str) -> str:
     return "".join(one if one.isprintable() else "?" for one in text)
 
 
-# Tools in the frames of one connection: those that stay, and those that a device of the client moves.
-
-
 _DEVICE, _FRAME = "device", "frame"
 _EXAMPLE = '[{"kind": "needle", "tip_mm": [0, 0, 0], "hub_mm": [0, 0, -120], "device": "NeedleToReference"}]'
 
 
 @dataclass(frozen=True)
 class ClientTool:
-    """A tool as a client set it."""
-
     tool: Tool
     device: str | None  # that moves it, and whose frame its points are in; None: it stays
 
 
 @dataclass(frozen=True, eq=False)
 class ClientTools:
-    """The tools of a client, and the poses that its devices sent last."""
-
     tools: tuple[ClientTool, ...] = ()
     poses: Mapping[str, FloatArray] = field(default_factory=dict)  # [4, 4] mm, exact, by device
 
     def are_moved_by(self, device: str) -> bool:
-        """Whether a device moves any of them."""
         return any(one.device == device for one in self.tools)
 
     def moved(self, device: str, pose: FloatArray) -> ClientTools:  # [4, 4] mm, exact
-        """The tools with a new pose of a device that moves some of them."""
         return replace(self, poses={**self.poses, device: pose})
 
     def placed(self, registration: Registration | None) -> tuple[Tool, ...]:
@@ -231,10 +196,7 @@ class ClientTools:
 
 
 def read_tools(text: str, before: ClientTools) -> ClientTools:
-    """The tools of a JSON text; devices that moved tools of `before` are where they were.
-
-    Raises InvalidArgument, naming the tool.
-    """
+    """The tools of a JSON text; devices of `before` are where they were. Raises InvalidArgument, naming the tool."""
     try:
         documents = json.loads(text)
     except (ValueError, RecursionError):
@@ -246,11 +208,6 @@ def read_tools(text: str, before: ClientTools) -> ClientTools:
     tools = tuple(_read(number, one) for number, one in enumerate(documents))
     devices = {one.device for one in tools}
     return ClientTools(tools, {device: pose for device, pose in before.poses.items() if device in devices})
-
-
-def tools_text(tools: ClientTools) -> str:
-    """The tools as `read_tools` takes them."""
-    return json.dumps([_document(one) for one in tools.tools])
 
 
 def _read(number: int, document: Any) -> ClientTool:
@@ -276,9 +233,6 @@ def _document(one: ClientTool) -> dict[str, Any]:
     return {**{name: value for name, value in document.items() if name != _FRAME}, _DEVICE: one.device}
 
 
-# The scanner of one connection: the settings of its frames under the names that PLUS has for them.
-
-
 _NO_GAIN_PERCENT = 50.0
 _DB_A_PERCENT = FRAME_RANGE_DB / 100.0
 _SCENE, _PROBE, _REGISTRATION, _TOOLS = "Scene", "Probe", "Registration", "Tools"
@@ -286,8 +240,6 @@ _SCENE, _PROBE, _REGISTRATION, _TOOLS = "Scene", "Probe", "Registration", "Tools
 
 @dataclass(frozen=True)
 class _DisplayParameter:
-    """A parameter that is a field of `Display`."""
-
     field: str
     read: Callable[[str], Any]
     write: Callable[[Any], str]
@@ -337,20 +289,13 @@ class Scanner:
     """The setup of the frames of one connection, and the scene of its devices that name none."""
 
     def __init__(self, scenes: SceneChooser, registrations: Registrations, setup: Setup) -> None:
-        self.setup = setup
-        self._scenes = scenes
-        self._registrations = registrations
+        self.setup, self._scenes, self._registrations = setup, scenes, registrations
 
     def move(self, device: str, pose: FloatArray) -> None:  # [4, 4] mm, exact
-        """Takes the pose of a device that moves tools, for the frames to come."""
         self.setup = replace(self.setup, tools=self.setup.tools.moved(device, pose))
 
     async def set(self, parameter: str, value: str) -> None:
-        """Sets a parameter for the frames to come.
-
-        Raises InvalidArgument for an unknown parameter and for a value that cannot be, InvalidProbe, SceneNotFound,
-        RegistrationNotFound.
-        """
+        """Sets a parameter for the frames to come. Raises InvalidArgument, SceneNotFound, RegistrationNotFound."""
         if parameter == _SCENE:
             await self._scenes.prefer(value)
         elif parameter == _REGISTRATION:
@@ -370,24 +315,23 @@ class Scanner:
         self.setup = replace(self.setup, settings=replace(self.setup.settings, **values))
 
     async def get(self, parameter: str) -> str:
-        """The value of a parameter. Raises InvalidArgument for an unknown one and for one that is not set,
-        SceneNotFound where no scene is chosen."""
+        """Raises InvalidArgument for a parameter that is unknown or not set, SceneNotFound where none is chosen."""
         if parameter == _SCENE:
             return await self._scenes.choose("")
         if parameter == _REGISTRATION:
             return self.setup.registration or ""
         if parameter == _TOOLS:
-            return tools_text(self.setup.tools)
-        settings = self.setup.settings
-        write: Callable[[Any], str]
+            return json.dumps([_document(one) for one in self.setup.tools.tools])
         if parameter == _PROBE:
-            value, write = settings.probe, _probe_text
+            probe = self.setup.settings.probe
+            text = None if probe is None else json.dumps(to_dict(probe, with_none=False))
         else:
             of_display = _of_display(parameter)
-            value, write = getattr(settings.display or AS_RENDERED, of_display.field), of_display.write
-        if value is None:
+            value = getattr(self.setup.settings.display or AS_RENDERED, of_display.field)
+            text = None if value is None else of_display.write(value)
+        if text is None:
             raise InvalidArgument("is not set: frames have that of their scene")
-        return write(value)
+        return text
 
 
 def _of_display(parameter: str) -> _DisplayParameter:
@@ -404,22 +348,12 @@ def _probe(text: str) -> Probe:
     return from_dict(Probe, document)
 
 
-def _probe_text(probe: Probe) -> str:
-    return json.dumps(to_dict(probe, with_none=False))
-
-
-# Answers the commands of one connection.
-
-
 _ASKS, _ANSWERS = "CMD_", "ACK_"  # beginnings of the names of devices whose STRING is a command, and a reply
 _SET, _GET = "SetUsParameter", "GetUsParameter"
 
 
 async def answer(scanner: Scanner, message: Message) -> Message:
-    """The reply to a COMMAND, or to a STRING of a device CMD_…; it says what was wrong with the command, if so.
-
-    Raises IgtlMessageInvalid where the message holds no command.
-    """
+    """The reply to a COMMAND, or to a STRING of a device CMD_…, also to a wrong one. Raises IgtlMessageInvalid."""
     if message.type_name == "COMMAND":
         command = unpack_command(message.content)
         reply = await _reply(scanner, command.name, command.text)
@@ -438,34 +372,28 @@ async def answer(scanner: Scanner, message: Message) -> Message:
 
 async def _reply(scanner: Scanner, name: str, text: str) -> Reply:
     try:
-        request = read_request(name, text)
-        return await _obey(scanner, request)
+        asked, parameters = read_request(name, text)
+        known = {name.casefold(): name for name in (_SET, _GET)}
+        if (command := known.get(asked.casefold())) is None:
+            raise _invalid(f"the command must be {_SET} or {_GET}, got {shown(asked)}")
+        if not parameters:
+            raise _invalid(f'{command} must hold an element <Parameter Name="…"/> or more')
     except IgtlMessageInvalid as error:
-        return Reply(name, error=error.detail)
-
-
-async def _obey(scanner: Scanner, request: Request) -> Reply:
-    """Raises IgtlMessageInvalid for an unknown command and for one without parameters."""
-    known = {name.casefold(): name for name in (_SET, _GET)}
-    name = known.get(request.name.casefold())
-    if name is None:
-        raise IgtlMessageInvalid(f"the command must be {_SET} or {_GET}, got {shown(request.name)}", field="body")
-    if not request.parameters:
-        raise IgtlMessageInvalid(f'{name} must hold an element <Parameter Name="…"/> or more', field="body")
-    outcomes = []
-    for parameter, value in request.parameters.items():
+        return Reply(name, error.detail)
+    outcomes: list[tuple[str, str, str | None]] = []
+    for parameter, value in parameters.items():
+        problem, found = "", None
         try:
-            if name == _GET:
-                outcome = Outcome(parameter, value=await scanner.get(parameter))
+            if command == _GET:
+                found = await scanner.get(parameter)
             elif value is None:
-                outcome = Outcome(parameter, f"{parameter}: a Value is required")
+                problem = f"{parameter}: a Value is required"
             else:
                 await scanner.set(parameter, value)
-                outcome = Outcome(parameter)
         except UltragrayError as error:
-            outcome = Outcome(parameter, f"{parameter}: {error.detail}")
-        outcomes.append(outcome)
-    return Reply(name, f"{name} completed", outcomes=tuple(outcomes))
+            problem = f"{parameter}: {error.detail}"
+        outcomes.append((parameter, problem, found))
+    return Reply(command, outcomes=tuple(outcomes))
 
 
 def _message(type_name: str, asked: Message, device_name: str, content: bytes, metadata: Mapping[str, str]) -> Message:

@@ -5,10 +5,9 @@ from __future__ import annotations
 import asyncio
 import logging
 import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
 from dataclasses import replace
-from typing import Protocol
 
 from ultragray.errors import UltragrayError
 from ultragray.rendering.settings import FrameSettings
@@ -33,7 +32,7 @@ from ultragray_service.igtl.contents import (
     unpack_position,
     unpack_transform,
 )
-from ultragray_service.igtl.frames import Feed, Frame, FrameMaker, PoseMessage, Underway, WaitingPoses
+from ultragray_service.igtl.frames import Feed, Frame, PoseMessage, Underway, WaitingPoses, render_frame
 from ultragray_service.igtl.messages import HEADER_BYTES, Header, Message, pack_message, unpack_header, unpack_message
 from ultragray_service.igtl.routes import SceneChooser
 from ultragray_service.service import Service
@@ -51,16 +50,6 @@ _MANY_POSES = ("TDATA", "QTDATA")  # types that tell those of several instrument
 _log = logging.getLogger("ultragray.igtl")
 
 
-class Frames(Protocol):
-    """The part of the server that connections share."""
-
-    def newest(self) -> Frame | None:
-        """The newest frame of a scene that the caller may see."""
-
-    def publish(self, frame: Frame, source: Connection) -> None:
-        """Tells all connections that may see its scene about a frame."""
-
-
 class Connection:
     """Reads messages, renders the newest pose of each device, one after another, and sends."""
 
@@ -68,22 +57,21 @@ class Connection:
         self,
         service: Service,
         scenes: SceneChooser,
-        frames: Frames,
+        newest: Callable[[], Frame | None],
+        publish: Callable[[Frame, Connection], None],
         reader: asyncio.StreamReader,
         writer: asyncio.StreamWriter,
     ) -> None:
+        """`newest`: the newest frame that the caller may see; `publish`: shows one to all who may see it."""
         self.feed = Feed(self._turn, self._send)
         self.record = OpenStream("openigtlink")
         self._answers = 0
-        self._service = service
-        self._scenes = scenes
-        self._frames = frames
+        self._service, self._scenes = service, scenes
+        self._newest_of_all, self._publish = newest, publish
         thickness_mm = service.settings.igtl_slice_thickness_mm
         setup = Setup(FrameSettings(slice_thickness_mm=thickness_mm), service.settings.igtl_registration)
         self._scanner = Scanner(scenes, service.registrations, setup)
-        self._maker = FrameMaker(service, scenes, self._scanner)
-        self._reader = reader
-        self._writer = writer
+        self._reader, self._writer = reader, writer
         self._sending = asyncio.Lock()
         self._showing = asyncio.Lock()
         self._poses = WaitingPoses()
@@ -92,7 +80,6 @@ class Connection:
         self._unread = Unread(writer.transport)
 
     async def run(self) -> None:
-        """Until the client goes, sends what is no message, or takes too long."""
         work = [asyncio.ensure_future(self._render()), asyncio.ensure_future(self.feed.run())]
         try:
             while True:
@@ -119,11 +106,9 @@ class Connection:
             self._writer.close()
 
     def abort(self) -> None:
-        """Closes at once."""
         self._writer.transport.abort()
 
     async def _take_message(self) -> None:
-        """Raises IgtlMessageInvalid where what follows cannot be found any more."""
         begun = await self._reader.readexactly(1)
         slow = asyncio.get_running_loop().call_later(MESSAGE_TIMEOUT_S, self.abort)
         try:
@@ -187,16 +172,13 @@ class Connection:
 
     def _newest_frame(self, kind: str, query: Message) -> Message:
         """The newest frame as the query wants it; without content where there is none of that name."""
-        frame = self._frames.newest()
+        frame = self._newest_of_all()
         if frame is None or not frame.goes_by(query.device_name):
             return _reply(kind, query, b"")
         return frame.message(kind, query.version, query.message_id, query.device_name)
 
     async def _take_poses(self, message: Message, arrived: float) -> None:
-        """Moves the tools of devices that do so, and takes the poses of the others.
-
-        Where only tools have moved, the frame of the pose before is rendered again.
-        """
+        """Moves tools of devices, takes poses of others; where only tools moved, the last pose is rendered again."""
         tools = self._scanner.setup.tools
         if message.type_name == "TRANSFORM":
             poses = [(message.device_name, unpack_transform(message.content))]
@@ -238,7 +220,7 @@ class Connection:
 
     async def _show(self, underway: Underway) -> None:
         try:
-            frame = await self._maker.render(underway)
+            frame = await render_frame(self._service, self._scenes, self._scanner, underway)
         except UltragrayError as error:
             self._note(underway.posed, error)
             await self._refuse(underway.posed.message, error, underway.posed.arrived)
@@ -247,14 +229,13 @@ class Connection:
             unexpected = UltragrayError("an unexpected error, see the log")
             await self._refuse(underway.posed.message, unexpected, underway.posed.arrived)
         else:
-            self._frames.publish(frame, self)
+            self._publish(frame, self)
             self._note(frame.posed, frame.result)
             asked = frame.posed.message
             await self._send(frame.message("IMAGE", asked.version, asked.message_id))
             self._count(asked.type_name, "OK", frame.posed.arrived)
 
     def _note(self, posed: PoseMessage, outcome: RenderResult | UltragrayError) -> None:
-        """Shows an answer to those who watch."""
         self.record.name = posed.message.device_name
         self._answers += 1
         self.record.note(StreamAnswer(self._answers, None, outcome, posed.replaced))
@@ -269,7 +250,6 @@ class Connection:
         self._service.metrics.count_request("igtl", route, status, time.perf_counter() - arrived)
 
     async def _send(self, message: Message) -> None:
-        """Raises ConnectionError where the client has gone, or takes nothing for too long."""
         async with self._sending:
             self._unread.write(pack_message(message))
             stalled = asyncio.get_running_loop().call_later(SEND_TIMEOUT_S, self.abort)

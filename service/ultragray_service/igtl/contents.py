@@ -66,9 +66,6 @@ UNDERSTOOD = frozenset({*CAPABILITY, *(f"{prefix}TRANS" for prefix in _PREFIXES)
 HEARD = ("STATUS", "CAPABILITY", "RTS_")  # beginnings of types that are answers themselves
 
 
-# The contents of OpenIGTLink messages: poses, instruments, images, states, requests. All numbers are big-endian.
-
-
 TYPE_NAME_BYTES = 12
 
 _MATRIX = np.dtype((">f4", 12))  # the columns of a [3, 4] matrix, one after another
@@ -110,13 +107,11 @@ class Status:
 
 
 def unpack_transform(content: bytes) -> FloatArray:  # [4, 4] mm
-    """The rigid transform of a TRANSFORM. Raises IgtlMessageInvalid and InvalidPose."""
     _check_size("TRANSFORM", content, _MATRIX.itemsize)
     return _rigid(content, "TRANSFORM")
 
 
 def pack_transform(pose: FloatArray) -> bytes:  # [4, 4]
-    """The content of a TRANSFORM."""
     return pose[:3].T.astype(">f4").tobytes()
 
 
@@ -129,7 +124,6 @@ def unpack_position(content: bytes) -> FloatArray:  # [4, 4] mm
 
 
 def pack_position(pose: FloatArray) -> bytes:  # [4, 4]
-    """The content of a POSITION, with the whole quaternion."""
     w, x, y, z = quaternion_from_pose(pose)
     return struct.pack(">7f", *pose[:3, 3], x, y, z, w)
 
@@ -168,7 +162,6 @@ def unpack_instruments(
 
 
 def pack_instruments(type_name: str, instruments: Iterable[Instrument]) -> bytes:
-    """The content of a TDATA or QTDATA."""
     pack = pack_transform if type_name == "TDATA" else pack_position
     return b"".join(
         _INSTRUMENT.pack(pack_text(one.name, DEVICE_NAME_BYTES), _INSTRUMENT_6D, 0) + pack(one.pose)
@@ -177,7 +170,6 @@ def pack_instruments(type_name: str, instruments: Iterable[Instrument]) -> bytes
 
 
 def unpack_image(content: bytes) -> Image:
-    """The slice of an IMAGE of 8-bit pixels. Raises IgtlMessageInvalid for anything else."""
     if len(content) < _IMAGE.size:
         raise IgtlMessageInvalid(f"IMAGE must hold {_IMAGE.size} bytes or more, got {len(content)}", field="body")
     version, components, scalar, _, _, columns, rows, slices, vectors, *part = _IMAGE.unpack_from(content)
@@ -203,7 +195,6 @@ def pack_image(image: Image) -> bytes:
 
 
 def unpack_status(content: bytes) -> Status:
-    """Raises IgtlMessageInvalid."""
     if len(content) < _STATUS.size:
         raise IgtlMessageInvalid(f"STATUS must hold {_STATUS.size} bytes or more, got {len(content)}", field="body")
     code, sub_code, name = _STATUS.unpack_from(content)
@@ -211,20 +202,15 @@ def unpack_status(content: bytes) -> Status:
 
 
 def pack_status(status: Status) -> bytes:
-    """The content of a STATUS."""
     return _STATUS.pack(status.code, status.sub_code, pack_text(status.name, 19)) + status.text.encode() + b"\0"
 
 
 def pack_capability(type_names: Iterable[str]) -> bytes:
-    """The content of a CAPABILITY: the types that the sender understands."""
     return b"".join(name.encode().ljust(TYPE_NAME_BYTES, b"\0") for name in type_names)
 
 
 def unpack_interval_s(content: bytes) -> float:
-    """The least time between two messages that an STT_TDATA or STT_QTDATA asks for; none: 0.
-
-    Raises IgtlMessageInvalid.
-    """
+    """The least time between two messages of an STT_TDATA or STT_QTDATA; none: 0. Raises IgtlMessageInvalid."""
     if not content:
         return 0.0
     if len(content) < _INTERVAL.size:
@@ -253,9 +239,6 @@ def _placed(values: bytes, what: str) -> FloatArray:
     else:
         w = math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))
     return pose_from_position_quaternion(position, (w, x, y, z), field=what)
-
-
-# Errors as OpenIGTLink states: the protocol's own list of codes, and one table from ours to it.
 
 
 OK, UNKNOWN_ERROR, NOT_FOUND, ACCESS_DENIED, BUSY, TIMED_OUT = 1, 2, 4, 5, 6, 7

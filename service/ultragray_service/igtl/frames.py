@@ -58,7 +58,6 @@ class Underway:
 
     @property
     def pose(self) -> FloatArray:  # [4, 4] mm, exact
-        """The pose of the probe in the scene."""
         return self._placed(self.posed.pose)
 
     def give_to(self, posed: PoseMessage, deadline: float, setup: Setup) -> bool:
@@ -101,10 +100,7 @@ class WaitingPoses:
         return older is not None
 
     def again(self, posed: PoseMessage) -> None:
-        """Takes a pose that was there before and is to be rendered with another setup.
-
-        One of its device that still waits will be.
-        """
+        """Takes a pose again, to be rendered with another setup, unless one of its device still waits."""
         if posed.message.device_name not in self._poses:
             self._poses[posed.message.device_name] = posed
             self._come.set()
@@ -119,16 +115,11 @@ class WaitingPoses:
             await self._come.wait()
 
     def take(self) -> Underway:
-        """Takes a pose out, of which there is one."""
         self._underway = Underway(self._poses.pop(next(iter(self._poses))), Turn())
         return self._underway
 
     async def settled(self) -> None:
-        """Waits until every pose so far was answered or replaced."""
         await self._settled.wait()
-
-
-# A rendered frame, and the messages that carry it.
 
 
 _SLICE_MM = 1.0  # nominal thickness: an image of one slice has none
@@ -136,8 +127,6 @@ _SLICE_MM = 1.0  # nominal thickness: an image of one slice has none
 
 @dataclass(frozen=True, eq=False)
 class Frame:
-    """The rendering of a pose."""
-
     posed: PoseMessage
     result: RenderResult
     image: Image
@@ -149,7 +138,6 @@ class Frame:
         return name in ("", self.posed.message.device_name, image_name(self.posed.message.device_name))
 
     def message(self, kind: str, version: int, message_id: int = 0, name: str = "") -> Message:
-        """The frame as an IMAGE, or its pose as a TRANSFORM, POSITION, TDATA or QTDATA; `name` in place of its own."""
         device_name, pose = self.posed.message.device_name, self.result.poses[0]
         if self.registration is not None:
             pose = self.registration.flange_to_base(pose)
@@ -164,24 +152,21 @@ class Frame:
         )
 
     def _metadata(self) -> dict[str, str]:
-        result = self.result
+        result, placing = self.result, {}
+        if result.settings.registration is not None:
+            placing["probe_to_scene"] = json.dumps(result.poses[0].tolist(), separators=(",", ":"))
         return {
             "device": self.posed.message.device_name,
             "scene": result.scene,
             "scene_sha256": result.scene_sha256,
             "renderer": result.renderer,
             **_settings_texts(result.settings),
-            **self._placing(),
+            **placing,
             "replaced_poses": str(self.posed.replaced),
             **{name: f"{value:.3f}" for name, value in asdict(result.extrapolations[0]).items() if value is not None},
             "queue_ms": f"{result.queue_ms:.3f}",
             "render_ms": f"{result.render_ms:.3f}",
         }
-
-    def _placing(self) -> dict[str, str]:
-        """The pose in the scene, where a registration led there."""
-        is_led = self.result.settings.registration is not None
-        return {"probe_to_scene": json.dumps(self.result.poses[0].tolist(), separators=(",", ":"))} if is_led else {}
 
 
 @lru_cache(maxsize=256)
@@ -190,43 +175,30 @@ def _settings_texts(settings: Resolved) -> Mapping[str, str]:
     return settings_used(settings).texts()
 
 
-class FrameMaker:
-    """Renders poses of devices."""
+async def render_frame(service: Service, scenes: SceneChooser, scanner: Scanner, underway: Underway) -> Frame:
+    """The frame of a pose, or of one that took its turn, as the scanner is set.
 
-    def __init__(self, service: Service, scenes: SceneChooser, scanner: Scanner) -> None:
-        self._service = service
-        self._scenes = scenes
-        self._scanner = scanner
+    Probe and size are else those that the scene was trained with, and its thickness is that of the service's setting,
+    else that of the scene's beam. Raises SceneNotFound, RegistrationNotFound, and what planner and rendering raise.
+    """
+    service.life.require_serving()
+    scene = await scenes.choose(underway.posed.message.device_name)
+    ownership = service.owners.known(Kind.SCENE, scene)
+    setup, found = scanner.setup, None
+    if setup.registration is not None:
+        found = await service.registrations.of_scene(setup.registration, scene)
+    underway.setup, underway.registration = setup, found
+    asked = replace(setup.settings, tools=tools) if (tools := setup.tools.placed(found)) else setup.settings
 
-    async def render(self, underway: Underway) -> Frame:
-        """The frame of a pose, or of one that took its turn, as the scanner is set; else probe and size are those the
-        scene was trained with, and its thickness is that of the service's setting, else that of the scene's beam.
+    def complete(settings: Resolved) -> Resolved:
+        to_scale = true_to_scale(settings.probe, settings.height, service.settings.max_image_side)
+        display = replace(settings.display, pixel_mm=to_scale.pixel_mm)
+        return replace(settings, display=display, registration=setup.registration)
 
-        Raises SceneNotFound, RegistrationNotFound, and what RequestPlanner.plan and Service.render raise.
-        """
-        self._service.life.require_serving()
-        scene = await self._scenes.choose(underway.posed.message.device_name)
-        ownership = self._service.owners.known(Kind.SCENE, scene)
-        setup, found = self._scanner.setup, None
-        if setup.registration is not None:
-            found = await self._service.registrations.of_scene(setup.registration, scene)
-        underway.setup, underway.registration = setup, found
-        asked = replace(setup.settings, tools=tools) if (tools := setup.tools.placed(found)) else setup.settings
-
-        def complete(settings: Resolved) -> Resolved:
-            return replace(self._true_to_scale(settings), registration=setup.registration)
-
-        planner = self._service.planner
-        plan = await planner.plan(scene, asked, Encoding.UINT8, complete=complete)
-        result = await self._service.rendering.render(
-            plan, underway.pose[None], deadline=planner.deadline(None), turn=underway.turn
-        )
-        return Frame(underway.posed, result, image_of(result, found), ownership, found)
-
-    def _true_to_scale(self, settings: Resolved) -> Resolved:
-        side = self._service.settings.max_image_side
-        pixel_mm = true_to_scale(settings.probe, settings.height, side).pixel_mm
-        return replace(settings, display=replace(settings.display, pixel_mm=pixel_mm))
+    plan = await service.planner.plan(scene, asked, Encoding.UINT8, complete=complete)
+    deadline = service.planner.deadline(None)
+    result = await service.rendering.render(plan, underway.pose[None], deadline=deadline, turn=underway.turn)
+    return Frame(underway.posed, result, image_of(result, found), ownership, found)
 
 
 def image_of(result: RenderResult, registration: Registration | None = None) -> Image:
@@ -245,9 +217,6 @@ def image_of(result: RenderResult, registration: Registration | None = None) -> 
     return Image(pixels, to_scene if registration is None else registration.in_base(to_scene))
 
 
-# Subscriptions of a client: the newest frame that it has not seen, at most as often as it asked for.
-
-
 EnterTurn = Callable[[], AbstractAsyncContextManager[None]]
 
 
@@ -264,19 +233,16 @@ class Feed:
 
     def __init__(self, turn: EnterTurn, send: Callable[[Message], Awaitable[None]]) -> None:
         """`turn` is entered for each message, and waits until the client has read what came before."""
-        self._turn = turn
-        self._send = send
+        self._turn, self._send = turn, send
         self._subscriptions: dict[str, _Subscription] = {}
         self._fresh: dict[str, Frame] = {}
         self._changed = asyncio.Event()
 
     def start(self, kind: str, name: str, interval_s: float, version: int) -> None:
-        """From now on frames that go by `name` are told as messages of `kind`."""
         self._subscriptions[kind] = _Subscription(name, interval_s, version)
         self._changed.set()
 
     def stop(self, kind: str) -> None:
-        """No longer."""
         self._subscriptions.pop(kind, None)
         self._fresh.pop(kind, None)
 
@@ -288,9 +254,13 @@ class Feed:
                 self._changed.set()
 
     async def run(self) -> None:
-        """Sends until cancelled. Raises what `send` raises."""
         while True:
-            await self._wait(self._next_due())
+            due = min((self._subscriptions[kind].due for kind in self._fresh), default=None)
+            timeout_s = None if due is None else due - time.monotonic()
+            if timeout_s is None or timeout_s > 0:
+                with contextlib.suppress(asyncio.TimeoutError):
+                    await asyncio.wait_for(self._changed.wait(), timeout_s)
+            self._changed.clear()
             now = time.monotonic()
             for kind in [kind for kind in self._fresh if self._subscriptions[kind].due <= now]:
                 async with self._turn():
@@ -298,14 +268,3 @@ class Feed:
                         subscription = self._subscriptions[kind]
                         subscription.due = time.monotonic() + subscription.interval_s
                         await self._send(frame.message(kind, subscription.version))
-
-    def _next_due(self) -> float | None:
-        return min((self._subscriptions[kind].due for kind in self._fresh), default=None)
-
-    async def _wait(self, until: float | None) -> None:
-        """Until that time.monotonic(), or a change."""
-        timeout_s = None if until is None else until - time.monotonic()
-        if timeout_s is None or timeout_s > 0:
-            with contextlib.suppress(asyncio.TimeoutError):
-                await asyncio.wait_for(self._changed.wait(), timeout_s)
-        self._changed.clear()

@@ -47,7 +47,6 @@ class Message:
 
 
 def unpack_header(data: bytes) -> Header:
-    """The header in 58 bytes. Raises IgtlMessageInvalid where they cannot be one."""
     version, type_name, device_name, timestamp, body_bytes, crc = _HEADER.unpack(data)
     name = unpack_text(type_name)
     if version not in _VERSIONS or not name or not name.isascii() or not name.isprintable():
@@ -87,7 +86,6 @@ def unpack_message(header: Header, body: bytes) -> Message:
 
 
 def _unpack_metadata(index: bytes, values: bytes) -> dict[str, str]:
-    """Raises struct.error and ValueError."""
     metadata: dict[str, str] = {}
     if not index:
         return metadata
@@ -104,7 +102,6 @@ def _unpack_metadata(index: bytes, values: bytes) -> dict[str, str]:
 
 
 def pack_message(message: Message) -> bytes:
-    """The bytes of a message, its CRC included."""
     extended, index, values = b"", b"", b""
     if message.version > 1:
         index = _METADATA_COUNT.pack(len(message.metadata))

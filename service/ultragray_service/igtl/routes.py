@@ -38,18 +38,15 @@ class SceneChooser:
     """Chooses scenes by the names of devices; knows the scenes as they were at most a second ago."""
 
     def __init__(self, catalog: SceneCatalog, default: str | None) -> None:
-        self._catalog = catalog
-        self._default = default
+        self._catalog, self._default = catalog, default
         self._names: list[str] = []
         self._read_at = -_NAMES_LIVE_S
 
     async def named(self, device_name: str) -> str | None:
-        """The scene of that name, or of the name of the frame that the device's poses lead to."""
         names = await self._known()
         return next((name for name in (device_name, frame_of(device_name)) if name in names), None)
 
     async def prefer(self, scene: str) -> None:
-        """From now on the scene of devices that name none. Raises SceneNotFound."""
         if scene not in await self._known():
             raise SceneNotFound(f"there is no scene {shown(scene)}", field="scene")
         self._default = scene

@@ -40,18 +40,13 @@ class IgtlServer:
 
     @property
     def is_local(self) -> bool:
-        """Whether no other machine may connect."""
         return self._roles.is_local
 
     async def start(self, listener: socket.socket) -> None:
-        """Begins to answer on a bound socket."""
         self._server = await asyncio.start_server(self._connected, sock=listener)
 
     async def stop(self, grace_s: float) -> None:
-        """Lets what is being answered be answered, tells every client that the service stops, and closes.
-
-        Each may take `grace_s` seconds.
-        """
+        """Lets what is being answered be answered, each within `grace_s`, tells every client, and closes."""
         if self._server is None:
             return
         self._server.close()
@@ -66,11 +61,9 @@ class IgtlServer:
             connection.abort()
 
     def newest(self) -> Frame | None:
-        """The newest frame of a scene that the caller may see."""
         return next((frame for frame in reversed(self._frames.values()) if self._may_see(acting(), frame)), None)
 
     def publish(self, frame: Frame, source: Connection) -> None:
-        """Tells every client that may see its scene about a frame that was rendered for `source`."""
         kept_for = frame.ownership.owner if frame.ownership.private else None
         self._frames.pop(kept_for, None)
         self._frames[kept_for] = frame
@@ -85,7 +78,7 @@ class IgtlServer:
     async def _connected(self, reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         # Its own: a client knows the scenes that it may see.
         scenes = SceneChooser(self._service.catalog, self._service.settings.igtl_scene)
-        connection = Connection(self._service, scenes, self, reader, writer)
+        connection = Connection(self._service, scenes, self.newest, self.publish, reader, writer)
         host, port, *_ = writer.get_extra_info("peername") or ("::", 0)  # none of a peer that has gone already
         principal = self._roles.principal_of(host, asks=self._service.guard.asks)
         if principal is None:
@@ -96,7 +89,7 @@ class IgtlServer:
         with contextlib.ExitStack() as places:
             try:
                 self._service.limits.take_request()
-                places.callback(self._places.enter(host).leave)
+                places.enter_context(self._places.enter(host))
                 places.enter_context(self._service.limits.stream())
                 connection.record = places.enter_context(self._service.streams.opened("openigtlink", ""))
             except (TooManyConnections, RateLimited, LimitReached) as error:

@@ -32,9 +32,6 @@ def address_of(peer: str) -> str:
     return unquote(peer.partition(":")[2].rpartition(":")[0]).strip("[]")
 
 
-# Every error as google.rpc.Status, with the reason and the field that HTTP tells.
-
-
 ERROR_DOMAIN = "ultragray"
 REQUEST_ID_KEY = "x-request-id"
 _DETAILS_KEY = "grpc-status-details-bin"
@@ -69,14 +66,10 @@ async def abort(context: grpc.aio.ServicerContext, error: UltragrayError) -> NoR
     raise AssertionError("abort always raises")
 
 
-# Handlers of gRPC, taken apart and put together again by interceptors.
-
-
 Method = Callable[[Any, Any], Awaitable[Any]]
 
 
 def method_of(handler: Any) -> Method:
-    """The method of a handler, which has one."""
     for method in (handler.unary_unary, handler.unary_stream, handler.stream_unary, handler.stream_stream):
         if method is not None:
             return method  # type: ignore[no-any-return]
@@ -84,7 +77,6 @@ def method_of(handler: Any) -> Method:
 
 
 def with_method(handler: Any, method: Method) -> Any:
-    """The same handler, its method replaced."""
     return _with(handler, method, handler.request_deserializer)
 
 
@@ -111,16 +103,19 @@ def refusing_what_is_no_message(handler: Any) -> Any:
 
 
 def _with(handler: Any, method: Method, deserializer: Callable[[bytes], Any] | None) -> Any:
+    streaming = handler.request_streaming, handler.response_streaming
+    return make_handler(streaming, method, deserializer, handler.response_serializer)
+
+
+def make_handler(streaming: tuple[bool, bool], method: Method, *codecs: Any) -> grpc.RpcMethodHandler:
+    """A handler of gRPC; `streaming`: whether requests and answers are several, `codecs`: what reads and writes one."""
     make = {
         (False, False): grpc.unary_unary_rpc_method_handler,
         (False, True): grpc.unary_stream_rpc_method_handler,
         (True, False): grpc.stream_unary_rpc_method_handler,
         (True, True): grpc.stream_stream_rpc_method_handler,
-    }[handler.request_streaming, handler.response_streaming]
-    return make(method, deserializer, handler.response_serializer)
-
-
-# The surroundings of every call: API keys, request id, errors as statuses, log line and metrics.
+    }[streaming]
+    return make(method, *codecs)
 
 
 _OPEN_PREFIX = "/grpc.health.v1."
@@ -163,14 +158,16 @@ class CallContext(grpc.aio.ServerInterceptor):  # type: ignore[misc]
         else:
             if not is_own:
                 return handler
-            method = self._permitted(principal, credential, operation, method_of(handler))
+            method = method_of(handler)
+            if is_own and self._service.tracing is not None:
+                method = _traced(self._service.tracing, details.method.removeprefix("/"), headers, method)
+            method = self._permitted(principal, credential, operation, method)
         handler = with_method(handler, method)
         if is_own:
             handler = refusing_what_is_no_message(handler)
         return with_method(handler, self._wrap(details.method, method_of(handler), headers))
 
     def _permitted(self, principal: Principal, credential: str | None, operation: Operation, method: Method) -> Method:
-        """The method, for who may; it ends when the credential counts no more."""
         service = self._service
 
         async def call(request: Any, context: Any) -> Any:
@@ -221,6 +218,14 @@ class CallContext(grpc.aio.ServerInterceptor):  # type: ignore[misc]
         return call
 
 
+def _traced(tracing: Tracing, name: str, headers: dict[str, str], method: Method) -> Method:
+    async def call(request: Any, context: grpc.aio.ServicerContext) -> Any:
+        with tracing.call(name, headers):
+            return await method(request, context)
+
+    return call
+
+
 def _telling_errors(method: Method) -> Method:
     async def call(request: Any, context: grpc.aio.ServicerContext) -> Any:
         try:
@@ -237,26 +242,3 @@ def name_in(request: Any, operation: Operation) -> str:
         return ""
     holder = getattr(request, "settings", request)
     return str(getattr(holder, operation.about.value, ""))
-
-
-# An interceptor for a service that is traced: a span for each call.
-
-
-class TracedCalls(grpc.aio.ServerInterceptor):  # type: ignore[misc]
-    """Stands within `CallContext`, whose request id its spans carry."""
-
-    def __init__(self, tracing: Tracing) -> None:
-        self._tracing = tracing
-
-    async def intercept_service(self, continuation: Callable[[Any], Awaitable[Any]], details: Any) -> Any:
-        handler = await continuation(details)
-        if handler is None or not details.method.startswith(OWN_PREFIX):
-            return handler
-        method = method_of(handler)
-        headers = {key: value for key, value in details.invocation_metadata or () if isinstance(value, str)}
-
-        async def call(request: Any, context: grpc.aio.ServicerContext) -> Any:
-            with self._tracing.call(details.method.removeprefix("/"), headers):
-                return await method(request, context)
-
-        return with_method(handler, call)

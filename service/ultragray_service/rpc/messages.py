@@ -18,8 +18,7 @@ from ultragray.rendering.settings import RenderSettings, Resolved, settings_used
 from ultragray.rendering.volumes import SliceView
 from ultragray_proto.codec import MessageInvalid, from_message, to_message, words
 from ultragray_proto.v1 import geometry_pb2, jobs_pb2, rendering_pb2, scenes_pb2
-from ultragray_service.core.frames import FrameFacts, SliceFacts
-from ultragray_service.core.poses import exact_pose
+from ultragray_service.core.poses import FrameFacts, SliceFacts, exact_pose
 from ultragray_workers.jobs.kinds import KINDS, Specification
 from ultragray_workers.jobs.record import Job
 from ultragray_workers.pool.messages import RenderResult
@@ -40,7 +39,6 @@ def read(message: Any, cls: Any, **others: Any) -> Any:
 
 
 def read_settings(message: Any) -> tuple[str, RenderSettings]:
-    """The scene and the settings of a message that holds `settings`. Raises InvalidArgument; its field is a path."""
     if not message.HasField("settings"):
         raise InvalidArgument("settings is required", field="settings")
     with under("settings"):
@@ -57,7 +55,6 @@ def read_word(message: Any, field: str) -> str:
 
 
 def read_pose(message: geometry_pb2.Pose, field: str) -> FloatArray:  # [4, 4] mm
-    """The exact pose. Raises InvalidPose, naming the part of `field` to blame."""
     form = message.WhichOneof("form")
     if form == "matrix":
         values = message.matrix.values
@@ -78,7 +75,6 @@ def read_pose(message: geometry_pb2.Pose, field: str) -> FloatArray:  # [4, 4] m
 
 
 def read_poses(messages: Sequence[geometry_pb2.Pose], field: str) -> FloatArray:  # [C, 4, 4] mm
-    """The exact poses; many of them, as matrices, at once. Raises InvalidPose, naming the part of `field` to blame."""
     if all(pose.WhichOneof("form") == "matrix" and len(pose.matrix.values) == 16 for pose in messages):
         matrices = np.empty((len(messages), 16))
         for index, pose in enumerate(messages):
@@ -89,7 +85,6 @@ def read_poses(messages: Sequence[geometry_pb2.Pose], field: str) -> FloatArray:
 
 
 def frame_message(result: RenderResult, sequence: int, **others: Any) -> rendering_pb2.Frame:
-    """The frame of a result of one pose."""
     if (place := result.place) is not None:
         others["shared_data"] = rendering_pb2.SharedData(slot=place.slot, bytes=place.size)
     frame = to_message(FrameFacts.of(result), rendering_pb2.Frame, sequence=sequence, data=result.data, **others)
@@ -104,15 +99,11 @@ def _settings_message(settings: Resolved) -> rendering_pb2.Frame:
 
 
 def slice_message(result: RenderResult[SliceView]) -> rendering_pb2.Slice:
-    """The slice of a result of one."""
     return to_message(SliceFacts.of(result), rendering_pb2.Slice, data=result.data)
 
 
 def read_specification(message: jobs_pb2.SubmitJobRequest) -> tuple[Specification, str]:
-    """The checked specification, and the field that holds it.
-
-    Raises InvalidArgument, InvalidPose, UnknownOutput; their field is a path.
-    """
+    """The checked specification, and the field that holds it. Raises InvalidArgument and its kinds; field: a path."""
     kind = message.WhichOneof("specification")
     if kind is None:
         raise InvalidArgument(f"specification must hold one of {', '.join(KINDS)}", field="specification")
@@ -124,7 +115,6 @@ def read_specification(message: jobs_pb2.SubmitJobRequest) -> tuple[Specificatio
 
 
 def job_message(job: Job) -> jobs_pb2.Job:
-    """The message of a job."""
     error = None if job.reason is None else scenes_pb2.Error(reason=job.error or "", detail=job.reason)
     shown = replace(job, specification={"kind": job.kind, **job.specification}, error=None)
     return to_message(shown, jobs_pb2.Job, error=error)

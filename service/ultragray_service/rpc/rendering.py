@@ -7,6 +7,7 @@ import time
 from collections import deque
 from collections.abc import Awaitable, Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, TypeAlias
 
 import grpc
@@ -21,74 +22,16 @@ from ultragray_proto.v1 import rendering_pb2, scenes_pb2
 from ultragray_service.core.open_streams import StreamAnswer
 from ultragray_service.core.poses import check_pose_count, exact_poses
 from ultragray_service.core.rendering import Plan
-from ultragray_service.core.streams import MAX_WINDOW, FrameStream, SceneSettings, StreamMode, checked_s
+from ultragray_service.core.streams import MAX_WINDOW, FrameStream, Message, StreamMode, checked_s, unreadable
 from ultragray_service.errors import Refusal
 from ultragray_service.rpc.messages import frame_message, read, read_pose, read_settings, read_word, slice_message
 from ultragray_service.rpc.shared_memory import SharedMemory
 from ultragray_service.service import Service
-from ultragray_service.views.localizing import locate, sought_frame
+from ultragray_service.views.poses import locate, sought_frame
 from ultragray_workers.errors import QueueFull
 from ultragray_workers.pool.messages import Priority, RenderResult
 
 Context: TypeAlias = grpc.aio.ServicerContext
-
-
-class _Message:
-    """A RenderStreamRequest."""
-
-    def __init__(self, message: rendering_pb2.RenderStreamRequest, left_s: float | None) -> None:
-        self.message = message
-        self.sequence: int = message.sequence
-        self.client_time: int | None = message.client_time_ns if message.HasField("client_time_ns") else None
-        self.acknowledged: int | None = message.acknowledged if message.HasField("acknowledged") else None
-        self._left_s = left_s  # until the deadline of the call
-
-    @property
-    def window(self) -> int | None:
-        """Raises InvalidArgument for one beyond the limit."""
-        if self.message.window > MAX_WINDOW:
-            raise InvalidArgument(
-                f"window must be at most {MAX_WINDOW}, 0 for none, got {self.message.window}", field="window"
-            )
-        return self.message.window or None
-
-    def settings(self) -> SceneSettings | None:
-        return read_settings(self.message) if self.message.HasField("settings") else None
-
-    @property
-    def asks(self) -> bool:
-        return self.message.HasField("pose") or not (self.message.HasField("settings") or self.acknowledged is not None)
-
-    def pose(self) -> FloatArray:  # [4, 4] mm
-        if not self.message.HasField("pose"):
-            raise InvalidArgument("pose or settings is required", field="pose")
-        return read_pose(self.message.pose, "pose")
-
-    def timeout_s(self) -> float | None:
-        if not self.message.HasField("timeout_ms"):
-            return self._left_s
-        timeout_s = checked_s("timeout_ms", self.message.timeout_ms)
-        return timeout_s if self._left_s is None else min(self._left_s, timeout_s)
-
-
-class _Unreadable:
-    """Bytes that are no RenderStreamRequest; they raise why where their contents are asked for."""
-
-    sequence = 0
-    client_time = window = acknowledged = None
-    asks = True
-
-    def __init__(self, error: InvalidArgument) -> None:
-        self._error = error
-
-    def settings(self) -> SceneSettings | None:
-        return None
-
-    def pose(self) -> FloatArray:
-        raise self._error
-
-    def timeout_s(self) -> float | None:
-        return None
 
 
 class CallTransport:
@@ -105,23 +48,51 @@ class CallTransport:
         if self.destination is not None:
             self.destination.close()
 
-    async def receive(self) -> _Message | _Unreadable | None:
+    async def receive(self) -> Message | None:
         try:
             message = await self._context.read()
-        except InvalidArgument as error:
-            return _Unreadable(error)
-        return None if message is grpc.aio.EOF else _Message(message, self._context.time_remaining())
-
-    def mode(self, message: Any) -> StreamMode | None:
-        """Opens the memory that the client shares, too.
-
-        Raises InvalidArgument for a mode that does not exist, and for memory that is refused.
-        """
-        if isinstance(message, _Unreadable):
+        except InvalidArgument as error:  # bytes that are no RenderStreamRequest
+            return unreadable(error)
+        if message is grpc.aio.EOF:
             return None
-        mode = StreamMode(read_word(message.message, "mode") or StreamMode.ORDERED)
-        if message.message.HasField("shared_memory"):
-            self.destination = SharedMemory(message.message.shared_memory, self._context.peer())
+        left_s: float | None = self._context.time_remaining()
+        has = message.HasField
+
+        def pose() -> FloatArray:  # [4, 4] mm
+            if not has("pose"):
+                raise InvalidArgument("pose or settings is required", field="pose")
+            return read_pose(message.pose, "pose")
+
+        def timeout_s() -> float | None:
+            if not has("timeout_ms"):
+                return left_s
+            own_s = checked_s("timeout_ms", message.timeout_ms)
+            return own_s if left_s is None else min(left_s, own_s)
+
+        return Message(
+            sequence=message.sequence,
+            client_time=message.client_time_ns if has("client_time_ns") else None,
+            mode=partial(self._begun, message),
+            window=message.window or None,
+            acknowledged=message.acknowledged if has("acknowledged") else None,
+            settings=lambda: read_settings(message) if has("settings") else None,
+            asks=has("pose") or not (has("settings") or has("acknowledged")),
+            pose=pose,
+            timeout_s=timeout_s,
+        )
+
+    def _begun(self, first: rendering_pb2.RenderStreamRequest) -> StreamMode:
+        """The mode that the first message asks for; opens the memory that the client shares, too.
+
+        Raises InvalidArgument for a mode that does not exist, a window beyond the limit, and memory that is refused.
+        """
+        mode = StreamMode(read_word(first, "mode") or StreamMode.ORDERED)
+        if first.HasField("shared_memory"):
+            self.destination = SharedMemory(first.shared_memory, self._context.peer())
+        if first.window > MAX_WINDOW:
+            raise InvalidArgument(
+                f"window must be at most {MAX_WINDOW}, 0 for none, got {first.window}", field="window"
+            )
         return mode
 
     async def send(self, answer: StreamAnswer) -> None:
@@ -137,9 +108,6 @@ class CallTransport:
     hand_over = send  # flow control tells the client's library what was taken, not the service
 
 
-# RenderService: one frame, a batch of frames.
-
-
 _RETRY_S = 0.02
 _STREAM_NAME = "x-ultragray-stream-name"  # metadata
 
@@ -153,8 +121,6 @@ class _OfProbe:
 
 
 class RenderService:
-    """The methods of ultragray.v1.RenderService."""
-
     def __init__(self, service: Service) -> None:
         self._service = service
 
@@ -243,7 +209,6 @@ class RenderService:
         return to_message(found, rendering_pb2.LocalizeResponse)
 
     async def _plan(self, request: rendering_pb2.RenderRequest | rendering_pb2.RenderBatchRequest) -> Plan:
-        """The plan of a request. Raises what RequestPlanner.plan raises; the field is a path."""
         scene, asked = read_settings(request)
         return await self._service.planner.plan(
             scene, asked, asked.encoding, path="settings", registration=asked.registration
@@ -256,13 +221,11 @@ class RenderService:
         pose: FloatArray,
         context: Context,
     ) -> RenderResult:
-        """Renders a frame of a batch once the caller may have one more."""
         left_s = context.time_remaining()
         await self._service.limits.frame_turn(None if left_s is None else time.monotonic() + left_s)
         return await render(plan, pose, self._service.planner.deadline(context.time_remaining()))
 
     async def _render(self, plan: Plan, pose: FloatArray, deadline: float) -> RenderResult:
-        """Renders a frame of a batch."""
         return await self._service.rendering.render(plan, pose, priority=Priority.BATCH, deadline=deadline)
 
     async def _render_when_room(self, plan: Plan, pose: FloatArray, deadline: float) -> RenderResult:

@@ -2,79 +2,71 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Mapping
+from functools import partial
 from typing import Any
 
 import grpc
+from google.protobuf.descriptor import MethodDescriptor
+from google.protobuf.message import Message
+from google.protobuf.message_factory import GetMessageClass
 from grpc_health.v1 import health, health_pb2, health_pb2_grpc
 from grpc_reflection.v1alpha import reflection
 
+from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import (
     access_pb2,
-    access_pb2_grpc,
     datasets_pb2,
-    datasets_pb2_grpc,
     jobs_pb2,
-    jobs_pb2_grpc,
     registrations_pb2,
-    registrations_pb2_grpc,
     rendering_pb2,
-    rendering_pb2_grpc,
     scenes_pb2,
-    scenes_pb2_grpc,
     workers_pb2,
-    workers_pb2_grpc,
 )
 from ultragray_service.access.rules import require_all_methods
 from ultragray_service.core.readiness import Readiness
-from ultragray_service.rpc.calls import CallContext, TracedCalls
+from ultragray_service.rpc.calls import CallContext, make_handler
 from ultragray_service.rpc.rendering import RenderService
-from ultragray_service.rpc.resources import (
-    AccessService,
-    DatasetService,
-    JobService,
-    RegistrationService,
-    SceneService,
-    WorkerService,
-)
+from ultragray_service.rpc.resources import CALLS, STREAMS
 from ultragray_service.service import Service
 from ultragray_service.settings import Settings
-from ultragray_service.tls.server import HANDSHAKE_TIMEOUT_S, Certificates, CertificateWatch
+from ultragray_service.tls import HANDSHAKE_TIMEOUT_S, Certificates, CertificateWatch
 
 LEAST_MAX_MESSAGE_BYTES = 2 * 2**20  # room for a chunk of an upload
 LEAST_PING_INTERVAL_MS = 10_000
 MAX_CALLS_PER_CONNECTION = 1024
 _UNLIMITED = -1
 
-_SERVICERS: tuple[tuple[Any, Callable[[Service], Any], Callable[[Any, Any], None]], ...] = (
-    (scenes_pb2, SceneService, scenes_pb2_grpc.add_SceneServiceServicer_to_server),
-    (rendering_pb2, RenderService, rendering_pb2_grpc.add_RenderServiceServicer_to_server),
-    (datasets_pb2, DatasetService, datasets_pb2_grpc.add_DatasetServiceServicer_to_server),
-    (jobs_pb2, JobService, jobs_pb2_grpc.add_JobServiceServicer_to_server),
-    (access_pb2, AccessService, access_pb2_grpc.add_AccessServiceServicer_to_server),
-    (workers_pb2, WorkerService, workers_pb2_grpc.add_WorkerServiceServicer_to_server),
-    (registrations_pb2, RegistrationService, registrations_pb2_grpc.add_RegistrationServiceServicer_to_server),
-)
-_DESCRIPTORS = {name: one for file, *_ in _SERVICERS for name, one in file.DESCRIPTOR.services_by_name.items()}
+_FILES = (scenes_pb2, rendering_pb2, datasets_pb2, jobs_pb2, access_pb2, workers_pb2, registrations_pb2)
+_DESCRIPTORS = {name: one for file in _FILES for name, one in file.DESCRIPTOR.services_by_name.items()}
 SERVICE_NAMES = tuple(one.full_name for one in _DESCRIPTORS.values())
 
 
-def _methods() -> Iterator[str]:
-    """Every method of our services, as calls name them."""
-    for service in _DESCRIPTORS.values():
-        yield from (f"/{service.full_name}/{method.name}" for method in service.methods)
+def _handler(service: Service, rendering: RenderService, method: MethodDescriptor) -> grpc.RpcMethodHandler:
+    answer_class: Any = GetMessageClass(method.output_type)
+    name = f"{method.containing_service.name}.{method.name}"
+
+    async def call(request: Any, context: Any) -> Any:
+        answer = await CALLS[name](service, request)
+        if isinstance(answer, Message):
+            return answer
+        return answer_class(**answer) if isinstance(answer, Mapping) else to_message(answer, answer_class)
+
+    if name in CALLS:
+        run: Any = call
+    else:
+        run = partial(STREAMS[name], service) if name in STREAMS else getattr(rendering, method.name)
+    streaming = method.client_streaming, method.server_streaming
+    return make_handler(streaming, run, GetMessageClass(method.input_type).FromString, answer_class.SerializeToString)
 
 
 class GrpcServer:
-    """A server that listens once started, and tells its health."""
-
     def __init__(self, service: Service) -> None:
-        require_all_methods(_methods())
+        require_all_methods(
+            f"/{one.full_name}/{method.name}" for one in _DESCRIPTORS.values() for method in one.methods
+        )
         self._server = grpc.aio.server(
-            interceptors=[
-                CallContext(service),
-                *([] if service.tracing is None else [TracedCalls(service.tracing)]),
-            ],
+            interceptors=[CallContext(service)],
             options=[
                 ("grpc.max_receive_message_length", max(service.settings.max_body_bytes, LEAST_MAX_MESSAGE_BYTES)),
                 ("grpc.max_send_message_length", _UNLIMITED),
@@ -88,15 +80,16 @@ class GrpcServer:
         )
         self._health = Health()
         self._told = dict.fromkeys(("", *SERVICE_NAMES), False)
-        for _, servicer, add in _SERVICERS:
-            add(servicer(service), self._server)
+        rendering = RenderService(service)
+        for one in _DESCRIPTORS.values():
+            handlers = {method.name: _handler(service, rendering, method) for method in one.methods}
+            self._server.add_generic_rpc_handlers((grpc.method_handlers_generic_handler(one.full_name, handlers),))
         health_pb2_grpc.add_HealthServicer_to_server(self._health, self._server)
         reflection.enable_server_reflection(
             (*SERVICE_NAMES, health.SERVICE_NAME, reflection.SERVICE_NAME), self._server
         )
 
     def bind(self, host: str, port: int, certificates: CertificateWatch | None) -> int:
-        """Takes the port (0: a free one) and returns it; None: without TLS. Raises RuntimeError where it is in use."""
         address = f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
         if certificates is None:
             return int(self._server.add_insecure_port(address))
@@ -109,7 +102,6 @@ class GrpcServer:
         await self._server.start()
 
     async def tell_health(self, readiness: Readiness) -> None:
-        """Sets the answers of grpc.health.v1 from now on: that of the server as a whole, and of each service."""
         parts = readiness.components
         serving = {
             "RenderService": parts.frames.ready,
@@ -128,7 +120,6 @@ class GrpcServer:
                 await self._health.set(name, code.SERVING if is_serving else code.NOT_SERVING)
 
     async def stop(self, grace_s: float) -> None:
-        """Refuses new calls and gives those that run `grace_s` seconds."""
         await self._server.stop(grace_s)
 
 
@@ -167,12 +158,7 @@ def _connection_options(settings: Settings) -> list[tuple[str, int]]:
     ]
 
 
-# grpc.health.v1, with the method that the library's servicer leaves out.
-
-
 class Health(health.aio.HealthServicer):  # type: ignore[misc]
-    """Tells what `set` was told."""
-
     def __init__(self) -> None:
         super().__init__()
         self._statuses: dict[str, Any] = {}
@@ -182,6 +168,5 @@ class Health(health.aio.HealthServicer):  # type: ignore[misc]
         await super().set(service, status)
 
     async def List(self, request: Any, context: Any) -> Any:  # the name of the method
-        """The health of all services."""
         statuses = {name: health_pb2.HealthCheckResponse(status=status) for name, status in self._statuses.items()}
         return health_pb2.HealthListResponse(statuses=statuses)

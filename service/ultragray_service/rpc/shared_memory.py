@@ -34,8 +34,7 @@ class SharedMemory:
         """Opens the file and removes its name. Raises InvalidArgument for one that the peer may not share."""
         if not is_loopback(address_of(peer)):
             raise InvalidArgument(
-                f"{_FIELD} is for clients that reach the service by a loopback address, got one at {peer}",
-                field=_FIELD,
+                f"{_FIELD} is for clients that reach the service by a loopback address, got one at {peer}", field=_FIELD
             )
         _check_sizes(asked)
         self._slots, self._slot_bytes = asked.slots, asked.slot_bytes
@@ -53,7 +52,6 @@ class SharedMemory:
             os.unlink(path)
 
     def _check_file(self, asked: rendering_pb2.SharedMemory) -> None:
-        """Raises InvalidArgument unless the file is one that the client made to be shared."""
         status = os.fstat(self._descriptor)
         expected = HEADER_BYTES + self._slots * self._slot_bytes
         if not stat.S_ISREG(status.st_mode) or status.st_uid != os.geteuid():

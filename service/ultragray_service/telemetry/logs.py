@@ -29,7 +29,6 @@ _ACCEPTED_REQUEST_ID = re.compile(r"[A-Za-z0-9._:/+=-]{1,128}")
 
 
 def choose_request_id(offered: str | None) -> str:
-    """The id that the client offered where it is fit to be logged, else a new one."""
     if offered and _ACCEPTED_REQUEST_ID.fullmatch(offered):
         return offered
     return uuid.uuid4().hex
@@ -78,7 +77,6 @@ class HumanFormatter(logging.Formatter):
 
 
 def _sentence(record: logging.LogRecord) -> str:
-    """The message; of a request, whose facts are fields, these in words."""
     fields = getattr(record, "fields", {})
     if "duration_ms" not in fields:
         return record.getMessage()
@@ -87,7 +85,6 @@ def _sentence(record: logging.LogRecord) -> str:
 
 
 def is_for_people(log_format: str) -> bool:
-    """Whether the log goes to people: `human`, or `auto` where stderr is a terminal."""
     return log_format == "human" or (log_format == "auto" and sys.stderr.isatty())
 
 
@@ -111,11 +108,8 @@ def configure_logging(level: str, log_format: str = "json") -> None:
 
 
 # Traces of OpenTelemetry: a span for each request, and below it those of the render pool.
-#
 # `OTEL_EXPORTER_OTLP_ENDPOINT` turns them on; the other standard variables (OTEL_SERVICE_NAME, OTEL_TRACES_SAMPLER,
 # OTEL_EXPORTER_OTLP_HEADERS, ...) mean what OpenTelemetry says.
-
-
 _ENDPOINTS = ("OTEL_EXPORTER_OTLP_ENDPOINT", "OTEL_EXPORTER_OTLP_TRACES_ENDPOINT")
 _PROTOCOLS = ("OTEL_EXPORTER_OTLP_TRACES_PROTOCOL", "OTEL_EXPORTER_OTLP_PROTOCOL")
 _PROTOCOL = "http/protobuf"
@@ -124,10 +118,7 @@ _NS_PER_MS = 1_000_000
 
 
 class Tracing:
-    """The tracing of one process, on until `stop`."""
-
     def __init__(self, component: str) -> None:
-        """`component` is the service or the worker. Raises ExtraMissing, InvalidArgument for another protocol."""
         for name in _PROTOCOLS:
             if os.environ.get(name, _PROTOCOL) != _PROTOCOL:
                 raise InvalidArgument(f"{name} must be {_PROTOCOL}, got {os.environ[name]!r}", field=name)
@@ -145,10 +136,7 @@ class Tracing:
 
     @contextmanager
     def call(self, name: str, carrier: Mapping[str, str]) -> Iterator[trace.Span]:
-        """A span for a call of gRPC, a part of the trace that the `traceparent` of its metadata names.
-
-        FastAPI makes those of HTTP, with our `provider`.
-        """
+        """A span for a call of gRPC, within the trace that its metadata name; FastAPI makes those of HTTP."""
         with self._tracer.start_as_current_span(
             name,
             context=propagate.extract(carrier),
@@ -176,10 +164,8 @@ class Tracing:
             start_ns = end_ns
 
     def stop(self) -> None:
-        """Sends what has not been sent."""
         self.provider.shutdown()
 
 
 def start_tracing(component: str) -> Tracing | None:
-    """The tracing of this process; None where no endpoint is set. Raises what `Tracing` raises."""
     return Tracing(component) if any(os.environ.get(name) for name in _ENDPOINTS) else None

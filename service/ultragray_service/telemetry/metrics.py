@@ -51,9 +51,19 @@ class _Step:
     samples: dict[str, list[float]] = field(default_factory=lambda: {stage: [] for stage in STAGES})
     final: tuple[StageTimes, StageTimes] | None = None  # p50 and p99, in place of the samples, of a step that has ended
 
-    def quantiles(self, *, ended: bool) -> tuple[StageTimes, StageTimes] | tuple[None, None]:
-        if not self.requests:
-            return None, None
+    def summary(self, age: int) -> StatisticsStep:
+        """The step, which ended `age` steps ago; 0: it is going on."""
+        p50_ms, p99_ms = self._quantiles(ended=age > 0) if self.requests else (None, None)
+        return StatisticsStep(
+            seconds_ago=age * STEP_S,
+            frames=self.frames,
+            requests=self.requests,
+            errors=self.errors,
+            p50_ms=p50_ms,
+            p99_ms=p99_ms,
+        )
+
+    def _quantiles(self, *, ended: bool) -> tuple[StageTimes, StageTimes]:
         if self.final is not None:
             return self.final
         ordered = {stage: sorted(samples) for stage, samples in self.samples.items()}
@@ -95,15 +105,12 @@ class ServiceStatistics:
 
 
 class Statistics:
-    """A ring of steps. Belongs to one event loop."""
-
     def __init__(self, clock: Callable[[], float] = time.monotonic) -> None:
         self._clock = clock
         self._steps: deque[_Step] = deque(maxlen=STEPS)
         self._random = random.Random(0)
 
     def observe(self, frames: int, queue_ms: float, render_ms: float, encode_ms: float) -> None:
-        """One rendered request of the pool."""
         step = self._now()
         step.frames += frames
         step.requests += 1
@@ -115,14 +122,13 @@ class Statistics:
                 samples[place] = milliseconds
 
     def count_error(self) -> None:
-        """One request or message that the service could not answer as asked."""
         self._now().errors += 1
 
     def summaries(self) -> list[StatisticsStep]:
         """The steps of the last minutes, the oldest first; one for each, also where nothing happened."""
         now = self._step_number()
         found = {step.start: step for step in self._steps}
-        return [_summary(found.get(now - age) or _Step(now - age), age) for age in range(STEPS - 1, -1, -1)]
+        return [(found.get(now - age) or _Step(now - age)).summary(age) for age in range(STEPS - 1, -1, -1)]
 
     def _now(self) -> _Step:
         number = self._step_number()
@@ -146,28 +152,9 @@ def memory_bytes(pids: Iterable[int]) -> int:
     return total
 
 
-def _summary(step: _Step, age: int) -> StatisticsStep:
-    p50_ms, p99_ms = step.quantiles(ended=age > 0)
-    return StatisticsStep(
-        seconds_ago=age * STEP_S,
-        frames=step.frames,
-        requests=step.requests,
-        errors=step.errors,
-        p50_ms=p50_ms,
-        p99_ms=p99_ms,
-    )
-
-
 def _quantile(ordered: dict[str, list[float]], share: float) -> StageTimes:
-    return StageTimes(
-        **{
-            stage: round(samples[min(int(share * len(samples)), len(samples) - 1)], 3)
-            for stage, samples in ordered.items()
-        }
-    )
-
-
-# Prometheus metrics. Queue time is kept apart from render time and encode time.
+    place = {stage: min(int(share * len(samples)), len(samples) - 1) for stage, samples in ordered.items()}
+    return StageTimes(**{stage: round(samples[place[stage]], 3) for stage, samples in ordered.items()})
 
 
 _MILLISECONDS = (0.5, 1, 2, 4, 6, 8, 12, 16, 24, 32, 64, 125, 250, 500, 1000, 2000, 5000, 10_000, 30_000)
@@ -184,53 +171,46 @@ def _is_of_service(status: str) -> bool:
     return status.startswith("5") or status in _OVERLOADED
 
 
-class _PoolCollector(Collector):
-    """Reads the pool's state when it is scraped."""
+class _Collector(Collector):
+    """Asks a function when it is scraped."""
 
-    def __init__(self, pool: RenderPool) -> None:
-        self._pool = pool
+    def __init__(self, ask: Callable[[], Iterable[Metric]]) -> None:
+        self._ask = ask
 
-    def collect(self) -> Iterator[Metric]:
-        now = self._pool.statistics()
-        yield GaugeMetricFamily("ultragray_waiting_frames", "Frames that wait.", now.waiting_frames)
-        yield GaugeMetricFamily("ultragray_busy_processes", "Processes that render now.", now.busy)
-        yield GaugeMetricFamily("ultragray_processes_alive", "Render processes alive.", now.processes_alive)
-        restarts = "Render processes replaced after they died."
-        yield CounterMetricFamily("ultragray_process_restarts", restarts, now.restarts_total)
-        kills = "Render processes that hung, were killed and replaced."
-        yield CounterMetricFamily("ultragray_watchdog_kills", kills, now.kills_total)
-        stuck = "Render processes that have told nothing of their work for some seconds."
-        yield GaugeMetricFamily("ultragray_stuck_processes", stuck, now.stuck)
-        yield GaugeMetricFamily("ultragray_loaded_scenes", "Scenes that a process holds.", len(self._pool.loaded()))
+    def collect(self) -> Iterable[Metric]:
+        return self._ask()
 
 
-class _JobsCollector(Collector):
-    """Tells what was counted last: a scrape asks no database."""
+def _of_pool(pool: RenderPool) -> Iterator[Metric]:
+    now, gauge, counter = pool.statistics(), GaugeMetricFamily, CounterMetricFamily
+    yield gauge("ultragray_waiting_frames", "Frames that wait.", now.waiting_frames)
+    yield gauge("ultragray_busy_processes", "Processes that render now.", now.busy)
+    yield gauge("ultragray_processes_alive", "Render processes alive.", now.processes_alive)
+    yield counter("ultragray_process_restarts", "Render processes replaced after they died.", now.restarts_total)
+    kills = "Render processes that hung, were killed and replaced."
+    yield counter("ultragray_watchdog_kills", kills, now.kills_total)
+    stuck = "Render processes that have told nothing of their work for some seconds."
+    yield gauge("ultragray_stuck_processes", stuck, now.stuck)
+    yield gauge("ultragray_loaded_scenes", "Scenes that a process holds.", len(pool.loaded()))
 
-    def __init__(self, overview: Callable[[], JobsOverview]) -> None:
-        self._overview = overview
 
-    def collect(self) -> Iterator[Metric]:
-        now = self._overview()
-        family = GaugeMetricFamily("ultragray_jobs", "Jobs, counted every 10 s.", labels=["state"])
-        for state, count in now.counts.items():
-            family.add_metric([state.value], count)
+def _of_jobs(now: JobsOverview) -> Iterator[Metric]:
+    """What was counted last: a scrape asks no database."""
+    oldest = "Time that the job has waited that waits longest, by the device that it asks for; 0 where none waits."
+    for name, meaning, label, values in (
+        ("ultragray_jobs", "Jobs, counted every 10 s.", "state", now.counts),
+        ("ultragray_workers", "Workers of the jobs, likewise.", "state", now.workers),
+        ("ultragray_oldest_waiting_job_seconds", oldest, "device", now.oldest_waiting_s),
+    ):
+        family = GaugeMetricFamily(name, meaning, labels=[label])
+        for key, value in values.items():
+            family.add_metric([getattr(key, "value", key)], value)
         yield family
-        family = GaugeMetricFamily("ultragray_workers", "Workers of the jobs, likewise.", labels=["state"])
-        for worker_state, count in now.workers.items():
-            family.add_metric([worker_state.value], count)
-        yield family
-        oldest = "Time that the job has waited that waits longest, by the device that it asks for; 0 where none waits."
-        family = GaugeMetricFamily("ultragray_oldest_waiting_job_seconds", oldest, labels=["device"])
-        for device, oldest_s in now.oldest_waiting_s.items():
-            family.add_metric([device], oldest_s)
-        yield family
-        unfit = "Jobs that wait for a worker that is not there: none that is alive has what they ask for."
-        yield GaugeMetricFamily("ultragray_unfit_jobs", unfit, now.unfit)
+    unfit = "Jobs that wait for a worker that is not there: none that is alive has what they ask for."
+    yield GaugeMetricFamily("ultragray_unfit_jobs", unfit, now.unfit)
 
 
 def _role() -> str:
-    """The role of who asks."""
     try:
         return acting().role.value
     except LookupError:  # a door that knows nobody
@@ -238,91 +218,71 @@ def _role() -> str:
 
 
 class Metrics:
-    """One registry per service."""
-
     def __init__(self) -> None:
         self.registry = CollectorRegistry()
         self.statistics = Statistics()
         counter = partial(Counter, registry=self.registry)
         histogram = partial(Histogram, registry=self.registry)
         seconds = partial(histogram, buckets=_SECONDS)
-        self._requests = counter(
-            "ultragray_requests",
-            "Requests answered; a stream counts once, at its end.",
-            ["door", "route", "status"],
-        )
-        self._request_seconds = seconds(
-            "ultragray_request_seconds",
-            "From the arrival of a request to the end of its answer.",
-            ["door", "route"],
-        )
-        self._frame_errors = counter(
-            "ultragray_stream_frame_errors", "Messages of a stream that were answered with an error.", ["reason"]
-        )
+        door = ["door", "route"]
+        requests = "Requests answered; a stream counts once, at its end."
+        self._requests = counter("ultragray_requests", requests, [*door, "status"])
+        arrival = "From the arrival of a request to the end of its answer."
+        self._request_seconds = seconds("ultragray_request_seconds", arrival, door)
+        errors = "Messages of a stream that were answered with an error."
+        self._frame_errors = counter("ultragray_stream_frame_errors", errors, ["reason"])
         self._streams = Gauge("ultragray_open_streams", "Streams of poses that are open.", registry=self.registry)
-        self._dropped = counter(
-            "ultragray_stream_dropped_poses", "Poses of streams that newer ones replaced before they were rendered."
+        dropped = "Poses of streams that newer ones replaced before they were rendered."
+        self._dropped = counter("ultragray_stream_dropped_poses", dropped)
+        frames = "Frames rendered, by the role of who asked for them."
+        self._frames = counter("ultragray_frames", frames, ["scene", "role"])
+        limited = (
+            "Requests, frames, streams, jobs and uploads that a limit of their key refused, by the name of the limit."
         )
-        self._frames = counter(
-            "ultragray_frames", "Frames rendered, by the role of who asked for them.", ["scene", "role"]
-        )
-        self._limited = counter(
-            "ultragray_limited",
-            "Requests, frames, streams, jobs and uploads that a limit of their key refused, by the name of the limit.",
-            ["limit", "role"],
-        )
+        self._limited = counter("ultragray_limited", limited, ["limit", "role"])
         self._scenes: set[str] = set()  # that have a label of their own
         self._queue = seconds("ultragray_queue_seconds", "Waiting time of a request before it was rendered.")
         self._render = seconds("ultragray_render_seconds", "Render time of the batch that a request was in.")
         self._encode = seconds("ultragray_encode_seconds", "Encoding time of a request's frames.")
         self._batch = histogram("ultragray_batch_poses", "Poses rendered together.", buckets=_POSES)
-        self._searches = counter(
-            "ultragray_searches", "Frames looked for in a scene, and whether they were found.", ["scene", "found"]
-        )
+        searches = "Frames looked for in a scene, and whether they were found."
+        self._searches = counter("ultragray_searches", searches, ["scene", "found"])
         self._search = seconds("ultragray_search_seconds", "Time that looking for a frame took, without its wait.")
         ProcessCollector(registry=self.registry)
 
     def read(self, pool: RenderPool, jobs: Callable[[], JobsOverview], scenes: Collector) -> None:
         """From now on each scrape reads these, too. `jobs`: in numbers, as they were counted last."""
-        for collector in (_PoolCollector(pool), _JobsCollector(jobs), scenes):
+        for collector in (_Collector(lambda: _of_pool(pool)), _Collector(lambda: _of_jobs(jobs())), scenes):
             self.registry.register(collector)
 
     def tell_certificate_expiry(self, not_after: Callable[[], datetime]) -> None:
-        """The end of the certificate in use, which is asked for at each scrape."""
-        expiry = Gauge(
+        name, meaning = (
             "ultragray_certificate_expires_timestamp_seconds",
             "Unix time at which the TLS certificate in use expires.",
-            registry=self.registry,
         )
-        expiry.set_function(lambda: not_after().timestamp())
+        Gauge(name, meaning, registry=self.registry).set_function(lambda: not_after().timestamp())
 
     def count_request(self, door: str, route: str, status: str, seconds: float) -> None:
-        """One answered request of `door` http, websocket, grpc or igtl, whose errors are also frame errors."""
         self._requests.labels(door, route, status).inc()
         self._request_seconds.labels(door, route).observe(seconds)
         if door != "igtl" and _is_of_service(status) and not route.startswith(_HEALTH_ROUTES):
             self.statistics.count_error()
 
     def count_frame_error(self, error: UltragrayError) -> None:
-        """One message of a stream that was answered with an error."""
         self._frame_errors.labels(error.reason).inc()
         if _is_of_service(str(statuses_of(error).http)):
             self.statistics.count_error()
 
     def count_stream(self, change: int) -> None:
-        """One stream opened (+1) or closed (-1)."""
         self._streams.inc(change)
 
     def count_dropped(self) -> None:
-        """One pose of a stream that a newer one replaced."""
         self._dropped.inc()
 
     def count_limited(self, limit: str) -> None:
-        """One refusal by a limit of a key."""
         self._limited.labels(limit, _role()).inc()
 
     def observe_result(self, result: RenderResult[Any]) -> None:
-        """One rendered request of the pool."""
         self._frames.labels(self._label_of(result.scene), _role()).inc(len(result.poses))
         self._queue.observe(result.queue_ms / 1000)
         self._render.observe(result.render_ms / 1000)
@@ -331,7 +291,6 @@ class Metrics:
         self.statistics.observe(len(result.poses), result.queue_ms, result.render_ms, result.encode_ms)
 
     def observe_search(self, result: LocalizeResult) -> None:
-        """One frame that was looked for."""
         self._searches.labels(self._label_of(result.scene), str(result.found.is_found).lower()).inc()
         self._search.observe(result.search_ms / 1000)
 
@@ -344,5 +303,4 @@ class Metrics:
         return scene
 
     def exposition(self) -> bytes:
-        """The text that Prometheus scrapes."""
         return generate_latest(self.registry)

@@ -29,7 +29,7 @@ from ultragray.phantom.demo import DEMO_FILE
 from ultragray.rendering.pixels import encoded_image
 from ultragray.rendering.settings import Encoding
 from ultragray.scene.info import read_header
-from ultragray_service.core.jobs.jobs import Jobs
+from ultragray_service.core.jobs import Jobs
 from ultragray_service.core.poses import MatrixRows
 from ultragray_service.core.scenes import SceneCatalog
 from ultragray_service.core.threads import HelperProcesses, in_own_thread, to_its_end
@@ -128,18 +128,15 @@ class Prepared:
         return await asyncio.to_thread(read)
 
     async def settled(self, is_asked: Callable[[str], bool]) -> None:
-        """Wait until no folder is being made whose key `is_asked` accepts."""
         if tasks := {task for key, task in self._tasks.items() if is_asked(key)}:
             await asyncio.wait(tasks)
 
     def end(self) -> None:
-        """Stop what is being made; nothing begins any more."""
         self._ended = True
         for task in self._tasks.values():
             task.cancel()
 
     async def forget(self, is_doomed: Callable[[str], bool]) -> None:
-        """Remove the folders whose key `is_doomed` accepts, also those that are being made."""
         doomed = {task for key, task in self._tasks.items() if is_doomed(key)}
         for task in doomed:
             task.cancel()
@@ -154,7 +151,6 @@ class Prepared:
         await in_own_thread(remove)
 
     async def remove_stale(self) -> None:
-        """Remove what services that died while they made a folder left."""
         await in_own_thread(lambda: remove_abandoned(self.folder, _PREFIX))
 
     def _task(self, key: str, arguments: dict[str, str | None]) -> asyncio.Task[UltragrayError | None]:
@@ -167,7 +163,6 @@ class Prepared:
         return task
 
     async def _make(self, key: str, arguments: dict[str, str | None]) -> UltragrayError | None:
-        """Make the folder; None, or why that failed."""
         claim = ExitStack()
         error: UltragrayError | None = None
 
@@ -200,7 +195,6 @@ class Prepared:
         return error
 
     def _failure(self, key: str) -> UltragrayError | None:
-        """Why it failed, less than a minute ago."""
         now = time.monotonic()
         self._failures = {key: one for key, one in self._failures.items() if now - one[0] < _FAILURE_KEPT_S}
         return self._failures[key][1] if key in self._failures else None
@@ -258,9 +252,6 @@ def _size_bytes(folder: Path) -> int:
         return 0
 
 
-# The poses and the frames of a dataset, one by one.
-
-
 @dataclass(frozen=True)
 class DatasetPoses:
     """The poses of a dataset."""
@@ -270,8 +261,6 @@ class DatasetPoses:
 
 
 class DatasetViews(Prepared):
-    """Laid out at the first look, and kept by the content of the dataset."""
-
     name, what, fill = "dataset-views", "laying out the frames of the dataset", staticmethod(lay_out)
 
     def __init__(self, store: DatasetStore, settings: Settings, processes: HelperProcesses) -> None:
@@ -279,7 +268,6 @@ class DatasetViews(Prepared):
         self._store = store
 
     async def key(self, name: str) -> str:
-        """The content of a dataset. Raises DatasetNotFound, DatasetInvalid."""
         return (await asyncio.to_thread(self._store.get, name)).sha256
 
     async def poses_json(self, name: str) -> bytes:
@@ -294,7 +282,6 @@ class DatasetViews(Prepared):
             raise _deleted(name) from None
 
     async def frame_png(self, name: str, part: str, index: int) -> bytes:
-        """One frame of `part` (train or val). Raises as `poses_json`; DatasetNotFound also for no such frame."""
         key = (await self._laid_out(name)).name
         if (png := await self.picture_png(key, index, part)) is None:
             raise DatasetNotFound(f"the dataset {name!r} has no frame {index} in its part {part}", field="index")
@@ -309,9 +296,6 @@ class DatasetViews(Prepared):
 
 def _deleted(name: str) -> DatasetNotFound:
     return DatasetNotFound(f"the dataset {name!r} has been deleted", field="dataset")
-
-
-# A training while it runs: its curve, and a frame as the last checkpoint renders it.
 
 
 MAX_POINTS = 500
@@ -344,11 +328,9 @@ class TrainingViews(Prepared):
 
     def __init__(self, jobs: Jobs, datasets: DatasetStore, settings: Settings, processes: HelperProcesses) -> None:
         super().__init__(settings, processes)
-        self._jobs = jobs
-        self._datasets = datasets
+        self._jobs, self._datasets = jobs, datasets
 
     async def curve(self, job_id: str) -> TrainingCurve:
-        """The training so far. Raises JobNotFound."""
         journal, baselines = await self._jobs.do(_texts, job_id)
         return TrainingCurve(_curve_of(journal), json.loads(baselines or "{}"))
 
@@ -375,7 +357,6 @@ class TrainingViews(Prepared):
         return png
 
     async def forget_job(self, job_id: str) -> None:
-        """Remove the previews of a job."""
         await self.forget(lambda key: key.startswith(f"{job_id}-"))
 
     def _none(self, job: Job) -> ArtifactNotFound:
@@ -400,9 +381,6 @@ def _curve_of(journal: str | None) -> list[CurvePoint]:
         )
         for group in groups
     ]
-
-
-# A scene beside the held-out frames of the dataset that it was trained from.
 
 
 _FORMAT = 3  # of what is kept of a comparison
@@ -454,8 +432,6 @@ class Comparison:
 
 
 class Comparisons(Prepared):
-    """Computed at the first look, and kept by the hashes of scene and dataset."""
-
     name, what, fill = "comparisons", "comparing the scene", staticmethod(compare)
 
     def __init__(
@@ -467,9 +443,7 @@ class Comparisons(Prepared):
         processes: HelperProcesses,
     ) -> None:
         super().__init__(settings, processes)
-        self._scenes = scenes
-        self._catalog = catalog
-        self._datasets = datasets
+        self._scenes, self._catalog, self._datasets = scenes, catalog, datasets
 
     async def get(self, scene: str) -> Comparison:
         """Begin the comparison unless it is there; how far it is.
@@ -496,7 +470,6 @@ class Comparisons(Prepared):
         )
 
     async def key(self, scene: str) -> str:
-        """The key of a comparison, ready or not. Raises as `get`."""
         return (await self._wanted(scene))[0]
 
     async def frame_png(self, key: str, index: int, what: str) -> bytes:

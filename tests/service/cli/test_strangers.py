@@ -11,8 +11,8 @@ from typer.testing import CliRunner
 
 from ultragray.errors import DatasetInvalid
 from ultragray_service.cli.app import USER_ERROR, app
+from ultragray_service.cli.connection import exposes_key
 from ultragray_service.cli.remote import archive_of
-from ultragray_service.tls.client import exposes_key
 
 from ...certificates import Mounted, write_client
 

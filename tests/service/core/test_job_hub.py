@@ -3,9 +3,8 @@ from dataclasses import replace
 
 import pytest
 
-from ultragray_service.core.jobs import hub as job_hub
-from ultragray_service.core.jobs.hub import JobChange, JobHub
-from ultragray_service.core.jobs.log import TAIL_BYTES, GrowingLog
+from ultragray_service.core import jobs as job_hub
+from ultragray_service.core.jobs import TAIL_BYTES, GrowingLog, JobChange, JobHub
 from ultragray_workers.errors import JobNotFound
 from ultragray_workers.jobs.progress import JobState, Progress
 from ultragray_workers.jobs.record import Job

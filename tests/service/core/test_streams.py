@@ -78,6 +78,9 @@ class Faulty:
     sequence, client_time, asks = 7, 1.5, True
     window = acknowledged = None
 
+    def mode(self):
+        return StreamMode.ORDERED
+
     def settings(self):
         raise OverflowError("cannot convert float infinity to integer")
 
@@ -93,9 +96,6 @@ class FaultyTransport:
 
     async def receive(self):
         return next(self.messages, None)
-
-    def mode(self, message):
-        return StreamMode.ORDERED
 
     async def send(self, answered):
         self.answers.append(answered)

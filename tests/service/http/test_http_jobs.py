@@ -9,7 +9,7 @@ import pytest
 import sqlalchemy as sa
 from pydantic import TypeAdapter
 
-from ultragray_service.core.jobs.log import TAIL_BYTES
+from ultragray_service.core.jobs import TAIL_BYTES
 from ultragray_service.http.bodies import SPECIFICATIONS
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.kinds import Specification

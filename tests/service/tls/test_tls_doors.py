@@ -23,7 +23,7 @@ from websockets.sync.client import connect
 from ultragray.errors import InvalidArgument
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 from ultragray_service.settings import load_settings
-from ultragray_service.tls.server import CertificateFiles, CertificateWatch
+from ultragray_service.tls import CertificateFiles, CertificateWatch
 from ultragray_workers.errors import StartupFailed
 
 from ...certificates import AUTHORITY, KEY, RARE_CURVE, SERVER

@@ -54,35 +54,57 @@ _READ_IN_THREAD_BYTES = 2**20
 class PoolConfig(Contract):
     """Sizes of a pool. Raises InvalidArgument for values that no pool can have."""
 
-    processes: int = described("0: one per GPU that renders; on the CPU one.", 0, low=0, high=1024)
-    threads_per_process: int = described(
-        "0: the cores this process may use, divided by the number of processes.", 0, low=0, high=1024
+    processes: int = described(
+        "Render processes; 0: one per GPU, on the CPU one. More than there are GPUs share them.",
+        0,
+        low=0,
+        high=256,
+        topic="Compute",
     )
-    queue_limit_frames: int = described("Poses that may wait, for each priority.", 256, low=1, high=2**31)
-    client_limit_frames: int = described("Of one client, for each priority.", 256, low=1, high=2**31)
+    threads_per_process: int = described(
+        "Render threads of each; 0: cores // processes.", 0, low=0, high=1024, topic="Compute"
+    )
+    queue_limit_frames: int = described(
+        "Frames that may wait, interactive and batch frames each; beyond: QUEUE_FULL.", 256, low=1, high=100_000
+    )
+    client_limit_frames: int = described(
+        "Of those, frames of one client: of one name where keys are asked for, else of one address.",
+        256,
+        low=1,
+        high=100_000,
+    )
     max_queue_ms: float = described(
-        "How long others may keep an interactive request waiting; one that would wait longer is refused at once.",
+        "How long frames of others may keep an interactive request waiting; one that would wait longer is refused at "
+        "once (QUEUE_FULL), and told when to try again.",
         1000.0,
         above=0.0,
         high=3_600_000.0,
     )
     max_batch_poses: int = described(
-        "Poses rendered together; fewer for images of more than 512x512 pixels.", 16, low=1, high=MAX_BATCH_POSES
+        "Waiting poses of one scene that are rendered together; fewer above 512x512 pixels.",
+        16,
+        low=1,
+        high=MAX_BATCH_POSES,
     )
     memory_budget_bytes: int = described(
         "Of loaded scenes, per process, where they are rendered.", 4 * 2**30, low=1, high=2**63
     )
     max_footprint_pixels: int = described(
-        "Cost of a frame, see ultragray.rendering.limits.", 2**31, low=1, high=2**63 - 1
+        "Cost of one frame: pixels in the footprints of the Gaussians that it cuts, about 3e7 of 500,000 usual ones at "
+        "512x512; beyond: FRAME_TOO_COSTLY.",
+        2**31,
+        low=1,
+        high=2**62,
     )
     worker_grace_s: float = described(
-        "How long a process may leave a task untouched, or owe its answer after the deadline.",
+        "How long a render process may leave a task untouched, or owe an answer past its deadline, before it is killed "
+        "and replaced, and its frames are rendered again.",
         5.0,
         above=0.0,
         high=3600.0,
     )
     worker_timeout_s: float = described(
-        "How long a process may take for what has no deadline, such as loading a scene.",
+        "How long a render process may take to load a scene before it is killed and replaced.",
         120.0,
         above=0.0,
         high=86_400.0,

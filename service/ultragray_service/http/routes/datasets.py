@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import time
-from collections.abc import AsyncIterator
+from functools import partial
 from inspect import Parameter, Signature
 from typing import Annotated, Any, Literal
 
 from fastapi import APIRouter, Depends, Path, Query
-from starlette.requests import ClientDisconnect, Request
+from starlette.requests import Request
 from starlette.responses import Response
 
 from ultragray.datasets.source import UPLOAD_OPTIONS, UPLOADED_FORMATS
@@ -20,16 +20,21 @@ from ultragray_service.errors import UnsupportedMediaType
 from ultragray_service.http.accept import PNG
 from ultragray_service.http.bodies import FileParts
 from ultragray_service.http.dependencies import (
+    BINARY,
     NOT_MODIFIED,
+    Answers,
+    PageToken,
     SceneName,
     ServiceDep,
+    answer,
+    blocks_of,
+    check_upload,
     finish_or_abandon,
     problems,
     revalidated,
 )
 from ultragray_service.views.prepared import Comparison, DatasetPoses
 from ultragray_workers.datasets.store import DatasetRecord
-from ultragray_workers.errors import UploadTooLarge
 
 router = APIRouter(prefix="/v1/datasets", tags=["datasets"])
 
@@ -45,7 +50,6 @@ ARCHIVES = (
 
 DatasetName = Annotated[str, Path(description="Name of the dataset.", examples=["liver"])]
 PageSize = Annotated[int, Query(ge=1, le=MAX_PAGE_SIZE, description="Datasets on one page.")]
-PageToken = Annotated[str, Query(description="next_page_token of the page before.")]
 
 
 Private = Annotated[bool, Query(description="Whether others may not see it.")]
@@ -63,13 +67,12 @@ _given_options.__signature__ = Signature(  # type: ignore[attr-defined]  # what 
 )
 GivenOptions = Annotated[dict[str, str], Depends(_given_options)]
 
-_BINARY = {"schema": {"type": "string", "format": "binary"}}
 _UPLOAD: dict[str, Any] = {
     "requestBody": {
         "required": True,
         "description": f"An archive, or separate files: {' or '.join(one.upload_meaning for one in UPLOADED_FORMATS)}.",
         "content": {
-            **dict.fromkeys(ARCHIVES, _BINARY),
+            **dict.fromkeys(ARCHIVES, BINARY),
             MULTIPART: {
                 "schema": {
                     "type": "object",
@@ -79,11 +82,12 @@ _UPLOAD: dict[str, Any] = {
         },
     }
 }
-_Answers = dict[int | str, dict[str, Any]]
-_PRESENT: _Answers = {
+_PRESENT: Answers = {
     200: {"model": DatasetRecord, "description": "It is there already, with this content and these options."}
 }
-_PICTURE: _Answers = {200: {"description": "The image planes in space and some frames.", "content": {PNG: _BINARY}}}
+_PICTURE = answer("The image planes in space and some frames.", PNG)
+_FRAME_PICTURE = answer("8-bit grey, square pixels, 512 on the longer side.", PNG) | NOT_MODIFIED
+_POSES: Answers = {200: {"model": DatasetPoses}, **NOT_MODIFIED}
 
 
 @router.put(
@@ -103,12 +107,7 @@ async def put_dataset(
     """Uploads a dataset, checks it as `ultragray check` does, and keeps it. Empty options: as it is stored."""
     service.life.require_serving()
     media_type = _media_type(request)
-    announced = request.headers.get("content-length", "")
-    if announced.isdigit() and int(announced) > service.settings.max_dataset_bytes:
-        raise UploadTooLarge(
-            f"a dataset may have at most {service.settings.max_dataset_bytes} bytes, {announced} were announced",
-            field="body",
-        )
+    check_upload(request, service.settings.max_dataset_bytes, "a dataset")
     async with service.uploads.receive(dataset, options, private=private) as upload:
         if media_type == MULTIPART:
             await _receive_files(request, upload)
@@ -134,11 +133,7 @@ async def get_dataset(service: ServiceDep, dataset: DatasetName) -> DatasetRecor
     return await service.datasets.get(dataset)
 
 
-@router.get(
-    "/{dataset}/contact-sheet",
-    response_class=Response,
-    responses=_PICTURE | problems(401, 404, 422, 503),
-)
+@router.get("/{dataset}/contact-sheet", response_class=Response, responses=_PICTURE | problems(401, 404, 422, 503))
 async def get_contact_sheet(service: ServiceDep, dataset: DatasetName) -> Response:
     """A picture of the dataset, PNG."""
     return Response(await service.datasets.contact_sheet(dataset), media_type=PNG)
@@ -158,20 +153,18 @@ def _media_type(request: Request) -> str:
             f"Content-Type must be {MULTIPART} or one of {', '.join(ARCHIVES)}, got {content_type[:200]!r}",
             field="Content-Type",
         )
-    if request.headers.get("content-encoding", "identity").lower() != "identity":
-        raise UnsupportedMediaType("the body must not be compressed as a whole", field="Content-Encoding")
     return media_type
 
 
 async def _receive_archive(request: Request, upload: DatasetUpload) -> None:
     await upload.begin_archive()
-    async for block in _blocks(request, upload):
+    async for block in blocks_of(request, upload.next):
         await upload.write(block)
 
 
 async def _receive_files(request: Request, upload: DatasetUpload) -> None:
     parts = FileParts(request.headers["content-type"])
-    async for block in _blocks(request, upload):
+    async for block in blocks_of(request, upload.next):
         for event in parts.feed(block):
             if isinstance(event, str):
                 await upload.begin_file(event)
@@ -180,32 +173,9 @@ async def _receive_files(request: Request, upload: DatasetUpload) -> None:
     parts.finish()
 
 
-async def _blocks(request: Request, upload: DatasetUpload) -> AsyncIterator[bytes]:
-    """The body as it comes. Raises ClientDisconnect, and as `DatasetUpload.next`."""
-    more = True
-    while more:
-        message = await upload.next(request.receive())
-        if message["type"] == "http.disconnect":
-            raise ClientDisconnect
-        more = message.get("more_body", False)
-        yield message.get("body", b"")
-
-
-# Pictures to compare: a scene beside the frames held out from it, and the frames and poses of a dataset.
-
-
 comparison_router = APIRouter(prefix="/v1", tags=["console"])
 
 FrameIndex = Annotated[int, Path(ge=0, description="Place of the frame, from 0.")]
-_Answers2 = dict[int | str, dict[str, Any]]
-_FRAME_PICTURE: _Answers2 = {
-    200: {
-        "description": "8-bit grey, square pixels, 512 on the longer side.",
-        "content": {PNG: {"schema": {"type": "string", "format": "binary"}}},
-    },
-    304: {"description": NOT_MODIFIED},
-}
-_POSES: _Answers2 = {200: {"model": DatasetPoses}, 304: {"description": NOT_MODIFIED}}
 
 
 @comparison_router.get("/scenes/{scene}/comparison", responses=problems(401, 404, 422, 503))
@@ -229,26 +199,19 @@ async def get_compared_picture(
 ) -> Response:
     """A picture of a held-out frame; difference: three times the absolute one between truth and rendering."""
     key = await service.comparisons.key(scene)
-
-    async def picture() -> Response:
-        return Response(await service.comparisons.frame_png(key, index, what), media_type=PNG)
-
-    return await revalidated(request, f"{key}-{what}-{index}", picture)
+    picture = partial(service.comparisons.frame_png, key, index, what)
+    return await revalidated(request, f"{key}-{what}-{index}", picture, PNG)
 
 
 @comparison_router.get(
-    "/datasets/{dataset}/poses",
-    response_class=Response,
-    responses=_POSES | problems(401, 404, 422, 500, 503, 504, 507),
+    "/datasets/{dataset}/poses", response_class=Response, responses=_POSES | problems(401, 404, 422, 500, 503, 504, 507)
 )
 async def get_dataset_poses(request: Request, service: ServiceDep, dataset: DatasetName) -> Response:
     """Probe to scene, of the training frames and the held-out ones."""
     service.life.require_serving()
-
-    async def poses() -> Response:
-        return Response(await service.dataset_views.poses_json(dataset), media_type="application/json")
-
-    return await revalidated(request, f"{await service.dataset_views.key(dataset)}-poses", poses)
+    views = service.dataset_views
+    version = f"{await views.key(dataset)}-poses"
+    return await revalidated(request, version, partial(views.poses_json, dataset), "application/json")
 
 
 @comparison_router.get(
@@ -261,8 +224,6 @@ async def get_dataset_frame(
 ) -> Response:
     """A frame of a dataset; those of convex and phased probes as fans."""
     service.life.require_serving()
-
-    async def frame() -> Response:
-        return Response(await service.dataset_views.frame_png(dataset, part, index), media_type=PNG)
-
-    return await revalidated(request, f"{await service.dataset_views.key(dataset)}-{part}-{index}", frame)
+    views = service.dataset_views
+    version = f"{await views.key(dataset)}-{part}-{index}"
+    return await revalidated(request, version, partial(views.frame_png, dataset, part, index), PNG)

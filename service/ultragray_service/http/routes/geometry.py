@@ -15,7 +15,7 @@ from ultragray.geometry.registration import Registration
 from ultragray_service.core.registrations import NamedRegistration, RegistrationPage
 from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
 from ultragray_service.http.bodies import RegistrationBody, body_schema, read_json_body
-from ultragray_service.http.dependencies import ServiceDep, problems
+from ultragray_service.http.dependencies import PageToken, ServiceDep, problems
 
 router = APIRouter(prefix="/v1/probes", tags=["probes"])
 
@@ -46,14 +46,10 @@ async def probe_plane(request: Request) -> ImagePlane:
     return ImagePlane(probe.face_depth_mm, probe.pivot_depth_mm, lines_mm)
 
 
-# Registrations of robots and trackers to scenes.
-
-
 registrations_router = APIRouter(prefix="/v1/registrations", tags=["registrations"])
 
 Name = Annotated[str, Path(description="Name of the registration.", examples=["robot"])]
 PageSize = Annotated[int, Query(ge=1, le=MAX_PAGE_SIZE, description="Registrations on one page.")]
-PageToken = Annotated[str, Query(description="next_page_token of the page before.")]
 
 
 @registrations_router.get("", responses=problems(401, 422, 503))

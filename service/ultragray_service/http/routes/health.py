@@ -12,13 +12,7 @@ from starlette.responses import Response
 
 from ultragray import __version__
 from ultragray.contract import described
-from ultragray_service.access.principals import Me, me
-from ultragray_service.core.readiness import Components
-from ultragray_service.doors import ServiceInfo
-from ultragray_service.http.dependencies import ServiceDep, problems
-from ultragray_service.http.problems import problem_response
-from ultragray_service.telemetry.metrics import ServiceStatistics, memory_bytes
-from ultragray_service.views.audited import (
+from ultragray_service.access.audit import (
     DEFAULT_ENTRIES,
     DEFAULT_HOURS,
     MAX_ENTRIES,
@@ -26,6 +20,12 @@ from ultragray_service.views.audited import (
     AuditEntries,
     audit_entries,
 )
+from ultragray_service.access.principals import Me, me
+from ultragray_service.core.readiness import Components
+from ultragray_service.doors import ServiceInfo
+from ultragray_service.http.dependencies import ServiceDep, problems
+from ultragray_service.http.problems import problem_response
+from ultragray_service.telemetry.metrics import ServiceStatistics, memory_bytes
 
 
 @dataclass(frozen=True)
@@ -77,9 +77,6 @@ async def ready(service: ServiceDep) -> Ready | Response:
     return Ready(components, identity_provider="available" if is_available else "unavailable")
 
 
-# What the service is, and where its other doors are.
-
-
 service_router = APIRouter(prefix="/v1/service", tags=["service"])
 
 
@@ -87,9 +84,6 @@ service_router = APIRouter(prefix="/v1/service", tags=["service"])
 async def get_service(service: ServiceDep) -> ServiceInfo:
     """Version, and the ports of gRPC and OpenIGTLink, for pages that tell how to connect."""
     return service.doors.info(key_required=service.guard.asks)
-
-
-# The service at work: its frames and its jobs in numbers, and Prometheus.
 
 
 statistics_router = APIRouter()
@@ -122,9 +116,6 @@ async def get_statistics(service: ServiceDep) -> ServiceStatistics:
 async def metrics(service: ServiceDep) -> Response:
     """Requests, frames, queue, render and encode times, and the state of the render pool."""
     return Response(service.metrics.exposition(), media_type=CONTENT_TYPE_LATEST)
-
-
-# Who asks, how people sign in, and who did what.
 
 
 @dataclass(frozen=True)

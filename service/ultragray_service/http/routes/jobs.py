@@ -19,14 +19,20 @@ from starlette.types import Receive, Scope, Send
 
 from ultragray.contract import under
 from ultragray.errors import InvalidArgument
-from ultragray_service.core.jobs.estimates import JobEstimate, estimate
-from ultragray_service.core.jobs.hub import JobChange, JobWatch
-from ultragray_service.core.jobs.jobs import JobPage, WorkerList
-from ultragray_service.core.jobs.log import DEFAULT_LOG_BYTES, MAX_LOG_BYTES
+from ultragray_service.core.jobs import (
+    DEFAULT_LOG_BYTES,
+    MAX_LOG_BYTES,
+    JobChange,
+    JobEstimate,
+    JobPage,
+    JobWatch,
+    WorkerList,
+    estimate,
+)
 from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE
 from ultragray_service.http.accept import NPZ, PNG
 from ultragray_service.http.bodies import SPECIFICATION, JobBody, adapter_of, body_schema, read_json_body
-from ultragray_service.http.dependencies import JOB_EXAMPLES, ServiceDep, problems
+from ultragray_service.http.dependencies import JOB_EXAMPLES, Answers, PageToken, ServiceDep, answer, problems
 from ultragray_service.views.prepared import TrainingCurve
 from ultragray_workers.jobs.files import Artifact
 from ultragray_workers.jobs.kinds import KINDS, Specification
@@ -55,7 +61,6 @@ class LastEvent:
 
     @classmethod
     def read(cls, event_id: str) -> LastEvent:
-        """The inverse of `str`; for the id of another stream: nothing is known."""
         if (found := _ID.fullmatch(event_id)) is None:
             return cls()
         return cls(int(found[1]), found[2])
@@ -87,7 +92,6 @@ async def _events(watch: JobWatch, last: LastEvent) -> AsyncIterator[bytes]:
 
 
 def _written(change: JobChange, last: LastEvent) -> tuple[str, LastEvent]:
-    """The events of a change, and the id of the last of them."""
     text = ""
     if change.log:
         last = replace(last, log_offset=change.log_offset)
@@ -105,9 +109,6 @@ def _event(name: str, event_id: LastEvent, data: str) -> str:
     whole = data.replace("\r\n", "\n").replace("\r", "\n").removesuffix("\n")
     lines = "".join(f"data: {line}\n" for line in whole.split("\n"))
     return f"event: {name}\nid: {event_id}\n{lines}\n"
-
-
-# Training and batch rendering in the background.
 
 
 router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
@@ -132,25 +133,16 @@ _AnyKind: Any = Literal.__getitem__(("", *KINDS))
 StateFilter = Annotated[_AnyState, Query(description="Only jobs in this state; empty: all.")]
 KindFilter = Annotated[_AnyKind, Query(description="Only jobs of this kind; empty: all.")]
 PageSize = Annotated[int, Query(ge=1, le=MAX_PAGE_SIZE, description="Jobs on one page.")]
-PageToken = Annotated[str, Query(description="next_page_token of the page before.")]
 LogBytes = Annotated[int, Query(ge=1, le=MAX_LOG_BYTES, description="How much of the log's end is given.")]
 LastEventId = Annotated[str, Header(alias="Last-Event-ID", description="Id of the last event of an earlier stream.")]
 
 _SUBMIT = body_schema(JobBody, JOB_EXAMPLES)
-_Answers = dict[int | str, dict[str, Any]]
-_SAME_JOB: _Answers = {200: {"model": Job, "description": "The job that this request_id made before."}}
-_SAME_RETRY: _Answers = {200: {"model": Job, "description": "The job that an earlier call made."}}
-_LOG: _Answers = {200: {"description": "The end of the log.", "content": {"text/plain": {}}}}
-_FILE: _Answers = {
-    200: {
-        "description": "The file.",
-        "content": {
-            media_type: {"schema": {"type": "string", "format": "binary"}}
-            for media_type in (*MEDIA_TYPES.values(), _ANY_FILE)
-        },
-    }
-}
-_EVENTS: _Answers = {
+_SAME_JOB: Answers = {200: {"model": Job, "description": "The job that this request_id made before."}}
+_SAME_RETRY: Answers = {200: {"model": Job, "description": "The job that an earlier call made."}}
+_LOG: Answers = {200: {"description": "The end of the log.", "content": {"text/plain": {}}}}
+_FILE = answer("The file.", *MEDIA_TYPES.values(), _ANY_FILE)
+_PREVIEW = answer("8-bit grey: the frame as it was recorded, and to its right as it is rendered.", PNG)
+_EVENTS: Answers = {
     200: {
         "description": "Server-sent events: `progress` with the job (Job) at first and whenever it changed, at most "
         "twice a second; `log` with new lines. The stream ends after the job's final state.",
@@ -246,21 +238,13 @@ async def delete_job(service: ServiceDep, job: JobId) -> None:
     await service.delete_job(job)
 
 
-@router.get(
-    "/{job}/log",
-    response_class=PlainTextResponse,
-    responses=_LOG | problems(401, 404, 422, 503),
-)
+@router.get("/{job}/log", response_class=PlainTextResponse, responses=_LOG | problems(401, 404, 422, 503))
 async def get_job_log(service: ServiceDep, job: JobId, max_bytes: LogBytes = DEFAULT_LOG_BYTES) -> PlainTextResponse:
     """What the job's process wrote."""
     return PlainTextResponse(await service.jobs.do(JobStore.log_tail, job, max_bytes))
 
 
-@router.get(
-    "/{job}/artifacts/{name}",
-    response_class=FileResponse,
-    responses=_FILE | problems(401, 404, 422, 503),
-)
+@router.get("/{job}/artifacts/{name}", response_class=FileResponse, responses=_FILE | problems(401, 404, 422, 503))
 async def get_artifact(
     request: Request,
     service: ServiceDep,
@@ -275,19 +259,12 @@ async def get_artifact(
     return artifact_response(found, request.headers, media_type, SHOWN, disposition)
 
 
-@router.get(
-    "/{job}/events",
-    response_class=StreamingResponse,
-    responses=_EVENTS | problems(401, 404, 422, 503),
-)
+@router.get("/{job}/events", response_class=StreamingResponse, responses=_EVENTS | problems(401, 404, 422, 503))
 async def watch_job(service: ServiceDep, job: JobId, last_event_id: LastEventId = "") -> JobEvents:
     """Follows a job. A stream that ends before the final state goes on where it ended: say the id of its last event."""
     service.life.require_serving()
     last = LastEvent.read(last_event_id)
     return JobEvents(await service.jobs.hub.watch(job, last.log_offset), last)
-
-
-# A file of a job as an answer of HTTP: whole, or the range that was asked for.
 
 
 # A page that a job made is shown without scripts, in an origin of its own, and fetches nothing.
@@ -303,10 +280,7 @@ _RANGE = re.compile(r"bytes=(\d*)-(\d*)")
 def artifact_response(
     file: Artifact, asked: Headers, media_type: str, beside: Mapping[str, str], disposition: str
 ) -> Response:
-    """The answer to a GET with these headers. Of several ranges none is answered, but the whole file.
-
-    `beside`: further headers of the answer. `disposition`: inline or attachment.
-    """
+    """The answer to a GET of a file or of one range; `beside`: further headers, `disposition`: inline or attachment."""
     etag = f'"{file.stored.sha256}"'
     headers = {
         **beside,
@@ -345,38 +319,17 @@ def _read(file: Artifact, start: int, length: int) -> bytes:
     return chunk
 
 
-# A training while it runs.
-
-
-training_router = APIRouter(prefix="/v1/jobs", tags=["jobs"])
-
-_Answers2 = dict[int | str, dict[str, Any]]
-_PREVIEW: _Answers2 = {
-    200: {
-        "description": "8-bit grey: the frame as it was recorded, and to its right as it is rendered.",
-        "content": {PNG: {"schema": {"type": "string", "format": "binary"}}},
-    }
-}
-
-
-@training_router.get("/{job}/curve", responses=problems(401, 404, 422, 503))
+@router.get("/{job}/curve", responses=problems(401, 404, 422, 503))
 async def get_curve(service: ServiceDep, job: JobId) -> TrainingCurve:
     """Loss and held-out PSNR of a training so far, in at most 500 points."""
     return await service.training_views.curve(job)
 
 
-@training_router.get(
-    "/{job}/preview",
-    response_class=Response,
-    responses=_PREVIEW | problems(401, 404, 422, 500, 503, 504, 507),
-)
+@router.get("/{job}/preview", response_class=Response, responses=_PREVIEW | problems(401, 404, 422, 500, 503, 504, 507))
 async def get_preview(service: ServiceDep, job: JobId) -> Response:
     """A held-out frame, rendered from the last checkpoint of a running training: a new one comes every ten seconds."""
     service.life.require_serving()
     return Response(await service.training_views.preview_png(job), media_type=PNG)
-
-
-# The workers that do the jobs.
 
 
 workers_router = APIRouter(prefix="/v1/workers", tags=["jobs"])

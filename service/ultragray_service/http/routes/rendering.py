@@ -19,8 +19,7 @@ from ultragray.exchange.exports.formats import FORMATS, check_format, export_byt
 from ultragray.rendering.outputs import OUTPUTS
 from ultragray.rendering.settings import Encoding, Resolved, SettingsUsed, settings_used
 from ultragray.rendering.volumes import SliceSettings, SliceView
-from ultragray_service.core.frames import SliceFacts
-from ultragray_service.core.poses import exact_poses
+from ultragray_service.core.poses import SliceFacts, exact_poses
 from ultragray_service.http.accept import DICOM, JPEG, NPY, NPZ, PNG, RAW, choose, choose_of_slice
 from ultragray_service.http.bodies import RenderBody, body_schema, read_json_body
 from ultragray_service.http.dependencies import (
@@ -29,6 +28,7 @@ from ultragray_service.http.dependencies import (
     SLICE_EXAMPLES,
     SceneName,
     ServiceDep,
+    answer,
     finish_or_abandon,
     problems,
 )
@@ -66,18 +66,15 @@ _OPENAPI: dict[str, Any] = {
     "parameters": [{"name": "scene", "in": "path", "required": True, **SCENE_NAME}],
     **body_schema(RenderBody, RENDER_EXAMPLES),
 }
-_BINARY = {"schema": {"type": "string", "format": "binary"}}
-_ANSWER: dict[int | str, dict[str, Any]] = {
-    200: {
-        "description": "The frames. image/png and image/jpeg: one pose, one output. application/octet-stream "
-        "(parameter dtype=uint8 or float32): the outputs one after another, each [C, H, W]. application/x-npz "
-        "holds one float32 array [C, H, W] per output, `poses` [C, 4, 4], and the strings scene, scene_sha256 and "
-        "renderer. application/dicom: a multi-frame ultrasound image of bmode, true to scale: fans are scan-converted. "
-        "`*/*` gives PNG where it can hold the request, else npz.",
-        "content": {PNG: _BINARY, JPEG: _BINARY, RAW: _BINARY, NPZ: _BINARY, DICOM: _BINARY},
-        "headers": {name: {"description": text, "schema": {"type": "string"}} for name, text in RENDER_HEADERS.items()},
-    }
-}
+_ANSWER = answer(
+    "The frames. image/png and image/jpeg: one pose, one output. application/octet-stream (parameter dtype=uint8 or "
+    "float32): the outputs one after another, each [C, H, W]. application/x-npz holds one float32 array [C, H, W] per "
+    "output, `poses` [C, 4, 4], and the strings scene, scene_sha256 and renderer. application/dicom: a multi-frame "
+    "ultrasound image of bmode, true to scale: fans are scan-converted. `*/*` gives PNG where it can hold the request, "
+    "else npz.",
+    *(PNG, JPEG, RAW, NPZ, DICOM),
+    headers=RENDER_HEADERS,
+)
 
 
 @router.post(
@@ -133,7 +130,6 @@ def _dicom_of(result: RenderResult) -> bytes:
 
 
 def render_headers(result: RenderResult) -> dict[str, str]:
-    """The facts of an answer that stand beside the pixels."""
     settings, poses = result.settings, result.poses
     times = {stage: f"{getattr(result, f'{stage}_ms'):.3f}" for stage in STAGES}
     confidences = ["" if one.confidence is None else f"{one.confidence:.3f}" for one in result.extrapolations]
@@ -155,15 +151,9 @@ def render_headers(result: RenderResult) -> dict[str, str]:
 
 @lru_cache(maxsize=256)
 def _settings_headers(settings: Resolved) -> dict[str, str]:
-    """The headers that settings alone decide."""
     texts = {"dtype": settings.encoding.pixel_type.name, **settings_used(settings).texts()}
     return {_header_of(name): text for name, text in texts.items()}
 
-
-# Slices of a scene on any plane. The Accept header chooses the form.
-
-
-slices_router = APIRouter(prefix="/v1/scenes", tags=["render"])
 
 SLICE_HEADERS = {
     "X-Ultragray-Scene": "Name of the scene.",
@@ -173,19 +163,15 @@ SLICE_HEADERS = {
     "X-Ultragray-Pixel-To-Scene": "4x4 matrix from (column, row, k, 1), from 0 at pixels' centres, to mm, JSON.",
     "Server-Timing": "Waiting, sampling and encoding time, for browsers.",
 }
-_BINARY2 = {"schema": {"type": "string", "format": "binary"}}
-_SLICE_ANSWER: dict[int | str, dict[str, Any]] = {
-    200: {
-        "description": "The slice, [H, W]. image/png: grey, 255 at 1 (attenuation: at the largest value of the slice); "
-        "labels keep their numbers. application/x-npy and application/octet-stream: the values, row by row. `*/*` "
-        "gives PNG.",
-        "content": {PNG: _BINARY2, NPY: _BINARY2, RAW: _BINARY2},
-        "headers": {name: {"description": text, "schema": {"type": "string"}} for name, text in SLICE_HEADERS.items()},
-    }
-}
+_SLICE_ANSWER = answer(
+    "The slice, [H, W]. image/png: grey, 255 at 1 (attenuation: at the largest value of the slice); labels keep their "
+    "numbers. application/x-npy and application/octet-stream: the values, row by row. `*/*` gives PNG.",
+    *(PNG, NPY, RAW),
+    headers=SLICE_HEADERS,
+)
 
 
-@slices_router.post(
+@router.post(
     "/{scene}:slice",
     response_class=Response,
     openapi_extra=body_schema(SliceSettings, SLICE_EXAMPLES),

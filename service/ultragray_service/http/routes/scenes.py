@@ -6,12 +6,12 @@ import asyncio
 import base64
 import json
 import time
-from collections.abc import AsyncIterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Annotated, Any
 
 from fastapi import APIRouter, Query
-from starlette.requests import ClientDisconnect, Request
+from starlette.requests import Request
 from starlette.responses import FileResponse, Response
 
 from ultragray.contract import described
@@ -30,29 +30,31 @@ from ultragray_service.core.scene_points import (
 )
 from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE, Scene, SceneLoaded, ScenePage
 from ultragray_service.core.threads import PATIENCE_S
-from ultragray_service.core.uploads import arrival
-from ultragray_service.errors import UnsupportedMediaType
+from ultragray_service.core.uploads import arrivals
 from ultragray_service.http.accept import RAW
 from ultragray_service.http.bodies import LARGE_IMAGE, AssessBody, LocalizeBody, body_schema, read_json_body
 from ultragray_service.http.dependencies import (
+    BINARY,
     NOT_MODIFIED,
+    Answers,
+    PageToken,
     SceneName,
     ServiceDep,
+    answer,
+    blocks_of,
+    check_upload,
     finish_or_abandon,
     problems,
     revalidated,
 )
 from ultragray_service.http.routes.datasets import Private
-from ultragray_service.views.assessments import Assessments
-from ultragray_service.views.localizing import Located, locate, sought_frame
-from ultragray_workers.errors import UploadTooLarge
+from ultragray_service.views.poses import Assessments, Located, locate, sought_frame
 from ultragray_workers.jobs.owners import Kind
 from ultragray_workers.scene_names import SUFFIX, base_name
 
 router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
 
 PageSize = Annotated[int, Query(ge=1, le=MAX_PAGE_SIZE, description="Scenes on one page.")]
-PageToken = Annotated[str, Query(description="next_page_token of the page before.")]
 
 
 @router.get("", response_model_exclude_none=True, responses=problems(401, 422))
@@ -114,9 +116,6 @@ async def unload_scene(service: ServiceDep, scene: SceneName) -> SceneLoaded:
     return await service.scenes.unload(scene)
 
 
-# Scene files: downloaded, imported, deleted, and looked into.
-
-
 @dataclass(frozen=True)
 class ScenePoses:
     """Training poses of a scene, evenly taken."""
@@ -125,8 +124,6 @@ class ScenePoses:
     shift_mm: list[float] | None = described("How far each was corrected in the training; null: none was.", None)
     turn_deg: list[float] | None = described("And turned.", None)
 
-
-files_router = APIRouter(prefix="/v1/scenes", tags=["scenes"])
 
 PointLimit = Annotated[int, Query(ge=1, le=MAX_POINTS, description="Gaussians at most.")]
 PointFields = Annotated[
@@ -137,24 +134,22 @@ PointFields = Annotated[
         f"for: {', '.join(ALL_FIELDS)}.",
     ),
 ]
-_BINARY = {"schema": {"type": "string", "format": "binary"}}
-_Answers = dict[int | str, dict[str, Any]]
-_POINTS: _Answers = {
-    200: {
-        "description": "The length of the JSON that follows (uint32, little endian), the JSON with `count`, `fields` "
-        "and `total`, then float32 [count, fields] from a multiple of 8 bytes.",
-        "content": {RAW: _BINARY},
-    },
-    304: {"description": NOT_MODIFIED},
-}
-_POSES: _Answers = {200: {"model": ScenePoses}, 304: {"description": NOT_MODIFIED}}
-_FILE: _Answers = {200: {"description": "The scene file.", "content": {RAW: _BINARY}}}
+_POINTS = (
+    answer(
+        "The length of the JSON that follows (uint32, little endian), the JSON with `count`, `fields` and `total`, "
+        "then float32 [count, fields] from a multiple of 8 bytes.",
+        RAW,
+    )
+    | NOT_MODIFIED
+)
+_POSES: Answers = {200: {"model": ScenePoses}, **NOT_MODIFIED}
+_FILE = answer("The scene file.", RAW)
 _IMPORT: dict[str, Any] = {
-    "requestBody": {"required": True, "description": "A scene file (.ugr).", "content": {RAW: _BINARY}}
+    "requestBody": {"required": True, "description": "A scene file (.ugr).", "content": {RAW: BINARY}}
 }
 
 
-@files_router.get("/{scene}/gaussians", response_class=Response, responses=_POINTS | problems(401, 404, 422))
+@router.get("/{scene}/gaussians", response_class=Response, responses=_POINTS | problems(401, 404, 422))
 async def get_gaussians(
     request: Request,
     service: ServiceDep,
@@ -163,25 +158,21 @@ async def get_gaussians(
     fields: PointFields = None,
 ) -> Response:
     """Gaussians as points: position, intensity, transmittance and size, or `fields`; always the same even selection."""
-
-    async def points() -> Response:
-        return Response(await service.catalog.points(scene, limit, fields or FIELDS), media_type=RAW)
-
-    return await revalidated(request, (await service.catalog.version(scene)).tag, points)
+    version = (await service.catalog.version(scene)).tag
+    return await revalidated(request, version, partial(service.catalog.points, scene, limit, fields or FIELDS), RAW)
 
 
-@files_router.get("/{scene}/training-poses", response_class=Response, responses=_POSES | problems(401, 404, 422))
+@router.get("/{scene}/training-poses", response_class=Response, responses=_POSES | problems(401, 404, 422))
 async def get_training_poses(request: Request, service: ServiceDep, scene: SceneName) -> Response:
     """The poses that the scene was trained from, at most 10,000 of them, evenly taken."""
 
-    async def poses() -> Response:
-        header = await service.catalog.header(scene)
-        return Response(await asyncio.to_thread(_poses_json, header), media_type="application/json")
+    async def poses() -> bytes:
+        return await asyncio.to_thread(_poses_json, await service.catalog.header(scene))
 
-    return await revalidated(request, (await service.catalog.version(scene)).tag, poses)
+    return await revalidated(request, (await service.catalog.version(scene)).tag, poses, "application/json")
 
 
-@files_router.get("/{scene}/file", response_class=FileResponse, responses=_FILE | problems(401, 404, 422))
+@router.get("/{scene}/file", response_class=FileResponse, responses=_FILE | problems(401, 404, 422))
 async def download_scene(service: ServiceDep, scene: SceneName) -> FileResponse:
     """Downloads the scene file. Ranges are answered, so that a download can go on."""
     await service.catalog.header(scene)
@@ -189,7 +180,7 @@ async def download_scene(service: ServiceDep, scene: SceneName) -> FileResponse:
     return FileResponse(path, media_type=RAW, filename=f"{base_name(scene)}{SUFFIX}")
 
 
-@files_router.put(
+@router.put(
     "/{scene}",
     status_code=201,
     openapi_extra=_IMPORT,
@@ -198,21 +189,16 @@ async def download_scene(service: ServiceDep, scene: SceneName) -> FileResponse:
 async def import_scene(request: Request, service: ServiceDep, scene: SceneName, private: Private = False) -> Scene:
     """Takes a scene file in and serves it. It is checked first, and appears whole or not at all."""
     service.life.require_serving()
-    if request.headers.get("content-encoding", "identity").lower() != "identity":
-        raise UnsupportedMediaType("the body must not be compressed", field="Content-Encoding")
-    limit = service.settings.max_dataset_bytes
-    announced = request.headers.get("content-length", "")
-    if announced.isdigit() and int(announced) > limit:
-        raise UploadTooLarge(f"a scene file may have at most {limit} bytes, {announced} were announced", field="body")
-    async with service.imports.receive(scene, _blocks(request, service)) as received:
-        deadline = time.monotonic() + PATIENCE_S
-        header = await finish_or_abandon(
-            service.imports.accept(received, scene, private=private), request.receive, deadline
-        )
+    settings = service.settings
+    check_upload(request, settings.max_dataset_bytes, "a scene file")
+    with arrivals(service.life.draining, settings.upload_idle_timeout_s) as arrival:
+        async with service.imports.receive(scene, blocks_of(request, arrival)) as received:
+            accepting = service.imports.accept(received, scene, private=private)
+            header = await finish_or_abandon(accepting, request.receive, time.monotonic() + PATIENCE_S)
     return Scene.of(scene, header, 0, service.owners.known(Kind.SCENE, scene))
 
 
-@files_router.delete("/{scene}", status_code=204, responses=problems(401, 403, 404, 422, 503))
+@router.delete("/{scene}", status_code=204, responses=problems(401, 403, 404, 422, 503))
 async def delete_scene(service: ServiceDep, scene: SceneName) -> None:
     """Deletes a scene that was imported or that a job made, and frees its memory. Others are not the service's."""
     service.life.require_serving()
@@ -227,18 +213,3 @@ def _poses_json(header: SceneHeader) -> bytes:
     if corrections is not None:
         sizes = CorrectionSizes.of(corrections[chosen], poses[chosen]).to_dict()
     return json.dumps({"poses": poses[chosen].reshape(-1, 16).tolist(), **sizes}).encode()
-
-
-async def _blocks(request: Request, service: ServiceDep) -> AsyncIterator[bytes]:
-    """The body as it comes. Raises ClientDisconnect, and as `arrival`."""
-    stopping: asyncio.Future[Any] = asyncio.ensure_future(service.life.draining.wait())
-    more = True
-    try:
-        while more:
-            message = await arrival(request.receive(), service.settings.upload_idle_timeout_s, stopping)
-            if message["type"] == "http.disconnect":
-                raise ClientDisconnect
-            more = message.get("more_body", False)
-            yield message.get("body", b"")
-    finally:
-        stopping.cancel()

@@ -5,21 +5,22 @@ from __future__ import annotations
 import asyncio
 import contextlib
 import time
+from collections.abc import Awaitable, Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from typing import Annotated, Any
+from functools import partial, partialmethod
+from typing import Annotated, TypeVar
 
 from fastapi import APIRouter, Query, WebSocket, WebSocketDisconnect
 from pydantic import Field, FiniteFloat, TypeAdapter
 
 from ultragray.contract import described
 from ultragray.errors import InvalidArgument, UltragrayError
-from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.settings import RenderSettings, settings_used
 from ultragray_service.access.credentials import STREAM_PROTOCOL
-from ultragray_service.core.frames import FrameHeader
-from ultragray_service.core.open_streams import StreamAnswer, StreamSummary, Watcher
-from ultragray_service.core.streams import FrameStream, Message, SceneSettings, StreamMode
+from ultragray_service.core.open_streams import OpenStream, StreamAnswer, StreamSummary, Watcher
+from ultragray_service.core.poses import FrameHeader
+from ultragray_service.core.streams import FrameStream, Message, StreamMode, nothing, unreadable
 from ultragray_service.errors import Refusal, statuses_of
 from ultragray_service.http.bodies import StreamMessage, adapter_of, read_json
 from ultragray_service.http.dependencies import SceneName, ServiceDep, problems
@@ -28,6 +29,7 @@ from ultragray_service.http.protocol import HAND_OVER
 from ultragray_service.service import Service
 from ultragray_workers.errors import Draining
 
+T = TypeVar("T")
 _ALIGNMENT = 8  # so that a client may look at float32 pixels where they lie
 
 
@@ -72,7 +74,6 @@ def frame_bytes(answer: StreamAnswer) -> bytes:
 
 
 def refusal_text(answer: StreamAnswer) -> str:
-    """The text message in place of a frame."""
     assert isinstance(answer.outcome, UltragrayError)
     message = RefusalMessage(
         sequence=answer.sequence,
@@ -84,13 +85,10 @@ def refusal_text(answer: StreamAnswer) -> str:
     return text.decode()
 
 
-# The WebSocket: poses in, frames out.
-
-
 router = APIRouter(prefix="/v1/scenes", tags=["render"])
 
 _ROUTE = "/v1/scenes/{scene}/stream"
-_SERVICE_RESTART = 1012  # RFC 6455's registry of close codes
+_ENDED, _SERVICE_RESTART = 1000, 1012  # RFC 6455's registry of close codes
 
 StreamName = Annotated[str, Query(description="Of the stream, for those who watch it.")]
 
@@ -99,95 +97,49 @@ StreamName = Annotated[str, Query(description="Of the stream, for those who watc
 async def stream(websocket: WebSocket, scene: SceneName, name: StreamName = "") -> None:
     """Poses in, frames out, in the order of the poses."""
     service: Service = websocket.app.state.service
-    started = time.perf_counter()
-    place = ExitStack()
-    try:
-        check_subprotocols(websocket.scope["subprotocols"])
-        service.life.require_serving()
+
+    async def enter(place: ExitStack) -> OpenStream:
         await service.catalog.header(scene)
         place.enter_context(service.limits.stream())
-        noted = place.enter_context(
-            service.streams.opened("websocket", name or websocket.headers.get("user-agent", ""))
-        )
-    except UltragrayError as error:
-        await websocket.send_denial_response(problem_response(error))
-        service.metrics.count_request("websocket", _ROUTE, str(statuses_of(error).http), time.perf_counter() - started)
-        return
-    status = "closed"
+        return place.enter_context(service.streams.opened("websocket", name or websocket.headers.get("user-agent", "")))
+
+    async def answer(record: OpenStream) -> None:
+        transport = _WebSocketTransport(websocket, scene)
+        await FrameStream(service.rendering, transport, (scene, RenderSettings()), record).run()
+
+    await _serve(websocket, _ROUTE, enter, answer)
+
+
+async def _serve(
+    websocket: WebSocket, route: str, enter: Callable[[ExitStack], Awaitable[T]], answer: Callable[[T], Awaitable[None]]
+) -> None:
+    """Answers a WebSocket that `enter` lets in; what that enters lasts as long. Counts it at its end."""
+    service: Service = websocket.app.state.service
+    offered = websocket.scope["subprotocols"]
+    started, status = time.perf_counter(), "closed"
     try:
-        with place:
-            await websocket.accept(STREAM_PROTOCOL if STREAM_PROTOCOL in websocket.scope["subprotocols"] else None)
-            await FrameStream(
-                service.rendering, _WebSocketTransport(websocket, scene), (scene, RenderSettings()), noted
-            ).run()
+        with ExitStack() as place:
+            try:
+                if offered and STREAM_PROTOCOL not in offered:  # browsers hang up without it
+                    raise InvalidArgument(
+                        f"Sec-WebSocket-Protocol must offer {STREAM_PROTOCOL}, also beside a key",
+                        field="Sec-WebSocket-Protocol",
+                    )
+                service.life.require_serving()
+                entered = await enter(place)
+            except UltragrayError as error:
+                status = str(statuses_of(error).http)
+                await websocket.send_denial_response(problem_response(error))
+                return
+            await websocket.accept(STREAM_PROTOCOL if offered else None)
+            await answer(entered)
     except WebSocketDisconnect:
         pass
     except Draining as error:
         status = error.reason
         await websocket.close(_SERVICE_RESTART, error.reason)
     finally:
-        service.metrics.count_request("websocket", _ROUTE, status, time.perf_counter() - started)
-
-
-def check_subprotocols(offered: list[str]) -> None:
-    """Raises InvalidArgument for an offer without the one that is spoken: browsers hang up without it."""
-    if offered and STREAM_PROTOCOL not in offered:
-        raise InvalidArgument(
-            f"Sec-WebSocket-Protocol must offer {STREAM_PROTOCOL}, also beside a key", field="Sec-WebSocket-Protocol"
-        )
-
-
-class _Message:
-    """A message that could be read."""
-
-    def __init__(self, message: StreamMessage, scene: str) -> None:
-        self.sequence = message.sequence
-        self.client_time = message.client_time_ms
-        self.mode = message.mode
-        self.window = message.window
-        self.acknowledged = message.acknowledged
-        self._message = message
-        self._scene = scene
-
-    def settings(self) -> SceneSettings | None:
-        return None if self._message.settings is None else (self._scene, self._message.settings)
-
-    @property
-    def asks(self) -> bool:
-        return self._message.pose is not None
-
-    def pose(self) -> FloatArray:  # [4, 4] mm
-        assert self._message.pose is not None
-        return self._message.pose.exact("pose")
-
-    def timeout_s(self) -> float | None:
-        return None if self._message.timeout_ms is None else self._message.timeout_ms / 1000.0
-
-
-class _Unreadable:
-    """A message that could not: it has its numbers, as far as they can be read, and raises why."""
-
-    def __init__(self, text: str | None, error: UltragrayError) -> None:
-        try:
-            numbers = _NUMBERS.validate_json(text or "")
-        except (ValueError, RecursionError):
-            numbers = _Numbers()
-        self.sequence, self.client_time = numbers.sequence, numbers.client_time_ms
-        self._error = error
-
-    def settings(self) -> SceneSettings | None:
-        if (self._error.field or "").startswith("settings"):
-            raise self._error
-        return None
-
-    asks = True
-    window = acknowledged = None
-
-    def pose(self) -> FloatArray:
-        raise self._error
-
-    def timeout_s(self) -> float | None:
-        return None
+        service.metrics.count_request("websocket", route, status, time.perf_counter() - started)
 
 
 @dataclass(frozen=True)
@@ -199,52 +151,56 @@ class _Numbers:
 _NUMBERS = TypeAdapter(_Numbers)
 
 
-class _WebSocketTransport:
-    """One connection. Its mode is read from the first message that can be read."""
+def _message_of(text: str | None, scene: str) -> Message:
+    try:
+        if text is None:
+            raise InvalidArgument("messages must be JSON in text frames, got a binary one")
+        message = read_json(text, StreamMessage)
+    except UltragrayError as error:
+        try:
+            numbers = _NUMBERS.validate_json(text or "")
+        except (ValueError, RecursionError):
+            numbers = _Numbers()
+        of_settings = (error.field or "").startswith("settings")
+        return unreadable(error, of_settings=of_settings, sequence=numbers.sequence, client_time=numbers.client_time_ms)
+    pose, settings, timeout_ms = message.pose, message.settings, message.timeout_ms
+    return Message(
+        sequence=message.sequence,
+        client_time=message.client_time_ms,
+        mode=lambda: message.mode or StreamMode.ORDERED,
+        window=message.window,
+        acknowledged=message.acknowledged,
+        settings=lambda: None if settings is None else (scene, settings),
+        asks=pose is not None,
+        pose=nothing if pose is None else partial(pose.exact, "pose"),  # type: ignore[arg-type]  # it asks for none
+        timeout_s=lambda: None if timeout_ms is None else timeout_ms / 1000.0,
+    )
 
+
+class _WebSocketTransport:
     destination = None
 
     def __init__(self, websocket: WebSocket, scene: str) -> None:
-        self._websocket = websocket
-        self._scene = scene
+        self._websocket, self._scene = websocket, scene
 
-    async def receive(self) -> _Message | _Unreadable:
-        """Raises WebSocketDisconnect."""
+    async def receive(self) -> Message:
         await asyncio.sleep(0)  # reading does not wait while the buffer is full: others get their turn
         received = await self._websocket.receive()
         if received["type"] == "websocket.disconnect":
             raise WebSocketDisconnect(received.get("code", 1005))
-        text = received.get("text")
-        try:
-            if text is None:
-                raise InvalidArgument("messages must be JSON in text frames, got a binary one")
-            return _Message(read_json(text, StreamMessage), self._scene)
-        except UltragrayError as error:
-            return _Unreadable(text, error)
+        return _message_of(received.get("text"), self._scene)
 
-    def mode(self, message: Message) -> StreamMode | None:
-        return (message.mode or StreamMode.ORDERED) if isinstance(message, _Message) else None
+    async def send(self, answer: StreamAnswer, *, hand_over: bool = False) -> None:
+        is_refusal = isinstance(answer.outcome, UltragrayError)
+        contents = {"text": refusal_text(answer)} if is_refusal else {"bytes": frame_bytes(answer)}
+        await self._websocket.send({"type": "websocket.send", HAND_OVER: hand_over, **contents})
 
-    async def send(self, answer: StreamAnswer) -> None:
-        await self._websocket.send({"type": "websocket.send", **_contents(answer)})
-
-    async def hand_over(self, answer: StreamAnswer) -> None:
-        await self._websocket.send({"type": "websocket.send", HAND_OVER: True, **_contents(answer)})
-
-
-def _contents(answer: StreamAnswer) -> dict[str, Any]:
-    if isinstance(answer.outcome, UltragrayError):
-        return {"text": refusal_text(answer)}
-    return {"bytes": frame_bytes(answer)}
-
-
-# The open streams, and the WebSocket that shows what one of them asks for and gets.
+    hand_over = partialmethod(send, hand_over=True)
 
 
 streams_router = APIRouter(prefix="/v1/streams", tags=["streams"])
 
 _STREAMS_ROUTE = "/v1/streams/{stream}/watch"
-_ENDED, _SERVICE_RESTART = 1000, 1012  # RFC 6455's registry of close codes
 
 SceneFilter = Annotated[str | None, Query(description="Only streams whose newest frame is of this scene.")]
 
@@ -270,34 +226,16 @@ async def list_streams(service: ServiceDep, scene: SceneFilter = None) -> Stream
 async def watch(websocket: WebSocket, stream: str) -> None:
     """Shows a stream as its client sees it: the newest answer each time the watcher has taken the one before."""
     service: Service = websocket.app.state.service
-    started = time.perf_counter()
-    place = ExitStack()
-    try:
-        offered = websocket.scope["subprotocols"]
-        check_subprotocols(offered)
-        service.life.require_serving()
+
+    async def enter(place: ExitStack) -> Watcher:
         place.enter_context(service.limits.stream())
-        watcher = place.enter_context(service.streams.get(stream).watched())
-    except UltragrayError as error:
-        place.close()
-        await websocket.send_denial_response(problem_response(error))
-        service.metrics.count_request(
-            "websocket", _STREAMS_ROUTE, str(statuses_of(error).http), time.perf_counter() - started
-        )
-        return
-    status = "closed"
-    try:
-        with place:
-            await websocket.accept(STREAM_PROTOCOL if STREAM_PROTOCOL in offered else None)
-            status = await _show(service, websocket, watcher)
-    except WebSocketDisconnect:
-        pass
-    finally:
-        service.metrics.count_request("websocket", _STREAMS_ROUTE, status, time.perf_counter() - started)
+        return place.enter_context(service.streams.get(stream).watched())
+
+    await _serve(websocket, _STREAMS_ROUTE, enter, partial(_show, service, websocket))
 
 
-async def _show(service: Service, websocket: WebSocket, watcher: Watcher) -> str:
-    """Until the stream ends, the watcher goes, or the service stops; how it ended."""
+async def _show(service: Service, websocket: WebSocket, watcher: Watcher) -> None:
+    """Until the stream ends or the watcher goes. Raises Draining where the service stops first."""
     showing = asyncio.ensure_future(_pass_on(websocket, watcher))
     gone = asyncio.ensure_future(_until_gone(websocket))
     stopping = asyncio.ensure_future(service.life.draining.wait())
@@ -305,13 +243,11 @@ async def _show(service: Service, websocket: WebSocket, watcher: Watcher) -> str
     try:
         await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)
         if gone.done():
-            return "closed"
-        if showing.done():
-            showing.result()
-            await websocket.close(_ENDED, "STREAM_ENDED")
-            return "closed"
-        await websocket.close(_SERVICE_RESTART, Draining.reason)
-        return Draining.reason
+            return
+        if not showing.done():
+            raise Draining("the service is stopping")
+        showing.result()
+        await websocket.close(_ENDED, "STREAM_ENDED")
     finally:
         for task in tasks:
             task.cancel()
@@ -319,12 +255,9 @@ async def _show(service: Service, websocket: WebSocket, watcher: Watcher) -> str
 
 
 async def _pass_on(websocket: WebSocket, watcher: Watcher) -> None:
-    """Sends answers as the stream's own client gets them, as many as the watcher takes."""
+    transport = _WebSocketTransport(websocket, "")
     while (answer := await watcher.next()) is not None:
-        if isinstance(answer.outcome, UltragrayError):
-            await websocket.send({"type": "websocket.send", "text": refusal_text(answer)})
-        else:
-            await websocket.send({"type": "websocket.send", HAND_OVER: True, "bytes": frame_bytes(answer)})
+        await transport.hand_over(answer)
 
 
 async def _until_gone(websocket: WebSocket) -> None:

@@ -33,7 +33,6 @@ class CertificateFiles:
     client_ca: Path | None
 
     def read(self) -> CertificateBytes:
-        """The contents as they are now. Raises StartupFailed where a file cannot be read."""
         return CertificateBytes(
             _read(self.certificate, "tls_certificate"),
             _read(self.key, "tls_key"),
@@ -41,7 +40,6 @@ class CertificateFiles:
         )
 
     def load(self, read: CertificateBytes) -> Certificates:
-        """Certificates that a client can accept now. Raises StartupFailed, with a sentence that names the setting."""
         try:
             return self._load(read)
         except (UnsupportedAlgorithm, x509.DuplicateExtension, ValueError) as error:
@@ -100,8 +98,6 @@ class CertificateFiles:
 
 @dataclass(frozen=True)
 class CertificateBytes:
-    """The contents of the files at one moment, PEM."""
-
     chain: bytes
     key: bytes = field(repr=False)
     client_authorities: bytes | None
@@ -109,8 +105,6 @@ class CertificateBytes:
 
 @dataclass(frozen=True)
 class Certificates:
-    """Certificates that the doors may use: key and certificate belong together and are valid."""
-
     content: CertificateBytes
     names: str
     not_before: datetime
@@ -130,7 +124,6 @@ def _read(path: Path, setting: str) -> bytes:
 
 
 def _names(certificate: x509.Certificate) -> str:
-    """Who the certificate says the server is, for the log."""
     try:
         names = certificate.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     except x509.ExtensionNotFound:
@@ -140,9 +133,6 @@ def _names(certificate: x509.Certificate) -> str:
 
 def _unusable(setting: str, reason: str) -> StartupFailed:
     return StartupFailed(f"{setting} cannot be used: {reason}", field=setting)
-
-
-# Certificates that follow their files while the doors are open.
 
 
 _POLL_S = 1.0
@@ -156,7 +146,6 @@ class CertificateWatch:
     """The certificates in use. Files that cannot be used leave the last good ones in their place."""
 
     def __init__(self, files: CertificateFiles) -> None:
-        """Raises StartupFailed where the files cannot be used."""
         self._files = files
         self._told: tuple[str, float] | None = None
         self.current = files.load(files.read())
@@ -164,13 +153,11 @@ class CertificateWatch:
 
     @classmethod
     def of(cls, settings: Settings) -> CertificateWatch | None:
-        """The watch over the files of the settings; None: the doors speak no TLS. Raises StartupFailed."""
         if settings.tls_certificate is None or settings.tls_key is None:
             return None
         return cls(CertificateFiles(settings.tls_certificate, settings.tls_key, settings.tls_client_ca))
 
     async def follow(self) -> None:
-        """Looks at the files for ever; tells in the log what is in use and what is wrong."""
         rounds = Rounds("the watch over TLS certificates", _log)
         while True:
             await asyncio.sleep(_POLL_S)

@@ -1,21 +1,62 @@
-"""Real frames looked for in scenes, as all front doors ask for it and tell of it."""
+"""What a scene says of poses, and where it finds real frames, as all front doors ask for it and tell of it."""
 
 from __future__ import annotations
 
+import asyncio
 from dataclasses import dataclass
 
 from ultragray.contract import described
 from ultragray.errors import InvalidArgument, RenderFailed
-from ultragray.geometry.probe import FloatArray
+from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.localization.settings import LocalizationSettings
 from ultragray.rendering.settings import Encoding, FrameSettings
+from ultragray.scene.confidence import Assessor, Extrapolation
+from ultragray.scene.info import SceneHeader
 from ultragray_service.access.audit import account
 from ultragray_service.access.principals import caller
 from ultragray_service.core.poses import MatrixRows
+from ultragray_service.core.registrations import Registrations
 from ultragray_service.core.rendering import Plan, Rendering
-from ultragray_service.core.scenes import scene_to_blame
+from ultragray_service.core.scenes import SceneCatalog, scene_to_blame
 from ultragray_workers.pool.messages import LocalizeResult, Priority, RenderRequest, SceneChangedError, Sought
 from ultragray_workers.pool.pool import MAX_SCENE_CHANGES
+
+
+@dataclass(frozen=True)
+class Assessments:
+    """Of poses, in their order."""
+
+    extrapolations: list[Extrapolation] = described("supported_share is null: only a rendered frame tells it.")
+
+
+class Assessing:
+    """Assesses the poses of one caller at a time, beside the event loop."""
+
+    def __init__(self, catalog: SceneCatalog, registrations: Registrations) -> None:
+        self._catalog, self._registrations = catalog, registrations
+        self._turn = asyncio.Lock()
+
+    async def assess(
+        self,
+        scene: str,
+        poses: FloatArray,  # [C, 4, 4] mm, exact
+        probe: Probe | None,
+        registration: str | None,
+    ) -> Assessments:
+        """The extrapolation of each pose of a probe (None: the scene's own), led into the scene by a registration.
+
+        Raises SceneNotFound, SceneFileInvalid, RegistrationNotFound, and InvalidProbe where no probe is known.
+        """
+        header = await self._catalog.header(scene)
+        if registration is not None:
+            poses = (await self._registrations.of_scene(registration, scene)).probe_to_scene(poses)
+        async with self._turn:
+            return Assessments(await asyncio.to_thread(_assess, header, poses, probe))
+
+
+def _assess(header: SceneHeader, poses: FloatArray, probe: Probe | None) -> list[Extrapolation]:
+    return Assessor(header.info, header.training_poses).assess(poses, probe)
+
 
 FRAMES_OF_A_SEARCH = 100  # that a search counts as: it takes as long, at 512x512
 
@@ -45,29 +86,23 @@ class Located:
 
     @classmethod
     def of(cls, result: LocalizeResult, plan: Plan) -> Located:
-        """A result of the pool, for a plan."""
         found = result.found
         in_base = None if plan.registration is None else plan.registration.flange_to_base(found.pose)
+        same = ("similarity", "is_found", "position_std_mm", "angle_std_deg", "shift_mm", "turn_deg")
         return cls(
+            **{name: getattr(found, name) for name in same},
             scene=result.scene,
             scene_sha256=result.scene_sha256,
             renderer=result.renderer,
             pose=found.pose.tolist(),
             flange_to_base=None if in_base is None else in_base.tolist(),
             registration=plan.settings.registration,
-            similarity=found.similarity,
-            is_found=found.is_found,
-            position_std_mm=found.position_std_mm,
-            angle_std_deg=found.angle_std_deg,
-            shift_mm=found.shift_mm,
-            turn_deg=found.turn_deg,
             queue_ms=round(result.queue_ms, 3),
             search_ms=round(result.search_ms, 3),
         )
 
 
 def sought_frame(image: bytes, height: int | None, width: int | None, settings: LocalizationSettings) -> Sought:
-    """The frame that a request asks for. Raises InvalidArgument for one side without the other."""
     if (height is None) != (width is None):
         raise InvalidArgument(
             "image_height and image_width go together: both for grey pixels, neither for a PNG file",
@@ -99,13 +134,7 @@ async def locate(
     await rendering.limits.take_frames(FRAMES_OF_A_SEARCH, deadline)
     for _ in range(MAX_SCENE_CHANGES):
         asked = RenderRequest(
-            plan.scene,
-            sought,
-            plan.placed(start)[None],
-            Priority.BATCH,
-            deadline,
-            plan.version,
-            caller(),
+            plan.scene, sought, plan.placed(start)[None], Priority.BATCH, deadline, plan.version, caller()
         )
         try:
             with scene_to_blame():

@@ -1,1 +1,0 @@
-"""Jobs for all front doors: the store, those who watch a job, and its log."""
