@@ -128,7 +128,7 @@ def test_tools_are_told_as_they_were_set_and_keep_their_place_when_they_are_set_
         ('[{"kind": "needle", "tip_mm": [0, 0, 0]}]', "hub_mm is required"),
         (json.dumps([{**NEEDLE, "device": "N" * 21}]), "of 1 to 20 bytes"),
         (json.dumps([{**NEEDLE, "device": "N", "frame": "scene"}]), "frame stands in place of device"),
-        (json.dumps([{"kind": "needle", "tip_mm": [0, 0, 0], "hub_mm": [0, 0, 9]}] * (MAX_TOOLS + 1)), "placed most 8"),
+        (json.dumps([{"kind": "needle", "tip_mm": [0, 0, 0], "hub_mm": [0, 0, 9]}] * (MAX_TOOLS + 1)), "at most 8"),
     ],
 )
 def test_what_is_no_tool_is_refused_and_those_before_stay(peer, value, text):
