@@ -30,7 +30,7 @@ FRAMES ?= 100000
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-notebooks test-console test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results methods ablations poses localization confidence libraries environment ros simulation figures demo-scene docs generate packages clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-notebooks test-console test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results methods ablations poses localization confidence environment ros figures demo-scene docs generate packages clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -201,12 +201,6 @@ confidence: $(VENV)/installed-dev  ## how true confidence and uncertainty are, s
 	@$(BIN)/python benchmarks/figures.py show confidence
 	$(KEEP) confidence
 
-libraries: $(VENV)/installed-dev  ## the image processing here beside scikit-image's: time and difference
-	$(READY)
-	$(BIN)/python benchmarks/libraries.py
-	@$(BIN)/python benchmarks/figures.py show libraries
-	$(KEEP) libraries
-
 environment: $(VENV)/installed-dev  ## steps a second of the gymnasium environment with a random policy
 	$(READY)
 	$(BIN)/python benchmarks/environment.py
@@ -219,14 +213,8 @@ ros: $(VENV)/installed-dev  ## the time from a pose published in ROS 2 to its im
 	@$(BIN)/python benchmarks/figures.py show ros
 	$(KEEP) ros
 
-simulation: $(VENV)/installed-dev  ## simulate 1,000 replicas behind Envoy, for docs/scaling.md; takes some minutes (ARGS="--only load" for one study)
-	$(READY)
-	$(BIN)/python benchmarks/simulation.py $(ARGS)
-	@$(BIN)/python benchmarks/figures.py show simulation
-	$(KEEP) simulation
-
 demo-scene: $(VENV)/installed  ## simulate the phantom, train the demo scene from it and put it in its place
-	$(BIN)/python -m ultragray.phantom.make_demo
+	$(BIN)/python benchmarks/demo_scene.py
 
 docs: $(VENV)/installed-dev  ## build the site of the documents into build/site; broken links and anchors fail
 	$(BIN)/python -m docs.generator

@@ -2,18 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
-from figures import Document, measure_runs
+import numpy as np
+
+from bone_shadow import BoneShadow
+from measuring import Document, Lines, measure_runs, table
 from ultragray.datasets.source import PHANTOM, SourceOptions, load_dataset
 from ultragray.learn.evaluation.scoring import render_sweep
 from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import TrainingConfig
 from ultragray.learn.training.config import TEXTURE
-from ultragray.phantom.imaging import BoneShadow
 from ultragray_studies.report import train_and_evaluate
 
 SEEDS = (0, 1, 2)
@@ -70,6 +72,39 @@ RUNS = {
     for variation, settings in {**WITHOUT, **CURVE}.items()
     for seed in SEEDS
 }
+
+
+def trained_without(figures: Document) -> Lines:
+    """Trainings without one part each, then the curve of texture."""
+    steps, count = SHORTER["steps"], SHORTER["max_gaussians"]
+    seeds = len(SEEDS)
+    sets = list(dict.fromkeys(name.split(", ")[0] for name in figures))
+    yield f"Trainings without one part each, of {steps} steps and {count:,} Gaussians: less than for the figures above."
+    yield f"PSNR (dB) and MS-SSIM on held-out frames, mean and standard deviation over {seeds} seeds; then, where"
+    yield from ("it is known, the mean absolute error in the shadow of bone.", "")
+
+    def cell(of: str, variation: str, keys: Sequence[str]) -> str:
+        runs = [figures.get(f"{of}, {variation}, seed {seed}", {}) for seed in SEEDS]
+        shown = []
+        for key in keys:
+            if values := [run[key] for run in runs if key in run]:
+                digits = {"psnr_db": 2, "shadow_mae": 4}.get(key, 3)
+                shown.append(f"{np.mean(values):.{digits}f} ± {np.std(values):.{digits}f}")
+        return " / ".join(shown) or "–"
+
+    def variations(names: Iterable[str], keys: Sequence[str]) -> Iterator[str]:
+        return table(("", *sets), ((name, *(cell(of, name, keys) for of in sets)) for name in names))
+
+    yield from variations(WITHOUT, ("psnr_db", "ms_ssim", "shadow_mae"))
+    yield from (
+        "",
+        "The share of SSIM in the loss (`texture`): PSNR, MS-SSIM and GMSD on held-out frames, and the contrast of",
+        "speckle (std/mean of the envelope), rendered and true:",
+        "",
+    )
+    keys = ("psnr_db", "ms_ssim", "gmsd", "speckle_contrast", "true_speckle_contrast")
+    yield from variations(CURVE, keys)
+
 
 if __name__ == "__main__":
     measure_runs("ablations", __doc__, RUNS)

@@ -18,8 +18,8 @@ import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 
-from figures import ROOT, Document, measure_runs
 from in_silico import IN_SILICO, Asked
+from measuring import ROOT, Document, Lines, columns, measure_runs, table
 from ultragray.datasets.source import load_dataset
 from ultragray.learn.evaluation.metrics import frame_metrics
 from ultragray.learn.evaluation.scoring import compare_deviations, render_sweep
@@ -142,6 +142,38 @@ def draw(figures: Document) -> None:
 
 def _rounded(values: list[float | None]) -> list[float]:
     return [round(float(value), 4) for value in values if value is not None]
+
+
+def confidence_and_uncertainty(figures: Document) -> Lines:
+    """What scenes tell of frames that they have not seen, beside what came out, cause by cause."""
+    found_cells = list(cells(figures))
+    rows = []
+    for name, cause, found in found_cells:
+        actual = np.array(found["actual"])
+        agreements = []
+        for key in ("told", "of_pose"):
+            rank = f"{rank_correlation(found, key):.2f}" if is_telling(found) else "–"
+            agreements.append(f"{error(found, key):.3f} / {rank}")
+        spread = f"{actual.mean():.2f} ± {actual.std():.2f}"
+        rows.append((name, str(figures[name]["training_frames"]), f"{cause} ({len(actual)})", spread, *agreements))
+    yield from table(("scene", "frames", "cause", "actual", "of the frame", "of the pose alone"), rows)
+    yield ""
+    telling = sum(is_telling(found) for *_, found in found_cells)
+    for key, of_what in (("told", "Of rendered frames"), ("of_pose", "Of poses alone")):
+        wrong = [f"{cause} of {name}" for name, cause, one in found_cells if error(one, key) > ERROR]
+        mixed = [
+            f"{cause} of {name}"
+            for name, cause, one in found_cells
+            if is_telling(one) and rank_correlation(one, key) < RANK
+        ]
+        listed, disordered = (", ".join(names) or "none" for names in (wrong, mixed))
+        yield f"{of_what}, {len(wrong)} of {len(found_cells)} errors are above {ERROR:g}: {listed}."
+        yield f"{len(mixed)} of {telling} rank correlations are below {RANK:g}: {disordered}."
+        yield ""
+    pixels = ({"scene": name, "cause": cause, **found["uncertainty"]} for name, cause, found in found_cells)
+    numbers = {"expected": "{expected:.3f}", "actual": "{actual:.3f}"}
+    shares = {"within 1σ": "{within_1:.0%}", "within 2σ": "{within_2:.0%}"}
+    yield from columns(pixels, {"scene": "{scene}", "cause": "{cause}", **numbers, **shares})
 
 
 if __name__ == "__main__":

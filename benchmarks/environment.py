@@ -15,7 +15,7 @@ import gymnasium
 import numpy as np
 import torch
 
-from figures import write
+from measuring import write
 from ultragray.phantom.demo import DEMO_FILE
 from ultragray.scene.gaussians import GaussianScene
 from ultragray_studies.bench.report import measured

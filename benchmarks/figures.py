@@ -1,4 +1,4 @@
-"""Measured figures: one way to take them, to record them, and to write them into the documents.
+"""Measured figures: one way to record them, and to write them into the documents.
 
     python benchmarks/figures.py ready            refuse a checkout with uncommitted changes, before hours are spent
     python benchmarks/figures.py record NAME ...  figures of this commit, from build/bench, to the place of those that
@@ -8,34 +8,33 @@
     python benchmarks/figures.py check            fail where a document does not hold what the files say
 
 A file is JSON that begins with `measured`: commit, date, machine; or it holds runs by name, each of which begins so. In
-documents, a table stands between `<!-- measured: NAME -->` and `<!-- end -->`; BLOCKS in tables.py makes it.
+documents, a table stands between `<!-- measured: NAME -->` and `<!-- end -->`; BLOCKS makes it.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
-import logging
 import re
 import subprocess
 import sys
-import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
-import torch
-
+import ablations
+import confidence
+import localization
+import measuring
+import methods_tables
+import poses
+import results_tables
+from measuring import Document, Lines, columns, described, heads, kept, read, staged, table
 from ultragray.files import write_whole
-from ultragray_studies.bench.report import DIRTY, changed_sources, commit, measured
+from ultragray_studies.bench.report import DIRTY, changed_sources, commit
 
-ROOT = Path(__file__).resolve().parents[1]
-STAGE = ROOT / "build" / "bench"  # where targets of the Makefile measure into; git ignores it
-SECONDS_PER_LINE = 15.0
 _PLACE = re.compile(r"(?<=<!-- measured: )([\w ,-]+?)( -->\n).*?(?=<!-- end -->)", flags=re.DOTALL)
 _SHOWN = 3  # names of changed files
-
-Document = dict[str, Any]
 
 # Every file of figures, with the target of the Makefile that measures it.
 TARGETS = {
@@ -44,82 +43,14 @@ TARGETS = {
     **dict.fromkeys(("cuda", "cuda_training"), "bench-cuda"),
     "results_tables": "results",
     "methods_tables": "methods",
-    **{name: name for name in ("ablations", "poses", "localization", "confidence", "libraries", "environment")},
-    **{name: name for name in ("ros", "simulation")},
+    **{name: name for name in ("ablations", "poses", "localization", "confidence", "environment", "ros")},
     "shards": "test-shards",
     **{f"{name}-run": f"test-{name}" for name in ("long", "soak", "replicas", "overload")},
 }
 
-log = logging.getLogger("figures")
-
 
 class NotRecordable(Exception):
     """The figures cannot be recorded; the message says why."""
-
-
-def kept(name: str) -> Path:
-    """The file that is under version control."""
-    return ROOT / ("tests" if name.endswith("-run") else "benchmarks") / f"{name}.json"
-
-
-def staged(name: str) -> Path:
-    """The file as its target leaves it."""
-    return STAGE / f"{name}.json"
-
-
-def read(path: Path) -> Document:
-    """A file of figures; empty where there is none yet."""
-    return dict(json.loads(path.read_text(encoding="utf-8"))) if path.exists() else {}
-
-
-def write(name: str, document: Document) -> None:
-    """Leave a file of figures to be recorded."""
-    staged(name).parent.mkdir(parents=True, exist_ok=True)
-    write_whole(staged(name), json.dumps(document, indent=1, allow_nan=False) + "\n")
-
-
-Run = Callable[[Path], Document]  # measures one run, given the folder of the data sets
-
-
-def measure_runs(name: str, about: str | None, runs: Mapping[str, Run], *, threads: int = 0) -> None:
-    """The program of a file that is measured run by run: `DATA_FOLDER [--only NAME ...]`.
-
-    A run's figures are written as soon as it is done, and it is not repeated at the same commit: a killed program goes
-    on. `threads`: 0 for all cores.
-    """
-    parser = argparse.ArgumentParser(description=(about or "").partition("\n")[0])
-    parser.add_argument("data_folder", type=Path, help="folder of the data sets")
-    parser.add_argument("--only", nargs="+", metavar="NAME", help="runs whose names begin so: " + ", ".join(runs))
-    given = parser.parse_args()
-    logging.basicConfig(level=logging.INFO, format="%(asctime)s %(message)s")
-    if threads:
-        torch.set_num_threads(threads)
-    for run, take in runs.items():
-        if given.only is None or run.startswith(tuple(given.only)):
-            head = measured(torch.get_num_threads())
-            known = read(staged(name)).get(run)
-            if known is not None and known["measured"]["commit"] == head["commit"] and not is_dirty(head):
-                continue
-            log.info("%s", run)
-            write(name, {**read(staged(name)), run: {**take(given.data_folder), "measured": head}})
-
-
-def is_dirty(head: Document) -> bool:
-    """Whether figures belong to no commit: the sources had changes, or were no checkout."""
-    return head["commit"] is None or head["commit"].endswith(DIRTY)
-
-
-def teller(name: str) -> Callable[[Any], None]:
-    """Says every quarter of a minute how far a training is."""
-    last_s = time.monotonic()
-
-    def tell(progress: Any) -> None:
-        nonlocal last_s
-        if time.monotonic() - last_s >= SECONDS_PER_LINE:
-            last_s = time.monotonic()
-            log.info("%s: step %d of %d, loss %.4f", name, progress.step, progress.steps, progress.loss)
-
-    return tell
 
 
 def recordable_commit() -> str:
@@ -151,50 +82,213 @@ def _is_of(document: Document, here: str) -> bool:
     return bool(document["measured"]["commit"] == here)
 
 
-def heads(document: Document) -> Iterator[Document]:
-    """The heads of a file: its one, or one of each run."""
-    if "measured" in document:
-        yield document["measured"]
-        return
-    for part in document.values():
-        yield from heads(part)
+# Tables of `make bench`, `bench-console`, `test-shards`, `environment` and `ros`; others stand beside their programs.
 
 
-def described(document: Document) -> str:
-    """Commits, dates and machines in words, each combination once."""
-    return "; ".join(
-        sorted({f"commit {one['commit']}, {one['date'][:10]}, {in_words(one['machine'])}" for one in heads(document)})
+def of_rows(**patterns: str) -> Callable[[Document], Lines]:
+    """A table of the rows of a file; of each column the head, with _ for a blank, and the pattern of its cells."""
+    return lambda measured: columns(measured["rows"], {head.replace("_", " "): one for head, one in patterns.items()})
+
+
+def frames(measured: Document) -> Lines:
+    """The kernel and the front doors, and the memory of a worker process."""
+    shown = of_rows(
+        What="{what}",
+        Gaussians="{gaussians:,}",
+        Threads="{threads}",
+        Poses_at_once="{poses}",
+        p50_ms="{p50_ms:.2f}",
+        p99_ms="{p99_ms:.2f}",
+        **{"Frames/s": "{frames_per_s:.0f}"},
+        Above_kernel_ms="{above_kernel_ms:.2f}",
+    )
+    yield from shown(measured)
+    memory = ", ".join(f"{int(count):,} Gaussians {mb:.0f} MB" for count, mb in measured["worker_memory_mb"].items())
+    yield from ("", f"Memory of a worker process: with {memory}.")
+
+
+def frames_at_a_glance(measured: Document) -> Lines:
+    """What a reader of the README wants to know: the kernel and each front door, p50 and p99 by number of Gaussians."""
+    names = {
+        ("kernel", 1): "renderer, 1 thread",
+        ("kernel", 2): "renderer, 2 threads",
+        ("gRPC stream", 2): "to a client over a gRPC stream",
+        ("HTTP raw", 2): "to a client over HTTP, raw pixels",
+        ("HTTP PNG", 2): "to a client over HTTP, PNG",
+    }
+    of = {(row["what"], row["threads"], row["gaussians"]): row for row in measured["rows"] if row["poses"] == 1}
+    counts = sorted({row["gaussians"] for row in measured["rows"]}, reverse=True)
+    cells = "{p50_ms:.1f} / {p99_ms:.1f} ms"
+    return table(
+        ("Median / 99th percentile", *(f"{count:,} Gaussians" for count in counts)),
+        ((name, *(cells.format_map(of[(*key, count)]) for count in counts)) for key, name in names.items()),
     )
 
 
-def in_words(machine: Document) -> str:
-    """A machine; figures of earlier commits do not say everything about theirs."""
-    model, memory = machine.get("model"), machine.get("memory_gib")
-    threads, cores = machine.get("threads"), machine.get("cores")
-    of_cores = "" if cores is None else f"{cores} cores"
-    parts = (
-        f"{machine['processor']} ({model})" if model else machine["processor"],
-        machine.get("instruction_set"),
-        " on ".join(part for part in (f"{threads} thread{'s'[: threads != 1]}" if threads else "", of_cores) if part),
-        f"{memory:.0f} GiB" if memory else None,
+def parts(measured: Document) -> Lines:
+    """The parts of a frame in the kernel, and its work."""
+    shown = {
+        "Scene": "{what}",
+        "Instructions": "{instruction_set}",
+        "Frame ms": "{frame_ms:.2f}",
+        **{name: f"{{{name.lower()}_ms:.2f}}" for name in ("Slicing", "Drawing", "Finishing")},
+        **{name: f"{{{name.lower()}:,.0f}}" for name in ("Slices", "Groups", "Rows")},
+        "Lanes used": "{lanes_used:.0%}",
+        "ns a row": "{ns_per_row:.1f}",
+        "MB moved": "{megabytes_moved:.0f}",
+        f"Modelled on {', '.join(measured['rows'][0]['modelled_speedups'])} cores": "{modelled}",
+    }
+    rows = (
+        {**row, "modelled": ", ".join(f"{speedup:.1f}" for speedup in row["modelled_speedups"].values())}
+        for row in measured["rows"]
     )
-    return ", ".join(part for part in parts if part)
+    return columns(rows, shown)
+
+
+def clients(measured: Document) -> Lines:
+    """What each kind of client gets."""
+    extent, by_client = measured["extent"], measured["clients"]
+    shown = {
+        f"Control loop, gRPC stream at 60 Hz for {extent['loop_s']:.0f} s, mode `latest`": (
+            "control loop",
+            "p50 {p50_ms:.1f}, p99 {p99_ms:.1f}, p99.9 {p99.9_ms:.1f} ms; jitter {jitter_ms:.1f} ms; {dropped:.0f} of "
+            "its poses dropped",
+        ),
+        **{
+            name: (name, "{frames_per_s:.0f} frames/s, to each at least {least_frames_per_s:.0f}")
+            for name in by_client
+            if name.startswith("WebSocket")
+        },
+        "OpenIGTLink, one pose after another": ("OpenIGTLink", "p50 {p50_ms:.1f}, p99 {p99_ms:.1f} ms"),
+        f"Augmentation: a job of {extent['frames']:,} frames, 8 bit, to npz, "
+        f"{extent['gaussians']:,} random Gaussians": (
+            "augmentation",
+            "{frames_per_s:.0f} frames/s; the kernel by itself {kernel_frames_per_s:.0f}: {share_of_kernel:.0%}",
+        ),
+    }
+
+    def filled(pattern: str, values: Document) -> str:  # a dot in a key is none of an attribute
+        return pattern.replace("p99.9_ms", "p999_ms").format_map({k.replace(".", ""): v for k, v in values.items()})
+
+    return table(("Client", "Measured"), ((what, filled(p, by_client[name])) for what, (name, p) in shown.items()))
+
+
+def control_loop(measured: Document) -> Lines:
+    """What a robot waits for."""
+    names = {
+        "median": "p50_ms",
+        "99 of 100 frames": "p99_ms",
+        "999 of 1,000 frames": "p99.9_ms",
+        "time between two frames, standard deviation": "jitter_ms",
+    }
+    loop = measured["clients"]["control loop"]
+    return table(
+        ("From sending a pose to having its frame", "ms"), ((name, f"{loop[key]:.1f}") for name, key in names.items())
+    )
+
+
+def shards(measured: Document) -> Lines:
+    """A batch on the queue and on Ray, beside the kernel."""
+    extent, workers = measured["extent"], measured["extent"]["workers"]
+    rows = [(f"kernel alone, {workers} processes of one thread", f"{measured['kernel_frames_per_s']:,.0f}", "", "")]
+    for engine, name in (("queue", "queue"), ("ray", "Ray")):
+        if (found := measured.get(engine)) is not None:
+            share = f"{found['share_of_kernel']:.0%}"
+            rows.append((f"{name}, {workers} workers", f"{found['frames_per_s']:,.0f}", share, str(found["kills"])))
+    what = f"{extent['frames']:,} frames of {extent['side']}x{extent['side']}, {extent['shards']} shards"
+    return table((what, "Frames/s", "Of the kernel", "Killed in the second half"), rows)
+
+
+def jobs(measured: Document) -> Lines:
+    """A service with a long list of jobs."""
+    rows = ({"what": what, **of} for what, of in measured["latency_ms"].items())
+    return columns(rows, {"What": "{what}", "p50 ms": "{p50:.1f}", "p99 ms": "{p99:.1f}"})
+
+
+def console(measured: Document) -> Lines:
+    """The console in Chromium."""
+    shown = {
+        "A sweep played at 512x512 for {seconds:.0f} s": (
+            "{frames_per_s[median]:.0f} frames/s, {frames_per_s[least]:.0f} in its slowest ten seconds"
+        ),
+        "Heap after a collection": "{heap_mib[first]:.0f} MiB at first, at most {heap_mib[most]:.0f} MiB",
+        "From a click in the 3D view until the picture shows it": (
+            "{click_in_3d_ms[median]:.0f} ms, at most {click_in_3d_ms[most]:.0f} ms"
+        ),
+        "First paint": "{first_paint_s:.2f} s",
+        "First image": "{first_image_s:.1f} s",
+        "Size of the page": "{bundle_gzip_kb:.0f} KB gzipped",
+    }
+    paint_s, image_s = (measured[name] / 1000 for name in ("first_contentful_paint_ms", "first_image_ms"))
+    known = {**measured, "first_paint_s": paint_s, "first_image_s": image_s}
+    return table(("What", "Measured"), ([text.format_map(known) for text in row] for row in shown.items()))
+
+
+def environment(measured: Document) -> Lines:
+    """Steps a second of a random policy, by size and contact."""
+    rows = ({**row, "contact": row["contact"] or "assumed"} for row in measured["rows"])
+    shown = {"Frame": "{side}x{side}", "Contact": "{contact}", "Steps/s": "{steps_per_s:.0f}"}
+    return columns(rows, {**shown, "p50 ms": "{p50_ms:.2f}", "p99 ms": "{p99_ms:.2f}"})
+
+
+@dataclass(frozen=True)
+class Block:
+    """One place in the documents: the file whose figures stand there, and the lines that are made of them."""
+
+    source: str
+    lines: Callable[[Document], Lines]
+    part: Callable[[Document], Document] = dict  # of the runs
+
+    def of(self, figures: Document) -> list[str]:
+        """The lines; the last says where the figures come from."""
+        part = self.part(figures)
+        return [*self.lines(part), "", f"{described(part)}."]
+
+
+BLOCKS = {
+    "frames": Block("results", frames),
+    "frames at a glance": Block("results", frames_at_a_glance),
+    "training steps": Block(
+        "training",
+        of_rows(
+            Gaussians="{gaussians:,}",
+            Images="{images}",
+            Threads="{threads}",
+            Step_ms="{step_ms:.1f}",
+            **{part.capitalize(): f"{{shares[{part}]:.0%}}" for part in ("forward", "loss", "backward", "optimizer")},
+        ),
+    ),
+    "parts of a frame": Block("kernel", parts),
+    "clients": Block("clients", clients),
+    "control loop": Block("clients", control_loop),
+    "jobs": Block("jobs", jobs),
+    "shards": Block("shards", shards),
+    "console": Block("console", console),
+    "environment": Block("environment", environment),
+    "ros": Block("ros", of_rows(Frame="{side}x{side}", Way="{way}", p50_ms="{p50_ms:.1f}", p99_ms="{p99_ms:.1f}")),
+    "results": Block("results_tables", results_tables.results),
+    "results at a glance": Block("results_tables", results_tables.results_at_a_glance, results_tables.glanced_at),
+    "methods": Block("methods_tables", methods_tables.methods),
+    "ablations": Block("ablations", ablations.trained_without),
+    "poses": Block("poses", poses.refined_poses),
+    "localization": Block("localization", localization.found_frames),
+    "confidence": Block("confidence", confidence.confidence_and_uncertainty),
+}
 
 
 def documents() -> list[Path]:
     """README.md and everything below docs/ that has a place for figures."""
-    pages = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+    pages = [measuring.ROOT / "README.md", *sorted((measuring.ROOT / "docs").rglob("*.md"))]
     return [page for page in pages if _PLACE.search(page.read_text(encoding="utf-8"))]
 
 
 def current(text: str, read_kept: Callable[[str], Document] = lambda name: read(kept(name))) -> str:
     """A document with the figures as the files have them."""
-    from tables import BLOCKS
 
     def block(place: re.Match[str]) -> str:
         one = BLOCKS[place[1]]
         lines = [*one.of(read_kept(one.source)), ""]
-        lines[-2] = f"`{kept(one.source).relative_to(ROOT)}`: {lines[-2]}"
+        lines[-2] = f"`{kept(one.source).relative_to(measuring.ROOT)}`: {lines[-2]}"
         return f"{place[1]}{place[2]}" + "\n".join(lines)
 
     return _PLACE.sub(block, text)
@@ -202,8 +296,6 @@ def current(text: str, read_kept: Callable[[str], Document] = lambda name: read(
 
 def show(target: str) -> None:
     """Print the tables of what a target measured."""
-    from tables import BLOCKS
-
     for name, one in BLOCKS.items():
         if TARGETS[one.source] == target and (found := read(staged(one.source))):
             sys.stdout.write("\n".join((f"# {name}", "", *one.of(found), "", "")))
@@ -217,18 +309,8 @@ def listing() -> Iterator[str]:
             continue
         yield f"{name}: {described(found)}"
         for of in sorted({str(head["commit"]).removesuffix(DIRTY) for head in heads(found)}):
-            command = [
-                "git",
-                "-C",
-                str(ROOT),
-                "rev-list",
-                "--count",
-                f"{of}..HEAD",
-                "--",
-                "model",
-                "workers",
-                "service",
-            ]
+            command = ["git", "-C", str(measuring.ROOT), "rev-list", "--count", f"{of}..HEAD", "--"]
+            command += ["model", "workers", "service"]
             done = subprocess.run(command, capture_output=True, text=True, check=False)
             since = f"{done.stdout.strip()} commits changed the product" if done.returncode == 0 else "age not known"
             yield f"    {of}: {since} since"
@@ -245,8 +327,6 @@ def main() -> None:
             for name, document in {name: to_record(name, here) for name in given.names}.items():
                 write_whole(kept(name), json.dumps(document, indent=1, allow_nan=False) + "\n")
                 if name == "confidence":
-                    import confidence
-
                     confidence.draw(document)
     except NotRecordable as error:
         sys.exit(f"error: {error}")
@@ -259,9 +339,8 @@ def main() -> None:
             text = page.read_text(encoding="utf-8")
             if (new := current(text)) != text:
                 if given.do == "check":
-                    sys.exit(
-                        f"error: {page.relative_to(ROOT)} is not what the figures say: run benchmarks/figures.py record"
-                    )
+                    name = page.relative_to(measuring.ROOT)
+                    sys.exit(f"error: {name} is not what the figures say: run benchmarks/figures.py record")
                 write_whole(page, new)
 
 

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from figures import Document, measure_runs
+from measuring import Document, Lines, columns, measure_runs
 from ultragray.datasets.source import load_dataset
 from ultragray.geometry.probe import FloatArray
 from ultragray.learn.localization.search import Motions, localize
@@ -91,6 +91,22 @@ def displaced(pose: FloatArray, motions: Motions, random: np.random.Generator) -
 def between(motions: Motions, one: FloatArray, other: FloatArray) -> tuple[float, float]:  # mm, degrees
     """How far two poses of an image are apart."""
     return motions.step_between(torch.from_numpy(one), torch.from_numpy(other))
+
+
+def found_frames(figures: Document) -> Lines:
+    """Held-out frames that were looked for."""
+    return columns(
+        ({"name": name, **figures[name]} for name in SETS if name in figures),
+        {
+            "set": "{name}",
+            "held-out frames": "{frames}",
+            f"within {FOUND_MM:g} mm and {FOUND_DEG:g}°": "{within:.0%}",
+            "from the recorded pose": "{within_from_recorded:.0%}",
+            "both end in one place": "{same_place:.0%}",
+            "median error": "{median_mm:.2f} mm, {median_deg:.2f}°",
+            "time, median and 90 of 100": "{p50_s:.2f} s, {p90_s:.2f} s",
+        },
+    )
 
 
 if __name__ == "__main__":

@@ -5,13 +5,14 @@ Each method's fit is kept in build/methods: a killed run goes on.
 
 from __future__ import annotations
 
+from collections.abc import Iterator, Sequence
 from functools import partial
 from pathlib import Path
 
-from figures import ROOT, Document, log, measure_runs, teller
+from measuring import ROOT, Document, Lines, log, measure_runs, table, teller
 from ultragray.datasets.source import PHANTOM, load_dataset
 from ultragray.learn.evaluation.methods import ComparisonSettings
-from ultragray.learn.report.tables import by_mean_rank, rank
+from ultragray.learn.report.tables import METRICS, by_mean_rank, rank, shown_value
 from ultragray_studies.bench.report import commit
 from ultragray_studies.comparison.result import Comparison
 from ultragray_studies.comparison.run import ComparisonProgress, compare_methods
@@ -60,7 +61,7 @@ def summary(comparison: Comparison, data_folder: Path) -> Document:
             "title": result.title,
             "failure": result.failure and result.failure.replace(f"{data_folder.resolve()}/", ""),
             "cost": dict(zip(COST_HEADINGS, cost_texts(result), strict=True)),
-            "seconds": result.seconds,
+            "seconds": result.cost.seconds,
             "frame_ms": result.frame_ms,
         }
         if result.evaluation is not None:
@@ -75,6 +76,35 @@ def summary(comparison: Comparison, data_folder: Path) -> Document:
         "order": by_mean_rank(comparison.measured),
         "methods": found,
     }
+
+
+def methods(figures: Document) -> Lines:
+    """A table of each run, best mean rank first, then what failed."""
+    for name, run in ((name, figures[name]) for name in RUNS if name in figures):
+        seconds = "" if run["budget_s"] is None else f", equal time {run['budget_s'] * run['times']:.0f} s"
+        yield from (f"### {name}", "")
+        yield f"{run['train_frames']} training and {run['val_frames']} held-out frames of {run['image']}{seconds}."
+        yield ""
+        measured = [run["methods"][key] for key in run["order"]]
+        failed = [one for one in run["methods"].values() if one["failure"] is not None]
+        yield from table(
+            ("method", *COST_HEADINGS, *(metric.heading for metric in METRICS), "mean rank"),
+            (_method(one, [other["mean"] for other in measured]) for one in measured),
+        )
+        for one in failed:
+            reason = one["failure"].replace("|", "/")
+            yield f"| {one['title']} | failed: {reason} {'| ' * (len(COST_HEADINGS) + len(METRICS))}|"
+        yield ""
+
+
+def _method(one: Document, means: Sequence[Document]) -> Iterator[str]:
+    yield from (one["title"], *one["cost"].values())
+    for metric in METRICS:
+        shown = shown_value(metric.name, one["mean"][metric.name])
+        best = max((mean[metric.name] for mean in means), key=lambda value, sign=metric.sign: sign * value)
+        bold = "**" if shown == shown_value(metric.name, best) else ""
+        yield f"{bold}{shown}{bold}"
+    yield f"{one['mean_rank']:.2f}"
 
 
 if __name__ == "__main__":

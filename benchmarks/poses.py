@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from figures import Document, measure_runs
+from measuring import Document, Lines, measure_runs, table
 from ultragray.datasets.source import load_dataset
 from ultragray.geometry.pose import rotation_angles_deg
 from ultragray.geometry.probe import FloatArray
@@ -87,6 +87,28 @@ def deviation(true: Sweep, poses: FloatArray) -> dict[str, float]:
 
 
 RUNS = {f"{name}, {error}, seed 0": partial(measure, name, error, 0) for name, error in CASES}
+
+
+def refined_poses(figures: Document) -> Lines:
+    """Trainings from poses with errors, with and without refinement."""
+    rows = []
+    for name, error in CASES:
+        runs = [run for key, run in figures.items() if key.startswith(f"{name}, {error}, ")]
+        if not runs:
+            continue
+        mean = {
+            key: float(np.mean([run[key] for run in runs])) for key in runs[0] if "_none" in key or "_frames" in key
+        }
+        scores = (f"{mean[f'psnr_db_{mode}']:.2f} dB / {mean[f'ms_ssim_{mode}']:.3f}" for mode in ("none", "frames"))
+        added_mm, added_deg, left_mm, left_deg = (
+            float(np.mean([run[which][unit] for run in runs])) for which in ("added", "left") for unit in ("mm", "deg")
+        )
+        removed = f"{1 - left_mm / added_mm:.0%}, {1 - left_deg / added_deg:.0%}" if error != RECORDED else ""
+        seeds = f" ({len(runs)} seeds)" if len(runs) > 1 else ""
+        rows.append((name, f"{error}{seeds}", *scores, f"{left_mm:.2f} mm, {left_deg:.2f}°", removed))
+    head = ("set", "errors", "PSNR and MS-SSIM without refinement", "with it", "error left over", "removed")
+    return table(head, rows)
+
 
 if __name__ == "__main__":
     measure_runs("poses", __doc__, RUNS)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from enum import Enum
 from functools import partial
@@ -11,14 +11,14 @@ from typing import Any
 
 import numpy as np
 
-from figures import Document, measure_runs, teller
+from bone_shadow import SHADOW_DB, BoneShadow
 from in_silico import IN_SILICO
+from measuring import Document, Lines, columns, measure_runs, table, teller
 from ultragray.datasets.source import PHANTOM, SourceOptions, load_dataset
 from ultragray.learn.evaluation.baselines import BASELINES, affordable_voxel_mm, evaluate_baselines, predict
 from ultragray.learn.evaluation.scoring import render_sweep
 from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import TrainingConfig
-from ultragray.phantom.imaging import BoneShadow
 from ultragray.scene.gaussians import GaussianScene
 from ultragray_studies.report import train_and_evaluate
 
@@ -117,6 +117,117 @@ def measure_shadow(scene: GaussianScene, dataset: Dataset, voxel_mm: float) -> d
         "median_mae": shadow.mean_absolute_error(compounded),
         "scene_transmittance": shadow.mean(render_sweep(scene, dataset.val, output="transmittance")),
     }
+
+
+ROW_NAMES = {
+    "scene": "**scene**",
+    "median": "median compounding",
+    "mean": "mean compounding",
+    "maximum": "maximum compounding",
+    "linear": "linear between frames",
+    "nearest": "nearest training frame",
+}
+README_ROWS = {
+    "ultranerf_liver": "simulated liver, trained on two sweeps",
+    "liver_convex": "human liver, convex probe",
+    "spine_phantom": "spine phantom, 17 frames",
+    "nwire_phantom": "N-wire phantom: bright dots in black",
+    "phantom": "built-in phantom, an unseen tilt",
+}
+_HEADS = {"psnr_db": "PSNR, dB", "ms_ssim": "MS-SSIM", "gms": "GMS", "gmsd": "GMSD"}
+_LESS_IS_BETTER = "gmsd"
+
+
+def results(figures: Document) -> Lines:
+    """A table of the trainings, one of each run's lead, then one of the metrics for each run."""
+    known = {name: figures[name] for name in RUNS if name in figures}
+    yield from columns(
+        ({"name": name, **run} for name, run in known.items()),
+        {
+            "run": "{name}",
+            "training / held-out frames": "{train_frames} / {val_frames}",
+            "image": "{image}",
+            "preset": "{preset}",
+            "steps": "{steps:,}",
+            "Gaussians": "{gaussians:,}",
+            "ms a step": "{step_ms:.0f}",
+            "total": "{total_s:.0f} s",
+        },
+    )
+    yield from (
+        "",
+        "The scene less the better of median compounding and linear interpolation (GMSD: the better less the scene, so",
+        "that more is better throughout):",
+        "",
+    )
+    yield from table(("run", *_HEADS.values()), ((name, *_leads(run)) for name, run in known.items()))
+    yield ""
+    for name, run in known.items():
+        yield from (f"## {name}", "")
+        yield from table(("held-out frames", *_HEADS.values()), _metrics(run))
+        yield from ("", " ".join(_notes(run)), "")
+        if (shadow := run.get("shadow")) is not None:
+            yield (
+                f"Where bone takes more than {SHADOW_DB:g} dB: mean absolute error {shadow['scene_mae']:.4f} (scene) "
+                f"against {shadow['median_mae']:.4f} (median compounding);"
+            )
+            yield from (f"mean transmittance of the scene {shadow['scene_transmittance']:.3f}.", "")
+
+
+def _leads(run: Document) -> Iterator[str]:
+    """The scene against the better of median compounding and linear interpolation, metric by metric."""
+    means = {method: run["metrics"][method]["mean"] for method in ("scene", "median", "linear")}
+    for key in _HEADS:
+        sign = -1.0 if key == _LESS_IS_BETTER else 1.0
+        lead = min(sign * (means["scene"][key] - means[method][key]) for method in ("median", "linear"))
+        yield f"{lead:+.{_digits(key)}f}"
+
+
+def _digits(key: str) -> int:
+    return 2 if key == "psnr_db" else 3
+
+
+def _metrics(run: Document) -> Iterator[list[str]]:
+    means = {method: run["metrics"][method]["mean"] for method in ROW_NAMES}
+    best = {key: (min if key == _LESS_IS_BETTER else max)(mean[key] for mean in means.values()) for key in _HEADS}
+    for method, row_name in ROW_NAMES.items():
+        cells = [row_name]
+        for key in _HEADS:
+            mean = f"{means[method][key]:.{_digits(key)}f}"
+            shown = f"**{mean}**" if mean == f"{best[key]:.{_digits(key)}f}" else mean
+            cells.append(f"{shown} ± {run['metrics'][method]['std'][key]:.{_digits(key)}f}")
+        yield cells
+
+
+def _notes(run: Document) -> Iterator[str]:
+    yield f"Compounding with voxels of {run['voxel_mm']:g} mm."
+    if run["split"]["train"]:
+        yield f"Training frames {run['split']['train']}, held out {run['split']['val']} of the training file."
+    if run["ms_ssim_scales"] < 5:
+        yield f"MS-SSIM over {run['ms_ssim_scales']} scales, which is what the images hold."
+    if run["settings"]:
+        settings = ", ".join(f"{key} {value:,}" for key, value in run["settings"].items())
+        yield f"Preset {run['preset']} with {settings}."
+
+
+def glanced_at(figures: Document) -> Document:
+    """The runs that the README shows."""
+    return {name: figures[name] for name in README_ROWS if name in figures}
+
+
+def results_at_a_glance(figures: Document) -> Lines:
+    """The README's table, of the runs that it shows."""
+    shown = "{psnr_db:.1f} dB, {ms_ssim:.3f}, {gmsd:.3f}"
+    return table(
+        ("PSNR, MS-SSIM, GMSD", "training", "this scene", "median compounding", "linear interpolation"),
+        (
+            (
+                *(README_ROWS[name], f"{run['total_s']:.0f} s"),
+                *(shown.format_map(run["metrics"][one]["mean"]) for one in ("scene", "median", "linear")),
+            )
+            for name, run in figures.items()
+        ),
+    )
 
 
 if __name__ == "__main__":

@@ -21,7 +21,7 @@ from typing import Any
 
 import numpy as np
 
-from figures import write
+from measuring import write
 from ultragray.phantom.demo import copy_demo_scene, demo_poses
 from ultragray_client import Client, RenderSettings
 from ultragray_studies.bench.report import measured

@@ -106,48 +106,33 @@ _RAISES = re.compile(r"\s*\bRaises\s.*?(?=\n\n|\Z)", flags=re.DOTALL)
 
 def generate_errors(output_folder: Path) -> Path:
     """Writes errors.py and returns its path."""
-    classes = {name: (base, source) for name, base, source in _error_classes()}
-    tree = _below("ClientError", {name: base for name, (base, _) in classes.items()})
+    classes = dict(_error_classes())
+    tree = _below("ClientError", {name: bases[0] for name, (bases, _) in classes.items()})
     drawn = "\n".join(["ClientError", *(line for line, _ in tree)])
-    names = [name for _, name in tree]
-    listed = f"ERRORS = (ClientError, {', '.join(names)})\n"
+    sources = [
+        f"class {name}({', '.join(classes[name][0])}):\n    {_quoted(_wrapped(classes[name][1]))}\n" for _, name in tree
+    ]
     target = output_folder / "errors.py"
-    sources = (classes[name][1] for name in names)
-    target.write_text(_ERRORS_HEADER.format(tree=drawn) + "\n".join([*sources, listed]))
+    target.write_text(_ERRORS_HEADER.format(tree=drawn) + "\n".join([*sources, "ERRORS = ClientError.branch()\n"]))
     return formatted([target])[0]
 
 
-def _error_classes() -> Iterator[tuple[str, str, str]]:
-    """Name, base and source of each class: below that of its gRPC status, which stands for all its reasons."""
+def _error_classes() -> Iterator[tuple[str, tuple[list[str], str]]]:
+    """Name, bases and meaning of each class: below that of its gRPC status, which stands for all its reasons."""
     meanings = {
         cls.reason: " ".join(inspect.cleandoc(cls.__doc__ or "").split("\n\n")[0].split()) for cls in error_classes()
     }
-    roots = {"INTERNAL"}
+    found = {}
     for reason, statuses in STATUSES.items():
         status = statuses.grpc
-        if reason in NOT_OVER_GRPC:
-            continue
-        if status not in roots:
-            roots.add(status)
-            meaning = meanings.get(status, f"Base of the errors whose gRPC status is {status}.")
-            yield _error_class(status, "ClientError", meaning, f"grpc_status = {status!r}")
-        if reason not in roots:
-            yield _error_class(reason, "ClientError" if status == "INTERNAL" else _camel(status), meanings[reason])
-    for reason, (base, meaning) in OWN_ERRORS.items():
-        yield _error_class(reason, base, meaning)
-
-
-def _error_class(reason: str, base: str, meaning: str, status: str = "") -> tuple[str, str, str]:
-    name = _camel(reason)
-    bases = ", ".join([base, *_ALSO.get(name, ())])
-    lines = (
-        f"class {name}({bases}):",
-        f"    {_quoted(_wrapped(meaning))}",
-        "",
-        f"    reason = {reason!r}",
-        status and f"    {status}",
-    )
-    return name, base, "\n".join(lines)
+        if reason not in {*NOT_OVER_GRPC, "INTERNAL"}:
+            base = "ClientError" if status == "INTERNAL" else _camel(status)
+            root = meanings.get(status, f"Base of the errors whose gRPC status is {status}.")
+            found.setdefault(base, ("ClientError", root))
+            found.setdefault(_camel(reason), (base, meanings[reason]))
+    found.pop("ClientError", None)
+    found |= {_camel(reason): base_and_meaning for reason, base_and_meaning in OWN_ERRORS.items()}
+    return ((name, ([base, *_ALSO.get(name, ())], meaning)) for name, (base, meaning) in found.items())
 
 
 def _camel(reason: str) -> str:
@@ -233,18 +218,19 @@ def _dataclass_source(cls: Any, name: str, bases: list[Any]) -> str:
 def _field_source(item: Field[Any], *, kw_only: bool) -> str:
     if str(item.type).startswith("Literal"):  # what tells a member of a family apart
         return f"    kind: Literal[{item.default!r}] = field_of(default={item.default!r}, repr=False, kw_only=True)"
-    default = ""
+    given = ""
     if item.default is not MISSING:
-        default = f" = {_default_source(item.default)}"
-    elif item.default_factory is not MISSING:
-        default = f" = field_of(default_factory={item.default_factory.__name__})"
-    if kw_only:
         given = f"default={_default_source(item.default)}"
-        if item.default_factory is not MISSING:
-            given = f"default_factory={item.default_factory.__name__}"
-        default = f" = field_of({given}, kw_only=True)"
+    elif item.default_factory is not MISSING:
+        given = f"default_factory={item.default_factory.__name__}"
+    default = f" = field_of({given}{', kw_only=True' if kw_only else ''})" if given else ""
+    if given.startswith("default=") and not kw_only:
+        default = f" = {given.removeprefix('default=')}"
     annotation = re.sub(r"\w+", lambda word: OWN_TYPES.get(word[0], word[0]), str(item.type))
-    return f"    {item.name}: {annotation}{default}\n    {_quoted(_wrapped(item.metadata['description']))}"
+    source, words = f"    {item.name}: {annotation}{default}", item.metadata["description"]
+    if len(line := f"{source}  # {words}") <= 120:
+        return line
+    return "\n".join([*(f"    # {part}" for part in textwrap.wrap(words, 110)), source])
 
 
 def _default_source(default: Any) -> str:

@@ -1,315 +1,163 @@
-"""The clients, for threads and for asyncio side by side: thin transports of the calls that `calls.py` describes.
-
-A method of a client is such a description carried out: `render = answer_method(ClientCalls.render)` has the parameters
-and the docstring of the description, and gives what the call answers.
+"""The clients, for threads and for asyncio: the same operations, each once, as the message that it sends and the answer
+that it reads. `transport.py` carries them out.
 """
 
 from __future__ import annotations
 
-import asyncio
-import inspect
-import time
-from collections.abc import AsyncGenerator, AsyncIterator, Callable, Coroutine, Generator, Iterator
-from contextlib import aclosing, closing
-from typing import Any, Concatenate, ParamSpec, TypeVar
+import uuid
+from collections.abc import Callable, Iterable, Mapping
+from contextlib import nullcontext
+from functools import partial
+from pathlib import Path
+from typing import Any, TypeVar
 
-import grpc
+import numpy as np
+import numpy.typing as npt
 
-from ultragray_client.calls import (
-    Attempt,
+from ultragray_client.connection import DEFAULT_ADDRESS, DEFAULT_TIMEOUT_S, ApiKey, Tls
+from ultragray_client.contract import (
+    Dataset,
+    DatasetOptions,
+    Extrapolation,
+    Probe,
+    RenderSettings,
+    SliceSettings,
+    Specification,
+)
+from ultragray_client.conversations import Batch, LastJob, Upload, Watch, download_into
+from ultragray_client.errors import InvalidPose
+from ultragray_client.exchange import PoseExchange, StreamMode
+from ultragray_client.frames import (
+    Frame,
+    Localization,
+    Slice,
+    frame_from_message,
+    localize_message,
+    settings_message,
+    slice_from_message,
+)
+from ultragray_client.geometry import PoseLike, pose_message, pose_messages
+from ultragray_client.messages import message_of
+from ultragray_client.records import (
+    AuditEntry,
+    Job,
+    JobEvent,
+    JobState,
+    Me,
+    Registration,
+    Scene,
+    SceneEntry,
+    Worker,
+    entry_from_message,
+    job_from_message,
+    scene_from_message,
+)
+from ultragray_client.transport import (
+    AnyConnection,
+    AsyncConnection,
     Call,
-    ClientCalls,
     Collection,
-    DatasetCalls,
-    JobCalls,
+    Connection,
+    Deletion,
+    Group,
     Listing,
-    Pause,
     PoseStream,
-    RegistrationCalls,
-    SceneCalls,
+    Sending,
     Talk,
-    WorkerCalls,
+    operation,
 )
-from ultragray_client.connection import (
-    CHANNEL_OPTIONS,
-    DEFAULT_ADDRESS,
-    DEFAULT_TIMEOUT_S,
-    ApiKey,
-    Terms,
-    Tls,
-    client_errors,
-    error_of_call,
-)
-from ultragray_client.errors import ClientError
-from ultragray_client.stream import AsyncFrameStream, FrameStream
+from ultragray_proto.codec import from_message
 from ultragray_proto.v1 import (
-    access_pb2_grpc,
-    datasets_pb2_grpc,
-    jobs_pb2_grpc,
-    registrations_pb2_grpc,
-    rendering_pb2_grpc,
-    scenes_pb2_grpc,
-    workers_pb2_grpc,
+    access_pb2,
+    datasets_pb2,
+    geometry_pb2,
+    jobs_pb2,
+    registrations_pb2,
+    rendering_pb2,
+    scenes_pb2,
+    workers_pb2,
 )
 
-P = ParamSpec("P")
 T = TypeVar("T")
-
-_STUBS: tuple[Callable[[Any], Any], ...] = (
-    access_pb2_grpc.AccessServiceStub,
-    datasets_pb2_grpc.DatasetServiceStub,
-    jobs_pb2_grpc.JobServiceStub,
-    registrations_pb2_grpc.RegistrationServiceStub,
-    rendering_pb2_grpc.RenderServiceStub,
-    scenes_pb2_grpc.SceneServiceStub,
-    workers_pb2_grpc.WorkerServiceStub,
-)
+_QUALITY = ("residual_mm", "residual_deg", "position_std_mm", "angle_std_deg")
 
 
-def _methods(channel: Any) -> dict[str, Any]:
-    """The methods of all services over a channel, by names such as "SceneService.GetScene"."""
-    stubs = {stub.__name__.removesuffix("Stub"): vars(stub(channel)) for stub in _STUBS}
-    return {f"{service}.{name}": method for service, methods in stubs.items() for name, method in methods.items()}
-
-
-class Connection(Terms):
-    """A channel that threads share. All methods raise ClientError."""
-
-    def __init__(self, address: str, api_key: ApiKey | None, tls: Tls | None, timeout_s: float) -> None:
-        super().__init__(address, api_key, tls, timeout_s)
-        if tls is None:
-            self._channel = grpc.insecure_channel(address, options=CHANNEL_OPTIONS)
-        else:
-            self._channel = grpc.secure_channel(address, tls.credentials(), options=tls.options())
-        self._methods = _methods(self._channel)
-
-    def close(self) -> None:
-        self._channel.close()
-
-    def answer(self, call: Call[T] | Collection[T]) -> T:
-        """The answer to a call, or what a conversation is collected to."""
-        if isinstance(call, Collection):
-            return self._collect(call)
-        steps, answer = call.steps(self), None
-        try:
-            step = next(steps)
-            while True:
-                failure = None
-                try:
-                    answer = self._carry_out(step)
-                except grpc.RpcError as error:
-                    failure = error_of_call(error, self.address)
-                step = steps.send(answer) if failure is None else steps.throw(failure)
-        except StopIteration as end:
-            return end.value  # type: ignore[no-any-return]
-
-    def _carry_out(self, step: Attempt | Pause) -> Any:
-        if isinstance(step, Pause):
-            return time.sleep(step.seconds)
-        return self._methods[step.method](step.content, timeout=step.timeout_s, metadata=step.metadata)
-
-    def iterate(self, talk: Talk[T]) -> Generator[T, None, None]:
-        """The results of a conversation as its messages come."""
-        retries, conversation = self.retries(talk.timeout_s), talk.conversation
-        while (request := conversation.request()) is not None:
-            try:
-                messages = self._methods[talk.method](
-                    request, timeout=retries.remaining_s(), metadata=self.metadata(request)
-                )
-                try:
-                    with client_errors(self.address):
-                        for message in messages:
-                            retries.progress()
-                            yield conversation.take(message)
-                finally:
-                    messages.cancel()
-                conversation.end_of_call()
-            except ClientError as error:
-                time.sleep(conversation.pause_s(error, retries))
-
-    def _collect(self, work: Collection[T]) -> T:
-        with work.keeper() as keeper, closing(self.iterate(Talk(work.method, keeper, work.timeout_s))) as items:
-            for item in items:
-                keeper.keep(item)
-        return keeper.result  # type: ignore[no-any-return]
-
-    def open(self, poses: PoseStream) -> FrameStream:
-        """A stream of poses."""
-        retries = self.stream_retries(poses.timeout_s, poses.reconnect_s)
-
-        def start(messages: Iterator[Any]) -> Any:
-            metadata = self.metadata(poses.exchange)
-            return self._methods[poses.method](messages, timeout=retries.remaining_s(), metadata=metadata)
-
-        return FrameStream(poses.exchange, start, retries, self.address)
-
-
-class AsyncConnection(Terms):
-    """A channel of the running event loop. All methods raise ClientError."""
-
-    def __init__(self, address: str, api_key: ApiKey | None, tls: Tls | None, timeout_s: float) -> None:
-        super().__init__(address, api_key, tls, timeout_s)
-        if tls is None:
-            self._channel = grpc.aio.insecure_channel(address, options=CHANNEL_OPTIONS)
-        else:
-            self._channel = grpc.aio.secure_channel(address, tls.credentials(), options=tls.options())
-        self._methods = _methods(self._channel)
-
-    async def close(self) -> None:
-        await self._channel.close()
-
-    async def answer(self, call: Call[T] | Collection[T]) -> T:
-        """The answer to a call, or what a conversation is collected to."""
-        if isinstance(call, Collection):
-            return await self._collect(call)
-        steps, answer = call.steps(self), None
-        try:
-            step = next(steps)
-            while True:
-                failure = None
-                try:
-                    answer = await self._carry_out(step)
-                except grpc.RpcError as error:
-                    failure = error_of_call(error, self.address)
-                step = steps.send(answer) if failure is None else steps.throw(failure)
-        except StopIteration as end:
-            return end.value  # type: ignore[no-any-return]
-
-    async def _carry_out(self, step: Attempt | Pause) -> Any:
-        if isinstance(step, Pause):
-            return await asyncio.sleep(step.seconds)
-        content = _read_in_threads(step.content) if isinstance(step.content, Iterator) else step.content
-        return await self._methods[step.method](content, timeout=step.timeout_s, metadata=step.metadata)
-
-    async def iterate(self, talk: Talk[T]) -> AsyncGenerator[T, None]:
-        """The results of a conversation as its messages come."""
-        retries, conversation = self.retries(talk.timeout_s), talk.conversation
-        while (request := conversation.request()) is not None:
-            try:
-                messages = self._methods[talk.method](
-                    request, timeout=retries.remaining_s(), metadata=self.metadata(request)
-                )
-                try:
-                    with client_errors(self.address):
-                        async for message in messages:
-                            retries.progress()
-                            yield conversation.take(message)
-                finally:
-                    messages.cancel()
-                conversation.end_of_call()
-            except ClientError as error:
-                await asyncio.sleep(conversation.pause_s(error, retries))
-
-    async def _collect(self, work: Collection[T]) -> T:
-        with work.keeper() as keeper:
-            async with aclosing(self.iterate(Talk(work.method, keeper, work.timeout_s))) as items:
-                async for item in items:
-                    await asyncio.to_thread(keeper.keep, item)
-        return keeper.result  # type: ignore[no-any-return]
-
-    def open(self, poses: PoseStream) -> AsyncFrameStream:
-        """A stream of poses."""
-        retries = self.stream_retries(poses.timeout_s, poses.reconnect_s)
-
-        def start() -> Any:
-            metadata = self.metadata(poses.exchange)
-            return self._methods[poses.method](timeout=retries.remaining_s(), metadata=metadata)
-
-        return AsyncFrameStream(poses.exchange, start, retries, self.address)
-
-
-async def _read_in_threads(messages: Iterator[T]) -> AsyncIterator[T]:
-    """Messages whose making waits for the disk."""
-    while (message := await asyncio.to_thread(next, messages, None)) is not None:
-        yield message
-
-
-def _method(describe: Callable[..., Any], verb: str, answer: str, *, is_awaited: bool = False) -> Any:
-    """A method of a client that does `verb` of its connection with what `describe` gives.
-
-    It has the name, the parameters and the docstring of the description. `answer` is what it returns, {} for the type
-    that the description has in brackets.
-    """
-
-    def at_once(self: Any, *arguments: Any, **keywords: Any) -> Any:
-        return getattr(self._connection, verb)(describe(*arguments, **keywords))
-
-    async def in_time(self: Any, *arguments: Any, **keywords: Any) -> Any:
-        return await at_once(self, *arguments, **keywords)
-
-    method: Any = in_time if is_awaited else at_once
-    signature = inspect.signature(describe)
-    kind, _, inner = str(signature.return_annotation).removesuffix("]").partition("[")
-    if kind == Listing.__name__:
-        inner = f"tuple[{inner}, ...]"
-    own = inspect.Parameter("self", inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    method.__signature__ = signature.replace(
-        parameters=[own, *signature.parameters.values()], return_annotation=answer.format(inner)
-    )
-    method.__name__, method.__qualname__ = describe.__name__, describe.__qualname__.replace("Calls", "")
-    method.__doc__ = describe.__doc__
-    return method
-
-
-def answer_method(describe: Callable[P, Call[T] | Collection[T]]) -> Callable[Concatenate[Any, P], T]:
-    """The method that waits for the answer to a call."""
-    return _method(describe, "answer", "{}")  # type: ignore[no-any-return]
-
-
-def iterator_method(describe: Callable[P, Talk[T]]) -> Callable[Concatenate[Any, P], Iterator[T]]:
-    """The method that gives the results of a conversation as they come."""
-    return _method(describe, "iterate", "Iterator[{}]")  # type: ignore[no-any-return]
-
-
-def stream_method(describe: Callable[P, PoseStream]) -> Callable[Concatenate[Any, P], FrameStream]:
-    """The method that opens a stream of poses."""
-    return _method(describe, "open", "FrameStream")  # type: ignore[no-any-return]
-
-
-def coroutine_method(
-    describe: Callable[P, Call[T] | Collection[T]],
-) -> Callable[Concatenate[Any, P], Coroutine[Any, Any, T]]:
-    """As `answer_method`, for asyncio."""
-    return _method(describe, "answer", "{}", is_awaited=True)  # type: ignore[no-any-return]
-
-
-def async_iterator_method(describe: Callable[P, Talk[T]]) -> Callable[Concatenate[Any, P], AsyncIterator[T]]:
-    """As `iterator_method`, for asyncio."""
-    return _method(describe, "iterate", "AsyncIterator[{}]")  # type: ignore[no-any-return]
-
-
-def async_stream_method(describe: Callable[P, PoseStream]) -> Callable[Concatenate[Any, P], AsyncFrameStream]:
-    """As `stream_method`, for asyncio."""
-    return _method(describe, "open", "AsyncFrameStream")  # type: ignore[no-any-return]
-
-
-class _Group:
-    """Operations that go over the connection of a client."""
-
-    def __init__(self, connection: Connection | AsyncConnection) -> None:
-        self._connection = connection
-
-
-class Scenes(_Group):
+class Scenes(Group[AnyConnection]):
     """`client.scenes`. All raise ClientError; a name that does not exist is SceneNotFound."""
 
-    list = answer_method(SceneCalls.list)
-    get = answer_method(SceneCalls.get)
-    load = answer_method(SceneCalls.load)
-    unload = answer_method(SceneCalls.unload)
+    @operation
+    def list(self, *, timeout_s: float | None = None) -> Listing[SceneEntry]:
+        """All scenes by name."""
+        request = scenes_pb2.ListScenesRequest()
+        return Listing("SceneService.ListScenes", request, "scenes", entry_from_message, timeout_s)
+
+    @operation
+    def get(self, name: str, *, timeout_s: float | None = None) -> Call[Scene]:
+        """All that a scene says about itself."""
+        return Call("SceneService.GetScene", scenes_pb2.GetSceneRequest(scene=name), scene_from_message, timeout_s)
+
+    @operation
+    def load(self, name: str, *, timeout_s: float | None = None) -> Call[int]:
+        """Loads a scene ahead of its first frame; the number of render processes that hold it."""
+        return Call("SceneService.LoadScene", scenes_pb2.LoadSceneRequest(scene=name), _loaded, timeout_s)
+
+    @operation
+    def unload(self, name: str, *, timeout_s: float | None = None) -> Call[int]:
+        """Frees a scene's memory; the number of render processes that still hold it."""
+        return Call("SceneService.UnloadScene", scenes_pb2.UnloadSceneRequest(scene=name), _loaded, timeout_s)
 
 
-class Datasets(_Group):
+class Datasets(Group[AnyConnection]):
     """`client.datasets`. All raise ClientError; a name that does not exist is DatasetNotFound."""
 
-    upload = answer_method(DatasetCalls.upload)
-    list = answer_method(DatasetCalls.list)
-    get = answer_method(DatasetCalls.get)
-    contact_sheet = answer_method(DatasetCalls.contact_sheet)
-    delete = answer_method(DatasetCalls.delete)
+    @operation
+    def upload(
+        self,
+        name: str,
+        path: str | Path,
+        *,
+        options: DatasetOptions | None = None,
+        private: bool = False,
+        timeout_s: float | None = None,
+    ) -> Sending[Dataset]:
+        """Uploads a folder with all below it, or an archive (.zip, .tar, .tar.gz, .tgz), and waits until it is checked.
+
+        Others do not see a `private` one. The same content and options again give the dataset that is there. Without
+        `timeout_s` it takes as long as it takes. Raises DatasetInvalid with the file and the frame, DatasetExists,
+        UploadTooLarge, StorageFull.
+        """
+        upload = Upload(name, path, options or DatasetOptions(), private)
+        return Sending(
+            "DatasetService.UploadDataset",
+            upload.messages,
+            lambda answer: from_message(answer.dataset, Dataset),
+            timeout_s,
+        )
+
+    @operation
+    def list(self, *, timeout_s: float | None = None) -> Listing[Dataset]:
+        """All datasets by name."""
+        request = datasets_pb2.ListDatasetsRequest()
+        return Listing("DatasetService.ListDatasets", request, "datasets", _one(Dataset), timeout_s)
+
+    @operation
+    def get(self, name: str, *, timeout_s: float | None = None) -> Call[Dataset]:
+        """One dataset."""
+        return Call("DatasetService.GetDataset", datasets_pb2.GetDatasetRequest(dataset=name), _one(Dataset), timeout_s)
+
+    @operation
+    def contact_sheet(self, name: str, *, timeout_s: float | None = None) -> Call[bytes]:
+        """A PNG of the image planes in space and of some frames."""
+        request = datasets_pb2.GetContactSheetRequest(dataset=name)
+        return Call("DatasetService.GetContactSheet", request, lambda answer: bytes(answer.png), timeout_s)
+
+    @operation
+    def delete(self, name: str, *, timeout_s: float | None = None) -> Call[None]:
+        """Raises DatasetInUse where a job needs it."""
+        return Deletion("DatasetService.DeleteDataset", datasets_pb2.DeleteDatasetRequest(dataset=name), timeout_s)
 
 
-class Jobs(_Group):
+class Jobs(Group[AnyConnection]):
     """`client.jobs`. All raise ClientError; an id that does not exist is JobNotFound.
 
     A submission has a `request_id`, one of its own unless one is given: the same id with the same job gives the job
@@ -317,41 +165,329 @@ class Jobs(_Group):
     see neither a `private` job nor the scene that it makes.
     """
 
-    submit = answer_method(JobCalls.submit)
-    list = answer_method(JobCalls.list)
-    get = answer_method(JobCalls.get)
-    watch = iterator_method(JobCalls.watch)
-    wait = answer_method(JobCalls.wait)
-    cancel = answer_method(JobCalls.cancel)
-    retry = answer_method(JobCalls.retry)
-    delete = answer_method(JobCalls.delete)
-    log = answer_method(JobCalls.log)
-    download = answer_method(JobCalls.download)
+    @operation
+    def submit(
+        self,
+        specification: Specification,
+        *,
+        request_id: str | None = None,
+        priority: int = 0,
+        private: bool = False,
+        timeout_s: float | None = None,
+    ) -> Call[Job]:
+        """Puts a job into the queue: `TrainJob(dataset="liver", scene="liver")` makes a scene that is served,
+        `RenderJob(scene="demo", sampler=FanSampler(tilt_deg=10, step_deg=2))` an archive of frames.
+
+        Raises DatasetNotFound, SceneNotFound, RegistrationNotFound, SceneExists, JobQueueFull, ExtraMissing,
+        StorageFull, LowConfidence and other kinds of InvalidArgument.
+        """
+        # With an id of its own a submission that is sent again gives the same job.
+        request_id = uuid.uuid4().hex if request_id is None else request_id
+        request = jobs_pb2.SubmitJobRequest(request_id=request_id, priority=priority, private=private)
+        job = getattr(request, specification.kind)
+        poses = getattr(specification, "poses", None)
+        others = {} if poses is None else {"poses": pose_messages(poses)}
+        job.MergeFrom(message_of(specification, type(job), **others))
+        job.SetInParent()
+        return Call("JobService.SubmitJob", request, lambda answer: job_from_message(answer.job), timeout_s)
+
+    @operation
+    def list(
+        self,
+        *,
+        state: JobState | str | None = None,
+        kind: str | None = None,
+        limit: int | None = None,
+        timeout_s: float | None = None,
+    ) -> Listing[Job]:
+        """The newest jobs first, at most `limit`; None: all that the service keeps."""
+        request = message_of({"state": state, "kind": kind}, jobs_pb2.ListJobsRequest)
+        return Listing("JobService.ListJobs", request, "jobs", job_from_message, timeout_s, limit)
+
+    @operation
+    def get(self, job_id: str, *, timeout_s: float | None = None) -> Call[Job]:
+        """One job."""
+        return Call("JobService.GetJob", jobs_pb2.GetJobRequest(job=job_id), job_from_message, timeout_s)
+
+    @operation
+    def watch(self, job_id: str, *, timeout_s: float | None = None) -> Talk[JobEvent]:
+        """The job at first and whenever it changed, and new lines of its log, until it is in its final state.
+
+        Goes on where the service was restarted in the meantime. Without `timeout_s` it takes as long as the job.
+        """
+        return Talk("JobService.WatchJob", Watch(job_id), timeout_s)
+
+    @operation
+    def wait(self, job_id: str, *, timeout_s: float | None = None) -> Collection[Job]:
+        """The job in its final state, whichever that is."""
+        return Collection("JobService.WatchJob", lambda: nullcontext(LastJob(job_id)), timeout_s)
+
+    @operation
+    def cancel(self, job_id: str, *, timeout_s: float | None = None) -> Call[Job]:
+        """Stops a job within a second. Raises JobFinished for one that succeeded or failed."""
+        return Call("JobService.CancelJob", jobs_pb2.CancelJobRequest(job=job_id), job_from_message, timeout_s)
+
+    @operation
+    def retry(self, job_id: str, *, timeout_s: float | None = None) -> Call[Job]:
+        """A new job in place of a failed or cancelled one; asked again, the same one. Raises JobNotFinished."""
+        return Call("JobService.RetryJob", jobs_pb2.RetryJobRequest(job=job_id), job_from_message, timeout_s)
+
+    @operation
+    def delete(self, job_id: str, *, timeout_s: float | None = None) -> Call[None]:
+        """Removes a finished job and its files; a scene that it trained stays. Raises JobInUse."""
+        return Deletion("JobService.DeleteJob", jobs_pb2.DeleteJobRequest(job=job_id), timeout_s)
+
+    @operation
+    def log(self, job_id: str, *, max_bytes: int = 65536, timeout_s: float | None = None) -> Call[str]:
+        """The end of what the job's process said."""
+        request = jobs_pb2.GetJobLogRequest(job=job_id, max_bytes=max_bytes)
+        return Call("JobService.GetJobLog", request, lambda answer: str(answer.log), timeout_s)
+
+    @operation
+    def download(
+        self, job_id: str, artifact: str, path: str | Path, *, timeout_s: float | None = None
+    ) -> Collection[None]:
+        """Writes an artifact to the file `path`, whole or not at all; goes on where the connection broke.
+
+        Raises ArtifactNotFound, and OSError where the file cannot be written.
+        """
+        return Collection(
+            "JobService.DownloadArtifact", partial(download_into, job_id, artifact, Path(path)), timeout_s
+        )
 
 
-class Workers(_Group):
+class Workers(Group[AnyConnection]):
     """`client.workers`. All raise ClientError; a name that does not exist is WorkerNotFound.
 
     Only admins pause, drain and resume; the worker obeys within two seconds, and rests until `resume`, restarts
     included.
     """
 
-    list = answer_method(WorkerCalls.list)
-    pause = answer_method(WorkerCalls.pause)
-    drain = answer_method(WorkerCalls.drain)
-    resume = answer_method(WorkerCalls.resume)
+    @operation
+    def list(self, *, timeout_s: float | None = None) -> Call[tuple[Worker, ...]]:
+        """The workers by name, also those that were lost within a day."""
+        return Call("WorkerService.ListWorkers", workers_pb2.ListWorkersRequest(), _each("workers", Worker), timeout_s)
+
+    @operation
+    def pause(self, name: str, *, timeout_s: float | None = None) -> Call[Worker]:
+        """Lets a worker take no more jobs; it ends the one at hand."""
+        return Call("WorkerService.PauseWorker", workers_pb2.PauseWorkerRequest(worker=name), _one(Worker), timeout_s)
+
+    @operation
+    def drain(self, name: str, *, timeout_s: float | None = None) -> Call[Worker]:
+        """As `pause`, but a training at hand goes back into the queue at once, and on elsewhere from its checkpoint."""
+        return Call("WorkerService.DrainWorker", workers_pb2.DrainWorkerRequest(worker=name), _one(Worker), timeout_s)
+
+    @operation
+    def resume(self, name: str, *, timeout_s: float | None = None) -> Call[Worker]:
+        """Lets a worker take jobs again."""
+        return Call("WorkerService.ResumeWorker", workers_pb2.ResumeWorkerRequest(worker=name), _one(Worker), timeout_s)
 
 
-class Registrations(_Group):
+class Registrations(Group[AnyConnection]):
     """`client.registrations`. All raise ClientError; a name that does not exist is RegistrationNotFound."""
 
-    list = answer_method(RegistrationCalls.list)
-    get = answer_method(RegistrationCalls.get)
-    put = answer_method(RegistrationCalls.put)
-    delete = answer_method(RegistrationCalls.delete)
+    @operation
+    def list(self, *, timeout_s: float | None = None) -> Listing[Registration]:
+        """All registrations that the key may see, by name."""
+        request = registrations_pb2.ListRegistrationsRequest()
+        return Listing("RegistrationService.ListRegistrations", request, "registrations", _one(Registration), timeout_s)
+
+    @operation
+    def get(self, name: str, *, timeout_s: float | None = None) -> Call[Registration]:
+        """One registration."""
+        request = registrations_pb2.GetRegistrationRequest(registration=name)
+        return Call("RegistrationService.GetRegistration", request, _one(Registration), timeout_s)
+
+    @operation
+    def put(
+        self,
+        name: str,
+        scene: str,
+        base_to_scene: npt.ArrayLike,
+        probe_to_flange: npt.ArrayLike | None = None,
+        *,
+        quality: Mapping[str, Any] | None = None,
+        timeout_s: float | None = None,
+    ) -> Call[Registration]:
+        """Keeps a registration of a scene, in place of one of that name which is the key's own.
+
+        Both links are [4, 4], mm; without `probe_to_flange` the probe's frame is the flange's. `quality` may hold
+        residual_mm, residual_deg, position_std_mm and angle_std_deg, as the file of `ultragray calibrate` does.
+        Raises InvalidPose, SceneNotFound, PermissionDenied, LimitReached.
+        """
+        links = {"base_to_scene": base_to_scene, "probe_to_flange": probe_to_flange}
+        matrices = {link: _matrix(pose, link) for link, pose in links.items() if pose is not None}
+        known = {key: value for key, value in (quality or {}).items() if key in _QUALITY}
+        content = message_of(known, registrations_pb2.Registration, scene=scene, **matrices)
+        request = registrations_pb2.PutRegistrationRequest(registration=name, content=content)
+        return Call("RegistrationService.PutRegistration", request, _one(Registration), timeout_s)
+
+    @operation
+    def delete(self, name: str, *, timeout_s: float | None = None) -> Call[None]:
+        """Forgets a registration."""
+        request = registrations_pb2.DeleteRegistrationRequest(registration=name)
+        return Call("RegistrationService.DeleteRegistration", request, lambda _: None, timeout_s)
 
 
-class Client:
+class _Client(Group[AnyConnection]):
+    """A client, but for its end."""
+
+    _connects: Any  # AnyConnection
+
+    def __init__(
+        self,
+        address: str = DEFAULT_ADDRESS,
+        *,
+        api_key: ApiKey | None = None,
+        tls: Tls | None = None,
+        timeout_s: float = DEFAULT_TIMEOUT_S,
+    ) -> None:
+        super().__init__(self._connects(address, api_key, tls, timeout_s))
+        self.scenes: Scenes[AnyConnection] = Scenes(self._connection)
+        self.datasets: Datasets[AnyConnection] = Datasets(self._connection)
+        self.jobs: Jobs[AnyConnection] = Jobs(self._connection)
+        self.workers: Workers[AnyConnection] = Workers(self._connection)
+        self.registrations: Registrations[AnyConnection] = Registrations(self._connection)
+
+    @operation
+    def render(
+        self, scene: str, pose: PoseLike, settings: RenderSettings | None = None, *, timeout_s: float | None = None
+    ) -> Call[Frame]:
+        """One frame of `pose`, [4, 4] mm or a Placement; `settings` None: B-mode in uint8, as the scene was trained.
+
+        Raises SceneNotFound, InvalidArgument and its kinds, QueueFull, DeadlineExceeded, Unavailable.
+        """
+        request = rendering_pb2.RenderRequest(settings=settings_message(scene, settings), pose=pose_message(pose))
+        return Call("RenderService.Render", request, frame_from_message, timeout_s)
+
+    @operation
+    def render_batch(
+        self,
+        scene: str,
+        poses: Iterable[PoseLike],
+        settings: RenderSettings | None = None,
+        *,
+        timeout_s: float | None = None,
+    ) -> Talk[Frame]:
+        """The frames of any number of poses ([C, 4, 4] mm, or as they come from an iterator), in order, as they are
+        ready; behind the frames of interactive callers.
+
+        Goes on from the first missing frame where the service is restarted. Without `timeout_s` it takes as long as it
+        takes. Otherwise as `render`; a refused pose is named `poses[index]`, and one below `min_confidence` only after
+        the frames before it.
+        """
+        return Talk("RenderService.RenderBatch", Batch(settings_message(scene, settings), poses), timeout_s)
+
+    @operation
+    def stream(
+        self,
+        scene: str,
+        settings: RenderSettings | None = None,
+        *,
+        mode: StreamMode | str = "ordered",
+        timeout_s: float | None = None,
+        shared_memory: bool = False,
+        reconnect_s: float | None = None,
+    ) -> PoseStream:
+        """A stream of poses: `with client.stream("demo", mode="latest") as stream: stream.send(pose)`.
+
+        `timeout_s` is the deadline of the whole stream; None: it has none. Otherwise as `render`.
+
+        Where the connection is lost, or the service stops, the stream goes on over another connection, with the same
+        sequences: it sends the poses without an answer again, a latest one the newest of them alone, and the others
+        count as dropped. `reconnect_s`: for so long it tries, before `receive` raises why it cannot (0: at once; None:
+        the client's `timeout_s`). `stream.reconnections` tells how often it went on.
+
+        `shared_memory`: pixels come through memory that is shared with the service instead of the connection, which
+        takes a Linux host that both run on, as the same user, and a loopback `address`; else InvalidArgument. The
+        arrays of a frame are views of that memory, and stay as they are for as long as anything refers to one of
+        them. While 16 frames are held, others come through the connection, as do those of more than 16 MiB.
+        """
+        exchange = PoseExchange(settings_message(scene, settings), mode, shared_memory=shared_memory)
+        return PoseStream("RenderService.RenderStream", exchange, timeout_s, reconnect_s)
+
+    @operation
+    def render_slice(self, scene: str, plane: SliceSettings, *, timeout_s: float | None = None) -> Call[Slice]:
+        """A field of a scene on any plane, without a probe. It waits and counts as a frame does.
+
+        Raises SceneNotFound, InvalidArgument and its kinds, QueueFull, DeadlineExceeded, Unavailable.
+        """
+        request = rendering_pb2.RenderSliceRequest(scene=scene, slice=message_of(plane, rendering_pb2.SliceSettings))
+        return Call("RenderService.RenderSlice", request, slice_from_message, timeout_s)
+
+    @operation
+    def assess_poses(
+        self,
+        scene: str,
+        poses: Iterable[PoseLike],
+        probe: Probe | None = None,
+        *,
+        registration: str | None = None,
+        timeout_s: float | None = None,
+    ) -> Call[tuple[Extrapolation, ...]]:
+        """How far frames at these poses of a probe (None: the scene's own) would extrapolate, without rendering any.
+
+        With a `registration` they are poses of the flange in its base.
+
+        `supported_share` is None: only a rendered frame tells it. Raises SceneNotFound, InvalidPose, InvalidProbe,
+        TooManyPoses.
+        """
+        request = message_of(
+            {"probe": probe, "registration": registration},
+            rendering_pb2.AssessPosesRequest,
+            scene=scene,
+            poses=list(pose_messages(poses)),
+        )
+        return Call("RenderService.AssessPoses", request, _each("extrapolations", Extrapolation), timeout_s)
+
+    @operation
+    def localize(
+        self,
+        scene: str,
+        image: npt.ArrayLike | bytes,
+        start: PoseLike,
+        *,
+        probe: Probe | None = None,
+        registration: str | None = None,
+        within_mm: float = 3.0,
+        within_deg: float = 5.0,
+        timeout_s: float | None = None,
+    ) -> Call[Localization]:
+        """Where in a scene a real frame was taken, looked for about `start`, which may be off by the two `within`.
+
+        `image`: grey values [H, W], uint8 or in [0, 1], or the bytes of a PNG file; rows along depth, columns across
+        scan lines, not scan-converted. `probe` took it (None: the scene's own). `is_found` of the answer says whether
+        its pose can be used. With a `registration` the start is a pose of the flange in its base, and the answer has
+        such a pose as well. Raises SceneNotFound, InvalidArgument and its kinds, QueueFull, DeadlineExceeded.
+        """
+        request = localize_message(scene, image, start, probe, registration, within_mm, within_deg)
+        return Call("RenderService.Localize", request, _one(Localization), timeout_s)
+
+    @operation
+    def who_am_i(self, *, timeout_s: float | None = None) -> Call[Me]:
+        """The name and the role that the key stands for."""
+        return Call("AccessService.WhoAmI", access_pb2.WhoAmIRequest(), _one(Me), timeout_s)
+
+    @operation
+    def audit(
+        self,
+        *,
+        since_hours: float = 24.0,
+        who: str | None = None,
+        what: str | None = None,
+        limit: int = 1000,
+        timeout_s: float | None = None,
+    ) -> Call[tuple[AuditEntry, ...]]:
+        """The last entries of the audit log, oldest first; `what`: an operation such as scene.delete, or scene.
+
+        For admins alone. Raises PermissionDenied, InvalidArgument.
+        """
+        request = access_pb2.ListAuditEntriesRequest(since_hours=since_hours, who=who, what=what, limit=limit)
+        return Call("AccessService.ListAuditEntries", request, _each("entries", AuditEntry), timeout_s)
+
+
+class Client(_Client[Connection]):
     """A service at `address` (HOST:PORT), encrypted where `tls` is given.
 
     `api_key` is a key or a token that the service knows, or a function that is called before each call and gives one
@@ -366,29 +502,7 @@ class Client:
     after the delay that it tells; nothing else is.
     """
 
-    def __init__(
-        self,
-        address: str = DEFAULT_ADDRESS,
-        *,
-        api_key: ApiKey | None = None,
-        tls: Tls | None = None,
-        timeout_s: float = DEFAULT_TIMEOUT_S,
-    ) -> None:
-        self._connection = Connection(address, api_key, tls, timeout_s)
-        self.scenes = Scenes(self._connection)
-        self.datasets = Datasets(self._connection)
-        self.jobs = Jobs(self._connection)
-        self.workers = Workers(self._connection)
-        self.registrations = Registrations(self._connection)
-
-    render = answer_method(ClientCalls.render)
-    render_batch = iterator_method(ClientCalls.render_batch)
-    stream = stream_method(ClientCalls.stream)
-    render_slice = answer_method(ClientCalls.render_slice)
-    assess_poses = answer_method(ClientCalls.assess_poses)
-    localize = answer_method(ClientCalls.localize)
-    who_am_i = answer_method(ClientCalls.who_am_i)
-    audit = answer_method(ClientCalls.audit)
+    _connects = Connection
 
     def close(self) -> None:
         """Ends all that is under way."""
@@ -401,87 +515,13 @@ class Client:
         self.close()
 
 
-class AsyncScenes(_Group):
-    """`Scenes` for asyncio."""
-
-    list = coroutine_method(SceneCalls.list)
-    get = coroutine_method(SceneCalls.get)
-    load = coroutine_method(SceneCalls.load)
-    unload = coroutine_method(SceneCalls.unload)
-
-
-class AsyncDatasets(_Group):
-    """`Datasets` for asyncio."""
-
-    upload = coroutine_method(DatasetCalls.upload)
-    list = coroutine_method(DatasetCalls.list)
-    get = coroutine_method(DatasetCalls.get)
-    contact_sheet = coroutine_method(DatasetCalls.contact_sheet)
-    delete = coroutine_method(DatasetCalls.delete)
-
-
-class AsyncJobs(_Group):
-    """`Jobs` for asyncio."""
-
-    submit = coroutine_method(JobCalls.submit)
-    list = coroutine_method(JobCalls.list)
-    get = coroutine_method(JobCalls.get)
-    watch = async_iterator_method(JobCalls.watch)
-    wait = coroutine_method(JobCalls.wait)
-    cancel = coroutine_method(JobCalls.cancel)
-    retry = coroutine_method(JobCalls.retry)
-    delete = coroutine_method(JobCalls.delete)
-    log = coroutine_method(JobCalls.log)
-    download = coroutine_method(JobCalls.download)
-
-
-class AsyncWorkers(_Group):
-    """`Workers` for asyncio."""
-
-    list = coroutine_method(WorkerCalls.list)
-    pause = coroutine_method(WorkerCalls.pause)
-    drain = coroutine_method(WorkerCalls.drain)
-    resume = coroutine_method(WorkerCalls.resume)
-
-
-class AsyncRegistrations(_Group):
-    """`Registrations` for asyncio."""
-
-    list = coroutine_method(RegistrationCalls.list)
-    get = coroutine_method(RegistrationCalls.get)
-    put = coroutine_method(RegistrationCalls.put)
-    delete = coroutine_method(RegistrationCalls.delete)
-
-
-class AsyncClient:
+class AsyncClient(_Client[AsyncConnection]):
     """`Client` for asyncio, with the same methods, to be awaited or iterated with `async for`.
 
     It is made and used within one event loop: `async with AsyncClient() as client: frame = await client.render(…)`.
     """
 
-    def __init__(
-        self,
-        address: str = DEFAULT_ADDRESS,
-        *,
-        api_key: ApiKey | None = None,
-        tls: Tls | None = None,
-        timeout_s: float = DEFAULT_TIMEOUT_S,
-    ) -> None:
-        self._connection = AsyncConnection(address, api_key, tls, timeout_s)
-        self.scenes = AsyncScenes(self._connection)
-        self.datasets = AsyncDatasets(self._connection)
-        self.jobs = AsyncJobs(self._connection)
-        self.workers = AsyncWorkers(self._connection)
-        self.registrations = AsyncRegistrations(self._connection)
-
-    render = coroutine_method(ClientCalls.render)
-    render_batch = async_iterator_method(ClientCalls.render_batch)
-    stream = async_stream_method(ClientCalls.stream)
-    render_slice = coroutine_method(ClientCalls.render_slice)
-    assess_poses = coroutine_method(ClientCalls.assess_poses)
-    localize = coroutine_method(ClientCalls.localize)
-    who_am_i = coroutine_method(ClientCalls.who_am_i)
-    audit = coroutine_method(ClientCalls.audit)
+    is_async, _connects = True, AsyncConnection
 
     async def close(self) -> None:
         """Ends all that is under way."""
@@ -492,3 +532,25 @@ class AsyncClient:
 
     async def __aexit__(self, *_: object) -> None:
         await self.close()
+
+
+def _one(cls: type[T]) -> Callable[[Any], T]:
+    return lambda message: from_message(message, cls)
+
+
+def _each(items: str, cls: type[T]) -> Callable[[Any], tuple[T, ...]]:
+    return lambda answer: tuple(from_message(one, cls) for one in getattr(answer, items))
+
+
+def _loaded(answer: Any) -> int:
+    return int(answer.loaded_processes)
+
+
+def _matrix(pose: npt.ArrayLike, field: str) -> geometry_pb2.Matrix:
+    try:
+        matrix = np.asarray(pose, np.float64)
+    except (TypeError, ValueError):
+        raise InvalidPose(f"{field} must be numbers [4, 4], got {type(pose).__name__}", field=field) from None
+    if matrix.shape != (4, 4):
+        raise InvalidPose(f"{field} must be [4, 4], got {list(matrix.shape)}", field=field)
+    return geometry_pb2.Matrix(values=matrix.ravel().tolist())

@@ -58,12 +58,9 @@ __all__ = [
 class ConvexProbe:
     """A curved array: scan lines fan out from the apex, which is the origin."""
 
-    opening_angle_deg: float
-    """Full angle of the fan."""
-    near_mm: float
-    """Radius of the face: distance from the apex at which the image begins."""
-    far_mm: float
-    """Distance from the apex at which the image ends, beyond `near_mm`."""
+    opening_angle_deg: float  # Full angle of the fan.
+    near_mm: float  # Radius of the face: distance from the apex at which the image begins.
+    far_mm: float  # Distance from the apex at which the image ends, beyond `near_mm`.
     kind: Literal["convex"] = field_of(default="convex", repr=False, kw_only=True)
 
 
@@ -71,12 +68,9 @@ class ConvexProbe:
 class LinearProbe:
     """A linear array: parallel scan lines along +z, the face centred on the origin."""
 
-    width_mm: float
-    """Width of the face."""
-    near_mm: float
-    """Depth at which the image begins."""
-    far_mm: float
-    """Depth at which the image ends, beyond `near_mm`."""
+    width_mm: float  # Width of the face.
+    near_mm: float  # Depth at which the image begins.
+    far_mm: float  # Depth at which the image ends, beyond `near_mm`.
     kind: Literal["linear"] = field_of(default="linear", repr=False, kw_only=True)
 
 
@@ -84,10 +78,8 @@ class LinearProbe:
 class PhasedProbe:
     """A phased array: scan lines fan out from the centre of the face; `near_mm` is 0."""
 
-    opening_angle_deg: float
-    """Full angle of the fan."""
-    far_mm: float
-    """Depth at which the image ends."""
+    opening_angle_deg: float  # Full angle of the fan.
+    far_mm: float  # Depth at which the image ends.
     kind: Literal["phased"] = field_of(default="phased", repr=False, kw_only=True)
 
 
@@ -98,10 +90,8 @@ class RadialProbe:
     Line j of W runs at the angle 360°·(j+½)/W from z towards +x; the last is followed by the first.
     """
 
-    near_mm: float
-    """Radius of the ring: distance from the centre at which the image begins."""
-    far_mm: float
-    """Distance from the centre at which the image ends, beyond `near_mm`."""
+    near_mm: float  # Radius of the ring: distance from the centre at which the image begins.
+    far_mm: float  # Distance from the centre at which the image ends, beyond `near_mm`.
     kind: Literal["radial"] = field_of(default="radial", repr=False, kw_only=True)
 
 
@@ -109,14 +99,10 @@ class RadialProbe:
 class SteeredProbe:
     """A linear array whose scan lines, parallel, leave the face at an angle; depths are along the lines."""
 
-    width_mm: float
-    """Width of the face."""
-    steering_deg: float
-    """Angle of the scan lines from the axial axis, positive towards +x."""
-    near_mm: float
-    """Depth along the scan lines at which the image begins."""
-    far_mm: float
-    """Depth along the scan lines at which the image ends, beyond `near_mm`."""
+    width_mm: float  # Width of the face.
+    steering_deg: float  # Angle of the scan lines from the axial axis, positive towards +x.
+    near_mm: float  # Depth along the scan lines at which the image begins.
+    far_mm: float  # Depth along the scan lines at which the image ends, beyond `near_mm`.
     kind: Literal["steered"] = field_of(default="steered", repr=False, kw_only=True)
 
 
@@ -149,48 +135,33 @@ class Box:
     """A solid box about a point, turned about it."""
 
     kind: Literal["box"] = field_of(default="box", repr=False, kw_only=True)
-    frame: ToolFrame = ToolFrame.SCENE
-    """Of its points; probe: it moves with the probe."""
-    brightness: float = 1.0
-    """Echo where a scan line meets it head on."""
-    roughness: float = 0.25
-    """Share of the brightness that is left at any angle."""
+    frame: ToolFrame = ToolFrame.SCENE  # Of its points; probe: it moves with the probe.
+    brightness: float = 1.0  # Echo where a scan line meets it head on.
+    roughness: float = 0.25  # Share of the brightness that is left at any angle.
+    # Strength of the first echo of its comet tail, of which each further one has the same share; 0: no tail.
     reverberation: float = 0.4
-    """Strength of the first echo of its comet tail, of which each further one has the same share; 0: no tail."""
-    opacity: float = 0.6
-    """Share of the beam that it stops where it is met head on."""
-    label: int = 255
-    """Of its pixels in the output labels."""
-    centre_mm: tuple[float, float, float]
-    """x, y and z of its middle."""
+    opacity: float = 0.6  # Share of the beam that it stops where it is met head on.
+    label: int = 255  # Of its pixels in the output labels.
+    centre_mm: tuple[float, float, float]  # x, y and z of its middle.
+    # w, x, y and z of the rotation from the box to its frame.
     quaternion: tuple[float, float, float, float] = (1.0, 0.0, 0.0, 0.0)
-    """w, x, y and z of the rotation from the box to its frame."""
-    size_mm: tuple[float, float, float]
-    """Lengths along its own x, y and z."""
+    size_mm: tuple[float, float, float]  # Lengths along its own x, y and z.
 
 
 @dataclass(frozen=True, kw_only=True)
 class Shaft:
     """A round shaft from its tip to its hub."""
 
-    frame: ToolFrame = ToolFrame.SCENE
-    """Of its points; probe: it moves with the probe."""
-    brightness: float = 1.0
-    """Echo where a scan line meets it head on."""
-    roughness: float = 0.25
-    """Share of the brightness that is left at any angle."""
+    frame: ToolFrame = ToolFrame.SCENE  # Of its points; probe: it moves with the probe.
+    brightness: float = 1.0  # Echo where a scan line meets it head on.
+    roughness: float = 0.25  # Share of the brightness that is left at any angle.
+    # Strength of the first echo of its comet tail, of which each further one has the same share; 0: no tail.
     reverberation: float = 0.4
-    """Strength of the first echo of its comet tail, of which each further one has the same share; 0: no tail."""
-    opacity: float = 0.6
-    """Share of the beam that it stops where it is met head on."""
-    label: int = 255
-    """Of its pixels in the output labels."""
-    tip_mm: tuple[float, float, float]
-    """x, y and z of the tip."""
-    hub_mm: tuple[float, float, float]
-    """x, y and z of the other end."""
-    diameter_mm: float = 0.7
-    """Diameter; 0.7 is 22 gauge."""
+    opacity: float = 0.6  # Share of the beam that it stops where it is met head on.
+    label: int = 255  # Of its pixels in the output labels.
+    tip_mm: tuple[float, float, float]  # x, y and z of the tip.
+    hub_mm: tuple[float, float, float]  # x, y and z of the other end.
+    diameter_mm: float = 0.7  # Diameter; 0.7 is 22 gauge.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -217,52 +188,37 @@ class Display:
     Gain, dynamic range, time-gain compensation and edge enhancement change B-mode only; the others change every output.
     """
 
-    gain_db: float = 0.0
-    """Added to every echo."""
-    dynamic_range_db: float = 60.0
-    """From white down to black."""
+    gain_db: float = 0.0  # Added to every echo.
+    dynamic_range_db: float = 60.0  # From white down to black.
+    # Gains at evenly spaced depths from the first row shown to the last, linear in between.
     tgc_db: tuple[float, ...] = ()
-    """Gains at evenly spaced depths from the first row shown to the last, linear in between."""
-    depth_mm: float | None = None
-    """Deeper rows, counted from the face, are cut off."""
-    flip: bool = False
-    """Left and right change places."""
-    pixel_mm: float | None = None
-    """Scan conversion to square pixels of this size."""
-    edge: float = 0.0
-    """Edge enhancement: how much of what a blur over 3x3 samples takes away is added."""
+    depth_mm: float | None = None  # Deeper rows, counted from the face, are cut off.
+    flip: bool = False  # Left and right change places.
+    pixel_mm: float | None = None  # Scan conversion to square pixels of this size.
+    edge: float = 0.0  # Edge enhancement: how much of what a blur over 3x3 samples takes away is added.
 
 
 @dataclass(frozen=True, kw_only=True)
 class FrameSettings:
     """Settings of what is rendered, but for the scene and the poses. None: as the scene has it."""
 
-    height: int | None = None
-    """Depth samples. Default: as trained, else 512."""
-    width: int | None = None
-    """Scan lines. Default: as trained, else 512."""
-    probe: Probe | None = None
-    """Instead of the scene's own."""
-    min_confidence: float | None = None
-    """What is below is refused, or masked."""
-    below_min_confidence: Below = Below.REFUSE
-    """mask: pixels of such frames that Gaussians do not support are 0."""
+    height: int | None = None  # Depth samples. Default: as trained, else 512.
+    width: int | None = None  # Scan lines. Default: as trained, else 512.
+    probe: Probe | None = None  # Instead of the scene's own.
+    min_confidence: float | None = None  # What is below is refused, or masked.
+    below_min_confidence: Below = Below.REFUSE  # mask: pixels of such frames that Gaussians do not support are 0.
+    # Full width at half maximum along elevation at the focus of the scene's beam; 0: a plane. Default: as trained.
     slice_thickness_mm: float | None = None
-    """Full width at half maximum along elevation at the focus of the scene's beam; 0: a plane. Default: as trained."""
+    # air: scan lines whose face is off the skin are dark. pressure: and a face that is pressed in compresses the
+    # tissue. Default: contact is assumed.
     contact: Contact | None = None
-    """air: scan lines whose face is off the skin are dark. pressure: and a face that is pressed in compresses the
-    tissue. Default: contact is assumed.
-    """
-    tools: tuple[Tool, ...] | None = None
-    """Needles and the like in the image; labels then are there for every scene."""
+    tools: tuple[Tool, ...] | None = None  # Needles and the like in the image; labels then are there for every scene.
+    # Second echo: share of what is heard beyond the first strong interface that is the mirror image of what lies
+    # before it. Default: 0.
     ghost: float | None = None
-    """Second echo: share of what is heard beyond the first strong interface that is the mirror image of what lies
-    before it. Default: 0.
-    """
-    display: Display | None = None
-    """Gain, depth, scan conversion ...; default: as rendered."""
+    display: Display | None = None  # Gain, depth, scan conversion ...; default: as rendered.
+    # Some of bmode, echo, transmittance, coverage, attenuation, labels, uncertainty.
     outputs: tuple[str, ...] = ("bmode",)
-    """Some of bmode, echo, transmittance, coverage, attenuation, labels, uncertainty."""
 
 
 class Encoding(str, Enum):
@@ -279,90 +235,64 @@ class Encoding(str, Enum):
 class RenderSettings(FrameSettings):
     """Settings with an encoding, for doors where neither an Accept header nor a file format decides it."""
 
-    encoding: Encoding = Encoding.UINT8
-    """Form of the pixels."""
+    encoding: Encoding = Encoding.UINT8  # Form of the pixels.
+    # Name of the registration by which the poses lead into the scene: they are then flange to base, or marker to
+    # tracker. Default: they are probe to scene.
     registration: str | None = None
-    """Name of the registration by which the poses lead into the scene: they are then flange to base, or marker to
-    tracker. Default: they are probe to scene.
-    """
 
 
 @dataclass(frozen=True, kw_only=True)
 class Additions:
     """What a frame has only where it was asked for, as it was used."""
 
-    min_confidence: float | None = None
-    """Below it the frame was refused, or masked; null: any."""
+    min_confidence: float | None = None  # Below it the frame was refused, or masked; null: any.
+    # mask: where the frame's confidence is below min_confidence, pixels without support are 0.
     below_min_confidence: Below = Below.REFUSE
-    """mask: where the frame's confidence is below min_confidence, pixels without support are 0."""
-    contact: Contact | None = None
-    """As used; null: it was assumed."""
-    tools: tuple[Tool, ...] = ()
-    """As used."""
-    ghost: float = 0.0
-    """As used; 0: none."""
-    registration: str | None = None
-    """That led the pose into the scene; null: none, it was sent as it is."""
+    contact: Contact | None = None  # As used; null: it was assumed.
+    tools: tuple[Tool, ...] = ()  # As used.
+    ghost: float = 0.0  # As used; 0: none.
+    registration: str | None = None  # That led the pose into the scene; null: none, it was sent as it is.
 
 
 @dataclass(frozen=True, kw_only=True)
 class SettingsUsed(Additions):
     """The settings of a frame, as used: with its scene and its pose all that is needed to render it again."""
 
-    probe: Probe
-    """As used."""
-    slice_thickness_mm: float
-    """As used: at the focus of the scene's beam; 0: a plane."""
-    rendered_height: int
-    """Depth samples, before the display settings were applied."""
-    rendered_width: int
-    """Scan lines, likewise."""
-    display: Display = Display()
-    """As used."""
-    height: int
-    """H."""
-    width: int
-    """W."""
-    picture: Picture
-    """Where the pixels lie."""
-    outputs: tuple[str, ...]
-    """In the order of the data."""
-    encoding: Encoding
-    """Of the pixels."""
+    probe: Probe  # As used.
+    slice_thickness_mm: float  # As used: at the focus of the scene's beam; 0: a plane.
+    rendered_height: int  # Depth samples, before the display settings were applied.
+    rendered_width: int  # Scan lines, likewise.
+    display: Display = Display()  # As used.
+    height: int  # H.
+    width: int  # W.
+    picture: Picture  # Where the pixels lie.
+    outputs: tuple[str, ...]  # In the order of the data.
+    encoding: Encoding  # Of the pixels.
 
 
 @dataclass(frozen=True)
 class Extrapolation:
     """Of one frame. None: the scene does not know its training views, has no model, or no coverage was given."""
 
-    distance_mm: float | None
-    """Distance to the nearest training views, a mean over the image."""
-    angle_deg: float | None
-    """Angle to them."""
+    distance_mm: float | None  # Distance to the nearest training views, a mean over the image.
+    angle_deg: float | None  # Angle to them.
+    # The MS-SSIM that a real frame at this pose is expected to have with the rendered one, 0 to 1.
     confidence: float | None
-    """The MS-SSIM that a real frame at this pose is expected to have with the rendered one, 0 to 1."""
-    supported_share: float | None
-    """Share of the pixels that Gaussians support: coverage of at least 0.3."""
+    supported_share: float | None  # Share of the pixels that Gaussians support: coverage of at least 0.3.
+    # Share of the scan lines that have contact with the skin; none where contact is assumed.
     contact_share: float | None = None
-    """Share of the scan lines that have contact with the skin; none where contact is assumed."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class SliceSettings:
     """A slice through a scene, on any plane: no probe is involved."""
 
-    field: str = "echo"
-    """At each point. attenuation: per mm."""
-    origin_mm: tuple[float, float, float]
-    """Corner of the first pixel, in the scene's frame."""
-    right: tuple[float, float, float] = (1.0, 0.0, 0.0)
-    """Direction of the rows, of any length."""
-    down: tuple[float, float, float] = (0.0, 0.0, 1.0)
-    """Direction of the columns, at a right angle."""
-    size_mm: tuple[float, float]
-    """Width and height."""
-    spacing_mm: float = 0.5
-    """Distance of two pixels."""
+    field: str = "echo"  # At each point. attenuation: per mm.
+    origin_mm: tuple[float, float, float]  # Corner of the first pixel, in the scene's frame.
+    right: tuple[float, float, float] = (1.0, 0.0, 0.0)  # Direction of the rows, of any length.
+    down: tuple[float, float, float] = (0.0, 0.0, 1.0)  # Direction of the columns, at a right angle.
+    size_mm: tuple[float, float]  # Width and height.
+    spacing_mm: float = 0.5  # Distance of two pixels.
 
 
 @dataclass(frozen=True)
@@ -373,125 +303,89 @@ class ElevationBeam:
     field. With neither focus nor depth of field it is as thick at every depth.
     """
 
-    thickness_mm: float
-    """Thickness at the focus: full width at half maximum along elevation."""
-    focus_mm: float | None = None
-    """Depth of the focus below the probe's face; none: the same thickness at every depth."""
+    thickness_mm: float  # Thickness at the focus: full width at half maximum along elevation.
+    focus_mm: float | None = None  # Depth of the focus below the probe's face; none: the same thickness at every depth.
+    # Depth over which it is at most √2 times as thick as at the focus: twice the Rayleigh range.
     depth_of_field_mm: float | None = None
-    """Depth over which it is at most √2 times as thick as at the focus: twice the Rayleigh range."""
 
 
 @dataclass(frozen=True)
 class DatasetOptions:
     """Options of reading a source. None leaves the choice to the source."""
 
+    # Frames to train from, such as 0:90 or 0:90,100:120:2: places in the training file, or in the sequence.
     train_frames: str | None = None
-    """Frames to train from, such as 0:90 or 0:90,100:120:2: places in the training file, or in the sequence."""
-    val_frames: str | None = None
-    """Frames to hold out, counted likewise."""
-    frames: str | None = None
-    """Frames of a sequence to read at all, such as 0:90,100:120:2."""
+    val_frames: str | None = None  # Frames to hold out, counted likewise.
+    frames: str | None = None  # Frames of a sequence to read at all, such as 0:90,100:120:2.
+    # Region of a sequence's image that shows ultrasound: columns,rows, such as 188:632,12:600 (ends left out).
     crop: str | None = None
-    """Region of a sequence's image that shows ultrasound: columns,rows, such as 188:632,12:600 (ends left out)."""
+    # Fan on the screen, of a recording with a convex or phased probe: opening angle (degrees), radius of the face
+    # and of the end (mm), column and row of the apex, such as 60,40,90,319.5,-120.
     fan: str | None = None
-    """Fan on the screen, of a recording with a convex or phased probe: opening angle (degrees), radius of the face
-    and of the end (mm), column and row of the apex, such as 60,40,90,319.5,-120.
-    """
+    # Tracked transform of a sequence to take, such as ProbeToTracker, where there are several; of a recording two
+    # frames of tf, such as probeTobase.
     transform: str | None = None
-    """Tracked transform of a sequence to take, such as ProbeToTracker, where there are several; of a recording two
-    frames of tf, such as probeTobase.
-    """
-    image_size: str | None = None
-    """Resize the frames: WIDTHxHEIGHT, such as 192x256."""
-    image_topic: str | None = None
-    """Topic of a recording to take images from, where there are several."""
-    pose_topic: str | None = None
-    """Topic of a recording to take poses from; /tf: from the transforms of tf."""
+    image_size: str | None = None  # Resize the frames: WIDTHxHEIGHT, such as 192x256.
+    image_topic: str | None = None  # Topic of a recording to take images from, where there are several.
+    pose_topic: str | None = None  # Topic of a recording to take poses from; /tf: from the transforms of tf.
 
 
 @dataclass(frozen=True)
 class ImageRegion:
     """Where the frames of a sequence lie in its images, brought to columns lateral and rows in depth."""
 
-    image_width: int
-    """Of the stored image, pixels."""
-    image_height: int
-    """Of the stored image, pixels."""
-    left: int
-    """Column of the stored image at which the frames begin."""
-    top: int
-    """Row at which they begin."""
-    width: int
-    """Of the frames in the stored image, pixels, before they are resized."""
-    height: int
-    """Likewise."""
-    lateral_mm: float
-    """Distance of two columns of the stored image."""
-    axial_mm: float
-    """Distance of two rows of the stored image."""
+    image_width: int  # Of the stored image, pixels.
+    image_height: int  # Of the stored image, pixels.
+    left: int  # Column of the stored image at which the frames begin.
+    top: int  # Row at which they begin.
+    width: int  # Of the frames in the stored image, pixels, before they are resized.
+    height: int  # Likewise.
+    lateral_mm: float  # Distance of two columns of the stored image.
+    axial_mm: float  # Distance of two rows of the stored image.
+    # The calibration, from pixels (column, row, 0) of the stored image to the probe's mm: 16 numbers row by row;
+    # empty where the file has none of that name.
     image_to_probe: tuple[float, ...] = ()
-    """The calibration, from pixels (column, row, 0) of the stored image to the probe's mm: 16 numbers row by row;
-    empty where the file has none of that name.
-    """
 
 
 @dataclass(frozen=True)
 class Dataset:
     """An accepted dataset."""
 
-    name: str
-    """Of letters, digits, '.', '_' and '-'."""
+    name: str  # Of letters, digits, '.', '_' and '-'.
+    # Its format: released, a folder with conf.json and .npy files (or its conf.json); plus, a PLUS sequence (.mha,
+    # .mhd, .nrrd, .nhdr); dicom, a DICOM cine loop (.dcm) with its poses beside it (.poses.npy or .poses.json);
+    # mcap, an MCAP recording of ROS 2 (.mcap) with images and poses, its geometry in it or beside it
+    # (.geometry.json).
     kind: str
-    """Its format: released, a folder with conf.json and .npy files (or its conf.json); plus, a PLUS sequence (.mha,
-    .mhd, .nrrd, .nhdr); dicom, a DICOM cine loop (.dcm) with its poses beside it (.poses.npy or .poses.json);
-    mcap, an MCAP recording of ROS 2 (.mcap) with images and poses, its geometry in it or beside it
-    (.geometry.json).
-    """
-    sha256: str
-    """Of images, poses, probe and split, however they were sent."""
-    bytes: int
-    """Of its files."""
-    created_at: str
-    """ISO 8601, UTC."""
-    train_frames: int
-    """Number of frames to train from."""
-    val_frames: int
-    """Number of frames held out."""
-    height: int
-    """Of a frame, pixels."""
-    width: int
-    """Of a frame, pixels."""
-    probe: Probe | None
-    """The probe that recorded it."""
-    warnings: tuple[str, ...]
-    """What looks wrong, for a person to decide."""
-    options: dict[str, str]
-    """How it was read: the query parameters of its upload."""
+    sha256: str  # Of images, poses, probe and split, however they were sent.
+    bytes: int  # Of its files.
+    created_at: str  # ISO 8601, UTC.
+    train_frames: int  # Number of frames to train from.
+    val_frames: int  # Number of frames held out.
+    height: int  # Of a frame, pixels.
+    width: int  # Of a frame, pixels.
+    probe: Probe | None  # The probe that recorded it.
+    warnings: tuple[str, ...]  # What looks wrong, for a person to decide.
+    options: dict[str, str]  # How it was read: the query parameters of its upload.
+    # Of a sequence: where its frames lie in the stored images, and its calibration; null where that is not known.
     region: ImageRegion | None = None
-    """Of a sequence: where its frames lie in the stored images, and its calibration; null where that is not known."""
-    owner: str | None = None
-    """Who uploaded it; null: nobody who is known."""
-    private: bool = False
-    """Whether others may not see it."""
+    owner: str | None = None  # Who uploaded it; null: nobody who is known.
+    private: bool = False  # Whether others may not see it.
 
 
 @dataclass(frozen=True)
 class ComparisonSettings:
     """Settings of a comparison."""
 
+    # Methods to compare, some of scene, median, mean, maximum, median-0.25mm, mean-0.25mm, maximum-0.25mm, linear,
+    # nearest, ultranerf-released, ultranerf-unit, ultranerf-mean, implicitvol, implicitvol-refined, rapidvol,
+    # ultragauss, ultragauss-shadow; all: each of them.
     methods: tuple[str, ...] = ("all",)
-    """Methods to compare, some of scene, median, mean, maximum, median-0.25mm, mean-0.25mm, maximum-0.25mm, linear,
-    nearest, ultranerf-released, ultranerf-unit, ultranerf-mean, implicitvol, implicitvol-refined, rapidvol,
-    ultragauss, ultragauss-shadow; all: each of them.
-    """
+    # equal: every method learns as long as the scene does with the preset fast on this machine; author: the steps
+    # of each author's recipe, however long they take.
     budget: str = "equal"
-    """equal: every method learns as long as the scene does with the preset fast on this machine; author: the steps
-    of each author's recipe, however long they take.
-    """
-    times: float = 1.0
-    """Factor on the equal time, for the methods other than the scene."""
-    seed: int = 0
-    """Of every random choice."""
+    times: float = 1.0  # Factor on the equal time, for the methods other than the scene.
+    seed: int = 0  # Of every random choice.
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -503,16 +397,14 @@ class CompareJob(ComparisonSettings):
     """
 
     kind: Literal["compare"] = field_of(default="compare", repr=False, kw_only=True)
+    # Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest.
     max_run_s: float | None = None
-    """Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest."""
+    # auto, cpu, cuda or cuda:N: what the worker must offer; auto: a GPU where it offers one, else its processor.
     device: str = "auto"
-    """auto, cpu, cuda or cuda:N: what the worker must offer; auto: a GPU where it offers one, else its processor."""
-    min_memory_gb: int | None = None
-    """Least memory of the device, 10^9 bytes; of cpu: of the host."""
+    min_memory_gb: int | None = None  # Least memory of the device, 10^9 bytes; of cpu: of the host.
+    # Labels that the worker must have, such as {"site": "lab1"}.
     worker_labels: dict[str, str] = field_of(default_factory=dict)
-    """Labels that the worker must have, such as {"site": "lab1"}."""
-    dataset: str
-    """Name of an uploaded dataset, with held-out frames."""
+    dataset: str  # Name of an uploaded dataset, with held-out frames.
 
 
 @dataclass(frozen=True)
@@ -522,21 +414,18 @@ class EvaluateJob:
     The means are the metrics of the job; evaluation.json has those of every frame.
     """
 
-    dataset: str
-    """Name of an uploaded dataset, which need not be the one that the scene was trained from."""
-    scene: str
-    """Name of a scene."""
-    baselines: bool = False
-    """Also score compounding of the training frames: the classical way."""
+    dataset: str  # Name of an uploaded dataset, which need not be the one that the scene was trained from.
+    scene: str  # Name of a scene.
+    baselines: bool = False  # Also score compounding of the training frames: the classical way.
     kind: Literal["evaluate"] = field_of(default="evaluate", repr=False, kw_only=True)
+    # Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest.
     max_run_s: float | None = field_of(default=None, kw_only=True)
-    """Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest."""
+    # auto, cpu, cuda or cuda:N: what the worker must offer; auto: a GPU where it offers one, else its processor.
     device: str = field_of(default="auto", kw_only=True)
-    """auto, cpu, cuda or cuda:N: what the worker must offer; auto: a GPU where it offers one, else its processor."""
+    # Least memory of the device, 10^9 bytes; of cpu: of the host.
     min_memory_gb: int | None = field_of(default=None, kw_only=True)
-    """Least memory of the device, 10^9 bytes; of cpu: of the host."""
+    # Labels that the worker must have, such as {"site": "lab1"}.
     worker_labels: dict[str, str] = field_of(default_factory=dict, kw_only=True)
-    """Labels that the worker must have, such as {"site": "lab1"}."""
 
 
 @dataclass(frozen=True)
@@ -547,14 +436,10 @@ class AroundSampler:
     shifts by a normal step of standard deviation `translation_mm` along each axis.
     """
 
-    count: int
-    """How many poses."""
-    translation_mm: float = 2.0
-    """Standard deviation along each axis."""
-    rotation_deg: float = 5.0
-    """Standard deviation of the angle."""
-    seed: int = 0
-    """Of the random choices."""
+    count: int  # How many poses.
+    translation_mm: float = 2.0  # Standard deviation along each axis.
+    rotation_deg: float = 5.0  # Standard deviation of the angle.
+    seed: int = 0  # Of the random choices.
     kind: Literal["around"] = field_of(default="around", repr=False, kw_only=True)
 
 
@@ -570,10 +455,8 @@ class CoveredSampler:
     turned about a random axis by an angle uniform up to the angle between them.
     """
 
-    count: int
-    """How many poses."""
-    seed: int = 0
-    """Of the random choices."""
+    count: int  # How many poses.
+    seed: int = 0  # Of the random choices.
     kind: Literal["covered"] = field_of(default="covered", repr=False, kw_only=True)
 
 
@@ -586,10 +469,8 @@ class FanSampler:
     `freehand_poses(tilt_deg=…)` of the phantom does.
     """
 
-    tilt_deg: float
-    """The largest tilt, to both sides."""
-    step_deg: float
-    """Between two tilts."""
+    tilt_deg: float  # The largest tilt, to both sides.
+    step_deg: float  # Between two tilts.
     kind: Literal["fan"] = field_of(default="fan", repr=False, kw_only=True)
 
 
@@ -603,10 +484,8 @@ class SplineSampler:
     along the chords. Poses that repeat count once.
     """
 
-    count: int | None = None
-    """How many poses."""
-    spacing_mm: float | None = None
-    """Instead of count: distance along the path."""
+    count: int | None = None  # How many poses.
+    spacing_mm: float | None = None  # Instead of count: distance along the path.
     kind: Literal["spline"] = field_of(default="spline", repr=False, kw_only=True)
 
 
@@ -629,60 +508,49 @@ class RenderJob(FrameSettings):
     a sampler keeps to poses that have `min_confidence`, and `poses` without a sampler must all have it.
     """
 
-    scene: str
-    """Name of a scene; NAME@SHA256, or NAME@ and 12 digits of it: with that content alone."""
-    poses: Iterable[PoseLike] | None = None
-    """4x4 matrices, mm, probe to scene."""
-    sampler: Sampler | None = None
-    """Makes poses of the given ones, else of the scene's training poses."""
+    scene: str  # Name of a scene; NAME@SHA256, or NAME@ and 12 digits of it: with that content alone.
+    poses: Iterable[PoseLike] | None = None  # 4x4 matrices, mm, probe to scene.
+    sampler: Sampler | None = None  # Makes poses of the given ones, else of the scene's training poses.
+    # tar: WebDataset; mcap: messages of ROS 2; dicom and plus (.igs.mha): bmode in uint8, true to scale. Default:
+    # npz; in shards tar.
     format: str | None = None
-    """tar: WebDataset; mcap: messages of ROS 2; dicom and plus (.igs.mha): bmode in uint8, true to scale. Default:
-    npz; in shards tar.
-    """
-    dtype: str | None = None
-    """Default: the format's own."""
+    dtype: str | None = None  # Default: the format's own.
+    # Frames of a file: the job becomes many files, which all workers make. Default: one file, above 100,000 frames
+    # 5,000 in each.
     shard_frames: int | None = None
-    """Frames of a file: the job becomes many files, which all workers make. Default: one file, above 100,000 frames
-    5,000 in each.
-    """
+    # Name of the registration by which the poses lead into the scene: they are then flange to base, or marker to
+    # tracker. Default: they are probe to scene.
     registration: str | None = None
-    """Name of the registration by which the poses lead into the scene: they are then flange to base, or marker to
-    tracker. Default: they are probe to scene.
-    """
     kind: Literal["render"] = field_of(default="render", repr=False, kw_only=True)
+    # Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest.
     max_run_s: float | None = field_of(default=None, kw_only=True)
-    """Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest."""
+    # auto, cpu, cuda or cuda:N: what the worker must offer; auto: a GPU where it offers one, else its processor.
     device: str = field_of(default="auto", kw_only=True)
-    """auto, cpu, cuda or cuda:N: what the worker must offer; auto: a GPU where it offers one, else its processor."""
+    # Least memory of the device, 10^9 bytes; of cpu: of the host.
     min_memory_gb: int | None = field_of(default=None, kw_only=True)
-    """Least memory of the device, 10^9 bytes; of cpu: of the host."""
+    # Labels that the worker must have, such as {"site": "lab1"}.
     worker_labels: dict[str, str] = field_of(default_factory=dict, kw_only=True)
-    """Labels that the worker must have, such as {"site": "lab1"}."""
 
 
 @dataclass(frozen=True)
 class TrainJob:
     """A dataset becomes a scene that is served."""
 
-    dataset: str
-    """Name of an uploaded dataset."""
-    scene: str
-    """Name that the scene will be served under."""
+    dataset: str  # Name of an uploaded dataset.
+    scene: str  # Name that the scene will be served under.
+    # fast: minutes on two cores; best: fast, with the effort that frames left out ask for, in half an hour; paper:
+    # the released recipe.
     preset: str = "fast"
-    """fast: minutes on two cores; best: fast, with the effort that frames left out ask for, in half an hour; paper:
-    the released recipe.
-    """
-    settings: dict[str, Any] = field_of(default_factory=dict)
-    """Any training settings instead of the preset's."""
+    settings: dict[str, Any] = field_of(default_factory=dict)  # Any training settings instead of the preset's.
     kind: Literal["train"] = field_of(default="train", repr=False, kw_only=True)
+    # Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest.
     max_run_s: float | None = field_of(default=None, kw_only=True)
-    """Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest."""
+    # auto, cpu, cuda or cuda:N: what the worker must offer; auto: a GPU where it offers one, else its processor.
     device: str = field_of(default="auto", kw_only=True)
-    """auto, cpu, cuda or cuda:N: what the worker must offer; auto: a GPU where it offers one, else its processor."""
+    # Least memory of the device, 10^9 bytes; of cpu: of the host.
     min_memory_gb: int | None = field_of(default=None, kw_only=True)
-    """Least memory of the device, 10^9 bytes; of cpu: of the host."""
+    # Labels that the worker must have, such as {"site": "lab1"}.
     worker_labels: dict[str, str] = field_of(default_factory=dict, kw_only=True)
-    """Labels that the worker must have, such as {"site": "lab1"}."""
 
 
 @dataclass(frozen=True)
@@ -692,25 +560,21 @@ class VoxelizeJob:
     volume.json says where its voxels lie.
     """
 
-    scene: str
-    """Name of a scene; NAME@SHA256, or NAME@ and 12 digits of it: with that content alone."""
-    field: str = "echo"
-    """At each point. attenuation: per mm."""
-    spacing_mm: float = 0.5
-    """Distance of two voxels along each axis."""
+    scene: str  # Name of a scene; NAME@SHA256, or NAME@ and 12 digits of it: with that content alone.
+    field: str = "echo"  # At each point. attenuation: per mm.
+    spacing_mm: float = 0.5  # Distance of two voxels along each axis.
+    # Ranges of x, y and z in the scene's frame, such as -20:20,0:30,-5:45. Default: the bounds of the Gaussians.
     box_mm: str | None = None
-    """Ranges of x, y and z in the scene's frame, such as -20:20,0:30,-5:45. Default: the bounds of the Gaussians."""
-    format: str = "nii.gz"
-    """Of the file."""
+    format: str = "nii.gz"  # Of the file.
     kind: Literal["voxelize"] = field_of(default="voxelize", repr=False, kw_only=True)
+    # Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest.
     max_run_s: float | None = field_of(default=None, kw_only=True)
-    """Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest."""
+    # auto, cpu, cuda or cuda:N: what the worker must offer; auto: a GPU where it offers one, else its processor.
     device: str = field_of(default="auto", kw_only=True)
-    """auto, cpu, cuda or cuda:N: what the worker must offer; auto: a GPU where it offers one, else its processor."""
+    # Least memory of the device, 10^9 bytes; of cpu: of the host.
     min_memory_gb: int | None = field_of(default=None, kw_only=True)
-    """Least memory of the device, 10^9 bytes; of cpu: of the host."""
+    # Labels that the worker must have, such as {"site": "lab1"}.
     worker_labels: dict[str, str] = field_of(default_factory=dict, kw_only=True)
-    """Labels that the worker must have, such as {"site": "lab1"}."""
 
 
 Specification: TypeAlias = CompareJob | EvaluateJob | RenderJob | TrainJob | VoxelizeJob

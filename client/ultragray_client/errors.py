@@ -76,261 +76,169 @@ from .client_error import ClientError as ClientError
 class InvalidArgument(ClientError, ValueError):
     """A value that cannot be used; `field` names it as the caller wrote it."""
 
-    reason = "INVALID_ARGUMENT"
-    grpc_status = "INVALID_ARGUMENT"
-
 
 class RequestMalformed(InvalidArgument):
     """Bytes that are no HTTP request, or too many requests at once on one connection."""
-
-    reason = "REQUEST_MALFORMED"
 
 
 class UploadTooLarge(InvalidArgument):
     """An upload over `ULTRAGRAY_MAX_DATASET_BYTES`, packed or unpacked, or of too many files."""
 
-    reason = "UPLOAD_TOO_LARGE"
-
 
 class TargetTooLong(InvalidArgument):
     """Path and query of a request over 16 KiB."""
-
-    reason = "TARGET_TOO_LONG"
 
 
 class InvalidPose(InvalidArgument):
     """Not a rigid probe→scene transform."""
 
-    reason = "INVALID_POSE"
-
 
 class InvalidProbe(InvalidArgument):
     """A probe that no transducer could have, such as far ≤ near."""
-
-    reason = "INVALID_PROBE"
 
 
 class InvalidImageSize(InvalidArgument):
     """Height or width outside the limits."""
 
-    reason = "INVALID_IMAGE_SIZE"
-
 
 class UnknownOutput(InvalidArgument):
     """An output that does not exist, none at all, or one that the scene does not have."""
-
-    reason = "UNKNOWN_OUTPUT"
 
 
 class LowConfidence(InvalidArgument):
     """A pose below the `min_confidence` that was asked for."""
 
-    reason = "LOW_CONFIDENCE"
-
 
 class FrameTooCostly(InvalidArgument):
     """A frame whose Gaussians cover more pixels than `ULTRAGRAY_MAX_FOOTPRINT_PIXELS` allows; ask for a smaller one."""
-
-    reason = "FRAME_TOO_COSTLY"
 
 
 class TooManyPoses(InvalidArgument):
     """More poses, or pixels, than one request may have; send several."""
 
-    reason = "TOO_MANY_POSES"
-
 
 class DatasetInvalid(InvalidArgument):
     """A tracked sweep that cannot be used; names the file, the frame and the reason."""
-
-    reason = "DATASET_INVALID"
 
 
 class HeadersTooLarge(InvalidArgument):
     """The head of a request over `ULTRAGRAY_MAX_HEADER_BYTES`, or more headers than `ULTRAGRAY_MAX_HEADERS`."""
 
-    reason = "HEADERS_TOO_LARGE"
-
 
 class Unauthenticated(ClientError):
     """No API key, or an unknown one."""
-
-    reason = "UNAUTHENTICATED"
-    grpc_status = "UNAUTHENTICATED"
 
 
 class PermissionDenied(ClientError):
     """A role that may not do what was asked, or something that belongs to somebody else."""
 
-    reason = "PERMISSION_DENIED"
-    grpc_status = "PERMISSION_DENIED"
-
 
 class HostRefused(PermissionDenied):
     """A `Host` that the service is not known as, where it asks for no key."""
-
-    reason = "HOST_REFUSED"
 
 
 class NotFound(ClientError):
     """Base of the errors whose gRPC status is NOT_FOUND."""
 
-    reason = "NOT_FOUND"
-    grpc_status = "NOT_FOUND"
-
 
 class SceneNotFound(NotFound):
     """No scene of that name."""
-
-    reason = "SCENE_NOT_FOUND"
 
 
 class RegistrationNotFound(NotFound):
     """No registration of that name."""
 
-    reason = "REGISTRATION_NOT_FOUND"
-
 
 class DatasetNotFound(NotFound):
     """No dataset of that name."""
-
-    reason = "DATASET_NOT_FOUND"
 
 
 class JobNotFound(NotFound):
     """No job of that id."""
 
-    reason = "JOB_NOT_FOUND"
-
 
 class WorkerNotFound(NotFound):
     """No worker of that name."""
-
-    reason = "WORKER_NOT_FOUND"
 
 
 class ArtifactNotFound(NotFound):
     """The job has no file of that name."""
 
-    reason = "ARTIFACT_NOT_FOUND"
-
 
 class DeadlineExceeded(ClientError, TimeoutError):
     """The deadline passed first."""
-
-    reason = "DEADLINE_EXCEEDED"
-    grpc_status = "DEADLINE_EXCEEDED"
 
 
 class RequestTooSlow(DeadlineExceeded):
     """A head that took longer than `ULTRAGRAY_HEADER_TIMEOUT_S`, or a body below `ULTRAGRAY_MIN_BYTES_PER_S`."""
 
-    reason = "REQUEST_TOO_SLOW"
-
 
 class JobTimeExceeded(DeadlineExceeded):
     """A job ran longer than its `max_run_s`, or `ULTRAGRAY_JOB_MAX_RUN_S`, and was ended."""
-
-    reason = "JOB_TIME_EXCEEDED"
 
 
 class AlreadyExists(ClientError):
     """Base of the errors whose gRPC status is ALREADY_EXISTS."""
 
-    reason = "ALREADY_EXISTS"
-    grpc_status = "ALREADY_EXISTS"
-
 
 class DatasetExists(AlreadyExists):
     """A dataset of that name has another content or other options; delete it first."""
-
-    reason = "DATASET_EXISTS"
 
 
 class SceneExists(AlreadyExists):
     """A scene of that name is there, or a job is making it."""
 
-    reason = "SCENE_EXISTS"
-
 
 class RequestIdConflict(AlreadyExists):
     """The `request_id` was used for something else."""
-
-    reason = "REQUEST_ID_CONFLICT"
 
 
 class FailedPrecondition(ClientError):
     """Base of the errors whose gRPC status is FAILED_PRECONDITION."""
 
-    reason = "FAILED_PRECONDITION"
-    grpc_status = "FAILED_PRECONDITION"
-
 
 class DatasetInUse(FailedPrecondition):
     """A job needs the dataset."""
-
-    reason = "DATASET_IN_USE"
 
 
 class JobFinished(FailedPrecondition):
     """A job that succeeded or failed cannot be cancelled."""
 
-    reason = "JOB_FINISHED"
-
 
 class JobNotFinished(FailedPrecondition):
     """Only a failed or cancelled job can be retried."""
-
-    reason = "JOB_NOT_FINISHED"
 
 
 class JobInUse(FailedPrecondition):
     """A job that waits or runs, or that another of those goes on from, cannot be deleted."""
 
-    reason = "JOB_IN_USE"
-
 
 class SceneFileInvalid(FailedPrecondition):
     """A scene file that is truncated, foreign or inconsistent."""
-
-    reason = "SCENE_FILE_INVALID"
 
 
 class ResourceExhausted(ClientError):
     """Base of the errors whose gRPC status is RESOURCE_EXHAUSTED."""
 
-    reason = "RESOURCE_EXHAUSTED"
-    grpc_status = "RESOURCE_EXHAUSTED"
-
 
 class QueueFull(ResourceExhausted):
     """Too many frames wait, or too many uploads are under way; retry."""
-
-    reason = "QUEUE_FULL"
 
 
 class RateLimited(ResourceExhausted):
     """More requests or frames in a second than the key may have; retry."""
 
-    reason = "RATE_LIMITED"
-
 
 class JobQueueFull(ResourceExhausted):
     """Too many jobs wait; retry."""
-
-    reason = "JOB_QUEUE_FULL"
 
 
 class LimitReached(ResourceExhausted):
     """As many streams, jobs, minutes of compute or bytes as the key may have; end or delete some, or wait."""
 
-    reason = "LIMIT_REACHED"
-
 
 class StorageFull(ResourceExhausted):
     """The artifact folder has no room, or a render job would write more than it has room for."""
-
-    reason = "STORAGE_FULL"
 
 
 class MemoryExceeded(ResourceExhausted):
@@ -338,50 +246,33 @@ class MemoryExceeded(ResourceExhausted):
     fit into memory; also where the machine has none left.
     """
 
-    reason = "MEMORY_EXCEEDED"
-
 
 class SceneTooLarge(ResourceExhausted):
     """A scene that does not fit `ULTRAGRAY_MEMORY_BUDGET_MB` at all."""
-
-    reason = "SCENE_TOO_LARGE"
 
 
 class JobStalled(ClientError):
     """The process of a job neither computed nor read nor wrote for `ULTRAGRAY_JOB_STALL_TIMEOUT_S`, and was ended."""
 
-    reason = "JOB_STALLED"
-
 
 class BackupInvalid(ClientError):
     """A backup that is not there, damaged, or made by a newer release (command line)."""
-
-    reason = "BACKUP_INVALID"
 
 
 class RestoreRefused(ClientError):
     """A backup or restore into a place that holds something else, or where somebody is at work (command line)."""
 
-    reason = "RESTORE_REFUSED"
-
 
 class RenderFailed(ClientError):
     """A worker could not render the frame."""
-
-    reason = "RENDER_FAILED"
 
 
 class Unimplemented(ClientError):
     """Base of the errors whose gRPC status is UNIMPLEMENTED."""
 
-    reason = "UNIMPLEMENTED"
-    grpc_status = "UNIMPLEMENTED"
-
 
 class BackendUnavailable(Unimplemented):
     """A backend that cannot run here."""
-
-    reason = "BACKEND_UNAVAILABLE"
 
 
 class ExtraMissing(Unimplemented):
@@ -389,138 +280,49 @@ class ExtraMissing(Unimplemented):
     jobs, command line, library).
     """
 
-    reason = "EXTRA_MISSING"
-
 
 class Unavailable(ClientError):
     """Base of the errors whose gRPC status is UNAVAILABLE."""
-
-    reason = "UNAVAILABLE"
-    grpc_status = "UNAVAILABLE"
 
 
 class TooManyConnections(Unavailable):
     """Connections over `ULTRAGRAY_MAX_CONNECTIONS`, or of one address over the limit of those; retry."""
 
-    reason = "TOO_MANY_CONNECTIONS"
-
 
 class NotReady(Unavailable):
     """The service is starting, or cannot render at the moment; retry."""
-
-    reason = "NOT_READY"
 
 
 class Draining(Unavailable):
     """The service is stopping; retry elsewhere."""
 
-    reason = "DRAINING"
-
 
 class IssuerUnavailable(Unavailable):
     """The issuer of a token does not answer, so that the token cannot be checked; API keys work all the same; retry."""
-
-    reason = "ISSUER_UNAVAILABLE"
 
 
 class StorageUnavailable(Unavailable):
     """The object storage does not answer, or refuses its credentials; what is cached is served all the same; retry."""
 
-    reason = "STORAGE_UNAVAILABLE"
-
 
 class DatabaseUnavailable(Unavailable):
     """The database of the jobs is away or takes no changes; scenes are rendered all the same; retry."""
-
-    reason = "DATABASE_UNAVAILABLE"
 
 
 class ArtifactFolderUnavailable(Unavailable):
     """The artifact folder is gone, or not the one that the jobs belong to: its share is not mounted; retry."""
 
-    reason = "ARTIFACT_FOLDER_UNAVAILABLE"
-
 
 class Unreachable(Unavailable):
     """Nobody answers at the address, or the connection broke."""
-
-    reason = "UNREACHABLE"
 
 
 class TlsFailed(ClientError):
     """The service shows no certificate to trust, or does not speak TLS."""
 
-    reason = "TLS_FAILED"
-
 
 class StreamEnded(ClientError):
     """A stream of poses that is over was asked to go on."""
 
-    reason = "STREAM_ENDED"
 
-
-ERRORS = (
-    ClientError,
-    InvalidArgument,
-    RequestMalformed,
-    UploadTooLarge,
-    TargetTooLong,
-    InvalidPose,
-    InvalidProbe,
-    InvalidImageSize,
-    UnknownOutput,
-    LowConfidence,
-    FrameTooCostly,
-    TooManyPoses,
-    DatasetInvalid,
-    HeadersTooLarge,
-    Unauthenticated,
-    PermissionDenied,
-    HostRefused,
-    NotFound,
-    SceneNotFound,
-    RegistrationNotFound,
-    DatasetNotFound,
-    JobNotFound,
-    WorkerNotFound,
-    ArtifactNotFound,
-    DeadlineExceeded,
-    RequestTooSlow,
-    JobTimeExceeded,
-    AlreadyExists,
-    DatasetExists,
-    SceneExists,
-    RequestIdConflict,
-    FailedPrecondition,
-    DatasetInUse,
-    JobFinished,
-    JobNotFinished,
-    JobInUse,
-    SceneFileInvalid,
-    ResourceExhausted,
-    QueueFull,
-    RateLimited,
-    JobQueueFull,
-    LimitReached,
-    StorageFull,
-    MemoryExceeded,
-    SceneTooLarge,
-    JobStalled,
-    BackupInvalid,
-    RestoreRefused,
-    RenderFailed,
-    Unimplemented,
-    BackendUnavailable,
-    ExtraMissing,
-    Unavailable,
-    TooManyConnections,
-    NotReady,
-    Draining,
-    IssuerUnavailable,
-    StorageUnavailable,
-    DatabaseUnavailable,
-    ArtifactFolderUnavailable,
-    Unreachable,
-    TlsFailed,
-    StreamEnded,
-)
+ERRORS = ClientError.branch()

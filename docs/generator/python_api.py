@@ -147,12 +147,10 @@ def signature(value: Any) -> str:
 def members(cls: type[Any]) -> Iterator[tuple[str, Any]]:
     """The public methods and properties that a class defines itself or has of private bases, by name."""
     own = [base for base in reversed(cls.__mro__) if base is cls or base.__name__.startswith("_")]
-    for name, value in sorted({name: value for base in own for name, value in vars(base).items()}.items()):
-        if not name.startswith("_"):
-            if isinstance(value, (staticmethod, classmethod)):
-                yield name, getattr(cls, name)
-            elif inspect.isfunction(value) or isinstance(value, property):
-                yield name, value
+    for name in sorted({name for base in own for name in vars(base) if not name.startswith("_")}):
+        value = getattr(cls, name)
+        if inspect.isroutine(value) or isinstance(value, property):
+            yield name, value
 
 
 def _documented(value: Any) -> str:

@@ -27,8 +27,10 @@ from ultragray_service.cli.terminal import (
     command_group,
     examples,
     output_option,
+    progress_bars,
     stop_on_signal,
     to_json,
+    wide_console,
 )
 
 if TYPE_CHECKING:
@@ -124,46 +126,43 @@ def _check_output(output: Path, *, force: bool) -> None:
 def _compare(
     dataset: Dataset, settings: ComparisonSettings, device: str, run: Path, output: Path | None, *, as_json: bool
 ) -> None:
+    from ultragray.files import write_whole
     from ultragray_studies.comparison.run import compare_methods
     from ultragray_studies.methods.registry import chosen_methods
 
-    last: ComparisonProgress | None = None
+    at, written = "stopped before the first method", []
     with stop_on_signal() as should_stop, _progress_bar() as show:
 
         def report(state: ComparisonProgress) -> None:
-            nonlocal last
-            last = state
+            nonlocal at
+            at = f"stopped at {state.method}, method {state.number} of {state.of}"
+            if state.fit is not None:
+                at += f", after step {state.fit.step:,} of {state.fit.steps:,}"
             show(state)
 
+        methods = chosen_methods(settings.methods)
         comparison = compare_methods(
-            dataset,
-            chosen_methods(settings.methods),
-            settings,
-            folder=run,
-            device=device,
-            report=report,
-            should_stop=should_stop,
+            dataset, methods, settings, folder=run, device=device, report=report, should_stop=should_stop
         )
-        written = [] if comparison is None or output is None else _write(comparison, dataset, run, output)
+        if comparison is not None and output is not None:
+            from ultragray_studies.comparison.page import write_comparison
+
+            for made in write_comparison(comparison, dataset, run):
+                written.append(output.with_suffix(made.suffix))
+                write_whole(written[-1], made.read_bytes())
     if comparison is None:
-        typer.echo(
-            f"{_where(last)}; {'nothing is kept' if output is None else 'go on with the same command'}", err=True
-        )
+        typer.echo(f"{at}; {'nothing is kept' if output is None else 'go on with the same command'}", err=True)
         raise typer.Exit(INTERRUPTED)
     if as_json:
-        typer.echo(to_json(comparison.to_dict() | {"written": [str(path) for path in written]}))
+        typer.echo(to_json(comparison.to_dict() | {"written": written}))
     else:
-        _print(comparison, written)
+        _print_table(comparison)
+        if comparison.measured:
+            print_speckle({one.title: one.evaluation for one in comparison.results if one.evaluation is not None})
+        for path in written:
+            typer.echo(f"wrote {path}")
     if not comparison.measured:
         raise typer.Exit(1)
-
-
-def _print(comparison: Comparison, written: list[Path]) -> None:
-    _print_table(comparison)
-    if comparison.measured:
-        print_speckle({one.title: one.evaluation for one in comparison.results if one.evaluation is not None})
-    for path in written:
-        typer.echo(f"wrote {path}")
 
 
 def _print_table(comparison: Comparison) -> None:
@@ -172,7 +171,6 @@ def _print_table(comparison: Comparison) -> None:
     from rich.table import Table
 
     from ultragray.learn.report.tables import METRICS, rank, shown_value
-    from ultragray_service.cli.terminal import wide_console
     from ultragray_studies.comparison.tables import budget_text, steps_text
 
     table = Table(box=None, pad_edge=False)
@@ -187,57 +185,30 @@ def _print_table(comparison: Comparison) -> None:
                 escape(one.title),
                 *(shown_value(metric.name, means[metric.name]) for metric in METRICS),
                 steps_text(one),
-                f"{one.seconds:,.1f}",
+                f"{one.cost.seconds:,.1f}",
                 f"{one.frame_ms:,.1f}",
-                f"{one.model_bytes / 1e6:,.2f}",
+                f"{one.cost.model_bytes / 1e6:,.2f}",
                 f"{ranks[one.name].mean:.2f}",
             )
     console, facts = wide_console(), comparison.dataset
     head = f"{facts.name}, {facts.val_frames} val frames, {comparison.machine}; budget: {budget_text(comparison)}"
-    console.print(head, highlight=False, markup=False, soft_wrap=True)
-    console.print(table)
-    for one in comparison.results:
-        if one.failure is not None:
-            console.print(f"{one.title} failed: {one.failure}", highlight=False, markup=False, soft_wrap=True)
-
-
-def _write(comparison: Comparison, dataset: Dataset, run: Path, output: Path) -> list[Path]:
-    """The page and what stands beside it, of the names that the output gives them."""
-    from ultragray.files import write_whole
-    from ultragray_studies.comparison.page import write_comparison
-
-    written = []
-    for made in write_comparison(comparison, dataset, run):
-        written.append(output.with_suffix(made.suffix))
-        write_whole(written[-1], made.read_bytes())
-    return written
-
-
-def _where(state: ComparisonProgress | None) -> str:
-    """Where a comparison was stopped."""
-    if state is None:
-        return "stopped before the first method"
-    at = f"stopped at {state.method}, method {state.number} of {state.of}"
-    return at if state.fit is None else f"{at}, after step {state.fit.step:,} of {state.fit.steps:,}"
+    failures = (f"{one.title} failed: {one.failure}" for one in comparison.results if one.failure is not None)
+    for part in (head, table, *failures):
+        console.print(part, highlight=False, markup=False, soft_wrap=part is not table)
 
 
 @contextmanager
 def _progress_bar() -> Iterator[Callable[[ComparisonProgress], None]]:
     """A bar a method on a terminal's stderr; elsewhere a line for each tenth of a fit."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
-
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}", markup=False), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Progress(*columns, console=console, transient=True, disable=not console.is_terminal) as bars:
+    with progress_bars("{task.description}", "bar", "of", "left") as bars:
         task = bars.add_task("", total=None)
 
         def show(state: ComparisonProgress) -> None:
             named, fit = f"{state.method} ({state.number} of {state.of})", state.fit
-            if console.is_terminal:
+            if bars.console.is_terminal:
                 done, of = (None, None) if fit is None else (fit.step, fit.steps)
                 bars.update(task, description=named, completed=done, total=of)
-            elif fit is not None and fit.step * 10 // fit.steps > (fit.step - 1) * 10 // fit.steps:
+            elif fit is not None and fit.ends_part(10):
                 sys.stderr.write(f"{named}: step {fit.step:,} of {fit.steps:,}: loss {fit.loss:.4f}\n")
 
         yield show

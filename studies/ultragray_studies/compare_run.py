@@ -65,7 +65,6 @@ def _report(job_run: JobRun, state: ComparisonProgress) -> None:
     else:
         left_s = fit.seconds_left if math.isfinite(fit.seconds_left) else None
         job_run.report(replace(at, step=fit.step, steps=fit.steps, loss=fit.loss, seconds_left=left_s))
-        if fit.step * _LINES // fit.steps == (fit.step - 1) * _LINES // fit.steps:
-            return
-        sys.stderr.write(f"{state.method}: step {fit.step:,} of {fit.steps:,}: loss {fit.loss:.4f}\n")
+        if fit.ends_part(_LINES):
+            sys.stderr.write(f"{state.method}: step {fit.step:,} of {fit.steps:,}: loss {fit.loss:.4f}\n")
     sys.stderr.flush()

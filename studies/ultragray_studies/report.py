@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from ultragray.errors import DatasetInvalid, UltragrayError
+from ultragray.errors import UltragrayError
 from ultragray.geometry.probe import FloatArray
 from ultragray.geometry.rotations import turns_of
 from ultragray.learn.evaluation.baselines import FOLDS as VOLUME_METHODS
@@ -132,15 +132,6 @@ def ablation_methods(config: TrainingConfig, gaussian_count: int) -> dict[str, M
     }
 
 
-def scene_evaluation(comparison: Comparison) -> Evaluation:
-    """The scores of the scene among the methods of a comparison. Raises DatasetInvalid where it has none."""
-    if SCENE in comparison.failures:
-        raise DatasetInvalid(
-            f"{comparison.dataset.name}: the scene cannot be measured on it: {comparison.failures[SCENE]}"
-        )
-    return comparison.measured[SCENE]
-
-
 def frame_tilts_deg(sweep: Sweep) -> FloatArray:  # [F]
     """Rotation of each frame against the mean, in degrees, about the axis that the sweep turns about most.
 
@@ -205,10 +196,9 @@ class ReportContent:
         """The rows of the comparison that are no ablations."""
         return [one for one in self.comparison.results if one.name not in self.ablations]
 
-    @property
-    def ablated(self) -> list[MethodResult]:
-        """The others."""
-        return [one for one in self.comparison.results if one.name in self.ablations]
+    def gaussian_count(self, name: str) -> int:
+        """That of an ablation."""
+        return read_header(self.folder / name / SCENE_FILE).info.gaussian_count
 
 
 def render_report(content: ReportContent) -> str:
@@ -244,39 +234,31 @@ def render_report(content: ReportContent) -> str:
 
 def _ablation_rows(content: ReportContent) -> list[Row]:
     """The full model where it was trained, then each ablation in its order."""
-    if not content.ablated:
-        return []
     evaluations: dict[str, Evaluation] = {}
     notes: dict[str, list[str]] = {}
-    if content.course is not None:
-        evaluations["full model"] = content.comparison.measured[SCENE]
-        notes["full model"] = _training_notes(content.scene.gaussian_count, content.course.step_s)
-    for one in content.ablated:
-        if one.evaluation is not None:
-            evaluations[one.name] = one.evaluation
-            notes[one.name] = _training_notes(_gaussian_count(content, one.name), one.seconds / one.steps)
+    failures: dict[str, str] = {}
+
+    def add(name: str, evaluation: Evaluation, gaussian_count: int, step_s: float) -> None:
+        evaluations[name], notes[name] = evaluation, [f"{gaussian_count:,}", f"{1000.0 * step_s:.0f}"]
+
+    if content.ablations and content.course is not None:
+        add("full model", content.comparison.measured[SCENE], content.scene.gaussian_count, content.course.step_s)
+    for one in content.comparison.results:
+        if one.name in content.ablations:
+            if one.evaluation is not None:
+                step_s = one.cost.seconds / one.cost.steps
+                add(one.name, one.evaluation, content.gaussian_count(one.name), step_s)
+            failures |= {} if one.failure is None else {one.name: one.failure}
     rows = {row.name: row for row in metric_rows(evaluations, notes)}
-    rows |= {one.name: Row(one.name, failure=one.failure) for one in content.ablated if one.failure is not None}
-    order = ["full model", *(one.name for one in content.ablated)]
-    return [rows[name] for name in order if name in rows]
-
-
-def _training_notes(gaussian_count: int, step_s: float) -> list[str]:
-    return [f"{gaussian_count:,}", f"{1000.0 * step_s:.0f}"]
-
-
-def _gaussian_count(content: ReportContent, name: str) -> int:
-    return read_header(content.folder / name / SCENE_FILE).info.gaussian_count
+    rows |= {name: Row(name, failure=reason) for name, reason in failures.items()}
+    return [rows[name] for name in ("full model", *content.ablations) if name in rows]
 
 
 def _counts_plot(content: ReportContent) -> str | None:
     """Over the runs that differ in their number of Gaussians only."""
     measured = content.comparison.measured
-    points: dict[int, FrameMetrics] = {
-        _gaussian_count(content, name): measured[name].mean
-        for name in GAUSSIAN_SHARES
-        if name in content.ablations and name in measured
-    }
+    shares = [name for name in GAUSSIAN_SHARES if name in content.ablations and name in measured]
+    points: dict[int, FrameMetrics] = {content.gaussian_count(name): measured[name].mean for name in shares}
     if content.course is not None:
         points[content.scene.gaussian_count] = measured[SCENE].mean
     return plot_counts(points) if len(points) > 1 else None

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import tempfile
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -13,6 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from ultragray.datasets.source import SourceOptions
+from ultragray.errors import DatasetInvalid
 from ultragray.learn.training.config import PRESET_MEANINGS, TrainingConfig
 from ultragray.scene.info import read_header
 from ultragray_service.cli.options import FieldsOf, with_options
@@ -25,6 +25,7 @@ from ultragray_service.cli.terminal import (
     command_group,
     examples,
     output_option,
+    progress_bars,
     tell,
 )
 
@@ -40,17 +41,6 @@ VoxelMm = Annotated[
         metavar="MM", help="Side of a voxel of compounding, mm.", show_default="0.5, or what fits into memory"
     ),
 ]
-Follow = Callable[["Progress | FitProgress"], None]
-
-
-@dataclass(frozen=True)
-class ReportOptions:
-    """The contents of the page besides the dataset."""
-
-    scene: Path | None
-    ablations: bool
-    voxel_mm: float
-
 
 command_app = command_group()
 
@@ -103,95 +93,63 @@ def report(
     require_frames(read.val)
     warn_about_dataset(read)
     voxel_mm = affordable_voxel_mm(read.train) if voxel_mm is None else voxel_mm
-    failures = _write_report(read, config, output, ReportOptions(scene, not no_ablations, voxel_mm))
+    failures = _write_report(read, config, output, scene, voxel_mm, ablations=not no_ablations)
     for name, reason in failures.items():
         typer.echo(f"failed: {name}: {reason}", err=True)
     tell(f"wrote {output}", {"output": str(output), "failed": failures}, as_json=json)
 
 
-def _write_report(dataset: Dataset, config: TrainingConfig, output: Path, options: ReportOptions) -> dict[str, str]:
+def _write_report(
+    dataset: Dataset, config: TrainingConfig, output: Path, scene_file: Path | None, voxel_mm: float, *, ablations: bool
+) -> dict[str, str]:
     """The studies that could not be finished, and why; the page has the others."""
     from ultragray.files import write_whole
     from ultragray.learn.evaluation.methods import ComparisonSettings
     from ultragray.scene.gaussians import GaussianScene
-    from ultragray_studies.comparison.run import SCENE, ComparisonProgress, compare_methods
+    from ultragray_studies import report as study
+    from ultragray_studies.comparison.run import SCENE, compare_methods
     from ultragray_studies.methods.gaussians import GivenScene
-    from ultragray_studies.report import (
-        Failed,
-        ReportContent,
-        ablation_methods,
-        attempt,
-        baselines,
-        render_report,
-        scene_evaluation,
-        study_tilt,
-        train_and_evaluate,
-    )
 
-    given = None if options.scene is None else GaussianScene.load(options.scene)
-    if given is not None:
-        check_scene_fits(given.info, dataset)
-    with _following() as follow, tempfile.TemporaryDirectory(prefix="ultragray-report-") as folder:
-        trained = None if given is not None else train_and_evaluate(dataset, config, report=follow(SCENE))
-        scene = given if trained is None else trained.scene
-        assert scene is not None
-        ablated = ablation_methods(config, scene.gaussian_count) if options.ablations else {}
-        followed = {name: follow(name) for name in ablated}
-
-        def advance(state: ComparisonProgress) -> None:
-            if state.fit is not None:
-                followed[state.method](state.fit)
-
+    if scene_file is not None:
+        scene, course = GaussianScene.load(scene_file), None
+        check_scene_fits(scene.info, dataset)
+    with _progress_bars() as follow, tempfile.TemporaryDirectory(prefix="ultragray-report-") as name:
+        folder = Path(name)
+        if scene_file is None:
+            trained = study.train_and_evaluate(dataset, config, report=partial(follow, SCENE))
+            scene, course = trained.scene, trained.course
+        ablated = study.ablation_methods(config, scene.gaussian_count) if ablations else {}
+        given = GivenScene(scene, 0.0 if course is None else course.seconds)
         comparison = compare_methods(
             dataset,
-            {
-                SCENE: GivenScene(scene, 0.0 if trained is None else trained.course.seconds),
-                **baselines(options.voxel_mm),
-                **ablated,
-            },
+            {SCENE: given, **study.baselines(voxel_mm), **ablated},
             ComparisonSettings(seed=config.seed),
-            folder=Path(folder),
-            report=advance,
+            folder=folder,
+            report=lambda state: None if state.fit is None else follow(state.method, state.fit),
         )
         assert comparison is not None  # nothing tells it to stop
-        scene_evaluation(comparison)
+        if (reason := comparison.failures.get(SCENE)) is not None:
+            raise DatasetInvalid(f"{dataset.name}: the scene cannot be measured on it: {reason}")
         tilt = None
-        if options.ablations:
-            tilt = attempt(partial(study_tilt, dataset.train, config, voxel_mm=options.voxel_mm, report=follow(TILT)))
-        content = ReportContent(
-            dataset,
-            scene,
-            comparison,
-            Path(folder),
-            course=None if trained is None else trained.course,
-            ablations=tuple(ablated),
-            tilt=tilt,
-        )
-        write_whole(output, render_report(content))
-    return {**comparison.failures, **({TILT: tilt.reason} if isinstance(tilt, Failed) else {})}
+        if ablations:
+            of_tilts = partial(study.study_tilt, dataset.train, config, voxel_mm=voxel_mm)
+            tilt = study.attempt(lambda: of_tilts(report=partial(follow, TILT)))
+        content = study.ReportContent(dataset, scene, comparison, folder, course, tuple(ablated), tilt)
+        write_whole(output, study.render_report(content))
+    return {**comparison.failures, **({TILT: tilt.reason} if isinstance(tilt, study.Failed) else {})}
 
 
 @contextlib.contextmanager
-def _following() -> Iterator[Callable[[str], Follow]]:
+def _progress_bars() -> Iterator[Callable[[str, Progress | FitProgress], None]]:
     """A bar for each training on a terminal's stderr; elsewhere one line when it begins."""
-    from rich.console import Console
-    from rich.progress import BarColumn, MofNCompleteColumn, TaskID, TextColumn, TimeRemainingColumn
-    from rich.progress import Progress as Bars
+    with progress_bars("{task.description}", "bar", "of", "left") as bars:
+        tasks: dict[str, Any] = {}
 
-    console = Console(stderr=True)
-    columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-    with Bars(*columns, console=console, disable=not console.is_terminal) as bars:
-
-        def follow(name: str) -> Follow:
-            task: list[TaskID] = []  # made by the first step: a study that is left out shows nothing
-
-            def advance(state: Progress | FitProgress) -> None:
-                if not task:
-                    task.append(bars.add_task(name))
-                    if not console.is_terminal:
-                        console.print(f"training: {name}", highlight=False)
-                bars.update(task[0], completed=state.step, total=state.steps)
-
-            return advance
+        def follow(name: str, state: Progress | FitProgress) -> None:
+            if name not in tasks:
+                tasks[name] = bars.add_task(name)
+                if not bars.console.is_terminal:
+                    bars.console.print(f"training: {name}", highlight=False)
+            bars.update(tasks[name], completed=state.step, total=state.steps)
 
         yield follow

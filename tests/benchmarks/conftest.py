@@ -35,9 +35,9 @@ class Repository:
 
 def adopt(monkeypatch, root):
     """Let the scripts take a folder for the root of their checkout."""
-    for module in (benchmark("figures"), report):
+    for module in (benchmark("measuring"), report):
         monkeypatch.setattr(module, "ROOT", root)
-    monkeypatch.setattr(benchmark("figures"), "STAGE", root / "build" / "bench")
+    monkeypatch.setattr(benchmark("measuring"), "STAGE", root / "build" / "bench")
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ import pytest
 
 from ..scripts import benchmark
 
-figures, tables = benchmark("figures"), benchmark("tables")
+figures, measuring = benchmark("figures"), benchmark("measuring")
 
 
 def of(commit, value):
@@ -74,7 +74,7 @@ def test_runs_are_kept_one_by_one_and_not_repeated_at_their_commit(repository, m
 
     def measure(*arguments):
         monkeypatch.setattr("sys.argv", ["results_tables.py", str(tmp_path), *arguments])
-        figures.measure_runs("results_tables", "Runs.", runs)
+        measuring.measure_runs("results_tables", "Runs.", runs)
 
     measure("--only", "second")
     with pytest.raises(OSError, match="no room"):
@@ -90,5 +90,5 @@ def test_runs_are_kept_one_by_one_and_not_repeated_at_their_commit(repository, m
 
 def test_every_place_has_its_block_and_every_block_its_place():
     text = "".join(page.read_text(encoding="utf-8") for page in figures.documents())
-    assert {name for name in tables.BLOCKS if f"<!-- measured: {name} -->\n" not in text} == set()
+    assert {name for name in figures.BLOCKS if f"<!-- measured: {name} -->\n" not in text} == set()
     assert figures.current(text), "a place without a block is a KeyError"

@@ -7,23 +7,23 @@ from ultragray.learn.evaluation.methods import ComparisonSettings
 
 from ..scripts import benchmark
 
-results, methods, ablations, tables = map(benchmark, ("results_tables", "methods_tables", "ablations", "tables"))
+results, methods, ablations = map(benchmark, ("results_tables", "methods_tables", "ablations"))
 SETTINGS = {"steps": 3, "max_gaussians": 40}
 
 
 def test_a_training_is_measured_beside_classical_methods(data, monkeypatch):
     run = results.Run("ball", options=SourceOptions("0:3", "3:6"), settings=SETTINGS)
     monkeypatch.setattr(results, "RUNS", {"two": run})
-    monkeypatch.setattr(tables, "README_ROWS", {"two": "a ball, the other half"})
+    monkeypatch.setattr(results, "README_ROWS", {"two": "a ball, the other half"})
     figures = {"two": results.measure("two", data)}
     assert (figures["two"]["train_frames"], figures["two"]["steps"]) == (3, 3)
     assert figures["two"]["total_s"] == pytest.approx(0.003 * figures["two"]["step_ms"])
-    text = "\n".join(tables.results(figures))
+    text = "\n".join(results.results(figures))
     mean = figures["two"]["metrics"]["scene"]["mean"]
     assert f"{mean['psnr_db']:.2f}" in text
     assert "Training frames 0:3, held out 3:6" in text
     assert text.count("| nearest training frame |") == 1
-    *_, row = tables.results_at_a_glance(tables.glanced_at({**figures, "other": {}}))
+    *_, row = results.results_at_a_glance(results.glanced_at({**figures, "other": {}}))
     assert row.startswith(f"| a ball, the other half | {figures['two']['total_s']:.0f} s |")
 
 
@@ -35,7 +35,7 @@ def test_methods_are_compared_and_what_failed_is_a_row_with_its_reason(data, mon
     assert list(one["methods"]) == ["median", "linear", "nearest"]
     assert methods.measure("one", data)["methods"] == one["methods"], "what was measured is not measured again"
     one["methods"]["other"] = {"title": "Other", "failure": "the loss is nan", "cost": {}}
-    lines = list(tables.methods({"one": one}))
+    lines = list(methods.methods({"one": one}))
     assert lines[0] == "### one"
     psnr = one["methods"]["median"]["mean"]["psnr_db"]
     assert any(line.startswith("| median compounding") and f"{psnr:.2f}" in line for line in lines)

@@ -6,7 +6,8 @@ import threading
 
 import pytest
 
-from ultragray_client import AsyncClient, Client
+from ultragray_client import AsyncClient, AsyncFrameStream, Client
+from ultragray_client.transport import Group
 
 from ..service.conftest import data_folder, demo_scene, start_service, start_shared_service
 
@@ -64,7 +65,7 @@ class Blocking:
     def _as_ordinary(self, value):
         if inspect.iscoroutine(value):
             return self._as_ordinary(self._run(value))
-        own = type(value).__name__.startswith("Async") or inspect.isasyncgen(value)
+        own = isinstance(value, (Group, AsyncFrameStream)) or inspect.isasyncgen(value)
         return Blocking(value, self._loop) if own or inspect.ismethod(value) else value
 
 

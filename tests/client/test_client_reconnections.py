@@ -3,17 +3,17 @@
 import signal
 import threading
 from concurrent import futures
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 
 import grpc
 import numpy as np
 import pytest
 
 from ultragray_client import JobState, RenderJob, RenderSettings, errors
-from ultragray_client.calls import Deletion, Pause
-from ultragray_client.connection import Retries, Terms
+from ultragray_client.connection import Retries
 from ultragray_client.conversations import Watch, download_into
 from ultragray_client.exchange import Unanswered
+from ultragray_client.transport import Connection, Deletion
 from ultragray_proto.v1 import jobs_pb2, rendering_pb2
 
 from .conftest import KEY
@@ -280,16 +280,16 @@ def test_a_log_is_not_told_twice():
     ],
 )
 def test_a_deletion_that_had_worked_is_no_error(failures, is_refused):
-    steps = Deletion("JobService.DeleteJob", None, None).steps(Terms("127.0.0.1:1", None, None, 60.0))
     left = list(failures)
 
-    def run():
-        step = next(steps)
-        with suppress(StopIteration):
-            while True:
-                is_through = isinstance(step, Pause) or not left
-                step = steps.send(None) if is_through else steps.throw(left.pop(0)("no"))
+    class Failing(Connection):
+        async def attempt(self, *_):
+            if left:
+                raise left.pop(0)("no")
 
+        async def rest(self, seconds): ...
+
+    connection = Failing("127.0.0.1:1", None, None, 60.0)
     with pytest.raises(errors.ClientError) if is_refused else nullcontext():
-        run()
+        connection.answer(Deletion("JobService.DeleteJob", None, None))
     assert not left

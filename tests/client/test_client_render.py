@@ -124,7 +124,7 @@ def test_a_batch_takes_poses_as_it_goes(client):
     assert not list(client.render_batch("demo", []))
 
 
-def test_both_clients_have_the_same_methods(client_service):
+def test_both_clients_have_the_same_methods():
     def signatures(cls):
         public = inspect.getmembers(cls, lambda value: inspect.isfunction(value))
         return {
@@ -134,11 +134,6 @@ def test_both_clients_have_the_same_methods(client_service):
         }
 
     assert signatures(Client) == signatures(AsyncClient)
-    with Client(client_service.grpc) as ordinary:
-        for group in ("scenes", "datasets", "jobs"):
-            cls = type(getattr(ordinary, group))
-            other = inspect.getmodule(AsyncClient)
-            assert signatures(cls) == signatures(getattr(other, f"Async{cls.__name__}"))
 
 
 FAN = ConvexProbe(opening_angle_deg=50.0, near_mm=20.0, far_mm=60.0)

@@ -19,9 +19,9 @@ from ultragray.contract import annotated_fields
 from ultragray_service.cli.app import app as command_line
 from ultragray_service.environment import OTHER_VARIABLES
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings
-from ultragray_studies.scaling import DECIDED
 
 from ..distribution.projects import pyproject
+from ..documents.tables import rows
 from ..surroundings import ROOT
 from .envoy import FOLDER
 
@@ -196,16 +196,20 @@ def test_document_names_every_file():
     assert [path.name for path in sorted(UNITS.iterdir()) if path.name not in document] == []
 
 
+DECIDED = dict(rows("../scaling.md", "What was decided"))
+
+
 def test_rings_have_the_decided_size_and_bound():
     document = yaml.safe_load((FOLDER / "envoy.yaml").read_text(encoding="utf-8"))
     rings = [one for one in document["static_resources"]["clusters"] if one["lb_policy"] == "RING_HASH"]
     assert len(rings) == 2
     for ring in rings:
-        assert ring["ring_hash_lb_config"] == {"minimum_ring_size": DECIDED.minimum_ring_size}
+        assert ring["ring_hash_lb_config"] == {"minimum_ring_size": int(DECIDED["Envoy: `minimum_ring_size`"])}
         bound = ring["common_lb_config"]["consistent_hashing_lb_config"]
-        assert bound == {"hash_balance_factor": DECIDED.hash_balance_factor}
+        assert bound == {"hash_balance_factor": int(DECIDED["Envoy: `hash_balance_factor`"])}
 
 
 def test_replicas_are_added_at_the_decided_wait():
     values = yaml.safe_load((ROOT / "docker/helm/values.yaml").read_text(encoding="utf-8"))
-    assert values["service"]["autoscaling"]["queueDelaySeconds"] == DECIDED.queue_p95_ms / 1000
+    decided_ms = DECIDED["More replicas where 5% of `ultragray_queue_seconds` are above"].removesuffix(" ms")
+    assert values["service"]["autoscaling"]["queueDelaySeconds"] == int(decided_ms) / 1000

@@ -72,7 +72,7 @@ CASES = {
     "air": ({"contact": "air"}, {"contact": Contact.AIR}),
     "pressure": ({"contact": "pressure"}, {"contact": Contact.PRESSURE}),
     "a plane": ({"slice_thickness_mm": 0.0}, {"beam": ElevationBeam(0.0)}),
-    "a thick slice": ({"slice_thickness_mm": 6.0}, {"beam": BEAM.as_thick_as(6.0)}),
+    "a thick slice": ({"slice_thickness_mm": 6.0}, {"beam": replace(BEAM, thickness_mm=6.0)}),
     "tools": ({"tools": to_dict(TOOLS)}, {"tools": TOOLS}),
     "a needle and a ghost": ({"tools": to_dict((NEEDLE,)), "ghost": 0.5}, {"tools": (NEEDLE,), "ghost": 0.5}),
     "labels": ({"outputs": ["labels", "bmode"], "tools": to_dict(TOOLS)}, {"tools": TOOLS}),
@@ -204,7 +204,8 @@ def test_openigtlink_has_the_thickness_of_its_setting(served, scene):
     assert message.metadata["slice_thickness_mm"] == "6.0"
     pixels = unpack_image(message.content).pixels
     height, width = pixels.shape
-    truth = render(scene, None, POSE, height=height, width=width, outputs=("bmode",), beam=BEAM.as_thick_as(6.0)).bmode
+    beam = replace(BEAM, thickness_mm=6.0)
+    truth = render(scene, None, POSE, height=height, width=width, outputs=("bmode",), beam=beam).bmode
     np.testing.assert_allclose(pixels / 255.0, truth[0].numpy(), atol=1.0 / 255.0)  # the pose came as float32
 
 

@@ -13,7 +13,7 @@ from ultragray_service.core.threads import HelperProcesses
 from ultragray_service.settings import load_settings
 from ultragray_service.wiring import make_service
 from ultragray_workers.jobs.store import JobStore
-from ultragray_workers.shelves import folder
+from ultragray_workers.storage import local
 
 
 @pytest.fixture
@@ -45,7 +45,7 @@ async def points(service):
 LONG = {
     "the sync of an import": (scene_imports, "sync", receive),
     "a name asked of the database": (JobStore, "makes_scene", receive),
-    "the copy of an import": (folder, "link_or_copy", publish),
+    "the copy of an import": (local, "link_or_copy", publish),
     "points of a scene": (catalog, "point_message", points),
 }
 

@@ -24,7 +24,6 @@ class Rounds:
 
     @contextmanager
     def round(self) -> Iterator[None]:
-        """Logs an exception of the body: when it is another than the round before had, and every ten minutes."""
         try:
             yield
         except Exception as error:

@@ -43,7 +43,11 @@ def read_pose_array(path: str | Path) -> npt.NDArray[Any]:
     """
     path = Path(path)
     try:
-        return _with_last_row(_read(path))
+        array = np.asarray(_read(path))
+        if array.ndim not in (2, 3) or array.shape[-2:] != (3, 4) or array.dtype.kind not in "fiu":
+            return array
+        last = np.broadcast_to(np.array([0.0, 0.0, 0.0, 1.0]), (*array.shape[:-2], 1, 4))
+        return np.concatenate([array, last], axis=-2)
     except (OSError, ValueError, EOFError, RecursionError, MemoryError) as error:
         raise InvalidPose(f"{path}: {_reason(error)}", field="poses") from error
 
@@ -66,23 +70,12 @@ def _read(path: Path) -> Any:
     raise ValueError("poses are read from .npy, .json and .mcap files")
 
 
-def _with_last_row(poses: Any) -> npt.NDArray[Any]:
-    array = np.asarray(poses)
-    if array.ndim not in (2, 3) or array.shape[-2:] != (3, 4) or array.dtype.kind not in "fiu":
-        return array
-    last = np.broadcast_to(np.array([0.0, 0.0, 0.0, 1.0]), (*array.shape[:-2], 1, 4))
-    return np.concatenate([array, last], axis=-2)
-
-
 def _reason(error: BaseException) -> str:
     if isinstance(error, FileNotFoundError):
         return "no such file"
     if isinstance(error, RecursionError):
         return "it nests too deeply"
     return f"not a file of poses that can be read: {error}"
-
-
-# Poses in MCAP files: geometry_msgs/PoseStamped of ROS 2, metres, such as `ros2 bag record -s mcap` writes them.
 
 
 PREFERRED = "/probe_pose"  # the end of the topic of the ROS 2 node
@@ -117,7 +110,6 @@ def read_mcap_poses(path: Path) -> FloatArray:  # [P, 4, 4]
 
 
 def _topic(summary: Any) -> str:
-    """The topic that holds the poses of the probe."""
     if summary is None:
         raise ValueError("it has no summary: its writing was not finished")
     kinds = {number: schema.name for number, schema in summary.schemas.items()}

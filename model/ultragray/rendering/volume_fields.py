@@ -6,20 +6,20 @@ Fields are sums over Gaussians as `reference` has them, without a probe: nothing
 from __future__ import annotations
 
 import gzip
-import io
 import math
 import struct
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
 
 from ultragray.errors import InvalidArgument
-from ultragray.files import atomic_path, write_whole
+from ultragray.files import atomic_path, npy_bytes, write_whole
 from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.backends.reference import MAX_WEIGHT, MIN_WEIGHT, intensity, inverse_root_covariance
 from ultragray.rendering.derived import MIN_WEIGHT_SUM
@@ -61,24 +61,24 @@ class _Ellipsoids:
         return cls(means, roots, reach, intensities, absorbed, labels)
 
 
-def sample_volume(scene: GaussianScene, field: str, grid: VolumeGrid) -> Iterator[npt.NDArray[np.generic]]:
+def sample_volume(
+    scene: GaussianScene, field: str, grid: VolumeGrid, limits: Limits = UNLIMITED
+) -> Iterator[npt.NDArray[np.generic]]:
     """A field in slabs [k, J, I] that follow each other along the grid's last axis: float32, labels uint8.
 
     What is held at once does not grow with the grid. Raises InvalidArgument for a field that is none of VOLUME_FIELDS,
-    and for labels of a scene that has none.
+    and for labels of a scene that has none; while they are sampled FrameTooCostly and GivenUp by `limits`, whose
+    footprint pixels are those of the boxes around Gaussians.
     """
     check_field(field, has_labels=scene.labels is not None)
-    return _slabs(scene, field, grid, UNLIMITED)
+    return _slabs(scene, field, grid, limits)
 
 
 def sample_slice(
     scene: GaussianScene, field: str, grid: VolumeGrid, limits: Limits = UNLIMITED
 ) -> npt.NDArray[np.generic]:  # [J, I]
-    """A field on a plane (`VolumeGrid.on_plane`). Raises what `sample_volume` raises, and FrameTooCostly and GivenUp by
-    `limits`: footprint pixels are those of the boxes around Gaussians."""
-    check_field(field, has_labels=scene.labels is not None)
-    layer: npt.NDArray[np.generic] = np.concatenate(list(_slabs(scene, field, grid, limits)))[0]
-    return layer
+    """A field on a plane (`VolumeGrid.on_plane`). Raises what `sample_volume` raises."""
+    return np.concatenate(list(sample_volume(scene, field, grid, limits)))[0]
 
 
 def _slabs(scene: GaussianScene, field: str, grid: VolumeGrid, limits: Limits) -> Iterator[npt.NDArray[np.generic]]:
@@ -104,12 +104,10 @@ class _Slab:
 
     @property
     def footprint(self) -> int:
-        """Pairs of a Gaussian and a voxel of the box around it."""
         return int(self._box_voxels(self._touching).sum())
 
     def _box_voxels(self, ids: IndexArray) -> IndexArray:
-        voxels: IndexArray = (self._high[ids] - self._low[ids] + 1).prod(axis=1)
-        return voxels
+        return (self._high[ids] - self._low[ids] + 1).prod(axis=1)
 
     def values(self, field: str) -> npt.NDArray[np.generic]:  # [voxels]
         ellipsoids = self.ellipsoids
@@ -118,14 +116,9 @@ class _Slab:
         if field == "labels":
             return self._labels()
         if field == "coverage":
-            return self._coverage(self._sums(self._touching, None)[0]).astype(np.float32)
+            return -np.expm1(-self._sums(self._touching, None)[0]).astype(np.float32)
         weight, weighted = self._sums(self._touching, None, ellipsoids.intensities)
-        return (self._coverage(weight) * weighted / (weight + 1e-8)).astype(np.float32)
-
-    @staticmethod
-    def _coverage(weight: FloatArray) -> FloatArray:
-        coverage: FloatArray = -np.expm1(-weight)
-        return coverage
+        return (-np.expm1(-weight) * weighted / (weight + 1e-8)).astype(np.float32)
 
     def _labels(self) -> npt.NDArray[np.uint8]:
         found, heaviest = np.zeros(math.prod(self.shape), np.uint8), np.zeros(math.prod(self.shape))
@@ -179,7 +172,6 @@ class _Slab:
 # takes the poses that arrive over OpenIGTLink. A program that shows LPS coordinates, such as ITK, negates the first
 # two.
 
-
 _COMPRESSION = 4  # of 1 to 9: beyond, seconds buy hardly a byte
 _UINT8, _FLOAT32 = 2, 16  # data types of NIfTI
 _ALIGNED, _MILLIMETRES = 2, 2
@@ -205,18 +197,20 @@ def write_volume(
     if suffix is None:
         raise InvalidArgument(f"a volume must end in {', '.join(VOLUME_SUFFIXES)}, got {path.name!r}", field="output")
     slabs = sample_volume(scene, field, grid)
-    with atomic_path(path) as temporary, temporary.open("wb") as file:
-        match suffix:
-            case ".nrrd":
-                file.write(_nrrd_header(field, grid, scene.info.label_names))
-                _write_compressed(file, b"", slabs, after_slab)
-            case ".nii":
-                file.write(_nifti_header(field, grid))
-                _write_slabs(file, slabs, after_slab)
-            case ".nii.gz":
-                _write_compressed(file, _nifti_header(field, grid), slabs, after_slab)
-            case _:
-                raise NotImplementedError(suffix)
+    with ExitStack() as stack:
+        file: Any = stack.enter_context(stack.enter_context(atomic_path(path)).open("wb"))
+        if suffix == ".nrrd":
+            file.write(_nrrd_header(field, grid, scene.info.label_names))
+        if suffix != ".nii":  # the header of NRRD is text before what is compressed
+            file = stack.enter_context(gzip.GzipFile("", "wb", _COMPRESSION, file, mtime=0))
+        if suffix != ".nrrd":
+            file.write(_nifti_header(field, grid))
+        done = 0
+        for slab in slabs:
+            file.write(slab.astype(slab.dtype.newbyteorder("<"), copy=False).tobytes())
+            done += len(slab)
+            if after_slab is not None:
+                after_slab(done)
 
 
 def write_slice(path: str | Path, scene: GaussianScene, field: str, grid: VolumeGrid) -> None:
@@ -229,15 +223,8 @@ def write_slice(path: str | Path, scene: GaussianScene, field: str, grid: Volume
     if path.suffix not in SLICE_SUFFIXES:
         raise InvalidArgument(f"a slice must end in {', '.join(SLICE_SUFFIXES)}, got {path.name!r}", field="output")
     pixels = sample_slice(scene, field, grid)
-    match path.suffix:
-        case ".npy":
-            data = io.BytesIO()
-            np.save(data, pixels)
-            write_whole(path, data.getvalue())
-        case ".png":
-            write_whole(path, image_file(as_grey(pixels, field), ".png").tobytes())
-        case _:
-            raise NotImplementedError(path.suffix)
+    is_picture = path.suffix == ".png"
+    write_whole(path, image_file(as_grey(pixels, field), ".png").tobytes() if is_picture else npy_bytes(pixels))
 
 
 def as_grey(pixels: npt.NDArray[Any], field: str) -> npt.NDArray[Any]:  # [J, I] -> [J, I]
@@ -250,30 +237,6 @@ def volume_facts(info: SceneInfo, field: str, grid: VolumeGrid) -> dict[str, Any
     names = {str(number): name for number, name in info.label_names.items()} if field == "labels" else {}
     shape, affine = list(grid.shape), grid.affine.tolist()
     return {"field": field, "shape": shape, "spacing_mm": grid.spacing_mm, "affine": affine, "label_names": names}
-
-
-def _write_compressed(
-    file: BinaryIO,
-    begin: bytes,
-    slabs: Iterable[npt.NDArray[np.generic]],
-    after_slab: Callable[[int], object] | None,
-) -> None:
-    with gzip.GzipFile("", "wb", _COMPRESSION, file, mtime=0) as packed:
-        packed.write(begin)
-        _write_slabs(packed, slabs, after_slab)
-
-
-def _write_slabs(
-    file: BinaryIO | gzip.GzipFile,
-    slabs: Iterable[npt.NDArray[np.generic]],
-    after_slab: Callable[[int], object] | None,
-) -> None:
-    done = 0
-    for slab in slabs:
-        file.write(slab.astype(slab.dtype.newbyteorder("<"), copy=False).tobytes())
-        done += len(slab)
-        if after_slab is not None:
-            after_slab(done)
 
 
 def _nifti_header(field: str, grid: VolumeGrid) -> bytes:  # [352]
@@ -296,7 +259,8 @@ def _nifti_header(field: str, grid: VolumeGrid) -> bytes:  # [352]
 
 
 def _nrrd_header(field: str, grid: VolumeGrid, label_names: Mapping[int, str]) -> bytes:
-    directions = " ".join(_nrrd_vector(axis * grid.spacing_mm) for axis in grid.axes)
+    vectors = (*(axis * grid.spacing_mm for axis in grid.axes), grid.origin_mm)
+    *directions, origin = (f"({','.join(repr(float(value)) for value in vector)})" for vector in vectors)
     lines = [
         "NRRD0005",
         f"content: UltraG-Ray {field}",
@@ -304,21 +268,14 @@ def _nrrd_header(field: str, grid: VolumeGrid, label_names: Mapping[int, str]) -
         "dimension: 3",
         "space: right-anterior-superior",
         f"sizes: {' '.join(map(str, grid.shape))}",
-        f"space directions: {directions}",
+        f"space directions: {' '.join(directions)}",
         "kinds: domain domain domain",
         'space units: "mm" "mm" "mm"',
-        f"space origin: {_nrrd_vector(grid.origin_mm)}",
+        f"space origin: {origin}",
         "endian: little",
         "encoding: gzip",
     ]
     if field == "labels":
-        lines += [f"label {number}:={_one_line(name)}" for number, name in sorted(label_names.items())]
+        names = {number: name.replace("\\", "\\\\").replace("\n", "\\n") for number, name in label_names.items()}
+        lines += [f"label {number}:={name}" for number, name in sorted(names.items())]
     return ("\n".join(lines) + "\n\n").encode()
-
-
-def _nrrd_vector(vector: npt.NDArray[np.float64]) -> str:
-    return "(" + ",".join(repr(float(value)) for value in vector) + ")"
-
-
-def _one_line(text: str) -> str:
-    return text.replace("\\", "\\\\").replace("\n", "\\n")

@@ -237,12 +237,11 @@ def render_shards(
 ) -> tuple[str, dict[str, Any]]:
     """Render what is missing of a batch on a cluster, and write its manifest; a sentence and a document of it."""
     from ultragray_workers.batches.on_ray import RayBatch, check_address
-    from ultragray_workers.storage.location import open_storage
+    from ultragray_workers.storage.location import parse_location
 
     check_address(on)
-    storage = open_storage(output)
-    if storage.local is not None:
-        folder = storage.local.resolve()
+    if isinstance(location := parse_location(output, "output"), Path):
+        folder = location.resolve()
         if folder.exists() and not folder.is_dir():
             raise InvalidArgument(f"--output must be a folder with --on, {output} is a file", field="output")
         output = str(folder)  # the workers of a cluster have other working folders

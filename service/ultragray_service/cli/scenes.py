@@ -360,7 +360,8 @@ def slicer(
     pose = poses[len(poses) // 2] if len(poses) else np.eye(4)
 
     from ultragray import GaussianScene
-    from ultragray.exchange.slicer import SlicerScene
+    from ultragray.exchange.slicer import slicer_scene
+    from ultragray.files import write_whole
     from ultragray.rendering.volume_fields import write_volume
     from ultragray.rendering.volumes import VolumeGrid
 
@@ -368,7 +369,7 @@ def slicer(
     with working(f"sampling {' x '.join(map(str, grid.shape))} points …"):
         write_volume(volume, GaussianScene.load(scene), "echo", grid)
     device = device_of(scene.stem)
-    SlicerScene(host, port, device, pose, volume.name).write(output)
+    write_whole(output, slicer_scene(host, port, device, pose, volume.name))
     image = image_name(device)
     document = {"file": str(output), "volume": str(volume), "device": device, "image": image, "address": igtl_address}
     tell(f"wrote {output} and {volume}: {device} is sent to {igtl_address}, {image} comes back", document, as_json=json)

@@ -143,7 +143,7 @@ class Report:
         for number, name in enumerate(columns):
             table.add_column(name, justify="right" if number else "left")
         for row in rows:
-            table.add_row(*(_cell(pattern, row) for pattern in columns.values()))
+            table.add_row(*(cell(pattern, row) for pattern in columns.values()))
         self._console.print(table)
         for note in notes:
             self._console.print(note)
@@ -153,7 +153,7 @@ class Report:
             self._console.print(f"written to {self._output}")
 
 
-def _cell(pattern: str, row: Mapping[str, Any]) -> str:
+def cell(pattern: str, row: Mapping[str, Any]) -> str:
     """The figures of a row in a format string; empty where one is None."""
     try:
         return pattern.format_map(row)

@@ -1,5 +1,6 @@
 """`ultragray bench`: the cost of a frame in the kernel and through each front door, here and now.
 
+Each door is that of a real server in a process of its own: gRPC by the Python client, HTTP by the standard library.
 Machines drift, so every time is also given in yards, a fixed piece of work timed in the same run (docs/physics.md §5).
 """
 
@@ -7,62 +8,28 @@ from __future__ import annotations
 
 import http.client
 import json
-import mmap
 import os
-import queue
 import re
-import secrets
 import socket
 import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
-import grpc
 import torch
 
 from ultragray.geometry.probe import FloatArray
-from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
-from ultragray_service.cli.connection import Connection
-from ultragray_service.rpc.shared_memory import FOLDER, FREE, HEADER_BYTES, TOKEN_BYTES
+from ultragray_client import Client, Encoding, FrameStream, RenderSettings
 from ultragray_studies.bench.kernel import BenchScene, bench_poses, bench_scenes, measure_kernel, time_ms
 from ultragray_studies.bench.report import Report, percentiles
 from ultragray_workers.errors import NotReady
 from ultragray_workers.jobs.worker.process import account_of
-
-_SLOT_BYTES = 4 * 2**20
-
-
-class SharedFile:
-    """A client's side of shared memory, as rendering.proto has it; the service removes the name of the file."""
-
-    def __init__(self, slots: int) -> None:
-        self.message = rendering_pb2.SharedMemory(
-            name=f"ultragray-{secrets.token_hex(16)}",
-            token=secrets.token_bytes(TOKEN_BYTES),
-            slots=slots,
-            slot_bytes=_SLOT_BYTES,
-        )
-        size = HEADER_BYTES + slots * _SLOT_BYTES
-        descriptor = os.open(f"{FOLDER}/{self.message.name}", os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
-        os.ftruncate(descriptor, size)
-        os.pwrite(descriptor, self.message.token + FREE * slots, 0)
-        self._map = mmap.mmap(descriptor, size)
-        os.close(descriptor)
-
-    def free(self, data: rendering_pb2.SharedData) -> None:
-        """The client has looked at the pixels where they lie."""
-        self._map[TOKEN_BYTES + data.slot : TOKEN_BYTES + data.slot + 1] = FREE
-
-
-# Latency and rate through each front door of a real server in a process of its own.
-
 
 SCENE = "bench"
 IN_FLIGHT = 8
@@ -95,7 +62,7 @@ def measure_served(bench: BenchScene, repeats: int, backend: str) -> Served:
         bench.scene.save(Path(folder) / f"{SCENE}.ugr")
         with running_server(Path(folder), backend, SCENE) as server:
             doors = [measure(server, poses) for measure in DOORS.values()]
-            return Served(doors, max(map(_memory_mb, _descendants(server.pid)), default=0.0))
+            return Served(doors, max(_memory_of_children_mb(server.pid), default=0.0))
 
 
 @dataclass(frozen=True)
@@ -108,9 +75,13 @@ class RunningServer:
     pid: int
     ready_s: float  # from its start until it was ready
 
-    def connection(self) -> Connection:
-        """A connection over HTTP."""
-        return Connection(f"http://127.0.0.1:{self.http_port}")
+    def client(self) -> Client:
+        """A client over gRPC."""
+        return Client(f"127.0.0.1:{self.grpc_port}")
+
+    def http(self) -> closing[http.client.HTTPConnection]:
+        """A connection over HTTP, which stays open."""
+        return closing(http.client.HTTPConnection("127.0.0.1", self.http_port, timeout=START_TIMEOUT_S))
 
 
 @contextmanager
@@ -118,25 +89,26 @@ def running_server(
     folder: Path, backend: str, scene: str, *, job_threads: int = 0, python: str = sys.executable
 ) -> Iterator[RunningServer]:
     """A service at rest of the scenes in `folder`, `scene` for OpenIGTLink, run by `python`. Raises NotReady."""
-    http_port, grpc_port, igtl_port = _free_port(), _free_port(), _free_port()
+    ports = {name: _free_port() for name in ("HTTP", "GRPC", "IGTL")}
     settings = {
-        "ULTRAGRAY_DATA_FOLDER": str(folder),
-        "ULTRAGRAY_HTTP_PORT": str(http_port),
-        "ULTRAGRAY_GRPC_PORT": str(grpc_port),
-        "ULTRAGRAY_IGTL_PORT": str(igtl_port),
-        "ULTRAGRAY_IGTL_SCENE": scene,
-        "ULTRAGRAY_TRAINING_THREADS": str(job_threads),
-        "ULTRAGRAY_BACKEND": backend,
-        "ULTRAGRAY_PRELOAD": scene,
-        "ULTRAGRAY_LOG_LEVEL": "error",
+        "DATA_FOLDER": folder,
+        **{f"{name}_PORT": port for name, port in ports.items()},
+        "IGTL_SCENE": scene,
+        "TRAINING_THREADS": job_threads,
+        "BACKEND": backend,
+        "PRELOAD": scene,
+        "LOG_LEVEL": "error",
     }
+    environment = os.environ | {f"ULTRAGRAY_{name}": str(value) for name, value in settings.items()}
     started = time.perf_counter()
-    process = subprocess.Popen([python, "-m", "ultragray_service"], env={**os.environ, **settings})
+    process = subprocess.Popen([python, "-m", "ultragray_service"], env=environment)
     try:
-        _wait_ready(process, http_port)
-        ready_s = time.perf_counter() - started
-        _wait_settled(process.pid)
-        yield RunningServer(http_port, grpc_port, igtl_port, process.pid, ready_s)
+        server = RunningServer(ports["HTTP"], ports["GRPC"], ports["IGTL"], process.pid, 0.0)
+        _wait(partial(_is_ready, server, process), 0.1, "was not ready")
+        server = replace(server, ready_s=time.perf_counter() - started)
+        # The worker for jobs starts too, which takes some seconds of both cores.
+        _wait(partial(_is_settled, process.pid), 0.0, "did not come to rest")
+        yield server
     finally:
         process.terminate()
         process.wait(timeout=30)
@@ -148,120 +120,70 @@ def _free_port() -> int:
         return int(probe.getsockname()[1])
 
 
-def _wait_ready(process: subprocess.Popen[bytes], port: int) -> None:
+def _wait(is_so: Callable[[], bool], pause_s: float, failing: str) -> None:
     end = time.monotonic() + START_TIMEOUT_S
-    while time.monotonic() < end and process.poll() is None:
-        with suppress(OSError), closing(http.client.HTTPConnection("127.0.0.1", port, timeout=5)) as connection:
-            connection.request("GET", "/v1/health/ready")
-            if connection.getresponse().status == 200:
-                return
-        time.sleep(0.1)
-    raise NotReady(f"the server of the benchmark was not ready within {START_TIMEOUT_S:g} s")
+    while not is_so():
+        if time.monotonic() > end:
+            raise NotReady(f"the server of the benchmark {failing} within {START_TIMEOUT_S:g} s")
+        time.sleep(pause_s)
 
 
-def _wait_settled(pid: int) -> None:
-    """Returns when the worker for jobs has started too, which takes some seconds of both cores. Raises NotReady."""
-    end = time.monotonic() + START_TIMEOUT_S
+def _is_ready(server: RunningServer, process: subprocess.Popen[bytes]) -> bool:
+    if process.poll() is not None:
+        raise NotReady(f"the server of the benchmark ended with the status {process.returncode}")
+    with suppress(OSError), server.http() as connection:
+        connection.request("GET", "/v1/health/ready")
+        return connection.getresponse().status == 200
+    return False
+
+
+def _is_settled(pid: int) -> bool:
     before = account_of(pid).cpu_s
-    while time.monotonic() < end:
-        time.sleep(1.0)
-        before, used_s = (now := account_of(pid).cpu_s), now - before
-        if used_s < SETTLED_SHARE:
-            return
-    raise NotReady(f"the server of the benchmark did not come to rest within {START_TIMEOUT_S:g} s")
-
-
-def pose_message(pose: FloatArray) -> geometry_pb2.Pose:  # [4, 4] mm
-    """A pose as gRPC takes it."""
-    return geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=pose.ravel().tolist()))
+    time.sleep(1.0)
+    return account_of(pid).cpu_s - before < SETTLED_SHARE
 
 
 def _grpc_stream(
-    what: str, outputs: Sequence[str], encoding: str, shares: bool, server: RunningServer, poses: FloatArray
+    what: str, settings: RenderSettings, shares_memory: bool, server: RunningServer, poses: FloatArray
 ) -> FrontDoor:
-    """`shares`: frames come through shared memory."""
-    settings = rendering_pb2.RenderSettings(scene=SCENE, outputs=outputs, encoding=encoding)
-    with grpc.insecure_channel(f"127.0.0.1:{server.grpc_port}") as channel:
-        stub = rendering_pb2_grpc.RenderServiceStub(channel)
-        memory, room = SharedFile(2 * IN_FLIGHT) if shares else None, _Turns()
-        stream = stub.RenderStream(room.requests(settings, poses, memory))
-        latency_ms = []
-        for _ in poses:
+    def ask(stream: FrameStream, pose: FloatArray) -> None:
+        stream.send(pose)
+        stream.receive()
+
+    with server.client() as client:
+        with client.stream(SCENE, settings, shared_memory=shares_memory) as stream:
+            latency_ms = [time_ms(ask, stream, pose) for pose in poses]
+        with client.stream(SCENE, settings, shared_memory=shares_memory) as stream:
             started = time.perf_counter()
-            room.release()
-            _take(next(stream), memory)
-            latency_ms.append(1000.0 * (time.perf_counter() - started))
-        memory, room = SharedFile(2 * IN_FLIGHT) if shares else None, _Turns()
-        started = time.perf_counter()
-        stream = stub.RenderStream(room.requests(settings, poses, memory))
-        for _ in range(IN_FLIGHT):
-            room.release()
-        for frame in stream:
-            _take(frame, memory)
-            room.release()
-        rate = len(poses) / (time.perf_counter() - started)
+            for pose in poses[:IN_FLIGHT]:
+                stream.send(pose)
+            for pose in poses[IN_FLIGHT:]:
+                stream.receive()
+                stream.send(pose)
+            for _ in poses[:IN_FLIGHT]:
+                stream.receive()
+            rate = len(poses) / (time.perf_counter() - started)
     return FrontDoor(what, latency_ms[WARM_UP:], rate)
 
 
-class _Turns:
-    """A request iterator that yields only after `release`, so that a known number is in flight."""
-
-    def __init__(self) -> None:
-        self._turns: queue.Queue[None] = queue.Queue()
-
-    def release(self) -> None:
-        self._turns.put(None)
-
-    def requests(
-        self, settings: rendering_pb2.RenderSettings, poses: FloatArray, memory: SharedFile | None
-    ) -> Iterator[rendering_pb2.RenderStreamRequest]:
-        for sequence, pose in enumerate(poses):
-            self._turns.get()
-            request = rendering_pb2.RenderStreamRequest(sequence=sequence, pose=pose_message(pose))
-            if sequence == 0:
-                request.settings.CopyFrom(settings)
-                if memory is not None:
-                    request.shared_memory.CopyFrom(memory.message)
-            yield request
-
-
-def _take(frame: rendering_pb2.Frame, memory: SharedFile | None) -> None:
-    """Raises NotReady for an error in place of a frame, and for pixels that do not lie where they should."""
-    if frame.HasField("error"):
-        raise NotReady(f"the benchmark's frame {frame.sequence} failed: {frame.error.detail}")
-    if memory is not None:
-        if not frame.HasField("shared_data"):
-            raise NotReady(f"the benchmark's frame {frame.sequence} did not come through shared memory")
-        memory.free(frame.shared_data)
-
-
 def _grpc_unary(server: RunningServer, poses: FloatArray) -> FrontDoor:
-    settings = rendering_pb2.RenderSettings(scene=SCENE)
-    with grpc.insecure_channel(f"127.0.0.1:{server.grpc_port}") as channel:
-        stub = rendering_pb2_grpc.RenderServiceStub(channel)
-        return _one_by_one(
-            "gRPC unary",
-            poses,
-            lambda pose: stub.Render(rendering_pb2.RenderRequest(settings=settings, pose=pose_message(pose))),
-        )
+    with server.client() as client:
+        return _one_by_one("gRPC unary", poses, partial(client.render, SCENE))
 
 
 def _http(what: str, media_type: str, server: RunningServer, poses: FloatArray) -> FrontDoor:
-    connection = http.client.HTTPConnection("127.0.0.1", server.http_port, timeout=60)
     headers = {"Accept": media_type, "Content-Type": "application/json"}
+    with server.http() as connection:
 
-    def render(pose: FloatArray) -> None:
-        body = json.dumps({"pose": {"matrix": pose.tolist()}})
-        connection.request("POST", f"/v1/scenes/{SCENE}/render", body, headers)
-        response = connection.getresponse()
-        data = response.read()
-        if response.status != 200:
-            raise NotReady(f"the benchmark's frame failed: {data[:500]!r}")
+        def render(pose: FloatArray) -> None:
+            body = json.dumps({"pose": {"matrix": pose.tolist()}})
+            connection.request("POST", f"/v1/scenes/{SCENE}/render", body, headers)
+            response = connection.getresponse()
+            data = response.read()
+            if response.status != 200:
+                raise NotReady(f"the benchmark's frame failed: {data[:500]!r}")
 
-    try:
         return _one_by_one(what, poses, render)
-    finally:
-        connection.close()
 
 
 def _one_by_one(what: str, poses: FloatArray, render: Callable[[FloatArray], object]) -> FrontDoor:
@@ -269,13 +191,12 @@ def _one_by_one(what: str, poses: FloatArray, render: Callable[[FloatArray], obj
     return FrontDoor(what, counted, 1000.0 * len(counted) / sum(counted))
 
 
-_BMODE = ("OUTPUT_BMODE",), "ENCODING_UINT8"
-_PLANES = ("OUTPUT_BMODE", "OUTPUT_ECHO", "OUTPUT_TRANSMITTANCE"), "ENCODING_FLOAT32"
+_PLANES = RenderSettings(outputs=("bmode", "echo", "transmittance"), encoding=Encoding.FLOAT32)
 _STREAMS = {
-    "gRPC stream": (*_BMODE, False),
-    "gRPC stream, shared memory": (*_BMODE, True),
-    "gRPC stream, 3 float32 outputs": (*_PLANES, False),
-    "gRPC stream, 3 float32 outputs, shared memory": (*_PLANES, True),
+    "gRPC stream": (RenderSettings(), False),
+    "gRPC stream, shared memory": (RenderSettings(), True),
+    "gRPC stream, 3 float32 outputs": (_PLANES, False),
+    "gRPC stream, 3 float32 outputs, shared memory": (_PLANES, True),
 }
 DOORS: dict[str, Callable[[RunningServer, FloatArray], FrontDoor]] = {
     **{what: partial(_grpc_stream, what, *how) for what, how in _STREAMS.items()},
@@ -285,37 +206,17 @@ DOORS: dict[str, Callable[[RunningServer, FloatArray], FrontDoor]] = {
 }
 
 
-def _descendants(pid: int) -> list[int]:
-    parents = {}
-    for folder in Path("/proc").glob("[0-9]*"):
-        try:
-            status = (folder / "status").read_text()
-        except OSError:
-            continue
-        if match := re.search(r"^PPid:\s+(\d+)", status, re.MULTILINE):
-            parents[int(folder.name)] = int(match[1])
-    found = [pid]
-    for parent in found:
-        found += [child for child, of in parents.items() if of == parent]
-    return found[1:]
+def _memory_of_children_mb(pid: int) -> Iterator[float]:
+    """Of each process below one, its resident memory with shared pages counted by share."""
+    for children in Path(f"/proc/{pid}/task").glob("*/children"):
+        for child in children.read_text(encoding="ascii").split():
+            with suppress(OSError):
+                rollup = Path(f"/proc/{child}/smaps_rollup").read_text(encoding="ascii")
+                if match := re.search(r"^Pss:\s+(\d+) kB", rollup, re.MULTILINE):
+                    yield int(match[1]) / 1024.0
+                yield from _memory_of_children_mb(int(child))
 
 
-def _memory_mb(pid: int) -> float:
-    try:
-        rollup = Path(f"/proc/{pid}/smaps_rollup").read_text()
-    except OSError:
-        return 0.0
-    match = re.search(r"^Pss:\s+(\d+) kB", rollup, re.MULTILINE)
-    return int(match[1]) / 1024.0 if match else 0.0
-
-
-# `ultragray bench`: the cost of a frame in the kernel and through each front door, here and now.
-#
-# Machines drift, so every time is also given in yards, a fixed piece of work timed in the same run (docs/physics.md
-# §5).
-
-
-Row: TypeAlias = dict[str, Any]
 COLUMNS = {
     "what": "{what}",
     "Gaussians": "{gaussians:,}",
@@ -335,7 +236,7 @@ def bench_frames(output: Path | None, quick: bool) -> None:
     report = Report(output, quick)
     repeats = 20 if quick else 200
     threads = torch.get_num_threads()
-    rows: list[Row] = []
+    rows: list[dict[str, Any]] = []
     memory_mb: dict[str, float] = {}
     report.time_yard()
     for scene in bench_scenes(quick):
@@ -353,7 +254,6 @@ def bench_frames(output: Path | None, quick: bool) -> None:
             row = _row(scene, yard, door.what, threads, 1, door.latency_ms)
             rows.append({**row, "frames_per_s": door.frames_per_s, "above_kernel_ms": row["p50_ms"] - kernel_p50})
     document = report.cpu_document(worker_memory_mb=memory_mb, rows=rows)
-    versions = document["versions"]
     names = ("ultragray", "torch", "numpy", "grpc", "uvicorn", "python")
     report.conclude(
         document,
@@ -361,12 +261,14 @@ def bench_frames(output: Path | None, quick: bool) -> None:
         rows,
         [
             *(f"worker memory with {int(count):,} Gaussians: {mb:.0f} MB" for count, mb in memory_mb.items()),
-            ", ".join(f"{name} {versions[name]}" for name in names),
+            ", ".join(f"{name} {document['versions'][name]}" for name in names),
         ],
     )
 
 
-def _row(scene: BenchScene, yard_ms: float, what: str, threads: int, poses: int, frame_ms: list[float]) -> Row:
+def _row(
+    scene: BenchScene, yard_ms: float, what: str, threads: int, poses: int, frame_ms: list[float]
+) -> dict[str, Any]:
     """One measurement: times per frame of `poses` rendered together; `above_kernel_ms` is for front doors."""
     p50, p99 = percentiles(frame_ms, 50, 99)
     return {

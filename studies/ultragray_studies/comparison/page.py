@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections import Counter
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +22,6 @@ from ultragray_studies.comparison.result import RESULT_FILE, Comparison, MethodR
 from ultragray_studies.comparison.run import frames_of
 from ultragray_studies.comparison.tables import budget_text, cost_texts, latex_table, steps_text
 from ultragray_studies.methods.gaussians import SceneMethod
-from ultragray_studies.methods.method import Description
 
 DISTANCE_BINS, LEAST_IN_BIN = 8, 3  # frames in fewer bins where there are not many
 LEAST_TURN_DEG = 1.0  # held-out frames that differ less in their angle show nothing by it
@@ -30,24 +29,13 @@ TILT_BINS = 6
 TILT_COLOURS = {"scene": SCENE_COLOUR, "median": COLOURS[0], "nearest": COLOURS[-1]}
 
 
-@dataclass(frozen=True)
-class Binned:
-    """Medians of a metric in bins of distance."""
-
-    distances: FloatArray  # [B] the median of each bin
-    medians: FloatArray  # [B]
-
-
-def binned_medians(distances: FloatArray, values: FloatArray) -> Binned:  # [F] both
-    """In at most DISTANCE_BINS bins of about equally many frames; frames equally far are in one bin."""
+def binned_medians(distances: FloatArray, values: FloatArray) -> FloatArray:  # [F] both -> [2, B]
+    """Medians of both in at most DISTANCE_BINS bins of about equally many frames; those equally far are in one bin."""
     count = max(1, min(DISTANCE_BINS, len(distances) // LEAST_IN_BIN))
     edges = np.unique(np.quantile(distances, np.linspace(0.0, 1.0, count + 1)).round(9))
     bins = np.searchsorted(edges[1:-1], distances.round(9), side="right")
     filled = [bins == number for number in np.unique(bins)]
-    return Binned(
-        np.array([np.median(distances[inside]) for inside in filled]),
-        np.array([np.median(values[inside]) for inside in filled]),
-    )
+    return np.array([[np.median(of[inside]) for inside in filled] for of in (distances, values)])
 
 
 def plot_distances(evaluations: Mapping[str, Evaluation], distances: Distances) -> str:
@@ -62,8 +50,7 @@ def plot_distances(evaluations: Mapping[str, Evaluation], distances: Distances) 
     for axis, (label, away) in zip(axes, shown.items(), strict=True):
         for place, (name, evaluation) in enumerate(evaluations.items()):
             psnr_db = np.array([frame.psnr_db for frame in evaluation.frames])
-            found = binned_medians(away, psnr_db)
-            axis.plot(found.distances, found.medians, marker="o", markersize=3.5, label=name, **line_style(place))
+            axis.plot(*binned_medians(away, psnr_db), marker="o", markersize=3.5, label=name, **line_style(place))
         axis.set(xlabel=label, ylabel="PSNR, dB (median)")
     handles, labels = axes[0].get_legend_handles_labels()
     drawn.legend(handles, labels, loc="outside right center", frameon=False, fontsize=9)
@@ -102,88 +89,54 @@ def plot_counts(points: Mapping[int, FrameMetrics]) -> str:
 # The page of a comparison: one HTML file that needs nothing else.
 
 
-@dataclass(frozen=True)
-class _Method:
-    """A method in words."""
-
-    name: str
-    title: str
-    anchor: str
-    description: Description
-    short: str | None  # by how much it is
-
-
 def render_comparison(comparison: Comparison, dataset: Dataset, folder: Path) -> str:
     """The HTML text; `folder` is that of the comparison, with the frames of each method."""
-    titles = _titles(comparison)
-    by_title = {titles[one.name]: one for one in comparison.results}
-    evaluations = {titles[name]: comparison.measured[name] for name in by_mean_rank(comparison.measured)}
-    return (
-        environment("ultragray_studies")
-        .get_template("comparison.html")
-        .render(
-            comparison=comparison,
-            facts=_facts(comparison),
-            rows=_rows(evaluations, by_title),
-            ranks=_with_anchors(rank_rows(evaluations), by_title),
-            speckle=speckle_rows(evaluations),
-            pictures=_pictures(evaluations, by_title, dataset, folder),
-            distance_plot=plot_distances(_scene_first(evaluations, titles), comparison.distances)
-            if evaluations
-            else None,
-            methods=[
-                _Method(one.name, title, _anchor(one), one.description, _short_text(one))
-                for title, one in by_title.items()
-            ],
-            shortened=any(one.is_short for one in comparison.results),
-            scales=min((found.ms_ssim_scales for found in evaluations.values()), default=5),
-        )
-    )
-
-
-def _titles(comparison: Comparison) -> dict[str, str]:
-    """By name; methods of the same title are told apart by their names."""
     counts = Counter(one.title for one in comparison.results)
-    return {
-        one.name: one.title if counts[one.title] == 1 else f"{one.title} ({one.name})" for one in comparison.results
+    by_title = {  # methods of the same title are told apart by their names
+        one.title if counts[one.title] == 1 else f"{one.title} ({one.name})": one for one in comparison.results
     }
-
-
-def _anchor(result: MethodResult) -> str:
-    return f"method-{result.name}"
-
-
-def _with_anchors(rows: list[Row], by_title: dict[str, MethodResult]) -> list[Row]:
-    return [replace(row, anchor=_anchor(by_title[row.name])) for row in rows]
-
-
-def _rows(evaluations: dict[str, Evaluation], by_title: dict[str, MethodResult]) -> list[Row]:
-    """Those that were measured, then those that failed."""
-    ranks = rank(evaluations)
+    titles = {one.name: title for title, one in by_title.items()}
+    evaluations = {titles[name]: comparison.measured[name] for name in by_mean_rank(comparison.measured)}
+    scene, ranks = titles.get(SceneMethod.name), rank(evaluations)
+    scene_first = {title: evaluations[title] for title in sorted(evaluations, key=lambda title: title != scene)}
     notes = {title: [f"{ranks[title].mean:.2f}", *cost_texts(by_title[title])] for title in evaluations}
     failed = [Row(title, failure=one.failure) for title, one in by_title.items() if one.failure is not None]
-    return _with_anchors([*metric_rows(evaluations, notes), *failed], by_title)
+
+    def with_anchors(rows: list[Row]) -> list[Row]:
+        return [replace(row, anchor=f"method-{by_title[row.name].name}") for row in rows]
+
+    values = {
+        "comparison": comparison,
+        "facts": _facts(comparison),
+        "rows": with_anchors([*metric_rows(evaluations, notes), *failed]),
+        "ranks": with_anchors(rank_rows(evaluations)),
+        "speckle": speckle_rows(evaluations),
+        "pictures": _pictures(evaluations, scene, by_title, dataset, folder),
+        "distance_plot": plot_distances(scene_first, comparison.distances) if evaluations else None,
+        "methods": [{"title": title, "row": one, "short": _short_text(one)} for title, one in by_title.items()],
+        "shortened": any(one.cost.is_short for one in comparison.results),
+        "scales": min((found.ms_ssim_scales for found in evaluations.values()), default=5),
+    }
+    return environment("ultragray_studies").get_template("comparison.html").render(values)
 
 
 def _pictures(
-    evaluations: dict[str, Evaluation], by_title: dict[str, MethodResult], dataset: Dataset, folder: Path
+    evaluations: dict[str, Evaluation],
+    scene: str | None,
+    by_title: dict[str, MethodResult],
+    dataset: Dataset,
+    folder: Path,
 ) -> list[FrameOfPage]:
     """The frames that tell most of the scene, or of the best method where the scene was not measured."""
     if not evaluations:
         return []
-    best = next(iter(evaluations))
-    telling = next((title for title in evaluations if by_title[title].name == SceneMethod.name), best)
+    telling = next((title for title in evaluations if title == scene), next(iter(evaluations)))
     places = telling_places(evaluations[telling])
     shown = [
         Shown.prediction(title, frames_of(folder, by_title[title].name), evaluation, list(places))
         for title, evaluation in evaluations.items()
     ]
     return frames_of_page(dataset.val.select(list(places)), list(places.values()), shown)
-
-
-def _scene_first(evaluations: dict[str, Evaluation], titles: dict[str, str]) -> dict[str, Evaluation]:
-    scene = titles.get(SceneMethod.name)
-    return {title: evaluations[title] for title in sorted(evaluations, key=lambda title: title != scene)}
 
 
 def _facts(comparison: Comparison) -> dict[str, str]:
@@ -203,9 +156,10 @@ def _facts(comparison: Comparison) -> dict[str, str]:
 
 
 def _short_text(result: MethodResult) -> str | None:
-    if not result.is_short or result.of_steps is None:
+    cost = result.cost
+    if not cost.is_short or cost.of_steps is None:
         return None
-    return f"Short: {steps_text(result)} steps of its author's recipe ({100.0 * result.steps / result.of_steps:.2g} %)."
+    return f"Short: {steps_text(result)} steps of its author's recipe ({100.0 * cost.steps / cost.of_steps:.2g} %)."
 
 
 # The files of a comparison: what it found as JSON, as a table of LaTeX and as a page.

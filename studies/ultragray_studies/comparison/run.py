@@ -15,7 +15,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -36,60 +36,40 @@ from ultragray_studies.methods.gaussians import SceneMethod
 from ultragray_studies.methods.method import Budget, FitProgress, FitRun, Fitted, FrameArray, Method, Pace, Paces
 
 RUN_FILE, METHOD_FILE, FRAMES_FILE = "run.json", "result.json", "frames.npy"
+SCENE = SceneMethod.name
+EQUAL_TIME = "equal time"  # among the paces: the seconds of the scene
+TIMED_FRAMES = 5
 
 
-@dataclass(frozen=True)
 class Place:
-    """A folder, and which comparison it holds."""
+    """The folder of a comparison."""
 
-    folder: Path
-    comparison: dict[str, Any]
-
-    @classmethod
-    def of(cls, folder: Path, dataset: Dataset, *, budget: str, times: float, seed: int) -> Place:
-        """The folder, made where it is not there. Raises TrainingStateInvalid where it holds another comparison."""
-        own = {
-            "format_version": FORMAT_VERSION,
-            "dataset": dataset.sha256,
-            "budget": budget,
-            "times": times,
-            "seed": seed,
-        }
-        place = cls(folder, own)
+    def __init__(self, folder: Path, **comparison: object) -> None:
+        """Make it where it is not there. Raises TrainingStateInvalid where it holds another comparison."""
+        self.folder, self._comparison = folder, comparison
         folder.mkdir(parents=True, exist_ok=True)
-        found = place.read()
-        for name, value in own.items():
-            if found and found.get(name) != value:
+        path = folder / RUN_FILE
+        if not path.exists():
+            self.budget_s: float | None = None
+            self.keep_budget(None)
+            return
+        try:
+            found = dict(json.loads(path.read_text(encoding="utf-8")))
+        except (ValueError, TypeError) as error:
+            raise TrainingStateInvalid(f"{path}: not the state of a comparison: {error}") from error
+        for name, value in comparison.items():
+            if found.get(name) != value:
                 raise TrainingStateInvalid(
                     f"{folder}: it holds a comparison with {name} {found.get(name)}, this one has {value}; "
                     "give another folder"
                 )
-        if not found:
-            place.write({})
-        return place
+        self.budget_s = found.get("budget_s")
 
-    def read(self) -> dict[str, Any]:
-        """What is known of the comparison; empty before it began."""
-        path = self.folder / RUN_FILE
-        if not path.exists():
-            return {}
-        try:
-            document = json.loads(path.read_text(encoding="utf-8"))
-        except ValueError as error:
-            raise TrainingStateInvalid(f"{path}: not the state of a comparison: {error}") from error
-        if not isinstance(document, dict) or not document:
-            raise TrainingStateInvalid(f"{path}: not the state of a comparison")
-        return document
-
-    def write(self, known: dict[str, Any]) -> None:
-        """Keeps what is known beside which comparison it is."""
-        write_whole(self.folder / RUN_FILE, json.dumps({**self.comparison, **known}, indent=1) + "\n")
-
-    def of_method(self, name: str) -> Path:
-        """The folder of a method's fit."""
-        folder = self.folder / name
-        folder.mkdir(exist_ok=True)
-        return folder
+    def keep_budget(self, seconds: float | None) -> None:
+        """Keep the equal time beside which comparison it is."""
+        self.budget_s = seconds
+        known = self._comparison if seconds is None else {**self._comparison, "budget_s": seconds}
+        write_whole(self.folder / RUN_FILE, json.dumps(known, indent=1) + "\n")
 
     def result(self, name: str) -> MethodResult | None:
         """The row of a method; None where it is not measured yet. Raises TrainingStateInvalid for a damaged one."""
@@ -101,8 +81,8 @@ class Place:
         except (ValueError, TypeError, LookupError) as error:
             raise TrainingStateInvalid(f"{path}: not a result that can be read: {error!r}") from error
 
-    def write_result(self, result: MethodResult, frames: FrameArray) -> None:  # [F, H, W] in [0, 1]
-        """The frames first: a row without them would count as done."""
+    def keep_result(self, result: MethodResult, frames: FrameArray) -> None:  # [F, H, W] in [0, 1]
+        """Write the frames first: a row without them would count as done."""
         array = io.BytesIO()
         np.save(array, to_uint8(frames))
         write_whole(self.folder / result.name / FRAMES_FILE, array.getvalue())
@@ -116,14 +96,6 @@ def frames_of(folder: Path, name: str) -> ByteArray:  # [F, H, W]
         return map_npy(path)
     except (OSError, ValueError) as error:
         raise TrainingStateInvalid(f"{path}: not frames that can be read: {error}") from error
-
-
-# A comparison: each method is fitted within the same budget and measured on the same held-out frames.
-
-
-SCENE = SceneMethod.name
-EQUAL_TIME = "equal time"  # among the paces: the seconds of the scene
-TIMED_FRAMES = 5
 
 
 @dataclass(frozen=True)
@@ -144,8 +116,8 @@ def compare_methods(
     folder: Path,
     device: str = "cpu",
     paces: Paces | None = None,
-    report: Callable[[ComparisonProgress], None] | None = None,
-    should_stop: Callable[[], bool] | None = None,
+    report: Callable[[ComparisonProgress], None] = lambda state: None,
+    should_stop: Callable[[], bool] = lambda: False,
 ) -> Comparison | None:
     """Compares methods by name; None where it was told to stop. The same call on the same folder goes on.
 
@@ -155,44 +127,46 @@ def compare_methods(
     require_frames(dataset.val)
     training_device(device, "auto")
     paces = default_paces(dataset, device) if paces is None else paces
-    place = Place.of(folder, dataset, budget=settings.budget, times=settings.times, seed=settings.seed)
-    kind = BudgetKind(settings.budget)
-    seconds: float | None = place.read().get("budget_s")
-    asked = set(methods)
+    shared: dict[str, Any] = {"budget": settings.budget, "times": settings.times, "seed": settings.seed}
+    place = Place(folder, format_version=FORMAT_VERSION, dataset=dataset.sha256, **shared)
+    kind, asked = BudgetKind(settings.budget), set(methods)
     needs_time = kind is BudgetKind.EQUAL and any(map(_learns_within_a_time, methods.values()))
+    seconds = place.budget_s
     if needs_time:
         if seconds is None and (pace := paces.known(EQUAL_TIME)) is not None:
             seconds = pace.start_s
         if SCENE in methods or seconds is None:
             methods = {SCENE: SceneMethod(), **methods}
-    run = FitRun(device=device, seed=settings.seed, should_stop=should_stop)
     results = []
     for number, (name, method) in enumerate(methods.items(), 1):
-        if should_stop is not None and should_stop():
+        if should_stop():
             return None
-        result: MethodResult | None
-        if _learns_within_a_time(method) and kind is BudgetKind.EQUAL and seconds is None:
-            result = _failed(name, method, device, "there is no equal time, since the scene failed")
+
+        def follow(fit: FitProgress | None, name: str = name, number: int = number) -> None:
+            report(ComparisonProgress(name, number, len(methods), fit))
+
+        if needs_time and seconds is None and _learns_within_a_time(method):
+            reason = "there is no equal time, since the scene failed"
+            result: MethodResult | None = _failed(name, method, device, reason)
         else:
+            follow(None)
             own_s = seconds if seconds is None or name == SCENE else seconds * settings.times
-            follow = _follower(report, name, number, len(methods))
-            result = _measured(name, method, dataset, Budget(kind, own_s, paces), replace(run, report=follow), place)
+            run = FitRun(folder / name, device, settings.seed, follow, should_stop)
+            result = _measured(name, method, dataset, Budget(kind, own_s, paces), run, place)
         if result is None:
             return None
         if needs_time and name == SCENE and result.failure is None and seconds is None:
-            seconds = result.seconds
+            seconds = result.cost.seconds
             paces.keep(EQUAL_TIME, Pace(seconds, 0.0))
-        if needs_time and seconds is not None:
-            place.write({"budget_s": seconds})
+        if needs_time and seconds != place.budget_s:
+            place.keep_budget(seconds)
         if name in asked:  # the scene may have been fitted for its time only
             results.append(result)
     return Comparison(
         dataset=DatasetFacts.of(dataset),
         machine="; ".join(dict.fromkeys(one.machine for one in results)),
-        budget=settings.budget,
+        **shared,
         budget_s=seconds if needs_time else None,
-        times=settings.times,
-        seed=settings.seed,
         distances=Distances.of(dataset),
         results=tuple(results),
     )
@@ -215,17 +189,6 @@ def _learns_within_a_time(method: Method) -> bool:
     return not isinstance(method, SceneMethod) and method.describe().published_steps is not None
 
 
-def _follower(
-    report: Callable[[ComparisonProgress], None] | None, name: str, number: int, of: int
-) -> Callable[[FitProgress | None], None]:
-    def follow(fit: FitProgress | None) -> None:
-        if report is not None:
-            report(ComparisonProgress(name, number, of, fit))
-
-    follow(None)
-    return follow
-
-
 def _measured(
     name: str, method: Method, dataset: Dataset, budget: Budget, run: FitRun, place: Place
 ) -> MethodResult | None:
@@ -236,27 +199,24 @@ def _measured(
     if (known := place.result(name)) is not None:
         return known
     try:
-        fitted = method.fit(dataset, budget, replace(run, folder=place.of_method(name)))
+        (place.folder / name).mkdir(exist_ok=True)
+        fitted = method.fit(dataset, budget, run)
         if fitted is None:
             return None
         result, frames = measure(name, method, fitted, dataset.val, machine_in_words(run.device))
     except UltragrayError as error:
         return _failed(name, method, run.device, str(error))
-    except (MemoryError, RuntimeError) as error:
-        if not _is_out_of_memory(error):
+    except (MemoryError, RuntimeError) as error:  # of memory on the CPU torch raises a plain RuntimeError
+        is_of_memory = isinstance(error, (MemoryError, torch.OutOfMemoryError))
+        if not is_of_memory and "DefaultCPUAllocator" not in str(error):
             raise
         return _failed(name, method, run.device, "the memory of this machine did not suffice")
-    place.write_result(result, frames)
+    place.keep_result(result, frames)
     return result
 
 
 def _failed(name: str, method: Method, device: str, reason: str) -> MethodResult:
     return MethodResult(name, method.describe(), machine_in_words(device), failure=reason)
-
-
-def _is_out_of_memory(error: Exception) -> bool:
-    """Also on the CPU, where torch raises a plain RuntimeError."""
-    return isinstance(error, (MemoryError, torch.OutOfMemoryError)) or "DefaultCPUAllocator" in str(error)
 
 
 def measure(name: str, method: Method, fitted: Fitted, sweep: Sweep, machine: str) -> tuple[MethodResult, FrameArray]:
@@ -268,28 +228,17 @@ def measure(name: str, method: Method, fitted: Fitted, sweep: Sweep, machine: st
     if not np.isfinite(frames).all():
         raise TrainingDiverged("frames that it expects are not finite")
     frames = np.clip(frames, 0.0, 1.0)
-    cost = fitted.cost
-    result = MethodResult(
-        name=name,
-        description=method.describe(),
-        machine=machine,
-        steps=cost.steps,
-        of_steps=cost.of_steps,
-        seconds=cost.seconds,
-        frame_ms=_frame_ms(fitted, sweep),
-        model_bytes=cost.model_bytes,
-        evaluation=evaluate_frames(frames, sweep),
-    )
-    return result, frames
+    evaluation = evaluate_frames(frames, sweep)
+    frame_ms = _frame_ms(fitted, sweep)
+    return MethodResult(name, method.describe(), machine, fitted.cost, frame_ms, evaluation), frames
 
 
 def _frame_ms(fitted: Fitted, sweep: Sweep) -> float:
     """The median time of one frame rendered alone, after the first, which may build what later ones use."""
     chosen = sweep.poses[spread_places(len(sweep), TIMED_FRAMES)]
-    poses = [chosen[place % len(chosen)][None] for place in range(TIMED_FRAMES + 1)]
     seconds = []
-    for pose in poses:
+    for place in range(TIMED_FRAMES + 1):
         began_s = time.perf_counter()
-        fitted.render(sweep.probe, pose, sweep.height, sweep.width)
+        fitted.render(sweep.probe, chosen[place % len(chosen)][None], sweep.height, sweep.width)
         seconds.append(time.perf_counter() - began_s)
     return 1000.0 * float(np.median(seconds[1:]))

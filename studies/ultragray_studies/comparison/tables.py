@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from ultragray.learn.evaluation.methods import BudgetKind
-from ultragray.learn.report.tables import METRICS, Row, by_mean_rank, metric_rows, rank
+from ultragray.learn.report.tables import METRICS, by_mean_rank, metric_rows, rank
 from ultragray_studies.comparison.result import Comparison, MethodResult
 
 COST_HEADINGS = ("steps", "training", "ms a frame", "MB")
@@ -11,19 +11,19 @@ COST_HEADINGS = ("steps", "training", "ms a frame", "MB")
 
 def cost_texts(result: MethodResult) -> list[str]:
     """The steps, the time, a frame and the size of a method."""
+    seconds, megabytes = result.cost.seconds, result.cost.model_bytes / 1e6
     return [
         steps_text(result),
-        duration_text(result.seconds) if result.seconds > 0.0 else "–",
-        f"{result.frame_ms:,.1f}" if result.frame_ms < 100.0 else f"{result.frame_ms:,.0f}",
-        f"{result.model_bytes / 1e6:,.2f}" if result.model_bytes < 1e7 else f"{result.model_bytes / 1e6:,.0f}",
+        duration_text(seconds) if seconds > 0.0 else "–",
+        f"{result.frame_ms:,.{1 if result.frame_ms < 100.0 else 0}f}",
+        f"{megabytes:,.{2 if megabytes < 10.0 else 0}f}",
     ]
 
 
 def steps_text(result: MethodResult) -> str:
     """Such as "1,240 of 200,000"; a dash where nothing is learned by steps."""
-    if not result.steps:
-        return "–"
-    return f"{result.steps:,}" if result.of_steps is None else f"{result.steps:,} of {result.of_steps:,}"
+    steps, of_steps = result.cost.steps, result.cost.of_steps
+    return f"{steps:,}" + ("" if of_steps is None else f" of {of_steps:,}") if steps else "–"
 
 
 def duration_text(seconds: float) -> str:
@@ -48,15 +48,9 @@ def budget_text(comparison: Comparison) -> str:
 # The table of a comparison as LaTeX, for the package booktabs.
 
 
-_ESCAPES = {
+_ESCAPES: dict[str, str | int | None] = {
     "\\": r"\textbackslash{}",
-    "{": r"\{",
-    "}": r"\}",
-    "%": r"\%",
-    "_": r"\_",
-    "&": r"\&",
-    "#": r"\#",
-    "$": r"\$",
+    **{character: f"\\{character}" for character in "{}%_&#$"},
     "~": r"\textasciitilde{}",
     "^": r"\textasciicircum{}",
     "±": r"$\pm$",
@@ -68,48 +62,45 @@ _ESCAPES = {
 
 def escaped(text: str) -> str:
     """The text, as LaTeX prints it."""
-    return "".join(_ESCAPES.get(character, character) for character in text)
+    return text.translate(str.maketrans(_ESCAPES))
 
 
 def latex_table(comparison: Comparison) -> str:
     """A `table` environment: best mean rank first, the best of each column bold, failures at the end."""
     by_name = {one.name: one for one in comparison.results}
-    order = by_mean_rank(comparison.measured)
-    ranks = rank(comparison.measured)
-    rows = metric_rows(
-        {name: comparison.measured[name] for name in order},
-        {name: [f"{ranks[name].mean:.2f}", *cost_texts(by_name[name])] for name in order},
-    )
+    ranks, facts = rank(comparison.measured), comparison.dataset
     headings = ["method", *(metric.heading for metric in METRICS), "mean rank", *COST_HEADINGS]
-    lines = [
-        r"% \usepackage{booktabs}",
-        r"\begin{table}",
-        r"\centering",
-        rf"\caption{{{escaped(_caption(comparison))}}}",
-        rf"\begin{{tabular}}{{l{'r' * (len(headings) - 1)}}}",
-        r"\toprule",
-        _line([escaped(heading) for heading in headings]),
-        r"\midrule",
-        *(_row(row, by_name[row.name].title) for row in rows),
-    ]
-    for name, failure in comparison.failures.items():
-        reason = rf"\multicolumn{{{len(headings) - 1}}}{{l}}{{failed: {escaped(failure)}}}"
-        lines.append(_line([escaped(by_name[name].title), reason]))
-    return "\n".join([*lines, r"\bottomrule", r"\end{tabular}", r"\end{table}", ""])
-
-
-def _caption(comparison: Comparison) -> str:
-    facts = comparison.dataset
-    return (
+    caption = (
         f"{facts.name}: mean ± standard deviation over {facts.val_frames} held-out frames; "
         f"budget: {budget_text(comparison)}; {comparison.machine}."
     )
 
+    def line(*cells: str) -> str:
+        return " & ".join(cells) + r" \\"
 
-def _row(row: Row, title: str) -> str:
-    cells = [rf"\textbf{{{escaped(text)}}}" if best else escaped(text) for text, best in row.cells]
-    return _line([escaped(title), *cells, *map(escaped, row.notes)])
-
-
-def _line(cells: list[str]) -> str:
-    return " & ".join(cells) + r" \\"
+    lines = []
+    for row in metric_rows({name: comparison.measured[name] for name in by_mean_rank(comparison.measured)}):
+        one = by_name[row.name]
+        cells = [rf"\textbf{{{escaped(text)}}}" if best else escaped(text) for text, best in row.cells]
+        notes = [f"{ranks[row.name].mean:.2f}", *cost_texts(one)]
+        lines.append(line(escaped(one.title), *cells, *map(escaped, notes)))
+    for name, failure in comparison.failures.items():
+        reason = rf"\multicolumn{{{len(headings) - 1}}}{{l}}{{failed: {escaped(failure)}}}"
+        lines.append(line(escaped(by_name[name].title), reason))
+    return "\n".join(
+        (
+            r"% \usepackage{booktabs}",
+            r"\begin{table}",
+            r"\centering",
+            rf"\caption{{{escaped(caption)}}}",
+            rf"\begin{{tabular}}{{l{'r' * (len(headings) - 1)}}}",
+            r"\toprule",
+            line(*map(escaped, headings)),
+            r"\midrule",
+            *lines,
+            r"\bottomrule",
+            r"\end{tabular}",
+            r"\end{table}",
+            "",
+        )
+    )

@@ -64,8 +64,7 @@ class SceneMethod(Method):
         seconds = -time.perf_counter()
 
         def follow(progress: Progress) -> None:
-            if run.report is not None:
-                run.report(FitProgress(progress.step, progress.steps, progress.loss, progress.seconds_left))
+            run.report(FitProgress(progress.step, progress.steps, progress.loss, progress.seconds_left))
 
         resume = folder is not None and (folder / CHECKPOINT_FILE).exists()
         if resume:

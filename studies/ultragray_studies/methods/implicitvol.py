@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -12,9 +11,8 @@ from torch.nn import functional
 
 from ultragray.geometry.probe import FloatArray
 from ultragray.learn.sweep import Dataset, Sweep, mean_axes
-from ultragray_studies.methods.learner import LearnedMethod, Learner
-from ultragray_studies.methods.method import Budget, Description
-from ultragray_studies.methods.parts import SliceLearner, as_tensor, encode, encoded_size, set_rate
+from ultragray_studies.methods.method import Description
+from ultragray_studies.methods.parts import PUBLISHED_FRAMES, EpochMethod, SliceLearner, as_tensor, encode, encoded_size
 
 WIDTH = 128
 FIRST_FREQUENCY = 30.0
@@ -24,23 +22,12 @@ LAST_BIAS = 0.02
 class SineLayer(nn.Module):
     """sin(w0 (W x + b)), W and b uniform in ±1/inputs where it is the first, else in ±√(6/inputs)/w0."""
 
-    def __init__(self, inputs: int, outputs: int, frequency: float, bound: float) -> None:
+    def __init__(self, inputs: int, outputs: int, *, is_first: bool = False) -> None:
         super().__init__()
-        self.frequency, self.bound = frequency, bound
+        self.frequency = FIRST_FREQUENCY if is_first else 1.0
+        self.bound = 1.0 / inputs if is_first else math.sqrt(6.0 / inputs)
         self.weight = nn.Parameter(torch.empty(outputs, inputs))
         self.bias = nn.Parameter(torch.empty(outputs))
-
-    @classmethod
-    def first(cls, inputs: int, outputs: int) -> SineLayer:
-        return cls(inputs, outputs, FIRST_FREQUENCY, 1.0 / inputs)
-
-    @classmethod
-    def later(cls, inputs: int, outputs: int) -> SineLayer:
-        return cls(inputs, outputs, 1.0, math.sqrt(6.0 / inputs))
-
-    def draw(self, generator: torch.Generator) -> None:
-        """Draws the weights anew."""
-        _draw_uniform([self.weight, self.bias], self.bound, generator)
 
     def forward(self, x: Tensor) -> Tensor:  # [..., inputs] -> [..., outputs]
         # The frequency goes to the weights, of which there are fewer than values.
@@ -57,21 +44,22 @@ class SineField(nn.Module):
     def __init__(self, generator: torch.Generator) -> None:
         super().__init__()
         point = encoded_size()
-        later = SineLayer.later
-        self.near = nn.Sequential(SineLayer.first(point, WIDTH), *(later(WIDTH, WIDTH) for _ in range(3)))
-        self.far = nn.Sequential(later(WIDTH + point, WIDTH), *(later(WIDTH, WIDTH) for _ in range(3)))
+        self.near = nn.Sequential(SineLayer(point, WIDTH, is_first=True), *(SineLayer(WIDTH, WIDTH) for _ in range(3)))
+        self.far = nn.Sequential(SineLayer(WIDTH + point, WIDTH), *(SineLayer(WIDTH, WIDTH) for _ in range(3)))
         self.middle = nn.Linear(WIDTH, WIDTH)
-        self.narrow = later(WIDTH, WIDTH // 2)
+        self.narrow = SineLayer(WIDTH, WIDTH // 2)
         self.last = nn.Linear(WIDTH // 2, 1)
         self.draw(generator)
 
     def draw(self, generator: torch.Generator) -> None:
         """Draws all weights anew, in the order of the layers; linear layers uniform in ±1/√inputs."""
         for layer in self.modules():
-            if isinstance(layer, SineLayer):
-                layer.draw(generator)
-            if isinstance(layer, nn.Linear):
-                _draw_uniform([layer.weight, layer.bias], 1.0 / math.sqrt(layer.in_features), generator)
+            if isinstance(layer, (SineLayer, nn.Linear)):
+                bound = layer.bound if isinstance(layer, SineLayer) else 1.0 / math.sqrt(layer.in_features)
+                for parameter in (layer.weight, layer.bias):
+                    drawn = torch.empty(parameter.shape).uniform_(-bound, bound, generator=generator)
+                    with torch.no_grad():
+                        parameter.copy_(drawn)
         nn.init.constant_(self.last.bias, LAST_BIAS)
 
     def forward(self, points: Tensor) -> Tensor:  # [..., 3] -> [...]
@@ -79,12 +67,6 @@ class SineField(nn.Module):
         found = self.far(torch.cat([self.near(encoded), encoded], dim=-1))
         value: Tensor = self.last(self.narrow(self.middle(found)))
         return value.squeeze(-1)
-
-
-def _draw_uniform(parameters: Sequence[Tensor], bound: float, generator: torch.Generator) -> None:
-    with torch.no_grad():
-        for parameter in parameters:
-            parameter.copy_(torch.empty(parameter.shape).uniform_(-bound, bound, generator=generator))
 
 
 # Pose refinement of ImplicitVol: three angles and three translations of each training frame, learned with the field.
@@ -171,6 +153,8 @@ def published_epoch(step: int, steps: int) -> int:
 class FieldLearner(SliceLearner):
     """A fit with the tracker's poses."""
 
+    field: SineField
+
     def __init__(self, dataset: Dataset, seed: int, device: torch.device) -> None:
         self.half_height_mm = dataset.probe.scan_line_length_mm / 2.0
         super().__init__(dataset, seed, device, dataset.centre_mm, np.full(3, self.half_height_mm))
@@ -178,13 +162,8 @@ class FieldLearner(SliceLearner):
         self.module = nn.ModuleDict({"field": self.field})
         self.optimizers = {"field": torch.optim.Adam(self.field.parameters(), RATE)}
 
-    def set_rates(self, step: int, steps: int) -> None:
-        decays = published_epoch(step, steps) // NETWORK_DECAY_EPOCHS
-        set_rate(self.optimizers["field"], RATE * NETWORK_DECAY**decays)
-
-    def values(self, points: Tensor) -> Tensor:
-        found: Tensor = self.field(points)
-        return found
+    def rates(self, step: int, steps: int) -> dict[str, float]:
+        return {"field": RATE * NETWORK_DECAY ** (published_epoch(step, steps) // NETWORK_DECAY_EPOCHS)}
 
 
 class RefiningLearner(FieldLearner):
@@ -200,10 +179,9 @@ class RefiningLearner(FieldLearner):
         self.module = nn.ModuleDict({"field": self.field, "poses": self.poses})
         self.optimizers = {**self.optimizers, "poses": torch.optim.Adam(self.poses.parameters(), RATE)}
 
-    def set_rates(self, step: int, steps: int) -> None:
-        super().set_rates(step, steps)
-        decays = published_epoch(step, steps) // POSE_DECAY_EPOCHS
-        set_rate(self.optimizers["poses"], RATE * POSE_DECAY**decays)
+    def rates(self, step: int, steps: int) -> dict[str, float]:
+        of_poses = RATE * POSE_DECAY ** (published_epoch(step, steps) // POSE_DECAY_EPOCHS)
+        return {**super().rates(step, steps), "poses": of_poses}
 
     def training_points(self, place: int) -> Tensor:
         return self.poses.points(place, self.pixels_mm)
@@ -227,7 +205,6 @@ def _restarts_before(step: int, steps: int) -> int:
 # ImplicitVol as methods: with the tracker's poses, and with poses that are refined.
 
 
-PUBLISHED_FRAMES = 128  # of the paper's example
 SOURCE = "Yeung et al., arXiv 2109.12108"
 FIELD_EQUATIONS = (
     "p = (R x + t - c) / (H_mm / 2), H_mm the height of the image, c the centre of the scene",
@@ -248,51 +225,40 @@ FIELD_CHOICES = (
 )
 
 
-class ImplicitVol(LearnedMethod):
-    """The field alone, with the tracker's poses."""
-
-    name = "implicitvol"
-
-    def describe(self) -> Description:
-        return Description(
-            title="ImplicitVol",
-            source=SOURCE,
-            summary="A network of sine layers gives the grey value of a point; a frame is its values at the pixels.",
-            equations=FIELD_EQUATIONS,
-            choices=("Poses stay the tracker's: all methods see the same.", *FIELD_CHOICES),
-            published_steps=EPOCHS * PUBLISHED_FRAMES,
-        )
-
-    def published_steps(self, dataset: Dataset) -> int:
-        """An epoch takes one step for each training frame."""
-        return EPOCHS * len(dataset.train)
-
-    def learner(self, dataset: Dataset, budget: Budget, seed: int, device: torch.device) -> Learner:
-        return FieldLearner(dataset, seed, device)
+REFINING_CHOICES = (
+    "M is the mean rotation of the tracked frames, so that no frame comes near the angles where Rz Ry Rx "
+    "has only two independent ones.",
+    "Held-out poses stay as they are given. The paper fixes no common motion of field and frames: here the "
+    "rigid motion that carries the tracked training frames onto the refined ones best is applied to them.",
+    "A restart of the network clears what the optimisers remember, not their schedules.",
+    "One Adam has the poses of all frames: a frame also moves in the steps of others, by its momentum.",
+)
 
 
-class RefinedImplicitVol(ImplicitVol):
-    """The field together with the poses of the training frames; those of held-out frames stay as they are given."""
+class ImplicitVol(EpochMethod):
+    """The field alone, with the tracker's poses, or together with the poses of the training frames.
 
-    name = "implicitvol-refined"
+    Those of held-out frames stay as they are given.
+    """
+
+    epochs = EPOCHS
+
+    def __init__(self, *, refines: bool = False) -> None:
+        self.name = "implicitvol-refined" if refines else "implicitvol"
+        self.learns = RefiningLearner if refines else FieldLearner
 
     def describe(self) -> Description:
+        refines = self.learns is RefiningLearner
         return Description(
-            title="ImplicitVol, poses refined",
+            title="ImplicitVol, poses refined" if refines else "ImplicitVol",
             source=SOURCE,
-            summary="As ImplicitVol, and three angles and three translations of each training frame are learned too.",
-            equations=(*FIELD_EQUATIONS, "R = M Rz Ry Rx, about the middle of the image"),
+            summary="As ImplicitVol, and three angles and three translations of each training frame are learned too."
+            if refines
+            else "A network of sine layers gives the grey value of a point; a frame is its values at the pixels.",
+            equations=(*FIELD_EQUATIONS, *(["R = M Rz Ry Rx, about the middle of the image"] if refines else [])),
             choices=(
-                "M is the mean rotation of the tracked frames, so that no frame comes near the angles where Rz Ry Rx "
-                "has only two independent ones.",
-                "Held-out poses stay as they are given. The paper fixes no common motion of field and frames: here the "
-                "rigid motion that carries the tracked training frames onto the refined ones best is applied to them.",
-                "A restart of the network clears what the optimisers remember, not their schedules.",
-                "One Adam has the poses of all frames: a frame also moves in the steps of others, by its momentum.",
+                *(REFINING_CHOICES if refines else ["Poses stay the tracker's: all methods see the same."]),
                 *FIELD_CHOICES,
             ),
             published_steps=EPOCHS * PUBLISHED_FRAMES,
         )
-
-    def learner(self, dataset: Dataset, budget: Budget, seed: int, device: torch.device) -> Learner:
-        return RefiningLearner(dataset, seed, device)

@@ -123,10 +123,8 @@ class Learner:
 
     def render(self, probe: Probe, poses: FloatArray, height: int, width: int) -> FrameArray:  # [C, H, W]
         with torch.no_grad():
-            frames = [
-                self.frame(probe, pose, height, width).detach().cpu()
-                for pose in (check_poses(poses) if len(poses) else [])
-            ]
+            exact = check_poses(poses) if len(poses) else poses
+            frames = [self.frame(probe, pose, height, width).detach().cpu() for pose in exact]
         return torch.stack(frames).float().numpy() if frames else np.zeros((0, height, width), np.float32)
 
 
@@ -163,42 +161,43 @@ class LearnedMethod(Method):
             raise MemoryExceeded(f"the memory of {device} did not suffice for {self.name}") from error
 
     def _fit(self, dataset: Dataset, budget: Budget, run: FitRun, device: torch.device) -> Learned | None:
+        def begin() -> Learner:
+            return self.learner(dataset, budget, run.seed, device)
+
         began_s = time.perf_counter()
-        learner = self.learner(dataset, budget, run.seed, device)
-        saved = _Saved.of(run.folder, self.name, dataset, run.seed)
+        learner, published = begin(), self.published_steps(dataset)
+        saved = _Saved(run.folder, {"method": self.name, "dataset_sha256": dataset.sha256, "seed": run.seed})
         done, steps, elapsed_s = saved.read(learner)
         if not steps:
-            start_s = time.perf_counter() - began_s
+            elapsed_s = start_s = time.perf_counter() - began_s
             steps = budget.steps(
-                self.name,
-                self.published_steps(dataset),
-                lambda: Pace(
-                    start_s, _seconds_of_step(self.learner(dataset, budget, run.seed, device)), is_confirmed=False
-                ),
+                self.name, published, lambda: Pace(start_s, _seconds_of_step(begin()), is_confirmed=False)
             )
-            elapsed_s = start_s
         saved_at = time.monotonic()
         while done < steps:
             step_s = -time.perf_counter()
             loss = learner.take_step(done, steps)
             step_s += time.perf_counter()
             done, elapsed_s = done + 1, elapsed_s + step_s
-            if run.report is not None:
-                run.report(FitProgress(done, steps, loss, (steps - done) * elapsed_s / done))
-            stop = run.should_stop is not None and run.should_stop() and done < steps
+            run.report(FitProgress(done, steps, loss, (steps - done) * elapsed_s / done))
+            stop = run.should_stop() and done < steps
             if stop or time.monotonic() - saved_at >= run.checkpoint_interval_s:
-                saved.write_state(learner, done, steps, elapsed_s)
+                saved.write(STATE_FILE, learner.state(), done, steps, elapsed_s)
                 saved_at = time.monotonic()
             if stop:
                 return None
-        if (shown := budget.shown_pace(self.name, steps, elapsed_s)) is not None:
-            saved.discard()
+        shown = budget.shown_pace(self.name, steps, elapsed_s)
+        model = learner.model()
+        if shown is None and saved.folder is not None and not (saved.folder / MODEL_FILE).exists():
+            saved.write(MODEL_FILE, model, steps, steps, elapsed_s)
+        if saved.folder is not None:  # the model is in its place, or the fit begins anew
+            (saved.folder / STATE_FILE).unlink(missing_ok=True)
+        if shown is not None:
             budget.paces.keep(self.name, shown)
             return self._fit(dataset, budget, run, device)
         budget.paces.confirm(self.name)
-        saved.write_model(learner, steps, elapsed_s)
-        published = self.published_steps(dataset)
-        return Learned(learner, Cost(elapsed_s, steps, published, _bytes(learner.model())))
+        size = sum(tensor.numel() * tensor.element_size() for tensor in model.values())
+        return Learned(learner, Cost(elapsed_s, steps, published, size))
 
 
 def _seconds_of_step(learner: Learner) -> float:
@@ -220,17 +219,10 @@ class _Saved:
     folder: Path | None
     fit: Mapping[str, object]  # which it is
 
-    @classmethod
-    def of(cls, folder: Path | None, method: str, dataset: Dataset, seed: int) -> _Saved:
-        return cls(folder, {"method": method, "dataset_sha256": dataset.sha256, "seed": seed})
-
     def read(self, learner: Learner) -> tuple[int, int, float]:
         """Steps done, steps, and seconds of what is there; zeros where nothing is. Raises TrainingStateInvalid."""
-        if self.folder is None:
-            return 0, 0, 0.0
         for name in (MODEL_FILE, STATE_FILE):
-            path = self.folder / name
-            if not path.exists():
+            if self.folder is None or not (path := self.folder / name).exists():
                 continue
             try:
                 with safe_open(path, framework="pt") as bundle:
@@ -247,21 +239,7 @@ class _Saved:
                 raise TrainingStateInvalid(f"{path}: not a fit that can be read: {error}") from error
         return 0, 0, 0.0
 
-    def write_state(self, learner: Learner, step: int, steps: int, elapsed_s: float) -> None:
-        self._write(STATE_FILE, learner.state(), step, steps, elapsed_s)
-
-    def write_model(self, learner: Learner, steps: int, elapsed_s: float) -> None:
-        """The model, in place of the state."""
-        if self.folder is not None and not (self.folder / MODEL_FILE).exists():
-            self._write(MODEL_FILE, learner.model(), steps, steps, elapsed_s)
-            (self.folder / STATE_FILE).unlink(missing_ok=True)
-
-    def discard(self) -> None:
-        """Removes the state, for a fit that begins anew."""
-        if self.folder is not None:
-            (self.folder / STATE_FILE).unlink(missing_ok=True)
-
-    def _write(self, name: str, tensors: Mapping[str, Tensor], step: int, steps: int, elapsed_s: float) -> None:
+    def write(self, name: str, tensors: Mapping[str, Tensor], step: int, steps: int, elapsed_s: float) -> None:
         if self.folder is None:
             return
         self.folder.mkdir(parents=True, exist_ok=True)
@@ -272,7 +250,3 @@ class _Saved:
 
 def _under(prefix: str, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     return {name.removeprefix(prefix): tensor for name, tensor in tensors.items() if name.startswith(prefix)}
-
-
-def _bytes(tensors: Mapping[str, Tensor]) -> int:
-    return sum(tensor.numel() * tensor.element_size() for tensor in tensors.values())

@@ -49,9 +49,8 @@ class Paces:
         self._section = json.dumps(dict(surroundings or {}), sort_keys=True)
         self._known: dict[str, Any] = {}
         if path is not None:
-            with contextlib.suppress(OSError, ValueError):  # then it is measured again
-                document = json.loads(path.read_text(encoding="utf-8"))
-                self._known = document if isinstance(document, dict) else {}
+            with contextlib.suppress(OSError, ValueError, TypeError):  # then it is measured again
+                self._known = dict(json.loads(path.read_text(encoding="utf-8")))
 
     def known(self, name: str) -> Pace | None:
         """What was measured of a method; None where nothing was, or the file is another's."""
@@ -64,8 +63,7 @@ class Paces:
     def keep(self, name: str, pace: Pace) -> None:
         """Keeps what was measured; in a place that cannot be written, for this process only."""
         section = self._known.get(self._section)
-        known = section if isinstance(section, dict) else {}
-        self._known[self._section] = {**known, name: astuple(pace)}
+        self._known[self._section] = {**(section if isinstance(section, dict) else {}), name: astuple(pace)}
         if self._path is not None:
             with contextlib.suppress(OSError):
                 self._path.parent.mkdir(parents=True, exist_ok=True)
@@ -80,8 +78,7 @@ class Paces:
         """What is known of a method, else what `measure` finds, which is kept."""
         pace = self.known(name)
         if pace is None or not pace.step_s > 0.0:
-            pace = measure()
-            self.keep(name, pace)
+            self.keep(name, pace := measure())
         return pace
 
 
@@ -124,12 +121,8 @@ class Budget:
         return shown if seconds < USED_SHARE * self.seconds and 0.0 < shown.step_s < pace.step_s else None
 
 
-# The protocol of a method: it is fitted to a sweep within a budget, and what was fitted predicts frames.
-#
-# method = METHODS["ultranerf-unit"] fitted = method.fit(dataset, Budget.equal(172.0)) frames =
-# fitted.render(dataset.probe, dataset.val.poses, 256, 128) # [C, H, W] in [0, 1]
-#
-# All methods see the same training frames, at the same size, with the same poses; none sees a held-out frame.
+# The protocol of a method: it is fitted to a sweep within a budget, and what was fitted predicts frames. All methods
+# see the same training frames, at the same size, with the same poses; none sees a held-out frame.
 
 
 FrameArray = npt.NDArray[np.float32]
@@ -156,6 +149,10 @@ class FitProgress:
     loss: float
     seconds_left: float
 
+    def ends_part(self, parts: int) -> bool:
+        """Whether the step is the last of one of so many parts of the fit."""
+        return self.step * parts // self.steps > (self.step - 1) * parts // self.steps
+
 
 @dataclass(frozen=True)
 class FitRun:
@@ -168,8 +165,8 @@ class FitRun:
     folder: Path | None = None
     device: str = "cpu"  # cpu, cuda or cuda:N
     seed: int = 0
-    report: Callable[[FitProgress], None] | None = None
-    should_stop: Callable[[], bool] | None = None
+    report: Callable[[FitProgress], None] = lambda progress: None
+    should_stop: Callable[[], bool] = lambda: False
     checkpoint_interval_s: float = 30.0
 
 

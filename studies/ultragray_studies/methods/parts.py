@@ -5,6 +5,7 @@ slices.
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,7 +15,8 @@ from torch.nn import functional
 
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.sweep import Dataset, Sweep, pixel_positions_mm
-from ultragray_studies.methods.learner import Learner
+from ultragray_studies.methods.learner import LearnedMethod, Learner
+from ultragray_studies.methods.method import Budget
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,9 +143,12 @@ def frame_of_step(step: int, frames: int, seed: int) -> int:
 class SliceLearner(Learner):
     """A fit of a field whose value at a pixel's place is the pixel: it depends on no direction and on no other pixel.
 
-    Coordinates of the field are those of the tracker, less `centre_mm`, over `half_mm`. The loss is 1 - SSIM of a whole
-    frame. Frames are cut off at 0 and 1 where they are rendered, not where they are learned.
+    `field` gives values [H, W] at points [H, W, 3], whose coordinates are those of the tracker, less `centre_mm`, over
+    `half_mm`. The loss is 1 - SSIM of a whole frame. Frames are cut off at 0 and 1 where they are rendered, not where
+    they are learned.
     """
+
+    field: Callable[[Tensor], Tensor]
 
     def __init__(
         self, dataset: Dataset, seed: int, device: torch.device, centre_mm: FloatArray, half_mm: FloatArray
@@ -153,12 +158,13 @@ class SliceLearner(Learner):
         self.pixels_mm = self.pixels_of(dataset.probe, dataset.train.height, dataset.train.width)
 
     @abstractmethod
-    def set_rates(self, step: int, steps: int) -> None:
-        """Sets the optimisers' rates for step `step` (from 0) of `steps`."""
+    def rates(self, step: int, steps: int) -> dict[str, float]:
+        """The optimisers' rates for step `step` (from 0) of `steps`."""
 
-    @abstractmethod
-    def values(self, points: Tensor) -> Tensor:  # [H, W, 3] -> [H, W]
-        """The field at points in its own coordinates."""
+    def set_rates(self, step: int, steps: int) -> None:
+        for name, rate in self.rates(step, steps).items():
+            for group in self.optimizers[name].param_groups:
+                group["lr"] = rate
 
     def training_points(self, place: int) -> Tensor:  # [H, W, 3]
         """The pixels of a training frame in the field's coordinates."""
@@ -180,15 +186,25 @@ class SliceLearner(Learner):
     def loss(self, step: int, steps: int) -> Tensor:
         self.set_rates(step, steps)
         place = frame_of_step(step, len(self.images), self.seed)
-        found = self.values(self.training_points(place))
+        found = self.field(self.training_points(place))
         return 1.0 - SIMILARITY.ssim(found[None], self.image(place)[None])
 
     def frame(self, probe: Probe, pose: FloatArray, height: int, width: int) -> Tensor:
         points = self.rendered_points(self.pixels_of(probe, height, width), pose)
-        return self.values(points).clamp(0.0, 1.0)
+        return self.field(points).clamp(0.0, 1.0)
 
 
-def set_rate(optimizer: torch.optim.Optimizer, rate: float) -> None:
-    """The same rate for all parameters of an optimiser."""
-    for group in optimizer.param_groups:
-        group["lr"] = rate
+PUBLISHED_FRAMES = 128  # of the example of ImplicitVol's paper; RapidVol is by the same group
+
+
+class EpochMethod(LearnedMethod):
+    """A method whose author counts epochs: one step for each training frame."""
+
+    epochs: int
+    learns: Callable[[Dataset, int, torch.device], Learner]
+
+    def published_steps(self, dataset: Dataset) -> int:
+        return self.epochs * len(dataset.train)
+
+    def learner(self, dataset: Dataset, budget: Budget, seed: int, device: torch.device) -> Learner:
+        return self.learns(dataset, seed, device)

@@ -10,9 +10,8 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from ultragray.learn.sweep import Dataset
-from ultragray_studies.methods.learner import LearnedMethod, Learner
-from ultragray_studies.methods.method import Budget, Description
-from ultragray_studies.methods.parts import Box, SliceLearner, set_rate
+from ultragray_studies.methods.method import Description
+from ultragray_studies.methods.parts import PUBLISHED_FRAMES, Box, EpochMethod, SliceLearner
 
 RANK, CELLS = 16, 128  # features of a plane, and its nodes along each side
 HIDDEN = 64
@@ -20,7 +19,6 @@ PLANE_SPREAD = 0.1  # features begin in 1 ± this
 FIRST_VALUE = 0.5  # the field begins near it: SSIM is 1 for an image's negative -I too, where a start below 0 leads
 PLANE_RATE, DECODER_RATE = 1e-2, 1e-3
 EPOCHS = 5_000
-PUBLISHED_FRAMES = 128  # of the example of ImplicitVol, by the same group
 LEAST_HALF_MM = 1.0  # of the box of frames that lie in one plane
 PLANES = ((0, 1), (1, 2), (0, 2))  # the axes of each: the first along its columns, the second along its rows
 
@@ -73,20 +71,15 @@ class TriPlaneLearner(SliceLearner):
             "decoder": torch.optim.Adam(self.field.decoder.parameters(), DECODER_RATE),
         }
 
-    def set_rates(self, step: int, steps: int) -> None:
+    def rates(self, step: int, steps: int) -> dict[str, float]:
         decay = 0.01 ** (step / steps)
-        set_rate(self.optimizers["planes"], PLANE_RATE * decay)
-        set_rate(self.optimizers["decoder"], DECODER_RATE * decay)
-
-    def values(self, points: Tensor) -> Tensor:
-        found: Tensor = self.field(points)
-        return found
+        return {"planes": PLANE_RATE * decay, "decoder": DECODER_RATE * decay}
 
 
-class RapidVol(LearnedMethod):
+class RapidVol(EpochMethod):
     """The tri-planes of RapidVol, as far as they are published."""
 
-    name = "rapidvol"
+    name, epochs, learns = "rapidvol", EPOCHS, TriPlaneLearner
 
     def describe(self) -> Description:
         return Description(
@@ -112,10 +105,3 @@ class RapidVol(LearnedMethod):
             ),
             published_steps=EPOCHS * PUBLISHED_FRAMES,
         )
-
-    def published_steps(self, dataset: Dataset) -> int:
-        """An epoch takes one step for each training frame."""
-        return EPOCHS * len(dataset.train)
-
-    def learner(self, dataset: Dataset, budget: Budget, seed: int, device: torch.device) -> Learner:
-        return TriPlaneLearner(dataset, seed, device)

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from ultragray.learn.evaluation.methods import chosen_names
 from ultragray_studies.methods.classical import PAPER_VOXEL_MM, Compounding, FromFrames
 from ultragray_studies.methods.gaussians import SceneMethod
-from ultragray_studies.methods.implicitvol import ImplicitVol, RefinedImplicitVol
+from ultragray_studies.methods.implicitvol import ImplicitVol
 from ultragray_studies.methods.method import Method
 from ultragray_studies.methods.rapidvol import RapidVol
 from ultragray_studies.methods.ultragauss import UltraGauss
@@ -23,7 +23,7 @@ METHODS: dict[str, Method] = {
         FromFrames("nearest"),
         *ULTRANERF,
         ImplicitVol(),
-        RefinedImplicitVol(),
+        ImplicitVol(refines=True),
         RapidVol(),
         UltraGauss(),
         UltraGauss("ultragauss-shadow", casts_shadow=True),

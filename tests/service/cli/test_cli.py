@@ -22,7 +22,7 @@ from ultragray.phantom.demo import DEMO_FILE
 from ultragray_service.cli.app import app
 from ultragray_service.cli.serve import ensure_scenes, link_scenes
 from ultragray_service.settings import Settings
-from ultragray_workers.shelves.opening import SCENES_FOLDER
+from ultragray_workers.scene_shelf import SCENES_FOLDER
 
 from .command_line import python, refused, run
 

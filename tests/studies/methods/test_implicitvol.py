@@ -49,7 +49,7 @@ def test_weights_fill_the_papers_ranges():
 
 
 def test_the_first_layer_is_the_sine_of_30_times_its_sum():
-    layer = SineLayer.first(2, 1)
+    layer = SineLayer(2, 1, is_first=True)
     layer.load_state_dict({"weight": torch.tensor([[0.1, -0.2]]), "bias": torch.tensor([0.05])})
     found = layer(torch.tensor([0.3, 0.1]))
     assert found.item() == pytest.approx(math.sin(30.0 * (0.03 - 0.02 + 0.05)), abs=1e-6)
@@ -173,6 +173,6 @@ def test_frames_that_moved_together_are_rendered_as_the_tracker_saw_them():
     learner = RefiningLearner(SMALL, 0, CPU)
     with torch.no_grad():
         learner.poses.shifts += torch.tensor([0.2, -0.1, 0.3])
-        moved = learner.values(learner.training_points(1)).clamp(0.0, 1.0).numpy()
+        moved = learner.field(learner.training_points(1)).clamp(0.0, 1.0).numpy()
     rendered = learner.render(PROBE, SMALL.train.poses[1:2], 12, 8)[0]
     np.testing.assert_allclose(rendered, moved, atol=2e-3)  # the finest octave makes much of a rounding

@@ -40,7 +40,7 @@ def test_a_field_that_shows_the_image_has_no_loss(name, monkeypatch):
     def image(points):
         return learner.image(place) + 0.0 * points.sum(dim=-1)
 
-    monkeypatch.setattr(learner, "values", image)
+    monkeypatch.setattr(learner, "field", image)
     assert learner.loss(0, 10).item() == pytest.approx(0.0, abs=1e-5)
 
 
@@ -53,7 +53,7 @@ def test_a_frame_is_taken_at_the_places_of_its_pixels(name, probe, monkeypatch):
     def ramp(points):
         return 0.5 + points @ direction
 
-    monkeypatch.setattr(learner, "values", ramp)
+    monkeypatch.setattr(learner, "field", ramp)
     pose = learner.dataset.train.poses[1].copy()
     pose[:3, :3] = [[0.8, 0.0, 0.6], [0.0, 1.0, 0.0], [-0.6, 0.0, 0.8]]
     frame = learner.render(probe, pose[None], 12, 8)[0]

@@ -115,8 +115,7 @@ def footprint_pixels(
         )
     except _cpu.GivenUp:
         raise GivenUp from None
-    found: list[int] = pixels.tolist()
-    return found
+    return pixels.tolist()
 
 
 def drawing_work(
@@ -141,7 +140,6 @@ def drawing_work(
 
 
 def _sorted(scene: GaussianScene, weighted: bool = False) -> _cpu.PreparedScene:
-    """The scene as the kernel takes it for many frames."""
     kind = Kind(scene.info.intensity, weighted)
     return scene.prepared(kind.place("cpu"), lambda: _prepare(scene.splats, kind))
 
@@ -149,10 +147,7 @@ def _sorted(scene: GaussianScene, weighted: bool = False) -> _cpu.PreparedScene:
 def _view_arguments(probe: Probe, poses_cm: FloatArray, height: int, width: int, beam: Tensor | None) -> dict[str, Any]:
     lines = KernelLines.of(probe)
     return {
-        "fanned": lines.fanned,
-        "wrap": lines.wrap,
-        "start": lines.start,
-        "span": lines.span,
+        **{name: getattr(lines, name) for name in ("fanned", "wrap", "start", "span")},
         "near_cm": probe.near_mm / 10.0,
         "far_cm": probe.far_mm / 10.0,
         "cull_far_cm": probe.cull_far_mm(height) / 10.0,

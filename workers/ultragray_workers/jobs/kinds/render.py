@@ -125,7 +125,6 @@ class RenderJob(FrameSettings, Specification):
         return FORMATS[self.format or "npz"]
 
     def plan(self, scene: SceneHeader, scene_sha256: str) -> BatchPlan:
-        """The plan of a job in shards. Raises InvalidArgument and its kind where no shard could be made."""
         return BatchPlan.prepared(
             scene,
             self,
@@ -219,7 +218,6 @@ class RenderJob(FrameSettings, Specification):
         return training_poses
 
     def check_room(self, frames: int, picture: Picture, free: int) -> None:
-        """Raises StorageFull where so many bytes are no room for so many frames."""
         needed = self.file_bytes(frames, picture)
         if needed > free:
             raise StorageFull(
