@@ -81,7 +81,7 @@ def test_the_loop_goes_on_while_a_large_body_is_read(monkeypatch):
         return "read"
 
     async def main():
-        reading = asyncio.ensure_future(bodies.read_large(b"[]", str, None, lambda value, cls: value))
+        reading = asyncio.ensure_future(bodies.read_large(b'""', str, None))
         while not begun.is_set():
             await asyncio.sleep(0.001)
         assert not reading.done()
@@ -168,7 +168,7 @@ def get(tmp_path):
     file = Artifact(storage, "frames.npz", StoredFile("jobs/one/frames.npz", len(CONTENT), "ab" * 32))
 
     async def shared(request):
-        return artifact_response(file, request.headers, "application/x-npz", SHOWN, "attachment")
+        return artifact_response(file, request.headers, "application/x-npz", "attachment")
 
     async def local(request):
         path = tmp_path / "jobs" / "one" / "frames.npz"
