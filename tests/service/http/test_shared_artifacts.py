@@ -32,7 +32,7 @@ def get(tmp_path: Path) -> Get:
     file = Artifact(storage, "frames.npz", StoredFile("jobs/one/frames.npz", len(CONTENT), "ab" * 32))
 
     async def shared(request: Request) -> Response:
-        return artifact_response(file, request.headers, "application/x-npz", SHOWN, "attachment")
+        return artifact_response(file, request.headers, "application/x-npz", "attachment")
 
     async def local(request: Request) -> Response:
         path = tmp_path / "jobs" / "one" / "frames.npz"
