@@ -112,7 +112,7 @@ describe("an operator", () => {
     await page.getByLabel("Name", { exact: true }).fill("hidden");
     await page.getByRole("checkbox", { name: /^Private/ }).check();
     await page.getByRole("button", { name: "Import", exact: true }).click();
-    await page.getByTestId("scene-hidden").getByText("private").waitFor();
+    await page.getByTestId("scene-hidden").getByText("private").waitFor({ timeout: BACKGROUND_TIMEOUT_MS });
 
     const other = await pageOf(at, "bob", "#/scenes");
     const row = other.getByTestId("scene-hers");

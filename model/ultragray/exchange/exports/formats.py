@@ -13,11 +13,15 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TypeAlias
 
+import numpy as np
+
 from ultragray.errors import InvalidArgument
 from ultragray.exchange.exports.exporter import Exporter, ExportHeader, stored_pixels
 from ultragray.files import atomic_path
+from ultragray.geometry.probe import Picture
 from ultragray.installation import extra_of, missing_extra
 from ultragray.rendering.display import true_to_scale
+from ultragray.rendering.outputs import OUTPUTS
 from ultragray.rendering.pixels import PixelArray
 from ultragray.rendering.settings import Resolved
 from ultragray.scene.confidence import Extrapolation
@@ -48,6 +52,12 @@ class Format:
             return settings
         pixel_mm = true_to_scale(settings.probe, settings.height).pixel_mm
         return replace(settings, display=replace(settings.display, pixel_mm=pixel_mm))
+
+
+def frame_bytes(outputs: Sequence[str], dtype: str, picture: Picture) -> int:
+    """The bytes that the pixels of a frame take in a file where they are not compressed."""
+    pixel_bytes = sum(1 if OUTPUTS[name].is_numbers else np.dtype(dtype).itemsize for name in outputs)
+    return picture.height * picture.width * pixel_bytes
 
 
 _HERE = __package__
