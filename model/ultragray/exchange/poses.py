@@ -102,9 +102,6 @@ def _reason(error: BaseException) -> str:
     return f"not a file of poses that can be read: {error}"
 
 
-# Poses in MCAP files: geometry_msgs/PoseStamped of ROS 2, metres, such as `ros2 bag record -s mcap` writes them.
-
-
 PREFERRED = "/probe_pose"  # the end of the topic of the ROS 2 node
 
 
@@ -137,7 +134,6 @@ def read_mcap_poses(path: Path) -> FloatArray:  # [P, 4, 4]
 
 
 def _topic(summary: Any) -> str:
-    """The topic that holds the poses of the probe."""
     if summary is None:
         raise ValueError("it has no summary: its writing was not finished")
     kinds = {number: schema.name for number, schema in summary.schemas.items()}

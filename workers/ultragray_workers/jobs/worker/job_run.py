@@ -26,8 +26,6 @@ class Stopped(Exception):
 
 
 class JobRun:
-    """One job in its process."""
-
     def __init__(
         self, folder: JobFolder, request: Request, should_stop: Callable[[], bool], channel: Channel | None = None
     ) -> None:

@@ -1,7 +1,7 @@
-"""Makes the demo scene and its pictures: what `make demo-scene` runs, in the source tree.
+"""Makes the demo scene and its pictures: `make demo-scene`.
 
 Simulates the phantom, trains with the preset `fast`, measures on the held-out sweep, gives each Gaussian the label of
-the tissue that it lies in, and writes `spine.ugr` beside this file and the README's pictures into docs/images.
+the tissue that it lies in, and puts `spine.ugr` in its place in the package and the README's pictures into docs/images.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from bone_shadow import BoneShadow
 from ultragray.files import write_whole
 from ultragray.geometry.probe import FloatArray, Probe, RadialProbe, SteeredProbe
 from ultragray.learn.evaluation.scoring import render_sweep
@@ -22,7 +23,6 @@ from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import Progress, TrainingConfig, train
 from ultragray.phantom import load_phantom, tissue_at
 from ultragray.phantom.demo import DEMO_FILE, LABEL_NAMES, labels_of
-from ultragray.phantom.imaging import BoneShadow
 from ultragray.rendering.display import true_to_scale
 from ultragray.rendering.frames import render, show
 from ultragray.rendering.pixels import image_file
@@ -30,7 +30,7 @@ from ultragray.scene.gaussians import GaussianScene
 
 DATASET_NAME = "demo lumbar spine (in silico)"
 MAX_GAUSSIANS = 50_000  # 3 MB, small enough to come with the code
-PICTURES_FOLDER = Path(__file__).parents[3] / "docs" / "images"
+PICTURES_FOLDER = Path(__file__).parents[1] / "docs" / "images"
 PICTURE_SIDE = 512
 PARAMEDIAN_MM = 12.0  # from the midline, across the laminae
 CATHETER_MM = (12.0, 0.0, 22.0)  # within the muscle, beside the vessel
