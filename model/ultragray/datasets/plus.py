@@ -254,8 +254,7 @@ class _Way:
 
 
 def _inverse(matrix: FloatArray) -> FloatArray:  # [4, 4]
-    found: FloatArray = np.linalg.inv(matrix)
-    return found
+    return np.asarray(np.linalg.inv(matrix), np.float64)
 
 
 def _values(stored: StoredSequence, name: TransformName) -> set[str]:
