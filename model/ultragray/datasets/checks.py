@@ -256,12 +256,24 @@ def _warnings(frames: _Frames) -> Iterator[str]:
     """What looks wrong about the frames of one recording."""
     if frames.times_s is not None:
         yield from clock_warnings(frames.times_s, frames.numbers)
+    yield from _moved_far(frames)
     jumps = list(_jumps(frames))
     yield from (text for _, text in jumps)
     yield from _repeats(frames)
     yield from _odd_images(frames)
     yield from _cuts(frames, {place for place, _ in jumps})
     yield from _overlays(frames)
+
+
+def _moved_far(frames: _Frames) -> Iterator[str]:
+    """Steps that no hand makes, as millimetres have it that are taken for metres."""
+    steps_mm = np.linalg.norm(np.diff(frames.poses[:, :3, 3], axis=0), axis=1)
+    usual = float(np.median(steps_mm / np.abs(np.diff(frames.numbers)).clip(min=1))) if len(steps_mm) > 2 else 0.0
+    if usual >= LONGEST_USUAL_STEP_MM:
+        yield (
+            f"the probe goes {usual:.0f} mm from frame to frame, {steps_mm.sum() / 1000:.3g} m in all: positions in "
+            "millimetres where metres are expected?"
+        )
 
 
 def _jumps(frames: _Frames) -> Iterator[tuple[int, str]]:
@@ -414,7 +426,6 @@ def _dataset_warnings(dataset: Dataset) -> list[str]:
     found = [
         *dict.fromkeys((*dataset.train.notes, *dataset.val.notes)),
         *(list(dataset.probe.oddities()) or _hardly_moved(dataset.train)),
-        *_moved_far(dataset.train),
     ]
     known = set(_contents(dataset.train))
     leaked = [place for place, frame in enumerate(_contents(dataset.val)) if frame in known]
@@ -437,18 +448,6 @@ def _hardly_moved(sweep: Sweep) -> list[str]:
     if travel_mm < pixel_mm:
         return [f"{found}, less than a pixel ({pixel_mm:.2g} mm): tracking stalled, or positions in metres?"]
     return [f"{found}, where scan lines are {sweep.probe.scan_line_length_mm:.0f} mm long: positions in centimetres?"]
-
-
-def _moved_far(sweep: Sweep) -> list[str]:
-    """Steps that no hand makes, as millimetres have it that are taken for metres."""
-    steps_mm = np.linalg.norm(np.diff(sweep.poses[:, :3, 3], axis=0), axis=1)
-    steps_mm /= np.abs(np.diff(sweep.frame_numbers)).clip(min=1)
-    if len(steps_mm) < 3 or (usual := float(np.median(steps_mm))) < LONGEST_USUAL_STEP_MM:
-        return []
-    return [
-        f"the probe goes {usual:.0f} mm from frame to frame, {steps_mm.sum() / 1000:.3g} m in all: positions in "
-        "millimetres where metres are expected?"
-    ]
 
 
 def _contents(sweep: Sweep) -> list[tuple[bytes, bytes]]:
