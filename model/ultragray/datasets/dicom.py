@@ -424,7 +424,10 @@ def _read_jpeg(
             if number == chosen[0] and INTERPRETATIONS[interpretation] == 3:
                 is_rgb, notes = _jpeg_colours(stream, interpretation)
             flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
-            frame = cv2.imdecode(np.frombuffer(_as_rgb(stream) if is_rgb else stream, np.uint8), flags)
+            size = re.search(rb"\xff[\xc0-\xc3]...(..)(..)", stream, re.DOTALL)  # never more than the header says
+            frame = None
+            if size is not None and tuple(int.from_bytes(side, "big") for side in size.groups()) == shape[1:]:
+                frame = cv2.imdecode(np.frombuffer(_as_rgb(stream) if is_rgb else stream, np.uint8), flags)
             if frame is None or frame.shape != shape[1:]:
                 raise DatasetInvalid(
                     f"{path}: frame {number}: it cannot be read as JPEG of {shape[2]} x {shape[1]} pixels"

@@ -174,6 +174,7 @@ BESIDE = ".geometry.json"
 
 
 TF, STATIC = "/tf", "/tf_static"
+LONGEST_LINK_MM = 5_000.0  # between two frames that do not move against each other
 SLOW_PATH_NS = 50_000_000  # by which images may be written later after their stamps than poses
 _Stamped: TypeAlias = tuple[int, int, Any, Any]  # stamp and time of writing in ns, position in metres, orientation
 
@@ -303,6 +304,9 @@ class TrackedPoses:
             if is_tracked and is_constant:
                 notes.append(f"{called} of {TF} never changes: taken for all images")
             is_moving = is_tracked and not is_constant
+            length_mm = float(np.linalg.norm(track.poses[-1, :3, 3]))
+            if not is_moving and length_mm > LONGEST_LINK_MM:
+                notes.append(f"{called} is {length_mm / 1000:.3g} m long: millimetres where metres are expected?")
             tracks.append((track, is_moving, is_inverted))
             ends = name[::-1] if is_inverted else name
             links.append(Link(*ends, called, TF if is_tracked else STATIC, is_inverted, is_moving))

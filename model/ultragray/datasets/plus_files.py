@@ -77,7 +77,9 @@ def pixel_shape(path: Path, sizes: list[int], channels: int) -> tuple[int, ...]:
         sizes = [*sizes[:2], sizes[3]]
     if len(sizes) != 3:
         raise DatasetInvalid(f"{path}: a sequence has columns x rows x frames, got {' x '.join(map(str, sizes))}")
-    if 0 in sizes[:2] and sizes[2]:
+    if not sizes[2]:
+        raise DatasetInvalid(f"{path}: it holds no frames")
+    if 0 in sizes[:2]:
         raise DatasetInvalid(f"{path}: it holds no images: a recording of the tracker alone, of {sizes[2]} frames")
     if channels not in (1, 3, 4):
         raise DatasetInvalid(f"{path}: pixels must have 1, 3 or 4 channels, got {channels}")

@@ -123,7 +123,7 @@ def read_table_sweep(
         notes=tuple(notes),
         region=region_of(size, shown.box, pixel_mm, image_to_sensor),
         chain=chain,
-        times_s=None if image_times_s is None else image_times_s[numbers],
+        times_s=None if image_times_s is None or not np.isfinite(image_times_s).all() else image_times_s[numbers],
     )
     return sweep, count
 

@@ -132,6 +132,14 @@ def test_grey_jpeg(write: Write, word: str) -> None:
     assert np.abs(found.astype(int) - shown[[2, 7]]).mean() <= 1
 
 
+def test_a_stream_of_another_size_is_not_decoded(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+    large = cv2.imencode(".jpg", np.full((2000, 2000), 90, np.uint8))[1].tobytes()
+    path = write(syntax=JPEGBaseline8Bit, data=encapsulate([large] * 10))
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    with pytest.raises(DatasetInvalid, match="frame 0: it cannot be read as JPEG of 128 x 96 pixels"):
+        load_dataset(path)
+
+
 @pytest.mark.parametrize("word", ["RGB", "YBR_FULL"])
 @pytest.mark.parametrize("stored", ["RGB", "YBR_FULL"])
 def test_raw_colours_are_read_as_they_are(write: Write, word: str, stored: str) -> None:

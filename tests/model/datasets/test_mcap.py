@@ -311,6 +311,20 @@ def test_a_static_transform_that_is_told_with_another_value_is_named(path: Path)
     assert "probeToflange of /tf_static was told with other values: the last is taken for all images" in notes
 
 
+def test_a_mount_in_millimetres_is_told(path: Path) -> None:
+    bag = Bag(path)
+    bag.geometry()
+    robot(bag)
+    mount = FLANGE_TO_PROBE.copy()
+    mount[:3, 3] *= 1000.0
+    bag.write(
+        "/tf_static", TRANSFORMS, {"transforms": [transform_message(mount, START_NS, "flange", "probe")]}, START_NS
+    )
+    bag.images()
+    notes = load_dataset(bag.finish()).train.notes
+    assert "probeToflange is 80.9 m long: millimetres where metres are expected?" in notes
+
+
 def test_a_parent_that_changes_is_named_with_both(path: Path) -> None:
     bag = Bag(path)
     bag.geometry()
