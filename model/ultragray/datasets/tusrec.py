@@ -120,6 +120,11 @@ def _read_scan(path: Path, frames: str | None) -> tuple[np.ndarray, FloatArray, 
             images, tforms = (file.get(key) for key in ("frames", "tforms"))
             if not all(isinstance(one, h5py.Dataset) for one in (images, tforms)):
                 raise DatasetInvalid(f"{path}: it must have frames and tforms, it has {', '.join(file) or 'nothing'}")
+            links = (file.get(key, getlink=True) for key in ("frames", "tforms"))
+            if any(type(link) is not h5py.HardLink for link in links) or any(
+                one.is_virtual or one.external for one in (images, tforms)
+            ):
+                raise DatasetInvalid(f"{path}: its frames and tforms must lie in the file itself")
             count = len(images) if images.ndim else 0
             if tforms.shape != (count, 4, 4) or tforms.dtype.kind != "f":
                 raise DatasetInvalid(

@@ -121,6 +121,31 @@ def test_what_cannot_be_used_is_one_clear_error(
         load_dataset(write(calibration=calibration, **arrays))
 
 
+@pytest.mark.parametrize("kind", ["external link", "soft link", "external bytes", "virtual"])
+def test_arrays_of_other_files_are_not_read(write: Callable[..., Path], tmp_path: Path, kind: str) -> None:
+    """An upload must not show what else lies on the machine."""
+    secret = tmp_path / "secret.h5"
+    with h5py.File(secret, "w") as file:
+        file["frames"] = FRAMES
+    path = write(frames=None)
+    with h5py.File(path, "a") as file:
+        if kind == "external link":
+            file["frames"] = h5py.ExternalLink(str(secret), "/frames")
+        elif kind == "soft link":
+            file["other"] = FRAMES
+            file["frames"] = h5py.SoftLink("/other")
+        elif kind == "external bytes":
+            (tmp_path / "secret.raw").write_bytes(FRAMES.tobytes())
+            places = [(str(tmp_path / "secret.raw"), 0, FRAMES.nbytes)]
+            file.create_dataset("frames", FRAMES.shape, "u1", external=places)
+        else:
+            layout = h5py.VirtualLayout(FRAMES.shape, "u1")
+            layout[:] = h5py.VirtualSource(str(secret), "frames", FRAMES.shape)
+            file.create_virtual_dataset("frames", layout)
+    with pytest.raises(DatasetInvalid, match="frames and tforms must lie in the file itself"):
+        load_dataset(path)
+
+
 def test_frames_without_a_pose_are_left_out(write: Callable[..., Path]) -> None:
     tforms = TFORMS.copy()
     tforms[5] = np.nan
