@@ -214,7 +214,7 @@ ros: $(VENV)/installed-dev  ## the time from a pose published in ROS 2 to its im
 	$(KEEP) ros
 
 demo-scene: $(VENV)/installed  ## simulate the phantom, train the demo scene from it and put it in its place
-	$(BIN)/python -m ultragray.phantom.make_demo
+	$(BIN)/python benchmarks/demo_scene.py
 
 docs: $(VENV)/installed-dev  ## build the site of the documents into build/site; broken links and anchors fail
 	$(BIN)/python -m docs.generator

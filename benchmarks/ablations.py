@@ -9,13 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from bone_shadow import BoneShadow
 from measuring import Document, Lines, measure_runs, table
 from ultragray.datasets.source import PHANTOM, SourceOptions, load_dataset
 from ultragray.learn.evaluation.scoring import render_sweep
 from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import TrainingConfig
 from ultragray.learn.training.config import TEXTURE
-from ultragray.phantom.imaging import BoneShadow
 from ultragray_studies.report import train_and_evaluate
 
 SEEDS = (0, 1, 2)

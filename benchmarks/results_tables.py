@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from bone_shadow import SHADOW_DB, BoneShadow
 from in_silico import IN_SILICO
 from measuring import Document, Lines, columns, measure_runs, table, teller
 from ultragray.datasets.source import PHANTOM, SourceOptions, load_dataset
@@ -18,7 +19,6 @@ from ultragray.learn.evaluation.baselines import BASELINES, affordable_voxel_mm,
 from ultragray.learn.evaluation.scoring import render_sweep
 from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import TrainingConfig
-from ultragray.phantom.imaging import SHADOW_DB, BoneShadow
 from ultragray.scene.gaussians import GaussianScene
 from ultragray_studies.report import train_and_evaluate
 

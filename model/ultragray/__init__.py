@@ -21,49 +21,28 @@ from ultragray.installation import __version__ as __version__
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 if TYPE_CHECKING:
-    from ultragray.errors import UltragrayError
-    from ultragray.geometry.pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
-    from ultragray.geometry.probe import (
-        ConvexProbe,
-        ElevationBeam,
-        LinearProbe,
-        PhasedProbe,
-        Probe,
-        RadialProbe,
-        SteeredProbe,
-    )
-    from ultragray.learn.localization.search import localize
-    from ultragray.learn.localization.settings import Localization
-    from ultragray.rendering.frames import Frames, render
-    from ultragray.scene.gaussians import GaussianScene
-    from ultragray.scene.info import SceneHeader, SceneInfo, read_header
-
-__all__ = [
-    "ConvexProbe",
-    "ElevationBeam",
-    "Frames",
-    "GaussianScene",
-    "LinearProbe",
-    "Localization",
-    "PhasedProbe",
-    "Probe",
-    "RadialProbe",
-    "SceneHeader",
-    "SceneInfo",
-    "SteeredProbe",
-    "UltragrayError",
-    "check_poses",
-    "localize",
-    "pose_from_position_quaternion",
-    "quaternion_from_pose",
-    "read_header",
-    "render",
-]
+    from ultragray.errors import UltragrayError as UltragrayError
+    from ultragray.geometry.pose import check_poses as check_poses
+    from ultragray.geometry.pose import pose_from_position_quaternion as pose_from_position_quaternion
+    from ultragray.geometry.pose import quaternion_from_pose as quaternion_from_pose
+    from ultragray.geometry.probe import ConvexProbe as ConvexProbe
+    from ultragray.geometry.probe import ElevationBeam as ElevationBeam
+    from ultragray.geometry.probe import LinearProbe as LinearProbe
+    from ultragray.geometry.probe import PhasedProbe as PhasedProbe
+    from ultragray.geometry.probe import Probe as Probe
+    from ultragray.geometry.probe import RadialProbe as RadialProbe
+    from ultragray.geometry.probe import SteeredProbe as SteeredProbe
+    from ultragray.learn.localization.search import localize as localize
+    from ultragray.learn.localization.settings import Localization as Localization
+    from ultragray.rendering.frames import Frames as Frames
+    from ultragray.rendering.frames import render as render
+    from ultragray.scene.gaussians import GaussianScene as GaussianScene
+    from ultragray.scene.info import SceneHeader as SceneHeader
+    from ultragray.scene.info import SceneInfo as SceneInfo
+    from ultragray.scene.info import read_header as read_header
 
 _MODULES = {
     "errors": ("UltragrayError",),
-    "learn.localization.search": ("localize",),
-    "learn.localization.settings": ("Localization",),
     "geometry.pose": ("check_poses", "pose_from_position_quaternion", "quaternion_from_pose"),
     "geometry.probe": (
         "ConvexProbe",
@@ -74,11 +53,14 @@ _MODULES = {
         "RadialProbe",
         "SteeredProbe",
     ),
+    "learn.localization.search": ("localize",),
+    "learn.localization.settings": ("Localization",),
     "rendering.frames": ("Frames", "render"),
     "scene.gaussians": ("GaussianScene",),
     "scene.info": ("SceneHeader", "SceneInfo", "read_header"),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}
+__all__ = sorted(_MODULE_OF)
 
 
 def __getattr__(name: str) -> Any:

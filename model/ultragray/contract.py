@@ -155,13 +155,12 @@ class Family(Contract):
 
 
 def kind_field(kind: str) -> Any:
-    """The field that tells a member of a family apart."""
     return field(default=kind, repr=False, kw_only=True, metadata={"description": "Always the same."})
 
 
 def annotated_fields(cls: Any) -> tuple[tuple[Field[Any], Any], ...]:
     """The fields of a dataclass that are given when it is made, each with its annotation as a type."""
-    return _annotated_fields(cls)
+    return _annotated_fields(cls)  # mypy takes no class for what a cache can hold
 
 
 @cache
@@ -226,7 +225,9 @@ def from_dict(cls: type[_T], document: Any) -> _T:
     if is_family and Family in cls.__bases__:
         cls = cls.member(document.get("kind"))  # type: ignore[attr-defined]
     known = {item.name: (item, annotation) for item, annotation in annotated_fields(cls)}
-    document = {name: value for name, value in document.items() if value is not None or not _needs_value(known, name)}
+    takes_none = {name for name, (_, annotation) in known.items() if optional_of(annotation)[1]}
+    left_out = {name for name, value in document.items() if value is None and name in known.keys() - takes_none}
+    document = {name: value for name, value in document.items() if name not in left_out}
     for name in document:
         if name not in known:
             takes = ", ".join(one for one in known if one != "kind") or "nothing"
@@ -240,11 +241,6 @@ def from_dict(cls: type[_T], document: Any) -> _T:
         with under(name, error):
             values[name] = _read(value, known[name][1])
     return cls(**values)
-
-
-def _needs_value(known: Mapping[str, tuple[Field[Any], Any]], name: str) -> bool:
-    """Whether null for a field is as if it were left out: it allows none."""
-    return name in known and not optional_of(known[name][1])[1]
 
 
 def blamed(cls: Any, location: Iterable[str | int]) -> tuple[str, type[InvalidArgument], Any]:
@@ -277,22 +273,17 @@ def _title(cls: Any) -> str:
 
 
 def _read(value: Any, annotation: Any) -> Any:
-    """A value of JSON as what the annotation says, where that is a class of ours."""
     kind, _ = optional_of(annotation)
     if value is not None and isinstance(kind, type) and (is_dataclass(kind) or issubclass(kind, Family)):
         return from_dict(kind, value)
-    if get_origin(kind) is tuple and isinstance(value, (list, tuple)) and _is_contract(get_args(kind)[0]):
-        return tuple(_read_in_list(place, one, get_args(kind)[0]) for place, one in enumerate(value))
-    return value
-
-
-def _is_contract(kind: Any) -> bool:
-    return isinstance(kind, type) and issubclass(kind, Contract)
-
-
-def _read_in_list(place: int, value: Any, kind: Any) -> Any:
-    with under(f"[{place}]"):
-        return from_dict(kind, value)
+    element = get_args(kind)[0] if get_origin(kind) is tuple and isinstance(value, (list, tuple)) else None
+    if not isinstance(element, type) or not issubclass(element, Contract):
+        return value
+    elements = []
+    for place, one in enumerate(value):
+        with under(f"[{place}]"):
+            elements.append(from_dict(element, one))
+    return tuple(elements)
 
 
 _Check = Callable[[Any], Any]  # the value in its own type; raises InvalidArgument
@@ -303,19 +294,13 @@ def _checks(cls: type[Contract]) -> tuple[tuple[str, Any, _Check, type[InvalidAr
     """Each field's name, its default in its own type, which needs no check, its check, and the error of that."""
     found = []
     for item, annotation in annotated_fields(cls):
-        check = _check_of(annotation, item)
+        kind, optional = optional_of(annotation)
+        check = _check_of_kind(kind, item)
+        if optional or item.default is None:
+            check = partial(_unless_none, check)
         default = MISSING if item.default is MISSING else check(item.default)
         found.append((item.name, default, check, item.metadata.get("error", cls.error)))
     return tuple(found)
-
-
-def _check_of(annotation: Any, item: Field[Any]) -> _Check:
-    """The check of a field, or of the elements of its list."""
-    kind, optional = optional_of(annotation)
-    check = _check_of_kind(kind, item)
-    if optional or item.default is None:
-        return lambda value: None if value is None else check(value)
-    return check
 
 
 def _check_of_kind(kind: Any, item: Field[Any]) -> _Check:
@@ -343,6 +328,10 @@ def _check_of_kind(kind: Any, item: Field[Any]) -> _Check:
 
 def _any(value: Any) -> Any:
     return value
+
+
+def _unless_none(check: _Check, value: Any) -> Any:
+    return None if value is None else check(value)
 
 
 def _word(words: tuple[Any, ...], value: Any) -> Any:

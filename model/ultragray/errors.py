@@ -21,18 +21,16 @@ UltragrayError
 ├── those of pool, datasets and jobs: ultragray_workers.errors
 └── those of the front doors: ultragray_service.errors
 
-Each class carries a `reason` that never changes: clients match on it, and the service looks up the statuses that its
-front doors answer with. It is the class's name in capitals, where the class does not say otherwise. The first
-paragraph of its docstring is its line in docs/reference/errors.md.
+Each class carries a `reason` that never changes, which is its name: clients match on it, and the service looks up the
+statuses that its front doors answer with. The first paragraph of its docstring is its line in docs/reference/errors.md.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Iterator
+from functools import partial
 from typing import ClassVar
-
-_WORD = re.compile(r"(?<!^)(?=[A-Z])")  # where a word of a class's name begins
 
 
 class UltragrayError(Exception):
@@ -44,9 +42,9 @@ class UltragrayError(Exception):
     reason: ClassVar[str] = "INTERNAL"
     title: ClassVar[str] = "Internal error"
 
-    def __init_subclass__(cls) -> None:
-        if "reason" not in vars(cls):
-            cls.reason = _WORD.sub("_", cls.__name__).upper()
+    def __init_subclass__(cls, *, title: str | None = None, reason: str | None = None) -> None:
+        cls.reason = reason or re.sub(r"(?<=[a-z])(?=[A-Z])", "_", cls.__name__).upper()
+        cls.title = title or cls.title
 
     def __init__(self, detail: str, *, field: str | None = None, retry_after_s: float | None = None) -> None:
         """`retry_after_s`: when the same request may succeed, where the one who raises it knows."""
@@ -56,11 +54,7 @@ class UltragrayError(Exception):
         self.retry_after_s = retry_after_s
 
     def __reduce__(self) -> tuple[object, ...]:  # crosses the pipe from a worker unchanged
-        return _rebuild, (type(self), self.detail, self.field, self.retry_after_s)
-
-
-def _rebuild(cls: type[UltragrayError], detail: str, field: str | None, retry_after_s: float | None) -> UltragrayError:
-    return cls(detail, field=field, retry_after_s=retry_after_s)
+        return partial(type(self), field=self.field, retry_after_s=self.retry_after_s), (self.detail,)
 
 
 def error_classes(base: type[UltragrayError] = UltragrayError) -> Iterator[type[UltragrayError]]:
@@ -70,107 +64,73 @@ def error_classes(base: type[UltragrayError] = UltragrayError) -> Iterator[type[
         yield from error_classes(cls)
 
 
-class InvalidArgument(UltragrayError, ValueError):
+class InvalidArgument(UltragrayError, ValueError, title="Invalid argument"):
     """A value that cannot be used; `field` names it as the caller wrote it."""
 
-    title = "Invalid argument"
 
-
-class InvalidPose(InvalidArgument):
+class InvalidPose(InvalidArgument, title="Not a rigid probe-to-scene transform"):
     """Not a rigid probe→scene transform."""
 
-    title = "Not a rigid probe-to-scene transform"
 
-
-class InvalidProbe(InvalidArgument):
+class InvalidProbe(InvalidArgument, title="Invalid probe"):
     """A probe that no transducer could have, such as far ≤ near."""
 
-    title = "Invalid probe"
 
-
-class InvalidImageSize(InvalidArgument):
+class InvalidImageSize(InvalidArgument, title="Invalid image size"):
     """Height or width outside the limits."""
 
-    title = "Invalid image size"
 
-
-class UnknownOutput(InvalidArgument):
+class UnknownOutput(InvalidArgument, title="Unknown output"):
     """An output that does not exist, none at all, or one that the scene does not have."""
 
-    title = "Unknown output"
 
-
-class LowConfidence(InvalidArgument):
+class LowConfidence(InvalidArgument, title="The confidence is too low"):
     """A pose below the `min_confidence` that was asked for."""
 
-    title = "The confidence is too low"
 
-
-class FrameTooCostly(InvalidArgument):
+class FrameTooCostly(InvalidArgument, title="The frame would take too long"):
     """A frame whose Gaussians cover more pixels than `ULTRAGRAY_MAX_FOOTPRINT_PIXELS` allows; ask for a smaller one."""
 
-    title = "The frame would take too long"
 
-
-class TooManyPoses(InvalidArgument):
+class TooManyPoses(InvalidArgument, title="Too many poses"):
     """More poses, or pixels, than one request may have; send several."""
 
-    title = "Too many poses"
 
-
-class SceneFileInvalid(UltragrayError):
+class SceneFileInvalid(UltragrayError, title="Invalid scene file"):
     """A scene file that is truncated, foreign or inconsistent."""
 
-    title = "Invalid scene file"
 
-
-class CheckpointInvalid(UltragrayError):
+class CheckpointInvalid(UltragrayError, title="Invalid checkpoint"):
     """A checkpoint, conf.json or pose file that cannot be imported (command line, library)."""
 
-    title = "Invalid checkpoint"
 
-
-class DatasetInvalid(UltragrayError):
+class DatasetInvalid(UltragrayError, title="Invalid dataset"):
     """A tracked sweep that cannot be used; names the file, the frame and the reason."""
 
-    title = "Invalid dataset"
 
-
-class TrainingDiverged(UltragrayError):
+class TrainingDiverged(UltragrayError, title="Training diverged"):
     """Loss or parameters of a training are no longer finite, or no method of a comparison came to its end."""
 
-    title = "Training diverged"
 
-
-class TrainingStateInvalid(UltragrayError):
+class TrainingStateInvalid(UltragrayError, title="Training cannot be resumed"):
     """A training folder that cannot be resumed from."""
 
-    title = "Training cannot be resumed"
 
-
-class MemoryExceeded(UltragrayError):
+class MemoryExceeded(UltragrayError, title="Memory exceeded"):
     """The check of a dataset or scene file, a comparison, a training, or a frame or scene on a GPU, that does not fit
     into memory; also where the machine has none left.
     """
 
-    title = "Memory exceeded"
 
-
-class BackendUnavailable(UltragrayError):
+class BackendUnavailable(UltragrayError, title="Render backend unavailable"):
     """A backend that cannot run here."""
 
-    title = "Render backend unavailable"
 
-
-class ExtraMissing(UltragrayError):
+class ExtraMissing(UltragrayError, title="Optional package not installed"):
     """A format, a command or traces whose package is not installed; the sentence says how to install it (uploads,
     jobs, command line, library).
     """
 
-    title = "Optional package not installed"
 
-
-class RenderFailed(UltragrayError):
+class RenderFailed(UltragrayError, title="Rendering failed"):
     """A worker could not render the frame."""
-
-    title = "Rendering failed"

@@ -8,12 +8,12 @@ import contextlib
 import errno
 import glob
 import hashlib
+import io
 import math
 import os
 import shutil
 import tempfile
 from collections.abc import Iterator
-from contextlib import suppress
 from pathlib import Path
 from tokenize import TokenError
 from typing import Any, BinaryIO
@@ -35,7 +35,9 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
         os.close(descriptor)
         temporary = Path(name)
         yield temporary
-        temporary.chmod(0o666 & ~_umask())
+        mask = os.umask(0)
+        os.umask(mask)
+        temporary.chmod(0o666 & ~mask)
         sync(temporary)
         temporary.replace(path)
         sync(path.parent)
@@ -66,9 +68,14 @@ def remove_stale_temporaries(path: str | Path) -> None:
 
 
 def write_whole(path: str | Path, content: str | bytes) -> None:
-    """Write a file of this content (text as UTF-8), or leave what was there."""
     with atomic_path(path) as temporary:
         temporary.write_bytes(content.encode() if isinstance(content, str) else content)
+
+
+def npy_bytes(array: Any) -> bytes:
+    file = io.BytesIO()
+    np.save(file, array, allow_pickle=False)
+    return file.getvalue()
 
 
 def sync(path: Path) -> None:
@@ -83,12 +90,6 @@ def sync(path: Path) -> None:
         os.close(descriptor)
 
 
-def _umask() -> int:
-    mask = os.umask(0)
-    os.umask(mask)
-    return mask
-
-
 def file_sha256(path: str | Path) -> str:
     """The hash that names a scene in every frame rendered from it: SHA-256 of its file, hexadecimal."""
     digest = hashlib.sha256()
@@ -98,15 +99,12 @@ def file_sha256(path: str | Path) -> str:
     return digest.hexdigest()
 
 
-# A second name for a file that never changes.
-
-
 def link_or_copy(source: Path, target: Path) -> None:
     """Makes `target` the same file as `source`, or a whole copy where that cannot be; an existing target stays.
 
     What is there then survives a loss of power. Raises OSError.
     """
-    with suppress(FileExistsError):
+    with contextlib.suppress(FileExistsError):
         try:
             os.link(source.resolve(), target)
         except FileExistsError:
@@ -129,9 +127,6 @@ def _copy(source: Path, target: Path) -> None:
                 raise FileExistsError from None
 
 
-# The version that a file of ours names: one of this release, or a sentence that says what to do.
-
-
 def require_version(found: Any, known: int) -> None:
     """Raises ValueError where a file is of another version than the release reads."""
     if type(found) is int and found > known:
@@ -146,7 +141,6 @@ def require_version(found: Any, known: int) -> None:
 # One array of numbers in a `.npy` file, mapped and not read; what is wrong with a file, in our words.
 #
 # The header is checked before numpy maps the file: its own messages advise to unpickle what is no array.
-
 
 _DAMAGED = "its .npy header is damaged or truncated"
 _MAGIC, _ZIP_MAGIC = b"\x93NUMPY", b"PK\x03\x04"

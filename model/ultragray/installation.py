@@ -72,9 +72,6 @@ def missing_extra(error: ImportError, purpose: str, *, field: str | None = None)
     return ExtraMissing(f"{purpose} needs {module}, which is not installed: {install_advice(extra)}", field=field)
 
 
-# Facts about the machine that this process runs on.
-
-
 _GROUP_LIMITS = (  # of the control group that a container is
     Path("/sys/fs/cgroup/memory.max"),
     Path("/sys/fs/cgroup/memory/memory.limit_in_bytes"),
@@ -101,7 +98,6 @@ def processor_model() -> str | None:
 
 
 def _cpu_info() -> dict[str, str]:
-    """What Linux says of the first processor."""
     path = Path("/proc/cpuinfo")
     if not path.exists():
         return {}

@@ -8,124 +8,84 @@ from ultragray.contract import described
 from ultragray.errors import UltragrayError
 
 
-class Unauthenticated(UltragrayError):
+class Unauthenticated(UltragrayError, title="Authentication required"):
     """No API key, or an unknown one."""
 
-    title = "Authentication required"
 
-
-class IssuerUnavailable(UltragrayError):
+class IssuerUnavailable(UltragrayError, title="The issuer of the token does not answer"):
     """The issuer of a token does not answer, so that the token cannot be checked; API keys work all the same; retry."""
 
-    title = "The issuer of the token does not answer"
 
-
-class PermissionDenied(UltragrayError):
+class PermissionDenied(UltragrayError, title="Not allowed to this key"):
     """A role that may not do what was asked, or something that belongs to somebody else."""
 
-    title = "Not allowed to this key"
 
-
-class RateLimited(UltragrayError):
+class RateLimited(UltragrayError, title="Too many in a second for this key"):
     """More requests or frames in a second than the key may have; retry."""
 
-    title = "Too many in a second for this key"
 
-
-class LimitReached(UltragrayError):
+class LimitReached(UltragrayError, title="This key has as much as it may"):
     """As many streams, jobs, minutes of compute or bytes as the key may have; end or delete some, or wait."""
 
-    title = "This key has as much as it may"
 
-
-class HostRefused(UltragrayError):
+class HostRefused(UltragrayError, title="Unknown host name"):
     """A `Host` that the service is not known as, where it asks for no key."""
 
-    title = "Unknown host name"
 
-
-class OriginRefused(UltragrayError):
+class OriginRefused(UltragrayError, title="Pages of this origin are not allowed"):
     """A page of another site opens a stream, or asks for anything where no key is asked for."""
 
-    title = "Pages of this origin are not allowed"
 
-
-class BodyTooLarge(UltragrayError):
+class BodyTooLarge(UltragrayError, title="Request body too large"):
     """A body over `ULTRAGRAY_MAX_BODY_BYTES`."""
 
-    title = "Request body too large"
 
-
-class NotAcceptable(UltragrayError):
+class NotAcceptable(UltragrayError, title="Accept header cannot be satisfied"):
     """The Accept header allows no type that can hold the request."""
 
-    title = "Accept header cannot be satisfied"
 
-
-class UnsupportedMediaType(UltragrayError):
+class UnsupportedMediaType(UltragrayError, title="Unsupported media type"):
     """A body that is not JSON (of an upload: no archive and no form), or compressed."""
 
-    title = "Unsupported media type"
 
-
-class HeadersTooLarge(UltragrayError):
+class HeadersTooLarge(UltragrayError, title="Request headers too large"):
     """The head of a request over `ULTRAGRAY_MAX_HEADER_BYTES`, or more headers than `ULTRAGRAY_MAX_HEADERS`."""
 
-    title = "Request headers too large"
 
-
-class TargetTooLong(UltragrayError):
+class TargetTooLong(UltragrayError, title="Request target too long"):
     """Path and query of a request over 16 KiB."""
 
-    title = "Request target too long"
 
-
-class RequestMalformed(UltragrayError):
+class RequestMalformed(UltragrayError, title="Not an HTTP request"):
     """Bytes that are no HTTP request, or too many requests at once on one connection."""
 
-    title = "Not an HTTP request"
 
-
-class RequestTooSlow(UltragrayError):
+class RequestTooSlow(UltragrayError, title="The request came too slowly"):
     """A head that took longer than `ULTRAGRAY_HEADER_TIMEOUT_S`, or a body below `ULTRAGRAY_MIN_BYTES_PER_S`."""
 
-    title = "The request came too slowly"
 
-
-class TooManyConnections(UltragrayError):
+class TooManyConnections(UltragrayError, title="Too many connections"):
     """Connections over `ULTRAGRAY_MAX_CONNECTIONS`, or of one address over the limit of those; retry."""
 
-    title = "Too many connections"
 
-
-class IgtlMessageInvalid(UltragrayError):
+class IgtlMessageInvalid(UltragrayError, title="Invalid OpenIGTLink message"):
     """An OpenIGTLink message whose header, checksum or content cannot be used."""
 
-    title = "Invalid OpenIGTLink message"
 
-
-class RouteNotFound(UltragrayError):
+class RouteNotFound(UltragrayError, title="No such route"):
     """No such path."""
 
-    title = "No such route"
 
-
-class MethodNotAllowed(UltragrayError):
+class MethodNotAllowed(UltragrayError, title="Method not allowed"):
     """The path exists, the method does not."""
 
-    title = "Method not allowed"
 
-
-class StreamNotFound(UltragrayError):
+class StreamNotFound(UltragrayError, title="No such open stream"):
     """No open stream of that id that the key may watch: it has ended, or is at another service of the same address."""
 
-    title = "No such open stream"
 
-
-class SceneReadOnly(UltragrayError):
+class SceneReadOnly(UltragrayError, title="Scene cannot be deleted"):
     """A scene of the data folder cannot be deleted over HTTP."""
-
-    title = "Scene cannot be deleted"
 
 
 @dataclass(frozen=True)
@@ -151,42 +111,75 @@ class Statuses:
     retry_after_s: int | None = None
 
 
-_REASONS = {  # by the answer to them, of the errors
-    Statuses(400, "INVALID_ARGUMENT"): "REQUEST_MALFORMED IGTL_MESSAGE_INVALID",
-    Statuses(401, "UNAUTHENTICATED"): "UNAUTHENTICATED",
-    Statuses(403, "PERMISSION_DENIED"): "PERMISSION_DENIED HOST_REFUSED ORIGIN_REFUSED SCENE_READ_ONLY",
-    Statuses(404, "NOT_FOUND"): (
-        "SCENE_NOT_FOUND REGISTRATION_NOT_FOUND DATASET_NOT_FOUND JOB_NOT_FOUND WORKER_NOT_FOUND "
-        "ARTIFACT_NOT_FOUND STREAM_NOT_FOUND"
-    ),
-    Statuses(404, "UNIMPLEMENTED"): "ROUTE_NOT_FOUND",
-    Statuses(405, "UNIMPLEMENTED"): "METHOD_NOT_ALLOWED",
-    Statuses(406, "INVALID_ARGUMENT"): "NOT_ACCEPTABLE",
-    Statuses(408, "DEADLINE_EXCEEDED"): "REQUEST_TOO_SLOW",
-    Statuses(409, "ALREADY_EXISTS"): "DATASET_EXISTS SCENE_EXISTS REQUEST_ID_CONFLICT",
-    Statuses(409, "FAILED_PRECONDITION"): "DATASET_IN_USE JOB_FINISHED JOB_NOT_FINISHED JOB_IN_USE",
-    Statuses(413, "INVALID_ARGUMENT"): "BODY_TOO_LARGE UPLOAD_TOO_LARGE",
-    Statuses(414, "INVALID_ARGUMENT"): "TARGET_TOO_LONG",
-    Statuses(415, "INVALID_ARGUMENT"): "UNSUPPORTED_MEDIA_TYPE",
-    Statuses(422, "FAILED_PRECONDITION"): "SCENE_FILE_INVALID TRAINING_DIVERGED TRAINING_STATE_INVALID",
-    Statuses(422, "INVALID_ARGUMENT"): (
-        "INVALID_ARGUMENT INVALID_POSE INVALID_PROBE INVALID_IMAGE_SIZE UNKNOWN_OUTPUT LOW_CONFIDENCE "
-        "FRAME_TOO_COSTLY TOO_MANY_POSES CHECKPOINT_INVALID DATASET_INVALID"
-    ),
-    Statuses(429, "RESOURCE_EXHAUSTED", retry_after_s=1): "QUEUE_FULL RATE_LIMITED",
-    Statuses(429, "RESOURCE_EXHAUSTED", retry_after_s=10): "JOB_QUEUE_FULL",
-    Statuses(429, "RESOURCE_EXHAUSTED"): "LIMIT_REACHED",
-    Statuses(431, "INVALID_ARGUMENT"): "HEADERS_TOO_LARGE",
-    Statuses(500, "INTERNAL"): "INTERNAL JOB_STALLED BACKUP_INVALID RESTORE_REFUSED STARTUP_FAILED RENDER_FAILED",
-    Statuses(501, "UNIMPLEMENTED"): "BACKEND_UNAVAILABLE EXTRA_MISSING",
-    Statuses(503, "UNAVAILABLE", retry_after_s=1): "TOO_MANY_CONNECTIONS NOT_READY DRAINING",
-    Statuses(503, "UNAVAILABLE", retry_after_s=5): (
-        "ISSUER_UNAVAILABLE STORAGE_UNAVAILABLE DATABASE_UNAVAILABLE ARTIFACT_FOLDER_UNAVAILABLE"
-    ),
-    Statuses(504, "DEADLINE_EXCEEDED"): "JOB_TIME_EXCEEDED DEADLINE_EXCEEDED",
-    Statuses(507, "RESOURCE_EXHAUSTED"): "STORAGE_FULL MEMORY_EXCEEDED SCENE_TOO_LARGE",
+STATUSES = {  # by the reason of the error
+    "INTERNAL": Statuses(500, "INTERNAL"),
+    "INVALID_ARGUMENT": Statuses(422, "INVALID_ARGUMENT"),
+    "INVALID_POSE": Statuses(422, "INVALID_ARGUMENT"),
+    "INVALID_PROBE": Statuses(422, "INVALID_ARGUMENT"),
+    "INVALID_IMAGE_SIZE": Statuses(422, "INVALID_ARGUMENT"),
+    "UNKNOWN_OUTPUT": Statuses(422, "INVALID_ARGUMENT"),
+    "LOW_CONFIDENCE": Statuses(422, "INVALID_ARGUMENT"),
+    "FRAME_TOO_COSTLY": Statuses(422, "INVALID_ARGUMENT"),
+    "TOO_MANY_POSES": Statuses(422, "INVALID_ARGUMENT"),
+    "UNAUTHENTICATED": Statuses(401, "UNAUTHENTICATED"),
+    "ISSUER_UNAVAILABLE": Statuses(503, "UNAVAILABLE", retry_after_s=5),
+    "PERMISSION_DENIED": Statuses(403, "PERMISSION_DENIED"),
+    "HOST_REFUSED": Statuses(403, "PERMISSION_DENIED"),
+    "ORIGIN_REFUSED": Statuses(403, "PERMISSION_DENIED"),
+    "BODY_TOO_LARGE": Statuses(413, "INVALID_ARGUMENT"),
+    "NOT_ACCEPTABLE": Statuses(406, "INVALID_ARGUMENT"),
+    "UNSUPPORTED_MEDIA_TYPE": Statuses(415, "INVALID_ARGUMENT"),
+    "HEADERS_TOO_LARGE": Statuses(431, "INVALID_ARGUMENT"),
+    "TARGET_TOO_LONG": Statuses(414, "INVALID_ARGUMENT"),
+    "REQUEST_MALFORMED": Statuses(400, "INVALID_ARGUMENT"),
+    "REQUEST_TOO_SLOW": Statuses(408, "DEADLINE_EXCEEDED"),
+    "TOO_MANY_CONNECTIONS": Statuses(503, "UNAVAILABLE", retry_after_s=1),
+    "IGTL_MESSAGE_INVALID": Statuses(400, "INVALID_ARGUMENT"),
+    "ROUTE_NOT_FOUND": Statuses(404, "UNIMPLEMENTED"),
+    "METHOD_NOT_ALLOWED": Statuses(405, "UNIMPLEMENTED"),
+    "SCENE_NOT_FOUND": Statuses(404, "NOT_FOUND"),
+    "REGISTRATION_NOT_FOUND": Statuses(404, "NOT_FOUND"),
+    "SCENE_FILE_INVALID": Statuses(422, "FAILED_PRECONDITION"),
+    "CHECKPOINT_INVALID": Statuses(422, "INVALID_ARGUMENT"),
+    "DATASET_INVALID": Statuses(422, "INVALID_ARGUMENT"),
+    "DATASET_NOT_FOUND": Statuses(404, "NOT_FOUND"),
+    "DATASET_EXISTS": Statuses(409, "ALREADY_EXISTS"),
+    "DATASET_IN_USE": Statuses(409, "FAILED_PRECONDITION"),
+    "UPLOAD_TOO_LARGE": Statuses(413, "INVALID_ARGUMENT"),
+    "STORAGE_FULL": Statuses(507, "RESOURCE_EXHAUSTED"),
+    "STORAGE_UNAVAILABLE": Statuses(503, "UNAVAILABLE", retry_after_s=5),
+    "TRAINING_DIVERGED": Statuses(422, "FAILED_PRECONDITION"),
+    "TRAINING_STATE_INVALID": Statuses(422, "FAILED_PRECONDITION"),
+    "MEMORY_EXCEEDED": Statuses(507, "RESOURCE_EXHAUSTED"),
+    "SCENE_EXISTS": Statuses(409, "ALREADY_EXISTS"),
+    "SCENE_READ_ONLY": Statuses(403, "PERMISSION_DENIED"),
+    "DATABASE_UNAVAILABLE": Statuses(503, "UNAVAILABLE", retry_after_s=5),
+    "ARTIFACT_FOLDER_UNAVAILABLE": Statuses(503, "UNAVAILABLE", retry_after_s=5),
+    "JOB_STALLED": Statuses(500, "INTERNAL"),
+    "JOB_TIME_EXCEEDED": Statuses(504, "DEADLINE_EXCEEDED"),
+    "JOB_NOT_FOUND": Statuses(404, "NOT_FOUND"),
+    "REQUEST_ID_CONFLICT": Statuses(409, "ALREADY_EXISTS"),
+    "JOB_FINISHED": Statuses(409, "FAILED_PRECONDITION"),
+    "JOB_NOT_FINISHED": Statuses(409, "FAILED_PRECONDITION"),
+    "JOB_IN_USE": Statuses(409, "FAILED_PRECONDITION"),
+    "JOB_QUEUE_FULL": Statuses(429, "RESOURCE_EXHAUSTED", retry_after_s=10),
+    "WORKER_NOT_FOUND": Statuses(404, "NOT_FOUND"),
+    "ARTIFACT_NOT_FOUND": Statuses(404, "NOT_FOUND"),
+    "STREAM_NOT_FOUND": Statuses(404, "NOT_FOUND"),
+    "SCENE_TOO_LARGE": Statuses(507, "RESOURCE_EXHAUSTED"),
+    "BACKEND_UNAVAILABLE": Statuses(501, "UNIMPLEMENTED"),
+    "EXTRA_MISSING": Statuses(501, "UNIMPLEMENTED"),
+    "QUEUE_FULL": Statuses(429, "RESOURCE_EXHAUSTED", retry_after_s=1),
+    "RATE_LIMITED": Statuses(429, "RESOURCE_EXHAUSTED", retry_after_s=1),
+    "LIMIT_REACHED": Statuses(429, "RESOURCE_EXHAUSTED"),
+    "DEADLINE_EXCEEDED": Statuses(504, "DEADLINE_EXCEEDED"),
+    "NOT_READY": Statuses(503, "UNAVAILABLE", retry_after_s=1),
+    "DRAINING": Statuses(503, "UNAVAILABLE", retry_after_s=1),
+    "BACKUP_INVALID": Statuses(500, "INTERNAL"),
+    "RESTORE_REFUSED": Statuses(500, "INTERNAL"),
+    "STARTUP_FAILED": Statuses(500, "INTERNAL"),
+    "RENDER_FAILED": Statuses(500, "INTERNAL"),
 }
-STATUSES = {reason: statuses for statuses, reasons in _REASONS.items() for reason in reasons.split()}
 
 
 def retry_after_s(error: UltragrayError) -> float | None:

@@ -24,7 +24,7 @@ from ultragray_service.errors import TooManyConnections
 from ultragray_service.settings import ENVIRONMENT_PREFIX
 from ultragray_service.tls import HANDSHAKE_TIMEOUT_S
 from ultragray_workers.errors import StartupFailed
-from ultragray_workers.rounds import Rounds
+from ultragray_workers.rounds import repeat
 
 _IPV6_NETWORK_BITS = 64  # what one subscriber has
 
@@ -87,7 +87,7 @@ class Acceptor:
         self._listener, self._connections, self._protocol = listener, connections, protocol
         self._refusal, self._send_patience_s, self._tls = refusal, send_patience_s, tls
         self._serving: set[asyncio.Task[None]] = set()
-        self._task = asyncio.ensure_future(self._accept())
+        self._task = asyncio.ensure_future(repeat("accepting connections", _log, 0.0, self._accept_one))
 
     def close(self) -> None:
         """Accepts nothing more; what was accepted stays."""
@@ -95,12 +95,6 @@ class Acceptor:
 
     async def wait_closed(self) -> None:
         await asyncio.wait({self._task})
-
-    async def _accept(self) -> None:
-        rounds = Rounds("accepting connections", _log)
-        while True:
-            with rounds.round():
-                await self._accept_one()
 
     async def _accept_one(self) -> None:
         try:
@@ -156,12 +150,11 @@ class OpenSockets:
         self._places: dict[int, Place] = {}  # the connections, by inode
 
     async def run(self) -> None:
-        rounds = Rounds(f"the watch over connections to port {self._port}", _log)
-        while True:
-            with rounds.round():
-                if refused := await asyncio.to_thread(self.look):
-                    _log.warning(f"closed {refused} connections to port {self._port}: too many of one address")
-            await asyncio.sleep(INTERVAL_S)
+        async def look() -> None:
+            if refused := await asyncio.to_thread(self.look):
+                _log.warning(f"closed {refused} connections to port {self._port}: too many of one address")
+
+        await repeat(f"the watch over connections to port {self._port}", _log, INTERVAL_S, look)
 
     def look(self) -> int:
         """Shuts down new connections beyond the cap; how many."""

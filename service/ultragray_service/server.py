@@ -16,6 +16,7 @@ import time
 from collections.abc import Awaitable
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import suppress
+from functools import partial
 from typing import Any
 
 import uvloop
@@ -35,13 +36,12 @@ from ultragray_service.listening import (
 )
 from ultragray_service.misspelt import unknown_variables
 from ultragray_service.rpc.server import GrpcServer
-from ultragray_service.service import Service
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings
 from ultragray_service.telemetry.logs import configure_logging, is_for_people
 from ultragray_service.tls import CertificateWatch
 from ultragray_service.wiring import make_service
 from ultragray_workers.errors import StartupFailed
-from ultragray_workers.rounds import Rounds
+from ultragray_workers.rounds import Rounds, repeat
 
 _FIRST_WAIT_S, _LONGEST_WAIT_S = 0.5, 30.0
 _STEADY_S = 60.0  # a worker that lived so long is started again after the first wait
@@ -195,9 +195,10 @@ async def serve(settings: Settings) -> None:
         await grpc_server.start()
         http_task = asyncio.ensure_future(http_server.serve([http_socket]))
         alive_task = asyncio.ensure_future(manager.tell_alive())
+        mirror_health = partial(grpc_server.tell_health, service.readiness)
         cap = Connections(settings.max_connections, settings.max_connections_per_address)  # gRPC accepts by itself
         watching = [
-            asyncio.ensure_future(_mirror_health(service, grpc_server)),
+            asyncio.ensure_future(repeat("the health of gRPC", _log, _HEALTH_POLL_S, mirror_health)),
             asyncio.ensure_future(OpenSockets(grpc_port, cap).run()),
         ]
         if certificates is not None:
@@ -300,11 +301,3 @@ async def _start_igtl(server: IgtlServer, settings: Settings, sockets: contextli
     port = int(listener.getsockname()[1])
     await server.start(listener)
     return authority(host, port)
-
-
-async def _mirror_health(service: Service, server: GrpcServer) -> None:
-    rounds = Rounds("the health of gRPC", _log)
-    while True:
-        with rounds.round():
-            await server.tell_health(service.readiness)
-        await asyncio.sleep(_HEALTH_POLL_S)

@@ -16,7 +16,7 @@ from ultragray_service.access.oidc import check_url, parse_roles
 from ultragray_service.access.principals import NAMES, Allowance, parse_allowed
 from ultragray_service.environment import PREFIX
 from ultragray_workers.jobs.kinds.base import MAX_RUN_S
-from ultragray_workers.pool.pool import PoolConfig
+from ultragray_workers.pool.messages import PoolConfig
 from ultragray_workers.storage.location import Location, StorageUrl, parse_location
 
 ENVIRONMENT_PREFIX = PREFIX

@@ -33,8 +33,8 @@ from ultragray_service.views.prepared import Comparisons, DatasetViews, Training
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.jobs.owners import Kind
 from ultragray_workers.jobs.store import JobStore
-from ultragray_workers.pool.messages import RenderResult
-from ultragray_workers.pool.pool import PoolConfig, RenderPool
+from ultragray_workers.pool.messages import PoolConfig, RenderResult
+from ultragray_workers.pool.pool import RenderPool
 from ultragray_workers.scenes import SceneStore
 from ultragray_workers.storage.location import open_storage
 

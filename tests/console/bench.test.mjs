@@ -6,13 +6,14 @@ import { deflateSync, gzipSync } from "node:zlib";
 
 import { built } from "./sources.mjs";
 
-const { between, moved, readCrop, whole, writeCrop, Sequence, rangeOf, ticks, tickText, readCalibration } = await built("train/sweeps.svelte", "shared/chart");
+const { between, holds, moved, readEdges, whole, writeCrop, Sequence, rangeOf, ticks, tickText, readCalibration } = await built("train/sweeps.svelte", "shared/chart");
 
 const SIZE = { width: 640, height: 480 };
 
 describe("a crop", () => {
   it("is written and read as the service does", () => {
     assert.equal(writeCrop({ left: 188, right: 632, top: 12, bottom: 400 }), "188:632,12:400");
+    const readCrop = (text, size) => [readEdges(text, size)].find((crop) => crop !== null && holds(crop, size)) ?? null;
     assert.deepEqual(readCrop(" 188:632 , 12:400 ", SIZE), { left: 188, right: 632, top: 12, bottom: 400 });
     assert.deepEqual(readCrop(":,10:", SIZE), { left: 0, right: 640, top: 10, bottom: 480 });
     for (const wrong of ["", "188:632", "632:188,0:10", "0:641,0:10", "a:b,c:d", "5:5,0:10"]) assert.equal(readCrop(wrong, SIZE), null, wrong);

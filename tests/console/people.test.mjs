@@ -4,7 +4,7 @@ import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
 import { describe, it } from "node:test";
 
-import { canvasState, openPage, picture, seriousFindings, until } from "./harness.mjs";
+import { BACKGROUND_TIMEOUT_MS, canvasState, openPage, picture, seriousFindings, until } from "./harness.mjs";
 import { askAs, giveKeys, pageOf } from "./people.mjs";
 import { tested } from "./tested.mjs";
 
@@ -93,7 +93,7 @@ describe("an operator", () => {
     await picture(page, "train-private");
     await page.getByRole("button", { name: "Upload and check" }).click();
     const panel = page.getByRole("region", { name: "Dataset mine" });
-    await panel.getByText("private").waitFor();
+    await panel.getByText("private").waitFor({ timeout: BACKGROUND_TIMEOUT_MS });
     await panel.getByText("you", { exact: true }).waitFor();
     const choice = page.getByRole("region", { name: "Training" }).getByRole("checkbox", { name: /^Private/ });
     assert.equal(await choice.isChecked(), true, "a training of a private sweep is proposed as a public one");
@@ -112,7 +112,7 @@ describe("an operator", () => {
     await page.getByLabel("Name", { exact: true }).fill("hidden");
     await page.getByRole("checkbox", { name: /^Private/ }).check();
     await page.getByRole("button", { name: "Import", exact: true }).click();
-    await page.getByTestId("scene-hidden").getByText("private").waitFor();
+    await page.getByTestId("scene-hidden").getByText("private").waitFor({ timeout: BACKGROUND_TIMEOUT_MS });
 
     const other = await pageOf(at, "bob", "#/scenes");
     const row = other.getByTestId("scene-hers");

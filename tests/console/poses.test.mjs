@@ -9,7 +9,8 @@ const {
   angle_deg, anglesFrom, distance_mm, english, fromPositionQuaternion, german, IDENTITY, POSE_FORMS, placeIn, poseFileOf, poseFromText,
   poseText, readPoses, REFERENCES, withPlaceIn, WRITTEN,
 } = await bundled(`export * from "./geometry/pose"; export * from "./geometry/pose_files";
-  export { connect as english } from "./words/en/programs"; import { german as texts } from "./words/de/german"; export const german = texts.connect;`);
+  import { english as all } from "./words/en/english"; import { german as texts } from "./words/de/german"; import { translated } from "./words/translated";
+  export const english = all.connect; export const german = translated(all, texts).connect;`);
 
 const TURNED = fromPositionQuaternion([12.5, -3, 40], [0.5, 0.5, -0.5, 0.5]);
 const TILTED = fromPositionQuaternion([-1.25, 0, 0.5], [Math.cos(0.3), Math.sin(0.3), 0, 0]);
@@ -24,7 +25,7 @@ const refusal = (name, text, words = english) => {
   try {
     read(name, text);
   } catch (error) {
-    return words.poseError(error);
+    return error.said(words.poseError);
   }
   return assert.fail("it was read");
 };
@@ -68,7 +69,7 @@ describe("a pose as text", () => {
       try {
         poseFromText(text, form);
       } catch (error) {
-        return english.poseError(error);
+        return error.said(english.poseError);
       }
       return null;
     };

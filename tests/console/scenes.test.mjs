@@ -5,7 +5,7 @@ import { readFileSync, writeFileSync } from "node:fs";
 import path from "node:path";
 import { describe, it } from "node:test";
 
-import { focused, hold, openPage, picture, seriousFindings, until } from "./harness.mjs";
+import { BACKGROUND_TIMEOUT_MS, focused, hold, openPage, picture, seriousFindings, until } from "./harness.mjs";
 import { put } from "./sweep.mjs";
 import { tested } from "./tested.mjs";
 
@@ -20,7 +20,7 @@ describe("scenes and service", () => {
     await page.getByLabel("Import a scene").setInputFiles(at.files.compared);
     await page.getByLabel("Name", { exact: true }).fill("mine");
     await page.getByRole("button", { name: "Import", exact: true }).click();
-    await page.getByRole("status").getByText("mine is there.").waitFor();
+    await page.getByRole("status").getByText("mine is there.").waitFor({ timeout: BACKGROUND_TIMEOUT_MS });
     const row = page.getByTestId("scene-mine");
     await row.getByRole("button", { name: "Load", exact: true }).click();
     await row.getByText("loaded").waitFor();
@@ -91,7 +91,7 @@ describe("scenes and service", () => {
     await page.getByRole("link", { name: "Scenes and service" }).click();
     await page.getByLabel("Import", { exact: true }).waitFor();
     release();
-    await page.getByRole("status").getByText("late is there.").waitFor();
+    await page.getByRole("status").getByText("late is there.").waitFor({ timeout: BACKGROUND_TIMEOUT_MS });
   });
 
   it("says what cannot be imported or read, and offers no deletion of what is not the service's", async () => {

@@ -4,7 +4,7 @@ import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
 import { describe, it } from "node:test";
 
-import { hold, openPage, picture, seriousFindings, until } from "./harness.mjs";
+import { BACKGROUND_TIMEOUT_MS, hold, openPage, picture, seriousFindings, until } from "./harness.mjs";
 import { put } from "./sweep.mjs";
 import { tested } from "./tested.mjs";
 
@@ -58,7 +58,7 @@ describe("an upload", () => {
     await progress.waitFor();
     assert.equal(await page.getByLabel("Name", { exact: true }).inputValue(), "slow");
     release();
-    await page.getByRole("region", { name: "Dataset slow" }).waitFor();
+    await page.getByRole("region", { name: "Dataset slow" }).waitFor({ timeout: BACKGROUND_TIMEOUT_MS });
     assert.equal(await progress.count(), 0);
     assert.deepEqual([page.faults, page.foreign], [[], []]);
     assert.equal(await asksBeforeClosing(page), false);

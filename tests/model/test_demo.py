@@ -17,10 +17,12 @@ from ultragray.learn.evaluation.scoring import evaluate, render_sweep
 from ultragray.learn.sweep import pixel_positions_mm
 from ultragray.learn.training import TrainingConfig
 from ultragray.phantom import Tissue, load_phantom, simulate, sweeps, tissue_at
-from ultragray.phantom import make_demo as make
 from ultragray.phantom.demo import DEMO_FILE, DEMO_IMAGE_SIDE, DEMO_PROBE, demo_poses, load_demo_scene
-from ultragray.phantom.imaging import BoneShadow
 
+from ..scripts import benchmark
+
+make = benchmark("demo_scene")
+BoneShadow = benchmark("bone_shadow").BoneShadow
 SIDE = 256
 MM_PER_PIXEL = 60.0 / SIDE
 MAX_BYTES = 4_500_000

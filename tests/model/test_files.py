@@ -7,7 +7,7 @@ import pickle
 import numpy as np
 import pytest
 
-from ultragray.files import atomic_path, link_or_copy, map_npy, remove_stale_temporaries
+from ultragray.files import atomic_path, link_or_copy, map_npy, remove_stale_temporaries, write_whole
 
 
 @pytest.fixture
@@ -169,3 +169,12 @@ def test_what_is_wrong_is_named(tmp_path):
         with pytest.raises(ValueError, match=reason) as caught:
             map_npy(path)
         assert "pickle" not in str(caught.value)
+
+
+def test_who_reads_a_file_while_it_is_written_whole_keeps_what_was_there(tmp_path):
+    path = tmp_path / "file"
+    write_whole(path, "before")
+    with path.open() as reader:
+        write_whole(path, "after")
+        assert reader.read() == "before"
+    assert path.read_text() == "after"

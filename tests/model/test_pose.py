@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from ultragray import check_poses, pose_from_position_quaternion, quaternion_from_pose
 from ultragray.errors import InvalidArgument, InvalidPose
-from ultragray.geometry.pose import position_distances_mm, rotation_angles_deg
+from ultragray.geometry.pose import rotation_angles_deg
 
 
 def turned_about_z(degrees):
@@ -127,10 +127,7 @@ def test_quaternions_survive_the_round_trip(raw):
     np.testing.assert_allclose(pose_from_position_quaternion((4.0, 5.0, 6.0), back), pose, atol=1e-12)
 
 
-def test_distances():
+def test_angles():
     first = np.stack([np.eye(4), turned_about_z(90.0)])
     second = np.stack([np.eye(4), turned_about_z(10.0), np.diag([1.0, -1.0, -1.0, 1.0])])
-    np.testing.assert_allclose(
-        position_distances_mm(first, second), [[0, math.sqrt(14), 0], [math.sqrt(14), 0, math.sqrt(14)]]
-    )
     np.testing.assert_allclose(rotation_angles_deg(first, second), [[0, 10, 180], [90, 80, 180]], atol=1e-6)

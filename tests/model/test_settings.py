@@ -1,5 +1,7 @@
 """Settings of frames, completed for a scene; image sizes."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -24,7 +26,7 @@ def resolved(beam, thickness_mm):
         (None, 0.0, PLANE),
         (None, 3.0, ElevationBeam(thickness_mm=3.0)),
         (FOCUSED, None, FOCUSED),
-        (FOCUSED, 0.0, FOCUSED.as_thick_as(0.0)),
+        (FOCUSED, 0.0, replace(FOCUSED, thickness_mm=0.0)),
         (FOCUSED, 3.0, ElevationBeam(thickness_mm=3.0, focus_mm=30.0, depth_of_field_mm=20.0)),
     ],
 )

@@ -6,9 +6,8 @@ import asyncio
 import contextlib
 import io
 import os
-from collections.abc import AsyncIterator, Callable, Coroutine, Iterator
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -17,7 +16,7 @@ import pytest
 from ultragray import GaussianScene, render
 from ultragray.rendering.settings import Encoding
 from ultragray.scene.confidence import FIGURES
-from ultragray_workers import PoolConfig, RenderPool, RenderRequest, RenderResult, SceneStore
+from ultragray_workers import PoolConfig, RenderPool, SceneStore
 from ultragray_workers.pool import processes as launcher
 
 from ..conftest import RUN
@@ -28,11 +27,10 @@ from .asking import HEIGHT, PROBE, WIDTH
 TIME_LIMIT_S = 180.0
 
 T = TypeVar("T")
-OpenPool = Callable[..., contextlib.AbstractAsyncContextManager[RenderPool]]
 
 
 @pytest.fixture(autouse=True)
-def warm_templates(monkeypatch: pytest.MonkeyPatch) -> None:
+def warm_templates(monkeypatch):
     """Pools of this process have their templates forked, but for tests that ask for `cold_templates`."""
     monkeypatch.setattr(launcher, "start_template", lambda channel: start_template(WARM_TEMPLATES.path(), channel))
 
@@ -41,13 +39,13 @@ _START_COLD = launcher.start_template
 
 
 @pytest.fixture
-def cold_templates(warm_templates: None, monkeypatch: pytest.MonkeyPatch) -> None:
+def cold_templates(warm_templates, monkeypatch):
     """Pools start their templates as they do where there are no tests."""
     monkeypatch.setattr(launcher, "start_template", _START_COLD)
 
 
 @pytest.fixture
-def scene_folder(tmp_path: Path, random_scene: Callable[..., GaussianScene]) -> Path:
+def scene_folder(tmp_path, random_scene):
     """Scenes `a` and `b`, which look different, trained with frames of 24x32."""
     info = {"probe": PROBE, "image_height": HEIGHT, "image_width": WIDTH}
     random_scene(50, seed=1, info=info).save(tmp_path / "a.ugr")
@@ -56,9 +54,9 @@ def scene_folder(tmp_path: Path, random_scene: Callable[..., GaussianScene]) -> 
 
 
 @pytest.fixture
-def open_pool(scene_folder: Path) -> OpenPool:
+def open_pool(scene_folder):
     @contextlib.asynccontextmanager
-    async def open_(**settings: Any) -> AsyncIterator[RenderPool]:
+    async def open_(**settings):
         pool = RenderPool(SceneStore(scene_folder), PoolConfig(**{"threads_per_process": 1, **settings}))
         await pool.start()
         try:
@@ -70,10 +68,10 @@ def open_pool(scene_folder: Path) -> OpenPool:
 
 
 @pytest.fixture
-def expect_frames(scene_folder: Path) -> Callable[[RenderRequest, RenderResult], None]:
+def expect_frames(scene_folder):
     """Asserts that a result is what a direct render() of its request gives."""
 
-    def check(request: RenderRequest, result: RenderResult) -> None:
+    def check(request, result):
         scene = GaussianScene.load(scene_folder / f"{request.scene}.ugr")
         asked = request.settings
         direct = render(
@@ -109,14 +107,14 @@ def expect_frames(scene_folder: Path) -> Callable[[RenderRequest, RenderResult],
 
 
 @pytest.fixture
-def processes() -> Callable[[], dict[int, str]]:
+def processes():
     """The workers and templates that this test has started and that live, by process id."""
     before = set(_pool_processes())  # servers of other tests
     return lambda: {pid: name for pid, name in _pool_processes().items() if pid not in before}
 
 
 @pytest.fixture(autouse=True)
-def nothing_left_behind(processes: Callable[[], dict[int, str]]) -> Iterator[None]:
+def nothing_left_behind(processes):
     """Every test must end without processes and open files of its own."""
     descriptors = open_channels_and_memories()
     yield
@@ -124,7 +122,7 @@ def nothing_left_behind(processes: Callable[[], dict[int, str]]) -> Iterator[Non
     assert open_channels_and_memories() <= descriptors
 
 
-def open_channels_and_memories() -> set[str]:
+def open_channels_and_memories():
     links = []
     for descriptor in Path("/proc/self/fd").iterdir():
         with contextlib.suppress(FileNotFoundError):
@@ -136,7 +134,7 @@ _NAMES = ("ug-worker", "ug-template")
 _TEMPLATE = b"ultragray_workers.pool.template"
 
 
-def _pool_processes() -> dict[int, str]:
+def _pool_processes():
     """Workers and templates of this test process, by process id; one that has just been started is called `python`."""
     found = {}
     for folder in Path("/proc").iterdir():
@@ -153,8 +151,8 @@ def _pool_processes() -> dict[int, str]:
 
 
 @pytest.fixture
-def until() -> Callable[..., Coroutine[Any, Any, None]]:
-    async def wait(condition: Callable[[], bool], timeout_s: float = 60.0) -> None:
+def until():
+    async def wait(condition, timeout_s=60.0):
         """Returns once the condition holds."""
         give_up = Deadline(timeout_s)
         while not condition():
@@ -164,11 +162,21 @@ def until() -> Callable[..., Coroutine[Any, Any, None]]:
     return wait
 
 
+@pytest.hookimpl(tryfirst=True)
+def pytest_pyfunc_call(pyfuncitem):
+    """Asynchronous tests run in a loop of their own, with a limit: a lost request fails its test and hangs nothing."""
+    if not asyncio.iscoroutinefunction(pyfuncitem.obj):
+        return None
+    arguments = {name: pyfuncitem.funcargs[name] for name in pyfuncitem._fixtureinfo.argnames}
+    asyncio.run(asyncio.wait_for(pyfuncitem.obj(**arguments), TIME_LIMIT_S))
+    return True
+
+
 @pytest.fixture
-def run() -> Callable[[Coroutine[Any, Any, T]], T]:
+def run():
     """asyncio.run with a limit, so that a lost request fails its test instead of hanging it."""
 
-    def run_(coroutine: Coroutine[Any, Any, T]) -> T:
+    def run_(coroutine):
         return asyncio.run(asyncio.wait_for(coroutine, TIME_LIMIT_S))
 
     return run_

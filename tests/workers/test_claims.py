@@ -7,7 +7,6 @@ import shutil
 import signal
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
 
@@ -25,7 +24,7 @@ with claimed_folder(Path(sys.argv[1]), ".making-"):
 """
 
 
-def test_a_claimed_folder_goes_with_what_is_left_in_it(tmp_path: Path) -> None:
+def test_a_claimed_folder_goes_with_what_is_left_in_it(tmp_path):
     with claimed_folder(tmp_path / "new", ".making-") as folder:
         assert [path.name for path in folder.iterdir()] == [LOCK_NAME]
         (folder / "part").mkdir()
@@ -34,7 +33,7 @@ def test_a_claimed_folder_goes_with_what_is_left_in_it(tmp_path: Path) -> None:
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["kept", "new"]
 
 
-def test_only_what_a_dead_process_claimed_is_abandoned(tmp_path: Path) -> None:
+def test_only_what_a_dead_process_claimed_is_abandoned(tmp_path):
     holder = subprocess.Popen(
         [sys.executable, "-c", HOLD, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
@@ -48,7 +47,7 @@ def test_only_what_a_dead_process_claimed_is_abandoned(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_a_folder_without_a_lock_is_left_a_while(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_folder_without_a_lock_is_left_a_while(tmp_path, monkeypatch):
     (tmp_path / "kept" / "deep").mkdir(parents=True)
     with monkeypatch.context() as dying:
         dying.setattr(shutil, "rmtree", lambda *_, **__: None)  # the service dies while it removes
@@ -60,7 +59,7 @@ def test_a_folder_without_a_lock_is_left_a_while(tmp_path: Path, monkeypatch: py
     assert not list(tmp_path.iterdir())
 
 
-def test_a_full_disk_is_told_apart() -> None:
+def test_a_full_disk_is_told_apart():
     with pytest.raises(StorageFull, match="no room for the dataset"), storage_full("the dataset"):
         raise OSError(28, "No space left on device")
     with pytest.raises(PermissionError), storage_full("the dataset"):

@@ -24,7 +24,7 @@ needs_sessions = pytest.mark.skipif(
 WITHOUT_CAPABILITY = ("setpriv", "--bounding-set=-sys_admin") if os.getuid() == 0 else ()
 
 
-def told(*, in_its_own_session: bool, nice: int = 0) -> tuple[int, str]:
+def told(*, in_its_own_session, nice=0):
     """The nice level of a process that gave way and, where the kernel knows one, its session with that one's level."""
     output = subprocess.run(
         [sys.executable, "-c", PROGRAM],
@@ -38,21 +38,21 @@ def told(*, in_its_own_session: bool, nice: int = 0) -> tuple[int, str]:
     return int(level), session
 
 
-def test_a_process_that_is_nice_already_is_as_nice_as_it_was_told_to_be() -> None:
+def test_a_process_that_is_nice_already_is_as_nice_as_it_was_told_to_be():
     already = os.nice(0)
     for nice in (0, 3, 7):
         assert told(in_its_own_session=False, nice=nice)[0] == max(LEVEL, min(19, already + nice))
 
 
 @needs_sessions
-def test_a_session_is_as_nice_as_the_process_that_leads_it() -> None:
+def test_a_session_is_as_nice_as_the_process_that_leads_it():
     before = OF_SESSION.read_text()
     assert told(in_its_own_session=True)[1].endswith(f"nice {LEVEL}")
     assert told(in_its_own_session=False)[1] == before.strip()
 
 
 @needs_sessions
-def test_sessions_that_begin_at_once_are_all_as_nice_as_they_were_told_to_be() -> None:
+def test_sessions_that_begin_at_once_are_all_as_nice_as_they_were_told_to_be():
     """Without CAP_SYS_ADMIN, Linux takes one write in 0.1 s from all processes together."""
     together = [
         subprocess.Popen(

@@ -12,7 +12,7 @@ from ultragray_workers.rounds import Rounds
 LOG = logging.getLogger("ultragray.test")
 
 
-def test_a_failure_is_logged_once_with_its_traceback_and_so_is_its_end(caplog: pytest.LogCaptureFixture) -> None:
+def test_a_failure_is_logged_once_with_its_traceback_and_so_is_its_end(caplog):
     rounds = Rounds("the watch", LOG)
     for error in (OSError("no files"), OSError("no files"), ValueError("odd"), None, None):
         with rounds.round():
@@ -25,9 +25,9 @@ def test_a_failure_is_logged_once_with_its_traceback_and_so_is_its_end(caplog: p
     assert "Traceback" in caplog.text
 
 
-def test_cancelling_ends_a_loop() -> None:
-    async def run() -> None:
-        async def loop() -> None:
+def test_cancelling_ends_a_loop():
+    async def run():
+        async def loop():
             rounds = Rounds("the watch", LOG)
             while True:
                 with rounds.round():

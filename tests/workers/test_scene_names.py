@@ -26,7 +26,7 @@ HASH = "0123456789abcdef" * 4
         ("../liver", None),
     ],
 )
-def test_a_reference_is_a_name_and_perhaps_a_pin(text: str, reference: SceneReference | None) -> None:
+def test_a_reference_is_a_name_and_perhaps_a_pin(text, reference):
     assert SceneReference.of(text) == reference
     if reference is None:
         with pytest.raises(InvalidArgument, match="scene must be"):
@@ -36,12 +36,12 @@ def test_a_reference_is_a_name_and_perhaps_a_pin(text: str, reference: SceneRefe
         assert base_name(text) == reference.name
 
 
-def test_a_pin_fits_what_begins_with_it() -> None:
+def test_a_pin_fits_what_begins_with_it():
     assert SceneReference("liver").fits(HASH)
     assert SceneReference("liver", HASH[:12]).fits(HASH)
     assert not SceneReference("liver", "f" * 12).fits(HASH)
 
 
-def test_nothing_new_is_named_with_a_pin() -> None:
+def test_nothing_new_is_named_with_a_pin():
     with pytest.raises(InvalidArgument, match="letters, digits"):
         check_scene_name(f"liver@{HASH}")

@@ -9,10 +9,10 @@ import pytest
 
 from ultragray.errors import SceneFileInvalid
 from ultragray_workers import SceneStore
+from ultragray_workers import scene_shelf as headers
 from ultragray_workers.errors import SceneNotFound
+from ultragray_workers.scene_shelf import SceneShelf
 from ultragray_workers.scenes import resident_bytes
-from ultragray_workers.shelves import headers
-from ultragray_workers.shelves.folder import FolderShelf
 
 
 def test_names_are_the_files_whose_names_can_stand_in_a_url(scene_folder):
@@ -146,13 +146,13 @@ def test_a_file_that_is_replaced_between_the_looks_at_it_is_looked_at_again(scen
     """Else a frame of the new file would be told for the pin of the old one."""
     store = SceneStore(scene_folder)
     content = store.sha256("a")
-    fetch = FolderShelf.fetch
+    fetch = SceneShelf.fetch
 
     def replace_first(shelf, name):
         if (scene_folder / "b.ugr").exists():
             (scene_folder / "b.ugr").replace(scene_folder / "a.ugr")
         return fetch(shelf, name)
 
-    monkeypatch.setattr(FolderShelf, "fetch", replace_first)
+    monkeypatch.setattr(SceneShelf, "fetch", replace_first)
     with pytest.raises(SceneNotFound, match="no longer has the content"):
         store.versioned_header(f"a@{content}")

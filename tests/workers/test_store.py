@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
 
@@ -17,7 +16,7 @@ from ultragray_workers.store import (
 )
 
 
-def test_folder_without_a_version_gets_one(tmp_path: Path) -> None:
+def test_folder_without_a_version_gets_one(tmp_path):
     for _ in range(2):
         OpenStore(tmp_path / "artifacts").close()
     assert json.loads((tmp_path / "artifacts" / "store.json").read_text()) == {"format_version": FORMAT_VERSION}
@@ -31,7 +30,7 @@ def test_folder_without_a_version_gets_one(tmp_path: Path) -> None:
         ('{"format_version": "one"}', "is damaged"),
     ],
 )
-def test_folder_that_cannot_be_used_is_refused_and_let_go(content: str, told: str, tmp_path: Path) -> None:
+def test_folder_that_cannot_be_used_is_refused_and_let_go(content, told, tmp_path):
     (tmp_path / "store.json").write_text(content)
     with pytest.raises(StartupFailed, match=told):
         OpenStore(tmp_path)
@@ -39,7 +38,7 @@ def test_folder_that_cannot_be_used_is_refused_and_let_go(content: str, told: st
         assert (tmp_path / "store.json").read_text() == content
 
 
-def test_folder_is_open_to_many_or_closed_to_all(tmp_path: Path) -> None:
+def test_folder_is_open_to_many_or_closed_to_all(tmp_path):
     first, second = OpenStore(tmp_path), OpenStore(tmp_path)
     with pytest.raises(RestoreRefused, match="stop all of them"), closed_store(tmp_path):
         pass
@@ -49,7 +48,7 @@ def test_folder_is_open_to_many_or_closed_to_all(tmp_path: Path) -> None:
         OpenStore(tmp_path)
 
 
-def test_folder_is_closed_until_its_restore_has_ended(tmp_path: Path) -> None:
+def test_folder_is_closed_until_its_restore_has_ended(tmp_path):
     write_restore_marker(tmp_path, "20261122T070301.123Z")
     with pytest.raises(StartupFailed, match="start it again where it was interrupted"):
         OpenStore(tmp_path)

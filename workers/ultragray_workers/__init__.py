@@ -9,8 +9,8 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from ultragray_workers.pool.messages import Priority, RenderRequest, RenderResult
-    from ultragray_workers.pool.pool import PoolConfig, PoolStatistics, RenderPool
+    from ultragray_workers.pool.messages import PoolConfig, Priority, RenderRequest, RenderResult
+    from ultragray_workers.pool.pool import PoolStatistics, RenderPool
     from ultragray_workers.scenes import SceneStore
 
 __all__ = [
@@ -24,8 +24,8 @@ __all__ = [
 ]
 
 _MODULES = {
-    "pool.pool": ("PoolConfig", "PoolStatistics", "RenderPool"),
-    "pool.messages": ("Priority", "RenderRequest", "RenderResult"),
+    "pool.pool": ("PoolStatistics", "RenderPool"),
+    "pool.messages": ("PoolConfig", "Priority", "RenderRequest", "RenderResult"),
     "scenes": ("SceneStore",),
 }
 _MODULE_OF = {name: module for module, names in _MODULES.items() for name in names}

@@ -36,31 +36,12 @@ def claimed_folder(parent: Path, prefix: str) -> Iterator[Path]:
         shutil.rmtree(folder, ignore_errors=True)
 
 
-@contextlib.contextmanager
-def out_of_sight(folder: Path, prefix: str = DELETED_PREFIX) -> Iterator[bool]:
-    """Others do not find the folder during the body; then it is removed, or put back where the body raises.
-
-    Gives whether it was there. Where the service dies meanwhile, the folder stays under another name with the prefix.
-    """
-    doomed = folder.with_name(f"{prefix}{secrets.token_hex(8)}")
-    try:
-        folder.rename(doomed)
-    except FileNotFoundError:  # another service was quicker
-        yield False
-        return
-    try:
-        yield True
-    except BaseException:
-        with contextlib.suppress(OSError):  # another one has the name now
-            doomed.rename(folder)
-        raise
-    shutil.rmtree(doomed, ignore_errors=True)
-
-
 def remove_whole(folder: Path, prefix: str = DELETED_PREFIX) -> None:
-    """Remove a folder: to others it goes at once. Nothing where it is gone. Raises OSError."""
-    with out_of_sight(folder, prefix):
-        pass
+    """Remove a folder: to others it goes at once, under another name with the prefix. Nothing where it is gone."""
+    doomed = folder.with_name(f"{prefix}{secrets.token_hex(8)}")
+    with contextlib.suppress(FileNotFoundError):
+        folder.rename(doomed)
+        shutil.rmtree(doomed, ignore_errors=True)
 
 
 def remove_abandoned(parent: Path, prefix: str) -> int:

@@ -9,179 +9,120 @@ from ultragray.errors import UltragrayError
 _NAMES_IN_MESSAGE = 5
 
 
-class SceneNotFound(UltragrayError):
+class SceneNotFound(UltragrayError, title="No such scene"):
     """No scene of that name."""
 
-    title = "No such scene"
 
-
-class RegistrationNotFound(UltragrayError):
+class RegistrationNotFound(UltragrayError, title="No such registration"):
     """No registration of that name."""
 
-    title = "No such registration"
 
-
-class DatasetNotFound(UltragrayError):
+class DatasetNotFound(UltragrayError, title="No such dataset"):
     """No dataset of that name."""
 
-    title = "No such dataset"
 
-
-class DatasetExists(UltragrayError):
+class DatasetExists(UltragrayError, title="Another dataset has that name"):
     """A dataset of that name has another content or other options; delete it first."""
 
-    title = "Another dataset has that name"
 
-
-class DatasetInUse(UltragrayError):
+class DatasetInUse(UltragrayError, title="Dataset in use"):
     """A job needs the dataset."""
 
-    title = "Dataset in use"
 
-
-class UploadTooLarge(UltragrayError):
+class UploadTooLarge(UltragrayError, title="Upload too large"):
     """An upload over `ULTRAGRAY_MAX_DATASET_BYTES`, packed or unpacked, or of too many files."""
 
-    title = "Upload too large"
 
-
-class StorageFull(UltragrayError):
+class StorageFull(UltragrayError, title="No room on the disk"):
     """The artifact folder has no room, or a render job would write more than it has room for."""
 
-    title = "No room on the disk"
 
-
-class StorageUnavailable(UltragrayError):
+class StorageUnavailable(UltragrayError, title="The object storage cannot be used"):
     """The object storage does not answer, or refuses its credentials; what is cached is served all the same; retry."""
 
-    title = "The object storage cannot be used"
 
-
-class SceneExists(UltragrayError):
+class SceneExists(UltragrayError, title="Scene already exists"):
     """A scene of that name is there, or a job is making it."""
 
-    title = "Scene already exists"
 
-
-class DatabaseUnavailable(UltragrayError):
+class DatabaseUnavailable(UltragrayError, title="The database of the jobs cannot be used"):
     """The database of the jobs is away or takes no changes; scenes are rendered all the same; retry."""
 
-    title = "The database of the jobs cannot be used"
 
-
-class ArtifactFolderUnavailable(UltragrayError):
+class ArtifactFolderUnavailable(UltragrayError, title="The artifact folder is not there"):
     """The artifact folder is gone, or not the one that the jobs belong to: its share is not mounted; retry."""
 
-    title = "The artifact folder is not there"
 
-
-class JobStalled(UltragrayError):
+class JobStalled(UltragrayError, title="The job got stuck"):
     """The process of a job neither computed nor read nor wrote for `ULTRAGRAY_JOB_STALL_TIMEOUT_S`, and was ended."""
 
-    title = "The job got stuck"
 
-
-class JobTimeExceeded(UltragrayError):
+class JobTimeExceeded(UltragrayError, title="The job took too long"):
     """A job ran longer than its `max_run_s`, or `ULTRAGRAY_JOB_MAX_RUN_S`, and was ended."""
 
-    title = "The job took too long"
 
-
-class JobNotFound(UltragrayError):
+class JobNotFound(UltragrayError, title="No such job"):
     """No job of that id."""
 
-    title = "No such job"
 
-
-class JobConflict(UltragrayError):
+class JobConflict(UltragrayError, title="Request id used for another job", reason="REQUEST_ID_CONFLICT"):
     """The `request_id` was used for something else."""
 
-    reason = "REQUEST_ID_CONFLICT"
-    title = "Request id used for another job"
 
-
-class JobFinished(UltragrayError):
+class JobFinished(UltragrayError, title="Job is finished"):
     """A job that succeeded or failed cannot be cancelled."""
 
-    title = "Job is finished"
 
-
-class JobNotFinished(UltragrayError):
+class JobNotFinished(UltragrayError, title="Job cannot be retried"):
     """Only a failed or cancelled job can be retried."""
 
-    title = "Job cannot be retried"
 
-
-class JobInUse(UltragrayError):
+class JobInUse(UltragrayError, title="Job in use"):
     """A job that waits or runs, or that another of those goes on from, cannot be deleted."""
 
-    title = "Job in use"
 
-
-class JobQueueFull(UltragrayError):
+class JobQueueFull(UltragrayError, title="Too many jobs are waiting"):
     """Too many jobs wait; retry."""
 
-    title = "Too many jobs are waiting"
 
-
-class WorkerNotFound(UltragrayError):
+class WorkerNotFound(UltragrayError, title="No such worker"):
     """No worker of that name."""
 
-    title = "No such worker"
 
-
-class ArtifactNotFound(UltragrayError):
+class ArtifactNotFound(UltragrayError, title="No such artifact"):
     """The job has no file of that name."""
 
-    title = "No such artifact"
 
-
-class SceneTooLarge(UltragrayError):
+class SceneTooLarge(UltragrayError, title="Scene exceeds the memory budget"):
     """A scene that does not fit `ULTRAGRAY_MEMORY_BUDGET_MB` at all."""
 
-    title = "Scene exceeds the memory budget"
 
-
-class QueueFull(UltragrayError):
+class QueueFull(UltragrayError, title="Too much is waiting"):
     """Too many frames wait, or too many uploads are under way; retry."""
 
-    title = "Too much is waiting"
 
-
-class DeadlineExceeded(UltragrayError):
+class DeadlineExceeded(UltragrayError, title="Deadline exceeded"):
     """The deadline passed first."""
 
-    title = "Deadline exceeded"
 
-
-class NotReady(UltragrayError):
+class NotReady(UltragrayError, title="Service is not ready"):
     """The service is starting, or cannot render at the moment; retry."""
 
-    title = "Service is not ready"
 
-
-class Draining(UltragrayError):
+class Draining(UltragrayError, title="Service is stopping"):
     """The service is stopping; retry elsewhere."""
 
-    title = "Service is stopping"
 
-
-class BackupInvalid(UltragrayError):
+class BackupInvalid(UltragrayError, title="Backup cannot be used"):
     """A backup that is not there, damaged, or made by a newer release (command line)."""
 
-    title = "Backup cannot be used"
 
-
-class RestoreRefused(UltragrayError):
+class RestoreRefused(UltragrayError, title="Place of the backup or restore cannot be used"):
     """A backup or restore into a place that holds something else, or where somebody is at work (command line)."""
 
-    title = "Place of the backup or restore cannot be used"
 
-
-class StartupFailed(UltragrayError):
+class StartupFailed(UltragrayError, title="Service cannot start"):
     """The service cannot start, such as on a port in use (command line)."""
-
-    title = "Service cannot start"
 
 
 def job_not_found(job_id: str) -> JobNotFound:

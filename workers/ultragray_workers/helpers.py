@@ -53,7 +53,6 @@ def answer_request(work: Callable[..., None]) -> None:
 
 
 def write_progress(folder: Path, share: float) -> None:
-    """Say which share of the work, from 0 to 1, is done."""
     temporary = folder / f"{PROGRESS_NAME}.new"
     temporary.write_text(str(share), encoding="utf-8")
     temporary.replace(folder / PROGRESS_NAME)
@@ -80,7 +79,6 @@ def write_stacks(folder: Path, stacks: Mapping[str, npt.NDArray[Any]], probe: Pr
 
 
 def read_picture(folder: Path, name: str, index: int) -> npt.NDArray[np.uint8] | None:  # [H', W']
-    """One frame with square pixels, scan-converted; None where it is not there."""
     try:
         stack = np.load(folder / f"{name}{SUFFIX}", mmap_mode="r")
         probe = from_dict(Probe, json.loads((folder / PROBE_NAME).read_text(encoding="utf-8")))

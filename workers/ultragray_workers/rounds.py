@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import time
-from collections.abc import Iterator
+from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 
 _REMIND_S = 600.0
@@ -24,7 +25,6 @@ class Rounds:
 
     @contextmanager
     def round(self) -> Iterator[None]:
-        """Logs an exception of the body: when it is another than the round before had, and every ten minutes."""
         try:
             yield
         except Exception as error:
@@ -37,3 +37,12 @@ class Rounds:
             if self._failure is not None:
                 self._log.warning("%s is in order again", self._what)
             self._failure = None
+
+
+async def repeat(what: str, log: logging.Logger, interval_s: float, work: Callable[[], Awaitable[object]]) -> None:
+    """Does `work` in rounds, for ever, with pauses of `interval_s` seconds; `what` as of `Rounds`."""
+    rounds = Rounds(what, log)
+    while True:
+        with rounds.round():
+            await work()
+        await asyncio.sleep(interval_s)

@@ -40,7 +40,6 @@ def is_scene_name(name: str) -> bool:
 
 
 def base_name(text: str) -> str:
-    """The name of a scene without the pin."""
     return text.partition("@")[0]
 
 

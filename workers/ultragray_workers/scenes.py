@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, nullcontext
 from pathlib import Path
 
 from ultragray.errors import SceneFileInvalid
@@ -12,10 +12,8 @@ from ultragray.files import file_sha256
 from ultragray.scene.info import SceneHeader, SceneInfo, read_header, scene_file_invalid
 from ultragray_workers.errors import SceneNotFound, known_names
 from ultragray_workers.scene_names import SUFFIX, SceneReference, base_name, check_scene_name
-from ultragray_workers.shelves.folder import FolderShelf
-from ultragray_workers.shelves.headers import KeptHeaders, floats_per_gaussian
-from ultragray_workers.shelves.shelf import Shelf
-from ultragray_workers.storage.local import FileVersion
+from ultragray_workers.scene_shelf import KeptHeaders, SceneShelf, floats_per_gaussian
+from ultragray_workers.storage.local import FileVersion, LocalStorage
 
 __all__ = ["SUFFIX", "SceneStore", "check_scene_file", "check_scene_name", "resident_bytes"]
 
@@ -39,11 +37,11 @@ class SceneStore:
     What blocks raises StorageUnavailable where a bucket does not answer.
     """
 
-    def __init__(self, *places: Path | Shelf, hides: Callable[[str], bool] = lambda name: False) -> None:
+    def __init__(self, *places: Path | SceneShelf, hides: Callable[[str], bool] = lambda name: False) -> None:
         """`hides`: whether a scene is hidden from whoever asks, who does not find it then."""
-        self.shelves = tuple(FolderShelf(place) if isinstance(place, Path) else place for place in places)
+        self.shelves = tuple(SceneShelf(LocalStorage(one)) if isinstance(one, Path) else one for one in places)
         self.hides = hides
-        self._headers: KeptHeaders[FileVersion] = KeptHeaders()
+        self._headers: KeptHeaders = KeptHeaders()
         self._hashes: dict[str, tuple[FileVersion, str]] = {}
         self._hashing = threading.Lock()
 
@@ -52,16 +50,14 @@ class SceneStore:
         return sorted({name for shelf in self.shelves for name in shelf.names()})
 
     def shown_names(self) -> list[str]:
-        """As `names`, without those that are hidden."""
         return [name for name in self.names() if not self.hides(name)]
 
-    def names_of(self, shelf: Shelf) -> set[str]:
+    def names_of(self, shelf: SceneShelf) -> set[str]:
         """The names of the scenes that are those of one of the shelves: none before it has the name."""
         before = self.shelves[: self.shelves.index(shelf)]
         return shelf.names().difference(*(other.names() for other in before))
 
-    def shelf_of(self, name: str) -> Shelf | None:
-        """The shelf that has the scene of a name; None where none does."""
+    def shelf_of(self, name: str) -> SceneShelf | None:
         return next((shelf for shelf in self.shelves if shelf.has(name)), None)
 
     def require(self, text: str) -> str:
@@ -82,7 +78,11 @@ class SceneStore:
         if shelf.here(reference.name) is not None:
             return self.versioned_header(text)[1]
         try:
-            return shelf.header(reference.name)
+            version = shelf.version(reference.name)  # before reading, so that a change meanwhile counts as newer
+            if (kept := self._headers.get(reference.name, version)) is None:
+                kept = shelf.header(reference.name)
+                self._headers.keep(reference.name, version, kept)
+            return kept
         except FileNotFoundError:
             raise self._not_found(text) from None
 
@@ -126,10 +126,7 @@ class SceneStore:
     def hold(self, name: str) -> Iterator[Path | None]:
         """The file of a scene, which stays on this host during the body; None where it is not on this host now."""
         shelf = next((shelf for shelf in self.shelves if shelf.knows(name)), None)
-        if shelf is None:
-            yield None
-            return
-        with shelf.hold(name) as path:
+        with nullcontext() if shelf is None else shelf.hold(name) as path:
             yield path
 
     def sha256(self, text: str) -> str:
@@ -151,11 +148,10 @@ class SceneStore:
         return known or name, shelf.bytes_of(name)
 
     def forget(self, name: str) -> None:
-        """Drops what is kept of a scene that was deleted."""
         self._headers.drop(name)
         self._hashes.pop(name, None)
 
-    def _found(self, text: str) -> tuple[SceneReference, Shelf]:
+    def _found(self, text: str) -> tuple[SceneReference, SceneShelf]:
         """The shelf of the scene that is asked for, with the content that is asked for. Raises SceneNotFound."""
         reference = SceneReference.of(text)
         if reference is None or self.hides(reference.name) or (shelf := self.shelf_of(reference.name)) is None:

@@ -25,8 +25,6 @@ _READ_ONLY = (errno.EACCES, errno.EPERM, errno.EROFS)
 
 
 class OpenStore:
-    """The artifact folder, open until it is closed; others may open it at the same time."""
-
     def __init__(self, folder: Path) -> None:
         """Raises StartupFailed for a folder of a newer release, and during a restore; OSError."""
         self._lock: IO[str] | None = None
@@ -78,12 +76,10 @@ def restore_under_way(folder: Path) -> str | None:
 
 
 def write_restore_marker(folder: Path, backup: str) -> None:
-    """From now on the folder cannot be opened. Raises OSError."""
     write_whole(folder / MARKER, json.dumps({"backup": backup}) + "\n")
 
 
 def remove_restore_marker(folder: Path) -> None:
-    """The folder can be opened again. Raises OSError."""
     (folder / MARKER).unlink(missing_ok=True)
     sync(folder)
 

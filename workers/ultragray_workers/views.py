@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from ultragray_workers.datasets.store import open_datasets
 from ultragray_workers.helpers import write_progress, write_stacks
-from ultragray_workers.storage.copies import DEFAULT_MAX_BYTES
+from ultragray_workers.storage.cache import DEFAULT_MAX_BYTES
 
 if TYPE_CHECKING:
     from ultragray.learn.evaluation.scoring import Evaluation
@@ -152,7 +152,6 @@ def compare(
 
 
 def _metrics(evaluation: Evaluation, index: int) -> dict[str, float]:
-    """Those of one frame."""
     frame = evaluation.frames[index]
     own = {name: getattr(frame, name) for name in _COMPARED}
     return {**own, "histogram_distance": evaluation.frame_speckle[index].histogram_distance}

@@ -30,13 +30,6 @@ from ultragray.scene.info import SceneHeader
 _RANGE = re.compile(r"(?P<before>[^{}]*)\{(?P<first>\d{1,9})\.\.(?P<last>\d{1,9})\}(?P<after>[^{}]*)")
 
 
-def name_range(before: str, last: int, after: str) -> str:
-    """The names from number 0 to `last`; of one file, its name."""
-    if last == 0:
-        return f"{before}{0:06d}{after}"
-    return f"{before}{{{0:06d}..{last:06d}}}{after}"
-
-
 def names_in(name: str) -> Iterator[str]:
     """All names that a name stands for: those of its range, or itself."""
     found = _RANGE.fullmatch(name)
@@ -57,9 +50,6 @@ def stands_for(name: str, one: str) -> bool:
     number = one.removeprefix(before).removesuffix(after)
     is_number = number.isascii() and number.isdecimal() and one == f"{before}{int(number):0{len(first)}d}{after}"
     return is_number and int(first) <= int(number) <= int(last)
-
-
-# The plan of a batch: which frames it has, and how they are divided into shards. Free of torch.
 
 
 SHARD_FRAMES = BLOCK_POSES  # of a shard where nothing else is asked for; a search draws no block twice then
@@ -131,11 +121,9 @@ class BatchPlan:
 
     @property
     def shard_count(self) -> int:
-        """The number of shards; all but the last have `shard_frames` frames."""
         return -(-self.frames // self.shard_frames)
 
     def frames_of(self, shard: int) -> range:
-        """The numbers of the frames of a shard."""
         first = shard * self.shard_frames
         return range(first, min(first + self.shard_frames, self.frames))
 
@@ -146,7 +134,8 @@ class BatchPlan:
     @property
     def file_names(self) -> str:
         """The names of all files, as WebDataset writes them: frames-{000000..000199}.tar."""
-        return name_range(f"{self.name}-", self.shard_count - 1, ".tar")
+        last = self.shard_count - 1
+        return f"{self.name}-{{000000..{last:06d}}}.tar" if last else self.file_name(0)
 
     def key(self, frame: int) -> str:
         """The name of a frame within its shard, unique in the batch and of one length."""
@@ -162,7 +151,6 @@ class BatchPlan:
         return assessed_part(self.sampler, base, probe, assess, least, places.start, places.stop)
 
     def resolved(self, header: SceneHeader) -> Resolved:
-        """The settings of the frames with nothing left open. Raises what `FrameSettings.resolved` raises."""
         return self.settings.resolved(header.info, Encoding.FLOAT32)
 
     def document(self) -> dict[str, Any]:
@@ -189,9 +177,6 @@ class BatchPlan:
         return hashlib.sha256(json.dumps(self.document(), sort_keys=True).encode()).hexdigest()
 
 
-# The manifest of a batch: what was asked for, and each file with its hash. Free of torch.
-
-
 MANIFEST_FILE = "manifest.json"
 
 
@@ -209,7 +194,6 @@ class ShardEntry:
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> ShardEntry:
-        """Inverse of `asdict`. Raises KeyError, TypeError."""
         return cls(**{item.name: document[item.name] for item in fields(cls)})
 
 

@@ -36,7 +36,7 @@ from ultragray.exchange.released_config import (
     read_released_config,
     released_centre_mm,
 )
-from ultragray.files import write_whole
+from ultragray.files import npy_bytes, write_whole
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.rendering.backends.reference import spherical_harmonics
 from ultragray.scene.gaussians import PARAMETERS, GaussianScene
@@ -166,8 +166,11 @@ def _load_without_code(path: Path) -> Any:
     if not path.is_file():
         raise CheckpointInvalid(f"{path}: no such file")
     try:
-        if _is_compressed(path):
-            raise CheckpointInvalid(f"{path}: its entries are compressed, which torch.save never does")
+        if zipfile.is_zipfile(path):
+            with zipfile.ZipFile(path) as archive:
+                stored = [entry.compress_type == zipfile.ZIP_STORED for entry in archive.infolist()]
+            if not all(stored):  # it could inflate to more than its own size
+                raise CheckpointInvalid(f"{path}: its entries are compressed, which torch.save never does")
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # torch warns about old formats that it reads all the same
             return torch.load(path, map_location="cpu", weights_only=True)
@@ -175,14 +178,6 @@ def _load_without_code(path: Path) -> Any:
         raise
     except Exception as error:  # whatever a hostile file makes the reader raise is the file's fault
         raise CheckpointInvalid(f"{path}: {_why_unreadable(error)}") from error
-
-
-def _is_compressed(path: Path) -> bool:
-    """Tell whether the file could inflate to more than its own size."""
-    if not zipfile.is_zipfile(path):
-        return False
-    with zipfile.ZipFile(path) as archive:
-        return any(entry.compress_type != zipfile.ZIP_STORED for entry in archive.infolist())
 
 
 def _why_unreadable(error: Exception) -> str:
@@ -216,7 +211,6 @@ def _check_tensors(path: Path, tensors: Mapping[str, Any]) -> None:
 # exp(−4·h)) does. For each Gaussian the coefficients of h are fitted anew, at the scene's own degree, to what the
 # released code can show.
 
-
 LOWEST, HIGHEST = 0.5, 0.999
 MAX_TRAINING_VIEWS = 32
 SPHERE_DIRECTIONS = 64
@@ -243,8 +237,14 @@ def fit_released_intensity(scene: GaussianScene) -> ReleasedIntensity:
     count, degree = scene.gaussian_count, scene.sh_degree
     coefficients = torch.cat([scene.sh0, scene.shN], dim=1)[..., 0].double()  # [N, K]
     fitted = torch.empty_like(coefficients)
-    sphere = spherical_harmonics(_sphere_directions(), degree)  # [F, K]
-    origins = _view_origins_cm(scene)  # [V, 3]
+    index = torch.arange(SPHERE_DIRECTIONS, dtype=torch.float64)  # of evenly spread directions, a Fibonacci lattice
+    z, angle = 1.0 - (2.0 * index + 1.0) / SPHERE_DIRECTIONS, math.pi * (1.0 + math.sqrt(5.0)) * index
+    radius = torch.sqrt(1.0 - z.square())
+    directions = torch.stack([radius * torch.cos(angle), radius * torch.sin(angle), z], dim=-1)
+    sphere = spherical_harmonics(directions, degree)  # [F, K]
+    poses = scene.poses_to_scene_cm(scene.training_poses)
+    chosen = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), MAX_TRAINING_VIEWS)).round().astype(int))
+    origins = torch.from_numpy(poses[chosen, :3, 3])  # [V, 3]
     largest, total, terms = 0.0, 0.0, 0
     for start in range(0, count, GAUSSIANS_PER_CHUNK):
         ids = slice(start, start + GAUSSIANS_PER_CHUNK)
@@ -270,29 +270,12 @@ def fit_released_intensity(scene: GaussianScene) -> ReleasedIntensity:
     return ReleasedIntensity(parameters[:, :1], parameters[:, 1:], largest, total / max(terms, 1))
 
 
-def _view_origins_cm(scene: GaussianScene) -> Tensor:  # [V, 3]
-    """The probe's origin in evenly chosen training poses, in the scene's own frame."""
-    poses = scene.poses_to_scene_cm(scene.training_poses)
-    chosen = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), MAX_TRAINING_VIEWS)).round().astype(int))
-    return torch.from_numpy(poses[chosen, :3, 3])
-
-
-def _sphere_directions() -> Tensor:  # [F, 3] unit
-    """Evenly spread directions: a Fibonacci lattice."""
-    index = torch.arange(SPHERE_DIRECTIONS, dtype=torch.float64)
-    z = 1.0 - (2.0 * index + 1.0) / SPHERE_DIRECTIONS
-    angle = math.pi * (1.0 + math.sqrt(5.0)) * index
-    radius = torch.sqrt(1.0 - z.square())
-    return torch.stack([radius * torch.cos(angle), radius * torch.sin(angle), z], dim=-1)
-
-
 # Export to the checkpoint format of the released UltraG-Ray code: the way back of `checkpoint`.
 #
 # The checkpoint holds what the released trainer saves and its viewer loads: step, global_tic and the six raw tensors
 # (docs/physics.md §2). What it cannot say lies beside it as the released dataset layout has it: conf.json (planes and
 # width in cm, on the released depth grid, §3) and poses_train.npy (mm). The released code puts the origin at the mean
 # image corner of those poses (§6), so the Gaussians are moved there: a pose in the tracker's frame shows the same.
-
 
 CONFIG_NAME = "conf.json"
 POSES_NAME = "poses_train.npy"
@@ -331,7 +314,7 @@ def export_checkpoint(scene: GaussianScene, checkpoint: str | Path, *, replace: 
             notes.append(f"the released trainer knows linear probes only: it does not read this {CONFIG_NAME}")
         if len(scene.training_poses):
             centre_mm = tuple(released_centre_mm(released_probe, scene.training_poses).tolist())
-            beside[POSES_NAME] = _npy(scene.training_poses)
+            beside[POSES_NAME] = npy_bytes(scene.training_poses)
         else:
             notes.append(f"no {POSES_NAME}: the scene has no training poses; poses are relative to its centre, {at}")
     if scene.labels is not None:
@@ -343,9 +326,14 @@ def export_checkpoint(scene: GaussianScene, checkpoint: str | Path, *, replace: 
         )
     splats, largest_error = _splats(scene, centre_mm, notes)
     folder = checkpoint.absolute().parent
-    if not replace:
-        _check_not_replaced(folder, beside)
-    beside[checkpoint.name] = _saved({"step": _step(scene), "global_tic": 0.0, "splats": splats})
+    for path, data in () if replace else ((folder / name, data) for name, data in beside.items()):
+        if path.exists() and path.read_bytes() != data:  # the conf.json or the poses of a dataset, which lies there
+            raise InvalidArgument(
+                f"{path} exists and says something else: export into a folder of its own", field="output"
+            )
+    step, saved = scene.info.training.get("step"), io.BytesIO()
+    torch.save({"step": step if type(step) is int else 0, "global_tic": 0.0, "splats": splats}, saved)
+    beside[checkpoint.name] = saved.getvalue()
     folder.mkdir(exist_ok=True)
     for name, data in beside.items():  # the checkpoint last: where it lies, everything does
         write_whole(folder / name, data)
@@ -379,12 +367,6 @@ def _config(probe: Probe, height: int, width: int, sh_degree: int) -> bytes:
     return (json.dumps(document, indent=1, allow_nan=False) + "\n").encode()
 
 
-def _npy(array: Any) -> bytes:
-    buffer = io.BytesIO()
-    np.save(buffer, array, allow_pickle=False)
-    return buffer.getvalue()
-
-
 def _splats(scene: GaussianScene, centre_mm: Vector, notes: list[str]) -> tuple[OrderedDict[str, Tensor], float]:
     """The six raw tensors about `centre_mm`, float32 on the CPU, each with a storage of its own."""
     shift_cm = (np.asarray(scene.info.centre_mm) - np.asarray(centre_mm)) / 10.0
@@ -402,24 +384,3 @@ def _splats(scene: GaussianScene, centre_mm: Vector, notes: list[str]) -> tuple[
         )
     plain = {name: tensors[name].to(torch.float32, memory_format=torch.contiguous_format).clone() for name in SPLATS}
     return OrderedDict(plain), largest_error
-
-
-def _step(scene: GaussianScene) -> int:
-    step = scene.info.training.get("step")
-    return step if type(step) is int else 0
-
-
-def _saved(document: Mapping[str, Any]) -> bytes:
-    buffer = io.BytesIO()
-    torch.save(dict(document), buffer)
-    return buffer.getvalue()
-
-
-def _check_not_replaced(folder: Path, files: Mapping[str, bytes]) -> None:
-    """An export into the folder of a dataset would replace the dataset's own conf.json and poses."""
-    for name, data in files.items():
-        path = folder / name
-        if path.exists() and path.read_bytes() != data:
-            raise InvalidArgument(
-                f"{path} exists and says something else: export into a folder of its own", field="output"
-            )

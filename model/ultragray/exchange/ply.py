@@ -40,7 +40,6 @@ _POSE = np.dtype([(f"m{row}{column}", "<f8") for row in range(4) for column in r
 
 
 def _vertex(sh_degree: int, has_labels: bool) -> np.dtype[np.void]:
-    """The record of a Gaussian."""
     rest = (f"f_rest_{k}" for k in range((sh_degree + 1) ** 2 - 1))
     scales, rotation = (f"scale_{axis}" for axis in range(3)), (f"rot_{k}" for k in range(4))
     names = ("x", "y", "z", "f_dc_0", *rest, "opacity", *scales, *rotation, "transmittance")
@@ -166,11 +165,8 @@ def _scene(metadata: str, vertices: Records, poses: Records | None) -> GaussianS
     rest = sum(name.startswith("f_rest_") for name in vertices.dtype.names or ())
 
     def columns(*chosen: str) -> Any:  # [N, len(chosen)]
-        return (
-            torch.from_numpy(np.stack([vertices[name] for name in chosen], axis=1))
-            if chosen
-            else torch.zeros((len(vertices), 0))
-        )
+        found = np.array([vertices[name] for name in chosen], np.float32)
+        return torch.from_numpy(found.reshape(len(chosen), len(vertices)).T.copy())
 
     splats = {
         "means": columns("x", "y", "z"),

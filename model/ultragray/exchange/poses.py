@@ -48,6 +48,26 @@ def read_pose_array(path: str | Path) -> npt.NDArray[Any]:
         raise InvalidPose(f"{path}: {_reason(error)}", field="poses") from error
 
 
+def read_frame_poses(path: str | Path) -> npt.NDArray[Any]:
+    """As `read_pose_array`, where a frame may have no pose: `null` in JSON, NaN in an array. Those are NaN here."""
+    path = Path(path)
+    if path.suffix != ".json":
+        return read_pose_array(path)
+    try:
+        document = _read(path)
+        shape = next((np.shape(pose) for pose in document if pose is not None), (4, 4))
+        missing = np.full(shape, np.nan).tolist()
+        return _with_last_row([missing if pose is None else pose for pose in document])
+    except (OSError, ValueError, RecursionError, MemoryError) as error:
+        raise InvalidPose(f"{path}: {_reason(error)}", field="poses") from error
+
+
+def frames_with_pose(poses: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:  # [F, 4, 4] -> [F]
+    """Whether each frame has a pose: one of NaN alone is none."""
+    found: npt.NDArray[np.bool_] = ~np.isnan(poses[:, :3]).all(axis=(1, 2))
+    return found
+
+
 def _read(path: Path) -> Any:
     if not path.is_file():  # a pipe or a device would never end
         raise FileNotFoundError
@@ -82,9 +102,6 @@ def _reason(error: BaseException) -> str:
     return f"not a file of poses that can be read: {error}"
 
 
-# Poses in MCAP files: geometry_msgs/PoseStamped of ROS 2, metres, such as `ros2 bag record -s mcap` writes them.
-
-
 PREFERRED = "/probe_pose"  # the end of the topic of the ROS 2 node
 
 
@@ -117,7 +134,6 @@ def read_mcap_poses(path: Path) -> FloatArray:  # [P, 4, 4]
 
 
 def _topic(summary: Any) -> str:
-    """The topic that holds the poses of the probe."""
     if summary is None:
         raise ValueError("it has no summary: its writing was not finished")
     kinds = {number: schema.name for number, schema in summary.schemas.items()}

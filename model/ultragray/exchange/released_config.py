@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -138,8 +139,7 @@ def _read_probe(path: Path, document: Mapping[str, Any]) -> Probe:
 def released_centre_mm(released_probe: Probe, poses: FloatArray) -> FloatArray:  # [P, 4, 4] mm -> [3]
     """The origin of a scene trained from these poses: the mean corner of its images (docs/physics.md §6)."""
     corner = released_probe.corners_mm().mean(axis=0)  # [3]
-    centre: FloatArray = (poses[:, :3, :3] @ corner + poses[:, :3, 3]).mean(axis=0)
-    return centre
+    return (poses[:, :3, :3] @ corner + poses[:, :3, 3]).mean(axis=0)
 
 
 def read_released_config(path: str | Path, within: Path | None = None) -> ReleasedConfig:
@@ -149,12 +149,16 @@ def read_released_config(path: str | Path, within: Path | None = None) -> Releas
     """
     path = Path(path)
     document = _read_object(path)
-    files = _named_files(path, document)
-    images, images_missing = _find_images(path, files, within)
+    files = {key: document[key] for key in FILE_KEYS if document.get(key) is not None}
+    for key, value in files.items():
+        if not isinstance(value, str):
+            raise CheckpointInvalid(f"{path}: {key} must be a path, got {repr(value)[:40]}")
+    images, images_missing = _find_images(path, files.get("images_file_train"), within)
+    folder = Path(files.get("images_file_train", "")).parent  # data/liver/images_train.npy names `liver`
     return ReleasedConfig(
         path=path,
         released_probe=_read_probe(path, document),
-        dataset_name=_dataset_name(path, files),
+        dataset_name=folder.name or path.resolve().parent.name or None,
         files=files,
         images=images,
         images_missing=images_missing,
@@ -196,21 +200,7 @@ def _count(path: Path, document: Mapping[str, Any], key: str, *, at_least: int) 
         raise CheckpointInvalid(f"{path}: {key} {error}") from None
 
 
-def _named_files(path: Path, document: Mapping[str, Any]) -> dict[str, str]:
-    named = {key: document[key] for key in FILE_KEYS if document.get(key) is not None}
-    for key, value in named.items():
-        if not isinstance(value, str):
-            raise CheckpointInvalid(f"{path}: {key} must be a path, got {repr(value)[:40]}")
-    return named
-
-
-def _dataset_name(path: Path, files: Mapping[str, str]) -> str | None:
-    """The folder that holds the dataset: `data/liver/images_train.npy` names `liver`."""
-    return Path(files.get("images_file_train", "")).parent.name or path.resolve().parent.name or None
-
-
-def _find_images(path: Path, files: Mapping[str, str], within: Path | None) -> tuple[TrainingImages | None, str]:
-    named = files.get("images_file_train")
+def _find_images(path: Path, named: str | None, within: Path | None) -> tuple[TrainingImages | None, str]:
     if named is None:
         return None, f"{path} names no images_file_train"
     found = _find(path, named, within)
@@ -222,8 +212,9 @@ def _find(path: Path, named: str, within: Path | None) -> Path | None:
     for candidate in _candidates(path, named):
         if within is not None and not candidate.is_relative_to(within):
             return None
-        if _is_file(candidate):
-            return candidate
+        with suppress(OSError, ValueError):  # a name too long, or with a null byte
+            if candidate.is_file():
+                return candidate
     return None
 
 
@@ -241,15 +232,7 @@ def _candidates(path: Path, named: str) -> Iterator[Path]:
 
 
 def _joined(folder: Path, named: str) -> Path:
-    """A path from a folder, without its `..`."""
     return Path(os.path.normpath(folder / named))
-
-
-def _is_file(path: Path) -> bool:
-    try:
-        return path.is_file()
-    except (OSError, ValueError):  # a name too long, or with a null byte
-        return False
 
 
 def _shape(path: Path) -> TrainingImages:

@@ -67,9 +67,6 @@ def _first_other(value: Any, wanted: Any) -> str | None:
     return None if is_as_wanted else ""
 
 
-# Poses of the probe in messages of ROS 2, whose lengths are metres.
-
-
 def pose_of_message(message: Any, *, field: str) -> FloatArray:  # [4, 4] mm
     """The pose of a geometry_msgs/PoseStamped with attributes. Raises InvalidPose."""
     return pose_of_parts(message.pose.position, message.pose.orientation, field=field)

@@ -64,7 +64,9 @@ class ShardTar:
             for name, pixels in frames.items():
                 data = pixels[place].data.cast("B")
                 parts += _member(f"{key}.{name}.npy", heads[name], data)
-            document = {"pose": pose, **{name: _rounded(value) for name, value in figure.figures().items()}}
+            figures_now = figure.figures().items()
+            rounded = {name: None if value is None else round(value, _FIGURE_DIGITS) for name, value in figures_now}
+            document = {"pose": pose, **rounded}
             parts += _member(f"{key}.json", json.dumps(document).encode())
         self._write(b"".join(parts))
 
@@ -120,13 +122,6 @@ def _header(name: str, size: int) -> bytes:
     if len(written) > 100 or size > _MAX_MEMBER:
         raise InvalidArgument(f"a shard holds no member of {size:,} bytes called {name}", field="outputs")
     return _fields(written, octal, b"%06o\0 " % (_EMPTY_SUM + sum(written) + sum(octal)))
-
-
-def _rounded(value: float | None) -> float | None:
-    return None if value is None else round(value, _FIGURE_DIGITS)
-
-
-# The work of a batch: a process that holds its scene makes one file after another.
 
 
 class ShardRenderer:

@@ -110,8 +110,7 @@ def pose_from_position_quaternion(
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     pose[:3, 3] = position_mm
-    exact: FloatArray = check_poses(pose, field=field)[0]
-    return exact
+    return check_poses(pose, field=field)[0]
 
 
 def quaternion_from_pose(pose: FloatArray) -> tuple[float, float, float, float]:
@@ -133,16 +132,12 @@ def quaternion_from_pose(pose: FloatArray) -> tuple[float, float, float, float]:
     return w, x, y, z
 
 
-def position_distances_mm(poses: FloatArray, others: FloatArray) -> FloatArray:  # [C, 4, 4], [P, 4, 4] -> [C, P]
-    """Distance between the probe origins, in mm."""
-    offsets = poses[:, None, :3, 3] - others[None, :, :3, 3]
-    distances: FloatArray = np.linalg.norm(offsets, axis=-1)
-    return distances
-
-
 def rotation_angles_deg(poses: FloatArray, others: FloatArray) -> FloatArray:  # [C, 4, 4], [P, 4, 4] -> [C, P]
     """Angle of the rotation from one probe orientation to the other, in degrees."""
-    difference = poses[:, None, :3, :3] - others[None, :, :3, :3]
-    half_chord = np.linalg.norm(difference, axis=(-2, -1)) / math.sqrt(8.0)  # sin(angle / 2)
-    angles: FloatArray = np.degrees(2.0 * np.arcsin(np.clip(half_chord, 0.0, 1.0)))
-    return angles
+    return np.degrees(turn_angles_rad(poses[:, None, :3, :3], others[None, :, :3, :3]))
+
+
+def turn_angles_rad(rotations: FloatArray, others: FloatArray) -> FloatArray:  # [..., 3, 3] both -> [...]
+    """Angle of the rotation from one to the other; shapes broadcast."""
+    half_chords = np.linalg.norm(rotations - others, axis=(-2, -1)) / math.sqrt(8.0)  # sin(angle / 2)
+    return 2.0 * np.arcsin(np.clip(half_chords, 0.0, 1.0))

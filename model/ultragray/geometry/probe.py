@@ -17,10 +17,11 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias, TypeVar
+from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
+from typing_extensions import Self
 
 from ultragray.contract import Contract, Family, annotated_fields, described, kind_field
 from ultragray.errors import InvalidArgument, InvalidProbe
@@ -30,7 +31,6 @@ from ultragray.errors import InvalidArgument, InvalidProbe
 # The place of a line is its `across`, a number that grows evenly from line to line, in mm or degrees: of W lines,
 # line j has start + span·(j+½)/W. A point of the plane has x and z, lateral and axial, or its depth along the line
 # through it and the across of that line.
-
 
 FloatArray: TypeAlias = npt.NDArray[np.float64]
 
@@ -62,7 +62,6 @@ class ScanLines(ABC):
         return -self.span / 2
 
     def across(self, width: int) -> FloatArray:  # [W]
-        """The across of each of W lines."""
         return self.start + self.span * ((np.arange(width) + 0.5) / width)
 
     @abstractmethod
@@ -106,7 +105,6 @@ class ParallelLines(ScanLines):
 
     @property
     def direction(self) -> tuple[float, float]:
-        """Of every line: x and z."""
         steering = math.radians(self.steering_deg)
         return math.sin(steering), math.cos(steering)
 
@@ -193,9 +191,6 @@ class RadialLines(_Angular):
 Lines: TypeAlias = ParallelLines | FannedLines | RadialLines
 
 
-# The place of a picture's pixels in the image plane of a probe.
-
-
 @dataclass(frozen=True)
 class Picture:
     """The grid of a picture [H, W].
@@ -234,9 +229,8 @@ class Picture:
         """Square pixels over a box of the image plane, from its upper edge on, as many to the left as to the right."""
         columns, rows = (max(1, math.ceil(side / pixel_mm)) for side in (box.right - box.left, box.bottom - box.top))
         middle = (box.left + box.right) / 2
-        return cls(
-            rows, columns, "mm", (middle + (1 - columns) * pixel_mm / 2, box.top + pixel_mm / 2), (pixel_mm, pixel_mm)
-        )
+        first = middle + (1 - columns) * pixel_mm / 2, box.top + pixel_mm / 2
+        return cls(rows, columns, "mm", first, (pixel_mm, pixel_mm))
 
     def positions_mm(self) -> tuple[FloatArray, FloatArray]:  # [1, W], [H, 1]
         """Column and row of each pixel's centre, in the units of the picture."""
@@ -245,15 +239,10 @@ class Picture:
         return columns[None, :], rows[:, None]
 
     def flipped(self) -> Picture:
-        """With left and right exchanged."""
         last = self.first[0] + (self.width - 1) * self.step[0]
         return replace(self, first=(last, self.first[1]), step=(-self.step[0], self.step[1]))
 
 
-# The base of all probes: what follows from a bundle of scan lines, a near and a far depth.
-
-
-_P = TypeVar("_P", bound="Probe")
 BoolArray = npt.NDArray[np.bool_]
 
 MAX_LENGTH_MM = 10_000.0
@@ -327,15 +316,12 @@ class Probe(Family):
 
     def cull_far_mm(self, height: int) -> float:
         """Depth beyond which a Gaussian's mean is culled: the top edge of the last row (infinite for one row)."""
-        if height == 1:
-            return math.inf
-        return self.near_mm + self.scan_line_length_mm * (height - 1) / height
+        return math.inf if height == 1 else self.near_mm + self.scan_line_length_mm * (height - 1) / height
 
     def cull(self, x_mm: FloatArray, z_mm: FloatArray, height: int) -> BoolArray:  # [N] each
         """A mask of the means of Gaussians that count, by their depth: up to the top edge of the last row."""
         depth, _ = self.lines.coordinates(x_mm, z_mm)
-        seen: BoolArray = (depth >= self.near_mm) & (depth <= self.cull_far_mm(height))
-        return seen
+        return (depth >= self.near_mm) & (depth <= self.cull_far_mm(height))
 
     def scan_lines(self, width: int) -> tuple[FloatArray, FloatArray]:  # [W, 3] mm, [W, 3]
         """The point of depth 0 of each scan line (mm), and its unit direction, in the probe frame."""
@@ -361,14 +347,17 @@ class Probe(Family):
         columns = np.array(self.lines.corner_shares)
         return np.concatenate([self.points_mm(np.full(columns.shape, row), columns) for row in (0.0, 1.0)])
 
-    def cropped(self: _P, share: float) -> _P:
+    def corners_from(self, poses: FloatArray) -> FloatArray:  # [C, 4, 4] mm -> [C, 2·K, 3]
+        """`corners_mm` in the frame that poses lead into."""
+        return np.einsum("fij,cj->fci", poses[:, :3, :3], self.corners_mm()) + poses[:, None, :3, 3]
+
+    def cropped(self, share: float) -> Self:
         """The same probe with scan lines that end after this share of their length."""
         return self.ending_at(self.near_mm + share * self.scan_line_length_mm)
 
-    def ending_at(self: _P, far_mm: float) -> _P:
+    def ending_at(self, far_mm: float) -> Self:
         """The same probe with another end of its scan lines."""
-        changed: _P = replace(self, far_mm=far_mm)  # type: ignore[type-var]  # every member is a dataclass
-        return changed
+        return replace(self, far_mm=far_mm)  # type: ignore[type-var]  # every member is a dataclass
 
     def frame_picture(self, height: int, width: int) -> Picture:
         """A frame [H, W] as it is."""
@@ -388,7 +377,6 @@ class Probe(Family):
 
 
 def odd_length(subject: str, measure: str, length_mm: float, usual_mm: tuple[float, float]) -> str:
-    """The sentence for a length that no probe has."""
     low, high = usual_mm
     return (
         f"the {subject} {length_mm:.3g} mm {measure}, where {low:g} to {high:g} mm are usual: a length in another "
@@ -400,15 +388,11 @@ def _in_probe_frame(vectors: FloatArray) -> FloatArray:  # [..., 2] (x, z) -> [.
     return np.stack([vectors[..., 0], np.zeros(vectors.shape[:-1]), vectors[..., 1]], axis=-1)
 
 
-# The base of convex and phased arrays.
-
-
 LARGEST_OPENING_DEG = 175.0
 SMALLEST_USUAL_OPENING_DEG = 5.0
 
 
 def opening_field() -> Any:
-    """The field for the angle of a fan."""
     return described("Full angle of the fan.", above=0.0, high=LARGEST_OPENING_DEG, example=60.0)
 
 
@@ -434,9 +418,6 @@ class Fan(Probe):
             )
 
 
-# The curved array.
-
-
 @dataclass(frozen=True)
 class ConvexProbe(Fan):
     """A curved array: scan lines fan out from the apex, which is the origin."""
@@ -447,9 +428,6 @@ class ConvexProbe(Fan):
         "Distance from the apex at which the image ends, beyond `near_mm`.", above=0.0, example=90.0
     )
     kind: Literal["convex"] = kind_field("convex")
-
-
-# The linear array.
 
 
 USUAL_WIDTHS_MM = (5.0, 200.0)
@@ -476,9 +454,6 @@ class LinearProbe(Probe):
         yield from super().oddities()
 
 
-# The phased array.
-
-
 @dataclass(frozen=True)
 class PhasedProbe(Fan):
     """A phased array: scan lines fan out from the centre of the face; `near_mm` is 0."""
@@ -488,9 +463,6 @@ class PhasedProbe(Fan):
     kind: Literal["phased"] = kind_field("phased")
 
     near_mm = 0.0
-
-
-# The radial probe: intravascular and endobronchial catheters, rotating endoscopes.
 
 
 @dataclass(frozen=True)
@@ -523,9 +495,6 @@ class RadialProbe(Probe):
         return 0.0
 
 
-# The linear array with steered beams.
-
-
 LARGEST_STEERING_DEG = 45.0
 
 
@@ -551,9 +520,6 @@ class SteeredProbe(Probe):
     @property
     def lines(self) -> ParallelLines:
         return ParallelLines(self.width_mm, self.steering_deg)
-
-
-# ElevationBeam: how thick a slice of tissue an image shows, by depth.
 
 
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
@@ -603,15 +569,5 @@ class ElevationBeam(Contract):
         thickness, focus, depth_of_field = self.numbers
         return thickness * math.hypot(1.0, 2.0 * (depth_mm - focus) / depth_of_field)
 
-    @property
-    def is_thin(self) -> bool:
-        """Whether it is a plane."""
-        return self.thickness_mm == 0.0
 
-    def as_thick_as(self, thickness_mm: float) -> ElevationBeam:
-        """A beam of the same shape with another thickness."""
-        return replace(self, thickness_mm=thickness_mm)
-
-
-PLANE = ElevationBeam(thickness_mm=0.0)
-"""No beam: an infinitely thin slice."""
+PLANE = ElevationBeam(thickness_mm=0.0)  # no beam: an infinitely thin slice

@@ -38,7 +38,6 @@ class PointFit:
 
     @property
     def rms_mm(self) -> float:
-        """Root mean square of the residuals."""
         return float(np.sqrt(np.square(self.residuals_mm).mean()))
 
 
@@ -51,8 +50,12 @@ def register_points(points: Any, targets: Any) -> PointFit:  # [N, 3] mm both
     points, targets = _checked(points, "points"), _checked(targets, "targets")
     if len(points) != len(targets):
         raise InvalidArgument(f"each point needs its target: got {len(points)} and {len(targets)}", field="targets")
-    for name, given in (("points", points), ("targets", targets)):
-        _require_a_plane(given, name)
+    for field, given in (("points", points), ("targets", targets)):
+        extents = np.linalg.svd(given - given.mean(axis=0), compute_uv=False)
+        if extents[1] <= LEAST_SPREAD * extents[0] or extents[0] == 0.0:
+            raise InvalidArgument(
+                f"{field} lie on a line, or in one place: a turn about it stays unknown; add one beside it", field=field
+            )
     middle, target_middle = points.mean(axis=0), targets.mean(axis=0)
     rotation = _rotation(points - middle, targets - target_middle)
     transform = np.eye(4)
@@ -76,8 +79,7 @@ def _rotation(points: FloatArray, targets: FloatArray) -> FloatArray:  # [N, 3] 
             "targets are the mirror image of points: one of the two frames is left-handed, or has two axes exchanged",
             field="targets",
         )
-    rotation: FloatArray = right.T @ np.diag([1.0, 1.0, sign]) @ left.T
-    return rotation
+    return right.T @ np.diag([1.0, 1.0, sign]) @ left.T
 
 
 def _deviations(
@@ -106,19 +108,10 @@ def _checked(values: Any, field: str) -> FloatArray:  # [N, 3]
     return array
 
 
-def _require_a_plane(points: FloatArray, field: str) -> None:
-    extents = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
-    if extents[1] <= LEAST_SPREAD * extents[0] or extents[0] == 0.0:
-        raise InvalidArgument(
-            f"{field} lie on a line, or in one place: a turn about it stays unknown; add one beside it", field=field
-        )
-
-
 # Registration from poses of the probe that are known in the robot's frame and in the scene's.
 #
 # Convention. probe→scene = base→scene · flange→base · probe→flange, all [4, 4], mm. For a tracked probe the base is
 # the tracker, and the flange the marker on the probe.
-
 
 LEVER_MM = 50.0  # at which a turn weighs as a shift: about half the depth of an image
 LEAST_POSES = 3  # where the mounting is unknown, too
@@ -154,7 +147,9 @@ def register_poses(
     mounting = np.eye(4) if probe_to_flange is None else check_poses(probe_to_flange, field="probe_to_flange")[0]
     in_base = flanges @ mounting
     transform = register_points(_as_points(in_base), _as_points(probes)).transform
-    return _fit(transform, in_base, probes, mounting)
+    fitted = transform @ in_base
+    deviations = _pose_deviations(fitted, probes) if len(probes) > 1 else (None, None)
+    return PoseFit(transform, mounting, *pose_residuals(fitted, probes), *deviations)
 
 
 def register_poses_and_mounting(flange_to_base: Any, probe_to_scene: Any) -> PoseFit:  # [N, 4, 4] mm both
@@ -200,12 +195,6 @@ def pose_residuals(poses: FloatArray, others: FloatArray) -> tuple[FloatArray, F
     return shifts_mm, np.degrees(np.linalg.norm(_rotation_vectors(turns), axis=1))
 
 
-def _fit(base_to_scene: FloatArray, in_base: FloatArray, probes: FloatArray, mounting: FloatArray) -> PoseFit:
-    residuals_mm, residuals_deg = pose_residuals(base_to_scene @ in_base, probes)
-    deviations = _pose_deviations(base_to_scene @ in_base, probes) if len(probes) > 1 else (None, None)
-    return PoseFit(base_to_scene, mounting, residuals_mm, residuals_deg, *deviations)
-
-
 def _pose_deviations(
     fitted: FloatArray,  # [N, 4, 4]
     probes: FloatArray,  # [N, 4, 4]
@@ -234,8 +223,7 @@ def _pose_deviations(
 
 
 def _as_points(poses: FloatArray) -> FloatArray:  # [N, 4, 4] -> [4N, 3]
-    points: FloatArray = (_ARMS @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]).reshape(-1, 3)
-    return points
+    return (_ARMS @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]).reshape(-1, 3)
 
 
 def _pairs(flange_to_base: Any, probe_to_scene: Any) -> tuple[FloatArray, FloatArray]:
@@ -254,12 +242,6 @@ def _rotation_vectors(rotations: FloatArray) -> FloatArray:  # [N, 3, 3] -> [N, 
     import cv2
 
     return np.stack([cv2.Rodrigues(rotation)[0][:, 0] for rotation in rotations])
-
-
-# Registration: the two links of a chain that lead a robot's poses into a scene, and their file. Free of torch.
-#
-# Convention. probe→scene = base→scene · flange→base · probe→flange, mm. For a tracked probe the base is the tracker,
-# and the flange the marker on the probe.
 
 
 FORMAT_VERSION = 1
@@ -305,36 +287,28 @@ class Registration(Contract):
     def probe_to_scene(self, flange_to_base: FloatArray) -> FloatArray:  # [..., 4, 4] mm, exact -> [..., 4, 4]
         """The poses of the probe in the scene, of poses of the flange in the base."""
         base_to_scene, probe_to_flange = self._links
-        poses: FloatArray = base_to_scene @ flange_to_base @ probe_to_flange
-        return poses
+        return base_to_scene @ flange_to_base @ probe_to_flange
 
     def marker_to_scene(self, marker_to_base: FloatArray) -> FloatArray:  # [..., 4, 4] mm, exact -> [..., 4, 4]
         """The poses in the scene of something else in the base than the probe, such as a needle's marker."""
-        base_to_scene, _ = self._links
-        poses: FloatArray = base_to_scene @ marker_to_base
-        return poses
+        return self._links[0] @ marker_to_base
 
     def in_base(self, to_scene: FloatArray) -> FloatArray:  # [..., 4, 4] mm -> [..., 4, 4]
         """Transforms into the scene as such into the base."""
-        base_to_scene, _ = self._links
-        poses: FloatArray = np.linalg.inv(base_to_scene) @ to_scene
-        return poses
+        return np.linalg.inv(self._links[0]) @ to_scene
 
     def flange_to_base(self, probe_to_scene: FloatArray) -> FloatArray:  # [..., 4, 4] mm, exact -> [..., 4, 4]
         """The poses of the flange in the base, of poses of the probe in the scene."""
         base_to_scene, probe_to_flange = self._links
-        poses: FloatArray = np.linalg.inv(base_to_scene) @ probe_to_scene @ np.linalg.inv(probe_to_flange)
-        return poses
+        return np.linalg.inv(base_to_scene) @ probe_to_scene @ np.linalg.inv(probe_to_flange)
 
 
 def rows(pose: FloatArray) -> Rows:  # [4, 4]
-    """A pose as the contract holds it."""
     first, second, third, fourth = ((float(a), float(b), float(c), float(d)) for a, b, c, d in pose)
     return first, second, third, fourth
 
 
 def save_registration(path: str | Path, registration: Registration) -> None:
-    """Writes the file of a registration, JSON, or leaves what was there."""
     document = {"format_version": FORMAT_VERSION, **to_dict(registration)}
     write_whole(path, json.dumps(document, indent=1, allow_nan=False) + "\n")
 

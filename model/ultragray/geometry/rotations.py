@@ -15,12 +15,10 @@ def about_axes(axes: FloatArray, angles: FloatArray) -> FloatArray:  # [C, 3] of
     nothing = np.zeros_like(x)
     cross = np.stack([nothing, -z, y, z, nothing, -x, -y, x, nothing], axis=1).reshape(-1, 3, 3)
     sine, versine = np.sin(angles)[:, None, None], (1.0 - np.cos(angles))[:, None, None]
-    rotations: FloatArray = np.eye(3) + sine * cross + versine * (cross @ cross)
-    return rotations
+    return np.eye(3) + sine * cross + versine * (cross @ cross)
 
 
 def random_directions(random: np.random.Generator, count: int) -> FloatArray:  # [C, 3]
-    """Unit vectors, uniform on the sphere."""
     directions = random.normal(size=(count, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     return directions
@@ -34,7 +32,6 @@ def blended(first: FloatArray, second: FloatArray, shares: FloatArray) -> FloatA
 
 
 def rotations_of(turns: FloatArray) -> FloatArray:  # [C, 3] rad -> [C, 3, 3]
-    """The rotations of turns, each an axis times an angle."""
     angles = np.linalg.norm(turns, axis=1)
     return about_axes(turns / np.maximum(angles, _NO_TURN)[:, None], angles)
 
@@ -42,8 +39,7 @@ def rotations_of(turns: FloatArray) -> FloatArray:  # [C, 3] rad -> [C, 3, 3]
 def turns_of(rotations: FloatArray) -> FloatArray:  # [C, 3, 3] -> [C, 3] rad
     """Axis times angle, at most π, of each rotation."""
     axes, angles = _axes_and_angles(rotations)
-    turns: FloatArray = axes * angles[:, None]
-    return turns
+    return axes * angles[:, None]
 
 
 def _axes_and_angles(rotations: FloatArray) -> tuple[FloatArray, FloatArray]:  # [C, 3, 3] -> [C, 3], [C] rad in [0, π]

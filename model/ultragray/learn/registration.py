@@ -99,7 +99,8 @@ def _agreeing(in_base: FloatArray, localizations: Sequence[Localization]) -> Boo
             field="images",
         )
     implied = [poses[index] @ np.linalg.inv(in_base[index]) for index in np.flatnonzero(is_found)]
-    votes = [_residuals(base_to_scene @ in_base, poses) for base_to_scene in implied]
+    apart = (pose_residuals(base_to_scene @ in_base, poses) for base_to_scene in implied)
+    votes = [np.hypot(shifts_mm, LEVER_MM * np.radians(turns_deg)) for shifts_mm, turns_deg in apart]
     medians = [float(np.median(vote[is_found])) for vote in votes]
     best = votes[int(np.argmin(medians))]
     agreeing = is_found & (best <= max(LEAST_OUTLIER_MM, OUTLIER * min(medians)))
@@ -110,13 +111,6 @@ def _agreeing(in_base: FloatArray, localizations: Sequence[Localization]) -> Boo
             field="images",
         )
     return agreeing
-
-
-def _residuals(poses: FloatArray, others: FloatArray) -> FloatArray:  # [N, 4, 4] both -> [N] mm
-    """Shifts, and turns as the way at the lever."""
-    shifts_mm, turns_deg = pose_residuals(poses, others)
-    together: FloatArray = np.hypot(shifts_mm, LEVER_MM * np.radians(turns_deg))
-    return together
 
 
 def _fit_of(

@@ -7,6 +7,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -38,12 +39,36 @@ class ImageRegion(Contract):
     )
 
 
+@dataclass(frozen=True)
+class Link:
+    """A transform on the way from pixels to the frame that the poses are in, as it was used."""
+
+    origin: str
+    target: str
+    transform: str  # its name where it comes from, such as ImageToProbe
+    source: str  # where it comes from
+    is_inverted: bool = False
+    is_tracked: bool = False  # another one in every frame
+
+    def __str__(self) -> str:
+        kind = "tracked" if self.is_tracked else "fixed"
+        inverse = "the inverse of " if self.is_inverted else ""
+        return f"{self.origin} → {self.target}: {inverse}{self.transform} of {self.source}, {kind}"
+
+
+@dataclass(frozen=True)
+class Chain:
+    """All that a recording says about the way from pixels to the frame of the poses."""
+
+    links: tuple[Link, ...] = ()
+    left_out: tuple[str, ...] = ()  # transforms that are no part of it, and where they are from
+
+
 # Sweep and Dataset: tracked B-mode frames, checked once and trusted afterwards.
 #
 # Convention. Images are uint8 [F, H, W], rows of equal thickness between the probe's near and far (docs/physics.md
 # §3); poses are rigid probe→tracker transforms [F, 4, 4] in mm. A scene trained from a dataset answers poses in that
 # frame.
-
 
 ByteArray: TypeAlias = npt.NDArray[np.uint8]
 IntArray: TypeAlias = npt.NDArray[np.int64]
@@ -57,7 +82,7 @@ def check_frame_poses(poses: FloatArray, frame_numbers: IntArray, source: str) -
     if poses.shape[1:] != (4, 4):
         raise DatasetInvalid(f"{source}: poses must be [F, 4, 4], got {list(poses.shape)}")
     try:
-        return check_poses(poses) if len(poses) else poses
+        return check_poses(poses)
     except InvalidPose:
         for number, pose in zip(frame_numbers, poses, strict=True):
             try:
@@ -82,6 +107,8 @@ class Sweep:
     source: str
     notes: tuple[str, ...] = ()  # what reading it left out or assumed, for a person
     region: ImageRegion | None = None  # of the stored images; None: the images are stored as they are
+    chain: Chain = Chain()
+    times_s: FloatArray | None = None  # [F] of the images, in the order of the frames
 
     def __repr__(self) -> str:
         frames = f"{len(self.images):,} frames of {self.images.shape[1]}x{self.images.shape[2]}"
@@ -127,13 +154,27 @@ class Sweep:
         """The frames at these places (not frame numbers) of this sweep."""
         chosen = np.asarray(places, dtype=np.int64)
         return replace(
-            self, images=self.images[chosen], poses=self.poses[chosen], frame_numbers=self.frame_numbers[chosen]
+            self,
+            images=self.images[chosen],
+            poses=self.poses[chosen],
+            frame_numbers=self.frame_numbers[chosen],
+            times_s=None if self.times_s is None else self.times_s[chosen],
         )
 
     def corners_mm(self) -> FloatArray:  # [F, 4 or 6, 3]
         """Corners of each image plane in the tracker's frame."""
-        corners: FloatArray = np.einsum("fij,cj->fci", self.poses[:, :3, :3], self.probe.corners_mm())
-        return corners + self.poses[:, None, :3, 3]
+        return self.probe.corners_from(self.poses)
+
+
+def frame_list(numbers: Iterable[int]) -> str:
+    """Frame numbers in words, at most ten of them: `1, 3, 5`; of more than ten those that follow each other as one."""
+    found = [(number, number) for number in map(int, numbers)]
+    if len(found) > 10:
+        for place in range(len(found) - 1, 0, -1):
+            if found[place - 1][1] + 1 == found[place][0]:
+                found[place - 1 : place + 1] = [(found[place - 1][0], found[place][1])]
+    words = [str(a) if a == b else f"{a} to {b}" for a, b in found[:10]]
+    return ", ".join(words) + (", …" if len(found) > 10 else "")
 
 
 def spread_places(count: int, most: int) -> IntArray:
@@ -143,12 +184,10 @@ def spread_places(count: int, most: int) -> IntArray:
 
 def corner_distances_mm(corners: FloatArray, others: FloatArray) -> FloatArray:  # [..., K, 3] both -> [...]
     """Distances between image planes: the mean over corresponding corners, mm; shapes broadcast."""
-    distances: FloatArray = np.linalg.norm(corners - others, axis=-1).mean(axis=-1)
-    return distances
+    return np.linalg.norm(corners - others, axis=-1).mean(axis=-1)
 
 
 def pixel_positions_mm(probe: Probe, height: int, width: int) -> FloatArray:  # [H·W, 3], row by row
-    """The place of each pixel in the probe frame, mm."""
     origins, directions = probe.scan_lines(width)
     positions: FloatArray = origins + probe.depths_mm(height)[:, None, None] * directions
     return positions.reshape(-1, 3)
@@ -157,14 +196,13 @@ def pixel_positions_mm(probe: Probe, height: int, width: int) -> FloatArray:  # 
 def mean_axes(poses: FloatArray) -> FloatArray:  # [F, 4, 4] -> [3, 3]
     """The rotation nearest to the mean of the poses' rotations."""
     left, _, right = np.linalg.svd(poses[:, :3, :3].mean(axis=0))
-    mean: FloatArray = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-    return mean
+    return left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
 
 
 def nearest_frames(sweep: Sweep, poses: FloatArray) -> IntArray:  # [C]
     """The place of the sweep's frame whose corners lie nearest on average, for each pose [C, 4, 4] (mm)."""
-    asked = np.einsum("cij,pj->cpi", poses[:, :3, :3], sweep.probe.corners_mm()) + poses[:, None, :3, 3]
     corners = sweep.corners_mm()
+    asked = sweep.probe.corners_from(poses)
     return np.array([corner_distances_mm(corners, own).argmin() for own in asked], np.int64)
 
 
@@ -198,8 +236,7 @@ class Dataset:
     @property
     def centre_mm(self) -> FloatArray:  # [3]
         """Origin of the scene: the mean of the corners of the training frames (docs/physics.md §6)."""
-        centre: FloatArray = self.train.corners_mm().mean(axis=(0, 1))
-        return centre
+        return self.train.corners_mm().mean(axis=(0, 1))
 
     @property
     def sha256(self) -> str:
@@ -231,7 +268,6 @@ class Distances:
 # The split of a sweep into frames to train from and frames held out.
 #
 # Ranges of frames are what a user writes: `0:90`, `0:90,100:120:2`, `7`, `:50`, `150:`.
-
 
 HELD_OUT_START, HELD_OUT_STEP = 2, 5  # of a single sequence: every fifth frame, from the third
 _PART = re.compile(r"(?P<start>\d{0,9})(?P<range>:(?P<stop>\d{0,9})(:(?P<step>\d{1,9}))?)?")
@@ -307,7 +343,10 @@ def parse_frame_ranges(text: str, count: int, *, option: str) -> list[int]:
                 f"{option} must be frames such as 7, 0:90 or 0:90,100:120:2 (the stop is left out), got {text[:80]!r}",
                 field=option,
             )
-        frames = _frames(match, count)
+        start, stop, step = int(match["start"] or 0), int(match["stop"] or count), int(match["step"] or 1)
+        if match["range"] is None:
+            stop = start + 1
+        frames = range(start, stop, step) if step else range(0)
         if not len(frames):
             raise InvalidArgument(f"{option}: {part.strip()!r} names no frame", field=option)
         if frames[-1] >= count:
@@ -317,10 +356,3 @@ def parse_frame_ranges(text: str, count: int, *, option: str) -> list[int]:
             )
         chosen.update(frames)
     return sorted(chosen)
-
-
-def _frames(match: re.Match[str], count: int) -> range:
-    if match["range"] is None:
-        return range(int(match["start"]), int(match["start"]) + 1)
-    start, stop, step = int(match["start"] or 0), int(match["stop"] or count), int(match["step"] or 1)
-    return range(start, stop, step) if step else range(0)

@@ -34,7 +34,6 @@ BLEND_MM = 2.0  # radius with which the parts run into each other
 
 
 def distance_mm(points: Floats) -> Floats:  # [N, 3] -> [N]
-    """Signed distance to the nearest vertebra."""
     local = _local(points)
     half = (BODY_HALF_WIDTH_MM - 2.0, BODY_HALF_LENGTH_MM - 2.0, 13.0)
     body = _box(local, (0.0, 0.0, BODY_DEPTH_MM + 15.0), half, 2.0)
@@ -88,7 +87,6 @@ def _blend(a: Floats, b: Floats) -> Floats:
 # Shapes are drawn straight and symmetric; `straightened` takes a point of the phantom to where it lies in the
 # drawing.
 
-
 LabelArray = npt.NDArray[np.uint8]
 
 SKIN_MM = 1.7
@@ -122,7 +120,6 @@ def tissue_at(points_mm: Floats) -> LabelArray:  # [N, 3] -> [N]
 
 
 def tissue_drawn(points: Floats) -> LabelArray:  # [N, 3] -> [N]
-    """The tissue at each point of the straight, symmetric drawing."""
     x, _, z = points.T
     fascia = fascia_depth_mm(x)
     in_canal = (np.abs(x) < CANAL_HALF_WIDTH_MM) & (z > canal_roof_mm(x))
@@ -150,13 +147,7 @@ def straightened(points: Floats) -> Floats:  # [N, 3] -> [N, 3]
 
 def fascia_depth_mm(x: Floats) -> Floats:
     """The thoracolumbar fascia: over the two muscle bellies, down to the spinous processes between them."""
-    depth: Floats = 10.0 - 1.6 * np.exp(-(((np.abs(x) - 14.0) / 9.0) ** 2)) + 2.0 * np.exp(-((x / 5.0) ** 2))
-    return depth
-
-
-def deep_fascia_depth_mm(x: Floats) -> Floats:
-    """The middle layer of that fascia, in front of the erector spinae."""
-    return 42.5 + 0.02 * (np.abs(x) - 22.0) ** 2
+    return 10.0 - 1.6 * np.exp(-(((np.abs(x) - 14.0) / 9.0) ** 2)) + 2.0 * np.exp(-((x / 5.0) ** 2))
 
 
 def canal_roof_mm(x: Floats) -> Floats:
@@ -168,8 +159,7 @@ def vessel_distance_mm(points: Floats) -> Floats:  # [N, 3] -> [N]
     """Distance from the wall of a vessel that winds along the right erector spinae, negative inside."""
     x, y, z = points.T
     centre_x, centre_z = 20.0 + 1.5 * np.sin(y / 14.0), 23.0 + 1.2 * np.sin(y / 19.0)
-    distance: Floats = np.hypot(x - centre_x, z - centre_z) - VESSEL_RADIUS_MM
-    return distance
+    return np.hypot(x - centre_x, z - centre_z) - VESSEL_RADIUS_MM
 
 
 def sac_distance_mm(points: Floats) -> Floats:  # [N, 3] -> [N]
@@ -177,11 +167,7 @@ def sac_distance_mm(points: Floats) -> Floats:  # [N, 3] -> [N]
     x, z = points[:, 0] / SAC_HALF_WIDTH_MM, (points[:, 2] - SAC_DEPTH_MM) / SAC_HALF_DEPTH_MM
     radius = np.hypot(x, z)
     steepness = np.hypot(x / SAC_HALF_WIDTH_MM, z / SAC_HALF_DEPTH_MM) / np.maximum(radius, 1e-9)
-    distance: Floats = (radius - 1.0) / np.maximum(steepness, 1e-9)
-    return distance
-
-
-# Scattering and absorption of the phantom's tissues, and the probe's pulse and beam.
+    return (radius - 1.0) / np.maximum(steepness, 1e-9)
 
 
 SPEED_MM_PER_US = 1.54
@@ -216,7 +202,6 @@ COMPENSATED = 0.6  # dB/(cm·MHz) that the scanner's time-gain compensation expe
 
 
 def round_trip_db_per_mm() -> FloatArray:  # [tissues]
-    """The loss of an echo in each tissue over a millimetre of depth, there and back."""
     return np.array([0.2 * FREQUENCY_MHZ * ACOUSTICS[tissue].attenuation for tissue in Tissue])
 
 
@@ -225,30 +210,20 @@ def backscatter_amplitudes() -> FloatArray:  # [tissues]
     return np.array([10.0 ** (ACOUSTICS[tissue].backscatter_db / 20.0) for tissue in Tissue])
 
 
-def compensated_db_per_mm() -> float:
-    """The gain of the time-gain compensation over a millimetre of depth."""
-    return 0.2 * FREQUENCY_MHZ * COMPENSATED
-
-
 def lateral_sigma_mm(depth_mm: Floats) -> Floats:
     """Width of the beam in the image plane, there and back."""
-    sigma: Floats = np.hypot(0.34, 0.011 * (depth_mm - FOCUS_MM))
-    return sigma
+    return np.hypot(0.34, 0.011 * (depth_mm - FOCUS_MM))
 
 
 def elevation_sigma_mm(depth_mm: Floats) -> Floats:
     """Thickness of the slice: 1.4 mm at half amplitude in the focus of the lens, more before and behind."""
-    sigma: Floats = np.hypot(0.6, 0.022 * (depth_mm - FOCUS_MM))
-    return sigma
+    return np.hypot(0.6, 0.022 * (depth_mm - FOCUS_MM))
 
 
 def elevation_weight(elevation_mm: Floats, depth_mm: Floats) -> Floats:
     """The share of an echo from beside the image plane that the beam leaves."""
     sigmas = elevation_mm / elevation_sigma_mm(depth_mm)
     return np.where(np.abs(sigmas) < ELEVATION_REACH, np.exp(-0.5 * sigmas * sigmas), 0.0)
-
-
-# Smooth seeded noise: the irregularity of fascicles and septa, a function of position alone.
 
 
 _PERIOD = 32  # lattice cells, a power of two
@@ -264,14 +239,12 @@ class LatticeNoise:
         self._cell_mm = cell_mm
 
     def __call__(self, points: Floats) -> Floats:  # [N, 3] -> [N]
-        """The noise at each point, mm."""
         (i, u), (j, v), (k, w) = (self._cell(points[:, axis] / size) for axis, size in enumerate(self._cell_mm))
         nodes = self._nodes
 
         def along_z(i: IntArray, j: IntArray) -> Floats:
             near = nodes[i, j, k]
-            value: Floats = near + w * (nodes[i, j, (k + 1) & _LAST] - near)
-            return value
+            return near + w * (nodes[i, j, (k + 1) & _LAST] - near)
 
         def along_y(i: IntArray) -> Floats:
             near = along_z(i, j)
@@ -291,7 +264,6 @@ class LatticeNoise:
 # The surfaces of the phantom that reflect: bone, skin, fasciae, septa, vessel wall, dura.
 #
 # Each is the zero of a function of the straight drawing, roughly a distance in mm, where `present` says so.
-
 
 Level = Callable[[Floats], Floats]  # [N, 3] -> [N]
 Present = Callable[[Floats], npt.NDArray[np.bool_]]  # [N, 3] -> [N]
@@ -332,22 +304,6 @@ def _along_fibres(points: Floats) -> Floats:  # [N, 3] -> [N, 3]
     return np.stack([x + 0.10 * np.sign(x) * y, y, z - lean - 0.06 * y], axis=1)
 
 
-def _perimysium(points: Floats) -> Floats:
-    return 1.2 * _BUNDLES(_along_fibres(points))
-
-
-def _endomysium(points: Floats) -> Floats:
-    return 0.9 * _FIBRES(_along_fibres(points))
-
-
-def _fat_septa(points: Floats) -> Floats:
-    return 1.2 * _LOBULES(points)
-
-
-def _nerve_roots(points: Floats) -> Floats:
-    return 1.2 * (_ROOTS(points) - 0.35)
-
-
 def _muscle_septa(points: Floats) -> Floats:
     """Between multifidus and longissimus, and between longissimus and iliocostalis."""
     side, y, z = np.abs(points[:, 0]), points[:, 1], points[:, 2]
@@ -370,10 +326,6 @@ def _in_fat(points: Floats) -> npt.NDArray[np.bool_]:
     return np.asarray((z > SKIN_MM + 0.3) & (z < fascia_depth_mm(x) - 0.3))
 
 
-def _in_sac(points: Floats) -> npt.NDArray[np.bool_]:
-    return np.asarray(sac_distance_mm(points) < -0.8)
-
-
 def _outside_bone(points: Floats) -> npt.NDArray[np.bool_]:
     return np.asarray(distance_mm(points) > 0.3)
 
@@ -387,7 +339,6 @@ def _within(half_width_mm: float) -> Present:
 
 
 def _sheet(depth_mm: Callable[[Floats], Floats]) -> Level:
-    """A surface at a depth that depends on x."""
     return lambda points: points[:, 2] - depth_mm(points[:, 0])
 
 
@@ -395,24 +346,27 @@ INTERFACES: tuple[Interface, ...] = (
     Interface(distance_mm, _everywhere, (10.0, 66.0), 38.0, 18.0, 26.0, 0.05),
     Interface(_sheet(lambda x: 0.5 + 0.0 * x), _everywhere, (0.0, 1.5), 26.0, 10.0, 25.0, 0.05),
     Interface(_sheet(lambda x: SKIN_MM + 0.0 * x), _everywhere, (0.5, 3.0), 20.0, 6.0, 20.0, 0.05),
-    Interface(_fat_septa, _in_fat, (1.0, 13.0), 15.0, 2.0, 18.0, 0.05),
+    Interface(lambda points: 1.2 * _LOBULES(points), _in_fat, (1.0, 13.0), 15.0, 2.0, 18.0, 0.05),
     Interface(_sheet(fascia_depth_mm), _outside_bone, (7.0, 14.0), 27.0, 8.0, 16.0, 0.04),
+    Interface(_sheet(lambda x: fascia_depth_mm(x) + FASCIA_MM), _outside_bone, (8.0, 15.0), 22.0, 6.0, 16.0, 0.04),
+    # the middle layer of that fascia, in front of the erector spinae
     Interface(
-        _sheet(lambda x: fascia_depth_mm(x) + FASCIA_MM),
-        _outside_bone,
-        (8.0, 15.0),
-        22.0,
-        6.0,
-        16.0,
-        0.04,
+        _sheet(lambda x: 42.5 + 0.02 * (np.abs(x) - 22.0) ** 2), _beside(16.0), (39.0, 52.0), 22.0, 6.0, 16.0, 0.04
     ),
-    Interface(_sheet(deep_fascia_depth_mm), _beside(16.0), (39.0, 52.0), 22.0, 6.0, 16.0, 0.04),
     Interface(_muscle_septa, _in_muscle, (10.0, 33.0), 16.0, 8.0, 18.0, 0.06),
-    Interface(_perimysium, _in_muscle, (9.0, 66.0), 20.0, 2.0, 13.0, 0.05),
-    Interface(_endomysium, _in_muscle, (9.0, 66.0), 9.0, -6.0, 13.0, 0.05),
+    Interface(  # perimysium
+        lambda points: 1.2 * _BUNDLES(_along_fibres(points)), _in_muscle, (9.0, 66.0), 20.0, 2.0, 13.0, 0.05
+    ),
+    Interface(  # endomysium
+        lambda points: 0.9 * _FIBRES(_along_fibres(points)), _in_muscle, (9.0, 66.0), 9.0, -6.0, 13.0, 0.05
+    ),
     Interface(vessel_distance_mm, _everywhere, (16.0, 30.0), 24.0, 8.0, 20.0, 0.04),
     Interface(_sheet(canal_roof_mm), _within(9.0), (33.0, 41.0), 20.0, 8.0, 20.0, 0.05),
     Interface(sac_distance_mm, _outside_bone, (38.0, 56.0), 22.0, 6.0, 18.0, 0.04),
-    Interface(_nerve_roots, _in_sac, (40.0, 54.0), 1.0, -9.0, 20.0, 0.05),
+    Interface(  # nerve roots
+        lambda points: 1.2 * (_ROOTS(points) - 0.35),
+        lambda points: np.asarray(sac_distance_mm(points) < -0.8),
+        *((40.0, 54.0), 1.0, -9.0, 20.0, 0.05),
+    ),
     Interface(_sheet(lambda x: BODY_DEPTH_MM + 0.0 * x), _within(17.0), (52.0, 57.0), 22.0, 8.0, 18.0, 0.05),
 )

@@ -4,7 +4,7 @@ Frame, mm: the phantom's. x to the patient's right, y caudal, z from the skin in
 skin over the middle vertebra, so that a probe at the origin with quaternion w=1 sees it in cross-section. The
 vertebrae are 35 mm apart.
 
-`ultragray.phantom.make_demo` trains the scene; the file that it wrote last is part of the package.
+`make demo-scene` trains it; the file that was written last is part of the package.
 """
 
 from __future__ import annotations
@@ -53,9 +53,6 @@ def demo_poses(count: int) -> FloatArray:  # [C, 4, 4] mm
     The middle frame of an odd count is the identity. Raises InvalidArgument for a negative count.
     """
     return freehand_poses(count)
-
-
-# The labels of the demo scene, and which tissues of the phantom they stand for.
 
 
 LABELS: dict[int, tuple[str, tuple[Tissue, ...]]] = {

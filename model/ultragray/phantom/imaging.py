@@ -13,21 +13,12 @@ from functools import lru_cache
 import numpy as np
 import numpy.typing as npt
 
-from ultragray.errors import DatasetInvalid, InvalidProbe
+from ultragray.errors import InvalidProbe
 from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray, Probe
-from ultragray.learn.sweep import ByteArray, IntArray, Sweep
+from ultragray.learn.sweep import ByteArray, IntArray
 from ultragray.phantom import anatomy
-from ultragray.phantom import anatomy as acoustics
-from ultragray.phantom.anatomy import (
-    INTERFACES,
-    Floats,
-    Interface,
-    Tissue,
-    backscatter_amplitudes,
-    fascicles,
-    tissue_at,
-)
+from ultragray.phantom.anatomy import Floats
 
 Float32Array = npt.NDArray[np.float32]
 
@@ -54,25 +45,16 @@ class Scatterers:
     lobe_rad: Float32Array  # [M] standard deviation of the specular lobe
 
     def between(self, pose: FloatArray, low_mm: float, high_mm: float) -> Scatterers:
-        """Those between two elevations in the frame of a pose."""
         axis = pose[:3, 1].astype(np.float32)
         zero = float(pose[:3, 3] @ pose[:3, 1])
         in_tissue, on_surface = (self.points_mm @ axis - zero, self.surface_mm @ axis - zero)
         inside = np.flatnonzero((in_tissue > low_mm) & (in_tissue < high_mm))
         facing = np.flatnonzero((on_surface > low_mm) & (on_surface < high_mm))
-        return Scatterers(
-            self.points_mm[inside],
-            self.amplitudes[inside],
-            self.surface_mm[facing],
-            self.normals[facing],
-            self.specular[facing],
-            self.diffuse[facing],
-            self.lobe_rad[facing],
-        )
+        on = self.surface_mm, self.normals, self.specular, self.diffuse, self.lobe_rad
+        return Scatterers(self.points_mm[inside], self.amplitudes[inside], *(values[facing] for values in on))
 
     @classmethod
     def join(cls, parts: list[Scatterers]) -> Scatterers:
-        """All scatterers of several blocks."""
         names = cls.__dataclass_fields__
         return cls(**{name: np.concatenate([getattr(part, name) for part in parts]) for name in names})
 
@@ -118,10 +100,10 @@ def _made(index: tuple[int, int, int]) -> Scatterers:
     points: Float32Array = ((np.asarray(index) + rng.random((count, 3))) * BLOCK_MM).astype(np.float32)
     drawn = anatomy.straightened(points)
     labels = anatomy.tissue_drawn(drawn)
-    amplitudes = backscatter_amplitudes()[labels] * rng.normal(0.0, 1.0, count)
+    amplitudes = anatomy.backscatter_amplitudes()[labels] * rng.normal(0.0, 1.0, count)
     muscle = labels == anatomy.Tissue.MUSCLE
-    amplitudes[muscle] *= 10.0 ** (FASCICLES_DB / 20.0 * fascicles(drawn[muscle]))
-    parts = [_on(interface, rng, points, drawn) for interface in INTERFACES]
+    amplitudes[muscle] *= 10.0 ** (FASCICLES_DB / 20.0 * anatomy.fascicles(drawn[muscle]))
+    parts = [_on(interface, rng, points, drawn) for interface in anatomy.INTERFACES]
     surface, normals, specular, diffuse, lobe = (np.concatenate(column) for column in zip(*parts, strict=True))
     heard = amplitudes != 0.0
     return Scatterers(
@@ -133,7 +115,7 @@ def _made(index: tuple[int, int, int]) -> Scatterers:
 
 
 def _on(
-    interface: Interface, rng: np.random.Generator, points: Floats, drawn: Floats
+    interface: anatomy.Interface, rng: np.random.Generator, points: Floats, drawn: Floats
 ) -> tuple[Floats, ...]:  # [M, 3], [M, 3], [M], [M], [M]
     """The scatterers near an interface moved onto it, with its normals there and their amplitudes."""
     low, high = interface.depths_mm
@@ -141,7 +123,9 @@ def _on(
     level = interface.level(drawn[near])
     close = np.abs(level) < 2.0 * BAND_MM  # the function is only roughly a distance
     near, level = near[close], level[close]
-    gradient = _gradient(interface, points[near], level)
+    shifted = (points[near] + _GRADIENT_STEP_MM * axis for axis in np.eye(3, dtype=np.float32))
+    steps = [interface.level(anatomy.straightened(there)) - level for there in shifted]
+    gradient = np.stack(steps, axis=1) / _GRADIENT_STEP_MM  # of the interface's function, in the phantom's frame
     steepness = np.maximum(np.linalg.norm(gradient, axis=1), 1e-6)
     kept = np.abs(level) < BAND_MM * steepness
     kept[kept] = interface.present(drawn[near[kept]])
@@ -158,20 +142,12 @@ def _on(
     )
 
 
-def _gradient(interface: Interface, points: Floats, level: Floats) -> Floats:  # [M, 3], [M] -> [M, 3]
-    """Of the interface's function, in the phantom's frame."""
-    shifted = (points + _GRADIENT_STEP_MM * axis for axis in np.eye(3, dtype=np.float32))
-    steps = [interface.level(anatomy.straightened(there)) - level for there in shifted]
-    return np.stack(steps, axis=1) / _GRADIENT_STEP_MM
-
-
 # B-mode frames of the phantom: scatterers under a beam, attenuation along the scan lines, envelope, log compression.
 #
 # One frame: every scatterer within the slice adds its amplitude, with the phase of its depth and the weight of the
 # beam in elevation, to a grid finer than the image. What tissue lies above takes its share there. The grid is
 # convolved with the pulse along depth and with the beam, which widens away from its focus, across; its magnitude is
 # the envelope.
-
 
 Complex64Array = npt.NDArray[np.complex64]
 
@@ -190,7 +166,8 @@ def simulate(poses: npt.ArrayLike, *, probe: Probe, height: int, width: int) -> 
     checked = check_poses(poses)
     frames = np.zeros((len(checked), height, width), dtype=np.uint8)
     for frame, pose in zip(frames, checked, strict=True):
-        frame[:] = _compressed(_power(field, grid, pose))
+        grey = MUSCLE_GREY + 10.0 * np.log10(_power(field, grid, pose) + 1e-12) / DYNAMIC_RANGE_DB
+        frame[:] = np.round(255.0 * np.clip(grey, 0.0, 1.0)).astype(np.uint8)
     return frames
 
 
@@ -200,11 +177,11 @@ def bone_attenuation_db(poses: npt.ArrayLike, *, probe: Probe, height: int, widt
     Raises InvalidPose for poses that are not rigid.
     """
     grid = Grid.of(probe, height, width)
-    per_mm = acoustics.round_trip_db_per_mm()[Tissue.BONE]
+    per_mm = anatomy.round_trip_db_per_mm()[anatomy.Tissue.BONE]
     checked = check_poses(poses)
     maps = np.zeros((len(checked), height, width), dtype=np.float32)
     for attenuation, pose in zip(maps, checked, strict=True):
-        bone = grid.tissue(pose) == Tissue.BONE
+        bone = grid.tissue(pose) == anatomy.Tissue.BONE
         attenuation[:] = grid.pixels(grid.above(per_mm * bone))
     return maps
 
@@ -247,7 +224,6 @@ class Grid:
 
     @property
     def first_mm(self) -> tuple[float, float]:
-        """Depth and lateral position of the grid's corner."""
         depth = self.probe.near_mm - self.margins[0] * self.cell_mm[0]
         return depth, -0.5 * self.probe.lines.span - self.margins[1] * self.cell_mm[1]
 
@@ -268,7 +244,6 @@ class Grid:
         return inside, row[inside] * columns + column[inside]
 
     def tissue(self, pose: FloatArray) -> npt.NDArray[np.uint8]:  # [R, C]
-        """The tissue in the middle of each cell."""
         return _tissue(pose, self.depths_mm, self.laterals_mm)
 
     def tissue_of_pixels(self, pose: FloatArray) -> npt.NDArray[np.uint8]:  # [H, W]
@@ -285,23 +260,21 @@ class Grid:
         return self.cell_mm[0] * (np.cumsum(seen, axis=0) - 0.5 * seen)
 
     def pixels(self, values: Floats) -> Floats:  # [R, C] -> [H, W]
-        """The mean over the cells of each pixel."""
         top, left = self.margins
         image = values[top : top + CELLS_PER_ROW * self.height, left : left + self.width]
-        mean: Floats = image.reshape(self.height, CELLS_PER_ROW, self.width).mean(axis=1)
-        return mean
+        return image.reshape(self.height, CELLS_PER_ROW, self.width).mean(axis=1)
 
 
 def _tissue(pose: FloatArray, depths_mm: Floats, laterals_mm: Floats) -> npt.NDArray[np.uint8]:  # [R], [C] -> [R, C]
     across = pose[:3, 3] + laterals_mm[:, None] * pose[:3, 0]
     points = across + depths_mm[:, None, None] * pose[:3, 2]  # [R, C, 3]
-    return tissue_at(points.reshape(-1, 3).astype(np.float32)).reshape(len(depths_mm), len(laterals_mm))
+    return anatomy.tissue_at(points.reshape(-1, 3).astype(np.float32)).reshape(len(depths_mm), len(laterals_mm))
 
 
 def _power(field: ScattererField, grid: Grid, pose: FloatArray) -> Floats:  # [H, W]
     """Mean square of the envelope over each pixel and the frequencies of the scanner, 1 in muscle."""
-    gain_db = acoustics.compensated_db_per_mm() * grid.depths_mm[:, None]
-    loss_db = grid.above(acoustics.round_trip_db_per_mm()[grid.tissue(pose)])
+    gain_db = 0.2 * anatomy.FREQUENCY_MHZ * anatomy.COMPENSATED * grid.depths_mm[:, None]
+    loss_db = grid.above(anatomy.round_trip_db_per_mm()[grid.tissue(pose)])
     sensitivity = (10.0 ** ((gain_db - loss_db) / 20.0)).astype(np.float32)
     looks = [np.abs(_blurred(echoes * sensitivity, grid)) ** 2 for echoes in _echoes(field, grid, pose)]
     return grid.pixels(np.mean(looks, axis=0))
@@ -310,29 +283,24 @@ def _power(field: ScattererField, grid: Grid, pose: FloatArray) -> Floats:  # [H
 def _echoes(field: ScattererField, grid: Grid, pose: FloatArray) -> Iterator[Complex64Array]:  # [R, C]
     """The scatterers of the slice on the grid, as phasors at each frequency."""
     depths, laterals = grid.depths_mm, grid.laterals_mm
-    reach = acoustics.ELEVATION_REACH * float(acoustics.elevation_sigma_mm(depths).max())
+    reach = anatomy.ELEVATION_REACH * float(anatomy.elevation_sigma_mm(depths).max())
     low, high = np.array([laterals[0], -reach, depths[0]]), np.array([laterals[-1], reach, depths[-1]])
     scatterers = field.slice(pose, low, high)
     points = np.concatenate([scatterers.points_mm, scatterers.surface_mm])
-    amplitudes = np.concatenate([scatterers.amplitudes, _reflected(scatterers, pose)])
+    cosine = np.minimum(np.abs(scatterers.normals @ pose[:3, 2].astype(np.float32)), 1.0)
+    lobe = np.exp(-0.5 * (np.arccos(cosine) / scatterers.lobe_rad) ** 2)
+    amplitudes = np.concatenate([scatterers.amplitudes, scatterers.diffuse + scatterers.specular * lobe])
     local = (points - pose[:3, 3].astype(np.float32)) @ pose[:3, :3].astype(np.float32)
     inside, cells = grid.cells(local[:, 0], local[:, 2])
     _, y, z = local[inside].T
-    weights = amplitudes[inside] * acoustics.elevation_weight(y, z)
+    weights = amplitudes[inside] * anatomy.elevation_weight(y, z)
     count = grid.shape[0] * grid.shape[1]
-    for frequency in acoustics.FREQUENCIES_MHZ:
-        phase = np.float32(4.0 * math.pi * frequency / acoustics.SPEED_MM_PER_US) * z
+    for frequency in anatomy.FREQUENCIES_MHZ:
+        phase = np.float32(4.0 * math.pi * frequency / anatomy.SPEED_MM_PER_US) * z
         echoes = np.empty(count, dtype=np.complex64)
         echoes.real = np.bincount(cells, weights * np.cos(phase), count)
         echoes.imag = np.bincount(cells, weights * np.sin(phase), count)
         yield echoes.reshape(grid.shape)
-
-
-def _reflected(scatterers: Scatterers, pose: FloatArray) -> Float32Array:  # [M]
-    """Amplitudes of the scatterers on interfaces for the beam of this pose."""
-    cosine = np.minimum(np.abs(scatterers.normals @ pose[:3, 2].astype(np.float32)), 1.0)
-    lobe = np.exp(-0.5 * (np.arccos(cosine) / scatterers.lobe_rad) ** 2)
-    return scatterers.diffuse + scatterers.specular * lobe
 
 
 def _blurred(echoes: Complex64Array, grid: Grid) -> Complex64Array:  # [R, C]
@@ -340,57 +308,14 @@ def _blurred(echoes: Complex64Array, grid: Grid) -> Complex64Array:  # [R, C]
     rows, columns = echoes.shape
     down = 2.0 * math.pi * np.fft.fftfreq(rows, grid.cell_mm[0])  # rad/mm
     across = 2.0 * math.pi * np.fft.fftfreq(columns, grid.cell_mm[1])
-    sigma = acoustics.lateral_sigma_mm(grid.depths_mm)
-    pulse = np.exp(-0.5 * (acoustics.PULSE_SIGMA_MM * down) ** 2)[:, None]
+    sigma = anatomy.lateral_sigma_mm(grid.depths_mm)
+    pulse = np.exp(-0.5 * (anatomy.PULSE_SIGMA_MM * down) ** 2)[:, None]
     beam = np.exp(-0.5 * (sigma[:, None] * across) ** 2)
     # Σ amplitude² over the scatterers of one pixel, for kernels of unit sum: what a wider beam gathers is divided out.
-    elevation = acoustics.elevation_sigma_mm(grid.depths_mm)
+    elevation = anatomy.elevation_sigma_mm(grid.depths_mm)
     cell = grid.cell_mm[0] * grid.cell_mm[1]
-    gathered = PER_MM3 * cell**2 * elevation / (4.0 * math.sqrt(math.pi) * sigma * acoustics.PULSE_SIGMA_MM)
+    gathered = PER_MM3 * cell**2 * elevation / (4.0 * math.sqrt(math.pi) * sigma * anatomy.PULSE_SIGMA_MM)
     beam /= np.sqrt(gathered)[:, None]
     pulsed = np.fft.ifft(np.fft.fft(echoes, axis=0) * pulse.astype(np.float32), axis=0)
     blurred = np.fft.ifft(np.fft.fft(pulsed, axis=1) * beam.astype(np.float32), axis=1)
     return blurred.astype(np.complex64)
-
-
-def _compressed(power: Floats) -> ByteArray:  # [H, W]
-    grey = MUSCLE_GREY + 10.0 * np.log10(power + 1e-12) / DYNAMIC_RANGE_DB
-    frame: ByteArray = np.round(255.0 * np.clip(grey, 0.0, 1.0)).astype(np.uint8)
-    return frame
-
-
-# The shadow of bone in the phantom, and the error of a rendering there.
-
-
-SHADOW_DB = 30.0  # taken by bone, there and back
-
-
-@dataclass(frozen=True, eq=False)
-class BoneShadow:
-    """The pixels of a sweep of the phantom from which bone takes more than SHADOW_DB."""
-
-    sweep: Sweep
-    hidden: npt.NDArray[np.bool_]  # [F, H, W]
-
-    @classmethod
-    def of(cls, sweep: Sweep) -> BoneShadow:
-        """Simulates the attenuation along each scan line.
-
-        Raises DatasetInvalid for a sweep of a probe that the phantom is not scanned with, or without a pixel behind
-        bone.
-        """
-        if not sweep.probe.is_true_to_scale:
-            raise DatasetInvalid(f"{sweep.source}: the phantom is scanned along upright lines, got {sweep.probe}")
-        attenuation_db = bone_attenuation_db(sweep.poses, probe=sweep.probe, height=sweep.height, width=sweep.width)
-        hidden = attenuation_db > SHADOW_DB
-        if not hidden.any():
-            raise DatasetInvalid(f"{sweep.source}: no pixel lies in the shadow of bone")
-        return cls(sweep, hidden)
-
-    def mean(self, values: Float32Array) -> float:  # [F, H, W]
-        """Mean of something over the shadow."""
-        return float(values[self.hidden].mean(dtype=np.float64))
-
-    def mean_absolute_error(self, frames: Float32Array) -> float:  # [F, H, W] in [0, 1]
-        """Mean absolute difference between predicted frames and those of the sweep over the shadow."""
-        return self.mean(np.abs(frames - self.sweep.images / np.float32(255.0)))

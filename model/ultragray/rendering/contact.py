@@ -18,6 +18,7 @@ import numpy.typing as npt
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.geometry.scan_conversion import interpolated
 
 # The skin as a sweep tells it: heights of the faces of its training views over a plane.
 #
@@ -25,15 +26,12 @@ from ultragray.geometry.probe import FloatArray, Probe
 # outermost face was, and the most that is known of it to give way is where the innermost face was: a training view is
 # neither in the air nor pressed beyond what was recorded.
 
-
 HeightArray: TypeAlias = npt.NDArray[np.float32]
 
 COUPLING_MM = 1.0  # of gel between face and skin: a face so near to the skin has contact
 MARGIN_MM = 15.0  # beyond the training faces the skin goes on, at the height of the nearest ones
 LEAST_SLOPE = 0.2  # cosine between a scan line and the way into the body: a flatter line has no contact
-_LEAST_AGREEMENT = (
-    0.6  # length of the mean axis of the views, 1 where all look one way: around a limb there is no height
-)
+_LEAST_AGREEMENT = 0.6  # length of the views' mean axis, 1 where all look one way: around a limb there is no height
 _LEAST_CELL_MM = 1.0
 _MOST_CELLS = 256  # each way
 _MOST_VIEWS = 4096  # of more, every second one is taken, or every third
@@ -96,30 +94,20 @@ class Skin:
         way = directions @ self.axes.T
         fall = np.minimum(way[..., 2], -LEAST_SLOPE)
         along = np.zeros(place.shape[:-1])
+        rows, columns = heights.shape
         for _ in range(_STEPS):
             at = place + along[..., None] * way
-            step = (at[..., 2] - self._height(heights, at)) / fall
+            y = np.clip(at[..., 1] / self.cell_mm, 0.0, rows - 1.001)  # beyond the cells, of the outermost ones
+            x = np.clip(at[..., 0] / self.cell_mm, 0.0, columns - 1.001)
+            step = (at[..., 2] - interpolated(heights, y, x)) / fall
             along -= step
             if np.abs(step).max(initial=0.0) < _MET_MM:
                 break
         at = place + along[..., None] * way
         column, row = (np.rint(at[..., axis] / self.cell_mm).astype(np.intp) for axis in (0, 1))
-        rows, columns = self.known.shape
         inside = (row >= 0) & (row < rows) & (column >= 0) & (column < columns) & (way[..., 2] <= -LEAST_SLOPE)
         met = inside & self.known[np.where(inside, row, 0), np.where(inside, column, 0)]
         return np.where(met, along, np.inf)
-
-    def _height(self, heights: HeightArray, at: FloatArray) -> FloatArray:  # [rows, columns], [..., 3] -> [...]
-        """Between the cells; beyond them that of the outermost ones."""
-        rows, columns = heights.shape
-        x = np.clip(at[..., 0] / self.cell_mm, 0.0, columns - 1.001)
-        y = np.clip(at[..., 1] / self.cell_mm, 0.0, rows - 1.001)
-        i, j = y.astype(np.intp), x.astype(np.intp)
-        down, right = y - i, x - j
-        upper = heights[i, j] * (1.0 - right) + heights[i, j + 1] * right
-        lower = heights[i + 1, j] * (1.0 - right) + heights[i + 1, j + 1] * right
-        found: FloatArray = upper * (1.0 - down) + lower * down
-        return found
 
 
 def way_in(poses: FloatArray, probe: Probe | None) -> tuple[FloatArray, Probe]:  # [P, 4, 4] mm -> [3]
@@ -152,7 +140,6 @@ def _axes(out: FloatArray, lateral: FloatArray) -> FloatArray:  # [3], [3] -> [3
 
 
 def _face_points(views: FloatArray, probe: Probe) -> FloatArray:  # [P, 4, 4] mm -> [P·K, 3] mm
-    """Points of the faces, not farther apart than a cell."""
     lines, depth = probe.lines, probe.face_depth_mm
     count = 2 + math.ceil(lines.breadth_mm(depth) / _LEAST_CELL_MM)
     origins, directions = lines.rays(lines.start + lines.span * np.linspace(0.0, 1.0, count))
@@ -171,9 +158,6 @@ def _filled(heights: HeightArray, met: npt.NDArray[np.bool_], nearest: npt.NDArr
     return filled
 
 
-# The contact of probes at poses with the skin, scan line by scan line.
-
-
 @dataclass(frozen=True, eq=False)
 class Touch:
     """Where the W scan lines of C poses meet the skin. Made by `Touch.of`."""
@@ -184,7 +168,6 @@ class Touch:
 
     @classmethod
     def of(cls, skin: Skin, probe: Probe, poses: FloatArray, width: int) -> Touch:  # [C, 4, 4] or [4, 4] mm
-        """The contact of a probe, which need not be that of the training views. Raises InvalidPose."""
         exact = check_poses(poses)
         origins, directions = probe.scan_lines(width)
         turned = exact[:, :3, :3].transpose(0, 2, 1)
@@ -200,8 +183,7 @@ class Touch:
     def pressed_mm(self) -> FloatArray:  # [C]
         """How far the face lies beyond the innermost training face, a mean over the lines with contact; at least 0."""
         pressed = np.where(self.lines, self.skin.pressed_mm(self.faces, self.directions), 0.0).sum(axis=1)
-        mean: FloatArray = pressed / np.maximum(self.lines.sum(axis=1), 1)
-        return mean
+        return pressed / np.maximum(self.lines.sum(axis=1), 1)
 
     @property
     def lines(self) -> npt.NDArray[np.bool_]:  # [C, W]
@@ -210,9 +192,7 @@ class Touch:
 
     @property
     def shares(self) -> FloatArray:  # [C]
-        """The share of the scan lines of each pose that have contact, 0 to 1."""
-        shares: FloatArray = self.lines.mean(axis=1)
-        return shares
+        return self.lines.mean(axis=1)
 
 
 # Tissue under pressure: compressed evenly between the face and the far end of the image, which stays where it was.
@@ -220,7 +200,6 @@ class Touch:
 # Of a scan line of length L from the face, pressed in by d, the sample at depth z shows the tissue that lay at z −
 # d·(1 − z/L) before: d above the face at the face itself, the same place at the far end. This is what a probe sees
 # that is d farther out along its middle scan line and whose lines are longer by d, with as many samples.
-
 
 MOST_COMPRESSION = 0.5  # of the depth of the image: a face pressed in farther moves on through the tissue
 

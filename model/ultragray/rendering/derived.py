@@ -1,11 +1,10 @@
-"""Outputs that follow from more than one plane at a pixel: labels, and the expected error of B-mode.
-
-`ultragray.rendering.outputs` says what they are and which planes they take; here is how, in torch.
+"""`Drawing`, the planes of some views, and outputs that follow from more than one plane at a pixel: labels, and the
+expected error of B-mode. `ultragray.rendering.outputs` says what they are and which planes they take.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -14,25 +13,110 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.geometry.probe import BoolArray, FloatArray, Probe
+from ultragray.rendering.backends.inputs import ScenePoses, as_array
+from ultragray.rendering.limits import Limits
+from ultragray.rendering.overlays import GHOST_PLANES, ToolsInView, add_ghosts
 from ultragray.scene.confidence import DepthBands, TrainingViews, read_model
 from ultragray.scene.gaussians import GaussianScene
 
 MIN_WEIGHT_SUM = 1.0 / 255.0  # a label with less is not seen
+View = tuple[Probe, ScenePoses, int, int]  # poses [C, 4, 4] in cm about the scene's centre; height and width
+ENDED_BY_AIR = ("bmode", "transmittance")  # planes that are 0 along a scan line without contact: no beam gets out
 
-WeightSum = Callable[[GaussianScene], Tensor]  # S of each pixel of a scene, [C, H, W]
+
+class Drawing:
+    """Views of a scene by one backend: the planes that outputs are derived from."""
+
+    def __init__(
+        self,
+        draw: Callable[..., dict[str, Tensor]],
+        scene: GaussianScene,
+        view: View,
+        limits: Limits,
+        beam: Tensor | None,
+        touching: BoolArray | None = None,
+        tools: ToolsInView | None = None,
+        ghost: float = 0.0,
+    ) -> None:
+        """`beam`: [3] in cm; `touching`: [C, W], whether scan lines have contact, None: all have."""
+        self.scene = scene
+        self.shape = (len(view[1]), view[2], view[3])
+        self._draw, self._view, self._limits, self._beam = draw, view, limits, beam
+        self._touching, self._tools, self._ghost = touching, tools, ghost
+        self._planes: dict[str, Tensor] = {}
+
+    @property
+    def probe(self) -> Probe:
+        return self._view[0]
+
+    @property
+    def poses_mm(self) -> FloatArray:
+        """[C, 4, 4] mm, in the frame of the sweep that the scene was trained from."""
+        return in_mm(self.scene, self._view[1])
+
+    def draw(self, planes: Sequence[str]) -> None:
+        """Draws planes of the whole scene at once."""
+        if planes:
+            drawn = self._draw(self.scene, *self._view, self._needed(planes), self._limits, self._beam)
+            self._planes = dict(drawn)
+        if self._tools is not None:
+            self._tools.draw(self._planes, self.shape[1], self.scene.means)
+        if self._touching is not None and not self._touching.all():
+            for name in set(ENDED_BY_AIR) & set(self._planes):
+                plane = self._planes[name]
+                self._planes[name] = plane * torch.from_numpy(self._touching).to(plane)[:, None]
+        if self._ghost and "bmode" in self._planes:
+            add_ghosts(self._planes, self.probe, self._ghost)
+
+    def _needed(self, planes: Sequence[str]) -> Sequence[str]:
+        """The planes to draw for these: those with them that tools and ghosts follow from."""
+        if self._ghost and set(GHOST_PLANES) & set(planes):
+            return tuple(dict.fromkeys((*planes, *GHOST_PLANES)))
+        if self._tools is not None and "bmode" in planes:
+            return tuple(dict.fromkeys((*planes, "transmittance")))
+        return planes
+
+    def plane(self, name: str) -> Tensor:  # [C, H, W]
+        return self._planes[name]
+
+    def plane_of(self, part: GaussianScene, name: str) -> Tensor:  # [C, H, W]
+        """A plane of some of the scene's Gaussians alone."""
+        return self._draw(part, *self._view, (name,), self._limits, self._beam)[name]
+
+    def mark_tools(self, labels: Tensor) -> None:
+        """Puts the labels of tools into labels [C, H, W], where they are."""
+        if self._tools is not None:
+            self._tools.mark(labels)
 
 
-def render_labels(scene: GaussianScene, shape: tuple[int, int, int], weight_sum: WeightSum) -> Tensor:
-    """argmax over l of S_l, the sum of w over the Gaussians of label l, [C, H, W] uint8; 0 where no S_l reaches 1/255.
+def in_mm(scene: GaussianScene, poses: ScenePoses) -> FloatArray:  # [C, 4, 4] cm -> [C, 4, 4] mm
+    """Poses of the scene's frame in that of the sweep that it was trained from."""
+    moved = as_array(poses).copy()
+    moved[:, :3, 3] = 10.0 * moved[:, :3, 3] + np.asarray(scene.info.centre_mm)
+    return moved
 
-    Gaussians without a label are those of label 0. Of labels that weigh the same, the smallest is taken.
+
+def render_labels(drawing: Drawing, weight_sum: str) -> Tensor:  # [C, H, W] uint8
+    """argmax over l of S_l, the plane `weight_sum` of the Gaussians of label l; 0 where no S_l reaches 1/255.
+
+    Gaussians without a label are those of label 0. Of labels that weigh the same, the smallest is taken. Tools are over
+    all.
     """
-    found = torch.zeros(shape, dtype=torch.uint8, device=scene.means.device)
-    heaviest = scene.means.new_zeros(shape)
+    scene = drawing.scene
     with torch.no_grad():
-        for label, part in scene.prepared("labels", lambda: _parts(scene)):
-            _keep_heavier(found, heaviest, label, weight_sum(part))
+        parts = scene.prepared("labels", lambda: label_parts(scene))
+        weights = ((label, drawing.plane_of(part, weight_sum)) for label, part in parts)
+        found = heaviest_labels(weights, scene.means.new_zeros(drawing.shape))
+    drawing.mark_tools(found)
+    return found
+
+
+def heaviest_labels(weights: Iterable[tuple[int, Tensor]], heaviest: Tensor) -> Tensor:  # [C, H, W] each
+    """The label of the largest weight at each pixel, uint8; 0 where none reaches 1/255. `heaviest`: zeros, changed."""
+    found = torch.zeros(heaviest.shape, dtype=torch.uint8, device=heaviest.device)
+    for label, weight in weights:
+        _keep_heavier(found, heaviest, label, weight)
     return found
 
 
@@ -49,7 +133,7 @@ def _keep_heavier(found: Tensor, heaviest: Tensor, label: int, weight: Tensor) -
         np.copyto(most, own, where=more)
 
 
-def _parts(scene: GaussianScene) -> list[tuple[int, GaussianScene]]:
+def label_parts(scene: GaussianScene) -> list[tuple[int, GaussianScene]]:
     """The Gaussians of each label that occurs, as scenes of their own; their intensities do not matter."""
     if scene.labels is None:
         return []
@@ -73,25 +157,20 @@ def _parts(scene: GaussianScene) -> list[tuple[int, GaussianScene]]:
 #     gap r      reach(i, r)·V         beyond     reach(d, 5 mm)·V
 #     thin       (1 − γ)·V             shadow     (1 − T)·B̄/10
 
-
 CELLS = 32  # a side; no more than pixels
 POINTS_PER_SIDE = 12
 GAPS_MM = (0.3, 1.0, 3.0)
 BEYOND_MM = 5.0
 
 
-def deviations(
-    scene: GaussianScene,
-    planes: tuple[Tensor, ...],  # bmode, coverage, transmittance, each [C, H, W]
-    poses: FloatArray,  # [C, 4, 4] mm
-    probe: Probe,
-) -> Tensor:  # [C, H, W]
-    """The output `uncertainty` of frames of a scene that has its model."""
+def deviations(drawing: Drawing, names: Sequence[str]) -> Tensor:  # [C, H, W]
+    """The output `uncertainty` of a scene that has its model, from the planes bmode, coverage and transmittance."""
+    scene, planes = drawing.scene, tuple(drawing.plane(name) for name in names)
     model = read_model(scene.info.confidence, len(scene.training_poses))
     assert model is not None
     assert model.uncertainty is not None
     views = TrainingViews(scene.training_poses, scene.info.probe_or(None))
-    terms = variance_terms(planes, view_distances(views, poses, probe), model.uncertainty.bands)
+    terms = variance_terms(planes, view_distances(views, drawing.poses_mm, drawing.probe), model.uncertainty.bands)
     weighted = [weight * term for weight, term in zip(model.uncertainty.variances, terms, strict=True)]
     deviation = torch.stack(weighted).sum(dim=0).clamp(0.0, 1.0).sqrt()
     return _interpolated(deviation, planes[0].shape[1:])
@@ -134,7 +213,6 @@ def variance_terms(
 
 
 def in_cells(frames: Tensor) -> Tensor:  # [C, H, W] -> [C, h, w]
-    """Means over the cells."""
     height, width = frames.shape[1:]
     return functional.adaptive_avg_pool2d(frames, (min(CELLS, height), min(CELLS, width)))
 

@@ -45,11 +45,9 @@ class Display(Contract):
 
     @property
     def changes_tone(self) -> bool:
-        """Whether B-mode values are changed."""
         return self.gain_db != 0.0 or self.dynamic_range_db != FRAME_RANGE_DB or any(self.tgc_db)
 
     def rows_shown(self, probe: Probe, height: int) -> int:
-        """The number of H rows that are not cut off, at least one."""
         if self.depth_mm is None:
             return height
         share = (probe.face_depth_mm + self.depth_mm - probe.near_mm) / probe.scan_line_length_mm
@@ -69,7 +67,6 @@ class Display(Contract):
         return picture.flipped() if self.flip else picture
 
     def gains(self, rows: int) -> FloatArray:  # [rows]
-        """The gain that is added to each row shown, in dB."""
         gains = np.full(rows, self.gain_db)
         if self.tgc_db:
             points = np.linspace(0.0, 1.0, len(self.tgc_db))

@@ -1,13 +1,13 @@
 """Poses in, frames out: `render` draws the outputs of a scene by the backend that fits, `show` turns them into what a
 display shows, and `render_shown` does both as the settings of a request want it.
 
-From scene and settings to pixels: `_views` (where the probe is, pressed or not) → `Drawing` (the backend's planes; air,
-tools and ghosts put into them) → outputs (`ultragray.rendering.outputs`) → `show`.
+From scene and settings to pixels: `_views` (where the probe is, pressed or not) → `derived.Drawing` (the backend's
+planes; air, tools and ghosts put into them) → outputs (`ultragray.rendering.outputs`) → `show`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import lru_cache
 from typing import Any
 
@@ -21,14 +21,15 @@ from ultragray.geometry.image_size import check_image_size
 from ultragray.geometry.probe import BoolArray, ElevationBeam, FloatArray, Probe
 from ultragray.geometry.scan_conversion import samples
 from ultragray.rendering.backends import cpu
-from ultragray.rendering.backends.inputs import ScenePoses, as_array, beam_cm, scene_poses
+from ultragray.rendering.backends.inputs import as_array, beam_cm, scene_poses
 from ultragray.rendering.backends.registry import BACKENDS, choose_backend
 from ultragray.rendering.confidence import SupportWatch
 from ultragray.rendering.contact import Skin, Touch, at_rest
+from ultragray.rendering.derived import Drawing, View, in_mm
 from ultragray.rendering.display import AS_RENDERED, FRAME_RANGE_DB, Display
 from ultragray.rendering.limits import UNLIMITED, Limits
 from ultragray.rendering.outputs import OUTPUTS, PLANES, check_available, check_outputs
-from ultragray.rendering.overlays import GHOST_PLANES, ToolsInView, add_ghosts
+from ultragray.rendering.overlays import ToolsInView
 from ultragray.rendering.settings import Contact, Resolved
 from ultragray.rendering.tools import ScanView, Tool
 from ultragray.scene.gaussians import GaussianScene
@@ -46,8 +47,7 @@ class Frames(Mapping[str, Tensor]):
 
     def __init__(self, outputs: Mapping[str, Tensor], touch: Touch | None = None) -> None:
         self._outputs = dict(outputs)
-        self.touch = touch
-        """The contact of each pose with the skin; None where it was assumed."""
+        self.touch = touch  # the contact of each pose with the skin; None where it was assumed
 
     def __getitem__(self, name: str) -> Tensor:
         return self._outputs[name]
@@ -66,76 +66,6 @@ class Frames(Mapping[str, Tensor]):
     def __repr__(self) -> str:
         count, height, width = next(iter(self._outputs.values())).shape if self._outputs else (0, 0, 0)
         return f"Frames({count:,} of {height}x{width}: {', '.join(self._outputs)})"
-
-
-View = tuple[Probe, ScenePoses, int, int]  # poses [C, 4, 4] in cm about the scene's centre; height and width
-ENDED_BY_AIR = ("bmode", "transmittance")  # planes that are 0 along a scan line without contact: no beam gets out
-
-
-class Drawing:
-    """Views of a scene by one backend: the planes that outputs are derived from."""
-
-    def __init__(
-        self,
-        draw: Callable[..., dict[str, Tensor]],
-        scene: GaussianScene,
-        view: View,
-        limits: Limits,
-        beam: Tensor | None,
-        touching: BoolArray | None = None,
-        tools: ToolsInView | None = None,
-        ghost: float = 0.0,
-    ) -> None:
-        """`beam`: [3] in cm; `touching`: [C, W], whether scan lines have contact, None: all have."""
-        self.scene = scene
-        self.shape = (len(view[1]), view[2], view[3])
-        self._draw, self._view, self._limits, self._beam = draw, view, limits, beam
-        self._touching, self._tools, self._ghost = touching, tools, ghost
-        self._planes: dict[str, Tensor] = {}
-
-    @property
-    def probe(self) -> Probe:
-        return self._view[0]
-
-    @property
-    def poses_mm(self) -> FloatArray:
-        """[C, 4, 4] mm, in the frame of the sweep that the scene was trained from."""
-        return _in_mm(self.scene, self._view[1])
-
-    def draw(self, planes: Sequence[str]) -> None:
-        """Draws planes of the whole scene at once."""
-        if planes:
-            drawn = self._draw(self.scene, *self._view, self._needed(planes), self._limits, self._beam)
-            self._planes = dict(drawn)
-        if self._tools is not None:
-            self._tools.draw(self._planes, self.shape[1], self.scene.means)
-        if self._touching is not None and not self._touching.all():
-            for name in set(ENDED_BY_AIR) & set(self._planes):
-                plane = self._planes[name]
-                self._planes[name] = plane * torch.from_numpy(self._touching).to(plane)[:, None]
-        if self._ghost and "bmode" in self._planes:
-            add_ghosts(self._planes, self.probe, self._ghost)
-
-    def _needed(self, planes: Sequence[str]) -> Sequence[str]:
-        """The planes to draw for these: those with them that tools and ghosts follow from."""
-        if self._ghost and set(GHOST_PLANES) & set(planes):
-            return tuple(dict.fromkeys((*planes, *GHOST_PLANES)))
-        if self._tools is not None and "bmode" in planes:
-            return tuple(dict.fromkeys((*planes, "transmittance")))
-        return planes
-
-    def plane(self, name: str) -> Tensor:  # [C, H, W]
-        """One of the planes that were drawn."""
-        return self._planes[name]
-
-    def plane_of(self, part: GaussianScene, name: str) -> Tensor:  # [C, H, W]
-        """A plane of some of the scene's Gaussians alone."""
-        return self._draw(part, *self._view, (name,), self._limits, self._beam)[name]
-
-    def mark_tools(self, labels: Tensor) -> None:
-        """Puts the labels of tools into labels [C, H, W], where they are."""
-        if self._tools is not None:
-            self._tools.mark(labels)
 
 
 def render(
@@ -204,22 +134,14 @@ def _tools_in_view(
     if not tools:
         return None
     probe, poses, _, width = view
-    poses_mm = _in_mm(scene, poses)[places]
+    poses_mm = in_mm(scene, poses)[places]
     if beam is None:
         return ToolsInView(tools, ScanView(probe, poses_mm, width))
     sigma, focus, rayleigh = (10.0 * beam.detach()).tolist()
     return ToolsInView(tools, ScanView(probe, poses_mm, width, (sigma, focus, rayleigh)))
 
 
-def _in_mm(scene: GaussianScene, poses: ScenePoses) -> FloatArray:  # [C, 4, 4] cm -> [C, 4, 4] mm
-    """Poses of the scene's frame in that of the sweep that it was trained from."""
-    moved = as_array(poses).copy()
-    moved[:, :3, 3] = 10.0 * moved[:, :3, 3] + np.asarray(scene.info.centre_mm)
-    return moved
-
-
 def _checked_contact(contact: Any) -> Contact | None:
-    """A Contact also by its word."""
     if contact is None:
         return None
     try:

@@ -37,7 +37,6 @@ class Limits:
         return replace(self, name_pose=lambda pose: self.name_pose(poses + pose))
 
     def check_flag(self) -> None:
-        """Raises GivenUp once the flag is raised."""
         if self.flag is not None and self.flag[0] >= self.number:
             raise GivenUp
 

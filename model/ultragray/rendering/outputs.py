@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -18,8 +18,7 @@ from ultragray.errors import UnknownOutput
 if TYPE_CHECKING:
     from torch import Tensor
 
-    from ultragray.geometry.probe import FloatArray, Probe
-    from ultragray.scene.gaussians import GaussianScene
+    from ultragray.rendering.derived import Drawing
     from ultragray.scene.info import SceneInfo
 
 
@@ -31,59 +30,27 @@ _Values = TypeVar("_Values", "npt.NDArray[Any]", "Tensor")
 _AMOUNTS, _NUMBERS = np.dtype("<f4"), np.dtype("u1")
 
 
-class Drawing(Protocol):
-    """Views of a scene by one backend: what outputs are derived from."""
-
-    @property
-    def scene(self) -> GaussianScene: ...
-    @property
-    def shape(self) -> tuple[int, int, int]:
-        """C, H, W."""
-
-    @property
-    def probe(self) -> Probe: ...
-    @property
-    def poses_mm(self) -> FloatArray:
-        """[C, 4, 4] mm, in the frame of the sweep that the scene was trained from."""
-
-    def plane(self, name: str) -> Tensor:  # [C, H, W]
-        """One of the planes that the output names."""
-
-    def plane_of(self, part: GaussianScene, name: str) -> Tensor:  # [C, H, W]
-        """A plane of some of the scene's Gaussians alone."""
-
-    def mark_tools(self, labels: Tensor) -> None:
-        """Puts the labels of tools into labels [C, H, W], where they are."""
-
-
 @dataclass(frozen=True)
 class Output:
     """One quantity of each pixel."""
 
     name: str
     meaning: str
-    planes: tuple[str, ...]
-    """The planes that the backends draw for it."""
-    derive: Callable[[Drawing], Tensor]
-    """The output [C, H, W] of a drawing."""
+    planes: tuple[str, ...]  # the planes that the backends draw for it
+    derive: Callable[[Drawing], Tensor]  # the output [C, H, W] of a drawing
+    # float32: amounts. uint8: numbers that stand for something, which nothing may interpolate or scale
     dtype: np.dtype[Any] = _AMOUNTS
-    """float32: amounts. uint8: numbers that stand for something, which nothing may interpolate or scale."""
-    unit: str = "1"
-    """Of its values, such as dB/cm; 1: a share."""
+    unit: str = "1"  # of its values, such as dB/cm; 1: a share
+    # the values that 8 bits hold as 0 and as 255; those beyond are held as these. float32 holds the values
     scale: tuple[float, float] = (0.0, 1.0)
-    """The values that 8 bits hold as 0 and as 255; those beyond are held as these. float32 holds the values."""
-    is_toned: bool = False
-    """Whether gain, dynamic range and time-gain compensation change it."""
-    shows_tools_alone: bool = False
-    """Whether a scene that does not give it gives it of tools."""
-    tells_support: bool = False
-    """Whether it keeps its values where pixels without support are blackened."""
+    is_toned: bool = False  # whether gain, dynamic range and time-gain compensation change it
+    shows_tools_alone: bool = False  # whether a scene that does not give it gives it of tools
+    tells_support: bool = False  # whether it keeps its values where pixels without support are blackened
+    # the scenes that give it, in words, where a scene does not; None where it does
     lacks: Callable[[SceneInfo], str | None] = lambda _: None
-    """The scenes that give it, in words, where a scene does not; None where it does."""
 
     @property
     def is_numbers(self) -> bool:
-        """Whether its pixels are numbers, not amounts."""
         return self.dtype == _NUMBERS
 
     @property
@@ -104,8 +71,7 @@ class Output:
         low, high = self.scale
         if self.is_numbers or (low, high) == (0.0, 1.0):
             return values
-        found: _Values = (values.clip(low, high) - low) / (high - low)
-        return found
+        return (values.clip(low, high) - low) / (high - low)
 
 
 OUTPUTS: dict[str, Output] = {}
@@ -121,9 +87,7 @@ def _register(name: str, meaning: str, **properties: Any) -> Output:
 def _labels(drawing: Drawing) -> Tensor:
     from ultragray.rendering.derived import render_labels  # needs torch
 
-    labels = render_labels(drawing.scene, drawing.shape, lambda part: drawing.plane_of(part, WEIGHT_SUM))
-    drawing.mark_tools(labels)
-    return labels
+    return render_labels(drawing, WEIGHT_SUM)
 
 
 def _attenuation(drawing: Drawing) -> Tensor:
@@ -136,16 +100,7 @@ def _attenuation(drawing: Drawing) -> Tensor:
 def _uncertainty(drawing: Drawing) -> Tensor:
     from ultragray.rendering.derived import deviations  # needs torch
 
-    planes = tuple(drawing.plane(name) for name in UNCERTAINTY.planes)
-    return deviations(drawing.scene, planes, drawing.poses_mm, drawing.probe)
-
-
-def _lacks_uncertainty(info: SceneInfo) -> str | None:
-    return None if info.confidence.get("uncertainty") else "whose training fitted its uncertainty; this one has none"
-
-
-def _lacks_labels(info: SceneInfo) -> str | None:
-    return None if info.label_names else "whose Gaussians carry labels; this one's carry none"
+    return deviations(drawing, UNCERTAINTY.planes)
 
 
 BMODE = _register("bmode", "B = E T, what a scanner shows", is_toned=True)
@@ -165,7 +120,7 @@ LABELS = _register(
     derive=_labels,
     dtype=_NUMBERS,
     shows_tools_alone=True,
-    lacks=_lacks_labels,
+    lacks=lambda info: None if info.label_names else "whose Gaussians carry labels; this one's carry none",
 )
 UNCERTAINTY = _register(
     "uncertainty",
@@ -173,7 +128,9 @@ UNCERTAINTY = _register(
     planes=("bmode", "coverage", "transmittance"),
     derive=_uncertainty,
     tells_support=True,
-    lacks=_lacks_uncertainty,
+    lacks=lambda info: (
+        None if info.confidence.get("uncertainty") else "whose training fitted its uncertainty; this one has none"
+    ),
 )
 
 
@@ -206,7 +163,6 @@ def check_outputs(outputs: Sequence[str], *, field: str = "outputs") -> tuple[st
 def check_available(
     outputs: Sequence[str], info: SceneInfo, *, with_tools: bool = False, field: str = "outputs"
 ) -> None:
-    """Raises UnknownOutput for outputs that a scene cannot give."""
     for name in outputs:
         if with_tools and OUTPUTS[name].shows_tools_alone:
             continue

@@ -124,7 +124,6 @@ class _Drawn:
 
 
 def _beyond(depth: Tensor, first: Tensor, last: Tensor) -> Tensor:  # [H, 1], [C, 1, w] -> [C, H, w]
-    """The distance of depths from the range between two others, 0 within it."""
     return torch.maximum(first - depth, depth - last).clamp(min=0.0)
 
 
@@ -137,9 +136,6 @@ def _mirrored(tool: Tool, slant: Tensor) -> Tensor:  # [...] -> [...]
     """The echo of a surface as of a mirror, by the sine of the angle at which it is met."""
     angle_deg = torch.rad2deg(torch.asin(slant))
     return tool.brightness * (1.0 - tool.roughness) * torch.exp(-0.5 * (angle_deg / HEAD_ON_SIGMA_DEG) ** 2)
-
-
-# The second echo: beyond the first strong interface of a scan line, a mirror image of what lies before it.
 
 
 STRONG_BMODE = 0.6  # of an interface that mirrors

@@ -34,12 +34,10 @@ class Encoding(str, Enum):
 
     @property
     def is_image_file(self) -> bool:
-        """Whether it holds exactly one frame of one output."""
         return self in (Encoding.PNG, Encoding.JPEG)
 
     @property
     def pixel_type(self) -> np.dtype[Any]:
-        """The type that pixels are rounded to."""
         return np.dtype("<f4") if self in (Encoding.FLOAT32, Encoding.NPZ) else np.dtype("u1")
 
 
@@ -133,6 +131,7 @@ class FrameSettings(Contract):
                 "min_confidence needs a scene that knows the confidence of its frames; this one was trained without",
                 field="min_confidence",
             )
+        given = {one.name: getattr(self, one.name, None) for one in fields(Additions)}
         return Resolved(
             probe=info.probe_or(self.probe),
             beam=info.beam_or(self.slice_thickness_mm),
@@ -141,13 +140,8 @@ class FrameSettings(Contract):
             outputs=self.outputs,
             encoding=encoding,
             display=self.display or AS_RENDERED,
-            **self._additions(),
+            **{name: value for name, value in given.items() if value is not None},
         )
-
-    def _additions(self) -> dict[str, Any]:
-        """The additions that are asked for."""
-        given = {one.name: getattr(self, one.name, None) for one in fields(Additions)}
-        return {name: value for name, value in given.items() if value is not None}
 
 
 def registration_field() -> Any:
@@ -254,7 +248,6 @@ class SettingsUsed(Additions):
 
 @lru_cache(maxsize=256)
 def settings_used(settings: Resolved) -> SettingsUsed:
-    """The settings of a request, as its frames tell them."""
     picture = settings.picture
     return SettingsUsed(
         probe=settings.probe,

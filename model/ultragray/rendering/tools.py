@@ -30,9 +30,6 @@ from ultragray.geometry.pose import (
 )
 from ultragray.geometry.probe import MAX_LENGTH_MM, FloatArray, Probe, length_field
 
-# Where scan lines meet a tool: what its echo and its shadow follow from, whatever its shape.
-
-
 LEAST_SLICE_SIGMA_MM = 0.1  # of the slice that tools are seen in, where the frames show a thinner one
 _LEAST_SPACING_MM = 1e-6
 
@@ -64,7 +61,6 @@ class ScanView:
 
     @cached_property
     def _apart_mm(self) -> float:
-        """Distance of neighbouring lines at depth 0."""
         origins, along = self._neighbours
         return abs(float((origins[1] - origins[0]) @ (along[0, 1], -along[0, 0])))
 
@@ -80,10 +76,8 @@ class ScanView:
         return np.maximum(at_focus * np.hypot(1.0, (depth_mm - focus) / rayleigh), LEAST_SLICE_SIGMA_MM)
 
     def in_probe_frame(self, points: FloatArray) -> FloatArray:  # [N, 3] mm -> [C, N, 3] mm
-        """Points of the scene frame as each pose sees them."""
         rotations, positions = self.poses[:, :3, :3], self.poses[:, :3, 3]
-        seen: FloatArray = (points - positions[:, None]) @ rotations
-        return seen
+        return (points - positions[:, None]) @ rotations
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,12 +101,7 @@ def covered(gap_mm: FloatArray, half_mm: float | FloatArray, spacing_mm: FloatAr
 
 
 def dot(vectors: FloatArray, others: FloatArray) -> FloatArray:  # [..., 3] both -> [...]
-    """Scalar products."""
-    product: FloatArray = (vectors * others).sum(axis=-1)
-    return product
-
-
-# The base of all tools: their material, and the frame that they lie in.
+    return (vectors * others).sum(axis=-1)
 
 
 MAX_TOOLS = 8  # of one frame
@@ -134,7 +123,6 @@ def point_field(meaning: str, **options: Any) -> Any:
 
 
 def moved_point(pose: FloatArray, point: Sequence[float]) -> tuple[float, float, float]:  # [4, 4] mm, [3] mm
-    """A point as a pose leads it."""
     x, y, z = (pose[:3, :3] @ np.array(point, np.float64) + pose[:3, 3]).tolist()
     return x, y, z
 
@@ -165,7 +153,6 @@ class Tool(Family):
         raise NotImplementedError
 
     def crossing(self, view: ScanView) -> Crossing:
-        """Where the scan lines meet it."""
         raise NotImplementedError
 
     def moved(self, pose: FloatArray) -> Self:  # [4, 4] mm, exact
@@ -177,14 +164,10 @@ class Tool(Family):
         return np.minimum(1.0 - (1.0 - self.opacity) ** (path_mm / self.thickness_mm), _MOST_STOPPED)
 
     def seen_by(self, view: ScanView, points: Sequence[Sequence[float]]) -> FloatArray:  # [N, 3] -> [C, N, 3]
-        """Points of the tool in the probe frame of each pose, mm."""
         array = np.array(points, np.float64)
         if self.frame is ToolFrame.SCENE:
             return view.in_probe_frame(array)
         return np.broadcast_to(array, (len(view.poses), *array.shape))
-
-
-# Convex bodies thicker than the beam: the side that is met first is seen, and hides what lies behind it.
 
 
 _LAYERS = np.array([-1.2816, -0.5244, 0.0, 0.5244, 1.2816])  # σ: the middles of fifths of a Gaussian slice
@@ -204,7 +187,6 @@ SpanOf = Callable[[FloatArray, FloatArray], Span]
 
 
 def overlap(one: Span, other: Span) -> Span:
-    """The part of lines that lies within both of two bodies."""
     return Span(
         np.maximum(one.enters, other.enters),
         np.minimum(one.leaves, other.leaves),
@@ -266,9 +248,6 @@ def crossing_of_solid(tool: Tool, view: ScanView, placed: FloatArray, span_of: S
     )
 
 
-# A box: a plate, a block, a guide.
-
-
 @dataclass(frozen=True, kw_only=True)
 class Box(Tool):
     """A solid box about a point, turned about it.
@@ -316,9 +295,6 @@ class Box(Tool):
         return crossing_of_solid(self, view, np.vstack([pose[:3, 3], pose[:3, 3] + pose[:3, :3].T]), span)
 
 
-# What is straight and has two ends.
-
-
 @dataclass(frozen=True, kw_only=True)
 class Shaft(Tool):
     """A round shaft from its tip to its hub.
@@ -344,15 +320,9 @@ class Shaft(Tool):
         return replace(self, frame=ToolFrame.SCENE, tip_mm=tip_mm, hub_mm=hub_mm)
 
 
-# A cylinder: a rod, a trocar, a drill.
-
-
 @dataclass(frozen=True, kw_only=True)
 class Cylinder(Shaft):
-    """A solid cylinder with flat ends, thicker than the beam: its near side is seen. What is thinner is a needle.
-
-    Raises InvalidArgument for a hub at the tip.
-    """
+    """A solid cylinder with flat ends, thicker than the beam: its near side is seen. What is thinner is a needle."""
 
     kind: Literal["cylinder"] = kind_field("cylinder")
 
@@ -372,18 +342,12 @@ class Cylinder(Shaft):
         return crossing_of_solid(self, view, np.vstack([middle, middle + axes]), span)
 
 
-# A needle: a shaft thinner than the beam, of which the middle line is seen.
-
-
 _LEAST_NEEDLE = 1e-12
 
 
 @dataclass(frozen=True, kw_only=True)
 class Needle(Shaft):
-    """A straight needle. Its echo lies on the line from tip to hub, so that the tip is where it is said to be.
-
-    Raises InvalidArgument for a hub at the tip.
-    """
+    """A straight needle. Its echo lies on the line from tip to hub, so that the tip is where it is said to be."""
 
     kind: Literal["needle"] = kind_field("needle")
 
@@ -464,9 +428,6 @@ def _bounded(low: FloatArray, high: FloatArray, slope: FloatArray, most: FloatAr
     return low, np.where(slope > -_LEAST_NEEDLE, np.minimum(high, limit), high)
 
 
-# Tools in files: a JSON list of them, each an object with its kind.
-
-
 def load_tools(path: str | Path) -> tuple[Tool, ...]:
     """The tools of a `.json` file. Raises InvalidArgument, naming the file, the tool and what was expected."""
     path = Path(path)
@@ -476,11 +437,10 @@ def load_tools(path: str | Path) -> tuple[Tool, ...]:
         document = json.loads(path.read_text(encoding="utf-8"))
         if not isinstance(document, list):
             raise InvalidArgument(f"it must hold a list of tools, got {shown(document)}")
-        return tuple(_tool(number, one) for number, one in enumerate(document))
+        tools = []
+        for number, one in enumerate(document):
+            with under(f"tools[{number}]"):
+                tools.append(from_dict(Tool, one))
+        return tuple(tools)
     except (OSError, ValueError, RecursionError) as error:  # InvalidArgument is a ValueError
         raise InvalidArgument(f"{path}: {error}", field="tools") from error
-
-
-def _tool(number: int, document: object) -> Tool:
-    with under(f"tools[{number}]"):
-        return from_dict(Tool, document)

@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -41,7 +42,6 @@ def voxel_bytes(field: str) -> int:
 #
 # Convention. Voxel (i, j, k) has its centre at origin_mm + spacing_mm · (i·axes[0] + j·axes[1] + k·axes[2]), in mm of
 # the frame of the training sweep, the frame of every pose (docs/poses.md).
-
 
 MAX_VOXELS = 1 << 28
 MAX_SIDE = 32767  # NIfTI-1 counts voxels along an axis in 16 bits
@@ -147,18 +147,16 @@ def parse_box(text: str) -> tuple[tuple[float, ...], tuple[float, ...]]:
     return tuple(low for low, _ in corners), tuple(high for _, high in corners)
 
 
-def _vector(values: Sequence[float], field: str, count: int = 3) -> FloatArray:
+def _vector(values: Sequence[float], field: str, count: int = 3, most: float = math.inf) -> FloatArray:
     vector = np.asarray(values, np.float64)
     if vector.shape != (count,) or not np.isfinite(vector).all():
         raise InvalidArgument(f"{field} must hold {count} finite numbers, got {values}", field=field)
+    if (np.abs(vector) > most).any():
+        raise InvalidArgument(f"{field} must be at most {most:g} mm, got {_words(vector)}", field=field)
     return vector
 
 
-def _lengths(values: Sequence[float], field: str, count: int = 3) -> FloatArray:
-    vector = _vector(values, field, count)
-    if (np.abs(vector) > MAX_POSITION_MM).any():
-        raise InvalidArgument(f"{field} must be at most {MAX_POSITION_MM:g} mm, got {_words(vector)}", field=field)
-    return vector
+_lengths = partial(_vector, most=MAX_POSITION_MM)
 
 
 def _direction(values: Sequence[float], field: str) -> FloatArray:
@@ -167,8 +165,7 @@ def _direction(values: Sequence[float], field: str) -> FloatArray:
     if largest == 0.0:
         raise InvalidArgument(f"{field} must be a direction, got {_words(vector)}", field=field)
     vector = vector / largest  # of which the square is a number
-    unit: FloatArray = vector / np.linalg.norm(vector)
-    return unit
+    return vector / np.linalg.norm(vector)
 
 
 def _check_spacing(spacing_mm: float) -> None:
@@ -197,9 +194,6 @@ def _words(vector: FloatArray) -> str:
     return "(" + ", ".join(f"{value:g}" for value in vector) + ")"
 
 
-# Slices as callers ask for them: a plane through a scene, and the field that is sampled on it. Free of torch.
-
-
 @dataclass(frozen=True, kw_only=True)
 class SliceSettings(Contract):
     """A slice through a scene, on any plane: no probe is involved. Raises InvalidArgument."""
@@ -216,7 +210,6 @@ class SliceSettings(Contract):
         self.grid()
 
     def grid(self) -> VolumeGrid:
-        """Its pixels. Raises InvalidArgument, naming the field."""
         return VolumeGrid.on_plane(self.origin_mm, self.right, self.down, self.size_mm, self.spacing_mm)
 
     @property
@@ -225,13 +218,15 @@ class SliceSettings(Contract):
         return Encoding.UINT8 if self.field == "labels" else Encoding.FLOAT32
 
     def view(self, encoding: Encoding) -> SliceView:
-        """The slice but for its place."""
         width, height, _ = self.grid().shape
         return SliceView(self.field, height, width, self.spacing_mm, encoding)
 
     def pose(self) -> FloatArray:  # [4, 4] mm
-        """Its place: the centre of the first pixel, x along the rows and z along the columns."""
-        return pose_of_grid(self.grid())
+        """Its place: the centre of the first pixel, x along its rows, z along its columns, y against its normal."""
+        grid, pose = self.grid(), np.eye(4)
+        pose[:3, :3] = np.stack([grid.axes[0], -grid.axes[2], grid.axes[1]], axis=1)
+        pose[:3, 3] = grid.origin_mm
+        return pose
 
 
 @dataclass(frozen=True)
@@ -259,15 +254,6 @@ class SliceView:
         return (self.field, self.height, self.width, self.spacing_mm)
 
     def grid(self, pose: FloatArray) -> VolumeGrid:  # [4, 4]
-        """The pixels of a slice at a pose."""
         right, against_normal, down = pose[:3, :3].T
         axes = np.stack([right, down, -against_normal])
         return VolumeGrid(pose[:3, 3], axes, self.spacing_mm, (self.width, self.height, 1))
-
-
-def pose_of_grid(grid: VolumeGrid) -> FloatArray:  # [4, 4] mm
-    """The pose of a slice's pixels: x along its rows, z along its columns, y against its normal."""
-    pose = np.eye(4)
-    pose[:3, :3] = np.stack([grid.axes[0], -grid.axes[2], grid.axes[1]], axis=1)
-    pose[:3, 3] = grid.origin_mm
-    return pose

@@ -11,7 +11,7 @@ import numpy as np
 
 from ultragray.contract import Family, described, kind_field
 from ultragray.errors import InvalidArgument
-from ultragray.geometry.pose import check_poses, rotation_angles_deg
+from ultragray.geometry.pose import check_poses, rotation_angles_deg, turn_angles_rad
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.geometry.rotations import about_axes, blended, random_directions
 
@@ -38,7 +38,6 @@ class Sampler(Family):
         return check_poses(self._made(checked, probe))
 
     def _made(self, base: FloatArray, probe: Probe) -> FloatArray:  # [P, 4, 4] -> [C, 4, 4] mm
-        """The poses from at least one checked base pose."""
         raise NotImplementedError
 
     def _require_few(self, made: float, name: str) -> None:
@@ -68,7 +67,6 @@ class DrawnSampler(Sampler):
         return self.with_draws(count, self.seed if number == 0 else seed_of(self.seed, number, _BLOCKS))
 
     def with_draws(self, count: int, seed: int) -> DrawnSampler:
-        """The same with another count and seed."""
         changes: Any = {"count": count, "seed": seed}
         return replace(self, **changes)  # type: ignore[type-var]  # its members are dataclasses
 
@@ -99,16 +97,11 @@ def seed_of(seed: int, *numbers: int) -> int:
 
 
 def count_field(*default: Any, high: int = MAX_POSES) -> Any:
-    """The field for the number of poses."""
     return described("How many poses.", *default, low=1, high=high)
 
 
 def seed_field() -> Any:
-    """The field for the seed of random choices."""
     return described("Of the random choices.", 0, low=0, high=MAX_SEED)
-
-
-# Random poses around a trajectory.
 
 
 @dataclass(frozen=True)
@@ -133,9 +126,6 @@ class AroundSampler(DrawnSampler):
         moved[:, :3, :3] = moved[:, :3, :3] @ about_axes(axes, angles)
         moved[:, :3, 3] += random.normal(0.0, self.translation_mm, (self.count, 3))
         return moved
-
-
-# Random poses within the region that the base poses cover.
 
 
 MAX_BASE_POSES = 10_000  # all are compared with all
@@ -165,7 +155,7 @@ class CoveredSampler(DrawnSampler):
             raise InvalidArgument(
                 f"sampler covered takes at most {MAX_BASE_POSES:,} base poses, got {len(base):,}", field="kind"
             )
-        corners = np.einsum("pij,kj->pki", base[:, :3, :3], probe.corners_mm()) + base[:, None, :3, 3]  # [P, K, 3] mm
+        corners = probe.corners_from(base)  # [P, K, 3] mm
         links, lengths = _shortest_links(corners.tobytes(), len(corners))
         lengths = np.where(lengths > LARGEST_GAP * np.median(lengths), 0.0, lengths)
         ends = np.cumsum(lengths)
@@ -182,7 +172,7 @@ class CoveredSampler(DrawnSampler):
         made[:, :3, :3] = blended(first[:, :3, :3], second[:, :3, :3], shares)
         radii = np.linalg.norm(steps, axis=1) * np.cbrt(random.uniform(size=self.count))
         made[:, :3, 3] += radii[:, None] * random_directions(random, self.count)
-        turns = _angles_rad(first, second) * random.uniform(size=self.count)
+        turns = turn_angles_rad(first[:, :3, :3], second[:, :3, :3]) * random.uniform(size=self.count)
         made[:, :3, :3] = made[:, :3, :3] @ about_axes(random_directions(random, self.count), turns)
         return made
 
@@ -204,15 +194,6 @@ def _shortest_links(packed: bytes, count: int) -> tuple[np.ndarray, FloatArray]:
         waiting, nearest = np.delete(waiting, chosen), np.delete(nearest, chosen)
         distances = np.delete(distances, chosen)
     return links, lengths
-
-
-def _angles_rad(first: FloatArray, second: FloatArray) -> FloatArray:  # [C, 4, 4] both -> [C]
-    half_chords = np.linalg.norm(first[:, :3, :3] - second[:, :3, :3], axis=(1, 2)) / np.sqrt(8.0)
-    angles: FloatArray = 2.0 * np.arcsin(np.clip(half_chords, 0.0, 1.0))
-    return angles
-
-
-# Tilted sweeps, as the paper records them.
 
 
 MAX_TILT_DEG = 90.0  # the beam lies along the skin then
@@ -242,9 +223,6 @@ class FanSampler(Sampler):
         axial = base[:, :3, 2] - fan[..., :3, 2]
         fan[..., :3, 3] += probe.pivot_depth_mm * axial
         return fan.reshape(-1, 4, 4)
-
-
-# Evenly spaced poses on a smooth path.
 
 
 SMALLEST_STEP_MM, SMALLEST_TURN_DEG = 1e-9, 1e-6
@@ -289,8 +267,7 @@ class SplineSampler(Sampler):
         assert self.spacing_mm is not None
         steps = min(length_mm / self.spacing_mm + 1e-9, 10.0 * MAX_POSES)
         self._require_few(math.floor(steps) + 1, "spacing_mm")
-        every: FloatArray = np.minimum(self.spacing_mm * np.arange(math.floor(steps) + 1), length_mm)
-        return every
+        return np.minimum(self.spacing_mm * np.arange(math.floor(steps) + 1), length_mm)
 
 
 def _without_repetitions(base: FloatArray) -> FloatArray:  # [P, 4, 4] -> [K, 4, 4]
@@ -316,8 +293,7 @@ def _natural_cubic(
     rest = 1.0 - share
     straight = rest * values[segments] + share * values[segments + 1]
     bend = (rest**3 - rest) * second[segments] + (share**3 - share) * second[segments + 1]
-    curve: FloatArray = straight + length**2 / 6.0 * bend
-    return curve
+    return straight + length**2 / 6.0 * bend
 
 
 def _second_derivatives(values: FloatArray, lengths: FloatArray) -> FloatArray:  # [K, 3], [K-1] -> [K, 3]
@@ -334,9 +310,6 @@ def _second_derivatives(values: FloatArray, lengths: FloatArray) -> FloatArray: 
     for knot in range(len(values) - 2, 0, -1):
         second[knot] -= above[knot] * second[knot + 1]
     return second
-
-
-# The base poses themselves.
 
 
 @dataclass(frozen=True)

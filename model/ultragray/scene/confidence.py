@@ -10,18 +10,15 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ultragray.contract import described
+from ultragray.contract import checked_number, described, under
 from ultragray.errors import InvalidArgument, LowConfidence
 from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray, Probe
-
-# The place of a pose relative to the views that a scene was trained on. Needs no torch.
-
 
 POINTS_PER_SIDE = 6  # of the grid of image points at which distances are taken
 ANGLE_MM_PER_DEG = 0.02  # added to distances to choose the nearest view: of two about as near, the less turned one
@@ -47,16 +44,6 @@ class ViewMeasures:
     angle_deg: FloatArray  # [C, K]
     weights: FloatArray  # [C, P], each row sums to 1
 
-    def averaged(self) -> ViewMeasures:
-        """The same with the mean over the points as the only one."""
-        return ViewMeasures(
-            nearest_mm=self.nearest_mm.mean(axis=1, keepdims=True),
-            distance_mm=self.distance_mm.mean(axis=1, keepdims=True),
-            interpolation_mm=self.interpolation_mm.mean(axis=1, keepdims=True),
-            angle_deg=self.angle_deg.mean(axis=1, keepdims=True),
-            weights=self.weights,
-        )
-
 
 class TrainingViews:
     """The images of P training poses [P, 4, 4] (mm, probe→scene) of one probe, in space. P is at least 1."""
@@ -80,7 +67,7 @@ class TrainingViews:
         count = len(poses)
         measures = np.zeros((4, count, len(points)))
         weights = np.zeros((count, len(self)))
-        checked = check_poses(poses) if count else poses
+        checked = check_poses(poses)
         for first in range(0, count, POSES_AT_ONCE):
             some = checked[first : first + POSES_AT_ONCE]
             places = np.arange(first, first + len(some))
@@ -153,7 +140,6 @@ class TrainingViews:
         return np.stack([nearest_mm, *capped, turned]), weights / weights.sum(axis=1, keepdims=True)
 
     def _angles_deg(self, poses: FloatArray) -> FloatArray:  # [B, 4, 4] -> [B, P]
-        """Angle of the rotation from each pose to each view."""
         cosine = 0.5 * (poses[:, :3, :3].reshape(-1, 9) @ self._rotations.T - 1.0)
         return np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
 
@@ -165,8 +151,7 @@ def _image_points(probe: Probe, per_side: int) -> FloatArray:  # [K, 3] mm, prob
 
 
 def _root_mean_square(values: FloatArray) -> FloatArray:  # [B, K, P] -> [B, P]
-    root: FloatArray = np.sqrt(np.einsum("bkp,bkp->bp", values, values) / values.shape[1]).astype(np.float64)
-    return root
+    return np.sqrt(np.einsum("bkp,bkp->bp", values, values) / values.shape[1]).astype(np.float64)
 
 
 # The model behind the output `uncertainty`: the variances that add up to that of a pixel's error. Needs no torch.
@@ -176,7 +161,6 @@ def _root_mean_square(values: FloatArray) -> FloatArray:  # [B, K, P] -> [B, P]
 # The terms vₖ are those of `ultragray.rendering.derived`. Those that grow with the distance to the training views
 # are shares of V = spread + (level − B̄)²: the mean squared error of a pixel that shows B̄ where the true grey value
 # may be any of those that the training images have at that depth.
-
 
 VARIANCE_TERMS = (
     "floor",
@@ -196,57 +180,54 @@ DIGITS = 6  # in a scene's metadata
 
 @dataclass(frozen=True)
 class DepthBands:
-    """Mean and variance of the training images' grey values, in [0, 1], in bands of depth.
-
-    Raises InvalidArgument for numbers that cannot be.
-    """
+    """Mean and variance of the training images' grey values, in [0, 1], in bands of depth. Raises InvalidArgument."""
 
     level: tuple[float, ...]  # [DEPTHS]
     spread: tuple[float, ...]  # [DEPTHS]
 
     def __post_init__(self) -> None:
         for name in ("level", "spread"):
-            object.__setattr__(self, name, _amounts(name, getattr(self, name), DEPTHS))
+            object.__setattr__(self, name, _numbers(f"uncertainty.{name}", getattr(self, name), DEPTHS, low=0.0))
 
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Fitted cₖ, and the depth bands of the training images.
-
-    Raises InvalidArgument for numbers that cannot be.
-    """
+    """Fitted cₖ, and the depth bands of the training images. Raises InvalidArgument."""
 
     variances: tuple[float, ...]  # [TERMS]
     bands: DepthBands
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "variances", _amounts("variances", self.variances, len(VARIANCE_TERMS)))
+        variances = _numbers("uncertainty.variances", self.variances, len(VARIANCE_TERMS), low=0.0)
+        object.__setattr__(self, "variances", variances)
 
     def to_dict(self) -> dict[str, Any]:
-        """A JSON object, as a scene's metadata holds it."""
         numbers = {"variances": self.variances, "level": self.bands.level, "spread": self.bands.spread}
         return {name: [round(value, DIGITS) for value in values] for name, values in numbers.items()}
 
     @classmethod
     def from_dict(cls, document: Any) -> Uncertainty:
         """Inverse of `to_dict`, but for the digits. Raises InvalidArgument for keys or values that cannot be."""
-        expected = {"variances", "level", "spread"}
-        if not isinstance(document, Mapping) or set(document) != expected:
-            found = sorted(document) if isinstance(document, Mapping) else document
-            raise InvalidArgument(
-                f"uncertainty must be an object with the keys {sorted(expected)}, got {found!r}", field="uncertainty"
-            )
+        _check_keys("uncertainty", document, {"variances", "level", "spread"})
         return cls(document["variances"], DepthBands(document["level"], document["spread"]))
 
 
-def _amounts(name: str, values: Any, count: int) -> tuple[float, ...]:
-    field = f"uncertainty.{name}"
+def _check_keys(name: str, document: Any, keys: set[str]) -> None:
+    if not isinstance(document, Mapping) or set(document) != keys:
+        found = sorted(document) if isinstance(document, Mapping) else document
+        raise InvalidArgument(f"{name} must be an object with the keys {sorted(keys)}, got {found!r}", field=name)
+
+
+def _numbers(name: str, values: Any, count: int | None = None, low: float = -math.inf) -> tuple[float, ...]:
+    """Finite numbers, as many as `count` (None: any number of them), at least `low`."""
     try:
         numbers = tuple(float(value) for value in values)
     except (TypeError, ValueError, OverflowError):
-        raise InvalidArgument(f"{field} must be numbers, got {values!r}", field=field) from None
-    if len(numbers) != count or not all(math.isfinite(value) and value >= 0.0 for value in numbers):
-        raise InvalidArgument(f"{field} must be {count} numbers, at least 0, got {values!r}", field=field)
+        raise InvalidArgument(f"{name} must be numbers, got {values!r}", field=name) from None
+    if not all(map(math.isfinite, numbers)):
+        raise InvalidArgument(f"{name} must be finite, got {values!r}", field=name)
+    if count not in (None, len(numbers)) or min(numbers, default=low) < low:
+        raise InvalidArgument(f"{name} must be {count} numbers, at least {low:g}, got {values!r}", field=name)
     return numbers
 
 
@@ -262,7 +243,6 @@ def _amounts(name: str, values: Any, count: int) -> tuple[float, ...]:
 # Where Gaussians support only the share s of a frame's pixels, c ≤ b + (1 − b)·g·s; the gain g is fitted to frames
 # with little support. For a pose alone s is estimated as s₀·mean over points of exp(−d²/r²); of a rendered frame it
 # is known. Needs no torch.
-
 
 VERSION = 2
 NEAR_MM, DISTANCE_MM, ANGLE_DEG = 0.3, 5.0, 10.0  # units of the terms
@@ -287,7 +267,6 @@ class Support:
             raise InvalidArgument(f"support must be positive numbers, got {list(numbers)}", field="support")
 
     def expected_shares(self, measures: ViewMeasures) -> FloatArray:  # [C]
-        """The share of supported pixels that frames at these poses are taken to have."""
         return self.share * within(measures.distance_mm, self.reach_mm)
 
 
@@ -308,21 +287,18 @@ class ConfidenceModel:
     uncertainty: Uncertainty | None = None  # of pixels; None: not known
 
     def __post_init__(self) -> None:
-        weights = _numbers("weights", self.weights)
-        if len(weights) != 1 + TERMS or min(weights[1:]) < 0.0:
-            raise InvalidArgument(
-                f"weights must be {1 + TERMS} numbers, from the second on at least 0, got {list(weights)}",
-                field="weights",
-            )
+        weights = _numbers("weights", self.weights, 1 + TERMS)
+        if min(weights[1:]) < 0.0:
+            raise InvalidArgument(f"weights must be at least 0 from the second on, got {weights}", field="weights")
         black, error = _numbers("black_ms_ssim and error", (self.black_ms_ssim, self.error))
         if not (0.0 <= black < 1.0 and 0.0 <= error <= 1.0):
             raise InvalidArgument(
                 f"black_ms_ssim and error must be in [0, 1], got {black:g} and {error:g}", field="black_ms_ssim"
             )
-        if type(self.fitted_on) is not int or self.fitted_on < 1:
-            raise InvalidArgument(f"fitted_on must be a positive integer, got {self.fitted_on!r}", field="fitted_on")
-        if self.fitted_to_mm is not None and _numbers("fitted_to_mm", [self.fitted_to_mm])[0] < 0.0:
-            raise InvalidArgument(f"fitted_to_mm must be at least 0, got {self.fitted_to_mm:g}", field="fitted_to_mm")
+        with under("fitted_on"):
+            checked_number(self.fitted_on, int, low=1)
+        if self.fitted_to_mm is not None:
+            _numbers("fitted_to_mm", [self.fitted_to_mm], 1, low=0.0)
         object.__setattr__(self, "weights", weights)
         object.__setattr__(self, "hardness", _numbers("hardness", self.hardness))
 
@@ -341,7 +317,6 @@ class ConfidenceModel:
         return np.minimum(confidences, most)
 
     def to_dict(self) -> dict[str, Any]:
-        """A JSON object, as a scene's metadata holds it."""
         return {
             "version": VERSION,
             **asdict(self),
@@ -361,15 +336,15 @@ class ConfidenceModel:
             raise InvalidArgument(
                 f"confidence must be an object of version {VERSION}, got {version!r}", field="confidence"
             )
-        names = [one.name for one in fields(cls)]
-        if set(document) != {"version", *names}:
-            raise InvalidArgument(
-                f"confidence must have the keys {sorted(('version', *names))}, got {sorted(document)}",
-                field="confidence",
-            )
+        names = {one.name for one in fields(cls)}
+        _check_keys("confidence", document, {"version", *names})
         values = {name: document[name] for name in names}
-        readers = {"support": _support_of, "uncertainty": Uncertainty.from_dict}
-        return cls(**values | {name: read(values[name]) for name, read in readers.items() if values[name] is not None})
+        if (support := values["support"]) is not None:
+            _check_keys("support", support, set(Support.__dataclass_fields__))
+            values["support"] = Support(**support)
+        if values["uncertainty"] is not None:
+            values["uncertainty"] = Uncertainty.from_dict(values["uncertainty"])
+        return cls(**values)
 
 
 def terms_of(
@@ -399,36 +374,11 @@ def predicted(weights: FloatArray, terms: FloatArray, black_ms_ssim: float) -> F
 
 def within(distance_mm: FloatArray, reach_mm: float) -> FloatArray:  # [C, K] -> [C]
     """The mean over the points of exp(−d²/r²)."""
-    shares: FloatArray = np.exp(-np.square(distance_mm / reach_mm)).mean(axis=1)
-    return shares
+    return np.exp(-np.square(distance_mm / reach_mm)).mean(axis=1)
 
 
 def logistic(values: FloatArray) -> FloatArray:
-    """σ of the formula."""
     return 1.0 / (1.0 + np.exp(-np.clip(values, -500.0, 500.0)))
-
-
-def _support_of(document: Any) -> Support:
-    expected = set(Support.__dataclass_fields__)
-    if not isinstance(document, Mapping) or set(document) != expected:
-        found = sorted(document) if isinstance(document, Mapping) else document
-        raise InvalidArgument(
-            f"support must be an object with the keys {sorted(expected)}, got {found!r}", field="support"
-        )
-    return Support(**document)
-
-
-def _numbers(name: str, values: Any) -> tuple[float, ...]:
-    try:
-        numbers = tuple(float(value) for value in values)
-    except (TypeError, ValueError, OverflowError):
-        raise InvalidArgument(f"{name} must be numbers, got {values!r}", field=name) from None
-    if not all(map(math.isfinite, numbers)):
-        raise InvalidArgument(f"{name} must be finite, got {values!r}", field=name)
-    return numbers
-
-
-# The assessment of a frame: its extrapolation, and how much a real frame would look like it. Needs no torch.
 
 
 SUPPORT_COVERAGE = 0.3  # γ below which a pixel's error is more than twice that of the others
@@ -465,20 +415,10 @@ def figure_arrays(extrapolations: Sequence[Extrapolation]) -> dict[str, npt.NDAr
     return {name: np.array([getattr(one, name) for one in extrapolations], dtype=np.float32) for name in names}
 
 
-class Trained(Protocol):
-    """A description of a scene and of its training, such as `ultragray.SceneInfo`."""
-
-    @property
-    def probe(self) -> Probe | None: ...
-    @property
-    def confidence(self) -> dict[str, Any]: ...
-    def probe_or(self, asked: Probe | None) -> Probe: ...
-
-
 class Assessor:
     """Computes the extrapolation of frames of one scene. Its distances and confidence need the pose alone."""
 
-    def __init__(self, info: Trained, training_poses: FloatArray) -> None:  # [P, 4, 4] mm
+    def __init__(self, info: Any, training_poses: FloatArray) -> None:  # SceneInfo, [P, 4, 4] mm
         """Raises InvalidArgument where the scene's `confidence` is damaged or made for other training poses."""
         known = info.probe is not None and len(training_poses) > 0
         self._info = info
@@ -541,23 +481,9 @@ def read_model(document: dict[str, Any], view_count: int) -> ConfidenceModel | N
     return model
 
 
-# A least confidence that frames must have. Needs no torch.
-
-
 def is_confident(extrapolation: Extrapolation, min_confidence: float) -> bool:
     """Whether a frame has the least confidence; one whose confidence is not known has none."""
     return (extrapolation.confidence or 0.0) >= min_confidence
-
-
-def _low_confidence(extrapolation: Extrapolation, min_confidence: float, field: str) -> LowConfidence:
-    """The error of a pose, named by its field, that does not have the least confidence."""
-    detail = f"{field} has a confidence of {extrapolation.confidence or 0.0:.2f}, {min_confidence:g} is asked for"
-    if extrapolation.distance_mm is not None and extrapolation.angle_deg is not None:
-        away = f"{extrapolation.distance_mm:.1f} mm and {extrapolation.angle_deg:.1f} degrees away"
-        detail = f"{detail}: the nearest training views are {away}"
-    if extrapolation.supported_share is not None:
-        detail = f"{detail}; Gaussians support {extrapolation.supported_share:.0%} of its pixels"
-    return LowConfidence(detail, field=field)
 
 
 def require_confidence(
@@ -572,8 +498,13 @@ def require_confidence(
 
     `first`: the number that they begin with; `name_pose`: how the caller names the pose of a number.
     """
-    if min_confidence is None:
-        return
-    for number, extrapolation in enumerate(extrapolations, first):
-        if not is_confident(extrapolation, min_confidence):
-            raise _low_confidence(extrapolation, min_confidence, name_pose(number))
+    for number, one in enumerate(extrapolations, first):
+        if min_confidence is not None and not is_confident(one, min_confidence):
+            field = name_pose(number)
+            detail = f"{field} has a confidence of {one.confidence or 0.0:.2f}, {min_confidence:g} is asked for"
+            if one.distance_mm is not None and one.angle_deg is not None:
+                away = f"{one.distance_mm:.1f} mm and {one.angle_deg:.1f} degrees away"
+                detail = f"{detail}: the nearest training views are {away}"
+            if one.supported_share is not None:
+                detail = f"{detail}; Gaussians support {one.supported_share:.0%} of its pixels"
+            raise LowConfidence(detail, field=field)

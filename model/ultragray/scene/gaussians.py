@@ -166,13 +166,7 @@ class GaussianScene:
         """The same scene with its tensors in another dtype or on another device."""
         moved: dict[str, Any] = {name: tensor.to(target) for name, tensor in self.splats.items()}
         labels = None if self.labels is None else self.labels.to(moved["means"].device)
-        return GaussianScene(
-            **moved,
-            info=self.info,
-            training_poses=self.training_poses,
-            labels=labels,
-            pose_corrections=self.pose_corrections,
-        )
+        return replace(self, **moved, labels=labels)
 
     def prepared(self, name: str, make: Callable[[], Prepared]) -> Prepared:
         """A backend's preparation of the scene, kept by name until one of the tensors, or the activation, changes.
@@ -192,8 +186,7 @@ class GaussianScene:
         ):
             kept = _Kept(tensors, versions, self.info.intensity, make())
             self._prepared[name] = kept  # one assignment: threads may render the scene at the same time
-        made: Prepared = kept.made
-        return made
+        return kept.made
 
     def poses_to_scene_cm(self, poses: FloatArray) -> FloatArray:  # [C, 4, 4] mm -> [C, 4, 4] cm
         """Poses in the sweep's frame (mm) as poses in the scene's own (cm, about its centre)."""

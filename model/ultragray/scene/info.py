@@ -83,7 +83,7 @@ class SceneInfo(Contract):
         """The beam of the scene, as thick as asked for (None: as it is); where it has none, one without a focus."""
         if self.beam is None:
             return PLANE if thickness_mm is None else ElevationBeam(thickness_mm)
-        return self.beam if thickness_mm is None else self.beam.as_thick_as(thickness_mm)
+        return self.beam if thickness_mm is None else replace(self.beam, thickness_mm=thickness_mm)
 
     def image_size_or(self, height: int | None, width: int | None) -> tuple[int, int]:
         """Height and width as asked for, else those of the training images, else 512."""
@@ -107,7 +107,6 @@ def _label_names(names: Any) -> dict[int, str]:
 
 
 def info_to_json(info: SceneInfo) -> str:
-    """The metadata entry of a scene file."""
     document = {"format_version": FORMAT_VERSION, **to_dict(info)}
     for name in ("label_names", "beam"):
         if not document[name]:
@@ -201,7 +200,6 @@ def check_header_size(start: bytes) -> None:
 
 
 def check_training_pose_count(count: int) -> None:
-    """Raises InvalidArgument for more than a scene may have."""
     if count > MAX_TRAINING_POSES:
         raise InvalidArgument(
             f"training_poses must be at most {MAX_TRAINING_POSES}, got {count}", field="training_poses"

@@ -94,10 +94,7 @@ class Role(str, Enum):
     ADMIN = "admin"  # and may do everything to everyone's
 
     def includes(self, other: Role) -> bool:
-        return _RANK[self] >= _RANK[other]
-
-
-_RANK = {role: rank for rank, role in enumerate(Role)}
+        return [*Role].index(self) >= [*Role].index(other)
 
 
 @dataclass(frozen=True)

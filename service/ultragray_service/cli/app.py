@@ -13,7 +13,7 @@ from typing import Annotated, Any
 import typer
 from typer.core import TyperCommand, TyperGroup
 
-from ultragray_service.cli.terminal import examples, option, warn
+from ultragray_service.cli.terminal import examples, interrupted_by_sigterm, option, warn
 
 USER_ERROR = 2  # the exit code of a mistake that the caller can mend
 INTERRUPTED = 130  # the exit code of a command that Ctrl-C or SIGTERM stopped
@@ -163,7 +163,8 @@ class _Commands(TyperGroup):
         from ultragray.installation import missing_extra
 
         try:
-            return super().invoke(ctx)
+            with interrupted_by_sigterm():
+                return super().invoke(ctx)
         except BrokenPipeError:  # `ultragray show scene.ugr | head`: nobody is left to tell
             raise
         except UltragrayError as error:

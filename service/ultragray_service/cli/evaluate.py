@@ -29,6 +29,8 @@ from ultragray_service.cli.terminal import (
 )
 
 if TYPE_CHECKING:
+    from rich.table import Table
+
     from ultragray.learn.evaluation.scoring import Evaluation, Reliability
     from ultragray.learn.sweep import Sweep
     from ultragray.scene.gaussians import GaussianScene
@@ -133,14 +135,20 @@ def _in_words(reliability: Reliability) -> str:
     )
 
 
-def print_metrics(title: str, evaluations: Mapping[str, Evaluation]) -> None:
-    from rich.console import Console
-    from rich.markup import escape
+def _table(*heads: str) -> Table:
     from rich.table import Table
 
     table = Table(box=None, pad_edge=False)
-    for place, head in enumerate(("", "PSNR, dB", "MS-SSIM", "GMS", "GMSD")):
+    for place, head in enumerate(heads):
         table.add_column(head, justify="right" if place else "left", no_wrap=True)
+    return table
+
+
+def print_metrics(title: str, evaluations: Mapping[str, Evaluation]) -> None:
+    from rich.console import Console
+    from rich.markup import escape
+
+    table = _table("", "PSNR, dB", "MS-SSIM", "GMS", "GMSD")
     for name, evaluation in evaluations.items():
         mean, std = evaluation.mean, evaluation.std
         table.add_row(
@@ -158,11 +166,8 @@ def print_metrics(title: str, evaluations: Mapping[str, Evaluation]) -> None:
 
 def print_speckle(evaluations: Mapping[str, Evaluation]) -> None:
     from rich.markup import escape
-    from rich.table import Table
 
-    table = Table(box=None, pad_edge=False)
-    for place, head in enumerate(("speckle", "contrast", "axial, mm", "lateral, mm", "histogram distance")):
-        table.add_column(head, justify="right" if place else "left", no_wrap=True)
+    table = _table("speckle", "contrast", "axial, mm", "lateral, mm", "histogram distance")
     summaries = {name: evaluation.speckle for name, evaluation in evaluations.items()}
     true = next(iter(summaries.values())).true
     rows = {

@@ -77,7 +77,7 @@ _COLUMNS: Columns = {
 }
 
 _jobs = Resource(command_app, "jobs", "7f3c2a", _COLUMNS, "JOB", "Id of the job.")
-JobArgument = Annotated[str, argument("Id of the job.")]
+JobArgument = Annotated[str, argument("Id of the job.", metavar="JOB")]
 
 
 @command_app.command(

@@ -6,8 +6,7 @@ import contextlib
 import json
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterator
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Mapping
 from http.client import HTTPMessage
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,7 +15,7 @@ from urllib.parse import urlencode
 import numpy as np
 
 from ultragray.contract import from_dict, to_dict
-from ultragray.datasets.source import UPLOAD_OPTIONS, UPLOADED_FORMATS, SourceOptions
+from ultragray.datasets.source import COMPANIONS, UPLOAD_OPTIONS, UPLOADED_FORMATS, SourceOptions
 from ultragray.errors import DatasetInvalid, InvalidArgument
 from ultragray.exchange.poses import load_poses
 from ultragray.files import write_whole
@@ -55,17 +54,6 @@ SUFFIXES = tuple(MEDIA_TYPES)
 FRAMES_FILE = "frames.json"
 
 
-@dataclass(frozen=True)
-class RenderRequest:
-    scene: str
-    output: Path
-    suffix: str | None  # of SUFFIXES; None: a folder of PNGs
-    poses: FloatArray | None  # [C, 4, 4] mm, of a file
-    sampler: Sampler | None
-    registration: str | None  # that leads these poses into the scene
-    settings: FrameSettings
-
-
 def checked_kind(output: Path, settings: FrameSettings, *, force: bool) -> str | None:
     """The ending of the output, of SUFFIXES; None: a folder. Raises InvalidArgument where it cannot be written."""
     if is_folder_name(output):
@@ -81,77 +69,43 @@ def checked_kind(output: Path, settings: FrameSettings, *, force: bool) -> str |
     return output.suffix
 
 
-def render_remotely(connection: Connection, request: RenderRequest) -> dict[str, Any]:
-    if request.registration is not None and (request.poses is None or request.sampler is not None):
-        raise InvalidArgument(
-            "a registration leads the poses of a file, which must be given with --poses and without --sampler; "
-            "ultragray jobs submit render samples about such poses",
-            field="registration",
-        )
-    poses = _poses(connection, request)
-    settings = to_dict(request.settings, with_none=False)
-    if request.registration is not None:
-        settings["registration"] = request.registration
-    if request.suffix is None:
-        shape = _write_folder(connection, request, settings, poses)
-    else:
-        if request.suffix != ".npz" and len(poses) != 1:
-            raise InvalidArgument(
-                f"a picture holds one frame, there are {len(poses)} poses: write a .npz file or a folder",
-                field="output",
-            )
-        body = {**settings, **({"pose": _pose(poses[0])} if len(poses) == 1 else {"poses": list(map(_pose, poses))})}
-        data, headers = _rendered(connection, request.scene, body, MEDIA_TYPES[request.suffix])
-        write_whole(request.output, data)
-        shape = headers["x-ultragray-shape"]
-    _, _, height, width = map(int, shape.split(","))
-    return {
-        "output": str(request.output),
-        "scene": request.scene,
-        "frames": len(poses),
-        "height": height,
-        "width": width,
-        "outputs": list(request.settings.outputs),
-    }
-
-
-def _poses(connection: Connection, request: RenderRequest) -> FloatArray:  # [C, 4, 4] mm
+def _poses(
+    connection: Connection, scene: str, base: FloatArray | None, sampler: Sampler | None, probe: Probe | None
+) -> FloatArray:  # [C, 4, 4] mm
     """The poses of a file, or those that a sampler makes; without either the middle training pose."""
-    base = request.poses
-    if request.sampler is None and base is not None:
+    if sampler is None and base is not None:
         return base
     if base is None:  # at most 10,000 training poses
-        found = connection.json("GET", route("scenes", request.scene, "training-poses"))
+        found = connection.json("GET", route("scenes", scene, "training-poses"))
         base = check_poses(np.array(found["poses"], np.float64).reshape(-1, 4, 4))
     if not len(base):
         raise InvalidArgument("--poses must be given: the scene holds no training poses", field="poses")
-    if request.sampler is None:
+    if sampler is None:
         middle: FloatArray = base[len(base) // 2][None]
         return middle
-    probe = request.settings.probe
     if probe is None:
-        document = connection.json("GET", route("scenes", request.scene))["probe"]
+        document = connection.json("GET", route("scenes", scene))["probe"]
         if document is None:
             raise InvalidArgument("--probe must be given: the scene does not know its own", field="probe")
         probe = from_dict(Probe, document)
-    return request.sampler.poses(base, probe)
+    return sampler.poses(base, probe)
 
 
-def _write_folder(connection: Connection, request: RenderRequest, settings: dict[str, Any], poses: FloatArray) -> str:
+def _write_folder(connection: Connection, scene: str, folder: Path, settings: dict[str, Any], poses: FloatArray) -> str:
     """A PNG for each pose and output, and a file that describes the frames; their shape as a header tells it."""
     shape, documents = "", []
     with counted("rendering", len(poses)) as report:
         for number, pose in enumerate(poses):
-            for output in request.settings.outputs:
+            for output in settings["outputs"]:
                 body = {**settings, "outputs": [output], "pose": _pose(pose)}
-                data, headers = _rendered(connection, request.scene, body, MEDIA_TYPES[".png"])
-                request.output.mkdir(parents=True, exist_ok=True)  # only now: a refusal leaves no folder
-                write_whole(request.output / f"frame_{number:05d}_{output}.png", data)
+                data, headers = _rendered(connection, scene, body, MEDIA_TYPES[".png"])
+                folder.mkdir(parents=True, exist_ok=True)  # only now: a refusal leaves no folder
+                write_whole(folder / f"frame_{number:05d}_{output}.png", data)
             shape = headers["x-ultragray-shape"]
             about = {name: json.loads(headers[f"x-ultragray-{name}"]) for name in ("pose", "extrapolation")}
             documents.append({"frame": number, "pose": about["pose"], **about["extrapolation"]})
             report(number + 1)
-    write_whole(request.output / FRAMES_FILE, json.dumps(documents))
+    write_whole(folder / FRAMES_FILE, json.dumps(documents))
     return shape
 
 
@@ -279,18 +233,32 @@ def render_scene(
     of_poses: Annotated[dict[str, Any], FieldsOf(RenderSettings, "registration")],
 ) -> None:
     """Have the service render a frame or some frames. Many thousands are a job: `ultragray jobs submit render`."""
-    from ultragray_service.cli.remote import render_remotely
-
-    suffix = checked_kind(output, settings, force=force)
-    given = None if poses is None else load_poses(poses)
-    request = RenderRequest(name, output, suffix, given, sampler, of_poses.get("registration"), settings)
-    document = render_remotely(connection, request)
-    size = f"{document['height']}x{document['width']}"
-    tell(
-        f"wrote {output}: {frames_in_words(document['frames'])} of {size}, {', '.join(settings.outputs)}",
-        document,
-        as_json=json,
-    )
+    suffix, registration = checked_kind(output, settings, force=force), of_poses.get("registration")
+    if registration is not None and (poses is None or sampler is not None):
+        raise InvalidArgument(
+            "a registration leads the poses of a file, which must be given with --poses and without --sampler; "
+            "ultragray jobs submit render samples about such poses",
+            field="registration",
+        )
+    chosen = _poses(connection, name, None if poses is None else load_poses(poses), sampler, settings.probe)
+    asked = {**to_dict(settings, with_none=False), "outputs": list(settings.outputs)}
+    if registration is not None:
+        asked["registration"] = registration
+    if suffix is None:
+        shape = _write_folder(connection, name, output, asked, chosen)
+    elif suffix != ".npz" and len(chosen) != 1:
+        raise InvalidArgument(
+            f"a picture holds one frame, there are {len(chosen)} poses: write a .npz file or a folder", field="output"
+        )
+    else:
+        of_many = {"pose": _pose(chosen[0])} if len(chosen) == 1 else {"poses": list(map(_pose, chosen))}
+        data, headers = _rendered(connection, name, {**asked, **of_many}, MEDIA_TYPES[suffix])
+        write_whole(output, data)
+        shape = headers["x-ultragray-shape"]
+    _, _, height, width = map(int, shape.split(","))
+    facts = {"frames": len(chosen), "height": height, "width": width, "outputs": asked["outputs"]}
+    what = f"{frames_in_words(len(chosen))} of {height}x{width}, {', '.join(settings.outputs)}"
+    tell(f"wrote {output}: {what}", {"output": str(output), "scene": name, **facts}, as_json=json)
 
 
 datasets_app = command_group("They are checked when they arrive; `ultragray jobs submit train NAME` trains from one.")
@@ -336,7 +304,8 @@ def upload_dataset(
     called = _name_of(sweep) if name is None else name
     options = {key: str(value) for key in UPLOAD_OPTIONS if (value := getattr(source, key)) is not None}
     query = urlencode({**options, **({"private": "true"} if private else {})})
-    with archive_of(sweep, source.device_set) as archive, transferred(f"uploading {called}") as begin:
+    companions = {name: path for name in COMPANIONS if (path := getattr(source, name)) is not None}
+    with archive_of(sweep, companions) as archive, transferred(f"uploading {called}") as begin:
         to = route("datasets", called, suffix=f"?{query}" if query else "")
         record, is_new = connection.upload(to, archive, begin(archive.stat().st_size))
     for text in record["warnings"]:
@@ -351,32 +320,32 @@ _datasets.add_delete("Delete a dataset that no job needs.")
 
 def _name_of(sweep: Path) -> str:
     found = sweep.resolve()
-    name = (found.parent if found.name == "conf.json" else found).name.split(".")[0]
+    name = (found.parent if _is_of_a_folder(found) else found).name.split(".")[0]
     if not name:
         raise InvalidArgument(f"--name must be given: {sweep} has none", field="name")
     return name
 
 
 @contextlib.contextmanager
-def archive_of(source: Path, device_set: Path | None = None) -> Iterator[Path]:
+def archive_of(source: Path, companions: Mapping[str, Path] | None = None) -> Iterator[Path]:
     """An archive of what a source is: itself, or a zip of the folder or of the sequence with the files that it needs.
 
-    `device_set` goes into the archive too. Raises DatasetInvalid where there is no such source or it is none, and
-    InvalidArgument for a device set beside an archive.
+    Files that are options go into the archive too. Raises DatasetInvalid where there is no such source or it is none,
+    and InvalidArgument for such files beside an archive.
     """
     if source.name.lower().endswith(ARCHIVE_SUFFIXES) and source.is_file():
-        if device_set is not None:
-            raise InvalidArgument(f"--device-set must be in the archive {source}", field="device_set")
+        for name in companions or ():
+            raise InvalidArgument(f"--{name.replace('_', '-')} must be in the archive {source}", field=name)
         yield source
         return
-    files = _files_of(source) + ([] if device_set is None else [device_set])
+    files = [*_files_of(source), *(companions or {}).values()]
     with tempfile.TemporaryDirectory(prefix="ultragray-upload-") as folder:
         archive = Path(folder, "upload.zip")
         with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED, compresslevel=1, strict_timestamps=False) as made:
             for path in files:
                 below = source if source.is_dir() else source.parent
-                name = path.relative_to(below) if path.is_relative_to(below) else Path(path.name)
-                made.write(path, name.as_posix())
+                inner = path.relative_to(below) if path.is_relative_to(below) else Path(path.name)
+                made.write(path, inner.as_posix())
         yield archive
 
 
@@ -389,7 +358,7 @@ def _files_of(source: Path) -> list[Path]:
         return files
     if not source.is_file():
         raise DatasetInvalid(f"{source}: no such file or folder")
-    if source.name == "conf.json":
+    if _is_of_a_folder(source):
         return _files_of(source.parent)
     format = next((one for one in UPLOADED_FORMATS if one.is_file(source)), None)
     if format is None:
@@ -398,6 +367,10 @@ def _files_of(source: Path) -> list[Path]:
     stems = {source.stem, source.name.split(".")[0]}  # of sweep.igs.mhd: sweep.igs and sweep
     beside = (source.with_name(f"{stem}{ending}") for stem in stems for ending in format.beside)
     return [source, *sorted(path for path in beside if path.is_file())]
+
+
+def _is_of_a_folder(source: Path) -> bool:
+    return any(one.is_folder and one.is_file(source) for one in UPLOADED_FORMATS)
 
 
 def _is_hidden(path: Path, folder: Path) -> bool:

@@ -6,6 +6,7 @@ Everything that can be wrong is found before torch is imported.
 from __future__ import annotations
 
 import contextlib
+import shutil
 import time
 from collections.abc import Iterator
 from functools import partial
@@ -16,7 +17,7 @@ import numpy as np
 
 from ultragray.errors import InvalidArgument, InvalidProbe
 from ultragray.exchange.batches import MANIFEST_FILE, SHARD_FRAMES, BatchPlan
-from ultragray.exchange.exports.formats import DTYPES, FORMATS, check_format, exporter_class, format_of
+from ultragray.exchange.exports.formats import DTYPES, FORMATS, check_format, exporter_class, format_of, frame_bytes
 from ultragray.exchange.poses import load_poses
 from ultragray.files import file_sha256
 from ultragray.rendering.settings import Encoding, FrameSettings
@@ -130,6 +131,16 @@ def checked_format(output: Path, settings: FrameSettings, dtype: str | None, *, 
     return format
 
 
+def _check_room(output: Path, needed: int, frames: int) -> None:
+    folder = next(one for one in output.absolute().parents if one.exists())
+    free = shutil.disk_usage(folder).free
+    if needed > free:
+        raise InvalidArgument(
+            f"{frames_in_words(frames)} take up to {needed / 1e9:,.1f} GB, {folder} has {free / 1e9:,.1f} GB left",
+            field="output",
+        )
+
+
 def render_frames(
     scene_file: Path,
     pose_file: Path | None,
@@ -154,6 +165,9 @@ def render_frames(
         sampler = TrainingSampler()
     assess = partial(Assessor(header.info, header.training_poses).assess, probe=settings.probe)
     poses, extrapolations = assessed_poses(sampler, base, settings.probe, assess, settings.least_confidence)
+    picture = (settings if format is None else FORMATS[format].shown(settings)).picture
+    stored = "uint8" if format is None else check_format(format, settings.outputs, dtype)
+    _check_room(output, len(poses) * frame_bytes(settings.outputs, stored, picture), len(poses))
 
     import torch  # everything that can be wrong was found before
 
@@ -237,12 +251,11 @@ def render_shards(
 ) -> tuple[str, dict[str, Any]]:
     """Render what is missing of a batch on a cluster, and write its manifest; a sentence and a document of it."""
     from ultragray_workers.batches.on_ray import RayBatch, check_address
-    from ultragray_workers.storage.location import open_storage
+    from ultragray_workers.storage.location import parse_location
 
     check_address(on)
-    storage = open_storage(output)
-    if storage.local is not None:
-        folder = storage.local.resolve()
+    if isinstance(location := parse_location(output, "output"), Path):
+        folder = location.resolve()
         if folder.exists() and not folder.is_dir():
             raise InvalidArgument(f"--output must be a folder with --on, {output} is a file", field="output")
         output = str(folder)  # the workers of a cluster have other working folders

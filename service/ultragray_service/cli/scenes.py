@@ -29,10 +29,9 @@ from ultragray_service.cli.terminal import (
     check_file,
     option,
     output_option,
-    print_facts,
     single,
     tell,
-    to_json,
+    tell_facts,
     warn,
     working,
 )
@@ -49,7 +48,6 @@ def demo(
 ) -> None:
     """It needs no data and no training: a first frame takes seconds."""
     from ultragray.phantom.demo import copy_demo_scene
-    from ultragray.scene.info import read_header
 
     check_file(output, [SCENE_SUFFIX], force=force)
     copy_demo_scene(output)
@@ -83,15 +81,11 @@ def show(
         document = describe_scene(Path(file))
     else:
         document = _describe_sweep(file, source)
-    if json:
-        typer.echo(to_json(document))
-    else:
-        print_facts(document)
+    tell_facts(document, as_json=json)
 
 
 def describe_scene(path: Path) -> dict[str, Any]:
     from ultragray.files import file_sha256
-    from ultragray.scene.info import read_header
 
     header = read_header(path)
     info, positions = header.info, header.training_poses[:, :3, 3]
@@ -360,7 +354,8 @@ def slicer(
     pose = poses[len(poses) // 2] if len(poses) else np.eye(4)
 
     from ultragray import GaussianScene
-    from ultragray.exchange.slicer import SlicerScene
+    from ultragray.exchange.slicer import slicer_scene
+    from ultragray.files import write_whole
     from ultragray.rendering.volume_fields import write_volume
     from ultragray.rendering.volumes import VolumeGrid
 
@@ -368,7 +363,7 @@ def slicer(
     with working(f"sampling {' x '.join(map(str, grid.shape))} points …"):
         write_volume(volume, GaussianScene.load(scene), "echo", grid)
     device = device_of(scene.stem)
-    SlicerScene(host, port, device, pose, volume.name).write(output)
+    write_whole(output, slicer_scene(host, port, device, pose, volume.name))
     image = image_name(device)
     document = {"file": str(output), "volume": str(volume), "device": device, "image": image, "address": igtl_address}
     tell(f"wrote {output} and {volume}: {device} is sent to {igtl_address}, {image} comes back", document, as_json=json)

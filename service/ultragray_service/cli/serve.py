@@ -14,6 +14,7 @@ from ultragray.phantom.demo import copy_demo_scene
 from ultragray.scene.info import read_header
 from ultragray_service.cli.options import FieldsOf, with_options
 from ultragray_service.cli.terminal import argument, single
+from ultragray_service.listening import check_port_is_free
 from ultragray_service.settings import ENVIRONMENT_PREFIX, Settings, load_settings
 from ultragray_workers.scenes import SUFFIX, SceneStore
 
@@ -62,6 +63,8 @@ def serve_scenes(scenes: Iterable[Path], options: Mapping[str, Any]) -> None:
     if not files:
         settings = load_settings(**options)
         folder = settings.data_folder
+        for field, what in (("http_port", "HTTP"), ("grpc_port", "gRPC")):  # before a file is written
+            check_port_is_free(settings.host, getattr(settings, field), what, field)
         if isinstance(folder, Path):
             if folder == Settings().data_folder:
                 folder.mkdir(exist_ok=True)  # any other folder must exist: its name may be mistyped

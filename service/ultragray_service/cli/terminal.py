@@ -7,6 +7,8 @@ import json
 import math
 import os
 import signal
+import threading
+import time
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from difflib import get_close_matches
 from pathlib import Path
@@ -114,6 +116,7 @@ def warn(text: str) -> None:
 
 
 SCENE_SUFFIX = ".ugr"  # the service lists no other files
+_TOLD_EVERY_S = 10.0
 _PIPE_COLUMNS = 400  # where no terminal says how wide it is, nothing is cut
 OR_A_FOLDER = ", or be a folder for PNGs (a name without an ending)"
 _PICTURES = (".png", ".jpg", ".jpeg")
@@ -139,9 +142,12 @@ def check_file(path: Path, suffixes: Sequence[str] = (), *, force: bool) -> None
 
 
 def check_folder(path: Path, *, force: bool) -> None:
-    """Raise InvalidArgument where `path` is a file, or without `force` a folder that holds something."""
+    """Raise InvalidArgument where `path` is a file, cannot be written to, or without `force` holds something."""
     if path.exists() and not path.is_dir():
         raise InvalidArgument(f"output must be a folder, {path} is a file", field="output")
+    existing = next(one for one in (path.absolute(), *path.absolute().parents) if one.exists())
+    if not os.access(existing, os.W_OK):
+        raise InvalidArgument(f"output must be a folder that can be written to, {existing} cannot", field="output")
     if path.is_dir() and not force and next(path.iterdir(), None) is not None:
         raise InvalidArgument(
             f"output must be a new or empty folder, {path} holds files: --force writes among them", field="output"
@@ -238,10 +244,21 @@ def progress_bars(*columns: str) -> Iterator[Progress]:
 
 @contextlib.contextmanager
 def counted(what: str, total: int) -> Iterator[Callable[[int], None]]:
-    """A function that is told how many of `total` are done: a bar on a terminal, nothing elsewhere."""
+    """A function that is told how many of `total` are done: a bar on a terminal, elsewhere a line every 10 s."""
+    started = told = time.monotonic()
+
+    def tell_done(done: int) -> None:
+        nonlocal told
+        bars.update(task, completed=done)
+        now = time.monotonic()
+        if bars.disable and done and now - told >= _TOLD_EVERY_S:
+            told = now
+            minutes = (now - started) * (total - done) / done / 60.0
+            typer.echo(f"{what}: {done:,} of {total:,}, {minutes:.1f} min left", err=True)
+
     with progress_bars("{task.description}", "bar", "of", "left") as bars:
         task = bars.add_task(what, total=total)
-        yield lambda done: bars.update(task, completed=done)
+        yield tell_done
 
 
 @contextlib.contextmanager
@@ -268,6 +285,23 @@ def working(what: str) -> Iterator[None]:
             yield
     else:
         yield
+
+
+@contextlib.contextmanager
+def interrupted_by_sigterm() -> Iterator[None]:
+    """SIGTERM ends what is done as Ctrl-C does: half-written files are removed. For the main thread alone."""
+
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
 
 
 @contextlib.contextmanager

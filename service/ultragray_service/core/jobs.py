@@ -45,7 +45,7 @@ from ultragray_workers.jobs.record import Job
 from ultragray_workers.jobs.store import Admit, JobsOverview, JobStore
 from ultragray_workers.jobs.workers import Worker
 from ultragray_workers.pool.messages import Priority
-from ultragray_workers.rounds import Rounds
+from ultragray_workers.rounds import repeat
 from ultragray_workers.scenes import SceneStore
 from ultragray_workers.storage.location import open_storage
 
@@ -410,7 +410,7 @@ class Jobs:
         return self._store.files
 
     def start(self) -> None:
-        self._counting = asyncio.create_task(self._count())
+        self._counting = asyncio.create_task(repeat("the count of the jobs", _log, COUNT_INTERVAL_S, self._count))
 
     async def do(self, method: Callable[Concatenate[JobStore, P], T], *arguments: P.args, **options: P.kwargs) -> T:
         """Calls a method of the store in a thread: `do(JobStore.get, job_id)`. Raises NotReady, DatabaseUnavailable."""
@@ -472,14 +472,10 @@ class Jobs:
             await asyncio.to_thread(self._opened.close)
 
     async def _count(self) -> None:
-        rounds = Rounds("the count of the jobs", _log)
-        while True:
-            with rounds.round():
-                try:
-                    self.overview = await self.do(JobStore.overview)
-                except (UltragrayError, SQLAlchemyError):
-                    self.overview = JobsOverview()
-            await asyncio.sleep(COUNT_INTERVAL_S)
+        try:
+            self.overview = await self.do(JobStore.overview)
+        except (UltragrayError, SQLAlchemyError):
+            self.overview = JobsOverview()
 
 
 @contextmanager

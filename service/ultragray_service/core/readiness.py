@@ -13,7 +13,7 @@ from ultragray_service.core.scenes import ScenePlaces
 from ultragray_service.core.threads import in_own_thread
 from ultragray_workers.errors import ArtifactFolderUnavailable, DatabaseUnavailable, NotReady
 from ultragray_workers.jobs.database import JobDatabase
-from ultragray_workers.rounds import Rounds
+from ultragray_workers.rounds import repeat
 
 CHECK_INTERVAL_S = 5.0
 PATIENCE_S = 5.0  # with a check that does not end
@@ -32,11 +32,7 @@ class WatchedPart:
         self.problem: UltragrayError | None = NotReady("the service is starting")
 
     async def run(self) -> None:
-        rounds = Rounds(f"the watch over {self._name}", _log)
-        while True:
-            with rounds.round():
-                await self.look()
-            await asyncio.sleep(CHECK_INTERVAL_S)
+        await repeat(f"the watch over {self._name}", _log, CHECK_INTERVAL_S, self.look)
 
     async def look(self) -> None:
         """Checks once. A check that hangs stays the only one until it ends."""

@@ -36,12 +36,8 @@ from ultragray_workers.errors import SceneNotFound, SceneTooLarge, StartupFailed
 from ultragray_workers.jobs.owners import Kind, Ownership
 from ultragray_workers.pool.pool import RenderPool
 from ultragray_workers.scene_names import base_name
+from ultragray_workers.scene_shelf import SCENES_FOLDER, SceneShelf
 from ultragray_workers.scenes import SceneStore
-from ultragray_workers.shelves.bucket import BucketShelf
-from ultragray_workers.shelves.folder import FolderShelf
-from ultragray_workers.shelves.index import SceneIndex
-from ultragray_workers.shelves.opening import SCENES_FOLDER
-from ultragray_workers.shelves.shelf import Shelf
 from ultragray_workers.storage.cache import Cache
 from ultragray_workers.storage.local import FileVersion
 from ultragray_workers.storage.location import Location, open_storage
@@ -61,50 +57,48 @@ class ScenePlaces(Collector):
         self._settings = settings
         self.data = self._shelf(settings.data_folder, "")
         self.made = self._shelf(settings.artifacts, SCENES_FOLDER)
-
-    @property
-    def buckets(self) -> tuple[BucketShelf, ...]:
-        return tuple(one for one in (self.data, self.made) if isinstance(one, BucketShelf))
+        self._shelves = (self.data, self.made)
 
     @property
     def problem(self) -> StorageUnavailable | None:
-        return next((one.index.problem for one in self.buckets if one.index.problem is not None), None)
+        return next((one.problem for one in self._shelves if one.problem is not None), None)
 
     @property
     def stale_problem(self) -> StorageUnavailable | None:
         """The same, once it lasts so long that scenes are not served any more."""
-        return next((one.index.problem for one in self.buckets if not one.index.is_usable), None)
+        return next((one.problem for one in self._shelves if not one.is_usable), None)
 
     def collect(self) -> Iterator[Metric]:
-        buckets, counts = self.buckets, self.cache.counts
+        far, counts = [one for one in self._shelves if not one.is_near], self.cache.counts
         counter, gauge = CounterMetricFamily, GaugeMetricFamily
         yield counter("ultragray_scene_cache_hits", "Requests whose scene was cached.", counts.hits)
         yield counter("ultragray_scene_cache_misses", "Scenes that were fetched from a bucket.", counts.misses)
         yield counter("ultragray_scene_cache_fetched_bytes", "Bytes of those.", counts.fetched_bytes)
         yield counter("ultragray_scene_cache_fetch_seconds", "Time that their fetches took in all.", counts.fetch_s)
-        held = self.cache.held_bytes() if buckets else 0
+        held = self.cache.held_bytes() if far else 0
         yield gauge("ultragray_scene_cache_bytes", "Bytes that the cache of this host holds.", held)
-        errors = sum(one.index.unavailable_total for one in buckets)
+        errors = sum(one.unavailable_total for one in far)
         yield counter("ultragray_scene_list_errors", "Times that a bucket did not tell its scenes.", errors)
-        age = max((one.index.age_s for one in buckets), default=0.0)
+        age = max((one.age_s for one in far), default=0.0)
         yield gauge("ultragray_scene_list_age_seconds", "Age of the oldest list of the scenes of a bucket.", age)
 
     async def open(self) -> None:
-        for bucket in self.buckets:
+        for shelf in self._shelves:
             with suppress(StorageUnavailable):  # told by health, and read as soon as it can be
-                await asyncio.to_thread(bucket.index.read)
-            bucket.follow()
+                await asyncio.to_thread(shelf.follow)
 
     async def close(self) -> None:
-        for bucket in self.buckets:
-            await asyncio.to_thread(bucket.close)
+        for shelf in self._shelves:
+            await asyncio.to_thread(shelf.close)
 
-    def _shelf(self, location: Location, folder: str) -> Shelf:
-        if isinstance(location, Path):
-            return FolderShelf(location / folder, open_storage(location))
-        storage = open_storage(location, patience_s=PATIENCE_S)
-        index = SceneIndex(storage, folder, self._settings.scene_list_max_age_s)
-        return BucketShelf(index, self.cache, self._settings.working_folder / SCENES_FOLDER)
+    def _shelf(self, location: Location, folder: str) -> SceneShelf:
+        return SceneShelf(
+            open_storage(location, patience_s=PATIENCE_S),
+            folder,
+            cache=self.cache,
+            working_folder=self._settings.working_folder / SCENES_FOLDER,
+            longest_stale_s=self._settings.scene_list_max_age_s,
+        )
 
 
 T = TypeVar("T")

@@ -28,15 +28,14 @@ from ultragray_service.core.threads import HelperProcesses, in_own_thread, to_it
 from ultragray_service.errors import LimitReached, SceneReadOnly
 from ultragray_service.settings import Settings
 from ultragray_workers.claims import storage_full
-from ultragray_workers.datasets.incoming import IncomingDataset, remove_stale
-from ultragray_workers.datasets.intake import take_in
+from ultragray_workers.datasets.intake import IncomingDataset, remove_stale, take_in
 from ultragray_workers.datasets.store import DatasetRecord, DatasetStore, check_dataset_name
 from ultragray_workers.errors import DeadlineExceeded, Draining, SceneExists, SceneNotFound, UploadTooLarge
 from ultragray_workers.jobs.owners import Kind
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.scene_names import SUFFIX, check_scene_name
+from ultragray_workers.scene_shelf import SceneShelf
 from ultragray_workers.scenes import SceneStore, check_scene_file
-from ultragray_workers.shelves.shelf import Shelf
 
 T = TypeVar("T")
 
@@ -252,7 +251,7 @@ class DatasetUpload:
                 killed=DatasetInvalid,
             )
             while not await self._take_name():
-                if await asyncio.to_thread(self._incoming.is_taken, self._name):
+                if await asyncio.to_thread(self._incoming.store.is_taken, self._name):
                     return await asyncio.to_thread(self._incoming.present, self._name), False
                 await asyncio.sleep(_POLL_INTERVAL_S)  # another upload of the name is being checked
             await self._claim.spread()
@@ -260,7 +259,7 @@ class DatasetUpload:
 
     async def _take_name(self) -> bool:
         """Whether the name is now this upload's; it is not where there is a dataset, whoever has it."""
-        if await asyncio.to_thread(self._incoming.is_taken, self._name):
+        if await asyncio.to_thread(self._incoming.store.is_taken, self._name):
             return False
         return await self._claim.take(lambda claim: asyncio.to_thread(self._incoming.is_there, self._name, claim))
 
@@ -281,7 +280,7 @@ MAX_IMPORTS = 4
 class SceneImports:
     """Takes scene files in, whole or not at all, onto a shelf of the store; and removes them."""
 
-    def __init__(self, store: SceneStore, shelf: Shelf, means: Means) -> None:
+    def __init__(self, store: SceneStore, shelf: SceneShelf, means: Means) -> None:
         self._store, self._shelf, self._means = store, shelf, means
         self._slots = Slots(MAX_IMPORTS, "imports of scenes")
 

@@ -41,7 +41,6 @@ _DIGITS = bytes(b"0"[0] if chr(byte).isdecimal() and byte < 128 else b" "[0] for
 _READER = ThreadPoolExecutor(1, "large-bodies")  # one at a time: they share one lock of the interpreter
 
 T = TypeVar("T")
-ReadSmall = Callable[[str, Any], Any]
 
 
 @dataclass(frozen=True)
@@ -57,21 +56,21 @@ class Apart:
     max_values: float = MAX_VALUES
 
 
-async def read_large(body: bytes, cls: type[T], apart: Apart | None, read_small: ReadSmall) -> T:
+async def read_large(body: bytes, cls: type[T], apart: Apart | None) -> T:
     if apart is not None and len(body) > apart.max_bytes:
         raise BodyTooLarge(f"this body must be at most {apart.max_bytes} bytes, got {len(body)}", field="body")
-    return await asyncio.get_running_loop().run_in_executor(_READER, _read, body, cls, apart, read_small)
+    return await asyncio.get_running_loop().run_in_executor(_READER, _read, body, cls, apart)
 
 
-def _read(body: bytes, cls: type[T], apart: Apart | None, read_small: ReadSmall) -> T:
+def _read(body: bytes, cls: type[T], apart: Apart | None) -> T:
     document = _decoded(body, MAX_VALUES if apart is None else apart.max_values)
     if apart is None or not isinstance(document, dict) or not isinstance(document.get(apart.key), apart.kind):
-        return _small(document, cls, read_small)
+        return _small(document, cls)
     much = document[apart.key]
-    rest: Any = _small({**document, apart.key: apart.kind()}, cls, read_small)
+    rest: Any = _small({**document, apart.key: apart.kind()}, cls)
     if apart.element is not None:
         apart.check_count(len(much))
-        much = [_element(apart, index, one, read_small) for index, one in enumerate(much)]
+        much = [_element(apart, index, one) for index, one in enumerate(much)]
     whole: T = replace(rest, **{apart.key: much})
     return whole
 
@@ -92,19 +91,18 @@ def _decoded(body: bytes, max_values: float) -> Any:
         raise InvalidArgument(f"this must be JSON: {error}") from None
 
 
-def _small(value: Any, cls: type[T], read_small: ReadSmall) -> T:
+def _small(value: Any, cls: type[T]) -> T:
     if not _is_small(value, _SMALL_VALUES):
         raise InvalidArgument(f"the body must hold at most {_SMALL_VALUES} values beside its poses", field="body")
-    read: T = read_small(json.dumps(value), cls)
-    return read
+    return read_json(json.dumps(value), cls)
 
 
-def _element(apart: Apart, index: int, value: Any, read_small: ReadSmall) -> Any:
+def _element(apart: Apart, index: int, value: Any) -> Any:
     path = f"{apart.key}[{index}]"
     if not _is_small(value, _ELEMENT_VALUES):
         raise apart.error(f"{path} must hold at most {_ELEMENT_VALUES} values", field=path)
     try:
-        return read_small(json.dumps(value), apart.element)
+        return read_json(json.dumps(value), apart.element)
     except UltragrayError as error:
         raise error_under(path, error, apart.error) from None
 
@@ -144,7 +142,7 @@ async def read_json_body(request: Request, cls: type[T], apart: Apart | None = N
         raise UnsupportedMediaType(f"Content-Type must be application/json, got {content_type!r}", field="Content-Type")
     require_uncompressed(request)
     body = await request.body()
-    return read_json(body, cls) if len(body) <= INLINE_BYTES else await read_large(body, cls, apart, read_json)
+    return read_json(body, cls) if len(body) <= INLINE_BYTES else await read_large(body, cls, apart)
 
 
 def read_json(text: str | bytes, cls: type[T]) -> T:

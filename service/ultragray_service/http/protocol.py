@@ -222,6 +222,11 @@ class BoundedHttp(HttpToolsProtocol):
         self._refused_for = error
         raise ValueError  # the parser hands over to `send_400_response`
 
+    def _should_upgrade(self) -> bool:
+        """A handshake has no body, and no request before it waits for an answer: else it is an ordinary request."""
+        is_alone = self.cycle is None or self.cycle.response_complete
+        return is_alone and not self.pipeline and not _has_body(self.headers) and super()._should_upgrade()
+
     def send_400_response(self, msg: str) -> None:
         self._refuse(self._refused_for or RequestMalformed("this is no HTTP request that can be read"))
 
@@ -307,11 +312,47 @@ class _Closing:
 
 
 class _BoundedWebSocket(PromptWebSocket):
+    """One connection. `look` must be called every second or so.
+
+    Frames that carry nothing are counted: pings, pongs that answer none of ours, empty fragments. Whoever sends more
+    than MAX_EMPTY_FRAMES at once, and EMPTY_FRAMES_PER_S in the long run, is closed with 1008 before the rest is read.
+    """
+
     def __init__(self, *arguments: Any, limits: Settings, refused: Refused, place: Place, **options: Any) -> None:
         super().__init__(*arguments, **options)
         self._refused, self._place = refused, place
         self._looked_at = self.loop.time()
         self._sending = _Sending(limits)
+        self._empty_frames, self._counted_at = 0.0, self._looked_at
+
+    def data_received(self, data: bytes) -> None:
+        for start in range(0, len(data), _PIECE_BYTES):
+            if self.transport.is_closing():
+                return
+            super().data_received(data[start : start + _PIECE_BYTES])
+
+    def handle_ping(self) -> None:
+        self._count_empty()
+        super().handle_ping()
+
+    def handle_pong(self, event: Frame) -> None:
+        if bytes(event.data) not in (self._ping_payload, self.pending_ping_payload):
+            self._count_empty()
+        super().handle_pong(event)
+
+    def handle_cont(self, event: Frame) -> None:
+        if not event.data:
+            self._count_empty()
+        super().handle_cont(event)
+
+    def _count_empty(self) -> None:
+        now = self.loop.time()
+        left = self._empty_frames - EMPTY_FRAMES_PER_S * (now - self._counted_at)
+        self._empty_frames, self._counted_at = max(0.0, left) + 1.0, now
+        if self._empty_frames > MAX_EMPTY_FRAMES and not self.transport.is_closing():
+            self.conn.fail(_POLICY_VIOLATION, "too many pings, pongs or empty frames")
+            self._write()
+            self.transport.close()
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._place.close()
@@ -347,6 +388,10 @@ class _Sending:
         return self._patience.is_over(before - self._waiting_bytes, elapsed_s)
 
 
+def _has_body(headers: list[tuple[bytes, bytes]]) -> bool:
+    return any(name == b"transfer-encoding" or (name == b"content-length" and value != b"0") for name, value in headers)
+
+
 def _may_be_long(headers: list[tuple[bytes, bytes]]) -> bool:
     """Whether the body after these headers may be longer than what is worth reading for its connection alone."""
     return any(
@@ -365,6 +410,10 @@ def refusal_bytes(error: UltragrayError, default_headers: list[tuple[bytes, byte
     lines = [STATUS_LINE[response.status_code], *(b"%s: %s\r\n" % header for header in headers), b"\r\n"]
     return b"".join([*lines, bytes(response.body)])
 
+
+MAX_EMPTY_FRAMES, EMPTY_FRAMES_PER_S = 100, 10.0  # of a WebSocket's client
+_PIECE_BYTES = 1024  # that are parsed before what they hold is counted
+_POLICY_VIOLATION = 1008
 
 MAX_STREAM_MESSAGE_BYTES = 2**16  # of a client, on a WebSocket
 _TICKS_PER_LOOK = 10  # of 0.1 s

@@ -11,34 +11,19 @@ import numpy as np
 import numpy.typing as npt
 
 from ultragray.errors import (
-    BackendUnavailable,
-    InvalidArgument,
     InvalidPose,
-    MemoryExceeded,
-    SceneFileInvalid,
     UltragrayError,
 )
 from ultragray.geometry.pose import check_poses, pose_from_position_quaternion, quaternion_from_pose
 from ultragray.geometry.probe import FloatArray
 from ultragray_service.errors import (
     IgtlMessageInvalid,
-    LimitReached,
-    PermissionDenied,
-    RateLimited,
     TooManyConnections,
-    Unauthenticated,
     statuses_of,
 )
 from ultragray_service.igtl.messages import DEVICE_NAME_BYTES, pack_text, unpack_text
 from ultragray_workers.errors import (
-    DeadlineExceeded,
     Draining,
-    NotReady,
-    QueueFull,
-    RegistrationNotFound,
-    SceneNotFound,
-    SceneTooLarge,
-    StorageUnavailable,
 )
 
 POSE_TYPES = ("TRANSFORM", "POSITION", "TDATA", "QTDATA")
@@ -244,32 +229,17 @@ def _placed(values: bytes, what: str) -> FloatArray:
 OK, UNKNOWN_ERROR, NOT_FOUND, ACCESS_DENIED, BUSY, TIMED_OUT = 1, 2, 4, 5, 6, 7
 CHECKSUM_ERROR, CONFIGURATION_ERROR, NO_RESOURCES, UNKNOWN_INSTRUCTION, NOT_READY, SHUTTING_DOWN = 9, 10, 11, 12, 13, 19
 
-_CODES: dict[type[UltragrayError], int] = {
-    SceneNotFound: NOT_FOUND,
-    RegistrationNotFound: NOT_FOUND,
-    PermissionDenied: ACCESS_DENIED,
-    Unauthenticated: ACCESS_DENIED,
-    QueueFull: BUSY,
-    TooManyConnections: BUSY,
-    RateLimited: BUSY,
-    LimitReached: BUSY,
-    DeadlineExceeded: TIMED_OUT,
-    InvalidArgument: CONFIGURATION_ERROR,
-    SceneFileInvalid: CONFIGURATION_ERROR,
-    MemoryExceeded: NO_RESOURCES,
-    SceneTooLarge: NO_RESOURCES,
-    IgtlMessageInvalid: UNKNOWN_INSTRUCTION,
-    BackendUnavailable: UNKNOWN_INSTRUCTION,
-    NotReady: NOT_READY,
-    StorageUnavailable: NOT_READY,
-    Draining: SHUTTING_DOWN,
+_CODES = {  # by the HTTP statuses of the same errors
+    **{400: UNKNOWN_INSTRUCTION, 401: ACCESS_DENIED, 403: ACCESS_DENIED, 404: NOT_FOUND, 422: CONFIGURATION_ERROR},
+    **{429: BUSY, 501: UNKNOWN_INSTRUCTION, 503: NOT_READY, 504: TIMED_OUT, 507: NO_RESOURCES},
 }
+_EXCEPTIONS = {TooManyConnections.reason: BUSY, Draining.reason: SHUTTING_DOWN}
 
 
 def state_of(error: UltragrayError) -> Status:
     """The state that tells an error: code of the list, HTTP status as sub-code, reason as name, detail as text."""
+    http = statuses_of(error).http
+    code = _EXCEPTIONS.get(error.reason) or _CODES.get(http, UNKNOWN_ERROR)
     if isinstance(error, IgtlMessageInvalid) and error.field == "crc":
         code = CHECKSUM_ERROR
-    else:
-        code = next((code for kind, code in _CODES.items() if isinstance(error, kind)), UNKNOWN_ERROR)
-    return Status(code, statuses_of(error).http, error.reason, error.detail)
+    return Status(code, http, error.reason, error.detail)

@@ -87,25 +87,17 @@ class SharedMemory:
 
 
 def _check_sizes(asked: rendering_pb2.SharedMemory) -> None:
-    if not _NAME.fullmatch(asked.name):
-        raise InvalidArgument(
-            f"{_FIELD}.name must be ultragray- and 32 hexadecimal digits, got {asked.name!r}", field=f"{_FIELD}.name"
-        )
-    if len(asked.token) != TOKEN_BYTES:
-        raise InvalidArgument(
-            f"{_FIELD}.token must have {TOKEN_BYTES} bytes, got {len(asked.token)}", field=f"{_FIELD}.token"
-        )
-    if not 1 <= asked.slots <= MAX_SLOTS:
-        raise InvalidArgument(
-            f"{_FIELD}.slots must be from 1 to {MAX_SLOTS}, got {asked.slots}", field=f"{_FIELD}.slots"
-        )
-    fits = asked.slot_bytes <= MAX_SLOT_BYTES and asked.slots * asked.slot_bytes <= MAX_BYTES
-    if not fits or asked.slot_bytes == 0 or asked.slot_bytes % PAGE_BYTES:
-        raise InvalidArgument(
-            f"{_FIELD}.slot_bytes must be a multiple of {PAGE_BYTES}, at most {MAX_SLOT_BYTES}, "
-            f"and at most {MAX_BYTES} for all slots together, got {asked.slot_bytes}",
-            field=f"{_FIELD}.slot_bytes",
-        )
+    slot_bytes = asked.slot_bytes
+    fits = 0 < slot_bytes <= MAX_SLOT_BYTES and asked.slots * slot_bytes <= MAX_BYTES and slot_bytes % PAGE_BYTES == 0
+    whole = f"at most {MAX_SLOT_BYTES}, and at most {MAX_BYTES} for all slots together"
+    for part, is_right, expected, given in (
+        ("name", _NAME.fullmatch(asked.name), "be ultragray- and 32 hexadecimal digits", repr(asked.name)),
+        ("token", len(asked.token) == TOKEN_BYTES, f"have {TOKEN_BYTES} bytes", len(asked.token)),
+        ("slots", 1 <= asked.slots <= MAX_SLOTS, f"be from 1 to {MAX_SLOTS}", asked.slots),
+        ("slot_bytes", fits, f"be a multiple of {PAGE_BYTES}, {whole}", slot_bytes),
+    ):
+        if not is_right:
+            raise InvalidArgument(f"{_FIELD}.{part} must {expected}, got {given}", field=f"{_FIELD}.{part}")
 
 
 def _refused(asked: rendering_pb2.SharedMemory, why: str) -> InvalidArgument:

@@ -17,7 +17,7 @@ from gymnasium import spaces
 from ultragray.contract import Contract, described
 from ultragray.errors import InvalidArgument, InvalidImageSize
 from ultragray.geometry.image_size import MAX_IMAGE_SIDE
-from ultragray.geometry.pose import check_poses, position_distances_mm, rotation_angles_deg
+from ultragray.geometry.pose import check_poses, rotation_angles_deg
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.geometry.rotations import about_axes, random_directions, rotations_of
 from ultragray.rendering.frames import render, touch_of
@@ -307,7 +307,7 @@ class StandardPlaneEnv(gymnasium.Env[Observation, npt.NDArray[np.float32]]):
     def _off_goal(self, pose: FloatArray) -> tuple[float, float]:
         """Distance of the middle of the face from that of the goal, mm, and the angle of the turn, degrees."""
         faces = [one @ _pivot(self._probe) for one in (pose, self.goal)]
-        distance = position_distances_mm(faces[0][None], faces[1][None])[0, 0]
+        distance = np.linalg.norm(faces[0][:3, 3] - faces[1][:3, 3])
         return float(distance), float(rotation_angles_deg(pose[None], self.goal[None])[0, 0])
 
 

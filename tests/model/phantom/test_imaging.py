@@ -12,8 +12,11 @@ from ultragray.errors import DatasetInvalid, InvalidPose
 from ultragray.phantom import Tissue, anatomy, bone_attenuation_db, imaging, simulate, tissue_at, tissues
 from ultragray.phantom import anatomy as bone
 from ultragray.phantom.anatomy import ACOUSTICS, FREQUENCY_MHZ
-from ultragray.phantom.imaging import NOTHING, PER_MM3, BoneShadow, ScattererField, Scatterers
+from ultragray.phantom.imaging import NOTHING, PER_MM3, ScattererField, Scatterers
 
+from ...scripts import benchmark
+
+BoneShadow = benchmark("bone_shadow").BoneShadow
 PROBE = LinearProbe(width_mm=24.0, near_mm=0.0, far_mm=50.0)
 HEIGHT, WIDTH = 214, 102  # about the phantom's own pixels
 SIZE = {"probe": PROBE, "height": HEIGHT, "width": WIDTH}
@@ -89,7 +92,7 @@ def test_speckle_has_the_statistics_of_three_independent_looks(monkeypatch):
     rng = np.random.default_rng(0)
     grid = imaging.Grid.of(PROBE, HEIGHT, WIDTH)
     cells = grid.cell_mm[0] * grid.cell_mm[1]
-    thickness = np.sqrt(np.pi) * imaging.acoustics.elevation_sigma_mm(grid.depths_mm)[:, None]  # of a weight squared
+    thickness = np.sqrt(np.pi) * imaging.anatomy.elevation_sigma_mm(grid.depths_mm)[:, None]  # of a weight squared
     looks = []
     for _ in range(3):
         noise = rng.normal(size=grid.shape) + 1j * rng.normal(size=grid.shape)

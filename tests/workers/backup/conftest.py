@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from pathlib import Path
-
 import pytest
 
 from ultragray.phantom.demo import copy_demo_scene
@@ -13,17 +10,16 @@ from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.scenes import SceneStore
 
-from ...postgres import NewDatabase
 from ..jobs.conftest import store_dataset
 
 
 @pytest.fixture
-def database_url(new_database: NewDatabase) -> str | None:
+def database_url(new_database):
     return new_database()
 
 
 @pytest.fixture
-def folders(tmp_path: Path) -> Folders:
+def folders(tmp_path):
     made = Folders(tmp_path / "data", tmp_path / "data" / "artifacts")
     store_dataset(made.artifacts, "tiny")
     copy_demo_scene(made.data / "demo.ugr")
@@ -31,25 +27,25 @@ def folders(tmp_path: Path) -> Folders:
 
 
 @pytest.fixture
-def elsewhere(tmp_path: Path) -> Folders:
+def elsewhere(tmp_path):
     """Where nothing is yet."""
     return Folders(tmp_path / "other" / "data", tmp_path / "other" / "artifacts")
 
 
 @pytest.fixture
-def backups(tmp_path: Path) -> Path:
+def backups(tmp_path):
     return tmp_path / "backups"
 
 
 @pytest.fixture
-def store(folders: Folders, database_url: str | None) -> Iterator[JobStore]:
+def store(folders, database_url):
     store = JobStore(folders.artifacts, database_url, scenes=SceneStore(folders.data))
     yield store
     store.close()
 
 
 @pytest.fixture
-def database(folders: Folders, database_url: str | None, store: JobStore) -> Iterator[JobDatabase]:
+def database(folders, database_url, store):
     """The queue below the store."""
     jobs = JobDatabase(folders.artifacts, database_url)
     yield jobs

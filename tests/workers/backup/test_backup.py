@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import fcntl
 import json
-from pathlib import Path
-from typing import Any
 
 import pytest
 import sqlalchemy as sa
@@ -13,54 +11,44 @@ import sqlalchemy as sa
 from ultragray.samplers import AroundSampler
 from ultragray_workers.backup import backing_up, manifest
 from ultragray_workers.backup.backing_up import back_up, verify
-from ultragray_workers.backup.contents import Folders
+from ultragray_workers.backup.contents import Folders, Objects
 from ultragray_workers.backup.database_copy import Database
-from ultragray_workers.backup.objects import Objects
 from ultragray_workers.backup.restoring import restore
 from ultragray_workers.errors import BackupInvalid, RestoreRefused
 from ultragray_workers.jobs import queue
-from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.progress import JobState
-from ultragray_workers.jobs.record import Files, Job, StoredFile
+from ultragray_workers.jobs.record import Files, StoredFile
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.tables import JOBS
 from ultragray_workers.scenes import SceneStore
 from ultragray_workers.storage.local import LocalStorage
 
-from ...postgres import NewDatabase
-
 ODD = "tab\there, line\nbreak, back\\slash, \\N, ünï©ode 🩻, 'quotes' \"both\""
 
 
-def submit(store: JobStore, name: str) -> Job:
+def submit(store, name):
     return store.submit(RenderJob(scene="demo", sampler=AroundSampler(2), height=16, width=16), request_id=name)[0]
 
 
-def set_row(database: JobDatabase, job: Job, **values: Any) -> None:
+def set_row(database, job, **values):
     """As the queue would."""
     with database.engine.begin() as connection:
         connection.execute(sa.update(JOBS).where(JOBS.c.id == job.id).values(**values))
 
 
-def restored(backups: Path, elsewhere: Folders, url: str | None) -> JobStore:
+def restored(backups, elsewhere, url):
     restore(backups, elsewhere, url)
     return JobStore(elsewhere.artifacts, url, scenes=SceneStore(elsewhere.data))
 
 
-def contents(folder: Path) -> dict[str, bytes]:
+def contents(folder):
     return {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
 
 
 def test_everything_comes_back_and_what_ran_waits_again(
-    store: JobStore,
-    database: JobDatabase,
-    folders: Folders,
-    backups: Path,
-    elsewhere: Folders,
-    database_url: str | None,
-    new_database: NewDatabase,
-) -> None:
+    store, database, folders, backups, elsewhere, database_url, new_database
+):
     waiting, running, done, odd = (submit(store, name) for name in ("waiting", "running", "done", ODD))
     checkpoint = StoredFile(f"jobs/{running.id}/2-1/run-1/checkpoint.safetensors", 3, "")
     LocalStorage(folders.artifacts).write(checkpoint.key, b"far")
@@ -91,26 +79,23 @@ def test_everything_comes_back_and_what_ran_waits_again(
     assert not (elsewhere.artifacts / "work").exists()
     assert (elsewhere.data / "demo.ugr").read_bytes() == (folders.data / "demo.ugr").read_bytes()
     again = queue.row_of(other.database.engine, running.id)
-    assert again is not None
     assert again.files == files
     newer = submit(other, "newer")
     assert other.list()[0][0].id == newer.id
     other.close()
 
 
-def test_second_backup_copies_only_what_is_new_and_old_ones_go(
-    store: JobStore, folders: Folders, backups: Path, database_url: str | None, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_second_backup_copies_only_what_is_new_and_old_ones_go(store, folders, backups, database_url, monkeypatch):
     submit(store, "one")
     first = back_up(folders, database_url, backups)
     assert first.new_files > 0
     gone = folders.artifacts / "scenes" / "gone.ugr"
     gone.parent.mkdir()
     gone.write_bytes(b"of the second backup alone")
-    read: list[Path] = []
+    read = []
     add = Objects.add
 
-    def noted(self: Objects, source: Path, **options: Any) -> Any:
+    def noted(self, source, **options):
         read.append(source)
         return add(self, source, **options)
 
@@ -128,9 +113,7 @@ def test_second_backup_copies_only_what_is_new_and_old_ones_go(
     assert [bad for _, bad in verify(backups)] == [[]]
 
 
-def test_damage_is_found_and_nothing_is_changed_by_its_restore(
-    store: JobStore, folders: Folders, backups: Path, elsewhere: Folders, database_url: str | None
-) -> None:
+def test_damage_is_found_and_nothing_is_changed_by_its_restore(store, folders, backups, elsewhere, database_url):
     submit(store, "one")
     made = back_up(folders, database_url, backups).manifest
     scene = next(entry for entry in made.files if entry.path == "demo.ugr")
@@ -152,21 +135,14 @@ def test_damage_is_found_and_nothing_is_changed_by_its_restore(
 
 
 def test_jobs_that_go_while_files_are_copied_are_gone_after_the_restore(
-    store: JobStore,
-    database: JobDatabase,
-    folders: Folders,
-    backups: Path,
-    elsewhere: Folders,
-    database_url: str | None,
-    new_database: NewDatabase,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    store, database, folders, backups, elsewhere, database_url, new_database, monkeypatch
+):
     stays, goes, ends = (submit(store, name) for name in ("stays", "goes", "ends"))
     set_row(database, goes, state="succeeded")
-    late: list[Job] = []
+    late = []
     snapshot = Database.snapshot
 
-    def then_they_go(self: Database, objects: Objects, work: Path) -> Any:
+    def then_they_go(self, objects, work):
         taken = snapshot(self, objects, work)
         if not late:
             store.delete(goes.id)
@@ -185,9 +161,7 @@ def test_jobs_that_go_while_files_are_copied_are_gone_after_the_restore(
     other.close()
 
 
-def test_backup_of_another_release_is_refused(
-    store: JobStore, folders: Folders, backups: Path, elsewhere: Folders, database_url: str | None
-) -> None:
+def test_backup_of_another_release_is_refused(store, folders, backups, elsewhere, database_url):
     submit(store, "one")
     made = back_up(folders, database_url, backups).manifest
     assert made.database is not None
@@ -203,7 +177,7 @@ def test_backup_of_another_release_is_refused(
             restore(backups, elsewhere, database_url)
 
 
-def test_place_that_cannot_be(folders: Folders, backups: Path, tmp_path: Path) -> None:
+def test_place_that_cannot_be(folders, backups, tmp_path):
     with pytest.raises(RestoreRefused, match="lies within"):
         back_up(folders, None, folders.artifacts / "backups")
     with pytest.raises(RestoreRefused, match="must be an existing folder"):
@@ -217,7 +191,7 @@ def test_place_that_cannot_be(folders: Folders, backups: Path, tmp_path: Path) -
             back_up(folders, None, backups)
 
 
-def test_manifest_that_points_outside_is_refused(folders: Folders, backups: Path, elsewhere: Folders) -> None:
+def test_manifest_that_points_outside_is_refused(folders, backups, elsewhere):
     made = back_up(folders, None, backups).manifest
     path = backups / "manifests" / f"{made.name}.json"
     document = json.loads(path.read_text())

@@ -4,29 +4,21 @@ from __future__ import annotations
 
 import hashlib
 import json
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import pytest
 import sqlalchemy as sa
 
 from ultragray_workers.backup import restoring
 from ultragray_workers.backup.backing_up import back_up
-from ultragray_workers.backup.contents import Folders
 from ultragray_workers.backup.restoring import restore
 from ultragray_workers.errors import BackupInvalid, RestoreRefused, StartupFailed
 from ultragray_workers.jobs import tables
-from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.store import JobStore
 
-from ...postgres import NewDatabase
 from .test_backup import contents, submit
 
 
-def test_nothing_is_overwritten_unasked(
-    store: JobStore, folders: Folders, backups: Path, database_url: str | None, new_database: NewDatabase
-) -> None:
+def test_nothing_is_overwritten_unasked(store, folders, backups, database_url, new_database):
     kept = submit(store, "kept")
     back_up(folders, database_url, backups)
     submit(store, "later")
@@ -45,8 +37,8 @@ def test_nothing_is_overwritten_unasked(
 
 @pytest.mark.parametrize("kind", ["file", "link", "folder"])
 def test_what_stands_in_the_way_is_named_before_anything_changes(
-    kind: str, store: JobStore, folders: Folders, backups: Path, elsewhere: Folders, database_url: str | None
-) -> None:
+    kind, store, folders, backups, elsewhere, database_url
+):
     back_up(folders, database_url, backups)
     elsewhere.artifacts.mkdir(parents=True)
     outside = elsewhere.data.parent / "outside"
@@ -63,7 +55,7 @@ def test_what_stands_in_the_way_is_named_before_anything_changes(
     assert not list(outside.iterdir())
 
 
-def forged(backups: Path, change: Callable[[dict[str, Any]], None]) -> None:
+def forged(backups, change):
     """Changes the only list of a folder of backups, and its hash."""
     (path,) = (backups / "manifests").glob("*.json")
     document = json.loads(path.read_text())
@@ -86,24 +78,14 @@ def forged(backups: Path, change: Callable[[dict[str, Any]], None]) -> None:
         ),
     ],
 )
-def test_lists_that_no_backup_has_are_damaged(
-    change: Callable[[dict[str, Any]], None],
-    expected: str,
-    store: JobStore,
-    folders: Folders,
-    backups: Path,
-    elsewhere: Folders,
-    database_url: str | None,
-) -> None:
+def test_lists_that_no_backup_has_are_damaged(change, expected, store, folders, backups, elsewhere, database_url):
     back_up(folders, database_url, backups)
     forged(backups, change)
     with pytest.raises(BackupInvalid, match=expected):
         restore(backups, elsewhere, database_url)
 
 
-def test_database_with_jobs_is_not_overwritten_by_another_folder(
-    store: JobStore, folders: Folders, backups: Path, elsewhere: Folders, database_url: str | None
-) -> None:
+def test_database_with_jobs_is_not_overwritten_by_another_folder(store, folders, backups, elsewhere, database_url):
     submit(store, "one")
     back_up(folders, database_url, backups)
     if database_url is None:  # each folder has a file of its own
@@ -115,21 +97,14 @@ def test_database_with_jobs_is_not_overwritten_by_another_folder(
 @pytest.mark.long
 @pytest.mark.parametrize("step", ["_write_files", "_load_database", "_let_jobs_go_on"])
 def test_interrupted_restore_goes_on_and_is_seen_by_nobody_before(
-    step: str,
-    store: JobStore,
-    folders: Folders,
-    backups: Path,
-    elsewhere: Folders,
-    database_url: str | None,
-    new_database: NewDatabase,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    step, store, folders, backups, elsewhere, database_url, new_database, monkeypatch
+):
     jobs = {submit(store, name).id for name in ("one", "two")}
     back_up(folders, database_url, backups)
     url = new_database()
     whole = getattr(restoring, step)
 
-    def interrupted(*arguments: Any) -> None:
+    def interrupted(*arguments):
         whole(*arguments)
         raise KeyboardInterrupt
 
@@ -150,8 +125,8 @@ def test_interrupted_restore_goes_on_and_is_seen_by_nobody_before(
 
 
 def test_restore_of_an_older_backup_brings_back_a_database_of_a_newer_release(
-    store: JobStore, database: JobDatabase, folders: Folders, backups: Path, database_url: str | None
-) -> None:
+    store, database, folders, backups, database_url
+):
     job = submit(store, "one")
     back_up(folders, database_url, backups)
     with database.engine.begin() as connection:
@@ -166,9 +141,7 @@ def test_restore_of_an_older_backup_brings_back_a_database_of_a_newer_release(
     again.close()
 
 
-def test_backup_of_the_other_kind_of_database_is_refused(
-    store: JobStore, folders: Folders, backups: Path, elsewhere: Folders, database_url: str | None
-) -> None:
+def test_backup_of_the_other_kind_of_database_is_refused(store, folders, backups, elsewhere, database_url):
     back_up(folders, database_url, backups)
     other = "postgresql://nobody@127.0.0.1:1/none" if database_url is None else None
     with pytest.raises(RestoreRefused, match="the backup holds a database of the kind"):

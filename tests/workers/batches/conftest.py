@@ -1,8 +1,5 @@
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -13,7 +10,6 @@ from ultragray.rendering.settings import FrameSettings
 from ultragray.samplers import AroundSampler
 from ultragray.scene.info import read_header
 from ultragray_workers.storage.location import open_storage
-from ultragray_workers.storage.storage import Storage
 
 PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 TRAINING = np.tile(np.eye(4), (6, 1, 1))
@@ -21,7 +17,7 @@ TRAINING[:, 1, 3] = np.arange(6)
 
 
 @pytest.fixture
-def scene_file(tmp_path: Path, random_scene: Callable[..., GaussianScene]) -> Path:
+def scene_file(tmp_path, random_scene):
     made = random_scene(60, info={"probe": PROBE, "image_height": 24, "image_width": 20})
     path = tmp_path / "one.ugr"
     GaussianScene.from_splats(made.splats, info=made.info, training_poses=TRAINING).save(path)
@@ -29,25 +25,25 @@ def scene_file(tmp_path: Path, random_scene: Callable[..., GaussianScene]) -> Pa
 
 
 @pytest.fixture
-def plan(scene_file: Path) -> BatchPlan:
+def plan(scene_file):
     """110 frames in three shards."""
     return plan_of(scene_file, 110, 40)
 
 
 @pytest.fixture
-def nothing_left_behind() -> None:
+def nothing_left_behind():
     """Instead of the one for pools: there are none here, and obstore keeps its connections."""
 
 
 @pytest.fixture(params=["folder", pytest.param("bucket", marks=pytest.mark.slow)])
-def storage(request: pytest.FixtureRequest, tmp_path: Path) -> Storage:
+def storage(request, tmp_path):
     """An empty storage: a folder, or a bucket of a real S3 server."""
     if request.param == "folder":
         return open_storage(tmp_path / "storage")
     return open_storage(request.getfixturevalue("new_bucket")(), patience_s=5)
 
 
-def plan_of(scene_file: Path, count: int, shard_frames: int) -> BatchPlan:
+def plan_of(scene_file, count, shard_frames):
     return BatchPlan.prepared(
         read_header(scene_file),
         FrameSettings(),

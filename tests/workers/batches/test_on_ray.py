@@ -8,7 +8,6 @@ import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
@@ -27,7 +26,7 @@ pytest.importorskip("ray", reason="Ray is not installed: pip install 'ultragray[
 pytestmark = [pytest.mark.slow, pytest.mark.filterwarnings("ignore")]  # of Ray's own
 
 
-def shard_processes() -> list[int]:
+def shard_processes():
     """The processes of the cluster that make shards."""
     found = []
     for folder in Path("/proc").glob("[0-9]*"):
@@ -39,14 +38,12 @@ def shard_processes() -> list[int]:
     return found
 
 
-def test_files_are_those_of_one_process_though_a_worker_is_killed_and_made_once(
-    scene_file: Path, tmp_path: Path
-) -> None:
+def test_files_are_those_of_one_process_though_a_worker_is_killed_and_made_once(scene_file, tmp_path):
     plan = plan_of(scene_file, 20_000, 1_000)
-    killed: list[int] = []
-    told: list[int] = []
+    killed = []
+    told = []
 
-    def report(frames: int) -> None:
+    def report(frames):
         told.append(frames)
         if frames and not killed and (found := shard_processes()):
             killed.append(found[0])
@@ -71,16 +68,14 @@ def test_files_are_those_of_one_process_though_a_worker_is_killed_and_made_once(
         RayBatch(plan_of(scene_file, 20_001, 1_000), scene_file, str(folder)).render("ray", told.append)
 
 
-def test_a_release_of_the_cluster_that_differs_is_told(
-    scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_release_of_the_cluster_that_differs_is_told(scene_file, tmp_path, monkeypatch):
     monkeypatch.setattr(on_ray.ultragray, "__version__", "99.0")
     with pytest.raises(Exception, match=r"shard 0: the Ray cluster has ultragray .*, this is 99\.0"):
         RayBatch(plan_of(scene_file, 20, 20), scene_file, str(tmp_path / "made")).render("ray", lambda frames: None)
 
 
 @pytest.fixture
-def head(tmp_path: Path) -> Iterator[str]:
+def head(tmp_path):
     """The address of a cluster that runs by itself, as others' clusters do."""
     with contextlib.ExitStack() as held:
         free = [held.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(2)]
@@ -98,27 +93,25 @@ def head(tmp_path: Path) -> Iterator[str]:
         process.wait(60)
 
 
-def _answers(port: int) -> bool:
+def _answers(port):
     with contextlib.suppress(OSError), socket.create_connection(("127.0.0.1", port), timeout=1):
         return True
     return False
 
 
 @pytest.mark.long
-def test_a_cluster_of_others_is_reached_by_its_address_and_goes_on_after_the_batch(
-    head: str, scene_file: Path, tmp_path: Path
-) -> None:
+def test_a_cluster_of_others_is_reached_by_its_address_and_goes_on_after_the_batch(head, scene_file, tmp_path):
     for number in (1, 2):
         plan = plan_of(scene_file, 400, 100)
         folder = tmp_path / f"made{number}"
-        told: list[int] = []
+        told = []
         RayBatch(plan, scene_file, str(folder)).render(head, told.append)
         assert told[-1] == 400
         ShardRenderer(plan, scene_file, torch.device("cpu")).render(3, tmp_path / "shard.tar")
         assert (tmp_path / "shard.tar").read_bytes() == (folder / plan.file_name(3)).read_bytes()
 
 
-def test_a_cluster_that_is_not_there_is_told_in_one_sentence(scene_file: Path, tmp_path: Path) -> None:
+def test_a_cluster_that_is_not_there_is_told_in_one_sentence(scene_file, tmp_path):
     with socket.create_server(("127.0.0.1", 0)) as free:
         port = free.getsockname()[1]
     with pytest.raises(BackendUnavailable, match=f"the Ray cluster ray://127.0.0.1:{port} cannot be used"):

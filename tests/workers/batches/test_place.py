@@ -3,30 +3,25 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
 import torch
 
 from ultragray.errors import InvalidArgument
-from ultragray.exchange.batches import BatchPlan
 from ultragray.exchange.shards import ShardRenderer
 from ultragray_workers.batches.place import ShardPlace
 from ultragray_workers.storage.location import open_storage
-from ultragray_workers.storage.storage import Storage
 
 from .conftest import plan_of
 
 
-def make(place: ShardPlace, scene_file: Path, folder: Path, shard: int) -> None:
+def make(place, scene_file, folder, shard):
     path = folder / f"{shard}.tar"
     place.keep(path, shard, ShardRenderer(place.plan, scene_file, torch.device("cpu")).render(shard, path))
     path.unlink()
 
 
-def test_a_batch_comes_together_whatever_happens_to_its_shards(
-    storage: Storage, plan: BatchPlan, scene_file: Path, tmp_path: Path
-) -> None:
+def test_a_batch_comes_together_whatever_happens_to_its_shards(storage, plan, scene_file, tmp_path):
     place = ShardPlace(storage, "some/batch", plan)
     assert place.whole() == []
     for shard in (2, 0):
@@ -53,9 +48,7 @@ def test_a_batch_comes_together_whatever_happens_to_its_shards(
     assert sum(shard["frames"] for shard in manifest["shards"]) == 110
 
 
-def test_shards_of_another_plan_do_not_count(
-    storage: Storage, plan: BatchPlan, scene_file: Path, tmp_path: Path
-) -> None:
+def test_shards_of_another_plan_do_not_count(storage, plan, scene_file, tmp_path):
     make(ShardPlace(storage, "batch", plan), scene_file, tmp_path, 0)
     other = ShardPlace(storage, "batch", plan_of(scene_file, 111, 40))
     assert other.whole() == []
@@ -64,7 +57,7 @@ def test_shards_of_another_plan_do_not_count(
         other.is_finished()
 
 
-def test_a_damaged_shard_of_a_folder_is_made_again(plan: BatchPlan, scene_file: Path, tmp_path: Path) -> None:
+def test_a_damaged_shard_of_a_folder_is_made_again(plan, scene_file, tmp_path):
     place = ShardPlace(open_storage(tmp_path / "folder"), "", plan)
     make(place, scene_file, tmp_path, 0)
     path = tmp_path / "folder" / "frames-000000.tar"

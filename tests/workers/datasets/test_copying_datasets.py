@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from pathlib import Path
 
 import pytest
 
@@ -16,15 +15,15 @@ from ..jobs.conftest import store_dataset
 
 
 @pytest.fixture
-def artifacts(tmp_path: Path) -> Path:
+def artifacts(tmp_path):
     for name in ("one", "two"):
         store_dataset(tmp_path / "artifacts", name)
     return tmp_path / "artifacts"
 
 
-def test_datasets_are_copied_once_and_read_as_they_were(artifacts: Path, tmp_path: Path) -> None:
+def test_datasets_are_copied_once_and_read_as_they_were(artifacts, tmp_path):
     bucket = LocalStorage(tmp_path / "bucket")
-    said: list[str] = []
+    said = []
     assert copy_datasets(LocalStorage(artifacts), bucket, said.append) == CopiedDatasets(2, 0)
     assert said == ["1 of 2: dataset one copied", "2 of 2: dataset two copied"]
     copies = DatasetStore(tmp_path / "host", bucket)
@@ -35,7 +34,7 @@ def test_datasets_are_copied_once_and_read_as_they_were(artifacts: Path, tmp_pat
     assert copy_datasets(LocalStorage(artifacts), bucket) == CopiedDatasets(1, 1)
 
 
-def test_another_dataset_of_that_name_stays(artifacts: Path, tmp_path: Path) -> None:
+def test_another_dataset_of_that_name_stays(artifacts, tmp_path):
     bucket = LocalStorage(tmp_path / "bucket")
     copy_datasets(LocalStorage(artifacts), bucket)
     manifest = artifacts / "datasets" / "one.json"

@@ -4,9 +4,6 @@ import contextlib
 import json
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -16,15 +13,14 @@ from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
 from ultragray.errors import DatasetInvalid, InvalidArgument
 from ultragray_workers import claims
-from ultragray_workers.datasets.incoming import IncomingDataset, remove_stale
-from ultragray_workers.datasets.intake import take_in
+from ultragray_workers.datasets.intake import IncomingDataset, remove_stale, take_in
 from ultragray_workers.datasets.store import DatasetStore, check_dataset_name
 from ultragray_workers.errors import DatasetExists, DatasetInUse, DatasetNotFound
 
 from ...dicom_files import write_cine
 
 
-def sweep(count: int, offset_mm: float) -> Sweep:
+def sweep(count, offset_mm):
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, 1, 3] = np.arange(count) + offset_mm
     images = np.random.default_rng(count).integers(0, 250, (count, 20, 16), dtype=np.uint8)
@@ -32,26 +28,23 @@ def sweep(count: int, offset_mm: float) -> Sweep:
 
 
 @pytest.fixture
-def files(tmp_path: Path) -> dict[str, bytes]:
+def files(tmp_path):
     """A dataset of the released layout: 8 training and 3 held-out frames of 20x16."""
     write_released(Dataset("tiny", sweep(8, 0.0), sweep(3, 0.5)), tmp_path / "tiny")
     return {path.name: path.read_bytes() for path in (tmp_path / "tiny").iterdir()}
 
 
 @pytest.fixture
-def store(tmp_path: Path) -> DatasetStore:
+def store(tmp_path):
     return DatasetStore(tmp_path / "artifacts")
 
 
-Receive = Callable[[dict[str, bytes]], IncomingDataset]
-
-
 @pytest.fixture
-def receive(store: DatasetStore) -> Iterator[Receive]:
+def receive(store):
     """Uploads files; what is left of them goes at the end."""
     with contextlib.ExitStack() as stack:
 
-        def receive_files(files: dict[str, bytes]) -> IncomingDataset:
+        def receive_files(files):
             incoming = IncomingDataset(store, 10_000_000)
             stack.callback(incoming.discard)
             for name, content in files.items():
@@ -63,22 +56,20 @@ def receive(store: DatasetStore) -> Iterator[Receive]:
         yield receive_files
 
 
-def arguments(incoming: IncomingDataset, name: str = "tiny", **options: str) -> dict[str, Any]:
+def arguments(incoming, name="tiny", **options):
     return {"folder": str(incoming.folder), "name": name, "options": options, "max_bytes": 10_000_000}
 
 
-def leftovers(store: DatasetStore) -> list[str]:
+def leftovers(store):
     return sorted(path.name for path in store.folder.iterdir())
 
 
-def npy(tmp_path: Path, array: np.ndarray) -> bytes:
+def npy(tmp_path, array):
     np.save(tmp_path / "array.npy", array)
     return (tmp_path / "array.npy").read_bytes()
 
 
-def test_an_upload_becomes_a_dataset_that_training_reads(
-    store: DatasetStore, receive: Receive, files: dict[str, bytes]
-) -> None:
+def test_an_upload_becomes_a_dataset_that_training_reads(store, receive, files):
     incoming = receive(files)
     assert store.names() == []
     take_in(**arguments(incoming, train_frames="0:6"))
@@ -94,9 +85,7 @@ def test_an_upload_becomes_a_dataset_that_training_reads(
     assert store.contact_sheet("tiny").startswith(b"\x89PNG")
 
 
-def test_warnings_of_the_check_are_kept(
-    store: DatasetStore, receive: Receive, files: dict[str, bytes], tmp_path: Path
-) -> None:
+def test_warnings_of_the_check_are_kept(store, receive, files, tmp_path):
     images = sweep(8, 0.0).images.copy()
     images[3] = images[3] // 40
     incoming = receive({**files, "images_train.npy": npy(tmp_path, images)})
@@ -105,13 +94,13 @@ def test_warnings_of_the_check_are_kept(
     assert warning.startswith("train: frames 3 are nearly black")
 
 
-def poisoned(tmp_path: Path, files: dict[str, bytes]) -> dict[str, bytes]:
+def poisoned(tmp_path, files):
     poses = sweep(8, 0.0).poses.copy()
     poses[5, 0, 0] = np.nan
     return {**files, "poses_train.npy": npy(tmp_path, poses)}
 
 
-def changed_config(files: dict[str, bytes], **changes: object) -> dict[str, bytes]:
+def changed_config(files, **changes):
     return {**files, "conf.json": json.dumps({**json.loads(files["conf.json"]), **changes}).encode()}
 
 
@@ -137,14 +126,7 @@ def changed_config(files: dict[str, bytes], **changes: object) -> dict[str, byte
     ],
     ids=["NaN pose", "truncated", "no conf.json", "a file missing", "two datasets", "bad JSON", "nothing"],
 )
-def test_what_is_refused_in_one_sentence(
-    change: Callable[..., dict[str, bytes]],
-    expected: str,
-    store: DatasetStore,
-    receive: Receive,
-    files: dict[str, bytes],
-    tmp_path: Path,
-) -> None:
+def test_what_is_refused_in_one_sentence(change, expected, store, receive, files, tmp_path):
     incoming = receive(change(tmp_path, files))
     with pytest.raises(DatasetInvalid, match=expected) as caught:
         take_in(**arguments(incoming))
@@ -153,9 +135,7 @@ def test_what_is_refused_in_one_sentence(
     assert leftovers(store) == []
 
 
-def test_conf_json_reads_no_file_but_those_of_the_upload(
-    store: DatasetStore, receive: Receive, files: dict[str, bytes], tmp_path: Path
-) -> None:
+def test_conf_json_reads_no_file_but_those_of_the_upload(store, receive, files, tmp_path):
     secret = tmp_path / "secret.npy"
     secret.write_bytes(files["images_train.npy"])
     for named in (str(secret), "../../../../../secret.npy"):
@@ -164,9 +144,7 @@ def test_conf_json_reads_no_file_but_those_of_the_upload(
             take_in(**arguments(incoming))
 
 
-def test_conf_json_does_not_tell_which_files_there_are_outside_the_upload(
-    store: DatasetStore, receive: Receive, files: dict[str, bytes], tmp_path: Path
-) -> None:
+def test_conf_json_does_not_tell_which_files_there_are_outside_the_upload(store, receive, files, tmp_path):
     (tmp_path / "there.npy").write_bytes(b"no array")
     for folder in (f"{tmp_path}/", "../../../../../", "x/../../../../../../"):
         refusals = set()
@@ -178,9 +156,7 @@ def test_conf_json_does_not_tell_which_files_there_are_outside_the_upload(
         assert len(refusals) == 1
 
 
-def test_a_path_of_another_machine_is_found_by_its_name_in_the_upload(
-    store: DatasetStore, receive: Receive, files: dict[str, bytes], tmp_path: Path
-) -> None:
+def test_a_path_of_another_machine_is_found_by_its_name_in_the_upload(store, receive, files, tmp_path):
     other = tmp_path / "images_train.npy"
     other.write_bytes(npy(tmp_path, sweep(3, 0.0).images))
     incoming = receive(changed_config(files, images_file_train=str(other)))
@@ -188,9 +164,7 @@ def test_a_path_of_another_machine_is_found_by_its_name_in_the_upload(
     assert incoming.accept("tiny")[0].train_frames == 8
 
 
-def test_options_are_named_as_requests_write_them(
-    store: DatasetStore, receive: Receive, files: dict[str, bytes]
-) -> None:
+def test_options_are_named_as_requests_write_them(store, receive, files):
     for options, field in (({"train_frames": "0:99"}, "train_frames"), ({"crop": "0:2,0:2"}, "crop")):
         with pytest.raises(InvalidArgument, match=rf"^{field}") as caught:
             take_in(**arguments(receive(files), **options))
@@ -198,7 +172,7 @@ def test_options_are_named_as_requests_write_them(
         assert "--" not in caught.value.detail
 
 
-def run_intake(given: dict[str, Any], memory_bytes: int) -> subprocess.CompletedProcess[str]:
+def run_intake(given, memory_bytes):
     program = (
         "from ultragray_workers.datasets.intake import take_in; "
         "from ultragray_workers.helpers import answer_request; answer_request(take_in)"
@@ -207,9 +181,7 @@ def run_intake(given: dict[str, Any], memory_bytes: int) -> subprocess.Completed
     return subprocess.run([sys.executable, "-c", program], input=json.dumps(request), capture_output=True, text=True)
 
 
-def test_memory_beyond_the_limit_is_one_clear_error(
-    store: DatasetStore, receive: Receive, files: dict[str, bytes], tmp_path: Path
-) -> None:
+def test_memory_beyond_the_limit_is_one_clear_error(store, receive, files, tmp_path):
     large = changed_config(files, images_file_train="large.npy")
     incoming = receive(large)
     with (incoming.folder / "dataset" / "files" / "large.npy").open("wb") as file:
@@ -223,7 +195,7 @@ def test_memory_beyond_the_limit_is_one_clear_error(
     assert answer["detail"].startswith("checking the dataset takes more than 512 MiB")
 
 
-def add(store: DatasetStore, receive: Receive, files: dict[str, bytes], name: str, **options: str) -> bool:
+def add(store, receive, files, name, **options):
     incoming = receive(files)
     take_in(**arguments(incoming, name, **options))
     is_new = incoming.accept(name)[1]
@@ -231,7 +203,7 @@ def add(store: DatasetStore, receive: Receive, files: dict[str, bytes], name: st
     return is_new
 
 
-def test_the_same_content_twice_is_one_dataset(store: DatasetStore, receive: Receive, files: dict[str, bytes]) -> None:
+def test_the_same_content_twice_is_one_dataset(store, receive, files):
     assert add(store, receive, files, "tiny")
     before = store.get("tiny")
     assert not add(store, receive, {f"deeper/{name}": content for name, content in files.items()}, "tiny")
@@ -241,9 +213,7 @@ def test_the_same_content_twice_is_one_dataset(store: DatasetStore, receive: Rec
     assert store.names() == ["tiny"]
 
 
-def test_a_manifest_of_an_unknown_format_is_damaged(
-    store: DatasetStore, receive: Receive, files: dict[str, bytes]
-) -> None:
+def test_a_manifest_of_an_unknown_format_is_damaged(store, receive, files):
     add(store, receive, files, "tiny")
     manifest = store.folder.parent / "datasets" / "tiny.json"
     manifest.write_text(manifest.read_text().replace('"released"', '"nifti"'))
@@ -251,7 +221,7 @@ def test_a_manifest_of_an_unknown_format_is_damaged(
         store.load("tiny")
 
 
-def test_deletion(store: DatasetStore, receive: Receive, files: dict[str, bytes]) -> None:
+def test_deletion(store, receive, files):
     add(store, receive, files, "tiny")
     with pytest.raises(DatasetInUse, match=r"needed by job 7 \(tiny\)"):
         store.delete("tiny", lambda name: f"job 7 ({name})")
@@ -264,16 +234,14 @@ def test_deletion(store: DatasetStore, receive: Receive, files: dict[str, bytes]
 
 
 @pytest.mark.parametrize("name", ["", "..", ".incoming-1", "a/b", "x" * 129, "ü", "a\n"])
-def test_names_that_no_dataset_has(store: DatasetStore, name: str) -> None:
+def test_names_that_no_dataset_has(store, name):
     with pytest.raises(InvalidArgument):
         check_dataset_name(name)
     with pytest.raises(DatasetNotFound):
         store.delete(name)
 
 
-def test_only_what_nobody_holds_is_stale(
-    store: DatasetStore, receive: Receive, files: dict[str, bytes], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_only_what_nobody_holds_is_stale(store, receive, files, monkeypatch):
     under_way = receive(files)
     (store.folder / ".incoming-dead").mkdir()
     (store.folder / ".incoming-dead" / "lock").write_bytes(b"")
@@ -286,7 +254,7 @@ def test_only_what_nobody_holds_is_stale(
     assert under_way.accept("tiny")[1]
 
 
-def test_nothing_is_written_after_a_discard(store: DatasetStore) -> None:
+def test_nothing_is_written_after_a_discard(store):
     incoming = IncomingDataset(store, 1000)
     incoming.begin_file("a")
     incoming.discard()
@@ -296,15 +264,15 @@ def test_nothing_is_written_after_a_discard(store: DatasetStore) -> None:
     assert leftovers(store) == []
 
 
-def test_importing_the_store_and_the_intake_needs_no_torch() -> None:
+def test_importing_the_store_and_the_intake_needs_no_torch():
     code = (
         "import sys, ultragray_workers.datasets.store, ultragray_workers.datasets.intake, "
-        "ultragray_workers.datasets.incoming; sys.exit('torch' in sys.modules or 'matplotlib' in sys.modules)"
+        "ultragray_workers.datasets.intake; sys.exit('torch' in sys.modules or 'matplotlib' in sys.modules)"
     )
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
-def test_a_cine_loop_with_its_poses_becomes_a_dataset(store: DatasetStore, receive: Receive, tmp_path: Path) -> None:
+def test_a_cine_loop_with_its_poses_becomes_a_dataset(store, receive, tmp_path):
     path = write_cine(tmp_path)
     incoming = receive({f"deep/{name}": (tmp_path / name).read_bytes() for name in (path.name, "sweep.poses.npy")})
     take_in(**arguments(incoming, crop="4:24,2:22"))

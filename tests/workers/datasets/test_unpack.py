@@ -3,8 +3,6 @@ from __future__ import annotations
 import io
 import tarfile
 import zipfile
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 
@@ -16,14 +14,14 @@ from ultragray_workers.errors import UploadTooLarge
 LIMIT_BYTES = 100_000
 
 
-def zip_of(path: Path, entries: dict[str, bytes]) -> Path:
+def zip_of(path, entries):
     with zipfile.ZipFile(path, "w", zipfile.ZIP_DEFLATED) as archive:
         for name, content in entries.items():
             archive.writestr(zipfile.ZipInfo(name), content, zipfile.ZIP_DEFLATED)
     return path
 
 
-def tar_of(path: Path, entries: dict[str, bytes], mode: str = "w") -> Path:
+def tar_of(path, entries, mode="w"):
     with tarfile.open(path, mode) as archive:  # type: ignore[call-overload]
         for name, content in entries.items():
             entry = tarfile.TarInfo(name)
@@ -32,7 +30,7 @@ def tar_of(path: Path, entries: dict[str, bytes], mode: str = "w") -> Path:
     return path
 
 
-def zip_with_link(path: Path) -> Path:
+def zip_with_link(path):
     entry = zipfile.ZipInfo("link")
     entry.external_attr = 0o120777 << 16
     with zipfile.ZipFile(path, "w") as archive:
@@ -40,8 +38,8 @@ def zip_with_link(path: Path) -> Path:
     return path
 
 
-def tar_with(kind: bytes) -> Callable[[Path], Path]:
-    def make(path: Path) -> Path:
+def tar_with(kind):
+    def make(path):
         entry = tarfile.TarInfo("entry")
         entry.type, entry.linkname = kind, "../../outside"
         with tarfile.open(path, "w") as archive:
@@ -51,12 +49,12 @@ def tar_with(kind: bytes) -> Callable[[Path], Path]:
     return make
 
 
-def files_below(folder: Path) -> dict[str, bytes]:
+def files_below(folder):
     return {str(path.relative_to(folder)): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
 @pytest.fixture
-def target(tmp_path: Path) -> Path:
+def target(tmp_path):
     folder = tmp_path / "deep" / "files"
     folder.mkdir(parents=True)
     return folder
@@ -70,7 +68,7 @@ CONTENT = {"liver/conf.json": b"{}", "liver/data/images.npy": b"\0" * 50_000, ".
     [zip_of, tar_of, lambda path, entries: tar_of(path, entries, "w:gz")],
     ids=["zip", "tar", "tar.gz"],
 )
-def test_every_kind_gives_the_same_files(make: Callable[..., Path], tmp_path: Path, target: Path) -> None:
+def test_every_kind_gives_the_same_files(make, tmp_path, target):
     unpack(make(tmp_path / "archive", CONTENT), target, LIMIT_BYTES)
     assert files_below(target) == {name.removeprefix("./"): content for name, content in CONTENT.items()}
 
@@ -79,9 +77,7 @@ def test_every_kind_gives_the_same_files(make: Callable[..., Path], tmp_path: Pa
 @pytest.mark.parametrize(
     "name", ["../evil", "a/../../evil", "/evil", "..", "a\\..\\evil", "new\nline", "x" * 300, "a/" * 300 + "b"]
 )
-def test_paths_that_leave_the_folder_or_are_no_text(
-    make: Callable[..., Path], name: str, tmp_path: Path, target: Path
-) -> None:
+def test_paths_that_leave_the_folder_or_are_no_text(make, name, tmp_path, target):
     with pytest.raises(DatasetInvalid, match="plain paths"):
         unpack(make(tmp_path / "archive", {"good": b"1", name: b"2"}), target, LIMIT_BYTES)
     assert {path.name for path in tmp_path.rglob("*") if path.is_file()} == {"archive", "good"}
@@ -95,14 +91,14 @@ def test_paths_that_leave_the_folder_or_are_no_text(
     ],
     ids=["zip link", "link", "hard link", "device", "pipe"],
 )
-def test_links_and_devices(make: Callable[[Path], Path], tmp_path: Path, target: Path) -> None:
+def test_links_and_devices(make, tmp_path, target):
     with pytest.raises(DatasetInvalid, match="no links and no devices"):
         unpack(make(tmp_path / "archive"), target, LIMIT_BYTES)
     assert not list(target.iterdir())
 
 
 @pytest.mark.parametrize("make", [zip_of, lambda path, entries: tar_of(path, entries, "w:gz")], ids=["zip", "tar.gz"])
-def test_a_bomb_stops_at_the_limit(make: Callable[..., Path], tmp_path: Path, target: Path) -> None:
+def test_a_bomb_stops_at_the_limit(make, tmp_path, target):
     archive = make(tmp_path / "archive", {"a": b"\0" * 60_000, "b": b"\0" * 20_000_000})
     assert archive.stat().st_size < LIMIT_BYTES
     with pytest.raises(UploadTooLarge, match="100000 bytes"):
@@ -111,29 +107,27 @@ def test_a_bomb_stops_at_the_limit(make: Callable[..., Path], tmp_path: Path, ta
 
 
 @pytest.mark.parametrize("make", [zip_of, tar_of])
-def test_too_many_files(
-    make: Callable[..., Path], tmp_path: Path, target: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_too_many_files(make, tmp_path, target, monkeypatch):
     monkeypatch.setattr(dataset_unpack, "MAX_FILES", 5)
     with pytest.raises(UploadTooLarge, match="at most 5 files"):
         unpack(make(tmp_path / "archive", {str(n): b"" for n in range(6)}), target, LIMIT_BYTES)
 
 
-def test_folders_count_too(tmp_path: Path, target: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folders_count_too(tmp_path, target, monkeypatch):
     monkeypatch.setattr(dataset_unpack, "MAX_ENTRIES", 5)
     with pytest.raises(UploadTooLarge, match="at most 5 entries"):
         unpack(zip_of(tmp_path / "archive", {f"{n}/": b"" for n in range(6)}), target, LIMIT_BYTES)
 
 
 @pytest.mark.parametrize("make", [zip_of, lambda path, entries: tar_of(path, entries, "w:gz"), tar_of])
-def test_damaged_archives(make: Callable[..., Path], tmp_path: Path, target: Path) -> None:
+def test_damaged_archives(make, tmp_path, target):
     whole = make(tmp_path / "archive", {"a": bytes(range(256)) * 100}).read_bytes()
     (tmp_path / "archive").write_bytes(whole[: len(whole) // 2])
     with pytest.raises(DatasetInvalid):
         unpack(tmp_path / "archive", target, LIMIT_BYTES)
 
 
-def test_a_zip_whose_directory_points_before_its_beginning(tmp_path: Path, target: Path) -> None:
+def test_a_zip_whose_directory_points_before_its_beginning(tmp_path, target):
     whole = zip_of(tmp_path / "archive", {"a": b"content"}).read_bytes()
     (tmp_path / "archive").write_bytes(whole[1:])
     with pytest.raises(DatasetInvalid, match="damaged"):
@@ -141,12 +135,12 @@ def test_a_zip_whose_directory_points_before_its_beginning(tmp_path: Path, targe
 
 
 @pytest.mark.parametrize("content", [b"", b"hello", b"\x89PNG", b"\x1f\x8b"])
-def test_what_is_no_archive(content: bytes, tmp_path: Path, target: Path) -> None:
+def test_what_is_no_archive(content, tmp_path, target):
     (tmp_path / "archive").write_bytes(content)
     with pytest.raises(DatasetInvalid, match="archive"):
         unpack(tmp_path / "archive", target, LIMIT_BYTES)
 
 
-def test_a_name_that_comes_twice(tmp_path: Path, target: Path) -> None:
+def test_a_name_that_comes_twice(tmp_path, target):
     with pytest.raises(DatasetInvalid, match="twice"):
         unpack(tar_of(tmp_path / "archive", {"a": b"1", "./a": b"2"}), target, LIMIT_BYTES)

@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
-from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe
+from ultragray import ConvexProbe, LinearProbe, PhasedProbe
 from ultragray.datasets import Sweep
 from ultragray.learn.evaluation.side_by_side import as_picture
 from ultragray_workers.helpers import PICTURE_SIDE, read_picture, write_stacks
@@ -20,7 +18,7 @@ PROBES = {
 
 
 @pytest.mark.parametrize("probe", PROBES.values(), ids=PROBES)
-def test_a_picture_is_that_of_its_frame(tmp_path: Path, probe: Probe) -> None:
+def test_a_picture_is_that_of_its_frame(tmp_path, probe):
     frames = np.random.default_rng(0).integers(0, 256, (3, 24, 20), dtype=np.uint8)
     floats = (frames / 255.0).astype(np.float32)
     write_stacks(tmp_path, {"bytes": frames, "floats": floats}, probe)
@@ -35,6 +33,6 @@ def test_a_picture_is_that_of_its_frame(tmp_path: Path, probe: Probe) -> None:
     assert read_picture(tmp_path, "others", 0) is None
 
 
-def test_there_may_be_no_frames(tmp_path: Path) -> None:
+def test_there_may_be_no_frames(tmp_path):
     write_stacks(tmp_path, {"val": np.zeros((0, 24, 20), np.uint8)}, PROBES["linear"])
     assert read_picture(tmp_path, "val", 0) is None

@@ -10,10 +10,8 @@ import sqlite3
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack, closing
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,14 +19,11 @@ import pytest
 from ultragray import LinearProbe
 from ultragray.datasets.released import write_released
 from ultragray.learn.sweep import Dataset, Sweep
-from ultragray_workers.datasets.shelf import FILES_NAME
-from ultragray_workers.datasets.store import DatasetRecord, DatasetStore, write_manifest
+from ultragray_workers.datasets.store import FILES_NAME, DatasetRecord, DatasetStore, write_manifest
 from ultragray_workers.jobs.database import SQLITE_FILE, JobDatabase
-from ultragray_workers.jobs.files import Artifact
 from ultragray_workers.jobs.folder import Request
 from ultragray_workers.jobs.kinds import TrainJob
 from ultragray_workers.jobs.progress import JobState
-from ultragray_workers.jobs.record import Job
 from ultragray_workers.jobs.store import JobStore
 
 from ...waiting import Deadline
@@ -54,7 +49,7 @@ os._exit(0)
 """
 
 
-def tiny_dataset(frames: int = 8, side: int = 16) -> Dataset:
+def tiny_dataset(frames=8, side=16):
     """A bright ball in grey noise; every fourth frame is held out."""
     poses = np.tile(np.eye(4), (frames, 1, 1))
     poses[:, 1, 3] = 0.8 * np.arange(frames)
@@ -64,13 +59,13 @@ def tiny_dataset(frames: int = 8, side: int = 16) -> Dataset:
     images = np.clip(ball + noise, 0, 255).astype(np.uint8)
     held_out = np.arange(frames) % 4 == 2
 
-    def part(chosen: Any) -> Sweep:
+    def part(chosen):
         return Sweep(images[chosen], poses[chosen], PROBE, np.arange(frames)[chosen], "tiny")
 
     return Dataset("tiny", part(~held_out), part(held_out))
 
 
-def store_dataset(artifact_folder: Path, name: str) -> Path:
+def store_dataset(artifact_folder, name):
     """A dataset as an upload leaves it; its files."""
     dataset = tiny_dataset()
     store = DatasetStore(artifact_folder)
@@ -97,27 +92,26 @@ def store_dataset(artifact_folder: Path, name: str) -> Path:
     return files_of(artifact_folder, name)
 
 
-def files_of(artifact_folder: Path, name: str) -> Path:
+def files_of(artifact_folder, name):
     """The files of a dataset in an artifact folder, as they were sent."""
-    with DatasetStore(artifact_folder).shelf.files(name) as files:
-        return files
+    with DatasetStore(artifact_folder).files(name) as folder:
+        return folder / FILES_NAME
 
 
-def request_of(specification: dict[str, Any], artifact_folder: Path, submitted: int = 1, **options: Any) -> Request:
+def request_of(specification, artifact_folder, submitted=1, **options):
     """The instructions of a worker without anything special, on the processor."""
     folder = str(artifact_folder)
     return Request(specification, submitted, None, None, "cpu", 1, 0, folder, folder, **options)
 
 
-def path_of(artifact: Artifact) -> Path:
+def path_of(artifact):
     """The file that an artifact is, of a folder."""
-    assert artifact.storage.local is not None
-    return artifact.storage.local / artifact.stored.key
+    path = artifact.storage.in_place(artifact.stored.key)
+    assert path is not None
+    return path
 
 
-def train_job(
-    scene: str, *, dataset: str = "tiny", steps: int = 20, max_run_s: float | None = None, **settings: Any
-) -> TrainJob:
+def train_job(scene, *, dataset="tiny", steps=20, max_run_s=None, **settings):
     values = {"steps": steps, "max_gaussians": 40, "batch_size": 2, **settings}
     return TrainJob(dataset=dataset, scene=scene, settings=values, device="cpu", max_run_s=max_run_s)
 
@@ -125,9 +119,7 @@ def train_job(
 class RunningWorker:
     """A worker in a process of its own. `options` are those of `work`, and `host`: the name that its host has."""
 
-    def __init__(
-        self, artifact_folder: Path, database_url: str | None, name: str, log: Path, options: dict[str, Any]
-    ) -> None:
+    def __init__(self, artifact_folder, database_url, name, log, options):
         self._artifact_folder, self._database_url = artifact_folder, database_url
         with log.open("ab") as file:
             self.process = subprocess.Popen(
@@ -141,7 +133,7 @@ class RunningWorker:
                 stderr=file,
             )
 
-    def suspend(self) -> None:
+    def suspend(self):
         """Stops it, but not while it writes: a SQLite file stays locked by who is stopped."""
         with ExitStack() as stack:
             if self._database_url is None:
@@ -151,17 +143,17 @@ class RunningWorker:
                 database.execute("BEGIN IMMEDIATE")  # once nobody else writes
             self.process.send_signal(signal.SIGSTOP)
 
-    def kill(self) -> None:
+    def kill(self):
         """As a loss of power to the worker would."""
         self.process.kill()
         self.process.wait()
 
-    def terminate(self) -> int:
+    def terminate(self):
         """As a service manager does."""
         self.process.send_signal(signal.SIGTERM)
         return self.process.wait(60)
 
-    def job_process(self) -> int | None:
+    def job_process(self):
         """The process of the job at hand."""
         for children in Path(f"/proc/{self.process.pid}/task").glob("*/children"):
             for pid in children.read_text().split():
@@ -171,39 +163,37 @@ class RunningWorker:
 
 
 @pytest.fixture
-def artifact_folder(tmp_path: Path) -> Path:
+def artifact_folder(tmp_path):
     folder = tmp_path / "artifacts"
     store_dataset(folder, "tiny")
     return folder
 
 
 @pytest.fixture
-def database_url() -> str | None:
+def database_url():
     """None: a SQLite file."""
     return None
 
 
 @pytest.fixture
-def jobs(artifact_folder: Path, database_url: str | None) -> Iterator[JobDatabase]:
+def jobs(artifact_folder, database_url):
     jobs = JobDatabase(artifact_folder, database_url)
     yield jobs
     jobs.close()
 
 
 @pytest.fixture
-def store(artifact_folder: Path, database_url: str | None) -> Iterator[JobStore]:
+def store(artifact_folder, database_url):
     store = JobStore(artifact_folder, database_url, queue_limit=20)
     yield store
     store.close()
 
 
 @pytest.fixture
-def start_worker(
-    artifact_folder: Path, database_url: str | None, tmp_path: Path
-) -> Iterator[Callable[..., RunningWorker]]:
-    started: list[RunningWorker] = []
+def start_worker(artifact_folder, database_url, tmp_path):
+    started = []
 
-    def start(name: str = "one", *, folder: Path = artifact_folder, **options: Any) -> RunningWorker:
+    def start(name="one", *, folder=artifact_folder, **options):
         started.append(RunningWorker(folder, database_url, name, tmp_path / f"{name}.log", options))
         return started[-1]
 
@@ -213,10 +203,10 @@ def start_worker(
 
 
 @pytest.fixture
-def until(store: JobStore) -> Callable[..., Job]:
+def until(store):
     """Waits for a job to be final, or whatever is asked for."""
 
-    def wait(job: Job, reached: Callable[[Job], bool] = lambda job: job.state in FINAL, timeout_s: float = 240) -> Job:
+    def wait(job, reached=lambda job: job.state in FINAL, timeout_s=240):
         end = Deadline(timeout_s)
         while not reached(job):
             assert not end.passed, (job, store.log_tail(job.id))

@@ -5,11 +5,8 @@ from __future__ import annotations
 import os
 import subprocess
 import sys
-from pathlib import Path
 
 import pytest
-
-from ...postgres import PostgresServer
 
 WORKERS, ROUNDS = 4, 10
 # Everything is imported once; of each round, all workers begin when the last of them is ready.
@@ -51,11 +48,9 @@ for url in sys.argv[2:]:
 @pytest.mark.long
 @pytest.mark.slow
 @pytest.mark.parametrize("kind", ["sqlite", "postgresql"])
-def test_workers_that_start_together_on_a_fresh_database(
-    kind: str, tmp_path: Path, request: pytest.FixtureRequest
-) -> None:
+def test_workers_that_start_together_on_a_fresh_database(kind, tmp_path, request):
     if kind == "postgresql":
-        server: PostgresServer = request.getfixturevalue("postgres")
+        server = request.getfixturevalue("postgres")
         urls = [server.create_database() for _ in range(ROUNDS)]
     else:
         urls = [f"sqlite:///{tmp_path}/{number}.sqlite" for number in range(ROUNDS)]

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import os
 from multiprocessing import get_context
-from pathlib import Path
 
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.progress import Progress
 
 
-def die_amid_the_work(path: Path) -> None:
+def die_amid_the_work(path):
     """Writes as a job does, and ends as by SIGKILL: nothing that would follow is run."""
     folder = JobFolder(path, "one")
     folder.write_progress(Progress(step=3))
@@ -21,7 +20,7 @@ def die_amid_the_work(path: Path) -> None:
         os._exit(9)
 
 
-def test_nothing_half_done_of_a_killed_process_is_left(tmp_path: Path) -> None:
+def test_nothing_half_done_of_a_killed_process_is_left(tmp_path):
     folder = JobFolder(tmp_path, "one")
     folder.path.mkdir(parents=True)
     process = get_context("fork").Process(target=die_amid_the_work, args=(tmp_path,))
@@ -35,7 +34,7 @@ def test_nothing_half_done_of_a_killed_process_is_left(tmp_path: Path) -> None:
     assert folder.progress() == Progress(step=3)
 
 
-def test_a_scratch_folder_begins_empty_and_goes(tmp_path: Path) -> None:
+def test_a_scratch_folder_begins_empty_and_goes(tmp_path):
     folder = JobFolder(tmp_path, "one")
     folder.path.mkdir(parents=True)
     with folder.scratch() as scratch:

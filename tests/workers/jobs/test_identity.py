@@ -2,32 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-
 import pytest
 
 from ultragray_workers.errors import ArtifactFolderUnavailable, StartupFailed, StorageUnavailable
+from ultragray_workers.jobs.database import KEY as FILE
 from ultragray_workers.jobs.database import JobDatabase
-from ultragray_workers.jobs.identity import KEY as FILE
 from ultragray_workers.jobs.progress import JobState
-from ultragray_workers.jobs.record import Job
-from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.storage.local import LocalStorage
 
-from ...postgres import PostgresServer
 from ...waiting import wait_until
-from .conftest import RunningWorker, train_job
+from .conftest import train_job
 
 
 @pytest.fixture
-def database_url(postgres: PostgresServer) -> str:
+def database_url(postgres):
     return postgres.create_database()
 
 
 def test_another_folder_is_refused_at_the_start_and_the_id_written_there_is_believed(
-    store: JobStore, artifact_folder: Path, database_url: str, tmp_path: Path
-) -> None:
+    store, artifact_folder, database_url, tmp_path
+):
     JobDatabase(artifact_folder, database_url).close()
     other = tmp_path / "not-mounted"
     with pytest.raises(StartupFailed, match=f"{FILE} holds no id, expected [0-9a-f]{{32}}. Mount the share") as caught:
@@ -40,16 +34,14 @@ def test_another_folder_is_refused_at_the_start_and_the_id_written_there_is_beli
         JobDatabase(other, database_url)
 
 
-def test_a_new_database_takes_the_id_of_its_folder(
-    store: JobStore, artifact_folder: Path, postgres: PostgresServer
-) -> None:
+def test_a_new_database_takes_the_id_of_its_folder(store, artifact_folder, postgres):
     before = (artifact_folder / FILE).read_text()
     JobDatabase(artifact_folder, postgres.create_database()).close()
     assert (artifact_folder / FILE).read_text() == before
 
 
 @pytest.mark.parametrize("database_url", [None])
-def test_a_database_within_the_folder_is_at_home_there(store: JobStore, artifact_folder: Path) -> None:
+def test_a_database_within_the_folder_is_at_home_there(store, artifact_folder):
     before = (artifact_folder / FILE).read_text()
     (artifact_folder / FILE).unlink()
     JobDatabase(artifact_folder, None).close()
@@ -57,13 +49,7 @@ def test_a_database_within_the_folder_is_at_home_there(store: JobStore, artifact
 
 
 @pytest.mark.long
-def test_a_share_that_vanishes_costs_no_job(
-    store: JobStore,
-    artifact_folder: Path,
-    tmp_path: Path,
-    start_worker: Callable[..., RunningWorker],
-    until: Callable[..., Job],
-) -> None:
+def test_a_share_that_vanishes_costs_no_job(store, artifact_folder, tmp_path, start_worker, until):
     """It is gone while a job runs, an empty folder of its name is there, and later it is back."""
     worker = start_worker()
     running, _ = store.submit(train_job("one", steps=3000))
@@ -88,9 +74,7 @@ def test_a_share_that_vanishes_costs_no_job(
     assert {job.state for job in done} == {JobState.SUCCEEDED}, done
 
 
-def test_a_storage_that_belongs_to_another_database_is_refused(
-    artifact_folder: Path, postgres: PostgresServer, tmp_path: Path
-) -> None:
+def test_a_storage_that_belongs_to_another_database_is_refused(artifact_folder, postgres, tmp_path):
     first, storage = postgres.create_database(), LocalStorage(tmp_path / "bucket")
     jobs = JobDatabase(artifact_folder, first, storage)
     jobs.identity.check_writable()
@@ -101,16 +85,14 @@ def test_a_storage_that_belongs_to_another_database_is_refused(
         JobDatabase(artifact_folder, first, LocalStorage(tmp_path / "another-bucket"))
 
 
-def test_a_storage_that_is_another_now_or_away_is_not_worked_in(
-    artifact_folder: Path, database_url: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_storage_that_is_another_now_or_away_is_not_worked_in(artifact_folder, database_url, tmp_path, monkeypatch):
     storage = LocalStorage(tmp_path / "bucket")
     jobs = JobDatabase(artifact_folder, database_url, storage)
     storage.write(FILE, b"another")
     with pytest.raises(ArtifactFolderUnavailable, match="another bucket or prefix"):
         jobs.identity.check()
 
-    def away(key: str, **_: object) -> bytes:
+    def away(key, **_):
         raise StorageUnavailable("it does not answer")
 
     monkeypatch.setattr(storage, "read", away)

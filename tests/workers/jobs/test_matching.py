@@ -43,7 +43,7 @@ LAPTOP = Offer((PROCESSOR,))
         (Demand("cpu", labels=(("rack", "4"), ("site", "lab2"))), [], []),
     ],
 )
-def test_the_devices_that_fit(demand: Demand, workstation: list[str], laptop: list[str]) -> None:
+def test_the_devices_that_fit(demand, workstation, laptop):
     assert [device.name for device in WORKSTATION.fitting(demand)] == workstation
     assert [device.name for device in LAPTOP.fitting(demand)] == laptop
 
@@ -60,12 +60,12 @@ def test_the_devices_that_fit(demand: Demand, workstation: list[str], laptop: li
         (Demand("cuda", 16, LABELS[1:]), "a worker with a GPU of at least 16 GB and the label site=lab1"),
     ],
 )
-def test_a_demand_in_words_and_there_and_back(demand: Demand, words: str) -> None:
+def test_a_demand_in_words_and_there_and_back(demand, words):
     assert str(demand) == words
     assert demand_of_key(demand.key) == demand
 
 
-def test_every_kind_of_job_demands_what_its_specification_says() -> None:
+def test_every_kind_of_job_demands_what_its_specification_says():
     asked = {"device": "cuda", "min_memory_gb": 8, "worker_labels": {"site": "lab1", "rack": "4"}}
     jobs = (
         TrainJob("liver", "liver", **asked),
@@ -74,7 +74,6 @@ def test_every_kind_of_job_demands_what_its_specification_says() -> None:
     )
     assert {Demand.of(to_dict(job)) for job in jobs} == {Demand("cuda", 8, LABELS)}
     assert Demand.of(to_dict(TrainJob("liver", "liver"))) == Demand()
-    assert Demand.of({"kind": "evaluate"}) == Demand()  # a job of a release before there were demands
 
 
 @pytest.mark.parametrize(
@@ -93,23 +92,23 @@ def test_every_kind_of_job_demands_what_its_specification_says() -> None:
         ({"worker_labels": {f"n{number}": "x" for number in range(11)}}, "worker_labels"),
     ],
 )
-def test_a_demand_that_no_worker_could_meet_is_refused_with_its_field(asked: dict[str, object], field: str) -> None:
+def test_a_demand_that_no_worker_could_meet_is_refused_with_its_field(asked, field):
     with pytest.raises(InvalidArgument, match=f"^{field} must be") as caught:
         EvaluateJob("liver", "liver", **asked)  # type: ignore[arg-type]
     assert caught.value.field == field
 
 
-def test_the_largest_demand_fits_into_an_index_of_postgresql() -> None:
+def test_the_largest_demand_fits_into_an_index_of_postgresql():
     labels = tuple((f"{number}{'n' * 62}", "v" * 63) for number in range(10))
     assert len(Demand("cuda:999", 10**6, labels).key) < 2000
 
 
-def test_an_offer_there_and_back() -> None:
+def test_an_offer_there_and_back():
     assert offer_of_json(WORKSTATION.to_json()) == WORKSTATION
     assert offer_of_json(None).devices == ()
 
 
-def test_a_job_that_nobody_can_take_says_what_it_asks_and_what_there_is() -> None:
+def test_a_job_that_nobody_can_take_says_what_it_asks_and_what_there_is():
     demand = Demand("cuda", 16, (("site", "lab2"),))
     asked = "a worker with a GPU of at least 16 GB and the label site=lab2"
     workstation, laptop = LivingWorker("big", WORKSTATION, False), LivingWorker("small", LAPTOP, False)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import pytest
 
-from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.owners import (
     NOBODYS,
     Kind,
@@ -15,15 +14,13 @@ from ultragray_workers.jobs.owners import (
     read_owners,
 )
 
-from ...postgres import NewDatabase
-
 
 @pytest.fixture
-def database_url(new_database: NewDatabase) -> str | None:
+def database_url(new_database):
     return new_database()
 
 
-def test_a_name_is_the_firsts_until_that_one_forgets_it(jobs: JobDatabase) -> None:
+def test_a_name_is_the_firsts_until_that_one_forgets_it(jobs):
     alice, bob = Ownership("alice", True, "a"), Ownership("bob", False, "b")
     with jobs.engine.begin() as connection:
         assert add_owner(connection, Kind.SCENE, "liver", alice)
@@ -35,7 +32,7 @@ def test_a_name_is_the_firsts_until_that_one_forgets_it(jobs: JobDatabase) -> No
 
 
 @pytest.mark.parametrize("earlier", [Ownership("alice", True, "a"), Ownership("alice", True, None)])
-def test_a_late_deletion_forgets_no_later_owner(jobs: JobDatabase, earlier: Ownership) -> None:
+def test_a_late_deletion_forgets_no_later_owner(jobs, earlier):
     with jobs.engine.begin() as connection:
         for later in (Ownership("bob", True, "b"), Ownership("alice", True, "c")):
             assert add_owner(connection, Kind.SCENE, "liver", earlier)

@@ -7,7 +7,6 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
 from itertools import pairwise
 from pathlib import Path
 
@@ -21,15 +20,11 @@ from ultragray.scene.gaussians import GaussianScene
 from ultragray_workers.errors import DatabaseUnavailable, StartupFailed
 from ultragray_workers.jobs.database import JobDatabase, checked_url
 from ultragray_workers.jobs.progress import JobState
-from ultragray_workers.jobs.record import Job
 from ultragray_workers.jobs.store import JobStore
 
-from ...postgres import PASSWORD, PostgresServer
+from ...postgres import PASSWORD
 from ...waiting import Deadline, at_this_load
-from .conftest import RunningWorker, files_of, train_job
-
-StartWorker = Callable[..., RunningWorker]
-Until = Callable[..., Job]
+from .conftest import files_of, train_job
 
 # `ultragray worker`, less patient with the dead.
 HOST = """
@@ -41,12 +36,12 @@ app()
 
 
 @pytest.fixture
-def database_url(postgres: PostgresServer) -> str:
+def database_url(postgres):
     return postgres.create_database()
 
 
 @pytest.fixture
-def hosts(artifact_folder: Path, database_url: str, tmp_path: Path) -> Iterator[dict[str, subprocess.Popen[bytes]]]:
+def hosts(artifact_folder, database_url, tmp_path):
     """Two machines, as far as they know: a data folder each, the artifact folder is shared."""
     running = {}
     for name in ("one", "two"):
@@ -76,13 +71,7 @@ def hosts(artifact_folder: Path, database_url: str, tmp_path: Path) -> Iterator[
 
 
 @pytest.mark.long
-def test_hosts_share_one_queue_and_one_takes_over_from_the_other(
-    store: JobStore,
-    artifact_folder: Path,
-    tmp_path: Path,
-    hosts: dict[str, subprocess.Popen[bytes]],
-    until: Until,
-) -> None:
+def test_hosts_share_one_queue_and_one_takes_over_from_the_other(store, artifact_folder, tmp_path, hosts, until):
     made = [until(job) for job in [store.submit(train_job(f"scene-{number}"))[0] for number in range(6)]]
     assert {job.state for job in made} == {JobState.SUCCEEDED}, made
     assert {job.worker for job in made} == set(hosts)
@@ -112,9 +101,7 @@ def test_hosts_share_one_queue_and_one_takes_over_from_the_other(
 
 
 @pytest.mark.long
-def test_training_goes_on_while_the_database_is_away(
-    store: JobStore, postgres: PostgresServer, tmp_path: Path, start_worker: StartWorker, until: Until
-) -> None:
+def test_training_goes_on_while_the_database_is_away(store, postgres, tmp_path, start_worker, until):
     worker = start_worker()
     job, _ = store.submit(train_job("one", steps=1_000_000))
     until(job, lambda job: (job.progress.step or 0) > 0)
@@ -145,9 +132,7 @@ def test_training_goes_on_while_the_database_is_away(
     ]
 
 
-def test_database_that_cannot_be_used_is_told_in_one_sentence(
-    postgres: PostgresServer, database_url: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_database_that_cannot_be_used_is_told_in_one_sentence(postgres, database_url, tmp_path, caplog):
     name = database_url.rpartition("/")[2]
     refused = {
         postgres.url("absent"): 'database "absent" does not exist',
@@ -167,7 +152,7 @@ def test_database_that_cannot_be_used_is_told_in_one_sentence(
     assert caplog.text == ""
 
 
-def test_statement_that_takes_too_long(postgres: PostgresServer, database_url: str, tmp_path: Path) -> None:
+def test_statement_that_takes_too_long(postgres, database_url, tmp_path):
     assert "statement_timeout" in checked_url(database_url, tmp_path)
     jobs = JobDatabase(tmp_path, f"{database_url}?options=-c%20statement_timeout%3D300")
     with pytest.raises(DatabaseUnavailable), jobs.engine.begin() as connection:
@@ -175,9 +160,7 @@ def test_statement_that_takes_too_long(postgres: PostgresServer, database_url: s
     jobs.close()
 
 
-def test_role_that_sees_no_other_database_is_enough(
-    postgres: PostgresServer, database_url: str, tmp_path: Path, caplog: pytest.LogCaptureFixture
-) -> None:
+def test_role_that_sees_no_other_database_is_enough(postgres, database_url, tmp_path, caplog):
     name = database_url.rpartition("/")[2]
     postgres.execute("CREATE ROLE modest LOGIN PASSWORD 'modest'")
     postgres.execute("REVOKE CONNECT ON DATABASE postgres FROM PUBLIC")

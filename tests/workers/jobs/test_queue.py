@@ -3,11 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 import sqlalchemy as sa
@@ -16,13 +13,12 @@ from ultragray_workers.errors import StartupFailed
 from ultragray_workers.jobs import queue, tables, workers
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.demand import Demand
+from ultragray_workers.jobs.owners import Kind, read_owners
 from ultragray_workers.jobs.progress import JobState, Outcome, Progress
-from ultragray_workers.jobs.record import Files, Piece, Row, StoredFile
-from ultragray_workers.jobs.store import JobStore
+from ultragray_workers.jobs.record import Files, Piece, StoredFile
 from ultragray_workers.jobs.tables import SCHEMA_VERSION
 from ultragray_workers.jobs.workers import Heartbeat
 
-from ...postgres import NewDatabase
 from .conftest import train_job
 
 ANY = [Demand("cpu").key]
@@ -33,22 +29,22 @@ FILES = Files(
 
 
 @pytest.fixture
-def database_url(new_database: NewDatabase) -> str | None:
+def database_url(new_database):
     return new_database()
 
 
 @pytest.fixture
-def engine(jobs: JobDatabase) -> sa.Engine:
+def engine(jobs):
     return jobs.engine
 
 
 @pytest.fixture
-def start(engine: sa.Engine, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callable[..., Heartbeat]]:
+def start(engine, monkeypatch):
     """Heartbeats that beat at their start only."""
     monkeypatch.setattr(workers, "BEAT_INTERVAL_S", 1000.0)
-    started: list[Heartbeat] = []
+    started = []
 
-    def start_(worker: str) -> Heartbeat:
+    def start_(worker):
         started.append(Heartbeat(engine, worker, lambda: None))
         return started[-1]
 
@@ -57,13 +53,13 @@ def start(engine: sa.Engine, monkeypatch: pytest.MonkeyPatch) -> Iterator[Callab
         heartbeat.stop()
 
 
-def taken(engine: sa.Engine, worker: str) -> Row:
+def taken(engine, worker):
     row = queue.take(engine, worker, ANY)
     assert row is not None
     return row
 
 
-def test_jobs_are_taken_by_priority_then_in_the_order_of_submission(store: JobStore, engine: sa.Engine) -> None:
+def test_jobs_are_taken_by_priority_then_in_the_order_of_submission(store, engine):
     ids = [
         store.submit(train_job(f"scene-{number}"), priority=priority)[0].id
         for number, priority in [(0, 0), (1, 5), (2, 0)]
@@ -73,11 +69,11 @@ def test_jobs_are_taken_by_priority_then_in_the_order_of_submission(store: JobSt
     assert queue.take(engine, "one", []) is None
 
 
-def test_of_many_workers_one_takes_a_job(store: JobStore, engine: sa.Engine) -> None:
+def test_of_many_workers_one_takes_a_job(store, engine):
     ids = {store.submit(train_job(f"scene-{number}"))[0].id for number in range(6)}
     together = threading.Barrier(4)
 
-    def take_all(worker: str) -> list[str]:
+    def take_all(worker):
         together.wait()
         found = []
         while (row := queue.take(engine, worker, ANY)) is not None:
@@ -89,16 +85,15 @@ def test_of_many_workers_one_takes_a_job(store: JobStore, engine: sa.Engine) -> 
     assert sorted(found) == sorted(ids)
 
 
-def test_a_worker_takes_only_jobs_with_its_demands(store: JobStore, engine: sa.Engine) -> None:
+def test_a_worker_takes_only_jobs_with_its_demands(store, engine):
     in_lab, _ = store.submit(replace(train_job("lab"), worker_labels={"site": "lab1"}))
     anywhere, _ = store.submit(train_job("anywhere"))
     assert taken(engine, "one").id == anywhere.id
     row = queue.take(engine, "one", queue.demands_waiting(engine))
-    assert row is not None
     assert row.id == in_lab.id
 
 
-def test_an_owner_has_no_more_running_than_it_may(store: JobStore, engine: sa.Engine) -> None:
+def test_an_owner_has_no_more_running_than_it_may(store, engine):
     for number in range(2):
         store.submit(train_job(f"scene-{number}"), owner="ann", admit=lambda jobs: 1)
     others, _ = store.submit(train_job("others"), owner="bob", admit=lambda jobs: 1)
@@ -109,7 +104,7 @@ def test_an_owner_has_no_more_running_than_it_may(store: JobStore, engine: sa.En
     assert taken(engine, "three").owner == "ann"
 
 
-def test_what_a_worker_writes_holds_for_its_own_attempt(store: JobStore, engine: sa.Engine) -> None:
+def test_what_a_worker_writes_holds_for_its_own_attempt(store, engine):
     job, _ = store.submit(train_job("one"))
     first = taken(engine, "one")
     assert queue.tell(engine, first, Progress(step=3, steps=20), FILES)
@@ -133,14 +128,14 @@ def test_what_a_worker_writes_holds_for_its_own_attempt(store: JobStore, engine:
     assert (told.metrics, told.progress.step) == ({"psnr_db": 20.5}, 5)
 
 
-def test_a_job_that_was_taken_and_not_begun_counts_no_attempt(store: JobStore, engine: sa.Engine) -> None:
+def test_a_job_that_was_taken_and_not_begun_counts_no_attempt(store, engine):
     job, _ = store.submit(train_job("one"))
     assert queue.put_back(engine, taken(engine, "one"), is_untouched=True)
     assert (store.get(job.id).attempts, store.get(job.id).worker) == (0, None)
     assert taken(engine, "one").attempt == 1
 
 
-def test_a_job_is_published_or_cancelled_whichever_comes_first(store: JobStore, engine: sa.Engine) -> None:
+def test_a_job_is_published_or_cancelled_whichever_comes_first(store, engine):
     job, _ = store.submit(train_job("one"), owner="ann")
     row = taken(engine, "one")
     assert queue.publish(engine, row, Outcome(artifacts=("one.ugr",)), FILES)
@@ -157,9 +152,20 @@ def test_a_job_is_published_or_cancelled_whichever_comes_first(store: JobStore, 
     assert store.submit(train_job("two"), owner="bob")[1]  # the name is free again
 
 
-def test_jobs_of_the_dead_wait_again_and_those_of_the_living_do_not(
-    store: JobStore, engine: sa.Engine, start: Callable[..., Heartbeat], monkeypatch: pytest.MonkeyPatch
-) -> None:
+@pytest.mark.parametrize("is_running", [False, True])
+def test_a_cancelled_job_gives_the_name_of_its_scene_back_at_once(store, engine, is_running):
+    """To ask for the name would also forget a claim of a job that is over: whoever lists owners asks for none."""
+    job, _ = store.submit(train_job("one"), owner="ann")
+    with engine.connect() as connection:
+        assert read_owners(connection).keys() == {(Kind.SCENE, "one")}
+    if is_running:
+        taken(engine, "one")
+    assert queue.cancel(engine, job.id)
+    with engine.connect() as connection:
+        assert read_owners(connection) == {}
+
+
+def test_jobs_of_the_dead_wait_again_and_those_of_the_living_do_not(store, engine, start, monkeypatch):
     mine, _ = start("mine"), start("other")
     for number in range(2):
         store.submit(train_job(f"scene-{number}"))
@@ -171,7 +177,7 @@ def test_jobs_of_the_dead_wait_again_and_those_of_the_living_do_not(
     assert mine.take_over() == [of_other.id]
 
 
-def test_a_worker_that_begins_lets_its_own_jobs_wait_again(store: JobStore, engine: sa.Engine) -> None:
+def test_a_worker_that_begins_lets_its_own_jobs_wait_again(store, engine):
     for number in range(2):
         store.submit(train_job(f"scene-{number}"))
     mine, _ = taken(engine, "mine"), taken(engine, "other")
@@ -179,7 +185,7 @@ def test_a_worker_that_begins_lets_its_own_jobs_wait_again(store: JobStore, engi
     assert queue.put_back_of(engine, "mine") == []
 
 
-def test_answers_about_jobs_that_wait_or_run(store: JobStore, engine: sa.Engine) -> None:
+def test_answers_about_jobs_that_wait_or_run(store, engine):
     running, waiting, over = (store.submit(train_job(scene))[0] for scene in ("running", "waiting", "over"))
     assert taken(engine, "one").id == running.id
     store.cancel(over.id)
@@ -192,7 +198,6 @@ def test_answers_about_jobs_that_wait_or_run(store: JobStore, engine: sa.Engine)
     }
     assert queue.find(engine, makes_scene="none") is None
     found = queue.find(engine, needs_dataset="tiny")
-    assert found is not None
     assert found.id in {waiting.id, running.id, after.id}
     assert queue.successor(engine, over.id) == after.id
     assert queue.finished_before(engine, 1e11, set(), 10) == []  # a job goes on from it
@@ -201,7 +206,7 @@ def test_answers_about_jobs_that_wait_or_run(store: JobStore, engine: sa.Engine)
     assert queue.finished_before(engine, 1e11, {over.id, after.id}, 10) == []
 
 
-def test_the_demands_that_wait_are_told_once_each(store: JobStore, engine: sa.Engine) -> None:
+def test_the_demands_that_wait_are_told_once_each(store, engine):
     assert queue.demands_waiting(engine) == []
     in_lab = replace(train_job("one"), worker_labels={"site": "lab1"})
     for scene in ("one", "two", "three"):
@@ -225,10 +230,10 @@ def test_the_demands_that_wait_are_told_once_each(store: JobStore, engine: sa.En
         lambda engine: queue.put_back_of_dead(engine),
     ],
 )
-def test_no_question_reads_all_rows(engine: sa.Engine, ask: Callable[[sa.Engine], Any]) -> None:
-    asked: list[tuple[str, Any]] = []
+def test_no_question_reads_all_rows(engine, ask):
+    asked = []
 
-    def listen(connection: Any, cursor: Any, statement: str, parameters: Any, *_: Any) -> None:
+    def listen(connection, cursor, statement, parameters, *_):
         asked.append((statement, parameters))
 
     sa.event.listen(engine, "before_cursor_execute", listen)
@@ -244,9 +249,7 @@ def test_no_question_reads_all_rows(engine: sa.Engine, ask: Callable[[sa.Engine]
     assert "Seq Scan on jobs" not in plan, plan
 
 
-def test_tables_of_another_release_are_refused_and_stay(
-    jobs: JobDatabase, artifact_folder: Path, database_url: str | None
-) -> None:
+def test_tables_of_another_release_are_refused_and_stay(jobs, artifact_folder, database_url):
     with jobs.engine.begin() as connection:
         connection.execute(sa.update(SCHEMA_VERSION).values(version=tables.VERSION + 1))
     with pytest.raises(StartupFailed, match=f"version {tables.VERSION + 1}, and this release knows version") as caught:

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 import os
 import time
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import pytest
 import sqlalchemy as sa
@@ -14,30 +11,26 @@ import sqlalchemy as sa
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import DatasetInUse, DatasetNotFound, JobInUse, JobNotFound
 from ultragray_workers.jobs import queue
-from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.folder import WORK
 from ultragray_workers.jobs.progress import JobState
-from ultragray_workers.jobs.record import Job
-from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.tables import JOBS
-from ultragray_workers.jobs.worker import housekeeping
-from ultragray_workers.jobs.worker.housekeeping import DAY_S, Housekeeper
+from ultragray_workers.jobs.worker import worker as housekeeping
+from ultragray_workers.jobs.worker.worker import DAY_S, Housekeeper
 from ultragray_workers.storage.local import LocalStorage
 
-from ...postgres import NewDatabase
 from .conftest import train_job
 
 
 @pytest.fixture
-def database_url(new_database: NewDatabase) -> str | None:
+def database_url(new_database):
     return new_database()
 
 
 @pytest.fixture
-def finished(store: JobStore, jobs: JobDatabase, artifact_folder: Path) -> Callable[..., tuple[Job, Path]]:
+def finished(store, jobs, artifact_folder):
     """Makes a cancelled job that ended so many days ago, with files as its worker would have left them."""
 
-    def make(scene: str, days_ago: float = 0.0) -> tuple[Job, Path]:
+    def make(scene, days_ago=0.0):
         job = store.cancel(store.submit(train_job(scene))[0].id)
         ended_ms = int((time.time() - days_ago * DAY_S) * 1000)
         with jobs.engine.begin() as connection:
@@ -47,7 +40,7 @@ def finished(store: JobStore, jobs: JobDatabase, artifact_folder: Path) -> Calla
     return make
 
 
-def make_files(artifact_folder: Path, job_id: str, days_ago: float, folder: str = "jobs") -> Path:
+def make_files(artifact_folder, job_id, days_ago, folder="jobs"):
     made = artifact_folder / folder / job_id
     (made / "artifacts").mkdir(parents=True)
     (made / "artifacts" / "metrics.json").write_text("{}")
@@ -56,16 +49,11 @@ def make_files(artifact_folder: Path, job_id: str, days_ago: float, folder: str 
     return made
 
 
-def left(artifact_folder: Path, folder: str = "jobs") -> set[str]:
+def left(artifact_folder, folder="jobs"):
     return {path.name for path in (artifact_folder / folder).iterdir()}
 
 
-Finished = Callable[..., tuple[Job, Path]]
-
-
-def test_a_finished_job_goes_with_its_files_and_its_request_id_is_free(
-    store: JobStore, artifact_folder: Path, finished: Finished
-) -> None:
+def test_a_finished_job_goes_with_its_files_and_its_request_id_is_free(store, artifact_folder, finished):
     job, _ = store.submit(train_job("named"), request_id="mine")
     store.cancel(job.id)
     store.delete(job.id)
@@ -84,7 +72,7 @@ def test_a_finished_job_goes_with_its_files_and_its_request_id_is_free(
             call(other.id)
 
 
-def test_what_another_job_goes_on_from_stays(store: JobStore, finished: Finished) -> None:
+def test_what_another_job_goes_on_from_stays(store, finished):
     job, folder = finished("one")
     successor, _ = store.retry(job.id)
     with pytest.raises(JobInUse, match=successor.id):
@@ -94,7 +82,7 @@ def test_what_another_job_goes_on_from_stays(store: JobStore, finished: Finished
     assert not folder.exists()
 
 
-def test_jobs_are_counted_by_state(store: JobStore, finished: Finished) -> None:
+def test_jobs_are_counted_by_state(store, finished):
     finished("one")
     finished("two")
     store.submit(train_job("three"))
@@ -107,9 +95,7 @@ def test_jobs_are_counted_by_state(store: JobStore, finished: Finished) -> None:
     }
 
 
-def test_old_jobs_go_and_what_is_needed_stays(
-    store: JobStore, jobs: JobDatabase, artifact_folder: Path, finished: Finished, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_old_jobs_go_and_what_is_needed_stays(store, jobs, artifact_folder, finished, monkeypatch):
     monkeypatch.setattr(housekeeping, "AT_ONCE", 2)
     monkeypatch.setattr(housekeeping, "STEP_PAUSE_S", 0.0)
     old = [finished(f"old-{number}", 31)[0] for number in range(3)]
@@ -122,7 +108,7 @@ def test_old_jobs_go_and_what_is_needed_stays(
     make_files(artifact_folder, f"{'2' * 24}.1", 1.1, WORK)  # of a worker that died
     make_files(artifact_folder, f"{young.id}.1", 1.1, WORK)
 
-    def keep_house() -> int:
+    def keep_house():
         return Housekeeper(jobs, artifact_folder, LocalStorage(artifact_folder), 30).keep_house()
 
     assert keep_house() == len(old) + 2
@@ -135,19 +121,17 @@ def test_old_jobs_go_and_what_is_needed_stays(
     assert source.id not in left(artifact_folder)
 
 
-def test_a_deletion_and_a_submission_at_once_never_both_succeed(
-    store: JobStore, artifact_folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_deletion_and_a_submission_at_once_never_both_succeed(store, artifact_folder, monkeypatch):
     datasets = DatasetStore(artifact_folder)
 
-    def submit_in_between(name: str) -> str | None:
+    def submit_in_between(name):
         """The first look finds nobody; then a job comes, before the dataset is out of sight."""
         if submitted:
             return store.uses_dataset(name)
         submitted.append(store.submit(train_job("one"))[0])
         return None
 
-    submitted: list[Job] = []
+    submitted = []
     with pytest.raises(DatasetInUse, match="needed by the job"):
         datasets.delete("tiny", submit_in_between)
     assert datasets.get("tiny").name == "tiny"
@@ -157,7 +141,7 @@ def test_a_deletion_and_a_submission_at_once_never_both_succeed(
 
     submit = queue.submit
 
-    def delete_in_between(*arguments: Any) -> bool:
+    def delete_in_between(*arguments):
         """The dataset was there when it was looked for, and is gone before a deletion could see the job."""
         datasets.delete("tiny")
         return submit(*arguments)

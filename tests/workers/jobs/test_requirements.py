@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -28,10 +25,10 @@ MODEL = ConfidenceModel((3.5, 1.2, 0.8, 0.1, 0.6), 0.06, (0.0,) * 3, 20, 0.04).t
 
 
 @pytest.fixture
-def save(tmp_path: Path, random_scene: Callable[..., GaussianScene]) -> Callable[..., bytes]:
+def save(tmp_path, random_scene):
     """Serves a scene and returns its file's content."""
 
-    def make(name: str, seed: int = 0, **changes: Any) -> bytes:
+    def make(name, seed=0, **changes):
         made = random_scene(20, seed=seed, info=INFO | changes)
         scene = GaussianScene.from_splats(made.splats, info=made.info, training_poses=POSES)
         scene.save(tmp_path / f"{name}.ugr")
@@ -41,16 +38,16 @@ def save(tmp_path: Path, random_scene: Callable[..., GaussianScene]) -> Callable
 
 
 @pytest.fixture
-def scenes(tmp_path: Path) -> SceneStore:
+def scenes(tmp_path):
     return SceneStore(tmp_path)
 
 
 @pytest.fixture
-def rendering_store(artifact_folder: Path, scenes: SceneStore) -> JobStore:
+def rendering_store(artifact_folder, scenes):
     return JobStore(artifact_folder, None, scenes=scenes, max_image_side=64)
 
 
-def kept(artifact_folder: Path, job_id: str) -> bytes:
+def kept(artifact_folder, job_id):
     folder = artifact_folder / "jobs" / job_id
     assert [path.name for path in folder.iterdir()] == ["one.ugr"]
     return (folder / "one.ugr").read_bytes()
@@ -66,7 +63,7 @@ def kept(artifact_folder: Path, job_id: str) -> bytes:
         (RenderJob(scene="none", sampler=TrainingSampler()), SceneNotFound),
     ],
 )
-def test_refused(job: RenderJob, error: type[Exception], save: Callable[..., bytes], rendering_store: JobStore) -> None:
+def test_refused(job, error, save, rendering_store):
     save("one")
     save("probeless", probe=None)
     with pytest.raises(error):
@@ -86,12 +83,7 @@ def test_refused(job: RenderJob, error: type[Exception], save: Callable[..., byt
         (RenderJob(scene="one", sampler=AroundSampler(50), format="dicom"), 50 * 24 * 20),
     ],
 )
-def test_room_for_all_pixels(
-    job: RenderJob,
-    needed_bytes: int,
-    save: Callable[..., bytes],
-    scenes: SceneStore,
-) -> None:
+def test_room_for_all_pixels(job, needed_bytes, save, scenes):
     save("one")
     job.check(Surroundings(scenes.header("one"), needed_bytes, 64))
     job.check(Surroundings(scenes.header("one"), None, 64))
@@ -99,10 +91,8 @@ def test_room_for_all_pixels(
         job.check(Surroundings(scenes.header("one"), needed_bytes - 1, 64))
 
 
-def test_given_poses_are_assessed_where_that_is_quick(
-    save: Callable[..., bytes], scenes: SceneStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def check(job: RenderJob) -> None:
+def test_given_poses_are_assessed_where_that_is_quick(save, scenes, monkeypatch):
+    def check(job):
         job.check(Surroundings(scenes.header(job.scene), None, 64))
 
     save("one", confidence=MODEL)
@@ -120,9 +110,9 @@ def test_given_poses_are_assessed_where_that_is_quick(
 
 
 def test_submission_sent_again_after_a_failure_takes_the_scene_of_now(
-    save: Callable[..., bytes], rendering_store: JobStore, artifact_folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def away(*arguments: Any, **options: Any) -> None:
+    save, rendering_store, artifact_folder, monkeypatch
+):
+    def away(*arguments, **options):
         raise DatabaseUnavailable("away")
 
     save("one", seed=1)
@@ -136,9 +126,7 @@ def test_submission_sent_again_after_a_failure_takes_the_scene_of_now(
     rendering_store.close()
 
 
-def test_retry_takes_the_scene_of_the_job_before(
-    save: Callable[..., bytes], rendering_store: JobStore, artifact_folder: Path, tmp_path: Path
-) -> None:
+def test_retry_takes_the_scene_of_the_job_before(save, rendering_store, artifact_folder, tmp_path):
     then = save("one", seed=1)
     job, _ = rendering_store.submit(RenderJob(scene="one", poses=POSES))
     rendering_store.cancel(job.id)
@@ -152,19 +140,14 @@ def test_retry_takes_the_scene_of_the_job_before(
     rendering_store.close()
 
 
-def test_scene_that_goes_meanwhile_and_a_disk_that_is_full(
-    save: Callable[..., bytes],
-    rendering_store: JobStore,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_scene_that_goes_meanwhile_and_a_disk_that_is_full(save, rendering_store, tmp_path, monkeypatch):
     save("one")
 
-    def gone(source: Path, target: Path) -> None:
+    def gone(source, target):
         source.unlink()
         raise FileNotFoundError(errno.ENOENT, "gone")
 
-    def full(source: Path, target: Path) -> None:
+    def full(source, target):
         raise OSError(errno.ENOSPC, "full")
 
     monkeypatch.setattr(local, "link_or_copy", full)

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import json
-from typing import Any
 
 import numpy as np
 import pytest
@@ -37,11 +36,11 @@ POSES = np.tile(np.eye(4), (3, 1, 1)).tolist()
         ),
     ],
 )
-def test_there_and_back(job: Any) -> None:
+def test_there_and_back(job):
     assert from_dict(json.loads(json.dumps(to_dict(job)))) == job
 
 
-def test_poses_as_lists_and_packed_are_the_same_and_exact() -> None:
+def test_poses_as_lists_and_packed_are_the_same_and_exact():
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, :3, 3] = np.random.default_rng(0).normal(size=(2, 3))
     listed, packed = (
@@ -55,36 +54,28 @@ def test_poses_as_lists_and_packed_are_the_same_and_exact() -> None:
     assert RenderJob(scene="liver", poses=poses) != listed
 
 
-def test_long_names_are_cut() -> None:
+def test_long_names_are_cut():
     with pytest.raises(InvalidArgument) as caught:
         from_dict({"kind": "train", "dataset": "liver", "scene": "one", "x" * 10**6: 1})
     assert caught.value.field == "x" * 100
     assert len(caught.value.detail) < 300
 
 
-def test_a_row_of_an_earlier_release_is_read() -> None:
-    row = {"kind": "render", "scene": "liver", "sampler": {"kind": "fan", "tilt_deg": 5.0, "step_deg": 2.5}}
-    row |= {"height": None, "width": 30, "outputs": ["echo"], "format": "tar", "dtype": None, "min_confidence": None}
-    assert from_dict(row) == RenderJob(
-        scene="liver", sampler=FanSampler(5.0, 2.5), width=30, outputs=("echo",), format="tar"
-    )
-
-
-def test_in_short_holds_no_poses() -> None:
+def test_in_short_holds_no_poses():
     short = in_short(RenderJob(scene="liver", poses=POSES))
     assert short["pose_count"] == 3
     assert "poses" not in short
 
 
-def train(**values: Any) -> dict[str, Any]:
+def train(**values):
     return {"kind": "train", "dataset": "liver", "scene": "one", **values}
 
 
-def render(**values: Any) -> dict[str, Any]:
+def render(**values):
     return {"kind": "render", "scene": "one", "poses": POSES, **values}
 
 
-def around(**values: Any) -> dict[str, Any]:
+def around(**values):
     return render(poses=None, sampler={"kind": "around", "count": 3, **values})
 
 
@@ -146,7 +137,7 @@ def around(**values: Any) -> dict[str, Any]:
         (around(speed=1), "sampler.speed"),
     ],
 )
-def test_refused_with_the_field(document: dict[str, Any], field: str) -> None:
+def test_refused_with_the_field(document, field):
     with pytest.raises(InvalidArgument) as caught:
         from_dict(document)
     assert caught.value.field == field

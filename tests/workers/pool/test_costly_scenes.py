@@ -17,7 +17,7 @@ from ultragray.phantom.demo import DEMO_FILE
 from ultragray.rendering.frames import footprint_pixels
 from ultragray_workers import PoolConfig, Priority
 from ultragray_workers.errors import DeadlineExceeded
-from ultragray_workers.pool import processes as watchdog
+from ultragray_workers.pool import dispatcher
 
 from ..asking import HEIGHT, PROBE, WIDTH, asking
 
@@ -62,173 +62,141 @@ def test_usual_scenes_are_far_below_the_default_limit(random_scene, random_poses
     assert max(costs) * times < limit
 
 
-def test_a_hostile_scene_is_refused_and_the_next_request_served(run, open_pool, costly_folder, random_poses):
-    async def main():
-        async with open_pool() as pool:
-            with pytest.raises(FrameTooCostly, match="a frame may cost 2,147 million") as refused:
-                await pool.render(large("hostile"))
-            assert refused.value.field == "pose"
-            with pytest.raises(FrameTooCostly) as refused:
-                await pool.render(asking("hostile", np.tile(POSE, (3, 1, 1)), height=512, width=512))
-            assert refused.value.field == "poses[0]"
-            await pool.render(asking("a", random_poses(1)))
-            assert pool.statistics().restarts_total == pool.statistics().kills_total == 0
-
-    run(main())
+async def test_a_hostile_scene_is_refused_and_the_next_request_served(open_pool, costly_folder, random_poses):
+    async with open_pool() as pool:
+        with pytest.raises(FrameTooCostly, match="a frame may cost 2,147 million") as refused:
+            await pool.render(large("hostile"))
+        assert refused.value.field == "pose"
+        with pytest.raises(FrameTooCostly) as refused:
+            await pool.render(asking("hostile", np.tile(POSE, (3, 1, 1)), height=512, width=512))
+        assert refused.value.field == "poses[0]"
+        await pool.render(asking("a", random_poses(1)))
+        assert pool.statistics().restarts_total == pool.statistics().kills_total == 0
 
 
-def test_company_of_a_frame_that_is_too_costly_is_rendered(run, open_pool, costly_folder, until):
-    async def main():
-        async with open_pool() as pool:
-            (worker,) = pool.statistics().pids
-            await pool.load("minutes")
-            os.kill(worker, signal.SIGSTOP)
-            away = POSE.copy()
-            away[0, 2, 3] = 1e4  # nothing is before the probe
-            first = asyncio.create_task(pool.render(asking("a", POSE)))
-            await until(lambda: pool.statistics().busy == 1)
-            tasks = [
-                asyncio.create_task(pool.render(asking("minutes", poses, height=512, width=512)))
-                for poses in (POSE, away)
-            ]
-            await until(lambda: pool.statistics().waiting_frames == 2)
-            os.kill(worker, signal.SIGCONT)
-            await first
-            refused, rendered = await asyncio.gather(*tasks, return_exceptions=True)
-            assert isinstance(refused, FrameTooCostly)
-            assert rendered.batch_size == 2
-
-    run(main())
+async def test_company_of_a_frame_that_is_too_costly_is_rendered(open_pool, costly_folder, until):
+    async with open_pool() as pool:
+        (worker,) = pool.statistics().pids
+        await pool.load("minutes")
+        os.kill(worker, signal.SIGSTOP)
+        away = POSE.copy()
+        away[0, 2, 3] = 1e4  # nothing is before the probe
+        first = asyncio.create_task(pool.render(asking("a", POSE)))
+        await until(lambda: pool.statistics().busy == 1)
+        tasks = [
+            asyncio.create_task(pool.render(asking("minutes", poses, height=512, width=512))) for poses in (POSE, away)
+        ]
+        await until(lambda: pool.statistics().waiting_frames == 2)
+        os.kill(worker, signal.SIGCONT)
+        await first
+        refused, rendered = await asyncio.gather(*tasks, return_exceptions=True)
+        assert isinstance(refused, FrameTooCostly)
+        assert rendered.batch_size == 2
 
 
-def test_a_frame_past_its_deadline_is_given_up_and_frees_the_worker(run, open_pool, costly_folder, random_poses):
-    async def main():
-        async with open_pool(max_footprint_pixels=2**62) as pool:
-            await asyncio.gather(pool.load("minutes"), pool.load("a"))
-            with pytest.raises(DeadlineExceeded):
-                await pool.render(large("minutes", deadline=time.monotonic() + 0.5))
-            await pool.render(asking("a", random_poses(1), deadline=time.monotonic() + SOON_S))
-            assert pool.statistics().restarts_total == pool.statistics().kills_total == 0
-
-    run(main())
+async def test_a_frame_past_its_deadline_is_given_up_and_frees_the_worker(open_pool, costly_folder, random_poses):
+    async with open_pool(max_footprint_pixels=2**62) as pool:
+        await asyncio.gather(pool.load("minutes"), pool.load("a"))
+        with pytest.raises(DeadlineExceeded):
+            await pool.render(large("minutes", deadline=time.monotonic() + 0.5))
+        await pool.render(asking("a", random_poses(1), deadline=time.monotonic() + SOON_S))
+        assert pool.statistics().restarts_total == pool.statistics().kills_total == 0
 
 
-def test_a_frame_whose_client_has_gone_is_given_up(run, open_pool, costly_folder, random_poses, until):
-    async def main():
-        async with open_pool(max_footprint_pixels=2**62) as pool:
-            await asyncio.gather(pool.load("minutes"), pool.load("a"))
-            task = asyncio.create_task(pool.render(large("minutes")))
-            await until(lambda: pool.statistics().busy == 1)
-            await asyncio.sleep(0.2)  # into the frame
-            task.cancel()
-            await until(lambda: pool.statistics().busy == 0, timeout_s=SOON_S)
-            await pool.render(asking("a", random_poses(1)))
-            assert pool.statistics().restarts_total == pool.statistics().kills_total == 0
-
-    run(main())
+async def test_a_frame_whose_client_has_gone_is_given_up(open_pool, costly_folder, random_poses, until):
+    async with open_pool(max_footprint_pixels=2**62) as pool:
+        await asyncio.gather(pool.load("minutes"), pool.load("a"))
+        task = asyncio.create_task(pool.render(large("minutes")))
+        await until(lambda: pool.statistics().busy == 1)
+        await asyncio.sleep(0.2)  # into the frame
+        task.cancel()
+        await until(lambda: pool.statistics().busy == 0, timeout_s=SOON_S)
+        await pool.render(asking("a", random_poses(1)))
+        assert pool.statistics().restarts_total == pool.statistics().kills_total == 0
 
 
-def test_in_a_batch_the_latest_deadline_counts(run, open_pool, costly_folder, until):
-    async def main():
-        async with open_pool(max_footprint_pixels=2**62) as pool:
-            await pool.load("minutes")
-            (worker,) = pool.statistics().pids
-            os.kill(worker, signal.SIGSTOP)
-            now = time.monotonic()
-            first = asyncio.create_task(pool.render(asking("a", POSE)))
-            await until(lambda: pool.statistics().busy == 1)
-            deadlines = [now + 1.0, now + 2.0]
-            tasks = [asyncio.create_task(pool.render(large("minutes", deadline=deadline))) for deadline in deadlines]
-            await until(lambda: pool.statistics().waiting_frames == 2)
-            os.kill(worker, signal.SIGCONT)
-            await first
-            with pytest.raises(DeadlineExceeded):
-                await tasks[0]
-            assert not tasks[1].done()
-            assert pool.statistics().busy == 1
-            with pytest.raises(DeadlineExceeded):
-                await tasks[1]
-            assert time.monotonic() >= deadlines[1]
-            await until(lambda: pool.statistics().busy == 0, timeout_s=SOON_S)
-
-    run(main())
+async def test_in_a_batch_the_latest_deadline_counts(open_pool, costly_folder, until):
+    async with open_pool(max_footprint_pixels=2**62) as pool:
+        await pool.load("minutes")
+        (worker,) = pool.statistics().pids
+        os.kill(worker, signal.SIGSTOP)
+        now = time.monotonic()
+        first = asyncio.create_task(pool.render(asking("a", POSE)))
+        await until(lambda: pool.statistics().busy == 1)
+        deadlines = [now + 1.0, now + 2.0]
+        tasks = [asyncio.create_task(pool.render(large("minutes", deadline=deadline))) for deadline in deadlines]
+        await until(lambda: pool.statistics().waiting_frames == 2)
+        os.kill(worker, signal.SIGCONT)
+        await first
+        with pytest.raises(DeadlineExceeded):
+            await tasks[0]
+        assert not tasks[1].done()
+        assert pool.statistics().busy == 1
+        with pytest.raises(DeadlineExceeded):
+            await tasks[1]
+        assert time.monotonic() >= deadlines[1]
+        await until(lambda: pool.statistics().busy == 0, timeout_s=SOON_S)
 
 
 @pytest.mark.parametrize("priority", list(Priority))
-def test_a_stopped_worker_is_killed_and_its_work_done_again(run, open_pool, random_poses, expect_frames, priority):
+async def test_a_stopped_worker_is_killed_and_its_work_done_again(open_pool, random_poses, expect_frames, priority):
     request = asking("a", random_poses(3), priority=priority, deadline=time.monotonic() + 60.0)
-
-    async def main():
-        async with open_pool(worker_grace_s=2.0) as pool:
-            (worker,) = pool.statistics().pids
-            os.kill(worker, signal.SIGSTOP)
-            result = await pool.render(request)  # long before its deadline: the task was not even taken up
-            statistics = pool.statistics()
-            assert (statistics.kills_total, statistics.restarts_total) == (1, 0)
-            assert statistics.pids != (worker,)
-            return result
-
-    expect_frames(request, run(main()))
+    async with open_pool(worker_grace_s=2.0) as pool:
+        (worker,) = pool.statistics().pids
+        os.kill(worker, signal.SIGSTOP)
+        result = await pool.render(request)  # long before its deadline: the task was not even taken up
+        statistics = pool.statistics()
+        assert (statistics.kills_total, statistics.restarts_total) == (1, 0)
+        assert statistics.pids != (worker,)
+        found = result
+    expect_frames(request, found)
 
 
-def test_a_worker_stopped_in_the_middle_of_a_frame_is_killed_after_its_deadline(
-    run, open_pool, costly_folder, random_poses, until
+async def test_a_worker_stopped_in_the_middle_of_a_frame_is_killed_after_its_deadline(
+    open_pool, costly_folder, random_poses, until
 ):
-    async def main():
-        async with open_pool(max_footprint_pixels=2**62, worker_grace_s=2.0) as pool:
-            await pool.load("minutes")
-            (worker,) = pool.statistics().pids
-            late = asyncio.create_task(pool.render(large("minutes", deadline=time.monotonic() + 1.5)))
-            await until(lambda: pool.statistics().busy == 1)
-            await asyncio.sleep(0.3)  # into the frame
-            os.kill(worker, signal.SIGSTOP)
-            next_one = asyncio.create_task(pool.render(asking("a", random_poses(1))))
-            with pytest.raises(DeadlineExceeded):
-                await late
-            await next_one
-            assert pool.statistics().kills_total == 1
-
-    run(main())
+    async with open_pool(max_footprint_pixels=2**62, worker_grace_s=2.0) as pool:
+        await pool.load("minutes")
+        (worker,) = pool.statistics().pids
+        late = asyncio.create_task(pool.render(large("minutes", deadline=time.monotonic() + 1.5)))
+        await until(lambda: pool.statistics().busy == 1)
+        await asyncio.sleep(0.3)  # into the frame
+        os.kill(worker, signal.SIGSTOP)
+        next_one = asyncio.create_task(pool.render(asking("a", random_poses(1))))
+        with pytest.raises(DeadlineExceeded):
+            await late
+        await next_one
+        assert pool.statistics().kills_total == 1
 
 
-def test_a_request_with_which_two_workers_hang_fails_alone(run, open_pool, costly_folder, random_poses, until):
-    async def main():
-        async with open_pool(max_footprint_pixels=2**62, worker_timeout_s=2.0) as pool:
-            with pytest.raises(RenderFailed, match="2 worker processes hung"):
-                await pool.render(large("minutes"))  # without a deadline: silence is all there is to go by
-            await pool.render(asking("b", random_poses(1)))
-            assert (pool.statistics().kills_total, pool.statistics().restarts_total) == (2, 0)
-
-    run(main())
+async def test_a_request_with_which_two_workers_hang_fails_alone(open_pool, costly_folder, random_poses, until):
+    async with open_pool(max_footprint_pixels=2**62, worker_timeout_s=2.0) as pool:
+        with pytest.raises(RenderFailed, match="2 worker processes hung"):
+            await pool.render(large("minutes"))  # without a deadline: silence is all there is to go by
+        await pool.render(asking("b", random_poses(1)))
+        assert (pool.statistics().kills_total, pool.statistics().restarts_total) == (2, 0)
 
 
-def test_a_load_that_hangs_is_ended(run, open_pool, until):
-    async def main():
-        async with open_pool(worker_grace_s=2.0, worker_timeout_s=2.0) as pool:
-            (worker,) = pool.statistics().pids
-            os.kill(worker, signal.SIGSTOP)
-            await pool.load("a")
-            assert pool.statistics().kills_total == 1
-            assert pool.loaded() == {"a": 1}
-
-    run(main())
+async def test_a_load_that_hangs_is_ended(open_pool, until):
+    async with open_pool(worker_grace_s=2.0, worker_timeout_s=2.0) as pool:
+        (worker,) = pool.statistics().pids
+        os.kill(worker, signal.SIGSTOP)
+        await pool.load("a")
+        assert pool.statistics().kills_total == 1
+        assert pool.loaded() == {"a": 1}
 
 
-def test_a_pool_whose_workers_are_stuck_is_not_ready(run, open_pool, random_poses, until, monkeypatch):
-    monkeypatch.setattr("ultragray_workers.pool.processes.STUCK_AFTER_S", 0.5)
-    assert watchdog.STUCK_AFTER_S <= 10.0
-
-    async def main():
-        async with open_pool(worker_grace_s=30.0) as pool:
-            (worker,) = pool.statistics().pids
-            assert pool.ready
-            os.kill(worker, signal.SIGSTOP)
-            assert pool.ready  # nobody asks for anything
-            task = asyncio.create_task(pool.render(asking("a", random_poses(1))))
-            await until(lambda: not pool.ready)
-            assert pool.statistics().stuck == 1
-            os.kill(worker, signal.SIGCONT)
-            await task
-            assert pool.ready
-
-    run(main())
+async def test_a_pool_whose_workers_are_stuck_is_not_ready(open_pool, random_poses, until, monkeypatch):
+    monkeypatch.setattr("ultragray_workers.pool.dispatcher.STUCK_AFTER_S", 0.5)
+    assert dispatcher.STUCK_AFTER_S <= 10.0
+    async with open_pool(worker_grace_s=30.0) as pool:
+        (worker,) = pool.statistics().pids
+        assert pool.ready
+        os.kill(worker, signal.SIGSTOP)
+        assert pool.ready  # nobody asks for anything
+        task = asyncio.create_task(pool.render(asking("a", random_poses(1))))
+        await until(lambda: not pool.ready)
+        assert pool.statistics().stuck == 1
+        os.kill(worker, signal.SIGCONT)
+        await task
+        assert pool.ready

@@ -51,251 +51,201 @@ def test_results_equal_a_direct_render(run, open_pool, random_poses, expect_fram
         assert min(result.queue_ms, result.render_ms, result.encode_ms) > 0
 
 
-def test_image_files_hold_the_frame_of_one_pose(run, open_pool, random_poses):
-    async def main():
-        async with open_pool() as pool:
-            with pytest.raises(InvalidArgument, match="png holds the frame of one pose, got 2"):
-                await pool.render(asking("a", random_poses(2), encoding=Encoding.PNG))
-            with pytest.raises(InvalidArgument, match="at least one pose"):
-                await pool.render(asking("a", np.zeros((0, 4, 4))))
-
-    run(main())
+async def test_image_files_hold_the_frame_of_one_pose(open_pool, random_poses):
+    async with open_pool() as pool:
+        with pytest.raises(InvalidArgument, match="png holds the frame of one pose, got 2"):
+            await pool.render(asking("a", random_poses(2), encoding=Encoding.PNG))
+        with pytest.raises(InvalidArgument, match="at least one pose"):
+            await pool.render(asking("a", np.zeros((0, 4, 4))))
 
 
-def test_waiting_requests_of_one_kind_are_rendered_together(run, open_pool, random_poses, expect_frames, until):
+async def test_waiting_requests_of_one_kind_are_rendered_together(open_pool, random_poses, expect_frames, until):
     alike = [asking("a", random_poses(1, seed=seed)) for seed in range(5)]
     other = asking("a", random_poses(1), height=10)
-
-    async def main():
-        async with open_pool() as pool:
-            (worker,) = pool.statistics().pids
-            os.kill(worker, signal.SIGSTOP)
-            first = asyncio.create_task(pool.render(asking("b", random_poses(1))))
-            await until(lambda: pool.statistics().busy == 1)
-            tasks = [asyncio.create_task(pool.render(request)) for request in [*alike, other]]
-            await until(lambda: pool.statistics().waiting_frames == 6)
-            os.kill(worker, signal.SIGCONT)
-            return await first, [await task for task in tasks]
-
-    first, results = run(main())
+    async with open_pool() as pool:
+        (worker,) = pool.statistics().pids
+        os.kill(worker, signal.SIGSTOP)
+        first = asyncio.create_task(pool.render(asking("b", random_poses(1))))
+        await until(lambda: pool.statistics().busy == 1)
+        tasks = [asyncio.create_task(pool.render(request)) for request in [*alike, other]]
+        await until(lambda: pool.statistics().waiting_frames == 6)
+        os.kill(worker, signal.SIGCONT)
+        first, results = await first, [await task for task in tasks]
     assert first.batch_size == 1
     assert [result.batch_size for result in results] == [5, 5, 5, 5, 5, 1]
     for request, result in zip([*alike, other], results, strict=True):
         expect_frames(request, result)
 
 
-def test_interactive_requests_go_before_batches_and_between_their_parts(run, open_pool, random_poses, until):
+async def test_interactive_requests_go_before_batches_and_between_their_parts(open_pool, random_poses, until):
     order = []
-
-    async def main():
-        async with open_pool(max_batch_poses=8) as pool:  # 2 for batches
-            pool.on_rendered = lambda result: order.append(result.scene)
-            (worker,) = pool.statistics().pids
-            os.kill(worker, signal.SIGSTOP)
-            batch = asking("a", random_poses(40), encoding=Encoding.FLOAT32, priority=Priority.BATCH)
-            tasks = [asyncio.create_task(pool.render(batch))]
-            await until(lambda: pool.statistics().waiting_frames == 38)  # its first part is under way
-            tasks.append(asyncio.create_task(pool.render(asking("b", random_poses(1)))))
-            await until(lambda: pool.statistics().waiting_frames == 39)
-            os.kill(worker, signal.SIGCONT)
-            await asyncio.gather(*tasks)
-
-    run(main())
+    async with open_pool(max_batch_poses=8) as pool:  # 2 for batches
+        pool.on_rendered = lambda result: order.append(result.scene)
+        (worker,) = pool.statistics().pids
+        os.kill(worker, signal.SIGSTOP)
+        batch = asking("a", random_poses(40), encoding=Encoding.FLOAT32, priority=Priority.BATCH)
+        tasks = [asyncio.create_task(pool.render(batch))]
+        await until(lambda: pool.statistics().waiting_frames == 38)  # its first part is under way
+        tasks.append(asyncio.create_task(pool.render(asking("b", random_poses(1)))))
+        await until(lambda: pool.statistics().waiting_frames == 39)
+        os.kill(worker, signal.SIGCONT)
+        await asyncio.gather(*tasks)
     assert order == ["b", "a"]
 
 
-def test_a_full_queue_refuses_more_but_keeps_room_for_interactive_requests(run, open_pool, random_poses, until):
-    async def main():
-        async with open_pool(queue_limit_frames=4) as pool:
-            (worker,) = pool.statistics().pids
-            os.kill(worker, signal.SIGSTOP)
-            batch = asking("a", random_poses(2), priority=Priority.BATCH)
-            tasks = [asyncio.create_task(pool.render(batch))]
-            await until(lambda: pool.statistics().busy == 1)
-            tasks += [asyncio.create_task(pool.render(batch)) for _ in range(2)]
-            await until(lambda: pool.statistics().waiting_frames == 4)
-            with pytest.raises(QueueFull):
-                await pool.render(batch)
-            tasks.append(asyncio.create_task(pool.render(asking("a", random_poses(1)))))
-            await until(lambda: pool.statistics().waiting_frames == 5)
-            os.kill(worker, signal.SIGCONT)
-            await asyncio.gather(*tasks)
-
-    run(main())
+async def test_a_full_queue_refuses_more_but_keeps_room_for_interactive_requests(open_pool, random_poses, until):
+    async with open_pool(queue_limit_frames=4) as pool:
+        (worker,) = pool.statistics().pids
+        os.kill(worker, signal.SIGSTOP)
+        batch = asking("a", random_poses(2), priority=Priority.BATCH)
+        tasks = [asyncio.create_task(pool.render(batch))]
+        await until(lambda: pool.statistics().busy == 1)
+        tasks += [asyncio.create_task(pool.render(batch)) for _ in range(2)]
+        await until(lambda: pool.statistics().waiting_frames == 4)
+        with pytest.raises(QueueFull):
+            await pool.render(batch)
+        tasks.append(asyncio.create_task(pool.render(asking("a", random_poses(1)))))
+        await until(lambda: pool.statistics().waiting_frames == 5)
+        os.kill(worker, signal.SIGCONT)
+        await asyncio.gather(*tasks)
 
 
-def test_a_request_past_its_deadline_is_dropped_while_the_worker_is_busy(run, open_pool, random_poses, until):
-    async def main():
-        async with open_pool() as pool:
-            (worker,) = pool.statistics().pids
-            os.kill(worker, signal.SIGSTOP)
-            first = asyncio.create_task(pool.render(asking("a", random_poses(1))))
-            await until(lambda: pool.statistics().busy == 1)
-            with pytest.raises(DeadlineExceeded):
-                await pool.render(asking("a", random_poses(3), deadline=time.monotonic() + 0.05))
-            assert pool.statistics().waiting_frames == 0
-            os.kill(worker, signal.SIGCONT)
-            await first
-            with pytest.raises(DeadlineExceeded):
-                await pool.render(asking("a", random_poses(1), deadline=time.monotonic() - 1.0))
-            await pool.render(asking("a", random_poses(1), deadline=time.monotonic() + 30.0))
-
-    run(main())
+async def test_a_request_past_its_deadline_is_dropped_while_the_worker_is_busy(open_pool, random_poses, until):
+    async with open_pool() as pool:
+        (worker,) = pool.statistics().pids
+        os.kill(worker, signal.SIGSTOP)
+        first = asyncio.create_task(pool.render(asking("a", random_poses(1))))
+        await until(lambda: pool.statistics().busy == 1)
+        with pytest.raises(DeadlineExceeded):
+            await pool.render(asking("a", random_poses(3), deadline=time.monotonic() + 0.05))
+        assert pool.statistics().waiting_frames == 0
+        os.kill(worker, signal.SIGCONT)
+        await first
+        with pytest.raises(DeadlineExceeded):
+            await pool.render(asking("a", random_poses(1), deadline=time.monotonic() - 1.0))
+        await pool.render(asking("a", random_poses(1), deadline=time.monotonic() + 30.0))
 
 
-def test_a_cancelled_request_leaves_the_queue(run, open_pool, random_poses, until):
+async def test_a_cancelled_request_leaves_the_queue(open_pool, random_poses, until):
     rendered = []
-
-    async def main():
-        async with open_pool() as pool:
-            pool.on_rendered = lambda result: rendered.append(result.scene)
-            (worker,) = pool.statistics().pids
-            os.kill(worker, signal.SIGSTOP)
-            tasks = [asyncio.create_task(pool.render(asking("a", random_poses(1))))]
-            await until(lambda: pool.statistics().busy == 1)
-            tasks.append(asyncio.create_task(pool.render(asking("b", random_poses(3)))))
-            await until(lambda: pool.statistics().waiting_frames == 3)
-            for task in tasks:  # one under way, one waiting
-                task.cancel()
-            await asyncio.wait(tasks)
-            assert all(task.cancelled() for task in tasks)
-            assert pool.statistics().waiting_frames == 0
-            os.kill(worker, signal.SIGCONT)
-            await pool.render(asking("a", random_poses(1)))
-            assert "b" not in pool.loaded()
-
-    run(main())
+    async with open_pool() as pool:
+        pool.on_rendered = lambda result: rendered.append(result.scene)
+        (worker,) = pool.statistics().pids
+        os.kill(worker, signal.SIGSTOP)
+        tasks = [asyncio.create_task(pool.render(asking("a", random_poses(1))))]
+        await until(lambda: pool.statistics().busy == 1)
+        tasks.append(asyncio.create_task(pool.render(asking("b", random_poses(3)))))
+        await until(lambda: pool.statistics().waiting_frames == 3)
+        for task in tasks:  # one under way, one waiting
+            task.cancel()
+        await asyncio.wait(tasks)
+        assert all(task.cancelled() for task in tasks)
+        assert pool.statistics().waiting_frames == 0
+        os.kill(worker, signal.SIGCONT)
+        await pool.render(asking("a", random_poses(1)))
+        assert "b" not in pool.loaded()
     assert rendered == ["a"]
 
 
-def test_load_and_unload_reach_every_process(run, open_pool):
-    async def main():
-        async with open_pool(processes=2) as pool:
-            assert pool.loaded() == {}
-            await pool.load("a")
-            assert pool.loaded() == {"a": 2}
-            await pool.unload("a")
-            await pool.unload("a")  # nothing to do, no error
-            assert pool.loaded() == {}
-            for call in (pool.load, pool.unload):
-                with pytest.raises(SceneNotFound, match="known scenes: a, b"):
-                    await call("missing")
-            with pytest.raises(SceneNotFound):
-                await pool.render(asking("../a", np.eye(4)[None]))
-
-    run(main())
+async def test_load_and_unload_reach_every_process(open_pool):
+    async with open_pool(processes=2) as pool:
+        assert pool.loaded() == {}
+        await pool.load("a")
+        assert pool.loaded() == {"a": 2}
+        await pool.unload("a")
+        await pool.unload("a")  # nothing to do, no error
+        assert pool.loaded() == {}
+        for call in (pool.load, pool.unload):
+            with pytest.raises(SceneNotFound, match="known scenes: a, b"):
+                await call("missing")
+        with pytest.raises(SceneNotFound):
+            await pool.render(asking("../a", np.eye(4)[None]))
 
 
-def test_a_scene_beyond_the_memory_budget_is_refused_and_the_worker_lives(run, open_pool):
-    async def main():
-        async with open_pool(memory_budget_bytes=100) as pool:
-            for call in (pool.load("a"), pool.render(asking("a", np.eye(4)[None]))):
-                with pytest.raises(SceneTooLarge, match="memory budget"):
-                    await call
-            assert pool.statistics().restarts_total == 0
-
-    run(main())
+async def test_a_scene_beyond_the_memory_budget_is_refused_and_the_worker_lives(open_pool):
+    async with open_pool(memory_budget_bytes=100) as pool:
+        for call in (pool.load("a"), pool.render(asking("a", np.eye(4)[None]))):
+            with pytest.raises(SceneTooLarge, match="memory budget"):
+                await call
+        assert pool.statistics().restarts_total == 0
 
 
-def test_a_replaced_file_is_rendered_as_it_is_now(run, open_pool, scene_folder, random_poses, expect_frames):
+async def test_a_replaced_file_is_rendered_as_it_is_now(open_pool, scene_folder, random_poses, expect_frames):
     request = asking("a", random_poses(1))
-
-    async def main():
-        async with open_pool() as pool:
-            before = await pool.render(request)
-            (scene_folder / "b.ugr").replace(scene_folder / "a.ugr")
-            return before, await pool.render(request)
-
-    before, after = run(main())
+    async with open_pool() as pool:
+        before = await pool.render(request)
+        (scene_folder / "b.ugr").replace(scene_folder / "a.ugr")
+        before, after = before, await pool.render(request)
     assert before.scene_sha256 != after.scene_sha256 == file_sha256(scene_folder / "a.ugr")
     expect_frames(request, after)
 
 
-def test_an_invalid_file_is_an_error_and_no_more(run, open_pool, scene_folder, random_poses):
+async def test_an_invalid_file_is_an_error_and_no_more(open_pool, scene_folder, random_poses):
     data = bytearray((scene_folder / "a.ugr").read_bytes())
     (scene_folder / "truncated.ugr").write_bytes(data[:-100])
     header_bytes = 8 + int.from_bytes(data[:8], "little")
     data[header_bytes:] = b"\xff" * (len(data) - header_bytes)  # a valid header over NaN: only the worker sees it
     (scene_folder / "nan.ugr").write_bytes(data)
-
-    async def main():
-        async with open_pool() as pool:
-            for name in ("truncated", "nan"):
-                with pytest.raises(SceneFileInvalid, match=name):
-                    await pool.render(asking(name, random_poses(1)))
-            await pool.render(asking("a", random_poses(1)))
-            assert pool.statistics().restarts_total == 0
-
-    run(main())
+    async with open_pool() as pool:
+        for name in ("truncated", "nan"):
+            with pytest.raises(SceneFileInvalid, match=name):
+                await pool.render(asking(name, random_poses(1)))
+        await pool.render(asking("a", random_poses(1)))
+        assert pool.statistics().restarts_total == 0
 
 
-def test_draining_answers_what_was_asked_and_refuses_more(run, open_pool, random_poses, until):
-    async def main():
-        async with open_pool() as pool:
-            assert pool.ready
-            (worker,) = pool.statistics().pids
-            os.kill(worker, signal.SIGSTOP)
-            tasks = [asyncio.create_task(pool.render(asking("a", random_poses(1)))) for _ in range(3)]
-            await until(lambda: pool.statistics().waiting_frames == 2)
-            await pool.drain(timeout_s=0.05)  # too short
-            assert not any(task.done() for task in tasks)
-            assert not pool.ready
-            with pytest.raises(Draining):
-                await pool.render(asking("a", random_poses(1)))
-            os.kill(worker, signal.SIGCONT)
-            await pool.drain(timeout_s=30.0)
-            assert all(task.done() for task in tasks)
-            assert len([await task for task in tasks]) == 3
-
-    run(main())
-
-
-def test_closing_fails_what_is_open_and_leaves_no_process(run, open_pool, random_poses, until, processes):
-    async def main():
-        async with open_pool(processes=2) as pool:
-            await until(lambda: sorted(processes().values()) == ["ug-template"] * 2 + ["ug-worker"] * 2)
-            for worker in pool.statistics().pids:
-                os.kill(worker, signal.SIGSTOP)  # closing must not depend on their help
-            tasks = [asyncio.create_task(pool.render(asking("a", random_poses(1)))) for _ in range(3)]
-            await until(lambda: pool.statistics().busy == 2)
-            await pool.close()
-            for task in tasks:
-                with pytest.raises(Draining):
-                    await task
-            assert processes() == {}
-
-    run(main())
-
-
-def test_a_pool_that_has_not_started_is_not_ready(run, scene_folder, random_poses):
-    async def main():
-        pool = RenderPool(SceneStore(scene_folder), PoolConfig())
+async def test_draining_answers_what_was_asked_and_refuses_more(open_pool, random_poses, until):
+    async with open_pool() as pool:
+        assert pool.ready
+        (worker,) = pool.statistics().pids
+        os.kill(worker, signal.SIGSTOP)
+        tasks = [asyncio.create_task(pool.render(asking("a", random_poses(1)))) for _ in range(3)]
+        await until(lambda: pool.statistics().waiting_frames == 2)
+        await pool.drain(timeout_s=0.05)  # too short
+        assert not any(task.done() for task in tasks)
         assert not pool.ready
-        with pytest.raises(NotReady):
+        with pytest.raises(Draining):
             await pool.render(asking("a", random_poses(1)))
+        os.kill(worker, signal.SIGCONT)
+        await pool.drain(timeout_s=30.0)
+        assert all(task.done() for task in tasks)
+        assert len([await task for task in tasks]) == 3
+
+
+async def test_closing_fails_what_is_open_and_leaves_no_process(open_pool, random_poses, until, processes):
+    async with open_pool(processes=2) as pool:
+        await until(lambda: sorted(processes().values()) == ["ug-template"] * 2 + ["ug-worker"] * 2)
+        for worker in pool.statistics().pids:
+            os.kill(worker, signal.SIGSTOP)  # closing must not depend on their help
+        tasks = [asyncio.create_task(pool.render(asking("a", random_poses(1)))) for _ in range(3)]
+        await until(lambda: pool.statistics().busy == 2)
         await pool.close()
-
-    run(main())
-
-
-def test_an_unknown_backend_fails_the_start(run, scene_folder, processes):
-    async def main():
-        with pytest.raises(BackendUnavailable, match="nonsense"):
-            await RenderPool(SceneStore(scene_folder), PoolConfig(backend="nonsense")).start()
+        for task in tasks:
+            with pytest.raises(Draining):
+                await task
         assert processes() == {}
 
-    run(main())
+
+async def test_a_pool_that_has_not_started_is_not_ready(scene_folder, random_poses):
+    pool = RenderPool(SceneStore(scene_folder), PoolConfig())
+    assert not pool.ready
+    with pytest.raises(NotReady):
+        await pool.render(asking("a", random_poses(1)))
+    await pool.close()
 
 
-def test_a_start_that_is_cancelled_leaves_no_process(run, cold_templates, scene_folder, processes, until):
-    async def main():
-        start = asyncio.create_task(RenderPool(SceneStore(scene_folder), PoolConfig()).start())
-        await until(lambda: processes() != {})
-        start.cancel()
-        await asyncio.wait([start])
-        assert processes() == {}
+async def test_an_unknown_backend_fails_the_start(scene_folder, processes):
+    with pytest.raises(BackendUnavailable, match="nonsense"):
+        await RenderPool(SceneStore(scene_folder), PoolConfig(backend="nonsense")).start()
+    assert processes() == {}
 
-    run(main())
+
+async def test_a_start_that_is_cancelled_leaves_no_process(cold_templates, scene_folder, processes, until):
+    start = asyncio.create_task(RenderPool(SceneStore(scene_folder), PoolConfig()).start())
+    await until(lambda: processes() != {})
+    start.cancel()
+    await asyncio.wait([start])
+    assert processes() == {}
 
 
 @pytest.mark.parametrize("settings", [{"processes": -1}, {"max_batch_poses": 1000}, {"queue_limit_frames": 0}])

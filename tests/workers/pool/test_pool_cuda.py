@@ -68,15 +68,11 @@ def test_frames_are_what_the_cpu_renders(
 
 
 @needs_no_gpu
-def test_no_gpu_is_one_clear_error_and_no_process(run, scene_folder, processes, monkeypatch):
+async def test_no_gpu_is_one_clear_error_and_no_process(scene_folder, processes, monkeypatch):
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
-
-    async def main():
-        with pytest.raises(BackendUnavailable, match="needs an NVIDIA GPU"):
-            await RenderPool(SceneStore(scene_folder), PoolConfig(backend="cuda")).start()
-        assert processes() == {}
-
-    run(main())
+    with pytest.raises(BackendUnavailable, match="needs an NVIDIA GPU"):
+        await RenderPool(SceneStore(scene_folder), PoolConfig(backend="cuda")).start()
+    assert processes() == {}
 
 
 @pytest.fixture
@@ -108,16 +104,12 @@ worker.render_device = take
 
 @pytest.mark.long
 @pytest.mark.parametrize(("asked", "expected"), [(0, 3), (1, 1), (4, 4)])
-def test_each_gpu_gets_a_process_where_no_number_is_given(run, open_pool, patch_workers, tmp_path, asked, expected):
+async def test_each_gpu_gets_a_process_where_no_number_is_given(open_pool, patch_workers, tmp_path, asked, expected):
     (tmp_path / "taken").mkdir()
     patch_workers(THREE_GPUS.format(folder=str(tmp_path / "taken")))
-
-    async def main():
-        async with open_pool(processes=asked) as pool:
-            await pool.load("a")
-            return pool.statistics(), pool.loaded()
-
-    statistics, loaded = run(main())
+    async with open_pool(processes=asked) as pool:
+        await pool.load("a")
+        statistics, loaded = pool.statistics(), pool.loaded()
     assert (statistics.processes_alive, loaded) == (expected, {"a": expected})
     assert {file.name for file in (tmp_path / "taken").iterdir()} == {str(number) for number in range(expected)}
 
@@ -134,28 +126,27 @@ frames.render = render_few
 """
 
 
-def test_out_of_memory_fails_the_request_and_no_more(run, open_pool, random_poses, expect_frames, until, patch_workers):
+async def test_out_of_memory_fails_the_request_and_no_more(
+    open_pool, random_poses, expect_frames, until, patch_workers
+):
     patch_workers(OUT_OF_MEMORY)
     large = asking("a", random_poses(1), height=61, outputs=("bmode", "echo"))
     alike = [asking("a", random_poses(2, seed=seed)) for seed in range(2)]  # too many together
-
-    async def main():
-        async with open_pool() as pool:
-            with pytest.raises(MemoryExceeded, match=r"1 frames of 61x32 pixels \(bmode, echo\)"):
-                await pool.render(large)
-            (worker,) = pool.statistics().pids
-            os.kill(worker, signal.SIGSTOP)
-            first = asyncio.create_task(pool.render(asking("b", random_poses(1))))
-            await until(lambda: pool.statistics().busy == 1)
-            tasks = [asyncio.create_task(pool.render(request)) for request in alike]
-            await until(lambda: pool.statistics().waiting_frames == 4)
-            os.kill(worker, signal.SIGCONT)
-            await first
-            results = [await task for task in tasks]
-            assert pool.statistics().restarts_total == 0
-            return results
-
-    for request, result in zip(alike, run(main()), strict=True):
+    async with open_pool() as pool:
+        with pytest.raises(MemoryExceeded, match=r"1 frames of 61x32 pixels \(bmode, echo\)"):
+            await pool.render(large)
+        (worker,) = pool.statistics().pids
+        os.kill(worker, signal.SIGSTOP)
+        first = asyncio.create_task(pool.render(asking("b", random_poses(1))))
+        await until(lambda: pool.statistics().busy == 1)
+        tasks = [asyncio.create_task(pool.render(request)) for request in alike]
+        await until(lambda: pool.statistics().waiting_frames == 4)
+        os.kill(worker, signal.SIGCONT)
+        await first
+        results = [await task for task in tasks]
+        assert pool.statistics().restarts_total == 0
+        found = results
+    for request, result in zip(alike, found, strict=True):
         assert result.batch_size == 4
         expect_frames(request, result)
 
@@ -174,19 +165,15 @@ frames.render = render_in_little
 
 @pytest.mark.gpu
 @needs_gpu
-def test_a_full_gpu_fails_the_request_and_no_more(run, open_pool, random_poses, patch_workers, monkeypatch):
+async def test_a_full_gpu_fails_the_request_and_no_more(open_pool, random_poses, patch_workers, monkeypatch):
     monkeypatch.delenv("TRITON_INTERPRET", raising=False)
     patch_workers(FULL_GPU)
-
-    async def main():
-        async with open_pool(backend="cuda", processes=1) as pool:
-            await pool.render(asking("a", random_poses(1)))
-            with pytest.raises(MemoryExceeded, match="1200"):
-                await pool.render(asking("a", random_poses(1), height=1200, width=1000))
-            await pool.render(asking("a", random_poses(1)))
-            assert pool.statistics().restarts_total == 0
-
-    run(main())
+    async with open_pool(backend="cuda", processes=1) as pool:
+        await pool.render(asking("a", random_poses(1)))
+        with pytest.raises(MemoryExceeded, match="1200"):
+            await pool.render(asking("a", random_poses(1), height=1200, width=1000))
+        await pool.render(asking("a", random_poses(1)))
+        assert pool.statistics().restarts_total == 0
 
 
 LOST_GPU = """
@@ -207,19 +194,16 @@ frames.render = lose_once
 """
 
 
-def test_a_worker_that_lost_its_gpu_is_replaced_and_the_work_done_again(
-    run, open_pool, random_poses, expect_frames, tmp_path, patch_workers
+async def test_a_worker_that_lost_its_gpu_is_replaced_and_the_work_done_again(
+    open_pool, random_poses, expect_frames, tmp_path, patch_workers
 ):
     """After an error of a kernel nothing works any more in the process that it belonged to."""
     lost = tmp_path / "lost"
     lost.touch()
     patch_workers(LOST_GPU.format(lost=str(lost)))
     request = asking("a", random_poses(2))
-
-    async def main():
-        async with open_pool() as pool:
-            result = await pool.render(request)
-            assert pool.statistics().restarts_total == 1
-            return result
-
-    expect_frames(request, run(main()))
+    async with open_pool() as pool:
+        result = await pool.render(request)
+        assert pool.statistics().restarts_total == 1
+        found = result
+    expect_frames(request, found)

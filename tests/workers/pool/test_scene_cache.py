@@ -12,8 +12,8 @@ from ultragray.errors import MemoryExceeded, SceneFileInvalid
 from ultragray.files import file_sha256
 from ultragray_workers import SceneStore
 from ultragray_workers.errors import SceneTooLarge
-from ultragray_workers.pool import scene_cache
-from ultragray_workers.pool.scene_cache import SceneCache
+from ultragray_workers.pool import worker as scene_cache
+from ultragray_workers.pool.worker import SceneCache
 from ultragray_workers.scenes import resident_bytes
 
 CPU = torch.device("cpu")

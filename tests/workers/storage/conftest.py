@@ -2,22 +2,18 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-
 import pytest
 
 from ultragray_workers.storage.location import open_storage
-from ultragray_workers.storage.storage import Storage
 
 
 @pytest.fixture
-def nothing_left_behind() -> None:
+def nothing_left_behind():
     """Instead of the one for pools: there are none here, and obstore keeps its connections."""
 
 
 @pytest.fixture(params=["folder", pytest.param("bucket", marks=pytest.mark.slow)])
-def storage(request: pytest.FixtureRequest, tmp_path: Path) -> Storage:
+def storage(request, tmp_path):
     """An empty storage: a folder, or a bucket of a real S3 server."""
     if request.param == "folder":
         return open_storage(tmp_path / "storage")
@@ -25,6 +21,6 @@ def storage(request: pytest.FixtureRequest, tmp_path: Path) -> Storage:
 
 
 @pytest.fixture
-def bucket(new_bucket: Callable[[], str]) -> Storage:
+def bucket(new_bucket):
     """An empty bucket, whose requests are repeated for 2 s."""
     return open_storage(new_bucket(), patience_s=2)

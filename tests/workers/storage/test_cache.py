@@ -8,7 +8,6 @@ import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
 
 import pytest
 
@@ -16,9 +15,9 @@ from ultragray_workers.errors import StorageFull, StorageUnavailable
 from ultragray_workers.storage import cache as cache_module
 from ultragray_workers.storage.cache import Cache
 from ultragray_workers.storage.local import LocalStorage
-from ultragray_workers.storage.storage import Entry, NotThere, Storage
+from ultragray_workers.storage.storage import Damaged, NotThere
 
-from ...object_storage import Fault, FaultyProxy
+from ...object_storage import Fault
 from ...waiting import wait_until
 
 SIZE = 1000
@@ -27,12 +26,12 @@ SIZE = 1000
 class SlowStorage(LocalStorage):
     """A folder of whose downloads each waits until the test lets it go."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder):
         super().__init__(folder)
         self.asked: list[str] = []
         self.go = threading.Event()
 
-    def download(self, key: str, path: Path, *, version: str | None = None) -> Entry:
+    def download(self, key, path, *, version=None):
         self.asked.append(key)
         if key.startswith("slow"):
             assert self.go.wait(20)
@@ -40,27 +39,26 @@ class SlowStorage(LocalStorage):
 
 
 @pytest.fixture
-def cache(tmp_path: Path) -> Cache:
+def cache(tmp_path):
     """Of room for three objects."""
-    return Cache(tmp_path / "cache", 3 * SIZE)
+    return Cache(tmp_path / "cache", 3 * SIZE, keep_s=0.0)
 
 
 @pytest.fixture
-def source(tmp_path: Path) -> SlowStorage:
+def source(tmp_path):
     storage = SlowStorage(tmp_path / "source")
     for key in ("a", "b", "c", "d", "slow"):
         storage.write(key, key.encode() * (SIZE // len(key)))
     return storage
 
 
-def fetch(cache: Cache, storage: Storage, key: str) -> bytes:
+def fetch(cache, storage, key):
     entry = storage.entry(key)
-    assert entry is not None
-    with cache.file(storage, key, entry.version) as path:
+    with cache.pin(storage, key, entry.version) as path:
         return path.read_bytes()
 
 
-def test_an_object_is_fetched_once(cache: Cache, source: SlowStorage) -> None:
+def test_an_object_is_fetched_once(cache, source):
     assert fetch(cache, source, "a") == fetch(cache, source, "a") == b"a" * SIZE
     assert source.asked == ["a"]
     counts = cache.counts
@@ -70,7 +68,7 @@ def test_an_object_is_fetched_once(cache: Cache, source: SlowStorage) -> None:
     assert source.asked == ["a"]
 
 
-def test_many_that_ask_at_once_wait_for_one_fetch_and_others_do_not(cache: Cache, source: SlowStorage) -> None:
+def test_many_that_ask_at_once_wait_for_one_fetch_and_others_do_not(cache, source):
     with ThreadPoolExecutor(8) as threads:
         asked = [threads.submit(fetch, cache, source, "slow") for _ in range(6)]
         wait_until(lambda: source.asked == ["slow"], within_s=10)
@@ -81,7 +79,7 @@ def test_many_that_ask_at_once_wait_for_one_fetch_and_others_do_not(cache: Cache
     assert source.asked == ["slow", "a"]
 
 
-def test_the_least_recently_used_goes_and_the_bound_holds(cache: Cache, source: SlowStorage) -> None:
+def test_the_least_recently_used_goes_and_the_bound_holds(cache, source):
     for key in ("a", "b", "c", "a", "d"):
         fetch(cache, source, key)
         time.sleep(0.01)
@@ -91,12 +89,11 @@ def test_the_least_recently_used_goes_and_the_bound_holds(cache: Cache, source: 
     assert source.asked == ["a", "b", "c", "d"]
 
 
-def test_what_is_in_use_stays(cache: Cache, source: SlowStorage, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_is_in_use_stays(cache, source, monkeypatch):
     monkeypatch.setattr(cache_module, "_WAIT_FOR_ROOM_S", 0.3)
     pins = []
     for key in ("a", "b", "c"):
         entry = source.entry(key)
-        assert entry is not None
         pins.append(cache.pin(source, key, entry.version))
     with pytest.raises(StorageFull, match=r"in use.*max_cache_bytes"):
         fetch(cache, source, "d")
@@ -108,24 +105,24 @@ def test_what_is_in_use_stays(cache: Cache, source: SlowStorage, monkeypatch: py
         pin.let_go()
 
 
-def test_an_object_larger_than_the_cache_names_the_setting(source: SlowStorage, tmp_path: Path) -> None:
+def test_an_object_larger_than_the_cache_names_the_setting(source, tmp_path):
     with pytest.raises(StorageFull, match="1000 bytes does not fit the cache of 999: raise max_cache_bytes"):
         fetch(Cache(tmp_path / "small", SIZE - 1), source, "a")
 
 
-def test_content_is_kept_by_its_hash_and_checked(cache: Cache, source: SlowStorage) -> None:
+def test_content_is_kept_by_its_hash_and_checked(cache, source):
     sha256 = hashlib.sha256(b"a" * SIZE).hexdigest()
-    with cache.file(source, "a", "any", sha256) as path:
+    with cache.pin(source, "a", "any", sha256) as path:
         assert path.name == sha256
     source.delete("a")
-    with cache.file(source, "elsewhere", "any", sha256) as path:
+    with cache.pin(source, "elsewhere", "any", sha256) as path:
         assert path.read_bytes() == b"a" * SIZE
-    with pytest.raises(StorageUnavailable, match=r"b in .* is damaged: its SHA-256 is"):
+    with pytest.raises(Damaged, match=r"b in .* is damaged: its SHA-256 is"):
         cache.pin(source, "b", "any", "0" * 64)
     assert [path.name for path in (cache.folder / "files").iterdir()] == [sha256]
 
 
-def test_a_version_that_has_gone_is_not_there(cache: Cache, source: SlowStorage) -> None:
+def test_a_version_that_has_gone_is_not_there(cache, source):
     for key, version in (("a", "old"), ("absent", "any")):
         with pytest.raises(NotThere):
             cache.pin(source, key, version)
@@ -146,11 +143,11 @@ class Deadly(LocalStorage):
             os._exit(7)
 
 storage = Deadly(Path(sys.argv[2]))
-Cache(Path(sys.argv[1]), 3000).pin(storage, "a", storage.entry("a").version)
+Cache(Path(sys.argv[1]), 3000, 0.0).pin(storage, "a", storage.entry("a").version)
 """
 
 
-def test_a_process_that_dies_while_it_fetches_leaves_nothing_that_stays(cache: Cache, source: SlowStorage) -> None:
+def test_a_process_that_dies_while_it_fetches_leaves_nothing_that_stays(cache, source):
     assert subprocess.run([sys.executable, "-c", DIES, cache.folder, source.folder], timeout=60).returncode == 7
     assert cache.held_bytes() == SIZE  # its space
     for key in ("b", "c", "d", "a"):
@@ -166,15 +163,15 @@ from pathlib import Path
 from ultragray_workers.storage.cache import Cache
 from ultragray_workers.storage.local import LocalStorage
 
-cache, storage = Cache(Path(sys.argv[1]), 3000), LocalStorage(Path(sys.argv[2]))
+cache, storage = Cache(Path(sys.argv[1]), 3000, 0.0), LocalStorage(Path(sys.argv[2]))
 for number in range(100):
     key = "abcd"[(int(sys.argv[3]) + number) % 4]
-    with cache.file(storage, key, storage.entry(key).version) as path:
+    with cache.pin(storage, key, storage.entry(key).version) as path:
         assert path.read_bytes() == key.encode() * 1000
 """
 
 
-def test_several_processes_share_the_bound(cache: Cache, source: SlowStorage) -> None:
+def test_several_processes_share_the_bound(cache, source):
     processes = [
         subprocess.Popen([sys.executable, "-c", FETCHES, cache.folder, source.folder, str(first)]) for first in range(3)
     ]
@@ -187,22 +184,19 @@ def test_several_processes_share_the_bound(cache: Cache, source: SlowStorage) ->
 
 
 @pytest.fixture
-def bucket_of_one(bucket: Storage) -> Storage:
+def bucket_of_one(bucket):
     bucket.write("a", b"a" * SIZE)
     return bucket
 
 
 @pytest.mark.slow
-def test_what_is_cached_is_there_without_the_bucket(
-    cache: Cache, bucket_of_one: Storage, object_proxy: FaultyProxy
-) -> None:
+def test_what_is_cached_is_there_without_the_bucket(cache, bucket_of_one, object_proxy):
     entry = bucket_of_one.entry("a")
-    assert entry is not None
     object_proxy.faults.append(Fault("cut_answer", "GET", bytes=300))
-    with cache.file(bucket_of_one, "a", entry.version) as path:
+    with cache.pin(bucket_of_one, "a", entry.version) as path:
         assert path.read_bytes() == b"a" * SIZE
     object_proxy.away = True
-    with cache.file(bucket_of_one, "a", entry.version) as path:
+    with cache.pin(bucket_of_one, "a", entry.version) as path:
         assert path.read_bytes() == b"a" * SIZE
     with pytest.raises(StorageUnavailable):
         cache.pin(bucket_of_one, "b", "any")

@@ -22,11 +22,11 @@ from ultragray_workers.storage.location import StorageUrl, parse_location
         ("az://container/a", StorageUrl("az", "container", "a")),
     ],
 )
-def test_paths_and_urls(given: str | Path, found: object) -> None:
+def test_paths_and_urls(given, found):
     assert parse_location(given, "data_folder") == found
 
 
-def test_a_url_is_written_as_it_is_read() -> None:
+def test_a_url_is_written_as_it_is_read():
     assert str(StorageUrl("s3", "scenes", "of/us")) == "s3://scenes/of/us"
     assert str(StorageUrl("s3", "scenes")) == "s3://scenes"
     assert str(StorageUrl("s3", "scenes").below("artifacts")) == "s3://scenes/artifacts"
@@ -47,7 +47,7 @@ def test_a_url_is_written_as_it_is_read() -> None:
         ("s3://[", "must be a path"),
     ],
 )
-def test_others_are_refused(given: str, sentence: str) -> None:
+def test_others_are_refused(given, sentence):
     with pytest.raises(InvalidArgument, match=sentence) as refused:
         parse_location(given, "data_folder")
     assert refused.value.field == "data_folder"

@@ -45,6 +45,11 @@ export class Unreachable extends Error {
   }
 }
 
+/** As tokens and headers hold bytes. */
+export function base64url(bytes: Uint8Array): string {
+  return btoa(String.fromCharCode(...bytes)).replaceAll("+", "-").replaceAll("/", "_").replaceAll("=", "");
+}
+
 /** One sentence for a person. */
 export function explain(error: unknown): string {
   return error instanceof Error ? error.message : String(error);
@@ -119,6 +124,19 @@ export async function untilAnswered<T>(
     }
     await new Promise((resolve) => setTimeout(resolve, pause_ms));
   }
+}
+
+/** Does something that asks as long as an effect holds: `told` hears what goes wrong until it ends, by what is returned. */
+export function asking(
+  work: (signal: AbortSignal, tell: (error: unknown) => void) => Promise<unknown>,
+  told: (error: unknown) => void,
+): () => void {
+  const ending = new AbortController();
+  const tell = (error: unknown): void => {
+    if (!ending.signal.aborted) told(error);
+  };
+  work(ending.signal, tell).catch(tell);
+  return () => ending.abort();
 }
 
 type AnswerTo<P extends Path, Method extends "get" | "post"> = paths[P] extends Record<

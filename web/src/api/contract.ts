@@ -56,9 +56,7 @@ export function exampleProbe(kind: string, depth_mm: number): Probe {
 }
 
 /** Throws ServiceError for a probe that cannot be. */
-export function imagePlane(probe: Probe): Promise<ImagePlane> {
-  return postJson("/v1/probes:plane", {}, probe);
-}
+export const imagePlane = (probe: Probe): Promise<ImagePlane> => postJson("/v1/probes:plane", {}, probe);
 
 export type Tool = NonNullable<StreamSettings["tools"]>[number];
 export type ToolKind = Tool["kind"];

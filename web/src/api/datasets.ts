@@ -66,10 +66,6 @@ export function framePath(dataset: string, part: Part, index: number): string {
   return address("/v1/datasets/{dataset}/frames/{part}/{index}", { dataset, part, index });
 }
 
-export function contactSheetPath(dataset: string): string {
-  return address("/v1/datasets/{dataset}/contact-sheet", { dataset });
-}
+export const contactSheetPath = (dataset: string): string => address("/v1/datasets/{dataset}/contact-sheet", { dataset });
 
-export function deleteDataset(dataset: string): Promise<void> {
-  return remove("/v1/datasets/{dataset}", { dataset });
-}
+export const deleteDataset = (dataset: string): Promise<void> => remove("/v1/datasets/{dataset}", { dataset });

@@ -40,27 +40,19 @@ export async function listJobs(count: number, { kind = "", state = "" }: JobFilt
   return { jobs: page.jobs as Job[], more: page.next_page_token !== "" };
 }
 
-export function getJob(job: string): Promise<Job> {
-  return getJson("/v1/jobs/{job}", { job }) as Promise<Job>;
-}
+export const getJob = (job: string): Promise<Job> => getJson("/v1/jobs/{job}", { job }) as Promise<Job>;
 
 /** Others see neither a private job nor the scene that it makes. */
 export function startJob(kind: string, specification: Record<string, unknown>, isPrivate: boolean): Promise<Job> {
   return postJson("/v1/jobs", {}, { kind, specification, private: isPrivate }) as Promise<Job>;
 }
 
-export function cancelJob(job: string): Promise<unknown> {
-  return postJson("/v1/jobs/{job}:cancel", { job });
-}
+export const cancelJob = (job: string): Promise<unknown> => postJson("/v1/jobs/{job}:cancel", { job });
 
-export function retryJob(job: string): Promise<Job> {
-  return postJson("/v1/jobs/{job}:retry", { job }) as Promise<Job>;
-}
+export const retryJob = (job: string): Promise<Job> => postJson("/v1/jobs/{job}:retry", { job }) as Promise<Job>;
 
 /** Removes a job that has ended, and its files. */
-export function deleteJob(job: string): Promise<void> {
-  return remove("/v1/jobs/{job}", { job });
-}
+export const deleteJob = (job: string): Promise<void> => remove("/v1/jobs/{job}", { job });
 
 /** What a render job of this specification would make; nothing is started. */
 export function estimateRendering(specification: Record<string, unknown>, signal: AbortSignal): Promise<JobEstimate> {
@@ -72,18 +64,14 @@ export function trainingCurve(job: string, signal: AbortSignal): Promise<Trainin
   return getJson("/v1/jobs/{job}/curve", { job }, { signal });
 }
 
-export function previewPath(job: string): string {
-  return address("/v1/jobs/{job}/preview", { job });
-}
+export const previewPath = (job: string): string => address("/v1/jobs/{job}/preview", { job });
 
 export function artifactPath(job: string, name: string): string {
   return address("/v1/jobs/{job}/artifacts/{name}", { job, name });
 }
 
 /** A file that a browser shows instead of saving it. */
-export function shownPath(job: string, name: string): string {
-  return `${artifactPath(job, name)}?show=true`;
-}
+export const shownPath = (job: string, name: string): string => `${artifactPath(job, name)}?show=true`;
 
 /** What a job is about: the scene that it makes or needs, else its dataset. */
 export function subjectOf({ specification }: Job): string {

@@ -8,21 +8,20 @@ import type { paths } from "./generated/schema";
 export type SceneEntry = Schemas["SceneEntry"];
 export type SceneDescription = Schemas["Scene"];
 
-/** Every scene of the service, by name. */
-export async function listScenes(): Promise<SceneEntry[]> {
-  const scenes: SceneEntry[] = [];
-  let token = "";
-  do {
-    const page = await getJson("/v1/scenes", {}, { query: { page_size: "1000", page_token: token } });
-    scenes.push(...page.scenes);
-    token = page.next_page_token;
-  } while (token !== "");
-  return scenes;
+/** All pages of a list. */
+async function pages<Page extends { next_page_token: string }>(ask: (query: Record<string, string>) => Promise<Page>): Promise<Page[]> {
+  const all: Page[] = [];
+  do all.push(await ask({ page_size: "1000", page_token: all.at(-1)?.next_page_token ?? "" }));
+  while (all.at(-1)!.next_page_token !== "");
+  return all;
 }
 
-export function describeScene(scene: string): Promise<SceneDescription> {
-  return getJson("/v1/scenes/{scene}", { scene });
+/** Every scene of the service, by name. */
+export async function listScenes(): Promise<SceneEntry[]> {
+  return (await pages((query) => getJson("/v1/scenes", {}, { query }))).flatMap(({ scenes }) => scenes);
 }
+
+export const describeScene = (scene: string): Promise<SceneDescription> => getJson("/v1/scenes/{scene}", { scene });
 
 /** An even selection of at most `limit` Gaussians. */
 export async function sceneGaussians(scene: string, limit: number): Promise<Gaussians> {
@@ -63,13 +62,9 @@ export function importScene(
   return putFile(path, new Blob([file]), told, signal);
 }
 
-export function deleteScene(scene: string): Promise<void> {
-  return remove("/v1/scenes/{scene}", { scene });
-}
+export const deleteScene = (scene: string): Promise<void> => remove("/v1/scenes/{scene}", { scene });
 
-export function sceneFilePath(scene: string): string {
-  return address("/v1/scenes/{scene}/file", { scene });
-}
+export const sceneFilePath = (scene: string): string => address("/v1/scenes/{scene}/file", { scene });
 
 export type Comparison = Schemas["Comparison"];
 export type ComparedFrame = Schemas["ComparedFrame"];
@@ -91,14 +86,7 @@ export type Registration = Schemas["NamedRegistration"];
 
 /** Every registration of the service, by name. */
 export async function listRegistrations(signal: AbortSignal): Promise<Registration[]> {
-  const all: Registration[] = [];
-  let token = "";
-  do {
-    const page = await getJson("/v1/registrations", {}, { query: { page_size: "1000", page_token: token }, signal });
-    all.push(...page.registrations);
-    token = page.next_page_token;
-  } while (token !== "");
-  return all;
+  return (await pages((query) => getJson("/v1/registrations", {}, { query, signal }))).flatMap(({ registrations }) => registrations);
 }
 
 export function deleteRegistration(registration: string): Promise<void> {

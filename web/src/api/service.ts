@@ -5,9 +5,7 @@ import { operations, roles } from "./generated/contract";
 
 export type ServiceInfo = Schemas["ServiceInfo"];
 
-export function serviceInfo(): Promise<ServiceInfo> {
-  return getJson("/v1/service", {});
-}
+export const serviceInfo = (): Promise<ServiceInfo> => getJson("/v1/service", {});
 
 export type SignInProvider = Schemas["SignInProvider"];
 
@@ -20,9 +18,7 @@ export type Me = Schemas["Me"];
 /** Something that the service does, as "POST /v1/jobs". */
 export type Operation = keyof typeof operations;
 
-export function whoAmI(): Promise<Me> {
-  return getJson("/v1/me", {});
-}
+export const whoAmI = (): Promise<Me> => getJson("/v1/me", {});
 
 /** Those who may do something. */
 export interface Allowed {
@@ -41,9 +37,7 @@ export function barredFor(me: Me, operation: Operation, owner: string | null): A
 export type Statistics = Schemas["ServiceStatistics"];
 export type StageTimes = Schemas["StageTimes"];
 
-export function statistics(signal: AbortSignal): Promise<Statistics> {
-  return getJson("/v1/statistics", {}, { signal });
-}
+export const statistics = (signal: AbortSignal): Promise<Statistics> => getJson("/v1/statistics", {}, { signal });
 
 export type AuditEntry = Schemas["AuditEntry"];
 

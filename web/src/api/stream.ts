@@ -1,6 +1,6 @@
 /** The WebSockets of the service: frames of a scene for the poses that are sent, and a stream of another program to watch. */
 
-import { apiKey, getJson, poseBody, type Schemas } from "./client";
+import { apiKey, base64url, getJson, poseBody, type Schemas } from "./client";
 import type { FrameHeader, Output, StreamSettings } from "./contract";
 
 /** Why a pose got no frame. */
@@ -233,12 +233,7 @@ export function socketAddress(path: string): URL {
 
 /** How a page, which cannot set headers, tells its key. */
 export function subprotocols(key: string | null): string[] {
-  return key === null ? [] : ["ultragray.v1", `ultragray.key.${base64url(key)}`];
-}
-
-function base64url(text: string): string {
-  const bytes = new TextEncoder().encode(text);
-  return btoa(String.fromCharCode(...bytes)).replaceAll("+", "-").replaceAll("/", "_").replaceAll("=", "");
+  return key === null ? [] : ["ultragray.v1", `ultragray.key.${base64url(new TextEncoder().encode(key))}`];
 }
 
 export type StreamSummary = Schemas["StreamSummary"];
@@ -250,10 +245,7 @@ export async function listStreams(scene: string, signal: AbortSignal): Promise<S
   return (await getJson("/v1/streams", {}, { query: { scene }, signal })).streams;
 }
 
-export interface WatchEvents {
-  frame(frame: Frame): void;
-  refused(refusal: Refusal): void;
-  connected(yes: boolean): void;
+interface WatchEvents extends StreamEvents {
   /** The stream has ended, or is not there (any more). */
   ended(): void;
 }

@@ -1,6 +1,6 @@
 /** What Compare looks at: the frame, what it is compared with and how, the pictures of it, and where they are enlarged. */
 
-import { explain, ServiceError, untilAnswered } from "../api/client";
+import { asking, explain, ServiceError, untilAnswered } from "../api/client";
 import { type ComparedFrame, type Comparison, comparisonOf, describeScene, type Metric } from "../api/scenes";
 import { router } from "../page/router.svelte";
 import { service } from "../page/service.svelte";
@@ -56,26 +56,34 @@ export class LoadedPicture {
       const wanted = path();
       this.stale = true;
       if (wanted === null) return;
-      const ending = new AbortController();
-      const tell = (error: unknown): void => {
-        if (ending.signal.aborted) return;
-        this.picture = null;
-        this.problem = explain(error);
-      };
-      untilAnswered(() => readGrey(wanted, ending.signal), tell, ending.signal)
-        .then((picture) => {
-          if (ending.signal.aborted) return;
-          this.picture = picture;
-          this.problem = null;
-          this.stale = false;
-        })
-        .catch(tell);
-      return () => ending.abort();
+      return asking(
+        async (signal, tell) => {
+          const picture = await untilAnswered(() => readGrey(wanted, signal), tell, signal);
+          if (!signal.aborted) [this.picture, this.problem, this.stale] = [picture, null, false];
+        },
+        (error) => ([this.picture, this.problem] = [null, explain(error)]),
+      );
     });
   }
 }
 
 const MOST_ASKED = 40; // scenes
+
+/** Asks for a comparison until it is there, or failed. */
+async function followComparison(
+  scene: string,
+  take: (comparison: Comparison) => void,
+  tell: (error: unknown) => void,
+  signal: AbortSignal,
+): Promise<void> {
+  for (;;) {
+    const found = await untilAnswered(() => comparisonOf(scene, signal), tell, signal);
+    if (signal.aborted) return;
+    take(found);
+    if (found.state !== "running") return;
+    await new Promise((resolve) => setTimeout(resolve, POLL_MS));
+  }
+}
 
 /** Has the service compare another scene with its held-out frames, too, until that is done. */
 export class Rival {
@@ -89,24 +97,11 @@ export class Rival {
       this.isReady = false;
       this.problem = null;
       if (wanted === null) return;
-      const ending = new AbortController();
-      const tell = (error: unknown): void => {
-        if (!ending.signal.aborted) this.problem = explain(error);
-      };
-      this.#follow(wanted, tell, ending.signal).catch(tell);
-      return () => ending.abort();
+      return asking(
+        (signal, tell) => followComparison(wanted, ({ state, reason }) => ([this.isReady, this.problem] = [state === "ready", reason]), tell, signal),
+        (error) => (this.problem = explain(error)),
+      );
     });
-  }
-
-  async #follow(scene: string, tell: (error: unknown) => void, signal: AbortSignal): Promise<void> {
-    for (;;) {
-      const { state, reason } = await untilAnswered(() => comparisonOf(scene, signal), tell, signal);
-      if (signal.aborted) return;
-      this.isReady = state === "ready";
-      this.problem = reason;
-      if (state !== "running") return;
-      await new Promise((resolve) => setTimeout(resolve, POLL_MS));
-    }
   }
 }
 
@@ -153,17 +148,16 @@ export class Bench {
   readonly place = $derived(this.sequence.indexOf(this.index));
 
   /** Must be made while a component is being made; ends with it. */
-  constructor(private readonly scene: string) {
+  constructor(scene: string) {
     $effect(() => {
       void this.#attempts;
-      const ending = new AbortController();
-      const tell = (error: unknown): void => {
-        if (ending.signal.aborted) return;
-        this.withoutDataset = error instanceof ServiceError && error.reason === "DATASET_NOT_FOUND";
-        this.problem = explain(error);
-      };
-      this.#follow(tell, ending.signal).catch(tell);
-      return () => ending.abort();
+      return asking(
+        (signal, tell) => followComparison(scene, (found) => ([this.comparison, this.problem] = [found, null]), tell, signal),
+        (error) => {
+          this.withoutDataset = error instanceof ServiceError && error.reason === "DATASET_NOT_FOUND";
+          this.problem = explain(error);
+        },
+      );
     });
     $effect(() => {
       void router.arrivals;
@@ -192,16 +186,6 @@ export class Bench {
   choose(chosen: Partial<Pick<Bench, "metric" | "against" | "mode" | "order">>): void {
     Object.assign(this, chosen);
     this.#keep();
-  }
-
-  /** Asks until the comparison is there, or failed. */
-  async #follow(tell: (error: unknown) => void, signal: AbortSignal): Promise<void> {
-    for (;;) {
-      this.comparison = await untilAnswered(() => comparisonOf(this.scene, signal), tell, signal);
-      this.problem = null;
-      if (this.comparison.state !== "running") return;
-      await new Promise((resolve) => setTimeout(resolve, POLL_MS));
-    }
   }
 
   #keep(): void {

@@ -71,22 +71,20 @@ const WEIGHTS = (() => {
 
 /** Along rows, then columns; at the edges the outermost pixels go on. */
 function blur(values: Float32Array, width: number, height: number): Float32Array {
-  const rows = new Float32Array(values.length);
-  const result = new Float32Array(values.length);
-  const inside = (at: number, size: number): number => Math.max(0, Math.min(size - 1, at));
-  for (let y = 0; y < height; y++)
-    for (let x = 0; x < width; x++) {
-      let sum = 0;
-      for (let tap = 0; tap < WEIGHTS.length; tap++) sum += WEIGHTS[tap]! * values[y * width + inside(x + tap - RADIUS, width)]!;
-      rows[y * width + x] = sum;
+  return smoothed(smoothed(values, width, 1), height, width);
+}
+
+/** Along one side of a picture, of so many pixels, from each of which to the next it is `step` values. */
+function smoothed(values: Float32Array, side: number, step: number): Float32Array {
+  return values.map((_, index) => {
+    const at = Math.floor(index / step) % side;
+    let sum = 0;
+    for (let tap = 0; tap < WEIGHTS.length; tap++) {
+      const place = Math.max(0, Math.min(side - 1, at + tap - RADIUS));
+      sum += WEIGHTS[tap]! * values[index + (place - at) * step]!;
     }
-  for (let y = 0; y < height; y++)
-    for (let x = 0; x < width; x++) {
-      let sum = 0;
-      for (let tap = 0; tap < WEIGHTS.length; tap++) sum += WEIGHTS[tap]! * rows[inside(y + tap - RADIUS, height) * width + x]!;
-      result[y * width + x] = sum;
-    }
-  return result;
+    return sum;
+  });
 }
 
 /** The grey values at which the colours of a difference end. */

@@ -1,14 +1,15 @@
 /** The frame of now as programs in other languages ask for it: whole programs, which run as they stand. */
 
 import { differingFields, type StreamSettings, type Tool } from "../api/contract";
+import type { ServiceInfo } from "../api/service";
 import { entry, type Pose, position, quaternion } from "../geometry/pose";
 
-export function keywords(values: Given): string {
+function keywords(values: Given): string {
   return Object.entries(values).map(([name, value]) => `${name}=${literal(value)}`).join(", ");
 }
 
 /** A value as Python writes it. */
-export function literal(value: unknown): string {
+function literal(value: unknown): string {
   if (value === null) return "None";
   if (typeof value === "boolean") return value ? "True" : "False";
   if (Array.isArray(value)) return `[${value.map(literal).join(", ")}]`;
@@ -17,23 +18,15 @@ export function literal(value: unknown): string {
   return JSON.stringify(value);
 }
 
-export function capital(word: string): string {
+function capital(word: string): string {
   return word.charAt(0).toUpperCase() + word.slice(1);
 }
 
-export const LANGUAGES = ["curl", "python", "grpc", "websocket", "igtl", "ros"] as const;
-export type Language = (typeof LANGUAGES)[number];
-
-/** Where the service is. */
-export interface Target {
+/** Where the service is, and what it says of its doors. */
+export interface Target extends ServiceInfo {
   /** As the page found it: https://host:port */
   origin: string;
   host: string;
-  grpcPort: number;
-  /** null: off. */
-  igtlPort: number | null;
-  igtlIsLocal: boolean;
-  keyRequired: boolean;
   scene: string;
 }
 
@@ -55,26 +48,17 @@ const MOST_DEVICE_NAME = 20; // letters, in OpenIGTLink
 const LARGEST_MESSAGE = 64 * 2 ** 20;
 const WHOLE_PARAMETERS = ["height", "width"]; // of the ROS 2 node
 
+const PROGRAMS = { curl, python, grpc, websocket, igtl, ros };
+export type Language = keyof typeof PROGRAMS;
+export const LANGUAGES = Object.keys(PROGRAMS) as Language[];
+
 /** The program; null where the service has no such door. */
 export function snippet(language: Language, target: Target, asked: Asked): string | null {
-  switch (language) {
-    case "curl":
-      return curl(target, asked);
-    case "python":
-      return python(target, asked);
-    case "grpc":
-      return grpc(target, asked);
-    case "websocket":
-      return websocket(target, asked);
-    case "igtl":
-      return target.igtlPort === null ? null : igtl(target, asked, target.igtlPort);
-    case "ros":
-      return ros(target, asked);
-  }
+  return PROGRAMS[language](target, asked);
 }
 
-function curl({ origin, scene, keyRequired }: Target, { pose, settings }: Asked): string {
-  const key = keyRequired ? ` -H 'X-API-Key: ${KEY}'` : "";
+function curl({ origin, scene, key_required }: Target, { pose, settings }: Asked): string {
+  const key = key_required ? ` -H 'X-API-Key: ${KEY}'` : "";
   const parts = Object.entries({ pose: placement(pose), ...known(settings) });
   const body = `{\n${parts.map(([name, value]) => `    ${JSON.stringify(name)}: ${JSON.stringify(value)}`).join(",\n")}\n  }`;
   return `curl -sS --fail-with-body ${origin}/v1/scenes/${encodeURIComponent(scene)}/render${key} \\
@@ -102,14 +86,14 @@ function python(target: Target, { pose, settings }: Asked): string {
     classes.push(...new Set(tools.map(({ kind }) => capital(kind))));
     if (tools.some(({ frame }) => frame !== undefined)) classes.push("ToolFrame");
   }
-  const options = [isSecure(target) ? ", tls=Tls()" : "", target.keyRequired ? `, api_key="${KEY}"` : ""].join("");
+  const options = [isSecure(target) ? ", tls=Tls()" : "", target.key_required ? `, api_key="${KEY}"` : ""].join("");
   if (isSecure(target)) classes.push("Tls");
   return `import numpy as np
 from ultragray_client import ${classes.sort().join(", ")}
 
 pose = ${matrix(pose)}
 settings = RenderSettings(${parts.join(", ")})
-with Client("${target.host}:${target.grpcPort}"${options}) as client:
+with Client("${target.host}:${target.grpc_port}"${options}) as client:
     frame = client.render("${target.scene}", pose, settings)
 print(frame, frame.extrapolation)
 np.save("frame.npy", frame["bmode"])
@@ -133,10 +117,10 @@ function grpc(target: Target, { pose, settings }: Asked): string {
   }
   if (tools !== undefined) message.tools = tools.map(grpcTool);
   const request = JSON.stringify({ settings: message, pose: { matrix: { values: pose.map(short) } } });
-  const key = target.keyRequired ? ` -H 'x-api-key: ${KEY}'` : "";
+  const key = target.key_required ? ` -H 'x-api-key: ${KEY}'` : "";
   return `grpcurl${isSecure(target) ? "" : " -plaintext"} -max-msg-sz ${LARGEST_MESSAGE}${key} \\
   -d '${request}' \\
-  ${target.host}:${target.grpcPort} ultragray.v1.RenderService/Render
+  ${target.host}:${target.grpc_port} ultragray.v1.RenderService/Render
 `;
 }
 
@@ -167,14 +151,15 @@ with connect(${streamAddress(target, "example")}) as stream:
 `;
 }
 
-function igtl({ scene, host, igtlIsLocal }: Target, { trainedPose }: Asked, port: number): string {
+function igtl({ scene, host, igtl_is_local, igtl_port }: Target, { trainedPose }: Asked): string | null {
+  if (igtl_port === null) return null;
   const device = scene.length > MOST_DEVICE_NAME ? "ProbeToReference" : scene;
   const image = scene.length > MOST_DEVICE_NAME ? "Image_Reference" : `Image_${scene}`.slice(0, MOST_DEVICE_NAME);
   return `import numpy as np
 import pyigtl
 
 pose = ${matrix(trainedPose)}
-client = pyigtl.OpenIGTLinkClient("${igtlIsLocal ? "127.0.0.1" : host}", ${port})
+client = pyigtl.OpenIGTLinkClient("${igtl_is_local ? "127.0.0.1" : host}", ${igtl_port})
 client.send_message(pyigtl.TransformMessage(pose, device_name="${device}"))
 image = client.wait_for_message("${image}", timeout=30)
 print(image.image.shape, image.ijk_to_world_matrix)
@@ -188,7 +173,7 @@ function ros(target: Target, { pose, settings }: Asked): string {
   const [w, i, j, k] = quaternion(pose).map(short);
   const place = `position: {x: ${x}, y: ${y}, z: ${z}}, orientation: {x: ${i}, y: ${j}, z: ${k}, w: ${w}}`;
   const { display, probe, tools, encoding: _, ...plain } = known(settings) as Given & { display?: Given; probe?: Given; tools?: ToldTool[] };
-  const given: Given = { address: `${target.host}:${target.grpcPort}`, scene: target.scene, ...plain };
+  const given: Given = { address: `${target.host}:${target.grpc_port}`, scene: target.scene, ...plain };
   const frame = settings.registration == null ? "scene" : "base";
   if (frame !== "scene") given.scene_frame = frame;
   if (isSecure(target)) given.tls = true;
@@ -199,7 +184,7 @@ function ros(target: Target, { pose, settings }: Asked): string {
     .filter(([, value]) => !(Array.isArray(value) && value.length === 0))
     .map(([name, value]) => ` \\\n  -p '${name}:=${parameter(name, value).replaceAll("'", "'\\''")}'`);
   return `# Then publish the pose of now: ros2 topic pub --once /ultragray/probe_pose geometry_msgs/msg/PoseStamped '{header: {frame_id: ${frame}}, pose: {${place}}}'
-${target.keyRequired ? `ULTRAGRAY_API_KEY=${KEY} ` : ""}ultragray-ros --ros-args${parameters.join("")}
+${target.key_required ? `ULTRAGRAY_API_KEY=${KEY} ` : ""}ultragray-ros --ros-args${parameters.join("")}
 `;
 }
 
@@ -213,7 +198,7 @@ function parameter(name: string, value: unknown): string {
 function streamAddress(target: Target, name: string): string {
   const base = target.origin.replace(/^http/, "ws");
   const address = `"${base}/v1/scenes/${encodeURIComponent(target.scene)}/stream?name=${name}"`;
-  return `${address}, max_size=None${target.keyRequired ? `, additional_headers={"X-API-Key": "${KEY}"}` : ""}`;
+  return `${address}, max_size=None${target.key_required ? `, additional_headers={"X-API-Key": "${KEY}"}` : ""}`;
 }
 
 function isSecure({ origin }: Target): boolean {

@@ -63,6 +63,13 @@ export function boxOf(lines: readonly Line[]): { left: number; right: number; to
   return { left: Math.min(...x), right: Math.max(...x), top: Math.min(...z), bottom: Math.max(...z) };
 }
 
+/** The pixel of a scan-converted picture of so many on its longer side; null where frames are pictures already. */
+export function squarePixel_mm(lines: readonly Line[], most: number): number | null {
+  if (areUpright(lines)) return null;
+  const { left, right, top, bottom } = boxOf(lines);
+  return Math.max(right - left, bottom - top) / most;
+}
+
 /** Whether all lines run along z: frames as they are stored are true to scale. */
 export function areUpright(lines: readonly Line[]): boolean {
   return lines.every(([x0, , x1]) => Math.abs(x1 - x0) < 1e-6);

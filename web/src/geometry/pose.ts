@@ -7,6 +7,18 @@ export const plus = (a: Vector, b: Vector): Vector => [a[0] + b[0], a[1] + b[1],
 export const minus = (a: Vector, b: Vector): Vector => [a[0] - b[0], a[1] - b[1], a[2] - b[2]];
 export const scaled = (a: Vector, by: number): Vector => [a[0] * by, a[1] * by, a[2] * by];
 export const length = (a: Vector): number => Math.hypot(...a);
+/** Where an arrow key leads on a screen: to the right, and down. */
+export const ARROWS: Readonly<Record<string, readonly [number, number]>> = {
+  ArrowLeft: [-1, 0],
+  ArrowRight: [1, 0],
+  ArrowUp: [0, -1],
+  ArrowDown: [0, 1],
+};
+/** A vector with one of its numbers in place of another. */
+export function replaced(vector: readonly number[], index: number, value: number): [number, number, number] {
+  return vector.map((before, i) => (i === index ? value : before)) as [number, number, number];
+}
+
 /** Of length 1; nothing stays nothing. */
 export const unit = (a: Vector): Vector => scaled(a, 1 / (length(a) || 1));
 export const cross = (a: Vector, b: Vector): Vector => [
@@ -233,7 +245,7 @@ export interface Place {
 export function placeIn(pose: Pose, reference: Reference, other: Pose): Place {
   if (reference === "absolute") return { position_mm: position(pose), angles_deg: anglesFrom(IDENTITY, pose) };
   const [p, q] = [position(pose), position(other)];
-  const way: Vector = [p[0] - q[0], p[1] - q[1], p[2] - q[2]];
+  const way = minus(p, q);
   return {
     position_mm: reference === "relativeScene" ? way : alongAxes(other, way),
     angles_deg: anglesFrom(other, pose),
@@ -244,9 +256,7 @@ export function placeIn(pose: Pose, reference: Reference, other: Pose): Place {
 export function withPlaceIn({ position_mm, angles_deg }: Place, reference: Reference, other: Pose): Pose {
   if (reference === "absolute") return fromPositionQuaternion(position_mm, orientationFrom(IDENTITY, angles_deg));
   const turned = fromPositionQuaternion(position(other), orientationFrom(other, angles_deg));
-  const [x, y, z] = position(other);
-  if (reference === "relativeScene")
-    return withPosition(turned, [x + position_mm[0], y + position_mm[1], z + position_mm[2]]);
+  if (reference === "relativeScene") return withPosition(turned, plus(position(other), position_mm));
   return withPosition(turned, position(translated(other, position_mm)));
 }
 

@@ -5,73 +5,88 @@ import {
   type Quaternion, type Vector, withPosition,
 } from "./pose";
 
-export type PoseFault =
-  | { kind: "json"; problem: string }
-  | { kind: "jsonNumbers"; key: string; names: string[] }
-  | { kind: "empty" }
-  | { kind: "tooMany"; count: number; most: number }
-  | { kind: "suffix"; suffix: string }
-  | { kind: "count"; found: number; expected: string }
-  | { kind: "number"; text: string }
-  | { kind: "quaternion"; length: number }
-  | { kind: "rotation"; mirrors: boolean }
-  | { kind: "lastRow" }
-  | { kind: "ros"; missing: string }
-  | { kind: "npy"; problem: "magic" | "short" }
-  | { kind: "npyType"; type: string }
-  | { kind: "npyShape"; shape: string }
-  | { kind: "csvHeader"; missing: string[] }
-  | { kind: "plusHeader" }
-  | { kind: "plusTransforms"; found: string[] };
+/** What can be wrong with poses: by the name of its sentence in the catalogues, what that is given. */
+interface Faults {
+  json: [problem: string];
+  jsonNumbers: [key: string, names: string];
+  empty: [];
+  tooMany: [count: number, most: number];
+  suffix: [suffix: string];
+  count: [found: number, expected: string];
+  number: [text: string];
+  quaternion: [length: number];
+  rotation: [];
+  mirror: [];
+  lastRow: [];
+  ros: [missing: string];
+  npyMagic: [];
+  npyShort: [];
+  npyType: [type: string];
+  npyShape: [shape: string];
+  csvHeader: [missing: string];
+  plusHeader: [];
+  plusTransforms: [found: string];
+}
+type Fault = keyof Faults;
 
-/** Poses that cannot be read: what is wrong, and in which line, or pose, counted from 1. */
-export class PoseError extends Error {
+/** How a language says what is wrong, and where. */
+export interface FaultWords {
+  line: (line: number, fault: string) => string;
+  pose: (pose: number, fault: string) => string;
+  faults: { [Kind in Fault]: (...given: Faults[Kind]) => string };
+}
+
+/** Where numbers stand: in which line, or pose, counted from 1. */
+interface Where {
+  line?: number;
+  pose?: number;
+}
+
+/** Poses that cannot be read. */
+export class PoseError<Kind extends Fault = Fault> extends Error {
   constructor(
-    readonly fault: PoseFault,
-    readonly line: number | null = null,
-    readonly pose: number | null = null,
+    readonly kind: Kind,
+    private readonly given: Faults[Kind],
+    private readonly where: Where = {},
   ) {
-    super(JSON.stringify(fault));
+    super(JSON.stringify([kind, ...given]));
     this.name = "PoseError";
+  }
+
+  /** In the words of a language. */
+  said({ line, pose, faults }: FaultWords): string {
+    const fault = faults[this.kind](...this.given);
+    if (this.where.line !== undefined) return line(this.where.line, fault);
+    return this.where.pose === undefined ? fault : pose(this.where.pose, fault);
   }
 }
 
 const ROTATION_TOLERANCE = 1e-3; // as of the service
 const LENGTH_TOLERANCE = 1e-2;
 
-/** Where numbers stand, for errors. */
-export interface Where {
-  line?: number;
-  pose?: number;
-}
-
 /** The pose of 12 or 16 numbers, row by row. */
-export function poseOfMatrix(numbers: readonly number[], where: Where = {}): Pose {
+function poseOfMatrix(numbers: readonly number[], where: Where = {}): Pose {
   const pose = numbers.length === 12 ? [...numbers, 0, 0, 0, 1] : numbers;
-  if (pose.length !== 16) throw fault({ kind: "count", found: numbers.length, expected: "12, 16" }, where);
+  if (pose.length !== 16) throw new PoseError("count", [numbers.length, "12, 16"], where);
   const last = [0, 0, 0, 1].some((expected, column) => Math.abs(entry(pose, 3, column) - expected) > ROTATION_TOLERANCE);
-  if (last) throw fault({ kind: "lastRow" }, where);
-  if (rotationError(pose) > ROTATION_TOLERANCE) throw fault({ kind: "rotation", mirrors: false }, where);
-  if (determinant(pose) < 0) throw fault({ kind: "rotation", mirrors: true }, where);
+  if (last) throw new PoseError("lastRow", [], where);
+  if (rotationError(pose) > ROTATION_TOLERANCE) throw new PoseError("rotation", [], where);
+  if (determinant(pose) < 0) throw new PoseError("mirror", [], where);
   return fromPositionQuaternion(position(pose), quaternion(pose));
 }
 
 /** The pose of a place and a quaternion w, x, y, z. */
-export function poseOfQuaternion(place: Vector, rotation: Quaternion, where: Where = {}): Pose {
+function poseOfQuaternion(place: Vector, rotation: Quaternion, where: Where = {}): Pose {
   const length = Math.hypot(...rotation);
-  if (Math.abs(length - 1) > LENGTH_TOLERANCE) throw fault({ kind: "quaternion", length }, where);
+  if (Math.abs(length - 1) > LENGTH_TOLERANCE) throw new PoseError("quaternion", [length], where);
   return fromPositionQuaternion(place, rotation);
 }
 
 /** A number as it is written. */
-export function numberOf(text: string, where: Where = {}): number {
+function numberOf(text: string, where: Where = {}): number {
   const number = Number(text);
-  if (text.trim() === "" || !Number.isFinite(number)) throw fault({ kind: "number", text: text.slice(0, 40) }, where);
+  if (text.trim() === "" || !Number.isFinite(number)) throw new PoseError("number", [text.slice(0, 40)], where);
   return number;
-}
-
-export function fault(what: ConstructorParameters<typeof PoseError>[0], { line, pose }: Where = {}): PoseError {
-  return new PoseError(what, line ?? null, pose ?? null);
 }
 
 /** The largest entry of RᵀR − 1. */
@@ -104,44 +119,32 @@ export function poseJson(pose: Pose): string {
   return JSON.stringify({ position_mm: { x, y, z }, quaternion: { w, x: i, y: j, z: k } });
 }
 
-/** The pose of such an object, or of one with a `matrix`. Throws PoseError. */
-export function poseFromJson(text: string): Pose {
-  return poseOf(parsed(text));
-}
-
 /** One or more poses: such objects or matrices of three or four rows, in a list or under `poses`. Throws PoseError. */
-export function posesFromJson(text: string): Pose[] {
+function posesFromJson(text: string): Pose[] {
   const document = parsed(text);
   const given = isObject(document) && "poses" in document ? document.poses : document;
   const list = Array.isArray(given) && !isMatrix(given) ? (given as unknown[]) : [given];
-  requireCount(list.length);
   return list.map((one, index) => poseOf(one, list.length > 1 ? { pose: index + 1 } : {}));
 }
 
 /** Seconds of each pose under `times_s`; null where there are none. */
-export function timesFromJson(text: string): number[] | null {
+function timesFromJson(text: string): number[] | null {
   const document = parsed(text);
   const times = isObject(document) ? document.times_s : null;
   return Array.isArray(times) && times.every(Number.isFinite) ? (times as number[]) : null;
-}
-
-/** Throws PoseError for none, and for more than one file may have. */
-export function requireCount(count: number): void {
-  if (count === 0) throw fault({ kind: "empty" });
-  if (count > MOST_POSES) throw fault({ kind: "tooMany", count, most: MOST_POSES });
 }
 
 function parsed(text: string): unknown {
   try {
     return JSON.parse(text);
   } catch (error) {
-    throw fault({ kind: "json", problem: error instanceof Error ? error.message : "" });
+    throw new PoseError("json", [error instanceof Error ? error.message : ""]);
   }
 }
 
 function poseOf(given: unknown, where: Where = {}): Pose {
   if (Array.isArray(given)) return poseOfMatrix(numbersIn(given), where);
-  if (!isObject(given)) throw fault({ kind: "json", problem: "position_mm, quaternion" }, where);
+  if (!isObject(given)) throw new PoseError("json", ["position_mm, quaternion"], where);
   if (given.matrix !== undefined) return poseOfMatrix(numbersIn(given.matrix), where);
   const place = numbersOf(given, "position_mm", ["x", "y", "z"], where);
   const [w, x, y, z] = numbersOf(given, "quaternion", ["w", "x", "y", "z"], where) as [number, number, number, number];
@@ -167,7 +170,7 @@ function numbersOf(given: Record<string, unknown>, key: string, names: string[],
   const value = given[key];
   const numbers = names.map((name) => (isObject(value) ? value[name] : undefined));
   if (!numbers.every((number) => typeof number === "number" && Number.isFinite(number)))
-    throw fault({ kind: "jsonNumbers", key, names }, where);
+    throw new PoseError("jsonNumbers", [key, names.join(", ")], where);
   return numbers as number[];
 }
 
@@ -202,29 +205,27 @@ export function poseText(pose: Pose, form: PoseForm): string {
 
 /** Reads what `poseText` writes, and what people make of it. Throws PoseError. */
 export function poseFromText(text: string, form: PoseForm): Pose {
-  if (form === "json") return poseFromJson(text);
+  if (form === "json") return poseOf(parsed(text));
   if (form === "ros") return poseFromRos(text);
   const numbers = (text.replace(/\b(np|numpy)\.|\bfloat(32|64)\b/g, "").match(NUMBER) ?? []).map((one) => numberOf(one));
   if (form === "matrix" || form === "numpy") return poseOfMatrix(numbers);
-  const [x, y, z, ...turn] = numbers as [number, number, number, ...number[]];
-  if (form === "euler") {
-    if (numbers.length !== 6) throw fault({ kind: "count", found: numbers.length, expected: "6" });
-    return fromPositionQuaternion([x, y, z], orientationFrom(IDENTITY, turn as unknown as [number, number, number]));
-  }
-  if (numbers.length !== 7) throw fault({ kind: "count", found: numbers.length, expected: "7" });
-  return poseOfQuaternion([x, y, z], turn as unknown as [number, number, number, number]);
+  const expected = form === "euler" ? 6 : 7;
+  if (numbers.length !== expected) throw new PoseError("count", [numbers.length, String(expected)]);
+  const [x, y, z, ...turn] = numbers as [...Vector, ...number[]];
+  if (form === "euler") return fromPositionQuaternion([x, y, z], orientationFrom(IDENTITY, turn as unknown as Vector));
+  return poseOfQuaternion([x, y, z], turn as unknown as Quaternion);
 }
 
 /** geometry_msgs/Pose as YAML, in either of its styles, metres. */
 function poseFromRos(text: string): Pose {
   const part = (name: string): string => {
     const found = new RegExp(`${name}\\s*:([\\s\\S]*?)(?=\\b(?:position|orientation)\\s*:|$)`).exec(text)?.[1];
-    if (found === undefined) throw fault({ kind: "ros", missing: name });
+    if (found === undefined) throw new PoseError("ros", [name]);
     return found;
   };
   const value = (name: string, axis: string): number => {
     const found = new RegExp(`\\b${axis}\\s*:\\s*(${NUMBER.source})`).exec(part(name))?.[1];
-    if (found === undefined) throw fault({ kind: "ros", missing: `${name}.${axis}` });
+    if (found === undefined) throw new PoseError("ros", [`${name}.${axis}`]);
     return numberOf(found);
   };
   const [x, y, z] = ["x", "y", "z"].map((axis) => value("position", axis) * PER_METRE) as [number, number, number];
@@ -267,15 +268,21 @@ export interface Chosen {
   transform?: string;
 }
 
-export const PLAIN = { takesUnit: true, transforms: [], transform: null, skipped: 0 };
+/** Poses whose lengths are in `unit`, brought to mm. Throws PoseError for too few or too many. */
+function fileOf(poses: Pose[], times_s: number[] | null, unit: Unit, unitIsKnown: boolean): PoseFile {
+  requireCount(poses.length);
+  const scaled = unit === "mm" ? poses : poses.map((pose) => withPosition(pose, metres(pose)));
+  return { poses: scaled, times_s, unit, unitIsKnown, takesUnit: true, transforms: [], transform: null, skipped: 0 };
+}
 
-/** Poses whose lengths are in `unit`, in mm. */
-export function inMillimetres(poses: Pose[], unit: Unit): Pose[] {
-  if (unit === "mm") return poses;
-  return poses.map((pose) => {
-    const [x, y, z] = position(pose);
-    return withPosition(pose, [x * 1000, y * 1000, z * 1000]);
-  });
+function requireCount(count: number): void {
+  if (count === 0) throw new PoseError("empty", []);
+  if (count > MOST_POSES) throw new PoseError("tooMany", [count, MOST_POSES]);
+}
+
+function metres(pose: Pose): Vector {
+  const [x, y, z] = position(pose);
+  return [x * PER_METRE, y * PER_METRE, z * PER_METRE];
 }
 
 interface Row {
@@ -288,32 +295,31 @@ const QUATERNION = ["qw", "qx", "qy", "qz"];
 const SEPARATOR = /[,;\t]\s*|\s+/;
 
 /** timestamp tx ty tz qx qy qz qw, metres; lines that begin with # are left out. Throws PoseError. */
-export function posesFromTum(text: string, { unit = "m" }: Chosen): PoseFile {
+function posesFromTum(text: string, { unit = "m" }: Chosen): PoseFile {
   const rows = rowsOf(text, /[\s,]+/);
   const times_s: number[] = [];
   const poses = rows.map(({ line, cells }) => {
-    if (cells.length !== 8) throw fault({ kind: "count", found: cells.length, expected: "8" }, { line });
-    const [time, x, y, z, qx, qy, qz, qw] = cells.map((cell) => numberOf(cell, { line })) as Eight;
+    if (cells.length !== 8) throw new PoseError("count", [cells.length, "8"], { line });
+    const [time, x, y, z, ...turn] = cells.map((cell) => numberOf(cell, { line })) as [number, ...Vector, ...Quaternion];
     times_s.push(time);
-    return poseOfQuaternion([x, y, z], [qw, qx, qy, qz], { line });
+    return poseOfQuaternion([x, y, z], [turn[3], turn[0], turn[1], turn[2]], { line });
   });
-  requireCount(poses.length);
-  return { ...PLAIN, poses: inMillimetres(poses, unit), times_s, unit, unitIsKnown: true };
+  return fileOf(poses, times_s, unit, true);
 }
 
 /**
  * With a header of x, y, z (or x_mm …, x_m …), qw, qx, qy, qz and perhaps time_s; without one, 12 or 16 numbers of a
  * matrix a line. Throws PoseError.
  */
-export function posesFromCsv(text: string, chosen: Chosen): PoseFile {
+function posesFromCsv(text: string, chosen: Chosen): PoseFile {
   const [first, ...others] = rowsOf(text, SEPARATOR);
-  if (first === undefined) throw fault({ kind: "empty" });
+  if (first === undefined) throw new PoseError("empty", []);
   const isHeader = first.cells.some((cell) => !Number.isFinite(Number(cell)));
   return isHeader ? withHeader(first, others, chosen) : matrices([first, ...others], chosen);
 }
 
 /** x_mm …, quaternion and time_s. */
-export function csvOf(poses: readonly Pose[], times_s: readonly number[] | null): string {
+function csvOf(poses: readonly Pose[], times_s: readonly number[] | null): string {
   const header = [...(times_s ? ["time_s"] : []), "x_mm", "y_mm", "z_mm", ...QUATERNION].join(",");
   const lines = poses.map((pose, index) => {
     const time = times_s ? [times_s[index]!.toFixed(4)] : [];
@@ -323,7 +329,7 @@ export function csvOf(poses: readonly Pose[], times_s: readonly number[] | null)
 }
 
 /** Metres; poses without times are numbered. */
-export function tumOf(poses: readonly Pose[], times_s: readonly number[] | null): string {
+function tumOf(poses: readonly Pose[], times_s: readonly number[] | null): string {
   const lines = poses.map((pose, index) => {
     const [w, x, y, z] = quaternion(pose);
     const place = position(pose).map((value) => (value / 1000).toFixed(7));
@@ -331,8 +337,6 @@ export function tumOf(poses: readonly Pose[], times_s: readonly number[] | null)
   });
   return ["# timestamp tx ty tz qx qy qz qw", ...lines, ""].join("\n");
 }
-
-type Eight = [number, number, number, number, number, number, number, number];
 
 function digits(value: number): string {
   return value.toFixed(8);
@@ -351,45 +355,41 @@ function withHeader(header: Row, rows: Row[], chosen: Chosen): PoseFile {
   const suffix = ["_mm", "_m", ""].find((one) => names.includes(`x${one}`)) ?? "";
   const needed = [...["x", "y", "z"].map((axis) => axis + suffix), ...QUATERNION];
   const missing = needed.filter((name) => !names.includes(name));
-  if (missing.length > 0) throw fault({ kind: "csvHeader", missing }, { line: header.line });
+  if (missing.length > 0) throw new PoseError("csvHeader", [missing.join(", ")], { line: header.line });
   const time = TIMES.map((name) => names.indexOf(name)).find((column) => column >= 0);
   const times_s: number[] = [];
   const poses = rows.map(({ line, cells }) => {
     if (cells.length !== names.length)
-      throw fault({ kind: "count", found: cells.length, expected: String(names.length) }, { line });
+      throw new PoseError("count", [cells.length, String(names.length)], { line });
     const values = needed.map((name) => numberOf(cells[names.indexOf(name)]!, { line }));
     if (time !== undefined) times_s.push(numberOf(cells[time]!, { line }));
     return poseOfQuaternion(values.slice(0, 3) as unknown as Vector, values.slice(3) as unknown as Quaternion, { line });
   });
-  requireCount(poses.length);
   const known = { _mm: "mm", _m: "m" }[suffix] as Unit | undefined;
-  const unit = chosen.unit ?? known ?? "mm";
-  const times = time === undefined ? null : times_s;
-  return { ...PLAIN, poses: inMillimetres(poses, unit), times_s: times, unit, unitIsKnown: known !== undefined };
+  return fileOf(poses, time === undefined ? null : times_s, chosen.unit ?? known ?? "mm", known !== undefined);
 }
 
 function matrices(rows: Row[], { unit = "mm" }: Chosen): PoseFile {
   const poses = rows.map(({ line, cells }) => {
     if (cells.length !== 12 && cells.length !== 16)
-      throw fault({ kind: "csvHeader", missing: ["x_mm", "y_mm", "z_mm", ...QUATERNION] }, { line });
+      throw new PoseError("csvHeader", [["x_mm", "y_mm", "z_mm", ...QUATERNION].join(", ")], { line });
     return poseOfMatrix(cells.map((cell) => numberOf(cell, { line })), { line });
   });
-  requireCount(poses.length);
-  return { ...PLAIN, poses: inMillimetres(poses, unit), times_s: null, unit, unitIsKnown: false };
+  return fileOf(poses, null, unit, false);
 }
 
 const MAGIC = [0x93, 0x4e, 0x55, 0x4d, 0x50, 0x59];
 
 /** Throws PoseError. */
-export function posesFromNpy(buffer: ArrayBuffer, { unit = "mm" }: Chosen): PoseFile {
+function posesFromNpy(buffer: ArrayBuffer, { unit = "mm" }: Chosen): PoseFile {
   const { type, columnsFirst, shape, start } = headerOf(buffer);
   const item = /^([<>])f([48])$/.exec(type);
-  if (item === null) throw fault({ kind: "npyType", type });
+  if (item === null) throw new PoseError("npyType", [type]);
   const size = Number(item[2]);
   const each = sizeOfOne(shape);
   const total = shape.reduce((product, side) => product * side, 1);
   requireCount(total / each);
-  if (buffer.byteLength < start + total * size) throw fault({ kind: "npy", problem: "short" });
+  if (buffer.byteLength < start + total * size) throw new PoseError("npyShort", []);
   const view = new DataView(buffer, start);
   const little = item[1] === "<";
   const at = (index: number): number => (size === 8 ? view.getFloat64(index * 8, little) : view.getFloat32(index * 4, little));
@@ -397,11 +397,11 @@ export function posesFromNpy(buffer: ArrayBuffer, { unit = "mm" }: Chosen): Pose
   const poses = Array.from({ length: total / each }, (_, pose) =>
     poseOfMatrix(Array.from({ length: each }, (_, index) => place(pose * each + index)), { pose: pose + 1 }),
   );
-  return { ...PLAIN, poses: inMillimetres(poses, unit), times_s: null, unit, unitIsKnown: false };
+  return fileOf(poses, null, unit, false);
 }
 
 /** [N, 4, 4] of float64, mm. */
-export function npyOf(poses: readonly Pose[]): Blob {
+function npyOf(poses: readonly Pose[]): Blob {
   const about = `{'descr': '<f8', 'fortran_order': False, 'shape': (${poses.length}, 4, 4), }`;
   const header = about.padEnd(Math.ceil((about.length + 11) / 64) * 64 - 11) + "\n"; // data begin at a multiple of 64
   const numbers = new Float64Array(poses.length * IDENTITY.length);
@@ -412,7 +412,7 @@ export function npyOf(poses: readonly Pose[]): Blob {
 
 function headerOf(buffer: ArrayBuffer): { type: string; columnsFirst: boolean; shape: number[]; start: number } {
   const bytes = new Uint8Array(buffer);
-  if (MAGIC.some((byte, index) => bytes[index] !== byte) || bytes.length < 12) throw fault({ kind: "npy", problem: "magic" });
+  if (MAGIC.some((byte, index) => bytes[index] !== byte) || bytes.length < 12) throw new PoseError("npyMagic", []);
   const view = new DataView(buffer);
   const isOld = bytes[6] === 1;
   const start = (isOld ? 10 : 12) + (isOld ? view.getUint16(8, true) : view.getUint32(8, true));
@@ -428,7 +428,7 @@ function sizeOfOne(shape: number[]): number {
   const [rows, columns] = shape.slice(-2);
   if (columns === 4 && (rows === 4 || rows === 3) && shape.length <= 3) return 4 * rows;
   if (shape.length === 2 && (columns === 12 || columns === 16)) return columns;
-  throw fault({ kind: "npyShape", shape: `(${shape.join(", ")})` });
+  throw new PoseError("npyShape", [`(${shape.join(", ")})`]);
 }
 
 /** Where an element lies whose first index runs fastest. */
@@ -454,28 +454,19 @@ interface SequenceFrame {
 }
 
 /** Throws PoseError. */
-export function posesFromPlus(text: string, chosen: Chosen): PoseFile {
+function posesFromPlus(text: string, chosen: Chosen): PoseFile {
   const frames = framesOf(text);
   const names = [...new Set(frames.flatMap((frame) => [...frame.matrices.keys()]))];
-  if (names.length === 0) throw fault({ kind: "plusHeader" });
+  if (names.length === 0) throw new PoseError("plusHeader", []);
   const rigid = names.filter((name) => isRigid(frames, name));
-  if (rigid.length === 0) throw fault({ kind: "plusTransforms", found: names });
+  if (rigid.length === 0) throw new PoseError("plusTransforms", [names.join(", ")]);
   const likely = LIKELY.find((name) => rigid.includes(name)) ?? rigid.find((name) => name.startsWith("Probe"));
   const transform = chosen.transform ?? likely ?? rigid[0]!;
   const used = frames.filter((frame) => frame.matrices.has(transform) && !frame.invalid.has(transform));
-  const poses: Pose[] = used.map((frame) => read(frame.matrices.get(transform)!));
-  requireCount(poses.length);
+  const poses = used.map((frame) => read(frame.matrices.get(transform)!));
   const times = used.map((frame) => frame.time_s);
-  return {
-    poses,
-    times_s: times.includes(null) ? null : (times as number[]),
-    unit: "mm",
-    unitIsKnown: true,
-    takesUnit: false,
-    transforms: rigid,
-    transform,
-    skipped: frames.length - used.length,
-  };
+  const file = fileOf(poses, times.includes(null) ? null : (times as number[]), "mm", true);
+  return { ...file, takesUnit: false, transforms: rigid, transform, skipped: frames.length - used.length };
 }
 
 function read({ line, text }: { line: number; text: string }): Pose {
@@ -490,7 +481,7 @@ function isRigid(frames: SequenceFrame[], name: string): boolean {
     read(first.matrices.get(name)!);
     return true;
   } catch (error) {
-    if (error instanceof PoseError && error.fault.kind === "rotation") return false;
+    if (error instanceof PoseError && (error.kind === "rotation" || error.kind === "mirror")) return false;
     throw error;
   }
 }
@@ -517,31 +508,30 @@ function note(frame: SequenceFrame, field: string, value: string, line: number):
   } else if (field.endsWith("Transform")) frame.matrices.set(field.slice(0, -"Transform".length), { line, text: value });
 }
 
+const utf8 = (buffer: ArrayBuffer): string => new TextDecoder("utf-8").decode(buffer);
+const latin1 = (buffer: ArrayBuffer): string => new TextDecoder("latin1").decode(buffer);
+const tum = (buffer: ArrayBuffer, chosen: Chosen): PoseFile => posesFromTum(utf8(buffer), chosen);
+const plus = (buffer: ArrayBuffer, chosen: Chosen): PoseFile => posesFromPlus(latin1(buffer), chosen);
+const READERS: Record<string, (buffer: ArrayBuffer, chosen: Chosen) => PoseFile> = {
+  ".json": (buffer) => ({ ...fileOf(posesFromJson(utf8(buffer)), timesFromJson(utf8(buffer)), "mm", true), takesUnit: false }),
+  ".npy": posesFromNpy,
+  ".csv": (buffer, chosen) => posesFromCsv(utf8(buffer), chosen),
+  ".tum": tum,
+  ".txt": tum,
+  ".mha": plus,
+  ".mhd": plus,
+};
 /** As a file input takes them. */
-export const POSE_SUFFIXES = [".json", ".npy", ".csv", ".tum", ".txt", ".mha", ".mhd"];
+export const POSE_SUFFIXES = Object.keys(READERS);
 /** How much of a file is read: PLUS puts its images behind the poses. */
 export const MOST_BYTES = 64 * 2 ** 20;
 
 /** The poses of a file. Throws PoseError. */
 export function readPoses(name: string, buffer: ArrayBuffer, chosen: Chosen = {}): PoseFile {
   const suffix = /\.[^.]*$/.exec(name.toLowerCase())?.[0] ?? "";
-  const text = (): string => new TextDecoder("utf-8").decode(buffer);
-  switch (suffix) {
-    case ".json":
-      return { ...PLAIN, poses: posesFromJson(text()), times_s: timesFromJson(text()), unit: "mm", unitIsKnown: true, takesUnit: false };
-    case ".npy":
-      return posesFromNpy(buffer, chosen);
-    case ".csv":
-      return posesFromCsv(text(), chosen);
-    case ".tum":
-    case ".txt":
-      return posesFromTum(text(), chosen);
-    case ".mha":
-    case ".mhd":
-      return posesFromPlus(new TextDecoder("latin1").decode(buffer), chosen);
-    default:
-      throw fault({ kind: "suffix", suffix });
-  }
+  const read = READERS[suffix];
+  if (read === undefined) throw new PoseError("suffix", [suffix]);
+  return read(buffer, chosen);
 }
 
 export const WRITTEN = ["json", "csv", "tum", "npy"] as const;

@@ -121,6 +121,11 @@ export function rangesOf(
   const { left, right, top, bottom } = boxOf(plane.lines_mm);
   const half = (right - left) / 2;
   const [low, high]: [Vector, Vector] = frame === "scene" ? [bounds.low, bounds.high] : [[left, -half, top], [right, half, bottom]];
+  return roomAround(low, high, beyond_mm);
+}
+
+/** The ranges of a box and of what is beyond it, in whole centimetres. */
+export function roomAround(low: Vector, high: Vector, beyond_mm: number): { min: number; max: number }[] {
   return [0, 1, 2].map((i) => ({
     min: Math.floor((low[i]! - beyond_mm) / 10) * 10,
     max: Math.ceil((high[i]! + beyond_mm) / 10) * 10,

@@ -5,7 +5,7 @@ import { untrack } from "svelte";
 import { type Output, OUTPUTS } from "../api/contract";
 import type { PlanePoint } from "../geometry/plane";
 import { type Kept, router } from "../page/router.svelte";
-import { poseOrNull, poseValue } from "../session/link";
+import { joined, numbersIn, poseOrNull, poseValue } from "../session/link";
 import { besideSession, type Session } from "../session/session.svelte";
 import { Calm } from "../shared/asking.svelte";
 import { nameIn } from "../shared/text";
@@ -37,7 +37,6 @@ export function labelNamesOf({ scene, tools }: Session): Record<string, string> 
   return Object.fromEntries(Object.entries(names).map(([label, known]) => [label, known.join(", ")]));
 }
 
-const BETWEEN = "_"; // stands in addresses as it is
 const FIRST: Output = "bmode";
 
 /** What a person looks at in Maps of a scene: the large map and the cursor. Kept while other views are shown, and in the address. */
@@ -82,22 +81,12 @@ export class MapsState {
 
   #take(kept: Kept): void {
     this.large = kept.map !== undefined && kept.map in OUTPUTS ? (kept.map as Output) : FIRST;
-    const [x_mm, z_mm] = numbersOf(kept.cursor, 2) ?? [];
+    const [x_mm, z_mm] = numbersIn(kept.cursor ?? "", 2) ?? [];
     this.cursor = x_mm === undefined || z_mm === undefined ? null : { x_mm, z_mm };
     const pose = poseOrNull(kept.pose);
     if (pose !== null) this.session.pose = pose;
     else if (poseValue(this.session.pose) !== poseValue(this.session.held(this.session.scene.home))) this.session.goHome();
   }
-}
-
-function joined(numbers: readonly number[], digits: number): string {
-  return numbers.map((value) => String(Number(value.toFixed(digits)))).join(BETWEEN);
-}
-
-function numbersOf(text: string | undefined, count: number): number[] | null {
-  const parts = text?.split(BETWEEN) ?? [];
-  const numbers = parts.map(Number);
-  return parts.length === count && !parts.includes("") && numbers.every(Number.isFinite) ? numbers : null;
 }
 
 /** What is looked at of a session; the same each time that Maps are shown. */

@@ -1,6 +1,6 @@
 /** The page and its service: whether it answers, whom the key or the login stands for, and the colours of the page. */
 
-import { apiKey, explain, forgetApiKey, getJson, isTooOften, pauseAfter, ServiceError, setApiKey } from "../api/client";
+import { apiKey, base64url, explain, forgetApiKey, getJson, isTooOften, pauseAfter, ServiceError, setApiKey } from "../api/client";
 import { listScenes, type SceneEntry } from "../api/scenes";
 import { barredFor, type Me, type Operation, signInProvider, type SignInProvider, whoAmI } from "../api/service";
 import { words } from "../words/words.svelte";
@@ -62,7 +62,7 @@ class Login {
       if (isBack) await this.#finish(query, asked);
       else this.#renewLater();
     } catch (error) {
-      this.problem = words.shell.login.failed(reasonOf(error));
+      this.problem = words.shell.login.failed(explain(error));
     }
   }
 
@@ -191,14 +191,6 @@ function random(): string {
 
 async function challenge(verifier: string): Promise<string> {
   return base64url(new Uint8Array(await crypto.subtle.digest("SHA-256", new TextEncoder().encode(verifier))));
-}
-
-function base64url(bytes: Uint8Array): string {
-  return btoa(String.fromCharCode(...bytes)).replaceAll("+", "-").replaceAll("/", "_").replaceAll("=", "");
-}
-
-function reasonOf(error: unknown): string {
-  return error instanceof Error ? error.message : String(error);
 }
 
 export const login = new Login();

@@ -9,7 +9,7 @@ import {
 } from "../geometry/plane";
 import {
   flangePose, fromPositionQuaternion, type Place, placeIn, type Pose, position, probePose, quaternion,
-  type Reference, type Registered, withPlaceIn, withPosition,
+  type Reference, type Registered, replaced, withPlaceIn, withPosition,
 } from "../geometry/pose";
 import type { PoseForm } from "../geometry/pose_files";
 import { router } from "../page/router.svelte";
@@ -35,7 +35,7 @@ export class CineLoop {
   count = $state(0);
   index = $state(0);
   current = $state.raw<Frame | null>(null);
-  #frames: Frame[] = [];
+  frames: Frame[] = [];
   #bytes = 0;
   #settings = "";
   #timer: ReturnType<typeof setInterval> | undefined;
@@ -43,24 +43,20 @@ export class CineLoop {
   /** `shown` hears of each frame of the loop that is shown. */
   constructor(private readonly shown: (frame: Frame) => void) {}
 
-  get frames(): readonly Frame[] {
-    return this.#frames;
-  }
-
   /** Takes a live frame; the oldest ones go, and all of them where the settings are others: as on a scanner. */
   push(frame: Frame): void {
     const settings = settingsOf(frame);
     if (settings !== this.#settings) this.clear();
     this.#settings = settings;
-    this.#frames.push(frame);
+    this.frames.push(frame);
     this.#bytes += frame.pixels.byteLength;
-    while (this.#frames.length > MOST_FRAMES || (this.#bytes > MOST_BYTES && this.#frames.length > 1))
-      this.#bytes -= this.#frames.shift()!.pixels.byteLength;
+    while (this.frames.length > MOST_FRAMES || (this.#bytes > MOST_BYTES && this.frames.length > 1))
+      this.#bytes -= this.frames.shift()!.pixels.byteLength;
   }
 
   clear(): void {
     this.pause();
-    this.#frames = [];
+    this.frames = [];
     this.#bytes = 0;
     this.count = this.index = 0;
     this.current = null;
@@ -68,12 +64,12 @@ export class CineLoop {
 
   /** Lets the loop stand at its newest frame. */
   stand(): void {
-    this.count = this.#frames.length;
+    this.count = this.frames.length;
     this.show(this.count - 1);
   }
 
   putBy(): Loop {
-    return { frames: [...this.#frames], index: this.index };
+    return { frames: [...this.frames], index: this.index };
   }
 
   restore({ frames, index }: Loop): void {
@@ -84,7 +80,7 @@ export class CineLoop {
   }
 
   show(index: number): void {
-    const frame = this.#frames[index];
+    const frame = this.frames[index];
     if (frame === undefined) return;
     this.index = index;
     this.current = frame;
@@ -165,8 +161,7 @@ export class Marks {
       return;
     }
     this.draft = null;
-    this.#put([...this.all, mark]);
-    if (mark.kind === "text") this.editing = mark.id;
+    this.#add(mark);
   }
 
   /** Puts one of the tool about a point, for keys to move. */
@@ -180,8 +175,7 @@ export class Marks {
       text: [{ x_mm, z_mm }],
     }[this.tool];
     const mark = this.#made(this.tool, frame, points);
-    this.#put([...this.all, mark]);
-    if (mark.kind === "text") this.editing = mark.id;
+    this.#add(mark);
     return mark;
   }
 
@@ -227,6 +221,11 @@ export class Marks {
     return index < 0 ? "" : letter(index);
   }
 
+  #add(mark: Mark): void {
+    this.#put([...this.all, mark]);
+    if (mark.kind === "text") this.editing = mark.id;
+  }
+
   #put(next: readonly Mark[], run: string | null = null): void {
     this.history.change((marks: readonly Mark[]) => this.restore(marks), this.all, next, { run, of: this });
     this.all = next;
@@ -270,11 +269,8 @@ export function resultOf({ kind, points, text }: Mark): string {
       return `${fixed(angleAt_deg(points as EllipsePoints), 1)}°`;
     case "ellipse": {
       const ellipse = ellipseOf(points as EllipsePoints);
-      return words.scan.results.ellipse({
-        axes: `${fixed(2 * ellipse.first_mm, 1)} × ${fixed(2 * ellipse.second_mm, 1)} mm`,
-        circumference: `${fixed(circumference_mm(ellipse), 1)} mm`,
-        area: `${fixed(area_mm2(ellipse) / 100, 2)} cm²`,
-      });
+      const axes = `${fixed(2 * ellipse.first_mm, 1)} × ${fixed(2 * ellipse.second_mm, 1)} mm`;
+      return words.scan.results.ellipse(axes, `${fixed(circumference_mm(ellipse), 1)} mm`, `${fixed(area_mm2(ellipse) / 100, 2)} cm²`);
     }
     case "text":
       return text;
@@ -438,10 +434,6 @@ export class PoseTelling {
   #meantBy(place: Place): Pose {
     return this.meant(withPlaceIn(place, this.reference, this.told(this.other)));
   }
-}
-
-function replaced(vector: Place["position_mm"], index: number, value: number): Place["position_mm"] {
-  return vector.map((before, i) => (i === index ? value : before)) as unknown as Place["position_mm"];
 }
 
 /** That of a session; the same for every view. */

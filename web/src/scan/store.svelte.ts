@@ -10,7 +10,7 @@ import { confidenceWords } from "../session/confidence.svelte";
 import { planes } from "../session/scene.svelte";
 import { saveBlob } from "../shared/asking.svelte";
 import { colour, GREYS, paint } from "../shared/colours";
-import { nameIn } from "../shared/text";
+import { fixed, nameIn } from "../shared/text";
 import { words } from "../words/words.svelte";
 import { lettersOf, type Mark, type Marks, PLAYED_PER_SECOND, resultOf, type ScanState } from "./scan.svelte";
 
@@ -85,7 +85,7 @@ export class Sheet {
       ...(warning === "" ? [] : [`${warning}.`]),
       scene,
       new Date().toISOString(),
-      said.slice(slice_thickness_mm),
+      said.slice(fixed(slice_thickness_mm, 1)),
       said.depthInCm,
       ...(tools.length === 0 ? [] : [said.drawn(tools.map(({ kind }) => nameIn(words.tools.kinds, kind)).join(", "))]),
       ...(ghost === 0 ? [] : [words.tools.ghostMeans]),

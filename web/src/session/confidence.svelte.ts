@@ -91,21 +91,20 @@ export function layerOver({ width, height }: { width: number; height: number }):
 export function hatched(pixels: Uint32Array, layer: Layer, coverage: Uint8Array, width: number): void {
   const period = Math.max(5, Math.round(layer.width / LINES));
   const thick = Math.max(1, Math.round(period / 5));
-  for (let row = 0; row < layer.height; row++) {
-    const of = row * layer.step * width;
-    for (let column = 0; column < layer.width; column++)
-      if ((column + row) % period < thick && coverage[of + column * layer.step]! < SUPPORTED)
-        pixels[row * layer.width + column] = HATCH;
-  }
+  overEach(layer, width, (at, of, diagonal) => {
+    if (diagonal % period < thick && coverage[of]! < SUPPORTED) pixels[at] = HATCH;
+  });
 }
 
 /** Colours pixels by the error that they are expected to have. */
 export function uncertain(pixels: Uint32Array, layer: Layer, deviation: Uint8Array, width: number): void {
-  for (let row = 0; row < layer.height; row++) {
-    const of = row * layer.step * width;
-    for (let column = 0; column < layer.width; column++)
-      pixels[row * layer.width + column] = COLOURS[deviation[of + column * layer.step]!]!;
-  }
+  overEach(layer, width, (at, of) => (pixels[at] = COLOURS[deviation[of]!]!));
+}
+
+/** Goes over the pixels of a layer; `of`: the pixel of the frame that each lies over. */
+function overEach({ width: columns, height, step }: Layer, width: number, put: (at: number, of: number, diagonal: number) => void): void {
+  for (let row = 0; row < height; row++)
+    for (let column = 0; column < columns; column++) put(row * columns + column, (row * width + column) * step, column + row);
 }
 
 /** From nothing over yellow to magenta, as CSS for the scale. */

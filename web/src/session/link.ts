@@ -36,8 +36,19 @@ const KEYS = [
 
 /** A pose as a value of an address. */
 export function poseValue(pose: Pose): string {
-  const numbers = [...position(pose).map((value) => value.toFixed(6)), ...quaternion(pose).map((value) => value.toFixed(9))];
-  return numbers.map((text) => String(Number(text))).join(BETWEEN);
+  return joined(position(pose), 6) + BETWEEN + joined(quaternion(pose), 9);
+}
+
+/** Numbers as a value of an address. */
+export function joined(numbers: readonly number[], digits: number): string {
+  return numbers.map((value) => String(Number(value.toFixed(digits)))).join(BETWEEN);
+}
+
+/** The numbers of such a value; null where they are not so many. */
+export function numbersIn(text: string, count: number): number[] | null {
+  const parts = text.split(BETWEEN);
+  const numbers = parts.map(Number);
+  return parts.length === count && !parts.includes("") && numbers.every(Number.isFinite) ? numbers : null;
 }
 
 /** The pose that a value of an address tells; null where it tells none. */
@@ -173,9 +184,8 @@ function sameLength(value: unknown, usual: unknown): unknown {
 }
 
 function readPose(text: string): Pose {
-  const numbers = text.split(BETWEEN).map(Number);
-  if (numbers.length !== 7 || text.split(BETWEEN).includes("") || !numbers.every(Number.isFinite))
-    throw new Error(words.session.link.pose);
+  const numbers = numbersIn(text, 7);
+  if (numbers === null) throw new Error(words.session.link.pose);
   const [x, y, z, ...rest] = numbers as [number, number, number, ...number[]];
   if (Math.abs(Math.hypot(...rest) - 1) > 1e-2) throw new Error(words.session.link.quaternion);
   return fromPositionQuaternion([x, y, z] as Vector, rest as unknown as Quaternion);

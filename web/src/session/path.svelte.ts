@@ -58,7 +58,7 @@ export class Path {
       this.#play(name, file.poses, file.times_s);
       this.file = file;
     } catch (error) {
-      const reason = error instanceof PoseError ? words.connect.poseError(error) : explain(error);
+      const reason = error instanceof PoseError ? error.said(words.connect.poseError) : explain(error);
       this.problem = words.connect.path.wrong(name, reason);
     }
   }

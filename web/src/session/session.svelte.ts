@@ -4,7 +4,7 @@ import {
   AS_RENDERED, AS_TRAINED, type Display, exampleTool, type ImagePlane, MOST_TOOLS, type Output,
   type PlainSettings, type Probe, type StreamSettings, type Tool, type ToolKind,
 } from "../api/contract";
-import { areUpright, boxOf } from "../geometry/plane";
+import { squarePixel_mm } from "../geometry/plane";
 import {
   between, IDENTITY, nearest, pivoted, placeOn, type Pose, type Quaternion, rotated, translated, type Vector,
 } from "../geometry/pose";
@@ -121,7 +121,7 @@ export class ImageSettings {
     const { depth_mm, flip } = this.display;
     return {
       ...(plain ? { ...AS_RENDERED, depth_mm, flip } : this.display),
-      pixel_mm: this.scanConverted ? squarePixel_mm(plane) : null,
+      pixel_mm: this.scanConverted ? squarePixel_mm(plane.lines_mm, MOST_PICTURE_PIXELS) : null,
     };
   }
 
@@ -148,26 +148,15 @@ export class ImageSettings {
   }
 }
 
-/** The pixel of a scan-converted picture; null for probes whose frames are pictures already. */
-function squarePixel_mm({ lines_mm }: ImagePlane): number | null {
-  if (areUpright(lines_mm)) return null;
-  const { left, right, top, bottom } = boxOf(lines_mm);
-  return Math.max(right - left, bottom - top) / MOST_PICTURE_PIXELS;
-}
-
 /** The tools in the image of a session, and which of them is worked on. */
 export class Tools {
-  #all = $state.raw<readonly Tool[]>([]);
+  all = $state.raw<readonly Tool[]>([]);
   #chosen = $state(0);
-  readonly chosen = $derived.by(() => Math.min(this.#chosen, this.#all.length - 1));
-  readonly current = $derived.by<Tool | null>(() => this.#all[this.chosen] ?? null);
-  readonly isFull = $derived.by(() => this.#all.length >= MOST_TOOLS);
+  readonly chosen = $derived.by(() => Math.min(this.#chosen, this.all.length - 1));
+  readonly current = $derived.by<Tool | null>(() => this.all[this.chosen] ?? null);
+  readonly isFull = $derived.by(() => this.all.length >= MOST_TOOLS);
 
   constructor(private readonly history: History) {}
-
-  get all(): readonly Tool[] {
-    return this.#all;
-  }
 
   choose(index: number): void {
     this.#chosen = index;
@@ -175,29 +164,29 @@ export class Tools {
 
   /** Adds one, which is then worked on. `placed` puts it somewhere. */
   add(kind: ToolKind, placed: (tool: Tool) => Tool): void {
-    this.#change([...this.#all, placed(exampleTool(kind))]);
-    this.#chosen = this.#all.length - 1;
+    this.#change([...this.all, placed(exampleTool(kind))]);
+    this.#chosen = this.all.length - 1;
   }
 
   /** Puts a changed one in the place of that which is worked on. */
   change(tool: Tool): void {
-    this.#change(this.#all.map((before, index) => (index === this.chosen ? tool : before)), `tool ${this.chosen}`);
+    this.#change(this.all.map((before, index) => (index === this.chosen ? tool : before)), `tool ${this.chosen}`);
   }
 
   removeChosen(): void {
-    this.#change(this.#all.filter((_, index) => index !== this.chosen));
+    this.#change(this.all.filter((_, index) => index !== this.chosen));
   }
 
   /** Takes all of them from elsewhere; not a step that can be undone. */
   take(all: readonly Tool[]): void {
-    this.#all = all;
+    this.all = all;
     this.#chosen = 0;
   }
 
   /** Changes of one `run` are one step. */
   #change(all: readonly Tool[], run: string | null = null): void {
-    this.history.change((put) => (this.#all = put), this.#all, all, { run });
-    this.#all = all;
+    this.history.change((put) => (this.all = put), this.all, all, { run });
+    this.all = all;
   }
 }
 
@@ -426,8 +415,7 @@ const sessions = new Map<string, Session>();
 export function sessionOf(scene: string): Session {
   const known = sessions.get(scene);
   if (known !== undefined) return known;
-  let session!: Session;
-  $effect.root(() => void (session = new Session(scene))); // what it derives outlives the view that asked first
+  const session = lasting(() => new Session(scene));
   sessions.set(scene, session);
   return session;
 }
@@ -440,9 +428,15 @@ export function besideSession<T>(make: (session: Session) => T): (session: Sessi
   return (session) => {
     const known = all.get(session);
     if (known !== undefined) return known;
-    let begun!: T;
-    $effect.root(() => void (begun = make(session))); // what it derives outlives the view that asked first
+    const begun = lasting(() => make(session));
     all.set(session, begun);
     return begun;
   };
+}
+
+/** What it derives outlives the view that asked first. */
+function lasting<T>(make: () => T): T {
+  let begun!: T;
+  $effect.root(() => void (begun = make()));
+  return begun;
 }

@@ -1,6 +1,6 @@
 /** What moves the probe by itself while it is held: keys, a gamepad, the playback of a track. */
 
-import type { Vector } from "../geometry/pose";
+import { scaled, type Vector } from "../geometry/pose";
 import type { Session } from "./session.svelte";
 
 const SPEED_MM_S = 25;
@@ -12,6 +12,7 @@ const PLAYED_VIEWS_PER_SECOND = 12;
 
 type Motion = { along: Vector; turn: Vector };
 
+const STILL: Vector = [0, 0, 0];
 /** By key; with Shift they turn. Arrows: lateral and elevation, page keys: axial. */
 const SLIDES: Record<string, Vector> = {
   ArrowLeft: [-1, 0, 0],
@@ -20,14 +21,6 @@ const SLIDES: Record<string, Vector> = {
   ArrowDown: [0, 1, 0],
   PageUp: [0, 0, -1],
   PageDown: [0, 0, 1],
-};
-const TURNS: Record<string, Vector> = {
-  ArrowLeft: [0, 0, -1],
-  ArrowRight: [0, 0, 1],
-  ArrowUp: [-1, 0, 0],
-  ArrowDown: [1, 0, 0],
-  PageUp: [0, -1, 0],
-  PageDown: [0, 1, 0],
 };
 
 type PadCommands = Record<"freeze" | "snap" | "store" | "home", () => void>;
@@ -133,14 +126,13 @@ export class Steering {
   }
 
   #step(key: string, shift: boolean, fine: boolean, seconds: number): void {
-    const none: Vector = [0, 0, 0];
-    const direction = (shift ? TURNS : SLIDES)[key] ?? none;
-    this.#move(shift ? { along: none, turn: direction } : { along: direction, turn: none }, seconds * (fine ? FINE : 1));
+    const along = SLIDES[key]!;
+    const turn: Vector = [along[1], along[2], along[0]]; // to the side rotates, up and down tilts, pages rock
+    this.#move(shift ? { along: STILL, turn } : { along, turn: STILL }, seconds * (fine ? FINE : 1));
   }
 
   #move({ along, turn }: Motion, seconds: number): void {
     seconds *= this.speed();
-    const scaled = (vector: Vector, factor: number): Vector => [vector[0] * factor, vector[1] * factor, vector[2] * factor];
     if (along.some((value) => value !== 0)) this.session.moveBy(scaled(along, SPEED_MM_S * seconds));
     if (turn.some((value) => value !== 0)) this.session.turnBy(scaled(turn, SPEED_DEG_S * seconds));
   }

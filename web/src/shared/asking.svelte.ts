@@ -63,6 +63,20 @@ export function polled<Answer>(
   };
 }
 
+/** What the service answers, asked for again and again; what `ask` reads at once is followed. */
+export class Polled<Answer> {
+  /** null: not known yet. */
+  answer = $state.raw<Answer | null>(null);
+  /** Why the newest answer is not there. */
+  problem = $state<string | null>(null);
+
+  /** Must be made while a component is being made; ends with it. */
+  constructor(every_ms: number, ask: (signal: AbortSignal) => Promise<Answer>) {
+    const taken = (answer: Answer): void => void ([this.answer, this.problem] = [answer, null]);
+    $effect(() => polled(ask, every_ms, taken, (error) => (this.problem = explain(error))));
+  }
+}
+
 /** Files on their way to the service. They outlive the view that sends them; leaving the page asks first. */
 export class Sending {
   /** Share of the bytes that were sent, 0 to 1; null: nothing is under way. */
@@ -181,11 +195,14 @@ export class Copying {
   /** Whether the newest was copied a moment ago. */
   done = $state(false);
 
-  /** Copies a text; false where the browser does not let the page. */
-  async copy(text: string): Promise<boolean> {
+  /** Copies a text; false where the browser does not let the page: then what `offer` has shown of it is selected. */
+  async copy(text: string, offer: () => HTMLInputElement | HTMLTextAreaElement | undefined): Promise<boolean> {
     try {
       await navigator.clipboard.writeText(text);
     } catch {
+      const offered = offer();
+      offered?.focus();
+      offered?.select();
       return false;
     }
     this.done = true;

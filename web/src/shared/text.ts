@@ -115,6 +115,10 @@ export function metricTitle(metric: Metric): string {
   return words.shared.field.labels[metric] ?? LABELS[metric].title;
 }
 
+export function metricValue(value: number, metric: Metric): string {
+  return fixed(value, LABELS[metric].digits);
+}
+
 /** Its name and unit. */
 export function metricLabel(metric: Metric): string {
   const { unit } = LABELS[metric];

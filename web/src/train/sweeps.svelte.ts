@@ -242,12 +242,6 @@ export function readEdges(text: string, size: Size): Crop | null {
   return { left, right, top, bottom };
 }
 
-/** The crop that a person wrote, as the service reads it; null where it is none of an image of this size. */
-export function readCrop(text: string, size: Size): Crop | null {
-  const crop = readEdges(text, size);
-  return crop !== null && holds(crop, size) ? crop : null;
-}
-
 /** Whether a crop lies in the image and holds a pixel. */
 export function holds({ left, right, top, bottom }: Crop, { width, height }: Size): boolean {
   return left >= 0 && left < right && right <= width && top >= 0 && top < bottom && bottom <= height;
@@ -310,7 +304,7 @@ class CropDrawing {
     this.state = "none";
     this.frame = null;
     this.index = 0;
-    if (!files.some(({ name }) => /\.(mha|mhd|nrrd|nhdr)$/i.test(name))) return;
+    if (!files.some(({ name }) => ENDINGS.test(name))) return;
     this.state = "reading";
     try {
       const sequence = await Sequence.among(files);

@@ -20,17 +20,15 @@ from pathlib import Path
 
 import ultragray
 from ultragray_workers.backup import manifest as manifests
-from ultragray_workers.backup.contents import DATA, Folders, StoredFile, files_of, job_id_of
+from ultragray_workers.backup.contents import DATA, Folders, Objects, StoredFile, files_of, job_id_of
 from ultragray_workers.backup.database_copy import Database
 from ultragray_workers.backup.manifest import FileEntry, Manifest
-from ultragray_workers.backup.objects import Objects
 from ultragray_workers.errors import BackupInvalid, RestoreRefused
 from ultragray_workers.jobs.progress import JobState
 
 _SETTLE_S = 5.0  # a job that is just being deleted has lost its folder, and soon its row
 _SETTLE_POLL_S = 0.1
 _Known = dict[tuple[str, str], FileEntry]
-_States = Mapping[str, JobState]
 
 
 @dataclass(frozen=True)
@@ -89,8 +87,6 @@ def alone_in(backup_folder: Path) -> Iterator[None]:
 
 
 class _Backup:
-    """One backup as it is made."""
-
     def __init__(self, folders: Folders, database: Database, objects: Objects, known: _Known) -> None:
         self._folders, self._database, self._objects = folders, database, objects
         self._known = known

@@ -5,7 +5,6 @@ The keys are the same below both, so that a service that is started with the oth
 
 from __future__ import annotations
 
-import hashlib
 import re
 import tempfile
 from collections.abc import Callable, Iterator
@@ -14,7 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from ultragray.files import file_sha256
-from ultragray_workers.datasets.shelf import DatasetShelf, without_files
+from ultragray_workers.datasets.store import DatasetStore, without_files
 from ultragray_workers.errors import RestoreRefused, StorageUnavailable
 from ultragray_workers.storage.storage import NotThere, Storage
 
@@ -26,8 +25,6 @@ _SCENES = re.compile(
 
 @dataclass(frozen=True)
 class Copied:
-    """What a copy has done."""
-
     scenes: int = 0
     bytes: int = 0
     already_there: int = 0
@@ -45,7 +42,8 @@ def copy_scenes(source: Storage, target: Storage, say: Callable[[str], None] = l
         with _file(source, key) as file:
             sha256 = file_sha256(file)
             is_new = target.entry(key) is None and target.upload(file, key, if_absent=True)
-            found = _sha256(target, key)
+            with _file(target, key) as copy:
+                found = file_sha256(copy)
             if found != sha256 and is_new:
                 raise StorageUnavailable(f"the copy of {key} in {target.location} has another SHA-256: copy again")
             if found != sha256:
@@ -62,32 +60,20 @@ def _names_last(key: str) -> tuple[bool, str]:
 
 @contextmanager
 def _file(storage: Storage, key: str) -> Iterator[Path]:
-    if storage.local is not None:
-        yield storage.local / key
+    if (path := storage.in_place(key)) is not None:
+        yield path
         return
     with tempfile.TemporaryDirectory(prefix="ultragray-copy-") as folder:
         path = Path(folder, "object")
-        storage.download(key, path)
+        try:
+            storage.download(key, path)
+        except NotThere as error:
+            raise StorageUnavailable(str(error)) from None
         yield path
-
-
-def _sha256(storage: Storage, key: str) -> str:
-    digest = hashlib.sha256()
-    try:
-        for chunk in storage.chunks(key):
-            digest.update(chunk)
-    except NotThere as error:
-        raise StorageUnavailable(str(error)) from None
-    return digest.hexdigest()
-
-
-# Copies the datasets of one storage into another, such as from a folder into a bucket.
 
 
 @dataclass(frozen=True)
 class CopiedDatasets:
-    """What a copy has done."""
-
     datasets: int = 0
     datasets_already_there: int = 0
 
@@ -100,21 +86,21 @@ def copy_datasets(
     Interrupted, the same call goes on with those that are missing. Raises RestoreRefused where the target has another
     dataset of a name, StorageUnavailable, OSError.
     """
-    copied = there = 0
+    copied = kept = 0
     with tempfile.TemporaryDirectory(prefix="ultragray-copy-") as copies:
-        here, shelf = DatasetShelf(source, Path(copies, "from")), DatasetShelf(target, Path(copies, "to"))
-        names = sorted(here.names())
+        here, there = DatasetStore(Path(copies, "from"), source), DatasetStore(Path(copies, "to"), target)
+        names = here.names()
         for number, name in enumerate(names, 1):
             manifest = here.manifest(name)
             if manifest is None:  # deleted meanwhile
                 continue
-            with here.folder(name) as folder:
-                is_new = shelf.manifest(name) is None and shelf.put(folder, manifest, name)
-            found = shelf.manifest(name)
+            with here.files(name) as folder:
+                is_new = there.manifest(name) is None and there.put(folder, manifest, name)
+            found = there.manifest(name)
             if not is_new and (found is None or without_files(found) != without_files(manifest)):
                 raise RestoreRefused(
                     f"{target.location} has another dataset {name!r}: delete it there, or choose another place"
                 )
-            copied, there = copied + is_new, there + (not is_new)
+            copied, kept = copied + is_new, kept + (not is_new)
             say(f"{number} of {len(names)}: dataset {name} {'copied' if is_new else 'is there already'}")
-    return CopiedDatasets(copied, there)
+    return CopiedDatasets(copied, kept)

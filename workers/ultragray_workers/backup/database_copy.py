@@ -18,8 +18,8 @@ import psycopg
 import sqlalchemy as sa
 from psycopg import sql
 
+from ultragray_workers.backup.contents import Objects
 from ultragray_workers.backup.manifest import DatabaseEntry, TableEntry
-from ultragray_workers.backup.objects import Objects
 from ultragray_workers.errors import BackupInvalid, RestoreRefused
 from ultragray_workers.jobs import queue, tables
 from ultragray_workers.jobs.database import checked_url
@@ -33,8 +33,6 @@ _BLOCK_BYTES = 2**20
 
 @dataclass(frozen=True)
 class Snapshot:
-    """A database at one moment."""
-
     entry: DatabaseEntry
     states: Mapping[str, JobState]  # of all jobs
 
@@ -49,7 +47,6 @@ class Database:
 
     @property
     def kind(self) -> str:
-        """sqlite or postgresql."""
         return self.url.get_backend_name()
 
     def snapshot(self, objects: Objects, work_folder: Path) -> Snapshot | None:
@@ -76,7 +73,6 @@ class Database:
         return Snapshot(entry, states)
 
     def states(self) -> Mapping[str, JobState]:
-        """The state of every job as it is now."""
         if self.sqlite is not None and not self.sqlite.is_file():
             return {}
         with _connected(self.url) as connection:

@@ -59,8 +59,6 @@ class DatabaseEntry:
 
 @dataclass(frozen=True)
 class Manifest:
-    """One backup."""
-
     name: str  # the time at which it began, UTC
     release: str
     files: tuple[FileEntry, ...]

@@ -17,10 +17,9 @@ import sqlalchemy as sa
 from ultragray.files import atomic_path, file_sha256, link_or_copy, sync
 from ultragray_workers.backup import manifest as manifests
 from ultragray_workers.backup.backing_up import alone_in
-from ultragray_workers.backup.contents import ARTIFACTS, Folders, files_of
+from ultragray_workers.backup.contents import ARTIFACTS, Folders, Objects, files_of
 from ultragray_workers.backup.database_copy import Database
 from ultragray_workers.backup.manifest import FileEntry, Manifest
-from ultragray_workers.backup.objects import Objects
 from ultragray_workers.errors import BackupInvalid, RestoreRefused
 from ultragray_workers.jobs import queue
 from ultragray_workers.jobs.database import JobDatabase

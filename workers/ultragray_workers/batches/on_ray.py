@@ -33,8 +33,6 @@ _MAKING = ".making-"  # begins the name of a folder in which a shard is made
 
 @dataclass(frozen=True)
 class RayBatch:
-    """A batch for a Ray cluster."""
-
     plan: BatchPlan
     scene_file: Path
     location: str  # of the files: a folder or the URL of a bucket
@@ -85,8 +83,8 @@ class RayBatch:
         finally:
             ray.shutdown()
         place.finish()
-        if place.storage.local is not None:
-            for left in place.storage.local.glob(f"{_MAKING}*"):  # by workers that died
+        if (making := place.storage.in_place(_MAKING)) is not None:
+            for left in making.parent.glob(f"{_MAKING}*"):  # by workers that died
                 shutil.rmtree(left, ignore_errors=True)
 
 
@@ -149,9 +147,10 @@ def _make_shard(
     place = ShardPlace(storage, "", plan)
     if place.entry(shard) is None:
         renderer = _renderer(plan, scene, backend)
-        if storage.local is not None:
-            storage.local.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryDirectory(dir=storage.local, prefix=_MAKING) as folder:
+        beside = None if (making := storage.in_place(_MAKING)) is None else making.parent
+        if beside is not None:
+            beside.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=beside, prefix=_MAKING) as folder:
             path = Path(folder) / plan.file_name(shard)
             place.keep(path, shard, renderer.render(shard, path))
     return len(plan.frames_of(shard))

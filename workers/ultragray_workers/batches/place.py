@@ -9,16 +9,14 @@ Any number of processes may write the same shard: they write the same bytes. Fre
 
 from __future__ import annotations
 
-import hashlib
 import json
-import shutil
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict
 from pathlib import Path
 
 from ultragray.errors import InvalidArgument
 from ultragray.exchange.batches import MANIFEST_FILE, BatchPlan, ShardEntry, manifest
-from ultragray.files import sync
+from ultragray.files import file_sha256, sync
 from ultragray_workers.storage.storage import NotThere, Storage
 
 _ENTRIES = "entries"
@@ -33,7 +31,6 @@ class ShardPlace:
         self._prefix = prefix
 
     def key(self, name: str) -> str:
-        """The key of a file."""
         return f"{self._prefix}/{name}" if self._prefix else name
 
     def keep(self, path: Path, shard: int, entry: ShardEntry) -> None:
@@ -59,7 +56,6 @@ class ShardPlace:
             return [shard for shard, entry in zip(asked, threads.map(self.entry, asked), strict=True) if entry]
 
     def is_finished(self) -> bool:
-        """Whether the manifest is there. Raises InvalidArgument for that of another batch."""
         try:
             found = json.loads(self.storage.read(self.key(MANIFEST_FILE)))
         except NotThere:
@@ -80,18 +76,14 @@ class ShardPlace:
             entries = [entry for entry in threads.map(self._written, shards) if entry is not None]
             document = json.dumps(manifest(self.plan, entries), indent=1) + "\n"
             self.storage.write(self.key(MANIFEST_FILE), document.encode())
-            list(threads.map(self.storage.delete, map(self._entry_key, shards)))
-        if self.storage.local is not None:
-            shutil.rmtree(self.storage.local / self.key(_ENTRIES), ignore_errors=True)
+        self.storage.delete_all(self.key(_ENTRIES))
 
     def take_over(self, before: ShardPlace) -> None:
         """Takes the whole shards of a batch of the same plan that was not finished, where files can be linked."""
-        if (folder := before.storage.local) is None:
-            return
-        for shard in before.whole():
+        for shard in before.whole() if before.storage.is_near else ():
             entry = before.entry(shard)
-            if entry is not None:
-                self.keep(folder / before.key(entry.file), shard, entry)
+            if entry is not None and (path := before.storage.in_place(before.key(entry.file))) is not None:
+                self.keep(path, shard, entry)
 
     def _written(self, shard: int) -> ShardEntry | None:
         try:
@@ -104,12 +96,8 @@ class ShardPlace:
         found = self.storage.entry(self.key(entry.file))
         if found is None or found.bytes != entry.bytes:
             return False
-        if self.storage.local is None:
-            return True
-        digest = hashlib.sha256()
-        for chunk in self.storage.chunks(self.key(entry.file)):
-            digest.update(chunk)
-        return digest.hexdigest() == entry.sha256
+        path = self.storage.in_place(self.key(entry.file))
+        return path is None or file_sha256(path) == entry.sha256
 
     def _entry_key(self, shard: int) -> str:
         return self.key(f"{_ENTRIES}/{shard:06d}.json")

@@ -36,13 +36,11 @@ class FileBudget:
         self._files_left = MAX_FILES
 
     def take_file(self) -> None:
-        """Raises UploadTooLarge for one file too many."""
         self._files_left -= 1
         if self._files_left < 0:
             raise UploadTooLarge(f"a dataset may have at most {MAX_FILES} files")
 
     def take_bytes(self, count: int) -> None:
-        """Raises UploadTooLarge beyond the limit."""
         self._bytes_left -= count
         if self._bytes_left < 0:
             raise UploadTooLarge(

@@ -1,6 +1,6 @@
 """The demand of a job (device, memory, labels), the offer of a worker, and which jobs fit which worker.
 
-`jobs.queue` keeps the key of a demand with its job; `worker.gate` takes only jobs that the worker's offer fits.
+`jobs.queue` keeps the key of a demand with its job; `worker.device.Gate` takes only jobs that the worker's offer fits.
 """
 
 from __future__ import annotations
@@ -60,7 +60,6 @@ class Demand:
 
 @lru_cache(maxsize=4096)
 def demand_of_key(key: str) -> Demand:
-    """Inverse of `Demand.key`."""
     values = json.loads(key)
     return Demand(values["device"], values["min_memory_gb"], tuple(sorted(values["labels"].items())))
 
@@ -136,7 +135,6 @@ NO_OFFER = Offer(())
 
 @lru_cache(maxsize=1024)
 def offer_of_json(text: str | None) -> Offer:
-    """Inverse of `Offer.to_json`; None: of a worker that offers nothing yet."""
     if text is None:
         return NO_OFFER
     values = json.loads(text)

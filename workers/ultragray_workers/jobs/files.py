@@ -42,7 +42,6 @@ class Log:
     files: Callable[[], Files]  # of the job as they are now
 
     def size(self) -> int:
-        """The bytes that there are now."""
         return sum(piece.bytes for piece in self.files().log)
 
     def read(self, start: int, length: int) -> bytes:
@@ -58,7 +57,6 @@ class JobFiles:
         self.storage, self._row, self._folder = storage, row, folder
 
     def log(self, job_id: str) -> Log:
-        """The log of a job."""
         return Log(self.storage, lambda: self._files(job_id))
 
     def artifacts(self, job_id: str) -> dict[str, Artifact]:
@@ -108,7 +106,6 @@ class JobFiles:
         self.storage.upload(path, scene_key(job_id, scene))
 
     def remove(self, job_id: str) -> None:
-        """Removes all that there is of a job."""
         self.storage.delete_all(f"{FOLDER}/{job_id}")
 
     def _files(self, job_id: str) -> Files:
@@ -139,12 +136,10 @@ class JobFiles:
 
 
 def batch_prefix(job_id: str) -> str:
-    """The prefix of the keys of a job's shards."""
     return f"{FOLDER}/{job_id}/{BATCH}"
 
 
 def scene_key(job_id: str, scene: str) -> str:
-    """The key of the scene that is kept for a job."""
     return f"{FOLDER}/{job_id}/{scene}{SUFFIX}"
 
 

@@ -26,7 +26,7 @@ from typing import Any
 
 from ultragray.files import remove_stale_temporaries, sync, write_whole
 from ultragray_workers.jobs.progress import Outcome, Progress
-from ultragray_workers.storage.copies import DEFAULT_MAX_BYTES
+from ultragray_workers.storage.cache import DEFAULT_MAX_BYTES
 
 WORK = "work"  # of the artifact folder
 
@@ -66,7 +66,6 @@ class JobFolder:
         self._outcome = self.path / "outcome.json"
 
     def request(self) -> Request | None:
-        """The worker's instructions; None where there are none."""
         document = _read(self._request)
         with contextlib.suppress(TypeError):
             return None if document is None else Request(**document)
@@ -74,46 +73,37 @@ class JobFolder:
 
     @property
     def attempt(self) -> int:
-        """The number of the attempt."""
         return int(self.path.name.rpartition(".")[2])
 
     def others(self) -> list[JobFolder]:
-        """The folders of other attempts at the job, on this host."""
         found = self.path.parent.glob(f"{self.job_id}.*")
         attempts = [int(path.suffix[1:]) for path in found if path.suffix[1:].isdigit() and path != self.path]
         return [JobFolder(self.artifact_folder, self.job_id, attempt) for attempt in attempts]
 
     def make(self) -> None:
-        """Makes the folder, empty. Raises OSError."""
         shutil.rmtree(self.path, ignore_errors=True)
         self.path.mkdir(parents=True)
 
     def remove(self) -> None:
-        """Removes the folder."""
         shutil.rmtree(self.path, ignore_errors=True)
 
     def write_request(self, request: Request) -> None:
-        """Replaces the file whole. Raises OSError."""
         _write(self._request, json.dumps(asdict(request)))
 
     def progress(self) -> Progress:
-        """The progress of the job, as far as its folder says."""
         document = _read(self._progress)
         return Progress() if document is None else Progress.from_dict(document)
 
     def write_progress(self, progress: Progress) -> None:
-        """Replaces the file whole. Raises OSError."""
         _write(self._progress, json.dumps(asdict(progress)))
 
     def outcome(self) -> Outcome | None:
-        """The end of the work; None where it goes on."""
         try:
             return Outcome.from_json(self._outcome.read_text(encoding="utf-8"))
         except FileNotFoundError:
             return None
 
     def write_outcome(self, outcome: Outcome) -> None:
-        """Replaces the file whole. Raises OSError."""
         _write(self._outcome, outcome.to_json())
 
     @contextlib.contextmanager
@@ -152,7 +142,6 @@ class JobFolder:
                 remove_stale_temporaries(path)
 
     def artifact_names(self) -> tuple[str, ...]:
-        """The files to download, sorted."""
         return tuple(sorted(path.name for path in self.artifacts.iterdir()))
 
 

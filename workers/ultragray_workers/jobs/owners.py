@@ -50,7 +50,6 @@ def add_owner(connection: sa.Connection, kind: Kind, name: str, ownership: Owner
 
 
 def read_owner(connection: sa.Connection, kind: Kind, name: str) -> Ownership:
-    """Whose a dataset or scene is, or is to be."""
     row = connection.execute(sa.select(OWNERS).where(*_is(kind, name))).one_or_none()
     return NOBODYS if row is None else Ownership(row.owner, row.private, row.claim)
 
@@ -63,7 +62,6 @@ def forget_owner(connection: sa.Connection, kind: Kind, name: str, ownership: Ow
 
 
 def read_owners(connection: sa.Connection) -> dict[tuple[Kind, str], Ownership]:
-    """All owners, by kind and name."""
     rows = connection.execute(sa.select(OWNERS))
     return {(Kind(row.kind), row.name): Ownership(row.owner, row.private, row.claim) for row in rows}
 

@@ -60,7 +60,6 @@ class Progress:
 
     @classmethod
     def from_dict(cls, document: Mapping[str, Any]) -> Progress:
-        """Inverse of `asdict`; what is left out is null."""
         return cls(**{item.name: document.get(item.name) for item in fields(cls)})
 
 
@@ -76,12 +75,10 @@ class Outcome:
     attempts: int = 1  # how often a process was started for it
 
     def to_json(self) -> str:
-        """The outcome as files and rows hold it."""
         return json.dumps(asdict(self))
 
     @classmethod
     def from_json(cls, text: str) -> Outcome:
-        """Inverse of `to_json`."""
         values = json.loads(text)
         values["artifacts"] = tuple(values["artifacts"])
         values["progress"] = Progress.from_dict(values["progress"])

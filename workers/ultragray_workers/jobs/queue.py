@@ -7,8 +7,8 @@
 A worker holds a job as long as the row names it and its attempt, and the worker gives signs of life (see
 `jobs.workers`): `put_back_of_dead` lets others go on with the jobs of one that does not. Whatever a worker writes of a
 job holds for its own attempt alone, so that one that was cut off, and comes back, changes nothing any more. What
-demands fit which worker is decided by `worker.gate`; here a job is taken by the keys of demands. All functions block,
-and raise DatabaseUnavailable where the database is away. Free of torch.
+demands fit which worker is decided by `worker.device.Gate`; here a job is taken by the keys of demands. All functions
+block, and raise DatabaseUnavailable where the database is away. Free of torch.
 """
 
 from __future__ import annotations
@@ -129,7 +129,6 @@ def _put_back(engine: sa.Engine, condition: sa.ColumnElement[bool]) -> list[str]
 
 
 def is_held(engine: sa.Engine, held: Row) -> bool:
-    """Whether a job still is the attempt of `held`."""
     with engine.connect() as connection:
         return connection.execute(sa.select(JOBS.c.number).where(*_holds(held))).first() is not None
 
@@ -207,14 +206,12 @@ def forget(engine: sa.Engine, job_id: str) -> None:
 
 
 def row_of(engine: sa.Engine, job_id: str) -> Row | None:
-    """The row of a job; None where there is no such job."""
     with engine.connect() as connection:
         row = connection.execute(sa.select(*COLUMNS).where(JOBS.c.id == job_id)).one_or_none()
     return None if row is None else Row.of(row)
 
 
 def specification_of(engine: sa.Engine, job_id: str) -> dict[str, Any]:
-    """The whole specification of a job that is there, in JSON."""
     with engine.connect() as connection:
         text = connection.execute(sa.select(JOBS.c.specification).where(JOBS.c.id == job_id)).scalar_one()
     specification: dict[str, Any] = json.loads(text)
@@ -261,19 +258,16 @@ def _read_token(token: str | None) -> int | None:
 
 
 def count_by_state(engine: sa.Engine) -> dict[JobState, int]:
-    """The number of jobs in each state that some are in."""
     counted = sa.select(JOBS.c.state, sa.func.count()).where(_IS_JOB).group_by(JOBS.c.state)
     with engine.connect() as connection:
         return {JobState(state): count for state, count in connection.execute(counted)}
 
 
 def count_waiting(engine: sa.Engine) -> int:
-    """The number of jobs that wait."""
     return _count(engine, JOBS.c.state == _QUEUED)
 
 
 def count_of_owner(engine: sa.Engine, owner: str) -> int:
-    """The number of an owner's jobs that wait or run."""
     return _count(engine, sa.and_(_IS_UNFINISHED, JOBS.c.owner == owner))
 
 
@@ -309,7 +303,6 @@ def find(engine: sa.Engine, *, needs_dataset: str | None = None, makes_scene: st
 
 
 def successor(engine: sa.Engine, job_id: str) -> str | None:
-    """A job that waits or runs and goes on from this one; None where there is none."""
     found = sa.select(JOBS.c.id).where(_IS_UNFINISHED, JOBS.c.retry_of == job_id).limit(1)
     with engine.connect() as connection:
         return connection.execute(found).scalar()
@@ -322,7 +315,6 @@ def known_ids(engine: sa.Engine, ids: Sequence[str]) -> set[str]:
 
 
 def ids_of_owner(engine: sa.Engine, owner: str) -> list[str]:
-    """The jobs of an owner, whatever became of them."""
     with engine.connect() as connection:
         return list(connection.execute(sa.select(JOBS.c.id).where(_IS_JOB, JOBS.c.owner == owner)).scalars())
 

@@ -26,8 +26,6 @@ MAX_PRIORITY = 1000
 
 @dataclass(frozen=True)
 class StoredFile:
-    """A whole object of the storage."""
-
     key: str
     bytes: int
     sha256: str
@@ -58,17 +56,14 @@ class Files:
     artifacts: Mapping[str, StoredFile] = field(default_factory=dict)
 
     def keys(self) -> set[str]:
-        """The keys of the objects."""
         pieces = {piece.key for piece in (*self.log, *self.journal)}
         return pieces | {file.key for file in (*self.run.values(), *self.artifacts.values())}
 
     def to_json(self) -> str:
-        """The list as a row holds it."""
         return json.dumps(asdict(self))
 
     @classmethod
     def from_json(cls, text: str | None) -> Files:
-        """Inverse of `to_json`; None: there are none yet."""
         if text is None:
             return cls()
         values = json.loads(text)
@@ -112,12 +107,10 @@ class Row:
 
     @property
     def ownership(self) -> Ownership:
-        """Whose the job is."""
         return Ownership(self.owner, self.private)
 
     @classmethod
     def of(cls, row: sa.Row[Any]) -> Row:
-        """The row of a query for `COLUMNS`."""
         values = dict(row._mapping)
         return cls(
             **{

@@ -1,6 +1,6 @@
 """The jobs as the service sees them: submitted, listed, watched, cancelled, retried, deleted. Free of torch.
 
-`submit` checks what the job needs (`jobs.requirements`) and writes its row; the workers take it from there. All that is
+`submit` checks what the job needs (`Requirements`) and writes its row; the workers take it from there. All that is
 told of a job is its row (`jobs.record`) and the objects that the row names (`jobs.files`).
 """
 
@@ -14,6 +14,7 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -26,6 +27,8 @@ from ultragray.errors import InvalidArgument
 from ultragray.exchange.batches import stands_for
 from ultragray.geometry.image_size import MAX_IMAGE_SIDE
 from ultragray.geometry.registration import Registration
+from ultragray.scene.info import SceneHeader, read_header
+from ultragray_workers.claims import storage_full
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import (
     ArtifactNotFound,
@@ -45,6 +48,7 @@ from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.demand import AUTO, CPU, CUDA, Demand, waits_for
 from ultragray_workers.jobs.files import Artifact, JobFiles
 from ultragray_workers.jobs.kinds import Specification
+from ultragray_workers.jobs.kinds.base import Surroundings
 from ultragray_workers.jobs.owners import (
     NOBODYS,
     Kind,
@@ -56,11 +60,11 @@ from ultragray_workers.jobs.owners import (
 )
 from ultragray_workers.jobs.progress import JobState
 from ultragray_workers.jobs.record import MAX_PRIORITY, Job, Row, job_of
-from ultragray_workers.jobs.requirements import Requirements
 from ultragray_workers.jobs.specification import from_dict, in_short, to_dict, value_in
 from ultragray_workers.jobs.workers import Wanted, Worker, WorkerState
+from ultragray_workers.scene_names import base_name
+from ultragray_workers.scene_shelf import SCENES_FOLDER
 from ultragray_workers.scenes import SceneStore
-from ultragray_workers.shelves.opening import SCENES_FOLDER
 from ultragray_workers.storage.local import LocalStorage
 from ultragray_workers.storage.storage import Storage
 from ultragray_workers.store import OpenStore
@@ -75,7 +79,6 @@ Shown = Callable[[Ownership], bool]  # whether whoever asks may know of a job
 
 
 def _admit_any(jobs: JobStore) -> int | None:
-    """Keeps no job out, and has any number of them run."""
     return None
 
 
@@ -100,8 +103,6 @@ class JobsOverview:
 
 @dataclass(frozen=True)
 class _Submission:
-    """A job that is asked for."""
-
     id: str
     specification: Specification
     summary: Mapping[str, Any]  # as jobs tell it: before a registration brought its poses into the scene
@@ -282,7 +283,6 @@ class JobStore:
         return self._job(row)
 
     def get(self, job_id: str) -> Job:
-        """Raises JobNotFound."""
         return self._job(self._row(job_id))
 
     def list(
@@ -309,7 +309,6 @@ class JobStore:
         return self._jobs(rows), token
 
     def ownership(self, job_id: str) -> Ownership:
-        """Whose a job is. Raises JobNotFound."""
         return self._row(job_id).ownership
 
     def cancel(self, job_id: str) -> Job:
@@ -364,7 +363,6 @@ class JobStore:
         queue.forget(self._engine, job_id)
 
     def overview(self) -> JobsOverview:
-        """The jobs in numbers."""
         found = queue.count_by_state(self._engine)
         states = [worker.state for worker in workers.list_workers(self._engine)]
         oldest_s, unfit, now_s = dict.fromkeys((AUTO, CPU, CUDA), 0.0), 0, time.time()
@@ -381,7 +379,6 @@ class JobStore:
         )
 
     def unfinished_of(self, owner: str) -> int:
-        """The number of an owner's jobs that wait or run."""
         return queue.count_of_owner(self._engine, owner)
 
     def usage_s(self, owner: str | None, since: datetime) -> dict[str, float]:
@@ -433,7 +430,6 @@ class JobStore:
         return _in_words(queue.find(self._engine, makes_scene=name), shown)
 
     def close(self) -> None:
-        """Ends the connections to the database; the folder may be restored."""
         self.database.close()
         self._open.close()
 
@@ -493,3 +489,84 @@ def _id_of(text: str, owner: str | None) -> str:
     """The id of the one job of an owner that a text without NUL stands for."""
     named = text if owner is None else f"{text}\0{owner}"
     return hashlib.sha256(named.encode("utf-8", "surrogatepass")).hexdigest()[:24]
+
+
+@dataclass(frozen=True)
+class Requirements:
+    """The datasets, scenes and registrations that jobs name."""
+
+    datasets: DatasetStore
+    scenes: SceneStore
+    registration: Callable[[str, str], Registration]  # finds that of a name, for a scene
+    files: JobFiles
+    free_bytes: Callable[[], int | None]  # of the storage of the files; None: not known
+    max_image_side: int
+
+    def provide(self, specification: Specification, job_id: str, before: str | None) -> None:
+        """Keeps the scene that the job needs, as it is now, for the job, once the job can be done.
+
+        `before`: the job that it replaces, whose scene is taken where it is still there. Raises DatasetNotFound,
+        DatasetInvalid, SceneExists, SceneNotFound, SceneFileInvalid, StorageFull, StorageUnavailable and what `check`
+        of the specification raises.
+        """
+        self.require_dataset(specification)
+        made = _named(specification, specification.makes_scene)
+        if made is not None and made in self.scenes.names():
+            raise SceneExists(
+                f"there is already a scene {made!r}: choose another name", field=specification.makes_scene
+            )
+        name = _named(specification, specification.needs_scene)
+        if name is None:
+            specification.check(self._surroundings(None))
+            return
+        with self._kept(name, before) as old:
+            if old is not None:
+                path, header = old, read_header(old)
+            else:
+                path, header = self.scenes.path(name), self.scenes.header(name)
+            with storage_full("the scene of the job"):
+                specification.check(self._surroundings(header))
+                try:
+                    self.files.keep_scene(path, name, job_id)
+                except FileNotFoundError:
+                    self.scenes.path(name)  # raises SceneNotFound where the scene has just gone
+                    raise
+
+    def placed(self, specification: Specification) -> Specification:
+        """The job with its poses brought into its scene by the registration that it names, as that is now.
+
+        Raises SceneNotFound, RegistrationNotFound, and InvalidArgument for one of another scene.
+        """
+        name = _named(specification, specification.needs_registration)
+        if name is None:
+            return specification
+        scene = _named(specification, specification.needs_scene)
+        self.scenes.path(scene)
+        return specification.registered(self.registration(name, scene))
+
+    def taken(self, specification: Specification, before: str | None) -> list[tuple[Kind, str]]:
+        """The dataset and the scene that `provide` takes; not a scene that the job replaced has kept."""
+        dataset, scene = (
+            _named(specification, one) for one in (specification.needs_dataset, specification.needs_scene)
+        )
+        found = [] if dataset is None else [(Kind.DATASET, dataset)]
+        if scene is None:
+            return found
+        with self._kept(scene, before) as kept:
+            return found if kept is not None else [*found, (Kind.SCENE, base_name(scene))]
+
+    def require_dataset(self, specification: Specification) -> None:
+        """Raises DatasetNotFound, DatasetInvalid where the job's dataset is not there."""
+        if (dataset := _named(specification, specification.needs_dataset)) is not None:
+            self.datasets.get(dataset)
+
+    def _surroundings(self, scene: SceneHeader | None) -> Surroundings:
+        return Surroundings(scene, self.free_bytes(), self.max_image_side)
+
+    def _kept(self, scene: str, before: str | None) -> AbstractContextManager[Path | None]:
+        """The scene that was kept for the job that is replaced; None where it is not there."""
+        return nullcontext() if before is None else self.files.kept_scene(before, scene)
+
+
+def _named(specification: Specification, field: str | None) -> Any:
+    return None if field is None else getattr(specification, field)

@@ -68,7 +68,7 @@ sa.Index(  # two jobs never make a scene of one name
     sqlite_where=sa.text("state IN ('queued', 'running') AND batch IS NULL"),
     postgresql_where=sa.text("state IN ('queued', 'running') AND batch IS NULL"),
 )
-SHARDS = sa.Table(  # of batches; see jobs.shards.table
+SHARDS = sa.Table(  # of batches; see jobs.shards.desk
     "shards",
     TABLES,
     sa.Column("job", sa.Text, primary_key=True),
@@ -102,7 +102,7 @@ WORKERS = sa.Table(
     sa.Column("job", sa.Text),
     sa.Column("wanted", sa.Text),  # by an administrator; NULL: that it takes jobs
 )
-STORE = sa.Table("store", TABLES, sa.Column("id", sa.Text, nullable=False))  # one row: see jobs.identity
+STORE = sa.Table("store", TABLES, sa.Column("id", sa.Text, nullable=False))  # one row: see jobs.database
 KEYS = sa.Table(  # API keys: rows stay when a key is revoked or has expired
     "keys",
     TABLES,
@@ -178,7 +178,6 @@ def make_tables(engine: sa.Engine) -> None:
 
 
 def version(connection: sa.Connection) -> int | None:
-    """The version of the tables in a database; None where there are none."""
     schema = None if connection.dialect.name == "sqlite" else SCHEMA
     if not sa.inspect(connection).has_table(SCHEMA_VERSION.name, schema=schema):
         return None

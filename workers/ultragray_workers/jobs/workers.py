@@ -92,7 +92,6 @@ def list_workers(engine: sa.Engine) -> list[Worker]:
 
 
 def living_workers(engine: sa.Engine) -> list[LivingWorker]:
-    """The workers that give signs of life, by name."""
     is_alive = WORKERS.c.seen_at_s > queue.now_s(engine) - queue.DEAD_AFTER_S
     found = sa.select(WORKERS.c.name, WORKERS.c.offer, WORKERS.c.wanted).where(is_alive).order_by(WORKERS.c.name)
     with engine.connect() as connection:
@@ -151,7 +150,6 @@ class Heartbeat:
         self._thread.start()
 
     def beat(self) -> None:
-        """Writes that the worker is alive."""
         with self._engine.begin() as connection:
             mine = WORKERS.c.name == self._worker
             facts = {**self._facts, "seen_at_s": queue.now_s(self._engine), "job": self._job_at_hand()}

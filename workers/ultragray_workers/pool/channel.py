@@ -91,7 +91,6 @@ class Board:
 
     @staticmethod
     def new_memory() -> int:
-        """The descriptor of memory for one board."""
         descriptor = os.memfd_create("ultragray-board")
         os.ftruncate(descriptor, _FIELDS * np.dtype(np.int64).itemsize)
         return descriptor

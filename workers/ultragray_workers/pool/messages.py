@@ -12,14 +12,80 @@ from typing import Any, Generic, Protocol
 
 from typing_extensions import TypeVar
 
+from ultragray.contract import Contract, described
 from ultragray.errors import UltragrayError
 from ultragray.geometry.probe import FloatArray
 from ultragray.learn.localization.settings import Localization, LocalizationSettings
 from ultragray.rendering.settings import Resolved
 from ultragray.rendering.volumes import SliceView
 from ultragray.scene.confidence import Extrapolation
+from ultragray_workers.pool.channel import MAX_DESCRIPTORS
 from ultragray_workers.pool.turns import UNKNOWN_CALLER, Caller
 from ultragray_workers.storage.local import FileVersion
+
+MAX_BATCH_POSES = MAX_DESCRIPTORS  # the memory of each part goes along with the task
+
+
+@dataclass(frozen=True)
+class PoolConfig(Contract):
+    """Sizes of a pool. Raises InvalidArgument for values that no pool can have."""
+
+    processes: int = described(
+        "Render processes; 0: one per GPU, on the CPU one. More than there are GPUs share them.",
+        0,
+        low=0,
+        high=256,
+        topic="Compute",
+    )
+    threads_per_process: int = described(
+        "Render threads of each; 0: cores // processes.", 0, low=0, high=1024, topic="Compute"
+    )
+    queue_limit_frames: int = described(
+        "Frames that may wait, interactive and batch frames each; beyond: QUEUE_FULL.", 256, low=1, high=100_000
+    )
+    client_limit_frames: int = described(
+        "Of those, frames of one client: of one name where keys are asked for, else of one address.",
+        256,
+        low=1,
+        high=100_000,
+    )
+    max_queue_ms: float = described(
+        "How long frames of others may keep an interactive request waiting; one that would wait longer is refused at "
+        "once (QUEUE_FULL), and told when to try again.",
+        1000.0,
+        above=0.0,
+        high=3_600_000.0,
+    )
+    max_batch_poses: int = described(
+        "Waiting poses of one scene that are rendered together; fewer above 512x512 pixels.",
+        16,
+        low=1,
+        high=MAX_BATCH_POSES,
+    )
+    memory_budget_bytes: int = described(
+        "Of loaded scenes, per process, where they are rendered.", 4 * 2**30, low=1, high=2**63
+    )
+    max_footprint_pixels: int = described(
+        "Cost of one frame: pixels in the footprints of the Gaussians that it cuts, about 3e7 of 500,000 usual ones at "
+        "512x512; beyond: FRAME_TOO_COSTLY.",
+        2**31,
+        low=1,
+        high=2**62,
+    )
+    worker_grace_s: float = described(
+        "How long a render process may leave a task untouched, or owe an answer past its deadline, before it is killed "
+        "and replaced, and its frames are rendered again.",
+        5.0,
+        above=0.0,
+        high=3600.0,
+    )
+    worker_timeout_s: float = described(
+        "How long a render process may take to load a scene before it is killed and replaced.",
+        120.0,
+        above=0.0,
+        high=86_400.0,
+    )
+    backend: str = "auto"
 
 
 @dataclass(frozen=True, eq=False)
@@ -108,12 +174,10 @@ class RenderResult(Generic[S]):
 
     @property
     def height(self) -> int:
-        """H of the frames."""
         return self.settings.picture.height
 
     @property
     def width(self) -> int:
-        """W of the frames."""
         return self.settings.picture.width
 
 
@@ -136,12 +200,8 @@ class LocalizeResult:
 class ForkWorker:
     """To a template process: fork a worker that serves the channel sent along."""
 
-    backend: str
-    number: int  # of its place in the pool, from 0: tells which GPU it takes
-    processes: int  # in the pool; 0: one per GPU, or one
-    threads: int  # 0: the cores this process may use, divided by the number of processes
-    memory_budget_bytes: int
-    max_footprint_pixels: int  # of a frame
+    pool: PoolConfig
+    number: int = 0  # of its place in the pool: tells which GPU it takes
 
 
 @dataclass(frozen=True)
@@ -205,16 +265,12 @@ class PackTask:
 
 @dataclass(frozen=True)
 class LoadTask:
-    """Load a scene, and render a frame of it."""
-
     scene: str
     path: str
 
 
 @dataclass(frozen=True)
 class UnloadTask:
-    """Drop a scene."""
-
     scene: str
 
 
@@ -223,8 +279,6 @@ AnyTask = Task[Any] | PackTask | LoadTask | UnloadTask
 
 @dataclass(frozen=True)
 class Rendered:
-    """A worker's report on one part."""
-
     size: int  # bytes of the reply so far: all of `data` when this was the request's only part
     scene_sha256: str
     renderer: str

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Collection, Mapping, Sequence
+from functools import cache
 from typing import Any, BinaryIO, Protocol
 
 import numpy as np
@@ -63,15 +64,14 @@ class _OnHost:
     waited_ms = 0.0
 
     def __init__(self, frames: Mapping[str, Tensor], wanted: Wanted) -> None:
-        self._frames = {name: _on_host(frames[name]) for name in wanted}
+        self._frames = {
+            name: frames[name].to("cpu", torch.uint8 if frames[name].dtype == torch.uint8 else torch.float32).numpy()
+            for name in wanted
+        }
 
     def take(self, name: str, pixel_type: np.dtype[Any], first: int, stop: int) -> Pixels:
         frames = self._frames[name][first:stop]
         return OUTPUTS[name].shares(frames) if pixel_type == np.uint8 else frames
-
-
-def _on_host(frames: Tensor) -> Pixels:
-    return frames.to("cpu", torch.uint8 if frames.dtype == torch.uint8 else torch.float32).numpy()
 
 
 class _FromGpu:
@@ -116,13 +116,9 @@ class _FromGpu:
         return self._host[name, pixel_type][first:stop].numpy()
 
 
-_copy_streams: dict[torch.device, torch.cuda.Stream] = {}
-
-
+@cache
 def _copy_stream(device: torch.device) -> torch.cuda.Stream:
-    if device not in _copy_streams:
-        _copy_streams[device] = torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
-    return _copy_streams[device]
+    return torch.cuda.Stream(device)  # type: ignore[no-untyped-call]
 
 
 def write_npz(

@@ -16,17 +16,16 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
-from ultragray.contract import Contract, described
 from ultragray.errors import InvalidArgument, RenderFailed
 from ultragray.rendering.settings import Resolved
 from ultragray.rendering.volumes import SliceView
 from ultragray_workers.errors import Draining, NotReady
-from ultragray_workers.pool.channel import MAX_DESCRIPTORS, read_start
+from ultragray_workers.pool.channel import read_start
 from ultragray_workers.pool.dispatcher import Dispatcher
 from ultragray_workers.pool.messages import (
-    ForkWorker,
     LoadTask,
     LocalizeResult,
+    PoolConfig,
     Rendered,
     RenderRequest,
     RenderResult,
@@ -35,7 +34,7 @@ from ultragray_workers.pool.messages import (
     Sought,
     UnloadTask,
 )
-from ultragray_workers.pool.processes import Launcher, Patience
+from ultragray_workers.pool.processes import Launcher
 from ultragray_workers.pool.waiting import Expiry, Ticket, Turn, WaitingQueue
 from ultragray_workers.scene_names import base_name
 from ultragray_workers.scenes import SceneStore
@@ -44,72 +43,9 @@ logger = logging.getLogger(__name__)
 
 R = TypeVar("R")
 
-MAX_BATCH_POSES = MAX_DESCRIPTORS  # the memory of each part goes along with the task
 MAX_REPLY_BYTES = 2**31 - 2**20
 MAX_SCENE_CHANGES = 3
 _READ_IN_THREAD_BYTES = 2**20
-
-
-@dataclass(frozen=True)
-class PoolConfig(Contract):
-    """Sizes of a pool. Raises InvalidArgument for values that no pool can have."""
-
-    processes: int = described(
-        "Render processes; 0: one per GPU, on the CPU one. More than there are GPUs share them.",
-        0,
-        low=0,
-        high=256,
-        topic="Compute",
-    )
-    threads_per_process: int = described(
-        "Render threads of each; 0: cores // processes.", 0, low=0, high=1024, topic="Compute"
-    )
-    queue_limit_frames: int = described(
-        "Frames that may wait, interactive and batch frames each; beyond: QUEUE_FULL.", 256, low=1, high=100_000
-    )
-    client_limit_frames: int = described(
-        "Of those, frames of one client: of one name where keys are asked for, else of one address.",
-        256,
-        low=1,
-        high=100_000,
-    )
-    max_queue_ms: float = described(
-        "How long frames of others may keep an interactive request waiting; one that would wait longer is refused at "
-        "once (QUEUE_FULL), and told when to try again.",
-        1000.0,
-        above=0.0,
-        high=3_600_000.0,
-    )
-    max_batch_poses: int = described(
-        "Waiting poses of one scene that are rendered together; fewer above 512x512 pixels.",
-        16,
-        low=1,
-        high=MAX_BATCH_POSES,
-    )
-    memory_budget_bytes: int = described(
-        "Of loaded scenes, per process, where they are rendered.", 4 * 2**30, low=1, high=2**63
-    )
-    max_footprint_pixels: int = described(
-        "Cost of one frame: pixels in the footprints of the Gaussians that it cuts, about 3e7 of 500,000 usual ones at "
-        "512x512; beyond: FRAME_TOO_COSTLY.",
-        2**31,
-        low=1,
-        high=2**62,
-    )
-    worker_grace_s: float = described(
-        "How long a render process may leave a task untouched, or owe an answer past its deadline, before it is killed "
-        "and replaced, and its frames are rendered again.",
-        5.0,
-        above=0.0,
-        high=3600.0,
-    )
-    worker_timeout_s: float = described(
-        "How long a render process may take to load a scene before it is killed and replaced.",
-        120.0,
-        above=0.0,
-        high=86_400.0,
-    )
-    backend: str = "auto"
 
 
 @dataclass(frozen=True)
@@ -144,15 +80,7 @@ class RenderPool:
         self._launcher = Launcher()
         self._dispatcher = Dispatcher(
             self._launcher,
-            ForkWorker(
-                backend=config.backend,
-                number=0,
-                processes=config.processes,
-                threads=config.threads_per_process,
-                memory_budget_bytes=config.memory_budget_bytes,
-                max_footprint_pixels=config.max_footprint_pixels,
-            ),
-            Patience(config.worker_grace_s, config.worker_timeout_s),
+            config,
             self._waiting,
         )
         self._open: set[Ticket] = set()
@@ -245,7 +173,6 @@ class RenderPool:
         await self._dispatcher.command_all(UnloadTask(scene))
 
     def loaded(self) -> dict[str, int]:
-        """Each loaded scene, and how many processes hold it."""
         return dict(Counter(name for slot in self._dispatcher.slots for name in slot.resident))
 
     def statistics(self) -> PoolStatistics:
@@ -292,26 +219,21 @@ class RenderPool:
         self, request: RenderRequest[Any], turn: Turn, read: Callable[[Ticket, Rendered], Awaitable[R]]
     ) -> R:
         with self._store.hold(request.scene) as path:
-            if path is not None:
-                return await self._answer_of_file(request, turn, path, read)
-        await asyncio.to_thread(self._store.path, request.scene)  # fetches it, or raises that there is none
-        raise SceneChangedError
-
-    async def _answer_of_file(
-        self, request: RenderRequest[Any], turn: Turn, path: Path, read: Callable[[Ticket, Rendered], Awaitable[R]]
-    ) -> R:
-        turn.ticket = ticket = self._ticket(request, path)
-        turn.expiry = Expiry(ticket, self._waiting)
-        try:
-            self._open.add(ticket)
-            self._dispatcher.submit(ticket)
-            rendered = await ticket.done
-            self._renderer = rendered.renderer
-            return await read(ticket, rendered)
-        finally:
-            turn.expiry.cancel()
-            self._open.discard(ticket)
-            self._dispatcher.discard(ticket)
+            if path is None:
+                await asyncio.to_thread(self._store.path, request.scene)  # fetches it, or raises that there is none
+                raise SceneChangedError
+            turn.ticket = ticket = self._ticket(request, path)
+            turn.expiry = Expiry(ticket, self._waiting)
+            try:
+                self._open.add(ticket)
+                self._dispatcher.submit(ticket)
+                rendered = await ticket.done
+                self._renderer = rendered.renderer
+                return await read(ticket, rendered)
+            finally:
+                turn.expiry.cancel()
+                self._open.discard(ticket)
+                self._dispatcher.discard(ticket)
 
     def _ticket(self, request: RenderRequest[Any], path: Path) -> Ticket:
         """Raises InvalidArgument for a request that no reply can hold."""
@@ -343,7 +265,6 @@ def _check_reply(settings: Resolved | SliceView, poses: int) -> None:
 
 
 async def _frames(ticket: Ticket, rendered: Rendered) -> RenderResult[Any]:
-    """The frames of a request, taken from its memory."""
     request, place = ticket.request, None
     if request.destination is not None:
         place = request.destination.put(ticket.reply_memory, rendered.size)
@@ -365,7 +286,6 @@ async def _frames(ticket: Ticket, rendered: Rendered) -> RenderResult[Any]:
 
 
 async def _place_found(ticket: Ticket, rendered: Rendered) -> LocalizeResult:
-    """Where the frame of a request was found."""
     assert rendered.found is not None
     return LocalizeResult(
         scene=ticket.request.scene,

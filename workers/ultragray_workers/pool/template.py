@@ -20,7 +20,6 @@ from ultragray_workers.pool.messages import ForkWorker, Hello
 
 
 def main(channel_descriptor: int) -> NoReturn:
-    """Serves the channel until the service hangs up or dies; then exits."""
     for number in (signal.SIGINT, signal.SIGTERM):  # meant for the service, which drains and then hangs up
         signal.signal(number, signal.SIG_IGN)
     signal.signal(signal.SIGCHLD, signal.SIG_IGN)  # no zombies

@@ -1,9 +1,14 @@
 """Turns between clients, and between the connections of each, by the workers' time that each has had.
 
-This is start-time fair queueing: every share has a virtual time, the seconds it was served, and the one that is
-furthest behind is next. One that comes, or comes back, starts where those are that wait, so that nobody saves up time;
-and one that has just been served long waits until the others have had as much. A client that opens more connections
-gets no more: they divide what it gets.
+This is start-time fair queueing (Goyal, Vin, Cheng 1996) on two levels. Every share i, a client or a connection of one,
+has a virtual time S_i: the seconds of workers that it was served. The queue has a clock V, the S of the share that was
+taken last. The next is the waiting share of the least S_i, of equal ones that with the fewest frames; taking work of
+w forecast seconds makes V = S_i, then S_i += w, and S_i += measured - w once it is known what it took. A share that
+begins to wait starts at max(S_i, V): nobody saves up time while away, and one that was just served long waits until the
+others have had as much. So any two shares that wait all the time get the same within the length of one part each. A
+client's connections have a clock of their own and divide what the client gets: opening more of them gains nothing. How
+long one more item of share i must wait follows: it is next when S_i has come to T = S_i + w_i, and until then every
+other share j is served min(w_j, T - S_j), at least a frame where it is behind (`_Share.before`).
 """
 
 from __future__ import annotations
@@ -12,10 +17,12 @@ import time
 from collections import OrderedDict
 from collections.abc import Hashable, Iterator
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from itertools import zip_longest
+from typing import Any, Generic, TypeVar
 
 Item = TypeVar("Item")
 
+_NO_ITEM: Any = object()
 _MOST_IDLE = 256  # shares that are remembered beside those that wait
 
 
@@ -175,14 +182,8 @@ def _in_turn(client: _Client[Item]) -> Iterator[Item]:
 
 def _alternate(rows: list[Iterator[Item]]) -> Iterator[Item]:
     """One item of each row, then the next of each, until there are no more."""
-    while rows:
-        left = []
-        for items in rows:
-            for item in items:
-                yield item
-                left.append(items)
-                break
-        rows = left
+    for items in zip_longest(*rows, fillvalue=_NO_ITEM):
+        yield from (item for item in items if item is not _NO_ITEM)
 
 
 def _forget_idle(shares: dict[str, _Client[Item]] | dict[str, _Connection[Item]], clock_s: float) -> None:
@@ -210,11 +211,9 @@ class Forecast:
         self._any_s = _FIRST_GUESS_S
 
     def frame_s(self, kind: Hashable) -> float:
-        """Seconds that a worker will take for a frame."""
         return self._frame_s.get(kind, self._any_s)
 
     def learn(self, kind: Hashable, frames: int, seconds: float) -> None:
-        """Takes note of what a worker took for some frames together."""
         measured_s = seconds / frames
         known_s = self._frame_s.get(kind, measured_s)
         self._frame_s[kind] = known_s + _WEIGHT * (measured_s - known_s)

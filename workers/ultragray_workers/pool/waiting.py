@@ -155,7 +155,6 @@ class WaitingQueue:
 
     @property
     def frames(self) -> int:
-        """Poses that wait."""
         again = (step.frames for tickets in self._again.values() for ticket in tickets for step in ticket.waiting)
         return sum(turns.frames for turns in self._turns.values()) + sum(again)
 
@@ -187,7 +186,6 @@ class WaitingQueue:
         again.move_to_end(ticket, last=False)
 
     def remove(self, ticket: Ticket) -> None:
-        """Drops all of a ticket that waits."""
         self._leave(ticket)
         ticket.waiting.clear()
 
@@ -347,7 +345,6 @@ class WaitingQueue:
 
 
 def _sum_of(steps: Iterable[Part]) -> tuple[int, float]:
-    """Their frames, and the work of these."""
     steps = list(steps)
     return sum(step.frames for step in steps), sum(step.work_s for step in steps)
 
@@ -365,7 +362,6 @@ class Expiry:
         self.watch()
 
     def watch(self) -> None:
-        """Looks at the deadlines, which may have changed."""
         self.cancel()
         give_up_at = self._ticket.give_up_at
         if give_up_at < math.inf:

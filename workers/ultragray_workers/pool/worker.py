@@ -1,6 +1,6 @@
 """The worker process: takes tasks from its channel one at a time, renders, encodes, answers. Imports torch.
 
-`_Worker.do` finds the work of a task by the kind of its settings (`_WORK`): frames, slices, a frame that is looked for.
+`_Worker._done` finds the work of a task by the kind of its settings: frames, slices, a frame that is looked for.
 Each part of a task has an answer of its own, as soon as its pixels lie in the memory of its request.
 """
 
@@ -13,16 +13,18 @@ import select
 import signal
 import threading
 import time
+from collections import OrderedDict
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import replace
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import Any, ClassVar
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ultragray.errors import MemoryExceeded, RenderFailed, UltragrayError
+from ultragray.errors import MemoryExceeded, RenderFailed, SceneFileInvalid, UltragrayError
+from ultragray.files import file_sha256
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.localization.pixels import read_grey, read_png
 from ultragray.learn.localization.search import localize
@@ -35,9 +37,10 @@ from ultragray.rendering.pixels import encoded_image, in_type
 from ultragray.rendering.settings import Encoding, Resolved
 from ultragray.rendering.volume_fields import as_grey, sample_slice
 from ultragray.rendering.volumes import SliceView
-from ultragray.scene.confidence import require_confidence
+from ultragray.scene.confidence import Assessor, require_confidence
 from ultragray.scene.gaussians import GaussianScene
-from ultragray_workers.errors import DeadlineExceeded
+from ultragray.scene.info import read_header, scene_file_invalid
+from ultragray_workers.errors import DeadlineExceeded, SceneTooLarge
 from ultragray_workers.pool.channel import Board, Channel, read_start, write_at
 from ultragray_workers.pool.messages import (
     Answer,
@@ -56,7 +59,8 @@ from ultragray_workers.pool.messages import (
     UnloadTask,
 )
 from ultragray_workers.pool.pixels import CHUNK_POSES, Arriving, Wanted, render_to_host, write_npz
-from ultragray_workers.pool.scene_cache import LoadedScene, SceneCache
+from ultragray_workers.scenes import resident_bytes
+from ultragray_workers.storage.local import FileVersion
 
 MAX_DETAIL_LENGTH = 2000
 
@@ -98,15 +102,15 @@ class _Worker:
         self._channel = channel
         self._board = board
         self._tasks = 0  # taken up
-        self._max_footprint_pixels = settings.max_footprint_pixels
-        self._backend = settings.backend
-        self._device = render_device(settings.backend, settings.number)
+        config = settings.pool
+        self._max_footprint_pixels, self._backend = config.max_footprint_pixels, config.backend
+        self._device = render_device(config.backend, settings.number)
         self.gpus = cuda.device_count() if self._device.type == "cuda" else 0
         if self.gpus:
             torch.cuda.set_device(self._device)  # kernels are launched on the current one
-        processes = settings.processes or max(1, self.gpus)
-        torch.set_num_threads(settings.threads or max(1, len(os.sched_getaffinity(0)) // processes))
-        self._scenes = SceneCache(settings.memory_budget_bytes, self._device)
+        processes = config.processes or max(1, self.gpus)
+        torch.set_num_threads(config.threads_per_process or max(1, len(os.sched_getaffinity(0)) // processes))
+        self._scenes = SceneCache(config.memory_budget_bytes, self._device)
 
     def warm_up(self) -> None:
         """Renders and encodes small frames, so that the first request does not pay for first uses."""
@@ -127,14 +131,22 @@ class _Worker:
         self._board.taken[0] = self._tasks
         try:
             if isinstance(task, Task):
-                work = self._WORK[type(task.view)](self, task, memories)
-                for part, outcome in enumerate(work):
+                for part, outcome in enumerate(self._done(task, memories)):
                     self._answer(part, outcome, last=part == len(task.parts) - 1)
             else:
                 self._answer(0, _outcome(lambda: self._do_other(task, memories)), last=True)
         finally:
             for memory in memories:
                 os.close(memory)
+
+    def _done(self, task: Task[Any], memories: Sequence[int]) -> Iterator[Outcome]:
+        """The outcomes of a task's parts: frames are rendered together, all else is done part by part."""
+        if isinstance(task.view, Resolved):
+            yield from self._render_parts(task, memories)
+            return
+        work = partial(self._WORK[type(task.view)], self, task)
+        for part, memory in zip(task.parts, memories, strict=True):
+            yield _outcome(partial(work, part, memory))
 
     def _answer(self, part: int, outcome: Outcome, *, last: bool) -> None:
         self._channel.send(Answer(part=part, outcome=outcome, last=last, resident=self._scenes.names()))
@@ -256,11 +268,6 @@ class _Worker:
                 f"free memory of {self._device}; ask for fewer or smaller ones"
             ) from error
 
-    def _sample_parts(self, task: Task[SliceView], memories: Sequence[int]) -> Iterator[Outcome]:
-        """Slices, part by part."""
-        for part, memory in zip(task.parts, memories, strict=True):
-            yield _outcome(partial(self._sample, task, part, memory))
-
     def _sample(self, task: Task[SliceView], part: TaskPart[SliceView], memory: int) -> Rendered:
         loaded, view = self._scene_of(task), part.settings
         started, size = time.monotonic(), 0
@@ -272,11 +279,6 @@ class _Worker:
             write_at(memory, data.data.cast("B"), number * data.nbytes)
             size = part.total * data.nbytes
         return self._rendered(loaded, started, size=size, first=part.first)
-
-    def _search_parts(self, task: Task[Sought], memories: Sequence[int]) -> Iterator[Outcome]:
-        """A real frame, which lies in the memory, and is looked for about the one pose."""
-        for part, memory in zip(task.parts, memories, strict=True):
-            yield _outcome(partial(self._search, task, part, memory))
 
     def _search(self, task: Task[Sought], part: TaskPart[Sought], memory: int) -> Rendered:
         loaded, asked = self._scene_of(task), part.settings.settings
@@ -294,11 +296,7 @@ class _Worker:
         )
         return self._rendered(loaded, started, found=found)
 
-    _WORK: ClassVar[dict[type, Callable[..., Iterator[Outcome]]]] = {  # by the kind of settings
-        Resolved: _render_parts,
-        SliceView: _sample_parts,
-        Sought: _search_parts,
-    }
+    _WORK: ClassVar[dict[type, Callable[..., Rendered]]] = {SliceView: _sample, Sought: _search}  # on one part
 
 
 def example_probes() -> tuple[Probe, ...]:
@@ -412,3 +410,108 @@ def _as_reported(error: Exception) -> UltragrayError:
 
 def _since_ms(started: float) -> float:
     return (time.monotonic() - started) * 1000.0
+
+
+MAX_SCENES = 256
+_READ_ATTEMPTS = 3
+
+
+@dataclass(frozen=True, eq=False)
+class LoadedScene:
+    scene: GaussianScene
+    sha256: str  # of the very bytes the tensors were read from
+    version: FileVersion
+    bytes: int
+
+    @cached_property
+    def assessor(self) -> Assessor:
+        """The assessor of its frames' extrapolation."""
+        return Assessor(self.scene.info, self.scene.training_poses)
+
+
+class SceneCache:
+    """At most `budget_bytes` of scenes on a device, as `resident_bytes` counts them."""
+
+    def __init__(self, budget_bytes: int, device: torch.device) -> None:
+        self._budget_bytes = budget_bytes
+        self._device = device
+        self._scenes: OrderedDict[str, LoadedScene] = OrderedDict()  # least recently used first
+
+    def names(self) -> tuple[str, ...]:
+        return tuple(self._scenes)
+
+    def get(self, name: str, path: str) -> LoadedScene:
+        """The scene of a file as it is now. Raises SceneFileInvalid, SceneTooLarge, MemoryExceeded."""
+        if (held := self.held(name, path)) is not None:
+            return held
+        self._make_room(name, path)
+        self._scenes[name] = loaded = self._load(name, path)
+        return loaded
+
+    def held(self, name: str, path: str) -> LoadedScene | None:
+        """The scene where it need not be loaded: it is here, and its file is the same. Raises SceneFileInvalid."""
+        try:
+            version = _version(path)
+        except SceneFileInvalid:
+            self.drop(name)
+            raise
+        held = self._scenes.get(name)
+        if held is not None and held.version == version:
+            self._scenes.move_to_end(name)
+            return held
+        self.drop(name)
+        return None
+
+    def drop(self, name: str) -> None:
+        self._scenes.pop(name, None)
+
+    def _make_room(self, name: str, path: str) -> None:
+        needed = resident_bytes(read_header(path).info)
+        if needed > self._budget_bytes:
+            raise SceneTooLarge(
+                f"scene {name!r} needs {_megabytes(needed)}, the memory budget for scenes is "
+                f"{_megabytes(self._budget_bytes)}",
+                field="scene",
+            )
+        while self._scenes and (self._held_bytes() + needed > self._budget_bytes or len(self._scenes) >= MAX_SCENES):
+            self._scenes.popitem(last=False)
+
+    def _load(self, name: str, path: str) -> LoadedScene:
+        loaded = _read(path)
+        try:
+            return replace(loaded, scene=loaded.scene.to(self._device))
+        except torch.OutOfMemoryError as error:
+            raise MemoryExceeded(
+                f"scene {name!r} of {_megabytes(loaded.bytes)} does not fit into the free memory of {self._device}; "
+                f"the memory budget for scenes is {_megabytes(self._budget_bytes)}, a lower one leaves more room",
+                field="scene",
+            ) from error
+
+    def _held_bytes(self) -> int:
+        return sum(loaded.bytes for loaded in self._scenes.values())
+
+
+def _read(path: str) -> LoadedScene:
+    """Tensors and hash of the same bytes: read again when the file changed in between."""
+    for _ in range(_READ_ATTEMPTS):
+        version = _version(path)
+        try:
+            scene, sha256 = GaussianScene.load(path), file_sha256(path)
+        except (UltragrayError, OSError) as error:
+            if _version(path) == version:
+                raise (error if isinstance(error, UltragrayError) else scene_file_invalid(path, error)) from error
+            continue
+        if _version(path) == version:
+            return LoadedScene(scene=scene, sha256=sha256, version=version, bytes=resident_bytes(scene.info))
+    raise SceneFileInvalid(f"{path}: it changed {_READ_ATTEMPTS} times while it was being read")
+
+
+def _version(path: str) -> FileVersion:
+    try:
+        return FileVersion.of(path)
+    except OSError as error:
+        raise scene_file_invalid(path, error) from error
+
+
+def _megabytes(count: int) -> str:
+    return f"{count / 2**20:.1f} MiB"

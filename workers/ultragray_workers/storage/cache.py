@@ -1,9 +1,10 @@
 """Objects of a bucket as files of this host: fetched on demand, the least recently used removed within a bound.
 
 files/NAME          a whole object; whoever uses it holds a shared lock on it, and locked files are not removed
-files/NAME.space    as large as the object that is being fetched, so that other processes leave it the room
+files/.NAME.part    as large as the object that is being fetched, so that other processes leave it the room
 fetching/NAME       locked by the one who fetches the object
-room                locked while room is made
+room                locked while room is made, and while an object gets its name
+.copy-…             links to the objects of a folder, as long as somebody uses them
 
 Several processes of a host share the folder; a process that dies leaves nothing locked.
 """
@@ -16,17 +17,22 @@ import hashlib
 import os
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import IO
 
-from ultragray.files import file_sha256, remove_stale_temporaries
-from ultragray_workers.errors import StorageFull, StorageUnavailable
-from ultragray_workers.storage.storage import NotThere, Storage
+from ultragray.files import TEMPORARY_SUFFIX, file_sha256, link_or_copy, remove_stale_temporaries
+from ultragray_workers.claims import claimed_folder, remove_abandoned
+from ultragray_workers.errors import StorageFull
+from ultragray_workers.storage.storage import Damaged, NotThere, Storage
 
-_FILES, _FETCHING, _ROOM, _SPACE = "files", "fetching", "room", ".space"
+KEEP_S = 10.0  # that a file stays after its last use, for whoever was told of it
+DEFAULT_MAX_BYTES = 20 * 2**30  # of the files of data sets
+_FILES, _FETCHING, _ROOM, _PART, _COPY = "files", "fetching", "room", ".part", ".copy-"
 _WAIT_FOR_ROOM_S, _LOOK_EVERY_S = 30.0, 0.1
+_AT_ONCE = 8  # objects of a folder
 
 
 @dataclass(frozen=True)
@@ -40,62 +46,76 @@ class CacheCounts:
 
 
 class Pin:
-    """A file of the cache, which stays until the pin is let go."""
+    """A file of the cache, which stays until the pin is let go, or the body is left."""
 
     def __init__(self, path: Path, file: IO[bytes]) -> None:
         self.path, self._file = path, file
 
     def let_go(self) -> None:
-        """From now on the file may be removed."""
         self._file.close()
+
+    def __enter__(self) -> Path:
+        return self.path
+
+    def __exit__(self, *exception: object) -> None:
+        self.let_go()
 
 
 class Cache:
     """A folder of at most `max_bytes` of fetched objects. Its methods may be called from any thread, and block."""
 
-    def __init__(self, folder: Path, max_bytes: int) -> None:
-        self.folder, self.max_bytes = folder, max_bytes
+    def __init__(self, folder: Path, max_bytes: int, keep_s: float = KEEP_S) -> None:
+        self.folder, self.max_bytes, self._keep_s = folder, max_bytes, keep_s
         self._files, self._fetching = folder / _FILES, folder / _FETCHING
         self._counting = threading.Lock()
-        self._counts = CacheCounts()
-
-    @property
-    def counts(self) -> CacheCounts:
-        with self._counting:
-            return self._counts
-
-    @contextlib.contextmanager
-    def file(self, storage: Storage, key: str, version: str, sha256: str | None = None) -> Iterator[Path]:
-        """The file of an object during the body. Raises as `pin`."""
-        pin = self.pin(storage, key, version, sha256)
-        try:
-            yield pin.path
-        finally:
-            pin.let_go()
+        self.counts = CacheCounts()
 
     def pin(self, storage: Storage, key: str, version: str, sha256: str | None = None) -> Pin:
         """The file of an object, fetched where it is not here; who asks meanwhile waits for the same fetch.
 
         `sha256`: of the content, which is checked, and under which the object is kept whatever its key and version.
-        Raises NotThere where the object has gone or changed, StorageUnavailable, StorageFull where the object has no
-        room, OSError of the folder.
+        Raises NotThere where the object has gone or changed, Damaged, StorageUnavailable, StorageFull where the object
+        has no room, OSError of the folder.
         """
         name = cache_name(storage, key, version, sha256)
         if (pin := self.held(name)) is not None:
-            self._count(hits=1)
             return pin
         began = time.monotonic()
         with self._alone_fetching(name):
-            pin = self.held(name)
-            if pin is None:
+            if (pin := self.held(name)) is None:
                 pin, size = self._fetch(name, storage, key, version, sha256)
                 self._count(misses=1, fetched_bytes=size, fetch_s=time.monotonic() - began)
-            else:
-                self._count(hits=1)
             return pin
 
-    def held(self, name: str) -> Pin | None:
-        """The file of an object (see `cache_name`) if it is here."""
+    @contextlib.contextmanager
+    def copies(self, storage: Storage, prefix: str, sha256: Mapping[str, str]) -> Iterator[Path]:
+        """A folder with objects below `prefix`, which stay during the body. Raises as `pin`.
+
+        `sha256`: of each, by its path below the prefix. Those that do not fit the cache are fetched and not kept.
+        """
+
+        def place(path: str) -> None:
+            key, target = f"{prefix}/{path}", content / path
+            target.parent.mkdir(parents=True, exist_ok=True)
+            try:
+                with self.pin(storage, key, "", sha256[path]) as file:
+                    link_or_copy(file, target)
+            except StorageFull:
+                storage.download(key, target)
+                _check(target, path, sha256[path])
+            except Damaged:
+                raise Damaged(path) from None
+
+        remove_abandoned(self.folder, _COPY)
+        with claimed_folder(self.folder, _COPY) as folder:
+            content = folder / "content"
+            content.mkdir()
+            with ThreadPoolExecutor(_AT_ONCE, "fetch") as threads:
+                list(threads.map(place, sha256))
+            yield content
+
+    def held(self, name: str, *, counts: bool = True) -> Pin | None:
+        """The file of an object (see `cache_name`) if it is here, which may count as a hit."""
         path = self._files / name
         while True:
             try:
@@ -105,15 +125,11 @@ class Cache:
             fcntl.flock(file, fcntl.LOCK_SH)
             if _is_at(file, path):  # else it was removed before it was locked
                 os.utime(file.fileno(), ns=(time.time_ns(), os.fstat(file.fileno()).st_mtime_ns))  # used last
+                self._count(hits=int(counts))
                 return Pin(path, file)
             file.close()
 
-    def count_hit(self) -> None:
-        """Counts a use of a file that was pinned before."""
-        self._count(hits=1)
-
     def held_bytes(self) -> int:
-        """Of the objects that are here or being fetched."""
         with self._room():
             return sum(size for _, size, _ in self._held())
 
@@ -122,30 +138,28 @@ class Cache:
         if entry is None or (sha256 is None and entry.version != version):
             raise NotThere(f"there is no {key} of the version {version} in {storage.location}")
         self._files.mkdir(parents=True, exist_ok=True)
-        space, part = self._files / f"{name}{_SPACE}", self._part(name)
+        part = self._part(name)
         try:
-            self._reserve(space, entry.bytes)
+            self._reserve(part, entry.bytes)
             storage.download(key, part, version=entry.version)
-            if sha256 is not None and (got := file_sha256(part)) != sha256:
-                raise StorageUnavailable(f"{key} in {storage.location} is damaged: its SHA-256 is {got}")
+            if sha256 is not None:
+                _check(part, f"{key} in {storage.location}", sha256)
             file = part.open("rb")
             fcntl.flock(file, fcntl.LOCK_SH)  # before others can see it
-            with self._room():  # else one who makes room could see neither the space nor the file
+            with self._room():  # else one who makes room could count the file twice
                 part.rename(self._files / name)
-                space.unlink()
             return Pin(self._files / name, file), entry.bytes
         finally:
             part.unlink(missing_ok=True)
-            space.unlink(missing_ok=True)
 
-    def _reserve(self, space: Path, needed: int) -> None:
+    def _reserve(self, part: Path, needed: int) -> None:
         if needed > self.max_bytes:
             raise StorageFull(
                 f"an object of {needed} bytes does not fit the cache of {self.max_bytes}: raise max_cache_bytes",
                 field="max_cache_bytes",
             )
         end = time.monotonic() + _WAIT_FOR_ROOM_S
-        while not self._try_to_reserve(space, needed):
+        while not self._try_to_reserve(part, needed):
             if time.monotonic() > end:
                 raise StorageFull(
                     f"all of the cache of {self.max_bytes} bytes is in use, {needed} more are needed: raise "
@@ -154,66 +168,60 @@ class Cache:
                 )
             time.sleep(_LOOK_EVERY_S)
 
-    def _try_to_reserve(self, space: Path, needed: int) -> bool:
+    def _try_to_reserve(self, part: Path, needed: int) -> bool:
         with self._room():
             held = sorted(self._held())
             left = self.max_bytes - sum(size for _, size, _ in held)
-            for _, size, path in held:
-                if left >= needed:
-                    break
-                if self._remove(path):
+            for used_at_s, size, path in held:
+                if left < needed and self._remove(path, used_at_s):
                     left += size
             if left < needed:
                 return False
-            with space.open("wb") as file:
+            with part.open("wb") as file:
                 file.truncate(needed)
             return True
 
     def _held(self) -> Iterator[tuple[float, int, Path]]:
         """When each object was used last, its bytes, and its file."""
-        names = {path.name for path in self._files.glob("[!.]*")}  # what is being fetched counts by the space it has
-        for name in names:
-            if name.removesuffix(_SPACE) == name or name.removesuffix(_SPACE) not in names:  # fetched a moment ago
+        for path in self._files.glob("*"):
+            if not path.name.endswith(TEMPORARY_SUFFIX):  # of a download, which counts by its part
                 with contextlib.suppress(FileNotFoundError):
-                    status = (self._files / name).stat()
-                    yield status.st_atime, status.st_size, self._files / name
+                    status = path.stat()
+                    yield status.st_atime, status.st_size, path
 
     @contextlib.contextmanager
     def _room(self) -> Iterator[None]:
-        """Nobody else reserves room or removes objects during the body."""
+        """Nobody else reserves room, removes objects or names them during the body."""
         self.folder.mkdir(parents=True, exist_ok=True)
         with (self.folder / _ROOM).open("a") as room:
             fcntl.flock(room, fcntl.LOCK_EX)
             yield
 
-    def _remove(self, path: Path) -> bool:
-        """Removes a file that nobody uses, or the space of a fetch whose process has died."""
-        name = path.name.removesuffix(_SPACE)
-        if name != path.name:
+    def _remove(self, path: Path, used_at_s: float) -> bool:
+        """Removes a file that nobody uses, or what a fetch has left whose process has died."""
+        if path.name.endswith(_PART):
+            name = path.name[1:].removesuffix(_PART)
             with self._lock_of_fetch(name) as lock:
                 if not _try_lock(lock):
                     return False
-                part = self._part(name)
-                part.unlink(missing_ok=True)
-                remove_stale_temporaries(part)
+                remove_stale_temporaries(path)
                 path.unlink(missing_ok=True)
                 (self._fetching / name).unlink(missing_ok=True)
                 return True
-        try:
-            with path.open("rb") as file:
-                if not _try_lock(file):
-                    return False
-                path.unlink()
-                return True
-        except FileNotFoundError:
-            return True
+        if time.time() - used_at_s < self._keep_s:
+            return False
+        with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
+            if not _try_lock(file):
+                return False
+            path.unlink()
+        return True
 
     @contextlib.contextmanager
     def _alone_fetching(self, name: str) -> Iterator[None]:
+        path = self._fetching / name
         while True:
             with self._lock_of_fetch(name) as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX)
-                path = self._fetching / name
                 if not _is_at(lock, path):
                     continue  # the one before has removed it
                 try:
@@ -223,7 +231,7 @@ class Cache:
                 return
 
     def _part(self, name: str) -> Path:
-        return self._files / f".{name}.part"
+        return self._files / f".{name}{_PART}"
 
     def _lock_of_fetch(self, name: str) -> IO[bytes]:
         self._fetching.mkdir(parents=True, exist_ok=True)
@@ -231,8 +239,8 @@ class Cache:
 
     def _count(self, hits: int = 0, misses: int = 0, fetched_bytes: int = 0, fetch_s: float = 0.0) -> None:
         with self._counting:
-            was = self._counts
-            self._counts = CacheCounts(
+            was = self.counts
+            self.counts = CacheCounts(
                 was.hits + hits, was.misses + misses, was.fetched_bytes + fetched_bytes, was.fetch_s + fetch_s
             )
 
@@ -241,6 +249,11 @@ def cache_name(storage: Storage, key: str, version: str, sha256: str | None) -> 
     """The name under which a cache keeps an object: by its content where that is known, with the suffix of its key."""
     content = sha256 or "v-" + hashlib.sha256(f"{storage.location}\n{key}\n{version}".encode()).hexdigest()
     return content + PurePosixPath(key).suffix
+
+
+def _check(file: Path, name: str, sha256: str) -> None:
+    if (got := file_sha256(file)) != sha256:
+        raise Damaged(f"{name} is damaged: its SHA-256 is {got}")
 
 
 def _is_at(file: IO[bytes], path: Path) -> bool:

@@ -16,8 +16,7 @@ from ultragray_workers.claims import remove_whole
 from ultragray_workers.storage.storage import Entry, NotThere, check_key
 
 _CLAIMS = "claims"  # prefix of keys; a claim is locked as long as its process lives
-_LOCK = ".storage.lock"  # held while an object is compared and replaced
-_CHUNK_BYTES = 2**20
+_LOCK = ".storage.lock"  # held while an object gets its place, where there are no links
 
 
 @dataclass(frozen=True)
@@ -30,7 +29,6 @@ class FileVersion:
 
     @property
     def tag(self) -> str:
-        """The version as a word."""
         return f"{self.mtime_ns:x}-{self.size:x}-{self.inode:x}"
 
     @classmethod
@@ -49,7 +47,7 @@ class LocalStorage:
     def __init__(self, folder: Path) -> None:
         self.folder = folder
         self.location = str(folder)
-        self.local: Path | None = folder
+        self.is_near = True
 
     def entries(self, prefix: str = "") -> Iterator[Entry]:
         for folder, _, names in os.walk(self._folder(prefix)):
@@ -82,23 +80,16 @@ class LocalStorage:
             file.seek(start)
             return file.read(-1 if length is None else length)
 
-    def write(self, key: str, data: bytes, *, if_absent: bool = False, if_version: str | None = None) -> bool:
+    def write(self, key: str, data: bytes, *, if_absent: bool = False) -> bool:
         path = self._path(key)
         path.parent.mkdir(parents=True, exist_ok=True)
         with self._whole(path) as made:
             made.write_bytes(data)
             sync(made)
-            if if_absent:
-                if not self._place_new(made, path):
-                    return path.read_bytes() == data
-            elif if_version is not None:
-                with self._alone():
-                    found = self.entry(key)
-                    if found is None or found.version != if_version:
-                        return found is not None and path.read_bytes() == data
-                    made.replace(path)
-            else:
+            if not if_absent:
                 made.replace(path)
+            elif not self._place_new(made, path):
+                return path.read_bytes() == data
         sync(path.parent)
         return True
 
@@ -111,7 +102,6 @@ class LocalStorage:
             link_or_copy(path, made)
             if not if_absent:
                 made.replace(target)
-                sync(target.parent)
             elif not self._place_new(made, target):
                 return False
         sync(target.parent)
@@ -122,11 +112,6 @@ class LocalStorage:
             link_or_copy(self._path(key), made)
             made.replace(path)
             return self._entry(key, os.stat(descriptor))
-
-    def chunks(self, key: str, *, version: str | None = None) -> Iterator[bytes]:
-        with self._open(key, version) as descriptor, open(descriptor, "rb", closefd=False) as file:
-            while chunk := file.read(_CHUNK_BYTES):
-                yield chunk
 
     def delete(self, key: str) -> None:
         path = self._path(key)
@@ -174,6 +159,9 @@ class LocalStorage:
     def free_bytes(self) -> int | None:
         return shutil.disk_usage(self.folder).free
 
+    def in_place(self, key: str) -> Path | None:
+        return self._path(key)
+
     def _folder(self, prefix: str) -> Path:
         return self.folder / check_key(prefix) if prefix else self.folder
 
@@ -210,17 +198,12 @@ class LocalStorage:
         except FileExistsError:
             return False
         except OSError:  # a file system without links
-            with self._alone():
+            with (self.folder / _LOCK).open("a") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)
                 if path.exists():
                     return False
                 made.replace(path)
         return True
-
-    @contextlib.contextmanager
-    def _alone(self) -> Iterator[None]:
-        with (self.folder / _LOCK).open("a") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX)
-            yield
 
     @staticmethod
     def _entry(key: str, status: os.stat_result) -> Entry:

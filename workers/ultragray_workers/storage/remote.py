@@ -12,17 +12,16 @@ import re
 import secrets
 import threading
 from collections.abc import Iterator, Mapping
-from concurrent.futures import ThreadPoolExecutor
 from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
 from ultragray.errors import InvalidArgument
-from ultragray.files import atomic_path, file_sha256
+from ultragray.files import atomic_path
 from ultragray.installation import missing_extra
 from ultragray_workers.errors import StorageUnavailable
-from ultragray_workers.storage.copies import LocalCopies
-from ultragray_workers.storage.storage import Damaged, Entry, NotThere, StorageUrl, check_key
+from ultragray_workers.storage.cache import Cache
+from ultragray_workers.storage.storage import Entry, NotThere, StorageUrl, check_key
 
 _ENVIRONMENT = {"s3": "AWS", "gs": "GOOGLE", "az": "AZURE"}
 _CONNECT_TIMEOUT_S, _SILENCE_TIMEOUT_S = 5, 30  # a request that hears nothing so long is repeated
@@ -30,7 +29,6 @@ _REQUEST_TIMEOUT_S = 3600  # of a whole request: the largest object over the slo
 _LONGEST_PAUSE_S = 5
 _SINGLE_REQUEST_BYTES = 16 * 2**20  # larger files are uploaded in parts
 _PART_BYTES, _MOST_PARTS, _PARTS_AT_ONCE = 8 * 2**20, 9000, 4  # S3 takes 10,000 parts
-_AT_ONCE = 8  # objects of a folder
 _CLAIMS = "claims"  # prefix of keys: who claims a token says so again and again; the clock is the bucket's
 REFRESH_S, DEAD_AFTER_S = 10.0, 60.0
 _STATUS = re.compile(r"Server returned non-2xx status code: (\d{3}[ A-Za-z]*)")
@@ -44,7 +42,7 @@ class _BeyondTheEnd(Exception):
 class RemoteStorage:
     """The objects of a bucket whose keys begin with a prefix."""
 
-    local: Path | None = None
+    is_near = False
 
     def __init__(self, url: StorageUrl, *, patience_s: float) -> None:
         """`patience_s`: how long a request that fails is repeated. Raises ExtraMissing, InvalidArgument."""
@@ -88,7 +86,8 @@ class RemoteStorage:
 
     def entry(self, key: str) -> Entry | None:
         try:
-            return _entry(self._head(key))
+            with self._asking(key):
+                return _entry(self._obstore.head(self._store, check_key(key)))
         except NotThere:
             return None
 
@@ -106,22 +105,16 @@ class RemoteStorage:
         except _BeyondTheEnd:
             return b""
 
-    def write(self, key: str, data: bytes, *, if_absent: bool = False, if_version: str | None = None) -> bool:
+    def write(self, key: str, data: bytes, *, if_absent: bool = False) -> bool:
         mode: Any = "create" if if_absent else "overwrite"
-        if if_version is not None:
-            try:
-                found = self._head(key)
-            except NotThere:
-                return False
-            if found["e_tag"] != if_version:
-                return self._holds(key, data)
-            # Google's storage compares the version, the others the ETag.
-            mode = {name: found[name] for name in ("e_tag", "version") if found[name] is not None}
         try:
             with self._asking():
                 self._obstore.put(self._store, check_key(key), data, mode=mode, use_multipart=False)
         except self._conflicts:
-            return self._holds(key, data)
+            try:
+                return self.read(key) == data  # then a write whose answer was lost has succeeded
+            except NotThere:
+                return False
         return True
 
     def upload(self, path: Path, key: str, *, if_absent: bool = False) -> bool:
@@ -142,43 +135,40 @@ class RemoteStorage:
         return True
 
     def download(self, key: str, path: Path, *, version: str | None = None) -> Entry:
-        entry, chunks = self._get(key, version)
+        try:
+            with self._asking(key):
+                options = {} if version is None else {"if_match": version}
+                result = self._obstore.get(self._store, check_key(key), options=options)
+        except self._conflicts:
+            raise NotThere(f"{key} in {self.location} is no longer of the version {version}") from None
+        entry, pieces = _entry(result.meta), iter(result.stream(min_chunk_size=_PART_BYTES))
         with atomic_path(path) as temporary:
             with temporary.open("wb") as file:
-                for chunk in chunks:
-                    file.write(chunk)
+                while True:
+                    with self._asking(key):
+                        piece = next(pieces, None)
+                    if piece is None:
+                        break
+                    file.write(piece)
             if (got := temporary.stat().st_size) != entry.bytes:
                 raise StorageUnavailable(f"{self.location} sent {got} of the {entry.bytes} bytes of {key}")
         return entry
-
-    def chunks(self, key: str, *, version: str | None = None) -> Iterator[bytes]:
-        yield from self._get(key, version)[1]
 
     def delete(self, key: str) -> None:
         with contextlib.suppress(NotThere), self._asking(key):
             self._obstore.delete(self._store, check_key(key))
 
     def delete_all(self, prefix: str) -> None:
-        for entry in list(self.entries(prefix)):
-            self.delete(entry.key)
+        keys = [entry.key for entry in self.entries(prefix)]
+        with contextlib.suppress(NotThere), self._asking(prefix):
+            self._obstore.delete(self._store, keys)
 
     def delete_half_written(self, prefix: str) -> None:
         """Does nothing: an object is there whole or not at all."""
 
     @contextlib.contextmanager
     def held(self, prefix: str, sha256: Mapping[str, str], folder: Path, max_bytes: int) -> Iterator[Path]:
-        def fetch_all(target: Path) -> None:
-            def fetch(path: str) -> None:
-                copy = target / path
-                copy.parent.mkdir(parents=True, exist_ok=True)
-                self.download(f"{prefix}/{path}", copy)
-                if file_sha256(copy) != sha256[path]:
-                    raise Damaged(path)
-
-            with ThreadPoolExecutor(_AT_ONCE, "fetch") as threads:
-                list(threads.map(fetch, sha256))
-
-        with LocalCopies(folder, max_bytes).held(prefix.replace("/", "-"), fetch_all) as copy:
+        with Cache(folder / ".copies", max_bytes, keep_s=0.0).copies(self, prefix, sha256) as copy:
             yield copy
 
     @contextlib.contextmanager
@@ -214,36 +204,11 @@ class RemoteStorage:
             self.delete(probe)
         return now is None or now.modified - claim.modified < DEAD_AFTER_S
 
-    def free_bytes(self) -> int | None:
+    def in_place(self, key: str) -> Path | None:
         return None
 
-    def _get(self, key: str, version: str | None) -> tuple[Entry, Iterator[bytes]]:
-        options = {} if version is None else {"if_match": version}
-        try:
-            with self._asking(key):
-                result = self._obstore.get(self._store, check_key(key), options=options)
-        except self._conflicts:
-            raise NotThere(f"{key} in {self.location} is no longer of the version {version}") from None
-        return _entry(result.meta), self._pieces(key, iter(result.stream(min_chunk_size=_PART_BYTES)))
-
-    def _pieces(self, key: str, stream: Iterator[Any]) -> Iterator[bytes]:
-        while True:
-            with self._asking(key):
-                piece = next(stream, None)
-            if piece is None:
-                return
-            yield bytes(piece)
-
-    def _head(self, key: str) -> Any:
-        with self._asking(key):
-            return self._obstore.head(self._store, check_key(key))
-
-    def _holds(self, key: str, data: bytes) -> bool:
-        """Whether an object is `data`: then a write whose answer was lost has succeeded."""
-        try:
-            return self.read(key) == data
-        except NotThere:
-            return False
+    def free_bytes(self) -> int | None:
+        return None
 
     @contextlib.contextmanager
     def _asking(self, key: str | None = None) -> Iterator[None]:

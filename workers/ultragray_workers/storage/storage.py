@@ -68,8 +68,11 @@ class Storage(Protocol):
         """Where it is, as a person wrote it, without credentials."""
 
     @property
-    def local(self) -> Path | None:
-        """The folder whose files are the objects, to be read in place; None where they must be downloaded."""
+    def is_near(self) -> bool:
+        """Whether objects are files of this host, looked at in microseconds; `upload` takes a condition in one step."""
+
+    def in_place(self, key: str) -> Path | None:
+        """The file that an object is, there or not; None where objects must be downloaded."""
 
     def entries(self, prefix: str = "") -> Iterator[Entry]:
         """The objects below `prefix` (whole parts of a path: `jobs` has `jobs/a`, not `jobs2/a`), in any order."""
@@ -86,12 +89,11 @@ class Storage(Protocol):
         Raises NotThere.
         """
 
-    def write(self, key: str, data: bytes, *, if_absent: bool = False, if_version: str | None = None) -> bool:
-        """Writes a small object, whole or not at all. False: the condition does not hold, and nothing changed.
+    def write(self, key: str, data: bytes, *, if_absent: bool = False) -> bool:
+        """Writes a small object, whole or not at all. False: `if_absent`, and there is one already.
 
-        `if_absent`: only where there is none; `if_version`: only over that version. An object that holds exactly `data`
-        counts as written, since an answer that was lost cannot be told from a success: where one writer must win, each
-        puts something of its own into `data`.
+        An object that holds exactly `data` counts as written, since an answer that was lost cannot be told from a
+        success: where one writer must win, each puts something of its own into `data`.
         """
 
     def upload(self, path: Path, key: str, *, if_absent: bool = False) -> bool:
@@ -106,9 +108,6 @@ class Storage(Protocol):
 
         Raises NotThere, OSError of the file.
         """
-
-    def chunks(self, key: str, *, version: str | None = None) -> Iterator[bytes]:
-        """The content piece by piece, of one version throughout. Raises NotThere before the first piece."""
 
     def delete(self, key: str) -> None:
         """Removes an object; nothing where it is absent."""

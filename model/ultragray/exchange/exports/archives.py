@@ -17,7 +17,7 @@ import numpy as np
 
 from ultragray.exchange.exports.exporter import Exporter, ExportHeader
 from ultragray.exchange.exports.formats import Add
-from ultragray.files import atomic_path
+from ultragray.files import atomic_path, npy_bytes
 from ultragray.rendering.outputs import OUTPUTS
 from ultragray.rendering.pixels import PixelArray, image_file
 from ultragray.scene.confidence import Extrapolation
@@ -30,15 +30,15 @@ class NpzExporter(Exporter):
         header = self._header
         self._archive = self._held.enter_context(zipfile.ZipFile(self._path, "w"))
         first, *others = header.settings.outputs
-        self._waiting = {name: self._held.enter_context(self._nameless()) for name in others}
+        self._waiting: dict[str, IO[bytes]] = {
+            name: self._held.enter_context(tempfile.TemporaryFile(dir=self._path.parent))  # noqa: SIM115
+            for name in others
+        }
         self._first = self._held.enter_context(self._member(first))
         self._files: dict[str, IO[bytes]] = {first: self._first, **self._waiting}
         for name, file in self._files.items():
             described = {"descr": header.pixel_type(name).str, "fortran_order": False, "shape": header.shape}
             np.lib.format.write_array_header_1_0(file, described)
-
-    def _nameless(self) -> IO[bytes]:
-        return tempfile.TemporaryFile(dir=self._path.parent)
 
     def _member(self, name: str) -> IO[bytes]:
         return self._archive.open(f"{name}.npy", "w", force_zip64=True)
@@ -61,9 +61,6 @@ class NpzExporter(Exporter):
                 np.lib.format.write_array(member, np.asarray(value), allow_pickle=False)
 
 
-# WebDataset: a tar with some files of one name for each frame.
-
-
 class TarExporter(Exporter):
     """A writer of 000012.OUTPUT.png (float32: .npy) for each output and 000012.json (pose, figures, origin)."""
 
@@ -75,9 +72,8 @@ class TarExporter(Exporter):
             number = self._done + place
             for name in self._header.settings.outputs:
                 frame = frames[name][place]
-                suffix, data = (
-                    ("png", image_file(frame, ".png").tobytes()) if frame.dtype == np.uint8 else ("npy", _npy(frame))
-                )
+                is_grey = frame.dtype == np.uint8
+                suffix, data = ("png", image_file(frame, ".png").tobytes()) if is_grey else ("npy", npy_bytes(frame))
                 self._member(f"{number:06d}.{name}.{suffix}", data)
             figures = self._extrapolations[number].figures()
             document = {"pose": self._header.poses[number].tolist(), **figures, **self._header.origin()}
@@ -87,15 +83,6 @@ class TarExporter(Exporter):
         member = tarfile.TarInfo(name)
         member.size = len(data)
         self._tar.addfile(member, io.BytesIO(data))
-
-
-def _npy(frame: PixelArray) -> bytes:
-    file = io.BytesIO()
-    np.lib.format.write_array(file, frame, allow_pickle=False)
-    return file.getvalue()
-
-
-# A folder of grey PNGs, one a frame and output, a pixel of labels holding the label; FRAMES_FILE describes each.
 
 
 FRAMES_FILE = "frames.json"

@@ -25,7 +25,7 @@ from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
 from pydicom.uid import UID, ExplicitVRLittleEndian, UltrasoundMultiFrameImageStorage
 
 from ultragray.errors import InvalidArgument
-from ultragray.exchange.exports.exporter import FRAME_TIME_MS, Exporter, ExportHeader
+from ultragray.exchange.exports.exporter import FRAME_TIME_MS, Exporter
 from ultragray.rendering.pixels import PixelArray
 
 PRIVATE_GROUP, PRIVATE_CREATOR, POSES_ELEMENT, FIGURES_ELEMENT, ORIGIN_ELEMENT = 0x0019, "ULTRAGRAY", 0x01, 0x02, 0x03
@@ -61,7 +61,17 @@ class DicomExporter(Exporter):
         self._data_set().save_as(self._file, enforce_file_format=True)
 
     def _data_set(self) -> FileDataset:
-        image_uid, series_uid, study_uid = map(UID, _uids(self._header))
+        header = self._header
+        poses = np.ascontiguousarray(header.poses, "<f8")
+        made_of = [
+            header.origin(),
+            header.settings.height,
+            header.settings.width,
+            hashlib.sha256(poses.tobytes()).hexdigest(),
+        ]
+        own = json.dumps(made_of, sort_keys=True)
+        names = f"image {own}", f"series {own}", f"study {header.scene_sha256}"
+        image_uid, series_uid, study_uid = (UID(f"2.25.{uuid.uuid5(_UIDS, name).int}") for name in names)
         meta = FileMetaDataset()
         meta.MediaStorageSOPClassUID = UltrasoundMultiFrameImageStorage
         meta.MediaStorageSOPInstanceUID = image_uid
@@ -73,7 +83,6 @@ class DicomExporter(Exporter):
         self._describe(data)
         self._describe_pixels(data)
         data.SequenceOfUltrasoundRegions = [self._region()]
-        poses = np.ascontiguousarray(self._header.poses, "<f8")
         figures = np.stack(list(self._figures().values()), axis=1).astype("<f4")
         block = data.private_block(PRIVATE_GROUP, PRIVATE_CREATOR, create=True)
         block.add_new(POSES_ELEMENT, "OD", poses.tobytes())
@@ -123,16 +132,6 @@ class DicomExporter(Exporter):
         region.ReferencePixelPhysicalValueY = picture.first[1] / 10.0
         region.PhysicalDeltaX, region.PhysicalDeltaY = picture.step[0] / 10.0, picture.step[1] / 10.0
         return region
-
-
-def _uids(header: ExportHeader) -> tuple[str, str, str]:
-    """The UIDs of the image, the series and the study."""
-    poses = hashlib.sha256(np.ascontiguousarray(header.poses, "<f8").tobytes()).hexdigest()
-    made_of = json.dumps([header.origin(), header.settings.height, header.settings.width, poses], sort_keys=True)
-    image, series = (f"{name} {made_of}" for name in ("image", "series"))
-    names = (image, series, f"study {header.scene_sha256}")
-    image_uid, series_uid, study_uid = (f"2.25.{uuid.uuid5(_UIDS, name).int}" for name in names)
-    return image_uid, series_uid, study_uid
 
 
 def _words(text: str) -> str:

@@ -40,12 +40,10 @@ class ExportHeader:
         return len(self.poses), self.settings.picture.height, self.settings.picture.width
 
     def pixel_type(self, output: str) -> np.dtype[Any]:
-        """The type that the pixels of an output are stored in."""
         return np.dtype("<u1" if OUTPUTS[output].is_numbers or self.dtype == "uint8" else "<f4")
 
     @property
     def settings_used(self) -> SettingsUsed:
-        """The settings as used."""
         return settings_used(replace(self.settings, encoding=Encoding(self.dtype)))
 
     def origin(self) -> dict[str, Any]:
@@ -112,7 +110,6 @@ class Exporter(ABC):
         """Write frames `_done` to `_done` + count; their extrapolations are in `_extrapolations` already."""
 
     def _finish(self) -> None:
-        """Write what comes after the last frame."""
         return
 
 

@@ -5,9 +5,7 @@ Another package adds a format by an entry point of the group `ultragray.exporter
 
 from __future__ import annotations
 
-import queue
 import tempfile
-import threading
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -15,11 +13,15 @@ from importlib.metadata import EntryPoint, entry_points
 from pathlib import Path
 from typing import TypeAlias
 
+import numpy as np
+
 from ultragray.errors import InvalidArgument
 from ultragray.exchange.exports.exporter import Exporter, ExportHeader, stored_pixels
 from ultragray.files import atomic_path
+from ultragray.geometry.probe import Picture
 from ultragray.installation import extra_of, missing_extra
 from ultragray.rendering.display import true_to_scale
+from ultragray.rendering.outputs import OUTPUTS
 from ultragray.rendering.pixels import PixelArray
 from ultragray.rendering.settings import Resolved
 from ultragray.scene.confidence import Extrapolation
@@ -42,7 +44,6 @@ class Format:
 
     @property
     def extra(self) -> str | None:
-        """The extra that brings its package."""
         return None if self.package is None else extra_of(self.package)
 
     def shown(self, settings: Resolved) -> Resolved:
@@ -51,6 +52,12 @@ class Format:
             return settings
         pixel_mm = true_to_scale(settings.probe, settings.height).pixel_mm
         return replace(settings, display=replace(settings.display, pixel_mm=pixel_mm))
+
+
+def frame_bytes(outputs: Sequence[str], dtype: str, picture: Picture) -> int:
+    """The bytes that the pixels of a frame take in a file where they are not compressed."""
+    pixel_bytes = sum(1 if OUTPUTS[name].is_numbers else np.dtype(dtype).itemsize for name in outputs)
+    return picture.height * picture.width * pixel_bytes
 
 
 _HERE = __package__
@@ -140,83 +147,41 @@ def check_format(name: str, outputs: Sequence[str], dtype: str | None) -> str:
 
 def exporter_class(name: str) -> type[Exporter]:
     """The exporter of a format. Raises ExtraMissing where a package that it needs is not installed."""
-    chosen = FORMATS[name]
     try:
-        found: type[Exporter] = EntryPoint(name, chosen.exporter, "").load()
+        return EntryPoint(name, FORMATS[name].exporter, "").load()
     except ImportError as error:
         raise missing_extra(error, f"format {name}", field="format") from error
-    return found
 
 
-# Writing an export beside the rendering: a thread takes the frames, two portions may wait.
-
-
-WAITING_PORTIONS = 2
-
-# The next frames, each output [B, H, W], and the extrapolation of each, [B]; neither is changed after.
+# Takes the next frames, each output [B, H, W], and the extrapolation of each, [B].
 Add: TypeAlias = Callable[[Mapping[str, PixelArray], Sequence[Extrapolation]], None]
-Portion: TypeAlias = tuple[Mapping[str, PixelArray], Sequence[Extrapolation]]
 
 
 @contextmanager
 def export_to(path: str | Path, format: str, header: ExportHeader) -> Iterator[Add]:
-    """A function that takes the rendered frames in order; at the end `path` is there, whole, or not at all.
+    """A function that writes the rendered frames, in order; at the end `path` is there, whole, or not at all.
 
-    The frames are converted and written by a thread of its own: the function returns at once unless two portions
-    wait. An error of the writing is raised by the next call, or at the end. Raises ExtraMissing, InvalidArgument,
-    OSError.
+    Raises ExtraMissing, InvalidArgument, OSError.
     """
-    make = exporter_class(format)
-    with atomic_path(path) as temporary:
-        exporter = make(temporary, header)
-        try:
-            with _beside(exporter, header) as add:
-                yield add
-        except BaseException:
-            exporter.abandon()
-            raise
-        exporter.close()
+    with atomic_path(path) as temporary, _exporting(temporary, format, header) as add:
+        yield add
 
 
 @contextmanager
-def _beside(exporter: Exporter, header: ExportHeader) -> Iterator[Add]:
-    waiting: queue.Queue[Portion | None] = queue.Queue(WAITING_PORTIONS)
-    failed: list[BaseException] = []
-    given_up = threading.Event()
-
-    def write() -> None:
-        while (portion := waiting.get()) is not None:
-            if failed or given_up.is_set():
-                continue
-            frames, extrapolations = portion
-            try:
-                stored = {
-                    name: stored_pixels(name, frames[name], header.pixel_type(name)) for name in header.settings.outputs
-                }
-                exporter.add(stored, extrapolations)
-            except BaseException as error:
-                failed.append(error)
+def _exporting(path: Path, format: str, header: ExportHeader) -> Iterator[Add]:
+    exporter = exporter_class(format)(path, header)
 
     def add(frames: Mapping[str, PixelArray], extrapolations: Sequence[Extrapolation]) -> None:
-        if failed:
-            raise failed[0]
-        waiting.put((frames, extrapolations))
+        outputs = header.settings.outputs
+        stored = {name: stored_pixels(name, frames[name], header.pixel_type(name)) for name in outputs}
+        exporter.add(stored, extrapolations)
 
-    writer = threading.Thread(target=write, name="export")
-    writer.start()
     try:
         yield add
     except BaseException:
-        given_up.set()
+        exporter.abandon()
         raise
-    finally:
-        waiting.put(None)
-        writer.join()
-    if failed:
-        raise failed[0]
-
-
-# An export that is small enough to be answered at once: its file as bytes.
+    exporter.close()
 
 
 def export_bytes(
@@ -226,16 +191,8 @@ def export_bytes(
 
     Raises ExtraMissing, InvalidArgument for frames that the format cannot hold, OSError.
     """
-    make = exporter_class(format)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder, "export")
-        exporter = make(path, header)
-        try:
-            exporter.add(
-                {name: stored_pixels(name, frames[name], header.pixel_type(name)) for name in frames}, extrapolations
-            )
-        except BaseException:
-            exporter.abandon()
-            raise
-        exporter.close()
+        with _exporting(path, format, header) as add:
+            add(frames, extrapolations)
         return path.read_bytes()

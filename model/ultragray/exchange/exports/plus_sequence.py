@@ -72,9 +72,7 @@ class PlusExporter(Exporter):
             "UltraGRayScene": " ".join(header.scene.split()),
             "UltraGRaySceneSha256": header.scene_sha256,
             "UltraGRayRenderer": header.renderer,
-            **{
-                f"UltraGRay{name.title().replace('_', '')}": text for name, text in header.settings_used.texts().items()
-            },
+            **{_key(name): text for name, text in header.settings_used.texts().items()},
         }
 
     def _line(self, key: str, value: str) -> None:

@@ -62,7 +62,7 @@ class Volume:
         volume = torch.stack([self.values, self.known])[None]  # [1, 2, X, Y, Z]
         last = np.array(self.values.shape) - 1
         planes = np.zeros((len(poses), height, width), np.float32)
-        for plane, pose in zip(planes, check_poses(poses) if len(poses) else poses, strict=True):
+        for plane, pose in zip(planes, check_poses(poses), strict=True):
             places = _on_grid(points, pose, self.axes, self.origin_mm, self.voxel_mm) * (2.0 / last) - 1.0
             grid = torch.from_numpy(places[:, ::-1].astype(np.float32))  # grid_sample wants the last axis first
             value, known = functional.grid_sample(volume, grid[None, None, None], align_corners=True)[0, :, 0, 0]
@@ -120,8 +120,7 @@ def _on_grid(
     voxel_mm: float,
 ) -> FloatArray:  # [P, 3] voxels
     rotation = axes.T @ pose[:3, :3] / voxel_mm
-    places: FloatArray = points @ rotation.T + axes.T @ (pose[:3, 3] - origin_mm) / voxel_mm
-    return places
+    return points @ rotation.T + axes.T @ (pose[:3, 3] - origin_mm) / voxel_mm
 
 
 def _extent_mm(sweep: Sweep, axes: FloatArray) -> tuple[FloatArray, FloatArray]:  # [3], [3]
@@ -216,13 +215,6 @@ def _spread(grid: Tensor) -> Tensor:  # [X, Y, Z]
     return grid
 
 
-# Classical baselines: frames predicted from the training frames themselves, without learning.
-#
-# - median, mean, maximum: a compounded volume, re-sliced (ultragray.learn.evaluation.baselines); - linear: each pixel
-# between the two training planes that enclose it, by its distance to them along their normals; - nearest: the
-# training frame whose corners lie nearest on average, as it is.
-
-
 FrameArray = npt.NDArray[np.float32]
 BASELINES = (*FOLDS, "linear", "nearest")
 
@@ -230,7 +222,8 @@ BASELINES = (*FOLDS, "linear", "nearest")
 def predict(sweep: Sweep, poses: FloatArray, method: str, *, voxel_mm: float = VOXEL_MM) -> FrameArray:  # [C, H, W]
     """The frames, in [0, 1], that one of BASELINES expects at poses [C, 4, 4] (mm) of the sweep's own probe.
 
-    `voxel_mm` is for the compounded volumes. Raises InvalidArgument for an unknown method, and as `compound` does.
+    `nearest`: the frame whose corners lie nearest on average. `linear`: `interpolate_planes`. The others: a compounded
+    volume of voxels of `voxel_mm`, re-sliced. Raises InvalidArgument for an unknown method, and as `compound` does.
     """
     if method not in BASELINES:
         raise InvalidArgument(f"method must be one of {', '.join(BASELINES)}, got {method!r}", field="method")
@@ -244,7 +237,6 @@ def predict(sweep: Sweep, poses: FloatArray, method: str, *, voxel_mm: float = V
 def evaluate_baselines(
     dataset: Dataset, methods: Sequence[str] = BASELINES, voxel_mm: float = VOXEL_MM
 ) -> dict[str, Evaluation]:
-    """The scores of each method on the held-out frames. Raises DatasetInvalid where there are none."""
     require_frames(dataset.val)
     return {
         method: evaluate_frames(predict(dataset.train, dataset.val.poses, method, voxel_mm=voxel_mm), dataset.val)
@@ -259,20 +251,15 @@ def interpolate_planes(sweep: Sweep, poses: FloatArray) -> FrameArray:  # [C, H,
     one side only it takes that, with none it is 0.
     """
     points = pixel_positions_mm(sweep.probe, sweep.height, sweep.width)
-    order = _distances_to_frames_mm(sweep, poses).argsort(axis=1)
+    asked = sweep.probe.corners_from(poses)
+    order = corner_distances_mm(asked[:, None], sweep.corners_mm()[None]).argsort(axis=1)  # [C, F]
     planes = np.zeros((len(poses), sweep.height, sweep.width), np.float32)
-    for plane, pose, frames in zip(planes, check_poses(poses) if len(poses) else poses, order, strict=True):
+    for plane, pose, frames in zip(planes, check_poses(poses), order, strict=True):
         plane[:] = _between(sweep, points @ pose[:3, :3].T + pose[:3, 3], frames).reshape(plane.shape)
     return planes
 
 
-def _distances_to_frames_mm(sweep: Sweep, poses: FloatArray) -> FloatArray:  # [C, F]
-    asked = np.einsum("cij,pj->cpi", poses[:, :3, :3], sweep.probe.corners_mm()) + poses[:, None, :3, 3]
-    return corner_distances_mm(asked[:, None], sweep.corners_mm()[None])
-
-
 def _between(sweep: Sweep, points: FloatArray, frames: IntArray) -> FloatArray:  # [P, 3] mm, [F] -> [P]
-    """Grey values of points in the tracker's frame; `frames`, nearest first, are all tried."""
     sides = 2
     distances = np.full((sides, len(points)), np.inf)
     values = np.zeros((sides, len(points)))
@@ -289,8 +276,7 @@ def _between(sweep: Sweep, points: FloatArray, frames: IntArray) -> FloatArray: 
                 values[side, nearer[inside]] = sampled
     weights = 1.0 / np.maximum(distances, 1e-9)  # 0 for a side without a frame
     total = weights.sum(axis=0)
-    blended: FloatArray = (weights * values).sum(axis=0) / np.where(total > 0, total, 1.0)
-    return blended
+    return (weights * values).sum(axis=0) / np.where(total > 0, total, 1.0)
 
 
 def _sample(sweep: Sweep, frame: int, local: FloatArray) -> tuple[npt.NDArray[np.bool_], FloatArray]:  # [P, 3] mm

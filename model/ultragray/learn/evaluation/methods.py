@@ -45,9 +45,6 @@ def chosen_names(names: Sequence[str]) -> tuple[str, ...]:
     return tuple(name for name in NAMES if name in names or ALL in names)
 
 
-# ComparisonSettings: what a comparison compares, and what each method may take. Free of torch.
-
-
 EVERY_METHOD = (ALL,)
 
 

@@ -40,11 +40,9 @@ class FrameMetrics:
     gmsd: float
 
     def to_dict(self) -> dict[str, float]:
-        """The four numbers by name, all finite."""
         return asdict(self)
 
     def is_better_than(self, other: FrameMetrics) -> bool:
-        """In each of the four."""
         higher = ("psnr_db", "ms_ssim", "gms")
         return self.gmsd < other.gmsd and all(getattr(self, name) > getattr(other, name) for name in higher)
 
@@ -82,18 +80,11 @@ def frame_metrics(rendered: Tensor, truth: Tensor) -> list[FrameMetrics]:
     return found
 
 
-def mean_metrics(frames: Sequence[FrameMetrics]) -> FrameMetrics:
-    """The mean of each metric over one frame or more."""
-    return FrameMetrics(*_table(frames).mean(dim=0).tolist())
-
-
-def std_metrics(frames: Sequence[FrameMetrics]) -> FrameMetrics:
-    """The standard deviation of each metric over all frames (divisor F), 0 for one frame."""
-    return FrameMetrics(*_table(frames).std(dim=0, correction=0).tolist())
-
-
-def _table(frames: Sequence[FrameMetrics]) -> Tensor:  # [F, 4]
-    return torch.tensor([tuple(frame.to_dict().values()) for frame in frames], dtype=torch.float64)
+def mean_and_std(frames: Sequence[FrameMetrics]) -> tuple[FrameMetrics, FrameMetrics]:
+    """Mean and standard deviation (divisor F) of each metric over one frame or more."""
+    table = torch.tensor([tuple(frame.to_dict().values()) for frame in frames], dtype=torch.float64)  # [F, 4]
+    mean, std = table.mean(dim=0), table.std(dim=0, correction=0)
+    return FrameMetrics(*mean.tolist()), FrameMetrics(*std.tolist())
 
 
 def _psnr_db(rendered: Tensor, truth: Tensor) -> Tensor:  # [C, 1, H, W] -> [C]
@@ -106,7 +97,7 @@ def _ms_ssim(rendered: Tensor, truth: Tensor) -> Tensor:  # [C, 1, H, W] -> [C]
     weights = torch.tensor(SCALE_WEIGHTS[:scales], dtype=torch.float64)
     factors = []
     for scale in range(scales):
-        luminance, contrast = _ssim_maps(rendered, truth)
+        luminance, contrast = ssim_maps(rendered, truth)
         coarsest = scale == scales - 1
         factors.append((luminance * contrast if coarsest else contrast).mean(dim=(1, 2, 3)).clamp_min(0.0))
         if not coarsest:
@@ -115,7 +106,7 @@ def _ms_ssim(rendered: Tensor, truth: Tensor) -> Tensor:  # [C, 1, H, W] -> [C]
     return (torch.stack(factors, dim=1) ** (weights / weights.sum())).prod(dim=1)
 
 
-def _ssim_maps(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:  # [C, 1, H, W] -> two of [C, 1, H-10, W-10]
+def ssim_maps(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:  # [C, 1, H, W] -> two of [C, 1, H-10, W-10]
     """The luminance term and the contrast-structure term; SSIM is their product."""
     c1, c2 = SSIM_CONSTANTS
     means = _smooth(torch.cat([x, y, x * x, y * y, x * y], dim=1))
@@ -127,7 +118,12 @@ def _ssim_maps(x: Tensor, y: Tensor) -> tuple[Tensor, Tensor]:  # [C, 1, H, W] -
 
 
 def _smooth(images: Tensor) -> Tensor:  # [C, 5, H, W] -> [C, 5, H-10, W-10]
-    offsets = torch.arange(WINDOW, dtype=images.dtype) - WINDOW // 2
+    """The mean of the window.
+
+    One group a field: cuDNN, which rounds the factors of a convolution to ten bits by default (TF32), is not asked
+    then, and a variance, the small difference of two such means, keeps its digits.
+    """
+    offsets = torch.arange(WINDOW, dtype=images.dtype, device=images.device) - WINDOW // 2
     window = torch.exp(-offsets.square() / (2.0 * WINDOW_SIGMA**2))
     window = (window / window.sum()).expand(images.shape[1], 1, 1, WINDOW)
     rows = functional.conv2d(images, window.transpose(2, 3), groups=images.shape[1])

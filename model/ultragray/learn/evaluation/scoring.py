@@ -11,10 +11,10 @@ import numpy.typing as npt
 import torch
 
 from ultragray.errors import DatasetInvalid, InvalidArgument
-from ultragray.learn.evaluation.metrics import FrameMetrics, frame_metrics, mean_metrics, ms_ssim_scales, std_metrics
+from ultragray.learn.evaluation.metrics import FrameMetrics, frame_metrics, mean_and_std, ms_ssim_scales
 from ultragray.learn.evaluation.speckle import FrameSpeckle, SpeckleSummary, compare_speckle, summarize
 from ultragray.learn.sweep import Dataset, IntArray, Sweep
-from ultragray.rendering.frames import render
+from ultragray.rendering.frames import Frames, render
 from ultragray.rendering.outputs import UNCERTAINTY
 from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.info import SceneInfo
@@ -34,17 +34,14 @@ class Evaluation:
 
     @property
     def mean(self) -> FrameMetrics:
-        """Over the frames."""
-        return mean_metrics(self.frames)
+        return mean_and_std(self.frames)[0]
 
     @property
     def std(self) -> FrameMetrics:
-        """Standard deviation over the frames."""
-        return std_metrics(self.frames)
+        return mean_and_std(self.frames)[1]
 
     @property
     def speckle(self) -> SpeckleSummary:
-        """Means over the frames."""
         return summarize(self.frame_speckle)
 
     def to_dict(self) -> dict[str, Any]:
@@ -66,8 +63,8 @@ def evaluate(scene: GaussianScene, sweep: Sweep, *, backend: str = "auto") -> Ev
 
     Raises DatasetInvalid where the sweep has no frames, InvalidImageSize below 11x11 pixels, BackendUnavailable.
     """
-    parts = (sweep.select(np.arange(len(sweep))[places]) for places in _chunks(sweep))
-    return _measured((render_sweep(scene, part, backend=backend) for part in parts), sweep)
+    parts = rendered_parts(scene, sweep, ("bmode",), backend)
+    return _measured((frames["bmode"].cpu().numpy() for _, frames in parts), sweep)
 
 
 def evaluate_frames(frames: npt.NDArray[np.float32], sweep: Sweep) -> Evaluation:  # [F, H, W] in [0, 1]
@@ -81,7 +78,6 @@ def evaluate_frames(frames: npt.NDArray[np.float32], sweep: Sweep) -> Evaluation
 
 
 def _measured(predictions: Iterable[npt.NDArray[np.float32]], sweep: Sweep) -> Evaluation:
-    """Measures the predicted frames of each of `_chunks`."""
     require_frames(sweep)
     scales = ms_ssim_scales(sweep.height, sweep.width)
     measured: list[FrameMetrics] = []
@@ -94,12 +90,10 @@ def _measured(predictions: Iterable[npt.NDArray[np.float32]], sweep: Sweep) -> E
 
 
 def frames_at_once(height: int, width: int) -> int:
-    """The number of frames of this size that are rendered and measured together."""
     return min(CHUNK_FRAMES, max(1, CHUNK_PIXELS // (height * width)))
 
 
 def _chunks(sweep: Sweep) -> Iterator[slice]:
-    """Places of the frames that are taken at once, in order."""
     count = frames_at_once(sweep.height, sweep.width)
     for first in range(0, len(sweep), count):
         yield slice(first, first + count)
@@ -131,27 +125,28 @@ def check_same_origin(info: SceneInfo, dataset: Dataset) -> list[str]:
     return warnings
 
 
+def rendered_parts(
+    scene: GaussianScene, sweep: Sweep, outputs: Sequence[str], backend: str
+) -> Iterator[tuple[Sweep, Frames]]:
+    """A few frames of the sweep at a time, and the outputs of the scene at their poses."""
+    for places in _chunks(sweep):
+        some = sweep.select(np.arange(len(sweep))[places])
+        with torch.no_grad():
+            frames = render(
+                scene, some.probe, some.poses, height=some.height, width=some.width, outputs=outputs, backend=backend
+            )
+        yield some, frames
+
+
 def render_sweep(
     scene: GaussianScene, sweep: Sweep, *, output: str = "bmode", backend: str = "auto"
 ) -> npt.NDArray[np.float32]:  # [F, H, W]
     """One output of the scene at every pose of the sweep, a few frames at a time."""
-    frames = np.zeros(sweep.images.shape, np.float32)
-    with torch.no_grad():
-        for places in _chunks(sweep):
-            rendered = render(
-                scene,
-                sweep.probe,
-                sweep.poses[places],
-                height=sweep.height,
-                width=sweep.width,
-                outputs=(output,),
-                backend=backend,
-            )
-            frames[places] = getattr(rendered, output).cpu().numpy()
-    return frames
-
-
-# The reliability of the output `uncertainty`: expected against actual errors of pixels, on held-out frames.
+    whole = np.zeros(sweep.images.shape, np.float32)
+    parts = rendered_parts(scene, sweep, (output,), backend)
+    for places, (_, frames) in zip(_chunks(sweep), parts, strict=True):
+        whole[places] = frames[output].cpu().numpy()
+    return whole
 
 
 BINS = np.array([0.0, 0.01, 0.02, 0.03, 0.045, 0.065, 0.09, 0.12, 0.16, 0.22, 0.3, 1.0])  # of the expected deviation
@@ -178,11 +173,9 @@ class Reliability:
     bins: tuple[Bin, ...]
 
     def to_dict(self) -> dict[str, Any]:
-        """A JSON object."""
         return asdict(self)
 
     def figures(self) -> dict[str, float]:
-        """The numbers over all pixels, by name."""
         named = {"expected": self.expected, "actual": self.actual, "within_1": self.within_1, "within_2": self.within_2}
         return {f"uncertainty_{name}": value for name, value in named.items()}
 
@@ -196,21 +189,9 @@ def measure_reliability(scene: GaussianScene, sweep: Sweep, *, backend: str = "a
     if UNCERTAINTY.lacks(scene.info) is not None:
         return None
     tallies = []
-    portion = frames_at_once(sweep.height, sweep.width)
-    with torch.no_grad():
-        for first in range(0, len(sweep), portion):
-            some = sweep.select(np.arange(first, min(first + portion, len(sweep))))
-            frames = render(
-                scene,
-                some.probe,
-                some.poses,
-                height=some.height,
-                width=some.width,
-                outputs=("bmode", "uncertainty"),
-                backend=backend,
-            )
-            bmode, deviation = (frames[name].cpu().numpy() for name in ("bmode", "uncertainty"))
-            tallies.append(_tally(some.images / np.float32(255.0) - bmode, deviation))
+    for some, frames in rendered_parts(scene, sweep, ("bmode", "uncertainty"), backend):
+        bmode, deviation = (frames[name].cpu().numpy() for name in ("bmode", "uncertainty"))
+        tallies.append(_tally(some.images / np.float32(255.0) - bmode, deviation))
     return _of_tally(np.sum(tallies, axis=0))
 
 

@@ -56,7 +56,6 @@ def write_spread(scene: GaussianScene, sweep: Sweep, evaluation: Evaluation, fol
 def side_by_side_panels(
     scene: GaussianScene, sweep: Sweep, *, backend: str = "auto"
 ) -> dict[str, npt.NDArray[np.float32]]:  # each [F, H, W] in [0, 1]
-    """The panels by title, as the probe samples them."""
     truth = (sweep.images / 255.0).astype(np.float32)
     rendered = render_sweep(scene, sweep, backend=backend)
     return {

@@ -66,7 +66,6 @@ class SpeckleSummary:
     frames: int
 
     def to_dict(self) -> dict[str, Any]:
-        """A JSON object."""
         return asdict(self)
 
     def figures(self) -> dict[str, float]:
@@ -84,7 +83,6 @@ class SpeckleSummary:
 
 
 def compare_speckle(rendered: FrameArray, truth: FrameArray, probe: Probe) -> list[FrameSpeckle]:  # [C, H, W] in [0, 1]
-    """The comparison of each of C frames of a probe with the true one."""
     tiles_mm = _pixels_mm(probe, *truth.shape[1:])
     found = []
     for shown, true in zip(rendered, truth, strict=True):
@@ -98,7 +96,6 @@ def compare_speckle(rendered: FrameArray, truth: FrameArray, probe: Probe) -> li
 
 
 def summarize(frames: Sequence[FrameSpeckle]) -> SpeckleSummary:
-    """Means over one frame or more."""
     true = [frame.true for frame in frames if frame.true is not None]
     return SpeckleSummary(
         true=_mean(true),
@@ -113,7 +110,6 @@ def _mean(several: Sequence[Speckle]) -> Speckle | None:
 
 
 def _tiles(frame: FrameArray) -> FloatArray:  # [H, W] -> [T, WINDOW_PIXELS, WINDOW_PIXELS]
-    """The whole tiles of a frame, row by row."""
     rows, columns = (side // WINDOW_PIXELS for side in frame.shape)
     whole = frame[: rows * WINDOW_PIXELS, : columns * WINDOW_PIXELS].astype(np.float64)
     tiles = whole.reshape(rows, WINDOW_PIXELS, columns, WINDOW_PIXELS).swapaxes(1, 2)

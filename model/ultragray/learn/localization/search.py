@@ -21,7 +21,7 @@ from torch.quasirandom import SobolEngine
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.image_size import check_image_size
 from ultragray.geometry.pose import check_poses
-from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.geometry.probe import Probe
 from ultragray.learn.localization.settings import NEAR_DEG, NEAR_MM, Localization, LocalizationSettings
 from ultragray.learn.sweep import pixel_positions_mm
 from ultragray.learn.training.poses import turned_by
@@ -40,8 +40,8 @@ def places_after(probe: Probe, motions: Tensor, rows: int, columns: int) -> Tens
     pixels = pixel_positions_mm(probe, rows, columns)
     moves = motions.numpy()
     moved = pixels @ moves[:, :3, :3].transpose(0, 2, 1) + moves[:, None, :3, 3]
-    depth, across = (share.reshape(rows, columns) for share in _coordinates(probe, pixels))
-    rows_after, columns_after = _coordinates(probe, moved)
+    depth, across = (share.reshape(rows, columns) for share in probe.lines.coordinates(pixels[:, 0], pixels[:, 2]))
+    rows_after, columns_after = probe.lines.coordinates(moved[..., 0], moved[..., 2])
     places = np.stack(
         [
             2.0 * (columns_after - across[0, 0]) / (across[0, -1] - across[0, 0]) - 1.0,
@@ -61,16 +61,10 @@ def slid(frames: Tensor, places: Tensor) -> Tensor:  # [K, H, W], [S, H, W, 2] -
     return after.reshape(count, len(places), rows, columns)
 
 
-def _coordinates(probe: Probe, points_mm: FloatArray) -> tuple[FloatArray, FloatArray]:  # [..., 3] -> [...] each
-    """Depth and place across the scan lines."""
-    return probe.lines.coordinates(points_mm[..., 0], points_mm[..., 2])
-
-
 # Small motions of the probe: shifts along its own axes and turns about the middle of its image, all in mm.
 #
 # A turn is given by the way that it moves a point at the typical distance from the middle, so that steps of all six
 # numbers weigh alike.
-
 
 GRID = 16  # rows and columns of the image that are looked at
 
@@ -89,7 +83,6 @@ class Motions:
         return cls(middle, float((positions - middle).square().sum(dim=1).mean().sqrt()))
 
     def moved(self, poses: Tensor, steps: Tensor) -> Tensor:  # [..., 4, 4], [..., 6] mm -> [..., 4, 4]
-        """Poses after steps."""
         return poses @ self.of_steps(steps)
 
     def of_steps(self, steps: Tensor) -> Tensor:  # [..., 6] mm -> [..., 4, 4]
@@ -110,7 +103,6 @@ class Motions:
         return shift_mm, math.degrees(math.acos(max(-1.0, min(1.0, cosine))))
 
     def degrees(self, turns_mm: Tensor) -> Tensor:
-        """Turns given in mm."""
         return torch.rad2deg(turns_mm / self.lever_mm)
 
 
@@ -118,7 +110,6 @@ class Motions:
 #
 # A frame is smoothed, its mean over a wider neighbourhood is taken off, and what is left is divided by its own
 # strength there. Coarse structures match from far away, fine ones tell the place exactly.
-
 
 NEIGHBOURHOOD = 3.0  # times as wide as the smoothing
 LEAST_STRENGTH = 0.02  # of grey values in [0, 1]: what varies less is noise
@@ -154,11 +145,8 @@ class Scale:
         return structure / (strength + LEAST_STRENGTH**2).sqrt()
 
     def _blurred(self, frames: Tensor, times: float) -> Tensor:
-        rows, columns = (
-            _smoother(self.rows, times * self.sigma_rows),
-            _smoother(self.columns, times * self.sigma_columns),
-        )
-        return rows @ frames @ columns.mT
+        rows = _smoother(self.rows, times * self.sigma_rows)
+        return rows @ frames @ _smoother(self.columns, times * self.sigma_columns).mT
 
 
 @lru_cache(maxsize=32)
@@ -184,7 +172,6 @@ def _smoother(count: int, sigma: float) -> Tensor:  # [count, count]
 #
 # Fine structures hold a search fast at places a millimetre beside the right one. So it goes back to smoother frames
 # once before it ends: from such a place they lead on.
-
 
 Rendered = Callable[[Tensor, int, int], Tensor]  # [C, 4, 4], rows, columns -> [C, rows, columns] in [0, 1]
 
@@ -276,7 +263,6 @@ class _Fit:
 
     @property
     def error(self) -> Tensor:  # [K]
-        """Mean squares of what is left."""
         return self.left.square().mean(dim=1)
 
     def after(self, steps: Tensor, poses: Tensor, left: Tensor) -> tuple[Tensor, _Fit]:  # [K, 6] mm
@@ -293,16 +279,8 @@ class _Fit:
 
     def replaced(self, which: Tensor, other: _Fit) -> _Fit:  # [K], of poses that the other has
         """The fit, some of whose poses have been taken anew."""
-
-        def placed(old: Tensor, new: Tensor) -> Tensor:
-            return old.index_put((which,), new)
-
-        return _Fit(
-            self.poses,
-            placed(self.left, other.left),
-            placed(self.changes, other.changes),
-            placed(self.corrections, other.corrections),
-        )
+        parts = ((self.left, other.left), (self.changes, other.changes), (self.corrections, other.corrections))
+        return _Fit(self.poses, *(old.index_put((which,), new) for old, new in parts))
 
 
 class _Search:
@@ -379,35 +357,31 @@ class _Search:
     def _linearised(self, poses: Tensor, stage: Stage, scale: Scale, target: Tensor, slides: bool = True) -> _Fit:
         """The fit at poses [K, 4, 4]; a frame that `slides` tells itself how motions within its plane change it."""
         count, size = len(poses), (scale.rows, scale.columns)
-        beside = _beside(self._probe, stage.probing_mm, *size)
-        is_slid = beside.is_slid if slides else torch.zeros_like(beside.is_slid)
+        motions, is_slid, places = _beside(self._probe, stage.probing_mm, *size)
+        if not slides:
+            is_slid = torch.zeros_like(is_slid)
         here = self._frames(poses, *size)
-        rendered = poses[:, None] @ beside.motions[~is_slid]
+        rendered = poses[:, None] @ motions[~is_slid]
         frames = torch.empty(count, len(is_slid), *size)
         frames[:, ~is_slid] = self._frames(rendered.reshape(-1, 4, 4), *size).reshape(count, -1, *size)
         if slides:
-            frames[:, is_slid] = slid(here, beside.places)
+            frames[:, is_slid] = slid(here, places)
         left = _missed(frames.reshape(-1, *size), scale, target).reshape(count, len(is_slid), -1)
         changes = (left[:, :6] - left[:, 6:]) / (2.0 * stage.probing_mm)
         return _Fit(poses, _missed(here, scale, target), changes, torch.zeros(count, dtype=torch.int64))
 
 
-@dataclass(frozen=True, eq=False)
-class _Beside:
-    """The motions of the central differences: for each of the six numbers a step forwards and one backwards."""
-
-    motions: Tensor  # [12, 4, 4], those forwards first
-    is_slid: Tensor  # [12], whether the motion is within the image plane
-    places: Tensor  # [6, rows, columns, 2] after the motions within the plane, see `places_after`
-
-
 @lru_cache(maxsize=32)
-def _beside(probe: Probe, step_mm: float, rows: int, columns: int) -> _Beside:
+def _beside(probe: Probe, step_mm: float, rows: int, columns: int) -> tuple[Tensor, Tensor, Tensor]:
+    """The motions [12, 4, 4] of the central differences, for each of the six numbers a step forwards, then backwards.
+
+    Then [12] whether a motion is within the image plane, and of those that are `places_after`.
+    """
     ahead = step_mm * torch.eye(6, dtype=torch.float64)
     steps = torch.cat([ahead, -ahead])
     is_slid = steps[:, IN_PLANE].any(dim=1)
     motions = Motions.of(probe).of_steps(steps)
-    return _Beside(motions, is_slid, places_after(probe, motions[is_slid], rows, columns))
+    return motions, is_slid, places_after(probe, motions[is_slid], rows, columns)
 
 
 def _missed(frames: Tensor, scale: Scale, target: Tensor) -> Tensor:  # [C, rows, columns] -> [C, pixels]
@@ -424,8 +398,7 @@ def _step(fit: _Fit, damping: Tensor) -> Tensor:  # [K] -> [K, 6] mm
     floor = 1e-2 * own.mean(dim=1, keepdim=True) + torch.finfo(torch.float64).tiny
     damped = curvature + torch.diag_embed(damping[:, None] * (own + floor) + 1e-9 * floor)
     downhill: Tensor = -torch.linalg.lstsq(damped, slope).solution[..., 0]
-    shortened: Tensor = downhill * (LONGEST_STEP_MM / downhill.norm(dim=1, keepdim=True).clamp(min=LONGEST_STEP_MM))
-    return shortened
+    return downhill * (LONGEST_STEP_MM / downhill.norm(dim=1, keepdim=True).clamp(min=LONGEST_STEP_MM))
 
 
 def _starts(start: Tensor, motions: Motions, within_mm: float, within_deg: float) -> Tensor:  # [4, 4] -> [S, 4, 4]

@@ -101,7 +101,6 @@ class Prediction:
 
     @classmethod
     def of_scene(cls, scene: GaussianScene, sweep: Sweep) -> Prediction:
-        """Raises as `evaluate_frames` does."""
         frames = np.clip(render_sweep(scene, sweep), 0.0, 1.0)
         return cls(evaluate_frames(frames, sweep), to_uint8(frames))
 
@@ -127,7 +126,6 @@ class ScenePage:
 
     @property
     def evaluation(self) -> Evaluation:
-        """That of the scene."""
         return next(iter(self.predictions.values())).evaluation
 
 
@@ -135,6 +133,7 @@ def render_page(page: ScenePage, template: str = "scene.html", *packages: str, *
     """The HTML text. A template of one of these packages that extends `scene.html` is given `more`, too."""
     evaluations = {title: one.evaluation for title, one in page.predictions.items()}
     is_alone = len(evaluations) + len(page.failures) == 1
+    settings = {} if page.course is None else page.scene.info.training
     values = {
         "title": page.dataset.name,
         "facts": _facts(page),
@@ -146,7 +145,7 @@ def render_page(page: ScenePage, template: str = "scene.html", *packages: str, *
         "frames_plot": plot_frames({t: one for t, one in evaluations.items() if t not in page.not_plotted}),
         "training_plot": None if page.course is None else svg(plot_training(page.course)),
         "pictures": _pictures(page),
-        "configuration": {} if page.course is None else _configuration(page.scene),
+        "configuration": {name: value for name, value in settings.items() if value is not None},
         **more,
     }
     return environment(*packages).get_template(template).render(values)
@@ -159,11 +158,6 @@ def environment(*packages: str) -> Environment:
     headings = [metric.heading for metric in METRICS]
     made.globals |= {"version": __version__, "gain": DIFFERENCE_GAIN, "headings": headings}
     return made
-
-
-def _configuration(scene: GaussianScene) -> dict[str, Any]:
-    """The settings of the training, without those that were not used."""
-    return {name: value for name, value in scene.info.training.items() if value is not None}
 
 
 def _facts(page: ScenePage) -> dict[str, str]:

@@ -34,7 +34,6 @@ def line_style(place: int) -> dict[str, Any]:
 
 
 def make_figure(count: int, size: tuple[float, float], *, columns: int) -> tuple[Figure, list[Axes]]:
-    """A figure of so many plots, in inches."""
     made = Figure(figsize=size, layout="constrained")
     grid = np.atleast_1d(made.subplots(-(-count // columns), columns))
     axes: list[Axes] = list(grid.ravel())
@@ -102,7 +101,6 @@ def plot_training(course: Course) -> Figure:
 
 
 def svg(drawn: Figure) -> str:
-    """The element `<svg>`."""
     text = io.StringIO()
     FigureCanvasSVG(drawn)
     drawn.savefig(text, format="svg", metadata=dict.fromkeys(("Date", "Creator", "Format", "Type")), transparent=True)
@@ -111,7 +109,6 @@ def svg(drawn: Figure) -> str:
 
 
 def write_training_curve(course: Course, path: Path) -> None:
-    """`plot_training` as a PNG."""
     figure = plot_training(course)
     FigureCanvasAgg(figure)
     figure.savefig(path, format="png", dpi=100)

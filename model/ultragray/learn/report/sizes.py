@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
+from ultragray.geometry.pose import turn_angles_rad
 from ultragray.geometry.probe import FloatArray
 
 
@@ -23,11 +23,9 @@ class CorrectionSizes:
         """Of corrections that were left-multiplied to the tracker's poses, which gave the training poses."""
         given = np.linalg.inv(corrections) @ training_poses
         shifts = np.linalg.norm(training_poses[:, :3, 3] - given[:, :3, 3], axis=1)
-        half_chords = np.linalg.norm(corrections[:, :3, :3] - np.eye(3), axis=(1, 2)) / math.sqrt(8.0)
-        return cls(shifts, np.degrees(2.0 * np.arcsin(np.clip(half_chords, 0.0, 1.0))))
+        return cls(shifts, np.degrees(turn_angles_rad(corrections[:, :3, :3], np.eye(3))))
 
     def to_dict(self) -> dict[str, Any]:
-        """A JSON object."""
         return {"shift_mm": self.shift_mm.tolist(), "turn_deg": self.turn_deg.tolist()}
 
     def __str__(self) -> str:

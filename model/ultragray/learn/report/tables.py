@@ -160,7 +160,6 @@ class DatasetFacts:
 
     @property
     def image_words(self) -> dict[str, str]:
-        """The rows of a page about the images."""
         return {
             "Image": f"{self.height} rows x {self.width} scan lines",
             "Pixel": f"{self.axial_mm:.2f} mm axial, {self.lateral_mm:.2f} mm lateral in the middle",

@@ -76,7 +76,6 @@ def _factor_rows(count: int, ratios: FloatArray) -> Iterator[tuple[FloatArray, F
 # but a probe that moves unevenly along its path looks noisy in that direction: the smallest r of the three is taken
 # for all.
 
-
 JUMP = 6.0  # median steps: a longer step begins a new sweep
 LEAST_FRAMES = 5  # of a sweep: fewer are not a path
 RATIOS = 10.0 ** np.arange(-6.0, 6.01, 0.25)  # of the variances q/r that are tried
@@ -94,7 +93,6 @@ class TrackerNoise:
 
     @property
     def is_small(self) -> bool:
-        """Whether the poses are good as they are."""
         return self.position_mm < GOOD_MM and self.turn_deg < GOOD_DEG
 
 
@@ -117,7 +115,6 @@ def tracker_noise(poses: FloatArray, ranges: Sequence[range]) -> TrackerNoise:  
 
 
 def without_noise(poses: FloatArray, ranges: Sequence[range]) -> FloatArray:  # [F, 4, 4] mm -> [F, 4, 4] mm
-    """The likeliest path of each sweep."""
     coordinates = _coordinates(poses, ranges)
     likelihood = _Likelihood.of(coordinates, ranges)
     noise = np.repeat(likelihood.noise_variances(), 3)
@@ -125,7 +122,8 @@ def without_noise(poses: FloatArray, ranges: Sequence[range]) -> FloatArray:  # 
     for number in range(_NUMBERS):
         if noise[number] == 0.0:
             continue
-        ratio = likelihood.best_ratio(number, noise[number])
+        costs = likelihood.log_determinants + likelihood.squares[:, number] / noise[number]
+        ratio = float(RATIOS[costs.argmin()])  # the likeliest q/r where r is the noise
         for frames in _long_enough(ranges):
             cleaned[frames, number] = smoothed(coordinates[frames, number], ratio)
     found = poses.copy()
@@ -175,10 +173,6 @@ class _Likelihood:
         best = variances[costs.argmin(axis=0), np.arange(_NUMBERS)]
         return float(best[:3].min()), float(best[3:].min())
 
-    def best_ratio(self, number: int, noise: float) -> float:
-        """The likeliest q/r of one coordinate where r is `noise`."""
-        return float(RATIOS[(self.log_determinants + self.squares[:, number] / noise).argmin()])
-
 
 # The registration of whole sweeps that cross: each is moved until its frames agree with those of the sweeps before
 # it.
@@ -188,7 +182,6 @@ class _Likelihood:
 # searched with large steps first, then with small ones. The mean brightness of a wider neighbourhood is subtracted
 # before: shadows turn with the probe, and with them two sweeps that cross correlate best where they are parallel (6
 # mm and 6° off on the simulated liver).
-
 
 HalfArray: TypeAlias = npt.NDArray[np.float16]
 
@@ -270,15 +263,10 @@ class _Match:
         if not _has_enough(self._crossings(here)):
             return None  # any agreement found elsewhere would be chance
         for level in LEVELS:
-            here, gain = self._climb_level(level, here)
+            correlation = partial(self._correlation, [_detail(sweep, *level.pixels) for sweep in self._sweeps])
+            here = _climbed(correlation, here, level)
+            gain = correlation(here) - correlation(np.zeros(_OVERLAP_NUMBERS))
         return self._motion(here) if gain >= LEAST_GAIN else None
-
-    def _climb_level(self, level: Level, start: FloatArray) -> tuple[FloatArray, float]:  # [6] -> [6]
-        """The best numbers that are found from `start`, and what the correlation gains against no motion."""
-        details = [_detail(sweep, *level.pixels) for sweep in self._sweeps]
-        correlation = partial(self._correlation, details)
-        here = _climbed(correlation, start, level)
-        return here, correlation(here) - correlation(np.zeros(_OVERLAP_NUMBERS))
 
     def _motion(self, numbers: FloatArray) -> FloatArray:  # [6] degrees, mm -> [4, 4]
         motion = np.eye(4)

@@ -60,7 +60,6 @@ class TrainedBeam:
             self._raw.clamp_(self._low, self._high)
 
     def found(self) -> ElevationBeam | None:
-        """The beam as it is now, for the scene."""
         if not self._config.learn_beam:
             return self._given
         thickness, focus, depth_of_field = self._raw.tolist()
@@ -72,20 +71,17 @@ class TrainedBeam:
         return self._config.learn_beam and found is not None and found.thickness_mm < 0.5 * frame_spacing_mm
 
     def tensors(self) -> dict[str, Tensor]:
-        """The state of the learned numbers, as `load` takes it; empty where none is learned."""
         if not self._config.learn_beam:
             return {}
         return {"raw": self._raw.detach(), **self._adam.state[self._raw]}
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
-        """Inverse of `tensors`."""
         if self._config.learn_beam:
             self._raw.data.copy_(tensors["raw"])
             self._adam.state[self._raw] = {name: tensors[name].clone() for name in tensors if name != "raw"}
 
 
 def expected_beam_tensors(config: TrainingConfig) -> dict[str, tuple[torch.dtype, tuple[int, ...]]]:
-    """Type and shape of each of `TrainedBeam.tensors`."""
     if not config.learn_beam:
         return {}
     return {

@@ -38,7 +38,6 @@ class Neighbours:
     extent_mm: float  # the farthest
 
     def without_ends(self) -> Neighbours:
-        """The gaps alone."""
         return replace(self, ends=self.ends[:0], outward=self.outward[:0])
 
     @cached_property
@@ -52,8 +51,7 @@ class Neighbours:
         gaps = np.maximum(self.gaps_mm, usual) / usual
         ends = np.full(len(self.ends), self.doublings)
         weights = np.concatenate([gaps, ends])
-        shares: FloatArray = weights / weights.sum()
-        return shares
+        return weights / weights.sum()
 
     @property
     def doublings(self) -> float:
@@ -84,7 +82,9 @@ def neighbours_of(sweep: Sweep) -> Neighbours:
         alike = rotation_angles_deg(pose[None], sweep.poses)[0] < ALIKE_DEG
         candidates = alike & ~beside & (distances > 0.0)
         nearest = np.flatnonzero(candidates)[np.argsort(distances[candidates], kind="stable")[:2]]
-        if len(nearest) and _crosses(offsets[nearest[0]] @ pose[:3, 1]):
+        heights_mm = offsets[nearest[0]] @ pose[:3, 1] if len(nearest) else np.zeros(1)
+        low, high = float(heights_mm.min()), float(heights_mm.max())
+        if min(-low, high) > CROSSING * max(-low, high):  # evenly: not as frames of a tilt do, whose faces meet
             found = nearest.tolist()
         else:
             found = []
@@ -109,15 +109,6 @@ def neighbours_of(sweep: Sweep) -> Neighbours:
         nearest_mm=min(spacing_mm or max(sweep.pixel_mm), extent_mm),
         extent_mm=extent_mm,
     )
-
-
-def _crosses(heights_mm: FloatArray) -> bool:  # [K] of the corners of a frame over the plane of another
-    """Whether the planes cross within the images, about evenly: not as frames of a tilt do, whose faces meet."""
-    low, high = float(heights_mm.min()), float(heights_mm.max())
-    return min(-low, high) > CROSSING * max(-low, high)
-
-
-# Planes that lie between two frames, blended from what these show where the plane is in space.
 
 
 ON_PLANE_MM = 1e-6  # distances are at least that: the nearer frame then has all the weight
@@ -207,7 +198,6 @@ def _on_lines(lines: Lines, x: Tensor, z: Tensor) -> tuple[Tensor, Tensor]:
 # between neighbouring frames (`neighbours_of`), at a place drawn anew each time, with the two frames blended by their
 # distances, in the way that predicts the sweep's own frames best (`features_follow_probe`).
 
-
 EXACT = 1e-9  # a squared error that counts as none
 TRIED_FRAMES = 32  # enough to tell which blend is better
 DOUBTFUL = 4.0  # times the mean difference of two frames: there their blend counts half
@@ -224,7 +214,6 @@ class Places:
 
     @property
     def nearer(self) -> IntArray:  # [V]
-        """The frame that lies nearer."""
         return np.where(self.shares > 0.5, self.frames[:, 1], self.frames[:, 0])
 
     def poses(self, sweep: Sweep) -> FloatArray:  # [V, 4, 4] mm

@@ -52,15 +52,11 @@ def write_checkpoint(path: Path, header: CheckpointHeader, tensors: Mapping[str,
 
 def read_checkpoint_header(path: Path) -> CheckpointHeader:
     """Raises TrainingStateInvalid, naming the file and the reason, where it is no checkpoint of a training."""
-    return _read(path, with_tensors=False)[0]
+    return read_checkpoint(path, with_tensors=False)[0]
 
 
-def read_checkpoint(path: Path) -> tuple[CheckpointHeader, dict[str, Tensor]]:
+def read_checkpoint(path: Path, *, with_tensors: bool = True) -> tuple[CheckpointHeader, dict[str, Tensor]]:
     """The header and the tensors by name. Raises TrainingStateInvalid, naming the file and the reason."""
-    return _read(path, with_tensors=True)
-
-
-def _read(path: Path, *, with_tensors: bool) -> tuple[CheckpointHeader, dict[str, Tensor]]:
     try:
         with safe_open(path, framework="pt") as bundle:
             header = _header((bundle.metadata() or {})[METADATA_KEY])

@@ -28,12 +28,12 @@ from ultragray.geometry.pose import rotation_angles_deg
 from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation.baselines import interpolate_planes
 from ultragray.learn.evaluation.metrics import frame_metrics
-from ultragray.learn.evaluation.scoring import evaluate, evaluate_frames, frames_at_once, render_sweep
+from ultragray.learn.evaluation.scoring import evaluate, evaluate_frames, render_sweep, rendered_parts
 from ultragray.learn.sweep import ByteArray, Dataset, IntArray, Sweep, spread_places
 from ultragray.learn.training.config import TrainingConfig
 from ultragray.rendering.derived import CELLS, in_cells, variance_terms, view_distances
 from ultragray.rendering.derived import POINTS_PER_SIDE as DEVIATION_POINTS
-from ultragray.rendering.frames import render
+from ultragray.rendering.outputs import UNCERTAINTY
 from ultragray.scene.confidence import (
     DEPTHS,
     FAR_MM,
@@ -108,9 +108,6 @@ def _most_tilted(poses: FloatArray) -> IntArray:  # [F, 4, 4] -> [≤ F]
     return np.argsort(farthest, kind="stable")[:count].astype(np.int64)
 
 
-# Frames of a sweep, predicted from other frames of it by linear interpolation: no learning, small pictures.
-
-
 PICTURE_SIDE = 64  # structure smaller than its pixels is speckle
 MOST_HELPERS = 16
 
@@ -143,7 +140,6 @@ class Neighbours:
         return tuple(order[allowed[order]][:MOST_HELPERS].tolist())
 
     def predict(self, row: int, helpers: tuple[int, ...]) -> Prediction:
-        """Predicts a target from these frames."""
         some, target = self._small.select(list(helpers)), self.targets[row]
         pose = self._small.poses[target : target + 1]
         picture = torch.from_numpy(interpolate_planes(some, pose))
@@ -159,9 +155,6 @@ def _pooled(images: ByteArray) -> ByteArray:  # [F, H, W] -> [F, h, w]
     size = (max(1, round(height * shares)), max(1, round(width * shares)))
     pooled = [functional.adaptive_avg_pool2d(torch.from_numpy(image)[None].float(), size)[0] for image in images]
     return torch.stack(pooled).round().to(torch.uint8).numpy()
-
-
-# The difficulty of predicting each training view from the other frames alone.
 
 
 MAX_FRAMES = 192  # that are predicted; the others take the hardness of their neighbours
@@ -201,9 +194,6 @@ def hardness_of_views(sweep: Sweep) -> FloatArray:  # [F]
     own = np.bincount(rows, misses, len(targets)) / np.maximum(counts, 1)  # [T]
     weights = TrainingViews(sweep.poses[targets], sweep.probe).measure(sweep.poses, sweep.probe).weights  # [F, T]
     return weights @ own
-
-
-# The fit of the model of `confidence` to frames whose scores are known.
 
 
 PRIOR_WEIGHTS = (3.6, 1.1, 1.5, 0.3, 0.6)  # about those of ten scenes; one that no view determines stays near its own
@@ -286,9 +276,6 @@ def fit_weights(
     return weights[:-1]
 
 
-# Frames predicted from one side only: how fast anatomy changes along a sweep, where no frame was held out.
-
-
 ONE_SIDED_FRAMES = 96  # that are predicted
 BEYOND_MM = (0.0, 1.5, 3.0, 5.0, 8.0, 12.0)  # along the path: only frames farther away are used
 
@@ -312,9 +299,6 @@ def one_sided_examples(sweep: Sweep, hardness: FloatArray) -> Examples:
     return Examples(terms_of(measures, hardness), np.array([one.ms_ssim for one in predictions]))
 
 
-# The fit of a scene's uncertainty: the variances that explain the errors of frames that a training did not see.
-
-
 LOOKED_AT = 40_000  # cells, over all frames
 FAR_SHARE = 0.05  # of the weight of those cells: weight of places far from all views, where no frame shows the error
 ITERATIONS = 300
@@ -326,20 +310,18 @@ def fit_uncertainty(scene: GaussianScene, views: TrainingViews, sweep: Sweep, *,
     `views` are those that the scene was trained from. Far from them no errors are known, and there the variance is
     to be that of the training images.
     """
-    bands = _bands(sweep.images)
+    edges = np.linspace(0, sweep.height, DEPTHS + 1).round().astype(int)
+    by_depth = [sweep.images[:, low:high] / np.float32(255.0) for low, high in pairwise(edges)]
+    bands = DepthBands(tuple(float(one.mean()) for one in by_depth), tuple(float(one.var()) for one in by_depth))
     stride = max(1, len(sweep) * CELLS**2 // LOOKED_AT) | 1  # odd, while CELLS is even: cells of every column are taken
     terms, squares = [], []
-    portion = frames_at_once(sweep.height, sweep.width)
-    with torch.no_grad():
-        for first in range(0, len(sweep), portion):
-            some = sweep.select(np.arange(first, min(first + portion, len(sweep))))
-            frames = render(scene, some.probe, some.poses, height=some.height, width=some.width, backend=backend)
-            planes = tuple(frames[name].cpu() for name in ("bmode", "coverage", "transmittance"))
-            distances = view_distances(views, some.poses, some.probe)
-            columns = [term.flatten()[::stride] for term in variance_terms(planes, distances, bands)]
-            terms.append(torch.stack(columns, dim=1).double().numpy())
-            errors = torch.from_numpy(some.images).float().div_(255.0) - planes[0]
-            squares.append(in_cells(errors.square()).flatten()[::stride].double().numpy())
+    for some, frames in rendered_parts(scene, sweep, UNCERTAINTY.planes, backend):
+        planes = tuple(frames[name].cpu() for name in UNCERTAINTY.planes)
+        distances = view_distances(views, some.poses, some.probe)
+        columns = [term.flatten()[::stride] for term in variance_terms(planes, distances, bands)]
+        terms.append(torch.stack(columns, dim=1).double().numpy())
+        errors = torch.from_numpy(some.images).float().div_(255.0) - planes[0]
+        squares.append(in_cells(errors.square()).flatten()[::stride].double().numpy())
     far_terms, far_squares = _far_away(bands)
     weight = FAR_SHARE * sum(map(len, squares)) / len(far_squares)
     variances = likeliest_variances(
@@ -363,12 +345,6 @@ def likeliest_variances(terms: FloatArray, squares: FloatArray, weights: FloatAr
     return found
 
 
-def _bands(images: ByteArray) -> DepthBands:  # [F, H, W]
-    edges = np.linspace(0, images.shape[1], DEPTHS + 1).round().astype(int)
-    bands = [images[:, low:high] / np.float32(255.0) for low, high in pairwise(edges)]
-    return DepthBands(tuple(float(band.mean()) for band in bands), tuple(float(band.var()) for band in bands))
-
-
 def _far_away(bands: DepthBands) -> tuple[FloatArray, FloatArray]:  # [DEPTHS, TERMS], [DEPTHS]
     """The terms of a black frame far from every view, and its expected squared error, in the middle of each band."""
     dark, lit = torch.zeros(1, DEPTHS, 1), torch.ones(1, DEPTHS, 1)
@@ -376,9 +352,6 @@ def _far_away(bands: DepthBands) -> tuple[FloatArray, FloatArray]:  # [DEPTHS, T
     columns = [term.flatten() for term in variance_terms((dark, dark, lit), (far, far), bands)]
     squares = np.array(bands.spread) + np.square(bands.level)
     return torch.stack(columns, dim=1).double().numpy(), squares
-
-
-# The model of `confidence`, fitted on frames that a shorter training of its own did not see.
 
 
 SHORTER, ENOUGH_STEPS = 0.25, 150  # share of the steps, and the number that is not cut: longer tells the same
@@ -436,7 +409,9 @@ def fit_confidence(dataset: Dataset, train_shorter: TrainShorter, *, backend: st
     views = TrainingViews(part.train.poses, sweep.probe)
     measures = views.measure(both.poses, sweep.probe)
     terms = terms_of(measures, hardness_of_views(part.train))
-    black, hardness = _black_ms_ssim(sweep), hardness_of_views(sweep)
+    some = sweep.select(spread_places(len(sweep), BLACK_FRAMES))
+    black = evaluate_frames(np.zeros(some.images.shape, np.float32), some).mean.ms_ssim  # that black frames reach
+    hardness = hardness_of_views(sweep)
     weights = fit_weights(Examples(terms, ms_ssim), black, one_sided_examples(sweep, hardness))
     misses = np.abs(predicted(weights, terms, black) - ms_ssim)[: len(unseen)]
     return ConfidenceModel(
@@ -452,13 +427,6 @@ def fit_confidence(dataset: Dataset, train_shorter: TrainShorter, *, backend: st
 
 
 def _measured(scene: GaussianScene, sweep: Sweep, backend: str) -> tuple[FloatArray, FloatArray]:  # [F], [F]
-    """MS-SSIM and the share of supported pixels of each frame."""
     ms_ssim = [frame.ms_ssim for frame in evaluate(scene, sweep, backend=backend).frames]
     coverage = render_sweep(scene, sweep, output="coverage", backend=backend)
     return np.array(ms_ssim), supported(coverage).mean(axis=(1, 2))
-
-
-def _black_ms_ssim(sweep: Sweep) -> float:
-    """The mean score of a black frame against the training frames."""
-    some = sweep.select(spread_places(len(sweep), BLACK_FRAMES))
-    return evaluate_frames(np.zeros(some.images.shape, np.float32), some).mean.ms_ssim

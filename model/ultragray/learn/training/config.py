@@ -206,7 +206,6 @@ class TrainingConfig(Contract):
 
     @property
     def given_beam(self) -> ElevationBeam | None:
-        """The beam that the settings describe."""
         if self.slice_thickness_mm is None:
             return None
         return ElevationBeam(self.slice_thickness_mm, self.slice_focus_mm, self.slice_depth_of_field_mm)

@@ -31,7 +31,6 @@ class BatchSampler:
         self._frame_count = frame_count
 
     def next_batch(self) -> Tensor:  # [b]
-        """The places of the next frames."""
         while len(self.waiting) < self.batch_size:
             order = torch.randperm(self._frame_count, generator=self.generator)
             self.waiting = torch.cat([self.waiting, order])
@@ -83,13 +82,9 @@ def out_of_plane_shift_mm(range_mm: float, generator: torch.Generator) -> float:
 
 
 def shift_out_of_plane(poses: FloatArray, shift_mm: float) -> FloatArray:  # [C, 4, 4] mm -> [C, 4, 4] mm
-    """The poses, each moved along its own elevation axis."""
     shifted = poses.copy()
     shifted[:, :3, 3] += shift_mm * poses[:, :3, 1]
     return shifted
-
-
-# Facts of a dataset that a training needs: its size, the spacing of its frames and pixels.
 
 
 SCALE_MARGIN = 1.1  # of the released recipe
@@ -186,7 +181,6 @@ def frame_spacing_mm(sweep: Sweep) -> float:
 # depth is dark in every frame, and along lines that are dark from the face on, which have no contact, there is no
 # evidence, and the share is 1.
 
-
 USUAL = 0.7  # quantile over all scan lines at a depth: brighter than most shadows, less than a reflector
 LEAST_USUAL = 0.03  # grey value, of 1, below which a depth tells nothing
 SMOOTHING_MM = 0.7, 1.0  # standard deviation across the scan lines and along them: speckle is no evidence
@@ -224,7 +218,6 @@ class Shadows:
         self._usual_below = _usual_by_depth(self._brightest_below(self._relative(some)))  # [H]
 
     def of(self, place: int) -> Beam:
-        """The evidence of the frame at a place of the sweep."""
         height, width = self._sweep.height, self._sweep.width
         if not len(self._bright_rows):
             return Beam(np.ones((height, width), np.float32), np.zeros((height, width), np.float32))
@@ -239,7 +232,6 @@ class Shadows:
         return Beam(left, (self._usual[:, None] * echo).astype(np.float32))
 
     def pixels(self) -> npt.NDArray[np.bool_]:  # [F, H, W]
-        """Which pixels of all frames lie in a shadow."""
         found = np.empty(self._sweep.images.shape, bool)
         for place, pixels in enumerate(found):
             pixels[:] = self.of(place).is_shadowed
@@ -248,10 +240,7 @@ class Shadows:
     def _smooth(self, place: int) -> FloatImage:  # [H, W]
         sigmas = [max(0.5, mm / pixel) for mm, pixel in zip(SMOOTHING_MM, (self._lateral, self._axial), strict=True)]
         image = self._sweep.images[place] / np.float32(255.0)
-        smooth: FloatImage = cv2.GaussianBlur(
-            image, (0, 0), sigmas[0], sigmaY=sigmas[1], borderType=cv2.BORDER_REPLICATE
-        )
-        return smooth
+        return cv2.GaussianBlur(image, (0, 0), sigmas[0], sigmaY=sigmas[1], borderType=cv2.BORDER_REPLICATE)
 
     def _relative(self, smooth: FloatImage) -> FloatImage:  # [F, H, W] both
         """Brightness over what is usual at its depth; 0 where the depth tells nothing."""

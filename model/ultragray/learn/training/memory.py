@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+from contextlib import suppress
 from pathlib import Path
 
 import torch
@@ -45,7 +46,6 @@ def training_device(name: str, backend: str) -> torch.device:
 
 
 def machine_in_words(device: str = "cpu") -> str:
-    """The processor, the threads, and the GPU where one is used."""
     threads = torch.get_num_threads()
     words = f"{processor_name()}, {threads} thread{'' if threads == 1 else 's'}"
     on = training_device(device, "auto")
@@ -53,7 +53,6 @@ def machine_in_words(device: str = "cpu") -> str:
 
 
 def forget_peak_memory(device: torch.device) -> None:
-    """Start the count of `peak_memory_mb` anew."""
     if device.type == "cuda":
         torch.cuda.init()  # type: ignore[no-untyped-call]  # there is nothing to reset before
         torch.cuda.reset_peak_memory_stats(device)
@@ -68,7 +67,6 @@ def peak_memory_mb(device: torch.device) -> float | None:
 #
 # The machine's for the backend `cpu`, the GPU's where that trains; `reference` keeps a graph of [H, W] for every
 # Gaussian that a frame touches, which nobody can foresee.
-
 
 BASE_BYTES = 512 << 20  # the process with torch loaded, and the scratch memory of its kernels (measured: up to 500)
 COPIES = 16  # parameters, gradients, moments; what refinements, checkpoints and the kernel copy (measured: 14)
@@ -107,7 +105,6 @@ def required_bytes(dataset: Dataset, config: TrainingConfig) -> int:
 
 
 def required_device_bytes(dataset: Dataset, config: TrainingConfig) -> int:
-    """An upper bound of what a training takes of a GPU."""
     assert config.max_gaussians is not None
     height, width = dataset.train.height, dataset.train.width
     per_frame = config.max_gaussians * CUDA_SLICE_BYTES + 4 * CUDA_PLANES * height * width
@@ -138,16 +135,13 @@ def available_bytes() -> int | None:
 
 
 def _free_memory() -> int | None:
-    try:
+    with suppress(OSError):
         for line in Path("/proc/meminfo").read_text(encoding="ascii").splitlines():
             if line.startswith("MemAvailable:"):
                 return int(line.split()[1]) * 1024
-    except OSError:
-        pass
-    try:
+    with suppress(ValueError, OSError):
         return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    except (ValueError, OSError):
-        return None
+    return None
 
 
 def _left_in_group() -> int | None:
@@ -155,18 +149,11 @@ def _left_in_group() -> int | None:
         (CONTROL_GROUPS, "memory.max", "memory.current", "inactive_file"),
         (CONTROL_GROUPS / "memory", "memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file"),
     ):
-        try:
-            taken = int((folder / used).read_text()) - _entry(folder / "memory.stat", reclaimable)
-            return int((folder / limit).read_text()) - taken
-        except (OSError, ValueError):  # another layout, or "max": no limit
-            continue
+        with suppress(OSError, ValueError):  # another layout, or "max": no limit
+            lines = (folder / "memory.stat").read_text(encoding="ascii").splitlines()
+            cached = int(dict(line.split() for line in lines).get(reclaimable, 0))  # counts as used but can be had
+            return int((folder / limit).read_text()) - int((folder / used).read_text()) + cached
     return None
-
-
-def _entry(path: Path, name: str) -> int:
-    """A number of memory.stat; 0 where it has none. What files take in a cache counts as used but can be had."""
-    values = dict(line.split() for line in path.read_text(encoding="ascii").splitlines())
-    return int(values.get(name, 0))
 
 
 def check_memory(dataset: Dataset, config: TrainingConfig, device: torch.device) -> None:

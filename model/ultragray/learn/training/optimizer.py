@@ -51,7 +51,6 @@ class Schedule:
         return min(reached, self._config.sh_degree)
 
     def has_floor(self, step: int) -> bool:
-        """Whether intensities are kept above their floors."""
         return step < self._config.floor_end * self.steps
 
     def refinement(self, done: int) -> int | None:
@@ -59,7 +58,6 @@ class Schedule:
         return self._refinements.get(done) if done > 0 else None
 
     def gaussian_limit(self, refinement: int) -> int:
-        """The number of Gaussians that there may be after a refinement."""
         config = self._config
         assert config.initial_gaussians is not None
         assert config.max_gaussians is not None
@@ -69,14 +67,10 @@ class Schedule:
         return config.initial_gaussians + round(share * (config.max_gaussians - config.initial_gaussians))
 
 
-# Adam over the raw parameters, whose moments follow the Gaussians through refinement and into checkpoints.
-
-
 MOMENTS = ("exp_avg", "exp_avg_sq")
 
 
 def is_trained(name: str, shape: Sequence[int], config: TrainingConfig) -> bool:
-    """Whether a parameter of this shape changes in a run."""
     return math.prod(shape) > 0 and (config.transmittance or name != "transmittances")
 
 
@@ -118,7 +112,6 @@ class Optimizer:
                 self._adam.state[new] = state
 
     def tensors(self) -> dict[str, Tensor]:
-        """The moments and step counts by name, as `load` takes them."""
         found = {}
         for name, group in self._groups.items():
             for key, value in self._adam.state.get(group["params"][0], {}).items():
@@ -133,9 +126,6 @@ class Optimizer:
             state = {key: value.to(parameter.device) for key, value in stored.items() if value is not None}
             if state:
                 self._adam.state[parameter] = state
-
-
-# Refinement: Gaussians whose position the images pull at are duplicated or split, useless ones are pruned.
 
 
 SPLIT_SHRINK = 1.6  # standard deviations of the halves of a split Gaussian are divided by this
@@ -185,7 +175,9 @@ def refine(
     split_scale × scene scale, else replaced by two of it, drawn from the Gaussian itself and 1.6 times smaller. Then
     all that are larger than prune_above, or smaller than prune_below, × scene scale go.
     """
-    chosen = _candidates(pull, limit - len(pull), config)
+    least = config.growth_gradient if config.growth == "threshold" else 0.0
+    order = torch.argsort(pull, descending=True, stable=True)[: max(0, limit - len(pull))]  # each takes one more place
+    chosen = order[pull[order] > least]
     is_large = _largest_cm(parameters["scales"][chosen]) > config.split_scale * scene_scale_cm
     split, duplicated = chosen[is_large], chosen[~is_large]
     stays = torch.ones(len(pull), dtype=torch.bool, device=pull.device)
@@ -200,13 +192,6 @@ def refine(
     order = left[spatial_order(grown["means"][left])]
     parent = torch.cat([kept, duplicated, split, split])
     return Refined({name: tensor[order] for name, tensor in grown.items()}, origin[order], parent[order])
-
-
-def _candidates(pull: Tensor, room: int, config: TrainingConfig) -> Tensor:  # [N] -> [n]
-    """Places of the Gaussians to refine, the most pulled first, each of which takes the room of one more."""
-    least = config.growth_gradient if config.growth == "threshold" else 0.0
-    order = torch.argsort(pull, descending=True, stable=True)[: max(0, room)]
-    return order[pull[order] > least]
 
 
 def _largest_cm(scales: Tensor) -> Tensor:  # [N, 3] log cm -> [N]
@@ -229,5 +214,4 @@ def rotate(quats: Tensor, vectors: Tensor) -> Tensor:  # [N, 4] wxyz of any norm
     unit = quats / quats.norm(dim=-1, keepdim=True)
     w, u = unit[:, :1], unit[:, 1:]
     across = torch.linalg.cross(u, vectors)
-    rotated: Tensor = vectors + 2.0 * (w * across + torch.linalg.cross(u, across))
-    return rotated
+    return vectors + 2.0 * (w * across + torch.linalg.cross(u, across))

@@ -27,7 +27,6 @@ def write_picture(folder: Path, step: int, frame: Sweep, rendered: FrameArray) -
 
 
 def pictures_in(folder: Path) -> list[Path]:
-    """The pictures of a run, in the order of its steps, the frame itself last."""
     return sorted(folder.glob("validation_*.png"))
 
 

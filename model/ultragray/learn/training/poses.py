@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 import torch
@@ -52,22 +53,16 @@ class Corrections:
         self._ease = torch.tensor(ease, dtype=torch.float64)
         self._middles = torch.from_numpy(np.stack([middles[list(places)].mean(axis=0) for places in groups]))  # [G, 3]
         self._lever_mm = float(np.linalg.norm(corners - middles[:, None], axis=-1).mean())
-        self._twists = torch.zeros((len(groups), 6), dtype=torch.float64, requires_grad=True)
-        self._adam = torch.optim.Adam([self._twists], lr=0.0, betas=(0.9, 0.99), eps=1e-12)
-
-    @property
-    def group_count(self) -> int:
-        return len(self._twists)
+        self.twists = torch.zeros((len(groups), 6), dtype=torch.float64, requires_grad=True)
+        self._adam = torch.optim.Adam([self.twists], lr=0.0, betas=(0.9, 0.99), eps=1e-12)
 
     def corrected(self, places: Tensor, poses: FloatArray) -> Tensor:  # [b], [b, 4, 4] -> [b, 4, 4] mm
         """Poses of the frames at these places, moved by their corrections, with their graph."""
         return self._motions(self._group_of[places]) @ torch.from_numpy(poses)
 
     def all_motions(self) -> FloatArray:  # [F, 4, 4]
-        """The correction of every frame."""
         with torch.no_grad():
-            found: FloatArray = self._motions(self._group_of).numpy()
-        return found
+            return self._motions(self._group_of).numpy()
 
     def update(self, rate: float) -> None:
         """One update of every group by its own gradient, at `rate` mm."""
@@ -76,20 +71,18 @@ class Corrections:
         self._adam.zero_grad(set_to_none=True)
 
     def tensors(self) -> dict[str, Tensor]:
-        """The state, for a checkpoint."""
-        state = self._adam.state.get(self._twists, {})
-        return {"twists": self._twists.detach(), **state}
+        state = self._adam.state.get(self.twists, {})
+        return {"twists": self.twists.detach(), **state}
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
-        """Inverse of `tensors`."""
         with torch.no_grad():
-            self._twists.copy_(tensors["twists"])
+            self.twists.copy_(tensors["twists"])
         state = {name: value for name, value in tensors.items() if name != "twists"}
         if state:
-            self._adam.state[self._twists] = state
+            self._adam.state[self.twists] = state
 
     def _motions(self, groups: Tensor) -> Tensor:  # [b] -> [b, 4, 4]
-        twists, middles, axes = self._twists[groups] * self._ease, self._middles[groups], self._axes[groups]
+        twists, middles, axes = self.twists[groups] * self._ease, self._middles[groups], self._axes[groups]
         rotations = turned_by(torch.einsum("gij,gj->gi", axes, twists[:, :3]) / self._lever_mm)
         shifts = middles - torch.einsum("gij,gj->gi", rotations, middles)
         shifts = shifts + torch.einsum("gij,gj->gi", axes, twists[:, 3:])
@@ -107,33 +100,23 @@ class FrameCorrections(Corrections):
 
     def step(self, done: float) -> None:
         """One update by the gradient of a step, `done` being the share of the run that is done."""
-        self._roughness().backward()  # type: ignore[no-untyped-call]
+        bends = [torch.diff(self.twists[sweep.start : sweep.stop], 2, dim=0).square().sum() for sweep in self._ranges]
+        (SMOOTHNESS * torch.stack(bends).sum()).backward()  # type: ignore[no-untyped-call]
         self.update(_rate(done))
-        with torch.no_grad():
-            self._remove_common_motion()
-
-    def _roughness(self) -> Tensor:
-        bends = [torch.diff(self._twists[sweep.start : sweep.stop], 2, dim=0).square().sum() for sweep in self._ranges]
-        return SMOOTHNESS * torch.stack(bends).sum()
-
-    def _remove_common_motion(self) -> None:
-        """Takes the mean of all turns and shifts, in the tracker's axes, off each."""
-        parts = self._twists.reshape(-1, 2, 3)
-        common = torch.einsum("gij,gpj->pi", self._axes, parts) / len(parts)
-        parts -= torch.einsum("gij,pi->gpj", self._axes, common)
+        with torch.no_grad():  # the mean of all turns and shifts, in the tracker's axes, is taken off each
+            parts = self.twists.reshape(-1, 2, 3)
+            common = torch.einsum("gij,gpj->pi", self._axes, parts) / len(parts)
+            parts -= torch.einsum("gij,pi->gpj", self._axes, common)
 
 
 class SweepCorrections(Corrections):
     """A correction for each sweep as a whole; that of the first is the identity."""
 
-    def __init__(self, sweep: Sweep, ranges: Sequence[range]) -> None:
-        super().__init__(sweep, ranges)
-
     def step(self, done: float) -> None:
         """One update by the gradient of a step, `done` being the share of the run that is done."""
         self.update(_rate(done))
         with torch.no_grad():
-            self._twists[0] = 0.0
+            self.twists[0] = 0.0
 
 
 def _rate(done: float) -> float:  # mm a step
@@ -145,25 +128,17 @@ def turned_by(turns: Tensor) -> Tensor:  # [G, 3] rad -> [G, 3, 3]
     x, y, z = turns.unbind(-1)
     zero = torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(-1, 3, 3)
-    rotations: Tensor = torch.linalg.matrix_exp(cross)
-    return rotations
+    return torch.linalg.matrix_exp(cross)
 
 
-# Pose refinement of a training run: before it by the path and the images, and in it together with the scene.
-
-
-_TRAINED: dict[str, type[FrameCorrections | SweepCorrections]] = {
-    "frames": FrameCorrections,
-    "sweeps": SweepCorrections,
-}
+TrainedCorrections: TypeAlias = FrameCorrections | SweepCorrections
+_TRAINED: dict[str, type[TrainedCorrections]] = {"frames": FrameCorrections, "sweeps": SweepCorrections}
 
 
 class PoseRefinement:
     """The corrections of the training frames, left-multiplied to their poses; `dataset` is the one to train from."""
 
-    def __init__(
-        self, dataset: Dataset, tracked: FloatArray, trained: FrameCorrections | SweepCorrections | None
-    ) -> None:
+    def __init__(self, dataset: Dataset, tracked: FloatArray, trained: TrainedCorrections | None) -> None:
         """`dataset` has the poses that the training begins with, `tracked` [F, 4, 4] (mm) are those of its frames."""
         self.dataset, self._tracked, self._trained = dataset, tracked, trained
 
@@ -191,8 +166,7 @@ class PoseRefinement:
 
     @property
     def group_count(self) -> int:
-        """The number of corrections that are trained: 0 where none is."""
-        return 0 if self._trained is None else self._trained.group_count
+        return 0 if self._trained is None else len(self._trained.twists)
 
     def corrected(self, places: Tensor, poses: FloatArray) -> ScenePoses:  # [b], [b, 4, 4] mm -> [b, 4, 4] mm
         """Poses of a batch as they are by now, with the graph of their corrections where these are trained."""
@@ -213,11 +187,9 @@ class PoseRefinement:
         return None if self._trained is None else self.poses() @ np.linalg.inv(self._tracked)
 
     def tensors(self) -> dict[str, Tensor]:
-        """The state of the trained corrections, for a checkpoint."""
         return {} if self._trained is None else self._trained.tensors()
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
-        """Inverse of `tensors`."""
         if self._trained is not None:
             self._trained.load(tensors)
 
@@ -227,7 +199,6 @@ class PoseRefinement:
 # A frame whose pose is off by a millimetre scores badly even in a perfect scene. Registering all of it first would
 # score the scene too well, so a frame is moved by its left half alone and scored on its right half, and the other way
 # round.
-
 
 STEPS = 60
 TEXTURE = 0.5  # share of SSIM in the loss that a frame is moved by
@@ -243,7 +214,6 @@ class HalvesScore:
     moved_mm: float
 
     def to_dict(self) -> dict[str, float]:
-        """A JSON object."""
         return asdict(self)
 
     def __str__(self) -> str:

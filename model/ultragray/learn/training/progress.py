@@ -55,7 +55,6 @@ class Course:
 
     @property
     def step_s(self) -> float:
-        """The mean over the steps."""
         return self.seconds / len(self.losses)
 
 
@@ -97,23 +96,15 @@ def _lines_until(path: Path, steps_done: int) -> list[bytes]:
         return []
     kept = []
     for line in path.read_bytes().splitlines(keepends=True):
-        if not line.endswith(b"\n") or not 1 <= _step_of(line) <= steps_done:
+        try:
+            document = json.loads(line)
+        except (ValueError, RecursionError):
+            break
+        step = document.get("step") if isinstance(document, dict) else None
+        if not line.endswith(b"\n") or type(step) is not int or not 1 <= step <= steps_done:
             break
         kept.append(line)
     return kept
-
-
-def _step_of(line: bytes) -> int:
-    """The step that a line is about; 0 where it is damaged."""
-    try:
-        document = json.loads(line)
-    except (ValueError, RecursionError):
-        return 0
-    step = document.get("step") if isinstance(document, dict) else None
-    return step if type(step) is int else 0
-
-
-# Metrics as TensorBoard event files, where the extra `tensorboard` is installed.
 
 
 def require_tensorboard() -> None:
@@ -137,7 +128,6 @@ class Board:
         self._writer = SummaryWriter(str(folder), purge_step=steps_done + 1 if steps_done else None)
 
     def write(self, line: Mapping[str, float]) -> None:
-        """A line of the journal, by its step."""
         for name, value in line.items():
             if name != "step":
                 self._writer.add_scalar(name, value, int(line["step"]))

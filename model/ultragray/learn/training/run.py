@@ -94,9 +94,6 @@ class _Tried:
         write_whole(self._path, json.dumps({**self._run, "metrics": found}, indent=2) + "\n")
 
 
-# train(): a dataset becomes a scene.
-
-
 FITTING = "fitting the confidence"
 
 Report: TypeAlias = Callable[[Progress], None]
@@ -131,8 +128,10 @@ def train(
     """
     if tensorboard:
         require_tensorboard()
-    if folder is not None and not resume:
-        _require_no_run(folder)
+    if folder is not None and not resume and (checkpoint := folder / CHECKPOINT_FILE).exists():
+        raise TrainingStateInvalid(
+            f"{checkpoint}: there is an unfinished run: resume it, or remove {folder} to begin anew"
+        )
     apart = _Apart(report, should_stop, device, backend)
     given = config or TrainingConfig()
     config = _with_effort(dataset, given, folder, resume, apart)
@@ -193,14 +192,6 @@ def _with_fit(report: Report | None, dataset: Dataset, config: TrainingConfig) -
         report(replace(progress, seconds_left=progress.seconds_left + fit_s))
 
     return tell
-
-
-def _require_no_run(folder: Path) -> None:
-    checkpoint = folder / CHECKPOINT_FILE
-    if checkpoint.exists():
-        raise TrainingStateInvalid(
-            f"{checkpoint}: there is an unfinished run: resume it, or remove {folder} to begin anew"
-        )
 
 
 def _with_effort(

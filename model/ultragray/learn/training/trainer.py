@@ -58,7 +58,7 @@ STEPS_PER_CHECK = 100  # of the parameters being finite; the loss is looked at a
 VALIDATIONS = 20  # in a run; the peak of a GPU's memory is noted as often
 VALIDATION_FRAMES = 8
 
-Log: TypeAlias = Callable[[dict[str, float]], None]
+Log: TypeAlias = Callable[[dict[str, float]], object]
 
 
 class Trainer:
@@ -144,17 +144,11 @@ class Trainer:
             remove_stale_temporaries(self.folder / name)
         write_whole(self.folder / CONFIG_FILE, json.dumps(self.config.to_dict(), indent=2) + "\n")
         with contextlib.ExitStack() as stack:
-            sinks: list[Journal | Board] = [Journal(self.folder / JOURNAL_FILE, steps_done=self.step)]
-            stack.callback(sinks[0].close)
+            journal = Journal(self.folder / JOURNAL_FILE, steps_done=self.step)
+            sinks: list[Journal | Board] = [stack.enter_context(contextlib.closing(journal))]
             if tensorboard:
-                sinks.append(Board(self.folder, steps_done=self.step))
-                stack.callback(sinks[1].close)
-
-            def log(line: dict[str, float]) -> None:
-                for sink in sinks:
-                    sink.write(line)
-
-            yield log
+                sinks.append(stack.enter_context(contextlib.closing(Board(self.folder, steps_done=self.step))))
+            yield lambda line: [sink.write(line) for sink in sinks]
 
     @contextlib.contextmanager
     def running_out_of_memory_explained(self) -> Iterator[None]:
@@ -176,7 +170,6 @@ class Trainer:
         should_stop: Callable[[], bool] | None,
         checkpoint_interval_s: float,
     ) -> None:
-        """Steps to the end, or until `should_stop`; see `train`."""
         saved_at = time.monotonic()
         while self.step < self._schedule.steps:
             progress = self._timed_step(log)
@@ -242,7 +235,9 @@ class Trainer:
             rendered, truth = torch.cat([own, between.weighted(others)]), torch.cat([truth, between.images])
         image = image_loss(rendered, truth, self._texture)
         if self._shadowed is not None:
-            image = image + self._price_of_absorption(frames["transmittance"], self._shadowed, neighbours)
+            # λ·mean(1 − T), in which pixels count 0 where one of the frames on either side shows a shadow
+            is_free = self._shadowed[cuda.upload(neighbours, self._device)].any(dim=1)
+            image = image + self.config.absorption_penalty * ((1.0 - frames["transmittance"]) * ~is_free).mean()
         image.backward()  # type: ignore[no-untyped-call]
         self.refinement.step(self.step / self._schedule.steps)
         with torch.no_grad():
@@ -278,16 +273,6 @@ class Trainer:
             backend=self._backend,
             beam=self._beam.numbers,
         )
-
-    def _price_of_absorption(
-        self,
-        transmittance: Tensor,  # [C, H, W]
-        shadowed: Tensor,  # [F, H, W]
-        neighbours: Tensor,  # [C, 2] the frames on either side of each view
-    ) -> Tensor:  # scalar
-        """λ·mean(1 − T), in which pixels count 0 where one of these frames shows a shadow."""
-        is_free = shadowed[cuda.upload(neighbours, self._device)].any(dim=1)
-        return self.config.absorption_penalty * ((1.0 - transmittance) * ~is_free).mean()
 
     def _view(self, sh_degree: int) -> GaussianScene:
         """The parameters as a scene, without the checks of `from_splats`, which read every value."""
@@ -363,17 +348,19 @@ class Trainer:
             return
         tensors = {
             **{f"parameter.{name}": tensor for name, tensor in self.parameters.items()},
-            **{f"adam.{name}": tensor for name, tensor in self._optimizer.tensors().items()},
-            **{f"pose.{name}": tensor for name, tensor in self.refinement.tensors().items()},
+            **{f"{part}.{name}": t for part, of in self._parts().items() for name, t in of.tensors().items()},
             "pull.total": self._pull.total,
             "pull.seen": self._pull.seen,
             "floor": self._floor,
             "waiting": self._sampler.waiting,
             "generator": self._generator.get_state(),
-            **{f"beam.{name}": tensor for name, tensor in self._beam.tensors().items()},
         }
         header = CheckpointHeader(self.step, self._timer.elapsed_s, self._dataset_sha256, self.config)
         write_checkpoint(self._checkpoint, header, tensors)
+
+    def _parts(self) -> dict[str, Optimizer | PoseRefinement | TrainedBeam]:
+        """The parts with a state of their own, by the prefix that their tensors have in a checkpoint."""
+        return {"adam": self._optimizer, "pose": self.refinement, "beam": self._beam}
 
     def restore(self) -> None:
         """Takes over the run of the folder's checkpoint. Raises TrainingStateInvalid where it is another run's."""
@@ -387,12 +374,10 @@ class Trainer:
         except RuntimeError as error:
             raise TrainingStateInvalid(f"{path}: its tensor generator is no generator's state: {error}") from error
         self._begin_with({name: tensors[f"parameter.{name}"] for name in PARAMETERS}, tensors["floor"])
-        prefix = "adam."
-        self._optimizer.load({k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)})
-        self._beam.load({k.removeprefix("beam."): v for k, v in tensors.items() if k.startswith("beam.")})
+        for part, of in self._parts().items():
+            of.load({name.removeprefix(f"{part}."): t for name, t in tensors.items() if name.startswith(f"{part}.")})
         self._pull = PullStatistics(tensors["pull.total"].to(self._device), tensors["pull.seen"].to(self._device))
         self._sampler.waiting = tensors["waiting"]
-        self.refinement.load({k.removeprefix("pose."): v for k, v in tensors.items() if k.startswith("pose.")})
         self.step = header.step
         self._timer = StepTimer(header.elapsed_s)
 

@@ -37,9 +37,6 @@ class Kind(NamedTuple):
         return f"{backend}, weighted" if self.weighted else backend
 
 
-# Poses as the backends take them: cm about the scene's centre, and the way back for a gradient.
-
-
 ScenePoses: TypeAlias = FloatArray | Tensor  # [C, 4, 4]; a tensor, float64 on the CPU, where it wants a gradient
 
 
@@ -56,14 +53,11 @@ def scene_poses(scene: GaussianScene, poses: Any) -> ScenePoses:  # [C, 4, 4] or
 
 
 def want_gradient(poses: ScenePoses) -> bool:
-    """Whether a loss is to be differentiated by these poses."""
     return isinstance(poses, Tensor) and poses.requires_grad and torch.is_grad_enabled()
 
 
 def as_array(poses: ScenePoses) -> FloatArray:  # [C, 4, 4]
-    """The numbers alone."""
-    array: FloatArray = poses.detach().numpy() if isinstance(poses, Tensor) else poses
-    return array
+    return poses.detach().numpy() if isinstance(poses, Tensor) else poses
 
 
 def gradient_by_poses(poses: Tensor, by_motion: Tensor) -> Tensor:  # [C, 4, 4], [C, 2, 3] -> [C, 4, 4]
@@ -99,9 +93,6 @@ class _Rigid(torch.autograd.Function):
         return by_poses.reshape(ctx.like.shape).to(ctx.like), None, None
 
 
-# Scan lines as the fast kernels take them, in cm and radians.
-
-
 class KernelLines(NamedTuple):
     """A bundle of lines that run side by side along z, or fan out from the origin.
 
@@ -120,7 +111,6 @@ class KernelLines(NamedTuple):
 
     @classmethod
     def of(cls, probe: Probe) -> KernelLines:
-        """The lines of a probe."""
         match probe.lines:
             case ParallelLines() as lines:
                 along_x, along_z = lines.direction
@@ -131,13 +121,9 @@ class KernelLines(NamedTuple):
                 return cls(True, lines.wrap, math.radians(lines.start), math.radians(lines.span), np.eye(3))
 
     def view_axes(self, poses: FloatArray) -> FloatArray:  # [C, 4, 4] -> [C, 4, 4]
-        """Poses whose axes are those of the sheared plane."""
         sheared = poses.copy()
         sheared[:, :3, :3] = poses[:, :3, :3] @ self.axes
         return sheared
-
-
-# The elevational beam as the backends take it: three numbers in cm, differentiable (docs/physics.md §3).
 
 
 def beam_cm(beam: ElevationBeam | Tensor | None, probe: Probe) -> Tensor | None:
@@ -146,7 +132,7 @@ def beam_cm(beam: ElevationBeam | Tensor | None, probe: Probe) -> Tensor | None:
     A tensor holds a beam's thickness, focus and depth of field in mm; gradients reach it.
     Raises InvalidArgument for one of another shape.
     """
-    if beam is None or (isinstance(beam, ElevationBeam) and beam.is_thin):
+    if beam is None or (isinstance(beam, ElevationBeam) and beam.thickness_mm == 0.0):
         return None
     if isinstance(beam, ElevationBeam):
         beam = torch.tensor(beam.numbers, dtype=torch.float64)
@@ -187,7 +173,6 @@ class BeamVariance(NamedTuple):
 
     @classmethod
     def of(cls, beam: Tensor, probe: Probe, height: int) -> BeamVariance:
-        """Of the numbers of `beam_cm`, for frames of a height."""
         sigma, focus, rayleigh = beam.tolist()
         slope2 = (sigma / rayleigh) ** 2
         ends = probe.near_mm / 10.0, probe.cull_far_mm(height) / 10.0
@@ -196,9 +181,6 @@ class BeamVariance(NamedTuple):
 
 
 THIN = BeamVariance(0.0, 0.0, 0.0, 0.0)
-
-
-# The order in which Gaussians that lie near each other come one after another.
 
 
 def spatial_order(means: Tensor) -> Tensor:  # [N, 3] -> [N]

@@ -27,16 +27,13 @@ from ultragray.scene.gaussians import GaussianScene
 class Backend:
     """One way to draw planes."""
 
+    # planes by name, [C, H, W] each: scene, probe, poses in cm [C, 4, 4], height, width, planes, limits, beam
     draw: Callable[..., dict[str, Tensor]]
-    """Planes by name, [C, H, W] each: scene, probe, poses in cm [C, 4, 4], height, width, planes, limits, beam."""
+    # whether it can draw a scene, which depends on where its tensors lie, and of which type they are
     supports: Callable[[GaussianScene], bool] = lambda _: True
-    """Whether it can draw a scene, which depends on where its tensors lie, and of which type they are."""
-    require: Callable[[], None] = lambda: None
-    """Raises BackendUnavailable where it cannot draw here."""
-    place: Callable[[], str] = lambda: "anywhere"
-    """Where it draws float32 scenes, in words."""
-    renderer: Callable[[GaussianScene], str] = lambda _: "reference"
-    """What the frames of a scene call it."""
+    require: Callable[[], None] = lambda: None  # raises BackendUnavailable where it cannot draw here
+    place: Callable[[], str] = lambda: "anywhere"  # where it draws float32 scenes, in words
+    renderer: Callable[[GaussianScene], str] = lambda _: "reference"  # what the frames of a scene call it
 
 
 BACKENDS: dict[str, Backend] = {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import hashlib
 import re
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator
 from dataclasses import dataclass, replace
 from pathlib import PurePosixPath
 from typing import Annotated, Any, Literal
@@ -256,7 +256,7 @@ async def get_artifact(
     found = await service.jobs.do(JobStore.artifact, job, name)
     media_type = MEDIA_TYPES.get(PurePosixPath(name).suffix, _ANY_FILE)
     disposition = "inline" if show else "attachment"
-    return artifact_response(found, request.headers, media_type, SHOWN, disposition)
+    return artifact_response(found, request.headers, media_type, disposition)
 
 
 @router.get("/{job}/events", response_class=StreamingResponse, responses=_EVENTS | problems(401, 404, 422, 503))
@@ -277,13 +277,11 @@ _CHUNK_BYTES = 2**20
 _RANGE = re.compile(r"bytes=(\d*)-(\d*)")
 
 
-def artifact_response(
-    file: Artifact, asked: Headers, media_type: str, beside: Mapping[str, str], disposition: str
-) -> Response:
-    """The answer to a GET of a file or of one range; `beside`: further headers, `disposition`: inline or attachment."""
+def artifact_response(file: Artifact, asked: Headers, media_type: str, disposition: str) -> Response:
+    """The answer to a GET of a file or of one range of it; `disposition`: inline or attachment."""
     etag = f'"{file.stored.sha256}"'
     headers = {
-        **beside,
+        **SHOWN,
         "accept-ranges": "bytes",
         "content-disposition": f"{disposition}; filename*=utf-8''{quote(file.name)}",
         "etag": etag,

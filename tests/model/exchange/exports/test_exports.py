@@ -3,7 +3,6 @@ import subprocess
 import sys
 import tarfile
 import threading
-import time
 import zipfile
 from dataclasses import replace
 
@@ -21,6 +20,7 @@ from ultragray.errors import ExtraMissing, InvalidArgument
 from ultragray.exchange.exports import FORMATS, ExportHeader, check_format, export_to
 from ultragray.exchange.exports.archives import NpzExporter
 from ultragray.exchange.exports.exporter import stored_pixels
+from ultragray.exchange.rendering import written_behind
 from ultragray.installation import install_advice
 from ultragray.rendering.settings import Contact, Resolved
 from ultragray.scene.confidence import FIGURES, Extrapolation, figure_arrays
@@ -176,7 +176,6 @@ def test_whole_or_not_at_all(tmp_path, format):
         break_off()
     assert [entry.name for entry in tmp_path.iterdir()] == [path.name]
     assert path.read_text() == "before"
-    assert not [thread for thread in threading.enumerate() if thread.name == "export"]
 
 
 @pytest.mark.parametrize("format", FORMATS)
@@ -194,53 +193,27 @@ def test_the_same_frames_make_the_same_file(tmp_path, format):
         assert written[0] == written[1]
 
 
-def test_writes_beside_the_rendering_and_holds_few_portions(tmp_path, monkeypatch):
-    written = []
+def test_a_portion_is_written_while_the_next_is_rendered():
+    written, given = [], []
     may_write = threading.Event()
 
-    def write(self, frames, count):
+    def write(number):
         may_write.wait(10)
-        written.append(count)
+        written.append(number)
 
-    monkeypatch.setattr(NpzExporter, "_write", write)
-    given = []
+    def give():
+        with written_behind(write) as later:
+            for number in range(4):
+                later(number)
+                given.append(number)
 
-    def give(add):
-        for _ in range(5):
-            add({"bmode": rendered()["bmode"][:1]}, TOLD[:1])
-            given.append(time.monotonic())
-
-    with export_to(tmp_path / "frames.npz", "npz", header(("bmode",))) as add:
-        giving = threading.Thread(target=give, args=(add,))
-        giving.start()
-        giving.join(0.3)
-        assert (len(given), written) == (3, [])  # one is being written, two wait
-        may_write.set()
-        giving.join(10)
-    assert written == [1] * 5
-
-
-def test_what_waits_is_dropped_where_the_rendering_fails(tmp_path, monkeypatch):
-    written = []
-    failed = threading.Event()
-
-    def write(self, frames, count):
-        failed.wait(10)
-        time.sleep(0.1)
-        written.append(count)
-
-    monkeypatch.setattr(NpzExporter, "_write", write)
-
-    def render_on():
-        with export_to(tmp_path / "frames.npz", "npz", header(("bmode",))) as add:
-            for _ in range(3):
-                add({"bmode": rendered()["bmode"][:1]}, TOLD[:1])
-            failed.set()
-            raise ValueError("no")
-
-    with pytest.raises(ValueError, match="no"):
-        render_on()
-    assert written == [1]
+    giving = threading.Thread(target=give)
+    giving.start()
+    giving.join(0.3)
+    assert (given, written) == ([0], [])  # it is being written; the next has to wait
+    may_write.set()
+    giving.join(10)
+    assert written == [0, 1, 2, 3]
 
 
 def test_an_error_of_the_writer_ends_the_rendering(tmp_path, monkeypatch):

@@ -8,8 +8,6 @@ import shutil
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
-from pathlib import Path
 
 import pytest
 import torch
@@ -23,22 +21,20 @@ from ultragray_workers.errors import DatasetNotFound
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.kinds import CompareJob, base
 from ultragray_workers.jobs.progress import JobState
-from ultragray_workers.jobs.record import Job
 from ultragray_workers.jobs.specification import from_dict, to_dict
-from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 
-from ..conftest import RunningWorker, request_of
+from ..conftest import request_of
 
 JOB = CompareJob(dataset="tiny", methods=("median", "nearest"))
 
 
 @pytest.fixture
-def job_run(artifact_folder: Path) -> Callable[..., JobRun]:
+def job_run(artifact_folder):
     """The run of a job."""
     torch.set_num_threads(1)
 
-    def make(job_id: str = "job", should_stop: Callable[[], bool] = lambda: False) -> JobRun:
+    def make(job_id="job", should_stop=lambda: False):
         folder = JobFolder(artifact_folder, job_id)
         folder.path.mkdir(parents=True, exist_ok=True)
         return JobRun(folder, request_of(to_dict(JOB), artifact_folder), should_stop)
@@ -46,7 +42,7 @@ def job_run(artifact_folder: Path) -> Callable[..., JobRun]:
     return make
 
 
-def test_scores_are_those_of_the_library(job_run: Callable[..., JobRun]) -> None:
+def test_scores_are_those_of_the_library(job_run):
     asked = job_run()
     outcome = from_dict(asked.request.specification).run(asked)
     dataset = DatasetStore(asked.folder.artifact_folder).load("tiny")
@@ -63,7 +59,7 @@ def test_scores_are_those_of_the_library(job_run: Callable[..., JobRun]) -> None
     assert (progress.method, progress.method_number, progress.methods) == ("nearest", 2, 2)
 
 
-def test_a_job_that_is_to_stop_goes_on_in_its_retry(job_run: Callable[..., JobRun], artifact_folder: Path) -> None:
+def test_a_job_that_is_to_stop_goes_on_in_its_retry(job_run, artifact_folder):
     first = job_run()
     first.should_stop = lambda: (first.folder.run / "median" / "result.json").exists()
     with pytest.raises(Stopped):
@@ -76,10 +72,8 @@ def test_a_job_that_is_to_stop_goes_on_in_its_retry(job_run: Callable[..., JobRu
     assert (again.folder.run / "median" / "result.json").read_bytes() == kept
 
 
-def test_a_comparison_of_which_every_method_fails_fails(
-    job_run: Callable[..., JobRun], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def fail(*_: object, **__: object) -> None:
+def test_a_comparison_of_which_every_method_fails_fails(job_run, monkeypatch):
+    def fail(*_, **__):
         raise MemoryExceeded("it needs 9 GB")
 
     monkeypatch.setattr(Compounding, "fit", fail)
@@ -88,7 +82,7 @@ def test_a_comparison_of_which_every_method_fails_fails(
         compare_run.run(job_run(), JOB)
 
 
-def test_what_cannot_be_is_refused_at_the_submission(artifact_folder: Path, store: JobStore) -> None:
+def test_what_cannot_be_is_refused_at_the_submission(artifact_folder, store):
     with pytest.raises(InvalidArgument, match="got 'newest'"):
         CompareJob(dataset="tiny", methods=("newest",))
     with pytest.raises(InvalidArgument, match="budget must be"):
@@ -98,7 +92,7 @@ def test_what_cannot_be_is_refused_at_the_submission(artifact_folder: Path, stor
     assert from_dict(to_dict(JOB)) == JOB
 
 
-def test_a_comparison_is_queued_without_torch() -> None:
+def test_a_comparison_is_queued_without_torch():
     program = (
         f"import sys; sys.path[:] = {sys.path!r}; from ultragray_workers.jobs.kinds import CompareJob; "
         "CompareJob(dataset='tiny', methods=('median',)); print('torch' in sys.modules)"
@@ -107,9 +101,7 @@ def test_a_comparison_is_queued_without_torch() -> None:
 
 
 @pytest.mark.long
-def test_killed_comparison_goes_on_and_repeats_no_step(
-    store: JobStore, start_worker: Callable[..., RunningWorker], until: Callable[..., Job]
-) -> None:
+def test_killed_comparison_goes_on_and_repeats_no_step(store, start_worker, until):
     job, _ = store.submit(CompareJob(dataset="tiny", methods=("scene", "nearest")))
     worker = start_worker("one")
     until(job, lambda job: "scene: step" in store.log_tail(job.id))
@@ -123,7 +115,7 @@ def test_killed_comparison_goes_on_and_repeats_no_step(
     assert len(lines) == len({line.partition(" of ")[0] for line in lines}) == 10, lines
 
 
-def test_without_the_studies_a_comparison_is_refused_in_words(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_the_studies_a_comparison_is_refused_in_words(monkeypatch):
     monkeypatch.setattr(base, "entry_points", lambda **_: ())
     surroundings = base.Surroundings(scene=None, free_bytes=None, max_image_side=1024)
     with pytest.raises(ExtraMissing, match="ultragray-studies, which is not installed"):

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,7 +10,6 @@ import torch
 
 from ultragray import ConvexProbe, GaussianScene
 from ultragray.errors import DatasetInvalid
-from ultragray.geometry.probe import Probe
 from ultragray.learn.evaluation.baselines import BASELINES
 from ultragray.learn.evaluation.scoring import evaluate
 from ultragray_workers.datasets.store import DatasetStore
@@ -20,23 +17,22 @@ from ultragray_workers.errors import DatasetNotFound, SceneNotFound
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.kinds import EvaluateJob, evaluate_run
 from ultragray_workers.jobs.progress import JobState
-from ultragray_workers.jobs.record import Job
 from ultragray_workers.jobs.specification import from_dict, to_dict
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 from ultragray_workers.scenes import SceneStore
 
-from ..conftest import PROBE, RunningWorker, request_of, tiny_dataset
+from ..conftest import PROBE, request_of, tiny_dataset
 
 JOB = EvaluateJob("tiny", "one")
 
 
 @pytest.fixture
-def job_run(artifact_folder: Path, random_scene: Callable[..., GaussianScene]) -> Callable[..., JobRun]:
+def job_run(artifact_folder, random_scene):
     """The run of a job whose folder holds its scene."""
     torch.set_num_threads(1)
 
-    def make(job: EvaluateJob = JOB, probe: Probe = PROBE, should_stop: Callable[[], bool] = lambda: False) -> JobRun:
+    def make(job=JOB, probe=PROBE, should_stop=lambda: False):
         folder = JobFolder(artifact_folder, "job")
         folder.path.mkdir(parents=True)
         random_scene(60, info={"probe": probe}).save(folder.path / "one.ugr")
@@ -45,7 +41,7 @@ def job_run(artifact_folder: Path, random_scene: Callable[..., GaussianScene]) -
     return make
 
 
-def test_scores_are_those_of_the_library(job_run: Callable[..., JobRun], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_scores_are_those_of_the_library(job_run, monkeypatch):
     monkeypatch.setattr(evaluate_run, "frames_at_once", lambda height, width: 1)
     asked = job_run()
     outcome = from_dict(asked.request.specification).run(asked)
@@ -60,29 +56,27 @@ def test_scores_are_those_of_the_library(job_run: Callable[..., JobRun], monkeyp
     assert sum(name.startswith("frame_") for name in outcome.artifacts) == len(held_out)
 
 
-def test_baselines_are_scored_beside_it(job_run: Callable[..., JobRun]) -> None:
+def test_baselines_are_scored_beside_it(job_run):
     outcome = evaluate_run.run(job_run(), EvaluateJob("tiny", "one", baselines=True))
     assert {f"{method}_psnr_db" for method in BASELINES} < set(outcome.metrics)
     assert all(np.isfinite(value) for value in outcome.metrics.values())
 
 
-def test_another_kind_of_probe_cannot_be_compared(job_run: Callable[..., JobRun]) -> None:
+def test_another_kind_of_probe_cannot_be_compared(job_run):
     asked = job_run(probe=ConvexProbe(60.0, 10.0, 60.0))
     with pytest.raises(DatasetInvalid, match="trained with a convex one"):
         evaluate_run.run(asked, JOB)
     assert not asked.folder.artifacts.exists()
 
 
-def test_a_job_that_is_to_stop_leaves_nothing(job_run: Callable[..., JobRun]) -> None:
+def test_a_job_that_is_to_stop_leaves_nothing(job_run):
     asked = job_run(should_stop=lambda: True)
     with pytest.raises(Stopped):
         evaluate_run.run(asked, JOB)
     assert not asked.folder.artifacts.exists()
 
 
-def test_the_queue_keeps_its_scene_and_its_dataset(
-    artifact_folder: Path, tmp_path: Path, random_scene: Callable[..., GaussianScene]
-) -> None:
+def test_the_queue_keeps_its_scene_and_its_dataset(artifact_folder, tmp_path, random_scene):
     random_scene(20, info={"probe": PROBE}).save(tmp_path / "one.ugr")
     store = JobStore(artifact_folder, None, scenes=SceneStore(tmp_path))
     job, _ = store.submit(JOB)
@@ -97,13 +91,7 @@ def test_the_queue_keeps_its_scene_and_its_dataset(
 
 
 @pytest.mark.long
-def test_a_worker_does_it(
-    store: JobStore,
-    artifact_folder: Path,
-    start_worker: Callable[..., RunningWorker],
-    until: Callable[..., Job],
-    random_scene: Callable[..., GaussianScene],
-) -> None:
+def test_a_worker_does_it(store, artifact_folder, start_worker, until, random_scene):
     (artifact_folder / "scenes").mkdir()
     random_scene(20, info={"probe": PROBE}).save(artifact_folder / "scenes" / "one.ugr")
     job, _ = store.submit(JOB)

@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -17,7 +15,7 @@ TRAINING[1, 0, 3] = 1000.0
 GIVEN = (np.eye(4) + 7.0 * np.eye(4, k=3))[None]
 
 
-def test_given_poses_and_training_poses_themselves() -> None:
+def test_given_poses_and_training_poses_themselves():
     np.testing.assert_array_equal(RenderJob(scene="one", poses=GIVEN.tolist()).poses_of(TRAINING, PROBE), GIVEN)
     job = RenderJob(scene="one", sampler=TrainingSampler())
     np.testing.assert_array_equal(job.poses_of(TRAINING, PROBE), TRAINING)
@@ -25,7 +23,7 @@ def test_given_poses_and_training_poses_themselves() -> None:
         job.poses_of(TRAINING[:0], PROBE)
 
 
-def test_a_sampler_makes_its_poses_of_given_ones_or_of_training_poses() -> None:
+def test_a_sampler_makes_its_poses_of_given_ones_or_of_training_poses():
     sampler = AroundSampler(20, seed=3)
     around = RenderJob(scene="one", sampler=sampler).poses_of(TRAINING, PROBE)
     np.testing.assert_array_equal(around, sampler.poses(TRAINING, PROBE))
@@ -33,12 +31,12 @@ def test_a_sampler_makes_its_poses_of_given_ones_or_of_training_poses() -> None:
     np.testing.assert_array_equal(fan[:, :3, 3], np.tile(GIVEN[:, :3, 3], (3, 1)))
 
 
-def told(poses: Any) -> list[Extrapolation]:  # [C, 4, 4] -> [C]
+def told(poses):  # [C, 4, 4] -> [C]
     """Sure of poses up to x = 10 mm."""
     return [Extrapolation(1.0, 2.0, 0.9 if pose[0, 3] <= 10 else 0.2, None) for pose in poses]
 
 
-def test_given_poses_must_be_confident_and_samplers_keep_to_those_that_are() -> None:
+def test_given_poses_must_be_confident_and_samplers_keep_to_those_that_are():
     poses, extrapolations = RenderJob(scene="one", poses=TRAINING).assessed_poses(TRAINING, PROBE, told)
     np.testing.assert_array_equal(poses, TRAINING)
     assert [one.confidence for one in extrapolations] == [0.9, 0.2]

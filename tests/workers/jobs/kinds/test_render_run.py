@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pydicom
@@ -42,22 +40,16 @@ OF_SUPPORT = ConfidenceModel(
 
 
 @pytest.fixture(autouse=True)
-def one_thread() -> None:
+def one_thread():
     torch.set_num_threads(1)
 
 
 @pytest.fixture
-def work(tmp_path: Path, random_scene: Callable[..., GaussianScene]) -> Callable[..., JobRun]:
+def work(tmp_path, random_scene):
     """The work of a job whose folder holds its scene."""
     info = {"probe": PROBE, "image_height": 24, "image_width": 20}
 
-    def make(
-        job: RenderJob,
-        *,
-        should_stop: Callable[[], bool] = lambda: False,
-        max_footprint_pixels: int | None = None,
-        **changes: object,
-    ) -> JobRun:
+    def make(job, *, should_stop=lambda: False, max_footprint_pixels=None, **changes):
         folder = JobFolder(tmp_path, "job")
         folder.path.mkdir(parents=True)
         made = random_scene(60, info=info | changes)
@@ -70,7 +62,7 @@ def work(tmp_path: Path, random_scene: Callable[..., GaussianScene]) -> Callable
     return make
 
 
-def test_poses_of_the_sampler_are_rendered_and_in_the_archive(work: Callable[..., JobRun]) -> None:
+def test_poses_of_the_sampler_are_rendered_and_in_the_archive(work):
     job = RenderJob(scene="one", sampler=CoveredSampler(50, seed=2), outputs=("bmode", "coverage"), dtype="uint8")
     asked = work(job)
     assert render_run.run(asked, job).artifacts == ("frames.npz",)
@@ -84,7 +76,7 @@ def test_poses_of_the_sampler_are_rendered_and_in_the_archive(work: Callable[...
             np.testing.assert_array_equal(archive[name], np.rint(getattr(frames, name).numpy() * 255))
 
 
-def test_tools_are_in_the_frames_with_their_labels(work: Callable[..., JobRun]) -> None:
+def test_tools_are_in_the_frames_with_their_labels(work):
     tools = (
         Needle(tip_mm=(5.0, 0.0, 25.0), hub_mm=(-12.0, 0.0, 8.0), frame=ToolFrame.PROBE, label=7),
         Cylinder(tip_mm=(8.0, -9.0, 30.0), hub_mm=(8.0, 9.0, 30.0), diameter_mm=4.0),
@@ -103,7 +95,7 @@ def test_tools_are_in_the_frames_with_their_labels(work: Callable[..., JobRun]) 
         assert float(archive["ghost"]) == 0.5
 
 
-def test_dicom_of_given_poses_in_a_fan(work: Callable[..., JobRun]) -> None:
+def test_dicom_of_given_poses_in_a_fan(work):
     job = RenderJob(
         scene="one", poses=TRAINING[:2].tolist(), sampler=FanSampler(5, 5), format="dicom", height=16, width=12
     )
@@ -115,7 +107,7 @@ def test_dicom_of_given_poses_in_a_fan(work: Callable[..., JobRun]) -> None:
     np.testing.assert_array_equal(poses, FanSampler(5, 5).poses(TRAINING[:2], PROBE))
 
 
-def test_plus_sequence_of_the_spline(work: Callable[..., JobRun]) -> None:
+def test_plus_sequence_of_the_spline(work):
     job = RenderJob(scene="one", sampler=SplineSampler(spacing_mm=0.5), format="plus")
     asked = work(job)
     assert render_run.run(asked, job).artifacts == ("frames.igs.mha",)
@@ -124,7 +116,7 @@ def test_plus_sequence_of_the_spline(work: Callable[..., JobRun]) -> None:
     np.testing.assert_allclose(sweep.poses[:, 1, 3], np.arange(11) / 2, atol=1e-9)
 
 
-def test_messages_of_ros_whose_poses_are_read_back(work: Callable[..., JobRun]) -> None:
+def test_messages_of_ros_whose_poses_are_read_back(work):
     job = RenderJob(scene="one", sampler=SplineSampler(spacing_mm=0.5), format="mcap")
     asked = work(job)
     assert render_run.run(asked, job).artifacts == ("frames.mcap",)
@@ -132,7 +124,7 @@ def test_messages_of_ros_whose_poses_are_read_back(work: Callable[..., JobRun]) 
     np.testing.assert_allclose(poses, SplineSampler(spacing_mm=0.5).poses(TRAINING, PROBE), atol=1e-9)
 
 
-def test_figures_of_each_frame_are_in_the_archive(work: Callable[..., JobRun], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_figures_of_each_frame_are_in_the_archive(work, monkeypatch):
     job = RenderJob(scene="one", sampler=AroundSampler(40, translation_mm=8.0), min_confidence=0.6, outputs=("echo",))
     asked = work(job, confidence=OF_SUPPORT)
     monkeypatch.setattr(rendering, "frames_at_once", lambda height, width: 7)
@@ -142,7 +134,6 @@ def test_figures_of_each_frame_are_in_the_archive(work: Callable[..., JobRun], m
     with np.load(asked.folder.artifacts / "frames.npz") as archive:
         poses = archive["poses"]
         coverage = render(scene, None, poses, height=24, width=20, outputs=("coverage",)).coverage
-        assert coverage is not None
         told = Assessor(scene.info, TRAINING).assess(poses, coverage=coverage.numpy())
         for name, figures in figure_arrays(told).items():
             np.testing.assert_allclose(archive[name], figures, rtol=1e-6)
@@ -152,7 +143,7 @@ def test_figures_of_each_frame_are_in_the_archive(work: Callable[..., JobRun], m
         assert "coverage" not in archive
 
 
-def test_a_pose_below_the_limit_ends_the_job_before_it_renders(work: Callable[..., JobRun]) -> None:
+def test_a_pose_below_the_limit_ends_the_job_before_it_renders(work):
     far = TRAINING.copy()
     far[4, 1, 3] = 40.0
     job = RenderJob(scene="one", poses=far, min_confidence=0.5)
@@ -162,7 +153,7 @@ def test_a_pose_below_the_limit_ends_the_job_before_it_renders(work: Callable[..
     assert not asked.folder.artifacts.exists()
 
 
-def test_a_long_search_stops_with_its_job(work: Callable[..., JobRun], monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_long_search_stops_with_its_job(work, monkeypatch):
     stops = iter([False, False, True])
     monkeypatch.setattr(render_run, "ASSESSED_AT_ONCE", 60)
     job = RenderJob(scene="one", sampler=AroundSampler(1000), min_confidence=0.99)
@@ -170,7 +161,7 @@ def test_a_long_search_stops_with_its_job(work: Callable[..., JobRun], monkeypat
         render_run.run(work(job, should_stop=lambda: next(stops), confidence=MODEL), job)
 
 
-def test_nothing_is_left_of_a_job_that_stops(work: Callable[..., JobRun]) -> None:
+def test_nothing_is_left_of_a_job_that_stops(work):
     stops = iter([False, True])
     job = RenderJob(scene="one", sampler=SplineSampler(count=100), height=256, width=256)
     asked = work(job, should_stop=lambda: next(stops))
@@ -179,21 +170,19 @@ def test_nothing_is_left_of_a_job_that_stops(work: Callable[..., JobRun]) -> Non
     assert [path.name for path in asked.folder.path.iterdir() if path.name != "progress.json"] == ["one.ugr"]
 
 
-def test_a_sampler_that_cannot_use_the_poses(work: Callable[..., JobRun]) -> None:
+def test_a_sampler_that_cannot_use_the_poses(work):
     job = RenderJob(scene="one", poses=TRAINING[:1].tolist(), sampler=SplineSampler(count=5))
     with pytest.raises(InvalidArgument, match="two different base poses"):
         render_run.run(work(job), job)
 
 
-def test_a_scene_without_a_probe(work: Callable[..., JobRun]) -> None:
+def test_a_scene_without_a_probe(work):
     job = RenderJob(scene="one", sampler=TrainingSampler())
     with pytest.raises(InvalidProbe):
         render_run.run(work(job, probe=None), job)
 
 
-def test_a_missing_package_is_told_before_anything_is_rendered(
-    work: Callable[..., JobRun], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_missing_package_is_told_before_anything_is_rendered(work, monkeypatch):
     monkeypatch.setitem(sys.modules, "h5py", None)
     monkeypatch.delitem(sys.modules, "ultragray.exchange.exports.hdf5", raising=False)
     job = RenderJob(scene="one", sampler=TrainingSampler(), format="hdf5")
@@ -201,7 +190,7 @@ def test_a_missing_package_is_told_before_anything_is_rendered(
         render_run.run(work(job), job)
 
 
-def test_frames_are_shown_as_asked_and_the_archive_says_where_their_pixels_lie(work: Callable[..., JobRun]) -> None:
+def test_frames_are_shown_as_asked_and_the_archive_says_where_their_pixels_lie(work):
     probe, display = ConvexProbe(50.0, 20.0, 60.0), Display(gain_db=2.0, depth_mm=30.0, pixel_mm=0.8, flip=True)
     job = RenderJob(scene="one", sampler=TrainingSampler(), probe=probe, display=display)
     asked = work(job)
@@ -218,7 +207,7 @@ def test_frames_are_shown_as_asked_and_the_archive_says_where_their_pixels_lie(w
         np.testing.assert_allclose(archive["bmode"], show(rendered, probe, display)["bmode"].numpy(), atol=1e-6)
 
 
-def test_frames_are_as_thick_as_asked_and_the_archive_says_so(work: Callable[..., JobRun]) -> None:
+def test_frames_are_as_thick_as_asked_and_the_archive_says_so(work):
     job = RenderJob(scene="one", sampler=TrainingSampler(), slice_thickness_mm=5.0)
     asked = work(job)
     render_run.run(asked, job)
@@ -229,7 +218,7 @@ def test_frames_are_as_thick_as_asked_and_the_archive_says_so(work: Callable[...
         assert float(archive["slice_thickness_mm"]) == 5.0
 
 
-def test_frames_below_the_limit_are_masked_instead_of_refused(work: Callable[..., JobRun]) -> None:
+def test_frames_below_the_limit_are_masked_instead_of_refused(work):
     far = TRAINING.copy()
     far[4, 1, 3] = 40.0
     job = RenderJob(
@@ -242,7 +231,7 @@ def test_frames_below_the_limit_are_masked_instead_of_refused(work: Callable[...
         assert (archive["bmode"][4] > 0).sum() < (archive["bmode"][0] > 0).sum()
 
 
-def test_a_frame_that_costs_more_than_the_limit_fails_the_job_and_is_named(work: Callable[..., JobRun]) -> None:
+def test_a_frame_that_costs_more_than_the_limit_fails_the_job_and_is_named(work):
     job = RenderJob(scene="one", poses=TRAINING[:2].tolist(), height=16, width=12)
     asked = work(job, max_footprint_pixels=1)
     with pytest.raises(FrameTooCostly, match="ask for fewer pixels") as refused:

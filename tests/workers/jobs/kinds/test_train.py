@@ -1,7 +1,5 @@
 from __future__ import annotations
 
-from pathlib import Path
-
 import pytest
 
 from ultragray.errors import InvalidArgument
@@ -10,10 +8,10 @@ from ultragray_workers.jobs.kinds.base import Surroundings
 
 
 @pytest.mark.long
-def test_a_training_may_not_have_more_memory_than_the_host(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_training_may_not_have_more_memory_than_the_host(tmp_path, monkeypatch):
     monkeypatch.setattr(train, "memory_bytes", lambda: 8 << 30)
 
-    def check(device: str, memory_gb: float | None) -> None:
+    def check(device, memory_gb):
         TrainJob("liver", "new", settings={"memory_gb": memory_gb}, device=device).check(
             Surroundings(None, tmp_path, 512)
         )

@@ -6,8 +6,6 @@ import hashlib
 import io
 import json
 import tarfile
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,34 +18,30 @@ from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.info import read_header
 from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.progress import JobState
-from ultragray_workers.jobs.record import Job
-from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.tables import JOBS, SHARDS
 
-from ..conftest import RunningWorker, path_of, train_job
+from ..conftest import path_of, train_job
 
-StartWorker = Callable[..., RunningWorker]
-Until = Callable[..., Job]
 SEED = 11
 
 
 @pytest.fixture
-def scene(artifact_folder: Path) -> Path:
+def scene(artifact_folder):
     path = artifact_folder / "scenes" / "spine.ugr"
     path.parent.mkdir()
     copy_demo_scene(path)
     return path
 
 
-def batch(count: int, shard_frames: int | None, **settings: object) -> RenderJob:
+def batch(count, shard_frames, **settings):
     size = {"height": 16, "width": 12} | settings
     return RenderJob(scene="spine", sampler=AroundSampler(count, seed=SEED), shard_frames=shard_frames, **size)
 
 
-def pixels_of(store: JobStore, job: Job) -> dict[str, bytes]:
+def pixels_of(store, job):
     """The pixels of each frame by its key, of all shards; each key once."""
     manifest = json.loads(path_of(store.artifact(job.id, "manifest.json")).read_text())
-    found: dict[str, bytes] = {}
+    found = {}
     for shard in manifest["shards"]:
         path = path_of(store.artifact(job.id, shard["file"]))
         assert path.stat().st_size == shard["bytes"]
@@ -58,19 +52,16 @@ def pixels_of(store: JobStore, job: Job) -> dict[str, bytes]:
                 if suffix == "bmode.npy":
                     assert key not in found
                     member = tar.extractfile(name)
-                    assert member is not None
                     found[key] = np.load(io.BytesIO(member.read())).tobytes()
     return found
 
 
-def is_under_way(job: Job) -> bool:
+def is_under_way(job):
     return (job.progress.frames_done or 0) > 0
 
 
 @pytest.mark.long
-def test_a_batch_goes_on_without_the_workers_that_die_and_has_each_frame_once(
-    store: JobStore, scene: Path, start_worker: StartWorker, until: Until
-) -> None:
+def test_a_batch_goes_on_without_the_workers_that_die_and_has_each_frame_once(store, scene, start_worker, until):
     count = 5_100
     job, _ = store.submit(batch(count, 250))
     workers = {name: start_worker(name, host=name) for name in ("one", "two")}
@@ -104,8 +95,8 @@ def test_a_batch_goes_on_without_the_workers_that_die_and_has_each_frame_once(
 
 @pytest.mark.long
 def test_a_shard_that_cannot_be_made_fails_the_job_which_names_it_and_a_retry_goes_on(
-    store: JobStore, scene: Path, start_worker: StartWorker, until: Until
-) -> None:
+    store, scene, start_worker, until
+):
     poses = np.tile(read_header(scene).training_poses, (6, 1, 1))  # too many to look at each when they are submitted
     poses[1000, :3, 3] += 500.0
     job = RenderJob(scene="spine", poses=poses, shard_frames=300, height=16, width=12, min_confidence=0.5)
@@ -125,9 +116,7 @@ def test_a_shard_that_cannot_be_made_fails_the_job_which_names_it_and_a_retry_go
 
 
 @pytest.mark.long
-def test_cancelling_ends_the_batch_and_its_shares(
-    store: JobStore, scene: Path, start_worker: StartWorker, until: Until
-) -> None:
+def test_cancelling_ends_the_batch_and_its_shares(store, scene, start_worker, until):
     job, _ = store.submit(batch(3_000_000, None))
     assert job.specification["format"] == "tar"
     workers = [start_worker(name, host=name) for name in ("one", "two")]
@@ -142,9 +131,7 @@ def test_cancelling_ends_the_batch_and_its_shares(
 
 
 @pytest.mark.long
-def test_a_share_leaves_its_worker_to_other_jobs(
-    store: JobStore, scene: Path, start_worker: StartWorker, until: Until
-) -> None:
+def test_a_share_leaves_its_worker_to_other_jobs(store, scene, start_worker, until):
     job, _ = store.submit(batch(500_000, 50))
     workers = [start_worker(name, host=name, longest_share_s=0.5) for name in ("one", "two")]
     until(job, lambda _: all(worker.job_process() for worker in workers))

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import pytest
@@ -16,20 +15,14 @@ from ultragray.installation import memory_bytes
 from ultragray_workers.errors import StartupFailed
 from ultragray_workers.jobs.demand import WorkerDevice
 from ultragray_workers.jobs.progress import JobState
-from ultragray_workers.jobs.record import Job
-from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.worker.device import DeviceLock, HostDevice, devices_of, lock_path
 from ultragray_workers.jobs.worker.process import holder_of
 
-from ....postgres import PostgresServer
 from ....waiting import wait_until
-from ..conftest import RunningWorker, train_job
-
-StartWorker = Callable[..., RunningWorker]
-Until = Callable[..., Job]
+from ..conftest import train_job
 
 
-def device(name: str, lock_name: str) -> HostDevice:
+def device(name, lock_name):
     return HostDevice(WorkerDevice(name=name, model="a model", memory_bytes=8 * 10**9), lock_name)
 
 
@@ -37,24 +30,23 @@ CPU = device("cpu", "cpu")
 
 
 @pytest.fixture
-def database_url(request: pytest.FixtureRequest) -> str | None:
+def database_url(request):
     if getattr(request, "param", "sqlite") == "sqlite":
         return None
-    server: PostgresServer = request.getfixturevalue("postgres")
+    server = request.getfixturevalue("postgres")
     return server.create_database()
 
 
-def is_training(job: Job) -> bool:
+def is_training(job):
     return job.state is JobState.RUNNING and (job.progress.step or 0) > 0
 
 
-def test_lock_is_of_one_worker_until_both_it_and_its_process_let_go(tmp_path: Path) -> None:
+def test_lock_is_of_one_worker_until_both_it_and_its_process_let_go(tmp_path):
     mine, other = DeviceLock(tmp_path, CPU, "mine"), DeviceLock(tmp_path, CPU, "other")
     assert mine.take()
     assert mine.take()
     assert not other.take()
     holder = holder_of(mine.path)
-    assert holder is not None
     assert holder[1] == "mine"
     process = subprocess.Popen([sys.executable, "-c", "input()"], stdin=subprocess.PIPE, pass_fds=[mine.fileno()])
     mine.release()
@@ -65,13 +57,13 @@ def test_lock_is_of_one_worker_until_both_it_and_its_process_let_go(tmp_path: Pa
     other.release()
 
 
-def test_every_device_has_a_lock_of_its_own(tmp_path: Path) -> None:
+def test_every_device_has_a_lock_of_its_own(tmp_path):
     assert [one.lock_name for one in devices_of("cpu")] == ["cpu"]
     devices = [CPU, device("cuda:0", "gpu-1"), device("cuda:1", "gpu-2")]
     assert len({lock_path(tmp_path, one) for one in devices}) == 3
 
 
-def test_the_processor_is_offered_with_the_cores_and_the_memory_of_the_host() -> None:
+def test_the_processor_is_offered_with_the_cores_and_the_memory_of_the_host():
     (processor,) = devices_of("cpu")
     assert processor.offered.name == "cpu"
     assert processor.offered.cores == len(os.sched_getaffinity(0))
@@ -79,16 +71,14 @@ def test_the_processor_is_offered_with_the_cores_and_the_memory_of_the_host() ->
 
 
 @pytest.mark.parametrize("asked", ["cuda:99", "tpu"])
-def test_a_worker_does_not_start_for_a_device_that_its_host_does_not_have(asked: str) -> None:
+def test_a_worker_does_not_start_for_a_device_that_its_host_does_not_have(asked):
     with pytest.raises(StartupFailed, match=r"device must be .*got '(cuda:99|tpu)'") as caught:
         devices_of(asked)
     assert caught.value.field == "device"
 
 
 @pytest.mark.long
-def test_who_waits_for_a_device_takes_no_job_and_another_host_does(
-    store: JobStore, start_worker: StartWorker, until: Until
-) -> None:
+def test_who_waits_for_a_device_takes_no_job_and_another_host_does(store, start_worker, until):
     """Three workers of one host, whose device is in use, and later one of another: of four jobs, it does the rest."""
     for name in ("one", "two", "three"):
         start_worker(name)
@@ -107,26 +97,7 @@ def test_who_waits_for_a_device_takes_no_job_and_another_host_does(
 
 
 @pytest.mark.long
-def test_a_job_that_asks_for_a_device_in_use_waits_in_the_queue(
-    store: JobStore, artifact_folder: Path, start_worker: StartWorker, until: Until
-) -> None:
-    """Nobody loses an attempt."""
-    held = DeviceLock(artifact_folder.resolve(), CPU, "somebody")
-    assert held.take()
-    start_worker("one")
-    job, _ = store.submit(train_job("one"))
-    time.sleep(3.0)
-    job = store.get(job.id)
-    assert (job.state, job.attempts) == (JobState.QUEUED, 0), job
-    held.release()
-    job = until(job)
-    assert (job.state, job.attempts) == (JobState.SUCCEEDED, 1), job
-
-
-@pytest.mark.long
-def test_a_stopped_worker_loses_its_job_and_its_device(
-    store: JobStore, start_worker: StartWorker, until: Until
-) -> None:
+def test_a_stopped_worker_loses_its_job_and_its_device(store, start_worker, until):
     one = start_worker("one")
     job, _ = store.submit(train_job("one", steps=600))
     until(job, is_training)
@@ -141,9 +112,7 @@ def test_a_stopped_worker_loses_its_job_and_its_device(
 
 @pytest.mark.long
 @pytest.mark.parametrize("database_url", ["postgresql"], indirect=True)
-def test_a_worker_that_comes_back_after_its_job_was_taken_over_leaves_it_alone(
-    store: JobStore, start_worker: StartWorker, until: Until
-) -> None:
+def test_a_worker_that_comes_back_after_its_job_was_taken_over_leaves_it_alone(store, start_worker, until):
     """A worker of another host, which nobody can end; its process has gone on all the time.
 
     A SQLite file might be locked by who is stopped, until that one goes on.

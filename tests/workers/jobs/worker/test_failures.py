@@ -8,7 +8,6 @@ import shutil
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -18,16 +17,11 @@ import pytest
 from ultragray.phantom.demo import copy_demo_scene
 from ultragray_workers.errors import StorageFull
 from ultragray_workers.jobs.kinds import RenderJob
-from ultragray_workers.jobs.kinds.render import Poses
 from ultragray_workers.jobs.progress import JobState
-from ultragray_workers.jobs.record import Job
 from ultragray_workers.jobs.store import JobStore
 
 from ....waiting import Deadline, at_this_load
-from ..conftest import FINAL, RunningWorker, store_dataset, train_job
-
-StartWorker = Callable[..., RunningWorker]
-Until = Callable[..., Job]
+from ..conftest import FINAL, store_dataset, train_job
 
 DISK_BYTES = 8 * 2**20
 # The loss of trainings with batches of three is NaN from the third step on.
@@ -43,15 +37,15 @@ if "ultragray_workers.jobs.worker.run_job" in sys.orig_argv:
 """
 
 
-def poses(count: int) -> Poses:
+def poses(count):
     return np.tile(np.eye(4), (count, 1, 1)).tolist()  # type: ignore[no-any-return]
 
 
-def is_training(job: Job) -> bool:
+def is_training(job):
     return job.state is JobState.RUNNING and (job.progress.step or 0) > 0
 
 
-def process_of(worker: RunningWorker, *, not_: int | None = None, timeout_s: float = 60.0) -> int:
+def process_of(worker, *, not_=None, timeout_s=60.0):
     """The process of the worker's job, once there is one."""
     end = Deadline(timeout_s)
     while (process := worker.job_process()) in (None, not_):
@@ -61,7 +55,7 @@ def process_of(worker: RunningWorker, *, not_: int | None = None, timeout_s: flo
     return process
 
 
-def assert_failed(job: Job, error: str, *told: str) -> None:
+def assert_failed(job, error, *told):
     assert (job.state, job.error) == (JobState.FAILED, error), job
     assert job.reason is not None
     assert "\n" not in job.reason
@@ -70,14 +64,7 @@ def assert_failed(job: Job, error: str, *told: str) -> None:
 
 
 @pytest.mark.long
-def test_poisoned_datasets_and_diverging_trainings(
-    store: JobStore,
-    artifact_folder: Path,
-    tmp_path: Path,
-    start_worker: StartWorker,
-    until: Until,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_poisoned_datasets_and_diverging_trainings(store, artifact_folder, tmp_path, start_worker, until, monkeypatch):
     images = store_dataset(artifact_folder, "images") / "files" / "images_train.npy"
     frames = np.load(images) / 255.0
     frames[2, 3, 4] = np.nan
@@ -102,8 +89,8 @@ def test_poisoned_datasets_and_diverging_trainings(
 
 @pytest.mark.long
 def test_dataset_deleted_while_it_is_trained_from_and_the_next_job_starts_within_a_second_of_a_cancel(
-    store: JobStore, artifact_folder: Path, start_worker: StartWorker, until: Until
-) -> None:
+    store, artifact_folder, start_worker, until
+):
     worker = start_worker()
     store_dataset(artifact_folder, "gone")
     job, _ = store.submit(train_job("one", dataset="gone", steps=1_000_000))
@@ -125,7 +112,7 @@ def test_dataset_deleted_while_it_is_trained_from_and_the_next_job_starts_within
 
 
 @pytest.fixture
-def small_disk(artifact_folder: Path) -> Iterator[Path]:
+def small_disk(artifact_folder):
     """The artifact folder is a file system of its own, which anybody can fill."""
     mounted = subprocess.run(
         ["mount", "-t", "tmpfs", "-o", f"size={DISK_BYTES}", "tmpfs", artifact_folder], capture_output=True, text=True
@@ -138,10 +125,10 @@ def small_disk(artifact_folder: Path) -> Iterator[Path]:
 
 
 @pytest.mark.long
-def test_full_disk(small_disk: Path, tmp_path: Path, start_worker: StartWorker) -> None:
+def test_full_disk(small_disk, tmp_path, start_worker):
     store = JobStore(small_disk, None)
 
-    def until(job: Job, reached: Callable[[Job], bool] = lambda job: job.state in FINAL) -> Job:
+    def until(job, reached=lambda job: job.state in FINAL):
         end = Deadline(60)
         while not reached(job):
             assert not end.passed, (job, store.log_tail(job.id), (tmp_path / "one.log").read_text())
@@ -174,9 +161,7 @@ def test_full_disk(small_disk: Path, tmp_path: Path, start_worker: StartWorker) 
 
 
 @pytest.mark.long
-def test_memory_that_does_not_suffice(
-    store: JobStore, artifact_folder: Path, start_worker: StartWorker, until: Until
-) -> None:
+def test_memory_that_does_not_suffice(store, artifact_folder, start_worker, until):
     (artifact_folder / "scenes").mkdir()
     copy_demo_scene(artifact_folder / "scenes" / "demo.ugr")
     worker = start_worker()
@@ -189,7 +174,7 @@ def test_memory_that_does_not_suffice(
 
     with memory_group() as group:
         job, _ = store.submit(train_job("one", steps=1_000_000))
-        killed: set[int] = set()
+        killed = set()
         while store.get(job.id).state in (JobState.QUEUED, JobState.RUNNING):
             process = worker.job_process() or 0
             if process and process not in killed:
@@ -202,7 +187,7 @@ def test_memory_that_does_not_suffice(
 
 
 @contextmanager
-def memory_group() -> Iterator[Path]:
+def memory_group():
     """A control group in which the kernel kills what takes more than 24 MiB; skips where none can be made."""
     version_1 = Path("/sys/fs/cgroup/memory")
     parent, limit = (version_1, "limit_in_bytes") if version_1.is_dir() else (version_1.parent, "max")

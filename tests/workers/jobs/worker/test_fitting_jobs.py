@@ -2,48 +2,36 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import pytest
 
 from ultragray.installation import memory_bytes
-from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.demand import Demand, WorkerDevice
 from ultragray_workers.jobs.progress import JobState
 from ultragray_workers.jobs.queue import demands_waiting
-from ultragray_workers.jobs.record import Job
-from ultragray_workers.jobs.store import JobStore
-from ultragray_workers.jobs.worker.device import DeviceLock, HostDevice
-from ultragray_workers.jobs.worker.gate import Gate
+from ultragray_workers.jobs.worker.device import DeviceLock, Gate, HostDevice
 
-from ....postgres import NewDatabase
 from ....waiting import wait_until
-from ..conftest import RunningWorker, train_job
-
-StartWorker = Callable[..., RunningWorker]
-Until = Callable[..., Job]
+from ..conftest import train_job
 
 
 @pytest.fixture
-def database_url(new_database: NewDatabase) -> str | None:
+def database_url(new_database):
     return new_database()
 
 
-def submit(store: JobStore, scene: str, *, device: str = "cpu", memory_gb: int | None = None, **labels: str) -> Job:
+def submit(store, scene, *, device="cpu", memory_gb=None, **labels):
     asked = {"device": device, "min_memory_gb": memory_gb, "worker_labels": labels}
     return store.submit(replace(train_job(scene), **asked))[0]
 
 
-def is_there(store: JobStore, worker: str) -> Callable[[], bool]:
+def is_there(store, worker):
     return lambda: worker in {one.name for one in store.workers()}
 
 
 @pytest.mark.long
-def test_each_job_goes_to_a_worker_that_fits_it_and_holds_nobody_up(
-    store: JobStore, start_worker: StartWorker, until: Until
-) -> None:
+def test_each_job_goes_to_a_worker_that_fits_it_and_holds_nobody_up(store, start_worker, until):
     """Jobs that nobody can take are first in the queue; those behind them are done in their order, by who fits."""
     too_large = submit(store, "too-large", memory_gb=memory_bytes() // 10**9 + 1)
     for_gpu = submit(store, "for-gpu", device="cuda")
@@ -68,9 +56,7 @@ def test_each_job_goes_to_a_worker_that_fits_it_and_holds_nobody_up(
 
 
 @pytest.mark.long
-def test_a_job_that_nobody_can_take_says_so_and_starts_when_a_fitting_worker_comes(
-    store: JobStore, start_worker: StartWorker, until: Until
-) -> None:
+def test_a_job_that_nobody_can_take_says_so_and_starts_when_a_fitting_worker_comes(store, start_worker, until):
     job = submit(store, "made", site="lab2")
     asked = "a worker with the device cpu and the label site=lab2"
     assert job.progress.waits_for == f"{asked}: none is running"
@@ -97,7 +83,7 @@ def test_a_job_that_nobody_can_take_says_so_and_starts_when_a_fitting_worker_com
 
 
 @pytest.mark.long
-def test_workers_tell_their_devices_and_labels(store: JobStore, start_worker: StartWorker) -> None:
+def test_workers_tell_their_devices_and_labels(store, start_worker):
     start_worker("one", labels={"site": "lab1"})
     wait_until(is_there(store, "one"))
     (worker,) = store.workers()
@@ -109,10 +95,10 @@ def test_workers_tell_their_devices_and_labels(store: JobStore, start_worker: St
 
 
 @pytest.fixture
-def workstation(jobs: JobDatabase, artifact_folder: Path) -> Callable[[str], Gate]:
+def workstation(jobs, artifact_folder):
     """The gate of a worker, in this process, on a host with two GPUs and a processor."""
 
-    def make(name: str) -> Gate:
+    def make(name):
         names = ("cuda:0", "cuda:1", "cpu")
         devices = [WorkerDevice(name=one, model="a model", memory_bytes=8 * 10**9) for one in names]
         locks = [DeviceLock(artifact_folder, HostDevice(one, one.name), name) for one in devices]
@@ -121,9 +107,7 @@ def workstation(jobs: JobDatabase, artifact_folder: Path) -> Callable[[str], Gat
     return make
 
 
-def test_a_worker_of_several_devices_holds_one_that_fits_and_leaves_the_others(
-    store: JobStore, workstation: Callable[[str], Gate]
-) -> None:
+def test_a_worker_of_several_devices_holds_one_that_fits_and_leaves_the_others(store, workstation):
     one, two = workstation("one"), workstation("two")
     assert one.opens() == []  # no job waits
     job = submit(store, "gpu", device="auto")
@@ -131,7 +115,6 @@ def test_a_worker_of_several_devices_holds_one_that_fits_and_leaves_the_others(
     assert two.opens() == []  # `one` holds all of them until it knows the job
     demand = Demand.of(job.specification)
     held = one.hold(demand)
-    assert held is not None
     assert held.device.name == "cuda:0"
     assert two.opens() == [key]
     assert two.hold(demand) is not None
@@ -146,9 +129,7 @@ def test_a_worker_of_several_devices_holds_one_that_fits_and_leaves_the_others(
         gate.close()
 
 
-def test_a_worker_that_rests_or_fits_nothing_does_not_hold_its_devices(
-    store: JobStore, workstation: Callable[[str], Gate]
-) -> None:
+def test_a_worker_that_rests_or_fits_nothing_does_not_hold_its_devices(store, workstation):
     submit(store, "elsewhere", site="lab1")
     one, two = workstation("one"), workstation("two")
     assert one.opens() == []

@@ -6,8 +6,6 @@ import os
 import signal
 import subprocess
 import sys
-from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,42 +14,35 @@ from ultragray.phantom.demo import copy_demo_scene
 from ultragray_workers.errors import WorkerNotFound
 from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.progress import JobState
-from ultragray_workers.jobs.record import Job
-from ultragray_workers.jobs.store import JobStore
-from ultragray_workers.jobs.workers import Wanted, Worker, WorkerState
+from ultragray_workers.jobs.workers import Wanted, WorkerState
 
 from ....waiting import wait_until
-from ..conftest import RunningWorker, train_job
-
-StartWorker = Callable[..., RunningWorker]
-Until = Callable[..., Job]
-COMMAND = [sys.executable, "-c", "from ultragray_service.cli.app import app; app()", "workers"]
+from ..conftest import train_job
 
 
-def worker_of(store: JobStore, name: str) -> Worker | None:
+def worker_of(store, name):
     return next((worker for worker in store.workers() if worker.name == name), None)
 
 
-def reaches(store: JobStore, name: str, state: WorkerState) -> None:
+def reaches(store, name, state):
     wait_until(lambda: (worker := worker_of(store, name)) is not None and worker.state is state)
 
 
-def is_under_way(job: Job) -> bool:
+def is_under_way(job):
     return (job.progress.step or 0) > 0
 
 
-def render_job(frames: int) -> RenderJob:
+def render_job(frames):
     return RenderJob(scene="demo", poses=np.tile(np.eye(4), (frames, 1, 1)), height=64, width=64)
 
 
 @pytest.mark.long
-def test_worker_tells_who_it_is_and_what_it_does(store: JobStore, start_worker: StartWorker, until: Until) -> None:
+def test_worker_tells_who_it_is_and_what_it_does(store, start_worker, until):
     running = start_worker()
     reaches(store, "one", WorkerState.IDLE)
     job = until(store.submit(train_job("made", steps=1_000_000))[0], is_under_way)
     reaches(store, "one", WorkerState.WORKING)
     worker = worker_of(store, "one")
-    assert worker is not None
     assert (worker.pid, worker.device, worker.job) == (running.process.pid, "cpu", job.id)
     assert worker.version
     assert worker.started_at
@@ -63,9 +54,7 @@ def test_worker_tells_who_it_is_and_what_it_does(store: JobStore, start_worker: 
 
 
 @pytest.mark.long
-def test_paused_worker_ends_its_job_and_takes_no_other_until_it_is_resumed(
-    store: JobStore, start_worker: StartWorker, until: Until
-) -> None:
+def test_paused_worker_ends_its_job_and_takes_no_other_until_it_is_resumed(store, start_worker, until):
     running = start_worker()
     first = until(store.submit(train_job("first", steps=150))[0], is_under_way)
     assert store.want("one", Wanted.PAUSE).state is WorkerState.PAUSING
@@ -82,9 +71,7 @@ def test_paused_worker_ends_its_job_and_takes_no_other_until_it_is_resumed(
 
 
 @pytest.mark.long
-def test_training_of_a_drained_worker_goes_on_at_another(
-    store: JobStore, start_worker: StartWorker, until: Until
-) -> None:
+def test_training_of_a_drained_worker_goes_on_at_another(store, start_worker, until):
     start_worker()
     job = until(store.submit(train_job("made", steps=1_500))[0], is_under_way)
     store.want("one", Wanted.DRAIN)
@@ -99,13 +86,8 @@ def test_training_of_a_drained_worker_goes_on_at_another(
 @pytest.mark.long
 @pytest.mark.parametrize(("drain_timeout_s", "state"), [(120.0, JobState.SUCCEEDED), (0.0, JobState.QUEUED)])
 def test_job_without_checkpoints_has_its_time_when_the_worker_is_stopped(
-    drain_timeout_s: float,
-    state: JobState,
-    store: JobStore,
-    artifact_folder: Path,
-    start_worker: StartWorker,
-    until: Until,
-) -> None:
+    drain_timeout_s, state, store, artifact_folder, start_worker, until
+):
     (artifact_folder / "scenes").mkdir()
     copy_demo_scene(artifact_folder / "scenes" / "demo.ugr")
     running = start_worker(drain_timeout_s=drain_timeout_s)
@@ -115,9 +97,7 @@ def test_job_without_checkpoints_has_its_time_when_the_worker_is_stopped(
 
 
 @pytest.mark.long
-def test_a_second_signal_ends_the_drain_of_a_worker_at_once(
-    store: JobStore, artifact_folder: Path, tmp_path: Path, until: Until
-) -> None:
+def test_a_second_signal_ends_the_drain_of_a_worker_at_once(store, artifact_folder, tmp_path, until):
     (artifact_folder / "scenes").mkdir()
     copy_demo_scene(artifact_folder / "scenes" / "demo.ugr")
     environment = {

@@ -4,9 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
-
-import pytest
 
 from ultragray.errors import FrameTooCostly
 from ultragray_workers.jobs.folder import JobFolder
@@ -16,23 +13,21 @@ from ultragray_workers.jobs.worker.job_run import JobRun
 from ..conftest import request_of
 
 
-def failing(error: Exception) -> Any:
-    def run(_: JobRun) -> None:
+def failing(error):
+    def run(_):
         raise error
 
     return SimpleNamespace(run=run)
 
 
-def outcome_of(error: Exception, folder: Path, monkeypatch: pytest.MonkeyPatch) -> Any:
+def outcome_of(error, folder, monkeypatch):
     job_folder = JobFolder(folder, "one")
     job_folder.path.mkdir(parents=True)
     monkeypatch.setattr(run_job, "from_dict", lambda specification: failing(error))
     return run_job._outcome_of(JobRun(job_folder, request_of({}, folder), lambda: False))
 
 
-def test_neither_the_reason_nor_the_log_of_a_fault_names_a_folder(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_neither_the_reason_nor_the_log_of_a_fault_names_a_folder(tmp_path, monkeypatch, capsys):
     message = f"cannot use '/srv/secret/tiny/conf.json', {tmp_path}/scenes/one.ugr or http://host/a/b"
     outcome = outcome_of(RuntimeError(message), tmp_path, monkeypatch)
     assert outcome.error == "INTERNAL"
@@ -43,6 +38,6 @@ def test_neither_the_reason_nor_the_log_of_a_fault_names_a_folder(
     assert str(Path(__file__).parent) not in log
 
 
-def test_a_frame_that_is_too_costly_is_told_with_its_pose(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_frame_that_is_too_costly_is_told_with_its_pose(tmp_path, monkeypatch):
     outcome = outcome_of(FrameTooCostly("a frame may cost less", field="poses[3]"), tmp_path, monkeypatch)
     assert (outcome.error, outcome.reason) == ("FRAME_TOO_COSTLY", "poses[3]: a frame may cost less")

@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
-
 import numpy as np
 import pytest
 
@@ -16,26 +12,24 @@ from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.progress import JobState, Outcome, Progress
-from ultragray_workers.jobs.record import Job, Row
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.worker import supervision
-from ultragray_workers.jobs.worker.device import DeviceLock, devices_of
-from ultragray_workers.jobs.worker.gate import Gate
+from ultragray_workers.jobs.worker.device import DeviceLock, Gate, devices_of
 from ultragray_workers.jobs.worker.supervision import Supervisor
+from ultragray_workers.scene_shelf import SceneShelf
 from ultragray_workers.storage.local import LocalStorage
 
 from ....waiting import wait_until
-from ..conftest import RunningWorker, path_of, request_of, train_job
+from ..conftest import path_of, request_of, train_job
 
 
 @pytest.fixture
-def finished(store: JobStore, artifact_folder: Path) -> Callable[[str], tuple[Job, JobFolder]]:
+def finished(store, artifact_folder):
     """A job and its folder, as a process that was done and a worker of this host that was killed leave it."""
 
-    def make(scene: str) -> tuple[Job, JobFolder]:
+    def make(scene):
         job, _ = store.submit(train_job(scene), priority=len(store.list()[0]))  # it goes first
         row = queue.take(store.database.engine, "dead", queue.demands_waiting(store.database.engine))
-        assert row is not None
         queue.put_back(store.database.engine, row)
         folder = JobFolder(artifact_folder, job.id, row.attempt)
         folder.run.mkdir(parents=True)
@@ -50,13 +44,7 @@ def finished(store: JobStore, artifact_folder: Path) -> Callable[[str], tuple[Jo
     return make
 
 
-def test_what_was_made_is_served_and_what_was_left_is_removed(
-    store: JobStore,
-    artifact_folder: Path,
-    finished: Callable[[str], tuple[Job, JobFolder]],
-    start_worker: Callable[..., RunningWorker],
-    until: Callable[..., Job],
-) -> None:
+def test_what_was_made_is_served_and_what_was_left_is_removed(store, artifact_folder, finished, start_worker, until):
     good, folder = finished("good")
     late, _ = finished("late")
     scenes = artifact_folder / "scenes"
@@ -76,14 +64,14 @@ def test_what_was_made_is_served_and_what_was_left_is_removed(
 
 
 @pytest.fixture
-def alone(store: JobStore, artifact_folder: Path) -> Iterator[Callable[[], Row]]:
+def alone(store, artifact_folder):
     """Takes a job and does it, in this process; its row as it was taken."""
     jobs = JobDatabase(artifact_folder, None)
     folder = artifact_folder.resolve()
     gate = Gate(jobs.identity, [DeviceLock(folder, device, "me") for device in devices_of("cpu")], (), list)
     supervisor = Supervisor(supervision.WorkerConfig(folder, LocalStorage(folder), "me"), jobs, gate)
 
-    def do() -> Row:
+    def do():
         row = queue.take(jobs.engine, "me", queue.demands_waiting(jobs.engine))
         assert row is not None
         supervisor.supervise(row)
@@ -93,40 +81,28 @@ def alone(store: JobStore, artifact_folder: Path) -> Iterator[Callable[[], Row]]
     jobs.close()
 
 
-def test_a_cancellation_while_the_scene_is_published_is_refused(
-    store: JobStore,
-    artifact_folder: Path,
-    finished: Callable[[str], tuple[Job, JobFolder]],
-    alone: Callable[[], Row],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_cancellation_while_the_scene_is_published_is_refused(store, artifact_folder, finished, alone, monkeypatch):
     job, _ = finished("late")
-    publish_made = supervision.publish_made
+    published = SceneShelf.publish
 
-    def publish(*arguments: Any) -> None:
+    def publish(*arguments):
         with pytest.raises(JobFinished, match="being served"):
             store.cancel(job.id)
-        publish_made(*arguments)
+        published(*arguments)
         with pytest.raises(JobFinished, match="being served"):
             store.cancel(job.id)
 
-    monkeypatch.setattr(supervision, "publish_made", publish)
+    monkeypatch.setattr(SceneShelf, "publish", publish)
     alone()
     assert (artifact_folder / "scenes" / "late.ugr").read_bytes() == b"made"
     assert store.get(job.id).state is JobState.SUCCEEDED
 
 
-def test_a_cancellation_that_comes_first_serves_nothing(
-    store: JobStore,
-    artifact_folder: Path,
-    finished: Callable[[str], tuple[Job, JobFolder]],
-    alone: Callable[[], Row],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_cancellation_that_comes_first_serves_nothing(store, artifact_folder, finished, alone, monkeypatch):
     job, _ = finished("late")
     publish = queue.publish
 
-    def cancelled_first(*arguments: Any) -> bool:
+    def cancelled_first(*arguments):
         store.cancel(job.id)
         return publish(*arguments)
 
@@ -138,23 +114,19 @@ def test_a_cancellation_that_comes_first_serves_nothing(
 
 
 def test_a_worker_that_died_while_it_served_the_scene_is_followed_by_one_that_serves_it(
-    store: JobStore,
-    artifact_folder: Path,
-    finished: Callable[[str], tuple[Job, JobFolder]],
-    alone: Callable[[], Row],
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+    store, artifact_folder, finished, alone, monkeypatch
+):
     """On another host, which has nothing but the record and the objects that it names."""
     job, _ = finished("late")
 
     class DiedError(BaseException):
         pass
 
-    def die(*_: Any) -> None:
+    def die(*_):
         raise DiedError
 
     with monkeypatch.context() as patched:
-        patched.setattr(supervision, "publish_made", die)
+        patched.setattr(SceneShelf, "publish", die)
         with pytest.raises(DiedError):
             alone()
     engine = store.database.engine
@@ -169,16 +141,16 @@ def test_a_worker_that_died_while_it_served_the_scene_is_followed_by_one_that_se
 
 @pytest.mark.long
 def test_the_result_of_a_lost_database_is_not_the_result_of_another_request(
-    store: JobStore, artifact_folder: Path, tmp_path: Path, start_worker: Callable[..., RunningWorker]
-) -> None:
+    store, artifact_folder, tmp_path, start_worker
+):
     """The issue's own case: four frames are asked for, where a folder holds the two of an earlier request."""
     (artifact_folder / "scenes").mkdir()
     copy_demo_scene(artifact_folder / "scenes" / "demo.ugr")
 
-    def asked(count: int) -> RenderJob:
+    def asked(count):
         return RenderJob(scene="demo", poses=np.tile(np.eye(4), (count, 1, 1)), height=16, width=16)
 
-    def done(store: JobStore, count: int) -> Job:
+    def done(store, count):
         worker = start_worker()
         job, is_new = store.submit(asked(count), request_id="mine")
         assert is_new

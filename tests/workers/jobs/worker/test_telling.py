@@ -2,20 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import pytest
 
 from ultragray_workers.errors import StorageUnavailable
 from ultragray_workers.jobs import queue
-from ultragray_workers.jobs.database import JobDatabase
-from ultragray_workers.jobs.files import CHECKPOINT_NAME, CONFIG_NAME, JOURNAL_NAME, JobFiles
+from ultragray_workers.jobs.files import CHECKPOINT_NAME, CONFIG_NAME, JOURNAL_NAME
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.progress import Outcome, Progress
-from ultragray_workers.jobs.record import Job, Row
-from ultragray_workers.jobs.store import JobStore
+from ultragray_workers.jobs.record import Row
 from ultragray_workers.jobs.worker import telling
 from ultragray_workers.jobs.worker.telling import Telling
 from ultragray_workers.storage.local import LocalStorage
@@ -29,15 +23,15 @@ class Unsteady(LocalStorage):
 
     failures, part = 0, ""
 
-    def upload(self, path: Path, key: str, **options: Any) -> bool:
+    def upload(self, path, key, **options):
         self._fail(key)
         return super().upload(path, key, **options)
 
-    def write(self, key: str, data: bytes, **options: Any) -> bool:
+    def write(self, key, data, **options):
         self._fail(key)
         return super().write(key, data, **options)
 
-    def _fail(self, key: str) -> None:
+    def _fail(self, key):
         if self.failures and self.part in key:
             self.failures -= 1
             raise StorageUnavailable("it is away")
@@ -46,16 +40,15 @@ class Unsteady(LocalStorage):
 class Attempt:
     """An attempt at a job by a worker of a host of its own, which has taken it over."""
 
-    def __init__(self, jobs: JobDatabase, storage: Unsteady, host: Path, watch: Callable[[], None]) -> None:
+    def __init__(self, jobs, storage, host, watch):
         self._engine = jobs.engine
         row = queue.take(jobs.engine, host.name, queue.demands_waiting(jobs.engine))
-        assert row is not None
         self.row: Row = row
         self.folder = JobFolder(host, row.id, row.attempt)
         self.telling = Telling(jobs, storage, self.folder, row, watch)
         self.telling.take_over()
 
-    def write_run(self, step: int) -> None:
+    def write_run(self, step):
         run = self.folder.run
         run.mkdir(exist_ok=True)
         (run / JOURNAL_NAME).write_text('{"step": 1}\n' * step)
@@ -63,43 +56,41 @@ class Attempt:
         (run / "new").replace(run / CHECKPOINT_NAME)
         self.folder.write_progress(Progress(step=step))
 
-    def give_up(self) -> None:
+    def give_up(self):
         """Its worker tells the last of the job, which waits again."""
         self.telling.tell_last()
         queue.put_back(self._engine, self.row)
 
-    def end(self, outcome: Outcome) -> bool:
+    def end(self, outcome):
         return queue.finish(self._engine, self.row, outcome, self.telling.end(outcome))
 
 
 @pytest.fixture
-def storage(artifact_folder: Path) -> Unsteady:
+def storage(artifact_folder):
     return Unsteady(artifact_folder)
 
 
 @pytest.fixture
-def attempt(jobs: JobDatabase, storage: Unsteady, tmp_path: Path) -> Callable[..., Attempt]:
+def attempt(jobs, storage, tmp_path):
     hosts = iter(range(100))
     return lambda watch=lambda: None: Attempt(jobs, storage, tmp_path / f"host-{next(hosts)}", watch)
 
 
 @pytest.fixture
-def job(store: JobStore) -> Job:
+def job(store):
     return store.submit(train_job("one"))[0]
 
 
 @pytest.fixture
-def files(store: JobStore) -> JobFiles:
+def files(store):
     return store.files
 
 
-def checkpoint_of(attempt: Attempt) -> bytes:
+def checkpoint_of(attempt):
     return (attempt.folder.run / CHECKPOINT_NAME).read_bytes()
 
 
-def test_a_successor_goes_on_from_the_checkpoint_and_its_log_follows(
-    attempt: Callable[..., Attempt], job: Job, store: JobStore, storage: Unsteady
-) -> None:
+def test_a_successor_goes_on_from_the_checkpoint_and_its_log_follows(attempt, job, store, storage):
     one = attempt()
     one.folder.log.write_bytes(b"begun\n")
     one.write_run(3)
@@ -113,13 +104,10 @@ def test_a_successor_goes_on_from_the_checkpoint_and_its_log_follows(
     two.telling.tell_last()
     assert store.log_tail(job.id) == "begun\ngoing on\n"
     with store.files.checkpoint(job.id) as newest:
-        assert newest is not None
         assert newest[0].read_bytes() == b"checkpoint of step 5"
 
 
-def test_who_was_cut_off_changes_nothing_any_more(
-    attempt: Callable[..., Attempt], jobs: JobDatabase, job: Job, store: JobStore
-) -> None:
+def test_who_was_cut_off_changes_nothing_any_more(attempt, jobs, job, store):
     one = attempt()
     queue.put_back(jobs.engine, one.row)
     two = attempt()
@@ -131,9 +119,7 @@ def test_who_was_cut_off_changes_nothing_any_more(
     assert (store.get(job.id).metrics, store.log_tail(job.id)) == ({"psnr_db": 1.0}, "")
 
 
-def test_a_checkpoint_that_was_half_told_is_none(
-    attempt: Callable[..., Attempt], jobs: JobDatabase, job: Job, storage: Unsteady
-) -> None:
+def test_a_checkpoint_that_was_half_told_is_none(attempt, jobs, job, storage):
     one = attempt()
     one.write_run(3)
     one.telling._tell(is_last=True)
@@ -143,12 +129,10 @@ def test_a_checkpoint_that_was_half_told_is_none(
     assert checkpoint_of(attempt()) == b"checkpoint of step 3"
 
 
-def test_an_end_waits_for_a_storage_that_is_away(
-    attempt: Callable[..., Attempt], job: Job, files: JobFiles, storage: Unsteady, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_end_waits_for_a_storage_that_is_away(attempt, job, files, storage, monkeypatch):
     monkeypatch.setattr(telling, "_RETRY_S", 0.05)
     monkeypatch.setattr(telling, "_LOOK_S", 0.02)
-    looks: list[int] = []
+    looks = []
     one = attempt(lambda: looks.append(storage.failures))
     with one.folder.new_artifacts() as made:
         (made / "frames.npz").write_bytes(bytes(range(256)))
@@ -159,13 +143,11 @@ def test_an_end_waits_for_a_storage_that_is_away(
     assert (found.stored.bytes, found.read(250, 100)) == (256, bytes(range(250, 256)))
 
 
-def test_a_caller_that_is_told_to_stop_does_not_wait(
-    attempt: Callable[..., Attempt], job: Job, storage: Unsteady, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_caller_that_is_told_to_stop_does_not_wait(attempt, job, storage, monkeypatch):
     one = attempt()
     one.folder.log.write_bytes(b"begun\n")
 
-    def stop() -> None:
+    def stop():
         raise InterruptedError
 
     storage.failures = 1000
@@ -174,9 +156,7 @@ def test_a_caller_that_is_told_to_stop_does_not_wait(
         one.telling.end(Outcome())
 
 
-def test_a_long_log_is_told_in_pieces_and_read_from_anywhere(
-    attempt: Callable[..., Attempt], job: Job, files: JobFiles, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_long_log_is_told_in_pieces_and_read_from_anywhere(attempt, job, files, monkeypatch):
     monkeypatch.setattr(telling, "PIECE_BYTES", 100)
     monkeypatch.setattr(telling, "MOST_BYTES", 250)
     one = attempt()
@@ -193,9 +173,7 @@ def test_a_long_log_is_told_in_pieces_and_read_from_anywhere(
     assert found.read(len(said) + 5, 10) == b""
 
 
-def test_a_success_leaves_what_it_names_and_the_scene_it_was_given(
-    attempt: Callable[..., Attempt], jobs: JobDatabase, job: Job, storage: Unsteady
-) -> None:
+def test_a_success_leaves_what_it_names_and_the_scene_it_was_given(attempt, jobs, job, storage):
     one = attempt()
     storage.write(f"jobs/{job.id}/demo.ugr", b"kept for the job")
     one.write_run(3)
@@ -206,15 +184,12 @@ def test_a_success_leaves_what_it_names_and_the_scene_it_was_given(
     assert two.end(Outcome(artifacts=("one.ugr",), progress=Progress(step=4)))
     two.telling.remove_others()
     row = queue.row_of(jobs.engine, job.id)
-    assert row is not None
     assert row.files.run == {}
     assert {entry.key for entry in storage.entries("jobs")} == row.files.keys() | {f"jobs/{job.id}/demo.ugr"}
 
 
 @pytest.mark.parametrize(("error", "goes_on"), [("JOB_STALLED", True), ("TRAINING_STATE_INVALID", False)])
-def test_a_retry_goes_on_from_the_checkpoint_of_its_predecessor(
-    attempt: Callable[..., Attempt], job: Job, store: JobStore, error: str, goes_on: bool
-) -> None:
+def test_a_retry_goes_on_from_the_checkpoint_of_its_predecessor(attempt, job, store, error, goes_on):
     one = attempt()
     one.write_run(7)
     assert one.end(Outcome(error=error, reason="it failed"))
@@ -222,13 +197,7 @@ def test_a_retry_goes_on_from_the_checkpoint_of_its_predecessor(
     assert (attempt().folder.run / CHECKPOINT_NAME).exists() is goes_on
 
 
-def test_what_changes_is_told_meanwhile(
-    attempt: Callable[..., Attempt],
-    job: Job,
-    store: JobStore,
-    storage: Unsteady,
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_what_changes_is_told_meanwhile(attempt, job, store, storage, monkeypatch):
     monkeypatch.setattr(telling, "TELL_INTERVAL_S", 0.05)
     one = attempt()
     with one.telling.telling():
@@ -240,9 +209,7 @@ def test_what_changes_is_told_meanwhile(
         wait_until(lambda: store.get(job.id).progress.step == 4)
 
 
-def test_a_job_that_was_removed_is_not_brought_back(
-    attempt: Callable[..., Attempt], jobs: JobDatabase, job: Job, store: JobStore
-) -> None:
+def test_a_job_that_was_removed_is_not_brought_back(attempt, jobs, job, store):
     one = attempt()
     one.write_run(2)
     store.cancel(job.id)
@@ -251,9 +218,7 @@ def test_a_job_that_was_removed_is_not_brought_back(
     assert queue.row_of(jobs.engine, job.id) is None
 
 
-def test_a_run_of_many_folders_goes_along_and_what_did_not_change_is_told_once(
-    attempt: Callable[..., Attempt], jobs: JobDatabase, job: Job
-) -> None:
+def test_a_run_of_many_folders_goes_along_and_what_did_not_change_is_told_once(attempt, jobs, job):
     one = attempt()
     run = one.folder.run
     (run / "scene").mkdir(parents=True)
@@ -265,8 +230,6 @@ def test_a_run_of_many_folders_goes_along_and_what_did_not_change_is_told_once(
     (run / "tri" / "fit").write_bytes(b"step 3")
     one.telling._tell(is_last=True)
     after = queue.row_of(jobs.engine, job.id)
-    assert before is not None
-    assert after is not None
     assert set(after.files.run) == {"scene/model", f"scene/{CONFIG_NAME}", "tri/fit"}
     assert after.files.run["scene/model"] == before.files.run["scene/model"]
     one.give_up()
@@ -275,9 +238,7 @@ def test_a_run_of_many_folders_goes_along_and_what_did_not_change_is_told_once(
     assert (two.folder.run / "tri" / "fit").read_bytes() == b"step 3"
 
 
-def test_a_worker_of_the_same_host_goes_on_where_the_dead_one_was(
-    jobs: JobDatabase, job: Job, store: JobStore, storage: Unsteady, tmp_path: Path
-) -> None:
+def test_a_worker_of_the_same_host_goes_on_where_the_dead_one_was(jobs, job, store, storage, tmp_path):
     """What was not told yet is not lost: the folder goes to the next attempt, and the log has each line once."""
     one = Attempt(jobs, storage, tmp_path / "host", lambda: None)
     one.folder.log.write_bytes(b"told\n")

@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from datetime import datetime, timezone
 from pathlib import Path
@@ -16,16 +15,12 @@ import pytest
 
 from ultragray_workers.jobs import queue
 from ultragray_workers.jobs.progress import JobState
-from ultragray_workers.jobs.record import Job
-from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.worker import process as watchdog
 from ultragray_workers.jobs.worker.process import Watchdog, kill_group
 
 from ....waiting import wait_until
-from ..conftest import RunningWorker, train_job
+from ..conftest import train_job
 
-StartWorker = Callable[..., RunningWorker]
-Until = Callable[..., Job]
 FOR_EVER = 1_000_000  # steps
 LONGEST_S = 1000.0
 # Trainings of the scene `sleeps` never come to their second step.
@@ -42,12 +37,12 @@ if "ultragray_workers.jobs.worker.run_job" in sys.orig_argv:
 """
 
 
-def is_training(job: Job) -> bool:
+def is_training(job):
     return job.state is JobState.RUNNING and (job.progress.step or 0) > 0
 
 
 @contextmanager
-def running(program: str) -> Iterator[int]:
+def running(program):
     """A process that has begun, and goes with all below it."""
     process = subprocess.Popen(
         [sys.executable, "-c", f"print(flush=True)\n{program}"], stdout=-1, start_new_session=True
@@ -72,11 +67,11 @@ def running(program: str) -> Iterator[int]:
         ("import threading; lock = threading.Lock(); lock.acquire(); lock.acquire()", False),
     ],
 )
-def test_gets_on_is_what_computes_or_moves_bytes(program: str, gets_on: bool) -> None:
+def test_gets_on_is_what_computes_or_moves_bytes(program, gets_on):
     with running(program) as pid:
         dog = Watchdog(pid, 3.0)
 
-        def is_stalled() -> bool:
+        def is_stalled():
             dog.look()
             return dog.is_stalled
 
@@ -88,7 +83,7 @@ def test_gets_on_is_what_computes_or_moves_bytes(program: str, gets_on: bool) ->
             time.sleep(0.1)
 
 
-def test_time_in_which_the_worker_itself_was_stopped_does_not_count(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_time_in_which_the_worker_itself_was_stopped_does_not_count(monkeypatch):
     now_s = 0.0
     monkeypatch.setattr(watchdog.time, "monotonic", lambda: now_s)
     with running("import time; time.sleep(3600)") as pid:
@@ -100,9 +95,7 @@ def test_time_in_which_the_worker_itself_was_stopped_does_not_count(monkeypatch:
 
 
 @pytest.mark.long
-def test_a_stopped_process_is_noticed_and_keeps_no_device(
-    store: JobStore, start_worker: StartWorker, until: Until
-) -> None:
+def test_a_stopped_process_is_noticed_and_keeps_no_device(store, start_worker, until):
     worker = start_worker(stall_timeout_s=3.0)
     job, _ = store.submit(train_job("one", steps=FOR_EVER))
     until(job, is_training)
@@ -125,9 +118,7 @@ def test_a_stopped_process_is_noticed_and_keeps_no_device(
 
 
 @pytest.mark.long
-def test_a_process_that_waits_for_ever_is_noticed(
-    store: JobStore, start_worker: StartWorker, until: Until, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_process_that_waits_for_ever_is_noticed(store, start_worker, until, tmp_path, monkeypatch):
     (tmp_path / "sitecustomize.py").write_text(SLEEP)
     monkeypatch.syspath_prepend(str(tmp_path))
     start_worker(stall_timeout_s=3.0)
@@ -138,9 +129,7 @@ def test_a_process_that_waits_for_ever_is_noticed(
 
 @pytest.mark.long
 @pytest.mark.parametrize("of", ["the request", "the worker"])
-def test_a_job_runs_for_its_longest_time_in_all_and_a_retry_goes_on(
-    store: JobStore, start_worker: StartWorker, until: Until, of: str
-) -> None:
+def test_a_job_runs_for_its_longest_time_in_all_and_a_retry_goes_on(store, start_worker, until, of):
     began, engine = datetime.now(timezone.utc), store.database.engine
     asked = train_job("one", steps=FOR_EVER, max_run_s=LONGEST_S if of == "the request" else 2 * LONGEST_S)
     limits = {"max_run_s": 0.0 if of == "the request" else LONGEST_S}
@@ -150,7 +139,6 @@ def test_a_job_runs_for_its_longest_time_in_all_and_a_retry_goes_on(
     until(job, is_training)
     assert worker.terminate() == 0  # writes a checkpoint
     row = queue.row_of(engine, job.id)
-    assert row is not None
     assert 0.0 < row.run_s == store.usage_s("ada", began)["cpu"]
     queue.add_run_time(engine, row, "cpu", LONGEST_S - row.run_s - 1.0)
 

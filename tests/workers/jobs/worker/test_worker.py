@@ -7,7 +7,6 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -22,25 +21,18 @@ from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import JobFinished, JobNotFinished, StartupFailed
 from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.progress import JobState
-from ultragray_workers.jobs.record import Job
-from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.worker.worker import claim_name
 
 from ....waiting import at_this_load
-from ..conftest import RunningWorker, files_of, path_of, store_dataset, train_job
-
-StartWorker = Callable[..., RunningWorker]
-Until = Callable[..., Job]
+from ..conftest import files_of, path_of, store_dataset, train_job
 
 
-def is_training(job: Job) -> bool:
+def is_training(job):
     return job.state is JobState.RUNNING and (job.progress.step or 0) > 0
 
 
 @pytest.mark.long
-def test_good_jobs_run_in_order_and_bad_ones_fail_with_a_reason(
-    store: JobStore, artifact_folder: Path, tmp_path: Path, start_worker: StartWorker, until: Until
-) -> None:
+def test_good_jobs_run_in_order_and_bad_ones_fail_with_a_reason(store, artifact_folder, tmp_path, start_worker, until):
     poisoned = store_dataset(artifact_folder, "poisoned") / "poses_train.npy"
     poses = np.load(poisoned)
     poses[1, 0, 3] = np.nan
@@ -95,7 +87,7 @@ def test_good_jobs_run_in_order_and_bad_ones_fail_with_a_reason(
     assert (tmp_path / "one.log").read_text() == ""  # jobs that fail are ordinary
 
 
-def test_name_of_a_worker_is_its_alone(tmp_path: Path) -> None:
+def test_name_of_a_worker_is_its_alone(tmp_path):
     with pytest.raises(StartupFailed, match="name must be"), claim_name(tmp_path, "a/b"):
         pass
     program = (
@@ -114,9 +106,7 @@ def test_name_of_a_worker_is_its_alone(tmp_path: Path) -> None:
 
 
 @pytest.mark.long
-def test_cancelled_within_a_second_and_retried_from_its_checkpoint(
-    store: JobStore, artifact_folder: Path, start_worker: StartWorker, until: Until
-) -> None:
+def test_cancelled_within_a_second_and_retried_from_its_checkpoint(store, artifact_folder, start_worker, until):
     worker = start_worker()
     job, _ = store.submit(train_job("one", steps=1_000_000))
     until(job, is_training)
@@ -141,12 +131,10 @@ def test_cancelled_within_a_second_and_retried_from_its_checkpoint(
     assert store.get(job.id).state is JobState.CANCELLED
 
 
-def test_process_that_dies_again_and_again_is_given_up(
-    store: JobStore, start_worker: StartWorker, until: Until
-) -> None:
+def test_process_that_dies_again_and_again_is_given_up(store, start_worker, until):
     job, _ = store.submit(train_job("one", steps=1_000_000))
     worker = start_worker()
-    ended: set[int] = set()
+    ended = set()
     while store.get(job.id).state in (JobState.QUEUED, JobState.RUNNING):
         process = worker.job_process()
         if process is not None and process not in ended:
@@ -163,8 +151,8 @@ def test_process_that_dies_again_and_again_is_given_up(
 @pytest.mark.long
 @pytest.mark.slow
 def test_killed_worker_is_replaced_and_the_scene_is_that_of_an_undisturbed_run(
-    store: JobStore, artifact_folder: Path, tmp_path: Path, start_worker: StartWorker, until: Until
-) -> None:
+    store, artifact_folder, tmp_path, start_worker, until
+):
     asked = train_job("one", steps=800)
     threads = torch.get_num_threads()
     torch.set_num_threads(1)

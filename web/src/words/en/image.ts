@@ -55,8 +55,7 @@ export const scan = {
   },
   results: {
     label: "Results",
-    ellipse: ({ axes, circumference, area }: Record<"axes" | "circumference" | "area", string>): string =>
-      `${axes}, circumference ${circumference}, area ${area}`,
+    ellipse: (axes: string, circumference: string, area: string): string => `${axes}, circumference ${circumference}, area ${area}`,
     frame: (number: number): string => `on frame ${number}`,
     remove: (letter: string): string => `Remove ${letter}`,
   },
@@ -77,13 +76,12 @@ export const scan = {
     noVideo: "This browser cannot record video. DICOM can hold the loop, too.",
     simulated: "Simulated, not for diagnosis.",
     drawn: (tools: string): string => `Drawn in: ${tools}`,
-    slice: (thickness_mm: number): string => `slice ${thickness_mm.toFixed(1)} mm`,
+    slice: (mm: string): string => `slice ${mm} mm`,
     depthInCm: "depth in cm",
   },
   link: {
     copy: "Copy link",
     hint: "Copy the link to this view: scene, pose, probe and settings",
-    copied: "Copied",
     byHand: "This browser does not let the page copy. The link is selected: press Ctrl+C.",
   },
   keys: {
@@ -159,7 +157,7 @@ export const scan = {
     depth: "Depth",
     slice: "Slice",
     sliceThickness: "Slice thickness",
-    trained: (thickness_mm: number): string => `As trained: ${thickness_mm.toFixed(1)} mm.`,
+    trained: (mm: string): string => `As trained: ${mm} mm.`,
     contact: "Off the skin",
     contactMeans: "What is shown where the face of the probe is not on the skin, which the training sweep tells",
     contactAssumed: "As on it",
@@ -206,7 +204,7 @@ export const space = {
   turn: "Turn",
   contact: "Contact",
   contactMeaning: "The face of the probe stays on the skin. Moving it along its axis presses.",
-  pressed: (depth_mm: number): string => `pressed ${depth_mm.toFixed(1)} mm`,
+  pressed: (mm: string): string => `pressed ${mm} mm`,
   noSkin: "The views of this scene look in many directions: there is no skin to stay on.",
   options: "Options",
   viewpoint: "Look from",

@@ -111,6 +111,8 @@ export const shared = {
     } as Named,
   },
   only: (who: string, what: string): string => `Only ${who} may ${what}.`,
+  copied: "Copied",
+  noCopy: "This browser does not let the page copy. The text is selected: press Ctrl+C.",
   keep: "Keep",
   fetching: "Fetching …",
   loading: "Loading",

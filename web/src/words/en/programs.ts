@@ -1,59 +1,38 @@
 /** Poses, programs and frames from elsewhere, in English. */
 
 import type { Reference } from "../../geometry/pose";
-import type { PoseError } from "../../geometry/pose_files";
+import { type FaultWords, POSE_SUFFIXES } from "../../geometry/pose_files";
 import type { Named } from "../translated";
 
-const SUFFIXES = ".json, .npy, .csv, .tum, .txt, .mha, .mhd";
-
-function fault({ fault: found }: PoseError): string {
-  switch (found.kind) {
-    case "json":
-      return `This is not JSON that the console knows: a pose is an object of position_mm and quaternion, or of matrix (${found.problem}).`;
-    case "jsonNumbers":
-      return `${found.key} needs the numbers ${found.names.join(", ")}.`;
-    case "empty":
-      return "There are no poses in it.";
-    case "tooMany":
-      return `There may be at most ${found.most} poses, and these are ${found.count}.`;
-    case "suffix":
-      return `Files of this kind (${found.suffix || "without an ending"}) are not read. Read are: ${SUFFIXES}.`;
-    case "count":
-      return `${found.found} numbers were found; ${found.expected.replace(", ", " or ")} were expected.`;
-    case "number":
-      return `“${found.text}” is not a number.`;
-    case "quaternion":
-      return `The quaternion must have length 1; this one has ${found.length.toFixed(3)}.`;
-    case "rotation":
-      return found.mirrors
-        ? "The matrix must hold a rotation; this one mirrors."
-        : "The matrix must hold a rotation: axes of length 1 at right angles.";
-    case "lastRow":
-      return "The matrix must end in the row 0 0 0 1; the translation is its last column.";
-    case "ros":
-      return `A pose of ROS has a position and an orientation; ${found.missing} was not found.`;
-    case "npy":
-      return found.problem === "magic" ? "This is not a file that NumPy wrote." : "The file ends before its last pose.";
-    case "npyType":
-      return `The numbers are of NumPy's type ${found.type}; float32 or float64 was expected.`;
-    case "npyShape":
-      return `The array has the shape ${found.shape}; (N, 4, 4) was expected, also (N, 3, 4), (N, 12) or (N, 16).`;
-    case "csvHeader":
-      return `The columns ${found.missing.join(", ")} are missing.`;
-    case "plusHeader":
-      return "There are no transforms of frames in it (lines such as Seq_Frame0000_ProbeToReferenceTransform).";
-    case "plusTransforms":
-      return `None of its transforms can be a pose of a probe: ${found.found.join(", ")} hold the size of pixels, or were never tracked.`;
-  }
-}
-
-/** The place of a fault before the fault itself. */
-function poseError(error: PoseError): string {
-  const said = fault(error);
-  if (error.line !== null) return `Line ${error.line}: ${said}`;
-  if (error.pose !== null) return `Pose ${error.pose}: ${said}`;
-  return said;
-}
+const poseError: FaultWords = {
+  line: (line, fault) => `Line ${line}: ${fault}`,
+  pose: (pose, fault) => `Pose ${pose}: ${fault}`,
+  faults: {
+    json: (problem) =>
+      `This is not JSON that the console knows: a pose is an object of position_mm and quaternion, or of matrix (${problem}).`,
+    jsonNumbers: (key, names) => `${key} needs the numbers ${names}.`,
+    empty: () => "There are no poses in it.",
+    tooMany: (count, most) => `There may be at most ${most} poses, and these are ${count}.`,
+    suffix: (suffix) =>
+      `Files of this kind (${suffix || "without an ending"}) are not read. Read are: ${POSE_SUFFIXES.join(", ")}.`,
+    count: (found, expected) => `${found} numbers were found; ${expected.replace(", ", " or ")} were expected.`,
+    number: (text) => `“${text}” is not a number.`,
+    quaternion: (length) => `The quaternion must have length 1; this one has ${length.toFixed(3)}.`,
+    rotation: () => "The matrix must hold a rotation: axes of length 1 at right angles.",
+    mirror: () => "The matrix must hold a rotation; this one mirrors.",
+    lastRow: () => "The matrix must end in the row 0 0 0 1; the translation is its last column.",
+    ros: (missing) => `A pose of ROS has a position and an orientation; ${missing} was not found.`,
+    npyMagic: () => "This is not a file that NumPy wrote.",
+    npyShort: () => "The file ends before its last pose.",
+    npyType: (type) => `The numbers are of NumPy's type ${type}; float32 or float64 was expected.`,
+    npyShape: (shape) => `The array has the shape ${shape}; (N, 4, 4) was expected, also (N, 3, 4), (N, 12) or (N, 16).`,
+    csvHeader: (missing) => `The columns ${missing} are missing.`,
+    plusHeader: () =>
+      "There are no transforms of frames in it (lines such as Seq_Frame0000_ProbeToReferenceTransform).",
+    plusTransforms: (found) =>
+      `None of its transforms can be a pose of a probe: ${found} hold the size of pixels, or were never tracked.`,
+  },
+};
 
 export const connect = {
   confidence: {
@@ -149,8 +128,6 @@ export const connect = {
     },
     textLabel: (form: string) => `Pose as ${form}, Enter applies`,
     copy: (form: string) => `Copy the pose as ${form}`,
-    copied: "Copied",
-    noCopy: "This browser does not let the page copy. The text is selected: press Ctrl+C.",
     gamepad: (name: string) => `Gamepad: ${name}`,
     steering: "Steering by keyboard and gamepad",
     slide: "Slide",
@@ -203,7 +180,7 @@ export const connect = {
     states: { queued: "Waits for its turn", running: "Rendering", succeeded: "Done", failed: "Failed", cancelled: "Cancelled" } as Named,
     cancel: "Cancel",
     download: (name: string) => `Download ${name}`,
-    may: (who: string) => `Only ${who} may start jobs.`,
+    may: "start jobs",
   },
   connection: {
     title: "Connect",
@@ -226,9 +203,7 @@ export const connect = {
     },
     intro: "How a program asks for this image:",
     copy: (language: string) => `Copy the example in ${language}`,
-    copied: "Copied",
     copyShort: "Copy",
-    selected: "This browser does not let the page copy. The text is selected: press Ctrl+C.",
     off: "This service has no OpenIGTLink port. Whoever runs it can open one.",
     registered: (name: string) => `The pose is flange to base; the service leads it into the scene by ${name}.`,
     notRegistered: "The pose is that of the probe in the scene; a connection of OpenIGTLink names a registration by the parameter Registration.",

@@ -25,5 +25,4 @@ class CompareJob(ComparisonSettings, Specification):
     needs_dataset = "dataset"
 
     def check(self, surroundings: Surroundings) -> None:
-        """Raises ExtraMissing where the methods are not installed."""
         self.plugin()

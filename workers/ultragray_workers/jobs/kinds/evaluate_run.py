@@ -74,7 +74,6 @@ def run(job_run: JobRun, job: EvaluateJob) -> Outcome:
 
 
 def _scored(job_run: JobRun, scene: GaussianScene, sweep: Sweep) -> Evaluation:
-    """The scores of the frames, portion by portion."""
     started, portion = time.monotonic(), frames_at_once(sweep.height, sweep.width)
     frames: list[FrameMetrics] = []
     speckle: list[FrameSpeckle] = []

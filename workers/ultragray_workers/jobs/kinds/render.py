@@ -14,12 +14,11 @@ from ultragray.contract import described, kind_field, shown, under
 from ultragray.errors import InvalidArgument
 from ultragray.exchange.batches import SHARD_FRAMES, BatchPlan
 from ultragray.exchange.exports import FORMATS, Format, check_format
-from ultragray.exchange.exports.formats import DTYPES
+from ultragray.exchange.exports.formats import DTYPES, frame_bytes
 from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray, Picture, Probe
 from ultragray.geometry.registration import Registration
 from ultragray.rendering.contact import way_in
-from ultragray.rendering.outputs import OUTPUTS
 from ultragray.rendering.settings import Encoding, FrameSettings, Resolved, registration_field
 from ultragray.samplers import (
     MAX_POSES,
@@ -125,7 +124,6 @@ class RenderJob(FrameSettings, Specification):
         return FORMATS[self.format or "npz"]
 
     def plan(self, scene: SceneHeader, scene_sha256: str) -> BatchPlan:
-        """The plan of a job in shards. Raises InvalidArgument and its kind where no shard could be made."""
         return BatchPlan.prepared(
             scene,
             self,
@@ -180,12 +178,10 @@ class RenderJob(FrameSettings, Specification):
 
     def file_bytes(self, frames: int, picture: Picture) -> int:
         """The most that so many frames take: their pixels, not compressed."""
-        dtype = np.dtype(check_format(self.file_format.name, self.outputs, self.dtype))
-        pixel_bytes = sum(1 if OUTPUTS[name].is_numbers else dtype.itemsize for name in self.outputs)
-        frame_bytes = picture.height * picture.width * pixel_bytes
+        size = frame_bytes(self.outputs, check_format(self.file_format.name, self.outputs, self.dtype), picture)
         if self.is_sharded:  # blocks of the tar around the pixels, pose and figures of each frame
-            frame_bytes += _MEMBER_BYTES * (1 + len(self.outputs))
-        return frames * frame_bytes
+            size += _MEMBER_BYTES * (1 + len(self.outputs))
+        return frames * size
 
     def _planned_frames(self, scene: SceneHeader) -> int:
         """The frames of a job in shards. Raises InvalidArgument where no shard could be made."""
@@ -219,7 +215,6 @@ class RenderJob(FrameSettings, Specification):
         return training_poses
 
     def check_room(self, frames: int, picture: Picture, free: int) -> None:
-        """Raises StorageFull where so many bytes are no room for so many frames."""
         needed = self.file_bytes(frames, picture)
         if needed > free:
             raise StorageFull(

@@ -118,12 +118,10 @@ class _Keeper:
         self._thread.shutdown()
 
     def keep(self, path: Path, shard: int, entry: ShardEntry) -> None:
-        """Takes over a file. Raises what keeping the one before raised."""
         self.wait()
         self._last = self._thread.submit(self._keep, path, shard, entry)
 
     def wait(self) -> None:
-        """Returns when all are in their place. Raises what keeping them raised."""
         if self._last is not None:
             self._last.result()
             self._last = None
@@ -153,7 +151,6 @@ class _Meter:
         self._since: tuple[float, int] | None = None  # a time, and the frames that were done then
 
     def finished(self, frames: int) -> None:
-        """Counts a shard that was made here."""
         self._finished += frames
 
     def look(self) -> None:

@@ -51,11 +51,9 @@ class VoxelizeJob(Specification):
 
     @property
     def file_name(self) -> str:
-        """The name of its volume."""
         return f"{self.field}.{self.format}"
 
     def grid(self, info: SceneInfo) -> VolumeGrid:
-        """Raises InvalidArgument for more voxels than a volume may have."""
         return VolumeGrid.over_scene(info, self.box_mm, self.spacing_mm)
 
     def check(self, surroundings: Surroundings) -> None:

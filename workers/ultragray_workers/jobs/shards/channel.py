@@ -1,64 +1,64 @@
-"""The process of a batch and its worker: the pipe between them, and the shards that the worker hands out over it.
-
-Messages are JSON, one a line. The worker's side is `shards.desk`.
-"""
+"""The pipe between the process of a batch and its worker, and the side of the process; the other is `shards.desk`."""
 
 from __future__ import annotations
 
 import json
 import os
-import select
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from multiprocessing import Pipe
+from multiprocessing.connection import Connection
 from typing import Any
 
 from ultragray.exchange.batches import BatchPlan
-from ultragray_workers.jobs.shards.table import Failed
 
-_CHUNK_BYTES = 1 << 16
 _POLL_S = 0.2
 _ASK_AGAIN_S = 0.5  # while others are at the last shards
 
 
-class Channel:
-    """One end: a pipe that is read, and one that is written."""
+@dataclass(frozen=True)
+class Failed:
+    """A shard that cannot be made, and why."""
 
-    def __init__(self, reading: int, writing: int) -> None:
-        self._reading, self._writing = reading, writing
-        self._begun = b""  # of a line
+    number: int
+    error: str  # stable reason
+    reason: str  # one sentence
+
+
+class Channel:
+    """One end of a pipe; messages are JSON."""
+
+    def __init__(self, descriptor: int) -> None:
+        self._pipe = Connection(descriptor)
         self.is_open = True  # the other end may still say something
+
+    @classmethod
+    def pair(cls) -> tuple[Channel, int]:
+        """An end for this process, and the descriptor for the end of another one, which inherits it."""
+        here, there = Pipe()
+        with here, there:
+            return cls(os.dup(here.fileno())), os.dup(there.fileno())
 
     def send(self, message: dict[str, Any]) -> None:
         """Says something; nothing where the other end has gone."""
-        data = json.dumps(message).encode() + b"\n"
         try:
-            while data:
-                data = data[os.write(self._writing, data) :]
-        except BrokenPipeError:
+            self._pipe.send_bytes(json.dumps(message).encode())
+        except ConnectionError:
             self.is_open = False
 
     def receive(self, timeout_s: float) -> Iterator[dict[str, Any]]:
         """What the other end has said; waits until it says something, or for so long."""
-        if not self.is_open or not select.select([self._reading], [], [], timeout_s)[0]:
-            return
-        data = os.read(self._reading, _CHUNK_BYTES)
-        self.is_open = bool(data)
-        *lines, self._begun = (self._begun + data).split(b"\n")
-        for line in lines:
-            yield json.loads(line)
+        try:
+            while self.is_open and self._pipe.poll(timeout_s):
+                yield json.loads(self._pipe.recv_bytes())
+                timeout_s = 0.0
+        except (EOFError, ConnectionError):
+            self.is_open = False
 
     def close(self) -> None:
-        """Ends this end."""
         self.is_open = False
-        for descriptor in (self._reading, self._writing):
-            os.close(descriptor)
-
-
-def channel() -> tuple[Channel, tuple[int, int]]:
-    """An end for this process, and the descriptors for the end of another one, which inherits them."""
-    there_reads, here_writes = os.pipe()
-    here_reads, there_writes = os.pipe()
-    return Channel(here_reads, here_writes), (there_reads, there_writes)
+        self._pipe.close()
 
 
 class BatchFailed(Exception):
@@ -80,7 +80,6 @@ class ShardQueue:
         self.frames_done: int | None = None  # of the whole batch; None: not known yet
 
     def lay_out(self, plan: BatchPlan, done: list[int]) -> None:
-        """Says what the batch is, and which of its shards are there already."""
         self._channel.send({"plan": {"frames": plan.frames, "shard_frames": plan.shard_frames, "done": done}})
 
     def take(self, meanwhile: Callable[[], None]) -> int | None:
@@ -103,7 +102,6 @@ class ShardQueue:
         return shard
 
     def done(self, shard: int) -> None:
-        """Says that a shard is in its place."""
         self._channel.send({"done": shard})
 
     def look(self, timeout_s: float = 0.0) -> None:

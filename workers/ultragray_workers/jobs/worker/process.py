@@ -10,13 +10,12 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 from ultragray_workers.jobs.folder import JobFolder
-from ultragray_workers.jobs.worker.device import DeviceLock
 
 STOP_WAIT_S = 10.0  # for the checkpoint of a training that is to stop
 _KILL_WAIT_S, _KILL_POLL_S = 5.0, 0.02
@@ -28,12 +27,13 @@ LONGEST_STEP_S = 2.0  # between two looks; what is longer, this worker itself wa
 
 @contextmanager
 def job_process(
-    folder: JobFolder, device: DeviceLock, threads: int, descriptors: Sequence[int] = ()
+    folder: JobFolder, device_lock: int, threads: int, descriptor: int | None = None
 ) -> Iterator[subprocess.Popen[bytes]]:
-    """A process at work in the folder, which shares the lock of its device; killed with its group at the end.
+    """A process at work in the folder, which inherits the lock of its device; killed with its group at the end.
 
-    `descriptors`: its end of a channel to this worker; this process has it no more.
+    `descriptor`: its end of a channel to this worker; this process has it no more.
     """
+    descriptors = [] if descriptor is None else [descriptor]
     with folder.log.open("ab") as log:
         process = subprocess.Popen(
             [
@@ -50,9 +50,9 @@ def job_process(
                 "OPENBLAS_NUM_THREADS": str(threads),
             },
             start_new_session=True,
-            pass_fds=[device.fileno(), *descriptors],
+            pass_fds=[device_lock, *descriptors],
         )
-    for descriptor in descriptors:
+    if descriptor is not None:
         os.close(descriptor)
     try:
         yield process
@@ -86,7 +86,6 @@ class Watchdog:
     """
 
     def __init__(self, pid: int, stall_timeout_s: float) -> None:
-        """`stall_timeout_s` 0: never."""
         self._pid, self._stall_timeout_s = pid, stall_timeout_s
         self._looked_at_s = time.monotonic()
         self._at_last_sign = Account()

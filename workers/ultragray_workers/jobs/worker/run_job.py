@@ -1,6 +1,6 @@
-"""The process of a job: `python -m ultragray_workers.jobs.worker.run_job JOB_FOLDER WORKER_PID [READ WRITE]`.
+"""The process of a job: `python -m ultragray_workers.jobs.worker.run_job JOB_FOLDER WORKER_PID [CHANNEL]`.
 
-READ and WRITE are the descriptors of a channel to the worker, of a job in shards.
+CHANNEL is the descriptor of a channel to the worker, of a job in shards.
 
 It dies with its worker, works alone in the folder, and as its last act says in outcome.json how the job ended. A job
 that fails is a process that ends well; SIGTERM ends it with exit code STOPPED and a checkpoint to go on from, and files
@@ -61,7 +61,7 @@ def main(folder_path: str, worker_pid: str, *descriptors: str) -> int:
             return FOLDER_LOST
         let_frames_go_first(request.nice)
         Path("/proc/self/oom_score_adj").write_text(_OOM_SCORE_ADJ, encoding="ascii")
-        channel = Channel(*map(int, descriptors)) if descriptors else None
+        channel = Channel(int(descriptors[0])) if descriptors else None
         job_run = JobRun(folder, request, lambda: bool(received), channel)
         try:
             outcome = _outcome_of(job_run)

@@ -37,8 +37,7 @@ from ultragray_workers.jobs.progress import Outcome
 from ultragray_workers.jobs.record import Files, Row
 from ultragray_workers.jobs.shards.desk import BatchOver, ShardDesk
 from ultragray_workers.jobs.specification import has_checkpoints, is_in_shards
-from ultragray_workers.jobs.worker.device import DeviceLock
-from ultragray_workers.jobs.worker.gate import Gate
+from ultragray_workers.jobs.worker.device import DeviceLock, Gate
 from ultragray_workers.jobs.worker.process import (
     STOP_WAIT_S,
     Watchdog,
@@ -49,8 +48,8 @@ from ultragray_workers.jobs.worker.process import (
 from ultragray_workers.jobs.worker.run_job import STOPPED, STORAGE_FULL
 from ultragray_workers.jobs.worker.telling import LAST_WAIT_S, Superseded, Telling
 from ultragray_workers.scene_names import SUFFIX
-from ultragray_workers.shelves.opening import publish_made
-from ultragray_workers.storage.copies import DEFAULT_MAX_BYTES
+from ultragray_workers.scene_shelf import SCENES_FOLDER, SceneShelf
+from ultragray_workers.storage.cache import DEFAULT_MAX_BYTES
 from ultragray_workers.storage.storage import Storage
 
 WATCH_INTERVAL_S = 0.25
@@ -90,20 +89,19 @@ class Supervisor:
     """Does the jobs of a worker, one at a time."""
 
     def __init__(self, config: WorkerConfig, jobs: JobDatabase, gate: Gate) -> None:
-        self._config, self._jobs, self._gate = config, jobs, gate
-        self._engine, self._identity = jobs.engine, jobs.identity
-        self._stop = threading.Event()
-        self._idle = threading.Event()
-        self._idle.set()
-        self._moved_at_s = time.monotonic()
-        self._stop_by_s = float("-inf")
+        self.config, self.jobs, self.gate = config, jobs, gate
+        self.stopping = threading.Event()
+        self.moved_at_s = time.monotonic()
         self.is_draining = False  # an administrator wants the job at hand to go to another worker
         self.job_at_hand: str | None = None
+        self._idle = threading.Event()
+        self._idle.set()
+        self._stop_by_s = float("-inf")
 
     @property
     def is_stuck(self) -> bool:
         """Whether there is a job at hand that nobody watches: then this worker should count as dead."""
-        return self.job_at_hand is not None and time.monotonic() - self._moved_at_s > STUCK_AFTER_S
+        return self.job_at_hand is not None and time.monotonic() - self.moved_at_s > STUCK_AFTER_S
 
     def stop(self, drain_timeout_s: float, hurry: threading.Event) -> None:
         """Ends the process at hand, which writes a checkpoint, and puts its job back into the queue.
@@ -111,11 +109,16 @@ class Supervisor:
         A job that would begin anew has `drain_timeout_s` to end first, or until `hurry` is set.
         """
         self._stop_by_s = time.monotonic() + drain_timeout_s
-        self._stop.set()
+        self.stopping.set()
         while time.monotonic() < self._stop_by_s and not hurry.is_set() and not self._idle.wait(_POLL_INTERVAL_S):
             pass
         self._stop_by_s = float("-inf")
         self._idle.wait(STOP_WAIT_S + LAST_WAIT_S + 5.0)
+
+    def must_stop(self, row: Row) -> bool:
+        """Whether the process at hand is to end now, since its worker stops; and a sign of life of the supervision."""
+        self.moved_at_s = time.monotonic()
+        return self.stopping.is_set() and (has_checkpoints(row.summary) or time.monotonic() > self._stop_by_s)
 
     def supervise(self, row: Row) -> None:
         """Does a job that this worker has taken, from where an earlier attempt left it, and ends it in the queue.
@@ -123,11 +126,11 @@ class Supervisor:
         It stays as it is there where it is cancelled, another worker's, or put back.
         """
         self._idle.clear()
-        self._moved_at_s = time.monotonic()
+        self.moved_at_s = time.monotonic()
         self.job_at_hand = row.id
         try:
-            with self._device_for(row) as device, _span(row, self._config.name) as span:
-                outcome = _JobAtHand(self, row, device).do()
+            with _span(row, self.config.name) as span:
+                outcome = _JobAtHand(self, row).do()
                 if outcome.error is not None:
                     span.set_status(Status(StatusCode.ERROR, outcome.error))
             _log.info(f"job {row.id} {'succeeded' if outcome.error is None else f'failed: {outcome.reason}'}")
@@ -136,122 +139,73 @@ class Supervisor:
         except Interrupted:
             pass
         finally:
-            self._gate.close()
+            self.gate.close()
             self.job_at_hand = None
             self._idle.set()
-
-    @contextmanager
-    def _device_for(self, row: Row) -> Iterator[DeviceLock]:
-        """A device that fits a job, held. Raises Interrupted where another job has it."""
-        lock = None
-        try:
-            lock = self._gate.hold(demand_of_key(row.demand))
-        except OSError:
-            self.require_storage(row)
-        if lock is None:
-            self._gate.close(for_s=_PAUSE_S)
-            self.until_database_answers(row, lambda: queue.put_back(self._engine, row, is_untouched=True))
-            raise Interrupted
-        try:
-            yield lock
-        finally:
-            lock.release()
-
-    def require_storage(self, row: Row) -> None:
-        """Puts a job back that failed because the artifact folder is gone. Raises Interrupted."""
-        try:
-            self._identity.check()
-        except ArtifactFolderUnavailable as error:
-            self.put_back(row, error.detail)
-
-    def put_back(self, row: Row, why: str) -> NoReturn:
-        """Lets the job wait again, and this worker take none for a while. Raises Interrupted."""
-        _log.error(f"the job {row.id} waits again: {why}")
-        self._gate.close(for_s=_PAUSE_S)
-        self.until_database_answers(row, lambda: queue.put_back(self._engine, row))
-        raise Interrupted
-
-    def give_back(self, row: Row) -> NoReturn:
-        """Lets the job wait again since this worker stops. Raises Interrupted."""
-        with suppress(DatabaseUnavailable, StorageFull):  # then the heartbeat of any worker puts it back
-            queue.put_back(self._engine, row)
-        raise Interrupted
-
-    def require_held(self, row: Row) -> None:
-        """Raises Interrupted unless the queue says that this worker runs the job, which is asked until it answers."""
-        self.until_database_answers(row, lambda: self.raise_unless_held(row))
-
-    def raise_unless_held(self, row: Row) -> None:
-        """Raises Interrupted unless the queue says that this worker runs the job, DatabaseUnavailable."""
-        if not queue.is_held(self._engine, row):
-            _log.info(f"job {row.id} is cancelled or another worker's: its process is ended")
-            raise Interrupted
-
-    def look_after(self, row: Row) -> None:
-        """Keeps a job at hand whose files are on their way. Raises Interrupted where it is not ours any more."""
-        self._moved_at_s = time.monotonic()
-        if self._stop.is_set():
-            self.give_back(row)
-        with suppress(DatabaseUnavailable):
-            self.raise_unless_held(row)
-
-    def until_database_answers(self, row: Row, ask: Callable[[], _T]) -> _T:
-        """The answer of a database that may be away or full for a while; a worker that stops does not wait for it."""
-        while True:
-            self._moved_at_s = time.monotonic()
-            try:
-                return ask()
-            except (DatabaseUnavailable, StorageFull):
-                if self._stop.wait(WATCH_INTERVAL_S):
-                    self.give_back(row)
-
-    def must_stop(self, row: Row) -> bool:
-        """Whether the process at hand is to end now, since its worker stops; and a sign of life of the supervision."""
-        self._moved_at_s = time.monotonic()
-        return self._stop.is_set() and (has_checkpoints(row.summary) or time.monotonic() > self._stop_by_s)
 
 
 class _JobAtHand:
     """One attempt at a job, from its take-over to its end."""
 
-    def __init__(self, supervisor: Supervisor, row: Row, device: DeviceLock) -> None:
-        self._supervisor, self._row, self._device = supervisor, row, device
-        self._config, self._engine = supervisor._config, supervisor._engine
+    def __init__(self, supervisor: Supervisor, row: Row) -> None:
+        self._supervisor, self._row, self._config = supervisor, row, supervisor.config
+        self._engine, self._check_storage = supervisor.jobs.engine, supervisor.jobs.identity.check
         self._folder = JobFolder(self._config.artifact_folder, row.id, row.attempt)
-        self._telling = Telling(
-            supervisor._jobs, self._config.storage, self._folder, row, lambda: supervisor.look_after(row)
-        )
+        self._telling = Telling(supervisor.jobs, self._config.storage, self._folder, row, self._look_after)
         self._limit_s = min(
             filter(None, [row.summary.get("max_run_s") or 0.0, self._config.max_run_s]), default=float("inf")
         )
         self._run_s, self._unsaved_s = row.run_s, 0.0
         self._desk: ShardDesk | None = None
+        self._device: DeviceLock
 
     def do(self) -> Outcome:
         """Does the job, and ends it in the queue. Raises Interrupted, Superseded."""
-        try:
+        with self._hold_device():
             try:
-                outcome = self._outcome() if self._is_needed() else Outcome()
-                if outcome.error is not None:
-                    self._supervisor.require_storage(self._row)
-                files = self._telling.end(outcome)
-                if outcome.error is None and self._made is not None:
-                    outcome = self._publish(outcome, files)
+                outcome, files = self._end()
+                if outcome.error is not None and (desk := self._desk) is not None:
+                    self._ask(lambda: desk.fail(outcome))
+                if not self._ask(lambda: queue.finish(self._engine, self._row, outcome, files)):
+                    raise Superseded
+                if is_in_shards(self._row.summary) and self._row.batch is None:
+                    self._ask(lambda: queue.cancel_shares(self._engine, self._row.id))
+                self._telling.remove_others()
+                return outcome
+            except Interrupted:
+                self._telling.tell_last()
+                raise
             finally:
-                self._save_run_time()
-            if outcome.error is not None and (desk := self._desk) is not None:
-                self._ask(lambda: desk.fail(outcome))
-            if not self._ask(lambda: queue.finish(self._engine, self._row, outcome, files)):
-                raise Superseded
-            if is_in_shards(self._row.summary) and self._row.batch is None:
-                self._ask(lambda: queue.cancel_shares(self._engine, self._row.id))
-            self._telling.remove_others()
-            return outcome
-        except Interrupted:
-            self._telling.tell_last()
-            raise
+                self._telling.forget()
+
+    @contextmanager
+    def _hold_device(self) -> Iterator[None]:
+        """Holds a device that fits the job. Raises Interrupted where another job has it."""
+        lock = None
+        try:
+            lock = self._supervisor.gate.hold(demand_of_key(self._row.demand))
+        except OSError:
+            self._require_storage()
+        if lock is None:
+            self._put_back(is_untouched=True)
+        self._device = lock
+        try:
+            yield
         finally:
-            self._telling.forget()
+            lock.release()
+
+    def _end(self) -> tuple[Outcome, Files]:
+        """The end of the work, all that was made in the storage, and the scene served."""
+        try:
+            outcome = self._outcome() if self._is_needed() else Outcome()
+            if outcome.error is not None:
+                self._require_storage()
+            files = self._telling.end(outcome)
+            if outcome.error is None and self._row.makes_scene is not None and self._row.batch is None:
+                outcome = self._publish(self._row.makes_scene, outcome, files)
+            return outcome, files
+        finally:
+            self._save_run_time()
 
     def _is_needed(self) -> bool:
         """Whether the batch of a share goes on; true of all other jobs."""
@@ -259,15 +213,7 @@ class _JobAtHand:
         found = None if batch is None else self._ask(lambda: queue.row_of(self._engine, batch))
         return batch is None or (found is not None and not found.state.is_final)
 
-    @property
-    def _made(self) -> str | None:
-        return None if self._row.batch is not None else self._row.makes_scene
-
-    def _ask(self, question: Callable[[], _T]) -> _T:
-        return self._supervisor.until_database_answers(self._row, question)
-
     def _outcome(self) -> Outcome:
-        """How the work ended."""
         folder, attempt = self._folder, self._row.attempt
         try:
             self._telling.take_over()
@@ -279,9 +225,11 @@ class _JobAtHand:
         except (JobStalled, JobTimeExceeded) as error:
             return Outcome(error.reason, error.detail, progress=folder.progress(), attempts=attempt)
         except OSError as error:
-            if not is_no_room(error) and attempt < MAX_KILLS:  # such as a share that has gone, and may be back by now
-                self._supervisor.put_back(self._row, f"its folder could not be used: {error.strerror}")
-            return _failure_of_storage(error)
+            if is_no_room(error):
+                return _STORAGE_FULL
+            if attempt < MAX_KILLS:  # such as a share that has gone, and may be back by now
+                self._put_back(f"its folder could not be used: {error.strerror}")
+            return Outcome(error="INTERNAL", reason=f"the folder of the job cannot be used: {error.strerror}")
         finally:
             folder.remove_leftovers()
 
@@ -303,12 +251,10 @@ class _JobAtHand:
                 max_copies_bytes=config.max_copies_bytes,
             )
         )
-        attempt = row.attempt
-        crashes = kills = 0
-        furthest = _furthest(folder)
+        attempt, crashes, kills, furthest = row.attempt, 0, 0, _furthest(folder)
         while True:
             memory_kills = _memory_kills()
-            self._supervisor.require_held(row)
+            self._ask(self._raise_unless_held)
             end_process_of_another_worker(folder)
             with _room_for_the_end(folder):
                 code = self._run_process()
@@ -319,17 +265,18 @@ class _JobAtHand:
                     f"the job ran for {self._limit_s:g} s, the longest that it may (its max_run_s, or "
                     "ULTRAGRAY_JOB_MAX_RUN_S); a retry goes on from its checkpoint"
                 )
-            self._supervisor.require_storage(row)
+            self._require_storage()
             if code == STORAGE_FULL:
-                return replace(_storage_full(), progress=folder.progress(), attempts=attempt)
+                return replace(_STORAGE_FULL, progress=folder.progress(), attempts=attempt)
             if _furthest(folder) > furthest:
                 crashes = kills = 0
             furthest = max(furthest, _furthest(folder))
-            is_kill = code in (-signal.SIGKILL, -signal.SIGTERM, STOPPED) and _memory_kills() == memory_kills
+            is_of_memory = _memory_kills() > memory_kills
+            is_kill = code in (-signal.SIGKILL, -signal.SIGTERM, STOPPED) and not is_of_memory
             kills, crashes = kills + is_kill, crashes + (not is_kill)
             _log.warning(f"the process of the job {row.id} died ({_in_words(code)})")
             if kills >= MAX_KILLS or crashes >= MAX_CRASHES:
-                failed = _failure_of_process(code, crashes + kills, _memory_kills() > memory_kills)
+                failed = _failure_of_process(code, crashes + kills, is_of_memory)
                 return replace(failed, progress=folder.progress(), attempts=attempt)
             attempt += 1
 
@@ -338,7 +285,9 @@ class _JobAtHand:
         supervisor, row, config = self._supervisor, self._row, self._config
         with (
             self._desk_of_batch() as desk,
-            job_process(self._folder, self._device, config.threads, desk.descriptors if desk else ()) as process,
+            job_process(
+                self._folder, self._device.fileno(), config.threads, None if desk is None else desk.descriptor
+            ) as process,
         ):
             watchdog = Watchdog(process.pid, config.stall_timeout_s)
             watched_at_s = float("-inf")
@@ -351,7 +300,10 @@ class _JobAtHand:
                         break
                     if supervisor.is_draining and has_checkpoints(row.summary):
                         end_with_checkpoint(process)
-                        self._leave_to_others()
+                        _log.info(f"the job {row.id} waits again: this worker is to rest")
+                        self._telling.tell_last()
+                        self._ask(lambda: queue.put_back(self._engine, row))
+                        raise Interrupted
                     if time.monotonic() - watched_at_s >= WATCH_INTERVAL_S:
                         self._add_run_time(watchdog.look())
                         if watchdog.is_stalled:
@@ -363,7 +315,7 @@ class _JobAtHand:
                             end_with_checkpoint(process)
                             break
                         with suppress(DatabaseUnavailable):  # the work goes on meanwhile
-                            supervisor.raise_unless_held(row)
+                            self._raise_unless_held()
                         watched_at_s = time.monotonic()
                     if desk is None:
                         time.sleep(_POLL_INTERVAL_S)
@@ -375,19 +327,11 @@ class _JobAtHand:
                 desk.settle()
             if is_given_back:
                 self._telling.tell_last()
-                supervisor.give_back(row)
+                self._give_back()
         return process.returncode
-
-    def _leave_to_others(self) -> NoReturn:
-        """Puts the job at hand back into the queue. Raises Interrupted."""
-        _log.info(f"the job {self._row.id} waits again: this worker is to rest")
-        self._telling.tell_last()
-        self._ask(lambda: queue.put_back(self._engine, self._row))
-        raise Interrupted
 
     @contextmanager
     def _desk_of_batch(self) -> Iterator[ShardDesk | None]:
-        """The desk of a process at a job in shards."""
         if not is_in_shards(self._row.summary):
             yield None
             return
@@ -401,19 +345,62 @@ class _JobAtHand:
         finally:
             desk.close()
 
-    def _publish(self, outcome: Outcome, files: Files) -> Outcome:
+    def _publish(self, scene: str, outcome: Outcome, files: Files) -> Outcome:
         """Serves the scene, unless the job was cancelled first; how the job ended then. Raises Superseded."""
         if not self._ask(lambda: queue.publish(self._engine, self._row, outcome, files)):
             raise Superseded
-        scene = self._made
-        assert scene is not None
-        file = self._folder.artifacts / f"{scene}{SUFFIX}"
+        file, shelf = self._folder.artifacts / f"{scene}{SUFFIX}", SceneShelf(self._config.storage, SCENES_FOLDER)
         try:
-            self._telling.patiently(lambda: publish_made(self._config.storage, file, scene))
+            self._telling.patiently(lambda: shelf.publish(file, scene))
         except SceneExists as error:
             reason = f"a scene {scene!r} appeared while this job made another: choose another name"
             return replace(outcome, error=error.reason, reason=reason)  # the scene can be downloaded
         return outcome
+
+    def _require_storage(self) -> None:
+        """Puts a job back that failed because the artifact folder is gone. Raises Interrupted."""
+        try:
+            self._check_storage()
+        except ArtifactFolderUnavailable as error:
+            self._put_back(error.detail)
+
+    def _put_back(self, why: str = "", *, is_untouched: bool = False) -> NoReturn:
+        """Lets the job wait again, and this worker take none for a while. Raises Interrupted."""
+        if why:
+            _log.error(f"the job {self._row.id} waits again: {why}")
+        self._supervisor.gate.close(for_s=_PAUSE_S)
+        self._ask(lambda: queue.put_back(self._engine, self._row, is_untouched=is_untouched))
+        raise Interrupted
+
+    def _give_back(self) -> NoReturn:
+        """Lets the job wait again since this worker stops. Raises Interrupted."""
+        with suppress(DatabaseUnavailable, StorageFull):  # then the heartbeat of any worker puts it back
+            queue.put_back(self._engine, self._row)
+        raise Interrupted
+
+    def _raise_unless_held(self) -> None:
+        """Raises Interrupted unless the queue says that this worker runs the job, DatabaseUnavailable."""
+        if not queue.is_held(self._engine, self._row):
+            _log.info(f"job {self._row.id} is cancelled or another worker's: its process is ended")
+            raise Interrupted
+
+    def _look_after(self) -> None:
+        """Keeps a job at hand whose files are on their way. Raises Interrupted where it is not ours any more."""
+        self._supervisor.moved_at_s = time.monotonic()
+        if self._supervisor.stopping.is_set():
+            self._give_back()
+        with suppress(DatabaseUnavailable):
+            self._raise_unless_held()
+
+    def _ask(self, question: Callable[[], _T]) -> _T:
+        """The answer of a database that may be away or full for a while; a worker that stops does not wait for it."""
+        while True:
+            self._supervisor.moved_at_s = time.monotonic()
+            try:
+                return question()
+            except (DatabaseUnavailable, StorageFull):
+                if self._supervisor.stopping.wait(WATCH_INTERVAL_S):
+                    self._give_back()
 
     def _add_run_time(self, seconds: float) -> None:
         self._run_s += seconds
@@ -437,12 +424,9 @@ def _span(row: Row, worker: str) -> Iterator[trace.Span]:
         "ultragray.worker": worker,
         "ultragray.attempt": row.attempt,
     }
-    with trace.get_tracer("ultragray").start_as_current_span(
-        f"job {row.kind}",
-        context=propagate.extract(row.trace),
-        kind=trace.SpanKind.CONSUMER,
-        attributes=attributes,
-    ) as span:
+    context, kind = propagate.extract(row.trace), trace.SpanKind.CONSUMER
+    tracer = trace.get_tracer("ultragray")
+    with tracer.start_as_current_span(f"job {row.kind}", context, kind, attributes=attributes) as span:
         yield span
 
 
@@ -489,14 +473,7 @@ def _failure_of_process(code: int, times: int, of_memory: bool) -> Outcome:
     )
 
 
-def _failure_of_storage(error: OSError) -> Outcome:
-    if is_no_room(error):
-        return _storage_full()
-    return Outcome(error="INTERNAL", reason=f"the folder of the job cannot be used: {error.strerror}")
-
-
-def _storage_full() -> Outcome:
-    return Outcome(error=StorageFull.reason, reason="the artifact folder has no room for what this job writes")
+_STORAGE_FULL = Outcome(error=StorageFull.reason, reason="the artifact folder has no room for what this job writes")
 
 
 def _in_words(code: int) -> str:

@@ -129,7 +129,6 @@ class Telling:
             self._storage.delete_half_written(top)
 
     def forget(self) -> None:
-        """Removes the folder of the job."""
         self._ended.set()
         self._folder.remove()
 
