@@ -90,6 +90,18 @@ def of_rows(**patterns: str) -> Callable[[Document], Lines]:
     return lambda measured: columns(measured["rows"], {head.replace("_", " "): one for head, one in patterns.items()})
 
 
+def on_a_gpu(**patterns: str) -> Callable[[Document], Lines]:
+    """`of_rows`, and the GPU that they were measured on."""
+
+    def lines(measured: Document) -> Lines:
+        yield from of_rows(**patterns)(measured)
+        gpu, versions = measured["gpu"], measured["versions"]
+        software = f"driver {gpu['driver']}, CUDA {gpu['cuda']}, torch {versions['torch']}, Triton {gpu['triton']}"
+        yield from ("", f"{gpu['name']}, {software}.")
+
+    return lines
+
+
 def frames(measured: Document) -> Lines:
     """The kernel and the front doors, and the memory of a worker process."""
     shown = of_rows(
@@ -259,6 +271,32 @@ BLOCKS = {
         ),
     ),
     "parts of a frame": Block("kernel", parts),
+    "frames on a GPU": Block(
+        "cuda",
+        on_a_gpu(
+            What="{what}",
+            Gaussians="{gaussians:,}",
+            Poses="{poses}",
+            p50_ms="{p50_ms:.2f}",
+            p99_ms="{p99_ms:.2f}",
+            **{"Frames/s": "{frames_per_s:,.0f}"},
+            Bandwidth="{bandwidth_share:.1%}",
+            Arithmetic="{arithmetic_share:.1%}",
+        ),
+    ),
+    "training steps on a GPU": Block(
+        "cuda_training",
+        on_a_gpu(
+            Gaussians="{gaussians:,}",
+            Images="{images}",
+            Step_ms="{step_ms:.1f}",
+            **{
+                f"{part.capitalize()} ms": f"{{part_ms[{part}]:.1f}}"
+                for part in ("forward", "loss", "backward", "optimizer")
+            },
+            **{"Peak MB": "{peak_memory_mb:,.0f}"},
+        ),
+    ),
     "clients": Block("clients", clients),
     "control loop": Block("clients", control_loop),
     "jobs": Block("jobs", jobs),

@@ -43,7 +43,7 @@ ROOTS = {
     "Dataset": DatasetRecord,
     "Specification": Specification,
 }
-LEFT_OUT = {"device_set"}  # a file is uploaded with its dataset
+LEFT_OUT = {"device_set", "calibration"}  # files are uploaded with their dataset
 OWN_TYPES = {"Poses": "Iterable[PoseLike]"}  # what the client takes in their place
 
 NOT_OVER_GRPC = {  # reasons of other doors, and of jobs that failed

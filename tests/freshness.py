@@ -12,7 +12,7 @@ from .waiting import at_this_load
 PERIOD_S = 1 / 60
 SPARE_S = 0.15  # beside the reader's own period
 # Between one reading and the next: at once, quickly, slowly, after a long stall, and slowly again.
-PAUSES_S = (*[0.0] * 20, *[0.05] * 20, *[0.3] * 6, 2.5, *[0.3] * 3, 1.0, *[0.05] * 10)
+PAUSES_S = (*[0.0] * 20, *[0.05] * 5, *[0.3] * 2, 1.0, *[0.05] * 5)
 
 
 class Door(Protocol):

@@ -125,11 +125,32 @@ def template(descriptor):
     main(descriptor)
 
 
+# What a service looks at now and then it looks at more often here, in seconds; those that start cold have their own.
+SHORT_WAITS = {
+    "access.audit.WRITE_INTERVAL_S": 0.2,
+    "access.credentials.LOOK_INTERVAL_S": 0.2,
+    "access.keys.INTERVAL_S": 0.25,
+    "access.owners.SPREAD_S": 0.5,  # two of the interval before
+    "core.jobs.READ_INTERVAL_S": 0.1,
+    "core.jobs.COUNT_INTERVAL_S": 0.5,
+    "core.readiness.CHECK_INTERVAL_S": 0.5,
+    "core.uploads._POLL_INTERVAL_S": 0.05,
+    "listening.HANDSHAKE_TIMEOUT_S": 2.0,
+    "rpc.server.HANDSHAKE_TIMEOUT_S": 2.0,
+    "tls._POLL_S": 0.2,
+}
+
+
 def service(templates):
     """The service, whose pool has its template forked as well."""
     from ultragray_service.__main__ import main
     from ultragray_workers.pool import processes as launcher
 
+    for place, seconds in SHORT_WAITS.items():
+        module, _, name = place.rpartition(".")
+        owner = importlib.import_module(f"ultragray_service.{module}")
+        assert isinstance(getattr(owner, name), float), place
+        setattr(owner, name, seconds)
     launcher.start_template = lambda descriptor: start_template(Path(templates), descriptor)
     return main()
 

@@ -328,6 +328,9 @@ class DatasetOptions:
     image_size: str | None = None  # Resize the frames: WIDTHxHEIGHT, such as 192x256.
     image_topic: str | None = None  # Topic of a recording to take images from, where there are several.
     pose_topic: str | None = None  # Topic of a recording to take poses from; /tf: from the transforms of tf.
+    # By how much images are stamped later than they were taken (negative: earlier): each gets the pose of that much
+    # before its stamp.
+    image_delay_ms: str | None = None
 
 
 @dataclass(frozen=True)
@@ -355,7 +358,8 @@ class Dataset:
     # Its format: released, a folder with conf.json and .npy files (or its conf.json); plus, a PLUS sequence (.mha,
     # .mhd, .nrrd, .nhdr); dicom, a DICOM cine loop (.dcm) with its poses beside it (.poses.npy or .poses.json);
     # mcap, an MCAP recording of ROS 2 (.mcap) with images and poses, its geometry in it or beside it
-    # (.geometry.json).
+    # (.geometry.json); table, a folder of pictures with their poses.csv and calibration.json (or its poses.csv);
+    # tusrec, a scan of TUS-REC (.h5) with its calibration (calib_matrix.csv, beside it or above).
     kind: str
     sha256: str  # Of images, poses, probe and split, however they were sent.
     bytes: int  # Of its files.

@@ -111,16 +111,16 @@ NB_MODULE(_cpu, m) {
            double cull_far_cm, BeamNumbers beam, Poses poses, int height, int width, int threads,
            const std::string& instruction_set, OptionalPlanes bmode, OptionalPlanes echo, OptionalPlanes transmittance,
            OptionalPlanes coverage, OptionalPlanes weight_sum, OptionalPlanes intensity_sum,
-           std::optional<int64_t> footprint_pixels, std::optional<Flag> flag, int64_t number) {
+           bool uncut, std::optional<int64_t> footprint_pixels, std::optional<Flag> flag, int64_t number) {
             const Outputs outputs =
                 planes_of({bmode, echo, transmittance, coverage, weight_sum, intensity_sum}, poses.shape(0), height, width);
-            const ProbeGeometry probe{fanned, wrap, start, span, near_cm, far_cm, cull_far_cm, beam_of(beam)};
+            const ProbeGeometry probe{fanned, wrap, start, span, near_cm, far_cm, cull_far_cm, beam_of(beam), uncut};
             const Limits limits = limits_of(footprint_pixels, flag, number);
             nb::gil_scoped_release release;
             render(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads, instruction_set, outputs,
                    limits);
         },
-        RENDER_ARGUMENTS, nb::arg("footprint_pixels") = nb::none(), nb::arg("flag").noconvert().none() = nb::none(),
+        RENDER_ARGUMENTS, nb::arg("uncut") = false, nb::arg("footprint_pixels") = nb::none(), nb::arg("flag").noconvert().none() = nb::none(),
         nb::arg("number") = 0);
 
     m.def(

@@ -3,6 +3,7 @@
 #include <algorithm>
 #include <cmath>
 #include <cstdlib>
+#include <limits>
 #include <memory>
 #include <new>
 #include <stdexcept>
@@ -53,7 +54,9 @@ View make_view(const ProbeGeometry& probe, const ScanLines& lines, const double*
     view.line_x = lines.x.data(), view.dir_x = lines.dir_x.data(), view.dir_z = lines.dir_z.data();
     if (!probe.fanned)
         for (int k = 0; k < kMaxLanes; ++k) view.spacing[k] = static_cast<float>(k * probe.span / width);
-    view.near = probe.near, view.cull_far = probe.cull_far;
+    view.near = probe.near;
+    view.cull_near = probe.uncut ? -std::numeric_limits<double>::infinity() : probe.near;
+    view.cull_far = probe.uncut ? std::numeric_limits<double>::infinity() : probe.cull_far;
     view.row_step = (probe.far - probe.near) / height;
     view.start = probe.start, view.span = probe.span, view.fanned = probe.fanned, view.wrap = probe.wrap;
     view.height = height, view.lines = width;

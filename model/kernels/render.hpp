@@ -16,6 +16,7 @@ struct ProbeGeometry {
     double start, span;  // of the scan lines, as in View
     double near, far, cull_far;
     Beam beam;
+    bool uncut = false;  // Gaussians count wherever their means lie
 };
 
 // Planes of many poses, each [C, H, W] or null; the last two are S, the sum of w, and that of I*w.

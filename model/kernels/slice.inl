@@ -95,7 +95,7 @@ inline void touched_lines_of_turn(const View& view, double room, Slice& s) {
 
 inline bool inside_planes(const View& view, double x, double z) {
     const double depth = view.fanned ? __builtin_sqrt(x * x + z * z) : z;
-    return depth >= view.near && depth <= view.cull_far && (!view.fanned || view.wrap || z > 0);
+    return depth >= view.cull_near && depth <= view.cull_far && (!view.fanned || view.wrap || z > 0);
 }
 
 // kLanes Gaussians seen in the probe frame.
@@ -232,7 +232,7 @@ void slice_clusters_of(const SceneView& scene, const View& view, int64_t first, 
     const float ny[3] = {float(view.axes[1][0]), float(view.axes[1][1]), float(view.axes[1][2])};
     const float o[3] = {float(view.origin[0]), float(view.origin[1]), float(view.origin[2])};
     // The culls here only save work; they are widened by what float32 may be off.
-    const float far = view.cull_far < 1e6 ? float(view.cull_far) : 1e6f;  // infinite for one row
+    const float far = float(view.near + view.row_step * view.height);
     const float slack = 1e-6f * (1.0f + far + __builtin_fabsf(o[0]) + __builtin_fabsf(o[1]) + __builtin_fabsf(o[2]));
     // A reach of 3.33 standard deviations; variances add up.
     const float beam_reach2 = float(kMaxM2 * (1 + 1e-5) * view.beam.most);

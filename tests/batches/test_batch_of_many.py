@@ -4,8 +4,6 @@ ULTRAGRAY_SHARDS_FRAMES says how many frames (make test-shards FRAMES=1000000), 
 figures go. In the first half of the frames nobody is killed: there the rate is measured.
 """
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
@@ -16,10 +14,8 @@ import sys
 import tarfile
 import threading
 import time
-from collections.abc import Callable, Iterator
 from io import BytesIO
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -35,7 +31,6 @@ from ultragray.scene.info import read_header
 from ultragray_studies.bench.report import measured
 from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.progress import JobState
-from ultragray_workers.jobs.record import Job
 from ultragray_workers.jobs.store import JobStore
 
 from ..surroundings import ROOT
@@ -75,7 +70,7 @@ print(done / passed)
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def place(tmp_path_factory):
     folder = tmp_path_factory.mktemp("batch")
     (folder / "artifacts" / "scenes").mkdir(parents=True)
     copy_demo_scene(folder / "artifacts" / "scenes" / "spine.ugr")
@@ -83,9 +78,9 @@ def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def figures(place: Path) -> Iterator[dict[str, Any]]:
+def figures(place):
     """What is measured; recorded at the end."""
-    found: dict[str, Any] = {
+    found = {
         "measured": measured(1),
         "extent": {"frames": FRAMES, "shards": SHARDS, "side": SIDE, "workers": WORKERS},
         "kernel_frames_per_s": kernel_rate(scene_of(place)),
@@ -100,11 +95,11 @@ def figures(place: Path) -> Iterator[dict[str, Any]]:
         write_whole(ROOT / RECORD, json.dumps(found, indent=1) + "\n")
 
 
-def scene_of(place: Path) -> Path:
+def scene_of(place):
     return place / "artifacts" / "scenes" / "spine.ugr"
 
 
-def plan_of(scene: Path) -> BatchPlan:
+def plan_of(scene):
     return BatchPlan.prepared(
         read_header(scene),
         FrameSettings(height=SIDE, width=SIDE),
@@ -116,7 +111,7 @@ def plan_of(scene: Path) -> BatchPlan:
     )
 
 
-def kernel_rate(scene: Path) -> float:
+def kernel_rate(scene):
     """Frames a second of the kernel alone, one process of one thread for each worker, all at the same time."""
     environment = {
         **os.environ,
@@ -130,20 +125,18 @@ def kernel_rate(scene: Path) -> float:
         for _ in range(WORKERS)
     ]
     for process in running:  # each has loaded its scene
-        assert process.stdout is not None
         assert process.stdout.readline() == "ready\n"
     return sum(float(process.communicate()[0]) for process in _started(running))
 
 
-def _started(processes: list[subprocess.Popen[str]]) -> list[subprocess.Popen[str]]:
+def _started(processes):
     for process in processes:
-        assert process.stdin is not None
         process.stdin.write("go\n")
         process.stdin.flush()
     return processes
 
 
-def check_frames(folder: Path, scene: Path) -> dict[str, str]:
+def check_frames(folder, scene):
     """The hashes of the files by name, once they are exactly the frames of the plan, each once."""
     plan = plan_of(scene)
     manifest = json.loads((folder / "manifest.json").read_text())
@@ -176,24 +169,24 @@ def check_frames(folder: Path, scene: Path) -> dict[str, str]:
 class Killer:
     """Kills workers and the processes of their jobs at random, and starts workers again."""
 
-    def __init__(self, start: Callable[[str], RunningWorker]) -> None:
+    def __init__(self, start):
         self._start, self._random = start, random.Random(SEED)
         self.workers = {f"host-{number}": start(f"host-{number}") for number in range(WORKERS)}
         self.kills = 0
         self._over = threading.Event()
         self._thread = threading.Thread(target=self._run)
 
-    def begin(self) -> None:
+    def begin(self):
         self._thread.start()
 
-    def end(self) -> None:
+    def end(self):
         self._over.set()
         if self._thread.ident is not None:
             self._thread.join()
         for worker in self.workers.values():
             worker.kill()
 
-    def _run(self) -> None:
+    def _run(self):
         while True:
             name = self._random.choice(sorted(self.workers))
             process = self.workers[name].job_process()
@@ -207,7 +200,7 @@ class Killer:
                 return
 
 
-def until(store: JobStore, job_id: str, reached: Callable[[Job], bool]) -> Job:
+def until(store, job_id, reached):
     end = Deadline(TIMEOUT_S)
     while not reached(job := store.get(job_id)) and job.state not in FINAL:
         assert not end.passed, (job, store.log_tail(job_id))
@@ -215,7 +208,7 @@ def until(store: JobStore, job_id: str, reached: Callable[[Job], bool]) -> Job:
     return job
 
 
-def test_the_queue_makes_each_frame_once_though_workers_are_killed(place: Path, figures: dict[str, Any]) -> None:
+def test_the_queue_makes_each_frame_once_though_workers_are_killed(place, figures):
     artifacts = place / "artifacts"
     store = JobStore(artifacts, os.environ.get("DATABASE_URL"))
     job = RenderJob(
@@ -229,7 +222,7 @@ def test_the_queue_makes_each_frame_once_though_workers_are_killed(place: Path, 
     try:
         submitted, _ = store.submit(job)
 
-        def done(one: Job) -> int:
+        def done(one):
             return one.progress.frames_done or 0
 
         first = until(store, submitted.id, lambda one: done(one) >= 0.1 * FRAMES)
@@ -251,14 +244,14 @@ def test_the_queue_makes_each_frame_once_though_workers_are_killed(place: Path, 
         assert share >= LEAST_SHARE
 
 
-def test_ray_makes_the_same_files_though_a_worker_is_killed(place: Path, figures: dict[str, Any]) -> None:
+def test_ray_makes_the_same_files_though_a_worker_is_killed(place, figures):
     pytest.importorskip("ray", reason="Ray is not installed: pip install 'ultragray[ray]'")
     from ultragray_workers.batches.on_ray import RayBatch
 
-    told: list[tuple[float, int]] = []
-    killed: list[int] = []
+    told = []
+    killed = []
 
-    def report(frames: int) -> None:
+    def report(frames):
         told.append((time.monotonic(), frames))
         if frames >= 0.5 * FRAMES and not killed:
             killed.append(ray_worker())
@@ -275,7 +268,7 @@ def test_ray_makes_the_same_files_though_a_worker_is_killed(place: Path, figures
     assert hashes == figures.get("hashes", hashes)
 
 
-def ray_worker() -> int:
+def ray_worker():
     """A process of the cluster that makes a shard."""
     for folder in Path("/proc").glob("[0-9]*"):
         try:

@@ -1,81 +1,68 @@
 """Both clients against a real service: what a test does with `client` it does with either."""
 
-from __future__ import annotations
-
 import asyncio
 import inspect
 import threading
-from collections.abc import Callable, Iterator
-from typing import Any
 
 import pytest
 
 from ultragray_client import AsyncClient, AsyncFrameStream, Client
 from ultragray_client.transport import Group
 
-from ..service.conftest import (
-    RunningService,
-    StartService,
-    data_folder,
-    demo_scene,
-    start_service,
-    start_shared_service,
-)
+from ..service.conftest import data_folder, demo_scene, start_service, start_shared_service
 
 __all__ = ["data_folder", "demo_scene", "start_service", "start_shared_service"]
 from .proxy import Proxy
 
 KEY = "0123456789abcdef-client"
 MAX_POSES = 40
-SETTINGS: dict[str, Any] = {"max_poses_per_request": MAX_POSES, "max_image_side": 600, "api_keys": KEY}
-
-# Of uploads and jobs, `make test` has those of the client for threads: both carry out the same descriptions.
-UPLOADS_AND_JOBS = {"test_client_recording.py", "test_client_resources.py"}
+SETTINGS = {"max_poses_per_request": MAX_POSES, "max_image_side": 600, "api_keys": KEY}
 
 
-def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+def pytest_collection_modifyitems(items):
+    """Of uploads and jobs, `make test` has those of the client for threads: both carry out the same descriptions."""
     for item in items:
-        if item.path.name in UPLOADS_AND_JOBS and "[asyncio" in item.name:
+        if item.path.name == "test_client_resources.py" and "[asyncio" in item.name:
             item.add_marker(pytest.mark.long)
 
 
 class Blocking:
     """An object for asyncio as if it were an ordinary one: awaits, iterates and enters for the caller."""
 
-    def __init__(self, target: Any, loop: asyncio.AbstractEventLoop) -> None:
+    def __init__(self, target, loop):
         self._target, self._loop = target, loop
 
-    def __getattr__(self, name: str) -> Any:
+    def __getattr__(self, name):
         return self._as_ordinary(getattr(self._target, name))
 
-    def __call__(self, *arguments: Any, **keywords: Any) -> Any:
-        async def call() -> Any:
+    def __call__(self, *arguments, **keywords):
+        async def call():
             return self._target(*arguments, **keywords)
 
         return self._as_ordinary(self._run(call()))
 
-    def __iter__(self) -> Iterator[Any]:
+    def __iter__(self):
         return self
 
-    def __next__(self) -> Any:
+    def __next__(self):
         try:
             return self._run(anext(self._target))
         except StopAsyncIteration:
             raise StopIteration from None
 
-    def __enter__(self) -> Any:
+    def __enter__(self):
         return self._as_ordinary(self._run(self._target.__aenter__()))
 
-    def __exit__(self, *error: Any) -> None:
+    def __exit__(self, *error):
         self._run(self._target.__aexit__(*error))
 
-    def _run(self, awaitable: Any) -> Any:
-        async def wait() -> Any:
+    def _run(self, awaitable):
+        async def wait():
             return await awaitable
 
         return asyncio.run_coroutine_threadsafe(wait(), self._loop).result(60)
 
-    def _as_ordinary(self, value: Any) -> Any:
+    def _as_ordinary(self, value):
         if inspect.iscoroutine(value):
             return self._as_ordinary(self._run(value))
         own = isinstance(value, (Group, AsyncFrameStream)) or inspect.isasyncgen(value)
@@ -83,7 +70,7 @@ class Blocking:
 
 
 @pytest.fixture(scope="session")
-def event_loop_thread() -> Iterator[asyncio.AbstractEventLoop]:
+def event_loop_thread():
     loop = asyncio.new_event_loop()
     thread = threading.Thread(target=loop.run_forever)
     thread.start()
@@ -94,24 +81,24 @@ def event_loop_thread() -> Iterator[asyncio.AbstractEventLoop]:
 
 
 @pytest.fixture(scope="session")
-def client_service(start_shared_service: StartService, tmp_path_factory: pytest.TempPathFactory) -> RunningService:
+def client_service(start_shared_service, tmp_path_factory):
     """It takes few poses at a time."""
     return start_shared_service(artifact_folder=tmp_path_factory.mktemp("artifacts"), **SETTINGS)
 
 
 @pytest.fixture(scope="module")
-def working_service(start_service: StartService, tmp_path_factory: pytest.TempPathFactory) -> RunningService:
+def working_service(start_service, tmp_path_factory):
     """The same with a worker for jobs."""
     artifacts = tmp_path_factory.mktemp("artifacts")
     return start_service(artifact_folder=artifacts, embedded_worker=True, training_threads=1, **SETTINGS)
 
 
 @pytest.fixture(params=["sync", "asyncio"])
-def make_client(request: pytest.FixtureRequest, event_loop_thread: asyncio.AbstractEventLoop) -> Iterator[Any]:
+def make_client(request, event_loop_thread):
     """Makes clients of either kind, with the arguments of both."""
-    made: list[Any] = []
+    made = []
 
-    def make(address: str, **keywords: Any) -> Any:
+    def make(address, **keywords):
         if request.param == "sync":
             made.append(Client(address, **keywords))
         else:
@@ -124,12 +111,12 @@ def make_client(request: pytest.FixtureRequest, event_loop_thread: asyncio.Abstr
 
 
 @pytest.fixture
-def client(make_client: Any, client_service: RunningService) -> Any:
+def client(make_client, client_service):
     return make_client(client_service.grpc, api_key=KEY, timeout_s=60.0)
 
 
 @pytest.fixture
-def proxy(client_service: RunningService) -> Iterator[Proxy]:
+def proxy(client_service):
     """The way to the service, which a test cuts."""
     proxy = Proxy(client_service.grpc)
     yield proxy
@@ -137,6 +124,6 @@ def proxy(client_service: RunningService) -> Iterator[Proxy]:
 
 
 @pytest.fixture
-def far_client(make_client: Callable[..., Any], proxy: Proxy) -> Any:
+def far_client(make_client, proxy):
     """A client that reaches the service by that way."""
     return make_client(proxy.address, api_key=KEY, timeout_s=60.0)

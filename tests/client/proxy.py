@@ -1,7 +1,5 @@
 """A proxy between a client and its service, which can break connections and lead elsewhere."""
 
-from __future__ import annotations
-
 import socket
 import threading
 from contextlib import suppress
@@ -10,31 +8,31 @@ from contextlib import suppress
 class Proxy:
     """Passes bytes on to a service; `cut_after` breaks a connection once so many bytes came back."""
 
-    def __init__(self, target: str) -> None:
+    def __init__(self, target):
         self.lead_to(target)
         self._listener = socket.create_server(("127.0.0.1", 0))
-        self._open: list[socket.socket] = [self._listener]
-        self._left: list[int] = []
+        self._open = [self._listener]
+        self._left = []
         self.cuts = 0
         self.address = f"127.0.0.1:{self._listener.getsockname()[1]}"
         threading.Thread(target=self._accept, daemon=True).start()
 
-    def lead_to(self, target: str) -> None:
+    def lead_to(self, target):
         """New connections lead to another service (HOST:PORT) from now on."""
         host, _, port = target.rpartition(":")
         self._target = (host, int(port))
 
-    def cut_after(self, *counts: int) -> None:
+    def cut_after(self, *counts):
         """Breaks the connection after so many bytes; the one that follows after as many as the next count says."""
         self._left = list(counts)
 
-    def close(self) -> None:
+    def close(self):
         for one in self._open:
             with suppress(OSError):  # it is shut already
                 one.shutdown(socket.SHUT_RDWR)  # closing alone would not wake those that wait for it
             one.close()
 
-    def _accept(self) -> None:
+    def _accept(self):
         while True:
             try:
                 near, _ = self._listener.accept()
@@ -49,7 +47,7 @@ class Proxy:
             threading.Thread(target=self._pass, args=(near, far, False), daemon=True).start()
             threading.Thread(target=self._pass, args=(far, near, True), daemon=True).start()
 
-    def _pass(self, source: socket.socket, sink: socket.socket, counted: bool) -> None:
+    def _pass(self, source, sink, counted):
         try:
             while data := source.recv(16384):
                 sink.sendall(data)

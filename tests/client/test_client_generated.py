@@ -1,10 +1,7 @@
 """What client/generate.py writes is committed as it writes it."""
 
-from __future__ import annotations
-
 from dataclasses import asdict
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
@@ -19,27 +16,27 @@ CLIENT = Path(__file__).resolve().parents[2] / "client"
 
 
 @pytest.fixture(scope="module")
-def generator() -> ModuleType:
+def generator():
     return loaded(CLIENT / "generate.py")
 
 
-def test_the_contract_is_current(generator: ModuleType, tmp_path: Path) -> None:
+def test_the_contract_is_current(generator, tmp_path):
     committed = CLIENT / "ultragray_client" / "contract.py"
     assert committed.read_text() == generator.generate_contract(tmp_path).read_text()
 
 
-def test_the_errors_are_current(generator: ModuleType, tmp_path: Path) -> None:
+def test_the_errors_are_current(generator, tmp_path):
     committed = CLIENT / "ultragray_client" / "errors.py"
     assert committed.read_text() == generator.generate_errors(tmp_path).read_text()
     assert STATUSES.keys() > generator.NOT_OVER_GRPC
 
 
-def test_the_writer_of_recordings_is_current(generator: ModuleType, tmp_path: Path) -> None:
+def test_the_writer_of_recordings_is_current(generator, tmp_path):
     for path in generator.generate_recording(tmp_path):
         committed = CLIENT / "ultragray_client" / "recording" / path.name
         assert committed.read_text() == path.read_text()
 
 
-def test_the_contract_has_the_defaults_of_the_library() -> None:
+def test_the_contract_has_the_defaults_of_the_library():
     for own, library in ((RenderSettings(), settings.RenderSettings()), (Display(), AS_RENDERED)):
         assert asdict(own) == asdict(library)

@@ -1,37 +1,35 @@
-"""Streams whose connection is lost, or whose service stops: they go on elsewhere, each pose with one frame."""
-
-from __future__ import annotations
+"""Connections that break off: streams, batches, downloads and watches go on, each pose with one frame."""
 
 import signal
 import threading
-from collections.abc import Callable
 from concurrent import futures
-from typing import Any
+from contextlib import nullcontext
 
 import grpc
 import numpy as np
 import pytest
 
-from ultragray_client import RenderSettings, errors
+from ultragray_client import JobState, RenderJob, RenderSettings, errors
+from ultragray_client.connection import Retries
+from ultragray_client.conversations import Watch, download_into
 from ultragray_client.exchange import Unanswered
-from ultragray_proto.v1 import rendering_pb2
+from ultragray_client.transport import Connection, Deletion
+from ultragray_proto.v1 import jobs_pb2, rendering_pb2
 
-from ..service.conftest import RunningService, StartService
-from ..waiting import wait_until
 from .conftest import KEY
 from .proxy import Proxy
 from .test_client_render import moved
-from .test_client_shared_memory import is_shared
+from .test_client_stream import is_shared
 
 SMALL = RenderSettings(height=16, width=16)
 
 
-def test_an_ordered_stream_gets_the_frame_of_each_pose_once(far_client: Any, proxy: Proxy) -> None:
+def test_an_ordered_stream_gets_the_frame_of_each_pose_once(far_client, proxy):
     shifts = np.linspace(-4, 4, 300)
     with far_client.stream("demo", SMALL) as stream:
         proxy.cut_after(3000, 10_000, 10_000)  # somewhere in a frame; the 300 have 76,800 pixels
 
-        def send() -> None:
+        def send():
             for x in shifts:
                 stream.send(moved(x))
             stream.done_sending()
@@ -46,8 +44,8 @@ def test_an_ordered_stream_gets_the_frame_of_each_pose_once(far_client: Any, pro
     assert stream.reconnections == proxy.cuts == 3
 
 
-def test_a_latest_stream_goes_on_with_the_newest_pose(far_client: Any, proxy: Proxy) -> None:
-    frames: list[Any] = []
+def test_a_latest_stream_goes_on_with_the_newest_pose(far_client, proxy):
+    frames = []
     with far_client.stream("demo", SMALL, mode="latest") as stream:
         for number, x in enumerate(np.linspace(-4, 4, 300), start=1):
             stream.send(moved(x))
@@ -66,8 +64,8 @@ def test_a_latest_stream_goes_on_with_the_newest_pose(far_client: Any, proxy: Pr
     assert stream.reconnections == proxy.cuts == 2
 
 
-def test_errors_in_place_of_frames_come_once(far_client: Any, proxy: Proxy) -> None:
-    told: list[tuple[int, str]] = []
+def test_errors_in_place_of_frames_come_once(far_client, proxy):
+    told = []
     with far_client.stream("demo", SMALL) as stream:
         proxy.cut_after(6000)  # before the first pose: answers may come while others are sent
         for number in range(1, 41):
@@ -85,8 +83,8 @@ def test_errors_in_place_of_frames_come_once(far_client: Any, proxy: Proxy) -> N
 
 
 @pytest.mark.parametrize("mode", ["ordered", "latest"])
-def test_a_stream_with_shared_memory_goes_on_with_new_memory(far_client: Any, proxy: Proxy, mode: str) -> None:
-    def frame_of(stream: Any, x: float) -> Any:
+def test_a_stream_with_shared_memory_goes_on_with_new_memory(far_client, proxy, mode):
+    def frame_of(stream, x):
         stream.send(moved(x))
         return stream.receive()
 
@@ -104,13 +102,9 @@ def test_a_stream_with_shared_memory_goes_on_with_new_memory(far_client: Any, pr
         np.testing.assert_array_equal(frame["bmode"], pixels)
 
 
-@pytest.mark.parametrize("mode", ["ordered", "latest"])
-@pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_a_stream_goes_on_at_another_service(
-    make_client: Callable[..., Any], start_service: StartService, number: signal.Signals, mode: str
-) -> None:
+@pytest.mark.parametrize(("number", "mode"), [(signal.SIGKILL, "ordered"), (signal.SIGTERM, "latest")])
+def test_a_stream_goes_on_at_another_service(make_client, start_service, number, mode):
     first, second = start_service(), start_service()
-    second_data = second.data_folder
     proxy = Proxy(first.grpc)
     client = make_client(proxy.address, timeout_s=60.0)
     with client.stream("demo", SMALL, mode=mode) as stream:
@@ -126,17 +120,16 @@ def test_a_stream_goes_on_at_another_service(
             frames.append(stream.receive())
         stream.send(moved(7.0))
         frames.append(stream.receive())
-    assert second_data == first.data_folder
     assert [frame.sequence for frame in frames] == list(range(6, 6 + len(frames)))
     assert [frame.pose[0, 3] for frame in frames] == [5.0, *[6.0] * (len(frames) - 2), 7.0]
     proxy.close()
 
 
 @pytest.mark.parametrize("mode", ["ordered", "latest"])
-def test_patience_ends(make_client: Callable[..., Any], client_service: RunningService, mode: str) -> None:
+def test_patience_ends(make_client, client_service, mode):
     proxy = Proxy(client_service.grpc)
     client = make_client(proxy.address, api_key=KEY)
-    with client.stream("demo", SMALL, mode=mode, reconnect_s=1.0) as stream:
+    with client.stream("demo", SMALL, mode=mode, reconnect_s=0.5) as stream:
         stream.send(moved(0.0))
         assert stream.receive().sequence == 1
         proxy.close()
@@ -148,30 +141,7 @@ def test_patience_ends(make_client: Callable[..., Any], client_service: RunningS
         client.stream("demo", reconnect_s=-1.0)
 
 
-def test_a_stream_that_has_all_its_frames_asks_nobody(far_client: Any, proxy: Proxy) -> None:
-    with far_client.stream("demo", SMALL) as stream:
-        stream.send(moved(0.0))
-        stream.receive()
-        proxy.close()
-        stream.done_sending()
-        with pytest.raises(errors.StreamEnded):
-            stream.receive()
-        assert stream.reconnections == 0
-
-
-def test_a_sender_may_be_ahead_while_nobody_reads(far_client: Any, proxy: Proxy) -> None:
-    with far_client.stream("demo", SMALL) as stream:
-        stream.send(moved(0.0))
-        wait_until(lambda: stream.receive().sequence == 1)
-        proxy.cut_after(0)
-        for x in range(30):
-            stream.send(moved(x))
-        stream.done_sending()
-        assert [frame.pose[0, 3] for frame in stream] == list(range(30))
-        assert stream.reconnections == proxy.cuts == 1
-
-
-def test_a_pose_is_sent_again_with_what_is_left_of_its_time(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_pose_is_sent_again_with_what_is_left_of_its_time(monkeypatch):
     now = 1000.0
     monkeypatch.setattr("ultragray_client.exchange.time.monotonic", lambda: now)
     unanswered = Unanswered(newest_alone=False)
@@ -187,19 +157,19 @@ def test_a_pose_is_sent_again_with_what_is_left_of_its_time(monkeypatch: pytest.
     assert [message.sequence for message in unanswered.again()] == [1, 3]
 
 
-class _Recorder(grpc.GenericRpcHandler):  # type: ignore[misc]
+class _Recorder(grpc.GenericRpcHandler):
     """Notes the metadata of every call, and refuses it."""
 
-    def __init__(self) -> None:
-        self.scenes: dict[str, list[str]] = {}
+    def __init__(self):
+        self.scenes = {}
 
-    def service(self, details: Any) -> Any:
+    def service(self, details):
         named = [value for key, value in details.invocation_metadata if key == "x-ultragray-scene"]
         self.scenes.setdefault(details.method.rpartition("/")[2], []).extend(named)
         return None
 
 
-def test_every_call_about_a_scene_names_it_to_proxies(make_client: Callable[..., Any]) -> None:
+def test_every_call_about_a_scene_names_it_to_proxies(make_client):
     recorder = _Recorder()
     server = grpc.server(futures.ThreadPoolExecutor(2), handlers=[recorder])
     client = make_client(f"127.0.0.1:{server.add_insecure_port('127.0.0.1:0')}")
@@ -222,3 +192,104 @@ def test_every_call_about_a_scene_names_it_to_proxies(make_client: Callable[...,
     quoted = ["liver%202%2F%C3%B6"]
     expected = dict.fromkeys(("RenderStream", "Render", "RenderBatch", "GetScene", "LoadScene"), quoted)
     assert recorder.scenes == {**expected, "ListScenes": [], "ListJobs": []}
+
+
+@pytest.fixture(scope="module")
+def client_service(working_service):
+    """One with a worker."""
+    return working_service
+
+
+def test_a_batch_goes_on(far_client, proxy):
+    poses = np.tile(np.eye(4), (120, 1, 1))
+    poses[:, 0, 3] = np.linspace(-4, 4, 120)
+    batch = far_client.render_batch("demo", poses, RenderSettings(height=64, width=64))
+    frames = [next(batch)]
+    proxy.cut_after(150_000)
+    frames += list(batch)
+    assert proxy.cuts == 1
+    assert [frame.sequence for frame in frames] == list(range(120))
+    assert [frame.pose[0, 3] for frame in frames] == poses[:, 0, 3].tolist()
+
+
+def test_a_download_goes_on_and_is_whole(far_client, client, proxy, tmp_path):
+    poses = np.tile(np.eye(4), (60, 1, 1))
+    job = client.jobs.submit(
+        RenderJob(scene="demo", poses=poses, height=200, width=200, dtype="float32", outputs=("bmode", "echo"))
+    )
+    assert client.jobs.wait(job.id, timeout_s=120).state is JobState.SUCCEEDED
+    client.jobs.download(job.id, "frames.npz", tmp_path / "straight.npz")
+    proxy.cut_after(8_000_000)
+    far_client.jobs.download(job.id, "frames.npz", tmp_path / "broken.npz")
+    assert proxy.cuts == 1
+    assert (tmp_path / "broken.npz").read_bytes() == (tmp_path / "straight.npz").read_bytes()
+    assert {path.name for path in tmp_path.iterdir()} == {"straight.npz", "broken.npz"}
+
+
+def test_a_watch_goes_on(far_client, client, proxy):
+    job = client.jobs.submit(RenderJob(scene="demo", poses=np.tile(np.eye(4), (20_000, 1, 1)), height=300, width=300))
+    events = far_client.jobs.watch(job.id)
+    assert next(events).job.id == job.id
+    proxy.cut_after(0)
+    cancel = threading.Timer(0.5, client.jobs.cancel, (job.id,))
+    cancel.start()
+    assert [event.job.state for event in events if event.job][-1] is JobState.CANCELLED
+    cancel.join()  # its answer may come after the event
+    assert proxy.cuts == 1
+
+
+def test_a_file_that_does_not_come_leaves_nothing(tmp_path):
+    def half():
+        with download_into("job", "file", tmp_path / "file") as download:
+            download.keep(jobs_pb2.ArtifactChunk(data=b"half", file_bytes=8))
+            request = download.request()
+            assert request.offset == 4
+            download.end_of_call()
+
+    with pytest.raises(errors.Unreachable, match="after 4 bytes"):
+        half()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_log_is_not_told_twice():
+    watch, retries = Watch("job"), Retries(None, patience_s=60.0)
+
+    def new(log):
+        return watch.take(jobs_pb2.JobEvent(log=log)).log
+
+    def break_off():
+        watch.pause_s(errors.Unreachable("gone"), retries)
+
+    assert new("one\ntwo\n") == "one\ntwo\n"
+    assert new("two\n") == "two\n"
+    break_off()
+    assert new("") == ""
+    assert new("one\ntwo\ntwo\nthree\n") == "three\n"
+    assert new("three\n") == "three\n"
+    break_off()
+    assert new("elsewhere\n") == "elsewhere\n"
+
+
+@pytest.mark.parametrize(
+    ("failures", "is_refused"),
+    [
+        ([errors.Unreachable, errors.NotFound], False),
+        ([errors.NotFound], True),
+        ([errors.Unreachable, errors.JobInUse], True),
+        ([errors.Unreachable], False),
+    ],
+)
+def test_a_deletion_that_had_worked_is_no_error(failures, is_refused):
+    left = list(failures)
+
+    class Failing(Connection):
+        async def attempt(self, *_):
+            if left:
+                raise left.pop(0)("no")
+
+        async def rest(self, seconds): ...
+
+    connection = Failing("127.0.0.1:1", None, None, 60.0)
+    with pytest.raises(errors.ClientError) if is_refused else nullcontext():
+        connection.answer(Deletion("JobService.DeleteJob", None, None))
+    assert not left

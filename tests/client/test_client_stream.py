@@ -1,27 +1,31 @@
-"""Streams of poses."""
+"""Streams of poses, whose frames may come through memory that is shared with the service."""
 
-from __future__ import annotations
-
+import ctypes
+import gc
+import os
+import subprocess
+import sys
 import threading
 import time
 from contextlib import suppress
-from typing import Any
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from ultragray_client import RenderSettings, errors
-from ultragray_client.exchange import PoseExchange
+from ultragray_client import exchange as shared_memory
+from ultragray_client.exchange import SLOTS, PoseExchange, SharedMemory
 from ultragray_client.frames import settings_message
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2
 
 from ..freshness import check_fresh
-from ..service.conftest import StartService
-from ..waiting import wait_until
+from ..service.conftest import ROOT
+from ..waiting import Deadline, wait_until
 from .test_client_render import moved
 
 
-def test_an_ordered_stream_answers_every_pose(client: Any) -> None:
+def test_an_ordered_stream_answers_every_pose(client):
     shifts = np.linspace(-4, 4, 120)
     with client.stream("demo", RenderSettings(height=16, width=16)) as stream:
         sequences = [stream.send(moved(x)) for x in shifts[:60]]
@@ -39,7 +43,7 @@ def test_an_ordered_stream_answers_every_pose(client: Any) -> None:
     assert all(0.0 < frame.timings.render_ms < frame.latency_ms < 60_000 for frame in frames)
 
 
-def test_a_latest_stream_counts_what_it_drops(client: Any) -> None:
+def test_a_latest_stream_counts_what_it_drops(client):
     with client.stream(
         "demo", RenderSettings(height=600, width=600, outputs=("bmode", "echo")), mode="latest"
     ) as stream:
@@ -53,13 +57,13 @@ def test_a_latest_stream_counts_what_it_drops(client: Any) -> None:
     assert frames[-1].pose[0, 3] == 4.0
 
 
-def test_latency_counts_from_the_measurement(client: Any) -> None:
+def test_latency_counts_from_the_measurement(client):
     with client.stream("demo", RenderSettings(height=8, width=8)) as stream:
         stream.send(moved(0.0), measured_ns=time.monotonic_ns() - 5_000_000_000)
         assert stream.receive().latency_ms > 5000.0
 
 
-def test_a_pose_that_gets_no_frame_does_not_end_a_stream(client: Any) -> None:
+def test_a_pose_that_gets_no_frame_does_not_end_a_stream(client):
     with client.stream("demo", RenderSettings(height=8, width=8)) as stream:
         stream.send(moved(0.0))
         bad = stream.send(2 * np.eye(4))
@@ -74,7 +78,7 @@ def test_a_pose_that_gets_no_frame_does_not_end_a_stream(client: Any) -> None:
         assert stream.receive().pose[0, 3] == 1.0
 
 
-def test_refused_settings_are_told_first(client: Any) -> None:
+def test_refused_settings_are_told_first(client):
     with client.stream("gone") as stream:
         stream.send(moved(0.0))
         with pytest.raises(errors.SceneNotFound):
@@ -83,17 +87,10 @@ def test_refused_settings_are_told_first(client: Any) -> None:
         client.stream("demo", mode="newest")
 
 
-def send_until_it_ends(stream: Any) -> None:
-    """Or 50 poses long: an ordered stream that nobody reads takes no more than 64."""
-    with suppress(errors.StreamEnded, errors.Unavailable):
-        for _ in range(50):
-            stream.send(moved(0.0))
-
-
-def test_a_stream_may_be_used_by_two_threads(client: Any) -> None:
+def test_a_stream_may_be_used_by_two_threads(client):
     with client.stream("demo", RenderSettings(height=8, width=8)) as stream:
 
-        def send() -> None:
+        def send():
             for _ in range(300):
                 stream.send(moved(0.0))
             stream.done_sending()
@@ -104,9 +101,7 @@ def test_a_stream_may_be_used_by_two_threads(client: Any) -> None:
         sender.join()
 
 
-def test_a_service_that_stops_ends_a_stream_that_is_not_to_reconnect(
-    make_client: Any, start_service: StartService
-) -> None:
+def test_a_service_that_stops_ends_a_stream_that_is_not_to_reconnect(make_client, start_service):
     service = start_service()
     client = make_client(service.grpc)
     with client.stream("demo", RenderSettings(height=8, width=8), reconnect_s=0.0) as stream:
@@ -119,22 +114,7 @@ def test_a_service_that_stops_ends_a_stream_that_is_not_to_reconnect(
             stream.send(moved(0.0))
 
 
-def test_the_frames_before_the_end_of_a_stream_come(make_client: Any, start_service: StartService) -> None:
-    service = start_service()
-    stream = make_client(service.grpc).stream("demo", RenderSettings(height=8, width=8), reconnect_s=0.0)
-    for _ in range(5):
-        stream.send(moved(0.0))
-    wait_until(lambda: service.metric("ultragray_frames_total") >= 5)
-    service.terminate()
-    send_until_it_ends(stream)
-    sequences: list[int] = []
-    with pytest.raises(errors.Unavailable):
-        sequences.extend(frame.sequence for frame in stream)
-    assert sequences == list(range(1, len(sequences) + 1))
-    assert len(sequences) >= 5
-
-
-def test_what_was_dropped_before_an_error_is_told_with_the_next_frame() -> None:
+def test_what_was_dropped_before_an_error_is_told_with_the_next_frame():
     exchange = PoseExchange(settings_message("demo", None), "latest")
     error = scenes_pb2.Error(reason="DEADLINE_EXCEEDED", detail="late")
     with pytest.raises(errors.DeadlineExceeded):
@@ -160,27 +140,172 @@ def test_what_was_dropped_before_an_error_is_told_with_the_next_frame() -> None:
 class ClientDoor:
     """A latest stream of either client."""
 
-    def __init__(self, stream: Any) -> None:
+    def __init__(self, stream):
         self._stream = stream
 
-    def send(self) -> None:
+    def send(self):
         self._stream.send(moved(0.0))
 
-    def receive(self) -> float:
+    def receive(self):
         frame = self._stream.receive()
         return time.monotonic() - float(frame.latency_ms) / 1000
 
 
-def test_a_latest_stream_gives_no_old_frame(client: Any) -> None:
+@pytest.mark.parametrize("make_client", ["sync"], indirect=True)
+def test_a_latest_stream_gives_no_old_frame(client):
     with client.stream("demo", RenderSettings(height=128, width=128), mode="latest") as stream:
         check_fresh(ClientDoor(stream))
 
 
-def test_a_latest_stream_may_be_read_before_anything_is_sent(client: Any) -> None:
+def test_a_latest_stream_may_be_read_before_anything_is_sent(client):
     with client.stream("demo", RenderSettings(height=8, width=8), mode="latest") as stream:
-        frames: list[Any] = []
+        frames = []
         reader = threading.Thread(target=lambda: frames.append(stream.receive()))
         reader.start()
         stream.send(moved(0.0))
         reader.join()
         assert frames[0].sequence == 1
+
+
+SMALL = RenderSettings(height=16, width=16)
+
+
+def is_shared(frame):
+    """Whether the pixels lie in shared memory, rather than in a message."""
+    owner = next(iter(frame.arrays.values()))
+    while isinstance(owner, np.ndarray):
+        owner = owner.base
+    return isinstance(getattr(owner, "obj", owner), ctypes.Array)
+
+
+@pytest.fixture
+def folder(monkeypatch, tmp_path):
+    """A folder in place of /dev/shm, so that nobody else makes files there; the service does not look there."""
+    monkeypatch.setattr(shared_memory, "_FOLDER", tmp_path)
+    return tmp_path
+
+
+@pytest.mark.parametrize(("mode", "encoding"), [("ordered", "uint8"), ("latest", "float32")])
+def test_frames_are_those_of_an_ordinary_stream(client, encoding, mode):
+    settings = RenderSettings(outputs=("coverage", "bmode", "transmittance"), encoding=encoding)
+    with (
+        client.stream("demo", settings) as ordinary,
+        client.stream("demo", settings, mode=mode, shared_memory=True) as shared,
+    ):
+        for x in range(40):
+            one, other = (frame_at(stream, x) for stream in (ordinary, shared))
+            assert (is_shared(one), is_shared(other)) == (False, True)
+            assert list(one.arrays) == list(other.arrays) == ["coverage", "bmode", "transmittance"]
+            for name, array in one.arrays.items():
+                assert other[name].dtype == array.dtype
+                assert not other[name].flags.writeable
+                np.testing.assert_array_equal(other[name], array)
+            np.testing.assert_array_equal(one.pose, other.pose)
+            assert (other.sequence, other.scene_sha256, other.picture) == (x + 1, one.scene_sha256, one.picture)
+
+
+def frame_at(stream, x_mm):
+    stream.send(moved(x_mm))
+    return stream.receive()
+
+
+def test_frames_that_are_held_are_not_overwritten(client):
+    with client.stream("demo", SMALL) as stream:
+        expected = [frame_at(stream, x)["bmode"] for x in range(SLOTS + 4)]
+    with client.stream("demo", SMALL, shared_memory=True) as stream:
+        held = []
+        shared = []
+        for x in range(SLOTS + 4):
+            frame = frame_at(stream, x)
+            shared.append(is_shared(frame))
+            held.append(frame["bmode"][2:, 3:])  # a view of the array alone keeps the slot
+        assert shared == [True] * SLOTS + [False] * 4
+        del frame
+        for kept, array in zip(held, expected, strict=True):
+            np.testing.assert_array_equal(kept, array[2:, 3:])
+        del held[3], kept
+        last = frame_at(stream, 3)
+        assert is_shared(last)
+        assert not is_shared(frame_at(stream, 4))
+    np.testing.assert_array_equal(last["bmode"], expected[3])  # after the end of the stream, too
+    np.testing.assert_array_equal(held[5], expected[6][2:, 3:])
+
+
+def test_frames_that_a_latest_stream_skips_free_their_slots(client):
+    skipped = 0
+    end = Deadline(60)
+    with client.stream("demo", SMALL, mode="latest", shared_memory=True) as stream:
+        while skipped <= SLOTS:
+            assert not end.passed
+            for x in range(8):  # of which some frames come, and take each other's place
+                stream.send(moved(x))
+            frame = stream.receive()
+            skipped += frame.dropped
+            assert is_shared(frame)
+
+
+def test_what_the_service_refuses_is_told(client, folder):
+    for _ in range(10):  # a pose may be on its way when the refusal comes, or not yet, or have arrived
+        with client.stream("demo", SMALL, shared_memory=True) as stream:
+            with suppress(errors.StreamEnded, errors.InvalidArgument):
+                for x in range(5):
+                    stream.send(moved(x))
+            with pytest.raises(errors.InvalidArgument, match="shared_memory") as refused:
+                stream.receive()
+            assert refused.value.field == "shared_memory.name"
+    assert list(folder.iterdir()) == []
+
+
+def test_a_system_without_such_memory_is_told(client, monkeypatch, tmp_path):
+    monkeypatch.setattr(shared_memory, "_FOLDER", tmp_path / "absent")
+    with pytest.raises(errors.InvalidArgument, match="shared_memory cannot be had on this system") as refused:
+        client.stream("demo", shared_memory=True)
+    assert refused.value.field == "shared_memory"
+
+
+def test_a_memory_that_is_not_used_leaves_no_file(folder):
+    memory = SharedMemory()
+    (file,) = folder.iterdir()
+    assert file.stat().st_mode & 0o777 == 0o600
+    assert file.stat().st_blocks * 512 <= 2 * 4096  # pages that nothing was written to take no memory
+    del memory
+    gc.collect()
+    assert list(folder.iterdir()) == []
+
+
+def test_the_memory_of_a_stream_goes_with_its_last_frame(client, client_service):
+    def mapped():
+        gc.collect()
+        return Path("/proc/self/maps").read_text().count("/dev/shm/ultragray-")
+
+    wait_until(lambda: mapped() == 0)
+    with client.stream("demo", SMALL, shared_memory=True) as stream:
+        frame = frame_at(stream, 0)
+        assert mapped() == 1
+    del stream
+    assert mapped() == 1
+    del frame
+    wait_until(lambda: mapped() == 0)
+
+
+FORKED = """
+import os
+from ultragray_client.exchange import SharedMemory
+from ultragray_proto.v1 import rendering_pb2
+
+memory = SharedMemory()
+memory._map[32] = 0  # as the service does
+pixels = memory.taken(rendering_pb2.Frame(shared_data=rendering_pb2.SharedData(slot=0, bytes=100)))
+child = os.fork()
+if child == 0:
+    del pixels
+    os._exit(memory._map[32])
+assert os.waitpid(child, 0)[1] == 0
+del pixels
+assert memory._map[32] == 1
+"""
+
+
+def test_a_child_process_does_not_free_what_its_parent_holds():
+    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(str(ROOT / name) for name in ("client", "proto"))}
+    subprocess.run([sys.executable, "-c", FORKED], env=environment, check=True)

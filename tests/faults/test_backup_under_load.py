@@ -1,7 +1,5 @@
 """A backup of a service and workers at work, the loss of all they had, and a restore elsewhere."""
 
-from __future__ import annotations
-
 import io
 import os
 import shutil
@@ -10,10 +8,7 @@ import sys
 import threading
 import uuid
 import zipfile
-from collections.abc import Callable, Iterator
 from contextlib import suppress
-from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
@@ -21,7 +16,6 @@ import pytest
 from ultragray.phantom.demo import copy_demo_scene
 from ultragray_workers.backup.contents import Folders
 
-from ..postgres import NewDatabase
 from ..waiting import wait_until
 from ..workers.jobs.conftest import files_of, store_dataset
 from .machine import Machine
@@ -32,19 +26,19 @@ _STAYING = 3  # jobs of the load that are left to be done
 COMMAND = [sys.executable, "-c", "from ultragray_service.cli.app import app; app()"]
 
 
-def ultragray(*arguments: str) -> str:
+def ultragray(*arguments):
     environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     done = subprocess.run([*COMMAND, *arguments], capture_output=True, text=True, env=environment, check=False)
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
-def options(folders: Folders, url: str | None) -> list[str]:
+def options(folders, url):
     given = ["--data-folder", str(folders.data), "--artifact-folder", str(folders.artifacts)]
     return given if url is None else [*given, "--database-url", url]
 
 
-def zipped(folder: Path) -> bytes:
+def zipped(folder):
     packed = io.BytesIO()
     with zipfile.ZipFile(packed, "w") as archive:
         for path in folder.rglob("*"):
@@ -53,18 +47,18 @@ def zipped(folder: Path) -> bytes:
     return packed.getvalue()
 
 
-def train(scene: str, steps: int) -> dict[str, Any]:
+def train(scene, steps):
     settings = {"steps": steps, "max_gaussians": 40, "batch_size": 2}
     return {"kind": "train", "specification": {"dataset": "tiny", "scene": scene, "settings": settings}}
 
 
-def render(scene: str, count: int) -> dict[str, Any]:
+def render(scene, count):
     sampler = {"kind": "around", "count": count}
     return {"kind": "render", "specification": {"scene": scene, "sampler": sampler, "height": 16, "width": 16}}
 
 
-def jobs_of(client: httpx.Client) -> dict[str, dict[str, Any]]:
-    found: dict[str, dict[str, Any]] = {}
+def jobs_of(client):
+    found = {}
     token = ""
     while True:
         page = client.get("/v1/jobs", params={"page_size": 100, "page_token": token}).json()
@@ -73,7 +67,7 @@ def jobs_of(client: httpx.Client) -> dict[str, dict[str, Any]]:
             return found
 
 
-def frame_of(client: httpx.Client, scene: str) -> bytes:
+def frame_of(client, scene):
     pose = {"position_mm": {"x": 0, "y": 0, "z": 0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}
     answer = client.post(
         f"/v1/scenes/{scene}/render",
@@ -88,30 +82,30 @@ def frame_of(client: httpx.Client, scene: str) -> bytes:
 class Load:
     """Jobs, scenes and datasets that come and go until the block ends."""
 
-    def __init__(self, url: str, scene: bytes, dataset: bytes) -> None:
+    def __init__(self, url, scene, dataset):
         self._url, self._scene, self._dataset = url, scene, dataset
         self._stop = threading.Event()
         self._threads = [threading.Thread(target=self._go, args=(one,)) for one in (self._jobs, self._files)]
         self.rounds = 0
 
-    def __enter__(self) -> Load:
+    def __enter__(self):
         for thread in self._threads:
             thread.start()
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         self._stop.set()
         for thread in self._threads:
             thread.join()
 
-    def _go(self, act: Callable[[httpx.Client], None]) -> None:
+    def _go(self, act):
         with httpx.Client(base_url=self._url, timeout=WAIT_S) as client:
             while not self._stop.is_set():
                 with suppress(httpx.HTTPError):
                     act(client)
                 self.rounds += 1
 
-    def _jobs(self, client: httpx.Client) -> None:
+    def _jobs(self, client):
         deleted, cancelled, stays = (client.post("/v1/jobs", json=render("demo", 2)).json().get("id") for _ in range(3))
         client.post(f"/v1/jobs/{deleted}:cancel")
         client.delete(f"/v1/jobs/{deleted}")
@@ -119,7 +113,7 @@ class Load:
         if self.rounds > _STAYING:
             client.post(f"/v1/jobs/{stays}:cancel")
 
-    def _files(self, client: httpx.Client) -> None:
+    def _files(self, client):
         name = f"passing-{uuid.uuid4().hex[:6]}"
         client.put(f"/v1/scenes/{name}", content=self._scene)
         client.put(f"/v1/datasets/{name}", content=self._dataset, headers={"Content-Type": "application/zip"})
@@ -128,12 +122,10 @@ class Load:
 
 
 @pytest.fixture
-def machines(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[Callable[[str, str | None], tuple[Machine, Folders]]]:
-    made: list[Machine] = []
+def machines(tmp_path, monkeypatch):
+    made = []
 
-    def make(name: str, url: str | None) -> tuple[Machine, Folders]:
+    def make(name, url):
         if url is not None:
             monkeypatch.setenv("ULTRAGRAY_DATABASE_URL", url)
         made.append(Machine(tmp_path / name))
@@ -145,11 +137,7 @@ def machines(
 
 
 @pytest.mark.long
-def test_service_that_was_lost_at_work_goes_on_elsewhere(
-    machines: Callable[[str, str | None], tuple[Machine, Folders]],
-    new_database: NewDatabase,
-    tmp_path: Path,
-) -> None:
+def test_service_that_was_lost_at_work_goes_on_elsewhere(machines, new_database, tmp_path):
     url = new_database()
     machine, folders = machines("first", url)
     backups = tmp_path / "backups"
@@ -161,13 +149,12 @@ def test_service_that_was_lost_at_work_goes_on_elsewhere(
 
     with httpx.Client(base_url=machine.http, timeout=WAIT_S) as client:
 
-        def submit(body: dict[str, Any]) -> str:
+        def submit(body):
             answer = client.post("/v1/jobs", json=body)
             assert answer.status_code == 201, answer.text
-            job_id: str = answer.json()["id"]
-            return job_id
+            return answer.json()["id"]
 
-        def is_done(job_id: str) -> bool:
+        def is_done(job_id):
             machine.tend()
             return bool(client.get(f"/v1/jobs/{job_id}").json()["state"] == "succeeded")
 
@@ -212,5 +199,5 @@ def test_service_that_was_lost_at_work_goes_on_elsewhere(
             frame_of(client, name)
 
 
-def is_over(client: httpx.Client) -> Callable[[str], bool]:
+def is_over(client):
     return lambda job: client.get(f"/v1/jobs/{job}").json()["state"] in ("succeeded", "failed", "cancelled")

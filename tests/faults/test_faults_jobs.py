@@ -4,18 +4,13 @@ ULTRAGRAY_FAULT_KILLS (`make test-faults` has 32) and ULTRAGRAY_FAULT_SEED choos
 killed once more, while all jobs wait and there is no worker.
 """
 
-from __future__ import annotations
-
 import json
 import os
 import random
 import tarfile
 import time
 from collections import Counter
-from collections.abc import Iterable, Iterator
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import grpc
 import httpx
@@ -29,7 +24,6 @@ from ultragray.learn.training import TrainingConfig, train
 from ultragray.phantom.demo import copy_demo_scene
 from ultragray_proto.v1 import jobs_pb2, jobs_pb2_grpc
 from ultragray_workers.jobs.progress import JobState
-from ultragray_workers.jobs.record import Job
 from ultragray_workers.jobs.store import JobStore
 
 from ..workers.jobs.conftest import files_of, store_dataset
@@ -52,13 +46,13 @@ POSES = np.tile(np.eye(4), (FRAMES, 1, 1))  # mm
 POSES[:, :3, 3] = np.random.default_rng(SEED).normal(0.0, 2.0, (FRAMES, 3))
 
 
-def training(scene: str, priority: int, seed: int, more: int) -> dict[str, Any]:
+def training(scene, priority, seed, more):
     settings = {"steps": STEPS + more, "seed": seed, "max_gaussians": 40, "batch_size": 2}
     specification = {"dataset": "tiny", "scene": scene, "settings": settings, "device": "cpu"}
     return {"kind": "train", "request_id": f"train {scene}", "priority": priority, "specification": specification}
 
 
-def rendering(request_id: str, priority: int, format: str) -> dict[str, Any]:
+def rendering(request_id, priority, format):
     specification = {"scene": "demo", "poses": POSES.tolist(), "height": HEIGHT, "width": WIDTH, "format": format}
     return {"kind": "render", "request_id": request_id, "priority": priority, "specification": specification}
 
@@ -67,7 +61,7 @@ FIRST = [*(training(*values) for values in TRAININGS), rendering("early", 1, "np
 LATE = rendering("late", -9, "tar")
 
 
-def submit(machine: Machine, body: dict[str, Any], over_grpc: bool) -> tuple[str, bool] | None:
+def submit(machine, body, over_grpc):
     """The id, and whether the job is new; None where the server is down or not ready."""
     if machine.http is None or machine.grpc is None:
         return None
@@ -101,7 +95,7 @@ class Killer:
     in the middle of a rendering.
     """
 
-    def __init__(self, machine: Machine, total_steps: int) -> None:
+    def __init__(self, machine, total_steps):
         self._machine, self._chance = machine, random.Random(SEED)
         chance = self._chance
         kinds = [("job", "worker", "server", "all")[number % 4] for number in range(KILLS)]
@@ -113,13 +107,13 @@ class Killer:
         self._plan = list(zip(kinds, moments, places, strict=True))
         self._latest = 0.1 * total_steps  # how long artifacts are waited for
         self._due_at = 0.0
-        self.done: list[tuple[str, str]] = []
+        self.done = []
 
     @property
-    def finished(self) -> bool:
+    def finished(self):
         return len(self.done) == len(self._plan)
 
-    def tend(self, steps_done: int, jobs: Iterable[Job]) -> None:
+    def tend(self, steps_done, jobs):
         """Kills if it is time to."""
         if self.finished or time.monotonic() < self._due_at:
             return
@@ -135,14 +129,14 @@ class Killer:
             soon = not self.finished and self._plan[len(self.done)][1] == "soon"
             self._due_at = time.monotonic() + self._chance.uniform(SOONEST_S, SOON_S if soon else 1.0)
 
-    def _is_finishing(self) -> bool:
+    def _is_finishing(self):
         """Whether a job has begun to write its artifacts and has not said how it ended."""
         folders = (self._machine.artifacts / "work").glob("*/artifacts*")
         return any(not (folder.parent / "outcome.json").exists() for folder in folders)
 
 
 @pytest.fixture
-def machine(tmp_path: Path) -> Iterator[Machine]:
+def machine(tmp_path):
     machine = Machine(tmp_path)
     copy_demo_scene(machine.data / "demo.ugr")
     store_dataset(machine.artifacts, "tiny")
@@ -150,27 +144,27 @@ def machine(tmp_path: Path) -> Iterator[Machine]:
     machine.kill_all()
 
 
-def is_rendering(job: Job) -> bool:
+def is_rendering(job):
     """Whether some frames are done, and others are not."""
     done, frames = job.progress.frames_done or 0, job.progress.frames or 0
     return job.kind == "render" and job.state is JobState.RUNNING and 0 < done < frames
 
 
-def steps_done(jobs: dict[str, Job]) -> int:
+def steps_done(jobs):
     return sum(job.progress.step or 0 for job in jobs.values() if job.kind == "train")
 
 
 @pytest.mark.long
-def test_every_job_ends_as_if_nothing_had_been_killed(machine: Machine) -> None:
+def test_every_job_ends_as_if_nothing_had_been_killed(machine):
     began = time.monotonic()
     machine.start_without_workers()
     store = JobStore(machine.artifacts, None)
     observer = Observer(machine, store)
-    ids: dict[str, str] = {}
+    ids = {}
     total_steps = sum(STEPS + more for _, _, _, more in TRAININGS)
     killer = Killer(machine, total_steps)
 
-    def ask(number: int, body: dict[str, Any]) -> None:
+    def ask(number, body):
         answer = submit(machine, body, over_grpc=number % 2 == 0)
         if answer is not None:
             ids[body["request_id"]] = answer[0]
@@ -225,12 +219,12 @@ def test_every_job_ends_as_if_nothing_had_been_killed(machine: Machine) -> None:
     )
 
 
-def artifact_of(machine: Machine, job: Job, name: str) -> Path:
+def artifact_of(machine, job, name):
     (path,) = (machine.artifacts / "jobs" / job.id).glob(f"*/artifacts/{name}")
     return path
 
 
-def check_artifacts_are_told(machine: Machine, jobs: dict[str, Job]) -> None:
+def check_artifacts_are_told(machine, jobs):
     """Over HTTP, each artifact is the file of the store."""
     for job in jobs.values():
         for name in job.artifacts:
@@ -239,7 +233,7 @@ def check_artifacts_are_told(machine: Machine, jobs: dict[str, Job]) -> None:
             assert answer.content == artifact_of(machine, job, name).read_bytes()
 
 
-def check_training(machine: Machine, job: Job, scene: str, seed: int, steps: int) -> None:
+def check_training(machine, job, scene, seed, steps):
     """The scene is that of an undisturbed run, byte for byte, and every step was taken once."""
     settings = training(scene, 0, seed, steps - STEPS)["specification"]["settings"]
     dataset = replace(load_dataset(files_of(machine.artifacts, "tiny")), name="tiny")
@@ -254,7 +248,7 @@ def check_training(machine: Machine, job: Job, scene: str, seed: int, steps: int
     assert [json.loads(line)["step"] for line in journal] == list(range(1, steps + 1))
 
 
-def check_renderings(machine: Machine, npz: Job, tar: Job) -> None:
+def check_renderings(machine, npz, tar):
     """All frames are there, and are those of a direct rendering."""
     scene = GaussianScene.load(machine.data / "demo.ugr")
     direct = render(scene, None, POSES, height=HEIGHT, width=WIDTH, outputs=("bmode",))
@@ -268,7 +262,7 @@ def check_renderings(machine: Machine, npz: Job, tar: Job) -> None:
     assert (npz.progress.frames_done, tar.progress.frames_done) == (FRAMES, FRAMES)
 
 
-def check_nothing_is_left(machine: Machine) -> None:
+def check_nothing_is_left(machine):
     """No checkpoint and no half-written file outlives its job."""
     assert list((machine.artifacts / "work").iterdir()) == []
     for path in (machine.artifacts / "jobs").rglob("*"):

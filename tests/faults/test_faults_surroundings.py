@@ -4,23 +4,17 @@ No job is lost or fails, and every scene and archive is as if nothing had been. 
 ULTRAGRAY_FAULT_SEED choose how often and when.
 """
 
-from __future__ import annotations
-
 import random
 import time
 from collections import Counter
-from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
 from ultragray.phantom.demo import copy_demo_scene
 from ultragray_workers.errors import DatabaseUnavailable
 from ultragray_workers.jobs.progress import JobState
-from ultragray_workers.jobs.record import Job
 from ultragray_workers.jobs.store import JobStore
 
-from ..postgres import PostgresServer
 from ..workers.jobs.conftest import store_dataset
 from .machine import DEAD_AFTER_S, Machine
 from .test_faults_jobs import (
@@ -44,11 +38,9 @@ BODIES = [*(training(*values) for values in TRAININGS), rendering("early", 1, "n
 
 
 @pytest.fixture
-def machine(tmp_path: Path, postgres: PostgresServer) -> Iterator[Machine]:
+def machine(tmp_path, postgres):
     machine = Machine(
-        tmp_path,
-        ULTRAGRAY_DATABASE_URL=postgres.create_database(),
-        ULTRAGRAY_JOB_STALL_TIMEOUT_S=str(STALL_TIMEOUT_S),
+        tmp_path, ULTRAGRAY_DATABASE_URL=postgres.create_database(), ULTRAGRAY_JOB_STALL_TIMEOUT_S=str(STALL_TIMEOUT_S)
     )
     copy_demo_scene(machine.data / "demo.ugr")
     store_dataset(machine.artifacts, "tiny")
@@ -59,17 +51,17 @@ def machine(tmp_path: Path, postgres: PostgresServer) -> Iterator[Machine]:
 class Surroundings:
     """All that a job needs beside its own process, and ways to take it away for a while."""
 
-    def __init__(self, machine: Machine, postgres: PostgresServer) -> None:
+    def __init__(self, machine, postgres):
         self._machine, self._postgres, self._chance = machine, postgres, random.Random(SEED)
         self._kinds = [self.cut_database, self.take_folder, self.stop_worker, self.stop_job]
-        self.done: Counter[str] = Counter()
+        self.done = Counter()
 
-    def fail(self) -> None:
+    def fail(self):
         """One failure of the next kind, and its end."""
         kind = self._kinds[self.done.total() % len(self._kinds)]
         self.done[kind.__name__] += kind(self._chance.uniform(1.0, 4.0))
 
-    def cut_database(self, seconds: float) -> bool:
+    def cut_database(self, seconds):
         self._postgres.stop()
         try:
             self._machine.tend_for(seconds)
@@ -77,7 +69,7 @@ class Surroundings:
             self._postgres.start()
         return True
 
-    def take_folder(self, seconds: float) -> bool:
+    def take_folder(self, seconds):
         """As a share that is unmounted: an empty folder of its name is there."""
         artifacts = self._machine.artifacts
         away, mountpoint = artifacts.with_name("away"), artifacts.with_name(f"mountpoint-{self.done.total()}")
@@ -88,15 +80,15 @@ class Surroundings:
         away.rename(artifacts)
         return True
 
-    def stop_worker(self, seconds: float) -> bool:
+    def stop_worker(self, seconds):
         return self._machine.stop_for_a_while("worker", self._chance, seconds + DEAD_AFTER_S)
 
-    def stop_job(self, seconds: float) -> bool:
+    def stop_job(self, seconds):
         return self._machine.stop_for_a_while("job", self._chance, seconds)
 
 
 @pytest.mark.long
-def test_every_job_ends_as_if_nothing_had_failed(machine: Machine, postgres: PostgresServer) -> None:
+def test_every_job_ends_as_if_nothing_had_failed(machine, postgres):
     began = time.monotonic()
     machine.start_without_workers()
     store = JobStore(machine.artifacts, machine.database_url)
@@ -138,5 +130,5 @@ def test_every_job_ends_as_if_nothing_had_failed(machine: Machine, postgres: Pos
     )
 
 
-def steps(jobs: dict[str, Job]) -> int:
+def steps(jobs):
     return sum(job.progress.step or 0 for job in jobs.values() if job.kind == "train")

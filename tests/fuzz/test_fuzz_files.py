@@ -8,12 +8,16 @@ import tarfile
 import warnings
 import zipfile
 
+import cv2
+import h5py
 import numpy as np
 import pydicom
 import pytest
 import torch
 from hypothesis import strategies as st
 from mcap.writer import CompressionType
+from pydicom.encaps import encapsulate
+from pydicom.uid import JPEGBaseline8Bit
 
 from ultragray.datasets import Dataset
 from ultragray.datasets.released import write_released
@@ -256,6 +260,51 @@ def test_dicom(door, open_reader, tmp_path):
     parts = {"sweep.dcm": mutated_cine(path), "sweep.poses.npy": mutated_array(poses)}
     reader = open_reader("folder")
     door("dicom").enter(chosen_parts(whole, parts), reader.read_files)
+
+
+def test_jpeg_streams_of_dicom(door, open_reader, tmp_path):
+    """Colours that header and stream call differently, in streams that are nearly right."""
+    colour = np.repeat(speckle(10, 24, 32)[..., None], 3, axis=-1)
+    streams = [cv2.imencode(".jpg", frame)[1].tobytes() for frame in colour]
+    described = {"SamplesPerPixel": 3, "PhotometricInterpretation": "RGB", "PlanarConfiguration": 0}
+    path = write_cine(tmp_path, syntax=JPEGBaseline8Bit, data=encapsulate(streams), **described)
+    whole = {"sweep.dcm": path.read_bytes(), "sweep.poses.npy": (tmp_path / "sweep.poses.npy").read_bytes()}
+    parts = {"sweep.dcm": st.one_of(mutated_cine(path), mutated_bytes([whole["sweep.dcm"]]))}
+    reader = open_reader("folder")
+    door("jpeg in dicom").enter(chosen_parts(whole, parts), reader.read_files)
+
+
+def test_tables_of_poses(door, open_reader):
+    rows = "".join(f"{n / 10},0,{n},0,1,0,0,0\n" for n in range(6))
+    calibration = {"image_to_sensor": IMAGE_TO_PROBE.tolist(), "position_unit": "mm", "euler_order": "ZYX"}
+    whole = {
+        **{f"{n}.png": cv2.imencode(".png", frame)[1].tobytes() for n, frame in enumerate(speckle(6, 20, 16))},
+        "poses.csv": f"time,x,y,z,qw,qx,qy,qz\n{rows}".encode(),
+        "calibration.json": json.dumps(calibration).encode(),
+    }
+    parts = {
+        "poses.csv": st.one_of(mutated_lines(whole["poses.csv"], b""), mutated_bytes([whole["poses.csv"]])),
+        "calibration.json": mutated_json([calibration]).map(as_json),
+        "3.png": mutated_bytes([whole["3.png"]]),
+    }
+    reader = open_reader("folder")
+    door("tables of poses").enter(chosen_parts(whole, parts), reader.read_files)
+
+
+def test_scans_of_tus_rec(door, open_reader, tmp_path):
+    with h5py.File(tmp_path / "scan.h5", "w") as file:
+        file["frames"], file["tforms"] = speckle(6, 20, 16), np.tile(np.eye(4), (6, 1, 1))
+    matrix = "0.2,0,0,0\n0,0.2,0,0\n0,0,1,0\n0,0,0,1\n"
+    whole = {
+        "scan.h5": (tmp_path / "scan.h5").read_bytes(),
+        "calib_matrix.csv": f"scaling\n{matrix}spatial_calibration\n{matrix.replace('0.2', '1')}".encode(),
+    }
+    parts = {
+        "scan.h5": mutated_bytes([whole["scan.h5"]]),
+        "calib_matrix.csv": mutated_lines(whole["calib_matrix.csv"], b""),
+    }
+    reader = open_reader("folder")
+    door("scans of TUS-REC").enter(chosen_parts(whole, parts), reader.read_files)
 
 
 def test_mcap(door, open_reader, tmp_path):

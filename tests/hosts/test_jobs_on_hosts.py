@@ -1,41 +1,122 @@
 """Datasets and jobs of several hosts over a bucket: each host sees all of them, and a job goes on elsewhere."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import json
+import os
+import subprocess
+import sys
 import tarfile
 import time
 import zipfile
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
-import grpc
 import httpx
-import numpy as np
 import pytest
 
 from ultragray.datasets.released import write_released
 from ultragray.datasets.source import load_dataset
 from ultragray.learn.training import TrainingConfig, train
-from ultragray_proto.v1 import jobs_pb2, jobs_pb2_grpc
+from ultragray.phantom.demo import copy_demo_scene
 from ultragray_workers.storage.location import open_storage
 
-from ..object_storage import AWAY_S, FaultyProxy
+from ..faults.machine import PATCHES, SERVE, WORK
+from ..object_storage import AWAY_S
 from ..waiting import wait_until
 from ..workers.jobs.conftest import tiny_dataset
-from .host import Host
+
+_START_TIMEOUT_S = 180.0
+
+
+class Host:
+    """Sees nothing of other hosts but the bucket and the database; its data folder has the demo scene."""
+
+    def __init__(self, folder, artifacts, database_url, **settings):
+        self.folder, self.data, self.cache = folder, folder / "data", folder / "cache"
+        for one in (self.data, self.cache, folder / "logs", folder / "patches"):
+            one.mkdir(parents=True)
+        copy_demo_scene(self.data / "demo.ugr")
+        (folder / "patches" / "sitecustomize.py").write_text(PATCHES)
+        self._environment = {
+            **os.environ,
+            "PYTHONPATH": os.pathsep.join([str(folder / "patches"), *filter(None, sys.path)]),
+            "OMP_NUM_THREADS": "1",
+            "ULTRAGRAY_DATA_FOLDER": str(self.data),
+            "ULTRAGRAY_ARTIFACT_FOLDER": artifacts,
+            "ULTRAGRAY_CACHE_FOLDER": str(self.cache),
+            "ULTRAGRAY_DATABASE_URL": database_url,
+            "ULTRAGRAY_EMBEDDED_WORKER": "false",
+            "ULTRAGRAY_HTTP_PORT": "0",
+            "ULTRAGRAY_GRPC_PORT": "0",
+            "ULTRAGRAY_THREADS_PER_PROCESS": "1",
+            "ULTRAGRAY_TRAINING_THREADS": "1",
+            "ULTRAGRAY_JOB_NICE": "0",
+            **settings,
+        }
+        self.processes = []
+
+    def serve(self):
+        """Starts a service; its addresses of HTTP and gRPC."""
+        process, log = self._spawn(SERVE, "service")
+
+        def addresses():
+            assert process.poll() is None, self.told()
+            for line in log.read_text().splitlines():
+                if '"grpc"' in line and line.endswith("}"):
+                    record = json.loads(line)
+                    return record["http"], record["grpc"]
+            return None
+
+        return wait_until(addresses, within_s=_START_TIMEOUT_S)
+
+    def work(self):
+        """Starts a worker."""
+        return self._spawn(WORK, "worker")[0]
+
+    def kill_all(self):
+        """As a loss of power: the processes of jobs die with their workers."""
+        for process in self.processes:
+            process.kill()
+            process.wait()
+
+    def told(self):
+        """The ends of the logs, for the message of a test that fails."""
+        logs = sorted((self.folder / "logs").iterdir())
+        return "\n".join(f"--- {self.folder.name}/{log.name}\n{log.read_text()[-4000:]}" for log in logs)
+
+    def _spawn(self, command, kind):
+        path = self.folder / "logs" / f"{kind}-{len(self.processes)}"
+        with path.open("ab") as log:
+            self.processes.append(subprocess.Popen(command, env=self._environment, stdout=log, stderr=log))
+        return self.processes[-1], path
+
+
+@pytest.fixture
+def bucket(new_bucket):
+    """The URL of an empty bucket."""
+    return new_bucket()
+
+
+@pytest.fixture
+def new_host(bucket, object_proxy, postgres, tmp_path):
+    """Makes a host of that name, with a folder of its own."""
+    database_url = postgres.create_database()
+    hosts = []
+
+    def make(name):
+        hosts.append(Host(tmp_path / name, f"{bucket}/artifacts", database_url))
+        return hosts[-1]
+
+    yield make
+    for host in hosts:
+        host.kill_all()
+
 
 STEPS, SEED = int(500 * AWAY_S), 3  # so many that the training outlasts the time without storage
 SETTINGS = {"steps": STEPS, "seed": SEED, "max_gaussians": 40, "batch_size": 2}
 
-NewHost = Callable[[str], Host]
 
-
-def released(folder: Path) -> bytes:
+def released(folder):
     """The tiny dataset as an archive."""
     write_released(tiny_dataset(), folder)
     packed = io.BytesIO()
@@ -46,24 +127,22 @@ def released(folder: Path) -> bytes:
     return packed.getvalue()
 
 
-def put_dataset(http: str, content: bytes) -> httpx.Response:
+def put_dataset(http, content):
     return httpx.put(
         f"{http}/v1/datasets/tiny", content=content, headers={"Content-Type": "application/zip"}, timeout=300
     )
 
 
-def get(http: str, path: str, **options: Any) -> httpx.Response:
+def get(http, path, **options):
     return httpx.get(f"{http}/v1/{path}", timeout=60, **options)
 
 
 @pytest.mark.long
-def test_a_training_goes_on_at_another_host_to_the_same_scene(
-    new_host: NewHost, object_proxy: FaultyProxy, tmp_path: Path
-) -> None:
+def test_a_training_goes_on_at_another_host_to_the_same_scene(new_host, object_proxy, tmp_path):
     one, two = new_host("one"), new_host("two")
     (a, _), (b, _) = one.serve(), two.serve()
 
-    def told() -> str:
+    def told():
         return one.told() + two.told()
 
     content = released(tmp_path / "released")
@@ -80,7 +159,7 @@ def test_a_training_goes_on_at_another_host_to_the_same_scene(
     }
     job = httpx.post(f"{b}/v1/jobs", json=body, timeout=60).json()["id"]
 
-    def progress(http: str = b) -> int:
+    def progress(http=b):
         return get(http, f"jobs/{job}").json()["progress"]["step"] or 0
 
     wait_until(lambda: progress() > STEPS // 20, within_s=240, every_s=0.5)
@@ -121,39 +200,7 @@ def test_a_training_goes_on_at_another_host_to_the_same_scene(
 
 
 @pytest.mark.long
-@pytest.mark.slow
-def test_a_rendering_is_made_on_one_host_and_downloaded_from_another(new_host: NewHost, bucket: str) -> None:
-    one, two = new_host("one"), new_host("two")
-    http, rpc = one.serve()
-    two.work()
-    poses = np.tile(np.eye(4), (5, 1, 1)).tolist()
-    specification = {"scene": "demo", "poses": poses, "height": 48, "width": 40, "format": "tar"}
-    body = {"kind": "render", "specification": specification}
-    job = httpx.post(f"{http}/v1/jobs", json=body, timeout=60).json()["id"]
-
-    def ended() -> dict[str, Any] | None:
-        found: dict[str, Any] = get(http, f"jobs/{job}").json()
-        return found if found["state"] in ("succeeded", "failed") else None
-
-    found = wait_until(ended, within_s=240, every_s=0.5)
-    assert (found["state"], found["progress"]["frames_done"]) == ("succeeded", 5), (found, one.told(), two.told())
-    whole = get(http, f"jobs/{job}/artifacts/frames.tar").content
-    with tarfile.open(fileobj=io.BytesIO(whole)) as archive:
-        assert len(archive.getnames()) == 10
-    with grpc.insecure_channel(rpc) as channel:
-        stub = jobs_pb2_grpc.JobServiceStub(channel)
-        asked = jobs_pb2.DownloadArtifactRequest(job=job, name="frames.tar", offset=1000)
-        assert b"".join(chunk.data for chunk in stub.DownloadArtifact(asked, timeout=60)) == whole[1000:]
-
-    storage = open_storage(f"{bucket}/artifacts")
-    assert [entry.key for entry in storage.entries(f"jobs/{job}") if entry.key.endswith("demo.ugr")]
-    assert httpx.delete(f"{http}/v1/jobs/{job}", timeout=60).status_code == 204
-    assert list(storage.entries(f"jobs/{job}")) == []
-    assert not list(two.cache.rglob(job)), "the host of the worker keeps nothing of it"
-
-
-@pytest.mark.long
-def test_hosts_make_the_shards_of_a_batch_together(new_host: NewHost, bucket: str, object_proxy: FaultyProxy) -> None:
+def test_hosts_make_the_shards_of_a_batch_together(new_host, bucket, object_proxy):
     one, two = new_host("one"), new_host("two")
     http, _ = one.serve()
     workers = [one.work(), two.work()]
@@ -162,10 +209,10 @@ def test_hosts_make_the_shards_of_a_batch_together(new_host: NewHost, bucket: st
     job = httpx.post(f"{http}/v1/jobs", json={"kind": "render", "specification": specification}, timeout=60).json()
     job = job["id"]
 
-    def told() -> str:
+    def told():
         return one.told() + two.told()
 
-    def found() -> dict[str, Any]:
+    def found():
         return dict(get(http, f"jobs/{job}").json())
 
     wait_until(lambda: found()["progress"]["frames_done"], within_s=240, every_s=0.2)
@@ -177,7 +224,7 @@ def test_hosts_make_the_shards_of_a_batch_together(new_host: NewHost, bucket: st
     assert ended["state"] == "succeeded", (ended, told())
     manifest = get(http, f"jobs/{job}/artifacts/manifest.json").json()
     assert sum(shard["frames"] for shard in manifest["shards"]) == 6_000
-    keys: list[str] = []
+    keys = []
     for shard in manifest["shards"]:
         content = get(http, f"jobs/{job}/artifacts/{shard['file']}").content
         assert hashlib.sha256(content).hexdigest() == shard["sha256"]

@@ -4,15 +4,12 @@ buildah builds it, as root, without namespaces. Its base is a Debian that mmdebs
 sources, its Node is this machine's, and pip is configured in the build as it is here. What was built before is reused.
 """
 
-from __future__ import annotations
-
 import configparser
 import os
 import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -33,15 +30,15 @@ _LEFT_OUT = (
 )
 
 
-def run(*command: str | Path) -> None:
+def run(*command):
     subprocess.run(command, check=True)
 
 
-def output(*command: str | Path) -> str:
+def output(*command):
     return subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True).stdout.strip()
 
 
-def problems() -> Iterator[str]:
+def problems():
     """A sentence for each thing that the build needs and this machine lacks."""
     missing = [tool for tool in TOOLS if shutil.which(tool) is None]
     if missing:
@@ -50,11 +47,11 @@ def problems() -> Iterator[str]:
         yield "the image is built and mounted as root; run: sudo make test-image"
 
 
-def has(image: str) -> bool:
+def has(image):
     return subprocess.run(["buildah", "inspect", "--type", "image", image], capture_output=True).returncode == 0
 
 
-def commit(image: str, base: str, *steps: Sequence[str | Path]) -> None:
+def commit(image, base, *steps):
     """Make `image` of `base` by steps of buildah; each gets the container as its second word."""
     container = output("buildah", "from", "--pull-never", base)
     try:
@@ -65,7 +62,7 @@ def commit(image: str, base: str, *steps: Sequence[str | Path]) -> None:
         run("buildah", "rm", container)
 
 
-def make_base() -> None:
+def make_base():
     """A Debian like the official image, from this machine's apt sources."""
     sources = [path for name in _APT_SOURCES if (path := Path("/etc/apt", name)).is_file()]
     with tempfile.TemporaryDirectory() as folder:
@@ -75,7 +72,7 @@ def make_base() -> None:
         commit(BASE, "scratch", ("add", archive, "/"))
 
 
-def make_node() -> None:
+def make_node():
     """The base with this machine's Node and npm, and npm's configuration."""
     node, npm = Path(shutil.which("node") or ""), Path(shutil.which("npm") or "").resolve().parents[1]
     with tempfile.TemporaryDirectory() as folder:
@@ -95,7 +92,7 @@ def make_node() -> None:
         commit(NODE, BASE, *steps)
 
 
-def pip_configuration(folder: Path) -> list[str]:
+def pip_configuration(folder):
     """Options that give the build this machine's pip configuration, with the local files that it names."""
     configuration = configparser.RawConfigParser()
     configuration.add_section("global")
@@ -120,7 +117,7 @@ def pip_configuration(folder: Path) -> list[str]:
     return [f"--secret=id=pip,src={written}", *sorted(set(volumes))]
 
 
-def build(*arguments: str) -> None:
+def build(*arguments):
     with tempfile.TemporaryDirectory() as folder:
         run(
             *("buildah", "build", "--isolation=chroot", "--format=docker", "--layers", "--pull-never"),
@@ -133,11 +130,11 @@ def build(*arguments: str) -> None:
         )
 
 
-def revision() -> str:
+def revision():
     return output("git", "-C", ROOT, "describe", "--always", "--dirty", "--abbrev=40", "--exclude=*")
 
 
-def main() -> None:
+def main():
     found = list(problems())
     if found:
         sys.exit("\n".join(f"error: {problem}" for problem in found))

@@ -1,17 +1,16 @@
-"""The image of docker/Dockerfile as it runs: read-only, without privileges, with the frames of this machine.
-
-ULTRAGRAY_TEST_IMAGE names it; `make test-image` builds it and sets that.
-"""
-
-from __future__ import annotations
+"""The image of docker/Dockerfile as it runs: read-only, without privileges, with the frames of this machine."""
 
 import json
 import os
 import re
+import shlex
 import socket
 import subprocess
-from collections.abc import Iterator
+from collections.abc import Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass
 from importlib.metadata import version
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -20,11 +19,83 @@ import pytest
 from ultragray.datasets.released import write_released
 from ultragray.phantom.demo import copy_demo_scene
 
-from ..service.conftest import StartService, service_starter
+from ..service.conftest import service_starter
 from ..service.test_lifecycle import IDENTITY
 from ..waiting import wait_until
 from ..workers.jobs.conftest import tiny_dataset
-from .container import Container, container_of
+
+# The root is read-only. $1: the root, $2 … $4: where /data, the cache and /tmp are; the rest is the command.
+_ENTER = """
+set -eu
+root=$1 data=$2 cache=$3 temporary=$4; shift 4
+mount --make-rprivate /
+mount --bind "$root" "$root"
+mount -t proc proc "$root/proc"
+mount --rbind /dev "$root/dev"
+mount --bind /etc/hosts "$root/etc/hosts"
+mount --bind "$data" "$root/data"
+mount --bind "$cache" "$root/var/cache/ultragray"
+mount --bind "$temporary" "$root/tmp"
+mount -o remount,bind,ro "$root"
+cd /
+exec chroot "$root" "$@"
+"""
+
+
+@dataclass(frozen=True)
+class Container:
+    """One image, mounted, with its writable folders beside it."""
+
+    root: Path
+    folder: Path  # holds data, cache and tmp
+    configuration: Mapping[str, Any]  # what the image says: User, Env, Cmd, Healthcheck, Labels …
+
+    @property
+    def data(self):
+        return self.folder / "data"
+
+    def command(self, *words, environment=None):
+        """What starts `words` as the image's user, in its environment and working folder."""
+        user, _, group = self.configuration["User"].partition(":")
+        variables = [*self.configuration["Env"], *(f"{name}={value}" for name, value in (environment or {}).items())]
+        folders = [str(self.folder / name) for name in ("data", "cache", "tmp")]
+        inside = f"cd {shlex.quote(self.configuration['WorkingDir'])} && exec {shlex.join(words)}"
+        return [
+            *("unshare", "--mount", "sh", "-c", _ENTER, "sh", str(self.root), *folders),
+            *("/usr/bin/setpriv", "--reuid", user, "--regid", group or user, "--clear-groups"),
+            *("--no-new-privs", "--inh-caps=-all", "--bounding-set=-all"),
+            *("/usr/bin/env", "--ignore-environment", *variables, "/bin/sh", "-c", inside),
+        ]
+
+    def run(self, *words, environment=None):
+        command = self.command(*words, environment=environment)
+        return subprocess.run(command, capture_output=True, text=True, timeout=300)
+
+    def start(self, words, environment, log):
+        """The process that is returned is the one of `words` itself: signals reach it."""
+        return subprocess.Popen(self.command(*words, environment=environment), stderr=log, stdin=subprocess.DEVNULL)
+
+
+@contextmanager
+def container_of(image, folder):
+    """The container lives as long as the `with` block; `folder` keeps what it wrote."""
+    inspected = subprocess.run(["buildah", "inspect", "--type", "image", image], check=True, capture_output=True)
+    configuration = json.loads(inspected.stdout)["Docker"]["config"]
+    user, _, group = configuration["User"].partition(":")
+    for name in ("data", "cache", "tmp"):
+        (folder / name).mkdir()
+        subprocess.run(["chown", f"{user}:{group}", folder / name], check=True)
+    name = subprocess.run(
+        ["buildah", "from", "--pull-never", image], check=True, stdout=subprocess.PIPE, text=True
+    ).stdout.strip()
+    try:
+        mounted = subprocess.run(["buildah", "mount", name], check=True, stdout=subprocess.PIPE, text=True)
+        root = Path(mounted.stdout.strip())
+        (root / "etc" / "hosts").touch()  # engines make it
+        yield Container(root, folder, configuration)
+    finally:
+        subprocess.run(["buildah", "rm", name], check=True, stdout=subprocess.DEVNULL)
+
 
 IMAGE = os.environ.get("ULTRAGRAY_TEST_IMAGE", "")
 MAX_BYTES = 1_250_000_000
@@ -38,7 +109,7 @@ pytestmark = pytest.mark.skipif(not IMAGE, reason="no image is named: make test-
 
 
 @pytest.fixture(scope="module")
-def container(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Container]:
+def container(tmp_path_factory):
     with container_of(IMAGE, tmp_path_factory.mktemp("container")) as container:
         yield container
 
@@ -46,7 +117,7 @@ def container(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Container]:
 class ContainedService:
     """The image's own command, on free ports of this machine."""
 
-    def __init__(self, container: Container) -> None:
+    def __init__(self, container):
         with socket.socket() as one, socket.socket() as other:
             one.bind(("127.0.0.1", 0))
             other.bind(("127.0.0.1", 0))
@@ -63,25 +134,25 @@ class ContainedService:
         with self.log_path.open("wb") as log:
             self.process = container.start(container.configuration["Cmd"], self.environment, log)
 
-    def healthy(self) -> bool:
+    def healthy(self):
         """What the image's health check says."""
         kind, *words = self.container.configuration["Healthcheck"]["Test"]
         assert kind == "CMD"
         return self.run(*words).returncode == 0
 
-    def run(self, *words: str) -> subprocess.CompletedProcess[str]:
+    def run(self, *words):
         return self.container.run(*words, environment=self.environment)
 
 
 @pytest.fixture(scope="module")
-def start_service(tmp_path_factory: pytest.TempPathFactory) -> Iterator[StartService]:
+def start_service(tmp_path_factory):
     folder = tmp_path_factory.mktemp("data")
     copy_demo_scene(folder / "demo.ugr")
     yield from service_starter(tmp_path_factory, folder)
 
 
 @pytest.fixture(scope="module")
-def contained(container: Container) -> Iterator[ContainedService]:
+def contained(container):
     """Ends with a SIGTERM, at which the service must exit with 0. It puts the demo scene into its folder by itself."""
     service = ContainedService(container)
     try:
@@ -99,12 +170,10 @@ def contained(container: Container) -> Iterator[ContainedService]:
     ("form", "outputs"),
     [("image/png", ["bmode"]), ("application/octet-stream;dtype=float32", ["bmode", "transmittance"])],
 )
-def test_frames_are_those_of_this_machine(
-    contained: ContainedService, start_service: StartService, form: str, outputs: list[str]
-) -> None:
+def test_frames_are_those_of_this_machine(contained, start_service, form, outputs):
     here = start_service()
 
-    def frame(address: str) -> bytes:
+    def frame(address):
         answer = httpx.post(
             f"{address}/v1/scenes/demo/render",
             json={"pose": IDENTITY, "height": 256, "width": 256, "outputs": outputs},
@@ -117,16 +186,16 @@ def test_frames_are_those_of_this_machine(
     assert frame(contained.http) == frame(here.http)
 
 
-def test_console_is_in_the_image(contained: ContainedService) -> None:
+def test_console_is_in_the_image(contained):
     answer = httpx.get(contained.http, timeout=60)
     assert answer.status_code == 200
     assert "<html" in answer.text
 
 
-def test_jobs_train_and_render_in_it(contained: ContainedService) -> None:
+def test_jobs_train_and_render_in_it(contained):
     write_released(tiny_dataset(), contained.container.folder / "tmp" / "tiny")
 
-    def succeed(*words: str) -> None:
+    def succeed(*words):
         done = contained.run("ultragray", *words)
         assert done.returncode == 0, done.stdout + done.stderr + contained.log_path.read_text()
 
@@ -138,7 +207,7 @@ def test_jobs_train_and_render_in_it(contained: ContainedService) -> None:
     assert httpx.get(f"{contained.http}/v1/scenes/trained", timeout=60).status_code == 200
 
 
-def test_user_has_no_privileges_and_the_root_is_read_only(container: Container) -> None:
+def test_user_has_no_privileges_and_the_root_is_read_only(container):
     script = "id -u; grep CapEff /proc/self/status; touch /opt/ultragray/x; touch /data/x /tmp/x /var/cache/ultragray/x"
     done = container.run("sh", "-c", script)
     assert done.stdout.split() == ["10001", "CapEff:", "0000000000000000"]
@@ -146,17 +215,17 @@ def test_user_has_no_privileges_and_the_root_is_read_only(container: Container) 
     assert done.stderr.count("\n") == 1, "only the first touch may fail"
 
 
-def test_command_line_and_library_are_there(container: Container) -> None:
+def test_command_line_and_library_are_there(container):
     assert "Serve scenes over HTTP and gRPC" in container.run("ultragray", "--help").stdout
     assert container.run("ultragray", "--version").stdout.strip().endswith(version("ultragray"))
 
 
 @pytest.mark.parametrize("command", ["gcc", "c++", "make", "pip", "node"])
-def test_nothing_is_left_of_what_built_it(container: Container, command: str) -> None:
+def test_nothing_is_left_of_what_built_it(container, command):
     assert container.run("sh", "-c", f"command -v {command}").stdout == ""
 
 
-def test_image_says_what_it_is(container: Container) -> None:
+def test_image_says_what_it_is(container):
     says = container.configuration
     assert says["User"] == "10001:10001"
     assert set(says["ExposedPorts"]) == {"8000/tcp", "50051/tcp", "18944/tcp"}
@@ -167,27 +236,27 @@ def test_image_says_what_it_is(container: Container) -> None:
     assert all(labels[name] for name in ("title", "description", "licenses", "base.name"))
 
 
-def test_image_is_of_a_bounded_size(container: Container) -> None:
+def test_image_is_of_a_bounded_size(container):
     files = (path for path in container.root.rglob("*") if path.is_file() and not path.is_symlink())
     size = sum(path.stat().st_size for path in files)
     assert size < MAX_BYTES, f"{IMAGE} has {size / 1e6:.0f} MB"
 
 
-def components(container: Container, name: str) -> dict[str, dict[str, Any]]:
+def components(container, name):
     """The components of one of the image's bills of materials, by their names."""
     bill = json.loads((container.root / "opt/ultragray/sbom" / f"{name}.cdx.json").read_text())
     assert bill["bomFormat"] == "CycloneDX"
     return {component["name"]: component for component in bill["components"]}
 
 
-def licences(component: dict[str, Any]) -> str:
+def licences(component):
     found = component.get("licenses", [])
     return " ".join(
         str(one.get("expression") or one["license"].get("id") or one["license"].get("name")) for one in found
     )
 
 
-def test_bill_of_materials_names_every_python_distribution_with_a_permissive_licence(container: Container) -> None:
+def test_bill_of_materials_names_every_python_distribution_with_a_permissive_licence(container):
     named = components(container, "python")
     listed = container.run(
         "python", "-c", "import importlib.metadata as m; print(*(d.name for d in m.distributions()))"
@@ -197,7 +266,7 @@ def test_bill_of_materials_names_every_python_distribution_with_a_permissive_lic
     assert set(others) <= IN_WORDS_ALONE, others
 
 
-def test_bill_of_materials_names_what_the_console_holds(container: Container) -> None:
+def test_bill_of_materials_names_what_the_console_holds(container):
     named = components(container, "console")
     del named["ultragray-console"]  # the project's own
     assert {"svelte", "three"} <= set(named)
@@ -205,7 +274,7 @@ def test_bill_of_materials_names_what_the_console_holds(container: Container) ->
     assert others == {}
 
 
-def test_bill_of_materials_names_every_package_of_debian(container: Container) -> None:
+def test_bill_of_materials_names_every_package_of_debian(container):
     named = components(container, "debian")
     listed = container.run("dpkg-query", "--show", "--showformat", "${Package}\n").stdout.split()
     assert set(listed) <= set(named)

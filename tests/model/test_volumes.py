@@ -83,7 +83,7 @@ def test_values_are_the_sums_over_all_gaussians(scene, field, grid):
 @pytest.mark.parametrize("field", VOLUME_FIELDS)
 def test_small_portions_give_the_same(scene, field, monkeypatch):
     whole = np.concatenate(list(sample_volume(scene, field, GRID)))
-    monkeypatch.setattr(fields_module, "POINTS_AT_ONCE", 300)  # two layers at once, a few Gaussians at once
+    monkeypatch.setattr(fields_module, "VOXELS_AT_ONCE", 300)  # two layers at once
     slabs = list(sample_volume(scene, field, GRID))
     assert [len(slab) for slab in slabs] == [2] * 5
     np.testing.assert_allclose(np.concatenate(slabs), whole, atol=1e-6)

@@ -1,14 +1,10 @@
 """Replicas and workers on hosts of their own: each has its folder and ports, and shares storage and database alone."""
 
-from __future__ import annotations
-
 import os
 import signal
 import socket
 import subprocess
 import sys
-from collections.abc import Mapping
-from pathlib import Path
 
 import httpx
 
@@ -22,7 +18,7 @@ _STOP_TIMEOUT_S = 60.0
 class ReplicaHost:
     """A service that can be struck, drained and started again at the same ports."""
 
-    def __init__(self, folder: Path, shared: Mapping[str, str]) -> None:
+    def __init__(self, folder, shared):
         """`shared`: settings that all hosts have, with the places of storage and database."""
         self.folder = folder
         folder.mkdir()
@@ -43,34 +39,34 @@ class ReplicaHost:
         self.starts = 0
         self.start()
 
-    def start(self) -> None:
+    def start(self):
         """Starts it; it is not yet ready when this returns."""
         self.starts += 1
         log = self.folder / f"log-{self.starts}"
         self.service = RunningService(self.folder, log, self._settings)
 
-    def wait_until_serving(self) -> None:
+    def wait_until_serving(self):
         self.service.wait_until_serving()
 
-    def strike(self) -> None:
+    def strike(self):
         """Kills it as a power cut would."""
         self.service.process.send_signal(signal.SIGKILL)
         self.service.process.wait(_STOP_TIMEOUT_S)
 
-    def drain(self) -> int:
+    def drain(self):
         """Stops it as an operator would; its exit status."""
         return self.service.terminate()
 
-    def loaded_scenes(self) -> list[str]:
+    def loaded_scenes(self):
         """The scenes that it has in memory."""
         page = httpx.get(f"{self.service.http}/v1/scenes?page_size=1000", timeout=60).raise_for_status().json()
         return [scene["name"] for scene in page["scenes"] if scene["loaded"]]
 
-    def frames(self) -> float:
+    def frames(self):
         """The frames that it has rendered since it was started."""
         return self.service.metric("ultragray_frames_total")
 
-    def stop(self) -> None:
+    def stop(self):
         self.service.process.send_signal(signal.SIGTERM)
         self.service.process.send_signal(signal.SIGTERM)  # at once
         self.service.process.wait(_STOP_TIMEOUT_S)
@@ -79,7 +75,7 @@ class ReplicaHost:
 class WorkerHost:
     """A worker for jobs that can be struck and started again."""
 
-    def __init__(self, folder: Path, shared: Mapping[str, str]) -> None:
+    def __init__(self, folder, shared):
         self.folder = folder
         folder.mkdir()
         self._environment = {
@@ -92,14 +88,14 @@ class WorkerHost:
         }
         self.start()
 
-    def start(self) -> None:
+    def start(self):
         with (self.folder / "log").open("ab") as log:
             self.process = subprocess.Popen(WORK, env=self._environment, cwd=self.folder, stdout=log, stderr=log)
 
-    def strike(self) -> None:
+    def strike(self):
         self.process.kill()
         self.process.wait(_STOP_TIMEOUT_S)
 
-    def stop(self) -> None:
+    def stop(self):
         self.process.terminate()
         self.process.wait(_STOP_TIMEOUT_S)

@@ -5,18 +5,13 @@ seconds, and a scene stays where it is loaded.
 ULTRAGRAY_REPLICAS_CLIENTS, _SCENES, _HOSTS, _WORKERS and _SECONDS size the run; make test-replicas has the full one.
 """
 
-from __future__ import annotations
-
 import asyncio
 import itertools
 import json
 import os
 import statistics
 from collections import Counter
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -25,7 +20,6 @@ from ultragray_workers.backup.copying import copy_scenes
 from ultragray_workers.storage.location import open_storage
 
 from ..docker.envoy import Envoy, program, script
-from ..postgres import PostgresServer
 from ..service.conftest import DEMO_PROBE, make_scene
 from ..surroundings import ROOT
 from ..waiting import at_this_load
@@ -35,7 +29,7 @@ from .visitors import Expected, Visitors, finished
 pytestmark = pytest.mark.long
 
 
-def _size(name: str, default: float) -> float:
+def _size(name, default):
     return float(os.environ.get(f"ULTRAGRAY_REPLICAS_{name}", default))
 
 
@@ -57,10 +51,10 @@ DOORS = ("ordered", "latest", "http", "websocket")
 class Cluster:
     """All hosts, the proxy before them, and what was done to them."""
 
-    def __init__(self, folder: Path, bucket: str, postgres: PostgresServer, started: ExitStack) -> None:
+    def __init__(self, folder, bucket, postgres, started):
         made = folder / "made"
         made.mkdir()
-        self.expected: dict[str, Expected] = {}
+        self.expected = {}
         for number in range(SCENES):
             path = made / f"scene{number}.ugr"
             make_scene(seed=number, probe=DEMO_PROBE).save(path)
@@ -84,19 +78,19 @@ class Cluster:
         replicas = [script().Replica("127.0.0.1", host.http_port, host.grpc_port) for host in self.hosts]
         self.envoy = started.enter_context(Envoy(folder, replicas, {HOT: HOT_REPLICAS}))
         self.envoy.wait_for()
-        self.disruptions: Counter[str] = Counter()
+        self.disruptions = Counter()
         self.loads = self.frames = 0.0
 
-    def note(self, host: ReplicaHost) -> None:
+    def note(self, host):
         """Adds what a replica did since it was started, before it ends."""
         self.loads += len(host.loaded_scenes())
         self.frames += host.frames()
 
-    def homes(self) -> dict[str, int]:
+    def homes(self):
         """By scene: the replicas that have it in memory."""
         return dict(Counter(itertools.chain.from_iterable(host.loaded_scenes() for host in self.hosts)))
 
-    def disrupt(self, number: int) -> None:
+    def disrupt(self, number):
         """Kills or drains a replica, and now and then kills a worker; returns when all are there again."""
         host = self.hosts[number % len(self.hosts)]
         self.note(host)
@@ -116,13 +110,13 @@ class Cluster:
 
 
 @pytest.fixture
-def cluster(tmp_path: Path, new_bucket: Callable[[], str], postgres: PostgresServer) -> Iterator[Cluster]:
+def cluster(tmp_path, new_bucket, postgres):
     program()  # skips where there is none
     with ExitStack() as started:
         yield Cluster(tmp_path, new_bucket(), postgres, started)
 
 
-async def _run(cluster: Cluster) -> tuple[Visitors, dict[str, Any]]:
+async def _run(cluster):
     visitors = Visitors(cluster.envoy.http, cluster.envoy.grpc, cluster.expected, PAUSE_S)
     scenes = sorted(cluster.expected)
     tasks = [asyncio.ensure_future(visitors.submit_jobs(scenes, JOB_EVERY_S))]
@@ -132,7 +126,7 @@ async def _run(cluster: Cluster) -> tuple[Visitors, dict[str, Any]]:
     loop = asyncio.get_running_loop()
     began = loop.time()
     await asyncio.sleep(SECONDS / 3)  # undisturbed, to see where scenes are
-    calm: dict[str, Any] = {
+    calm = {
         "replicas_by_scene": dict(sorted((await asyncio.to_thread(cluster.homes)).items())),
         "frames_by_replica": [await asyncio.to_thread(host.frames) for host in cluster.hosts],
     }
@@ -148,7 +142,7 @@ async def _run(cluster: Cluster) -> tuple[Visitors, dict[str, Any]]:
     return visitors, calm
 
 
-def test_frames_and_jobs_of_replicas_that_come_and_go(cluster: Cluster) -> None:
+def test_frames_and_jobs_of_replicas_that_come_and_go(cluster):
     visitors, calm = asyncio.run(_run(cluster))
     seen = visitors.seen
     states = asyncio.run(finished(cluster.envoy.grpc, seen.jobs, within_s=at_this_load(120.0)))
@@ -166,7 +160,7 @@ def test_frames_and_jobs_of_replicas_that_come_and_go(cluster: Cluster) -> None:
     assert statistics.mean(homes[scene] for scene in homes if scene != HOT) < HOSTS / 2 + 0.5, homes
 
 
-def _record(cluster: Cluster, visitors: Visitors, calm: dict[str, Any], states: Counter[str]) -> dict[str, Any]:
+def _record(cluster, visitors, calm, states):
     """What the file of the run says."""
     seen = visitors.seen
     resumed = sorted(seen.resumed_ms)
@@ -200,5 +194,5 @@ def _record(cluster: Cluster, visitors: Visitors, calm: dict[str, Any], states: 
     }
 
 
-def _at(ordered: list[float], share: float) -> float | None:
+def _at(ordered, share):
     return round(ordered[min(int(share * len(ordered)), len(ordered) - 1)], 1) if ordered else None

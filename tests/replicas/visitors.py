@@ -1,14 +1,11 @@
 """Clients of all kinds behind the proxy, each of one scene; every frame is compared with what the library renders."""
 
-from __future__ import annotations
-
 import asyncio
 import json
 import random
 import time
 from collections import Counter
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import httpx
 import numpy as np
@@ -37,7 +34,7 @@ class Expected:
     frames: Pixels  # of POSES, [P, H, W]
 
     @classmethod
-    def of(cls, path: Path) -> Expected:
+    def of(cls, path):
         rendered = render(GaussianScene.load(path), None, POSES, height=SIDE, width=SIDE).bmode.numpy()
         return cls(file_sha256(path), np.round(np.clip(rendered, 0, 1) * np.float32(255)).astype(np.uint8))
 
@@ -57,12 +54,12 @@ class Seen:
 class Visitors:
     """The clients of one run, until `over` is set."""
 
-    def __init__(self, http: str, grpc: str, expected: dict[str, Expected], pause_s: float) -> None:
+    def __init__(self, http, grpc, expected, pause_s):
         self._http, self._grpc, self._expected, self._pause_s = http, grpc, expected, pause_s
         self.over = asyncio.Event()
         self.seen = Seen()
 
-    async def visit(self, door: str, scene: str) -> None:
+    async def visit(self, door, scene):
         """Asks for frames of a scene at a door until all is over."""
         visit = {"ordered": self._stream, "latest": self._stream, "http": self._render, "websocket": self._websocket}
         try:
@@ -70,7 +67,7 @@ class Visitors:
         except Exception as error:
             self.seen.errors.append(f"{door} of {scene}: {type(error).__name__}: {error}"[:500])
 
-    async def submit_jobs(self, scenes: list[str], every_s: float) -> None:
+    async def submit_jobs(self, scenes, every_s):
         """Puts render jobs into the queue, one after another."""
         async with AsyncClient(self._grpc, timeout_s=PATIENCE_S) as client:
             while not self.over.is_set():
@@ -78,13 +75,13 @@ class Visitors:
                 self.seen.jobs.append((await client.jobs.submit(job)).id)
                 await self._pause(every_s)
 
-    async def _pause(self, seconds: float) -> None:
+    async def _pause(self, seconds):
         try:
             await asyncio.wait_for(self.over.wait(), random.uniform(0.5, 1.5) * seconds)
         except asyncio.TimeoutError:
             return
 
-    async def _stream(self, door: str, scene: str) -> None:
+    async def _stream(self, door, scene):
         """Three poses at a time, then their frames."""
         known, last = 0, 0
         async with (
@@ -110,7 +107,7 @@ class Visitors:
                     self._check(door, scene, frame.scene_sha256, asked[frame.sequence], frame["bmode"])
                 await self._pause(self._pause_s)
 
-    async def _render(self, door: str, scene: str) -> None:
+    async def _render(self, door, scene):
         headers = {"Accept": "application/octet-stream"}
         async with httpx.AsyncClient(base_url=self._http, timeout=PATIENCE_S) as client:
             while not self.over.is_set():
@@ -121,7 +118,7 @@ class Visitors:
                 self._check(door, scene, sha256, index, np.frombuffer(answer.content, np.uint8).reshape(SIDE, SIDE))
                 await self._pause(self._pause_s)
 
-    async def _websocket(self, door: str, scene: str) -> None:
+    async def _websocket(self, door, scene):
         """As a page does: connects again where the service is gone, and asks for the newest frame."""
         address = f"{self._http.replace('http', 'ws', 1)}/v1/scenes/{scene}/stream"
         while not self.over.is_set():
@@ -147,20 +144,20 @@ class Visitors:
                 self.seen.reconnections[door] += 1
                 await asyncio.sleep(0.1)
 
-    def _check(self, door: str, scene: str, sha256: str, index: int, pixels: Pixels) -> None:
+    def _check(self, door, scene, sha256, index, pixels):
         expected = self._expected[scene]
         self.seen.frames[door] += 1
         if sha256 != expected.sha256 or not np.array_equal(pixels, expected.frames[index]):
             self.seen.wrong.append(f"{door}: pose {index} of {scene} looks different")
 
 
-def _asked(index: int) -> dict[str, object]:
+def _asked(index):
     return {"pose": {"matrix": POSES[index].tolist()}, "height": SIDE, "width": SIDE}
 
 
-async def finished(grpc: str, jobs: list[str], within_s: float) -> Counter[str]:
+async def finished(grpc, jobs, within_s):
     """How many jobs ended in which state, or stand in it when the time has passed."""
-    states: Counter[str] = Counter()
+    states = Counter()
     end = time.monotonic() + within_s
     async with AsyncClient(grpc, timeout_s=PATIENCE_S) as client:
         for job in jobs:

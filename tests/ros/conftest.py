@@ -3,27 +3,15 @@
 The tests of this folder that ask for `peer` are skipped where rclpy is not installed: `make test-ros` installs it.
 """
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
 import threading
 import warnings
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
 
 import pytest
 
-from ..service.conftest import (
-    RunningService,
-    StartService,
-    data_folder,
-    demo_scene,
-    start_service,
-    start_shared_service,
-)
+from ..service.conftest import data_folder, demo_scene, start_service, start_shared_service
 from ..surroundings import ROOT
 from ..waiting import wait_until
 
@@ -35,12 +23,12 @@ NODE = "/ultragray"
 
 
 @pytest.fixture(scope="session")
-def ros_service(start_shared_service: StartService) -> RunningService:
+def ros_service(start_shared_service):
     return start_shared_service()
 
 
 @pytest.fixture(scope="session")
-def ros(home_of_the_tests: Path) -> Iterator[Any]:
+def ros(home_of_the_tests):
     """rclpy, ready to be used; the test is skipped where it is not installed."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", DeprecationWarning)  # of the parser that its messages are loaded with
@@ -55,28 +43,28 @@ def ros(home_of_the_tests: Path) -> Iterator[Any]:
 class Peer:
     """A node that publishes poses and keeps what comes back, by topic."""
 
-    def __init__(self, rclpy: Any) -> None:
+    def __init__(self, rclpy):
         from geometry_msgs.msg import PoseStamped
         from rclpy.executors import SingleThreadedExecutor
         from rclpy.qos import qos_profile_sensor_data
 
         self.node = rclpy.create_node("peer")
         self.quality = qos_profile_sensor_data
-        self.heard: dict[str, list[Any]] = {}
+        self.heard = {}
         self._poses = self.node.create_publisher(PoseStamped, f"{NODE}/probe_pose", 10)
         self._executor = SingleThreadedExecutor()
         self._executor.add_node(self.node)
         self._thread = threading.Thread(target=self._executor.spin)
         self._thread.start()
 
-    def listen(self, kind: Any, topic: str, quality: Any = None) -> list[Any]:
+    def listen(self, kind, topic, quality=None):
         """What comes on a topic of the node from now on."""
         heard = self.heard.setdefault(topic, [])
         self.node.create_subscription(kind, f"{NODE}/{topic}", heard.append, quality or self.quality)
         wait_until(lambda: self.node.count_publishers(f"{NODE}/{topic}"))
         return heard
 
-    def pose(self, stamp: int, *, y_m: float = 0.0, frame: str = "scene", w: float = 1.0) -> None:
+    def pose(self, stamp, *, y_m=0.0, frame="scene", w=1.0):
         """Publish a pose with a stamp of so many seconds, when the node listens."""
         from geometry_msgs.msg import PoseStamped
 
@@ -86,25 +74,25 @@ class Peer:
         wait_until(self._poses.get_subscription_count)
         self._poses.publish(message)
 
-    def frame(self, heard: list[Any], stamp: int, **pose: Any) -> Any:
+    def frame(self, heard, stamp, **pose):
         """What comes for a pose."""
         return self.pose_until(
             lambda: next((one for one in list(heard) if one.header.stamp.sec == stamp), None), stamp, **pose
         )
 
-    def pose_until(self, condition: Callable[[], Any], stamp: int, **pose: Any) -> Any:
+    def pose_until(self, condition, stamp, **pose):
         """The first true answer of `condition`. The pose is published again until then, as what comes before both sides
         know of each other is lost.
         """
 
-        def answer() -> Any:
+        def answer():
             if not (found := condition()):
                 self.pose(stamp, **pose)
             return found
 
         return wait_until(answer, every_s=0.1)
 
-    def call(self, kind: Any, service: str, **fields: Any) -> Any:
+    def call(self, kind, service, **fields):
         """The answer of a service of the node."""
         client = self.node.create_client(kind, f"{NODE}/{service}")
         wait_until(client.service_is_ready)
@@ -113,7 +101,7 @@ class Peer:
         self.node.destroy_client(client)
         return done.result()
 
-    def set(self, name: str, value: Any) -> str | None:
+    def set(self, name, value):
         """Set a parameter of the node; why it was refused, or None."""
         from rcl_interfaces.srv import SetParameters
         from rclpy.parameter import Parameter
@@ -122,20 +110,20 @@ class Peer:
         (result,) = self.call(SetParameters, "set_parameters", parameters=[message]).results
         return None if result.successful else result.reason
 
-    def transition(self, number: int) -> bool:
+    def transition(self, number):
         from lifecycle_msgs.msg import Transition
         from lifecycle_msgs.srv import ChangeState
 
         return bool(self.call(ChangeState, "change_state", transition=Transition(id=number)).success)
 
-    def close(self) -> None:
+    def close(self):
         self._executor.shutdown()
         self._thread.join()
         self.node.destroy_node()
 
 
 @pytest.fixture
-def peer(ros: Any) -> Iterator[Peer]:
+def peer(ros):
     peer = Peer(ros)
     yield peer
     peer.close()
@@ -144,7 +132,7 @@ def peer(ros: Any) -> Iterator[Peer]:
 class RunningNode:
     """`ultragray-ros` in a process of its own."""
 
-    def __init__(self, log: Path, parameters: dict[str, str]) -> None:
+    def __init__(self, log, parameters):
         arguments = [part for name, value in parameters.items() for part in ("-p", f"{name}:={value}")]
         self._log = log
         with log.open("wb") as file:
@@ -156,20 +144,20 @@ class RunningNode:
                 stderr=subprocess.STDOUT,
             )
 
-    def log(self) -> str:
+    def log(self):
         return self._log.read_text()
 
-    def stop(self) -> int:
+    def stop(self):
         """The exit code after an interrupt."""
         self.process.send_signal(2)
         return self.process.wait(60)
 
 
 @pytest.fixture
-def start_node(ros: Any, tmp_path: Path) -> Iterator[Callable[..., RunningNode]]:
-    started: list[RunningNode] = []
+def start_node(ros, tmp_path):
+    started = []
 
-    def start(**parameters: str) -> RunningNode:
+    def start(**parameters):
         started.append(RunningNode(tmp_path / f"node{len(started)}.log", parameters))
         return started[-1]
 

@@ -1,20 +1,88 @@
-"""Frames of the newest pose, from a real service; without ROS."""
-
-from __future__ import annotations
+"""Parameters of the node, and frames of the newest pose from a real service; without ROS."""
 
 import threading
-from collections.abc import Iterator
-from typing import Any
+from dataclasses import fields
 
 import numpy as np
 import pytest
 
-from ultragray_client import Client, Frame, RenderSettings
+from ultragray_client import Below, Client, Contact, ConvexProbe, Display, Needle, RenderSettings, ToolFrame
+from ultragray_client.errors import InvalidArgument
 from ultragray_ros.newest import NewestFrames, Problems
+from ultragray_ros.parameters import defaults, settings_of
 
 from ..client.proxy import Proxy
-from ..service.conftest import RunningService
 from ..waiting import wait_until
+
+
+def test_every_setting_is_a_parameter():
+    settings = {item.name for item in fields(RenderSettings)} - {"encoding", "display"}
+    assert set(defaults()) == settings | {f"display.{item.name}" for item in fields(Display)}
+
+
+def test_the_defaults_leave_everything_to_the_scene():
+    assert settings_of(defaults()) == RenderSettings()
+
+
+def test_no_default_is_of_a_type_that_ros_lacks():
+    for name, value in defaults().items():
+        assert isinstance(value, (bool, int, float, str, list)), name
+        assert value != [], f"{name}: the type of an empty list is not known"
+
+
+@pytest.mark.parametrize(
+    ("given", "expected"),
+    [
+        ({"height": 128, "outputs": ["bmode", "echo"]}, RenderSettings(height=128, outputs=("bmode", "echo"))),
+        ({"slice_thickness_mm": 0.0}, RenderSettings(slice_thickness_mm=0.0)),
+        (
+            {"min_confidence": 0.5, "below_min_confidence": "mask"},
+            RenderSettings(min_confidence=0.5, below_min_confidence=Below.MASK),
+        ),
+        ({"contact": "air"}, RenderSettings(contact=Contact.AIR)),
+        (
+            {"display.gain_db": -1.0, "display.tgc_db": [0.0, 6.0]},
+            RenderSettings(display=Display(gain_db=-1.0, tgc_db=(0.0, 6.0))),
+        ),
+        (
+            {"probe": '{"kind": "convex", "opening_angle_deg": 60, "near_mm": 40, "far_mm": 95}'},
+            RenderSettings(probe=ConvexProbe(60, 40, 95)),
+        ),
+        (
+            {
+                "tools": '[{"kind": "needle", "tip_mm": [5, 0, 30], "hub_mm": [-9, 0, 4], "frame": "probe"}]',
+                "ghost": 0.5,
+            },
+            RenderSettings(tools=(Needle(tip_mm=(5, 0, 30), hub_mm=(-9, 0, 4), frame=ToolFrame.PROBE),), ghost=0.5),
+        ),
+        ({"tools": "[]", "registration": "robot"}, RenderSettings(tools=(), registration="robot")),
+    ],
+)
+def test_what_parameters_stand_for(given, expected):
+    assert settings_of({**defaults(), "scene": "demo", **given}) == expected
+
+
+@pytest.mark.parametrize(
+    ("given", "told"),
+    [
+        ({"contact": "firm"}, "contact must be one of air, pressure, got 'firm'"),
+        ({"probe": "convex"}, "probe must be JSON with a kind"),
+        ({"probe": '{"kind": "square"}'}, "one of convex, linear, phased, radial, steered, and its numbers"),
+        ({"probe": '{"kind": "linear"}'}, "probe must be JSON with a kind"),
+        ({"probe": "[]"}, "probe must be JSON with a kind"),
+        ({"tools": "needle"}, "tools must be JSON with a kind, one of box, cylinder, needle"),
+        ({"tools": '{"kind": "needle"}'}, "it is no list"),
+        ({"tools": '[{"kind": "scalpel"}]'}, "tools must be JSON with a kind"),
+        (
+            {"tools": '[{"kind": "needle", "tip_mm": [0, 0, 1], "hub_mm": [0, 0, 2], "frame": "base"}]'},
+            "tools: frame must be one of scene, probe, got 'base'",
+        ),
+    ],
+)
+def test_a_word_that_does_not_exist_is_refused(given, told):
+    with pytest.raises(InvalidArgument, match=told):
+        settings_of({**defaults(), **given})
+
 
 SMALL = RenderSettings(height=16, width=16)
 
@@ -22,37 +90,37 @@ SMALL = RenderSettings(height=16, width=16)
 class Taker:
     """Keeps what comes, and holds the thread that brings it while it is told to."""
 
-    def __init__(self) -> None:
-        self.frames: list[tuple[Frame, int, int]] = []
-        self.errors: list[Any] = []
+    def __init__(self):
+        self.frames = []
+        self.errors = []
         self.may_go_on = threading.Event()
         self.may_go_on.set()
 
-    def take(self, frame: Frame, tag: int, replaced: int) -> None:
+    def take(self, frame, tag, replaced):
         self.frames.append((frame, tag, replaced))
         self.may_go_on.wait(60)
 
-    def tags(self) -> list[int]:
+    def tags(self):
         return [tag for _, tag, _ in self.frames]
 
 
 @pytest.fixture
-def client(ros_service: RunningService) -> Iterator[Client]:
+def client(ros_service):
     with Client(ros_service.grpc) as client:
         yield client
 
 
-def newest(client: Client, taker: Taker, scene: str = "demo", timeout_s: float = 60.0) -> NewestFrames[int]:
+def newest(client, taker, scene="demo", timeout_s=60.0):
     return NewestFrames(client, scene, SMALL, timeout_s=timeout_s, take=taker.take, tell=taker.errors.append)
 
 
-def moved(x_mm: float) -> np.ndarray:
+def moved(x_mm):
     pose = np.eye(4)
     pose[0, 3] = x_mm
     return pose
 
 
-def test_the_newest_pose_takes_the_place_of_those_that_wait(client: Client) -> None:
+def test_the_newest_pose_takes_the_place_of_those_that_wait(client):
     taker = Taker()
     frames = newest(client, taker)
     taker.may_go_on.clear()
@@ -69,7 +137,7 @@ def test_the_newest_pose_takes_the_place_of_those_that_wait(client: Client) -> N
     assert frame.pose[0, 3] == 0.5
 
 
-def test_a_pose_that_is_refused_leaves_the_stream_as_it_is(client: Client) -> None:
+def test_a_pose_that_is_refused_leaves_the_stream_as_it_is(client):
     taker = Taker()
     frames = newest(client, taker)
     frames.render(np.zeros((4, 4)), 1)
@@ -81,7 +149,7 @@ def test_a_pose_that_is_refused_leaves_the_stream_as_it_is(client: Client) -> No
     assert taker.tags() == [2]
 
 
-def test_other_settings_and_another_scene_hold_from_the_next_pose_on(client: Client) -> None:
+def test_other_settings_and_another_scene_hold_from_the_next_pose_on(client):
     taker = Taker()
     frames = newest(client, taker, scene="absent")
     frames.render(np.eye(4), 1)
@@ -94,7 +162,7 @@ def test_other_settings_and_another_scene_hold_from_the_next_pose_on(client: Cli
     assert taker.frames[0][0]["bmode"].shape == (24, 16)
 
 
-def test_a_frame_that_is_too_late_is_told_and_not_taken(client: Client) -> None:
+def test_a_frame_that_is_too_late_is_told_and_not_taken(client):
     taker = Taker()
     frames = newest(client, taker, timeout_s=1e-6)
     frames.render(np.eye(4), 1)
@@ -104,7 +172,7 @@ def test_a_frame_that_is_too_late_is_told_and_not_taken(client: Client) -> None:
     assert taker.frames == []
 
 
-def test_a_service_that_comes_back_is_asked_again(ros_service: RunningService) -> None:
+def test_a_service_that_comes_back_is_asked_again(ros_service):
     proxy, taker = Proxy("127.0.0.1:1"), Taker()
     with Client(proxy.address) as client:
         frames = newest(client, taker)
@@ -112,7 +180,7 @@ def test_a_service_that_comes_back_is_asked_again(ros_service: RunningService) -
         wait_until(lambda: taker.errors)
         proxy.lead_to(ros_service.grpc)
 
-        def came() -> bool:
+        def came():
             frames.render(np.eye(4), 2)
             return bool(taker.frames)
 
@@ -122,7 +190,7 @@ def test_a_service_that_comes_back_is_asked_again(ros_service: RunningService) -
     assert {error.reason for error in taker.errors} == {"UNREACHABLE"}
 
 
-def test_closing_ends_a_wait_for_a_frame(ros_service: RunningService) -> None:
+def test_closing_ends_a_wait_for_a_frame(ros_service):
     silent, taker = Proxy(ros_service.grpc), Taker()
     with Client(silent.address) as client:
         frames = newest(client, taker)
@@ -134,10 +202,10 @@ def test_closing_ends_a_wait_for_a_frame(ros_service: RunningService) -> None:
     assert not [thread for thread in threading.enumerate() if thread.name == "ultragray-newest"]
 
 
-def test_problems_are_told_once_in_a_while_by_their_kind(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_problems_are_told_once_in_a_while_by_their_kind(monkeypatch):
     now = [100.0]
     monkeypatch.setattr("ultragray_ros.newest.time.monotonic", lambda: now[0])
-    told: list[str] = []
+    told = []
     problems = Problems(told.append)
     for _ in range(4):
         problems.tell("UNREACHABLE", "nobody answers")

@@ -1,12 +1,8 @@
 """The node between a real service and a real publisher and subscriber."""
 
-from __future__ import annotations
-
 import io
 import json
 import re
-from collections.abc import Callable
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -15,31 +11,26 @@ from PIL import Image as Picture
 
 from ultragray_client import Client, Display, RenderSettings
 
-from ..service.conftest import RunningService
 from ..surroundings import ROOT
 from ..waiting import wait_until
-from .conftest import Peer, RunningNode
 
 pytestmark = pytest.mark.slow
 
 CONFIGURE, CLEANUP, ACTIVATE, DEACTIVATE = 1, 2, 3, 4
-Start = Callable[..., RunningNode]
 
 
-def pixels(image: Any) -> np.ndarray:
+def pixels(image):
     return np.frombuffer(image.data, np.uint8).reshape(image.height, image.step)
 
 
-def rendered(service: RunningService, y_mm: float, settings: RenderSettings | None = None) -> np.ndarray:
+def rendered(service, y_mm, settings=None):
     pose = np.eye(4)
     pose[1, 3] = y_mm
     with Client(service.grpc) as client:
         return client.render("demo", pose, settings)["bmode"]
 
 
-def test_a_pose_becomes_an_image_with_its_stamp_its_confidence_and_its_geometry(
-    start_node: Start, peer: Peer, ros_service: RunningService
-) -> None:
+def test_a_pose_becomes_an_image_with_its_stamp_its_confidence_and_its_geometry(start_node, peer, ros_service):
     from diagnostic_msgs.msg import DiagnosticArray
     from rclpy.qos import DurabilityPolicy, QoSProfile
     from sensor_msgs.msg import CompressedImage, Image
@@ -77,9 +68,7 @@ def test_a_pose_becomes_an_image_with_its_stamp_its_confidence_and_its_geometry(
     assert node.stop() == 0
 
 
-def test_the_command_of_the_launch_file_starts_the_node(
-    start_node: Start, peer: Peer, ros_service: RunningService
-) -> None:
+def test_the_command_of_the_launch_file_starts_the_node(start_node, peer, ros_service):
     from sensor_msgs.msg import Image
 
     launch = ElementTree.parse(ROOT / "ros/launch/ultragray.launch.xml").getroot()
@@ -92,9 +81,7 @@ def test_the_command_of_the_launch_file_starts_the_node(
     assert peer.frame(peer.listen(Image, "bmode"), 1).header.frame_id == "transducer"
 
 
-def test_settings_are_parameters_which_the_service_checks(
-    start_node: Start, peer: Peer, ros_service: RunningService
-) -> None:
+def test_settings_are_parameters_which_the_service_checks(start_node, peer, ros_service):
     from sensor_msgs.msg import Image
 
     start_node(address=ros_service.grpc, width="40")
@@ -118,9 +105,7 @@ def test_settings_are_parameters_which_the_service_checks(
     assert peer.frame(peer.listen(Image, "transmittance"), 4).width == image.width
 
 
-def test_what_cannot_be_rendered_is_logged_and_the_node_goes_on(
-    start_node: Start, peer: Peer, ros_service: RunningService
-) -> None:
+def test_what_cannot_be_rendered_is_logged_and_the_node_goes_on(start_node, peer, ros_service):
     from sensor_msgs.msg import Image
 
     node = start_node(address=ros_service.grpc)
@@ -136,7 +121,7 @@ def test_what_cannot_be_rendered_is_logged_and_the_node_goes_on(
     assert node.log().count("INVALID_POSE") == 1, "the log is throttled"
 
 
-def test_the_node_is_a_lifecycle_node(start_node: Start, peer: Peer, ros_service: RunningService) -> None:
+def test_the_node_is_a_lifecycle_node(start_node, peer, ros_service):
     from sensor_msgs.msg import Image
 
     start_node(address=ros_service.grpc, autostart="false")
@@ -164,7 +149,7 @@ def test_the_node_is_a_lifecycle_node(start_node: Start, peer: Peer, ros_service
         ({"tls": "true", "root_certificates": "absent.pem"}, "absent.pem cannot be read"),
     ],
 )
-def test_a_node_that_cannot_start_says_why(start_node: Start, parameters: dict[str, str], told: str) -> None:
+def test_a_node_that_cannot_start_says_why(start_node, parameters, told):
     node = start_node(**parameters)
     assert node.process.wait(60) == 1
     assert told in node.log()

@@ -1,7 +1,5 @@
 """Poses from transforms. tf2_ros has no wheel: a stand-in of its names gives the transforms; all else is ROS's."""
 
-from __future__ import annotations
-
 import sys
 import types
 from typing import Any
@@ -22,7 +20,7 @@ class Buffer:
 
     known: Any = None
 
-    def lookup_transform(self, target: str, source: str, time: Any) -> Any:
+    def lookup_transform(self, target, source, time):
         assert (target, source, time.nanoseconds) == ("scene", "probe", 0)
         if self.known is None:
             raise TransformException('"scene" passed to lookupTransform argument target_frame does not exist')
@@ -30,14 +28,14 @@ class Buffer:
 
 
 class TransformListener:
-    def __init__(self, buffer: Buffer, node: Any) -> None:
+    def __init__(self, buffer, node):
         self.is_listening = True
 
-    def unregister(self) -> None:
+    def unregister(self):
         self.is_listening = False
 
 
-def test_each_transform_becomes_a_pose_once(ros: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_each_transform_becomes_a_pose_once(ros, monkeypatch):
     stand_in = types.ModuleType("tf2_ros")
     for cls in (Buffer, TransformListener, TransformException):
         setattr(stand_in, cls.__name__, cls)
@@ -47,13 +45,13 @@ def test_each_transform_becomes_a_pose_once(ros: Any, monkeypatch: pytest.Monkey
     from ultragray_ros.newest import Problems
     from ultragray_ros.topics import TransformedPoses
 
-    taken: list[Any] = []
-    told: list[str] = []
+    taken = []
+    told = []
     node = ros.create_node("tf_peer")
     poses = TransformedPoses(node, "scene", "probe", rate_hz=200.0, take=taken.append, problems=Problems(told.append))
 
-    def spin_until(condition: Any) -> None:
-        def turned() -> Any:
+    def spin_until(condition):
+        def turned():
             ros.spin_once(node, timeout_sec=0.1)
             return condition()
 

@@ -1,17 +1,13 @@
 """A real service in a process of its own, on free ports."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 import grpc
 import httpx
@@ -38,7 +34,7 @@ class RunningService:
 
     process: WarmProcess | subprocess.Popen[bytes]
 
-    def __init__(self, data_folder: Path, log_path: Path, environment: dict[str, str], *, cold: bool = False) -> None:
+    def __init__(self, data_folder, log_path, environment, *, cold=False):
         """`cold` starts `python -m ultragray_service`; else it is forked from a process with the imports done."""
         self.data_folder = data_folder
         self.log_path = log_path
@@ -65,17 +61,17 @@ class RunningService:
                     WARM_SERVICES.path(), "service", arguments, environment=whole, folder=folder, files=files
                 )
 
-    def __enter__(self) -> RunningService:
+    def __enter__(self):
         return self
 
-    def __exit__(self, *_: object) -> None:
+    def __exit__(self, *_):
         self.terminate()
 
-    def log(self) -> list[dict[str, Any]]:
+    def log(self):
         whole = self.log_path.read_text().rpartition("\n")[0]  # the last line may be half written
         return [json.loads(line) for line in whole.split("\n") if line.startswith("{")]
 
-    def wait_until_serving(self) -> None:
+    def wait_until_serving(self):
         end = Deadline(START_TIMEOUT_S)
         while not end.passed:
             for record in self.log():
@@ -86,7 +82,7 @@ class RunningService:
             time.sleep(0.05)
         raise AssertionError(f"not serving after {START_TIMEOUT_S} s: {self.log_path.read_text()}")
 
-    def terminate(self) -> int:
+    def terminate(self):
         if self.process.poll() is None:
             self.process.send_signal(signal.SIGTERM)
         try:
@@ -96,27 +92,35 @@ class RunningService:
             self.process.wait()
             raise
 
-    def metric(self, name: str) -> float:
+    def metric(self, name):
         """The sum of all lines of /metrics that begin with `name`."""
         lines = httpx.get(f"{self.http}/metrics", timeout=60).text.splitlines()
         return sum(float(line.rpartition(" ")[2]) for line in lines if line.startswith(name))
 
-    def resident_bytes(self) -> int:
+    def stream_url(self, scene="demo"):
+        """The WebSocket of a scene."""
+        return f"{self.http.replace('http', 'ws', 1)}/v1/scenes/{scene}/stream"
+
+    def resident_bytes(self):
         pages = int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1])
         return pages * os.sysconf("SC_PAGE_SIZE")
 
-    def channel(self) -> grpc.Channel:
+    def channel(self):
         return grpc.insecure_channel(self.grpc, options=[("grpc.max_receive_message_length", -1)])
 
 
-StartService = Callable[..., RunningService]
+def split(message):
+    """What a WebSocket's frame tells about itself, and its pixels."""
+    assert isinstance(message, bytes), message
+    end = 4 + int.from_bytes(message[:4], "little")
+    return json.loads(message[4:end]), message[end:]
 
 
-def make_scene(gaussians: int = 400, *, probe: LinearProbe | None = None, seed: int = 0) -> GaussianScene:
+def make_scene(gaussians=400, *, probe=None, seed=0):
     """A cloud about the image plane, centred 20 mm deep, with five training poses 1 mm apart along y."""
     rng = np.random.default_rng(seed)
 
-    def tensor(values: Any) -> torch.Tensor:
+    def tensor(values):
         return torch.tensor(values, dtype=torch.float32)
 
     poses = np.tile(np.eye(4), (5, 1, 1))
@@ -145,12 +149,12 @@ DEMO_PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=40.0)
 
 
 @pytest.fixture(scope="session")
-def demo_scene() -> GaussianScene:
+def demo_scene():
     return make_scene(probe=DEMO_PROBE)
 
 
 @pytest.fixture(scope="session")
-def data_folder(tmp_path_factory: pytest.TempPathFactory, demo_scene: GaussianScene) -> Path:
+def data_folder(tmp_path_factory, demo_scene):
     """Two scenes that render, one that needs a probe to be named, and three files that are no scenes."""
     folder = tmp_path_factory.mktemp("data")
     demo_scene.save(folder / "demo.ugr")
@@ -163,11 +167,11 @@ def data_folder(tmp_path_factory: pytest.TempPathFactory, demo_scene: GaussianSc
     return folder
 
 
-def service_starter(tmp_path_factory: pytest.TempPathFactory, data_folder: Path) -> Iterator[StartService]:
+def service_starter(tmp_path_factory, data_folder):
     """Starts services with settings as keywords: `start_service(max_image_side=128)`; all are stopped at the end."""
     with ExitStack() as started:
 
-        def start(*, wait: bool = True, cold: bool = False, **settings: object) -> RunningService:
+        def start(*, wait=True, cold=False, **settings):
             environment = {f"ULTRAGRAY_{name.upper()}": str(value) for name, value in settings.items()}
             log_path = tmp_path_factory.mktemp("service") / "log"
             service = started.enter_context(RunningService(data_folder, log_path, environment, cold=cold))
@@ -179,19 +183,19 @@ def service_starter(tmp_path_factory: pytest.TempPathFactory, data_folder: Path)
 
 
 @pytest.fixture(scope="module")
-def start_service(tmp_path_factory: pytest.TempPathFactory, data_folder: Path) -> Iterator[StartService]:
+def start_service(tmp_path_factory, data_folder):
     """Starts services that live until the module ends."""
     yield from service_starter(tmp_path_factory, data_folder)
 
 
 @pytest.fixture(scope="session")
-def start_shared_service(tmp_path_factory: pytest.TempPathFactory, data_folder: Path) -> Iterator[StartService]:
+def start_shared_service(tmp_path_factory, data_folder):
     """Starts services that live until all tests have ended: for those that tests only read from."""
     yield from service_starter(tmp_path_factory, data_folder)
 
 
 @pytest.fixture(scope="session")
-def service(start_shared_service: StartService) -> RunningService:
+def service(start_shared_service):
     """The service that most tests share."""
     return start_shared_service(
         max_image_side=600, max_poses_per_request=40, queue_limit_frames=64, max_request_pixels=4_000_000
@@ -199,35 +203,35 @@ def service(start_shared_service: StartService) -> RunningService:
 
 
 @pytest.fixture(scope="session")
-def http(service: RunningService) -> Iterator[httpx.Client]:
+def http(service):
     with httpx.Client(base_url=service.http, timeout=120) as client:
         yield client
 
 
 @pytest.fixture(scope="session")
-def channel(service: RunningService) -> Iterator[grpc.Channel]:
+def channel(service):
     with service.channel() as channel:
         yield channel
 
 
 @pytest.fixture(scope="session")
-def renders(channel: grpc.Channel) -> rendering_pb2_grpc.RenderServiceStub:
+def renders(channel):
     return rendering_pb2_grpc.RenderServiceStub(channel)
 
 
 @pytest.fixture(scope="session")
-def scenes(channel: grpc.Channel) -> scenes_pb2_grpc.SceneServiceStub:
+def scenes(channel):
     return scenes_pb2_grpc.SceneServiceStub(channel)
 
 
 @pytest.fixture
-def pose_body() -> dict[str, Any]:
+def pose_body():
     """The identity 1 mm off centre, as HTTP takes it."""
     return {"position_mm": {"x": 1.0, "y": 0.0, "z": 0.0}, "quaternion": {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}}
 
 
 @pytest.fixture
-def pose_matrix() -> Any:
+def pose_matrix():
     """The same pose, [4, 4] mm."""
     matrix = np.eye(4)
     matrix[0, 3] = 1.0
@@ -235,7 +239,7 @@ def pose_matrix() -> Any:
 
 
 @pytest.fixture
-def pose_message() -> geometry_pb2.Pose:
+def pose_message():
     """The same pose, as gRPC takes it."""
     return geometry_pb2.Pose(
         placement=geometry_pb2.Placement(
@@ -245,12 +249,12 @@ def pose_message() -> geometry_pb2.Pose:
 
 
 @pytest.fixture
-def settings_message() -> rendering_pb2.RenderSettings:
+def settings_message():
     return rendering_pb2.RenderSettings(scene="demo")
 
 
 @pytest.fixture
-def scene_file(tmp_path: Path, random_scene: Callable[..., GaussianScene], random_poses: Callable[..., Any]) -> Path:
+def scene_file(tmp_path, random_scene, random_poses):
     """Sixty Gaussians and five training poses."""
     info = {
         "centre_mm": (1.0, 2.0, 3.0),
@@ -265,7 +269,7 @@ def scene_file(tmp_path: Path, random_scene: Callable[..., GaussianScene], rando
 
 
 @pytest.fixture
-def pose_file(tmp_path: Path, random_poses: Callable[..., Any]) -> Path:
+def pose_file(tmp_path, random_poses):
     path = tmp_path / "poses.npy"
     np.save(path, random_poses(7, seed=3))
     return path

@@ -1,23 +1,18 @@
 """A reader of a latest stream gets no old frame, whatever it does: over gRPC one that acknowledges, else any."""
 
-from __future__ import annotations
-
 import json
 import queue
-import struct
 import time
-from collections.abc import Iterator
-from typing import Any
 
 import grpc
 import numpy as np
 import pytest
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
 
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2
 
 from ..freshness import check_fresh
-from .conftest import RunningService
+from .conftest import split
 
 IDENTITY = geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=np.eye(4).ravel().tolist()))
 SMALL = {"height": 128, "width": 128, "encoding": "jpeg"}  # some KB: buffers hold hundreds of them
@@ -28,65 +23,56 @@ LATEST = rendering_pb2.STREAM_MODE_LATEST
 class GrpcDoor:
     """A client that acknowledges each frame as it takes it."""
 
-    def __init__(self, renders: Any, settings: dict[str, Any], window: int = 1) -> None:
-        self._messages: queue.Queue[Any] = queue.Queue()
+    def __init__(self, renders, settings, window=1):
+        self._messages = queue.Queue()
         self._sequence = 0
         self.frames = renders.RenderStream(iter(self._messages.get, None))
         asked = {**settings, "encoding": f"ENCODING_{settings['encoding'].upper()}"}
         self.put(settings=rendering_pb2.RenderSettings(scene="demo", **asked), mode=LATEST, window=window)
 
-    def put(self, **fields: Any) -> None:
+    def put(self, **fields):
         self._messages.put(rendering_pb2.RenderStreamRequest(**fields))
 
-    def send(self) -> None:
+    def send(self):
         self._sequence += 1
         self.put(sequence=self._sequence, pose=IDENTITY, client_time_ns=time.monotonic_ns())
 
-    def take(self) -> rendering_pb2.Frame:
+    def take(self):
         frame = next(self.frames)
         assert not frame.HasField("error"), frame.error
         return frame
 
-    def receive(self) -> float:
+    def receive(self):
         frame = self.take()
         self.put(acknowledged=frame.sequence)
         return float(frame.client_time_ns / 1e9)
 
-    def close(self) -> None:
+    def close(self):
         self._messages.put(None)
         self.frames.cancel()
 
 
 class WebSocketDoor:
-    """A client that reads a WebSocket, and acknowledges its frames or not."""
+    """A client that reads a WebSocket."""
 
-    def __init__(self, connection: ClientConnection, settings: dict[str, Any], window: int | None) -> None:
+    def __init__(self, connection, settings):
         self._connection = connection
-        self._sequence = 0
-        self._acknowledges = window is not None
-        connection.send(json.dumps({"mode": "latest", "window": window, "settings": settings}))
+        connection.send(json.dumps({"mode": "latest", "settings": settings}))
 
-    def send(self) -> None:
-        self._sequence += 1
+    def send(self):
         pose = {"matrix": np.eye(4).tolist()}
-        message = {"sequence": self._sequence, "pose": pose, "client_time_ms": 1000 * time.monotonic()}
-        self._connection.send(json.dumps(message))
+        self._connection.send(json.dumps({"pose": pose, "client_time_ms": 1000 * time.monotonic()}))
 
-    def receive(self) -> float:
-        message = self._connection.recv(timeout=60)
-        assert isinstance(message, bytes), message
-        (length,) = struct.unpack_from("<I", message)
-        about = json.loads(message[4 : 4 + length])
-        if self._acknowledges:
-            self._connection.send(json.dumps({"acknowledged": about["sequence"]}))
+    def receive(self):
+        about, _ = split(self._connection.recv(timeout=60))
         return float(about["client_time_ms"] / 1000)
 
 
 @pytest.fixture
-def open_grpc(renders: Any) -> Iterator[Any]:
-    doors: list[GrpcDoor] = []
+def open_grpc(renders):
+    doors = []
 
-    def open_one(settings: dict[str, Any], window: int = 1) -> GrpcDoor:
+    def open_one(settings, window=1):
         doors.append(GrpcDoor(renders, settings, window))
         return doors[-1]
 
@@ -96,21 +82,17 @@ def open_grpc(renders: Any) -> Iterator[Any]:
 
 
 @pytest.mark.parametrize("settings", [SMALL, pytest.param(LARGE, marks=pytest.mark.long)], ids=["small", "large"])
-def test_grpc(open_grpc: Any, settings: dict[str, Any]) -> None:
+def test_grpc(open_grpc, settings):
     check_fresh(open_grpc(settings))
 
 
-@pytest.mark.parametrize(
-    "window", [pytest.param(1, marks=pytest.mark.long), None], ids=["acknowledged", "unacknowledged"]
-)
 @pytest.mark.parametrize("settings", [SMALL, pytest.param(LARGE, marks=pytest.mark.long)], ids=["small", "large"])
-def test_websocket(service: RunningService, settings: dict[str, Any], window: int | None) -> None:
-    address = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/demo/stream"
-    with connect(address, compression=None, max_size=None, close_timeout=0.2) as connection:
-        check_fresh(WebSocketDoor(connection, settings, window))
+def test_websocket_without_acknowledgements(service, settings):
+    with connect(service.stream_url(), compression=None, max_size=None, close_timeout=0.2) as connection:
+        check_fresh(WebSocketDoor(connection, settings))
 
 
-def test_no_more_answers_come_than_the_window_has_room_for(open_grpc: Any, service: RunningService) -> None:
+def test_no_more_answers_come_than_the_window_has_room_for(open_grpc, service):
     door = open_grpc(SMALL, window=3)
     for _ in range(3):
         door.send()
@@ -127,6 +109,6 @@ def test_no_more_answers_come_than_the_window_has_room_for(open_grpc: Any, servi
     assert door.take().sequence == 23
 
 
-def test_a_window_beyond_the_limit_ends_the_stream(open_grpc: Any) -> None:
+def test_a_window_beyond_the_limit_ends_the_stream(open_grpc):
     with pytest.raises(grpc.RpcError, match="window must be at most 16"):
         open_grpc(SMALL, window=17).take()

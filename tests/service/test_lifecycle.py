@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import os
 import signal
 import socket
@@ -8,8 +6,6 @@ import sys
 import threading
 import time
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-from typing import Any
 
 import grpc
 import httpx
@@ -19,7 +15,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 
 from ..waiting import at_this_load, wait_until
-from .conftest import ROOT, SOURCE_FOLDERS, RunningService, StartService
+from .conftest import ROOT, SOURCE_FOLDERS
 from .rpc.test_grpc_render import Conversation, error_info, moved
 
 IDENTITY = {"position_mm": {"x": 0, "y": 0, "z": 0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}
@@ -29,15 +25,15 @@ SLOW = {"backend": "reference", "max_batch_poses": 1}  # so that frames still wa
 
 
 @pytest.fixture(scope="module")
-def slow(start_service: StartService) -> RunningService:
+def slow(start_service):
     return start_service(**SLOW)
 
 
-def render(service: RunningService, client: httpx.Client, **body: Any) -> httpx.Response:
+def render(service, client, **body):
     return client.post(f"{service.http}/v1/scenes/demo/render", json={"pose": IDENTITY, **body}, timeout=120)
 
 
-def test_sigterm_answers_what_is_in_flight_and_exits_cleanly(start_service: StartService) -> None:
+def test_sigterm_answers_what_is_in_flight_and_exits_cleanly(start_service):
     service = start_service(cold=True, **SLOW)
     frames = rendering_pb2.RenderSettings(scene="demo", **SMALL)
     with service.channel() as channel, httpx.Client(timeout=60) as client, ThreadPoolExecutor(8) as threads:
@@ -64,7 +60,7 @@ def test_sigterm_answers_what_is_in_flight_and_exits_cleanly(start_service: Star
             client.get(f"{service.http}/v1/health/live")
 
 
-def test_sigint_stops_an_idle_service_at_once(start_service: StartService) -> None:
+def test_sigint_stops_an_idle_service_at_once(start_service):
     service = start_service()
     with httpx.Client(timeout=60) as idle, service.channel() as channel:
         idle.get(f"{service.http}/v1/health/live")
@@ -76,7 +72,7 @@ def test_sigint_stops_an_idle_service_at_once(start_service: StartService) -> No
     assert service.log()[-1]["message"] == "stopped"
 
 
-def test_a_second_signal_stops_at_once(start_service: StartService) -> None:
+def test_a_second_signal_stops_at_once(start_service):
     service = start_service(**SLOW)
     with httpx.Client(timeout=60) as client, ThreadPoolExecutor(4) as threads:
         pending = [threads.submit(render, service, client, height=256, width=256) for _ in range(4)]
@@ -93,7 +89,7 @@ def test_a_second_signal_stops_at_once(start_service: StartService) -> None:
             assert isinstance(error, httpx.TransportError) if error else answer.result().status_code == 503
 
 
-def test_a_service_that_leaves_is_not_ready_and_answers_until_it_stops(start_service: StartService) -> None:
+def test_a_service_that_leaves_is_not_ready_and_answers_until_it_stops(start_service):
     service = start_service(drain_delay_s=3)
     with service.channel() as channel, httpx.Client(timeout=60) as client:
         conversation = Conversation(rendering_pb2_grpc.RenderServiceStub(channel))
@@ -119,13 +115,13 @@ def test_a_service_that_leaves_is_not_ready_and_answers_until_it_stops(start_ser
         assert service.process.wait(60) == 0
 
 
-def not_ready(service: RunningService, client: httpx.Client) -> Any:
+def not_ready(service, client):
     """The problem that readiness tells; None: the service is ready."""
     answer = client.get(f"{service.http}/v1/health/ready")
     return answer.json() if answer.status_code == 503 else None
 
 
-def test_a_second_signal_ends_the_delay(start_service: StartService) -> None:
+def test_a_second_signal_ends_the_delay(start_service):
     service = start_service(drain_delay_s=600)
     service.process.send_signal(signal.SIGTERM)
     wait_until(lambda: any("not ready any more" in record["message"] for record in service.log()))
@@ -133,14 +129,14 @@ def test_a_second_signal_ends_the_delay(start_service: StartService) -> None:
     assert service.process.wait(60) == 0
 
 
-def test_sigterm_while_starting(start_service: StartService) -> None:
+def test_sigterm_while_starting(start_service):
     service = start_service(wait=False)
     wait_until(service.log)
     assert service.terminate() == 0
     assert not any("grpc" in record for record in service.log()), "it was ready before it was stopped"
 
 
-def test_a_full_queue_is_told_with_a_time_to_retry(start_service: StartService) -> None:
+def test_a_full_queue_is_told_with_a_time_to_retry(start_service):
     service = start_service(**SLOW, queue_limit_frames=2)
     with httpx.Client(timeout=60) as client, ThreadPoolExecutor(12) as threads:
         answers = list(threads.map(lambda _: render(service, client, **SMALL), range(12)))
@@ -164,7 +160,7 @@ def test_a_full_queue_is_told_with_a_time_to_retry(start_service: StartService) 
         assert render(service, client).status_code == 200
 
 
-def test_frames_of_a_client_that_has_gone_are_dropped(slow: RunningService) -> None:
+def test_frames_of_a_client_that_has_gone_are_dropped(slow):
     with httpx.Client(timeout=60) as client:
         host, port = slow.http.removeprefix("http://").split(":")
         body = (
@@ -185,12 +181,12 @@ def test_frames_of_a_client_that_has_gone_are_dropped(slow: RunningService) -> N
         assert render(slow, client).status_code == 200
 
 
-def test_interactive_frames_go_before_a_batch(slow: RunningService) -> None:
+def test_interactive_frames_go_before_a_batch(slow):
     with slow.channel() as channel, httpx.Client(timeout=60) as client:
         stub = rendering_pb2_grpc.RenderServiceStub(channel)
         settings = rendering_pb2.RenderSettings(scene="demo", **SMALL)
         batch = rendering_pb2.RenderBatchRequest(settings=settings, poses=[moved(0)] * 12)
-        received: list[int] = []
+        received = []
         reader = threading.Thread(target=lambda: received.extend(f.sequence for f in stub.RenderBatch(batch)))
         reader.start()
         wait_until(lambda: slow.metric(WAITING))
@@ -201,7 +197,7 @@ def test_interactive_frames_go_before_a_batch(slow: RunningService) -> None:
         assert received == list(range(12))
 
 
-def test_a_port_in_use_is_one_clear_error(start_service: StartService, service: RunningService) -> None:
+def test_a_port_in_use_is_one_clear_error(start_service, service):
     http_port, grpc_port = service.http.rsplit(":", 1)[1], service.grpc.rsplit(":", 1)[1]
     for settings, name in (({"http_port": http_port}, "HTTP"), ({"grpc_port": grpc_port}, "gRPC")):
         second = start_service(wait=False, cold=name == "HTTP", **settings)
@@ -219,7 +215,7 @@ def test_a_port_in_use_is_one_clear_error(start_service: StartService, service: 
         ({"processes": "none"}, "ULTRAGRAY_PROCESSES"),
     ],
 )
-def test_bad_settings_are_one_clear_error(start_service: StartService, settings: dict[str, str], expected: str) -> None:
+def test_bad_settings_are_one_clear_error(start_service, settings, expected):
     service = start_service(wait=False, **settings)
     assert service.process.wait(60) == 1
     said = service.log_path.read_text()
@@ -228,14 +224,7 @@ def test_bad_settings_are_one_clear_error(start_service: StartService, settings:
 
 
 @pytest.mark.slow
-def test_the_service_process_never_imports_torch() -> None:
+def test_the_service_process_never_imports_torch():
     code = "import sys, ultragray_service.server; sys.exit('torch' in sys.modules)"
     path = os.pathsep.join(str(ROOT / folder) for folder in SOURCE_FOLDERS)
     subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": path}, check=True)
-
-
-def test_a_running_service_holds_no_torch(service: RunningService) -> None:
-    maps = Path(f"/proc/{service.process.pid}/maps")
-    if not maps.exists():
-        pytest.skip("needs /proc")
-    assert "libtorch" not in maps.read_text()

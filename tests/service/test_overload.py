@@ -1,12 +1,8 @@
 """More asked for than can be rendered, and scenes that would take for ever: answers of a real service."""
 
-from __future__ import annotations
-
 import contextlib
 import threading
 import time
-from pathlib import Path
-from typing import Any
 
 import grpc
 import httpx
@@ -17,7 +13,7 @@ from ultragray import GaussianScene, SceneInfo
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 
 from ..waiting import at_this_load, wait_until
-from .conftest import DEMO_PROBE, RunningService, StartService, make_scene
+from .conftest import DEMO_PROBE, make_scene
 from .rpc.test_grpc_render import error_info, moved
 
 IDENTITY = {"position_mm": {"x": 0, "y": 0, "z": 0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}
@@ -25,7 +21,7 @@ LARGE = {"height": 512, "width": 512}
 
 
 @pytest.fixture(scope="module")
-def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def scenes(tmp_path_factory):
     """`demo`, and scenes of 20,000 Gaussians of 148 cm and of e^88 cm before the probe."""
     folder = tmp_path_factory.mktemp("scenes")
     make_scene(probe=DEMO_PROBE).save(folder / "demo.ugr")
@@ -42,17 +38,17 @@ def scenes(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def render(client: httpx.Client, scene: str, **body: Any) -> httpx.Response:
+def render(client, scene, **body):
     return client.post(f"/v1/scenes/{scene}/render", json={"pose": IDENTITY, **body}, timeout=60)
 
 
 @pytest.fixture(scope="module")
-def strict(start_service: StartService, scenes: Path) -> RunningService:
+def strict(start_service, scenes):
     return start_service(data_folder=scenes)
 
 
 @pytest.mark.parametrize("scene", ["wide", "endless"])
-def test_a_scene_that_would_take_minutes_is_refused_by_both_doors(strict: RunningService, scene: str) -> None:
+def test_a_scene_that_would_take_minutes_is_refused_by_both_doors(strict, scene):
     with httpx.Client(base_url=strict.http, timeout=60) as client, strict.channel() as channel:
         refused = render(client, scene, **LARGE)
         assert (refused.status_code, refused.json()["reason"], refused.json()["field"]) == (
@@ -74,7 +70,7 @@ def test_a_scene_that_would_take_minutes_is_refused_by_both_doors(strict: Runnin
     assert strict.metric("ultragray_process_restarts_total") == strict.metric("ultragray_watchdog_kills_total") == 0
 
 
-def test_a_frame_past_its_deadline_frees_the_worker(start_service: StartService, scenes: Path) -> None:
+def test_a_frame_past_its_deadline_frees_the_worker(start_service, scenes):
     service = start_service(data_folder=scenes, max_footprint_pixels=2**62)
     with httpx.Client(base_url=service.http, timeout=60) as client:
         assert render(client, "wide", height=16, width=16).status_code == 200
@@ -87,18 +83,12 @@ def test_a_frame_past_its_deadline_frees_the_worker(start_service: StartService,
     assert service.metric("ultragray_watchdog_kills_total") == 0
 
 
-@pytest.fixture
-def slow(start_service: StartService, scenes: Path) -> RunningService:
-    """A service of some ten frames a second: capacity is soon exceeded."""
-    return start_service(data_folder=scenes, backend="reference", max_batch_poses=1, max_queue_ms=500.0)
-
-
 @pytest.mark.long
-def test_a_request_names_how_long_it_waits_to_begin(start_service: StartService, scenes: Path) -> None:
+def test_a_request_names_how_long_it_waits_to_begin(start_service, scenes):
     service = start_service(data_folder=scenes, backend="reference", max_batch_poses=1, max_queue_ms=600_000)
     poses, size = [IDENTITY] * 256, {"height": 64, "width": 64}
 
-    def fill() -> None:
+    def fill():
         with contextlib.suppress(httpx.HTTPError):  # the service stops before it is done
             httpx.post(f"{service.http}/v1/scenes/demo/render", json={"poses": poses, **size}, timeout=600)
 

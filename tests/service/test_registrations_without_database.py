@@ -1,62 +1,56 @@
 """Frames go on by the registrations that a service has copied, while the database that keeps them is away."""
 
-from __future__ import annotations
-
 import json
 import time
-from pathlib import Path
-from typing import Any
 
 import httpx
 import numpy as np
 import pytest
 import sqlalchemy as sa
 
-from ultragray_service.access.keys import INTERVAL_S
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.owners import tell_change
 from ultragray_workers.jobs.tables import REGISTRATIONS
 
-from ..postgres import PostgresServer
 from ..waiting import at_this_load, wait_until
-from .conftest import StartService
+from ..warm import SHORT_WAITS
 
 PATH = "/v1/registrations/robot"
 TOO_LATE_S = 30.0  # whoever waits for the database waits for ten
 AT_ONCE_S = 5.0  # a frame that does not wait for it
 
 
-def put(http: httpx.Client, by_mm: float) -> None:
+def put(http, by_mm):
     base_to_scene = np.eye(4)
     base_to_scene[1, 3] = by_mm
     answer = http.put(PATH, json={"scene": "demo", "base_to_scene": base_to_scene.tolist()})
     assert answer.status_code == 200, answer.text
 
 
-def render(http: httpx.Client, pose: dict[str, Any], registration: str) -> httpx.Response:
+def render(http, pose, registration):
     body = {"pose": pose, "height": 16, "width": 16, "registration": registration}
     return http.post("/v1/scenes/demo/render", json=body)
 
 
-def shift_mm(answer: httpx.Response) -> float:
+def shift_mm(answer):
     assert answer.status_code == 200, answer.text
     pose = json.loads(answer.headers["X-Ultragray-Pose"])  # [4, 4] mm, in the scene
     return float(pose[1][3])
 
 
-def assert_shifted(answer: httpx.Response, by_mm: float) -> None:
+def assert_shifted(answer, by_mm):
     assert shift_mm(answer) == by_mm
     assert answer.elapsed.total_seconds() < at_this_load(AT_ONCE_S)
 
 
-def assert_unavailable(answer: httpx.Response) -> None:
+def assert_unavailable(answer):
     assert (answer.status_code, answer.json()["reason"]) == (503, "DATABASE_UNAVAILABLE"), answer.text
 
 
-@pytest.mark.parametrize("silent", [False, True], ids=["stopped", "silent"])
+@pytest.mark.parametrize("silent", [False, pytest.param(True, marks=pytest.mark.long)], ids=["stopped", "silent"])
 def test_frames_go_on_by_a_registration_that_was_read_while_the_database_is_away(
-    start_service: StartService, postgres: PostgresServer, tmp_path: Path, pose_body: dict[str, Any], silent: bool
-) -> None:
+    start_service, postgres, tmp_path, pose_body, silent
+):
     shared = {"artifact_folder": tmp_path, "database_url": postgres.create_database()}
     service, other = (start_service(**shared) for _ in range(2))
     take_away, give_back = (postgres.pause, postgres.resume) if silent else (postgres.stop, postgres.start)
@@ -67,7 +61,8 @@ def test_frames_go_on_by_a_registration_that_was_read_while_the_database_is_away
         put(http, 3.0)
         assert_shifted(render(elsewhere, pose_body, "robot"), 3.0)
         put(http, 4.0)
-        time.sleep(at_this_load(2 * INTERVAL_S))  # an answer does not tell whether it is from the copy yet
+        # An answer does not tell whether it is from the copy yet.
+        time.sleep(at_this_load(2 * SHORT_WAITS["access.keys.INTERVAL_S"]))
         take_away()
         try:
             for _ in range(2):
@@ -86,9 +81,7 @@ def test_frames_go_on_by_a_registration_that_was_read_while_the_database_is_away
         wait_until(lambda: render(elsewhere, pose_body, "robot").status_code == 404)
 
 
-def test_one_that_cannot_be_read_hinders_no_other(
-    start_service: StartService, tmp_path: Path, pose_body: dict[str, Any]
-) -> None:
+def test_one_that_cannot_be_read_hinders_no_other(start_service, tmp_path, pose_body):
     service = start_service(artifact_folder=tmp_path)
     with httpx.Client(base_url=service.http, timeout=TOO_LATE_S) as http:
         put(http, 3.0)

@@ -1,15 +1,10 @@
 """A scene whose file is replaced while frames of it are asked for: no frame mixes the old one with the new one."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os
-import struct
 import threading
 import time
-from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import httpx
 import numpy as np
@@ -17,31 +12,26 @@ import pytest
 from websockets.sync.client import connect
 
 from ultragray import LinearProbe
-from ultragray_service.igtl.contents import unpack_image
 
-from .conftest import RunningService, StartService, make_scene
-from .igtl.conftest import Peer, address_of
+from .conftest import make_scene
 
 SWAPS = 8
-BETWEEN_SWAPS_S = 0.25
-
-Seen = tuple[str, float]  # SHA-256 of the scene, far_mm of the probe of a frame
-Ask = Callable[[], Iterator[Seen]]
+BETWEEN_SWAPS_S = 0.1
 
 
 class Changing:
     """A scene that is replaced by one with another probe, and back."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder):
         self.path = folder / "changing.ugr"
         self._contents = []
-        self.known: set[Seen] = set()
+        self.known = set()
         for far_mm, gaussians in ((40.0, 400), (60.0, 500)):
             make_scene(gaussians, probe=LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=far_mm)).save(self.path)
             self._contents.append(self.path.read_bytes())
             self.known.add((hashlib.sha256(self._contents[-1]).hexdigest(), far_mm))
 
-    def swap(self) -> None:
+    def swap(self):
         self._contents.reverse()
         other = self.path.with_suffix(".new")
         other.write_bytes(self._contents[0])
@@ -49,26 +39,26 @@ class Changing:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     return tmp_path_factory.mktemp("changing")
 
 
 @pytest.fixture(scope="module")
-def changing(folder: Path) -> Changing:
+def changing(folder):
     return Changing(folder)
 
 
 @pytest.fixture(scope="module")
-def service(start_service: StartService, changing: Changing, folder: Path) -> RunningService:
-    return start_service(data_folder=folder, igtl_port=0, igtl_scene="changing")
+def service(start_service, changing, folder):
+    return start_service(data_folder=folder)
 
 
-def check(changing: Changing, ask: Ask) -> None:
+def check(changing, ask):
     """Both contents are seen while they are swapped, each with its own probe only."""
-    seen: set[Seen] = set()
+    seen = set()
     done = threading.Event()
 
-    def swap() -> None:
+    def swap():
         for _ in range(SWAPS):
             time.sleep(BETWEEN_SWAPS_S)
             changing.swap()
@@ -86,10 +76,10 @@ def check(changing: Changing, ask: Ask) -> None:
         swapping.join()
 
 
-def test_http(service: RunningService, changing: Changing) -> None:
+def test_http(service, changing):
     body = {"poses": [{"matrix": np.eye(4).tolist()}] * 3, "dtype": "uint8"}
 
-    def ask() -> Iterator[Seen]:
+    def ask():
         answer = client.post("/v1/scenes/changing/render", json=body, headers={"Accept": "application/octet-stream"})
         assert answer.status_code == 200, answer.text
         probe = json.loads(answer.headers["X-Ultragray-Probe"])
@@ -99,44 +89,10 @@ def test_http(service: RunningService, changing: Changing) -> None:
         check(changing, ask)
 
 
-def test_websocket(service: RunningService, changing: Changing) -> None:
-    message = json.dumps({"pose": {"matrix": np.eye(4).tolist()}})
-
-    def ask() -> Iterator[Seen]:
-        connection.send(message)
-        answer = connection.recv(timeout=60)
-        assert isinstance(answer, bytes), answer
-        (length,) = struct.unpack_from("<I", answer)
-        about = json.loads(answer[4 : 4 + length])
-        yield about["scene_sha256"], about["probe"]["far_mm"]
-
-    address = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/changing/stream"
-    with connect(address, compression=None, max_size=None, close_timeout=0.2) as connection:
-        check(changing, ask)
-
-
-def test_openigtlink(service: RunningService, changing: Changing) -> None:
-    peer = Peer(address_of(service))
-
-    def ask() -> Iterator[Seen]:
-        peer.send_pose(np.eye(4), "changing", version=2)
-        message = peer.receive()
-        assert message.type_name == "IMAGE", message
-        image = unpack_image(message.content)
-        far_mm = np.linalg.norm(image.matrix[:3, 1]) * image.pixels.shape[0]
-        yield message.metadata["scene_sha256"], round(float(far_mm), 3)
-
-    check(changing, ask)
-    peer.socket.close()
-
-
-def test_what_the_new_scene_cannot_give_is_told_and_the_stream_goes_on(
-    service: RunningService, changing: Changing
-) -> None:
+def test_what_the_new_scene_cannot_give_is_told_and_the_stream_goes_on(service, changing):
     """A scene without a probe of its own takes the place of one with a probe, under a stream that names none."""
     message = json.dumps({"pose": {"matrix": np.eye(4).tolist()}})
-    address = f"{service.http.replace('http', 'ws', 1)}/v1/scenes/changing/stream"
-    with connect(address, compression=None, max_size=None, close_timeout=0.2) as connection:
+    with connect(service.stream_url("changing"), compression=None, max_size=None, close_timeout=0.2) as connection:
         connection.send(message)
         assert isinstance(connection.recv(timeout=60), bytes)
         make_scene(20).save(changing.path)

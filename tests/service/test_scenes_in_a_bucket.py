@@ -1,11 +1,7 @@
 """Services over one bucket and one PostgreSQL: each serves what another imports, and what is cached without S3."""
 
-from __future__ import annotations
-
 import hashlib
 import time
-from pathlib import Path
-from typing import Any
 
 import httpx
 import numpy as np
@@ -14,30 +10,22 @@ import pytest
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
 from ultragray_workers.storage.location import open_storage
 
-from ..object_storage import AWAY_S, FaultyProxy, ObjectServer, credentials
-from ..postgres import PostgresServer
+from ..object_storage import AWAY_S, FaultyProxy, credentials
 from ..waiting import Deadline, at_this_load, wait_until
-from .conftest import DEMO_PROBE, RunningService, StartService, make_scene
+from .conftest import DEMO_PROBE, make_scene
 
 WITHIN_S = 10.0
 
 
 @pytest.fixture(scope="module")
-def proxy(object_server: ObjectServer) -> Any:
+def proxy(object_server):
     proxy = FaultyProxy(object_server.port)
     yield proxy
     proxy.close()
 
 
 @pytest.fixture(scope="module")
-def replicas(
-    start_service: StartService,
-    object_server: ObjectServer,
-    proxy: FaultyProxy,
-    postgres: PostgresServer,
-    data_folder: Path,
-    tmp_path_factory: pytest.TempPathFactory,
-) -> list[RunningService]:
+def replicas(start_service, object_server, proxy, postgres, data_folder, tmp_path_factory):
     """Two services over a bucket in which an operator has put the scene `demo`."""
     cache = tmp_path_factory.mktemp("cache")
     url, database = f"s3://{object_server.create_bucket()}/scenes", postgres.create_database()
@@ -47,37 +35,19 @@ def replicas(
         open_storage(url).upload(data_folder / "demo.ugr", "demo.ugr")
         return [
             start_service(
-                data_folder=url,
-                database_url=database,
-                cache_folder=cache,
-                preload="demo" if number == 0 else "",
+                data_folder=url, database_url=database, cache_folder=cache, preload="demo" if number == 0 else ""
             )
             for number in range(2)
         ]
 
 
-def render(service: RunningService, scene: str, accept: str = "application/octet-stream") -> httpx.Response:
+def render(service, scene, accept="application/octet-stream"):
     body = {"poses": [{"matrix": np.eye(4).tolist()}], "height": 32, "width": 32, "dtype": "uint8"}
     return httpx.post(f"{service.http}/v1/scenes/{scene}/render", json=body, headers={"Accept": accept}, timeout=60)
 
 
 @pytest.mark.long
-def test_frames_are_those_of_a_folder(
-    replicas: list[RunningService], start_service: StartService, data_folder: Path
-) -> None:
-    local = render(start_service(data_folder=data_folder), "demo")
-    assert local.status_code == 200
-    for replica in replicas:
-        answer = render(replica, "demo")
-        assert answer.status_code == 200, answer.text
-        assert answer.content == local.content
-        assert answer.headers["x-ultragray-scene-sha256"] == local.headers["x-ultragray-scene-sha256"]
-
-
-@pytest.mark.long
-def test_a_scene_is_imported_listed_pinned_and_deleted(
-    replicas: list[RunningService], scene_file: Path, tmp_path: Path
-) -> None:
+def test_a_scene_is_imported_listed_pinned_and_deleted(replicas, scene_file, tmp_path):
     one, other = replicas
     content = scene_file.read_bytes()
     sha256 = hashlib.sha256(content).hexdigest()
@@ -108,9 +78,7 @@ def test_a_scene_is_imported_listed_pinned_and_deleted(
 
 
 @pytest.mark.long
-def test_what_is_cached_is_served_while_the_bucket_is_away(
-    replicas: list[RunningService], proxy: FaultyProxy, tmp_path: Path
-) -> None:
+def test_what_is_cached_is_served_while_the_bucket_is_away(replicas, proxy, tmp_path):
     one, other = replicas
     for seed, name in enumerate(("cached", "elsewhere")):
         make_scene(60, probe=DEMO_PROBE, seed=seed).save(tmp_path / f"{name}.ugr")
@@ -121,7 +89,7 @@ def test_what_is_cached_is_served_while_the_bucket_is_away(
     proxy.away = True
     try:
 
-        def away() -> bool:
+        def away():
             return not httpx.get(f"{one.http}/v1/health/ready").json()["components"]["scenes"]["ready"]
 
         wait_until(away, within_s=30)

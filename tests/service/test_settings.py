@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest
@@ -8,7 +6,7 @@ from ultragray.errors import InvalidArgument
 from ultragray_service.settings import load_settings
 
 
-def test_environment_sets_and_overrides_win(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_environment_sets_and_overrides_win(monkeypatch):
     monkeypatch.setenv("ULTRAGRAY_HTTP_PORT", "9000")
     monkeypatch.setenv("ULTRAGRAY_GRPC_PORT", "9001")
     monkeypatch.setenv("ULTRAGRAY_PRELOAD", "liver, spine")
@@ -19,7 +17,7 @@ def test_environment_sets_and_overrides_win(monkeypatch: pytest.MonkeyPatch) -> 
     assert settings.data_folder == Path("/scenes")
 
 
-def test_defaults() -> None:
+def test_defaults():
     settings = load_settings()
     assert (settings.host, settings.http_port, settings.grpc_port) == ("127.0.0.1", 8000, 50051)
     assert settings.max_poses_per_request == 1024
@@ -40,14 +38,14 @@ def test_defaults() -> None:
         ("log_level", "loud"),
     ],
 )
-def test_bad_values_name_the_variable(monkeypatch: pytest.MonkeyPatch, name: str, value: str) -> None:
+def test_bad_values_name_the_variable(monkeypatch, name, value):
     monkeypatch.setenv(f"ULTRAGRAY_{name.upper()}", value)
     with pytest.raises(InvalidArgument, match=f"ULTRAGRAY_{name.upper()}.*{value}") as caught:
         load_settings()
     assert caught.value.field == name
 
 
-def test_short_keys_are_refused_and_no_key_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_short_keys_are_refused_and_no_key_is_shown(monkeypatch):
     monkeypatch.setenv("ULTRAGRAY_API_KEYS", "hunter2")
     with pytest.raises(InvalidArgument) as caught:
         load_settings()
@@ -56,7 +54,7 @@ def test_short_keys_are_refused_and_no_key_is_shown(monkeypatch: pytest.MonkeyPa
     assert "0123456789abcdef" not in repr(load_settings())
 
 
-def test_folders_are_paths_or_urls(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_folders_are_paths_or_urls(monkeypatch):
     monkeypatch.setenv("ULTRAGRAY_DATA_FOLDER", "s3://scenes/of/us")
     with pytest.raises(InvalidArgument, match=r"ULTRAGRAY_DATABASE_URL.*s3://scenes/of/us/artifacts.*SQLite"):
         load_settings()
@@ -70,7 +68,7 @@ def test_folders_are_paths_or_urls(monkeypatch: pytest.MonkeyPatch) -> None:
     assert load_settings(data_folder="file:///srv/scenes").working_folder == Path("/srv/scenes/artifacts")
 
 
-def test_urls_that_cannot_be_name_the_variable(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_urls_that_cannot_be_name_the_variable(monkeypatch):
     monkeypatch.setenv("ULTRAGRAY_ARTIFACT_FOLDER", "http://host/artifacts")
     with pytest.raises(InvalidArgument, match=r"ULTRAGRAY_ARTIFACT_FOLDER.*must be a path.*'http'"):
         load_settings()

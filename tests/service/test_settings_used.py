@@ -1,13 +1,10 @@
 """Every door tells every setting of a frame as it was used: none of them has a list of its own."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
 from dataclasses import fields
 from enum import Enum
 from pathlib import Path
-from typing import Any, get_args, get_type_hints
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -32,16 +29,10 @@ from ultragray_service.rpc.messages import frame_message
 from ultragray_workers.pool.messages import RenderResult
 
 HEIGHT, WIDTH = 12, 10
-EXAMPLES: dict[Any, Any] = {
-    float: 0.25,
-    int: 3,
-    bool: True,
-    str: "arm",
-    Needle: Needle(tip_mm=(0.0, 0.0, 9.0), hub_mm=(5.0, 0.0, 1.0)),
-}
+EXAMPLES = {float: 0.25, int: 3, bool: True, str: "arm", Needle: Needle(tip_mm=(0.0, 0.0, 9.0), hub_mm=(5.0, 0.0, 1.0))}
 
 
-def example(annotation: Any, default: Any) -> Any:
+def example(annotation, default):
     """A value of an annotation that is not the default."""
     if isinstance(annotation, type) and issubclass(annotation, Enum):
         return next(one for one in annotation if one is not default)
@@ -65,7 +56,7 @@ SETTINGS = Resolved(
 PLAIN = Resolved(LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=24.0), HEIGHT, WIDTH)
 
 
-def result(settings: Resolved) -> RenderResult:
+def result(settings):
     height, width = settings.picture.height, settings.picture.width
     return RenderResult(
         scene="demo",
@@ -82,9 +73,9 @@ def result(settings: Resolved) -> RenderResult:
     )
 
 
-def parsed(texts: dict[str, str], key: Callable[[str], str]) -> dict[str, Any]:
+def parsed(texts, key):
     """The settings that texts tell under the keys of their names."""
-    found: dict[str, Any] = {}
+    found = {}
     for one in fields(SettingsUsed):
         if (text := texts.get(key(one.name))) is not None:
             found[one.name] = text.split(",") if one.name == "outputs" else text
@@ -93,37 +84,36 @@ def parsed(texts: dict[str, str], key: Callable[[str], str]) -> dict[str, Any]:
     return found
 
 
-def http(settings: Resolved) -> dict[str, Any]:
+def http(settings):
     return parsed(render_headers(result(settings)), lambda name: f"X-Ultragray-{name.replace('_', '-').title()}")
 
 
-def websocket(settings: Resolved) -> dict[str, Any]:
+def websocket(settings):
     message = frame_bytes(StreamAnswer(1, None, result(settings)))
-    told: dict[str, Any] = json.loads(message[4 : 4 + int.from_bytes(message[:4], "little")])
-    return told
+    return json.loads(message[4 : 4 + int.from_bytes(message[:4], "little")])
 
 
-def grpc(settings: Resolved) -> dict[str, Any]:
+def grpc(settings):
     message = frame_message(result(settings), 1)
     return origin_of(frame_from_message(type(message).FromString(message.SerializeToString())))
 
 
-def igtl(settings: Resolved) -> dict[str, Any]:
+def igtl(settings):
     rendered = result(settings)
     posed = PoseMessage(Message("TRANSFORM", "demo", b""), np.eye(4), 0.0)
-    frame = Frame(posed, rendered, image_of(rendered), None, None)  # type: ignore[arg-type]
-    return parsed(frame.message("IMAGE", 2).metadata, lambda name: name)  # type: ignore[arg-type]
+    frame = Frame(posed, rendered, image_of(rendered), None, None)
+    return parsed(frame.message("IMAGE", 2).metadata, lambda name: name)
 
 
-def header(settings: Resolved) -> ExportHeader:
+def header(settings):
     return ExportHeader(settings, "uint8", np.eye(4)[None], "demo", "0" * 64, "ultragray/0 cpu")
 
 
-def export(settings: Resolved) -> dict[str, Any]:
+def export(settings):
     return header(settings).origin()
 
 
-def plus(settings: Resolved) -> dict[str, Any]:
+def plus(settings):
     exporter = PlusExporter(Path("/dev/null"), header(settings))
     try:
         return parsed(exporter._fields(), lambda name: f"UltraGRay{name.title().replace('_', '')}")
@@ -131,7 +121,7 @@ def plus(settings: Resolved) -> dict[str, Any]:
         exporter.abandon()
 
 
-def ros(settings: Resolved) -> dict[str, Any]:
+def ros(settings):
     """The geometry of a topic, of a recording and of a file of a job."""
     document = geometry_document(grpc(settings), "probe")
     own = geometry_document(export(settings), "probe")
@@ -143,14 +133,14 @@ DOORS = [http, websocket, grpc, igtl, export, plus, ros]
 
 
 @pytest.mark.parametrize("door", DOORS, ids=lambda door: door.__name__)
-def test_every_door_tells_every_setting_as_used(door: Callable[[Resolved], dict[str, Any]]) -> None:
+def test_every_door_tells_every_setting_as_used(door):
     expected = json.loads(json.dumps(to_dict(settings_used(SETTINGS))))
     told = json.loads(json.dumps(door(SETTINGS)))
     assert {name: told.get(name) for name in expected} == expected
 
 
 @pytest.mark.parametrize("door", DOORS, ids=lambda door: door.__name__)
-def test_what_was_not_asked_for_may_be_left_out(door: Callable[[Resolved], dict[str, Any]]) -> None:
+def test_what_was_not_asked_for_may_be_left_out(door):
     expected = json.loads(json.dumps(to_dict(settings_used(PLAIN))))
     told = json.loads(json.dumps(door(PLAIN)))
     left_out = expected.keys() - told.keys()
@@ -160,6 +150,6 @@ def test_what_was_not_asked_for_may_be_left_out(door: Callable[[Resolved], dict[
     }
 
 
-def test_every_setting_has_a_value_of_its_own_here() -> None:
+def test_every_setting_has_a_value_of_its_own_here():
     assert all(getattr(SETTINGS, one.name) != one.default for one in fields(Additions))
     assert settings_used(SETTINGS).display != settings_used(PLAIN).display

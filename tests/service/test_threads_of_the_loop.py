@@ -1,22 +1,15 @@
 """Long work keeps nobody waiting who needs a thread of the event loop for a moment."""
 
-from __future__ import annotations
-
 import asyncio
 import threading
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from pathlib import Path
-from typing import Any
 
 import pytest
 
-from ultragray import GaussianScene
 from ultragray_service.access.principals import LOCAL, act_as
 from ultragray_service.core import scenes as catalog
 from ultragray_service.core import uploads as scene_imports
 from ultragray_service.core.threads import HelperProcesses
-from ultragray_service.service import Service
 from ultragray_service.settings import load_settings
 from ultragray_service.wiring import make_service
 from ultragray_workers.jobs.store import JobStore
@@ -24,32 +17,32 @@ from ultragray_workers.storage import local
 
 
 @pytest.fixture
-def blocked() -> Iterator[threading.Event]:
+def blocked():
     """Until it is set, the work lasts."""
     event = threading.Event()
     yield event
     event.set()
 
 
-async def body() -> AsyncIterator[bytes]:
+async def body():
     yield b"bytes"
 
 
-async def receive(service: Service) -> None:
+async def receive(service):
     async with service.imports.receive("sent", body()):
         pass
 
 
-async def publish(service: Service) -> None:
+async def publish(service):
     async with service.imports.receive("sent", body()) as received:
         await service.imports.accept(received, "sent", private=False)
 
 
-async def points(service: Service) -> None:
+async def points(service):
     await service.catalog.points("demo", 10, None)
 
 
-LONG: dict[str, tuple[Any, str, Callable[[Service], Awaitable[None]]]] = {
+LONG = {
     "the sync of an import": (scene_imports, "sync", receive),
     "a name asked of the database": (JobStore, "makes_scene", receive),
     "the copy of an import": (local, "link_or_copy", publish),
@@ -58,24 +51,22 @@ LONG: dict[str, tuple[Any, str, Callable[[Service], Awaitable[None]]]] = {
 
 
 @pytest.mark.parametrize("name", LONG)
-def test_long_work_leaves_the_threads_of_the_loop(
-    name: str, tmp_path: Path, demo_scene: GaussianScene, blocked: threading.Event, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_long_work_leaves_the_threads_of_the_loop(name, tmp_path, demo_scene, blocked, monkeypatch):
     owner, function, begin = LONG[name]
     begun = threading.Event()
 
-    def wait(*_: object) -> None:
+    def wait(*_):
         begun.set()
         blocked.wait(30)
 
-    async def checked(*_: object, **__: object) -> None: ...
+    async def checked(*_, **__): ...
 
     monkeypatch.setattr(owner, function, wait)
     monkeypatch.setattr(HelperProcesses, "run", checked)
     monkeypatch.setattr(scene_imports, "read_header", lambda _: None)
     demo_scene.save(tmp_path / "demo.ugr")
 
-    async def main() -> None:
+    async def main():
         act_as(LOCAL, address="127.0.0.1", connection="test")
         service = make_service(load_settings(data_folder=tmp_path))
         await service.jobs.open()

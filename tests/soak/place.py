@@ -1,7 +1,5 @@
 """The service under soak, as its visitors know it: where it is, and what each frame of its scenes must show."""
 
-from __future__ import annotations
-
 import os
 import random
 import shutil
@@ -35,11 +33,11 @@ class Place:
     expected: dict[str, Pixels]  # by the SHA-256 of a scene file: the frames of POSES, [P, H, W]
     over: threading.Event = field(default_factory=threading.Event)
 
-    def check(self, sha256: str, index: int, pixels: npt.NDArray[np.uint8]) -> None:
+    def check(self, sha256, index, pixels):
         """Asserts that a frame is the one of pose `index`, of the version that it says it is of."""
         assert np.array_equal(pixels, self.expected[sha256][index]), f"pose {index} of {sha256[:12]} looks different"
 
-    def replace_scene(self) -> None:
+    def replace_scene(self):
         """Puts another version in the place of the scene that changes, at once."""
         folder = self.service.data_folder
         other = folder / "incoming"
@@ -47,14 +45,13 @@ class Place:
         os.replace(other, folder / f"{CHANGING}.ugr")
 
 
-def frames_of(path: Path) -> Pixels:
+def frames_of(path):
     """The frames of POSES as they must be, [P, H, W]."""
     rendered = render(GaussianScene.load(path), None, POSES, height=HEIGHT, width=WIDTH).bmode.numpy()
-    pixels: Pixels = np.round(np.clip(rendered, 0, 1) * np.float32(255)).astype(np.uint8)
-    return pixels
+    return np.round(np.clip(rendered, 0, 1) * np.float32(255)).astype(np.uint8)
 
 
-def make_scenes(data_folder: Path, versions_folder: Path) -> tuple[Path, ...]:
+def make_scenes(data_folder, versions_folder):
     """Writes the scenes of the data folder, and the versions of the one that changes."""
     versions = tuple(versions_folder / f"{number}.ugr" for number in range(3))
     for seed, path in enumerate((data_folder / f"{STEADY}.ugr", *versions)):

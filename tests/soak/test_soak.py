@@ -4,8 +4,6 @@ Nothing fails but what is made to fail, every frame is the right one, and no pro
 the end than after it has warmed up.
 """
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os
@@ -14,9 +12,6 @@ import signal
 import threading
 import time
 from collections import Counter
-from collections.abc import Callable, Iterator
-from pathlib import Path
-from typing import Any
 
 import pytest
 
@@ -26,8 +21,8 @@ from ultragray.files import file_sha256
 from ultragray_studies.bench.report import measured
 
 from ..model.learn.conftest import make_tiny_dataset
-from ..processes import Growth, Taken, by_role, family
-from ..service.conftest import RunningService, service_starter
+from ..processes import Growth, by_role, family
+from ..service.conftest import service_starter
 from ..service.igtl.conftest import address_of
 from ..surroundings import ROOT
 from .place import STEADY, Place, frames_of, make_scenes
@@ -51,14 +46,14 @@ LASTING = (RENDERER, JOB_WORKER, "ug-template", "ultragray_service")  # roles; o
 class Soak:
     """The threads of one run: visitors, the killer, the sampler; and what they saw."""
 
-    def __init__(self, place: Place) -> None:
+    def __init__(self, place):
         self._place = place
-        self.visits: Counter[str] = Counter()
-        self.errors: list[str] = []
-        self.kills: Counter[str] = Counter()
-        self.samples: list[dict[int, Taken]] = []
+        self.visits = Counter()
+        self.errors = []
+        self.kills = Counter()
+        self.samples = []
 
-    def run(self, seconds: float) -> None:
+    def run(self, seconds):
         threads = [threading.Thread(target=self._visit, args=item, name=item[0]) for item in VISITORS.items()]
         threads += [threading.Thread(target=target) for target in (self._kill, self._sample)]
         for thread in threads:
@@ -69,7 +64,7 @@ class Soak:
             thread.join(END_WITHIN_S)
             assert not thread.is_alive(), f"{thread.name} does not end"
 
-    def _visit(self, name: str, visit: Callable[[Place], None]) -> None:
+    def _visit(self, name, visit):
         while not self._place.over.is_set():
             try:
                 visit(self._place)
@@ -79,7 +74,7 @@ class Soak:
                 if len(self.errors) > 50:
                     self._place.over.set()
 
-    def _kill(self) -> None:
+    def _kill(self):
         """Render processes, and now and then the worker for jobs."""
         next_job_kill = time.monotonic() + JOB_KILL_EVERY_S
         while not self._place.over.wait(RENDER_KILL_EVERY_S):
@@ -92,11 +87,11 @@ class Soak:
                     os.kill(random.choice(found), signal.SIGKILL)
                     self.kills[role] += 1
 
-    def _sample(self) -> None:
+    def _sample(self):
         while not self._place.over.wait(SAMPLE_EVERY_S):
             self.samples.append(family(self._place.service.process.pid))
 
-    def growth(self) -> dict[str, dict[str, Growth]]:
+    def growth(self):
         """By role and by what is taken."""
         series = by_role(self.samples)
         return {
@@ -106,7 +101,7 @@ class Soak:
 
 
 @pytest.fixture
-def place(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Place]:
+def place(tmp_path, tmp_path_factory):
     data, versions = tmp_path / "data", tmp_path / "versions"
     data.mkdir()
     versions.mkdir()
@@ -129,7 +124,7 @@ def place(tmp_path: Path, tmp_path_factory: pytest.TempPathFactory) -> Iterator[
     starter.close()
 
 
-def test_all_kinds_of_clients_for_a_long_time(place: Place) -> None:
+def test_all_kinds_of_clients_for_a_long_time(place):
     soak = Soak(place)
     soak.run(SECONDS)
     growth = soak.growth()
@@ -144,12 +139,12 @@ def test_all_kinds_of_clients_for_a_long_time(place: Place) -> None:
         assert of["descriptors"].absolute <= max(MOST_NEW_DESCRIPTORS, most * of["descriptors"].earlier), (role, of)
 
 
-def assert_log_is_clean(service: RunningService) -> None:
+def assert_log_is_clean(service):
     said = service.log_path.read_text()
     assert "Traceback" not in said, said[max(0, said.index("Traceback") - 1000) :][:4000]
 
 
-def record_of(soak: Soak, growth: dict[str, dict[str, Growth]]) -> dict[str, Any]:
+def record_of(soak, growth):
     """What the file of the run says."""
     return {
         "measured": measured(os.cpu_count() or 1),

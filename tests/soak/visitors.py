@@ -1,15 +1,11 @@
 """What clients of all kinds do, one visit at a time: those that work, and those that are slow or vanish."""
 
-from __future__ import annotations
-
 import itertools
 import json
 import random
 import socket
 import struct
 import time
-from collections.abc import Callable
-from typing import Any
 
 import cv2
 import httpx
@@ -22,7 +18,7 @@ from ultragray_service.igtl.contents import unpack_image
 from ultragray_service.igtl.messages import HEADER_BYTES, Message, pack_message
 
 from ..service.igtl.conftest import Peer
-from .place import CHANGING, POSES, STEADY, Place
+from .place import CHANGING, POSES, STEADY
 
 TIMEOUT_S = 60.0
 UPLOAD_TIMEOUT_S = 600.0  # they are checked one at a time
@@ -30,15 +26,15 @@ STREAMED = 40  # poses of one visit to a stream
 _numbers = itertools.count()
 
 
-def any_pose() -> int:
+def any_pose():
     return random.randrange(len(POSES))
 
 
-def body(index: int, **more: Any) -> dict[str, Any]:
+def body(index, **more):
     return {"pose": {"matrix": POSES[index].tolist()}, **more}
 
 
-def grpc_unary(place: Place) -> None:
+def grpc_unary(place):
     with Client(place.service.grpc) as client:
         for _ in range(20):
             scene, index = random.choice([STEADY, CHANGING]), any_pose()
@@ -47,14 +43,14 @@ def grpc_unary(place: Place) -> None:
             time.sleep(0.02)
 
 
-def grpc_batch(place: Place) -> None:
+def grpc_batch(place):
     with Client(place.service.grpc) as client:
         for index, frame in enumerate(client.render_batch(STEADY, POSES, timeout_s=TIMEOUT_S)):
             place.check(frame.scene_sha256, index, frame["bmode"])
     time.sleep(0.2)
 
 
-def grpc_ordered(place: Place) -> None:
+def grpc_ordered(place):
     sent = [any_pose() for _ in range(STREAMED)]
     with Client(place.service.grpc) as client, client.stream(CHANGING, timeout_s=TIMEOUT_S) as stream:
         for index in sent:
@@ -64,9 +60,9 @@ def grpc_ordered(place: Place) -> None:
             place.check(frame.scene_sha256, index, frame["bmode"])
 
 
-def _latest(place: Place, read_every_s: float) -> None:
+def _latest(place, read_every_s):
     """Poses at 60 Hz, and a reader that takes its time."""
-    sent: dict[int, int] = {}
+    sent = {}
     with Client(place.service.grpc) as client, client.stream(STEADY, mode="latest", timeout_s=TIMEOUT_S) as stream:
         next_read = time.monotonic()
         for _ in range(STREAMED * 3):
@@ -79,15 +75,15 @@ def _latest(place: Place, read_every_s: float) -> None:
             time.sleep(1 / 60)
 
 
-def grpc_latest(place: Place) -> None:
+def grpc_latest(place):
     _latest(place, read_every_s=0.0)
 
 
-def grpc_latest_slow_reader(place: Place) -> None:
+def grpc_latest_slow_reader(place):
     _latest(place, read_every_s=0.5)
 
 
-def http_raw(place: Place) -> None:
+def http_raw(place):
     with httpx.Client(base_url=place.service.http, timeout=TIMEOUT_S) as client:
         for _ in range(20):
             scene, index = random.choice([STEADY, CHANGING]), any_pose()
@@ -101,7 +97,7 @@ def http_raw(place: Place) -> None:
             time.sleep(0.02)
 
 
-def http_png(place: Place) -> None:
+def http_png(place):
     with httpx.Client(base_url=place.service.http, timeout=TIMEOUT_S) as client:
         for _ in range(10):
             index = any_pose()
@@ -113,7 +109,7 @@ def http_png(place: Place) -> None:
             time.sleep(0.05)
 
 
-def websocket(place: Place) -> None:
+def websocket(place):
     address = f"{place.service.http.replace('http', 'ws', 1)}/v1/scenes/{CHANGING}/stream"
     with connect(address, compression=None, max_size=None) as stream:
         for sequence in range(STREAMED):
@@ -129,7 +125,7 @@ def websocket(place: Place) -> None:
             time.sleep(0.02)
 
 
-def igtl(place: Place) -> None:
+def igtl(place):
     peer = Peer(place.igtl)
     with peer.socket:
         for _ in range(STREAMED):
@@ -142,7 +138,7 @@ def igtl(place: Place) -> None:
             time.sleep(0.02)
 
 
-def http_slow_reader(place: Place) -> None:
+def http_slow_reader(place):
     """Many frames in one answer, taken a little at a time."""
     asked = {"poses": [{"matrix": pose.tolist()} for pose in POSES], "height": 256, "width": 256}
     headers = {"Accept": "application/x-npz"}
@@ -155,7 +151,7 @@ def http_slow_reader(place: Place) -> None:
             time.sleep(0.05)
 
 
-def vanishing(place: Place) -> None:
+def vanishing(place):
     """Clients that are cut off, each at another door, in the middle of what they do."""
     host, port = place.service.http.removeprefix("http://").split(":")
     document = json.dumps(body(0)).encode()
@@ -186,7 +182,7 @@ def vanishing(place: Place) -> None:
     time.sleep(0.3)
 
 
-def scenes(place: Place) -> None:
+def scenes(place):
     """Scenes come, are replaced, loaded, unloaded and go, while others render them."""
     place.replace_scene()
     with Client(place.service.grpc) as client, httpx.Client(base_url=place.service.http, timeout=TIMEOUT_S) as http:
@@ -205,7 +201,7 @@ def scenes(place: Place) -> None:
     time.sleep(0.5)
 
 
-def datasets(place: Place) -> None:
+def datasets(place):
     with Client(place.service.grpc) as client:
         name = f"sweep-{next(_numbers)}"
         client.datasets.upload(name, place.dataset, timeout_s=UPLOAD_TIMEOUT_S)
@@ -214,7 +210,7 @@ def datasets(place: Place) -> None:
     time.sleep(1.0)
 
 
-def jobs(place: Place) -> None:
+def jobs(place):
     """An archive of frames, and now and then a training, each watched to its end, and removed."""
     number = next(_numbers)
     with Client(place.service.grpc) as client, httpx.Client(base_url=place.service.http, timeout=TIMEOUT_S) as http:
@@ -233,9 +229,9 @@ def jobs(place: Place) -> None:
             client.datasets.delete(scene)
 
 
-def watched(http: httpx.Client, job: str) -> dict[str, Any]:
+def watched(http, job):
     """The job as its server-sent events tell it at the end."""
-    last: dict[str, Any] = {}
+    last = {}
     with http.stream("GET", f"/v1/jobs/{job}/events", timeout=UPLOAD_TIMEOUT_S) as events:
         events.raise_for_status()
         event = ""
@@ -248,14 +244,14 @@ def watched(http: httpx.Client, job: str) -> dict[str, Any]:
     return last
 
 
-def lists(place: Place) -> None:
+def lists(place):
     with httpx.Client(base_url=place.service.http, timeout=TIMEOUT_S) as http:
         for path in ("/v1/scenes", f"/v1/scenes/{STEADY}", "/v1/datasets", "/v1/jobs", "/v1/statistics", "/metrics"):
             http.get(path).raise_for_status()
     time.sleep(0.5)
 
 
-VISITORS: dict[str, Callable[[Place], None]] = {
+VISITORS = {
     visitor.__name__: visitor
     for visitor in (
         *(grpc_unary, grpc_batch, grpc_ordered, grpc_latest, grpc_latest_slow_reader),

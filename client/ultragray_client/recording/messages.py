@@ -62,7 +62,6 @@ DEFINITIONS = {
 
 
 def header(time_ns: int, frame_id: str) -> dict[str, Any]:
-    """A std_msgs/Header."""
     return {"stamp": {"sec": time_ns // NS_PER_S, "nanosec": time_ns % NS_PER_S}, "frame_id": frame_id}
 
 

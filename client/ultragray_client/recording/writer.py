@@ -28,7 +28,6 @@ class RosRecording:
     """
 
     def __init__(self, file: IO[bytes]) -> None:
-        """Begin the file. Raises OSError."""
         self._writer = Writer(file)
         self._schemas = {name: self._writer.register_msgdef(name, text) for name, text in ros.DEFINITIONS.items()}
         self._count = 0

@@ -6,16 +6,21 @@ from __future__ import annotations
 
 import hashlib
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Iterator, Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
 from itertools import pairwise
 
+import cv2
 import numpy as np
+import numpy.typing as npt
 
+from ultragray.datasets.clocks import DelayEstimate, clock_warnings, estimate_delay
+from ultragray.datasets.images import CropBox
 from ultragray.geometry.pose import rotation_angles_deg
-from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.geometry.probe import Fan, FloatArray, Probe
 from ultragray.geometry.rotations import turns_of
-from ultragray.learn.sweep import Dataset, Distances, Sweep, corner_distances_mm
+from ultragray.learn.sweep import Chain, Dataset, Distances, Sweep, corner_distances_mm, frame_list
 
 VOXEL_MM = 1.0
 MAX_VOXELS = 8_000_000
@@ -80,7 +85,15 @@ DARKEST_PEAK = 16  # of 255
 SAME_POSE_MM = 1e-6
 SHORTEST_TRAVEL = 0.1  # of the length of the scan lines
 TURN_IN_PLACE_DEG = 5.0
+LONGEST_USUAL_STEP_MM = 50.0
 MAX_TILT_FRAMES = 300
+THUMBNAIL = (32, 32)
+LEAST_PICTURES = 8  # of which changes and marks can be told
+CUT_FACTOR, SMALLEST_CUT = 8.0, 0.15  # of one minus the correlation of two pictures
+STILL, BRIGHT = 6, 40  # levels: JPEG keeps text so
+LEAST_MARKS, LEAST_ALIVE, MAX_BOXES = 12, 0.2, 3
+MARGIN = 2  # pixels around marks whose edges are smoothed
+MARK_CONTRAST = 2.0  # to the darkest of the pixels around: the bright band below a probe's face has less
 
 
 @dataclass(frozen=True)
@@ -119,39 +132,93 @@ class DatasetReport:
     val_distance_median_mm: float | None  # to the nearest training frame: mean distance of the corners
     val_distance_max_mm: float | None
     val_angle_max_deg: float | None  # to that nearest frame
-    warnings: tuple[str, ...]
-
-    @property
-    def labelled_warnings(self) -> tuple[str, ...]:
-        """Every warning, the part that it is about first."""
-        return (
-            *(f"train: {text}" for text in self.train.warnings),
-            *(f"val: {text}" for text in (self.val.warnings if self.val else ())),
-            *self.warnings,
-        )
+    chain: Chain  # from pixels to the frame of the poses
+    image_delay_ms: float | None  # of the images to the poses, as path and pictures tell it
+    warnings: tuple[str, ...]  # all of them, those of one part with its name
 
 
 def check_dataset(dataset: Dataset) -> DatasetReport:
-    """Describe both parts and how far the held-out frames lie from the training frames."""
+    """Describe both parts and how far the held-out frames lie from the training frames.
+
+    Two parts of one recording are judged together, in the order of its frames.
+    """
     away = Distances.of(dataset)
     distances, angles = away.mm, away.deg
+    train, val = dataset.train, dataset.val
+    is_one = train.source == val.source and not set(train.frame_numbers) & set(val.frame_numbers)
+    recording = _Frames(train, val) if is_one else _Frames(train)
+    delay = recording.delay()
+    reports = {"train": check_sweep(train), **({"val": check_sweep(val)} if len(val) else {})}
+    if is_one:
+        found = list(_warnings(recording))
+        reports = {name: replace(report, warnings=()) for name, report in reports.items()}
+    else:
+        found = [f"{name}: {text}" for name, report in reports.items() for text in report.warnings]
+    if delay is not None:
+        found.append(
+            f"images seem to come {delay.delay_ms:.0f} ms {'after' if delay.delay_ms > 0 else 'before'} their poses: "
+            f"path and pictures fit so ({delay.unexplained:.0%} unexplained, {delay.without:.0%} without): "
+            f"--image-delay-ms {delay.delay_ms:.0f} corrects it"
+        )
     return DatasetReport(
         name=dataset.name,
         sha256=dataset.sha256,
         probe=dataset.probe,
-        train=check_sweep(dataset.train),
-        val=check_sweep(dataset.val) if len(dataset.val) else None,
+        train=reports["train"],
+        val=reports.get("val"),
         val_distance_median_mm=float(np.median(distances)) if len(distances) else None,
         val_distance_max_mm=float(distances.max()) if len(distances) else None,
         val_angle_max_deg=float(angles.max()) if len(angles) else None,
-        warnings=tuple(_dataset_warnings(dataset)),
+        chain=train.chain,
+        image_delay_ms=None if delay is None else delay.delay_ms,
+        warnings=(*found, *_dataset_warnings(dataset)),
     )
+
+
+class _Frames:
+    """The frames of sweeps in the order of their numbers, without a copy of the images."""
+
+    def __init__(self, *sweeps: Sweep) -> None:
+        numbers = np.concatenate([sweep.frame_numbers for sweep in sweeps])
+        order = np.argsort(numbers, kind="stable") if len(sweeps) > 1 else np.arange(len(numbers))
+        places = [(sweep, place) for sweep in sweeps for place in range(len(sweep))]
+        self.numbers = numbers[order]
+        self.poses = np.concatenate([sweep.poses for sweep in sweeps])[order]
+        self.corners = np.concatenate([sweep.corners_mm() for sweep in sweeps])[order]
+        self.region, self.probe = sweeps[0].region, sweeps[0].probe
+        self._places = [places[place] for place in order]
+        times = [sweep.times_s for sweep in sweeps if sweep.times_s is not None]
+        self.times_s = np.concatenate(times)[order] if len(times) == len(sweeps) else None
+        self.steps_mm = corner_distances_mm(self.corners[:-1], self.corners[1:])
+
+    def images(self) -> Iterator[np.ndarray]:
+        return (sweep.images[place] for sweep, place in self._places)
+
+    def image(self, frame: int) -> np.ndarray:
+        sweep, place = self._places[frame]
+        found: np.ndarray = sweep.images[place]
+        return found
+
+    @cached_property
+    def thumbnails(self) -> npt.NDArray[np.float32]:  # [F, P] without mean, of length 1
+        small = [cv2.resize(one, THUMBNAIL, interpolation=cv2.INTER_AREA).ravel() for one in self.images()]
+        looks = np.array(small, np.float32)
+        looks -= looks.mean(axis=1, keepdims=True)
+        looks /= np.maximum(np.linalg.norm(looks, axis=1, keepdims=True), 1e-9)
+        return looks
+
+    def delay(self) -> DelayEstimate | None:
+        """How late the images are, where the frames have times and the motion tells it."""
+        if self.times_s is None or len(self.times_s) < 2:
+            return None
+        _, places = np.unique(self.times_s, return_index=True)
+        return estimate_delay(self.thumbnails[places].astype(np.float64), self.corners[places], self.times_s[places])
 
 
 def check_sweep(sweep: Sweep) -> SweepReport:
     """Describe the frames of a sweep (at least one) and list what looks wrong, with frame numbers."""
-    corners = sweep.corners_mm()
-    steps_mm = corner_distances_mm(corners[:-1], corners[1:])
+    frames = _Frames(sweep)
+    corners, steps_mm = frames.corners, frames.steps_mm
     steps_deg = np.array([rotation_angles_deg(a[None], b[None])[0, 0] for a, b in pairwise(sweep.poses)])
     thinned = sweep.poses[:: -(-len(sweep) // MAX_TILT_FRAMES)]
     swept = swept_volume(sweep)
@@ -176,7 +243,7 @@ def check_sweep(sweep: Sweep) -> SweepReport:
         swept_ml=swept.swept_ml,
         coverage=swept.coverage,
         voxel_mm=swept.voxel_mm,
-        warnings=(*_jumps(sweep, steps_mm), *_repeats(sweep), *_odd_images(sweep)),
+        warnings=tuple(_warnings(frames)),
     )
 
 
@@ -185,53 +252,78 @@ def _vector(values: FloatArray) -> tuple[float, float, float]:
     return x, y, z
 
 
-def _jumps(sweep: Sweep, steps_mm: FloatArray) -> list[str]:
+def _warnings(frames: _Frames) -> Iterator[str]:
+    """What looks wrong about the frames of one recording."""
+    if frames.times_s is not None:
+        yield from clock_warnings(frames.times_s, frames.numbers)
+    yield from _moved_far(frames)
+    jumps = list(_jumps(frames))
+    yield from (text for _, text in jumps)
+    yield from _repeats(frames)
+    yield from _odd_images(frames)
+    yield from _cuts(frames, {place for place, _ in jumps})
+    yield from _overlays(frames)
+
+
+def _moved_far(frames: _Frames) -> Iterator[str]:
+    """Steps that no hand makes, as millimetres have it that are taken for metres."""
+    steps_mm = np.linalg.norm(np.diff(frames.poses[:, :3, 3], axis=0), axis=1)
+    usual = float(np.median(steps_mm / np.abs(np.diff(frames.numbers)).clip(min=1))) if len(steps_mm) > 2 else 0.0
+    if usual >= LONGEST_USUAL_STEP_MM:
+        yield (
+            f"the probe goes {usual:.0f} mm from frame to frame, {steps_mm.sum() / 1000:.3g} m in all: positions in "
+            "millimetres where metres are expected?"
+        )
+
+
+def _jumps(frames: _Frames) -> Iterator[tuple[int, str]]:
     """Steps far longer than usual: a frame off its two neighbours, or a gap such as between two sweeps."""
-    gaps = np.abs(np.diff(sweep.frame_numbers)).clip(min=1)
-    speeds = steps_mm / gaps
+    numbers, steps_mm = frames.numbers, frames.steps_mm
+    speeds = steps_mm / np.abs(np.diff(numbers)).clip(min=1)
     if len(speeds) < 3:
-        return []
+        return
     usual = float(np.median(speeds))
     spread = 1.4826 * float(np.median(np.abs(speeds - usual)))
     limit = max(JUMP_FACTOR * usual, usual + JUMP_SPREADS * spread, SMALLEST_JUMP_MM)
     jumps = [int(place) for place in np.flatnonzero(speeds > limit)]
-    numbers, found, skip = sweep.frame_numbers, [], -1
+    skip = -1
     for place in jumps:
         if place == skip:
             continue
         if place + 1 in jumps:
-            found.append(
+            yield (
+                place,
                 f"frame {numbers[place + 1]} lies {steps_mm[place]:.1f} mm off the frame before and "
-                f"{steps_mm[place + 1]:.1f} mm off the one after it, where {usual:.2g} mm are usual: a wrong pose?"
+                f"{steps_mm[place + 1]:.1f} mm off the one after it, where {usual:.2g} mm are usual: a wrong pose?",
             )
             skip = place + 1
         else:
-            found.append(
+            yield (
+                place,
                 f"a jump of {steps_mm[place]:.1f} mm from frame {numbers[place]} to {numbers[place + 1]}, where "
-                f"{usual:.2g} mm are usual: another sweep, or lost tracking?"
+                f"{usual:.2g} mm are usual: another sweep, or lost tracking?",
             )
-    return found
 
 
-def _repeats(sweep: Sweep) -> list[str]:
-    poses = np.round(sweep.poses / SAME_POSE_MM).astype(np.int64)
-    found = []
-    for places in _groups(poses):
-        if len({_digest(sweep.images[place]) for place in places}) == 1:
-            found.append(f"frames {_list(sweep, places)} are the same frame: one pose, one image")
+def _repeats(frames: _Frames) -> Iterator[str]:
+    numbers = frames.numbers
+    poses = np.round(frames.poses / SAME_POSE_MM).astype(np.int64)
+    images = [_digest(image) for image in frames.images()]
+    for places in _groups([_digest(pose) for pose in poses]):
+        if len({images[place] for place in places}) == 1:
+            yield f"frames {frame_list(numbers[places])} are the same frame: one pose, one image"
         else:
-            found.append(f"frames {_list(sweep, places)} share one pose, but show different images: tracking stalled?")
-    for places in _groups(sweep.images):
+            yield f"frames {frame_list(numbers[places])} share one pose, but show different images: tracking stalled?"
+    for places in _groups(images):
         if len({_digest(poses[place]) for place in places}) > 1:
-            found.append(f"frames {_list(sweep, places)} show one image at different poses: a frozen picture?")
-    return found
+            yield f"frames {frame_list(numbers[places])} show one image at different poses: a frozen picture?"
 
 
-def _groups(arrays: np.ndarray) -> list[list[int]]:
-    """Places whose arrays are equal, in groups of two and more."""
+def _groups(digests: Sequence[bytes]) -> list[list[int]]:
+    """Places whose digests are equal, in groups of two and more."""
     places: dict[bytes, list[int]] = {}
-    for place, array in enumerate(arrays):
-        places.setdefault(_digest(array), []).append(place)
+    for place, digest in enumerate(digests):
+        places.setdefault(digest, []).append(place)
     return [group for group in places.values() if len(group) > 1]
 
 
@@ -239,16 +331,95 @@ def _digest(array: np.ndarray) -> bytes:
     return hashlib.blake2b(np.ascontiguousarray(array).reshape(-1).data, digest_size=16).digest()
 
 
-def _odd_images(sweep: Sweep) -> list[str]:
-    def where(is_odd: Callable[[np.ndarray], bool]) -> list[int]:
-        return [place for place, image in enumerate(sweep.images) if is_odd(image)]
+def _odd_images(frames: _Frames) -> Iterator[str]:
+    dark = [place for place, image in enumerate(frames.images()) if image.max() < DARKEST_PEAK]
+    bright = [place for place, image in enumerate(frames.images()) if np.mean(image == 255) > SATURATED_SHARE]
+    if dark:
+        yield f"frames {frame_list(frames.numbers[dark])} are nearly black: no pixel reaches {DARKEST_PEAK} of 255"
+    if bright:
+        listed = frame_list(frames.numbers[bright])
+        yield f"frames {listed} are saturated: over {SATURATED_SHARE:.0%} of the pixels are 255"
 
-    found = []
-    if dark := where(lambda image: bool(image.max() < DARKEST_PEAK)):
-        found.append(f"frames {_list(sweep, dark)} are nearly black: no pixel reaches {DARKEST_PEAK} of 255")
-    if bright := where(lambda image: float(np.mean(image == 255)) > SATURATED_SHARE):
-        found.append(f"frames {_list(sweep, bright)} are saturated: over {SATURATED_SHARE:.0%} of the pixels are 255")
-    return found
+
+def _cuts(frames: _Frames, jumps: set[int]) -> Iterator[str]:
+    """Pictures that change at once where the probe hardly moves: another depth, gain or mode."""
+    looks = frames.thumbnails
+    if len(looks) < LEAST_PICTURES:
+        return
+    changes = 1.0 - (looks[:-1] * looks[1:]).sum(axis=1)
+    usual = float(np.median(changes))
+    for place in np.flatnonzero(changes > max(CUT_FACTOR * usual, SMALLEST_CUT)):
+        is_single = place > 0 and 1.0 - float(looks[place - 1] @ looks[place + 1]) < changes[place] / 2
+        is_slow = frames.steps_mm[place] <= 2 * np.median(frames.steps_mm)
+        if place not in jumps and is_slow and not is_single:
+            yield (
+                f"the picture changes at once from frame {frames.numbers[place]} to {frames.numbers[place + 1]}, "
+                f"{changes[place] / max(usual, 1e-6):.0f} times as much as usual, where the probe hardly moves: were "
+                "frames lost, or was the depth or another setting changed?"
+            )
+
+
+def _overlays(frames: _Frames) -> Iterator[str]:
+    """Bright pixels that never change while others do: text, rulers and logos of the scanner."""
+    boxes = overlay_boxes(frames.images(), len(frames.numbers))
+    if boxes:
+        left, top = (frames.region.left, frames.region.top) if frames.region else (0, 0)
+        is_fan = isinstance(frames.probe, Fan)
+        places = "; ".join(
+            f"columns {left + box.left}:{left + box.right}, rows {top + box.top}:{top + box.bottom}"
+            for box in boxes[:MAX_BOXES]
+        )
+        yield (
+            f"bright pixels never change at {places}{' of the scan lines' if is_fan else ''}: text or a ruler burnt "
+            "in, perhaps a name? Crop it away"
+        )
+
+
+def overlay_boxes(images: Iterable[np.ndarray], count: int) -> list[CropBox]:
+    """Where images show the same bright marks while the rest of them changes, the largest first."""
+    if count < LEAST_PICTURES:
+        return []
+    low = high = None
+    for image in images:
+        low = image.copy() if low is None else np.minimum(low, image, out=low)
+        high = image.copy() if high is None else np.maximum(high, image, out=high)
+    if low is None or high is None:
+        return []
+    is_still = high.astype(np.int16) - low <= STILL
+    marks = is_still & (low >= BRIGHT)
+    alive = np.mean(high[~marks].astype(np.int16) - low[~marks] > 2 * STILL) if not marks.all() else 0.0
+    if alive < LEAST_ALIVE or marks.sum() < LEAST_MARKS:
+        return []
+    grown = cv2.dilate(marks.astype(np.uint8), np.ones((5, 9), np.uint8))
+    _, labels, stats, _ = cv2.connectedComponentsWithStats(grown, connectivity=8)
+    boxes = []
+    for label in range(1, len(stats)):
+        rows, columns = np.nonzero(marks & (labels == label))
+        if len(rows) >= LEAST_MARKS and _stands_out(marks & (labels == label), marks, low):
+            box = CropBox(int(columns.min()), int(columns.max()) + 1, int(rows.min()), int(rows.max()) + 1)
+            boxes.append((len(rows), box))
+    return [box for _, box in sorted(boxes, key=lambda one: -one[0])]
+
+
+def without_names(dataset: Dataset) -> tuple[Dataset, int]:
+    """The dataset without what may name a person: its name, and marks burnt into its pixels, which become black.
+
+    And how many marks there were. What is dim, changes, or lies in fewer than eight frames is not found.
+    """
+    given, parts = (dataset.train, dataset.val), []
+    boxes = overlay_boxes((image for part in given for image in part.images), sum(map(len, given)))
+    for part in given:
+        images = part.images.copy() if boxes else part.images
+        for box in boxes:
+            top, left = max(0, box.top - MARGIN), max(0, box.left - MARGIN)
+            images[:, top : box.bottom + MARGIN, left : box.right + MARGIN] = 0
+        parts.append(replace(part, images=images))
+    return Dataset("anonymous", *parts), len(boxes)
+
+
+def _stands_out(mark: np.ndarray, marks: np.ndarray, low: np.ndarray) -> bool:
+    around = (cv2.dilate(mark.astype(np.uint8), np.ones((3, 3), np.uint8)) > 0) & ~marks
+    return not around.any() or float(low[mark].mean()) >= MARK_CONTRAST * float(np.median(low[around]))
 
 
 def _dataset_warnings(dataset: Dataset) -> list[str]:
@@ -259,7 +430,8 @@ def _dataset_warnings(dataset: Dataset) -> list[str]:
     known = set(_contents(dataset.train))
     leaked = [place for place, frame in enumerate(_contents(dataset.val)) if frame in known]
     if leaked:
-        found.append(f"held-out frames {_list(dataset.val, leaked)} are also training frames: metrics will flatter")
+        listed = frame_list(dataset.val.frame_numbers[leaked])
+        found.append(f"held-out frames {listed} are also training frames: metrics will flatter")
     return found
 
 
@@ -280,9 +452,3 @@ def _hardly_moved(sweep: Sweep) -> list[str]:
 
 def _contents(sweep: Sweep) -> list[tuple[bytes, bytes]]:
     return [(_digest(image), _digest(pose)) for image, pose in zip(sweep.images, sweep.poses, strict=True)]
-
-
-def _list(sweep: Sweep, places: Sequence[int]) -> str:
-    """Frame numbers as text, at most ten of them."""
-    numbers = [str(sweep.frame_numbers[place]) for place in places]
-    return ", ".join(numbers[:10]) + (f" and {len(numbers) - 10} more" if len(numbers) > 10 else "")

@@ -10,75 +10,134 @@ The extra `dicom`.
 from __future__ import annotations
 
 import io
+import re
 import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import cv2
 import numpy as np
 
+from ultragray.datasets.clocks import delay_note, parse_delay_ns, poses_before
 from ultragray.datasets.fan import FanGeometry, FanLines, parse_fan
 from ultragray.datasets.images import (
     MAX_PIXEL_BYTES,
     CropBox,
+    check_pixel_mm,
     grey_frames,
     parse_crop,
-    pixel_size_mm,
     poses_from_image_transforms,
     region_of,
 )
+from ultragray.datasets.released import no_pose_note
 from ultragray.errors import DatasetInvalid, InvalidArgument, InvalidPose
-from ultragray.exchange.poses import load_poses
+from ultragray.exchange.poses import frames_with_pose, read_frame_poses
 from ultragray.geometry.probe import FloatArray
 from ultragray.installation import missing_extra
-from ultragray.learn.sweep import ByteArray, IntArray, Sweep, parse_frame_ranges
+from ultragray.learn.sweep import ByteArray, Chain, IntArray, Link, Sweep, check_frame_poses, parse_frame_ranges
 
 POSE_SUFFIXES = (".poses.npy", ".poses.json")
 MAX_HEADER_BYTES = 16 << 20  # of all that stands before the pixels
 DEFLATED = "1.2.840.10008.1.2.1.99"  # the whole data set is compressed: it could inflate without bounds
-CENTIMETRES, TISSUE_2D = 3, 1
-INTERPRETATIONS = {"MONOCHROME2": 1, "RGB": 3, "YBR_FULL": 3, "YBR_FULL_422": 3}  # samples of a pixel
-SMALLEST_PIXEL_MM, LARGEST_PIXEL_MM = 1e-4, 10.0
+JPEG = ("1.2.840.10008.1.2.4.50", "1.2.840.10008.1.2.4.51")  # baseline, extended
+CENTIMETRES, TISSUE_2D, TISSUE = 3, 1, 1
+GREY, RGB, YBR = (
+    ("MONOCHROME1", "MONOCHROME2", "PALETTE COLOR"),
+    ("RGB", "YBR_ICT", "YBR_RCT"),  # decoders of JPEG 2000 undo the two transforms
+    ("YBR_FULL", "YBR_FULL_422"),
+)
+INTERPRETATIONS = {**dict.fromkeys(GREY, 1), **dict.fromkeys((*RGB, *YBR), 3)}  # samples of a pixel
+PERSON = ("PatientName", "PatientID", "PatientBirthDate", "OtherPatientIDs", "AccessionNumber")
+NOBODY = re.compile(r"(?i)\W*|.*(anon|unknown|phantom|test).*")
+GREYER = 0.25  # of the colour that an image has as its header calls it: the other reading is right
 
 
 def read_dicom_sweep(
-    path: Path, *, frames: str | None = None, crop: str | None = None, fan: str | None = None
+    path: Path,
+    *,
+    frames: str | None = None,
+    crop: str | None = None,
+    fan: str | None = None,
+    image_delay_ms: str | None = None,
 ) -> tuple[Sweep, int]:
-    """The frames of a cine loop, and their number in the file.
+    """The frames of a cine loop that have a pose, and the number of frames in the file.
 
     `frames` (ranges, `parse_frame_ranges`) chooses among them; `crop` is "columns,rows" of the stored image, default:
-    the region. `fan` (`parse_fan`) says that the image is that of a convex or phased probe: the frames are its scan
-    lines. Colour becomes luma. Raises DatasetInvalid, naming the file, the frame and the reason; InvalidArgument for
-    options that do not fit; ExtraMissing without pydicom.
+    the region; of several regions it chooses that which holds it. `fan` (`parse_fan`) says that the image is that of a
+    convex or phased probe: the frames are its scan lines. `image_delay_ms` is by how much the images come later than
+    the poses. Colour becomes luma. Raises DatasetInvalid, naming the file, the frame and the reason; InvalidArgument
+    for options that do not fit; ExtraMissing without pydicom.
     """
     if fan is not None and crop is not None:
         raise InvalidArgument("fan must be given without crop: it says where the image lies", field="fan")
+    delay_ns = parse_delay_ns(image_delay_ms)
     header = _read_header(path)
     shape = _shape(path, header, is_fan=fan is not None)
-    region, pixel_mm = _region(path, header, shape)
-    poses = _read_poses(path, shape[0])
-    ranges = range(shape[0]) if frames is None else parse_frame_ranges(frames, shape[0], option="frames")
-    chosen = np.array(ranges, np.int64)
-    stored = _read_frames(path, header, shape, chosen)
-    notes = () if "TransducerType" in header else ("the file does not name its transducer: taken as a linear one",)
-    if fan is not None:
-        return _fan_sweep(path, stored, poses[chosen], parse_fan(fan), pixel_mm, chosen), shape[0]
-    box = region if crop is None else parse_crop(crop, *shape[1:])
-    lateral_mm, axial_mm = pixel_mm
-    image_to_probe = np.array(
-        [
-            [lateral_mm, 0.0, 0.0, -lateral_mm * (region.left + region.right - 1) / 2],
-            [0.0, 0.0, 1.0, 0.0],
-            [0.0, axial_mm, 0.0, -axial_mm * (region.top - 0.5)],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
+    region, notes = _region(path, header, shape, crop)
+    poses, poses_path = _read_poses(path, shape[0])
+    numbers, times_s = np.flatnonzero(frames_with_pose(poses)), _times(path, header, shape[0])
+    notes += no_pose_note(numbers, shape[0], poses_path)
+    poses = check_frame_poses(poses[numbers], numbers, str(poses_path))
+    if delay_ns:
+        poses, known = poses_before(poses, None if times_s is None else times_s[numbers], delay_ns, path)
+        poses, numbers = poses[known], numbers[known]
+    if frames is not None:
+        is_chosen = np.isin(numbers, parse_frame_ranges(frames, shape[0], option="frames"))
+        poses, numbers = poses[is_chosen], numbers[is_chosen]
+    if not len(numbers):
+        raise DatasetInvalid(f"{path}: none of its frames that were chosen has a pose in {poses_path.name}")
+    stored, pixel_notes = _read_frames(path, header, shape, numbers)
+    notes += (*pixel_notes, *_header_notes(path, header), *delay_note(delay_ns))
+    chain = Chain(
+        (
+            Link("pixels", "region", region.source, path.name),
+            Link("region", "Tracker", "pose", poses_path.name, is_tracked=True),
+        )
     )
-    box_poses, probe = poses_from_image_transforms(poses[chosen] @ image_to_probe, box, chosen, path)
-    images = stored[:, box.top : box.bottom, box.left : box.right]
-    shown = region_of(shape[1:], box, pixel_size_mm(poses[:1] @ image_to_probe), image_to_probe)
-    sweep = Sweep(np.ascontiguousarray(images), box_poses, probe, chosen, str(path), notes, shown)
-    return sweep, shape[0]
+    if fan is not None:
+        sweep = _fan_sweep(path, stored, poses, parse_fan(fan), region.pixel_mm, numbers)
+    else:
+        box = region.box if crop is None else parse_crop(crop, *shape[1:])
+        lateral_mm, axial_mm = region.pixel_mm
+        image_to_probe = np.array(
+            [
+                [lateral_mm, 0.0, 0.0, -lateral_mm * (region.box.left + region.box.right - 1) / 2],
+                [0.0, 0.0, 1.0, 0.0],
+                [0.0, axial_mm, 0.0, -axial_mm * (region.box.top - 0.5)],
+                [0.0, 0.0, 0.0, 1.0],
+            ]
+        )
+        box_poses, probe = poses_from_image_transforms(poses @ image_to_probe, box, numbers, path)
+        images = np.ascontiguousarray(stored[:, box.top : box.bottom, box.left : box.right])
+        shown = region_of(shape[1:], box, region.pixel_mm, image_to_probe)
+        sweep = Sweep(images, box_poses, probe, numbers, str(path), (), shown)
+    return replace(sweep, notes=notes, chain=chain, times_s=None if times_s is None else times_s[numbers]), shape[0]
+
+
+def _times(path: Path, header: Any, count: int) -> FloatArray | None:  # [F] s
+    """The times of the frames; None where the file does not say them."""
+    with _in_our_words(path):
+        vector = header.get("FrameTimeVector")
+        if vector is not None and len(vector) == count:
+            return np.cumsum([0.0, *map(float, vector[1:])]) / 1000
+        step_ms = header.get("FrameTime")
+        return np.arange(count) * float(step_ms) / 1000 if step_ms and float(step_ms) > 0 else None
+
+
+def _header_notes(path: Path, header: Any) -> tuple[str, ...]:
+    with _in_our_words(path):
+        named = [name for name in PERSON if not NOBODY.fullmatch(str(header.get(name, "")))]
+        is_burnt_in = str(header.get("BurnedInAnnotation", "")).upper() == "YES"
+        transducer = header.get("TransducerType")
+    notes = (
+        "" if transducer is not None else "the file does not name its transducer: taken as a linear one",
+        f"its header names a person ({', '.join(named)}): convert --anonymize leaves it out" if named else "",
+        "the file says that its pixels name a person (BurnedInAnnotation YES): crop them" if is_burnt_in else "",
+    )
+    return tuple(note for note in notes if note)
 
 
 def _fan_sweep(
@@ -156,11 +215,14 @@ def _value(path: Path, header: Any, name: str) -> Any:
 def _shape(path: Path, header: Any, *, is_fan: bool) -> tuple[int, int, int]:  # frames, rows, columns
     """The size of the frames. Raises DatasetInvalid for what is no cine loop of 8 bits in grey or colour, and for a
     probe that is not linear unless its fan is known."""
-    if (bits := _value(path, header, "BitsAllocated")) != 8:
-        raise DatasetInvalid(f"{path}: pixels must have 8 bits (BitsAllocated 8), got {str(bits)[:40]}")
+    bits, stored = _value(path, header, "BitsAllocated"), header.get("BitsStored", 8)
+    if bits not in (8, 16) or header.get("PixelRepresentation", 0) != 0:
+        raise DatasetInvalid(
+            f"{path}: pixels must have 8 or 16 bits (BitsAllocated) without a sign, got {str(bits)[:40]}"
+        )
     interpretation = str(_value(path, header, "PhotometricInterpretation"))
     samples = _value(path, header, "SamplesPerPixel")
-    if INTERPRETATIONS.get(interpretation) != samples:
+    if INTERPRETATIONS.get(interpretation) != samples or not 1 <= int(stored) <= bits:
         raise DatasetInvalid(
             f"{path}: PhotometricInterpretation must be {', '.join(INTERPRETATIONS)} with SamplesPerPixel 1 or 3, got "
             f"{interpretation[:40]} with {str(samples)[:40]}"
@@ -182,36 +244,75 @@ def _shape(path: Path, header: Any, *, is_fan: bool) -> tuple[int, int, int]:  #
     return frames, rows, columns
 
 
-def _region(path: Path, header: Any, shape: tuple[int, int, int]) -> tuple[CropBox, tuple[float, float]]:
-    """The part of the image that shows ultrasound, and the lateral and axial size of its pixels, mm."""
+@dataclass(frozen=True)
+class _Region:
+    """A part of the image that shows ultrasound, and the lateral and axial size of its pixels, mm."""
+
+    box: CropBox
+    pixel_mm: tuple[float, float]
+    source: str
+
+    @property
+    def crop(self) -> str:
+        """As the option `crop` names it."""
+        return f"{self.box.left}:{self.box.right},{self.box.top}:{self.box.bottom}"
+
+
+def _region(path: Path, header: Any, shape: tuple[int, int, int], crop: str | None) -> tuple[_Region, tuple[str, ...]]:
+    """The region that shows ultrasound, that of several which holds the crop, and what is to be told of it."""
     _, rows, columns = shape
     with _in_our_words(path):
         regions = [one for one in header.get("SequenceOfUltrasoundRegions", []) if _is_tissue(one)]
-        if len(regions) > 1:
-            raise DatasetInvalid(f"{path}: it has {len(regions)} regions that show a plane, one is expected")
-        if regions:
-            (region,) = regions
-            left, top, right, bottom = (
-                int(_value(path, region, f"RegionLocation{name}")) for name in ("MinX0", "MinY0", "MaxX1", "MaxY1")
-            )
-            box = CropBox(left, right + 1, top, bottom + 1)
-            lateral_mm, axial_mm = (10.0 * float(_value(path, region, f"PhysicalDelta{axis}")) for axis in "XY")
-        else:
-            box = CropBox(0, columns, 0, rows)
+        echoes = [one for one in regions if one.get("RegionDataType") == TISSUE]
+        found = list(dict.fromkeys(_read_region(path, one) for one in echoes or regions))
+        if not found:
             if "PixelSpacing" not in header:
                 raise DatasetInvalid(
                     f"{path}: it does not say how large a pixel is: no region of SequenceOfUltrasoundRegions in "
                     "centimetres, and no PixelSpacing"
                 )
             axial_mm, lateral_mm = (float(spacing) for spacing in header.PixelSpacing)
-    if not (0 <= box.left < box.right <= columns and 0 <= box.top < box.bottom <= rows):
-        raise DatasetInvalid(f"{path}: its region {box} does not lie within {columns} x {rows} pixels")
-    if not all(SMALLEST_PIXEL_MM <= size <= LARGEST_PIXEL_MM for size in (lateral_mm, axial_mm)):
-        raise DatasetInvalid(
-            f"{path}: a pixel must be {SMALLEST_PIXEL_MM:g} to {LARGEST_PIXEL_MM:g} mm, it is {lateral_mm:g} x "
-            f"{axial_mm:g} mm"
+            found = [_Region(CropBox(0, columns, 0, rows), (lateral_mm, axial_mm), "PixelSpacing")]
+    if len(found) > 1:
+        listed = "; ".join(
+            f"{one.crop} (pixels of {one.pixel_mm[0]:.4g} x {one.pixel_mm[1]:.4g} mm)" for one in found[:8]
         )
-    return box, (lateral_mm, axial_mm)
+        box = None if crop is None else parse_crop(crop, rows, columns)
+        found = [] if box is None else [one for one in found if _holds(one.box, box)]
+        if len(found) != 1:
+            raise DatasetInvalid(f"{path}: it has several regions that show a plane, choose one with crop: {listed}")
+    (region,) = found
+    check_pixel_mm(region.pixel_mm, min(rows, columns), f"{path}: {region.source}")
+    box = region.box
+    clipped = CropBox(box.left, min(box.right, columns), box.top, min(box.bottom, rows))
+    beyond = max(box.right - columns, box.bottom - rows, -box.left, -box.top)
+    if clipped.width < 1 or clipped.height < 1 or (beyond > 1 and crop is None):
+        raise DatasetInvalid(
+            f"{path}: its region, columns and rows {region.crop}, does not lie within {columns} x {rows} pixels: say "
+            "with crop which part to take"
+        )
+    if beyond != 1:
+        return region, ()
+    note = f"its region, columns and rows {region.crop}, ends one pixel beyond the image: clipped by that pixel"
+    return replace(region, box=clipped), (note,)
+
+
+def _holds(outer: CropBox, inner: CropBox) -> bool:
+    return (
+        outer.left <= inner.left
+        and inner.right <= outer.right
+        and outer.top <= inner.top
+        and inner.bottom <= outer.bottom
+    )
+
+
+def _read_region(path: Path, region: Any) -> _Region:
+    left, top, right, bottom = (
+        int(_value(path, region, f"RegionLocation{name}")) for name in ("MinX0", "MinY0", "MaxX1", "MaxY1")
+    )
+    lateral_mm, axial_mm = (10.0 * float(_value(path, region, f"PhysicalDelta{axis}")) for axis in "XY")
+    box = CropBox(left, right + 1, top, bottom + 1)
+    return _Region(box, (lateral_mm, axial_mm), "SequenceOfUltrasoundRegions")
 
 
 def _is_tissue(region: Any) -> bool:
@@ -219,28 +320,39 @@ def _is_tissue(region: Any) -> bool:
     return region.get("RegionSpatialFormat") == TISSUE_2D and units == (CENTIMETRES, CENTIMETRES)
 
 
-def _read_poses(path: Path, count: int) -> FloatArray:  # [F, 4, 4]
+def _read_poses(path: Path, count: int) -> tuple[FloatArray, Path]:  # [F, 4, 4]
+    """The poses of all frames, NaN of those without one, and their file."""
     named = [path.with_name(f"{path.name[: -len(path.suffix)]}{suffix}") for suffix in POSE_SUFFIXES]
     found = [file for file in named if file.is_file()]
     if len(found) != 1:
         wanted = " or ".join(file.name for file in named)
         raise DatasetInvalid(f"{path}: the poses of its frames must lie beside it in {wanted}, found {len(found)}")
     try:
-        poses = load_poses(found[0])
+        poses = read_frame_poses(found[0])
     except InvalidPose as error:
         raise DatasetInvalid(error.detail) from error
+    if poses.dtype.kind not in "fiu" or poses.ndim != 3 or poses.shape[1:] != (4, 4):
+        raise DatasetInvalid(
+            f"{found[0]}: poses must be numbers [N, 4, 4] or [N, 3, 4], got {poses.dtype} {list(poses.shape)}"
+        )
     if len(poses) != count:
         raise DatasetInvalid(f"{path} holds {count} frames, but {found[0]} {len(poses)} poses")
-    return poses
+    return np.array(poses, np.float64), found[0]
 
 
-def _read_frames(path: Path, header: Any, shape: tuple[int, int, int], chosen: IntArray) -> ByteArray:
-    """The chosen frames [C, rows, columns], decoded one at a time; colours become their luma."""
+def _read_frames(
+    path: Path, header: Any, shape: tuple[int, int, int], chosen: IntArray
+) -> tuple[ByteArray, tuple[str, ...]]:
+    """The chosen frames [C, rows, columns], decoded one at a time, and notes; colours become their luma."""
     frames = np.empty((len(chosen), *shape[1:]), np.uint8)
+    interpretation = str(header.PhotometricInterpretation)
+    syntax = header.file_meta.TransferSyntaxUID
+    if syntax in JPEG and int(header.get("BitsStored", 8)) == 8 and interpretation != "PALETTE COLOR":
+        return _read_jpeg(path, header, shape, chosen)
+    said: tuple[str, ...] = ()
     with _in_our_words(path):
-        from pydicom.pixels import get_decoder, iter_pixels
+        from pydicom.pixels import apply_color_lut, get_decoder, iter_pixels
 
-        syntax = header.file_meta.TransferSyntaxUID
         try:
             decoder = get_decoder(syntax) if syntax.is_compressed else None
         except NotImplementedError:
@@ -250,16 +362,104 @@ def _read_frames(path: Path, header: Any, shape: tuple[int, int, int], chosen: I
             raise DatasetInvalid(
                 f"{path}: pixels compressed as {syntax.name} cannot be read without a decoder: {needed}"
             )
-        is_colour = INTERPRETATIONS[str(header.PhotometricInterpretation)] == 3
-        # Not raw: YBR becomes RGB.
-        pixels = iter_pixels(path, indices=[int(number) for number in chosen], raw=not is_colour)
+        pixels = iter_pixels(path, indices=[int(number) for number in chosen], raw=True)
+        surplus = max(0, int(header.get("BitsStored", 8)) - 8)
+        is_ybr = interpretation in YBR
         for number, out in zip(chosen, frames, strict=True):
             with _in_our_words(f"{path}: frame {number}"):
                 frame = next(pixels)
-            expected = (*out.shape, 3) if is_colour else out.shape
-            if frame.shape != expected or frame.dtype != out.dtype:
+                if interpretation == "PALETTE COLOR":
+                    frame = apply_color_lut(frame, header)
+                    surplus = 8 * (frame.dtype.itemsize - 1)
+            expected = out.shape if interpretation in GREY[:2] else (*out.shape, 3)
+            if frame.shape != expected or frame.dtype.kind != "u":
                 raise DatasetInvalid(
-                    f"{path}: frame {number} must be uint8 {list(expected)}, got {frame.dtype} {list(frame.shape)}"
+                    f"{path}: frame {number} must be unsigned {list(expected)}, got {frame.dtype} {list(frame.shape)}"
                 )
-            out[:] = grey_frames(frame[None], str(path))[0]
-    return frames
+            frame = np.asarray(frame >> surplus if surplus else frame, np.uint8)
+            if number == chosen[0] and frame.ndim == 3 and interpretation != "PALETTE COLOR":
+                is_ybr, said = _is_ybr(frame, interpretation)
+            out[:] = frame[..., 0] if is_ybr else grey_frames(frame[None], str(path))[0]
+            if interpretation == "MONOCHROME1":
+                np.subtract(255, out, out=out)
+    if surplus:
+        said = (*said, f"pixels of {header.BitsStored} bits were made 8: {(256 << surplus) - 1} became 255")
+    return frames, said
+
+
+def _is_ybr(frame: ByteArray, interpretation: str) -> tuple[bool, tuple[str, ...]]:  # [rows, columns, 3] as decoded
+    """Whether the samples are luma and two differences of colour: an ultrasound image is mostly grey as one or the
+    other, whatever its header calls it."""
+    first, *others = (frame[..., channel].astype(np.int16) for channel in range(3))
+    as_ybr, as_rgb = (sum(float(np.abs(one - grey).mean()) for one in others) for grey in (128, first))
+    is_ybr = interpretation in YBR
+    if (as_rgb if is_ybr else as_ybr) < GREYER * (as_ybr if is_ybr else as_rgb):
+        return not is_ybr, (_other_colours(interpretation, "RGB" if is_ybr else "YBR_FULL"),)
+    return is_ybr, ()
+
+
+def _other_colours(said: str, found: str) -> str:
+    return f"the header says {said}, the pixels are {found}: read as they are"
+
+
+def _read_jpeg(
+    path: Path, header: Any, shape: tuple[int, int, int], chosen: IntArray
+) -> tuple[ByteArray, tuple[str, ...]]:
+    """Frames of JPEG streams of 8 bits, whose own markers say what their colours are."""
+    frames, places = np.empty((len(chosen), *shape[1:]), np.uint8), {int(one): at for at, one in enumerate(chosen)}
+    interpretation, is_rgb = str(header.PhotometricInterpretation), False
+    notes: tuple[str, ...] = ()
+    with _in_our_words(path), path.open("rb") as file:
+        import pydicom
+        from pydicom.encaps import generate_frames
+
+        pydicom.dcmread(file, stop_before_pixels=True)
+        file.seek(12, io.SEEK_CUR)  # tag, VR and length of the pixels
+        streams = generate_frames(file, number_of_frames=shape[0])
+        for number in range(int(chosen[-1]) + 1):
+            with _in_our_words(f"{path}: frame {number}"):
+                stream = next(streams)
+            if number not in places:
+                continue
+            if number == chosen[0] and INTERPRETATIONS[interpretation] == 3:
+                is_rgb, notes = _jpeg_colours(stream, interpretation)
+            flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+            size = re.search(rb"\xff[\xc0-\xc3]...(..)(..)", stream, re.DOTALL)  # never more than the header says
+            frame = None
+            if size is not None and tuple(int.from_bytes(side, "big") for side in size.groups()) == shape[1:]:
+                frame = cv2.imdecode(np.frombuffer(_as_rgb(stream) if is_rgb else stream, np.uint8), flags)
+            if frame is None or frame.shape != shape[1:]:
+                raise DatasetInvalid(
+                    f"{path}: frame {number}: it cannot be read as JPEG of {shape[2]} x {shape[1]} pixels"
+                )
+            frames[places[number]] = 255 - frame if interpretation == "MONOCHROME1" else frame
+    return frames, notes
+
+
+def _jpeg_colours(stream: bytes, interpretation: str) -> tuple[bool, tuple[str, ...]]:
+    """Whether the decoder must be told that the samples are RGB, and what differs from the header.
+
+    A decoder goes by the markers JFIF (YCbCr) and Adobe (either) and by the names of the components. A stream without
+    them is taken as YCbCr; where its components are of one size, it may be RGB all the same, as old writers leave it.
+    """
+    begin = stream[: stream.find(b"\xff\xda")]
+    frame_header = re.search(rb"\xff[\xc0-\xc2]..\x08....\x03(.)(.).(.)(.).(.)(.).", begin, re.DOTALL)
+    names = b"" if frame_header is None else b"".join(frame_header.group(1, 3, 5))
+    sizes = set() if frame_header is None else set(frame_header.group(2, 4, 6))
+    adobe = re.search(rb"\xff\xee..Adobe.{6}(.)", begin, re.DOTALL)
+    is_rgb = names in (b"RGB", b"rgb") if adobe is None else adobe[1] == b"\0"
+    is_told = adobe is not None or b"JFIF\0" in begin[:32] or is_rgb
+    if not is_told and len(sizes) == 1:
+        decoded = [cv2.imdecode(np.frombuffer(one, np.uint8), cv2.IMREAD_COLOR) for one in (stream, _as_rgb(stream))]
+        colours = [float(np.ptp(one.astype(np.int16), axis=2).mean()) for one in decoded if one is not None]
+        if len(colours) == 2:
+            ybr, rgb = colours
+            is_rgb = interpretation in RGB if GREYER < (rgb + 1) / (ybr + 1) < 1 / GREYER else rgb < ybr
+    is_other = not is_told and is_rgb != (interpretation in RGB)
+    notes = (_other_colours(interpretation, "RGB" if is_rgb else "YBR_FULL"),) if is_other else ()
+    return is_rgb and not is_told, notes
+
+
+def _as_rgb(stream: bytes) -> bytes:
+    """A JPEG stream whose decoder is told by Adobe's marker that its samples are RGB."""
+    return stream[:2] + b"\xff\xee\x00\x0eAdobe\x00\x64\x00\x00\x00\x00\x00" + stream[2:]

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import math
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from xml.etree import ElementTree
@@ -82,6 +82,20 @@ def read_device_set(path: Path) -> DeviceSet:
     if not transforms:
         raise DatasetInvalid(f"{path}: it has no Transform under CoordinateDefinitions")
     return DeviceSet(path, root, transforms)
+
+
+def clip_rectangles(device_set: DeviceSet) -> Iterator[tuple[str, tuple[float, ...]]]:
+    """The rectangles of a device set, by the element that has them: column and row of the origin, width and height.
+
+    `VolumeReconstruction` clips images that were recorded, a `Device` those that it is about to record, `Segmentation`
+    looks for wires in it.
+    """
+    for element in device_set.root.iter():
+        if element.get("ClipRectangleSize"):
+            number = _reader(element, device_set.path)
+            origin, size = number("ClipRectangleOrigin", 2), number("ClipRectangleSize", 2)
+            if min(size) > 0:
+                yield element.tag, (*origin, *size)
 
 
 def find_path(names: Iterable[TransformName], start: str, goal: str) -> list[tuple[TransformName, bool]] | None:
@@ -242,9 +256,15 @@ def _reader(element: Element, path: Path) -> Callable[[str, int], tuple[float, .
     return numbers
 
 
-def poses_of_fan(top_centres: FloatArray, fan: FanGeometry, width: int, pixel_mm: tuple[float, float]) -> FloatArray:
-    """Poses [F, 4, 4] whose origin is the apex and whose z is the middle of the fan, from those of whole images of
-    `width` columns whose origin is their top centre."""
+def poses_of_fan(
+    top_centres: FloatArray,  # [F, 4, 4]
+    fan: FanGeometry,
+    column: float,
+    row: float,
+    pixel_mm: tuple[float, float],
+) -> FloatArray:  # [F, 4, 4]
+    """Poses whose origin is the apex and whose z is the middle of the fan, from those whose origin is at a place of the
+    image."""
     middle = math.radians((fan.start_deg + fan.stop_deg) / 2)
     step = np.eye(4)
     step[:3, :3] = [
@@ -252,8 +272,8 @@ def poses_of_fan(top_centres: FloatArray, fan: FanGeometry, width: int, pixel_mm
         [0.0, 1.0, 0.0],
         [-math.sin(middle), 0.0, math.cos(middle)],
     ]
-    step[0, 3] = (fan.apex_column - (width - 1) / 2) * pixel_mm[0]
-    step[2, 3] = (fan.apex_row + 0.5) * pixel_mm[1]
+    step[0, 3] = (fan.apex_column - column) * pixel_mm[0]
+    step[2, 3] = (fan.apex_row - row) * pixel_mm[1]
     poses: FloatArray = top_centres @ step
     return poses
 
@@ -298,3 +318,38 @@ class FanLines:
         for image, out in zip(images, frames, strict=True):
             cv2.remap(np.ascontiguousarray(image), columns, rows, cv2.INTER_LINEAR, dst=out)
         return frames
+
+
+@dataclass(frozen=True)
+class ShownFrames:
+    """What of images is trained from: their crop, or the scan lines of their fan."""
+
+    frames: ByteArray  # [F, H, W]
+    poses: FloatArray  # [F, 4, 4]
+    probe: Probe
+    box: CropBox
+    notes: tuple[str, ...] = ()
+
+
+def shown_frames(
+    images: ByteArray,  # [F, rows, columns]
+    top_centres: FloatArray,  # [F, 4, 4] poses whose origin is the top centre of the box
+    linear: Probe,  # that spans the box
+    box: CropBox,
+    fan: FanGeometry | None,
+    pixel_mm: tuple[float, float],
+) -> ShownFrames:
+    """The pixels in a box, or of a fan, of which nothing beyond the box is seen. Raises InvalidArgument."""
+    inner = np.s_[:, box.top : box.bottom, box.left : box.right]
+    if fan is None:
+        return ShownFrames(np.ascontiguousarray(images[inner]), top_centres, linear, box)
+    size = images.shape[1], images.shape[2]
+    if (box.height, box.width) != size:
+        clipped = np.zeros_like(images)
+        clipped[inner] = images[inner]
+        images = clipped
+    poses = poses_of_fan(top_centres, fan, (box.left + box.right - 1) / 2, box.top - 0.5, pixel_mm)
+    lines = FanLines(fan, size, pixel_mm)
+    beyond = 1.0 - lines.share
+    notes = (f"{beyond:.1%} of the fan lies beyond the image and is black",) if beyond > 1e-3 else ()
+    return ShownFrames(lines.frames(images), poses, fan.probe(), lines.box, notes)

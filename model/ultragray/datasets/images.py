@@ -14,7 +14,7 @@ import numpy.typing as npt
 from ultragray.errors import DatasetInvalid, InvalidArgument
 from ultragray.geometry.image_size import MAX_IMAGE_SIDE
 from ultragray.geometry.probe import FloatArray, LinearProbe
-from ultragray.learn.sweep import ByteArray, ImageRegion, IntArray
+from ultragray.learn.sweep import ByteArray, ImageRegion, IntArray, frame_list
 
 MAX_PIXEL_BYTES = 4 << 30  # of the frames in a file
 
@@ -141,6 +141,7 @@ def _luma(frame: ByteArray, size: tuple[int, int]) -> ByteArray:
 
 SCALE_TOLERANCE = 1e-3  # relative; trackers write six digits
 SMALLEST_ANGLE_DEG = 45.0
+SMALLEST_PIXEL_MM, LARGEST_PIXEL_MM, LARGEST_IMAGE_MM = 2e-3, 10.0, 1000.0
 
 
 def poses_from_image_transforms(
@@ -158,12 +159,15 @@ def poses_from_image_transforms(
     scales = np.stack([np.linalg.norm(columns, axis=1), np.linalg.norm(rows, axis=1)], axis=1)  # [F, 2] mm
     usual = np.median(scales, axis=0)
     cosines = np.abs((columns * rows).sum(axis=1)) / scales.prod(axis=1)
-    for number, scale, cosine in zip(frame_numbers, scales, cosines, strict=True):
-        if np.abs(scale / usual - 1.0).max() > SCALE_TOLERANCE:
-            raise DatasetInvalid(
-                f"{path}: frame {number}: a pixel is {scale[0]:.5g} x {scale[1]:.5g} mm, in other frames "
-                f"{usual[0]:.5g} x {usual[1]:.5g}"
-            )
+    changed = np.abs(scales / usual - 1.0).max(axis=1) > SCALE_TOLERANCE
+    if changed.any():
+        others = ", ".join(dict.fromkeys(f"{size[0]:.5g} x {size[1]:.5g}" for size in scales[changed][:5]))
+        raise DatasetInvalid(
+            f"{path}: frame {frame_list(frame_numbers[changed])}: a pixel is {others} mm, in other frames "
+            f"({frame_list(frame_numbers[~changed])}) {usual[0]:.5g} x {usual[1]:.5g}: was the depth changed? Choose "
+            "frames of one size with frames"
+        )
+    for number, cosine in zip(frame_numbers, cosines, strict=True):
         if not cosine < np.cos(np.radians(SMALLEST_ANGLE_DEG)):
             raise DatasetInvalid(f"{path}: frame {number}: columns and rows of the image are nearly parallel")
     x = columns / scales[:, :1]
@@ -175,6 +179,18 @@ def poses_from_image_transforms(
     poses[:, :3, 3] = (transforms @ top_centre)[:, :3]
     width_mm, depth_mm = (round(float(size), 9) for size in usual * (crop.width, crop.height))
     return poses, LinearProbe(width_mm=width_mm, near_mm=0.0, far_mm=depth_mm)
+
+
+def check_pixel_mm(pixel_mm: tuple[float, float], side: int, where: str) -> None:
+    """Raises DatasetInvalid, naming `where`, for the size (lateral, axial) of a pixel that no image has whose shorter
+    side has so many pixels."""
+    low, high = min(pixel_mm), max(pixel_mm)
+    if low < SMALLEST_PIXEL_MM or (high > LARGEST_PIXEL_MM and high * side > LARGEST_IMAGE_MM) or not low < np.inf:
+        unit = ": lengths in metres?" if 0 < high < SMALLEST_PIXEL_MM else ""
+        raise DatasetInvalid(
+            f"{where} makes a pixel {pixel_mm[0]:.5g} x {pixel_mm[1]:.5g} mm (width x height), it must be "
+            f"{SMALLEST_PIXEL_MM:g} to {LARGEST_PIXEL_MM:g} mm{unit}"
+        )
 
 
 def pixel_size_mm(transforms: FloatArray) -> tuple[float, float]:  # [F, 4, 4] pixels → mm

@@ -10,24 +10,40 @@ from __future__ import annotations
 import json
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from ultragray.contract import Contract, described, from_dict
+from ultragray.datasets.clocks import (
+    MAX_GAP_NS,
+    NS_PER_MS,
+    NS_PER_S,
+    BoolArray,
+    PoseTrack,
+    delay_note,
+    parse_delay_ns,
+)
 from ultragray.datasets.fan import FanGeometry, FanLines, TransformName, find_path
 from ultragray.datasets.images import MAX_PIXEL_BYTES, parse_crop, poses_from_image_transforms, region_of
-from ultragray.datasets.mcap_messages import KINDS, NS_PER_S, MessageFile, StoredMessage, grey_image, time_of
+from ultragray.datasets.mcap_messages import KINDS, MessageFile, StoredMessage, grey_image, time_of
 from ultragray.errors import DatasetInvalid, InvalidArgument, InvalidPose
 from ultragray.exchange.ros_fields import TRANSFORM, TRANSFORMS, pose_of_parts
 from ultragray.exchange.ros_messages import POSE, TEXT
 from ultragray.geometry.probe import Fan, FloatArray, Picture, Probe
-from ultragray.geometry.rotations import blended
-from ultragray.learn.sweep import ByteArray, ImageRegion, IntArray, Sweep, parse_frame_ranges
+from ultragray.learn.sweep import (
+    ByteArray,
+    Chain,
+    ImageRegion,
+    IntArray,
+    Link,
+    Sweep,
+    frame_list,
+    parse_frame_ranges,
+)
 
 MAX_GEOMETRY_BYTES = 1 << 20
 SAME = 1e-6  # relative, of the places of pixels
@@ -154,42 +170,13 @@ def geometry_beside(path: Path) -> ImageGeometry | None:
 BESIDE = ".geometry.json"
 
 
-# Poses at the times of images: from the tracked poses before and after, position linear, orientation by slerp.
+# Poses at the times of images: from the tracked poses before and after.
 
 
-TF = "/tf"
-MAX_GAP_NS = 200_000_000  # a hand that moves on goes another way within a longer time
-
-BoolArray: TypeAlias = npt.NDArray[np.bool_]
-_Stamped: TypeAlias = tuple[int, Any, Any]  # time in ns, position in metres, orientation
-
-
-@dataclass(frozen=True, eq=False)
-class PoseTrack:
-    """Poses over time, ascending; one that is fixed has no times."""
-
-    times_ns: IntArray  # [P], of a fixed one [0]
-    poses: FloatArray  # [P, 4, 4] mm, of a fixed one [1, 4, 4]
-
-    def fixed(self) -> PoseTrack:
-        """The last pose alone, for all times."""
-        return PoseTrack(self.times_ns[:0], self.poses[-1:])
-
-    def at(self, times_ns: IntArray) -> tuple[FloatArray, BoolArray]:  # [F] -> [F, 4, 4], [F]
-        """The pose at each time, and whether it is known: at the time of a pose, or between two at most 0.2 s apart."""
-        if not len(self.times_ns):
-            return np.repeat(self.poses, len(times_ns), axis=0), np.ones(len(times_ns), bool)
-        after = np.minimum(np.searchsorted(self.times_ns, times_ns), len(self.times_ns) - 1)
-        exact = self.times_ns[after] == times_ns
-        before = np.where(exact, after, np.maximum(after - 1, 0))
-        gaps = self.times_ns[after] - self.times_ns[before]
-        known = exact | ((self.times_ns[before] < times_ns) & (times_ns < self.times_ns[after]) & (gaps <= MAX_GAP_NS))
-        shares = np.where(known, (times_ns - self.times_ns[before]) / np.maximum(gaps, 1), 0.0)
-        first, second = self.poses[before], self.poses[after]
-        found = first.copy()
-        found[:, :3, :3] = blended(first[:, :3, :3], second[:, :3, :3], shares)
-        found[:, :3, 3] += shares[:, None] * (second[:, :3, 3] - first[:, :3, 3])
-        return found, known
+TF, STATIC = "/tf", "/tf_static"
+LONGEST_LINK_MM = 5_000.0  # between two frames that do not move against each other
+SLOW_PATH_NS = 50_000_000  # by which images may be written later after their stamps than poses
+_Stamped: TypeAlias = tuple[int, int, Any, Any]  # stamp and time of writing in ns, position in metres, orientation
 
 
 @dataclass(frozen=True)
@@ -198,7 +185,10 @@ class Way:
 
     name: str  # the topic, or the frames of tf, such as probeTobase
     steps: tuple[tuple[PoseTrack, bool], ...]  # True: inverted
-    lost: int  # poses that are none, such as of a tracker that lost the probe
+    links: tuple[Link, ...]
+    left_out: tuple[str, ...]  # other transforms
+    notes: tuple[str, ...]
+    written_ns: int  # how long after their stamps poses were written, usually
 
     def at(self, times_ns: IntArray) -> tuple[FloatArray, BoolArray]:  # [F] -> [F, 4, 4], [F]
         """The pose at each time, and whether it is known."""
@@ -222,9 +212,10 @@ class TrackedPoses:
     def __init__(self, path: Path) -> None:
         self._path = path
         self._poses: dict[str, list[_Stamped]] = {}
+        self._frames: dict[str, Counter[str]] = {}  # that the poses of a topic are in
         self._tracked: dict[str, set[TransformName]] = {}  # what the transforms of a topic are of, by topic
         self._transforms: dict[TransformName, list[_Stamped]] = {}  # from child to parent
-        self._fixed: dict[TransformName, _Stamped] = {}
+        self._fixed: dict[TransformName, list[_Stamped]] = {}
 
     @property
     def topics(self) -> list[str]:
@@ -236,24 +227,24 @@ class TrackedPoses:
         if message.kind == POSE:
             stamped = message.decode()
             parts = stamped.pose.position, stamped.pose.orientation
-            self._poses.setdefault(message.topic, []).append((time_of(stamped.header, message.log_time_ns), *parts))
+            times = time_of(stamped.header, message.log_time_ns), message.log_time_ns
+            self._poses.setdefault(message.topic, []).append((*times, *parts))
+            self._frames.setdefault(message.topic, Counter())[stamped.header.frame_id.lstrip("/")] += 1
         elif message.kind == TRANSFORM:
             transform = message.decode()
             self._poses.setdefault(message.topic, []).append(_stamped(transform, message))
             self._tracked.setdefault(message.topic, set()).add(_name_of(transform))
         elif message.kind == TRANSFORMS:
+            kept = self._fixed if message.topic.endswith("_static") else self._transforms
             for transform in message.decode().transforms:
-                name = _name_of(transform)
-                if message.topic.endswith("_static"):
-                    self._fixed[name] = _stamped(transform, message)
-                else:
-                    self._transforms.setdefault(name, []).append(_stamped(transform, message))
+                kept.setdefault(_name_of(transform), []).append(_stamped(transform, message))
 
     def way(self, topic: str, frame: str, transform: str | None) -> Way:
         """The poses of a topic, or of tf those between two frames that `transform` names, such as probeTobase.
 
         None: from `frame`, the one of the images, as far up as tf leads. Raises DatasetInvalid where there is no such
-        way or all of its poses are none, InvalidArgument for a transform of a topic and for frames that there are not.
+        way, its frames change or all of its poses are none, InvalidArgument for a transform of a topic and for frames
+        that there are not.
         """
         if topic == TF:
             return self._way_of_transforms(frame, transform)
@@ -265,15 +256,24 @@ class TrackedPoses:
                 f"{self._path}: {topic} must tell the poses of one thing, it tells those of {len(tracked)}: {names}; "
                 f"record them as tf, or on topics of their own"
             )
-        track, lost = self._track(self._poses[topic], topic)
-        return Way(topic, ((track, False),), lost)
+        frames = self._frames.get(topic, Counter())
+        if len(frames) > 1:
+            listed = " and ".join(f"{name!r} ({count} poses)" for name, count in sorted(frames.items()))
+            raise DatasetInvalid(
+                f"{self._path}: the poses of {topic} must be in one frame, their frame_id is {listed}: record them on "
+                "topics of their own"
+            )
+        track, notes = self._track(self._poses[topic], topic)
+        name = next(iter(tracked), ("probe", next(iter(frames), "") or "tracker"))
+        link = Link(*name, topic, self._path.name, is_tracked=True)
+        return Way(topic, ((track, False),), (link,), (), notes, _written_ns(self._poses[topic]))
 
     def _way_of_transforms(self, frame: str, transform: str | None) -> Way:
         names = {*self._transforms, *self._fixed}
         frames = sorted({one for name in names for one in name})
         example, known = "To".join(min(names)), ", ".join(frames)
         if transform is None:
-            start, goal = frame, _root(frame, dict(sorted(names)))
+            start, goal = frame, self._root(frame)
             if goal == start:
                 raise DatasetInvalid(
                     f"{self._path}: tf leads nowhere from the frame of the images, {frame!r}: say with transform "
@@ -290,29 +290,88 @@ class TrackedPoses:
         way = find_path(names, start, goal)
         if way is None or all(name not in self._transforms for name, _ in way):
             raise DatasetInvalid(f"{self._path}: no tracked transforms of tf lead from {start} to {goal}")
-        steps, lost = [], 0
+        tracks, links = [], []
+        notes: list[str] = []
         for name, is_inverted in way:
-            is_tracked = name in self._transforms
-            stamped = self._transforms[name] if is_tracked else [self._fixed[name]]
-            track, lost_here = self._track(stamped, "To".join(name))
-            steps.append((track if is_tracked else track.fixed(), is_inverted))
-            lost += lost_here
-        return Way(f"{start}To{goal}", tuple(steps), lost)
+            called, is_tracked = "To".join(name), name in self._transforms
+            track, found = self._track((self._transforms if is_tracked else self._fixed)[name], called)
+            notes += found
+            is_constant = np.ptp(track.poses, axis=0).max() < SAME
+            if is_tracked and name in self._fixed:
+                notes.append(f"{called} of {STATIC} is left out: {TF} tells it as well")
+            if not is_tracked and not is_constant:
+                notes.append(f"{called} of {STATIC} was told with other values: the last is taken for all images")
+            if is_tracked and is_constant:
+                notes.append(f"{called} of {TF} never changes: taken for all images")
+            is_moving = is_tracked and not is_constant
+            length_mm = float(np.linalg.norm(track.poses[-1, :3, 3]))
+            if not is_moving and length_mm > LONGEST_LINK_MM:
+                notes.append(f"{called} is {length_mm / 1000:.3g} m long: millimetres where metres are expected?")
+            tracks.append((track, is_moving, is_inverted))
+            ends = name[::-1] if is_inverted else name
+            links.append(Link(*ends, called, TF if is_tracked else STATIC, is_inverted, is_moving))
+        if not any(is_moving for _, is_moving, _ in tracks):  # a probe that stays where it is has times all the same
+            tracks = [
+                (track, name in self._transforms, flip) for (track, _, flip), (name, _) in zip(tracks, way, strict=True)
+            ]
+        steps = tuple((track if is_moving else track.fixed(), flip) for track, is_moving, flip in tracks)
+        used = {name for name, _ in way}
+        left_out = tuple("To".join(name) for name in sorted(names - used))
+        written_ns = _written_ns([one for name in used & {*self._transforms} for one in self._transforms[name]])
+        return Way(f"{start}To{goal}", steps, tuple(links), left_out, tuple(notes), written_ns)
 
-    def _track(self, stamped: Sequence[_Stamped], name: str) -> tuple[PoseTrack, int]:
-        """The poses over time, and how many are none."""
+    def _root(self, frame: str) -> str:
+        """The frame that tf leads up to from this one, by the parent of each. Raises DatasetInvalid for two parents."""
+        parents: dict[str, list[str]] = {}
+        for child, parent in sorted({*self._transforms, *self._fixed}):
+            parents.setdefault(child, []).append(parent)
+        seen = {frame}
+        while found := parents.get(frame):
+            if len(found) > 1:
+                raise DatasetInvalid(
+                    f"{self._path}: the parent of {frame} in tf changes between {' and '.join(found)}: say with "
+                    f"transform which poses to take, such as {frame}To{found[0]}"
+                )
+            if found[0] in seen:
+                break
+            frame = found[0]
+            seen.add(frame)
+        return frame
+
+    def _track(self, stamped: Sequence[_Stamped], name: str) -> tuple[PoseTrack, tuple[str, ...]]:
+        """The poses over time, and what is to be told of them."""
         found: dict[int, FloatArray] = {}
         problems: list[str] = []
-        for time_ns, position, turn in stamped:
+        twice = back = 0
+        latest = stamped[0][0]
+        for time_ns, _, position, turn in stamped:
+            back, latest = back + (time_ns < latest), time_ns
             try:
-                found[time_ns] = pose_of_parts(position, turn, field="a pose")
+                pose = pose_of_parts(position, turn, field="a pose")
             except InvalidPose as error:
                 problems.append(error.detail)
+                continue
+            twice += time_ns in found and not np.allclose(found[time_ns], pose, atol=SAME)
+            found[time_ns] = pose
         if not found:
-            raise DatasetInvalid(f"{self._path}: none of the {len(stamped)} poses of {name} is one: {problems[0]}")
+            unit = " (millimetres where metres are expected?)" if "lie within" in problems[0] else ""
+            raise DatasetInvalid(
+                f"{self._path}: none of the {len(stamped)} poses of {name} is one: {problems[0]}{unit}"
+            )
         times = sorted(found)
         track = PoseTrack(np.array(times, np.int64), np.array([found[time_ns] for time_ns in times]))
-        return track, len({time_ns for time_ns, _, _ in stamped} - set(times))
+        lost = len({time_ns for time_ns, *_ in stamped} - set(times))
+        notes = (
+            f"{lost} poses of {name} are none, such as of a probe that was lost, and were passed over" if lost else "",
+            f"{twice} poses of {name} have the stamp of another one: the last of them is taken" if twice else "",
+            f"the stamps of {name} step back {back} times: its poses were put in their order" if back else "",
+        )
+        return track, tuple(note for note in notes if note)
+
+
+def _written_ns(stamped: Sequence[_Stamped]) -> int:
+    """How long after their stamps messages were written, usually."""
+    return int(np.median([written - stamp for stamp, written, *_ in stamped]))
 
 
 def _name_of(transform: Any) -> TransformName:
@@ -322,16 +381,7 @@ def _name_of(transform: Any) -> TransformName:
 
 def _stamped(transform: Any, message: StoredMessage) -> _Stamped:
     parts = transform.transform.translation, transform.transform.rotation
-    return time_of(transform.header, message.log_time_ns), *parts
-
-
-def _root(frame: str, parents: Mapping[str, str]) -> str:
-    """The frame that tf leads up to from this one, by the parent of each."""
-    seen = {frame}
-    while (parent := parents.get(frame)) is not None and parent not in seen:
-        seen.add(parent)
-        frame = parent
-    return frame
+    return time_of(transform.header, message.log_time_ns), message.log_time_ns, *parts
 
 
 # A recorded sweep out of an MCAP file: one topic of images, the poses at their times, and their geometry.
@@ -351,6 +401,7 @@ def read_mcap_sweep(
     transform: str | None = None,
     image_topic: str | None = None,
     pose_topic: str | None = None,
+    image_delay_ms: str | None = None,
 ) -> tuple[Sweep, int]:
     """The images of one topic that have a pose, and how many images it has.
 
@@ -358,9 +409,11 @@ def read_mcap_sweep(
     Of several topics, that of images which ends in /bmode and that of poses which ends in /probe_pose are taken unless
     `image_topic` and `pose_topic` name others; `/tf` stands for the transforms of tf, of which `transform`, such as
     probeTobase, names two frames. A pose lies between those before and after the image (position linear, orientation
-    by slerp), at most 0.2 s apart; the notes say how many images have none. Raises DatasetInvalid, naming the file, the
-    frame and the reason; InvalidArgument for options that do not fit.
+    by slerp), at most 0.2 s apart; the notes say how many images have none. `image_delay_ms` is by how much the images
+    are stamped later than the poses. Raises DatasetInvalid, naming the file, the frame and the reason; InvalidArgument
+    for options that do not fit.
     """
+    delay_ns = parse_delay_ns(image_delay_ms)
     file = MessageFile(path)
     contents = _Contents(file)
     topic = _chosen(path, "image_topic", image_topic, sorted(contents.image_counts), PREFERRED_IMAGES, contents)
@@ -369,14 +422,18 @@ def read_mcap_sweep(
     numbers = range(count) if frames is None else parse_frame_ranges(frames, count, option="frames")
     times = _ImageTimes(file, topic, numbers)
     way = contents.poses.way(source, times.frame_id, transform)
-    poses, known = way.at(times.times_ns)
+    poses, known = way.at(times.times_ns - delay_ns)
     if not known.any():
-        raise DatasetInvalid(f"{path}: none of {len(known)} images has a pose: {_why_none(times.times_ns, way)}")
+        raise DatasetInvalid(f"{path}: none of {len(known)} images has a pose: {_why_none(times, delay_ns, way)}")
     with_pose = times.numbers[known]
-    geometry = contents.geometry_of(topic, times.log_times_ns[known], with_pose)
+    geometry, geometry_source = contents.geometry_of(topic, times.log_times_ns[known], with_pose)
     images = _read_images(file, topic, with_pose)
-    notes = _notes(file, way, source == TF and transform is None, times.numbers[~known])
-    return geometry.sweep(images, poses[known], with_pose, path, notes, crop), count
+    is_guessed = source == TF and transform is None
+    notes = (*_notes(file, way, is_guessed, times.numbers[~known]), *_path_notes(times, way), *delay_note(delay_ns))
+    sweep = geometry.sweep(images, poses[known], with_pose, path, notes, crop)
+    pixels = Link("pixels", way.links[0].origin, "geometry", geometry_source)
+    seconds = (times.times_ns[known] - times.times_ns.min()) / NS_PER_S
+    return replace(sweep, chain=Chain((pixels, *way.links), way.left_out), times_s=seconds), count
 
 
 class _Contents:
@@ -397,10 +454,11 @@ class _Contents:
             else:
                 self.poses.take(message)
 
-    def geometry_of(self, topic: str, log_times_ns: IntArray, numbers: IntArray) -> ImageGeometry:
-        """The one geometry of images. Raises DatasetInvalid where there is none, or it changes among them."""
+    def geometry_of(self, topic: str, log_times_ns: IntArray, numbers: IntArray) -> tuple[ImageGeometry, str]:
+        """The one geometry of images, and where it is from. Raises DatasetInvalid where there is none, or it changes
+        among them."""
         if (given := geometry_beside(self._path)) is not None:
-            return given
+            return given, f"{self._path.stem}{BESIDE}"
         near = [told for name, told in self._geometries.items() if topic.startswith(name.removesuffix(GEOMETRY[1:]))]
         if len(near) != 1:
             raise DatasetInvalid(
@@ -415,10 +473,12 @@ class _Contents:
         for number, text in zip(numbers, texts, strict=True):
             if known[text] != known[texts[0]]:
                 raise DatasetInvalid(
-                    f"{self._path}: frame {number}: its geometry is another one than that of frame {numbers[0]}: "
-                    f"choose those of one geometry with frames, such as {numbers[0]}:{number}"
+                    f"{self._path}: frame {number}: its geometry, {known[text].probe}, is another one than that of "
+                    f"frame {numbers[0]}, {known[texts[0]].probe}: was the depth changed? Choose those of one geometry "
+                    f"with frames, such as {numbers[0]}:{number}"
                 )
-        return known[texts[0]]
+        (near_topic,) = (name for name, texts_near in self._geometries.items() if texts_near is near[0])
+        return known[texts[0]], near_topic
 
 
 def _chosen(path: Path, option: str, asked: str | None, topics: list[str], preferred: str, contents: _Contents) -> str:
@@ -451,12 +511,21 @@ class _ImageTimes:
     """The times of images, [F] each, and the frame that they are in."""
 
     def __init__(self, file: MessageFile, topic: str, numbers: Any) -> None:
-        found, self.frame_id = [], ""
+        found, frames = [], Counter[str]()
         for number, message in _chosen_images(file, topic, numbers):
             header = message.decode().header
-            self.frame_id = self.frame_id or header.frame_id.lstrip("/")
+            frames[header.frame_id.lstrip("/")] += 1
             found.append((number, time_of(header, message.log_time_ns), message.log_time_ns))
+        if len(frames) > 1:
+            listed = " and ".join(f"{name!r} ({count} images)" for name, count in sorted(frames.items()))
+            raise DatasetInvalid(f"{file.path}: the images of {topic} must be of one probe, their frame_id is {listed}")
+        self.frame_id = next(iter(frames), "")
         self.numbers, self.times_ns, self.log_times_ns = np.array(found, np.int64).reshape(-1, 3).T
+
+    @property
+    def written_ns(self) -> int:
+        """How long after their stamps images were written, usually."""
+        return int(np.median(self.log_times_ns - self.times_ns))
 
 
 def _read_images(file: MessageFile, topic: str, numbers: IntArray) -> ByteArray:  # [F, rows, columns]
@@ -482,15 +551,30 @@ def _read_images(file: MessageFile, topic: str, numbers: IntArray) -> ByteArray:
     return images
 
 
-def _why_none(times_ns: IntArray, way: Way) -> str:
+def _why_none(times: _ImageTimes, delay_ns: int, way: Way) -> str:
     begin, end = (time_ns / NS_PER_S for time_ns in way.span_ns)
-    first, last = times_ns[0] / NS_PER_S, times_ns[-1] / NS_PER_S
+    stamps = times.times_ns - delay_ns
+    first, last = stamps.min() / NS_PER_S, stamps.max() / NS_PER_S
     if last < begin or end < first:
+        apart_ms = (way.written_ns - times.written_ns) / NS_PER_MS
+        by_writing = f" (by the times of writing {apart_ms:.0f} ms apart: --image-delay-ms {apart_ms:.0f})"
         return (
             f"images are stamped {first:.3f} to {last:.3f} s, poses of {way.name} {begin:.3f} to {end:.3f} s: were the "
-            "clocks other ones?"
+            f"clocks other ones{by_writing if abs(apart_ms) > SLOW_PATH_NS / NS_PER_MS else ''}?"
         )
     return f"those of {way.name} before and after an image must be at most {MAX_GAP_NS / 1e6:g} ms apart"
+
+
+def _path_notes(times: _ImageTimes, way: Way) -> tuple[str, ...]:
+    """What the times of writing tell of the two clocks."""
+    apart_ms = (way.written_ns - times.written_ns) / NS_PER_MS
+    if abs(apart_ms) <= SLOW_PATH_NS / NS_PER_MS:
+        return ()
+    return (
+        f"images were written {times.written_ns / NS_PER_MS:.0f} ms after their stamps, poses of {way.name} "
+        f"{way.written_ns / NS_PER_MS:.0f} ms: one of them comes slowly, or their clocks differ; then "
+        f"--image-delay-ms {apart_ms:.0f} corrects it",
+    )
 
 
 def _notes(file: MessageFile, way: Way, is_way_guessed: bool, left_out: IntArray) -> tuple[str, ...]:
@@ -499,12 +583,11 @@ def _notes(file: MessageFile, way: Way, is_way_guessed: bool, left_out: IntArray
         notes.append("the file breaks off: its recording was not finished; it was read as far as it goes")
     if is_way_guessed:
         notes.append(f"poses are taken from tf: {way.name}")
-    if way.lost:
-        notes.append(f"{way.lost} poses of {way.name} are none, such as of a probe that was lost, and were passed over")
+    notes += way.notes
     if len(left_out):
-        listed = ", ".join(map(str, left_out[:10])) + (", …" if len(left_out) > 10 else "")
         notes.append(
-            f"images without poses at most {MAX_GAP_NS / 1e6:g} ms apart around them were left out: {listed} "
+            f"images without poses at most {MAX_GAP_NS / 1e6:g} ms apart around them were left out: "
+            f"{frame_list(left_out)} "
             f"({len(left_out)} in all)"
         )
     return tuple(notes)

@@ -15,6 +15,7 @@ from mcap.records import Channel, Chunk, McapRecord, Message, Schema
 from mcap.stream_reader import StreamReader, breakup_chunk
 from mcap_ros2.decoder import DecoderFactory
 
+from ultragray.datasets.clocks import NS_PER_S
 from ultragray.datasets.images import grey_frames
 from ultragray.errors import DatasetInvalid
 from ultragray.exchange.ros_fields import COMPRESSED, check_fields
@@ -23,7 +24,6 @@ from ultragray.learn.sweep import ByteArray
 
 MAX_RECORD_BYTES = 1 << 30  # of a chunk, compressed or not
 MAX_TIME_NS = (1 << 63) - 1
-NS_PER_S = 1_000_000_000
 
 
 @dataclass(frozen=True)

@@ -10,6 +10,7 @@ import re
 import zlib
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from typing import BinaryIO
 
@@ -70,12 +71,16 @@ def split_fields(
 def pixel_shape(path: Path, sizes: list[int], channels: int) -> tuple[int, ...]:  # [F, rows, columns(, channels)]
     """The shape of the pixels from the sizes of a header, fastest axis first: columns, rows, frames.
 
-    A fourth size goes with volumes of one slice. Raises DatasetInvalid for other volumes.
+    A fourth size goes with volumes of one slice. Raises DatasetInvalid for other volumes, and where there are none.
     """
     if len(sizes) == 4 and sizes[2] == 1:
         sizes = [*sizes[:2], sizes[3]]
     if len(sizes) != 3:
         raise DatasetInvalid(f"{path}: a sequence has columns x rows x frames, got {' x '.join(map(str, sizes))}")
+    if not sizes[2]:
+        raise DatasetInvalid(f"{path}: it holds no frames")
+    if 0 in sizes[:2]:
+        raise DatasetInvalid(f"{path}: it holds no images: a recording of the tracker alone, of {sizes[2]} frames")
     if channels not in (1, 3, 4):
         raise DatasetInvalid(f"{path}: pixels must have 1, 3 or 4 channels, got {channels}")
     shape = tuple(reversed(sizes))
@@ -90,47 +95,67 @@ def whole_numbers(path: Path, key: str, text: str) -> list[int]:
     return [int(word) for word in words]
 
 
-def read_payload(
-    header: Path, file_name: str | None, offset: int, shape: tuple[int, ...], *, deflated: bool
-) -> ByteArray:
-    """uint8 pixels of `shape`, from `offset` of the header's file, or of `file_name` beside it.
+@dataclass(frozen=True)
+class Payload:
+    """Where the pixels of a sequence lie: in the file of the header, or in files beside it, in equal shares."""
 
-    Raises DatasetInvalid, naming the file, where there are fewer or more bytes than the shape holds, or the deflated
-    bytes are damaged; what is inflated never exceeds the shape.
-    """
-    path = header if file_name is None else _beside(header, file_name)
-    expected = int(np.prod([int(side) for side in shape], dtype=object))
-    if not 0 < expected <= MAX_PIXEL_BYTES:
-        raise DatasetInvalid(
-            f"{header}: {' x '.join(map(str, shape))} bytes of pixels, the limit is {MAX_PIXEL_BYTES >> 30} GiB"
-        )
-    if not deflated:
-        _require_size(path, header, max(0, path.stat().st_size - offset), expected)
-        return np.fromfile(path, np.uint8, expected, offset=offset).reshape(shape)
-    with path.open("rb") as file:
-        file.seek(offset)
-        deflated_limit = expected + expected // 256 + (1 << 16)  # incompressible pixels grow by far less
-        pixels = _inflate(file.read(deflated_limit), path, expected)
-    _require_size(path, header, len(pixels), expected)
-    return np.frombuffer(pixels, np.uint8).reshape(shape)
+    header: Path
+    files: tuple[str, ...]  # beside the header; none: its own
+    offset: int  # in each file; -1: the pixels are its end
+    dtype: str  # such as u1 or >i2
+    deflated: bool
+    deflated_bytes: int | None = None
+
+    def read(self, shape: tuple[int, ...]) -> tuple[ByteArray, tuple[str, ...]]:
+        """uint8 pixels of `shape`, and notes of what was changed.
+
+        Of 16 bits the power of two above the largest value of the file becomes 256, so that sequences of one scanner
+        are scaled alike. Raises DatasetInvalid, naming the file, where there are fewer or more bytes than the shape
+        holds, the deflated bytes are damaged or values lie below 0; what is inflated never exceeds the shape.
+        """
+        paths = [_beside(self.header, name) for name in self.files] or [self.header]
+        width = np.dtype(self.dtype).itemsize
+        expected = width * int(np.prod([int(side) for side in shape], dtype=object))
+        if not 0 < expected <= MAX_PIXEL_BYTES:
+            raise DatasetInvalid(
+                f"{self.header}: {' x '.join(map(str, shape))} pixels of {width} bytes, the limit is "
+                f"{MAX_PIXEL_BYTES >> 30} GiB"
+            )
+        if expected % len(paths):
+            raise DatasetInvalid(f"{self.header}: {len(paths)} files cannot hold {shape[0]} frames in equal shares")
+        shares = [self._share(path, expected // len(paths)) for path in paths]
+        stored = (shares[0] if len(shares) == 1 else np.concatenate(shares)).view(self.dtype).reshape(shape)
+        return (np.asarray(stored, np.uint8), ()) if width == 1 else _eight_bits(stored, self.header)
+
+    def _share(self, path: Path, expected: int) -> ByteArray:
+        size = path.stat().st_size
+        if self.offset >= 0:
+            offset = self.offset
+        elif self.deflated and self.deflated_bytes is None:
+            raise DatasetInvalid(f"{self.header}: HeaderSize -1 of compressed pixels needs CompressedDataSize")
+        else:
+            offset = max(0, size - (self.deflated_bytes if self.deflated and self.deflated_bytes else expected))
+        if not self.deflated:
+            _require_size(path, self.header, max(0, size - offset), expected)
+            return np.fromfile(path, np.uint8, expected, offset=offset)
+        with path.open("rb") as file:
+            file.seek(offset)
+            deflated_limit = expected + expected // 256 + (1 << 16)  # incompressible pixels grow by far less
+            pixels = _inflate(file.read(deflated_limit), path, expected)
+        _require_size(path, self.header, len(pixels), expected)
+        return np.frombuffer(pixels, np.uint8)
 
 
-def read_wide_payload(
-    header: Path, file_name: str | None, offset: int, shape: tuple[int, ...], dtype: str, *, deflated: bool
-) -> tuple[ByteArray, str]:
-    """Pixels of 16 bits (a numpy dtype such as ">i2") as uint8 of `shape`, and a note that says how.
-
-    The power of two above the largest value of the file becomes 256, so that sequences of one scanner are scaled
-    alike. Raises what `read_payload` raises, and DatasetInvalid for values below 0.
-    """
-    stored = read_payload(header, file_name, offset, (*shape, 2), deflated=deflated).view(dtype)[..., 0]
+def _eight_bits(stored: np.ndarray, header: Path) -> tuple[ByteArray, tuple[str, ...]]:
     if int(stored.min()) < 0:
-        raise DatasetInvalid(f"{header}: 16-bit pixels must not be below 0, the smallest is {stored.min()}")
+        raise DatasetInvalid(
+            f"{header}: 16-bit pixels must not be below 0, the smallest is {stored.min()}: RF data, not B-mode?"
+        )
     surplus = max(0, int(stored.max()).bit_length() - 8)
-    pixels = np.empty(shape, np.uint8)
+    pixels = np.empty(stored.shape, np.uint8)
     for frame, out in zip(stored, pixels, strict=True):
         out[:] = frame >> surplus
-    return pixels, f"pixels of 16 bits were made 8: {(256 << surplus) - 1} became 255"
+    return pixels, (f"pixels of 16 bits were made 8: {(256 << surplus) - 1} became 255",)
 
 
 def _inflate(data: bytes, path: Path, expected: int) -> bytes:
@@ -165,15 +190,17 @@ def _beside(header: Path, file_name: str) -> Path:
 # MetaImage sequences: .mha (also .igs.mha), and .mhd with its pixels in a .raw or .zraw file.
 
 
-_DTYPES = {"MET_UCHAR": "u1", "MET_USHORT": "u2", "MET_SHORT": "i2"}
+_DTYPES = {"MET_UCHAR": "u1", "MET_UCHAR_ARRAY": "u1", "MET_USHORT": "u2", "MET_SHORT": "i2"}
 _MOST_SIGNIFICANT_FIRST = ("BinaryDataByteOrderMSB", "ElementByteOrderMSB")
+MAX_FILES = 100_000
 
 
 def read_meta_image(path: Path) -> StoredSequence:
     """The sequence in a MetaImage file of 8 or 16 bits a pixel. Raises DatasetInvalid, naming file and reason."""
     with path.open("rb") as file:
         entries: dict[str, str] = {}
-        for line in header_lines(file, path):
+        lines = header_lines(file, path)
+        for line in lines:
             key, separator, value = (part.strip() for part in line.partition("="))
             if not separator and line.strip():
                 raise DatasetInvalid(f"{path}: not a MetaImage file: a line of its header is {line[:80]!r}")
@@ -182,26 +209,59 @@ def read_meta_image(path: Path) -> StoredSequence:
                 break
         else:
             raise DatasetInvalid(f"{path}: not a MetaImage file, or truncated: its header has no ElementDataFile")
-        offset = file.tell()
+        files = _data_files(path, value, lines)
+        offset = 0 if files else file.tell()
+
+    def number(key: str, default: str) -> int:
+        return whole_numbers(path, key, entries.get(key, default))[0]
+
+    def flag(key: str, default: str = "False") -> bool:
+        return entries.get(key, default)[:1] in ("T", "t", "1")  # as MetaIO reads it
+
+    _check_b_mode(path, entries.get("UltrasoundImageType", ""))
+    sizes = whole_numbers(path, "DimSize", entries.get("DimSize", ""))
+    shape = pixel_shape(path, sizes, number("ElementNumberOfChannels", "1"))
     dtype = _DTYPES.get(entries.get("ElementType", ""))
-    if dtype is None or entries.get("BinaryData", "True").lower() != "true":
+    if dtype is None or not flag("BinaryData", "True"):
         raise DatasetInvalid(
             f"{path}: pixels must be binary {', '.join(_DTYPES)}, got ElementType "
             f"{entries.get('ElementType', 'missing')}"
         )
-    sizes = whole_numbers(path, "DimSize", entries.get("DimSize", ""))
-    channels = whole_numbers(path, "ElementNumberOfChannels", entries.get("ElementNumberOfChannels", "1"))[0]
-    shape = pixel_shape(path, sizes, channels)
     fields, frame_fields = split_fields(path, entries, shape[0])
-    local = entries["ElementDataFile"].upper() == "LOCAL"
-    header_size = whole_numbers(path, "HeaderSize", entries.get("HeaderSize", "0"))[0]
-    place = (None if local else entries["ElementDataFile"], offset if local else header_size, shape)
-    deflated = entries.get("CompressedData", "False").lower() == "true"
-    if dtype == "u1":
-        return StoredSequence(path, read_payload(path, *place, deflated=deflated), fields, frame_fields)
-    most_first = any(entries.get(key, "False").lower() == "true" for key in _MOST_SIGNIFICANT_FIRST)
-    pixels, note = read_wide_payload(path, *place, (">" if most_first else "<") + dtype, deflated=deflated)
-    return StoredSequence(path, pixels, fields, frame_fields, (note,))
+    if entries.get("HeaderSize", "0") == "-1":
+        offset = -1
+    elif (header_size := number("HeaderSize", "0")) > 0:
+        offset = header_size
+    deflated = flag("CompressedData")
+    deflated_bytes = number("CompressedDataSize", "0") or None
+    order = ">" if any(map(flag, _MOST_SIGNIFICANT_FIRST)) else "<"
+    pixels, notes = Payload(path, files, offset, order + dtype, deflated, deflated_bytes).read(shape)
+    return StoredSequence(path, pixels, fields, frame_fields, notes)
+
+
+def _data_files(path: Path, value: str, following: Iterator[str]) -> tuple[str, ...]:
+    """The files that ElementDataFile names: LOCAL (none), one, LIST and one on each following line, or a pattern such
+    as `frame%03d.raw 1 30 1` with its first, last and step."""
+    words = value.split()
+    if value.upper() == "LOCAL":
+        return ()
+    if words and words[0].upper() == "LIST":
+        files = [line.strip() for line in islice(following, MAX_FILES) if line.strip()]
+        if not files:
+            raise DatasetInvalid(f"{path}: its ElementDataFile is a LIST, but no file follows")
+        return tuple(files)
+    pattern = re.fullmatch(r"(\S*%0?\d?d\S*)((?: \d{1,9}){2,3})", " ".join(words))
+    if pattern is None:
+        return (value,)
+    first, last, step = (*map(int, pattern[2].split()), 1)[:3]
+    return tuple(pattern[1] % number for number in islice(range(first, last + 1, max(1, step)), MAX_FILES))
+
+
+def _check_b_mode(path: Path, kind: str) -> None:
+    """Refuse images that are none, by the name that PLUS gives their kind: RF_REAL, RF_IQ_LINE, RF_I_LINE_Q_LINE."""
+    if kind.upper() not in ("", "XX", "BRIGHTNESS", "RGB_COLOR"):
+        is_rf = " (RF data, before the envelope is detected)" if kind.upper().startswith("RF") else ""
+        raise DatasetInvalid(f"{path}: images must be B-mode (BRIGHTNESS or RGB_COLOR), got {kind[:40]}{is_rf}")
 
 
 # NRRD sequences: .nrrd and .seq.nrrd, and .nhdr with its pixels in a file of their own; raw or gzip.
@@ -212,6 +272,7 @@ _NRRD_DTYPES = {
     **dict.fromkeys(("ushort", "unsigned short", "unsigned short int", "uint16", "uint16_t"), "u2"),
     **dict.fromkeys(("short", "short int", "signed short", "signed short int", "int16", "int16_t"), "i2"),
 }
+_TYPE = "ultrasoundimagetype"
 _TIME_KINDS = ("list", "time")
 _COLOUR_KINDS = ("vector", "rgb-color", "rgba-color", "3-color", "4-color", "3-vector", "4-vector")
 
@@ -219,59 +280,90 @@ _COLOUR_KINDS = ("vector", "rgb-color", "rgba-color", "3-color", "4-color", "3-v
 def read_nrrd(path: Path) -> StoredSequence:
     """The sequence in an NRRD file of 8 or 16 bits a pixel. Raises DatasetInvalid, naming file and reason."""
     with path.open("rb") as file:
-        fields, own = _read_header(file, path)
+        fields, own, listed = _read_header(file, path)
         offset = file.tell()
+    _check_b_mode(path, next((value for key, value in own.items() if key.replace(" ", "").lower() == _TYPE), ""))
+    counted = {int(match[1]) for key in own if (match := _FRAME_FIELD.fullmatch(key))}
+    layout = _layout(path, fields, max(counted) + 1 if counted else 0)
     dtype = _NRRD_DTYPES.get(fields.get("type", "").lower())
     if dtype is None:
         raise DatasetInvalid(f"{path}: pixels must be uchar, ushort or short, got type {fields.get('type', 'missing')}")
     encoding = fields.get("encoding", "").lower()
     if encoding not in ("raw", "gzip", "gz"):
         raise DatasetInvalid(f"{path}: encoding must be raw or gzip, got {encoding or 'none'}")
-    if any(fields.get(key, "0") != "0" for key in ("line skip", "lineskip", "byte skip", "byteskip")):
-        raise DatasetInvalid(f"{path}: files with a line skip or byte skip cannot be read")
-    shape = _shape(path, fields)
-    file_fields, frame_fields = split_fields(path, own, shape[0])
+    skipped = fields.get("byte skip", fields.get("byteskip", "0"))
+    if fields.get("line skip", fields.get("lineskip", "0")) != "0" or (skipped != "0" and encoding != "raw"):
+        raise DatasetInvalid(f"{path}: a line skip, and a byte skip of compressed pixels, cannot be read")
+    file_fields, frame_fields = split_fields(path, own, layout.shape[0])
     data_file = fields.get("data file", fields.get("datafile"))
-    place, deflated = (data_file, 0 if data_file else offset, shape), encoding != "raw"
-    if dtype == "u1":
-        return StoredSequence(path, read_payload(path, *place, deflated=deflated), file_fields, frame_fields)
+    files = () if data_file is None else _data_files(path, data_file, iter(listed))
     order = ">" if fields.get("endian", "little").lower() == "big" else "<"
-    pixels, note = read_wide_payload(path, *place, order + dtype, deflated=deflated)
-    return StoredSequence(path, pixels, file_fields, frame_fields, (note,))
+    begin = -1 if skipped == "-1" else (0 if files else offset) + whole_numbers(path, "byte skip", skipped)[0]
+    payload = Payload(path, files, begin, order + dtype, encoding != "raw")
+    stored, notes = payload.read(layout.stored)
+    pixels = np.ascontiguousarray(stored.transpose(layout.axes)).reshape(layout.shape)
+    return StoredSequence(path, pixels, file_fields, frame_fields, notes)
 
 
-def _read_header(file: BinaryIO, path: Path) -> tuple[dict[str, str], dict[str, str]]:
-    """The format's fields (`sizes: …`, by lower-case name) and the file's own (`Seq_Frame0000_…:=…`)."""
+def _read_header(file: BinaryIO, path: Path) -> tuple[dict[str, str], dict[str, str], list[str]]:
+    """The format's fields (`sizes: …`, by lower-case name), the file's own (`Seq_Frame0000_…:=…`), and the lines after
+    `data file: LIST`."""
     lines = header_lines(file, path)
     if not next(lines, "").startswith("NRRD000"):
         raise DatasetInvalid(f"{path}: not an NRRD file: it does not begin with NRRD000")
     fields: dict[str, str] = {}
     own: dict[str, str] = {}
+    listed: list[str] = []
     for line in lines:
         if not line:
             break
         key, separator, value = line.partition(":")
         if line.startswith("#"):
             continue
+        if fields.get("data file", fields.get("datafile", "")).upper().startswith("LIST"):
+            listed = [line, *islice((one for one in lines if one), MAX_FILES)]
+            break
         if not separator:
             raise DatasetInvalid(f"{path}: not an NRRD file: a line of its header is {line[:80]!r}")
         if value.startswith("="):
             own[key.strip()] = value[1:].strip()
         else:
             fields[key.strip().lower()] = value.strip()
-    return fields, own
+    return fields, own, listed
 
 
-def _shape(path: Path, fields: dict[str, str]) -> tuple[int, ...]:  # [F, rows, columns(, channels)]
+@dataclass(frozen=True)
+class _Layout:
+    stored: tuple[int, ...]  # slowest axis first
+    axes: tuple[int, ...]  # of `stored`, in the order of `shape`
+    shape: tuple[int, ...]  # [F, rows, columns(, channels)]
+
+
+def _layout(path: Path, fields: dict[str, str], frame_fields: int) -> _Layout:
+    """Which axis is that of the frames and which that of colours: by their kinds, else by the axis without a direction
+    in space, else by the number of frames that have fields; else the frames are the last one."""
     sizes = whole_numbers(path, "sizes", fields.get("sizes", ""))
     kinds = fields.get("kinds", "").lower().split()
-    channels = 1
-    if len(kinds) == len(sizes):
-        if kinds[0] in _COLOUR_KINDS:
-            channels, sizes, kinds = sizes[0], sizes[1:], kinds[1:]
-        if any(kind in _TIME_KINDS for kind in kinds[:-1]):
-            raise DatasetInvalid(f"{path}: the frames must be the last axis, got kinds {fields['kinds']!r}")
-    return pixel_shape(path, sizes, channels)
+    directions = re.findall(r"none|\([^)]*\)", fields.get("space directions", "").lower())
+    kinds = kinds if len(kinds) == len(sizes) else ["???"] * len(sizes)
+    times = [place for place, kind in enumerate(kinds) if kind in _TIME_KINDS]
+    colours = [place for place, kind in enumerate(kinds) if kind in _COLOUR_KINDS]
+    if not times and colours and sizes[colours[0]] not in (1, 3, 4):  # a frame a component, as of a MultiVolume
+        times, colours = colours, []
+    if not times and len(directions) == len(sizes):
+        times = [place for place, one in enumerate(directions) if one == "none" and place not in colours]
+    if not times:
+        places = [place for place in range(len(sizes)) if place not in colours]
+        counted = [place for place in (*places[::-1][:1], *places[:1]) if sizes[place] == frame_fields]
+        times = counted[:1] or places[-1:]
+    if len(times) != 1 or len(colours) > 1:
+        raise DatasetInvalid(f"{path}: one axis must be that of the frames, got kinds {fields.get('kinds', 'none')!r}")
+    space = [place for place in range(len(sizes)) if place not in (*times, *colours)]
+    channels = sizes[colours[0]] if colours else 1
+    shape = pixel_shape(path, [*(sizes[place] for place in space), sizes[times[0]]], channels)
+    last = len(sizes) - 1
+    axes = tuple(last - place for place in (*times, *reversed(space), *colours))
+    return _Layout(tuple(reversed(sizes)), axes, shape)
 
 
 # UltrasoundImageOrientation of PLUS: where a stored image's axes point.

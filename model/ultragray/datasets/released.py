@@ -15,11 +15,11 @@ import numpy as np
 
 from ultragray.datasets.images import grey_frames
 from ultragray.errors import CheckpointInvalid, DatasetInvalid, InvalidArgument, InvalidPose
-from ultragray.exchange.poses import read_pose_array
+from ultragray.exchange.poses import frames_with_pose, read_frame_poses
 from ultragray.exchange.released_config import ReleasedConfig, probe_keys, read_released_config
 from ultragray.files import atomic_path, map_npy, write_whole
 from ultragray.geometry.probe import FloatArray, Probe
-from ultragray.learn.sweep import ByteArray, Dataset, Sweep, check_frame_poses
+from ultragray.learn.sweep import ByteArray, Chain, Dataset, IntArray, Link, Sweep, check_frame_poses, frame_list
 
 CONFIG_NAME = "conf.json"
 
@@ -62,10 +62,18 @@ def require_files_below(config_path: Path, folder: Path) -> None:
 
 def _read_part(config: ReleasedConfig, part: str, probe: Probe) -> Sweep:
     images_path, poses_path = (_file(config, f"{kind}_file_{part}") for kind in ("images", "poses"))
-    images, poses = _read_images(images_path), _read_poses(poses_path)
-    if len(images) != len(poses):
-        raise DatasetInvalid(f"{images_path} holds {len(images)} images, but {poses_path} {len(poses)} poses")
-    return Sweep(images=images, poses=poses, probe=probe, frame_numbers=np.arange(len(images)), source=str(images_path))
+    images, (numbers, poses, count) = _read_images(images_path), _read_poses(poses_path)
+    if len(images) != count:
+        raise DatasetInvalid(f"{images_path} holds {len(images)} images, but {poses_path} {count} poses")
+    return Sweep(
+        images=images if len(numbers) == count else images[numbers],
+        poses=poses,
+        probe=probe,
+        frame_numbers=numbers,
+        source=str(images_path),
+        notes=no_pose_note(numbers, count, poses_path),
+        chain=Chain((Link("Probe", "Tracker", "pose", poses_path.name, is_tracked=True),)),
+    )
 
 
 def _file(config: ReleasedConfig, key: str) -> Path:
@@ -85,16 +93,26 @@ def _read_images(path: Path) -> ByteArray:  # [F, H, W]
     return grey_frames(frames, str(path))
 
 
-def _read_poses(path: Path) -> FloatArray:  # [F, 4, 4]
+def _read_poses(path: Path) -> tuple[IntArray, FloatArray, int]:  # [F], [F, 4, 4]
+    """Numbers of the frames that have a pose, their poses, and the number of all."""
     try:
-        poses = read_pose_array(path)
+        poses = read_frame_poses(path)
     except InvalidPose as error:
         raise DatasetInvalid(error.detail) from error
     if poses.dtype.kind not in "fiu" or poses.ndim != 3 or poses.shape[1:] != (4, 4):
         raise DatasetInvalid(
             f"{path}: poses must be numbers [N, 4, 4] or [N, 3, 4], got {poses.dtype} {list(poses.shape)}"
         )
-    return check_frame_poses(np.array(poses, np.float64), np.arange(len(poses)), str(path))
+    numbers = np.flatnonzero(frames_with_pose(poses := np.array(poses, np.float64)))
+    return numbers, check_frame_poses(poses[numbers], numbers, str(path)), len(poses)
+
+
+def no_pose_note(numbers: IntArray, count: int, path: Path) -> tuple[str, ...]:
+    """What a person is told of the frames without a pose."""
+    missing = sorted(set(range(count)) - set(numbers.tolist()))
+    if not missing:
+        return ()
+    return (f"frames without a pose in {path.name} were left out: {frame_list(missing)} ({len(missing)} in all)",)
 
 
 def write_released(dataset: Dataset, folder: str | Path, *, replace: bool = False) -> None:

@@ -36,6 +36,9 @@ class SourceOptions(Contract):
     val_frames: str | None = described("Frames to hold out, counted likewise.", None)
     frames: str | None = described("Frames of a sequence to read at all, such as 0:90,100:120:2.", None)
     device_set: Path | None = described("PLUS device set (.xml) with the calibration ImageToProbe of a sequence.", None)
+    calibration: Path | None = described(
+        "Calibration of the images, of a TUS-REC scan (.csv) or a table of poses (.json); else it lies beside.", None
+    )
     crop: str | None = described(
         "Region of a sequence's image that shows ultrasound: columns,rows, such as 188:632,12:600 (ends left out).",
         None,
@@ -53,6 +56,11 @@ class SourceOptions(Contract):
     image_size: str | None = described("Resize the frames: WIDTHxHEIGHT, such as 192x256.", None)
     image_topic: str | None = described("Topic of a recording to take images from, where there are several.", None)
     pose_topic: str | None = described("Topic of a recording to take poses from; /tf: from the transforms of tf.", None)
+    image_delay_ms: str | None = described(
+        "By how much images are stamped later than they were taken (negative: earlier): each gets the pose of that "
+        "much before its stamp.",
+        None,
+    )
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -82,6 +90,7 @@ class DatasetFormat:
     files: tuple[str, ...] = ()  # none: built in, never a file
     options: tuple[str, ...] = ()  # fields of SourceOptions that it takes, beside EVERY_FORMAT_TAKES
     beside: tuple[str, ...] = ()  # endings of the files that lie beside such a file, with its stem, and belong to it
+    is_folder: bool = False  # whether the whole folder of such a file belongs to it
     companions: Mapping[str, str] = field(default_factory=dict)  # pattern of the file of an upload that is an option
     upload_check: str | None = None  # "module:function" of (source, folder): raises where it needs files elsewhere
 
@@ -97,7 +106,8 @@ class DatasetFormat:
             train, val = split_parts(found.train, found.val, *wanted)
             return replace(found, train=train, val=val)
         sweep, frame_count = found
-        return Dataset(path.name.split(".")[0], *split_sequence(sweep, frame_count, *wanted))
+        place = path.resolve().parent if self.is_folder and path.is_file() else path
+        return Dataset(place.name.split(".")[0], *split_sequence(sweep, frame_count, *wanted))
 
     def check_upload(self, source: Path, folder: Path) -> None:
         """Raises DatasetInvalid where an upload in this format names files outside of its folder."""
@@ -169,9 +179,13 @@ FORMATS: Mapping[str, DatasetFormat] = {
             name="released",
             noun="folder of the released layout",
             meaning="a folder with conf.json and .npy files (or its conf.json)",
-            is_source=lambda source: Path(source).is_dir() or source.lower().endswith(".json"),
+            is_source=lambda source: (
+                (Path(source).is_dir() and not (Path(source) / "poses.csv").is_file())
+                or source.lower().endswith(".json")
+            ),
             reader="ultragray.datasets.released:read_released",
             files=("conf.json",),
+            is_folder=True,
             upload_check="ultragray.datasets.released:require_files_below",
         ),
         DatasetFormat(
@@ -181,7 +195,7 @@ FORMATS: Mapping[str, DatasetFormat] = {
             is_source=lambda source: source.lower().endswith(PLUS_SUFFIXES),
             reader="ultragray.datasets.plus:read_plus_sweep",
             files=tuple(f"*{suffix}" for suffix in PLUS_SUFFIXES),
-            options=("frames", "device_set", "crop", "fan", "transform"),
+            options=("frames", "device_set", "crop", "fan", "transform", "image_delay_ms"),
             beside=(".raw", ".zraw", ".raw.gz"),
             companions={"device_set": "*.xml"},
         ),
@@ -192,7 +206,7 @@ FORMATS: Mapping[str, DatasetFormat] = {
             is_source=lambda source: source.lower().endswith(".dcm"),
             reader="ultragray.datasets.dicom:read_dicom_sweep",
             files=("*.dcm",),
-            options=("frames", "crop", "fan"),
+            options=("frames", "crop", "fan", "image_delay_ms"),
             beside=(".poses.npy", ".poses.json"),
         ),
         DatasetFormat(
@@ -203,8 +217,28 @@ FORMATS: Mapping[str, DatasetFormat] = {
             is_source=lambda source: source.lower().endswith(".mcap"),
             reader="ultragray.datasets.mcap:read_mcap_sweep",
             files=("*.mcap",),
-            options=("frames", "crop", "transform", "image_topic", "pose_topic"),
+            options=("frames", "crop", "transform", "image_topic", "pose_topic", "image_delay_ms"),
             beside=(".geometry.json",),
+        ),
+        DatasetFormat(
+            name="table",
+            noun="pose table",
+            meaning="a folder of pictures with their poses.csv and calibration.json (or its poses.csv)",
+            is_source=lambda source: source.lower().endswith(".csv") or (Path(source) / "poses.csv").is_file(),
+            reader="ultragray.datasets.table:read_table_sweep",
+            files=("poses.csv",),
+            options=("frames", "crop", "fan", "calibration", "image_delay_ms"),
+            is_folder=True,
+        ),
+        DatasetFormat(
+            name="tusrec",
+            noun="TUS-REC scan",
+            meaning="a scan of TUS-REC (.h5) with its calibration (calib_matrix.csv, beside it or above)",
+            is_source=lambda source: source.lower().endswith(".h5"),
+            reader="ultragray.datasets.tusrec:read_tusrec_sweep",
+            files=("*.h5",),
+            options=("frames", "crop", "fan", "calibration"),
+            companions={"calibration": "*.csv"},
         ),
         DatasetFormat(  # the last: a word, no file
             name=PHANTOM,
@@ -217,9 +251,8 @@ FORMATS: Mapping[str, DatasetFormat] = {
     )
 }
 UPLOADED_FORMATS = tuple(one for one in FORMATS.values() if one.files)
+COMPANIONS = tuple(dict.fromkeys(option for one in UPLOADED_FORMATS for option in one.companions))
 # What an upload may be given in words; the other options are files of it.
 UPLOAD_OPTIONS = {
-    item.name: str(item.metadata["description"])
-    for item in fields(SourceOptions)
-    if not any(item.name in one.companions for one in FORMATS.values())
+    item.name: str(item.metadata["description"]) for item in fields(SourceOptions) if item.name not in COMPANIONS
 }

@@ -43,13 +43,29 @@ def read_pose_array(path: str | Path) -> npt.NDArray[Any]:
     """
     path = Path(path)
     try:
-        array = np.asarray(_read(path))
-        if array.ndim not in (2, 3) or array.shape[-2:] != (3, 4) or array.dtype.kind not in "fiu":
-            return array
-        last = np.broadcast_to(np.array([0.0, 0.0, 0.0, 1.0]), (*array.shape[:-2], 1, 4))
-        return np.concatenate([array, last], axis=-2)
+        return _with_last_row(_read(path))
     except (OSError, ValueError, EOFError, RecursionError, MemoryError) as error:
         raise InvalidPose(f"{path}: {_reason(error)}", field="poses") from error
+
+
+def read_frame_poses(path: str | Path) -> npt.NDArray[Any]:
+    """As `read_pose_array`, where a frame may have no pose: `null` in JSON, NaN in an array. Those are NaN here."""
+    path = Path(path)
+    if path.suffix != ".json":
+        return read_pose_array(path)
+    try:
+        document = _read(path)
+        shape = next((np.shape(pose) for pose in document if pose is not None), (4, 4))
+        missing = np.full(shape, np.nan).tolist()
+        return _with_last_row([missing if pose is None else pose for pose in document])
+    except (OSError, ValueError, RecursionError, MemoryError) as error:
+        raise InvalidPose(f"{path}: {_reason(error)}", field="poses") from error
+
+
+def frames_with_pose(poses: npt.NDArray[Any]) -> npt.NDArray[np.bool_]:  # [F, 4, 4] -> [F]
+    """Whether each frame has a pose: one of NaN alone is none."""
+    found: npt.NDArray[np.bool_] = ~np.isnan(poses[:, :3]).all(axis=(1, 2))
+    return found
 
 
 def _read(path: Path) -> Any:
@@ -68,6 +84,14 @@ def _read(path: Path) -> Any:
     if path.suffix == ".mcap":
         return read_mcap_poses(path)
     raise ValueError("poses are read from .npy, .json and .mcap files")
+
+
+def _with_last_row(poses: Any) -> npt.NDArray[Any]:
+    array = np.asarray(poses)
+    if array.ndim not in (2, 3) or array.shape[-2:] != (3, 4) or array.dtype.kind not in "fiu":
+        return array
+    last = np.broadcast_to(np.array([0.0, 0.0, 0.0, 1.0]), (*array.shape[:-2], 1, 4))
+    return np.concatenate([array, last], axis=-2)
 
 
 def _reason(error: BaseException) -> str:

@@ -7,6 +7,7 @@ from __future__ import annotations
 import hashlib
 import json
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import TypeAlias
 
@@ -36,6 +37,31 @@ class ImageRegion(Contract):
         "empty where the file has none of that name.",
         (),
     )
+
+
+@dataclass(frozen=True)
+class Link:
+    """A transform on the way from pixels to the frame that the poses are in, as it was used."""
+
+    origin: str
+    target: str
+    transform: str  # its name where it comes from, such as ImageToProbe
+    source: str  # where it comes from
+    is_inverted: bool = False
+    is_tracked: bool = False  # another one in every frame
+
+    def __str__(self) -> str:
+        kind = "tracked" if self.is_tracked else "fixed"
+        inverse = "the inverse of " if self.is_inverted else ""
+        return f"{self.origin} → {self.target}: {inverse}{self.transform} of {self.source}, {kind}"
+
+
+@dataclass(frozen=True)
+class Chain:
+    """All that a recording says about the way from pixels to the frame of the poses."""
+
+    links: tuple[Link, ...] = ()
+    left_out: tuple[str, ...] = ()  # transforms that are no part of it, and where they are from
 
 
 # Sweep and Dataset: tracked B-mode frames, checked once and trusted afterwards.
@@ -81,6 +107,8 @@ class Sweep:
     source: str
     notes: tuple[str, ...] = ()  # what reading it left out or assumed, for a person
     region: ImageRegion | None = None  # of the stored images; None: the images are stored as they are
+    chain: Chain = Chain()
+    times_s: FloatArray | None = None  # [F] of the images, in the order of the frames
 
     def __repr__(self) -> str:
         frames = f"{len(self.images):,} frames of {self.images.shape[1]}x{self.images.shape[2]}"
@@ -126,12 +154,27 @@ class Sweep:
         """The frames at these places (not frame numbers) of this sweep."""
         chosen = np.asarray(places, dtype=np.int64)
         return replace(
-            self, images=self.images[chosen], poses=self.poses[chosen], frame_numbers=self.frame_numbers[chosen]
+            self,
+            images=self.images[chosen],
+            poses=self.poses[chosen],
+            frame_numbers=self.frame_numbers[chosen],
+            times_s=None if self.times_s is None else self.times_s[chosen],
         )
 
     def corners_mm(self) -> FloatArray:  # [F, 4 or 6, 3]
         """Corners of each image plane in the tracker's frame."""
         return self.probe.corners_from(self.poses)
+
+
+def frame_list(numbers: Iterable[int]) -> str:
+    """Frame numbers in words, at most ten of them: `1, 3, 5`; of more than ten those that follow each other as one."""
+    found = [(number, number) for number in map(int, numbers)]
+    if len(found) > 10:
+        for place in range(len(found) - 1, 0, -1):
+            if found[place - 1][1] + 1 == found[place][0]:
+                found[place - 1 : place + 1] = [(found[place - 1][0], found[place][1])]
+    words = [str(a) if a == b else f"{a} to {b}" for a, b in found[:10]]
+    return ", ".join(words) + (", …" if len(found) > 10 else "")
 
 
 def spread_places(count: int, most: int) -> IntArray:

@@ -4,7 +4,7 @@ expected error of B-mode. `ultragray.rendering.outputs` says what they are and w
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -104,12 +104,19 @@ def render_labels(drawing: Drawing, weight_sum: str) -> Tensor:  # [C, H, W] uin
     all.
     """
     scene = drawing.scene
-    found = torch.zeros(drawing.shape, dtype=torch.uint8, device=scene.means.device)
-    heaviest = scene.means.new_zeros(drawing.shape)
     with torch.no_grad():
-        for label, part in scene.prepared("labels", lambda: _parts(scene)):
-            _keep_heavier(found, heaviest, label, drawing.plane_of(part, weight_sum))
+        parts = scene.prepared("labels", lambda: label_parts(scene))
+        weights = ((label, drawing.plane_of(part, weight_sum)) for label, part in parts)
+        found = heaviest_labels(weights, scene.means.new_zeros(drawing.shape))
     drawing.mark_tools(found)
+    return found
+
+
+def heaviest_labels(weights: Iterable[tuple[int, Tensor]], heaviest: Tensor) -> Tensor:  # [C, H, W] each
+    """The label of the largest weight at each pixel, uint8; 0 where none reaches 1/255. `heaviest`: zeros, changed."""
+    found = torch.zeros(heaviest.shape, dtype=torch.uint8, device=heaviest.device)
+    for label, weight in weights:
+        _keep_heavier(found, heaviest, label, weight)
     return found
 
 
@@ -126,7 +133,7 @@ def _keep_heavier(found: Tensor, heaviest: Tensor, label: int, weight: Tensor) -
         np.copyto(most, own, where=more)
 
 
-def _parts(scene: GaussianScene) -> list[tuple[int, GaussianScene]]:
+def label_parts(scene: GaussianScene) -> list[tuple[int, GaussianScene]]:
     """The Gaussians of each label that occurs, as scenes of their own; their intensities do not matter."""
     if scene.labels is None:
         return []

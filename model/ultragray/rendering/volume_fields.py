@@ -1,6 +1,7 @@
 """The fields of a scene on the grids of volumes and slices (`ultragray.rendering.volumes`), and files of them.
 
-Fields are sums over Gaussians as `reference` has them, without a probe: nothing is rendered on the way.
+Fields are sums over Gaussians as `reference` has them, without a probe: a layer of voxels is a plane through the scene,
+on which the CPU's kernel sums as it does for frames, but every Gaussian, wherever its mean lies, and nothing absorbs.
 """
 
 from __future__ import annotations
@@ -8,57 +9,30 @@ from __future__ import annotations
 import gzip
 import math
 import struct
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import ExitStack
-from dataclasses import dataclass
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 import torch
+from torch import Tensor
 
 from ultragray.errors import InvalidArgument
 from ultragray.files import atomic_path, npy_bytes, write_whole
-from ultragray.geometry.probe import FloatArray
-from ultragray.rendering.backends.reference import MAX_WEIGHT, MIN_WEIGHT, intensity, inverse_root_covariance
-from ultragray.rendering.derived import MIN_WEIGHT_SUM
+from ultragray.rendering.backends import cpu
+from ultragray.rendering.derived import heaviest_labels, label_parts
 from ultragray.rendering.limits import UNLIMITED, Limits
 from ultragray.rendering.pixels import image_file
 from ultragray.rendering.volumes import SLICE_SUFFIXES, VOLUME_SUFFIXES, VolumeGrid, check_field
 from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.info import SceneInfo
 
-POINTS_AT_ONCE = 1 << 21  # voxels of a slab, and pairs of voxel and Gaussian: some 250 MB
-_RADIUS = math.sqrt(-2.0 * math.log(MIN_WEIGHT))
-
-IndexArray = npt.NDArray[np.int64]
-
-
-@dataclass(frozen=True)
-class _Ellipsoids:
-    """The Gaussians of a scene in steps of a grid."""
-
-    means: FloatArray  # [N, 3] voxels
-    roots: FloatArray  # [N, 3, 3]: |L·(index − mean)|² is m²
-    reach: FloatArray  # [N, 3] voxels from the mean at which w falls below 1/255, along each axis
-    intensities: FloatArray  # [N]
-    absorbed: FloatArray  # [N] 1 − τ, per mm
-    labels: IndexArray  # [N]
-
-    @classmethod
-    def of(cls, scene: GaussianScene, grid: VolumeGrid) -> _Ellipsoids:
-        with torch.no_grad():
-            exact = scene.to("cpu").to(torch.float64)
-            steps = torch.from_numpy(np.ascontiguousarray(grid.axes.T * grid.spacing_mm / 10.0))  # cm a voxel
-            roots = inverse_root_covariance(exact, steps).numpy()
-            intensities = intensity(exact, exact.means).numpy()  # seen from its own mean: no direction
-            absorbed = torch.sigmoid(-exact.transmittances).numpy() / 10.0
-            means_mm = exact.means.numpy() * 10.0 + np.asarray(scene.info.centre_mm)
-        labels = np.zeros(len(means_mm), np.int64) if exact.labels is None else exact.labels.numpy().astype(np.int64)
-        means = (means_mm - grid.origin_mm) @ grid.axes.T / grid.spacing_mm
-        reach = _RADIUS * np.linalg.norm(np.linalg.inv(roots), axis=2)
-        return cls(means, roots, reach, intensities, absorbed, labels)
+VOXELS_AT_ONCE = 1 << 22  # of a slab: some 50 MB
+_CERTAIN = 40.0  # the logit of a weight of 1
+_SH_C0 = 0.5 / math.sqrt(math.pi)  # the harmonic of degree 0
 
 
 def sample_volume(
@@ -67,8 +41,8 @@ def sample_volume(
     """A field in slabs [k, J, I] that follow each other along the grid's last axis: float32, labels uint8.
 
     What is held at once does not grow with the grid. Raises InvalidArgument for a field that is none of VOLUME_FIELDS,
-    and for labels of a scene that has none; while they are sampled FrameTooCostly and GivenUp by `limits`, whose
-    footprint pixels are those of the boxes around Gaussians.
+    and for labels of a scene that has none; while they are sampled FrameTooCostly and GivenUp by `limits`, as a frame
+    of such a size would.
     """
     check_field(field, has_labels=scene.labels is not None)
     return _slabs(scene, field, grid, limits)
@@ -82,85 +56,53 @@ def sample_slice(
 
 
 def _slabs(scene: GaussianScene, field: str, grid: VolumeGrid, limits: Limits) -> Iterator[npt.NDArray[np.generic]]:
-    ellipsoids = _Ellipsoids.of(scene, grid)
+    parts = scene.prepared(f"volumes of {field}", lambda: _parts(scene, field))
     columns, rows, depth = grid.shape
-    thickness = max(1, POINTS_AT_ONCE // (columns * rows))
-    for first in range(0, depth, thickness):
-        slab = _Slab(ellipsoids, (columns, rows, min(thickness, depth - first)), first, limits)
-        limits.check_costs([slab.footprint])
-        yield slab.values(field).reshape(slab.shape[::-1])
+    at_once = max(1, VOXELS_AT_ONCE // (columns * rows))
+    corner = np.eye(4)
+    corner[:3, :3] = np.stack([grid.axes[0], -grid.axes[2], grid.axes[1]], axis=1)
+    corner[:3, 3] = grid.origin_mm - grid.spacing_mm / 2.0 * (grid.axes[0] + grid.axes[1])
+    for first in range(0, depth, at_once):
+        poses = np.tile(corner, (min(at_once, depth - first), 1, 1))
+        poses[:, :3, 3] += (first + np.arange(len(poses)))[:, None] * grid.spacing_mm * grid.axes[2]
+        sums = (
+            (label, cpu.plane_sums(part, part.poses_to_scene_cm(poses), rows, columns, grid.spacing_mm / 10.0, limits))
+            for label, part in parts
+        )
+        yield _values(field, sums, (len(poses), rows, columns))
 
 
-class _Slab:
-    """The voxels of a grid from one number of its last axis on."""
+def _values(
+    field: str, sums: Iterable[tuple[int, tuple[Tensor, Tensor]]], shape: tuple[int, int, int]
+) -> npt.NDArray[np.generic]:  # [k, J, I]
+    """A field from Σ w and Σ I·w of each part of the scene."""
+    if field == "labels":
+        return heaviest_labels(((label, weight) for label, (weight, _) in sums), torch.zeros(shape)).numpy()
+    ((_, (weight, weighted)),) = sums
+    if field == "attenuation":
+        return weighted.mul_(0.1).numpy()
+    coverage = torch.expm1(-weight).neg_()
+    return (coverage if field == "coverage" else coverage.mul_(weighted).div_(weight + 1e-8)).numpy()
 
-    def __init__(self, ellipsoids: _Ellipsoids, shape: tuple[int, int, int], first: int, limits: Limits) -> None:
-        self.ellipsoids, self.shape, self._limits = ellipsoids, shape, limits
-        self._offset = np.array([0, 0, first])
-        means = ellipsoids.means - self._offset
-        self._low = np.maximum(np.ceil(means - ellipsoids.reach), 0).astype(np.int64)
-        self._high = np.minimum(np.floor(means + ellipsoids.reach), np.array(shape) - 1).astype(np.int64)
-        self._touching = np.flatnonzero((self._high >= self._low).all(axis=1))
 
-    @property
-    def footprint(self) -> int:
-        return int(self._box_voxels(self._touching).sum())
+def _parts(scene: GaussianScene, field: str) -> list[tuple[int, GaussianScene]]:
+    """Scenes for the kernel of sums, whose Gaussians have a weight of 1 and as intensity what is to be summed: their
+    own as seen from their own means, which is from no direction, or 1 − τ, per cm. For labels one scene each."""
+    if field == "labels":
+        return [(label, _weighing_one(part)) for label, part in label_parts(scene)]
+    weighing = _weighing_one(scene)
+    if field != "attenuation":
+        return [(0, weighing)]
+    constant = (scene.transmittances.detach().to("cpu", torch.float32) / (-4.0 * _SH_C0)).reshape(-1, 1, 1)
+    info = replace(weighing.info, intensity="sigmoid")
+    return [(0, GaussianScene(**{**weighing.splats, "sh0": constant}, info=info))]
 
-    def _box_voxels(self, ids: IndexArray) -> IndexArray:
-        return (self._high[ids] - self._low[ids] + 1).prod(axis=1)
 
-    def values(self, field: str) -> npt.NDArray[np.generic]:  # [voxels]
-        ellipsoids = self.ellipsoids
-        if field == "attenuation":
-            return self._sums(self._touching, ellipsoids.absorbed)[0].astype(np.float32)
-        if field == "labels":
-            return self._labels()
-        if field == "coverage":
-            return -np.expm1(-self._sums(self._touching, None)[0]).astype(np.float32)
-        weight, weighted = self._sums(self._touching, None, ellipsoids.intensities)
-        return (-np.expm1(-weight) * weighted / (weight + 1e-8)).astype(np.float32)
-
-    def _labels(self) -> npt.NDArray[np.uint8]:
-        found, heaviest = np.zeros(math.prod(self.shape), np.uint8), np.zeros(math.prod(self.shape))
-        labels = self.ellipsoids.labels[self._touching]
-        for label in np.unique(labels):
-            (weight,) = self._sums(self._touching[labels == label], None)
-            heavier = (weight > heaviest) & (weight >= MIN_WEIGHT_SUM)
-            found[heavier], heaviest[heavier] = label, weight[heavier]
-        return found
-
-    def _sums(self, chosen: IndexArray, *wanted: FloatArray | None) -> list[FloatArray]:  # [n], [N]s -> [voxels]s
-        """Σ factor·w of the chosen Gaussians at each voxel, for each of the wanted factors; for None Σ w."""
-        totals = [np.zeros(math.prod(self.shape)) for _ in wanted]
-        counts = self._box_voxels(chosen)
-        ends = np.cumsum(counts)
-        start = 0
-        while start < len(chosen):
-            self._limits.check_flag()
-            before = ends[start - 1] if start else 0
-            stop = max(start + 1, int(np.searchsorted(ends, before + POINTS_AT_ONCE, side="right")))
-            ids = chosen[start:stop]
-            owner, voxels, weight = self._weights(ids, counts[start:stop])
-            for total, factors in zip(totals, wanted, strict=True):
-                term = weight if factors is None else weight * factors[ids][owner]
-                total += np.bincount(voxels, term, minlength=len(total))
-            start = stop
-        return totals
-
-    def _weights(self, ids: IndexArray, counts: IndexArray) -> tuple[IndexArray, IndexArray, FloatArray]:
-        """Each pair of a Gaussian and a voxel of its box: the place in `ids`, the voxel's number, and w."""
-        owner = np.repeat(np.arange(len(ids)), counts)
-        number = np.arange(len(owner)) - np.repeat(np.cumsum(counts) - counts, counts)
-        low, sides = self._low[ids], self._high[ids] - self._low[ids] + 1
-        width, height = sides[owner, 0], sides[owner, 1]
-        index = np.stack([number % width, number // width % height, number // (width * height)], axis=1) + low[owner]
-        offset = index + self._offset - self.ellipsoids.means[ids][owner]
-        across = np.einsum("pij,pj->pi", self.ellipsoids.roots[ids][owner], offset)
-        weight = np.minimum(np.exp(-0.5 * (across * across).sum(axis=1)), MAX_WEIGHT)
-        counted = weight >= MIN_WEIGHT
-        columns, rows, _ = self.shape
-        voxels = (index[:, 2] * rows + index[:, 1]) * columns + index[:, 0]
-        return owner[counted], voxels[counted], weight[counted]
+def _weighing_one(scene: GaussianScene) -> GaussianScene:
+    splats = {name: tensor.detach().to("cpu", torch.float32) for name, tensor in scene.splats.items()}
+    certain = torch.full_like(splats["transmittances"], _CERTAIN)
+    tensors: dict[str, Any] = {**splats, "transmittances": certain, "shN": splats["shN"][:, :0]}
+    return GaussianScene(**tensors, info=replace(scene.info, sh_degree=0))
 
 
 # Slices as pictures; volumes as NIfTI-1 (.nii, .nii.gz) and NRRD (.nrrd), written slab by slab.

@@ -25,7 +25,7 @@ _sym_db = _symbol_database.Default()
 from ultragray_proto.v1 import geometry_pb2 as ultragray_dot_v1_dot_geometry__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1bultragray/v1/datasets.proto\x12\x0cultragray.v1\x1a\x1bultragray/v1/geometry.proto\"m\n\x14UploadDatasetRequest\x12,\n\x06header\x18\x01 \x01(\x0b\x32\x1a.ultragray.v1.UploadHeaderH\x00\x12\x0e\n\x04\x66ile\x18\x02 \x01(\tH\x00\x12\x0f\n\x05\x63hunk\x18\x03 \x01(\x0cH\x00\x42\x06\n\x04part\"p\n\x0cUploadHeader\x12\x0f\n\x07\x64\x61taset\x18\x01 \x01(\t\x12-\n\x07options\x18\x02 \x01(\x0b\x32\x1c.ultragray.v1.DatasetOptions\x12\x0f\n\x07\x61rchive\x18\x03 \x01(\x08\x12\x0f\n\x07private\x18\x04 \x01(\x08\"\xb5\x01\n\x0e\x44\x61tasetOptions\x12\x0c\n\x04\x63rop\x18\x01 \x01(\t\x12\x12\n\nimage_size\x18\x02 \x01(\t\x12\x0e\n\x06\x66rames\x18\x03 \x01(\t\x12\x14\n\x0ctrain_frames\x18\x04 \x01(\t\x12\x12\n\nval_frames\x18\x05 \x01(\t\x12\x0b\n\x03\x66\x61n\x18\x06 \x01(\t\x12\x11\n\ttransform\x18\x07 \x01(\t\x12\x13\n\x0bimage_topic\x18\x08 \x01(\t\x12\x12\n\npose_topic\x18\t \x01(\t\"P\n\x15UploadDatasetResponse\x12&\n\x07\x64\x61taset\x18\x01 \x01(\x0b\x32\x15.ultragray.v1.Dataset\x12\x0f\n\x07\x63reated\x18\x02 \x01(\x08\"\xd1\x02\n\x07\x44\x61taset\x12\x0c\n\x04kind\x18\x02 \x01(\t\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06sha256\x18\x03 \x01(\t\x12\r\n\x05\x62ytes\x18\x04 \x01(\x03\x12\x12\n\ncreated_at\x18\x05 \x01(\t\x12\x14\n\x0ctrain_frames\x18\x06 \x01(\x05\x12\x12\n\nval_frames\x18\x07 \x01(\x05\x12\x0e\n\x06height\x18\x08 \x01(\x05\x12\r\n\x05width\x18\t \x01(\x05\x12\"\n\x05probe\x18\n \x01(\x0b\x32\x13.ultragray.v1.Probe\x12\x10\n\x08warnings\x18\x0b \x03(\t\x12-\n\x07options\x18\x0c \x01(\x0b\x32\x1c.ultragray.v1.DatasetOptions\x12\r\n\x05owner\x18\r \x01(\t\x12\x0f\n\x07private\x18\x0e \x01(\x08\x12)\n\x06region\x18\x0f \x01(\x0b\x32\x19.ultragray.v1.ImageRegion\"\xb0\x01\n\x0bImageRegion\x12\x13\n\x0bimage_width\x18\x01 \x01(\x05\x12\x14\n\x0cimage_height\x18\x02 \x01(\x05\x12\x0c\n\x04left\x18\x03 \x01(\x05\x12\x0b\n\x03top\x18\x04 \x01(\x05\x12\r\n\x05width\x18\x05 \x01(\x05\x12\x0e\n\x06height\x18\x06 \x01(\x05\x12\x12\n\nlateral_mm\x18\x07 \x01(\x01\x12\x10\n\x08\x61xial_mm\x18\x08 \x01(\x01\x12\x16\n\x0eimage_to_probe\x18\t \x03(\x01\"<\n\x13ListDatasetsRequest\x12\x11\n\tpage_size\x18\x01 \x01(\x05\x12\x12\n\npage_token\x18\x02 \x01(\t\"X\n\x14ListDatasetsResponse\x12\'\n\x08\x64\x61tasets\x18\x01 \x03(\x0b\x32\x15.ultragray.v1.Dataset\x12\x17\n\x0fnext_page_token\x18\x02 \x01(\t\"$\n\x11GetDatasetRequest\x12\x0f\n\x07\x64\x61taset\x18\x01 \x01(\t\")\n\x16GetContactSheetRequest\x12\x0f\n\x07\x64\x61taset\x18\x01 \x01(\t\"&\n\x17GetContactSheetResponse\x12\x0b\n\x03png\x18\x01 \x01(\x0c\"\'\n\x14\x44\x65leteDatasetRequest\x12\x0f\n\x07\x64\x61taset\x18\x01 \x01(\t\"(\n\x15\x44\x65leteDatasetResponse\x12\x0f\n\x07\x64\x61taset\x18\x01 \x01(\t2\xc3\x03\n\x0e\x44\x61tasetService\x12Z\n\rUploadDataset\x12\".ultragray.v1.UploadDatasetRequest\x1a#.ultragray.v1.UploadDatasetResponse(\x01\x12U\n\x0cListDatasets\x12!.ultragray.v1.ListDatasetsRequest\x1a\".ultragray.v1.ListDatasetsResponse\x12\x44\n\nGetDataset\x12\x1f.ultragray.v1.GetDatasetRequest\x1a\x15.ultragray.v1.Dataset\x12^\n\x0fGetContactSheet\x12$.ultragray.v1.GetContactSheetRequest\x1a%.ultragray.v1.GetContactSheetResponse\x12X\n\rDeleteDataset\x12\".ultragray.v1.DeleteDatasetRequest\x1a#.ultragray.v1.DeleteDatasetResponseb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x1bultragray/v1/datasets.proto\x12\x0cultragray.v1\x1a\x1bultragray/v1/geometry.proto\"m\n\x14UploadDatasetRequest\x12,\n\x06header\x18\x01 \x01(\x0b\x32\x1a.ultragray.v1.UploadHeaderH\x00\x12\x0e\n\x04\x66ile\x18\x02 \x01(\tH\x00\x12\x0f\n\x05\x63hunk\x18\x03 \x01(\x0cH\x00\x42\x06\n\x04part\"p\n\x0cUploadHeader\x12\x0f\n\x07\x64\x61taset\x18\x01 \x01(\t\x12-\n\x07options\x18\x02 \x01(\x0b\x32\x1c.ultragray.v1.DatasetOptions\x12\x0f\n\x07\x61rchive\x18\x03 \x01(\x08\x12\x0f\n\x07private\x18\x04 \x01(\x08\"\xe5\x01\n\x0e\x44\x61tasetOptions\x12\x0c\n\x04\x63rop\x18\x01 \x01(\t\x12\x12\n\nimage_size\x18\x02 \x01(\t\x12\x0e\n\x06\x66rames\x18\x03 \x01(\t\x12\x14\n\x0ctrain_frames\x18\x04 \x01(\t\x12\x12\n\nval_frames\x18\x05 \x01(\t\x12\x0b\n\x03\x66\x61n\x18\x06 \x01(\t\x12\x11\n\ttransform\x18\x07 \x01(\t\x12\x13\n\x0bimage_topic\x18\x08 \x01(\t\x12\x12\n\npose_topic\x18\t \x01(\t\x12\x1b\n\x0eimage_delay_ms\x18\n \x01(\tH\x00\x88\x01\x01\x42\x11\n\x0f_image_delay_ms\"P\n\x15UploadDatasetResponse\x12&\n\x07\x64\x61taset\x18\x01 \x01(\x0b\x32\x15.ultragray.v1.Dataset\x12\x0f\n\x07\x63reated\x18\x02 \x01(\x08\"\xd1\x02\n\x07\x44\x61taset\x12\x0c\n\x04kind\x18\x02 \x01(\t\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06sha256\x18\x03 \x01(\t\x12\r\n\x05\x62ytes\x18\x04 \x01(\x03\x12\x12\n\ncreated_at\x18\x05 \x01(\t\x12\x14\n\x0ctrain_frames\x18\x06 \x01(\x05\x12\x12\n\nval_frames\x18\x07 \x01(\x05\x12\x0e\n\x06height\x18\x08 \x01(\x05\x12\r\n\x05width\x18\t \x01(\x05\x12\"\n\x05probe\x18\n \x01(\x0b\x32\x13.ultragray.v1.Probe\x12\x10\n\x08warnings\x18\x0b \x03(\t\x12-\n\x07options\x18\x0c \x01(\x0b\x32\x1c.ultragray.v1.DatasetOptions\x12\r\n\x05owner\x18\r \x01(\t\x12\x0f\n\x07private\x18\x0e \x01(\x08\x12)\n\x06region\x18\x0f \x01(\x0b\x32\x19.ultragray.v1.ImageRegion\"\xb0\x01\n\x0bImageRegion\x12\x13\n\x0bimage_width\x18\x01 \x01(\x05\x12\x14\n\x0cimage_height\x18\x02 \x01(\x05\x12\x0c\n\x04left\x18\x03 \x01(\x05\x12\x0b\n\x03top\x18\x04 \x01(\x05\x12\r\n\x05width\x18\x05 \x01(\x05\x12\x0e\n\x06height\x18\x06 \x01(\x05\x12\x12\n\nlateral_mm\x18\x07 \x01(\x01\x12\x10\n\x08\x61xial_mm\x18\x08 \x01(\x01\x12\x16\n\x0eimage_to_probe\x18\t \x03(\x01\"<\n\x13ListDatasetsRequest\x12\x11\n\tpage_size\x18\x01 \x01(\x05\x12\x12\n\npage_token\x18\x02 \x01(\t\"X\n\x14ListDatasetsResponse\x12\'\n\x08\x64\x61tasets\x18\x01 \x03(\x0b\x32\x15.ultragray.v1.Dataset\x12\x17\n\x0fnext_page_token\x18\x02 \x01(\t\"$\n\x11GetDatasetRequest\x12\x0f\n\x07\x64\x61taset\x18\x01 \x01(\t\")\n\x16GetContactSheetRequest\x12\x0f\n\x07\x64\x61taset\x18\x01 \x01(\t\"&\n\x17GetContactSheetResponse\x12\x0b\n\x03png\x18\x01 \x01(\x0c\"\'\n\x14\x44\x65leteDatasetRequest\x12\x0f\n\x07\x64\x61taset\x18\x01 \x01(\t\"(\n\x15\x44\x65leteDatasetResponse\x12\x0f\n\x07\x64\x61taset\x18\x01 \x01(\t2\xc3\x03\n\x0e\x44\x61tasetService\x12Z\n\rUploadDataset\x12\".ultragray.v1.UploadDatasetRequest\x1a#.ultragray.v1.UploadDatasetResponse(\x01\x12U\n\x0cListDatasets\x12!.ultragray.v1.ListDatasetsRequest\x1a\".ultragray.v1.ListDatasetsResponse\x12\x44\n\nGetDataset\x12\x1f.ultragray.v1.GetDatasetRequest\x1a\x15.ultragray.v1.Dataset\x12^\n\x0fGetContactSheet\x12$.ultragray.v1.GetContactSheetRequest\x1a%.ultragray.v1.GetContactSheetResponse\x12X\n\rDeleteDataset\x12\".ultragray.v1.DeleteDatasetRequest\x1a#.ultragray.v1.DeleteDatasetResponseb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -37,27 +37,27 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_UPLOADHEADER']._serialized_start=185
   _globals['_UPLOADHEADER']._serialized_end=297
   _globals['_DATASETOPTIONS']._serialized_start=300
-  _globals['_DATASETOPTIONS']._serialized_end=481
-  _globals['_UPLOADDATASETRESPONSE']._serialized_start=483
-  _globals['_UPLOADDATASETRESPONSE']._serialized_end=563
-  _globals['_DATASET']._serialized_start=566
-  _globals['_DATASET']._serialized_end=903
-  _globals['_IMAGEREGION']._serialized_start=906
-  _globals['_IMAGEREGION']._serialized_end=1082
-  _globals['_LISTDATASETSREQUEST']._serialized_start=1084
-  _globals['_LISTDATASETSREQUEST']._serialized_end=1144
-  _globals['_LISTDATASETSRESPONSE']._serialized_start=1146
-  _globals['_LISTDATASETSRESPONSE']._serialized_end=1234
-  _globals['_GETDATASETREQUEST']._serialized_start=1236
-  _globals['_GETDATASETREQUEST']._serialized_end=1272
-  _globals['_GETCONTACTSHEETREQUEST']._serialized_start=1274
-  _globals['_GETCONTACTSHEETREQUEST']._serialized_end=1315
-  _globals['_GETCONTACTSHEETRESPONSE']._serialized_start=1317
-  _globals['_GETCONTACTSHEETRESPONSE']._serialized_end=1355
-  _globals['_DELETEDATASETREQUEST']._serialized_start=1357
-  _globals['_DELETEDATASETREQUEST']._serialized_end=1396
-  _globals['_DELETEDATASETRESPONSE']._serialized_start=1398
-  _globals['_DELETEDATASETRESPONSE']._serialized_end=1438
-  _globals['_DATASETSERVICE']._serialized_start=1441
-  _globals['_DATASETSERVICE']._serialized_end=1892
+  _globals['_DATASETOPTIONS']._serialized_end=529
+  _globals['_UPLOADDATASETRESPONSE']._serialized_start=531
+  _globals['_UPLOADDATASETRESPONSE']._serialized_end=611
+  _globals['_DATASET']._serialized_start=614
+  _globals['_DATASET']._serialized_end=951
+  _globals['_IMAGEREGION']._serialized_start=954
+  _globals['_IMAGEREGION']._serialized_end=1130
+  _globals['_LISTDATASETSREQUEST']._serialized_start=1132
+  _globals['_LISTDATASETSREQUEST']._serialized_end=1192
+  _globals['_LISTDATASETSRESPONSE']._serialized_start=1194
+  _globals['_LISTDATASETSRESPONSE']._serialized_end=1282
+  _globals['_GETDATASETREQUEST']._serialized_start=1284
+  _globals['_GETDATASETREQUEST']._serialized_end=1320
+  _globals['_GETCONTACTSHEETREQUEST']._serialized_start=1322
+  _globals['_GETCONTACTSHEETREQUEST']._serialized_end=1363
+  _globals['_GETCONTACTSHEETRESPONSE']._serialized_start=1365
+  _globals['_GETCONTACTSHEETRESPONSE']._serialized_end=1403
+  _globals['_DELETEDATASETREQUEST']._serialized_start=1405
+  _globals['_DELETEDATASETREQUEST']._serialized_end=1444
+  _globals['_DELETEDATASETRESPONSE']._serialized_start=1446
+  _globals['_DELETEDATASETRESPONSE']._serialized_end=1486
+  _globals['_DATASETSERVICE']._serialized_start=1489
+  _globals['_DATASETSERVICE']._serialized_end=1940
 # @@protoc_insertion_point(module_scope)

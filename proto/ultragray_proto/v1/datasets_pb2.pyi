@@ -30,7 +30,7 @@ class UploadHeader(_message.Message):
     def __init__(self, dataset: _Optional[str] = ..., options: _Optional[_Union[DatasetOptions, _Mapping]] = ..., archive: _Optional[bool] = ..., private: _Optional[bool] = ...) -> None: ...
 
 class DatasetOptions(_message.Message):
-    __slots__ = ("crop", "image_size", "frames", "train_frames", "val_frames", "fan", "transform", "image_topic", "pose_topic")
+    __slots__ = ("crop", "image_size", "frames", "train_frames", "val_frames", "fan", "transform", "image_topic", "pose_topic", "image_delay_ms")
     CROP_FIELD_NUMBER: _ClassVar[int]
     IMAGE_SIZE_FIELD_NUMBER: _ClassVar[int]
     FRAMES_FIELD_NUMBER: _ClassVar[int]
@@ -40,6 +40,7 @@ class DatasetOptions(_message.Message):
     TRANSFORM_FIELD_NUMBER: _ClassVar[int]
     IMAGE_TOPIC_FIELD_NUMBER: _ClassVar[int]
     POSE_TOPIC_FIELD_NUMBER: _ClassVar[int]
+    IMAGE_DELAY_MS_FIELD_NUMBER: _ClassVar[int]
     crop: str
     image_size: str
     frames: str
@@ -49,7 +50,8 @@ class DatasetOptions(_message.Message):
     transform: str
     image_topic: str
     pose_topic: str
-    def __init__(self, crop: _Optional[str] = ..., image_size: _Optional[str] = ..., frames: _Optional[str] = ..., train_frames: _Optional[str] = ..., val_frames: _Optional[str] = ..., fan: _Optional[str] = ..., transform: _Optional[str] = ..., image_topic: _Optional[str] = ..., pose_topic: _Optional[str] = ...) -> None: ...
+    image_delay_ms: str
+    def __init__(self, crop: _Optional[str] = ..., image_size: _Optional[str] = ..., frames: _Optional[str] = ..., train_frames: _Optional[str] = ..., val_frames: _Optional[str] = ..., fan: _Optional[str] = ..., transform: _Optional[str] = ..., image_topic: _Optional[str] = ..., pose_topic: _Optional[str] = ..., image_delay_ms: _Optional[str] = ...) -> None: ...
 
 class UploadDatasetResponse(_message.Message):
     __slots__ = ("dataset", "created")

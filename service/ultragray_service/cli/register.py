@@ -28,6 +28,7 @@ from ultragray_service.cli.terminal import (
     output_option,
     single,
     tell,
+    warn,
     working,
 )
 
@@ -130,14 +131,17 @@ def points(
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """From three or more points that are known in both frames, not on a line."""
+    """From three or more points that are known in both frames, not on a line. Exit status 1: they contradict each
+    other."""
     check_file(output, SUFFIXES, force=force)
     mounting = _mounting(probe_to_flange)
     import numpy as np
 
+    from ultragray.geometry.contradictions import point_contradiction
     from ultragray.geometry.registration import Registration, register_points, rows
 
-    fit = register_points(_read_points(in_base), _read_points(in_scene))
+    known = _read_points(in_base), _read_points(in_scene)
+    fit = register_points(*known)
     registration = Registration(
         base_to_scene=rows(fit.transform),
         probe_to_flange=rows(np.eye(4) if mounting is None else mounting),
@@ -145,7 +149,8 @@ def points(
         position_std_mm=fit.position_std_mm,
         angle_std_deg=fit.angle_std_deg,
     )
-    _write(output, registration, "points", fit.residuals_mm.tolist(), [], as_json=json)
+    doubt = point_contradiction(fit, *known)
+    _write(output, registration, "points", fit.residuals_mm.tolist(), [], doubt=doubt, as_json=json)
 
 
 @calibrate_app.command(
@@ -165,13 +170,17 @@ def poses(
     force: Force = False,
     json: Json = False,
 ) -> None:
-    """From poses of the flange and where the probe was in the scene: registration, and hand–eye calibration."""
+    """From poses of the flange and where the probe was in the scene: registration, and hand–eye calibration.
+
+    Exit status 1: they contradict each other; the worst sample and the likely cause are named.
+    """
     check_file(output, SUFFIXES, force=force)
     if find_mounting and probe_to_flange is not None:
         raise InvalidArgument(
             "--find-mounting finds what --probe-to-flange gives: name one of them", field="find_mounting"
         )
     in_base, in_scene, mounting = load_poses(flange), load_poses(probe), _mounting(probe_to_flange)
+    from ultragray.geometry.contradictions import pose_contradiction
     from ultragray.geometry.registration import register_poses, register_poses_and_mounting
 
     if find_mounting:
@@ -179,7 +188,8 @@ def poses(
     else:
         fit = register_poses(in_base, in_scene, mounting)
     residuals = fit.residuals_mm.tolist(), fit.residuals_deg.tolist()
-    _write(output, _registration(fit), "poses", *residuals, as_json=json)
+    doubt = pose_contradiction(fit, in_base, in_scene, is_mounting_given=not find_mounting)
+    _write(output, _registration(fit), "poses", *residuals, doubt=doubt, as_json=json)
 
 
 @calibrate_app.command(
@@ -280,6 +290,7 @@ def _write(
     residuals_deg: list[float],
     left_out: list[int] | None = None,
     *,
+    doubt: str | None = None,
     as_json: bool,
 ) -> None:
     from ultragray.contract import to_dict
@@ -287,6 +298,7 @@ def _write(
 
     save_registration(path, registration)
     document = to_dict(registration) | {"residuals_mm": residuals_mm, "residuals_deg": residuals_deg}
+    document["warnings"] = [] if doubt is None else [doubt]
     if left_out is not None:
         document["left_out"] = left_out
     sentences = [
@@ -302,6 +314,9 @@ def _write(
     if left_out:
         sentences.append(f"left out, as they were not found or do not fit the others: {', '.join(map(str, left_out))}")
     tell("\n".join(sentences), document, as_json=as_json)
+    if doubt is not None:
+        warn(f"{doubt}: {path} is not to be trusted")
+        raise typer.Exit(1)
 
 
 def _range(values: list[float]) -> str:

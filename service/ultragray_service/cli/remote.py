@@ -6,7 +6,7 @@ import contextlib
 import json
 import tempfile
 import zipfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from http.client import HTTPMessage
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,7 +15,7 @@ from urllib.parse import urlencode
 import numpy as np
 
 from ultragray.contract import from_dict, to_dict
-from ultragray.datasets.source import UPLOAD_OPTIONS, UPLOADED_FORMATS, SourceOptions
+from ultragray.datasets.source import COMPANIONS, UPLOAD_OPTIONS, UPLOADED_FORMATS, SourceOptions
 from ultragray.errors import DatasetInvalid, InvalidArgument
 from ultragray.exchange.poses import load_poses
 from ultragray.files import write_whole
@@ -304,7 +304,8 @@ def upload_dataset(
     called = _name_of(sweep) if name is None else name
     options = {key: str(value) for key in UPLOAD_OPTIONS if (value := getattr(source, key)) is not None}
     query = urlencode({**options, **({"private": "true"} if private else {})})
-    with archive_of(sweep, source.device_set) as archive, transferred(f"uploading {called}") as begin:
+    companions = {name: path for name in COMPANIONS if (path := getattr(source, name)) is not None}
+    with archive_of(sweep, companions) as archive, transferred(f"uploading {called}") as begin:
         to = route("datasets", called, suffix=f"?{query}" if query else "")
         record, is_new = connection.upload(to, archive, begin(archive.stat().st_size))
     for text in record["warnings"]:
@@ -319,32 +320,32 @@ _datasets.add_delete("Delete a dataset that no job needs.")
 
 def _name_of(sweep: Path) -> str:
     found = sweep.resolve()
-    name = (found.parent if found.name == "conf.json" else found).name.split(".")[0]
+    name = (found.parent if _is_of_a_folder(found) else found).name.split(".")[0]
     if not name:
         raise InvalidArgument(f"--name must be given: {sweep} has none", field="name")
     return name
 
 
 @contextlib.contextmanager
-def archive_of(source: Path, device_set: Path | None = None) -> Iterator[Path]:
+def archive_of(source: Path, companions: Mapping[str, Path] | None = None) -> Iterator[Path]:
     """An archive of what a source is: itself, or a zip of the folder or of the sequence with the files that it needs.
 
-    `device_set` goes into the archive too. Raises DatasetInvalid where there is no such source or it is none, and
-    InvalidArgument for a device set beside an archive.
+    Files that are options go into the archive too. Raises DatasetInvalid where there is no such source or it is none,
+    and InvalidArgument for such files beside an archive.
     """
     if source.name.lower().endswith(ARCHIVE_SUFFIXES) and source.is_file():
-        if device_set is not None:
-            raise InvalidArgument(f"--device-set must be in the archive {source}", field="device_set")
+        for name in companions or ():
+            raise InvalidArgument(f"--{name.replace('_', '-')} must be in the archive {source}", field=name)
         yield source
         return
-    files = _files_of(source) + ([] if device_set is None else [device_set])
+    files = [*_files_of(source), *(companions or {}).values()]
     with tempfile.TemporaryDirectory(prefix="ultragray-upload-") as folder:
         archive = Path(folder, "upload.zip")
         with zipfile.ZipFile(archive, "w", zipfile.ZIP_DEFLATED, compresslevel=1, strict_timestamps=False) as made:
             for path in files:
                 below = source if source.is_dir() else source.parent
-                name = path.relative_to(below) if path.is_relative_to(below) else Path(path.name)
-                made.write(path, name.as_posix())
+                inner = path.relative_to(below) if path.is_relative_to(below) else Path(path.name)
+                made.write(path, inner.as_posix())
         yield archive
 
 
@@ -357,7 +358,7 @@ def _files_of(source: Path) -> list[Path]:
         return files
     if not source.is_file():
         raise DatasetInvalid(f"{source}: no such file or folder")
-    if source.name == "conf.json":
+    if _is_of_a_folder(source):
         return _files_of(source.parent)
     format = next((one for one in UPLOADED_FORMATS if one.is_file(source)), None)
     if format is None:
@@ -366,6 +367,10 @@ def _files_of(source: Path) -> list[Path]:
     stems = {source.stem, source.name.split(".")[0]}  # of sweep.igs.mhd: sweep.igs and sweep
     beside = (source.with_name(f"{stem}{ending}") for stem in stems for ending in format.beside)
     return [source, *sorted(path for path in beside if path.is_file())]
+
+
+def _is_of_a_folder(source: Path) -> bool:
+    return any(one.is_folder and one.is_file(source) for one in UPLOADED_FORMATS)
 
 
 def _is_hidden(path: Path, folder: Path) -> bool:

@@ -57,7 +57,7 @@ def read_dataset(source: str, options: SourceOptions) -> Dataset:
 def warn_about_dataset(dataset: Dataset) -> None:
     from ultragray.datasets.checks import check_dataset
 
-    for text in check_dataset(dataset).labelled_warnings:
+    for text in check_dataset(dataset).warnings:
         warn(text)
 
 
@@ -113,10 +113,13 @@ def _print_report(report: DatasetReport) -> None:
             f"mm and up to {report.val_angle_max_deg:.2f}° from the nearest training frame",
             soft_wrap=True,
         )
-    warnings = report.labelled_warnings
-    for warning in warnings:
+    for link in report.chain.links:
+        console.print(escape(str(link)), soft_wrap=True, highlight=False)
+    if report.chain.left_out:
+        console.print(f"no part of it: {escape(', '.join(report.chain.left_out))}", soft_wrap=True, highlight=False)
+    for warning in report.warnings:
         console.print(f"[yellow]warning:[/] {escape(warning)}", soft_wrap=True)
-    if not warnings:
+    if not report.warnings:
         console.print("[green]nothing suspicious[/]")
 
 
@@ -133,7 +136,7 @@ def _describe(part: SweepReport) -> dict[str, str]:
         "largest turn in a step, °": f"{part.step_max_deg:.2f}",
         "largest angle between frames, °": f"{part.tilt_deg:.1f}",
         "tilt about lateral, elevation, axial, °": ", ".join(f"{angle:.1f}" for angle in part.tilt_range_deg),
-        f"crossed voxels of {part.voxel_mm:.3g} mm, mL": f"{part.swept_ml:.1f}",
+        "crossed voxels, mL (voxel, mm)": f"{part.swept_ml:.1f} ({part.voxel_mm:.3g})",
         "their share of the box around": f"{part.coverage:.0%}",
     }
 
@@ -175,6 +178,10 @@ def convert(
         Path | None,
         option("A scene trained from it: its corrected training poses are written.", metavar="SCENE", shown=False),
     ] = None,
+    anonymize: Annotated[
+        bool,
+        option("Leave out names: the source's, and text burnt into the pixels, which becomes black.", "--anonymize"),
+    ] = False,
     *,
     source: SourceOptions,
 ) -> None:
@@ -186,10 +193,16 @@ def convert(
     read = read_dataset(sweep, source)
     if header is not None:
         read = _with_poses_of(poses_of, header, read)
+    marks = 0
+    if anonymize:
+        from ultragray.datasets.checks import without_names
+
+        read, marks = without_names(read)
     write_released(read, output, replace=force)
     tell(
         f"wrote {output}: {len(read.train)} training and {len(read.val)} held-out frames of "
-        f"{read.train.width}x{read.train.height}, {read.probe}",
+        f"{read.train.width}x{read.train.height}, {read.probe}"
+        + (f"; {marks} marks in the pixels are black now: look at them" if anonymize else ""),
         {
             "output": str(output),
             "sha256": read.sha256,
@@ -197,6 +210,7 @@ def convert(
             "held_out_frames": len(read.val),
             "image_height": read.train.height,
             "image_width": read.train.width,
+            **({"blackened_marks": marks} if anonymize else {}),
         },
         as_json=json,
     )

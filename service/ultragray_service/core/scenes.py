@@ -61,7 +61,6 @@ class ScenePlaces(Collector):
 
     @property
     def problem(self) -> StorageUnavailable | None:
-        """What keeps a list of scenes from being read; None: nothing does."""
         return next((one.problem for one in self._shelves if one.problem is not None), None)
 
     @property
@@ -70,7 +69,6 @@ class ScenePlaces(Collector):
         return next((one.problem for one in self._shelves if not one.is_usable), None)
 
     def collect(self) -> Iterator[Metric]:
-        """What Prometheus shows of the cache and the buckets."""
         far, counts = [one for one in self._shelves if not one.is_near], self.cache.counts
         counter, gauge = CounterMetricFamily, GaugeMetricFamily
         yield counter("ultragray_scene_cache_hits", "Requests whose scene was cached.", counts.hits)
@@ -85,13 +83,11 @@ class ScenePlaces(Collector):
         yield gauge("ultragray_scene_list_age_seconds", "Age of the oldest list of the scenes of a bucket.", age)
 
     async def open(self) -> None:
-        """Reads the lists of scenes, and follows their changes."""
         for shelf in self._shelves:
             with suppress(StorageUnavailable):  # told by health, and read as soon as it can be
                 await asyncio.to_thread(shelf.follow)
 
     async def close(self) -> None:
-        """Follows them no more."""
         for shelf in self._shelves:
             await asyncio.to_thread(shelf.close)
 
@@ -103,9 +99,6 @@ class ScenePlaces(Collector):
             working_folder=self._settings.working_folder / SCENES_FOLDER,
             longest_stale_s=self._settings.scene_list_max_age_s,
         )
-
-
-# Facts about scenes, read from their files without blocking the event loop.
 
 
 T = TypeVar("T")

@@ -281,7 +281,7 @@ def _copy_jobs(artifact_folder: Path, count: int) -> None:
         times = ("created_ms", "started_ms", "finished_ms")
         copies = [
             {**original, **{name: original[name] - 1000 * number for name in times}}
-            | {"number": -number, "id": f"{number:024x}"}
+            | {"number": original["number"] + number, "id": f"{number:024x}"}
             for number in range(1, count)
         ]
         connection.execute(sa.insert(JOBS), copies)

@@ -54,5 +54,7 @@ def test_images_that_are_no_plane_are_refused() -> None:
 def test_a_scale_that_changes_is_refused() -> None:
     usual = image_transform((0.2, 0, 0), (0, 0, 0.1), (0, 1, 0))
     other = image_transform((0.21, 0, 0), (0, 0, 0.1), (0, 1, 0))
-    with pytest.raises(DatasetInvalid, match=r"frame 9: a pixel is 0\.21 x 0\.1 mm, in other frames 0\.2 x 0\.1"):
+    with pytest.raises(
+        DatasetInvalid, match=r"frame 9: a pixel is 0\.21 x 0\.1 mm, in other frames \(3, 5\) 0\.2 x 0\.1"
+    ):
         poses_from_image_transforms(np.concatenate([usual, usual, other]), CROP, np.array([3, 5, 9]), PATH)

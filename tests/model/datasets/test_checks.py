@@ -5,15 +5,17 @@ from __future__ import annotations
 import json
 import tracemalloc
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 
 from ultragray import ConvexProbe, LinearProbe, Probe
 from ultragray.contract import to_dict
 from ultragray.datasets import Dataset, Sweep
-from ultragray.datasets.checks import check_dataset, check_sweep
+from ultragray.datasets.checks import check_dataset, check_sweep, without_names
 from ultragray.datasets.source import load_dataset
 
 
@@ -53,6 +55,79 @@ def test_a_pose_off_its_neighbours_is_named(make_sweep: Callable[..., Sweep]) ->
     text = warnings_of(make_sweep(12, poses=poses, frame_numbers=np.arange(100, 112)))
     assert text.startswith("frame 107 lies 20.0 mm off the frame before and 20.0 mm off the one after it")
     assert "\n" not in text
+
+
+def test_a_lost_pose_is_named_whichever_part_it_is_in(make_sweep: Callable[..., Sweep]) -> None:
+    """A tracker that lost the probe says that it lies at its own origin, 2 m away."""
+    for lost in (4, 7, 0):
+        poses = make_sweep(30).poses.copy()
+        poses[:, :3, 3] += -190.0, -98.0, -1949.0
+        poses[lost] = np.eye(4)
+        sweep = make_sweep(30, poses=poses)
+        held_out = np.arange(30) % 5 == 2
+        parts = sweep.select(np.flatnonzero(~held_out)), sweep.select(np.flatnonzero(held_out))
+        report = check_dataset(Dataset("one", *parts))
+        told = f"frame {lost} lies 19" if lost else "a jump of 19"
+        assert [text for text in report.warnings if text.startswith(told)]
+        assert {report.train.voxel_mm > 1.0, report.val is not None and report.val.voxel_mm > 1.0} == {True, False}
+
+
+def test_positions_in_millimetres_where_metres_are_expected_are_named(make_sweep: Callable[..., Sweep]) -> None:
+    sweep = make_sweep(24, step_mm=1000.0)
+    (told,) = check_dataset(Dataset("one", sweep, sweep.select([]))).warnings
+    assert told == (
+        "the probe goes 1000 mm from frame to frame, 23 m in all: positions in millimetres where metres are expected?"
+    )
+
+
+def moving_texture(count: int = 20) -> np.ndarray:  # [count, 96, 128]
+    """Texture that changes slowly from frame to frame."""
+    random = np.random.default_rng(1)
+    ends = [cv2.GaussianBlur(random.normal(size=(96, 128)).astype(np.float32), (0, 0), 2.0) for _ in range(3)]
+    shares = np.linspace(0, 2, count)
+    frames = [ends[int(min(s, 1.99))] * (1 - s % 1) + ends[int(min(s, 1.99)) + 1] * (s % 1) for s in shares[:-1]]
+    return np.clip(110 + 300 * np.stack([*frames, ends[2]]), 1, 250).astype(np.uint8)
+
+
+@pytest.mark.parametrize("height", [12, 24])
+def test_text_that_is_burnt_in_is_named_with_its_place_and_made_black(
+    make_sweep: Callable[..., Sweep], height: int
+) -> None:
+    plain = moving_texture()
+    images = plain.copy()
+    for image in images:
+        cv2.putText(image, "DOE JANE", (6, 30), cv2.FONT_HERSHEY_SIMPLEX, height / 24, 255, 1, cv2.LINE_AA)
+        image[::8, 122:126] = 200  # a ruler
+    sweep = make_sweep(len(images), images=images)
+    dataset = Dataset("DOE", sweep.select(range(15)), sweep.select(range(15, 20)))
+    report = check_dataset(dataset)
+    (told,) = (text for text in report.warnings if "never change" in text)
+    assert told.endswith("text or a ruler burnt in, perhaps a name? Crop it away")
+    cleaned, marks = without_names(dataset)
+    assert (cleaned.name, marks >= 2) == ("anonymous", True)
+    assert not [text for text in check_dataset(cleaned).warnings if "never change" in text]
+    text = np.abs(images[0].astype(int) - plain[0]) > 60
+    text &= images[0] > 200
+    assert cleaned.train.images[0][text].max() == 0
+    assert np.mean(cleaned.train.images != sweep.images[:15]) < 0.45
+    assert not [
+        text for text in check_dataset(replace(dataset, train=sweep_of(sweep, plain))).warnings if "never" in text
+    ]
+
+
+def sweep_of(sweep: Sweep, images: np.ndarray) -> Sweep:
+    return replace(sweep.select(range(15)), images=images[:15])
+
+
+def test_a_picture_that_changes_at_once_is_named(make_sweep: Callable[..., Sweep]) -> None:
+    images = moving_texture()
+    assert not [text for text in warnings_of(make_sweep(20, images=images)).splitlines() if "at once" in text]
+    for frame in range(12, 20):  # half the depth from there on
+        images[frame] = cv2.resize(images[frame][:48, 32:96], (128, 96))
+    told = warnings_of(make_sweep(20, images=images))
+    assert "the picture changes at once from frame 11 to 12" in told
+    assert "was the depth or another setting changed?" in told
+    assert told.count("at once") == 1
 
 
 def test_a_gap_is_named_but_frames_that_were_left_out_are_none(make_sweep: Callable[..., Sweep]) -> None:
@@ -148,7 +223,7 @@ def test_poses_in_other_units_are_named(
 def test_real_units_are_usual(data_folder: Path, name: str) -> None:
     dataset = load_dataset(data_folder / name)
     warnings = check_dataset(dataset).warnings
-    assert not [text for text in warnings if "usual" in text or "positions" in text]
+    assert not [text for text in warnings if ("usual:" in text and "unit" in text) or "positions" in text]
 
 
 def test_images_are_compared_without_a_copy_of_them(make_sweep: Callable[..., Sweep]) -> None:

@@ -116,10 +116,11 @@ COMPRESSED = encapsulate([b"\xff\xd8\xff\xd9"] * len(FRAMES))
     [
         ({"poses": None}, r"must lie beside it in sweep\.poses\.npy or sweep\.poses\.json, found 0"),
         ({"poses": POSES[:7]}, r"sweep\.dcm holds 10 frames, but .*sweep\.poses\.npy 7 poses"),
-        ({"poses": POSES * 2.0}, r"sweep\.poses\.npy: poses\[0\] must end in the row"),
+        ({"poses": POSES * 2.0}, r"sweep\.poses\.npy: frame 0: its pose must end in the row"),
         ({"SamplesPerPixel": 3}, r"with SamplesPerPixel 1 or 3, got MONOCHROME2 with 3"),
-        ({"PhotometricInterpretation": "MONOCHROME1"}, r"must be MONOCHROME2, RGB, .* got MONOCHROME1 with 1"),
-        ({"BitsAllocated": 16}, r"pixels must have 8 bits \(BitsAllocated 8\), got 16"),
+        ({"PhotometricInterpretation": "CMYK"}, r"must be MONOCHROME1, MONOCHROME2, PALETTE COLOR, .* got CMYK with 1"),
+        ({"BitsAllocated": 32}, r"pixels must have 8 or 16 bits \(BitsAllocated\) without a sign, got 32"),
+        ({"PixelRepresentation": 1}, r"without a sign"),
         ({"TransducerType": "CURVED LINEAR"}, r"TransducerType is CURVED LINEAR: say with fan"),
         ({"NumberOfFrames": None}, r"it lacks NumberOfFrames"),
         ({"NumberOfFrames": 2_000_000_000}, r"its header says 2000000000 x 24 x 32"),
@@ -129,10 +130,19 @@ COMPRESSED = encapsulate([b"\xff\xd8\xff\xd9"] * len(FRAMES))
         ),
         ({"SequenceOfUltrasoundRegions": None}, r"does not say how large a pixel is"),
         ({"SequenceOfUltrasoundRegions": [region(PhysicalUnitsXDirection=4)]}, r"does not say how large a pixel is"),
-        ({"SequenceOfUltrasoundRegions": [region(), region()]}, r"has 2 regions that show a plane"),
+        (
+            {"SequenceOfUltrasoundRegions": [region(), region(PhysicalDeltaX=0.04)]},
+            r"several regions .*: 4:24,2:22 \(pixels of 0\.5 x 0\.25 mm\); 4:24,2:22 \(pixels of 0\.4 x 0\.25 mm\)",
+        ),
         ({"SequenceOfUltrasoundRegions": [region(PhysicalDeltaX=None)]}, r"it lacks PhysicalDeltaX"),
-        ({"SequenceOfUltrasoundRegions": [region(PhysicalDeltaY=0.0)]}, r"a pixel must be 0\.0001 to 10 mm"),
-        ({"SequenceOfUltrasoundRegions": [region(RegionLocationMaxX1=32)]}, r"does not lie within 32 x 24 pixels"),
+        (
+            {"SequenceOfUltrasoundRegions": [region(PhysicalDeltaY=0.0)]},
+            r"SequenceOfUltrasoundRegions makes a pixel 0\.5 x 0 mm",
+        ),
+        (
+            {"SequenceOfUltrasoundRegions": [region(RegionLocationMaxX1=33)]},
+            r"columns and rows 4:34,2:22, does not lie within 32 x 24",
+        ),
         ({"SequenceOfUltrasoundRegions": None, "PixelSpacing": [0.1]}, r"it cannot be read as DICOM"),
         ({"syntax": UID("1.2.840.10008.1.2.4.100"), "data": COMPRESSED}, r"compressed as .* cannot be read"),
         (

@@ -18,6 +18,7 @@ from ultragray.contract import to_dict
 from ultragray.datasets import Dataset
 from ultragray.datasets import mcap as mcap_recording
 from ultragray.datasets import mcap_messages as messages
+from ultragray.datasets.checks import check_dataset
 from ultragray.datasets.source import SourceOptions, load_dataset
 from ultragray.errors import DatasetInvalid, ExtraMissing, InvalidArgument
 from ultragray.exchange import ros_messages as ros
@@ -253,6 +254,118 @@ def test_one_topic_of_two_tracked_tools_is_refused(path: Path) -> None:
         load_dataset(bag.finish())
 
 
+def test_poses_of_one_topic_in_two_frames_are_refused_with_both_names(path: Path) -> None:
+    bag = Bag(path)
+    bag.geometry()
+    for number in range(51):
+        time_ns = START_NS + number * SECOND // 50
+        for frame_id in ("robot_base", "camera_link"):
+            bag.write("/pose", ros.POSE, pose_message(moving_pose(number / 50), time_ns, frame_id), time_ns)
+    bag.images()
+    with pytest.raises(DatasetInvalid, match=r"of /pose must be in one frame, .*'camera_link' .51 .* 'robot_base' .51"):
+        load_dataset(bag.finish())
+
+
+def test_images_of_two_probes_on_one_topic_are_refused_with_both_names(path: Path) -> None:
+    bag = Bag(path)
+    bag.geometry()
+    bag.poses()
+    for number in range(COUNT):
+        message = image_message(image_at(number), image_time_ns(number))
+        message["header"]["frame_id"] = "left" if number % 2 else "right"
+        bag.write("/us/image", ros.IMAGE, message, image_time_ns(number))
+    with pytest.raises(DatasetInvalid, match=r"must be of one probe, their frame_id is 'left' .* and 'right'"):
+        load_dataset(bag.finish())
+
+
+@pytest.mark.parametrize("topic", ["/tf", "/tf_static"])
+def test_a_transform_that_is_told_once_holds_for_all_images(path: Path, topic: str) -> None:
+    bag = Bag(path)
+    bag.geometry()
+    for number in range(51):
+        time_ns = START_NS + number * SECOND // 50
+        flange = moving_pose(number / 50) @ np.linalg.inv(FLANGE_TO_PROBE)
+        bag.write("/tf", TRANSFORMS, {"transforms": [transform_message(flange, time_ns, "base", "flange")]}, time_ns)
+    mount = transform_message(FLANGE_TO_PROBE, START_NS + SECOND // 2, "flange", "probe")
+    bag.write(topic, TRANSFORMS, {"transforms": [mount]}, START_NS + SECOND // 2)
+    bag.images()
+    dataset = load_dataset(bag.finish())
+    numbers, _, poses = parts(dataset)
+    assert len(numbers) == COUNT
+    np.testing.assert_allclose(poses, [pose_at(number) for number in numbers], atol=1e-2)
+    assert [(link.transform, link.source, link.is_tracked) for link in dataset.train.chain.links[1:]] == [
+        ("probeToflange", topic, False),
+        ("flangeTobase", "/tf", True),
+    ]
+    assert ("probeToflange of /tf never changes: taken for all images" in dataset.train.notes) == (topic == "/tf")
+
+
+def test_a_static_transform_that_is_told_with_another_value_is_named(path: Path) -> None:
+    bag = Bag(path)
+    bag.geometry()
+    robot(bag)
+    moved = transform_message(FLANGE_TO_PROBE @ FLANGE_TO_PROBE, START_NS + SECOND, "flange", "probe")
+    bag.write("/tf_static", TRANSFORMS, {"transforms": [moved]}, START_NS + SECOND)
+    bag.images()
+    notes = load_dataset(bag.finish()).train.notes
+    assert "probeToflange of /tf_static was told with other values: the last is taken for all images" in notes
+
+
+def test_a_mount_in_millimetres_is_told(path: Path) -> None:
+    bag = Bag(path)
+    bag.geometry()
+    robot(bag)
+    mount = FLANGE_TO_PROBE.copy()
+    mount[:3, 3] *= 1000.0
+    bag.write(
+        "/tf_static", TRANSFORMS, {"transforms": [transform_message(mount, START_NS, "flange", "probe")]}, START_NS
+    )
+    bag.images()
+    notes = load_dataset(bag.finish()).train.notes
+    assert "probeToflange is 80.9 m long: millimetres where metres are expected?" in notes
+
+
+def test_a_parent_that_changes_is_named_with_both(path: Path) -> None:
+    bag = Bag(path)
+    bag.geometry()
+    for number in range(51):
+        time_ns = START_NS + number * SECOND // 50
+        parent = "table" if number < 25 else "patient"
+        message = transform_message(moving_pose(number / 50), time_ns, parent, "probe")
+        bag.write("/tf", TRANSFORMS, {"transforms": [message]}, time_ns)
+    bag.images()
+    bag.finish()
+    with pytest.raises(DatasetInvalid, match=r"the parent of probe in tf changes between patient and table: say with"):
+        load_dataset(path)
+    numbers, _, poses = parts(load_dataset(path, SourceOptions(transform="probeTotable")))
+    assert numbers.tolist() == [
+        number for number in range(COUNT) if image_time_ns(number) <= START_NS + 24 * SECOND // 50
+    ]
+    np.testing.assert_allclose(poses, [pose_at(number) for number in numbers], atol=1e-9)
+
+
+@pytest.mark.parametrize(("scale", "is_far"), [(1000.0, False), (1000.0, True), (0.001, False)])
+def test_lengths_in_another_unit_are_told(path: Path, scale: float, is_far: bool) -> None:
+    bag = Bag(path)
+    bag.geometry()
+    for number in range(51):
+        time_ns = START_NS + number * SECOND // 50
+        message = pose_message(moving_pose(6 * number / 50), time_ns)
+        for axis in "xyz":
+            message["pose"]["position"][axis] *= scale
+        if is_far:
+            message["pose"]["position"]["z"] -= 1949.0
+        bag.write("/pose", ros.POSE, message, time_ns)
+    bag.images()
+    if is_far:
+        with pytest.raises(DatasetInvalid, match=r"lie within 1e\+06 mm.* \(millimetres where metres are expected\?\)"):
+            load_dataset(bag.finish())
+        return
+    warnings = check_dataset(load_dataset(bag.finish())).warnings
+    told = "millimetres where metres are expected?" if scale > 1 else "positions in metres?"
+    assert any(text.endswith(told) or "positions not in millimetres?" in text for text in warnings)
+
+
 def test_topics_are_chosen_or_listed(path: Path) -> None:
     bag = Bag(path)
     bag.geometry(topic="/a/geometry")
@@ -307,7 +420,10 @@ def changing(path: Path, *, size: bool) -> Path:
     ("size", "told"),
     [
         (True, r"frame 8 has 40 x 24 pixels, frame 0 32 x 24: choose those of one size with frames, such as 0:8"),
-        (False, r"frame 8: its geometry is another one than that of frame 0: choose .* such as 0:8"),
+        (
+            False,
+            r"frame 8: its geometry, .*, is another one than that of frame 0, .*: was the depth .* such as 0:8",
+        ),
     ],
 )
 def test_what_changes_on_the_way_is_told_with_the_frames_to_choose(path: Path, size: bool, told: str) -> None:

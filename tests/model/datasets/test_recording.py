@@ -129,7 +129,10 @@ def test_invalid_frames_are_left_out_and_told(tmp_path: Path, plus_files: Simple
     path = plus_files.write_mha(tmp_path / "s.mha", plus_files.speckle(6, ROWS, COLUMNS), fields)
     sweep, frame_count = read_plus_sweep(path, device_set=device_set)
     assert (sweep.frame_numbers.tolist(), frame_count) == ([0, 2, 4], 6)
-    assert sweep.notes[0] == "frames without a valid pose or image were left out: 1, 3, 5 (3 in all)"
+    assert sweep.notes[0] == (
+        "frames without a valid pose or image were left out: 1, 3, 5 (3 in all: ProbeToTracker INVALID in 1; "
+        "ImageStatus INVALID in 1; ProbeToTracker missing in 1)"
+    )
     assert "oriented" in sweep.notes[1]
     assert "the whole image of 20 x 30 pixels" in sweep.notes[2]
 

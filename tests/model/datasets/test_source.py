@@ -66,7 +66,7 @@ def test_sources_that_are_none_are_refused(folder: Path, tmp_path: Path) -> None
     with pytest.raises(DatasetInvalid, match=r"a\.txt: a dataset is a folder with conf\.json"):
         load_dataset(tmp_path / "a.txt")
     for options in (SourceOptions(crop="0:1,0:1"), SourceOptions(frames="0"), SourceOptions(device_set=folder)):
-        takers = r"PLUS sequences(, DICOM cine loops and MCAP recordings)?"
+        takers = r"PLUS sequences(, DICOM cine loops, MCAP recordings, pose tables and TUS-REC scans)?"
         with pytest.raises(InvalidArgument, match=rf"is for {takers}, tiny is none"):
             load_dataset(folder, options)
 

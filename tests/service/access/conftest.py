@@ -1,13 +1,9 @@
 """A service with keys of every kind, and things that belong to one of them."""
 
-from __future__ import annotations
-
 import time
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import httpx
 import pytest
@@ -18,7 +14,7 @@ from ultragray_service.access.principals import Role
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.tables import KEYS
 
-from ..conftest import DEMO_PROBE, RunningService, StartService, make_scene
+from ..conftest import DEMO_PROBE, RunningService, make_scene
 from ..http.test_http_datasets import released_files, zipped
 
 POSE = {"position_mm": {"x": 0, "y": 0, "z": 0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}
@@ -35,48 +31,42 @@ class Keyed:
     client: httpx.Client  # without a key
     artifact_folder: Path
 
-    def headers(self, who: str) -> dict[str, str]:
+    def headers(self, who):
         key = self.keys[who]
         return {} if key is None else {"x-api-key": key}
 
-    def http(self, who: str, method: str, path: str, **options: Any) -> httpx.Response:
+    def http(self, who, method, path, **options):
         return self.client.request(method, path, headers=self.headers(who), **options)
 
-    def submit(self, who: str, *, private: bool = False, scene: str = "demo", **more: Any) -> httpx.Response:
+    def submit(self, who, *, private=False, scene="demo", **more):
         body = {"kind": "render", "specification": {"scene": scene, "poses": [MATRIX]}, "private": private, **more}
         return self.http(who, "POST", "/v1/jobs", json=body)
 
 
-@contextmanager
-def open_keyed(start_service: StartService, folder: Path, database_url: str | None) -> Iterator[Keyed]:
-    """A service with keys; without a URL its database is a SQLite file in its artifact folder."""
-    database = JobDatabase(folder, database_url)
+@pytest.fixture(scope="module")
+def keyed(start_service, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("artifacts")
+    database = JobDatabase(folder, None)
     store = KeyStore(database.engine)
-    keys: dict[str, str | None] = {"nobody": None, "wrong": "ultragray_" + 43 * "0"}
+    keys = {"nobody": None, "wrong": "ultragray_" + 43 * "0"}
     for name, role in {"expired": Role.ADMIN, "revoked": Role.ADMIN, **ROLES}.items():
         _, keys[name] = store.create(name, role, 1.0)
     store.revoke("revoked")
     with database.engine.begin() as connection:
         connection.execute(sa.update(KEYS).where(KEYS.c.name == "expired").values(expires_at_s=time.time()))
     database.close()
-    service = start_service(artifact_folder=folder, **({} if database_url is None else {"database_url": database_url}))
+    service = start_service(artifact_folder=folder)
     with httpx.Client(base_url=service.http, timeout=60) as client:
         yield Keyed(service, keys, client, folder)
 
 
-@pytest.fixture(scope="module")
-def keyed(start_service: StartService, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Keyed]:
-    with open_keyed(start_service, tmp_path_factory.mktemp("artifacts"), None) as keyed:
-        yield keyed
-
-
 @pytest.fixture(scope="session")
-def scene_bytes(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def scene_bytes(tmp_path_factory):
     path = tmp_path_factory.mktemp("scene") / "scene.ugr"
     make_scene(30, seed=5, probe=DEMO_PROBE).save(path)
     return path.read_bytes()
 
 
 @pytest.fixture(scope="session")
-def dataset_bytes(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def dataset_bytes(tmp_path_factory):
     return zipped(released_files(Path(tmp_path_factory.mktemp("dataset")) / "tiny"))

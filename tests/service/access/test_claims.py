@@ -1,12 +1,8 @@
 """A name belongs to whoever claimed it first, and no longer than what it names is there or being made."""
 
-from __future__ import annotations
-
 import threading
-from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from pathlib import Path
 
 import httpx
 import pytest
@@ -15,36 +11,18 @@ import sqlalchemy as sa
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.tables import OWNERS
 
-from ...postgres import PostgresServer
 from ...waiting import wait_until
-from ..conftest import DEMO_PROBE, StartService, make_scene
-from .conftest import Keyed, open_keyed
-
-
-@pytest.fixture(scope="module", params=["sqlite", "postgresql"])
-def database_url(request: pytest.FixtureRequest) -> str | None:
-    if request.param == "sqlite":
-        return None
-    server: PostgresServer = request.getfixturevalue("postgres")
-    return server.create_database()
+from ..conftest import DEMO_PROBE, make_scene
 
 
 @pytest.fixture(scope="module")
-def keyed(
-    start_service: StartService, tmp_path_factory: pytest.TempPathFactory, database_url: str | None
-) -> Iterator[Keyed]:
-    with open_keyed(start_service, tmp_path_factory.mktemp("artifacts"), database_url) as keyed:
-        yield keyed
-
-
-@pytest.fixture(scope="module")
-def database(keyed: Keyed, database_url: str | None) -> Iterator[JobDatabase]:
-    database = JobDatabase(keyed.artifact_folder, database_url)
+def database(keyed):
+    database = JobDatabase(keyed.artifact_folder, None)
     yield database
     database.close()
 
 
-def owner_of(database: JobDatabase, kind: str, name: str) -> str | None:
+def owner_of(database, kind, name):
     with database.engine.connect() as connection:
         return connection.execute(
             sa.select(OWNERS.c.owner).where(OWNERS.c.kind == kind, OWNERS.c.name == name)
@@ -52,16 +30,16 @@ def owner_of(database: JobDatabase, kind: str, name: str) -> str | None:
 
 
 @contextmanager
-def held_back(keyed: Keyed, who: str, path: str, content: bytes) -> Iterator[Future[httpx.Response]]:
+def held_back(keyed, who, path, content):
     """The answer to an upload whose last bytes are sent when the body of the context ends."""
     release = threading.Event()
 
-    def parts() -> Iterator[bytes]:
+    def parts():
         yield content[:100]
         release.wait()
         yield content[100:]
 
-    def put() -> httpx.Response:
+    def put():
         return httpx.put(f"{keyed.service.http}{path}", content=parts(), headers=keyed.headers(who), timeout=60)
 
     with ThreadPoolExecutor(1) as executor:
@@ -73,20 +51,20 @@ def held_back(keyed: Keyed, who: str, path: str, content: bytes) -> Iterator[Fut
             release.set()
 
 
-def train(keyed: Keyed, who: str, dataset: str, scene: str, *, private: bool = False) -> httpx.Response:
+def train(keyed, who, dataset, scene, *, private=False):
     body = {"kind": "train", "specification": {"dataset": dataset, "scene": scene}, "private": private}
     return keyed.http(who, "POST", "/v1/jobs", json=body)
 
 
 @pytest.fixture(scope="module")
-def dataset(keyed: Keyed, dataset_bytes: bytes) -> str:
+def dataset(keyed, dataset_bytes):
     answer = keyed.http("alice", "PUT", "/v1/datasets/common", content=dataset_bytes)
     assert answer.status_code == 201, answer.text
     return "common"
 
 
 @pytest.fixture(scope="module")
-def other_scene_bytes(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def other_scene_bytes(tmp_path_factory):
     path = tmp_path_factory.mktemp("scene") / "scene.ugr"
     make_scene(30, seed=6, probe=DEMO_PROBE).save(path)
     return path.read_bytes()
@@ -96,13 +74,8 @@ def other_scene_bytes(tmp_path_factory: pytest.TempPathFactory) -> bytes:
 @pytest.mark.parametrize("is_same_content", [False, True])
 @pytest.mark.parametrize("private", ["false", "true"])
 def test_a_slow_import_takes_nobodys_scene_over(
-    keyed: Keyed,
-    database: JobDatabase,
-    scene_bytes: bytes,
-    other_scene_bytes: bytes,
-    private: str,
-    is_same_content: bool,
-) -> None:
+    keyed, database, scene_bytes, other_scene_bytes, private, is_same_content
+):
     name = f"liver-{private}-{is_same_content}"
     path = f"/v1/scenes/{name}?private={private}"
     with held_back(keyed, "bob", path, scene_bytes if is_same_content else other_scene_bytes) as late:
@@ -116,9 +89,7 @@ def test_a_slow_import_takes_nobodys_scene_over(
     assert keyed.http("alice", "DELETE", path).status_code == 204
 
 
-def test_a_slow_import_takes_no_training_over(
-    keyed: Keyed, database: JobDatabase, dataset: str, scene_bytes: bytes
-) -> None:
+def test_a_slow_import_takes_no_training_over(keyed, database, dataset, scene_bytes):
     with held_back(keyed, "bob", "/v1/scenes/spine?private=true", scene_bytes) as late:
         assert train(keyed, "alice", dataset, "spine", private=True).status_code == 201
     assert (late.result().status_code, late.result().json()["reason"]) == (409, "SCENE_EXISTS")
@@ -126,45 +97,7 @@ def test_a_slow_import_takes_no_training_over(
 
 
 @pytest.mark.long
-def test_a_training_takes_no_scene_over_that_is_being_imported(
-    keyed: Keyed, database: JobDatabase, dataset: str, scene_bytes: bytes
-) -> None:
-    answers: list[tuple[int, str]] = []
-    with ThreadPoolExecutor(1) as executor:
-        path = "/v1/scenes/knee?private=true"
-        importing = executor.submit(keyed.http, "bob", "PUT", path, content=scene_bytes)
-        wait_until(lambda: owner_of(database, "scene", "knee") == "bob")
-        answer = train(keyed, "alice", dataset, "knee", private=True)
-        answers.append((answer.status_code, answer.json().get("reason", "")))
-    assert importing.result().status_code == 201
-    assert answers == [(409, "SCENE_EXISTS")]
-    assert owner_of(database, "scene", "knee") == "bob"
-    assert keyed.http("bob", "GET", "/v1/scenes/knee").json()["private"] is True
-
-
-@pytest.mark.long
-def test_of_two_uploads_of_one_dataset_the_first_to_finish_owns_it(
-    keyed: Keyed, database: JobDatabase, dataset_bytes: bytes
-) -> None:
-    def put(who: str) -> httpx.Response:
-        url = f"{keyed.service.http}/v1/datasets/race?private=true"
-        return httpx.put(url, content=dataset_bytes, headers=keyed.headers(who), timeout=120)
-
-    with ThreadPoolExecutor(4) as executor:
-        answers = dict(zip("abcd", executor.map(put, ("alice", "bob", "alice", "bob")), strict=True))
-    statuses = sorted(answer.status_code for answer in answers.values())
-    assert statuses == [200, 201, 409, 409], [answer.text for answer in answers.values()]
-    (made,) = (answer.json() for answer in answers.values() if answer.status_code == 201)
-    assert owner_of(database, "dataset", "race") == made["owner"]
-    (other,) = {"alice", "bob"} - {made["owner"]}
-    assert keyed.http(made["owner"], "GET", "/v1/datasets/race").status_code == 200
-    assert keyed.http(other, "GET", "/v1/datasets/race").status_code == 404
-
-
-@pytest.mark.long
-def test_a_claim_that_a_dead_service_left_keeps_nobody_out(
-    keyed: Keyed, database: JobDatabase, dataset: str, scene_bytes: bytes, dataset_bytes: bytes
-) -> None:
+def test_a_claim_that_a_dead_service_left_keeps_nobody_out(keyed, database, dataset, scene_bytes, dataset_bytes):
     left = [("scene", "left"), ("scene", "left-too"), ("dataset", "left")]
     with database.engine.begin() as connection:
         for kind, name in left:
@@ -178,14 +111,14 @@ def test_a_claim_that_a_dead_service_left_keeps_nobody_out(
     wait_until(lambda: keyed.http("bob", "GET", "/v1/scenes/left").status_code == 200)
 
 
-def put_file(keyed: Keyed, name: str) -> Path:
+def put_file(keyed, name):
     """A scene that an administrator puts into the data folder."""
     path = keyed.service.data_folder / f"{name}.ugr"
     path.write_bytes((keyed.service.data_folder / "demo.ugr").read_bytes())
     return path
 
 
-def test_an_upload_that_fails_leaves_no_claim(keyed: Keyed, database: JobDatabase) -> None:
+def test_an_upload_that_fails_leaves_no_claim(keyed, database):
     for path in ("/v1/scenes/broken", "/v1/datasets/broken"):
         assert keyed.http("bob", "PUT", f"{path}?private=true", content=b"PK broken" * 1000).status_code == 422
     assert owner_of(database, "scene", "broken") is None
@@ -193,19 +126,5 @@ def test_an_upload_that_fails_leaves_no_claim(keyed: Keyed, database: JobDatabas
     path = put_file(keyed, "broken")
     try:
         assert keyed.http("reader", "GET", "/v1/scenes/broken").status_code == 200
-    finally:
-        path.unlink()
-
-
-@pytest.mark.long
-def test_a_training_that_is_cancelled_leaves_no_claim(keyed: Keyed, database: JobDatabase, dataset: str) -> None:
-    job = train(keyed, "alice", dataset, "given-up", private=True).json()["id"]
-    assert owner_of(database, "scene", "given-up") == "alice"
-    path = put_file(keyed, "given-up")
-    try:
-        wait_until(lambda: keyed.http("reader", "GET", "/v1/scenes/given-up").status_code == 404)
-        assert keyed.http("alice", "POST", f"/v1/jobs/{job}:cancel").status_code == 200
-        assert owner_of(database, "scene", "given-up") is None
-        wait_until(lambda: keyed.http("reader", "GET", "/v1/scenes/given-up").status_code == 200)
     finally:
         path.unlink()

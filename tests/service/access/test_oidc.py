@@ -1,36 +1,129 @@
-"""Tokens of an OpenID Connect issuer, verified with the keys that a real issuer publishes over HTTP."""
-
-from __future__ import annotations
+"""Tokens of an OpenID Connect issuer: verified with the keys that it publishes, and at the doors beside API keys."""
 
 import asyncio
 import base64
 import hmac
 import json
+import threading
 import time
-from collections.abc import AsyncIterator, Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
-from typing import Any
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
+import httpx
 import jwt
 import pytest
-from cryptography.hazmat.primitives.asymmetric import rsa
+from cryptography.hazmat.primitives.asymmetric import ec, ed25519, rsa
 from cryptography.hazmat.primitives.serialization import Encoding, PublicFormat
-from jwt.algorithms import RSAAlgorithm
+from jwt.algorithms import ECAlgorithm, OKPAlgorithm, RSAAlgorithm
 
 from ultragray.errors import InvalidArgument, UltragrayError
+from ultragray_client import Client
 from ultragray_service.access import oidc as issuer_module
-from ultragray_service.access.oidc import LEEWAY_S, MAX_TOKEN_BYTES, OidcTokens, claim_at, parse_roles
+from ultragray_service.access.keys import KeyStore
+from ultragray_service.access.oidc import LEEWAY_S, MAX_TOKEN_BYTES, claim_at, parse_roles
 from ultragray_service.access.principals import Role
 from ultragray_service.errors import IssuerUnavailable
 from ultragray_service.settings import load_settings
 from ultragray_service.wiring import oidc_tokens
+from ultragray_workers.jobs.database import JobDatabase
 
-from ...waiting import Deadline
-from .identity_provider import IdentityProvider
+from ...waiting import Deadline, wait_until
+from .conftest import MATRIX
+
+AUDIENCE = "ultragray"
+_KINDS = {
+    "RS256": (lambda: rsa.generate_private_key(65537, 2048), RSAAlgorithm),
+    "ES256": (lambda: ec.generate_private_key(ec.SECP256R1()), ECAlgorithm),
+    "EdDSA": (ed25519.Ed25519PrivateKey.generate, OKPAlgorithm),
+}
+
+
+class IdentityProvider:
+    """Answers while it is `up`; counts how often its keys were asked for."""
+
+    def __init__(self):
+        self.up = True
+        self.fetches = 0
+        self.endpoints = {}  # of the sign-in, as it publishes them
+        self.published = []
+        self.keys = {}
+        provider = self
+
+        class Handler(BaseHTTPRequestHandler):
+            def do_GET(self):
+                provider._answer(self)
+
+            def log_message(self, *_):
+                pass
+
+        self._server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+        self.url = f"http://127.0.0.1:{self._server.server_port}/realms/hospital"
+        self._thread = threading.Thread(target=self._server.serve_forever)
+        self._thread.start()
+
+    def close(self):
+        self._server.shutdown()
+        self._thread.join()
+        self._server.server_close()
+
+    def add_key(self, key_id, algorithm="RS256", **published):
+        """A new key; what is published of it."""
+        make, kind = _KINDS[algorithm]
+        private = make()
+        public = kind.to_jwk(private.public_key(), as_dict=True) | {"kid": key_id, "use": "sig", "alg": algorithm}
+        self.keys[key_id] = algorithm, private
+        self.published.append(public | published)
+        return self.published[-1]
+
+    def remove_key(self, key_id):
+        self.published = [one for one in self.published if one["kid"] != key_id]
+
+    def settings(self):
+        """Settings of a service that takes its tokens."""
+        return {
+            "oidc_issuer": self.url,
+            "oidc_audience": AUDIENCE,
+            "oidc_role_claim": "realm_access.roles",
+            "oidc_roles": "ultragray-admin=admin,radiology=reader,research=operator",
+        }
+
+    def claims(self, **changed):
+        """Claims of a token that is good for an hour; `name=None` leaves one out."""
+        now = int(time.time())
+        claims = {
+            "iss": self.url,
+            "aud": AUDIENCE,
+            "sub": "alice",
+            "iat": now,
+            "exp": now + 3600,
+            "realm_access": {"roles": ["radiology", "offline_access"]},
+        } | changed
+        return {name: value for name, value in claims.items() if value is not None}
+
+    def token(self, key_id="one", *, headers=None, **changed):
+        """A token that the key signed."""
+        algorithm, private = self.keys[key_id]
+        return jwt.encode(self.claims(**changed), private, algorithm, headers={"kid": key_id} | (headers or {}))
+
+    def _answer(self, request):
+        if not self.up:
+            request.send_error(503)
+            return
+        if request.path.endswith("/.well-known/openid-configuration"):
+            document = {"issuer": self.url, "jwks_uri": f"{self.url}/certs", **self.endpoints}
+        else:
+            self.fetches += 1
+            document = {"keys": self.published}
+        content = json.dumps(document).encode()
+        request.send_response(200)
+        request.send_header("Content-Length", str(len(content)))
+        request.end_headers()
+        request.wfile.write(content)
 
 
 @pytest.fixture
-def provider() -> Iterator[IdentityProvider]:
+def provider():
     found = IdentityProvider()
     found.add_key("one")
     yield found
@@ -38,9 +131,8 @@ def provider() -> Iterator[IdentityProvider]:
 
 
 @asynccontextmanager
-async def following(provider: IdentityProvider, **settings: str) -> AsyncIterator[OidcTokens]:
+async def following(provider, **settings):
     tokens = oidc_tokens(load_settings(**{**provider.settings(), **settings}))
-    assert tokens is not None
     task = asyncio.ensure_future(tokens.issuer.follow())
     try:
         await until(lambda: tokens.issuer.problem is None)
@@ -49,27 +141,27 @@ async def following(provider: IdentityProvider, **settings: str) -> AsyncIterato
         task.cancel()
 
 
-async def until(condition: Callable[[], bool]) -> None:
+async def until(condition):
     end = Deadline(60)
     while not condition():
         assert not end.passed
         await asyncio.sleep(0.01)
 
 
-def with_tokens(provider: IdentityProvider, check: Callable[[OidcTokens], None], **settings: str) -> None:
-    async def run() -> None:
+def with_tokens(provider, check, **settings):
+    async def run():
         async with following(provider, **settings) as tokens:
             check(tokens)
 
     asyncio.run(run())
 
 
-def unsigned(header: dict[str, Any], claims: dict[str, Any], signature: bytes = b"") -> str:
+def unsigned(header, claims, signature=b""):
     parts = (json.dumps(header).encode(), json.dumps(claims).encode(), signature)
     return ".".join(base64.urlsafe_b64encode(part).rstrip(b"=").decode() for part in parts)
 
 
-def signed_with_the_public_key(provider: IdentityProvider) -> str:
+def signed_with_the_public_key(provider):
     """As if the public key, which everybody knows, were the shared secret of HS256."""
     public = provider.keys["one"][1].public_key().public_bytes(Encoding.PEM, PublicFormat.SubjectPublicKeyInfo)
     content = unsigned({"alg": "HS256", "typ": "JWT", "kid": "one"}, provider.claims())[:-1]
@@ -77,19 +169,18 @@ def signed_with_the_public_key(provider: IdentityProvider) -> str:
     return f"{content}.{base64.urlsafe_b64encode(signature).rstrip(b'=').decode()}"
 
 
-def refusal(tokens: OidcTokens, token: str) -> str:
+def refusal(tokens, token):
     with pytest.raises(UltragrayError) as caught:
         tokens.authenticate(token)
     return f"{type(caught.value).__name__}: {caught.value.detail}"
 
 
 @pytest.mark.parametrize("algorithm", ["RS256", "ES256", "EdDSA"])
-def test_a_token_becomes_a_principal(provider: IdentityProvider, algorithm: str) -> None:
+def test_a_token_becomes_a_principal(provider, algorithm):
     provider.add_key("two", algorithm)
 
-    def check(tokens: OidcTokens) -> None:
+    def check(tokens):
         principal = tokens.authenticate(token)
-        assert principal is not None
         assert (principal.name, principal.role, principal.source) == ("oidc:alice", Role.READER, "oidc")
         assert principal.expires_at_s == jwt.decode(token, options={"verify_signature": False})["exp"] + LEEWAY_S
         assert tokens.authenticate(token) is principal, "the signature is verified once"
@@ -98,15 +189,15 @@ def test_a_token_becomes_a_principal(provider: IdentityProvider, algorithm: str)
     with_tokens(provider, check)
 
 
-def test_what_is_no_token_is_left_to_other_sources(provider: IdentityProvider) -> None:
-    def check(tokens: OidcTokens) -> None:
+def test_what_is_no_token_is_left_to_other_sources(provider):
+    def check(tokens):
         for credential in ("", "ultragray_abcdefgh", "a.b", "a.b.c.d", "ä.b.c", "a.b.c\n", "." * 50_000):
             assert tokens.authenticate(credential) is None
 
     with_tokens(provider, check)
 
 
-def test_tokens_that_are_refused_say_why(provider: IdentityProvider) -> None:
+def test_tokens_that_are_refused_say_why(provider):
     now = time.time()
     foreign = rsa.generate_private_key(65537, 2048)
     algorithm = "names an algorithm that its key does not allow"
@@ -133,27 +224,26 @@ def test_tokens_that_are_refused_say_why(provider: IdentityProvider) -> None:
         provider.token(realm_access={"roles": [{}, None, 7]}): "PermissionDenied: ",
     }
 
-    def check(tokens: OidcTokens) -> None:
+    def check(tokens):
         for token, expected in refusals.items():
             assert expected in refusal(tokens, token)
 
     with_tokens(provider, check)
 
 
-def test_clocks_may_differ_a_little(provider: IdentityProvider) -> None:
+def test_clocks_may_differ_a_little(provider):
     now = int(time.time())
 
-    def check(tokens: OidcTokens) -> None:
+    def check(tokens):
         assert tokens.authenticate(provider.token(exp=now - 5))
         assert tokens.authenticate(provider.token(nbf=now + 5, iat=now + 5))
 
     with_tokens(provider, check)
 
 
-def test_numbers_that_no_clock_holds_are_refused_or_bounded(provider: IdentityProvider) -> None:
-    def check(tokens: OidcTokens) -> None:
+def test_numbers_that_no_clock_holds_are_refused_or_bounded(provider):
+    def check(tokens):
         principal = tokens.authenticate(provider.token(exp=10**300))
-        assert principal is not None
         assert principal.expires_at_s is not None
         assert "cannot be read" in refusal(tokens, provider.token(exp=float("inf")))
         assert "cannot be read" in refusal(tokens, provider.token(exp="soon"))
@@ -164,13 +254,12 @@ def test_numbers_that_no_clock_holds_are_refused_or_bounded(provider: IdentityPr
     with_tokens(provider, check)
 
 
-def test_the_highest_role_counts_wherever_the_claim_lies(provider: IdentityProvider) -> None:
-    def roles_of(claim: str, **claims: Any) -> Role:
-        found: list[Role] = []
+def test_the_highest_role_counts_wherever_the_claim_lies(provider):
+    def roles_of(claim, **claims):
+        found = []
 
-        def check(tokens: OidcTokens) -> None:
+        def check(tokens):
             principal = tokens.authenticate(provider.token(**claims))
-            assert principal is not None
             found.append(principal.role)
 
         with_tokens(provider, check, oidc_role_claim=claim)
@@ -184,12 +273,10 @@ def test_the_highest_role_counts_wherever_the_claim_lies(provider: IdentityProvi
     assert claim_at({"a": "text"}, "a.b.c") is None
 
 
-def test_new_keys_are_fetched_when_a_token_names_them(
-    provider: IdentityProvider, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_new_keys_are_fetched_when_a_token_names_them(provider, monkeypatch):
     monkeypatch.setattr(issuer_module, "LEAST_INTERVAL_S", 0.2)
 
-    async def run() -> None:
+    async def run():
         async with following(provider) as tokens:
             before = provider.token("one")
             assert tokens.authenticate(before)
@@ -204,16 +291,16 @@ def test_new_keys_are_fetched_when_a_token_names_them(
             fetches = provider.fetches
             for _ in range(100):
                 assert "does not have" in refusal(tokens, before)
-            await asyncio.sleep(0.5)
+            await asyncio.sleep(0.3)
             assert provider.fetches == fetches, "keys that the issuer does not have are not asked for again and again"
 
     asyncio.run(run())
 
 
-def test_many_unknown_keys_are_one_fetch(provider: IdentityProvider, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_many_unknown_keys_are_one_fetch(provider, monkeypatch):
     monkeypatch.setattr(issuer_module, "LEAST_INTERVAL_S", 0.5)
 
-    async def run() -> None:
+    async def run():
         async with following(provider) as tokens:
             fetches = provider.fetches
             for number in range(300):
@@ -224,7 +311,7 @@ def test_many_unknown_keys_are_one_fetch(provider: IdentityProvider, monkeypatch
     asyncio.run(run())
 
 
-def test_keys_that_sign_no_tokens_are_passed_over(provider: IdentityProvider) -> None:
+def test_keys_that_sign_no_tokens_are_passed_over(provider):
     provider.add_key("encryption", use="enc")
     provider.add_key("other", alg="RSA-OAEP")
     small = RSAAlgorithm.to_jwk(rsa.generate_private_key(65537, 1024).public_key(), as_dict=True)
@@ -234,36 +321,24 @@ def test_keys_that_sign_no_tokens_are_passed_over(provider: IdentityProvider) ->
         {"kty": "EC", "crv": "P-256", "x": "AA", "y": "AA", "kid": "broken"},
         {"kty": "new", "kid": "new"},
     ]
-    with_tokens(provider, lambda tokens: _keys_are(tokens, {"one", None}))
+    found = []
+    with_tokens(provider, lambda tokens: found.append(set(tokens.issuer.keys)))
+    assert found == [{"one", None}]
 
 
-def _keys_are(tokens: OidcTokens, expected: set[str | None]) -> None:
-    assert tokens.issuer.keys.keys() == expected
-
-
-def test_a_token_without_the_id_of_a_key_is_of_the_only_one(provider: IdentityProvider) -> None:
+def test_a_token_without_the_id_of_a_key_is_of_the_only_one(provider):
     token = jwt.encode(provider.claims(), provider.keys["one"][1], "RS256")
-    with_tokens(provider, lambda tokens: _principal_of(tokens, token))
+    with_tokens(provider, lambda tokens: tokens.authenticate(token))
     provider.add_key("two")
-    with_tokens(provider, lambda tokens: _refused(tokens, token))
+    with_tokens(provider, lambda tokens: refusal(tokens, token))
 
 
-def _principal_of(tokens: OidcTokens, token: str) -> None:
-    assert tokens.authenticate(token)
-
-
-def _refused(tokens: OidcTokens, token: str) -> None:
-    assert refusal(tokens, token)
-
-
-def test_an_issuer_that_is_away_leaves_the_keys_that_are_known(
-    provider: IdentityProvider, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_an_issuer_that_is_away_leaves_the_keys_that_are_known(provider, monkeypatch):
     monkeypatch.setattr(issuer_module, "LEAST_INTERVAL_S", 0.05)
     monkeypatch.setattr(issuer_module, "REFRESH_S", 0.1)
     monkeypatch.setattr(issuer_module, "RETRY_S", 0.1)
 
-    async def run() -> None:
+    async def run():
         async with following(provider) as tokens:
             provider.up = False
             await until(lambda: tokens.issuer.problem is not None)
@@ -278,13 +353,21 @@ def test_an_issuer_that_is_away_leaves_the_keys_that_are_known(
     asyncio.run(run())
 
 
-def test_an_issuer_of_another_name_is_not_believed(provider: IdentityProvider) -> None:
-    async def run() -> None:
-        tokens = oidc_tokens(load_settings(**{**provider.settings(), "oidc_issuer": provider.url + "/"}))
-        assert tokens is not None
+@pytest.mark.parametrize(
+    ("end", "token_endpoint", "problem"),
+    [
+        ("/", "https://hospital.example", "calls itself"),
+        ("", "http://hospital.example", "token_endpoint must be a URL"),
+    ],
+)
+def test_an_issuer_of_another_name_or_without_encryption_is_not_believed(provider, end, token_endpoint, problem):
+    provider.endpoints = {"authorization_endpoint": f"{provider.url}/auth", "token_endpoint": token_endpoint}
+
+    async def run():
+        tokens = oidc_tokens(load_settings(**{**provider.settings(), "oidc_issuer": provider.url + end}))
         task = asyncio.ensure_future(tokens.issuer.follow())
-        await until(lambda: "calls itself" in str(tokens.issuer.problem))
-        assert not tokens.issuer.keys
+        await until(lambda: problem in str(tokens.issuer.problem))
+        assert (tokens.issuer.keys, tokens.issuer.endpoints) == ({}, None)
         task.cancel()
 
     asyncio.run(run())
@@ -301,11 +384,127 @@ def test_an_issuer_of_another_name_is_not_believed(provider: IdentityProvider) -
         ({"oidc_roles": "radiology=chief"}, "reader, operator, admin, got 'radiology=chief'"),
     ],
 )
-def test_settings_that_cannot_work(changed: dict[str, str | None], expected: str) -> None:
+def test_settings_that_cannot_work(changed, expected):
     given = {"oidc_issuer": "https://login.example", "oidc_audience": "ultragray", "oidc_roles": "a=admin", **changed}
     with pytest.raises(InvalidArgument, match=expected):
         load_settings(**{name: value for name, value in given.items() if value is not None})
 
 
-def test_roles_are_parsed() -> None:
+def test_roles_are_parsed():
     assert parse_roles(("a=admin", "CN=Radiology=reader")) == {"a": Role.ADMIN, "CN=Radiology": Role.READER}
+
+
+KEY = "0123456789abcdef-environment"
+
+
+@pytest.fixture(scope="module")
+def issuer():
+    found = IdentityProvider()
+    found.add_key("one")
+    yield found
+    found.close()
+
+
+@pytest.fixture(scope="module")
+def guarded(start_service, issuer):
+    service = start_service(**issuer.settings(), api_keys=KEY)
+    wait_until(lambda: identity_provider(service) == "available")
+    return service
+
+
+def identity_provider(service):
+    return httpx.get(f"{service.http}/v1/health/ready", timeout=60).json()["identity_provider"]
+
+
+def ask(service, credential):
+    return httpx.get(f"{service.http}/v1/scenes", headers={"Authorization": f"Bearer {credential}"}, timeout=60)
+
+
+def test_a_token_opens_both_doors(guarded, issuer):
+    assert ask(guarded, issuer.token()).status_code == 200
+    given = iter([issuer.token(), issuer.token(exp=1)])
+    with Client(guarded.grpc, api_key=lambda: next(given), timeout_s=60.0) as client:
+        assert client.scenes.list()
+        with pytest.raises(Exception, match="UNAUTHENTICATED: the token has expired"):
+            client.scenes.list()
+
+
+@pytest.mark.long
+def test_an_issuer_that_is_away_shuts_out_only_its_tokens(start_service):
+    issuer = IdentityProvider()
+    issuer.add_key("one")
+    issuer.up = False
+    try:
+        service = start_service(**issuer.settings(), api_keys=KEY)
+        assert ask(service, KEY).status_code == 200
+        refused = ask(service, issuer.token())
+        assert (refused.status_code, refused.json()["reason"]) == (503, "ISSUER_UNAVAILABLE")
+        assert int(refused.headers["retry-after"]) >= 1
+        assert identity_provider(service) == "unavailable"
+        wait_until(lambda: any("cannot be checked" in record["message"] for record in service.log()))
+        issuer.up = True
+        wait_until(lambda: ask(service, issuer.token()).status_code == 200)
+        assert identity_provider(service) == "available"
+    finally:
+        issuer.close()
+
+
+@pytest.mark.long
+def test_a_rotation_of_keys_leaves_sessions_and_their_revocation_alone(start_service, tmp_path):
+    issuer = IdentityProvider()
+    issuer.add_key("one")
+    database = JobDatabase(tmp_path, None)
+    store = KeyStore(database.engine)
+    _, bob = store.create("bob", Role.OPERATOR, None)
+    try:
+        service = start_service(**issuer.settings(), artifact_folder=tmp_path)
+        wait_until(lambda: identity_provider(service) == "available")
+        with ThreadPoolExecutor() as threads, httpx.Client(base_url=service.http, timeout=None) as client:
+            body = {"kind": "render", "specification": {"scene": "demo", "poses": [MATRIX]}}
+            job = client.post("/v1/jobs", json=body, headers={"X-API-Key": bob}).json()["id"]  # no worker takes it
+            opened = []
+
+            def watch(credential):
+                headers = {"Authorization": f"Bearer {credential}"}
+                with client.stream("GET", f"/v1/jobs/{job}/events", headers=headers) as events:
+                    opened.append(credential)
+                    with pytest.raises(httpx.RemoteProtocolError):  # cut
+                        events.read()
+
+            of_token = threads.submit(watch, issuer.token("one"))
+            of_key = threads.submit(watch, bob)
+            wait_until(lambda: len(opened) == 2)
+            issuer.add_key("two")
+            issuer.remove_key("one")
+            wait_until(lambda: ask(service, issuer.token("two")).status_code == 200)
+            assert not of_key.done()
+            store.revoke("bob")
+            of_key.result(60)
+            of_token.result(60)  # its key is gone for good
+    finally:
+        database.close()
+        issuer.close()
+
+
+def test_the_page_is_told_where_people_sign_in(start_service):
+    issuer = IdentityProvider()
+    issuer.add_key("one")
+    issuer.endpoints = {
+        "authorization_endpoint": f"{issuer.url}/auth",
+        "token_endpoint": "https://tokens.hospital.example:8443/token",
+    }
+    try:
+        service = start_service(**issuer.settings(), oidc_client_id="console", oidc_scope="openid roles")
+        wait_until(lambda: identity_provider(service) == "available")
+        assert httpx.get(f"{service.http}/v1/sign-in", timeout=60).json() == {
+            "issuer": {**issuer.endpoints, "client_id": "console", "scope": "openid roles"}
+        }
+        policy = httpx.get(service.http, timeout=60).headers["content-security-policy"]
+        assert policy.endswith(" https://tokens.hospital.example:8443")
+    finally:
+        issuer.close()
+
+
+def test_without_a_client_id_people_sign_in_with_keys(guarded):
+    assert httpx.get(f"{guarded.http}/v1/sign-in", timeout=60).json() == {"issuer": None}
+    assert "hospital" not in httpx.get(guarded.http, timeout=60).headers["content-security-policy"]

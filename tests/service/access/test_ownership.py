@@ -1,11 +1,11 @@
 """What is private is not there for others, at any door; what is not can be read by all, and changed by its owner."""
 
-from __future__ import annotations
-
+import time
 from functools import partial
 
 import grpc
 import pytest
+import sqlalchemy as sa
 
 from ultragray_proto.v1 import (
     geometry_pb2,
@@ -16,13 +16,16 @@ from ultragray_proto.v1 import (
     scenes_pb2,
     scenes_pb2_grpc,
 )
+from ultragray_workers.jobs.database import JobDatabase
+from ultragray_workers.jobs.tables import WORKERS
 
 from ...waiting import wait_until
-from .conftest import MATRIX, POSE, Keyed
+from .conftest import MATRIX, POSE
+from .test_audit import entries
 
 
 @pytest.fixture(scope="module")
-def private(keyed: Keyed, scene_bytes: bytes, dataset_bytes: bytes) -> str:
+def private(keyed, scene_bytes, dataset_bytes):
     """The id of a private job of alice's; her scene and dataset are called secret."""
     answer = keyed.http("alice", "PUT", "/v1/scenes/secret?private=true", content=scene_bytes)
     assert (answer.status_code, answer.json()["owner"], answer.json()["private"]) == (201, "alice", True)
@@ -33,18 +36,18 @@ def private(keyed: Keyed, scene_bytes: bytes, dataset_bytes: bytes) -> str:
     return str(answer.json()["id"])
 
 
-def names(keyed: Keyed, who: str, what: str) -> set[str]:
+def names(keyed, who, what):
     found = keyed.http(who, "GET", f"/v1/{what}").json()[what]
     return {one.get("name", one.get("id")) for one in found}
 
 
-def test_lists_leave_out_what_others_keep_to_themselves(keyed: Keyed, private: str) -> None:
+def test_lists_leave_out_what_others_keep_to_themselves(keyed, private):
     for what, name in {"scenes": "secret", "datasets": "secret", "jobs": private}.items():
         seen = {who: name in names(keyed, who, what) for who in ("alice", "admin", "bob", "reader")}
         assert seen == {"alice": True, "admin": True, "bob": False, "reader": False}, what
 
 
-def test_a_page_of_jobs_is_full_though_others_are_left_out(keyed: Keyed) -> None:
+def test_a_page_of_jobs_is_full_though_others_are_left_out(keyed):
     mine = [keyed.submit("bob").json()["id"] for _ in range(2)]
     for _ in range(3):
         keyed.submit("alice", private=True)
@@ -80,10 +83,8 @@ ROUTES = [
 
 
 @pytest.mark.parametrize(("method", "path", "body"), ROUTES)
-def test_private_things_answer_as_if_they_were_not_there(
-    keyed: Keyed, private: str, method: str, path: str, body: object
-) -> None:
-    def ask(name: str) -> tuple[int, str]:
+def test_private_things_answer_as_if_they_were_not_there(keyed, private, method, path, body):
+    def ask(name):
         filled = None if body is None else filled_in(body, name)
         answer = keyed.http("bob", method, path.format(name=name), json=filled)
         document = {**answer.json(), "request_id": ""}
@@ -94,7 +95,7 @@ def test_private_things_answer_as_if_they_were_not_there(
     assert (status, text) == ask("absent")
 
 
-def filled_in(value: object, name: str) -> object:
+def filled_in(value, name):
     if isinstance(value, dict):
         return {key: filled_in(one, name) for key, one in value.items()}
     if isinstance(value, list):
@@ -116,8 +117,8 @@ JOB_ROUTES = [
 
 
 @pytest.mark.parametrize(("method", "suffix"), JOB_ROUTES)
-def test_private_jobs_answer_as_if_they_were_not_there(keyed: Keyed, private: str, method: str, suffix: str) -> None:
-    def ask(job: str) -> tuple[int, str]:
+def test_private_jobs_answer_as_if_they_were_not_there(keyed, private, method, suffix):
+    def ask(job):
         answer = keyed.http("bob", method, f"/v1/jobs/{job}{suffix}")
         return answer.status_code, str({**answer.json(), "request_id": ""}).replace(job, "JOB")
 
@@ -125,9 +126,7 @@ def test_private_jobs_answer_as_if_they_were_not_there(keyed: Keyed, private: st
     assert ask(private)[0] == 404
 
 
-def test_names_of_private_things_are_taken_all_the_same(
-    keyed: Keyed, private: str, scene_bytes: bytes, dataset_bytes: bytes
-) -> None:
+def test_names_of_private_things_are_taken_all_the_same(keyed, private, scene_bytes, dataset_bytes):
     for answer, reason in (
         (keyed.http("bob", "PUT", "/v1/scenes/secret", content=scene_bytes), "SCENE_EXISTS"),
         (keyed.http("bob", "PUT", "/v1/datasets/secret", content=dataset_bytes), "DATASET_EXISTS"),
@@ -137,7 +136,7 @@ def test_names_of_private_things_are_taken_all_the_same(
     assert keyed.http("alice", "GET", "/v1/datasets/secret").json()["owner"] == "alice"
 
 
-def test_a_private_job_that_is_in_the_way_is_not_named(keyed: Keyed, scene_bytes: bytes, dataset_bytes: bytes) -> None:
+def test_a_private_job_that_is_in_the_way_is_not_named(keyed, scene_bytes, dataset_bytes):
     assert keyed.http("bob", "PUT", "/v1/datasets/lent", content=dataset_bytes).status_code == 201
     for private, scene in ((True, "hush"), (False, "told")):
         body = {"kind": "train", "specification": {"dataset": "lent", "scene": scene}, "private": private}
@@ -152,23 +151,7 @@ def test_a_private_job_that_is_in_the_way_is_not_named(keyed: Keyed, scene_bytes
         assert keyed.http("alice", "POST", f"/v1/jobs/{job}:cancel").status_code == 200
 
 
-def test_the_request_ids_of_two_owners_are_two(keyed: Keyed) -> None:
-    mine = keyed.submit("alice", request_id="same", private=True)
-    others = keyed.submit("bob", request_id="same")
-    assert (mine.status_code, others.status_code) == (201, 201)
-    assert mine.json()["id"] != others.json()["id"]
-    again = keyed.submit("alice", request_id="same", private=True)
-    assert (again.status_code, again.json()["id"]) == (200, mine.json()["id"])
-
-
-def test_the_owner_and_admins_see_and_render(keyed: Keyed, private: str) -> None:
-    for who in ("alice", "admin"):
-        assert keyed.http(who, "POST", "/v1/scenes/secret/render", json={"pose": POSE}).status_code == 200
-        assert keyed.http(who, "GET", "/v1/datasets/secret").json()["private"] is True
-        assert keyed.http(who, "GET", f"/v1/jobs/{private}").json()["owner"] == "alice"
-
-
-def test_over_grpc_too(keyed: Keyed, private: str) -> None:
+def test_over_grpc_too(keyed, private):
     pose = geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=[float(one) for row in MATRIX for one in row]))
     asked = rendering_pb2.RenderStreamRequest(settings=rendering_pb2.RenderSettings(scene="secret"), pose=pose)
     with keyed.service.channel() as channel:
@@ -190,13 +173,13 @@ def test_over_grpc_too(keyed: Keyed, private: str) -> None:
             assert frame.error.reason == reason
 
 
-def test_a_key_tells_whose_it_is(keyed: Keyed) -> None:
+def test_a_key_tells_whose_it_is(keyed):
     answer = keyed.http("reader", "GET", "/v1/me").json()
     assert (answer["name"], answer["role"], answer["key_required"]) == ("reader", "reader", True)
     assert answer["expires_at"].startswith("20")
 
 
-def test_others_things_can_be_read_and_not_changed(keyed: Keyed, scene_bytes: bytes) -> None:
+def test_others_things_can_be_read_and_not_changed(keyed, scene_bytes):
     assert keyed.http("alice", "PUT", "/v1/scenes/shared", content=scene_bytes).status_code == 201
     assert keyed.http("reader", "POST", "/v1/scenes/shared/render", json={"pose": POSE}).status_code == 200
     refused = keyed.http("bob", "DELETE", "/v1/scenes/shared")
@@ -206,7 +189,7 @@ def test_others_things_can_be_read_and_not_changed(keyed: Keyed, scene_bytes: by
     assert keyed.http("bob", "PUT", "/v1/scenes/shared", content=scene_bytes).json()["owner"] == "bob"
 
 
-def test_a_scene_that_a_job_makes_is_its_owners(keyed: Keyed, private: str) -> None:
+def test_a_scene_that_a_job_makes_is_its_owners(keyed, private):
     specification = {"dataset": "secret", "scene": "trained"}
     body = {"kind": "train", "specification": specification, "private": True}
     assert keyed.http("alice", "POST", "/v1/jobs", json=body).status_code == 201
@@ -220,7 +203,7 @@ def test_a_scene_that_a_job_makes_is_its_owners(keyed: Keyed, private: str) -> N
         published.unlink()
 
 
-def test_a_request_id_of_a_deleted_job_shows_nobody_the_private_job_of_another(keyed: Keyed) -> None:
+def test_a_request_id_of_a_deleted_job_shows_nobody_the_private_job_of_another(keyed):
     first = keyed.submit("bob", request_id="run-1").json()["id"]
     assert keyed.http("bob", "GET", f"/v1/jobs/{first}").status_code == 200
     assert keyed.http("bob", "POST", f"/v1/jobs/{first}:cancel").status_code == 200
@@ -231,23 +214,14 @@ def test_a_request_id_of_a_deleted_job_shows_nobody_the_private_job_of_another(k
     assert keyed.http("alice", "POST", f"/v1/jobs/{second}:cancel").status_code == 200
 
 
-def test_a_request_id_that_is_used_again_may_be_private_this_time(keyed: Keyed) -> None:
-    first = keyed.submit("alice", request_id="twice").json()["id"]
-    assert keyed.http("bob", "GET", f"/v1/jobs/{first}").status_code == 200
-    assert keyed.http("alice", "POST", f"/v1/jobs/{first}:cancel").status_code == 200
-    assert keyed.http("alice", "DELETE", f"/v1/jobs/{first}").status_code == 204
-    second = keyed.submit("alice", request_id="twice", private=True).json()["id"]
-    assert keyed.http("bob", "GET", f"/v1/jobs/{second}").status_code == 404
-
-
-def test_a_request_id_with_another_private_asks_for_something_else(keyed: Keyed) -> None:
+def test_a_request_id_with_another_private_asks_for_something_else(keyed):
     for first in (False, True):
         assert keyed.submit("alice", request_id=f"changes {first}", private=first).status_code == 201
         answer = keyed.submit("alice", request_id=f"changes {first}", private=not first)
         assert (answer.status_code, answer.json()["reason"]) == (409, "REQUEST_ID_CONFLICT")
 
 
-def test_a_job_on_something_private_is_private(keyed: Keyed, private: str) -> None:
+def test_a_job_on_something_private_is_private(keyed, private):
     by_scene = keyed.submit("alice", scene="secret", request_id="on secret")
     body = {"kind": "train", "specification": {"dataset": "secret", "scene": "of-secret"}}
     for answer in (by_scene, keyed.http("alice", "POST", "/v1/jobs", json=body)):
@@ -257,7 +231,7 @@ def test_a_job_on_something_private_is_private(keyed: Keyed, private: str) -> No
 
 
 @pytest.mark.long
-def test_a_retry_uses_nothing_that_the_owner_of_the_job_may_not_see(keyed: Keyed, dataset_bytes: bytes) -> None:
+def test_a_retry_uses_nothing_that_the_owner_of_the_job_may_not_see(keyed, dataset_bytes):
     assert keyed.http("bob", "PUT", "/v1/datasets/swap", content=dataset_bytes).status_code == 201
     body = {"kind": "train", "specification": {"dataset": "swap", "scene": "swapped"}}
     job = keyed.http("bob", "POST", "/v1/jobs", json=body).json()["id"]
@@ -271,3 +245,118 @@ def test_a_retry_uses_nothing_that_the_owner_of_the_job_may_not_see(keyed: Keyed
     assert keyed.http("bob", "PUT", "/v1/datasets/swap", content=dataset_bytes).status_code == 201
     retried = keyed.http("admin", "POST", f"/v1/jobs/{job}:retry")
     assert (retried.status_code, retried.json()["owner"]) == (201, "bob")
+
+
+ARM = "/v1/registrations/alices-arm"
+
+
+def seen(keyed):
+    """The status of asking for it, and whether it is in the list."""
+    return {
+        who: (keyed.http(who, "GET", ARM).status_code, "alices-arm" in names(keyed, who, "registrations"))
+        for who in ("alice", "admin", "bob", "reader")
+    }
+
+
+@pytest.mark.parametrize("private", ["true", "false"])
+def test_it_stays_private_when_its_scene_is_deleted_and_another_takes_the_name(keyed, scene_bytes, private):
+    scene = "/v1/scenes/patient-42"
+    assert keyed.http("alice", "PUT", f"{scene}?private=true", content=scene_bytes).status_code == 201
+    body = {"scene": "patient-42", "base_to_scene": MATRIX, "probe_to_flange": MATRIX}
+    assert keyed.http("alice", "PUT", ARM, json=body).status_code == 200
+    as_before = {"alice": (200, True), "admin": (200, True), "bob": (404, False), "reader": (404, False)}
+    assert seen(keyed) == as_before
+    assert keyed.http("alice", "DELETE", scene).status_code == 204
+    assert seen(keyed) == as_before
+    request = {"pose": {"matrix": MATRIX}, "registration": "alices-arm"}
+    refused = keyed.http("bob", "POST", "/v1/scenes/demo/render", json=request)
+    assert (refused.status_code, refused.json()["reason"]) == (404, "REGISTRATION_NOT_FOUND")
+    assert "patient-42" not in refused.text
+    assert keyed.http("bob", "PUT", f"{scene}?private={private}", content=scene_bytes).status_code == 201
+    assert seen(keyed) == as_before
+    if private == "false":
+        assert keyed.http("alice", "POST", f"{scene}/render", json=request).status_code == 200
+    refused = keyed.http("bob", "POST", f"{scene}/render", json=request)
+    assert (refused.status_code, refused.json()["reason"]) == (404, "REGISTRATION_NOT_FOUND")
+    assert keyed.http("alice", "DELETE", ARM).status_code == 204
+    assert keyed.http("bob", "DELETE", scene).status_code == 204
+
+
+def test_one_that_an_admin_puts_for_a_private_scene_is_for_its_owner_too(keyed, scene_bytes):
+    scene = "/v1/scenes/patient-43"
+    assert keyed.http("alice", "PUT", f"{scene}?private=true", content=scene_bytes).status_code == 201
+    body = {"scene": "patient-43", "base_to_scene": MATRIX, "probe_to_flange": MATRIX}
+    assert keyed.http("admin", "PUT", ARM, json=body).status_code == 200
+    assert seen(keyed) == {"alice": (200, True), "admin": (200, True), "bob": (404, False), "reader": (404, False)}
+    assert keyed.http("admin", "DELETE", ARM).status_code == 204
+    assert keyed.http("alice", "DELETE", scene).status_code == 204
+
+
+def test_an_admin_who_replaces_one_for_a_private_scene_takes_it_from_its_first_owner(keyed, scene_bytes):
+    scene = "/v1/scenes/patient-44"
+    assert keyed.http("alice", "PUT", f"{scene}?private=true", content=scene_bytes).status_code == 201
+    body = {"scene": "demo", "base_to_scene": MATRIX, "probe_to_flange": MATRIX}
+    assert keyed.http("bob", "PUT", ARM, json=body).status_code == 200
+    assert keyed.http("admin", "PUT", ARM, json={**body, "scene": "patient-44"}).status_code == 200
+    assert seen(keyed) == {"alice": (200, True), "admin": (200, True), "bob": (404, False), "reader": (404, False)}
+    assert keyed.http("alice", "GET", ARM).json()["owner"] == "admin"
+    assert keyed.http("bob", "DELETE", ARM).status_code == 404
+    assert keyed.http("bob", "PUT", ARM, json=body).status_code == 403
+    assert keyed.http("admin", "DELETE", ARM).status_code == 204
+    assert keyed.http("alice", "DELETE", scene).status_code == 204
+
+
+@pytest.fixture
+def database(keyed):
+    opened = JobDatabase(keyed.artifact_folder, None)
+    yield opened
+    with opened.engine.begin() as connection:
+        connection.execute(sa.delete(WORKERS))
+    opened.close()
+
+
+def let_work(database, name, job):
+    """A worker that goes on living, at work on a job, as its heartbeat would write it."""
+    with database.engine.begin() as connection:
+        facts = {"seen_at_s": time.time() + 3600.0, "host": "bench", "pid": 7, "device": "cpu", "version": "1"}
+        connection.execute(sa.insert(WORKERS).values(name=name, job=job, **facts))
+
+
+def told_workers(keyed, who):
+    answer = keyed.http(who, "GET", "/v1/workers").json()
+    return {worker["name"]: (worker["state"], worker["job"]) for worker in answer["workers"]}
+
+
+def test_of_a_private_job_others_see_only_that_a_worker_is_busy(keyed, database):
+    secret = keyed.submit("alice", private=True).json()["id"]
+    shared = keyed.submit("alice").json()["id"]
+    for name, job in {"one": secret, "two": shared, "three": None, "four": "0" * 24}.items():
+        let_work(database, name, job)
+    common = {"two": ("working", shared), "three": ("idle", None), "four": ("working", None)}
+    for who, seen in {"alice": secret, "admin": secret, "bob": None, "reader": None}.items():
+        assert told_workers(keyed, who) == {"one": ("working", seen), **common}, who
+
+
+def test_admins_pause_drain_and_resume_over_http(keyed, database):
+    let_work(database, "one", None)
+    for wish, state in (("pause", "paused"), ("drain", "drained"), ("resume", "idle")):
+        answer = keyed.http("admin", "POST", f"/v1/workers/one:{wish}")
+        assert (answer.status_code, answer.json()["state"]) == (200, state)
+        assert told_workers(keyed, "reader") == {"one": (state, None)}
+        refused = keyed.http("alice", "POST", f"/v1/workers/one:{wish}")
+        assert (refused.status_code, refused.json()["reason"]) == (403, "PERMISSION_DENIED")
+        assert f"worker.{wish} needs the role admin, and alice has operator" in refused.json()["detail"]
+        absent = keyed.http("admin", "POST", f"/v1/workers/absent:{wish}")
+        assert (absent.status_code, absent.json()["reason"]) == (404, "WORKER_NOT_FOUND")
+
+    def audited():
+        found = entries(keyed.artifact_folder, "--what", "worker")
+        return {(one["who"], one["what"], one["target"], one["result"]) for one in found}
+
+    for wish in ("pause", "drain", "resume"):
+        expected = {
+            ("admin", f"worker.{wish}", "one", "OK"),
+            ("alice", f"worker.{wish}", "one", "PERMISSION_DENIED"),
+            ("admin", f"worker.{wish}", "absent", "WORKER_NOT_FOUND"),
+        }
+        wait_until(lambda expected=expected: expected <= audited())

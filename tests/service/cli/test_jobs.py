@@ -1,81 +1,65 @@
-"""`ultragray jobs` against a real service with its worker."""
+"""`ultragray jobs`, `workers` and `worker` against a real service with its worker."""
 
-from __future__ import annotations
-
-import io
 import json
 import os
+import signal
 import subprocess
 import sys
 import tarfile
-import zipfile
-from collections.abc import Iterator
-from pathlib import Path
 
 import httpx
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import CliRunner
 
-from ultragray import LinearProbe
-from ultragray.datasets import Dataset, Sweep
-from ultragray.datasets.released import write_released
 from ultragray.files import file_sha256
+from ultragray.samplers import AroundSampler
 from ultragray_service.cli.app import app
 from ultragray_service.cli.jobs import JOB_CANCELLED, JOB_FAILED, results
+from ultragray_workers.jobs.kinds import RenderJob
+from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.store import JobStore
+from ultragray_workers.scenes import SceneStore
 
-from ..conftest import ROOT, SOURCE_FOLDERS, RunningService, StartService
+from ...waiting import wait_until
+from ..conftest import ROOT, SOURCE_FOLDERS
+from ..http.test_http_datasets import zipped
+from .command_line import noise_sweep
 
 WAIT_S = 120.0
 KEY = "0123456789abcdef-jobs"
 
 
-def run(server: RunningService, *arguments: object, key: str = KEY) -> Result:
+def run(server, *arguments, key=KEY):
     environment = {"ULTRAGRAY_ADDRESS": server.http, "ULTRAGRAY_API_KEY": key}
     return CliRunner().invoke(app, ["jobs", *map(str, arguments)], env=environment)
 
 
-def done(server: RunningService, *arguments: object) -> str:
+def done(server, *arguments):
     result = run(server, *arguments)
     assert result.exit_code == 0, result.output
     return result.stdout
 
 
-def tiny_dataset(folder: Path) -> bytes:
-    """A zip of a sweep of 20x16 pixels: 8 frames to train from, 2 held out."""
-    images = np.random.default_rng(0).integers(0, 250, (10, 20, 16), dtype=np.uint8)
-    poses = np.tile(np.eye(4), (10, 1, 1))
-    poses[:, 1, 3] = np.arange(10)
-    parts = [
-        Sweep(images[part], poses[part], LinearProbe(40.0, 0.0, 50.0), np.arange(len(images[part])), "sweep")
-        for part in (slice(0, 8), slice(8, 10))
-    ]
-    write_released(Dataset("tiny", *parts), folder)
-    packed = io.BytesIO()
-    with zipfile.ZipFile(packed, "w") as archive:
-        for path in folder.iterdir():
-            archive.write(path, path.name)
-    return packed.getvalue()
-
-
 @pytest.fixture(scope="module")
-def server(start_service: StartService, tmp_path_factory: pytest.TempPathFactory) -> RunningService:
+def server(start_service, tmp_path_factory):
     return start_service(
         artifact_folder=tmp_path_factory.mktemp("artifacts"), embedded_worker=True, training_threads=1, api_keys=KEY
     )
 
 
 @pytest.fixture(scope="module")
-def client(server: RunningService, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+def client(server, tmp_path_factory):
     """Knows the service, which holds the dataset `tiny`."""
     with httpx.Client(base_url=server.http, headers={"X-API-Key": KEY}, timeout=WAIT_S) as client:
-        content = tiny_dataset(tmp_path_factory.mktemp("tiny"))
+        folder = noise_sweep(tmp_path_factory.mktemp("sweep") / "tiny")
+        content = zipped({path.name: path.read_bytes() for path in folder.iterdir()})
         stored = client.put("/v1/datasets/tiny", content=content, headers={"Content-Type": "application/zip"})
         assert stored.status_code == 201, stored.text
         yield client
 
 
-def test_a_job_that_no_worker_can_take_is_submitted_with_a_warning(server: RunningService) -> None:
+def test_a_job_that_no_worker_can_take_is_submitted_with_a_warning(server):
     asked = ("--min-memory-gb", "900000", "--require", "site=lab1", "--require", "rack=4")
     result = run(server, "submit", "render", "demo", "--sampler", "training", *asked)
     assert result.exit_code == 0, result.output
@@ -88,14 +72,7 @@ def test_a_job_that_no_worker_can_take_is_submitted_with_a_warning(server: Runni
     done(server, "cancel", job)
 
 
-@pytest.mark.parametrize("label", ["lab1", "site=", "site=lab 1"])
-def test_a_label_that_is_none_is_refused(server: RunningService, label: str) -> None:
-    result = run(server, "submit", "render", "demo", "--require", label)
-    assert result.exit_code == 2
-    assert "--require" in result.stderr or "worker_labels must be" in " ".join(result.stderr.split())
-
-
-def test_a_scene_is_trained_watched_and_served(server: RunningService, client: httpx.Client, tmp_path: Path) -> None:
+def test_a_scene_is_trained_watched_and_served(server, client, tmp_path):
     settings = ("--set", "steps=12", "--set", "max_gaussians=60", "--device", "cpu")
     options = (*settings, "--request-id", "first", "--wait")
     result = run(server, "submit", "train", "tiny", "--scene", "trained", *options)
@@ -128,7 +105,7 @@ def test_a_scene_is_trained_watched_and_served(server: RunningService, client: h
     assert json.loads(events.rpartition("\ndata: ")[2])["state"] == "succeeded"
 
 
-def test_poses_of_a_file_become_an_archive(server: RunningService, client: httpx.Client, tmp_path: Path) -> None:
+def test_poses_of_a_file_become_an_archive(server, client, tmp_path):
     poses = np.tile(np.eye(4), (3, 1, 1))
     poses[:, 1, 3] = (0.5, 1.5, 2.5)
     np.save(tmp_path / "poses.npy", poses)
@@ -145,9 +122,7 @@ def test_poses_of_a_file_become_an_archive(server: RunningService, client: httpx
     assert job in done(server, "list", "--state", "succeeded")
 
 
-def test_shards_are_downloaded_by_one_name_those_that_are_missing(
-    server: RunningService, client: httpx.Client, tmp_path: Path
-) -> None:
+def test_shards_are_downloaded_by_one_name_those_that_are_missing(server, client, tmp_path):
     sampler = ("--sampler", "around", "--count", 50, "--shard-frames", 20, "--height", 24, "--width", 16)
     job = done(server, "submit", "render", "demo", *sampler, "--wait").splitlines()[0]
     told = client.get(f"/v1/jobs/{job}").json()
@@ -164,7 +139,7 @@ def test_shards_are_downloaded_by_one_name_those_that_are_missing(
     assert client.get(f"/v1/jobs/{job}/artifacts/{files}").status_code == 404
 
 
-def test_a_job_that_fails_says_why_by_its_exit_code(server: RunningService, client: httpx.Client) -> None:
+def test_a_job_that_fails_says_why_by_its_exit_code(server, client):
     result = run(server, "submit", "train", "tiny", "--scene", "never", "--set", "memory_gb=0.001", "--wait")
     assert result.exit_code == JOB_FAILED, result.output
     assert "memory_gb allows" in result.stderr.splitlines()[-1]
@@ -172,7 +147,7 @@ def test_a_job_that_fails_says_why_by_its_exit_code(server: RunningService, clie
     assert "Traceback" not in result.output
 
 
-def test_a_cancelled_job_has_its_own_exit_code_and_can_be_retried(server: RunningService, client: httpx.Client) -> None:
+def test_a_cancelled_job_has_its_own_exit_code_and_can_be_retried(server, client):
     job = done(server, "submit", "train", "tiny", "--scene", "long", "--set", "steps=1000000").strip()
     used = client.delete("/v1/datasets/tiny")
     assert (used.status_code, used.json()["reason"]) == (409, "DATASET_IN_USE")
@@ -190,15 +165,12 @@ def test_a_cancelled_job_has_its_own_exit_code_and_can_be_retried(server: Runnin
     [
         (("watch", "0" * 24), "there is no job"),
         (("list", "--api-key", "x" * 16), "API key"),
-        (("submit", "render", "demo", "--count", "3"), "--count is of a sampler: name it with --sampler"),
-        (("submit", "render", "demo", "--sampler", "fan", "--count", "3"), "kind fan takes tilt_deg, step_deg"),
         (("submit", "render", "demo", "--format", "dicom", "--outputs", "echo"), "bmode alone in format dicom"),
         (("submit", "render", "gone"), "no scene"),
         (("submit", "train", "tiny", "--scene", "new", "--set", "stepz=3"), "no setting stepz; it has steps, "),
-        (("download", "0" * 24, "name", "-o", "nowhere/name"), "output must lie in a folder that exists"),
     ],
 )
-def test_mistakes_give_one_line(server: RunningService, arguments: tuple[str, ...], told: str) -> None:
+def test_mistakes_give_one_line(server, arguments, told):
     result = run(server, *arguments)
     assert result.exit_code == 2, result.output
     assert result.stderr.startswith("error: ")
@@ -206,7 +178,7 @@ def test_mistakes_give_one_line(server: RunningService, arguments: tuple[str, ..
     assert result.stderr.count("\n") == 1
 
 
-def test_a_watch_outlives_a_restart_of_the_service(start_service: StartService, tmp_path: Path) -> None:
+def test_a_watch_outlives_a_restart_of_the_service(start_service, tmp_path):
     settings = {"artifact_folder": tmp_path / "artifacts", "embedded_worker": False, "api_keys": KEY}
     first = start_service(**settings)
     job = done(first, "submit", "render", "demo").strip()
@@ -218,7 +190,6 @@ def test_a_watch_outlives_a_restart_of_the_service(start_service: StartService, 
         text=True,
     )
     try:
-        assert watching.stderr is not None
         assert watching.stderr.readline() == f"{job} queued waits for a worker: none is running\n"
         first.process.kill()
         first.process.wait(WAIT_S)
@@ -230,10 +201,57 @@ def test_a_watch_outlives_a_restart_of_the_service(start_service: StartService, 
         watching.communicate()
 
 
-def test_many_metrics_stand_in_lines_of_their_own() -> None:
+def test_many_metrics_stand_in_lines_of_their_own():
     few = {"metrics": {"psnr_db": 28.125}, "artifacts": ["scene.ugr"]}
     assert results(few) == "; psnr_db 28.12; artifacts: scene.ugr"
     many = {"metrics": {f"method_{number}_gms": 0.5 for number in range(7)}, "artifacts": ["comparison.html"]}
     first, *lines = results(many).split("\n")
     assert first == "; artifacts: comparison.html"
     assert lines == [f"  method_{number}_gms 0.5" for number in range(7)]
+
+
+def test_commands_list_pause_drain_and_resume(server):
+    def asked(*arguments):
+        environment = {"ULTRAGRAY_ADDRESS": server.http, "ULTRAGRAY_API_KEY": KEY}
+        return CliRunner().invoke(app, ["workers", *arguments], env=environment)
+
+    def told(*arguments):
+        result = asked(*arguments)
+        assert result.exit_code == 0, result.output
+        return result.stdout
+
+    def states():
+        return {worker["name"]: worker["state"] for worker in json.loads(told("list", "--json"))}
+
+    assert wait_until(lambda: "idle" in states().values())
+    (name,) = states()
+    for wish, state in (("pause", "paused"), ("drain", "drained"), ("resume", "idle")):
+        assert told(wish, name) == f"{name} {state}\n"
+        assert states() == {name: state}
+    assert told("list").splitlines()[0].split()[:3] == ["name", "state", "job"]
+    absent = asked("pause", "absent")
+    assert (absent.exit_code, "absent" in absent.stderr) == (2, True)
+
+
+WORKER = [sys.executable, "-c", "from ultragray_service.cli.app import app; app()", "worker"]
+
+
+@pytest.mark.slow
+def test_worker_command_does_a_job_and_stops(data_folder, tmp_path):
+    demo_store = JobStore(tmp_path / "artifacts", None, scenes=SceneStore(data_folder))
+    job, _ = demo_store.submit(RenderJob(scene="demo", sampler=AroundSampler(2), height=16, width=16))
+    options = ["--artifact-folder", str(tmp_path / "artifacts"), "--name", "mine", "--device", "cpu", "--threads", "1"]
+    process = subprocess.Popen([*WORKER, *options], stderr=subprocess.PIPE, text=True)
+    try:
+        wait_until(lambda: demo_store.get(job.id).state.is_final)
+        job = demo_store.get(job.id)
+        assert (job.state, job.worker) == (JobState.SUCCEEDED, "mine"), job
+    finally:
+        process.send_signal(signal.SIGTERM)
+        _, told = process.communicate(timeout=60)
+    assert process.returncode == 0, told
+    messages = [json.loads(line)["message"] for line in told.splitlines()]
+    assert "worker mine takes jobs" in messages
+    assert f"job {job.id} succeeded" in messages
+    assert messages[-1] == "worker mine stopped"
+    demo_store.close()

@@ -1,44 +1,38 @@
 """`ultragray scenes` and `ultragray datasets` against a real service."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Iterator
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
-from typer.testing import CliRunner, Result
+from typer.testing import CliRunner
 
-from ultragray import LinearProbe, read_header
-from ultragray.datasets import Dataset, Sweep
-from ultragray.datasets.released import write_released
-from ultragray.geometry.registration import Registration, rows, save_registration
+from ultragray import read_header
 from ultragray_service.cli.app import app
 
-from ..conftest import HEIGHT, WIDTH, RunningService, StartService
+from ..conftest import HEIGHT, WIDTH
+from .command_line import noise_sweep
 
 KEY = "0123456789abcdef-remote"
 
 
 @pytest.fixture(scope="module")
-def server(start_service: StartService, tmp_path_factory: pytest.TempPathFactory) -> RunningService:
+def server(start_service, tmp_path_factory):
     return start_service(artifact_folder=tmp_path_factory.mktemp("artifacts"), api_keys=KEY)
 
 
-def run(server: RunningService, *arguments: object, key: str = KEY) -> Result:
+def run(server, *arguments, key=KEY):
     environment = {"ULTRAGRAY_ADDRESS": server.http, "ULTRAGRAY_API_KEY": key}
     return CliRunner().invoke(app, list(map(str, arguments)), env=environment)
 
 
-def done(server: RunningService, *arguments: object) -> str:
+def done(server, *arguments):
     result = run(server, *arguments)
     assert result.exit_code == 0, result.output
     return result.stdout
 
 
-def refused(server: RunningService, *arguments: object, key: str = KEY) -> str:
+def refused(server, *arguments, key=KEY):
     result = run(server, *arguments, key=key)
     assert result.exit_code == 2, result.output
     assert result.stderr.startswith("error: ")
@@ -47,14 +41,14 @@ def refused(server: RunningService, *arguments: object, key: str = KEY) -> str:
 
 
 @pytest.fixture
-def scene(server: RunningService, tmp_path: Path) -> Iterator[str]:
+def scene(server, tmp_path):
     """The name of a scene that was uploaded."""
     done(server, "scenes", "download", "demo", "-o", tmp_path / "demo.ugr")
     yield done(server, "scenes", "upload", tmp_path / "demo.ugr", "--name", "mine", "--json") and "mine"
     done(server, "scenes", "delete", "mine")
 
 
-def test_a_scene_goes_down_and_up_again(server: RunningService, scene: str, tmp_path: Path) -> None:
+def test_a_scene_goes_down_and_up_again(server, scene, tmp_path):
     assert read_header(tmp_path / "demo.ugr").info.gaussian_count == 400
     listed = json.loads(done(server, "scenes", "list", "--json"))
     assert {"demo", scene} <= {one["name"] for one in listed}
@@ -70,7 +64,7 @@ def test_a_scene_goes_down_and_up_again(server: RunningService, scene: str, tmp_
     assert not (tmp_path / "none.ugr").exists()
 
 
-def test_a_frame_as_a_picture(server: RunningService, tmp_path: Path) -> None:
+def test_a_frame_as_a_picture(server, tmp_path):
     picture = tmp_path / "frame.png"
     assert f"wrote {picture}: 1 frame of {HEIGHT}x{WIDTH}" in done(server, "scenes", "render", "demo", "-o", picture)
     assert cv2.imread(str(picture), cv2.IMREAD_GRAYSCALE).shape == (HEIGHT, WIDTH)
@@ -80,46 +74,7 @@ def test_a_frame_as_a_picture(server: RunningService, tmp_path: Path) -> None:
     assert picture.read_bytes() != before
 
 
-def test_frames_of_poses_in_one_archive_are_those_that_are_rendered_here(
-    server: RunningService, tmp_path: Path
-) -> None:
-    poses = np.tile(np.eye(4), (3, 1, 1))
-    poses[:, 1, 3] = [0.0, 1.5, 3.0]
-    np.save(tmp_path / "poses.npy", poses)
-    asked = ("--poses", tmp_path / "poses.npy", "--height", 24, "--width", 20, "--outputs", "bmode,echo")
-    done(server, "scenes", "render", "demo", "-o", tmp_path / "there.npz", *asked)
-    done(server, "scenes", "download", "demo", "-o", tmp_path / "demo.ugr")
-    done(server, "render", tmp_path / "demo.ugr", "-o", tmp_path / "here.npz", *asked)
-    with np.load(tmp_path / "there.npz") as there, np.load(tmp_path / "here.npz") as here:
-        assert there["bmode"].shape == (3, 24, 20)
-        np.testing.assert_array_equal(there["poses"], poses)
-        for name in ("bmode", "echo"):
-            np.testing.assert_allclose(there[name], here[name], atol=1e-5)
-
-
-def test_poses_of_a_flange_are_led_into_the_scene_by_a_registration(server: RunningService, tmp_path: Path) -> None:
-    to_scene, to_flange, in_scene = np.eye(4), np.eye(4), np.tile(np.eye(4), (2, 1, 1))
-    to_scene[:3, 3], to_flange[:3, 3] = [100.0, -20.0, 5.0], [0.0, 0.0, 80.0]
-    in_scene[:, 1, 3] = [1.0, 2.0]
-    registration = Registration(base_to_scene=rows(to_scene), probe_to_flange=rows(to_flange))
-    save_registration(tmp_path / "robot.json", registration)
-    done(server, "registrations", "upload", tmp_path / "robot.json", "--scene", "demo")
-    np.save(tmp_path / "flange.npy", np.linalg.inv(to_scene) @ in_scene @ np.linalg.inv(to_flange))
-    np.save(tmp_path / "probe.npy", in_scene)
-    asked = ("scenes", "render", "demo", "--height", 24, "--width", 20)
-    done(server, *asked, "--poses", tmp_path / "probe.npy", "-o", tmp_path / "probe.npz")
-    led = ("--poses", tmp_path / "flange.npy", "--registration", "robot")
-    done(server, *asked, *led, "-o", tmp_path / "flange.npz")
-    with np.load(tmp_path / "probe.npz") as probe, np.load(tmp_path / "flange.npz") as flange:
-        np.testing.assert_allclose(flange["poses"], in_scene, atol=1e-9)
-        np.testing.assert_allclose(flange["bmode"], probe["bmode"], atol=1e-4)
-        assert probe["bmode"].max() > 0.0
-    done(server, *asked, *led, "-o", tmp_path / "pictures")
-    assert len(list((tmp_path / "pictures").glob("*.png"))) == 2
-    assert "without --sampler" in refused(server, *asked, *led, "--sampler", "training", "-o", tmp_path / "more.npz")
-
-
-def test_a_sampler_makes_a_folder_of_pictures(server: RunningService, tmp_path: Path) -> None:
+def test_a_sampler_makes_a_folder_of_pictures(server, tmp_path):
     folder = tmp_path / "pictures"
     sampled = ("--sampler", "training", "--height", 8, "--width", 8, "--outputs", "bmode,transmittance")
     document = json.loads(done(server, "scenes", "render", "demo", "-o", folder, *sampled, "--json"))
@@ -134,39 +89,23 @@ def test_a_sampler_makes_a_folder_of_pictures(server: RunningService, tmp_path: 
 @pytest.mark.parametrize(
     ("arguments", "told"),
     [
-        (("-o", "f.gif"), "must end in .png, .jpg or .npz, or be a folder for PNGs"),
-        (("-o", "f.png", "--outputs", "bmode,echo"), "a picture holds one output"),
         (("-o", "f.png", "--sampler", "training"), "a picture holds one frame, there are 5 poses"),
-        (("-o", "f.png", "--poses", "none.npy"), "none.npy: no such file"),
-        (("-o", "f.png", "--height", 100_000), "height must be"),
         (("-o", "pictures", "--outputs", "labels"), "labels"),
-        (("-o", "f.png", "--registration", "robot"), "a registration leads the poses of a file"),
     ],
 )
-def test_mistakes_leave_nothing(
-    server: RunningService,
-    tmp_path: Path,
-    monkeypatch: pytest.MonkeyPatch,
-    arguments: tuple[object, ...],
-    told: str,
-) -> None:
+def test_mistakes_leave_nothing(server, tmp_path, monkeypatch, arguments, told):
     monkeypatch.chdir(tmp_path)
     assert told in refused(server, "scenes", "render", "demo", *arguments)
     assert list(tmp_path.iterdir()) == []
 
 
 @pytest.fixture
-def sweep(tmp_path: Path) -> Path:
-    images = np.random.default_rng(0).integers(0, 250, (10, 20, 16), dtype=np.uint8)
-    poses = np.tile(np.eye(4), (10, 1, 1))
-    poses[:, 1, 3] = np.arange(10)
-    whole = Sweep(images, poses, LinearProbe(40.0, 0.0, 50.0), np.arange(10), "sweep")
-    write_released(Dataset("tiny", whole.select(range(8)), whole.select([8, 9])), tmp_path / "tiny")
-    return tmp_path / "tiny"
+def sweep(tmp_path):
+    return noise_sweep(tmp_path / "tiny")
 
 
 @pytest.mark.long
-def test_a_folder_becomes_a_dataset(server: RunningService, sweep: Path) -> None:
+def test_a_folder_becomes_a_dataset(server, sweep):
     assert "uploaded tiny: 8 training and 2 held-out frames of 16x20" in done(server, "datasets", "upload", sweep)
     assert "tiny is there already, the same" in done(server, "datasets", "upload", sweep / "conf.json")
     record = json.loads(done(server, "datasets", "show", "tiny", "--json"))
@@ -181,29 +120,22 @@ def test_a_folder_becomes_a_dataset(server: RunningService, sweep: Path) -> None
     assert "tiny" in refused(server, "datasets", "show", "tiny")
 
 
-def test_what_is_no_sweep_is_not_sent(server: RunningService, tmp_path: Path) -> None:
+def test_what_is_no_sweep_is_not_sent(server, tmp_path):
     (tmp_path / "notes.txt").write_text("nothing")
     assert "no sweep lies in this folder" in refused(server, "datasets", "upload", tmp_path)
-    assert "an upload is an archive" in refused(server, "datasets", "upload", tmp_path / "notes.txt")
-    assert "no such file or folder" in refused(server, "datasets", "upload", tmp_path / "none")
     (tmp_path / "a.zip").write_bytes(b"no zip at all")
     assert refused(server, "datasets", "upload", tmp_path / "a.zip")
     assert json.loads(done(server, "datasets", "list", "--json")) == []
 
 
-def test_without_a_key_nothing_is_told(server: RunningService, sweep: Path) -> None:
-    for arguments in (("scenes", "list"), ("datasets", "list"), ("datasets", "upload", sweep)):
-        assert "API key" in refused(server, *arguments, key="wrong-key-0123456789")
-
-
-def test_a_large_upload_that_is_refused_at_once_tells_why(server: RunningService, tmp_path: Path) -> None:
+def test_a_large_upload_that_is_refused_at_once_tells_why(server, tmp_path):
     large = tmp_path / "large.zip"
     with large.open("wb") as file:
         file.truncate(2**27)
     assert "API key" in refused(server, "datasets", "upload", large, key="wrong-key-0123456789")
 
 
-def test_a_registration_goes_up_and_is_listed_shown_and_deleted(server: RunningService, tmp_path: Path) -> None:
+def test_a_registration_goes_up_and_is_listed_shown_and_deleted(server, tmp_path):
     base_to_scene = np.eye(4)
     base_to_scene[:3, 3] = (1.0, 2.0, 3.0)
     np.save(tmp_path / "flange.npy", np.eye(4)[None])

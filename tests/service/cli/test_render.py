@@ -1,11 +1,7 @@
 """`ultragray render`: real files in, real files out; a mistake gives one line and exit code 2."""
 
-from __future__ import annotations
-
 import json
-from collections.abc import Callable
 from dataclasses import fields, replace
-from pathlib import Path
 
 import cv2
 import h5py
@@ -14,11 +10,10 @@ import pytest
 import torch
 
 import ultragray
-from ultragray import ConvexProbe, GaussianScene, LinearProbe, PhasedProbe, render
+from ultragray import GaussianScene, LinearProbe, render
 from ultragray.contract import to_dict
 from ultragray.datasets.plus import read_plus_sweep
 from ultragray.files import file_sha256
-from ultragray.geometry.scan_conversion import scan_convert
 from ultragray.rendering.backends import cpu
 from ultragray.rendering.settings import SettingsUsed
 from ultragray.rendering.tools import Needle, ToolFrame
@@ -28,13 +23,13 @@ from ultragray.scene.confidence import FIGURES, Assessor, ConfidenceModel, figur
 from .command_line import refused, run
 
 LINEAR = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
-CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=50.0)
-PHASED = PhasedProbe(opening_angle_deg=90.0, far_mm=50.0)
+
+
 ORIGIN = ("scene", "scene_sha256", "renderer", "probe", "slice_thickness_mm", "display", "picture")
 CONVEX_JSON = '{"kind": "convex", "opening_angle_deg": 60, "near_mm": 10, "far_mm": 50}'
 
 
-def test_render_writes_an_npz_that_can_be_replayed(scene_file: Path, pose_file: Path, tmp_path: Path) -> None:
+def test_render_writes_an_npz_that_can_be_replayed(scene_file, pose_file, tmp_path):
     output = tmp_path / "frames.npz"
     result = run(
         *("render", scene_file, "--poses", pose_file, "--height", 16, "--width", 12),
@@ -55,20 +50,13 @@ def test_render_writes_an_npz_that_can_be_replayed(scene_file: Path, pose_file: 
             np.testing.assert_allclose(frames[name], getattr(again, name).numpy(), atol=1e-6)
 
 
-def test_shards_need_an_engine_that_exists(scene_file: Path, tmp_path: Path) -> None:
-    made = ("render", scene_file, "-o", tmp_path / "made", "--sampler", "around", "--count", 20)
-    assert "--shard-frames is of shards: name an engine with --on" in refused(*made, "--shard-frames", 5)
-    assert "on must be ray or ray://HEAD:PORT, got 'spark'" in refused(*made, "--on", "spark")
-    assert "count 100,001 is more than the 100,000 poses" in refused(*made[:-1], 100_001)
-
-
-def test_without_poses_the_training_views_are_rendered_as_trained(scene_file: Path, tmp_path: Path) -> None:
+def test_without_poses_the_training_views_are_rendered_as_trained(scene_file, tmp_path):
     assert run("render", scene_file, "-o", tmp_path / "f.npz").exit_code == 0
     with np.load(tmp_path / "f.npz") as frames:
         assert frames["bmode"].shape == (5, 24, 20)
 
 
-def test_render_writes_pngs(scene_file: Path, tmp_path: Path) -> None:
+def test_render_writes_pngs(scene_file, tmp_path):
     folder, npz = tmp_path / "pictures", tmp_path / "f.npz"
     arguments = ("render", scene_file, "--outputs", "bmode,coverage", "-o")
     assert run(*arguments, folder).exit_code == 0
@@ -83,7 +71,7 @@ def test_render_writes_pngs(scene_file: Path, tmp_path: Path) -> None:
 
 
 @pytest.fixture
-def knowing_file(scene_file: Path, tmp_path: Path) -> Path:
+def knowing_file(scene_file, tmp_path):
     """The scene with a model of its confidence."""
     scene = GaussianScene.load(scene_file)
     model = ConfidenceModel((3.5, 1.2, 0.8, 0.1, 0.6), 0.06, (0.125,) * 5, 20, 0.04)
@@ -91,12 +79,9 @@ def knowing_file(scene_file: Path, tmp_path: Path) -> Path:
     return tmp_path / "knowing.ugr"
 
 
-def test_render_tells_and_stores_how_far_frames_extrapolate(
-    knowing_file: Path, scene_file: Path, tmp_path: Path
-) -> None:
+def test_render_tells_and_stores_how_far_frames_extrapolate(knowing_file, scene_file, tmp_path):
     scene = GaussianScene.load(knowing_file)
     coverage = render(scene, None, scene.training_poses, height=24, width=20, outputs=("coverage",)).coverage
-    assert coverage is not None
     expected = Assessor(scene.info, scene.training_poses).assess(scene.training_poses, coverage=coverage.numpy())
     figures = figure_arrays(expected)
     low, high = figures["confidence"].min(), figures["confidence"].max()
@@ -117,7 +102,7 @@ def test_render_tells_and_stores_how_far_frames_extrapolate(
         assert np.isnan(frames["confidence"]).all()
 
 
-def test_render_draws_the_tools_of_a_file(scene_file: Path, tmp_path: Path) -> None:
+def test_render_draws_the_tools_of_a_file(scene_file, tmp_path):
     scene = GaussianScene.load(scene_file)
     needle = Needle(tip_mm=(5.0, 0.0, 25.0), hub_mm=(-12.0, 0.0, 8.0), frame=ToolFrame.PROBE)
     file, output = tmp_path / "tools.json", tmp_path / "f.npz"
@@ -137,7 +122,7 @@ def test_render_draws_the_tools_of_a_file(scene_file: Path, tmp_path: Path) -> N
     assert "tools must be a list of at most 8 values, got 9" in refused(*arguments, "--force")
 
 
-def test_render_keeps_to_a_least_confidence(knowing_file: Path, scene_file: Path, tmp_path: Path) -> None:
+def test_render_keeps_to_a_least_confidence(knowing_file, scene_file, tmp_path):
     scene = GaussianScene.load(knowing_file)
     arguments = ("render", knowing_file, "-o", tmp_path / "f.npz", "--force", "--min-confidence", 0.5)
     assert run(*arguments, "--sampler", "around", "--count", 30, "--translation-mm", 8).exit_code == 0
@@ -161,15 +146,7 @@ def test_render_keeps_to_a_least_confidence(knowing_file: Path, scene_file: Path
     assert "needs a scene that knows" in refused("render", scene_file, *arguments[2:])
 
 
-def test_info_tells_how_well_a_scene_knows_its_confidence(knowing_file: Path, scene_file: Path) -> None:
-    document = json.loads(run("show", knowing_file, "--json").output)
-    assert (document["confidence"]["error"], document["confidence"]["fitted_on"]) == (0.04, 20)
-    assert "hardness" not in document["confidence"]
-    assert "error=0.04" in run("show", knowing_file).output
-    assert json.loads(run("show", scene_file, "--json").output)["confidence"] == {}
-
-
-def test_render_samples_poses_into_the_format_of_the_name(scene_file: Path, pose_file: Path, tmp_path: Path) -> None:
+def test_render_samples_poses_into_the_format_of_the_name(scene_file, pose_file, tmp_path):
     sampler = ("--sampler", "fan", "--tilt-deg", 2, "--step-deg", 2, "--poses", pose_file)
     for name in ("f.npz", "f.igs.mha", "f.h5"):
         result = run("render", scene_file, *sampler, "--dtype", "uint8", "-o", tmp_path / name)
@@ -184,18 +161,7 @@ def test_render_samples_poses_into_the_format_of_the_name(scene_file: Path, pose
             np.testing.assert_array_equal(file["bmode"], frames["bmode"])
 
 
-def test_render_with_another_probe_as_a_fan(scene_file: Path, tmp_path: Path) -> None:
-    folder = tmp_path / "fan"
-    result = run("render", scene_file, "--probe", CONVEX_JSON, "--scan-convert", 0.5, "-o", folder)
-    assert result.exit_code == 0, result.output
-    picture = cv2.imread(str(folder / "frame_00000_bmode.png"), cv2.IMREAD_UNCHANGED)
-    scene = GaussianScene.load(scene_file)
-    frame = render(scene, CONVEX, scene.training_poses[:1], height=24, width=20).bmode
-    assert frame is not None
-    np.testing.assert_array_equal(picture, np.rint(scan_convert(frame[0].numpy(), CONVEX, 0.5) * 255))
-
-
-def test_threads_and_backend_are_used(scene_file: Path, tmp_path: Path) -> None:
+def test_threads_and_backend_are_used(scene_file, tmp_path):
     result = run("render", scene_file, "-o", tmp_path / "f.npz", "--threads", 3, "--backend", "reference")
     assert result.exit_code == 0
     assert torch.get_num_threads() == 3
@@ -203,36 +169,7 @@ def test_threads_and_backend_are_used(scene_file: Path, tmp_path: Path) -> None:
         assert str(frames["renderer"]).endswith(" reference")
 
 
-@pytest.mark.parametrize(
-    ("arguments", "message"),
-    [
-        (["--outputs", ","], "at least one of bmode"),
-        (["--outputs", "bmode,labels"], "labels only for a scene whose Gaussians carry labels"),
-        (["--width", 100_000], "width must be an integer from 1"),
-        (["--probe", '{"kind": "linear", "width_mm": 40, "near_mm": 50, "far_mm": 50}'], "far_mm must be greater"),
-        (["--probe", '{"kind": "sector"}'], "kind must be one of convex, linear, phased"),
-        (["--tgc-db", "1,two"], "tgc_db[1] must be a finite number from -100 to 100, got 'two'"),
-        (["--gain-db", 1000], "gain_db must be a finite number from -100 to 100"),
-        (["--below-min-confidence", "hide"], "below_min_confidence must be one of refuse, mask"),
-        (["--scan-convert", 0.0, "--probe", CONVEX_JSON], "pixel_mm must be a finite number from"),
-        (["-o", "frames.png"], "end in .npz, .tar, .zarr.zip, .h5, .dcm, .igs.mha or .mcap, or be a folder for PNGs"),
-        (["-o", "frames.dcm", "--outputs", "echo"], "bmode alone in format dicom"),
-        (["--dtype", "uint8"], "--dtype must be left out for PNGs"),
-        (["--sampler", "around"], "count is required by kind around"),
-        (["--seed", 3], "--seed is of a sampler"),
-    ],
-)
-def test_mistakes_of_render_are_named(
-    scene_file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, arguments: list[object], message: str
-) -> None:
-    monkeypatch.chdir(tmp_path)
-    before = sorted(tmp_path.iterdir())
-    output = [] if "-o" in arguments else ["-o", "pictures"]
-    assert message in refused("render", scene_file, *output, *arguments)
-    assert sorted(tmp_path.iterdir()) == before
-
-
-def test_what_is_there_is_replaced_only_with_force(scene_file: Path, tmp_path: Path) -> None:
+def test_what_is_there_is_replaced_only_with_force(scene_file, tmp_path):
     file, folder = tmp_path / "f.npz", tmp_path / "pictures"
     file.write_text("mine")
     folder.mkdir()
@@ -248,7 +185,7 @@ def test_what_is_there_is_replaced_only_with_force(scene_file: Path, tmp_path: P
     assert (folder / "notes.txt").exists()
 
 
-def test_a_sentence_for_people_is_a_document_for_programs(scene_file: Path, tmp_path: Path) -> None:
+def test_a_sentence_for_people_is_a_document_for_programs(scene_file, tmp_path):
     output = tmp_path / "f.npz"
     result = run("render", scene_file, "-o", output, "--json", "--height", 8, "--width", 8)
     document = json.loads(result.stdout)
@@ -256,9 +193,7 @@ def test_a_sentence_for_people_is_a_document_for_programs(scene_file: Path, tmp_
     assert document["confidence_min"] is None
 
 
-def test_a_scene_that_knows_no_probe_or_poses_asks_for_them(
-    tmp_path: Path, random_scene: Callable[..., GaussianScene]
-) -> None:
+def test_a_scene_that_knows_no_probe_or_poses_asks_for_them(tmp_path, random_scene):
     path = tmp_path / "bare.ugr"
     random_scene(3).save(path)
     assert "--probe must be given" in refused("render", path, "-o", tmp_path / "f.npz")

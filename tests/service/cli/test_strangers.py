@@ -1,20 +1,20 @@
-"""Commands that ask a service, and something else answers: another kind of server, a proxy, one that breaks off."""
-
-from __future__ import annotations
+"""Commands that ask a service over TLS, or something else answers: another server, a proxy, one that breaks off."""
 
 import threading
 import zipfile
-from collections.abc import Iterator
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
-from pathlib import Path
 from typing import ClassVar
 
 import pytest
+import trustme
 from typer.testing import CliRunner
 
 from ultragray.errors import DatasetInvalid
-from ultragray_service.cli.app import app
+from ultragray_service.cli.app import USER_ERROR, app
+from ultragray_service.cli.connection import exposes_key
 from ultragray_service.cli.remote import archive_of
+
+from ...certificates import Mounted, write_client
 
 KEY = "0123456789abcdef-strangers"
 
@@ -29,7 +29,7 @@ class Stranger(BaseHTTPRequestHandler):
         "/short": (200, {"Content-Length": "100"}, b"{"),
     }
 
-    def do_GET(self) -> None:
+    def do_GET(self):
         self.keys.append(self.headers["X-API-Key"])
         place = "/" + self.path.split("/")[1]
         there = f"http://localhost:{self.server.server_address[1]}/page"
@@ -40,12 +40,12 @@ class Stranger(BaseHTTPRequestHandler):
         self.end_headers()
         self.wfile.write(body)
 
-    def log_message(self, format: str, *args: object) -> None:
+    def log_message(self, format, *args):
         pass
 
 
 @pytest.fixture
-def stranger() -> Iterator[str]:
+def stranger():
     Stranger.keys = []
     server = ThreadingHTTPServer(("127.0.0.1", 0), Stranger)
     thread = threading.Thread(target=server.serve_forever)
@@ -65,7 +65,7 @@ def stranger() -> Iterator[str]:
         ("elsewhere", "redirects to http://localhost:"),
     ],
 )
-def test_what_is_no_service_is_told_in_one_line(stranger: str, place: str, told: str) -> None:
+def test_what_is_no_service_is_told_in_one_line(stranger, place, told):
     address = f"{stranger}/{place}"
     result = CliRunner().invoke(app, ["scenes", "list", "--address", address, "--api-key", KEY])
     assert result.exit_code == 2
@@ -74,18 +74,18 @@ def test_what_is_no_service_is_told_in_one_line(stranger: str, place: str, told:
     assert result.stderr.count("\n") == 1
 
 
-def test_a_key_is_not_sent_on_to_where_an_address_redirects(stranger: str) -> None:
+def test_a_key_is_not_sent_on_to_where_an_address_redirects(stranger):
     CliRunner().invoke(app, ["scenes", "list", "--address", f"{stranger}/elsewhere", "--api-key", KEY])
     assert Stranger.keys == [KEY]
 
 
-def test_an_upload_takes_the_files_of_the_sweep_alone(tmp_path: Path) -> None:
+def test_an_upload_takes_the_files_of_the_sweep_alone(tmp_path):
     for name in ("a[1].mhd", "a[1].raw", "a[1].patient.pdf", "a[1].ugr"):
         (tmp_path / name).write_bytes(b"x")
     assert archived(tmp_path / "a[1].mhd") == ["a[1].mhd", "a[1].raw"]
 
 
-def test_a_folder_is_uploaded_without_what_is_hidden(tmp_path: Path) -> None:
+def test_a_folder_is_uploaded_without_what_is_hidden(tmp_path):
     for name in ("conf.json", "images_train.npy", ".git/objects/ab", ".notes"):
         path = tmp_path / name
         path.parent.mkdir(parents=True, exist_ok=True)
@@ -95,6 +95,65 @@ def test_a_folder_is_uploaded_without_what_is_hidden(tmp_path: Path) -> None:
         pass
 
 
-def archived(source: Path) -> list[str]:
+def archived(source):
     with archive_of(source) as archive, zipfile.ZipFile(archive) as opened:
         return sorted(opened.namelist())
+
+
+@pytest.fixture(scope="module")
+def mounted(tmp_path_factory):
+    found = Mounted(tmp_path_factory.mktemp("certificates") / "tls")
+    found.put(found.issue())
+    return found
+
+
+def listed(server, **environment):
+    variables = {f"ULTRAGRAY_{name.upper()}": str(value) for name, value in environment.items()}
+    return CliRunner().invoke(app, ["jobs", "list", "--address", server], env=variables)
+
+
+def refusal(server, **environment):
+    result = listed(server, **environment)
+    assert result.exit_code == USER_ERROR, result.output
+    return " ".join(result.stderr.split())
+
+
+def test_jobs_are_asked_over_tls(start_service, mounted, tmp_path):
+    service = start_service(**mounted.settings())
+    assert listed(service.http, ca=mounted.root).exit_code == 0
+    stranger = tmp_path / "stranger.pem"
+    trustme.CA().cert_pem.write_to_path(stranger)
+    assert "a certificate that is not to be trusted" in refusal(service.http, ca=stranger)
+    assert "name its authority with --ca" in refusal(service.http)
+    assert "if it speaks TLS, name it with https://" in refusal(service.http.replace("https", "http"))
+
+
+def test_mutual_tls(start_service, mounted, tmp_path):
+    service = start_service(**mounted.settings(mutual=True))
+    certificate, key = write_client(mounted.authority, tmp_path)
+    own = {"ca": mounted.root, "client_certificate": certificate, "client_key": key}
+    assert listed(service.http, **own).exit_code == 0
+    assert "--client-certificate" in refusal(service.http, ca=mounted.root)
+
+
+def test_tls_to_a_service_without_it(service):
+    assert "does not speak TLS: name it with http://" in refusal(service.http.replace("http", "https"))
+
+
+def test_files_that_cannot_be_used(mounted, tmp_path):
+    certificate, _ = write_client(mounted.authority, tmp_path)
+    server = "https://127.0.0.1:1"
+    assert "must be given together" in refusal(server, client_certificate=certificate)
+    assert "no certificate and its key (" in refusal(server, client_certificate=certificate, client_key=certificate)
+    assert "holds no certificates (No such file" in refusal(server, ca=tmp_path / "none")
+
+
+def test_a_key_that_travels_openly_is_told():
+    warning = "warning: the API key travels unencrypted to "
+    assert warning not in listed("http://127.0.0.1:1", api_key="0123456789abcdef").stderr
+    assert warning in listed("http://host.invalid:1", api_key="0123456789abcdef").stderr
+    assert exposes_key("http://192.0.2.1:1")
+    assert exposes_key("http://scanner:8000")
+    assert not exposes_key("http://localhost:8000")
+    assert not exposes_key("http://[::1]:8000")
+    assert not exposes_key("https://scanner:8000")

@@ -1,22 +1,16 @@
 """Wrong command lines, one a row: exit code 2, one line that says what is wrong, and nothing is written."""
 
-from __future__ import annotations
-
 import os
 import socket
 import subprocess
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from ultragray import LinearProbe
-from ultragray.datasets import Dataset, Sweep
-from ultragray.datasets.released import write_released
 from ultragray.phantom.demo import copy_demo_scene
 
-from .command_line import python, run
+from .command_line import noise_sweep, python, run
 
 SOURCES = str(Path(__file__).resolve().parents[3])
 NOBODY = "http://127.0.0.1:9"  # the port of `discard`, where nobody listens
@@ -46,6 +40,20 @@ WRONG = {  # the command line, and a part of the line that it gives
     "render scene.ugr -o a.npz --dtype int8": "dtype must be one of float32, uint8",
     "render scene.ugr -o a.npz --min-confidence 2": "min_confidence must be",
     "render scene.ugr -o a.npz --backend gpu": "backend must be one of",
+    "render scene.ugr -o a.npz --outputs ,": "at least one of bmode",
+    "render scene.ugr -o a.npz --width 100000": "width must be an integer from 1",
+    'render scene.ugr -o a.npz --probe {"kind":"sector"}': "kind must be one of convex, linear, phased",
+    "render scene.ugr -o a.npz --tgc-db 1,two": "tgc_db[1] must be a finite number from -100 to 100, got 'two'",
+    "render scene.ugr -o a.npz --gain-db 1000": "gain_db must be a finite number from -100 to 100",
+    "render scene.ugr -o a.npz --below-min-confidence hide": "below_min_confidence must be one of refuse, mask",
+    "render scene.ugr -o a.npz --scan-convert 0.0": "pixel_mm must be a finite number from",
+    "render scene.ugr -o a.dcm --outputs echo": "bmode alone in format dicom",
+    "render scene.ugr -o pictures --dtype uint8": "--dtype must be left out for PNGs",
+    "render scene.ugr -o a.npz --sampler around": "count is required by kind around",
+    "render scene.ugr -o a.npz --seed 3": "--seed is of a sampler",
+    "render scene.ugr -o a.npz --sampler around --count 100001": "count 100,001 is more than the 100,000 poses",
+    "render scene.ugr -o a --sampler around --count 20 --shard-frames 5": "--shard-frames is of shards: name an engine",
+    "render scene.ugr -o a --sampler around --count 20 --on spark": "on must be ray or ray://HEAD:PORT, got 'spark'",
     "render scene.ugr -o a.npz --threads -1": "--threads must be greater than or equal to 0, got '-1'",
     "train sweep -o a.ugr --steps 0": "steps must be an integer from 1",
     "train sweep -o a.ugr --preset slow": "preset must be",
@@ -56,12 +64,27 @@ WRONG = {  # the command line, and a part of the line that it gives
     "train sweep -o a.ugr --resume": "no checkpoint to resume from",
     "compare sweep --methods middle": "methods must be some of all, scene, median, mean, maximum",
     "compare sweep --times 0": "times must be",
+    "compare sweep --budget half": "budget must be one of equal, author, got 'half'",
+    "compare sweep --device tpu": "device must be",
+    "report sweep -o a.html --preset slow": "preset must be",
+    "voxelize scene.ugr -o v.nii --right 0,1,0": "right and down are for a slice",
+    "voxelize scene.ugr -o s.png --plane-mm 0,0,nan --size-mm 9,9": "plane_mm must be 3 finite numbers",
+    "voxelize scene.ugr -o s.png --plane-mm 0,0,0": "a slice needs size_mm",
+    "voxelize scene.ugr -o s.png": "is for a slice: give plane_mm and size_mm",
+    "voxelize scene.ugr -o v.nrrd --spacing-mm 0.01": "the limit is",
+    "worker --artifact-folder . --device tpu": "device must be auto, cpu, cuda or cuda:N, got 'tpu'",
+    "worker --artifact-folder . --device cuda:99": "device must be one of this host, got 'cuda:99'",
+    "worker --artifact-folder . --label lab1": "--label takes NAME=VALUE, got 'lab1'",
+    "worker --artifact-folder . --label site=l;b": "label must be names and values of 1 to 63 letters",
     "eval scene.ugr sweep --split half": "--split must be one of val, train, got 'half'",
     "check sweep --train-frames x": "train_frames",
     "check sweep --crop 1:2,3:4": "crop is for PLUS sequences",
     "convert sweep -o made --image-size huge": "image_size",
     "keys create alice --role king": "--role must be one of reader, operator, admin, got 'king'",
     "keys create alice --role reader --limit speed=3": "speed",
+    "jobs submit render demo --require lab1": "--require",
+    "jobs submit render demo --count 3": "--count is of a sampler: name it with --sampler",
+    "jobs submit render demo --sampler fan --count 3": "kind fan takes tilt_deg, step_deg",
     "jobs submit train liver --scene s --priority 5000": "--priority must be less than or equal to 1000, got '5000'",
     "bench --train --jobs": "give one of --train, --jobs",
     "bench --backend gpu": "backend must be cpu or cuda",
@@ -95,6 +118,11 @@ WRONG = {  # the command line, and a part of the line that it gives
     "serve none.ugr": "none.ugr: no such file",
     "serve notes.ugr": "notes.ugr: not a scene file",
     "datasets upload none": "none: no such file or folder",
+    "datasets upload notes.txt": "an upload is an archive",
+    "localize scene.ugr notes.txt --start pose.npy": "must end in .png or .npy",
+    "calibrate points notes.txt pose.npy -o a.json": "must end in .npy or .csv",
+    "storage copy none to": "FROM must be an existing folder",
+    "worker --data-folder none": "artifact_folder must be an existing folder",
     "scenes upload notes.ugr": "notes.ugr: not a scene file",
     "backup backups --data-folder none": "none",
     "restore none": "none",
@@ -110,6 +138,16 @@ WRONG = {  # the command line, and a part of the line that it gives
     "render scene.ugr -o kept.npz": "kept.npz exists: --force replaces it",
     "render scene.ugr -o sweep": "sweep holds files: --force writes among them",
     "render scene.ugr -o none/a.npz": "none does not",
+    "render scene.ugr -o a.png": "or be a folder for PNGs",
+    "export scene.ugr -o none/a.ply": "none does not",
+    "export scene.ugr -o none/none/a.pt": "none does not",
+    "import notes.ply -o a.txt": "output must end in .ugr",
+    "eval scene.ugr sweep -o notes.txt": "notes.txt is a file",
+    "report sweep -o sweep": "is a folder",
+    "demo -o none/a.ugr": "none does not",
+    "demo -o a.txt": "output must end in .ugr, got 'a.txt'",
+    "voxelize scene.ugr -o v.mha": "must end in .nii.gz, .nii or .nrrd",
+    "slicer scene.ugr -o a.xml": "must end in .mrml",
     "train sweep -o a.txt": "output must end in .ugr, got 'a.txt'",
     "train sweep -o scene.ugr": "scene.ugr exists: --force",
     "eval scene.ugr sweep -o sweep": "sweep holds files",
@@ -121,6 +159,11 @@ WRONG = {  # the command line, and a part of the line that it gives
     "bench -o scene.ugr": "scene.ugr exists: --force",
     f"scenes download demo -o scene.ugr --address {NOBODY}": "scene.ugr exists: --force",
     f"scenes render demo -o a.gif --address {NOBODY}": "must end in .png, .jpg or .npz",
+    f"scenes render demo -o a.png --outputs bmode,echo --address {NOBODY}": "a picture holds one output",
+    f"scenes render demo -o a.png --poses none.npy --address {NOBODY}": "none.npy: no such file",
+    f"scenes render demo -o a.png --height 100000 --address {NOBODY}": "height must be",
+    f"scenes render demo -o a.png --registration arm --address {NOBODY}": "a registration leads the poses of a file",
+    f"jobs download 7 name -o none/name --address {NOBODY}": "output must lie in a folder that exists",
     # A service that is not there.
     "scenes list --address localhost:8000": "--address must be a URL such as http://127.0.0.1:8000",
     f"scenes list --address {NOBODY}": f"no service answers at {NOBODY} (connection refused)",
@@ -146,31 +189,28 @@ AS_PROCESSES = (  # the start of a process and its end are real here
 
 
 @pytest.fixture(scope="module")
-def place(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def place(tmp_path_factory):
     """A folder with a scene, a sweep, and files that are something else."""
     folder = tmp_path_factory.mktemp("place")
     copy_demo_scene(folder / "scene.ugr")
-    images = np.random.default_rng(0).integers(0, 250, (10, 20, 16), dtype=np.uint8)
-    poses = np.tile(np.eye(4), (10, 1, 1))
-    poses[:, 1, 3] = np.arange(10)
-    sweep = Sweep(images, poses, LinearProbe(40.0, 0.0, 50.0), np.arange(10), "sweep")
-    write_released(Dataset("sweep", sweep.select(range(8)), sweep.select([8, 9])), folder / "sweep")
+    noise_sweep(folder / "sweep")
+    np.save(folder / "pose.npy", np.eye(4))
     for name in ("notes.txt", "notes.ugr", "notes.ply", "notes.pt", "kept.npz"):
         (folder / name).write_text("some notes, long enough to be looked at")
     return folder
 
 
 @pytest.fixture(scope="module")
-def busy_port() -> Iterator[int]:
+def busy_port():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         yield taken.getsockname()[1]
 
 
-def contents(folder: Path) -> dict[str, bytes | None]:
+def contents(folder):
     return {str(path.relative_to(folder)): path.read_bytes() if path.is_file() else None for path in folder.rglob("*")}
 
 
-def check(line: str, code: int, stdout: str, stderr: str) -> None:
+def check(line, code, stdout, stderr):
     assert code == 2, stderr
     assert stdout == ""
     (told,) = [one for one in stderr.splitlines() if not one.startswith(("simulating", "warning: "))]
@@ -181,7 +221,7 @@ def check(line: str, code: int, stdout: str, stderr: str) -> None:
 
 
 @pytest.mark.parametrize("line", [line for line in WRONG if line not in AS_PROCESSES])
-def test_one_line_tells_a_mistake(line: str, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_line_tells_a_mistake(line, place, monkeypatch):
     monkeypatch.chdir(place)
     before = contents(place)
     result = run(*line.split())
@@ -191,7 +231,7 @@ def test_one_line_tells_a_mistake(line: str, place: Path, monkeypatch: pytest.Mo
 
 @pytest.mark.long
 @pytest.mark.parametrize("line", AS_PROCESSES)
-def test_a_process_ends_with_one_line(line: str, place: Path, busy_port: int) -> None:
+def test_a_process_ends_with_one_line(line, place, busy_port):
     before = contents(place)
     arguments = line.replace("BUSY", str(busy_port)).split()
     program = "from ultragray_service.cli.app import app; app()"
@@ -203,11 +243,11 @@ def test_a_process_ends_with_one_line(line: str, place: Path, busy_port: int) ->
     assert contents(place) == before
 
 
-def clean_environment() -> dict[str, str]:
+def clean_environment():
     return {name: value for name, value in os.environ.items() if not name.startswith("ULTRAGRAY_")}
 
 
-def test_a_mistake_is_told_before_torch_is_imported(place: Path) -> None:
+def test_a_mistake_is_told_before_torch_is_imported(place):
     lines = [
         line for line in WRONG if line.split()[0] in ("render", "train", "eval", "check", "scenes", "jobs", "show")
     ]
@@ -229,7 +269,7 @@ def test_a_mistake_is_told_before_torch_is_imported(place: Path) -> None:
         ("ULTRAGRAY_SERVER", ""),  # the beginning that all share makes it like none of them
     ],
 )
-def test_a_misspelt_variable_is_told(variable: str, meant: str, place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_misspelt_variable_is_told(variable, meant, place, monkeypatch):
     monkeypatch.setenv(variable, "1")
     result = run("show", place / "scene.ugr", "--json")
     assert result.exit_code == 0

@@ -1,15 +1,10 @@
-from __future__ import annotations
-
 import asyncio
-from collections.abc import Coroutine
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import pytest
 
 from ultragray_service.core import jobs as job_hub
-from ultragray_service.core.jobs import TAIL_BYTES, GrowingLog, JobChange, JobHub, JobWatch
+from ultragray_service.core.jobs import TAIL_BYTES, GrowingLog, JobChange, JobHub
 from ultragray_workers.errors import JobNotFound
 from ultragray_workers.jobs.progress import JobState, Progress
 from ultragray_workers.jobs.record import Job
@@ -19,30 +14,30 @@ WAIT_S = 60.0
 
 
 @pytest.fixture(autouse=True)
-def _short_interval(monkeypatch: pytest.MonkeyPatch) -> None:
+def _short_interval(monkeypatch):
     monkeypatch.setattr(job_hub, "READ_INTERVAL_S", INTERVAL_S)
 
 
 class FileLog:
     """A log that is a file."""
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path):
         self._path = path
 
-    def size(self) -> int:
+    def size(self):
         return self._path.stat().st_size if self._path.exists() else 0
 
-    def read(self, start: int, length: int) -> bytes:
+    def read(self, start, length):
         return self._path.read_bytes()[start : start + length] if self._path.exists() else b""
 
 
 class OneJob:
     """A job that is changed by hand; counts how often it is read."""
 
-    def __init__(self, folder: Path) -> None:
+    def __init__(self, folder):
         self.log_path = folder / "log.txt"
         self.reads = 0
-        self.error: Exception | None = None
+        self.error = None
         self.job = Job(
             id="one",
             kind="train",
@@ -66,7 +61,7 @@ class OneJob:
         )
         self.hub = JobHub(self.get, lambda job_id: FileLog(self.log_path))
 
-    def get(self, job_id: str) -> Job:
+    def get(self, job_id):
         self.reads += 1
         if job_id != "one":
             raise JobNotFound(f"there is no job {job_id!r}")
@@ -74,27 +69,27 @@ class OneJob:
             raise self.error
         return self.job
 
-    def move(self, **changes: Any) -> None:
+    def move(self, **changes):
         self.job = replace(self.job, **changes)
 
 
 @pytest.fixture
-def one(tmp_path: Path) -> OneJob:
+def one(tmp_path):
     return OneJob(tmp_path)
 
 
-def run(work: Coroutine[Any, Any, None]) -> None:
+def run(work):
     asyncio.run(asyncio.wait_for(work, WAIT_S))
 
 
-async def change(watch: JobWatch) -> JobChange:
+async def change(watch):
     found = await watch.next(WAIT_S)
     assert found is not None
     return found
 
 
-def test_many_watchers_cost_one_reader(one: OneJob) -> None:
-    async def work() -> None:
+def test_many_watchers_cost_one_reader(one):
+    async def work():
         watches = [await one.hub.watch("one") for _ in range(50)]
         assert one.hub.readers == 1
         for watch in watches:
@@ -111,8 +106,8 @@ def test_many_watchers_cost_one_reader(one: OneJob) -> None:
     run(work())
 
 
-def test_the_reader_goes_with_its_last_watcher(one: OneJob) -> None:
-    async def work() -> None:
+def test_the_reader_goes_with_its_last_watcher(one):
+    async def work():
         first, second = await one.hub.watch("one"), await one.hub.watch("one")
         first.close()
         assert one.hub.readers == 1
@@ -129,8 +124,8 @@ def test_the_reader_goes_with_its_last_watcher(one: OneJob) -> None:
     run(work())
 
 
-def test_a_watch_ends_after_the_final_state_and_the_last_line(one: OneJob) -> None:
-    async def work() -> None:
+def test_a_watch_ends_after_the_final_state_and_the_last_line(one):
+    async def work():
         one.log_path.write_text("begin\n")
         watch = await one.hub.watch("one")
         assert await change(watch) == JobChange(one.job, "begin\n", 6)
@@ -154,14 +149,13 @@ def test_a_watch_ends_after_the_final_state_and_the_last_line(one: OneJob) -> No
     run(work())
 
 
-def test_a_watcher_who_reads_slowly_gets_the_newest_state(one: OneJob) -> None:
-    async def work() -> None:
+def test_a_watcher_who_reads_slowly_gets_the_newest_state(one):
+    async def work():
         watch = await one.hub.watch("one")
         for step in range(5):
             one.move(progress=Progress(step=step))
             await asyncio.sleep(3 * INTERVAL_S)
         found = await change(watch)
-        assert found.job is not None
         assert found.job.progress.step == 4
         assert await watch.next(2 * INTERVAL_S) == JobChange(None, "", 0)
         watch.close()
@@ -169,8 +163,8 @@ def test_a_watcher_who_reads_slowly_gets_the_newest_state(one: OneJob) -> None:
     run(work())
 
 
-def test_an_unknown_job_and_one_that_cannot_be_read_any_more(one: OneJob) -> None:
-    async def work() -> None:
+def test_an_unknown_job_and_one_that_cannot_be_read_any_more(one):
+    async def work():
         with pytest.raises(JobNotFound):
             await one.hub.watch("two")
         assert one.hub.readers == 0
@@ -184,8 +178,8 @@ def test_an_unknown_job_and_one_that_cannot_be_read_any_more(one: OneJob) -> Non
     run(work())
 
 
-def test_a_closed_hub_ends_every_watch(one: OneJob) -> None:
-    async def work() -> None:
+def test_a_closed_hub_ends_every_watch(one):
+    async def work():
         watch = await one.hub.watch("one")
         await change(watch)
         one.hub.close()
@@ -199,7 +193,7 @@ def test_a_closed_hub_ends_every_watch(one: OneJob) -> None:
     run(work())
 
 
-def test_a_log_is_told_in_whole_lines(tmp_path: Path) -> None:
+def test_a_log_is_told_in_whole_lines(tmp_path):
     path = tmp_path / "log.txt"
     log = GrowingLog(FileLog(path))
     assert log.read() == ""
@@ -212,7 +206,7 @@ def test_a_log_is_told_in_whole_lines(tmp_path: Path) -> None:
     assert log.read() == "anew\n"
 
 
-def test_a_long_log_is_told_from_its_end_and_then_whole(tmp_path: Path) -> None:
+def test_a_long_log_is_told_from_its_end_and_then_whole(tmp_path):
     path = tmp_path / "log.txt"
     lines = [f"line {number:06d}" for number in range(20_000)]
     path.write_text("\n".join(lines) + "\n")
@@ -227,15 +221,15 @@ def test_a_long_log_is_told_from_its_end_and_then_whole(tmp_path: Path) -> None:
     assert log.offset == path.stat().st_size
 
 
-def test_a_log_is_told_from_a_given_byte_and_a_line_without_end_in_pieces(tmp_path: Path) -> None:
+def test_a_log_is_told_from_a_given_byte_and_a_line_without_end_in_pieces(tmp_path):
     path = tmp_path / "log.txt"
     path.write_text("told before\n" + "x" * 200_000 + "\nafter\n")
     log = GrowingLog(FileLog(path), len("told before\n"))
     assert read_whole(log) == "x" * 200_000 + "\nafter\n"
 
 
-def test_the_final_state_comes_with_the_last_lines_of_a_long_log(one: OneJob) -> None:
-    async def work() -> None:
+def test_the_final_state_comes_with_the_last_lines_of_a_long_log(one):
+    async def work():
         lines = "".join(f"line {number:06d}\n" for number in range(20_000))
         one.log_path.write_text(lines)
         one.move(state=JobState.SUCCEEDED)
@@ -250,7 +244,7 @@ def test_the_final_state_comes_with_the_last_lines_of_a_long_log(one: OneJob) ->
     run(work())
 
 
-def read_whole(log: GrowingLog) -> str:
+def read_whole(log):
     told = log.read()
     while log.has_more:
         told += log.read()

@@ -1,9 +1,6 @@
 """The page at /: its headers, its files, and what is there before it was built."""
 
-from __future__ import annotations
-
 import asyncio
-from pathlib import Path
 
 import httpx
 import pytest
@@ -11,24 +8,22 @@ from fastapi import FastAPI
 
 from ultragray_service.http.app import CONSOLE_FOLDER, add_console
 
-from ..conftest import StartService
-
 KEY = "0123456789abcdef-console"
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     return tmp_path / "console"
 
 
 @pytest.fixture
-def page(folder: Path) -> httpx.AsyncClient:
+def page(folder):
     app = FastAPI()
     add_console(app, folder)
     return httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://test")
 
 
-def build(folder: Path) -> None:
+def build(folder):
     (folder / "assets").mkdir(parents=True)
     (folder / "index.html").write_text("<!doctype html><title>console</title>")
     (folder / "favicon.svg").write_text("<svg/>")
@@ -36,11 +31,11 @@ def build(folder: Path) -> None:
     (folder / "assets" / "index-1a2b.js").write_text("export {};" * 1000)
 
 
-def get(page: httpx.AsyncClient, path: str, **headers: str) -> httpx.Response:
+def get(page, path, **headers):
     return asyncio.run(page.get(path, headers={name.replace("_", "-"): value for name, value in headers.items()}))
 
 
-def test_before_it_is_built_a_page_says_how(page: httpx.AsyncClient) -> None:
+def test_before_it_is_built_a_page_says_how(page):
     answer = get(page, "/")
     assert answer.status_code == 200
     assert "make console" in answer.text
@@ -48,7 +43,7 @@ def test_before_it_is_built_a_page_says_how(page: httpx.AsyncClient) -> None:
     assert get(page, "/assets/index-1a2b.js").status_code == 404
 
 
-def test_the_page_is_asked_for_again_and_its_files_are_kept(page: httpx.AsyncClient, folder: Path) -> None:
+def test_the_page_is_asked_for_again_and_its_files_are_kept(page, folder):
     build(folder)
     answer = get(page, "/")
     assert "<title>console</title>" in answer.text
@@ -64,14 +59,14 @@ def test_the_page_is_asked_for_again_and_its_files_are_kept(page: httpx.AsyncCli
 
 
 @pytest.mark.parametrize("path", ["/assets/%2e%2e/index.html", "/assets/%2e%2e%2findex.html"])
-def test_only_assets_lie_below_assets(page: httpx.AsyncClient, folder: Path, path: str) -> None:
+def test_only_assets_lie_below_assets(page, folder, path):
     build(folder)
     assert get(page, path).request.url.raw_path == path.encode()
     assert get(page, path).status_code == 404
 
 
 @pytest.mark.parametrize("path", ["/", "/favicon.svg"])
-def test_what_did_not_change_is_not_sent_again(page: httpx.AsyncClient, folder: Path, path: str) -> None:
+def test_what_did_not_change_is_not_sent_again(page, folder, path):
     build(folder)
     tag = get(page, path).headers["etag"]
     for known in (tag, f"W/{tag}", f'"other", {tag}'):
@@ -85,7 +80,7 @@ def test_what_did_not_change_is_not_sent_again(page: httpx.AsyncClient, folder: 
     assert changed.headers["etag"] != tag
 
 
-def test_the_policy_lets_nothing_foreign_in(page: httpx.AsyncClient) -> None:
+def test_the_policy_lets_nothing_foreign_in(page):
     headers = get(page, "/").headers
     policy = dict(part.split(" ", 1) for part in headers["content-security-policy"].split("; "))
     assert policy["default-src"] == "'self'"
@@ -103,12 +98,12 @@ def test_the_policy_lets_nothing_foreign_in(page: httpx.AsyncClient) -> None:
         ("a,b", ""),
     ],
 )
-def test_the_policy_names_the_sockets_of_its_host(page: httpx.AsyncClient, host: str, sockets: str) -> None:
+def test_the_policy_names_the_sockets_of_its_host(page, host, sockets):
     policy = get(page, "/", host=host).headers["content-security-policy"]
     assert policy.endswith(f"; connect-src 'self'{sockets}")
 
 
-def test_a_service_with_keys_serves_the_page_to_everyone(start_service: StartService) -> None:
+def test_a_service_with_keys_serves_the_page_to_everyone(start_service):
     with httpx.Client(base_url=start_service(api_keys=KEY).http, timeout=60) as http:
         assert http.get("/").status_code == 200
         head = http.head("/")

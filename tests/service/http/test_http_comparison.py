@@ -1,23 +1,14 @@
 """A scene beside the held-out frames of its dataset, and the frames and poses of a dataset."""
 
-from __future__ import annotations
-
-import os
-import signal
 import time
-from collections.abc import Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import cv2
 import httpx
 import numpy as np
 import pytest
 
-from ultragray import GaussianScene, LinearProbe
+from ultragray import LinearProbe
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
 from ultragray.phantom.demo import DEMO_FILE
@@ -26,16 +17,16 @@ from ultragray_proto.v1 import datasets_pb2, datasets_pb2_grpc
 from ultragray_workers.helpers import PROGRESS_NAME
 from ultragray_workers.views import PICTURES
 
-from ...waiting import Deadline, wait_until
-from ..conftest import RunningService, StartService, make_scene
-from .test_http_datasets import helper_process, zipped
+from ...waiting import Deadline
+from ..conftest import make_scene
+from .test_http_datasets import zipped
 
 RAW = {"Content-Type": "application/octet-stream"}
 PROBE = LinearProbe(40.0, 0.0, 40.0)
 WAIT_S = 60.0
 
 
-def sweep(count: int, offset_mm: float) -> Sweep:
+def sweep(count, offset_mm):
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, 1, 3] = np.arange(count) + offset_mm
     images = np.broadcast_to(20 + 8 * np.arange(16, dtype=np.uint8), (count, 24, 16)) + np.arange(
@@ -47,23 +38,23 @@ def sweep(count: int, offset_mm: float) -> Sweep:
 DATASET = Dataset("tiny", sweep(6, 0.0), sweep(3, 0.5))
 
 
-def scene_of(dataset: Dataset, seed: int = 3) -> GaussianScene:
+def scene_of(dataset, seed=3):
     scene = make_scene(probe=PROBE, seed=seed)
     scene.info = replace(scene.info, dataset_name=dataset.name, dataset_sha256=dataset.sha256)
     return scene
 
 
 @pytest.fixture(scope="module")
-def artifacts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def artifacts(tmp_path_factory):
     return tmp_path_factory.mktemp("artifacts")
 
 
 @pytest.fixture(scope="module")
-def service(start_service: StartService, artifacts: Path) -> RunningService:
+def service(start_service, artifacts):
     return start_service(artifact_folder=artifacts)
 
 
-def upload(client: httpx.Client, name: str, dataset: Dataset, folder: Path) -> None:
+def upload(client, name, dataset, folder):
     write_released(dataset, folder)
     packed = zipped({path.name: path.read_bytes() for path in folder.iterdir()})
     answer = client.put(f"/v1/datasets/{name}", content=packed, headers={"Content-Type": "application/zip"})
@@ -71,7 +62,7 @@ def upload(client: httpx.Client, name: str, dataset: Dataset, folder: Path) -> N
 
 
 @pytest.fixture(scope="module")
-def http(service: RunningService, tmp_path_factory: pytest.TempPathFactory) -> Iterator[httpx.Client]:
+def http(service, tmp_path_factory):
     with httpx.Client(base_url=service.http, timeout=60) as client:
         for dataset in (DATASET, replace(DATASET, name="whole", val=DATASET.val.select(np.arange(0)))):
             upload(client, dataset.name, dataset, tmp_path_factory.mktemp("dataset"))
@@ -79,10 +70,10 @@ def http(service: RunningService, tmp_path_factory: pytest.TempPathFactory) -> I
         yield client
 
 
-def finished(http: httpx.Client, scene: str) -> dict[str, Any]:
+def finished(http, scene):
     end = Deadline(WAIT_S)
     while not end.passed:
-        found: dict[str, Any] = http.get(f"/v1/scenes/{scene}/comparison").json()
+        found = http.get(f"/v1/scenes/{scene}/comparison").json()
         if found["state"] != "running":
             return found
         assert 0.0 <= found["progress"] < 1.0
@@ -91,12 +82,12 @@ def finished(http: httpx.Client, scene: str) -> dict[str, Any]:
     raise AssertionError(f"not compared within {WAIT_S} s")
 
 
-def picture(answer: httpx.Response) -> np.ndarray:
+def picture(answer):
     assert answer.headers["content-type"] == "image/png", answer.text
     return np.asarray(cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_UNCHANGED))
 
 
-def assert_revalidated(http: httpx.Client, path: str) -> None:
+def assert_revalidated(http, path):
     """Who has it is not sent it again."""
     whole = http.get(path)
     assert whole.headers["cache-control"] == "private, no-cache"
@@ -104,7 +95,7 @@ def assert_revalidated(http: httpx.Client, path: str) -> None:
     assert (again.status_code, again.content) == (304, b"")
 
 
-def test_poses_and_frames_of_a_dataset(http: httpx.Client) -> None:
+def test_poses_and_frames_of_a_dataset(http):
     poses = http.get("/v1/datasets/tiny/poses").json()
     for part, own in (("train", DATASET.train), ("val", DATASET.val)):
         np.testing.assert_allclose(np.reshape(poses[part], (-1, 4, 4)), own.poses, atol=1e-9)
@@ -119,7 +110,7 @@ def test_poses_and_frames_of_a_dataset(http: httpx.Client) -> None:
 
 
 @pytest.mark.long
-def test_a_scene_is_compared_with_the_frames_held_out_from_it(http: httpx.Client, artifacts: Path) -> None:
+def test_a_scene_is_compared_with_the_frames_held_out_from_it(http, artifacts):
     assert http.get("/v1/scenes/of-tiny/comparison/0/truth.png").json()["reason"] == "ARTIFACT_NOT_FOUND"
     found = finished(http, "of-tiny")
     assert (found["state"], found["dataset"], found["error"]) == ("ready", "tiny", None)
@@ -145,7 +136,7 @@ def test_a_scene_is_compared_with_the_frames_held_out_from_it(http: httpx.Client
     assert kept.stat().st_ino == before
 
 
-def test_what_cannot_be_compared_says_why(http: httpx.Client) -> None:
+def test_what_cannot_be_compared_says_why(http):
     missing = http.get("/v1/scenes/demo/comparison").json()
     assert (missing["reason"], missing["field"]) == ("DATASET_NOT_FOUND", "scene")
     assert "'synthetic'" in missing["detail"]
@@ -155,14 +146,12 @@ def test_what_cannot_be_compared_says_why(http: httpx.Client) -> None:
     assert http.get("/v1/scenes/nobody/comparison").json()["reason"] == "SCENE_NOT_FOUND"
 
 
-def made_of(dataset: Dataset, artifacts: Path) -> int:
+def made_of(dataset, artifacts):
     return len([*artifacts.glob(f"dataset-views/*{dataset.sha256}"), *artifacts.glob(f"comparisons/*{dataset.sha256}")])
 
 
 @pytest.mark.long
-def test_nothing_stays_of_a_deleted_dataset(
-    http: httpx.Client, service: RunningService, artifacts: Path, tmp_path: Path
-) -> None:
+def test_nothing_stays_of_a_deleted_dataset(http, service, artifacts, tmp_path):
     doomed = Dataset("doomed", sweep(5, 0.0), sweep(2, 0.5))
     upload(http, "doomed", doomed, tmp_path / "doomed")
     upload(http, "same", doomed, tmp_path / "same")
@@ -176,53 +165,7 @@ def test_nothing_stays_of_a_deleted_dataset(
     assert made_of(doomed, artifacts) == 0
 
 
-@pytest.mark.long
-def test_a_dataset_deleted_while_it_is_laid_out(
-    http: httpx.Client, service: RunningService, artifacts: Path, tmp_path: Path
-) -> None:
-    doomed = Dataset("doomed", sweep(4, 0.0), sweep(2, 0.5))
-    upload(http, "doomed", doomed, tmp_path / "doomed")
-    with ThreadPoolExecutor(1) as executor:
-        answer = executor.submit(http.get, "/v1/datasets/doomed/poses")
-        os.kill(wait_until(lambda: helper_process(service, "lay_out")), signal.SIGSTOP)
-        assert http.delete("/v1/datasets/doomed").status_code == 204
-        assert answer.result().json()["reason"] == "DATASET_NOT_FOUND"
-    assert made_of(doomed, artifacts) == len(list(artifacts.glob("dataset-views/.*"))) == 0
-
-
-@pytest.mark.long
-def test_a_service_that_stops_or_dies_while_it_lays_a_dataset_out(start_service: StartService, tmp_path: Path) -> None:
-    with ThreadPoolExecutor(1) as executor:
-
-        def begin() -> tuple[RunningService, Future[httpx.Response], int]:
-            service = start_service(artifact_folder=tmp_path / "artifacts")
-            if not (tmp_path / "tiny").is_dir():
-                with httpx.Client(base_url=service.http, timeout=60) as client:
-                    upload(client, "tiny", DATASET, tmp_path / "tiny")
-            asked = executor.submit(httpx.get, f"{service.http}/v1/datasets/tiny/poses", timeout=60)
-            helper = wait_until(lambda: helper_process(service, "lay_out"))
-            os.kill(helper, signal.SIGSTOP)
-            return service, asked, helper
-
-        def left() -> list[Path]:
-            return list((tmp_path / "artifacts" / "dataset-views").iterdir())
-
-        first, asked, _ = begin()
-        assert first.terminate() == 0
-        answer = asked.result()
-        assert (answer.status_code, answer.json()["reason"]) == (503, "DRAINING")
-        assert not left()
-        second, asked, helper = begin()
-        second.process.kill()
-        with suppress(ProcessLookupError):  # it was stopped before it had asked to end with its parent, or has ended
-            os.kill(helper, signal.SIGCONT)
-        assert isinstance(asked.exception(), httpx.HTTPError)
-        assert left()
-        start_service(artifact_folder=tmp_path / "artifacts")
-        assert not left()
-
-
-def test_what_was_made_of_the_demo_scene_outlives_a_restart(start_service: StartService, tmp_path: Path) -> None:
+def test_what_was_made_of_the_demo_scene_outlives_a_restart(start_service, tmp_path):
     demo, gone = (
         tmp_path / "artifacts" / "comparisons" / f"3-{'0' * 64}-{sha256}"
         for sha256 in (read_header(DEMO_FILE).info.dataset_sha256, "f" * 64)

@@ -1,11 +1,6 @@
-from __future__ import annotations
-
 import copy
 import json
-from collections.abc import Iterator
-from typing import Any
 
-import httpx
 import numpy as np
 import pytest
 
@@ -16,40 +11,28 @@ LINEAR = {"kind": "linear", "width_mm": 40.0, "near_mm": 0.0, "far_mm": 40.0}
 
 
 @pytest.fixture(autouse=True)
-def _renders_afterwards(http: httpx.Client) -> Iterator[None]:
+def _renders_afterwards(http):
     """Whatever was sent, the service answers the next good request."""
     yield
     answer = http.post("/v1/scenes/demo/render", json={"pose": GOOD_POSE}, headers={"Accept": "image/png"})
     assert answer.status_code == 200
 
 
-def matrix(change: Any) -> dict[str, Any]:
+def matrix(place, value):
     values = np.eye(4)
-    change(values)
+    values[place] = value
     return {"matrix": values.tolist()}
 
 
-def placed(part: str, **changes: Any) -> dict[str, Any]:
-    pose: dict[str, Any] = copy.deepcopy(PLACED)
+def placed(part, **changes):
+    pose = copy.deepcopy(PLACED)
     pose[part].update(changes)
     return pose
 
 
-def mirror(values: Any) -> None:
-    values[0, 0] = -1
-
-
-def scale(values: Any) -> None:
-    values[:3, :3] *= 2
-
-
-def bad_last_row(values: Any) -> None:
-    values[3, 0] = 1
-
-
-def assert_problem(answer: httpx.Response, status: int, reason: str, field: str | None) -> dict[str, Any]:
+def assert_problem(answer, status, reason, field):
     assert answer.headers["content-type"] == "application/problem+json", answer.text
-    problem: dict[str, Any] = answer.json()
+    problem = answer.json()
     assert (answer.status_code, problem["reason"], problem["field"]) == (status, reason, field), problem
     assert set(problem) == {"type", "title", "status", "detail", "reason", "field", "request_id"}
     assert problem["status"] == status
@@ -59,28 +42,16 @@ def assert_problem(answer: httpx.Response, status: int, reason: str, field: str 
     return problem
 
 
-BAD_BODIES: dict[str, tuple[dict[str, Any], str, str | None]] = {
-    "mirrored": ({"pose": matrix(mirror)}, "INVALID_POSE", "pose.matrix"),
-    "scaled": ({"pose": matrix(scale)}, "INVALID_POSE", "pose.matrix"),
-    "last row": ({"pose": matrix(bad_last_row)}, "INVALID_POSE", "pose.matrix"),
-    "second of two": ({"poses": [GOOD_POSE, matrix(mirror)]}, "INVALID_POSE", "poses[1].matrix"),
+BAD_BODIES = {
+    "mirrored": ({"pose": matrix((0, 0), -1)}, "INVALID_POSE", "pose.matrix"),
+    "scaled": ({"pose": matrix((2, 2), 2)}, "INVALID_POSE", "pose.matrix"),
+    "last row": ({"pose": matrix((3, 0), 1)}, "INVALID_POSE", "pose.matrix"),
+    "second of two": ({"poses": [GOOD_POSE, matrix((0, 0), -1)]}, "INVALID_POSE", "poses[1].matrix"),
     "three rows": ({"pose": {"matrix": np.eye(4)[:3].tolist()}}, "INVALID_POSE", "pose.matrix"),
-    "ragged": (
-        {"poses": [{"matrix": [[1, 0, 0, 0], [0, 1, 0], [0, 0, 1, 0], [0, 0, 0, 1]]}]},
-        "INVALID_POSE",
-        "poses[0].matrix[1]",
-    ),
-    "text in matrix": (
-        {"pose": {"matrix": [["1", 0, 0, 0], *np.eye(4)[1:].tolist()]}},
-        "INVALID_POSE",
-        "pose.matrix[0][0]",
-    ),
+    "ragged": ({"poses": [{"matrix": [[1, 0, 0, 0], [0, 1, 0]]}]}, "INVALID_POSE", "poses[0].matrix[1]"),
+    "text in matrix": ({"pose": {"matrix": [["1", 0, 0, 0]] * 4}}, "INVALID_POSE", "pose.matrix[0][0]"),
     "norm": ({"pose": placed("quaternion", w=2.0)}, "INVALID_POSE", "pose.quaternion"),
-    "no w": (
-        {"poses": [GOOD_POSE, {**PLACED, "quaternion": {"x": 0.0, "y": 0.0, "z": 0.0}}]},
-        "INVALID_POSE",
-        "poses[1].quaternion.w",
-    ),
+    "no w": ({"poses": [GOOD_POSE, {**PLACED, "quaternion": {}}]}, "INVALID_POSE", "poses[1].quaternion.w"),
     "far away": ({"pose": placed("position_mm", x=1e7)}, "INVALID_POSE", "pose"),
     "no position": ({"pose": {"quaternion": PLACED["quaternion"]}}, "INVALID_POSE", "pose.position_mm"),
     "no quaternion": ({"pose": {"position_mm": PLACED["position_mm"]}}, "INVALID_POSE", "pose.quaternion"),
@@ -94,17 +65,9 @@ BAD_BODIES: dict[str, tuple[dict[str, Any], str, str | None]] = {
     "unknown key within": ({"pose": {**PLACED, "angle": 5}}, "INVALID_ARGUMENT", "pose.angle"),
     "height 0": ({"pose": GOOD_POSE, "height": 0}, "INVALID_IMAGE_SIZE", "height"),
     "width beyond the limit": ({"pose": GOOD_POSE, "width": 601}, "INVALID_IMAGE_SIZE", "width"),
-    "height of a fraction": ({"pose": GOOD_POSE, "height": 1.5}, "INVALID_IMAGE_SIZE", "height"),
     "height as text": ({"pose": GOOD_POSE, "height": "64"}, "INVALID_IMAGE_SIZE", "height"),
     "unknown output": ({"pose": GOOD_POSE, "outputs": ["bmode", "doppler"]}, "UNKNOWN_OUTPUT", "outputs"),
-    "no output": ({"pose": GOOD_POSE, "outputs": []}, "UNKNOWN_OUTPUT", "outputs"),
     "far at near": ({"pose": GOOD_POSE, "probe": {**LINEAR, "near_mm": 40.0}}, "INVALID_PROBE", "probe.far_mm"),
-    "no width": (
-        {"pose": GOOD_POSE, "probe": {"kind": "linear", "near_mm": 0, "far_mm": 1}},
-        "INVALID_PROBE",
-        "probe.width_mm",
-    ),
-    "width 0": ({"pose": GOOD_POSE, "probe": {**LINEAR, "width_mm": 0}}, "INVALID_PROBE", "probe.width_mm"),
     "unknown probe": ({"pose": GOOD_POSE, "probe": {**LINEAR, "kind": "matrix"}}, "INVALID_PROBE", "probe.kind"),
     "probe without kind": ({"pose": GOOD_POSE, "probe": {}}, "INVALID_PROBE", "probe.kind"),
     "timeout": ({"pose": GOOD_POSE, "timeout_ms": 0}, "INVALID_ARGUMENT", "timeout_ms"),
@@ -113,21 +76,21 @@ BAD_BODIES: dict[str, tuple[dict[str, Any], str, str | None]] = {
 
 
 @pytest.mark.parametrize("case", BAD_BODIES)
-def test_bad_body(http: httpx.Client, case: str) -> None:
+def test_bad_body(http, case):
     body, reason, field = BAD_BODIES[case]
     problem = assert_problem(http.post("/v1/scenes/demo/render", json=body), 422, reason, field)
     assert field is None or field in problem["detail"]
 
 
 @pytest.mark.parametrize("literal", ["NaN", "Infinity", "-Infinity", "1e999"])
-def test_numbers_that_are_not_finite(http: httpx.Client, literal: str) -> None:
+def test_numbers_that_are_not_finite(http, literal):
     body = json.dumps({"poses": [GOOD_POSE, PLACED]}).replace('{"x": 0.0', f'{{"x": {literal}', 1)
     answer = http.post("/v1/scenes/demo/render", content=body, headers={"Content-Type": "application/json"})
     assert_problem(answer, 422, "INVALID_POSE", "poses[1].position_mm.x")
 
 
 @pytest.mark.parametrize("body", [b"", b"{", b"[]", b"null", b'{"pose": ', b"\xff\xfe", b"[" * 100_000])
-def test_bodies_that_are_no_object(http: httpx.Client, body: bytes) -> None:
+def test_bodies_that_are_no_object(http, body):
     answer = http.post("/v1/scenes/demo/render", content=body, headers={"Content-Type": "application/json"})
     assert_problem(answer, 422, "INVALID_ARGUMENT", None)
 
@@ -143,7 +106,7 @@ def test_bodies_that_are_no_object(http: httpx.Client, body: bytes) -> None:
         ("empty", 422, "SCENE_FILE_INVALID"),
     ],
 )
-def test_scenes_that_cannot_be_rendered(http: httpx.Client, scene: str, status: int, reason: str) -> None:
+def test_scenes_that_cannot_be_rendered(http, scene, status, reason):
     if scene == "..":
         scene = "..%20"
     for suffix in ("/render", ":load"):
@@ -152,32 +115,27 @@ def test_scenes_that_cannot_be_rendered(http: httpx.Client, scene: str, status: 
     assert_problem(http.get(f"/v1/scenes/{scene}"), status, reason, "scene")
 
 
-def test_a_scene_without_a_probe_needs_one(http: httpx.Client) -> None:
+def test_a_scene_without_a_probe_needs_one(http):
     answer = http.post("/v1/scenes/probeless/render", json={"pose": GOOD_POSE})
     assert_problem(answer, 422, "INVALID_PROBE", "probe")
 
 
 @pytest.mark.parametrize("accept", ["image/png", "image/jpeg;q=0.5, image/*", "text/html"])
-def test_accept_that_cannot_hold_the_request(http: httpx.Client, accept: str) -> None:
+def test_accept_that_cannot_hold_the_request(http, accept):
     body = {"poses": [GOOD_POSE, GOOD_POSE]}
     answer = http.post("/v1/scenes/demo/render", json=body, headers={"Accept": accept})
     problem = assert_problem(answer, 406, "NOT_ACCEPTABLE", "Accept")
     assert "application/x-npz" in problem["detail"]
 
 
-@pytest.mark.parametrize("content_type", ["text/plain", "application/x-www-form-urlencoded"])
-def test_bodies_that_are_not_json(http: httpx.Client, content_type: str) -> None:
-    answer = http.post("/v1/scenes/demo/render", content=b"{}", headers={"Content-Type": content_type})
-    assert_problem(answer, 415, "UNSUPPORTED_MEDIA_TYPE", "Content-Type")
+@pytest.mark.parametrize(("name", "value"), [("Content-Type", "text/plain"), ("Content-Encoding", "gzip")])
+def test_bodies_that_are_not_json(http, name, value):
+    headers = {"Content-Type": "application/json", name: value}
+    answer = http.post("/v1/scenes/demo/render", content=b"{}", headers=headers)
+    assert_problem(answer, 415, "UNSUPPORTED_MEDIA_TYPE", name)
 
 
-def test_compressed_bodies_are_refused(http: httpx.Client) -> None:
-    headers = {"Content-Type": "application/json", "Content-Encoding": "gzip"}
-    answer = http.post("/v1/scenes/demo/render", content=b"\x1f\x8b", headers=headers)
-    assert_problem(answer, 415, "UNSUPPORTED_MEDIA_TYPE", "Content-Encoding")
-
-
-def test_body_too_large(http: httpx.Client) -> None:
+def test_body_too_large(http):
     body = b" " * (8 * 2**20 + 1)
     headers = {"Content-Type": "application/json"}
     answer = http.post("/v1/scenes/demo/render", content=body, headers=headers)
@@ -185,17 +143,7 @@ def test_body_too_large(http: httpx.Client) -> None:
     assert str(8 * 2**20) in problem["detail"]
 
 
-def test_chunked_body_too_large(http: httpx.Client) -> None:
-    def chunks() -> Iterator[bytes]:
-        for _ in range(9):
-            yield b" " * 2**20
-
-    headers = {"Content-Type": "application/json"}
-    answer = http.post("/v1/scenes/demo/render", content=chunks(), headers=headers)
-    assert_problem(answer, 413, "BODY_TOO_LARGE", "body")
-
-
-def test_unknown_route_and_method(http: httpx.Client) -> None:
+def test_unknown_route_and_method(http):
     assert_problem(http.get("/v1/nothing"), 404, "ROUTE_NOT_FOUND", None)
     answer = http.patch("/v1/scenes/demo")
     assert_problem(answer, 405, "METHOD_NOT_ALLOWED", None)
@@ -203,21 +151,18 @@ def test_unknown_route_and_method(http: httpx.Client) -> None:
     assert_problem(http.get("/v1/scenes/demo/render"), 405, "METHOD_NOT_ALLOWED", None)
 
 
-@pytest.mark.parametrize("page_size", ["0", "1001", "many"])
-def test_page_size(http: httpx.Client, page_size: str) -> None:
-    answer = http.get("/v1/scenes", params={"page_size": page_size})
-    assert_problem(answer, 422, "INVALID_ARGUMENT", "page_size")
+@pytest.mark.parametrize(
+    ("name", "value"), [("page_size", "0"), ("page_size", "1001"), ("page_size", "many"), ("page_token", "*")]
+)
+def test_pages_that_there_are_none_of(http, name, value):
+    assert_problem(http.get("/v1/scenes", params={name: value}), 422, "INVALID_ARGUMENT", name)
 
 
-def test_page_token(http: httpx.Client) -> None:
-    assert_problem(http.get("/v1/scenes", params={"page_token": "*"}), 422, "INVALID_ARGUMENT", "page_token")
-
-
-def test_an_answer_of_too_many_pixels(http: httpx.Client) -> None:
+def test_an_answer_of_too_many_pixels(http):
     body = {"poses": [GOOD_POSE] * 12, "height": 600, "width": 600}
     assert_problem(http.post("/v1/scenes/demo/render", json=body), 422, "TOO_MANY_POSES", "poses")
 
 
-def test_deadline(http: httpx.Client) -> None:
+def test_deadline(http):
     body = {"poses": [GOOD_POSE] * 8, "height": 600, "width": 600, "timeout_ms": 0.01}
     assert_problem(http.post("/v1/scenes/demo/render", json=body), 504, "DEADLINE_EXCEEDED", None)

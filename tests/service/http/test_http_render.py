@@ -1,56 +1,40 @@
-from __future__ import annotations
+"""Scenes and their frames over HTTP: every form of an answer, and what it tells."""
 
 import hashlib
 import io
 import json
-from typing import Any
+import math
+import re
+from datetime import datetime
 
 import cv2
 import httpx
 import numpy as np
+import pydicom
 import pytest
 
-from ultragray import GaussianScene, render
+from ultragray import render
 from ultragray.scene.confidence import FIGURES
 
-from ..conftest import HEIGHT, WIDTH, RunningService
+from ..conftest import HEIGHT, WIDTH
 
 ONE_STEP = 1.001 / 255
 
 
-def expected(scene: GaussianScene, poses: Any, **options: Any) -> Any:
+def expected(scene, poses, **options):
     frames = render(scene, options.pop("probe", None), poses, height=HEIGHT, width=WIDTH, **options)
     return {name: getattr(frames, name).numpy() for name in options["outputs"]}
 
 
-def post(http: httpx.Client, body: dict[str, Any], accept: str | None = None, scene: str = "demo") -> httpx.Response:
+def post(http, body, accept=None, scene="demo"):
     headers = {} if accept is None else {"Accept": accept}
     return http.post(f"/v1/scenes/{scene}/render", json=body, headers=headers)
 
 
-def test_raw_pixels_are_those_of_the_library(
-    http: httpx.Client, demo_scene: GaussianScene, pose_body: Any, pose_matrix: Any
-) -> None:
-    answer = post(http, {"pose": pose_body}, "application/octet-stream")
-    assert answer.status_code == 200
-    assert answer.headers["content-type"] == "application/octet-stream"
-    assert answer.headers["x-ultragray-shape"] == f"1,1,{HEIGHT},{WIDTH}"
-    assert answer.headers["x-ultragray-dtype"] == "uint8"
-    frame = np.frombuffer(answer.content, np.uint8).reshape(HEIGHT, WIDTH)
-    truth = expected(demo_scene, pose_matrix, outputs=("bmode",))["bmode"][0]
-    assert truth.max() > 0.1
-    assert np.abs(frame / 255 - truth).max() <= ONE_STEP
-
-
-@pytest.mark.parametrize(
-    ("accept", "extra"),
-    [("application/octet-stream;dtype=float32", {}), ("application/octet-stream", {"dtype": "float32"})],
-)
-def test_raw_float32_holds_outputs_one_after_another(
-    http: httpx.Client, demo_scene: GaussianScene, pose_body: Any, pose_matrix: Any, accept: str, extra: Any
-) -> None:
+def test_raw_float32_holds_outputs_one_after_another(http, demo_scene, pose_body, pose_matrix):
     outputs = ["transmittance", "bmode"]
-    answer = post(http, {"poses": [pose_body, pose_body], "outputs": outputs, **extra}, accept)
+    body = {"poses": [pose_body, pose_body], "outputs": outputs}
+    answer = post(http, body, "application/octet-stream;dtype=float32")
     assert answer.headers["x-ultragray-shape"] == f"2,2,{HEIGHT},{WIDTH}"
     assert answer.headers["x-ultragray-dtype"] == "float32"
     assert answer.headers["x-ultragray-outputs"] == "transmittance,bmode"
@@ -64,15 +48,7 @@ def test_raw_float32_holds_outputs_one_after_another(
 @pytest.mark.parametrize(
     ("accept", "media_type", "tolerance"), [(None, "image/png", ONE_STEP), ("image/jpeg", "image/jpeg", 0.2)]
 )
-def test_images(
-    http: httpx.Client,
-    demo_scene: GaussianScene,
-    pose_body: Any,
-    pose_matrix: Any,
-    accept: str | None,
-    media_type: str,
-    tolerance: float,
-) -> None:
+def test_images(http, demo_scene, pose_body, pose_matrix, accept, media_type, tolerance):
     answer = post(http, {"pose": pose_body}, accept)
     assert answer.headers["content-type"] == media_type
     image = cv2.imdecode(np.frombuffer(answer.content, np.uint8), cv2.IMREAD_UNCHANGED)
@@ -81,9 +57,7 @@ def test_images(
     assert np.abs(image / 255 - truth).max() <= tolerance
 
 
-def test_npz_holds_frames_poses_and_origin(
-    http: httpx.Client, service: RunningService, demo_scene: GaussianScene, pose_body: Any, pose_matrix: Any
-) -> None:
+def test_npz_holds_frames_poses_and_origin(http, service, demo_scene, pose_body, pose_matrix):
     answer = post(http, {"poses": [pose_body, {"matrix": np.eye(4).tolist()}], "outputs": ["bmode", "coverage"]})
     assert answer.headers["content-type"] == "application/x-npz"
     with np.load(io.BytesIO(answer.content)) as bundle:
@@ -98,7 +72,7 @@ def test_npz_holds_frames_poses_and_origin(
     assert str(arrays["scene_sha256"]) == answer.headers["x-ultragray-scene-sha256"] == sha256
 
 
-def test_headers_let_the_frame_be_rendered_again(http: httpx.Client, pose_body: Any) -> None:
+def test_headers_let_the_frame_be_rendered_again(http, pose_body):
     nearly = {"position_mm": pose_body["position_mm"], "quaternion": {"w": 0.9999, "x": 0.0, "y": 0.0, "z": 0.004}}
     answer = post(http, {"pose": nearly})
     headers = answer.headers
@@ -114,12 +88,12 @@ def test_headers_let_the_frame_be_rendered_again(http: httpx.Client, pose_body: 
     assert again.content == answer.content
 
 
-def test_a_scene_without_a_probe_renders_when_one_is_given(http: httpx.Client, pose_body: Any) -> None:
+def test_a_scene_without_a_probe_renders_when_one_is_given(http, pose_body):
     probe = {"kind": "convex", "opening_angle_deg": 60.0, "near_mm": 10.0, "far_mm": 40.0}
     assert post(http, {"pose": pose_body, "probe": probe}, scene="probeless").status_code == 200
 
 
-def test_request_id_is_echoed_or_made(http: httpx.Client, pose_body: Any) -> None:
+def test_request_id_is_echoed_or_made(http, pose_body):
     headers = {"X-Request-Id": "robot-7.42"}
     answer = http.post("/v1/scenes/demo/render", json={"pose": pose_body}, headers=headers)
     assert answer.headers["x-request-id"] == "robot-7.42"
@@ -128,9 +102,7 @@ def test_request_id_is_echoed_or_made(http: httpx.Client, pose_body: Any) -> Non
     assert "injected" not in hostile.headers["x-request-id"]
 
 
-def test_new_scene_files_appear_without_a_restart(
-    http: httpx.Client, service: RunningService, demo_scene: GaussianScene, pose_body: Any
-) -> None:
+def test_new_scene_files_appear_without_a_restart(http, service, demo_scene, pose_body):
     path = service.data_folder / "late.ugr"
     assert post(http, {"pose": pose_body}, scene="late").status_code == 404
     demo_scene.save(path)
@@ -140,7 +112,7 @@ def test_new_scene_files_appear_without_a_restart(
         path.unlink()
 
 
-def test_documented_examples_work(http: httpx.Client) -> None:
+def test_documented_examples_work(http):
     document = http.get("/openapi.json").json()
     operation = document["paths"]["/v1/scenes/{scene}/render"]["post"]
     examples = operation["requestBody"]["content"]["application/json"]["examples"]
@@ -149,3 +121,180 @@ def test_documented_examples_work(http: httpx.Client) -> None:
         body = {"height": 16, "width": 16, **example["value"]}
         assert post(http, body).status_code == 200, example
     assert http.get("/docs").status_code == 200
+
+
+DICOM = {"Accept": "application/dicom"}
+
+
+def stored(http, body):
+    answer = http.post("/v1/scenes/demo/render", json=body, headers=DICOM)
+    assert answer.status_code == 200, answer.text
+    assert answer.headers["content-type"] == "application/dicom"
+    return answer, pydicom.dcmread(io.BytesIO(answer.content))
+
+
+def test_one_frame_holds_the_pixels_and_their_spacing(http, pose_body):
+    answer, image = stored(http, {"pose": pose_body, "display": {"gain_db": 6.0}})
+    raw = http.post(
+        "/v1/scenes/demo/render",
+        json={"pose": pose_body, "display": {"gain_db": 6.0}},
+        headers={"Accept": "application/octet-stream"},
+    )
+    assert image.pixel_array.tobytes() == raw.content
+    picture = json.loads(answer.headers["x-ultragray-picture"])
+    region = image.SequenceOfUltrasoundRegions[0]
+    assert (region.PhysicalDeltaX, region.PhysicalDeltaY) == pytest.approx([step / 10 for step in picture["step"]])
+    assert (image.NumberOfFrames, image.Rows, image.Columns) == (1, HEIGHT, WIDTH)
+
+
+def test_other_outputs_and_float_pixels_are_refused(http, pose_body):
+    for extra, field in [({"outputs": ["echo"]}, "outputs"), ({"dtype": "float32"}, "dtype")]:
+        answer = http.post("/v1/scenes/demo/render", json={"pose": pose_body, **extra}, headers=DICOM)
+        assert (answer.status_code, answer.json()["field"]) == (422, field)
+
+
+LINEAR = {"kind": "linear", "width_mm": 40.0, "near_mm": 5.0, "far_mm": 50.0}
+
+
+def plane(http, probe):  # [W, 2, 2]: line, end, (x, z)
+    answer = http.post("/v1/probes:plane", json=probe)
+    assert answer.status_code == 200, answer.text
+    document = answer.json()
+    return document["face_depth_mm"], np.array(document["lines_mm"]).reshape(-1, 2, 2)
+
+
+def test_lines_run_from_the_left_edge_of_the_image_to_its_right_one(http):
+    face_depth_mm, lines = plane(http, LINEAR)
+    assert face_depth_mm == 0.0
+    np.testing.assert_allclose(lines[:, :, 0], np.linspace(-20.0, 20.0, len(lines))[:, None] * np.ones(2), atol=1e-6)
+    np.testing.assert_allclose(lines[:, :, 1], np.tile([5.0, 50.0], (len(lines), 1)))
+
+
+def test_each_kind_has_an_example_that_can_be(http):
+    schemas = http.get("/openapi.json").json()["components"]["schemas"]
+    mapping = schemas["RenderSettings"]["properties"]["probe"]["anyOf"][0]["discriminator"]["mapping"]
+    assert {"linear", "convex", "phased"} <= mapping.keys()
+    for kind, reference in mapping.items():
+        (example,) = schemas[reference.rpartition("/")[2]]["examples"]
+        assert example["kind"] == kind
+        face_depth_mm, lines = plane(http, example)
+        assert math.isfinite(face_depth_mm)
+        assert np.isfinite(lines).all()
+
+
+@pytest.mark.parametrize(
+    ("probe", "field"),
+    [({**LINEAR, "far_mm": 5.0}, "far_mm"), ({**LINEAR, "width_mm": "wide"}, "width_mm"), ({"kind": "curved"}, "kind")],
+)
+def test_a_probe_that_cannot_be_is_refused(http, probe, field):
+    answer = http.post("/v1/probes:plane", json=probe)
+    assert answer.status_code == 422
+    assert field in answer.json()["field"] + answer.json()["detail"]
+
+
+NAMES = ["demo", "empty", "foreign", "probeless", "second", "truncated"]
+
+
+def test_list_names_every_file_and_what_is_wrong_with_it(http, service):
+    page = http.get("/v1/scenes").json()
+    assert [entry["name"] for entry in page["scenes"]] == NAMES
+    assert page["next_page_token"] == ""
+    entries = {entry["name"]: entry for entry in page["scenes"]}
+    demo = entries["demo"]
+    assert (demo["gaussian_count"], demo["image_height"], demo["image_width"]) == (400, HEIGHT, WIDTH)
+    assert (demo["probe_kind"], demo["metrics"]) == ("linear", {"psnr": 20.5})
+    changed_s = datetime.fromisoformat(demo["changed_at"]).timestamp()
+    assert abs(changed_s - (service.data_folder / "demo.ugr").stat().st_mtime) <= 1
+    assert "probe_kind" not in entries["probeless"]
+    assert "error" not in demo
+    for name in ("empty", "foreign", "truncated"):
+        assert entries[name]["error"]["reason"] == "SCENE_FILE_INVALID"
+        assert f"{name}.ugr" in entries[name]["error"]["detail"]
+
+
+@pytest.mark.parametrize("page_size", [1, 4])
+def test_pages_join_to_the_whole_list(http, page_size):
+    names = []
+    token = ""
+    while True:
+        page = http.get("/v1/scenes", params={"page_size": page_size, "page_token": token}).json()
+        assert len(page["scenes"]) <= page_size
+        names += [entry["name"] for entry in page["scenes"]]
+        token = page["next_page_token"]
+        if not token:
+            break
+    assert names == NAMES
+
+
+def test_a_scene_says_all_about_itself(http, service):
+    scene = http.get("/v1/scenes/demo").json()
+    assert scene["probe"] == {"kind": "linear", "width_mm": 40.0, "near_mm": 0.0, "far_mm": 40.0}
+    assert scene["centre_mm"] == {"x": 0.0, "y": 0.0, "z": 20.0}
+    assert scene["bounds"]["min_mm"]["z"] < 20 < scene["bounds"]["max_mm"]["z"]
+    assert (scene["image_height"], scene["image_width"], scene["sh_degree"]) == (HEIGHT, WIDTH, 0)
+    assert scene["intensity"] == "released"
+    assert scene["metrics"] == {"psnr": 20.5}
+    assert scene["dataset_name"] == "synthetic"
+    assert scene["file_bytes"] == (service.data_folder / "demo.ugr").stat().st_size
+    training = scene["training_poses"]
+    assert training["count"] == 5
+    assert training["position_max_mm"] == {"x": 0.0, "y": 4.0, "z": 0.0}
+    assert training["first"]["quaternion"] == {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}
+    assert training["middle"]["position_mm"]["y"] == 2.0
+    assert training["last"]["matrix"][1] == [0.0, 1.0, 0.0, 4.0]
+
+
+def test_load_and_unload(http):
+    assert http.post("/v1/scenes/second:load").json() == {"scene": "second", "loaded": True, "loaded_processes": 1}
+    assert http.get("/v1/scenes/second").json()["loaded"] is True
+    assert http.post("/v1/scenes/second:unload").json()["loaded"] is False
+    assert http.post("/v1/scenes/second:unload").status_code == 200
+    assert http.get("/v1/scenes/second").json()["loaded"] is False
+    assert http.post("/v1/scenes/nowhere:unload").json()["reason"] == "SCENE_NOT_FOUND"
+
+
+def sample(exposition, name):
+    """The value of a metric, all its labels together."""
+    lines = [line for line in exposition.splitlines() if line.startswith((f"{name} ", f"{name}{{"))]
+    assert name in exposition
+    return sum(float(line.split()[-1]) for line in lines)
+
+
+def test_metrics_count_frames_and_keep_the_three_times_apart(http):
+    identity = {"position_mm": {"x": 0, "y": 0, "z": 0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}
+    before = http.get("/metrics").text
+    assert http.post("/v1/scenes/demo/render", json={"poses": [identity] * 3}).status_code == 200
+    after = http.get("/metrics").text
+    assert sample(after, "ultragray_frames_total") == sample(before, "ultragray_frames_total") + 3
+    for stage in ("queue", "render", "encode"):
+        name = f"ultragray_{stage}_seconds_count"
+        assert sample(after, name) == sample(before, name) + 1
+    assert sample(after, "ultragray_processes_alive") == 1
+    assert sample(after, "ultragray_process_restarts_total") == 0
+    assert sample(after, "ultragray_waiting_frames") == 0
+    assert sample(after, "ultragray_loaded_scenes") >= 1
+    assert 'ultragray_requests_total{door="http",route="/v1/scenes/{scene}/render",status="200"}' in after
+
+
+def test_pages_of_allowed_origins_may_call(start_service):
+    service = start_service(cors_origins="https://console.example")
+    asked = {"Access-Control-Request-Method": "POST", "Access-Control-Request-Headers": "content-type"}
+    for origin, allowed in (("https://console.example", True), ("https://other.example", False)):
+        answer = httpx.options(f"{service.http}/v1/scenes/demo/render", headers={"Origin": origin, **asked})
+        assert (answer.headers.get("access-control-allow-origin") == origin) is allowed
+    answer = httpx.get(f"{service.http}/v1/scenes", headers={"Origin": "https://console.example"}, timeout=60)
+    assert "X-Ultragray-Shape" in answer.headers["access-control-expose-headers"]
+
+
+def test_the_docs_need_nothing_from_outside(http):
+    page = http.get("/docs").text
+    assets = re.findall(r'(?:src|href)="([^"]+)"', page)
+    assert len(assets) >= 3
+    for asset in assets:
+        assert asset.startswith("/docs/static/")
+        assert http.get(asset).status_code == 200
+
+
+@pytest.mark.parametrize("path", ["/v1/health/live", "/v1/health/ready"])
+def test_health_answers_head(http, path):  # what load balancers send
+    assert http.head(path).status_code == 200

@@ -1,21 +1,12 @@
 """Ready means: frames are rendered, and jobs are taken. Who cannot write down a job is not ready for it."""
 
-from __future__ import annotations
-
-import subprocess
-import sys
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
-
 import httpx
 import numpy as np
 import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
-from ...postgres import PostgresServer
 from ...waiting import wait_until
-from ..conftest import RunningService, StartService
+from ..tls.test_healthcheck import check
 
 IN_ORDER = {"ready": True, "detail": None}
 NOT_SERVING, SERVING = health_pb2.HealthCheckResponse.NOT_SERVING, health_pb2.HealthCheckResponse.SERVING
@@ -23,27 +14,27 @@ FILE = "jobs.sqlite"
 _WRITE_VERSION, _CHANGE_COUNTER = 18, slice(24, 28)  # of the header of a SQLite file
 
 
-def ready(service: RunningService) -> tuple[int, dict[str, Any]]:
+def ready(service):
     answer = httpx.get(f"{service.http}/v1/health/ready", timeout=60)
     return answer.status_code, answer.json()
 
 
-def wait_for(service: RunningService, status: int) -> dict[str, Any]:
+def wait_for(service, status):
     return wait_until(lambda: (said := ready(service))[0] == status and said[1], every_s=0.2) or {}
 
 
-def health(service: RunningService, name: str) -> int:
+def health(service, name):
     with service.channel() as channel:
         stub = health_pb2_grpc.HealthStub(channel)
         return int(stub.Check(health_pb2.HealthCheckRequest(service=name), timeout=60).status)
 
 
-def renders(service: RunningService, pose_body: dict[str, Any]) -> int:
+def renders(service, pose_body):
     body = {"poses": [pose_body], "height": 16, "width": 16}
     return httpx.post(f"{service.http}/v1/scenes/demo/render", json=body, timeout=60).status_code
 
 
-def make_read_only(file: Path) -> None:
+def make_read_only(file):
     """Marks a SQLite file as one of a later format, which may be read and not written: modes do not bind root."""
     header = bytearray(file.read_bytes()[:100])
     header[_WRITE_VERSION] = 3
@@ -54,35 +45,25 @@ def make_read_only(file: Path) -> None:
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     return tmp_path / "artifacts"
 
 
 @pytest.fixture
-def service(start_service: StartService, folder: Path) -> RunningService:
+def service(start_service, folder):
     return start_service(artifact_folder=folder)
 
 
-def test_every_part_of_a_service_in_order_is_told(service: RunningService) -> None:
-    parts = {"frames": IN_ORDER, "jobs": IN_ORDER, "artifacts": IN_ORDER, "scenes": IN_ORDER}
+def test_a_service_whose_sqlite_file_was_removed_is_not_ready_until_it_is_back(service, folder, tmp_path, pose_body):
     status, said = ready(service)
-    assert (status, said["status"], said["components"]) == (200, "ready", parts)
-
-
-def test_a_service_whose_sqlite_file_was_removed_is_not_ready_until_it_is_back(
-    service: RunningService, folder: Path, tmp_path: Path, pose_body: dict[str, Any]
-) -> None:
+    in_order = dict.fromkeys(("frames", "jobs", "artifacts", "scenes"), IN_ORDER)
+    assert (status, said["status"], said["components"]) == (200, "ready", in_order)
     (folder / FILE).rename(tmp_path / FILE)
     problem = wait_for(service, 503)
     assert problem["reason"] == "DATABASE_UNAVAILABLE"
     assert "removed or replaced" in problem["detail"]
-    jobs = {"ready": False, "detail": problem["detail"]}
-    assert problem["components"] == {
-        "frames": IN_ORDER,
-        "jobs": jobs,
-        "artifacts": IN_ORDER,
-        "scenes": IN_ORDER,
-    }
+    assert problem["components"] == {**in_order, "jobs": {"ready": False, "detail": problem["detail"]}}
+    assert check(service).returncode == 1, "the health check of containers follows"
     assert renders(service, pose_body) == 200
     wait_until(lambda: health(service, "") == NOT_SERVING)
     assert health(service, "ultragray.v1.JobService") == NOT_SERVING
@@ -92,9 +73,16 @@ def test_a_service_whose_sqlite_file_was_removed_is_not_ready_until_it_is_back(
     wait_for(service, 200)
     wait_until(lambda: health(service, "ultragray.v1.JobService") == SERVING)
     assert health(service, "") == SERVING
+    with service.channel() as channel:
+        asked = health_pb2.HealthCheckRequest(service="ultragray.v1.JobService")
+        watching = health_pb2_grpc.HealthStub(channel).Watch(asked, timeout=60)
+        while next(watching).status != SERVING:
+            pass
+        service.process.terminate()
+        assert next(watching).status == NOT_SERVING
 
 
-def test_a_service_whose_sqlite_file_is_read_only_is_not_ready(service: RunningService, folder: Path) -> None:
+def test_a_service_whose_sqlite_file_is_read_only_is_not_ready(service, folder):
     make_read_only(folder / FILE)
     problem = wait_for(service, 503)
     assert (problem["reason"], problem["components"]["artifacts"]) == ("DATABASE_UNAVAILABLE", IN_ORDER)
@@ -105,7 +93,7 @@ def test_a_service_whose_sqlite_file_is_read_only_is_not_ready(service: RunningS
     assert (refused.status_code, refused.json()["reason"]) == (503, "DATABASE_UNAVAILABLE"), refused.text
 
 
-def test_a_service_without_its_share_is_not_ready(service: RunningService, folder: Path, tmp_path: Path) -> None:
+def test_a_service_without_its_share_is_not_ready(service, folder, tmp_path):
     folder.rename(tmp_path / "unmounted")
     folder.mkdir()
     components = wait_for(service, 503)["components"]
@@ -114,30 +102,13 @@ def test_a_service_without_its_share_is_not_ready(service: RunningService, folde
     assert str(tmp_path) not in str(ready(service))
 
 
-def test_a_service_that_only_renders_is_ready_without_jobs_and_tells(start_service: StartService, folder: Path) -> None:
+def test_a_service_that_only_renders_is_ready_without_jobs_and_tells(start_service, folder):
     service = start_service(artifact_folder=folder, ready_without_jobs=True)
     (folder / FILE).unlink()
     wait_until(lambda: not ready(service)[1]["components"]["jobs"]["ready"], every_s=0.2)
     assert ready(service)[0] == 200
     wait_until(lambda: health(service, "ultragray.v1.JobService") == NOT_SERVING)
     assert health(service, "") == SERVING
-
-
-def test_the_health_check_of_containers_follows(service: RunningService, folder: Path) -> None:
-    port = service.http.rpartition(":")[2]
-
-    def check() -> int:
-        environment = {"ULTRAGRAY_HTTP_PORT": port, "PYTHONPATH": ":".join(sys.path)}
-        command = [sys.executable, "-m", "ultragray_service.healthcheck"]
-        return subprocess.run(command, env=environment, stderr=subprocess.DEVNULL, check=False).returncode
-
-    assert wait_until(lambda: check() == 0)
-    (folder / FILE).unlink()
-    wait_for(service, 503)
-    assert check() == 1
-
-
-Change = Callable[[PostgresServer, str], None]
 
 
 @pytest.mark.long
@@ -155,13 +126,8 @@ Change = Callable[[PostgresServer, str], None]
     ],
 )
 def test_a_service_whose_server_is_away_or_read_only_is_not_ready_until_it_is_back(
-    start_service: StartService,
-    postgres: PostgresServer,
-    folder: Path,
-    take_away: Change,
-    give_back: Change,
-    said: str,
-) -> None:
+    start_service, postgres, folder, take_away, give_back, said
+):
     url = postgres.create_database()
     service = start_service(artifact_folder=folder, database_url=url)
     assert ready(service)[0] == 200
@@ -173,14 +139,3 @@ def test_a_service_whose_server_is_away_or_read_only_is_not_ready_until_it_is_ba
     finally:
         give_back(postgres, url)
     wait_for(service, 200)
-
-
-def test_a_service_that_stops_says_so_of_every_part(service: RunningService) -> None:
-    with service.channel() as channel:
-        watching = health_pb2_grpc.HealthStub(channel).Watch(
-            health_pb2.HealthCheckRequest(service="ultragray.v1.JobService"), timeout=60
-        )
-        while next(watching).status != SERVING:
-            pass
-        service.process.terminate()
-        assert next(watching).status == NOT_SERVING

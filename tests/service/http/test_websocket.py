@@ -1,45 +1,37 @@
-"""The WebSocket stream against a real service."""
-
-from __future__ import annotations
+"""The WebSocket streams of a real service, and those who watch the streams of others."""
 
 import base64
 import contextlib
 import json
 import socket
 import struct
-import time
-from collections.abc import Callable, Iterator
 from dataclasses import fields
-from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from pydantic import TypeAdapter
 from websockets.exceptions import ConnectionClosed, InvalidStatus
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
 
+from ultragray_client import Client
+from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc
 from ultragray_service.http.routes.streams import FrameMessage, RefusalMessage
 
 from ...waiting import wait_until
-from ..conftest import HEIGHT, WIDTH, RunningService
+from ..conftest import HEIGHT, WIDTH, split
 
 TIMEOUT_S = 120.0
 KEY = "a-key-of-twenty-chars"
 
 
-def at(x: float) -> dict[str, Any]:
+def at(x):
     return {"position_mm": {"x": x, "y": 0.0, "z": 0.0}, "quaternion": {"w": 1.0, "x": 0.0, "y": 0.0, "z": 0.0}}
 
 
-def address(service: RunningService, scene: str = "demo") -> str:
-    return f"{service.http.replace('http', 'ws', 1)}/v1/scenes/{scene}/stream"
-
-
-def checked(kind: Any, text: str | bytes) -> dict[str, Any]:
+def checked(kind, text):
     """The JSON of a message, which must be as the OpenAPI document says."""
     TypeAdapter(kind).validate_json(text)
-    document: dict[str, Any] = json.loads(text)
+    document = json.loads(text)
     assert document.keys() == {field.name for field in fields(kind)}
     return document
 
@@ -47,13 +39,13 @@ def checked(kind: Any, text: str | bytes) -> dict[str, Any]:
 class Stream:
     """A client's end of a stream."""
 
-    def __init__(self, connection: ClientConnection) -> None:
+    def __init__(self, connection):
         self.connection = connection
 
-    def send(self, **message: Any) -> None:
+    def send(self, **message):
         self.connection.send(json.dumps(message))
 
-    def receive(self) -> tuple[dict[str, Any], bytes]:
+    def receive(self):
         message = self.connection.recv(timeout=TIMEOUT_S)
         if isinstance(message, str):
             return checked(RefusalMessage, message), b""
@@ -61,23 +53,25 @@ class Stream:
         assert (4 + length) % 8 == 0
         return checked(FrameMessage, message[4 : 4 + length]), message[4 + length :]
 
-    def ask(self, **message: Any) -> tuple[dict[str, Any], bytes]:
+    def ask(self, **message):
         self.send(**message)
         return self.receive()
 
 
 @pytest.fixture
-def open_stream(service: RunningService) -> Iterator[Callable[..., Stream]]:
+def open_stream(service):
     with contextlib.ExitStack() as opened:
 
-        def open_(scene: str = "demo", **options: Any) -> Stream:
-            connection = connect(address(service, scene), compression=None, max_size=None, close_timeout=0.2, **options)
+        def open_(scene="demo", **options):
+            connection = connect(
+                service.stream_url(scene), compression=None, max_size=None, close_timeout=0.2, **options
+            )
             return Stream(opened.enter_context(connection))
 
         yield open_
 
 
-def test_an_answer_has_what_its_message_gave(open_stream: Callable[..., Stream]) -> None:
+def test_an_answer_has_what_its_message_gave(open_stream):
     about, data = open_stream().ask(
         sequence=2**40, settings={"encoding": "float32"}, pose=at(1.5), client_time_ms=12.25
     )
@@ -88,14 +82,7 @@ def test_an_answer_has_what_its_message_gave(open_stream: Callable[..., Stream])
     assert len(data) == 4 * HEIGHT * WIDTH
 
 
-@pytest.mark.parametrize("encoding", ["png", "jpeg"])
-def test_image_files(open_stream: Callable[..., Stream], encoding: str) -> None:
-    about, data = open_stream().ask(settings={"encoding": encoding, "height": 20, "width": 30}, pose=at(0.0))
-    assert about["encoding"] == encoding
-    assert cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED).shape == (20, 30)
-
-
-def test_ordered_streams_answer_every_pose_and_settings_may_change(open_stream: Callable[..., Stream]) -> None:
+def test_ordered_streams_answer_every_pose_and_settings_may_change(open_stream):
     stream = open_stream()
     for k in range(30):
         settings = {"settings": {"height": 10, "width": 12}} if k == 20 else {}
@@ -105,7 +92,7 @@ def test_ordered_streams_answer_every_pose_and_settings_may_change(open_stream: 
     assert [answer["height"] for answer in answers] == [HEIGHT] * 20 + [10] * 10
 
 
-def test_latest_streams_answer_for_the_newest_pose(open_stream: Callable[..., Stream]) -> None:
+def test_latest_streams_answer_for_the_newest_pose(open_stream):
     stream = open_stream()
     settings = {"height": 600, "width": 600, "outputs": ["bmode", "echo", "transmittance", "coverage"]}
     stream.send(mode="latest", settings=settings)
@@ -118,10 +105,10 @@ def test_latest_streams_answer_for_the_newest_pose(open_stream: Callable[..., St
     assert len(answers) + sum(answer["dropped"] for answer in answers) == 300
 
 
-def test_bad_messages_do_not_end_a_stream(open_stream: Callable[..., Stream]) -> None:
+def test_bad_messages_do_not_end_a_stream(open_stream):
     stream = open_stream()
 
-    def refused(**message: Any) -> tuple[str, str | None]:
+    def refused(**message):
         about, _ = stream.ask(sequence=5, **message)
         assert about["sequence"] == 5
         assert about["error"]["detail"]
@@ -145,7 +132,7 @@ def test_bad_messages_do_not_end_a_stream(open_stream: Callable[..., Stream]) ->
     assert stream.ask(pose=at(0.0))[1]
 
 
-def test_refused_settings_change_nothing(open_stream: Callable[..., Stream]) -> None:
+def test_refused_settings_change_nothing(open_stream):
     stream = open_stream()
     bad = {"height": 100_000}
     assert stream.ask(sequence=1, settings=bad)[0]["error"]["field"] == "settings.height"
@@ -155,43 +142,44 @@ def test_refused_settings_change_nothing(open_stream: Callable[..., Stream]) -> 
     assert stream.ask(sequence=5, pose=at(0.0))[0]["height"] == 10
 
 
-def test_clients_that_break_off_leave_no_trace(service: RunningService, open_stream: Callable[..., Stream]) -> None:
+def test_clients_that_break_off_leave_no_trace(service, open_stream):
     before = len(service.log())
     for _ in range(6):
         stream = open_stream()
         for k in range(20):
             stream.send(settings={"height": 600, "width": 600}, pose=at(k / 10))
         stream.receive()
+        assert service.metric("ultragray_open_streams") >= 1
         stream.connection.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         stream.connection.socket.close()
     assert open_stream().ask(pose=at(0.0))[1]
-    time.sleep(0.3)
+    wait_until(lambda: service.metric("ultragray_open_streams") <= 1)
     assert [record for record in service.log()[before:] if record["level"] == "error"] == []
 
 
-def test_what_cannot_be_streamed_is_refused_before_it_begins(service: RunningService) -> None:
-    with pytest.raises(InvalidStatus) as refusal, connect(address(service, "nowhere")):
+def test_what_cannot_be_streamed_is_refused_before_it_begins(service):
+    with pytest.raises(InvalidStatus) as refusal, connect(service.stream_url("nowhere")):
         pass
     assert refusal.value.response.status_code == 404
     problem = json.loads(refusal.value.response.body)
     assert problem["reason"] == "SCENE_NOT_FOUND"
 
 
-@pytest.mark.parametrize("origin", ["http://elsewhere.example", "http://[", "null", ""])
-def test_pages_of_other_sites_are_refused(service: RunningService, origin: str) -> None:
+@pytest.mark.parametrize("origin", ["http://elsewhere.example", ""])
+def test_pages_of_other_sites_are_refused(service, origin):
     before = len(service.log())
-    with pytest.raises(InvalidStatus) as refusal, connect(address(service), origin=origin):
+    with pytest.raises(InvalidStatus) as refusal, connect(service.stream_url(), origin=origin):
         pass
     assert [record for record in service.log()[before:] if record["level"] == "error"] == []
     assert json.loads(refusal.value.response.body)["reason"] == "ORIGIN_REFUSED"
 
 
-def test_pages_of_the_service_itself_are_welcome(service: RunningService) -> None:
-    with connect(address(service), origin=service.http):
+def test_pages_of_the_service_itself_are_welcome(service):
+    with connect(service.stream_url(), origin=service.http):
         pass
 
 
-def test_a_message_beyond_the_limit_ends_the_stream_only(open_stream: Callable[..., Stream]) -> None:
+def test_a_message_beyond_the_limit_ends_the_stream_only(open_stream):
     stream, other = open_stream(), open_stream()
     stream.connection.send("x" * 70_000)
     with pytest.raises(ConnectionClosed, match="1009"):
@@ -199,49 +187,147 @@ def test_a_message_beyond_the_limit_ends_the_stream_only(open_stream: Callable[.
     assert other.ask(pose=at(0.0))[1]
 
 
-def test_a_reader_that_stops_costs_others_nothing(service: RunningService, open_stream: Callable[..., Stream]) -> None:
-    stuck = open_stream(max_queue=1)
-    stuck.send(mode="latest", settings={"height": 600, "width": 600})
-    before = service.resident_bytes()
-    for k in range(2000):
-        stuck.send(sequence=k, pose=at(k / 1000))
-    other = open_stream()
-    for k in range(20):
-        assert other.ask(sequence=k, pose=at(0.0))[0]["sequence"] == k
-    assert service.resident_bytes() - before < 64 * 2**20
-
-
-def test_streams_are_counted(service: RunningService, open_stream: Callable[..., Stream]) -> None:
-    def open_streams() -> float:
-        return service.metric("ultragray_open_streams")
-
-    before = open_streams()
-    stream = open_stream()
-    stream.ask(pose=at(0.0))
-    assert open_streams() == before + 1
-    stream.connection.close()
-    wait_until(lambda: open_streams() == before)
-
-
-def test_keys_are_asked_for(start_service: Callable[..., RunningService]) -> None:
+def test_keys_are_asked_for(start_service):
     service = start_service(api_keys=KEY)
-    with pytest.raises(InvalidStatus) as refusal, connect(address(service)):
+    with pytest.raises(InvalidStatus) as refusal, connect(service.stream_url()):
         pass
     assert refusal.value.response.status_code == 401
-    with connect(address(service), additional_headers={"Authorization": f"Bearer {KEY}"}):
+    with connect(service.stream_url(), additional_headers={"Authorization": f"Bearer {KEY}"}):
         pass
     offered = "ultragray.key." + base64.urlsafe_b64encode(KEY.encode()).decode().rstrip("=")
-    with connect(address(service), subprotocols=["ultragray.v1", offered]) as connection:  # type: ignore[list-item]
+    with connect(service.stream_url(), subprotocols=["ultragray.v1", offered]) as connection:
         assert connection.subprotocol == "ultragray.v1"
         assert Stream(connection).ask(pose=at(0.0))[1]
 
 
-def test_a_stop_ends_streams_after_their_frames(start_service: Callable[..., RunningService]) -> None:
+def test_a_stop_ends_streams_after_their_frames(start_service):
     service = start_service()
-    with connect(address(service), max_size=None) as connection:
+    with connect(service.stream_url(), max_size=None) as connection:
         stream = Stream(connection)
         stream.ask(pose=at(0.0))
         service.process.terminate()
         with pytest.raises(ConnectionClosed, match="1012"):
             stream.receive()
     assert service.terminate() == 0
+
+
+POSES = 40
+
+
+def streams(http, **query):
+    return http.get("/v1/streams", params=query).raise_for_status().json()["streams"]
+
+
+def watching(service, stream_id, **options):
+    base = service.http.replace("http", "ws", 1)
+    return connect(f"{base}/v1/streams/{stream_id}/watch", max_size=None, close_timeout=0.2, **options)
+
+
+def shown(watcher):
+    message = watcher.recv(timeout=TIMEOUT_S)
+    return (json.loads(message), b"") if isinstance(message, str) else split(message)
+
+
+@pytest.fixture
+def robot(service):
+    with connect(f"{service.stream_url()}?name=UR5", compression=None, max_size=None, close_timeout=0.2) as connection:
+        yield connection
+
+
+def named(http, name):
+    """The newest stream of a name: that of the test before may still be closing."""
+    return wait_until(lambda: next((one for one in reversed(streams(http)) if one["name"] == name), None))
+
+
+def step(robot, sequence, x, **others):
+    robot.send(json.dumps({"sequence": sequence, "mode": "latest", "pose": at(x), **others}))
+    return shown(robot)
+
+
+def test_a_watcher_sees_each_frame_as_the_client_gets_it(service, http, robot):
+    step(robot, 0, 0.0, settings={"height": 40, "width": 30, "outputs": ["bmode", "coverage"]})
+    told = named(http, "UR5")
+    assert (told["door"], told["scene"], told["frames"]) == ("websocket", "demo", 1)
+    with watching(service, told["id"]) as watcher:
+        wait_until(lambda: named(http, "UR5")["watchers"] == 1)
+        for sequence in range(1, POSES + 1):
+            own, pixels = step(robot, sequence, sequence / 10)
+            seen, passed_on = shown(watcher)
+            assert seen == own
+            assert passed_on == pixels
+    assert streams(http, scene="demo")
+    assert streams(http, scene="another") == []
+
+
+def test_a_watcher_is_told_of_refusals_and_of_the_end(service, http, robot):
+    step(robot, 0, 0.0)
+    told = named(http, "UR5")
+    with watching(service, told["id"]) as watcher:
+        wait_until(lambda: named(http, "UR5")["watchers"] == 1)
+        robot.send(json.dumps({"sequence": 7, "pose": {"matrix": [[1]]}}))
+        assert shown(robot)[0]["error"]["reason"] == "INVALID_POSE"
+        about, _ = shown(watcher)
+        assert (about["sequence"], about["error"]["reason"]) == (7, "INVALID_POSE")
+        robot.close()
+        with pytest.raises(ConnectionClosed) as closed:
+            shown(watcher)
+        assert (closed.value.rcvd.code, closed.value.rcvd.reason) == (1000, "STREAM_ENDED")
+    with pytest.raises(InvalidStatus) as refused:
+        watching(service, told["id"])
+    assert json.loads(refused.value.response.body)["reason"] == "STREAM_NOT_FOUND"
+
+
+def test_a_call_of_grpc_is_watched_too(service, http):
+    with service.channel() as channel:
+        calls = rendering_pb2_grpc.RenderServiceStub(channel)
+        identity = geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=np.eye(4).ravel()))
+        settings = rendering_pb2.RenderSettings(scene="demo", height=20, width=30)
+
+        def requests():
+            yield rendering_pb2.RenderStreamRequest(sequence=1, settings=settings, pose=identity)
+            wait_until(lambda: named(http, "arm")["frames"] == 1)
+            with watching(service, named(http, "arm")["id"]) as watcher:
+                wait_until(lambda: named(http, "arm")["watchers"] == 1)
+                yield rendering_pb2.RenderStreamRequest(sequence=2, pose=identity)
+                seen.append(shown(watcher))
+
+        seen = []
+        metadata = (("x-ultragray-stream-name", "arm"),)
+        frames = list(calls.RenderStream(requests(), metadata=metadata, timeout=TIMEOUT_S))
+    assert [frame.sequence for frame in frames] == [1, 2]
+    assert seen[0][0]["sequence"] == 2
+    assert seen[0][1] == frames[1].data
+
+
+def test_the_service_tells_its_ports(service, http):
+    told = http.get("/v1/service").raise_for_status().json()
+    assert told["grpc_port"] == int(service.grpc.rpartition(":")[2])
+    assert (told["igtl_port"], told["tls"], told["key_required"]) == (None, False, False)
+
+
+def test_poses_are_assessed_as_frames_are_without_their_support(service, http):
+    poses = [at(0.0), at(2.5), {"matrix": np.eye(4).tolist()}]
+    found = http.post("/v1/scenes/demo:assess", json={"poses": poses}).raise_for_status().json()["extrapolations"]
+    with Client(service.grpc) as client:
+        matrices = np.tile(np.eye(4), (3, 1, 1))
+        matrices[1, 0, 3] = 2.5
+        told = client.assess_poses("demo", matrices)
+        frame = client.render("demo", matrices[1])
+    assert [one["distance_mm"] for one in found] == [one.distance_mm for one in told]
+    assert found[1]["distance_mm"] == pytest.approx(frame.extrapolation.distance_mm)
+    assert found[1]["supported_share"] is told[1].supported_share is None
+
+
+@pytest.mark.parametrize(
+    ("body", "reason", "field"),
+    [
+        ({}, "INVALID_ARGUMENT", "poses"),
+        ({"poses": [{"matrix": [[1]]}]}, "INVALID_POSE", "poses[0].matrix"),
+        ({"poses": [at(0.0)] * 1025}, "TOO_MANY_POSES", "poses"),
+        ({"poses": [at(0.0)], "probe": {"kind": "linear"}}, "INVALID_PROBE", "probe"),
+    ],
+)
+def test_what_cannot_be_assessed_is_refused(http, body, reason, field):
+    answer = http.post("/v1/scenes/demo:assess", json=body)
+    assert (answer.status_code, answer.json()["reason"]) == (422, reason)
+    assert answer.json()["field"].startswith(field)

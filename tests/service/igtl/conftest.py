@@ -1,24 +1,19 @@
 """A real service with OpenIGTLink, and a client that speaks through a socket."""
 
-from __future__ import annotations
-
 import socket
-from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyigtl
 import pytest
 
 from ultragray import ConvexProbe, GaussianScene
-from ultragray_service.igtl.contents import Image, Status, pack_transform, unpack_image, unpack_status
+from ultragray_service.igtl.contents import pack_transform, unpack_image, unpack_status
 from ultragray_service.igtl.messages import HEADER_BYTES, Message, pack_message, unpack_header, unpack_message
 
 from ...waiting import wait_until
-from ..conftest import DEMO_PROBE, RunningService, StartService, make_scene
+from ..conftest import DEMO_PROBE, make_scene
 
 TIMEOUT_S = 60.0
 FAN = ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0)
@@ -27,7 +22,7 @@ FAN = ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0)
 class Peer:
     """One connection, blocking."""
 
-    def __init__(self, address: str, *, source: str = "", **options: Any) -> None:
+    def __init__(self, address, *, source="", **options):
         host, port = address.rsplit(":", 1)
         self.socket = socket.socket()
         if source:
@@ -37,37 +32,37 @@ class Peer:
         self.socket.settimeout(TIMEOUT_S)
         self.socket.connect((host, int(port)))
 
-    def send(self, type_name: str, device_name: str = "demo", content: bytes = b"", **more: Any) -> None:
+    def send(self, type_name, device_name="demo", content=b"", **more):
         self.socket.sendall(pack_message(Message(type_name, device_name, content, **more)))
 
-    def send_pose(self, pose: Any, device_name: str = "demo", **more: Any) -> None:
+    def send_pose(self, pose, device_name="demo", **more):
         self.send("TRANSFORM", device_name, pack_transform(pose), **more)
 
-    def receive(self) -> Message:
+    def receive(self):
         header = unpack_header(self._exactly(HEADER_BYTES))
         return unpack_message(header, self._exactly(header.body_bytes))
 
-    def image(self) -> Image:
+    def image(self):
         message = self.receive()
         assert message.type_name == "IMAGE", unpack_status(message.content)
         return unpack_image(message.content)
 
-    def status(self) -> Status:
+    def status(self):
         message = self.receive()
         assert message.type_name == "STATUS"
         return unpack_status(message.content)
 
-    def ask(self, type_name: str, device_name: str = "demo", content: bytes = b"", **more: Any) -> Message:
+    def ask(self, type_name, device_name="demo", content=b"", **more):
         self.send(type_name, device_name, content, **more)
         return self.receive()
 
-    def is_closed(self) -> bool:
+    def is_closed(self):
         try:
             return self.socket.recv(1) == b""
         except ConnectionError:
             return True
 
-    def _exactly(self, count: int) -> bytes:
+    def _exactly(self, count):
         data = b""
         while len(data) < count:
             chunk = self.socket.recv(count - len(data))
@@ -77,11 +72,8 @@ class Peer:
         return data
 
 
-Connect = Callable[..., Peer]
-
-
 @pytest.fixture(scope="session")
-def igtl_folder(data_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def igtl_folder(data_folder, tmp_path_factory):
     """Linear scenes (images of `medium` are 128x128, of `large` 512x512), and `fan` of a convex probe."""
     folder = tmp_path_factory.mktemp("igtl")
     for name in ("demo", "second"):
@@ -90,25 +82,25 @@ def igtl_folder(data_folder: Path, tmp_path_factory: pytest.TempPathFactory) -> 
     for name, side in (("medium", 128), ("large", 512)):
         info = replace(demo.info, image_height=side, image_width=side)
         GaussianScene.from_splats(demo.splats, info=info).save(folder / f"{name}.ugr")
-    make_scene(seed=2, probe=FAN).save(folder / "fan.ugr")  # type: ignore[arg-type]
+    make_scene(seed=2, probe=FAN).save(folder / "fan.ugr")
     return folder
 
 
 @pytest.fixture(scope="session")
-def igtl_service(start_shared_service: StartService, igtl_folder: Path) -> RunningService:
+def igtl_service(start_shared_service, igtl_folder):
     return start_shared_service(data_folder=igtl_folder, igtl_port=0, igtl_scene="demo")
 
 
-def address_of(service: RunningService) -> str:
+def address_of(service):
     return str(next(record["igtl"] for record in service.log() if "igtl" in record))
 
 
 @pytest.fixture
-def connect(igtl_service: RunningService) -> Iterator[Connect]:
+def connect(igtl_service):
     """Opens connections to the shared service; all are closed after the test."""
-    peers: list[Peer] = []
+    peers = []
 
-    def open_one(address: str | None = None, **options: Any) -> Peer:
+    def open_one(address=None, **options):
         peers.append(Peer(address or address_of(igtl_service), **options))
         return peers[-1]
 
@@ -118,12 +110,12 @@ def connect(igtl_service: RunningService) -> Iterator[Connect]:
 
 
 @pytest.fixture
-def peer(connect: Connect) -> Peer:
+def peer(connect):
     return connect()
 
 
 @contextmanager
-def pyigtl_client(address: str) -> Iterator[pyigtl.OpenIGTLinkClient]:
+def pyigtl_client(address):
     host, port = address.rsplit(":", 1)
     client = pyigtl.OpenIGTLinkClient(host, int(port))
     try:
@@ -133,13 +125,13 @@ def pyigtl_client(address: str) -> Iterator[pyigtl.OpenIGTLinkClient]:
         client.stop()
 
 
-def moved(x_mm: float) -> np.ndarray:
+def moved(x_mm):
     pose = np.eye(4)
     pose[0, 3] = x_mm
     return pose
 
 
-def random_pose(seed: int) -> Any:
+def random_pose(seed):
     """A pose [4, 4] mm near the scenes of the tests, as exact as float32 numbers are."""
     from ultragray.geometry.pose import pose_from_position_quaternion
 

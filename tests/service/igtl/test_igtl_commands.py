@@ -1,12 +1,7 @@
 """Scanner settings over OpenIGTLink: as PLUS has them, in a STRING and in a COMMAND, through pyigtl and as bytes."""
 
-from __future__ import annotations
-
 import json
 import struct
-from collections.abc import Iterator
-from contextlib import contextmanager
-from typing import Any
 from xml.etree import ElementTree
 
 import numpy as np
@@ -28,16 +23,16 @@ from ultragray_service.igtl.commands import (
 from ultragray_service.igtl.contents import unpack_image, unpack_status
 
 from ...documents.tables import code, rows
-from ..conftest import DEMO_PROBE, RunningService
+from ..conftest import DEMO_PROBE
 from ..rpc.test_grpc_render import matrix_pose
-from .conftest import Connect, Peer, address_of, moved, pyigtl_client
+from .conftest import address_of, moved, pyigtl_client
 from .test_igtl_mischief import still_serves
 from .test_igtl_server import over_grpc
 
 SET_DEPTH = '<Command Name="SetUsParameter" UsDeviceId="US"><Parameter Name="DepthMm" Value="20"/></Command>'
 
 
-def command(name: str, *parameters: tuple[str, ...]) -> str:
+def command(name, *parameters):
     """The XML of a command; each parameter is a name, or a name and a value."""
     root = ElementTree.Element("Command", Name=name)
     for parameter in parameters:
@@ -45,7 +40,7 @@ def command(name: str, *parameters: tuple[str, ...]) -> str:
     return ElementTree.tostring(root, encoding="unicode")
 
 
-def ask(peer: Peer, text: str) -> ElementTree.Element:
+def ask(peer, text):
     """The reply to a command in a COMMAND of version 2."""
     answer = peer.ask("COMMAND", "US", pack_command(Command(3, "", text)), version=2, message_id=8)
     assert (answer.type_name, answer.device_name, answer.message_id) == ("RTS_COMMAND", "US", 8)
@@ -55,43 +50,36 @@ def ask(peer: Peer, text: str) -> ElementTree.Element:
     return root
 
 
-def set_to(peer: Peer, **values: str) -> None:
+def set_to(peer, **values):
     assert ask(peer, command("SetUsParameter", *values.items())).get("Status") == "SUCCESS"
 
 
-def value_of(peer: Peer, parameter: str) -> str | None:
+def value_of(peer, parameter):
     return ask(peer, command("GetUsParameter", (parameter,)))[0].get("Value")
 
 
 # pyigtl
 
 
-class _CommandMessage(pyigtl.messages.MessageBase):  # type: ignore[misc]
+class _CommandMessage(pyigtl.messages.MessageBase):
     """COMMAND, which pyigtl lacks; header, metadata and checksum are its own."""
 
     name, number, text = "", 0, ""
 
-    def __init__(self, **options: Any) -> None:
+    def __init__(self, **options):
         super().__init__(**options)
         self._message_type, self.header_version, self._valid_message = "COMMAND", 2, True
 
-    def _pack_content(self) -> bytes:
+    def _pack_content(self):
         text = self.text.encode("ascii")
         return struct.pack(">I128sHI", self.number, self.name.encode(), 3, len(text)) + text
 
-    def _unpack_content(self, content: bytes) -> None:
+    def _unpack_content(self, content):
         self.number, name, _, length = struct.unpack_from(">I128sHI", content)
         self.name, self.text = name.rstrip(b"\0").decode(), content[138 : 138 + length].decode()
 
 
-@contextmanager
-def commanding(service: RunningService, monkeypatch: pytest.MonkeyPatch) -> Iterator[pyigtl.OpenIGTLinkClient]:
-    monkeypatch.setitem(pyigtl.messages.message_type_to_class_constructor, "RTS_COMMAND", _CommandMessage)
-    with pyigtl_client(address_of(service)) as client:
-        yield client
-
-
-def test_pyigtl_sets_the_depth_by_a_string_and_gets_shorter_images(igtl_service: RunningService) -> None:
+def test_pyigtl_sets_the_depth_by_a_string_and_gets_shorter_images(igtl_service):
     with pyigtl_client(address_of(igtl_service)) as client:
         client.send_message(pyigtl.TransformMessage(np.eye(4), device_name="demo"))
         whole = client.wait_for_message("Image_demo", timeout=60).image[0]
@@ -108,30 +96,10 @@ def test_pyigtl_sets_the_depth_by_a_string_and_gets_shorter_images(igtl_service:
     assert np.array_equal(cut, whole[: len(cut)])
 
 
-def test_pyigtl_sets_and_asks_by_commands_with_metadata(
-    igtl_service: RunningService, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    with commanding(igtl_service, monkeypatch) as client:
-        for number, name, text in (
-            (41, "SetUsParameter", command("SetUsParameter", ("GainPercent", "60"), ("DynRangeDb", "45"))),
-            (42, "GetUsParameter", command("GetUsParameter", ("GainPercent",), ("DynRangeDb",))),
-        ):
-            message = _CommandMessage(device_name="Scanner")
-            message.number, message.name, message.text, message.message_id = number, name, text, 7
-            client.send_message(message)
-            reply = client.wait_for_message("Scanner", timeout=60)
-            assert (reply.message_type, reply.number, reply.name, reply.message_id) == ("RTS_COMMAND", number, name, 7)
-        assert reply.metadata == {"GainPercent": "60", "DynRangeDb": "45", "Status": "SUCCESS"}
-        parameters = {one.get("Name"): one.get("Value") for one in ElementTree.fromstring(reply.text)}
-        assert parameters == {"GainPercent": "60", "DynRangeDb": "45"}
-
-
 # Settings
 
 
-def test_gain_range_and_compensation_are_those_of_the_display_settings(
-    peer: Peer, igtl_service: RunningService
-) -> None:
+def test_gain_range_and_compensation_are_those_of_the_display_settings(peer, igtl_service):
     set_to(peer, GainPercent="40", DynRangeDb="50", TimeGainCompensation="-3 0 6")
     peer.send_pose(moved(1), version=2)
     answer = peer.receive()
@@ -146,7 +114,7 @@ def test_gain_range_and_compensation_are_those_of_the_display_settings(
     assert not np.array_equal(pixels, over_grpc(igtl_service, "demo", moved(1)))
 
 
-def test_every_parameter_is_told_as_it_was_set(peer: Peer) -> None:
+def test_every_parameter_is_told_as_it_was_set(peer):
     values = {
         "DepthMm": "31.5",
         "GainPercent": "62.5",
@@ -162,7 +130,7 @@ def test_every_parameter_is_told_as_it_was_set(peer: Peer) -> None:
     assert {name: value_of(peer, name) for name in values} == values
 
 
-def test_scene_and_probe_are_those_of_the_next_frames(peer: Peer) -> None:
+def test_scene_and_probe_are_those_of_the_next_frames(peer):
     set_to(peer, Scene="second", Probe='{"kind": "convex", "opening_angle_deg": 60, "near_mm": 10, "far_mm": 50}')
     peer.send_pose(np.eye(4), "ProbeToReference", version=2)
     answer = peer.receive()
@@ -172,7 +140,7 @@ def test_scene_and_probe_are_those_of_the_next_frames(peer: Peer) -> None:
     assert peer.receive().metadata["scene"] == "demo"  # its name goes first
 
 
-def test_settings_are_those_of_one_connection(connect: Connect) -> None:
+def test_settings_are_those_of_one_connection(connect):
     one, other = connect(), connect()
     set_to(one, DepthMm="10", GainPercent="90")
     assert (value_of(other, "GainPercent"), value_of(other, "DepthMm")) == ("50", None)
@@ -190,20 +158,15 @@ def test_settings_are_those_of_one_connection(connect: Connect) -> None:
     [
         ("DepthMm", "deep", "must be a number, got 'deep'"),
         ("DepthMm", "-3", "DepthMm: depth_mm must be a finite number"),
-        ("DepthMm", "nan", "depth_mm must be a finite number"),
         ("GainPercent", "101", "from 0 to 100, got '101'"),
         ("DynRangeDb", "0", "from 1 to 200"),
         ("TimeGainCompensation", " ".join(["1"] * 17), "at most 16 values"),
-        ("TimeGainCompensation", "1 2 x", "must be a number, got 'x'"),
         ("Scene", "absent", "there is no scene 'absent'"),
-        ("Probe", "linear", "must be JSON"),
         ("Probe", '{"kind": "linear", "width_mm": -1}', "near_mm is required"),
         ("FrequencyMhz", "5", f"must be one of {', '.join(PARAMETERS)}, got 'FrequencyMhz'"),
     ],
 )
-def test_a_value_that_cannot_be_is_refused_and_the_others_are_set(
-    peer: Peer, parameter: str, value: str, text: str
-) -> None:
+def test_a_value_that_cannot_be_is_refused_and_the_others_are_set(peer, parameter, value, text):
     valid = ("DepthMm" if parameter == "GainPercent" else "GainPercent", "25")
     reply = ask(peer, command("SetUsParameter", (parameter, value), valid))
     assert [one.get("Success") for one in reply] == ["false", "true"]
@@ -219,7 +182,6 @@ BOMB = '<!DOCTYPE a [<!ENTITY b "xxxxxxxxxx"><!ENTITY c "&b;&b;&b;&b;">]><Comman
     ("text", "expected"),
     [
         ("", "must be XML"),
-        ("<Command", "must be XML"),
         (BOMB, "no DOCTYPE"),
         ('<Command Name="&c;"/>', "undefined entity"),
         ("<Other/>", "an element Command, got 'Other'"),
@@ -229,15 +191,11 @@ BOMB = '<!DOCTYPE a [<!ENTITY b "xxxxxxxxxx"><!ENTITY c "&b;&b;&b;&b;">]><Comman
         (command("GetUsParameter", ("DepthMm",)), "is not set"),
         (command("GetUsParameter", ("GainPercent",), ("GainPercent",)), "'GainPercent' twice"),
         ('<Command Name="SetUsParameter"><Depth/></Command>', "got 'Depth'"),
-        (
-            command("GetUsParameter", *[(f"P{number}",) for number in range(MAX_PARAMETERS + 1)]),
-            "at most 32 parameters",
-        ),
+        (command("GetUsParameter", *[("P",)] * (MAX_PARAMETERS + 1)), "at most 32 parameters"),
         (f"<Command>{' ' * MAX_COMMAND_BYTES}</Command>", "at most 4096 bytes"),
-        ("<a>" * 1300, "must be XML"),
     ],
 )
-def test_a_bad_command_gets_one_clear_reply(peer: Peer, text: str, expected: str) -> None:
+def test_a_bad_command_gets_one_clear_reply(peer, text, expected):
     reply = ask(peer, text)
     assert reply.get("Status") == "FAIL"
     assert expected in str(reply.get("Error"))
@@ -245,7 +203,7 @@ def test_a_bad_command_gets_one_clear_reply(peer: Peer, text: str, expected: str
     still_serves(peer)
 
 
-def test_a_reply_is_xml_whatever_was_sent(peer: Peer) -> None:
+def test_a_reply_is_xml_whatever_was_sent(peer):
     hostile = '{"kind": "\\ud800\\u0000<&\\""}'
     reply = ask(peer, command("SetUsParameter", ("Probe", hostile), ('<&"ä', "1")))
     assert [one.get("Name") for one in reply] == ["Probe", '<&"ä']
@@ -259,15 +217,12 @@ def test_a_reply_is_xml_whatever_was_sent(peer: Peer) -> None:
     [
         ("STRING", "note", pack_string("hello"), "of a device called CMD_1 or the like, got 'note'"),
         ("STRING", "CMD_1", b"\0\3\0\5hell", "a text of 5 bytes must follow, got 4"),
-        ("STRING", "CMD_1", b"\0", "4 bytes or more, got 1"),
         ("STRING", "CMD_1", b"\0\3\0\1\xff", "ASCII or UTF-8"),
         ("COMMAND", "US", bytes(137), "138 bytes or more, got 137"),
         ("COMMAND", "US", bytes(134) + struct.pack(">I", 2**31), f"a text of {2**31} bytes must follow, got 0"),
     ],
 )
-def test_messages_without_a_command_are_refused(
-    peer: Peer, type_name: str, device_name: str, content: bytes, text: str
-) -> None:
+def test_messages_without_a_command_are_refused(peer, type_name, device_name, content, text):
     answer = peer.ask(type_name, device_name, content)
     assert (answer.type_name, answer.device_name) == ("STATUS", device_name)
     assert text in unpack_status(answer.content).text
@@ -277,15 +232,15 @@ def test_messages_without_a_command_are_refused(
 # Bytes
 
 
-def framed(version: int, type_name: bytes, device_name: bytes, body: bytes) -> bytes:
+def framed(version, type_name, device_name, body):
     return struct.pack(">H12s20sQQQ", version, type_name, device_name, 0, len(body), crc64.ecma_182(body)) + body
 
 
-def command_bytes(number: int, name: bytes, text: bytes) -> bytes:
+def command_bytes(number, name, text):
     return number.to_bytes(4, "big") + name.ljust(128, b"\0") + b"\0\3" + len(text).to_bytes(4, "big") + text
 
 
-def test_a_command_of_header_version_1_is_answered_without_metadata(peer: Peer) -> None:
+def test_a_command_of_header_version_1_is_answered_without_metadata(peer):
     content = command_bytes(5, b"SetUsParameter", SET_DEPTH.encode())
     peer.socket.sendall(framed(1, b"COMMAND", b"US", content))
     answer = peer.receive()
@@ -295,7 +250,7 @@ def test_a_command_of_header_version_1_is_answered_without_metadata(peer: Peer) 
     assert answer.content == command_bytes(5, b"SetUsParameter", reply.text.encode())[:132] + answer.content[132:]
 
 
-def test_a_longer_extended_header_and_metadata_around_a_command_are_skipped(peer: Peer) -> None:
+def test_a_longer_extended_header_and_metadata_around_a_command_are_skipped(peer):
     content = command_bytes(6, b"", command("GetUsParameter", ("DynRangeDb",)).encode())
     index, values = struct.pack(">HHHI", 1, 4, 3, 2), b"Keyavl"
     extended = struct.pack(">HHIIxxxx", 16, len(index), len(values), 99)  # a later version may add fields
@@ -305,12 +260,12 @@ def test_a_longer_extended_header_and_metadata_around_a_command_are_skipped(peer
     assert unpack_command(answer.content).name == "GetUsParameter"
 
 
-def test_a_name_in_the_header_must_be_that_of_the_xml(peer: Peer) -> None:
+def test_a_name_in_the_header_must_be_that_of_the_xml(peer):
     answer = peer.ask("COMMAND", "US", pack_command(Command(1, "GetUsParameter", SET_DEPTH)))
     assert "calls the command 'GetUsParameter', its XML 'SetUsParameter'" in unpack_command(
         answer.content
     ).text.replace("&#39;", "'")
 
 
-def test_parameters_are_those_of_the_reference() -> None:
+def test_parameters_are_those_of_the_reference():
     assert tuple(code(cells[0])[0] for cells in rows("openigtlink.md", "Scanner settings")) == PARAMETERS

@@ -1,11 +1,7 @@
 """What is wrong with messages and connections is told, and does no harm to others."""
 
-from __future__ import annotations
-
 import contextlib
 import os
-import socket
-import struct
 import time
 from pathlib import Path
 
@@ -17,14 +13,13 @@ from ultragray_service.igtl.contents import unpack_status
 from ultragray_service.igtl.messages import HEADER_BYTES, Message, pack_message
 
 from ...waiting import wait_until
-from ..conftest import RunningService, StartService
-from .conftest import Connect, Peer, moved
+from .conftest import Peer, moved
 
 MEBIBYTE = 2**20
 DROPPED = "ultragray_stream_dropped_poses_total"
 
 
-def still_serves(peer: Peer) -> None:
+def still_serves(peer):
     peer.send_pose(np.eye(4), "demo", timestamp=12345)
     while True:
         answer = peer.receive()
@@ -45,7 +40,7 @@ def still_serves(peer: Peer) -> None:
         ("STT_QTDATA", bytes(2), 12, "IGTL_MESSAGE_INVALI", "4 bytes, got 2"),
     ],
 )
-def test_refusals(peer: Peer, type_name: str, content: bytes, code: int, reason: str, text: str) -> None:
+def test_refusals(peer, type_name, content, code, reason, text):
     answer = peer.ask(type_name, "x", content, timestamp=3)
     status = unpack_status(answer.content)
     assert (answer.type_name, answer.device_name, answer.timestamp) == ("STATUS", "x", 3)
@@ -54,7 +49,7 @@ def test_refusals(peer: Peer, type_name: str, content: bytes, code: int, reason:
     still_serves(peer)
 
 
-def test_a_wrong_checksum_is_told_and_the_connection_stays(peer: Peer, igtl_service: RunningService) -> None:
+def test_a_wrong_checksum_is_told_and_the_connection_stays(peer, igtl_service):
     before = igtl_service.metric('ultragray_stream_frame_errors_total{reason="IGTL_MESSAGE_INVALID"}')
     data = bytearray(pack_message(Message("TRANSFORM", "demo", bytes(48))))
     data[-1] ^= 1
@@ -66,17 +61,15 @@ def test_a_wrong_checksum_is_told_and_the_connection_stays(peer: Peer, igtl_serv
     assert igtl_service.metric('ultragray_stream_frame_errors_total{reason="IGTL_MESSAGE_INVALID"}') == before + 1
 
 
-def test_answers_of_the_client_are_heard_in_silence(peer: Peer) -> None:
+def test_answers_of_the_client_are_heard_in_silence(peer):
     for type_name in ("STATUS", "CAPABILITY", "RTS_IMAGE"):
         peer.send(type_name, "x", bytes(40))
     assert peer.ask("GET_STATUS", "end").device_name == "end"
 
 
 @pytest.mark.parametrize("type_name", ["TRANSFORM", "IMAGE"])
-@pytest.mark.parametrize("size", [2**60, 2**63, 2**64 - 1, MAX_SKIPPED_BYTES + 1])
-def test_a_size_beyond_all_bounds_is_refused_without_memory(
-    connect: Connect, igtl_service: RunningService, type_name: str, size: int
-) -> None:
+@pytest.mark.parametrize("size", [2**63, MAX_SKIPPED_BYTES + 1])
+def test_a_size_beyond_all_bounds_is_refused_without_memory(connect, igtl_service, type_name, size):
     peer = connect()
     before = igtl_service.resident_bytes()
     header = bytearray(pack_message(Message(type_name, "x"))[:HEADER_BYTES])
@@ -88,45 +81,8 @@ def test_a_size_beyond_all_bounds_is_refused_without_memory(
     still_serves(connect())
 
 
-def test_garbage_closes_its_connection_and_no_other(connect: Connect) -> None:
-    bystander = connect()
-    rng = np.random.default_rng(0)
-    for _ in range(60):
-        attacker = connect()
-        garbage = rng.integers(0, 256, int(rng.integers(58, 3000)), np.uint8).tobytes()
-        try:
-            attacker.socket.sendall(garbage)
-            assert attacker.status().code == 12
-            assert attacker.is_closed()
-        except ConnectionError:
-            pass  # what it sent was not read: the kernel resets
-    for _ in range(60):  # messages with flipped bits: some are refused, some close, some are poses still
-        attacker = connect()
-        data = np.frombuffer(pack_message(Message("TRANSFORM", "x", bytes(48), version=2)), np.uint8).copy()
-        data[rng.integers(0, len(data), 3)] ^= rng.integers(1, 256, 3).astype(np.uint8)
-        attacker.socket.sendall(data.tobytes())
-        attacker.socket.close()
-    still_serves(bystander)
-
-
-def test_clients_that_vanish_in_the_middle_of_a_message(connect: Connect, igtl_service: RunningService) -> None:
-    data = pack_message(Message("TRANSFORM", "demo", bytes(48)))
-    for length in (1, 57, 58, 80):
-        peer = connect()
-        peer.socket.sendall(data[:length])
-        peer.socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))  # a reset, no FIN
-        peer.socket.close()
-    for _ in range(20):
-        peer = connect()
-        for _ in range(20):
-            peer.send_pose(np.eye(4))
-        peer.socket.close()
-    still_serves(connect())
-    assert not [record for record in igtl_service.log() if record["level"] == "error"]
-
-
 @pytest.mark.long
-def test_a_message_that_does_not_end_is_cut_off(connect: Connect) -> None:
+def test_a_message_that_does_not_end_is_cut_off(connect):
     idle, slow = connect(), connect()
     data = pack_message(Message("TRANSFORM", "demo", bytes(48)))
     sent = 0
@@ -139,9 +95,7 @@ def test_a_message_that_does_not_end_is_cut_off(connect: Connect) -> None:
     still_serves(idle)  # silence between messages is nothing bad
 
 
-def test_a_reader_that_stops_costs_bounded_memory_and_nobody_a_frame(
-    connect: Connect, igtl_service: RunningService
-) -> None:
+def test_a_reader_that_stops_costs_bounded_memory_and_nobody_a_frame(connect, igtl_service):
     stopped, healthy = connect(SO_RCVBUF=4096), connect()
     stopped.ask("STT_IMAGE", "")
     still_serves(healthy)
@@ -155,7 +109,7 @@ def test_a_reader_that_stops_costs_bounded_memory_and_nobody_a_frame(
     assert igtl_service.resident_bytes() - before < 20 * MEBIBYTE
 
 
-def held(service: RunningService, peers: list[Peer]) -> int:
+def held(service, peers):
     """How many of the service's descriptors are its ends of these connections."""
     ports = {peer.socket.getsockname()[1] for peer in peers}
     entries = [line.split() for line in Path("/proc/net/tcp").read_text().splitlines()[1:]]
@@ -164,7 +118,7 @@ def held(service: RunningService, peers: list[Peer]) -> int:
 
 
 @pytest.mark.long
-def test_a_reader_that_stops_for_long_is_cut_off(connect: Connect, igtl_service: RunningService) -> None:
+def test_a_reader_that_stops_for_long_is_cut_off(connect, igtl_service):
     peers = [connect(SO_RCVBUF=4096), connect(SO_RCVBUF=4096)]
     for count in range(60):  # more images than the kernel's buffers hold
         for peer in peers:
@@ -175,12 +129,12 @@ def test_a_reader_that_stops_for_long_is_cut_off(connect: Connect, igtl_service:
     wait_until(lambda: not held(igtl_service, peers), within_s=SEND_TIMEOUT_S + 20, every_s=0.5)
 
 
-def test_more_connections_than_allowed_are_told_so(start_service: StartService) -> None:
+def test_more_connections_than_allowed_are_told_so(start_service):
     service = start_service(igtl_port=0, max_connections=30, max_connections_per_address=20)
     address = next(record["igtl"] for record in service.log() if "igtl" in record)
     with contextlib.ExitStack() as opened:
 
-        def connect(source: str) -> Peer:
+        def connect(source):
             peer = Peer(address, source=source)
             opened.enter_context(peer.socket)
             return peer
@@ -196,25 +150,9 @@ def test_more_connections_than_allowed_are_told_so(start_service: StartService) 
         for peer in peers:
             peer.socket.close()
 
-        def is_let_in() -> bool:
+        def is_let_in():
             late = connect("127.0.0.2")
             late.send("GET_STATUS")
             return late.status().code == 1
 
         wait_until(is_let_in)
-
-
-NUMBERS = (np.nan, np.inf, -np.inf, -0.0, 1e-45, -1e-38, 1e38, 3.4e38, -3.4e38)
-
-
-@pytest.mark.parametrize("number", NUMBERS)
-def test_numbers_at_the_edge_of_float32_are_answered_and_the_connection_goes_on(peer: Peer, number: float) -> None:
-    plain = np.eye(3, 4, dtype=">f4")
-    for place in np.ndindex(3, 4):
-        values = plain.copy()
-        values[place] = number
-        peer.send("TRANSFORM", "demo", values.T.tobytes())
-        peer.send("GET_STATUS")
-        while (answer := peer.receive()).type_name != "STATUS" or unpack_status(answer.content).code != 1:
-            if answer.type_name == "STATUS":
-                assert unpack_status(answer.content).name in ("INVALID_POSE", "INVALID_ARGUMENT"), (place, number)

@@ -1,7 +1,5 @@
 """One client cannot lock the others out of gRPC."""
 
-from __future__ import annotations
-
 import contextlib
 import resource
 import socket
@@ -12,7 +10,6 @@ import pytest
 from grpc_health.v1 import health_pb2, health_pb2_grpc
 
 from ...waiting import wait_until
-from ..conftest import RunningService, StartService
 
 TOTAL, PER_ADDRESS = 40, 10
 TIMEOUT_S = 60.0
@@ -20,18 +17,18 @@ PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + b"\0\0\0\4\0\0\0\0\0"  # with em
 
 
 @pytest.fixture(scope="module")
-def limited(start_service: StartService) -> RunningService:
+def limited(start_service):
     return start_service(
         max_connections=TOTAL, max_connections_per_address=PER_ADDRESS, header_timeout_s=2, idle_timeout_s=3
     )
 
 
-def open_socket(service: RunningService, source: str) -> socket.socket:
+def open_socket(service, source):
     host, port = service.grpc.rsplit(":", 1)
     return socket.create_connection((host, int(port)), timeout=TIMEOUT_S, source_address=(source, 0))
 
 
-def is_open(connection: socket.socket) -> bool:
+def is_open(connection):
     connection.setblocking(False)
     with contextlib.suppress(BlockingIOError):
         try:
@@ -43,7 +40,7 @@ def is_open(connection: socket.socket) -> bool:
     return True
 
 
-def answers(service: RunningService) -> bool:
+def answers(service):
     """Whether a new client is answered. Clients of a test before may be counted for a moment longer."""
     options = [("grpc.use_local_subchannel_pool", 1)]
     with grpc.insecure_channel(service.grpc, options=options) as channel:
@@ -54,7 +51,7 @@ def answers(service: RunningService) -> bool:
     return True
 
 
-def test_connections_of_one_address_are_capped_and_others_come_in(limited: RunningService) -> None:
+def test_connections_of_one_address_are_capped_and_others_come_in(limited):
     with contextlib.ExitStack() as opened:
         early = [opened.enter_context(open_socket(limited, "127.0.0.2")) for _ in range(PER_ADDRESS // 2)]
         for connection in early:
@@ -68,20 +65,20 @@ def test_connections_of_one_address_are_capped_and_others_come_in(limited: Runni
         wait_until(lambda: answers(limited), within_s=TIMEOUT_S)
 
 
-def test_a_connection_that_never_speaks_http2_is_cut(limited: RunningService) -> None:
+def test_a_connection_that_never_speaks_http2_is_cut(limited):
     with open_socket(limited, "127.0.0.3") as silent, open_socket(limited, "127.0.0.3") as foreign:
         foreign.sendall(PREFACE[:-9])
         wait_until(lambda: not is_open(silent) and not is_open(foreign), within_s=TIMEOUT_S)
 
 
-def test_an_idle_connection_is_closed(limited: RunningService) -> None:
+def test_an_idle_connection_is_closed(limited):
     with open_socket(limited, "127.0.0.4") as idle:
         idle.sendall(PREFACE)
         wait_until(lambda: not is_open(idle), within_s=TIMEOUT_S)
 
 
 @pytest.mark.parametrize("size", [70_000, 5_000_000])
-def test_long_metadata_is_refused(limited: RunningService, size: int) -> None:
+def test_long_metadata_is_refused(limited, size):
     options = [("grpc.use_local_subchannel_pool", 1)]
     with grpc.insecure_channel(limited.grpc, options=options) as channel:
         check = health_pb2_grpc.HealthStub(channel).Check
@@ -91,12 +88,12 @@ def test_long_metadata_is_refused(limited: RunningService, size: int) -> None:
     wait_until(lambda: answers(limited), within_s=TIMEOUT_S)
 
 
-def test_clients_that_come_and_go_leave_no_place_taken(limited: RunningService) -> None:
+def test_clients_that_come_and_go_leave_no_place_taken(limited):
     for _ in range(3 * PER_ADDRESS):
         wait_until(lambda: answers(limited), within_s=TIMEOUT_S)
 
 
-def test_a_want_of_open_files_does_not_end_the_watch_over_connections(start_service: StartService) -> None:
+def test_a_want_of_open_files_does_not_end_the_watch_over_connections(start_service):
     service = start_service(max_connections=TOTAL, max_connections_per_address=PER_ADDRESS)
     limits = resource.prlimit(service.process.pid, resource.RLIMIT_NOFILE)
     resource.prlimit(service.process.pid, resource.RLIMIT_NOFILE, (3, limits[1]))
@@ -110,5 +107,5 @@ def test_a_want_of_open_files_does_not_end_the_watch_over_connections(start_serv
         wait_until(lambda: sum(map(is_open, sockets)) == PER_ADDRESS)
 
 
-def logged(service: RunningService, *words: str) -> bool:
+def logged(service, *words):
     return any(all(word in record["message"] for word in words) for record in service.log())

@@ -1,19 +1,16 @@
 """The dashboard and the alerts in docker/monitoring ask for metrics that a service has, with labels that these have."""
 
-from __future__ import annotations
-
 import json
 import re
 import shutil
 import subprocess
-from typing import Any
 
 import httpx
 import pytest
 import yaml
 from prometheus_client.parser import text_string_to_metric_families
 
-from ..conftest import ROOT, RunningService
+from ..conftest import ROOT
 
 MONITORING = ROOT / "docker" / "monitoring"
 METRIC = re.compile(r"\b(?:ultragray|process)_[a-z_]+")
@@ -21,7 +18,7 @@ BY = re.compile(r"\bby \(([a-z, ]+)\)")
 OF_PROMETHEUS = {"instance", "job", "le"}
 
 
-def expressions() -> dict[str, str]:
+def expressions():
     """Every query of the dashboard and of the alerts, by its place."""
     dashboard = json.loads((MONITORING / "dashboard.json").read_text())
     queries = {
@@ -35,12 +32,12 @@ def expressions() -> dict[str, str]:
 
 
 @pytest.fixture(scope="module")
-def labels_of(service: RunningService, module_pose: dict[str, Any]) -> dict[str, set[str]]:
+def labels_of(service, module_pose):
     """The labels of each sample that a service has told once it rendered, answered and refused."""
     render = f"{service.http}/v1/scenes/demo/render"
     assert httpx.post(render, json={"pose": module_pose}, timeout=60).status_code == 200
     text = httpx.get(f"{service.http}/metrics", timeout=60).text
-    found: dict[str, set[str]] = {"ultragray_certificate_expires_timestamp_seconds": set()}  # only with TLS
+    found = {"ultragray_certificate_expires_timestamp_seconds": set()}  # only with TLS
     for family in text_string_to_metric_families(text):
         found.setdefault(family.name, set())
         if family.type == "counter":
@@ -51,12 +48,12 @@ def labels_of(service: RunningService, module_pose: dict[str, Any]) -> dict[str,
 
 
 @pytest.fixture(scope="module")
-def module_pose() -> dict[str, Any]:
+def module_pose():
     return {"position_mm": {"x": 0, "y": 0, "z": 0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}
 
 
 @pytest.mark.parametrize("place", expressions())
-def test_queries_ask_for_metrics_that_there_are(labels_of: dict[str, set[str]], place: str) -> None:
+def test_queries_ask_for_metrics_that_there_are(labels_of, place):
     query = expressions()[place]
     metrics = set(METRIC.findall(query))
     assert metrics <= set(labels_of), place
@@ -70,14 +67,14 @@ def test_queries_ask_for_metrics_that_there_are(labels_of: dict[str, set[str]], 
 @pytest.mark.parametrize(
     "check", [["check", "rules", "alerts.yaml"], ["check", "config", "--syntax-only", "prometheus.yaml"]]
 )
-def test_prometheus_takes_its_files(check: list[str]) -> None:
+def test_prometheus_takes_its_files(check):
     *command, name = check
     done = subprocess.run(["promtool", *command, str(MONITORING / name)], capture_output=True, text=True)
     assert done.returncode == 0, done.stdout + done.stderr
 
 
-def test_files_of_grafana_name_one_another() -> None:
-    def read(name: str) -> Any:
+def test_files_of_grafana_name_one_another():
+    def read(name):
         return yaml.safe_load((MONITORING / name).read_text())
 
     used = {

@@ -1,36 +1,24 @@
 """The health check of containers against real services."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys
-from pathlib import Path
-
-import pytest
 
 from ultragray_service.healthcheck import DEFAULT_HTTP_PORT, ready_url
 from ultragray_service.settings import Settings
 
-from ...certificates import Mounted, write_client
-from ..conftest import ROOT, RunningService, StartService
+from ...certificates import write_client
+from ..conftest import ROOT
 
 
-def check(service: RunningService, **environment: object) -> subprocess.CompletedProcess[str]:
+def check(service, **environment):
     given = {f"ULTRAGRAY_{name.upper()}": str(value) for name, value in environment.items()}
     port = {"ULTRAGRAY_HTTP_PORT": service.http.rpartition(":")[2], "PYTHONPATH": str(ROOT / "service")}
     command = [sys.executable, "-m", "ultragray_service.healthcheck"]
     return subprocess.run(command, env={**os.environ, **port, **given}, capture_output=True, text=True, check=False)
 
 
-@pytest.fixture
-def mounted(tmp_path: Path) -> Mounted:
-    found = Mounted(tmp_path / "tls")
-    found.put(found.issue())
-    return found
-
-
-def test_with_and_without_tls(service: RunningService, start_service: StartService, mounted: Mounted) -> None:
+def test_with_and_without_tls(service, start_service, mounted):
     assert check(service).returncode == 0
     encrypted = start_service(**mounted.settings())
     assert check(encrypted, **mounted.settings()).returncode == 0
@@ -40,7 +28,7 @@ def test_with_and_without_tls(service: RunningService, start_service: StartServi
     assert "Traceback" not in wrong.stderr
 
 
-def test_mutual_tls_takes_a_certificate(start_service: StartService, mounted: Mounted, tmp_path: Path) -> None:
+def test_mutual_tls_takes_a_certificate(start_service, mounted, tmp_path):
     settings = mounted.settings(mutual=True)
     service = start_service(**settings)
     certificate, key = write_client(mounted.authority, tmp_path)
@@ -48,7 +36,7 @@ def test_mutual_tls_takes_a_certificate(start_service: StartService, mounted: Mo
     assert check(service, **settings, client_certificate=certificate, client_key=key).returncode == 0
 
 
-def test_where_it_asks() -> None:
+def test_where_it_asks():
     assert str(Settings().http_port) == DEFAULT_HTTP_PORT
     assert ready_url({}) == "http://127.0.0.1:8000/v1/health/ready"
     assert ready_url({"ULTRAGRAY_HOST": "0.0.0.0", "ULTRAGRAY_HTTP_PORT": "1"}) == "http://127.0.0.1:1/v1/health/ready"

@@ -1,12 +1,5 @@
 """A training while it runs: its curve and its preview, over HTTP, with a worker."""
 
-from __future__ import annotations
-
-import json
-from collections.abc import Iterator
-from pathlib import Path
-from typing import Any
-
 import cv2
 import httpx
 import numpy as np
@@ -18,23 +11,19 @@ from ultragray_service.views.prepared import MAX_POINTS
 from ultragray_workers.jobs.files import CHECKPOINT_NAME, CONFIG_NAME, JOURNAL_NAME
 
 from ...waiting import wait_until
-from ..conftest import StartService
 from ..http.test_http_comparison import DATASET
 from ..http.test_http_datasets import zipped
 
-WAIT_S = 90.0
 STEPS = 40_000  # more than are done here
 
 
 @pytest.fixture(scope="module")
-def artifacts(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def artifacts(tmp_path_factory):
     return tmp_path_factory.mktemp("artifacts")
 
 
 @pytest.fixture(scope="module")
-def http(
-    start_service: StartService, tmp_path_factory: pytest.TempPathFactory, artifacts: Path
-) -> Iterator[httpx.Client]:
+def http(start_service, tmp_path_factory, artifacts):
     folder = tmp_path_factory.mktemp("dataset")
     write_released(DATASET, folder)
     service = start_service(artifact_folder=artifacts, embedded_worker=True, training_threads=1)
@@ -45,20 +34,19 @@ def http(
         yield client
 
 
-def train(http: httpx.Client, scene: str, **settings: Any) -> str:
+def train(http, scene, **settings):
     body = {"kind": "train", "specification": {"dataset": "tiny", "scene": scene, "settings": settings}}
     answer = http.post("/v1/jobs", json=body)
     assert answer.status_code == 201, answer.text
-    job: str = answer.json()["id"]
-    return job
+    return answer.json()["id"]
 
 
-def test_the_names_of_the_files_of_a_run() -> None:
+def test_the_names_of_the_files_of_a_run():
     assert (JOURNAL_NAME, CHECKPOINT_NAME, CONFIG_NAME) == (JOURNAL_FILE, CHECKPOINT_FILE, CONFIG_FILE)
 
 
 @pytest.mark.long
-def test_the_curve_of_a_finished_training_and_of_other_jobs(http: httpx.Client) -> None:
+def test_the_curve_of_a_finished_training_and_of_other_jobs(http):
     job = train(http, "short", steps=30, max_gaussians=50, confidence=False)
     wait_until(lambda: http.get(f"/v1/jobs/{job}").json()["state"] == "succeeded")
     curve = http.get(f"/v1/jobs/{job}/curve").json()
@@ -76,41 +64,13 @@ def test_the_curve_of_a_finished_training_and_of_other_jobs(http: httpx.Client) 
 
 
 @pytest.mark.long
-def test_a_training_keeps_a_picture_of_each_validation(http: httpx.Client) -> None:
-    job = train(http, "pictured", steps=30, max_gaussians=50, confidence=False)
-    artifacts = wait_until(lambda: (told := http.get(f"/v1/jobs/{job}").json())["state"] == "succeeded" and told)[
-        "artifacts"
-    ]
-    pictures = [name for name in artifacts if name.startswith("validation_")]
-    assert pictures == [*(f"validation_{step:08d}.png" for step in range(2, 31, 2)), "validation_truth.png"]
-    sizes = {http.get(f"/v1/jobs/{job}/artifacts/{name}").headers["content-type"] for name in pictures}
-    assert sizes == {"image/png"}
-
-
-@pytest.mark.long
-def test_the_phases_of_a_training_and_the_time_left_until_its_end(http: httpx.Client) -> None:
-    job = train(http, "phased", steps=150, max_gaussians=50, confidence=False)
-    told: dict[str, float | None] = {}
-    with http.stream("GET", f"/v1/jobs/{job}/events") as answer:
-        for line in answer.iter_lines():
-            if line.startswith("data: {"):
-                progress = json.loads(line.removeprefix("data: "))["progress"]
-                told[progress["phase"]] = progress["seconds_left"]
-    assert told.keys() >= {"training", "report"}
-    assert told["report"] is not None  # it is not yet done when its steps are
-    assert told["report"] > 1.0
-    assert http.get(f"/v1/jobs/{job}").json()["progress"]["phase"] is None
-
-
-@pytest.mark.long
-def test_a_training_is_seen_while_it_runs(http: httpx.Client, artifacts: Path) -> None:
+def test_a_training_is_seen_while_it_runs(http, artifacts):
     job = train(http, "long", steps=STEPS, max_gaussians=50, confidence=False)
     missing = http.get(f"/v1/jobs/{job}/preview").json()
     assert (missing["reason"], missing["field"]) == ("ARTIFACT_NOT_FOUND", "job")
 
-    def curve() -> list[dict[str, Any]]:
-        points: list[dict[str, Any]] = http.get(f"/v1/jobs/{job}/curve").json()["points"]
-        return points
+    def curve():
+        return http.get(f"/v1/jobs/{job}/curve").json()["points"]
 
     before = wait_until(curve)
     after = wait_until(lambda: (found := curve())[-1]["step"] > before[-1]["step"] + 600 and found)

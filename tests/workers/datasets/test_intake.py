@@ -5,6 +5,8 @@ import json
 import subprocess
 import sys
 
+import cv2
+import h5py
 import numpy as np
 import pytest
 
@@ -92,6 +94,33 @@ def test_warnings_of_the_check_are_kept(store, receive, files, tmp_path):
     take_in(**arguments(incoming))
     (warning,) = incoming.accept("tiny")[0].warnings
     assert warning.startswith("train: frames 3 are nearly black")
+
+
+def test_scans_and_tables_of_poses_are_taken_in_with_what_belongs_to_them(store, receive, tmp_path):
+    frames, poses = sweep(8, 0.0).images, np.tile(np.eye(4), (8, 1, 1))
+    poses[:, 1, 3] = np.arange(8)
+    with h5py.File(tmp_path / "scan.h5", "w") as file:
+        file["frames"], file["tforms"] = frames, poses
+    scale, tool = ("\n".join(",".join(map(str, row)) for row in m) for m in (np.diag([0.5, 0.5, 1, 1]), np.eye(4)))
+    table = "x_mm,y_mm,z_mm,qw,qx,qy,qz\n" + "\n".join(f"0,{number},0,1,0,0,0" for number in range(8))
+    calibration = {"image_to_sensor": [[0.5, 0, 0, 0], [0, 0, 1, 0], [0, 0.5, 0, 0], [0, 0, 0, 1]]}
+    uploads = {
+        "tusrec": {
+            "frames_transfs/000/scan.h5": (tmp_path / "scan.h5").read_bytes(),
+            "calib_matrix.csv": f"scaling\n{scale}\nspatial_calibration\n{tool}\n".encode(),
+        },
+        "table": {
+            **{f"sweep/{n}.png": cv2.imencode(".png", frame)[1].tobytes() for n, frame in enumerate(frames)},
+            "sweep/poses.csv": table.encode(),
+            "sweep/calibration.json": json.dumps(calibration).encode(),
+        },
+    }
+    for kind, files in uploads.items():
+        incoming = receive(files)
+        take_in(**arguments(incoming))
+        record = incoming.accept(kind)[0]
+        assert (record.kind, record.train_frames, record.val_frames) == (kind, 6, 2)
+        np.testing.assert_array_equal(store.load(kind).val.images, frames[[2, 7]])
 
 
 def poisoned(tmp_path, files):

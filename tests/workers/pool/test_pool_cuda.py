@@ -147,7 +147,7 @@ async def test_out_of_memory_fails_the_request_and_no_more(
         assert pool.statistics().restarts_total == 0
         found = results
     for request, result in zip(alike, found, strict=True):
-        assert result.batch_size == 4
+        assert result.batch_size > 2  # more than fit together: each was rendered again alone
         expect_frames(request, result)
 
 

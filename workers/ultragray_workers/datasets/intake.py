@@ -161,7 +161,7 @@ def check_files(files: Path, name: str, options: dict[str, str], contact_sheet: 
         height=dataset.train.height,
         width=dataset.train.width,
         probe=dataset.probe,
-        warnings=report.labelled_warnings,
+        warnings=report.warnings,
         options=options,
         region=dataset.train.region,
     )

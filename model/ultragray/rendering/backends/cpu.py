@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -14,7 +15,7 @@ from torch.autograd.function import once_differentiable
 
 from ultragray import _cpu
 from ultragray.errors import BackendUnavailable
-from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.geometry.probe import FloatArray, LinearProbe, Probe
 from ultragray.rendering.backends.inputs import (
     THIN,
     BeamVariance,
@@ -27,7 +28,7 @@ from ultragray.rendering.backends.inputs import (
     want_gradient,
 )
 from ultragray.rendering.limits import UNLIMITED, GivenUp, Limits
-from ultragray.rendering.outputs import PLANES, SUMS
+from ultragray.rendering.outputs import INTENSITY_SUM, PLANES, SUMS, WEIGHT_SUM
 from ultragray.scene.gaussians import PARAMETERS, GaussianScene
 
 INSTRUCTION_SETS: tuple[str, ...] = tuple(_cpu.instruction_sets())  # what this processor can run, best first
@@ -74,7 +75,7 @@ def render_outputs(
         )
         return dict(zip(outputs, frames, strict=True))
     planes = _empty_planes(view, outputs)
-    try:
+    with _limited(limits):
         _cpu.render(
             _sorted(scene, weighted),
             **view,
@@ -83,11 +84,47 @@ def render_outputs(
             flag=limits.flag,
             number=limits.number,
         )
+    return planes
+
+
+def plane_sums(
+    scene: GaussianScene,
+    corners_cm: FloatArray,  # [C, 4, 4] about the scene's centre
+    rows: int,
+    columns: int,
+    spacing_cm: float,
+    limits: Limits = UNLIMITED,
+) -> tuple[Tensor, Tensor]:  # [C, rows, columns] both
+    """Σ w and Σ I·w on planes of square pixels, over all Gaussians, as `registry.weighted_sums` has them for a probe.
+
+    A plane's pose has its origin at the outer corner of the first pixel, x along the rows and z along the columns. The
+    scene is one that it supports. Raises FrameTooCostly, GivenUp.
+    """
+    probe = LinearProbe(10.0 * spacing_cm * columns, 0.0, 10.0 * spacing_cm * rows)
+    view = _view_arguments(probe, corners_cm, rows, columns, None) | {"start": 0.0, "instruction_set": "auto"}
+    planes = _empty_planes(view, SUMS)
+    with _limited(limits):
+        _cpu.render(
+            _sorted(scene, weighted=True),
+            **view,
+            **_arrays(planes),
+            uncut=True,
+            footprint_pixels=limits.footprint_pixels,
+            flag=limits.flag,
+            number=limits.number,
+        )
+    return planes[WEIGHT_SUM], planes[INTENSITY_SUM]
+
+
+@contextmanager
+def _limited(limits: Limits) -> Iterator[None]:
+    """The kernel's errors at a limit as ours."""
+    try:
+        yield
     except _cpu.GivenUp:
         raise GivenUp from None
     except _cpu.TooCostly as error:
         raise limits.too_costly(*error.args) from None
-    return planes
 
 
 def footprint_pixels(
@@ -104,7 +141,7 @@ def footprint_pixels(
     """The cost of each pose (`ultragray.rendering.limits`), without drawing it. Raises GivenUp."""
     view = _view_arguments(probe, poses_cm, height, width, beam)
     pixels = np.empty(len(poses_cm), np.int64)
-    try:
+    with _limited(limits):
         _cpu.footprints(
             _sorted(scene),
             **view,
@@ -113,8 +150,6 @@ def footprint_pixels(
             flag=limits.flag,
             number=limits.number,
         )
-    except _cpu.GivenUp:
-        raise GivenUp from None
     return pixels.tolist()
 
 

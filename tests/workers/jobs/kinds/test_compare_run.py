@@ -8,6 +8,7 @@ import shutil
 import signal
 import subprocess
 import sys
+from dataclasses import replace
 
 import pytest
 import torch
@@ -57,6 +58,15 @@ def test_scores_are_those_of_the_library(job_run):
     assert [one["name"] for one in document["results"]] == ["median", "nearest"]
     progress = asked.progress
     assert (progress.method, progress.method_number, progress.methods) == ("nearest", 2, 2)
+
+
+def test_the_log_of_a_job_has_the_warnings_of_its_dataset(job_run, monkeypatch, capsys):
+    get = DatasetStore.get
+    monkeypatch.setattr(
+        DatasetStore, "get", lambda store, name: replace(get(store, name), warnings=("train: frame 4 lies off",))
+    )
+    job_run().load_dataset("tiny")
+    assert capsys.readouterr().err == "warning: train: frame 4 lies off\n"
 
 
 def test_a_job_that_is_to_stop_goes_on_in_its_retry(job_run, artifact_folder):

@@ -35,7 +35,7 @@ class JobRun:
         self._reported_at = float("-inf")
 
     def load_dataset(self, name: str) -> Dataset:
-        """A dataset of the service; waits for a storage that is away.
+        """A dataset of the service, its warnings in the log; waits for a storage that is away.
 
         Raises Stopped, DatasetNotFound, DatasetInvalid.
         """
@@ -43,7 +43,10 @@ class JobRun:
         datasets = open_datasets(self.folder.artifact_folder, request.storage, request.max_copies_bytes)
         while True:
             try:
-                return datasets.load(name)
+                dataset = datasets.load(name)
+                for text in datasets.get(name).warnings:
+                    sys.stderr.write(f"warning: {text}\n")
+                return dataset
             except StorageUnavailable as error:
                 if not is_away:
                     sys.stderr.write(f"waiting for the dataset {name}: {error.detail}\n")

@@ -1,0 +1,129 @@
+"""Samples of a registration that contradict each other: which one is worst, and which mistake would explain it.
+
+Each likely mistake is undone, and the fit tried again: the one that leaves least is the likely cause.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from itertools import combinations
+from typing import Any
+
+import numpy as np
+
+from ultragray.errors import UltragrayError
+from ultragray.geometry.pose import check_poses
+from ultragray.geometry.probe import FloatArray
+from ultragray.geometry.registration import (
+    LEVER_MM,
+    PointFit,
+    PoseFit,
+    register_points,
+    register_poses,
+    register_poses_and_mounting,
+)
+
+LARGEST_MM, LARGEST_DEG = 5.0, 3.0  # residuals of samples that agree, as hands and trackers measure
+SMALLEST_MM, SMALLEST_DEG = 0.5, 0.5  # below which nothing is doubted
+CURED = 0.2  # of the residuals: a mistake whose undoing leaves no more is the likely cause
+MOST_EXCHANGED = 12  # samples, the worst, among which two exchanged ones are looked for
+LEAST_TO_LEAVE_ONE_OUT = 5
+FLOOR_MM = 1e-3  # residuals below it are alike
+UNITS = {1000.0: "metres", 10.0: "centimetres"}
+
+_Given = dict[str, FloatArray]
+
+
+def pose_contradiction(
+    fit: PoseFit, flange_to_base: Any, probe_to_scene: Any, *, is_mounting_given: bool
+) -> str | None:
+    """The worst sample and the likely cause, in words; None where the poses agree."""
+    given = {"flange": check_poses(flange_to_base), "probe": check_poses(probe_to_scene)}
+    if is_mounting_given:
+        given["probe_to_flange"] = fit.probe_to_flange[None]
+
+    def score(given: _Given) -> float:
+        poses = given["flange"], given["probe"]
+        found = (
+            register_poses(*poses, given["probe_to_flange"][0])
+            if is_mounting_given
+            else register_poses_and_mounting(*poses)
+        )
+        return _root_mean_square(found.residuals_mm, found.residuals_deg)
+
+    return _explained(given, fit.residuals_mm, fit.residuals_deg, score)
+
+
+def point_contradiction(fit: PointFit, in_base: Any, in_scene: Any) -> str | None:
+    """As `pose_contradiction`, of points [N, 3]."""
+    given = {"base": np.asarray(in_base, np.float64), "scene": np.asarray(in_scene, np.float64)}
+    nothing = np.zeros_like(fit.residuals_mm)
+    return _explained(
+        given, fit.residuals_mm, nothing, lambda given: register_points(given["base"], given["scene"]).rms_mm
+    )
+
+
+def _root_mean_square(mm: FloatArray, deg: FloatArray) -> float:
+    return float(np.sqrt(np.mean(mm**2 + (LEVER_MM * np.radians(deg)) ** 2)))
+
+
+def _explained(given: _Given, mm: FloatArray, deg: FloatArray, score: Callable[[_Given], float]) -> str | None:
+    if mm.max() < SMALLEST_MM and deg.max() < SMALLEST_DEG:
+        return None
+    weights = mm**2 + (LEVER_MM * np.radians(deg)) ** 2
+    best, cause = CURED * _root_mean_square(mm, deg), ""
+    for text, changes in _mistakes(given, np.argsort(-weights)):
+        try:
+            left = max(FLOOR_MM, score({**given, **changes}))
+        except UltragrayError:  # what is left cannot be fitted
+            continue
+        if left < best:
+            best, cause = left, text
+    if not cause and mm.max() <= LARGEST_MM and deg.max() <= LARGEST_DEG:
+        return None
+    worst = int(weights.argmax())
+    angle = f" and {deg[worst]:.2g}°" if deg.any() else ""
+    likely = f"likely {cause} (without it {best:.2g} mm are left)" if cause else "no single mistake explains it"
+    return (
+        f"the samples contradict each other: sample {worst}, the worst (counted from 0), is {mm[worst]:.3g} mm{angle} "
+        f"off; {likely}"
+    )
+
+
+def _mistakes(given: _Given, worst_first: np.ndarray) -> Iterator[tuple[str, Mapping[str, FloatArray]]]:
+    """Each likely mistake, and what was given as it would be without it."""
+    (one_name, one), (other_name, other), *mounting = given.items()
+    for factor, unit in UNITS.items():  # only the ratio of both units shows
+        yield f"the positions of {one_name} are in {unit}", {one_name: _scaled(one, factor)}
+        yield (
+            f"the positions of {other_name} are in {unit}",
+            {name: _scaled(samples, 1 / factor) for name, samples in ((one_name, one), *mounting)},
+        )
+        for name, samples in mounting:
+            yield f"the position of {name} is in {unit}", {name: _scaled(samples, factor)}
+    for name, samples in given.items():
+        if samples.ndim == 3:
+            yield f"the poses of {name} are inverted", {name: np.asarray(np.linalg.inv(samples), np.float64)}
+    if len(one) > LEAST_TO_LEAVE_ONE_OUT:
+        yield f"{one_name} is one sample late", {one_name: one[1:], other_name: other[:-1]}
+        yield f"{one_name} is one sample early", {one_name: one[:-1], other_name: other[1:]}
+    for first, second in combinations(sorted(worst_first[:MOST_EXCHANGED]), 2):
+        order = np.arange(len(one))
+        order[[first, second]] = second, first
+        yield f"samples {first} and {second} are exchanged", {other_name: other[order]}
+    for place in worst_first if len(one) >= LEAST_TO_LEAVE_ONE_OUT else ():
+        kept = np.arange(len(one)) != place
+        stale = [
+            f", {name} is that of sample {near}: a stale one"
+            for name, samples in ((one_name, one), (other_name, other))
+            for near in (place - 1, place + 1)
+            if 0 <= near < len(one) and np.allclose(samples[near], samples[place], atol=1e-6)
+        ]
+        yield f"sample {place} alone is wrong{''.join(stale[:1])}", {one_name: one[kept], other_name: other[kept]}
+
+
+def _scaled(samples: FloatArray, factor: float) -> FloatArray:  # [N, 4, 4] or [N, 3]
+    scaled = samples.copy()
+    places = scaled[:, :3, 3] if samples.ndim == 3 else scaled
+    places *= factor
+    return scaled

@@ -1,0 +1,271 @@
+"""What the words of a DICOM header say of its pixels, against what the stream holds."""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pydicom
+import pytest
+from PIL import Image
+from pydicom.encaps import encapsulate
+from pydicom.pixels import convert_color_space
+from pydicom.uid import JPEG2000, JPEGBaseline8Bit
+
+from ultragray.datasets.source import SourceOptions, load_dataset
+from ultragray.errors import DatasetInvalid
+
+from ...dicom_files import FRAMES, POSES, region, write_cine
+
+Write = Callable[..., Path]
+SIZE = (96, 128)
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Write:
+    return partial(
+        write_cine,
+        tmp_path,
+        Rows=SIZE[0],
+        Columns=SIZE[1],
+        SequenceOfUltrasoundRegions=None,
+        PixelSpacing=[0.3, 0.3],
+    )
+
+
+def echoes(seed: int = 0) -> np.ndarray:  # [10, 96, 128] smooth, black beside a sector
+    random = np.random.default_rng(seed)
+    frames = random.integers(20, 235, (10, 12, 16)).astype(np.uint8)
+    grown = np.stack([cv2.resize(frame, SIZE[::-1], interpolation=cv2.INTER_CUBIC) for frame in frames])
+    grown[:, :, :20] = 0
+    return grown
+
+
+def with_flow(grey: np.ndarray) -> np.ndarray:  # [10, 96, 128, 3]
+    """The same in colour: a box of red and blue, as flow is shown, and grey elsewhere."""
+    colour = np.repeat(grey[..., None], 3, axis=-1)
+    colour[:, 30:50, 60:90] = (200, 30, 20)
+    colour[:, 50:60, 60:90] = (20, 40, 190)
+    return colour
+
+
+def luma(colour: np.ndarray) -> np.ndarray:
+    return colour @ [0.299, 0.587, 0.114]
+
+
+def without_markers(stream: bytes) -> bytes:
+    """A JPEG stream without JFIF's marker, as many scanners write it."""
+    length = int.from_bytes(stream[4:6], "big")
+    assert stream[2:4] == b"\xff\xe0"
+    return stream[:2] + stream[4 + length :]
+
+
+def ycbcr_jpeg(colour: np.ndarray, *, subsampled: bool = True) -> bytes:
+    out = io.BytesIO()
+    Image.fromarray(colour).save(out, "JPEG", quality=98, subsampling=2 if subsampled else 0)
+    return out.getvalue()
+
+
+def rgb_jpeg(colour: np.ndarray) -> bytes:
+    """RGB as it is, named so by Adobe's marker."""
+    out = io.BytesIO()
+    Image.fromarray(colour).save(out, "JPEG", quality=98, keep_rgb=True, subsampling=0)
+    return out.getvalue()
+
+
+def without_adobe(stream: bytes) -> bytes:
+    """RGB that nothing names: neither a marker nor the components, which are 1, 2 and 3."""
+    place = stream.find(b"\xff\xee")
+    if place >= 0:
+        length = int.from_bytes(stream[place + 2 : place + 4], "big")
+        stream = stream[:place] + stream[place + 2 + length :]
+    for marker, offset, step in ((b"\xff\xc0", 10, 3), (b"\xff\xda", 5, 2)):
+        at = stream.find(marker)
+        changed = bytearray(stream)
+        for channel in range(3):
+            changed[at + offset + channel * step] = channel + 1
+        stream = bytes(changed)
+    return stream
+
+
+STREAMS: dict[str, Callable[[np.ndarray], bytes]] = {
+    "YCbCr with JFIF": ycbcr_jpeg,
+    "YCbCr bare": lambda frame: without_markers(ycbcr_jpeg(frame)),
+    "YCbCr bare, not subsampled": lambda frame: without_markers(ycbcr_jpeg(frame, subsampled=False)),
+    "RGB with Adobe's marker": rgb_jpeg,
+    "RGB bare": lambda frame: without_adobe(rgb_jpeg(frame)),
+}
+
+
+@pytest.mark.parametrize("word", ["RGB", "YBR_FULL", "YBR_FULL_422"])
+@pytest.mark.parametrize("stream", STREAMS)
+@pytest.mark.parametrize("colours", [lambda grey: np.repeat(grey[..., None], 3, axis=-1), with_flow])
+def test_a_jpeg_stream_is_read_as_it_is_whatever_the_header_calls_it(
+    write: Write, word: str, stream: str, colours: Callable[[np.ndarray], np.ndarray]
+) -> None:
+    colour = colours(echoes())
+    data = encapsulate([STREAMS[stream](frame) for frame in colour])
+    path = write(
+        syntax=JPEGBaseline8Bit, SamplesPerPixel=3, PhotometricInterpretation=word, PlanarConfiguration=0, data=data
+    )
+    sweep = load_dataset(path).val
+    off = np.abs(sweep.images - luma(colour)[[2, 7]])
+    assert np.median(off) <= 1
+    assert np.percentile(off, 95) <= 2
+    is_bare, is_rgb = "bare" in stream, stream.startswith("RGB")
+    told = [note for note in sweep.notes if note.startswith("the header says")]
+    assert bool(told) == (is_bare and is_rgb != (word == "RGB"))
+
+
+@pytest.mark.parametrize("word", ["MONOCHROME1", "MONOCHROME2"])
+def test_grey_jpeg(write: Write, word: str) -> None:
+    grey = echoes()
+    shown = 255 - grey if word == "MONOCHROME1" else grey
+    data = encapsulate([cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tobytes() for frame in grey])
+    found = load_dataset(write(syntax=JPEGBaseline8Bit, PhotometricInterpretation=word, data=data)).val.images
+    assert np.abs(found.astype(int) - shown[[2, 7]]).max() <= 8
+    assert np.abs(found.astype(int) - shown[[2, 7]]).mean() <= 1
+
+
+def test_a_stream_of_another_size_is_not_decoded(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+    large = cv2.imencode(".jpg", np.full((2000, 2000), 90, np.uint8))[1].tobytes()
+    path = write(syntax=JPEGBaseline8Bit, data=encapsulate([large] * 10))
+    monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
+    with pytest.raises(DatasetInvalid, match="frame 0: it cannot be read as JPEG of 128 x 96 pixels"):
+        load_dataset(path)
+
+
+@pytest.mark.parametrize("word", ["RGB", "YBR_FULL"])
+@pytest.mark.parametrize("stored", ["RGB", "YBR_FULL"])
+def test_raw_colours_are_read_as_they_are(write: Write, word: str, stored: str) -> None:
+    colour = with_flow(echoes())
+    data = colour if stored == "RGB" else convert_color_space(colour, "RGB", "YBR_FULL")
+    path = write(SamplesPerPixel=3, PhotometricInterpretation=word, PlanarConfiguration=0, data=data.tobytes())
+    sweep = load_dataset(path).val
+    assert np.abs(sweep.images - luma(colour)[[2, 7]]).max() <= 2
+    assert any("the header says" in note for note in sweep.notes) == (word != stored)
+    if word == stored:  # pydicom itself, where the header is right
+        assert np.abs(sweep.images - luma(pydicom.dcmread(path).pixel_array)[[2, 7]]).max() <= 2
+
+
+@pytest.mark.parametrize("planar", [0, 1])
+def test_planes_of_colour(write: Write, planar: int) -> None:
+    colour = with_flow(echoes())
+    data = colour if planar == 0 else colour.transpose(0, 3, 1, 2)
+    path = write(
+        SamplesPerPixel=3,
+        PhotometricInterpretation="RGB",
+        PlanarConfiguration=planar,
+        data=np.ascontiguousarray(data).tobytes(),
+    )
+    assert np.abs(load_dataset(path).val.images - luma(colour)[[2, 7]]).max() <= 1
+
+
+@pytest.mark.parametrize("word", ["RGB", "YBR_RCT", "YBR_ICT"])
+def test_colour_jpeg_2000(write: Write, word: str) -> None:
+    colour = with_flow(echoes())
+    streams = []
+    for frame in colour:
+        out = io.BytesIO()
+        Image.fromarray(frame).save(out, "JPEG2000", irreversible=word == "YBR_ICT", mct=1, no_jp2=True)
+        streams.append(out.getvalue())
+    path = write(
+        syntax=JPEG2000,
+        SamplesPerPixel=3,
+        PhotometricInterpretation=word,
+        PlanarConfiguration=0,
+        data=encapsulate(streams),
+    )
+    assert np.abs(load_dataset(path).val.images - luma(colour)[[2, 7]]).max() <= 2
+
+
+def test_a_palette(write: Write) -> None:
+    indices = echoes()
+    table = np.random.default_rng(1).integers(0, 256, (256, 3))
+    luts: dict[str, Any] = {}
+    for channel, name in enumerate(("Red", "Green", "Blue")):
+        luts[f"{name}PaletteColorLookupTableDescriptor"] = [256, 0, 16]
+        luts[f"{name}PaletteColorLookupTableData"] = (table[:, channel].astype("<u2") * 257).tobytes()
+    path = write(PhotometricInterpretation="PALETTE COLOR", data=indices.tobytes(), **luts)
+    assert np.abs(load_dataset(path).val.images - luma(table[indices])[[2, 7]]).max() <= 1
+
+
+def test_more_bits_are_made_eight(write: Write) -> None:
+    stored = echoes().astype(np.uint16) * 16 + 5
+    path = write(BitsAllocated=16, BitsStored=12, HighBit=11, data=stored.astype("<u2").tobytes())
+    sweep = load_dataset(path).val
+    np.testing.assert_array_equal(sweep.images, echoes()[[2, 7]])
+    assert "pixels of 12 bits were made 8: 4095 became 255" in sweep.notes
+
+
+SMALL: dict[str, Any] = {"Rows": FRAMES.shape[1], "Columns": FRAMES.shape[2], "PixelSpacing": None}
+
+
+@pytest.mark.parametrize("end", [{"RegionLocationMaxX1": 32}, {"RegionLocationMaxY1": 24}])
+def test_a_region_that_ends_one_pixel_beyond_is_clipped_by_it(write: Write, end: dict[str, int]) -> None:
+    whole = {"RegionLocationMaxX1": 31, "RegionLocationMaxY1": 23}
+    expected = load_dataset(write(**SMALL, SequenceOfUltrasoundRegions=[region(**whole)]))
+    found = load_dataset(write(**SMALL, SequenceOfUltrasoundRegions=[region(**{**whole, **end})]))
+    np.testing.assert_array_equal(found.val.images, expected.val.images)
+    np.testing.assert_allclose(found.val.poses, expected.val.poses)
+    assert "ends one pixel beyond the image: clipped by that pixel" in "".join(found.val.notes)
+    assert not expected.val.notes
+
+
+def test_several_regions_are_listed_and_one_is_chosen_by_a_crop(write: Write) -> None:
+    left, right = region(RegionLocationMaxX1=13), region(RegionLocationMinX0=16, PhysicalDeltaX=0.1)
+    path = write(**SMALL, SequenceOfUltrasoundRegions=[left, right])
+    with pytest.raises(DatasetInvalid, match=r"one with crop: 4:14,2:22 \(pixels .*; 16:24,2:22 \(pixels of 1 x"):
+        load_dataset(path)
+    alone = write(**SMALL, SequenceOfUltrasoundRegions=[right])
+    expected = load_dataset(alone, SourceOptions(crop="16:24,3:20"))
+    path = write(**SMALL, SequenceOfUltrasoundRegions=[left, right])
+    found = load_dataset(path, SourceOptions(crop="16:24,3:20"))
+    np.testing.assert_array_equal(found.train.images, expected.train.images)
+    np.testing.assert_allclose(found.train.poses, expected.train.poses)
+    assert found.probe == expected.probe
+    flow = region(RegionDataType=2, RegionLocationMinX0=8)
+    both = load_dataset(write(**SMALL, SequenceOfUltrasoundRegions=[region(), flow, region()]))
+    assert both.train.images.shape[1:] == (20, 20)
+
+
+@pytest.mark.parametrize("kind", ["null", "NaN"])
+def test_a_frame_without_a_pose_is_left_out_and_named(write: Write, tmp_path: Path, kind: str) -> None:
+    path = write(
+        data=echoes().tobytes(),
+        poses=None if kind == "null" else np.where(np.isin(np.arange(10), [3, 7])[:, None, None], np.nan, POSES),
+    )
+    if kind == "null":
+        rows = [None if number in (3, 7) else pose[:3].tolist() for number, pose in enumerate(POSES)]
+        (tmp_path / "sweep.poses.json").write_text(str(rows).replace("None", "null"))
+    sweep = load_dataset(path)
+    numbers = sorted([*sweep.train.frame_numbers, *sweep.val.frame_numbers])
+    assert numbers == [0, 1, 2, 4, 5, 6, 8, 9]
+    assert any(note.endswith("were left out: 3, 7 (2 in all)") for note in sweep.train.notes)
+    np.testing.assert_array_equal(sweep.val.images, echoes()[sweep.val.frame_numbers])
+
+
+def test_names_and_burnt_in_text_are_told(write: Write) -> None:
+    notes = load_dataset(write(data=echoes().tobytes(), PatientName="Doe^Jane", BurnedInAnnotation="YES")).train.notes
+    assert "its header names a person (PatientName): convert --anonymize leaves it out" in notes
+    assert any("BurnedInAnnotation YES" in note for note in notes)
+    assert not load_dataset(write(data=echoes().tobytes(), PatientName="Anonymous", PatientID="")).train.notes
+
+
+TOP_CENTRE = np.array([0.0, 0.0, 0.0, 1.0])
+
+
+def test_a_delay_of_the_images_by_the_times_of_the_frames(write: Write) -> None:
+    path = write(data=echoes().tobytes(), FrameTime=40.0)
+    found = load_dataset(path, SourceOptions(image_delay_ms="20"))
+    numbers = [*found.train.frame_numbers, *found.val.frame_numbers]
+    assert sorted(numbers) == list(range(1, 10))
+    at = dict(enumerate(POSES))
+    for number, pose in zip(found.train.frame_numbers, found.train.poses, strict=True):
+        middle = (at[number] + at[number - 1]) / 2 @ TOP_CENTRE
+        assert np.abs(pose[:3, 3] - middle[:3]).max() < 0.02

@@ -1,0 +1,178 @@
+"""Pictures in a folder with a table of poses."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+from scipy.spatial.transform import Rotation
+
+from ultragray.datasets.source import SourceOptions, load_dataset
+from ultragray.datasets.table import rotation_of_angles
+from ultragray.errors import DatasetInvalid, InvalidArgument
+
+COUNT, ROWS, COLUMNS = 12, 40, 60
+FRAMES = np.random.default_rng(2).integers(0, 250, (COUNT, ROWS, COLUMNS), dtype=np.uint8)
+TIMES = 3.0 + 0.05 * np.arange(COUNT)
+TURNS = Rotation.from_rotvec(np.linspace(0, 0.5, COUNT)[:, None] * [0.3, 1.0, -0.4])
+PLACES = np.linspace(0, 1, COUNT)[:, None] * [4.0, 20.0, -3.0] + [100.0, -50.0, 30.0]
+CALIBRATION = np.array([[0.2, 0.0, 0.0, -6.0], [0.0, 0.0, 1.0, 0.5], [0.0, 0.25, 0.0, 2.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+@pytest.fixture
+def write(tmp_path: Path) -> Callable[..., Path]:
+    def write(
+        header: str, rows: np.ndarray, *, pictures: str = ".", names: str = "frame_{}.png", **calibration: Any
+    ) -> Path:
+        folder = tmp_path / "sweep"
+        (folder / pictures).mkdir(parents=True, exist_ok=True)
+        for number, frame in enumerate(FRAMES):
+            cv2.imwrite(str(folder / pictures / names.format(number)), frame)
+        lines = [header, *(",".join("" if value is None else str(value) for value in row) for row in rows)]
+        (folder / "poses.csv").write_text("\n".join(lines))
+        document = {"image_to_sensor": CALIBRATION.tolist(), **calibration}
+        (folder / "calibration.json").write_text(json.dumps(document))
+        return folder
+
+    return write
+
+
+def quaternions() -> np.ndarray:  # [N, 4] w, x, y, z
+    return np.roll(TURNS.as_quat(), 1, axis=1)
+
+
+def table(*columns: np.ndarray) -> list[list[Any]]:
+    return [list(row) for row in np.concatenate([np.atleast_2d(one.T).T for one in columns], axis=1).tolist()]
+
+
+def check(folder: Path, options: SourceOptions | None = None, shift_s: float = 0.0) -> None:
+    dataset = load_dataset(folder, options)
+    for part in (dataset.train, dataset.val):
+        np.testing.assert_array_equal(part.images, FRAMES[part.frame_numbers])
+        for number, pose in zip(part.frame_numbers, part.poses, strict=True):
+            share = (TIMES[number] - shift_s - TIMES[0]) / (TIMES[-1] - TIMES[0])
+            true = np.eye(4)
+            true[:3, :3] = Rotation.from_rotvec(0.5 * share * np.array([0.3, 1.0, -0.4])).as_matrix()
+            true[:3, 3] = share * np.array([4.0, 20.0, -3.0]) + [100.0, -50.0, 30.0]
+            true = true @ CALIBRATION
+            top_centre = (true @ ((COLUMNS - 1) / 2, -0.5, 0, 1))[:3]
+            assert np.abs(pose[:3, 3] - top_centre).max() < 0.02
+            assert np.abs(pose[:3, 0] - true[:3, 0] / 0.2).max() < 1e-5
+            assert np.abs(pose[:3, 2] - true[:3, 1] / 0.25).max() < 1e-5
+
+
+@pytest.mark.parametrize(("unit", "scale"), [("mm", 1.0), ("cm", 0.1), ("m", 0.001)])
+@pytest.mark.parametrize("is_in_name", [True, False])
+def test_positions_in_their_unit_and_quaternions(
+    write: Callable[..., Path], unit: str, scale: float, is_in_name: bool
+) -> None:
+    suffix = f"_{unit}" if is_in_name else ""
+    header = f"time,x{suffix},y{suffix},z{suffix},qw,qx,qy,qz"
+    folder = write(
+        header, table(TIMES, PLACES * scale, quaternions()), **({} if is_in_name else {"position_unit": unit})
+    )
+    check(folder)
+    check(folder / "poses.csv")
+    assert load_dataset(folder / "poses.csv").name == "sweep"
+    assert f"pose (x, y, z in {unit}, quaternion)" in str(load_dataset(folder).train.chain.links[1])
+
+
+@pytest.mark.parametrize("order", ["ZYX", "XYZ", "xyz", "zyx", "YXZ", "ZXZ"[:2] + "Y"])
+@pytest.mark.parametrize("unit", ["deg", "rad"])
+def test_angles_in_their_order_and_unit(write: Callable[..., Path], order: str, unit: str) -> None:
+    angles = TURNS.as_euler(order, degrees=unit == "deg")
+    by_axis = np.empty_like(angles)
+    for place, axis in enumerate(order.upper()):
+        by_axis[:, "XYZ".index(axis)] = angles[:, place]
+    header = f"t,tx_mm,ty_mm,tz_mm,rx_{unit},ry_{unit},rz_{unit}"
+    check(write(header, table(TIMES, PLACES, by_axis), euler_order=order))
+
+
+def test_turns_agree_with_another_library() -> None:
+    angles = np.array([0.3, -0.8, 1.2])
+    for order in ("XYZ", "ZYX", "YZX", "xyz", "zxy"):
+        theirs = Rotation.from_euler(order, [angles["XYZ".index(axis)] for axis in order.upper()]).as_matrix()
+        np.testing.assert_allclose(rotation_of_angles(angles, order), theirs, atol=1e-12)
+
+
+def test_rows_name_their_pictures(write: Callable[..., Path], tmp_path: Path) -> None:
+    rows = table(TIMES, PLACES, quaternions())
+    named = [[*row, f"images/us{number}.jpg.png"] for number, row in enumerate(rows)]
+    folder = write("time,x_mm,y_mm,z_mm,qw,qx,qy,qz,file", named, pictures="images", names="us{}.jpg.png")
+    check(folder)
+    (folder / "images" / "us3.jpg.png").unlink()
+    with pytest.raises(DatasetInvalid, match=r"the picture 'images/us3\.jpg\.png' was not found"):
+        load_dataset(folder)
+
+
+def test_poses_between_rows_at_the_times_of_pictures(write: Callable[..., Path]) -> None:
+    dense = np.linspace(TIMES[0] - 0.2, TIMES[-1] + 0.2, 60)
+    share = (dense - TIMES[0]) / (TIMES[-1] - TIMES[0])
+    places = share[:, None] * [4.0, 20.0, -3.0] + [100.0, -50.0, 30.0]
+    turns = Rotation.from_rotvec(0.5 * share[:, None] * [0.3, 1.0, -0.4])
+    rows = table(1000 * dense, places, np.roll(turns.as_quat(), 1, axis=1))
+    folder = write("time_ms,x_mm,y_mm,z_mm,qw,qx,qy,qz", rows)
+    with pytest.raises(DatasetInvalid, match=r"it has 60 poses for 12 pictures: name them in a column file, or their"):
+        load_dataset(folder)
+    stamped = "\n".join(["file,time", *(f"frame_{number}.png,{time}" for number, time in enumerate(TIMES))])
+    (folder / "images.csv").write_text(stamped)
+    check(folder)
+    check(folder, SourceOptions(image_delay_ms="60"), shift_s=0.06)
+    check(folder, SourceOptions(image_delay_ms="-35"), shift_s=-0.035)
+
+
+def test_rows_without_a_pose_are_left_out(write: Callable[..., Path]) -> None:
+    rows = table(TIMES, PLACES, quaternions())
+    rows[4][1:4] = [None, None, None]
+    rows[8][4] = "nan"
+    dataset = load_dataset(write("time,x_mm,y_mm,z_mm,qw,qx,qy,qz", rows))
+    assert "pictures without a pose were left out: 4, 8 (2 in all)" in dataset.train.notes
+    assert sorted([*dataset.train.frame_numbers, *dataset.val.frame_numbers]) == [0, 1, 2, 3, 5, 6, 7, 9, 10, 11]
+
+
+@pytest.mark.parametrize(
+    ("header", "calibration", "message"),
+    [
+        ("time,x,y,z,qw,qx,qy,qz", {}, "does not say in which unit its positions are: name columns such as x_mm"),
+        ("time,x_mm,y_mm,z_mm,rx,ry,rz,other", {}, "angles need their unit and order"),
+        ("time,x_mm,y_mm,z_mm,rx_deg,ry_deg,rz_deg,other", {}, "angles need their unit and order"),
+        ("time,x_mm,y_mm,q,qw,qx,qy,qz", {}, r"it lacks columns of a position \(x, y, z\), it has time, x_mm"),
+        ("time,x_mm,y_mm,z_mm,qw,qx,qy,other", {}, "it lacks columns of a quaternion"),
+        ("time,x_mm,y_mm,z_mm,qx,qy,qz,qw", {}, None),
+        ("time,x_mm,y_mm,z_mm,qw,qx,qy,qz", {"euler_order": "XX"}, "euler_order must be three of XYZ"),
+        ("time,x_mm,y_mm,z_mm,qw,qx,qy,qz", {"image_to_sensor": [1, 2]}, "image_to_sensor must be 16 finite numbers"),
+        ("time,x_mm,y_mm,z_mm,qw,qx,qy,qz", {"position_unit": "inch"}, "the calibration cannot be read: position_unit"),
+        (
+            "time,x_mm,y_mm,z_mm,qw,qx,qy,qz",
+            {"image_to_sensor": (np.diag([1e-3, 1e-3, 1e-3, 1]) @ CALIBRATION).tolist()},
+            r"calibration\.json: image_to_sensor makes a pixel 0\.0002 x 0\.00025 mm .* metres\?",
+        ),
+    ],
+)
+def test_what_cannot_be_used_is_one_clear_error(
+    write: Callable[..., Path], header: str, calibration: dict[str, Any], message: str | None
+) -> None:
+    folder = write(header, table(TIMES, PLACES, quaternions()), **calibration)
+    if message is None:  # any order of columns
+        assert len(load_dataset(folder).train) > 0
+        return
+    with pytest.raises(DatasetInvalid, match=message):
+        load_dataset(folder)
+
+
+def test_pictures_that_do_not_go_with_it(write: Callable[..., Path]) -> None:
+    rows = table(TIMES, PLACES, quaternions())
+    folder = write("time,x_mm,y_mm,z_mm,qw,qx,qy,qz", rows)
+    cv2.imwrite(str(folder / "frame_5.png"), FRAMES[5][:20])
+    with pytest.raises(DatasetInvalid, match=r"frame_5\.png: it has 60 x 20 pixels, frame_0\.png 60 x 40"):
+        load_dataset(folder)
+    (folder / "frame_5.png").write_bytes(b"no picture")
+    with pytest.raises(DatasetInvalid, match=r"frame_5\.png: it cannot be read as a picture"):
+        load_dataset(folder)
+    with pytest.raises(InvalidArgument, match="fan must be given without crop"):
+        load_dataset(folder, SourceOptions(crop="0:9,0:9", fan="60,40,90,1,1"))
