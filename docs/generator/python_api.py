@@ -7,6 +7,7 @@ import re
 from collections.abc import Iterator
 from dataclasses import is_dataclass
 from enum import Enum
+from functools import cached_property
 from importlib import import_module
 from types import ModuleType
 from typing import Any
@@ -149,6 +150,8 @@ def members(cls: type[Any]) -> Iterator[tuple[str, Any]]:
     own = [base for base in reversed(cls.__mro__) if base is cls or base.__name__.startswith("_")]
     for name in sorted({name for base in own for name in vars(base) if not name.startswith("_")}):
         value = getattr(cls, name)
+        if isinstance(value, cached_property):
+            value = property(value.func)
         if inspect.isroutine(value) or isinstance(value, property):
             yield name, value
 

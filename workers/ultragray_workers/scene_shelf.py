@@ -85,7 +85,8 @@ class SceneShelf:
         """
         self.storage, self.is_near = storage, storage.is_near
         self._prefix, self._cache, self._longest_stale_s = prefix, cache, longest_stale_s
-        self._working_folder = storage.in_place(self._key(MAKING_PREFIX)) or working_folder
+        within = storage.in_place(self._key(MAKING_PREFIX))
+        self._working_folder = working_folder if within is None else within.parent
         self._known: dict[str, Placed] = {}
         self._read_at_s: float | None = None  # time.monotonic()
         self._tried_at_s = 0.0

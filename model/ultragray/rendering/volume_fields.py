@@ -95,7 +95,8 @@ def _parts(scene: GaussianScene, field: str) -> list[tuple[int, GaussianScene]]:
         return [(0, weighing)]
     constant = (scene.transmittances.detach().to("cpu", torch.float32) / (-4.0 * _SH_C0)).reshape(-1, 1, 1)
     info = replace(weighing.info, intensity="sigmoid")
-    return [(0, GaussianScene(**{**weighing.splats, "sh0": constant}, info=info))]
+    tensors: dict[str, Any] = {**weighing.splats, "sh0": constant}
+    return [(0, GaussianScene(**tensors, info=info))]
 
 
 def _weighing_one(scene: GaussianScene) -> GaussianScene:

@@ -497,7 +497,7 @@ def test_the_page_is_told_where_people_sign_in(start_service):
         service = start_service(**issuer.settings(), oidc_client_id="console", oidc_scope="openid roles")
         wait_until(lambda: identity_provider(service) == "available")
         assert httpx.get(f"{service.http}/v1/sign-in", timeout=60).json() == {
-            "issuer": {**issuer.endpoints, "client_id": "console", "scope": "openid roles"}
+            "provider": {**issuer.endpoints, "client_id": "console", "scope": "openid roles"}
         }
         policy = httpx.get(service.http, timeout=60).headers["content-security-policy"]
         assert policy.endswith(" https://tokens.hospital.example:8443")
@@ -506,5 +506,5 @@ def test_the_page_is_told_where_people_sign_in(start_service):
 
 
 def test_without_a_client_id_people_sign_in_with_keys(guarded):
-    assert httpx.get(f"{guarded.http}/v1/sign-in", timeout=60).json() == {"issuer": None}
+    assert httpx.get(f"{guarded.http}/v1/sign-in", timeout=60).json() == {"provider": None}
     assert "hospital" not in httpx.get(guarded.http, timeout=60).headers["content-security-policy"]

@@ -1,8 +1,11 @@
 """Options made of contract dataclasses: names, help, defaults, and the way back."""
 
+from __future__ import annotations
+
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path
+from typing import Annotated, Any
 
 import pytest
 import typer
@@ -11,8 +14,8 @@ from typer.testing import CliRunner
 from ultragray.contract import Contract, described
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.probe import LinearProbe, Probe
-from ultragray.samplers import FanSampler
-from ultragray_service.cli.options import with_options
+from ultragray.samplers import FanSampler, Sampler
+from ultragray_service.cli.options import FieldsOf, with_options
 
 
 class Way(str, Enum):
@@ -38,16 +41,16 @@ class Asked(Contract):
     inner: Inner | None = described("Not shown.", None)
 
 
-def given(*arguments, some=False):
-    found = []
+def given(*arguments: object, some: bool = False) -> Any:
+    found: list[Any] = []
     app = typer.Typer()
 
     @with_options
-    def whole(asked, sampler):
+    def whole(asked: Asked, sampler: Sampler | None) -> None:
         found.append((asked, sampler))
 
     @with_options
-    def fields(options):
+    def fields(options: Annotated[dict[str, Any], FieldsOf(Asked, "number", "absorbs", environment="OUR_")]) -> None:
         found.append(options)
 
     app.command()(fields if some else whole)
@@ -57,7 +60,7 @@ def given(*arguments, some=False):
     return found[0] if found else result
 
 
-def test_every_kind_of_field_has_its_option():
+def test_every_kind_of_field_has_its_option() -> None:
     asked, sampler = given(
         *("me", "--folder", "/tmp", "--number", 4, "--is-loud", "--no-absorbs", "--gains", "0.5, 3", "--way", "back"),
         *("--probe", '{"kind": "linear", "width_mm": 40, "near_mm": 0, "far_mm": 50}', "--scan-convert", 0.75),
@@ -68,18 +71,18 @@ def test_every_kind_of_field_has_its_option():
     assert sampler == FanSampler(4, 2)
 
 
-def test_what_is_not_given_keeps_its_default():
+def test_what_is_not_given_keeps_its_default() -> None:
     asked, sampler = given("me", "--folder", "/tmp")
     assert asked == Asked("me", Path("/tmp"))
     assert sampler is None
 
 
-def test_fields_are_taken_as_they_are_given():
+def test_fields_are_taken_as_they_are_given() -> None:
     assert given(some=True) == {}
     assert given("--number", 5, "--no-absorbs", some=True) == {"number": 5, "absorbs": False}
 
 
-def test_help_has_the_meaning_the_limits_and_the_default():
+def test_help_has_the_meaning_the_limits_and_the_default() -> None:
     text = " ".join(given("--help").output.replace("│", " ").split())
     assert "How many. From 1 to 9. [default: (3)]" in text
     assert "Gains. [default: (1.0,2.0)]" in text
@@ -100,6 +103,6 @@ def test_help_has_the_meaning_the_limits_and_the_default():
         (("--sampler", "fan", "--tilt-deg", 3), "step_deg is required"),
     ],
 )
-def test_mistakes_are_named(arguments, told):
+def test_mistakes_are_named(arguments: tuple[object, ...], told: str) -> None:
     with pytest.raises(InvalidArgument, match=told):
         given("me", "--folder", "/tmp", *arguments)
