@@ -63,10 +63,10 @@ def test_a_finished_fit_is_found_in_its_folder(mean_image, make_dataset, tmp_pat
 @pytest.mark.parametrize("folder", [None, "fit"])
 def test_a_fit_that_was_timed_in_a_busy_moment_gets_its_time(folder, mean_image, make_dataset, tmp_path):
     budget = Budget.equal(0.5)
-    budget.paces.keep(mean_image.name, Pace(0.0, 0.1, is_confirmed=False))  # it takes a thousandth of that
+    budget.paces.keep(mean_image.name, Pace(0.0, 0.5, is_confirmed=False))  # a step takes a thousandth of that
     run = FitRun(folder=None if folder is None else tmp_path / folder)
     fitted = mean_image.fit(make_dataset(), budget, run)
-    assert fitted.cost.steps > 10
+    assert fitted.cost.steps > 1  # which that pace would leave
     again = mean_image.fit(make_dataset(), budget)
     assert again.cost.steps == fitted.cost.steps
 

@@ -37,8 +37,8 @@ def test_a_write_whose_answer_was_lost_counts_as_written(bucket, object_proxy):
     assert bucket.read("a") == b"one"
 
 
-def test_a_torn_upload_is_repeated_and_never_half_there(bucket, object_proxy, tmp_path):
-    content = os.urandom(LARGE)
+def test_a_torn_upload_is_repeated_and_never_half_there(new_bucket, object_proxy, tmp_path):
+    content, bucket = os.urandom(LARGE), open_storage(new_bucket(), patience_s=60)
     (tmp_path / "large").write_bytes(content)
     object_proxy.faults += [
         Fault("cut_request", "PUT", bytes=2**20),
