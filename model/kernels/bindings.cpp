@@ -110,8 +110,8 @@ NB_MODULE(_cpu, m) {
         [](const PreparedScene& scene, bool fanned, bool wrap, double start, double span, double near_cm, double far_cm,
            double cull_far_cm, BeamNumbers beam, Poses poses, int height, int width, int threads,
            const std::string& instruction_set, OptionalPlanes bmode, OptionalPlanes echo, OptionalPlanes transmittance,
-           OptionalPlanes coverage, OptionalPlanes weight_sum, OptionalPlanes intensity_sum,
-           bool uncut, std::optional<int64_t> footprint_pixels, std::optional<Flag> flag, int64_t number) {
+           OptionalPlanes coverage, OptionalPlanes weight_sum, OptionalPlanes intensity_sum, bool uncut,
+           std::optional<int64_t> footprint_pixels, std::optional<Flag> flag, int64_t number) {
             const Outputs outputs =
                 planes_of({bmode, echo, transmittance, coverage, weight_sum, intensity_sum}, poses.shape(0), height, width);
             const ProbeGeometry probe{fanned, wrap, start, span, near_cm, far_cm, cull_far_cm, beam_of(beam), uncut};
@@ -120,8 +120,8 @@ NB_MODULE(_cpu, m) {
             render(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads, instruction_set, outputs,
                    limits);
         },
-        RENDER_ARGUMENTS, nb::arg("uncut") = false, nb::arg("footprint_pixels") = nb::none(), nb::arg("flag").noconvert().none() = nb::none(),
-        nb::arg("number") = 0);
+        RENDER_ARGUMENTS, nb::arg("uncut") = false, nb::arg("footprint_pixels") = nb::none(),
+        nb::arg("flag").noconvert().none() = nb::none(), nb::arg("number") = 0);
 
     m.def(
         "footprints",

@@ -60,13 +60,13 @@ struct View {
     const double* line_x;  // [W + kMaxLanes] lateral origin of each scan line
     const double* dir_x;   // [W + kMaxLanes] direction of each scan line in the image plane
     const double* dir_z;
-    float spacing[kMaxLanes];         // of parallel lines: line_x of a line and of those after it, from the former
-    double near, row_step;            // row i lies at near + row_step * (i + 1/2)
-    double cull_near, cull_far;       // Gaussians whose means lie outside do not count
-    double start, span;               // line j of W is at start + span * (j + 1/2) / W: cm along x, or radians from z
-    bool wrap;                        // fanned all the way round: the first line follows the last
-    bool absorbs;                     // whether Gaussians do
-    bool fanned;                      // the lines run from an apex at the origin, else side by side along z
+    float spacing[kMaxLanes];    // of parallel lines: line_x of a line and of those after it, from the former
+    double near, row_step;       // row i lies at near + row_step * (i + 1/2)
+    double cull_near, cull_far;  // Gaussians whose means lie outside do not count
+    double start, span;          // line j of W is at start + span * (j + 1/2) / W: cm along x, or radians from z
+    bool wrap;                   // fanned all the way round: the first line follows the last
+    bool absorbs;                // whether Gaussians do
+    bool fanned;                 // the lines run from an apex at the origin, else side by side along z
     int height, lines;
     Beam beam;
 };
