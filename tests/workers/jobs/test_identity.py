@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import pytest
+import sqlalchemy as sa
 
-from ultragray_workers.errors import ArtifactFolderUnavailable, StartupFailed, StorageUnavailable
+from ultragray_workers.errors import ArtifactFolderUnavailable, DatabaseUnavailable, StartupFailed, StorageUnavailable
 from ultragray_workers.jobs.database import KEY as FILE
-from ultragray_workers.jobs.database import JobDatabase
+from ultragray_workers.jobs.database import SQLITE_FILE, JobDatabase
 from ultragray_workers.jobs.progress import JobState
+from ultragray_workers.jobs.tables import WORKERS
 from ultragray_workers.storage.local import LocalStorage
 
 from ...waiting import wait_until
@@ -99,3 +101,14 @@ def test_a_storage_that_is_another_now_or_away_is_not_worked_in(artifact_folder,
     with pytest.raises(ArtifactFolderUnavailable, match="does not answer"):
         jobs.identity.check()
     jobs.close()
+
+
+def test_a_write_into_a_file_that_was_moved_meanwhile_says_so(tmp_path):
+    """SQLite itself calls such a file read-only."""
+    database = JobDatabase(tmp_path, None)
+    with database.engine.connect() as connection:
+        connection.execute(sa.select(WORKERS.c.name))
+        (tmp_path / SQLITE_FILE).rename(tmp_path / "moved")
+        with pytest.raises(DatabaseUnavailable, match="removed or replaced"):
+            connection.execute(sa.insert(WORKERS).values(name="one", seen_at_s=0.0))
+    database.close()

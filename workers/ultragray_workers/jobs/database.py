@@ -87,9 +87,9 @@ class JobDatabase:
                 "(ULTRAGRAY_DATABASE_URL names it: server and database must be there, user and password right)",
                 field="database_url",
             ) from error
-        sa.event.listen(engine, "handle_error", _raise_as_ours)
+        self._opened = _inode(self._file) if self._file else None
+        sa.event.listen(engine, "handle_error", self._raise_as_ours)
         if self._file:
-            self._opened = _inode(self._file)
             # SQLite would make an empty file in place of one that was removed.
             sa.event.listen(engine, "do_connect", lambda *_: self._require_same_file())
 
@@ -108,6 +108,10 @@ class JobDatabase:
 
     def close(self) -> None:
         self.engine.dispose()
+
+    def _raise_as_ours(self, context: ExceptionContext) -> None:
+        self._require_same_file()  # SQLite calls one that was moved read-only
+        _raise_as_ours(context)
 
     def _require_same_file(self) -> None:
         if self._file and _inode(self._file) != self._opened:
