@@ -59,9 +59,8 @@ def _slabs(scene: GaussianScene, field: str, grid: VolumeGrid, limits: Limits) -
     parts = scene.prepared(f"volumes of {field}", lambda: _parts(scene, field))
     columns, rows, depth = grid.shape
     at_once = max(1, VOXELS_AT_ONCE // (columns * rows))
-    corner = np.eye(4)
-    corner[:3, :3] = np.stack([grid.axes[0], -grid.axes[2], grid.axes[1]], axis=1)
-    corner[:3, 3] = grid.origin_mm - grid.spacing_mm / 2.0 * (grid.axes[0] + grid.axes[1])
+    corner = grid.pose
+    corner[:3, 3] -= grid.spacing_mm / 2.0 * (grid.axes[0] + grid.axes[1])
     for first in range(0, depth, at_once):
         poses = np.tile(corner, (min(at_once, depth - first), 1, 1))
         poses[:, :3, 3] += (first + np.arange(len(poses)))[:, None] * grid.spacing_mm * grid.axes[2]

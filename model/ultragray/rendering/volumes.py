@@ -112,6 +112,14 @@ class VolumeGrid:
         return cls(first, np.stack([*axes, np.cross(*axes)]), float(spacing_mm), (columns, rows, 1))
 
     @property
+    def pose(self) -> FloatArray:  # [4, 4] mm
+        """Of its first layer: the centre of the first pixel, x along rows, z along columns, y against the normal."""
+        pose = np.eye(4)
+        pose[:3, :3] = np.stack([self.axes[0], -self.axes[2], self.axes[1]], axis=1)
+        pose[:3, 3] = self.origin_mm
+        return pose
+
+    @property
     def affine(self) -> FloatArray:  # [4, 4]
         """From voxel (i, j, k, 1) to mm in the scene's frame."""
         matrix = np.eye(4)
@@ -223,10 +231,7 @@ class SliceSettings(Contract):
 
     def pose(self) -> FloatArray:  # [4, 4] mm
         """Its place: the centre of the first pixel, x along its rows, z along its columns, y against its normal."""
-        grid, pose = self.grid(), np.eye(4)
-        pose[:3, :3] = np.stack([grid.axes[0], -grid.axes[2], grid.axes[1]], axis=1)
-        pose[:3, 3] = grid.origin_mm
-        return pose
+        return self.grid().pose
 
 
 @dataclass(frozen=True)
