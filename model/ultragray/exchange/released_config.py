@@ -139,7 +139,8 @@ def _read_probe(path: Path, document: Mapping[str, Any]) -> Probe:
 def released_centre_mm(released_probe: Probe, poses: FloatArray) -> FloatArray:  # [P, 4, 4] mm -> [3]
     """The origin of a scene trained from these poses: the mean corner of its images (docs/physics.md §6)."""
     corner = released_probe.corners_mm().mean(axis=0)  # [3]
-    return (poses[:, :3, :3] @ corner + poses[:, :3, 3]).mean(axis=0)
+    mean: FloatArray = (poses[:, :3, :3] @ corner + poses[:, :3, 3]).mean(axis=0)
+    return mean
 
 
 def read_released_config(path: str | Path, within: Path | None = None) -> ReleasedConfig:

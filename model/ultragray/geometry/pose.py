@@ -110,7 +110,8 @@ def pose_from_position_quaternion(
         [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
     ]
     pose[:3, 3] = position_mm
-    return check_poses(pose, field=field)[0]
+    checked: FloatArray = check_poses(pose, field=field)[0]
+    return checked
 
 
 def quaternion_from_pose(pose: FloatArray) -> tuple[float, float, float, float]:
@@ -140,4 +141,5 @@ def rotation_angles_deg(poses: FloatArray, others: FloatArray) -> FloatArray:  #
 def turn_angles_rad(rotations: FloatArray, others: FloatArray) -> FloatArray:  # [..., 3, 3] both -> [...]
     """Angle of the rotation from one to the other; shapes broadcast."""
     half_chords = np.linalg.norm(rotations - others, axis=(-2, -1)) / math.sqrt(8.0)  # sin(angle / 2)
-    return 2.0 * np.arcsin(np.clip(half_chords, 0.0, 1.0))
+    radians: FloatArray = 2.0 * np.arcsin(np.clip(half_chords, 0.0, 1.0))
+    return radians

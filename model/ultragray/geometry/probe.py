@@ -349,7 +349,8 @@ class Probe(Family):
 
     def corners_from(self, poses: FloatArray) -> FloatArray:  # [C, 4, 4] mm -> [C, 2·K, 3]
         """`corners_mm` in the frame that poses lead into."""
-        return np.einsum("fij,cj->fci", poses[:, :3, :3], self.corners_mm()) + poses[:, None, :3, 3]
+        corners: FloatArray = np.einsum("fij,cj->fci", poses[:, :3, :3], self.corners_mm()) + poses[:, None, :3, 3]
+        return corners
 
     def cropped(self, share: float) -> Self:
         """The same probe with scan lines that end after this share of their length."""

@@ -79,7 +79,8 @@ def _rotation(points: FloatArray, targets: FloatArray) -> FloatArray:  # [N, 3] 
             "targets are the mirror image of points: one of the two frames is left-handed, or has two axes exchanged",
             field="targets",
         )
-    return right.T @ np.diag([1.0, 1.0, sign]) @ left.T
+    rotation: FloatArray = right.T @ np.diag([1.0, 1.0, sign]) @ left.T
+    return rotation
 
 
 def _deviations(

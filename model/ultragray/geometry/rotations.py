@@ -15,7 +15,8 @@ def about_axes(axes: FloatArray, angles: FloatArray) -> FloatArray:  # [C, 3] of
     nothing = np.zeros_like(x)
     cross = np.stack([nothing, -z, y, z, nothing, -x, -y, x, nothing], axis=1).reshape(-1, 3, 3)
     sine, versine = np.sin(angles)[:, None, None], (1.0 - np.cos(angles))[:, None, None]
-    return np.eye(3) + sine * cross + versine * (cross @ cross)
+    rotations: FloatArray = np.eye(3) + sine * cross + versine * (cross @ cross)
+    return rotations
 
 
 def random_directions(random: np.random.Generator, count: int) -> FloatArray:  # [C, 3]

@@ -74,4 +74,5 @@ def interpolated_frames(
     below, beside = np.minimum(i + 1, height - 1), (j + 1) % width
     upper = frames[which, i, j] * (1 - right) + frames[which, i, beside] * right
     lower = frames[which, below, j] * (1 - right) + frames[which, below, beside] * right
-    return upper * (1 - down) + lower * down
+    values: FloatArray = upper * (1 - down) + lower * down
+    return values

@@ -184,7 +184,8 @@ def spread_places(count: int, most: int) -> IntArray:
 
 def corner_distances_mm(corners: FloatArray, others: FloatArray) -> FloatArray:  # [..., K, 3] both -> [...]
     """Distances between image planes: the mean over corresponding corners, mm; shapes broadcast."""
-    return np.linalg.norm(corners - others, axis=-1).mean(axis=-1)
+    means: FloatArray = np.linalg.norm(corners - others, axis=-1).mean(axis=-1)
+    return means
 
 
 def pixel_positions_mm(probe: Probe, height: int, width: int) -> FloatArray:  # [H·W, 3], row by row
@@ -196,7 +197,8 @@ def pixel_positions_mm(probe: Probe, height: int, width: int) -> FloatArray:  # 
 def mean_axes(poses: FloatArray) -> FloatArray:  # [F, 4, 4] -> [3, 3]
     """The rotation nearest to the mean of the poses' rotations."""
     left, _, right = np.linalg.svd(poses[:, :3, :3].mean(axis=0))
-    return left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    rotation: FloatArray = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    return rotation
 
 
 def nearest_frames(sweep: Sweep, poses: FloatArray) -> IntArray:  # [C]
@@ -236,7 +238,8 @@ class Dataset:
     @property
     def centre_mm(self) -> FloatArray:  # [3]
         """Origin of the scene: the mean of the corners of the training frames (docs/physics.md §6)."""
-        return self.train.corners_mm().mean(axis=(0, 1))
+        mean: FloatArray = self.train.corners_mm().mean(axis=(0, 1))
+        return mean
 
     @property
     def sha256(self) -> str:

@@ -147,7 +147,8 @@ def straightened(points: Floats) -> Floats:  # [N, 3] -> [N, 3]
 
 def fascia_depth_mm(x: Floats) -> Floats:
     """The thoracolumbar fascia: over the two muscle bellies, down to the spinous processes between them."""
-    return 10.0 - 1.6 * np.exp(-(((np.abs(x) - 14.0) / 9.0) ** 2)) + 2.0 * np.exp(-((x / 5.0) ** 2))
+    depth: Floats = 10.0 - 1.6 * np.exp(-(((np.abs(x) - 14.0) / 9.0) ** 2)) + 2.0 * np.exp(-((x / 5.0) ** 2))
+    return depth
 
 
 def canal_roof_mm(x: Floats) -> Floats:
@@ -159,7 +160,8 @@ def vessel_distance_mm(points: Floats) -> Floats:  # [N, 3] -> [N]
     """Distance from the wall of a vessel that winds along the right erector spinae, negative inside."""
     x, y, z = points.T
     centre_x, centre_z = 20.0 + 1.5 * np.sin(y / 14.0), 23.0 + 1.2 * np.sin(y / 19.0)
-    return np.hypot(x - centre_x, z - centre_z) - VESSEL_RADIUS_MM
+    distance: Floats = np.hypot(x - centre_x, z - centre_z) - VESSEL_RADIUS_MM
+    return distance
 
 
 def sac_distance_mm(points: Floats) -> Floats:  # [N, 3] -> [N]
@@ -167,7 +169,8 @@ def sac_distance_mm(points: Floats) -> Floats:  # [N, 3] -> [N]
     x, z = points[:, 0] / SAC_HALF_WIDTH_MM, (points[:, 2] - SAC_DEPTH_MM) / SAC_HALF_DEPTH_MM
     radius = np.hypot(x, z)
     steepness = np.hypot(x / SAC_HALF_WIDTH_MM, z / SAC_HALF_DEPTH_MM) / np.maximum(radius, 1e-9)
-    return (radius - 1.0) / np.maximum(steepness, 1e-9)
+    distance: Floats = (radius - 1.0) / np.maximum(steepness, 1e-9)
+    return distance
 
 
 SPEED_MM_PER_US = 1.54
@@ -212,12 +215,14 @@ def backscatter_amplitudes() -> FloatArray:  # [tissues]
 
 def lateral_sigma_mm(depth_mm: Floats) -> Floats:
     """Width of the beam in the image plane, there and back."""
-    return np.hypot(0.34, 0.011 * (depth_mm - FOCUS_MM))
+    sigma: Floats = np.hypot(0.34, 0.011 * (depth_mm - FOCUS_MM))
+    return sigma
 
 
 def elevation_sigma_mm(depth_mm: Floats) -> Floats:
     """Thickness of the slice: 1.4 mm at half amplitude in the focus of the lens, more before and behind."""
-    return np.hypot(0.6, 0.022 * (depth_mm - FOCUS_MM))
+    sigma: Floats = np.hypot(0.6, 0.022 * (depth_mm - FOCUS_MM))
+    return sigma
 
 
 def elevation_weight(elevation_mm: Floats, depth_mm: Floats) -> Floats:
@@ -244,7 +249,8 @@ class LatticeNoise:
 
         def along_z(i: IntArray, j: IntArray) -> Floats:
             near = nodes[i, j, k]
-            return near + w * (nodes[i, j, (k + 1) & _LAST] - near)
+            values: Floats = near + w * (nodes[i, j, (k + 1) & _LAST] - near)
+            return values
 
         def along_y(i: IntArray) -> Floats:
             near = along_z(i, j)

@@ -262,7 +262,8 @@ class Grid:
     def pixels(self, values: Floats) -> Floats:  # [R, C] -> [H, W]
         top, left = self.margins
         image = values[top : top + CELLS_PER_ROW * self.height, left : left + self.width]
-        return image.reshape(self.height, CELLS_PER_ROW, self.width).mean(axis=1)
+        cells: Floats = image.reshape(self.height, CELLS_PER_ROW, self.width).mean(axis=1)
+        return cells
 
 
 def _tissue(pose: FloatArray, depths_mm: Floats, laterals_mm: Floats) -> npt.NDArray[np.uint8]:  # [R], [C] -> [R, C]

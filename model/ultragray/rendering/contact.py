@@ -183,7 +183,8 @@ class Touch:
     def pressed_mm(self) -> FloatArray:  # [C]
         """How far the face lies beyond the innermost training face, a mean over the lines with contact; at least 0."""
         pressed = np.where(self.lines, self.skin.pressed_mm(self.faces, self.directions), 0.0).sum(axis=1)
-        return pressed / np.maximum(self.lines.sum(axis=1), 1)
+        mean: FloatArray = pressed / np.maximum(self.lines.sum(axis=1), 1)
+        return mean
 
     @property
     def lines(self) -> npt.NDArray[np.bool_]:  # [C, W]
@@ -192,7 +193,8 @@ class Touch:
 
     @property
     def shares(self) -> FloatArray:  # [C]
-        return self.lines.mean(axis=1)
+        shares: FloatArray = self.lines.mean(axis=1)
+        return shares
 
 
 # Tissue under pressure: compressed evenly between the face and the far end of the image, which stays where it was.

@@ -101,7 +101,8 @@ def covered(gap_mm: FloatArray, half_mm: float | FloatArray, spacing_mm: FloatAr
 
 
 def dot(vectors: FloatArray, others: FloatArray) -> FloatArray:  # [..., 3] both -> [...]
-    return (vectors * others).sum(axis=-1)
+    products: FloatArray = (vectors * others).sum(axis=-1)
+    return products
 
 
 MAX_TOOLS = 8  # of one frame

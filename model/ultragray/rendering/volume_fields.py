@@ -52,7 +52,8 @@ def sample_slice(
     scene: GaussianScene, field: str, grid: VolumeGrid, limits: Limits = UNLIMITED
 ) -> npt.NDArray[np.generic]:  # [J, I]
     """A field on a plane (`VolumeGrid.on_plane`). Raises what `sample_volume` raises."""
-    return np.concatenate(list(sample_volume(scene, field, grid, limits)))[0]
+    plane: npt.NDArray[np.generic] = np.concatenate(list(sample_volume(scene, field, grid, limits)))[0]
+    return plane
 
 
 def _slabs(scene: GaussianScene, field: str, grid: VolumeGrid, limits: Limits) -> Iterator[npt.NDArray[np.generic]]:

@@ -267,7 +267,8 @@ class SplineSampler(Sampler):
         assert self.spacing_mm is not None
         steps = min(length_mm / self.spacing_mm + 1e-9, 10.0 * MAX_POSES)
         self._require_few(math.floor(steps) + 1, "spacing_mm")
-        return np.minimum(self.spacing_mm * np.arange(math.floor(steps) + 1), length_mm)
+        distances: FloatArray = np.minimum(self.spacing_mm * np.arange(math.floor(steps) + 1), length_mm)
+        return distances
 
 
 def _without_repetitions(base: FloatArray) -> FloatArray:  # [P, 4, 4] -> [K, 4, 4]
@@ -293,7 +294,8 @@ def _natural_cubic(
     rest = 1.0 - share
     straight = rest * values[segments] + share * values[segments + 1]
     bend = (rest**3 - rest) * second[segments] + (share**3 - share) * second[segments + 1]
-    return straight + length**2 / 6.0 * bend
+    curve: FloatArray = straight + length**2 / 6.0 * bend
+    return curve
 
 
 def _second_derivatives(values: FloatArray, lengths: FloatArray) -> FloatArray:  # [K, 3], [K-1] -> [K, 3]

@@ -151,7 +151,8 @@ def _image_points(probe: Probe, per_side: int) -> FloatArray:  # [K, 3] mm, prob
 
 
 def _root_mean_square(values: FloatArray) -> FloatArray:  # [B, K, P] -> [B, P]
-    return np.sqrt(np.einsum("bkp,bkp->bp", values, values) / values.shape[1]).astype(np.float64)
+    root: FloatArray = np.sqrt(np.einsum("bkp,bkp->bp", values, values) / values.shape[1]).astype(np.float64)
+    return root
 
 
 # The model behind the output `uncertainty`: the variances that add up to that of a pixel's error. Needs no torch.
@@ -374,7 +375,8 @@ def predicted(weights: FloatArray, terms: FloatArray, black_ms_ssim: float) -> F
 
 def within(distance_mm: FloatArray, reach_mm: float) -> FloatArray:  # [C, K] -> [C]
     """The mean over the points of exp(−d²/r²)."""
-    return np.exp(-np.square(distance_mm / reach_mm)).mean(axis=1)
+    mean: FloatArray = np.exp(-np.square(distance_mm / reach_mm)).mean(axis=1)
+    return mean
 
 
 def logistic(values: FloatArray) -> FloatArray:

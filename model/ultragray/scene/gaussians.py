@@ -186,7 +186,8 @@ class GaussianScene:
         ):
             kept = _Kept(tensors, versions, self.info.intensity, make())
             self._prepared[name] = kept  # one assignment: threads may render the scene at the same time
-        return kept.made
+        made: Prepared = kept.made
+        return made
 
     def poses_to_scene_cm(self, poses: FloatArray) -> FloatArray:  # [C, 4, 4] mm -> [C, 4, 4] cm
         """Poses in the sweep's frame (mm) as poses in the scene's own (cm, about its centre)."""

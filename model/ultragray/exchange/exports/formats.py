@@ -148,7 +148,8 @@ def check_format(name: str, outputs: Sequence[str], dtype: str | None) -> str:
 def exporter_class(name: str) -> type[Exporter]:
     """The exporter of a format. Raises ExtraMissing where a package that it needs is not installed."""
     try:
-        return EntryPoint(name, FORMATS[name].exporter, "").load()
+        exporter: type[Exporter] = EntryPoint(name, FORMATS[name].exporter, "").load()
+        return exporter
     except ImportError as error:
         raise missing_extra(error, f"format {name}", field="format") from error
 

@@ -276,7 +276,8 @@ def _between(sweep: Sweep, points: FloatArray, frames: IntArray) -> FloatArray: 
                 values[side, nearer[inside]] = sampled
     weights = 1.0 / np.maximum(distances, 1e-9)  # 0 for a side without a frame
     total = weights.sum(axis=0)
-    return (weights * values).sum(axis=0) / np.where(total > 0, total, 1.0)
+    mean: FloatArray = (weights * values).sum(axis=0) / np.where(total > 0, total, 1.0)
+    return mean
 
 
 def _sample(sweep: Sweep, frame: int, local: FloatArray) -> tuple[npt.NDArray[np.bool_], FloatArray]:  # [P, 3] mm

@@ -398,7 +398,8 @@ def _step(fit: _Fit, damping: Tensor) -> Tensor:  # [K] -> [K, 6] mm
     floor = 1e-2 * own.mean(dim=1, keepdim=True) + torch.finfo(torch.float64).tiny
     damped = curvature + torch.diag_embed(damping[:, None] * (own + floor) + 1e-9 * floor)
     downhill: Tensor = -torch.linalg.lstsq(damped, slope).solution[..., 0]
-    return downhill * (LONGEST_STEP_MM / downhill.norm(dim=1, keepdim=True).clamp(min=LONGEST_STEP_MM))
+    steps: Tensor = downhill * (LONGEST_STEP_MM / downhill.norm(dim=1, keepdim=True).clamp(min=LONGEST_STEP_MM))
+    return steps
 
 
 def _starts(start: Tensor, motions: Motions, within_mm: float, within_deg: float) -> Tensor:  # [4, 4] -> [S, 4, 4]

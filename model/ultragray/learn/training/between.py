@@ -51,7 +51,8 @@ class Neighbours:
         gaps = np.maximum(self.gaps_mm, usual) / usual
         ends = np.full(len(self.ends), self.doublings)
         weights = np.concatenate([gaps, ends])
-        return weights / weights.sum()
+        shares: FloatArray = weights / weights.sum()
+        return shares
 
     @property
     def doublings(self) -> float:

@@ -240,7 +240,10 @@ class Shadows:
     def _smooth(self, place: int) -> FloatImage:  # [H, W]
         sigmas = [max(0.5, mm / pixel) for mm, pixel in zip(SMOOTHING_MM, (self._lateral, self._axial), strict=True)]
         image = self._sweep.images[place] / np.float32(255.0)
-        return cv2.GaussianBlur(image, (0, 0), sigmas[0], sigmaY=sigmas[1], borderType=cv2.BORDER_REPLICATE)
+        smooth: FloatImage = cv2.GaussianBlur(
+            image, (0, 0), sigmas[0], sigmaY=sigmas[1], borderType=cv2.BORDER_REPLICATE
+        )
+        return smooth
 
     def _relative(self, smooth: FloatImage) -> FloatImage:  # [F, H, W] both
         """Brightness over what is usual at its depth; 0 where the depth tells nothing."""

@@ -19,7 +19,8 @@ def kernel_image_loss(rendered: Tensor, truth: Tensor, texture: float, *, instru
     inside the image.
     Differentiable with respect to `rendered`. Raises ValueError for smaller images.
     """
-    return _ImageLoss.apply(rendered, truth, texture, instruction_set)  # type: ignore[no-untyped-call]
+    loss: Tensor = _ImageLoss.apply(rendered, truth, texture, instruction_set)  # type: ignore[no-untyped-call]
+    return loss
 
 
 class _ImageLoss(torch.autograd.Function):

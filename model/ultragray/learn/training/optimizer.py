@@ -214,4 +214,5 @@ def rotate(quats: Tensor, vectors: Tensor) -> Tensor:  # [N, 4] wxyz of any norm
     unit = quats / quats.norm(dim=-1, keepdim=True)
     w, u = unit[:, :1], unit[:, 1:]
     across = torch.linalg.cross(u, vectors)
-    return vectors + 2.0 * (w * across + torch.linalg.cross(u, across))
+    rotated: Tensor = vectors + 2.0 * (w * across + torch.linalg.cross(u, across))
+    return rotated

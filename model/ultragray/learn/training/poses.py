@@ -128,7 +128,8 @@ def turned_by(turns: Tensor) -> Tensor:  # [G, 3] rad -> [G, 3, 3]
     x, y, z = turns.unbind(-1)
     zero = torch.zeros_like(x)
     cross = torch.stack([zero, -z, y, z, zero, -x, -y, x, zero], dim=-1).reshape(-1, 3, 3)
-    return torch.linalg.matrix_exp(cross)
+    rotations: Tensor = torch.linalg.matrix_exp(cross)
+    return rotations
 
 
 TrainedCorrections: TypeAlias = FrameCorrections | SweepCorrections
