@@ -111,6 +111,7 @@ def test_the_life_of_a_training(client, folder, name, tmp_path):
     events = list(client.jobs.watch(job.id))
     done = [event.job for event in events if event.job][-1]
     assert (done.state, done.progress.step, done.error) == (JobState.SUCCEEDED, 20, None)
+    assert {"metrics.json", "metrics.jsonl", "training_curve.png", "report.html"} < set(done.artifacts)
     assert done.state.final
     assert done == client.jobs.wait(job.id) == client.jobs.get(job.id)
     assert done in client.jobs.list(state="succeeded", kind="train")

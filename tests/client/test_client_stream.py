@@ -19,7 +19,6 @@ from ultragray_client.exchange import SLOTS, PoseExchange, SharedMemory
 from ultragray_client.frames import settings_message
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2
 
-from ..freshness import check_fresh
 from ..service.conftest import ROOT
 from ..waiting import Deadline, wait_until
 from .test_client_render import moved
@@ -135,26 +134,6 @@ def test_what_was_dropped_before_an_error_is_told_with_the_next_frame():
     )
     assert exchange.frame(exchange.arrived(answer), dropped_here=4).dropped == 7
     assert exchange.frame(exchange.arrived(answer)).dropped == 1
-
-
-class ClientDoor:
-    """A latest stream of either client."""
-
-    def __init__(self, stream):
-        self._stream = stream
-
-    def send(self):
-        self._stream.send(moved(0.0))
-
-    def receive(self):
-        frame = self._stream.receive()
-        return time.monotonic() - float(frame.latency_ms) / 1000
-
-
-@pytest.mark.parametrize("make_client", ["sync"], indirect=True)
-def test_a_latest_stream_gives_no_old_frame(client):
-    with client.stream("demo", RenderSettings(height=128, width=128), mode="latest") as stream:
-        check_fresh(ClientDoor(stream))
 
 
 def test_a_latest_stream_may_be_read_before_anything_is_sent(client):

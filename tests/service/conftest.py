@@ -19,7 +19,7 @@ from ultragray import GaussianScene, LinearProbe, SceneInfo
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc, scenes_pb2_grpc
 
 from ..waiting import Deadline
-from ..warm import SOURCE_FOLDERS, WARM_TEMPLATES, WarmProcess, WarmServer, fork
+from ..warm import SOURCE_FOLDERS, WARM_WORK, WarmProcess, WarmServer, fork
 
 ROOT = Path(__file__).resolve().parents[2]
 START_TIMEOUT_S = 120.0
@@ -56,7 +56,7 @@ class RunningService:
                 self.process = subprocess.Popen(command, env=whole, stdin=nothing, stderr=log, cwd=folder)
             else:
                 files = (nothing.fileno(), log.fileno(), log.fileno())
-                arguments = [str(WARM_TEMPLATES.path())]
+                arguments = [str(WARM_WORK.path())]
                 self.process = fork(
                     WARM_SERVICES.path(), "service", arguments, environment=whole, folder=folder, files=files
                 )

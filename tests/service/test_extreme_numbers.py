@@ -1,19 +1,16 @@
 """Numbers at the edge of what a float or an integer can be, in every field of the contract, through every door."""
 
 import json
-import queue
 import sys
 from dataclasses import MISSING
 from typing import get_args, get_origin
 
 import numpy as np
-import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from ultragray.contract import Contract, Family, annotated_fields, optional_of
 from ultragray.rendering.settings import RenderSettings
-from ultragray_proto.v1 import geometry_pb2, rendering_pb2
 
 TIMEOUT_S = 60.0
 MANY = settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -91,51 +88,3 @@ def test_http(http, asked, pose):
     answer = http.post("/v1/scenes/demo/render", content=json.dumps({**asked, "pose": pose}), timeout=TIMEOUT_S)
     assert answer.status_code in (200, 422), answer.text
     assert answer.status_code == 200 or answer.json()["field"], answer.text
-
-
-class Stream:
-    """A stream that must outlive all that is asked of it."""
-
-    def __init__(self, renders):
-        self._messages = queue.Queue()
-        self._frames = renders.RenderStream(iter(self._messages.get, None))
-
-    def ask(self, message):
-        self._messages.put(message)
-        return next(self._frames)
-
-    def end(self):
-        self._messages.put(None)
-
-
-@pytest.fixture(scope="module")
-def grpc_stream(renders):
-    stream = Stream(renders)
-    yield stream
-    stream.end()
-
-
-@EXTREME
-@example(asked=DEEP, pose=POSE)
-@MANY
-def test_grpc_stream(grpc_stream, asked, pose):
-    try:
-        message = rendering_pb2.RenderStreamRequest(settings=settings_message(asked), pose=pose_message(pose))
-    except (ValueError, OverflowError):  # an integer that the message has no room for
-        return
-    error = grpc_stream.ask(message).error
-    assert not error.reason or error.field, error
-
-
-def settings_message(asked):
-    given = dict(asked)
-    if (probe := given.pop("probe", None)) is not None:
-        inner = {name: value for name, value in probe.items() if name != "kind"}
-        given["probe"] = geometry_pb2.Probe(**{probe["kind"]: inner})
-    return rendering_pb2.RenderSettings(scene="demo", **given)
-
-
-def pose_message(pose):
-    if "matrix" in pose:
-        return geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=np.ravel(pose["matrix"])))
-    return geometry_pb2.Pose(placement=geometry_pb2.Placement(**pose))

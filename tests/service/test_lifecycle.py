@@ -224,7 +224,11 @@ def test_bad_settings_are_one_clear_error(start_service, settings, expected):
 
 
 @pytest.mark.slow
-def test_the_service_process_never_imports_torch():
-    code = "import sys, ultragray_service.server; sys.exit('torch' in sys.modules)"
+def test_neither_service_nor_worker_nor_intake_import_torch():
+    code = (
+        "import sys, ultragray_service.server, ultragray_workers.datasets.intake, "
+        "ultragray_workers.jobs.worker.worker; from ultragray_workers.jobs.kinds import CompareJob; "
+        "CompareJob(dataset='tiny', methods=('median',)); sys.exit('torch' in sys.modules)"
+    )
     path = os.pathsep.join(str(ROOT / folder) for folder in SOURCE_FOLDERS)
     subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": path}, check=True)

@@ -1,7 +1,5 @@
 """Names of scenes, with and without a pin."""
 
-from __future__ import annotations
-
 import pytest
 
 from ultragray.errors import InvalidArgument

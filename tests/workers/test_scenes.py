@@ -1,8 +1,5 @@
 """The folder of scene files."""
 
-from __future__ import annotations
-
-import hashlib
 import weakref
 
 import pytest
@@ -114,22 +111,6 @@ def test_what_is_described_is_all_but_the_gaussians(scene_folder):
     path = scene_folder / "a.ugr"
     length = int.from_bytes(path.read_bytes()[:8], "little")
     assert headers._described_bytes(header) == 30 * (8 + length) + header.training_poses.nbytes
-
-
-def test_a_pin_asks_for_one_content_of_a_file(scene_folder):
-    store = SceneStore(scene_folder)
-    content, other = (hashlib.sha256((scene_folder / f"{name}.ugr").read_bytes()).hexdigest() for name in "ab")
-    for pin in (content, content[:12]):
-        version, header = store.versioned_header(f"a@{pin}")
-        assert store.cached_versioned_header(f"a@{pin}") == (version, header)
-        assert store.header(f"a@{pin}") is header
-    with pytest.raises(SceneNotFound, match=f"no longer has the content {other}; it is now a@{content}"):
-        store.versioned_header(f"a@{other}")
-    (scene_folder / "b.ugr").replace(scene_folder / "a.ugr")
-    assert store.cached_versioned_header(f"a@{content}") is None
-    with pytest.raises(SceneNotFound, match=f"it is now a@{other}"):
-        store.path(f"a@{content}")
-    assert store.path(f"a@{other}") == scene_folder / "a.ugr"
 
 
 def test_a_pin_hides_nothing_and_shows_nothing(scene_folder):

@@ -1,7 +1,5 @@
 """Copies of datasets into a storage that hosts share: whole, resumable, and never over another."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

@@ -1,5 +1,3 @@
-from __future__ import annotations
-
 import contextlib
 import json
 import subprocess
@@ -291,14 +289,6 @@ def test_nothing_is_written_after_a_discard(store):
     with pytest.raises(ValueError, match="discarded"):
         incoming.begin_file("b")
     assert leftovers(store) == []
-
-
-def test_importing_the_store_and_the_intake_needs_no_torch():
-    code = (
-        "import sys, ultragray_workers.datasets.store, ultragray_workers.datasets.intake, "
-        "ultragray_workers.datasets.intake; sys.exit('torch' in sys.modules or 'matplotlib' in sys.modules)"
-    )
-    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
 def test_a_cine_loop_with_its_poses_becomes_a_dataset(store, receive, tmp_path):

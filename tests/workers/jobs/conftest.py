@@ -1,7 +1,5 @@
 """Jobs with real workers, each a process of its own, on datasets that train within a second."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

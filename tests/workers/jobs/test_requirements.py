@@ -1,7 +1,5 @@
 """Render jobs that could not be done are refused; the scene of the others is kept as it is."""
 
-from __future__ import annotations
-
 import errno
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Scenes in a worker's memory."""
 
-from __future__ import annotations
-
 import shutil
 
 import pytest

@@ -1,7 +1,5 @@
 """Copies of the scenes of an installation: whole, compared, resumable, and never over something else."""
 
-from __future__ import annotations
-
 import pytest
 
 from ultragray_workers.backup.copying import Copied, copy_scenes

@@ -1,7 +1,5 @@
 """A bucket that fails: requests are repeated, and what cannot be told is a StorageUnavailable without secrets."""
 
-from __future__ import annotations
-
 import os
 import sys
 import time

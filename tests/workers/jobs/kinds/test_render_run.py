@@ -1,7 +1,5 @@
 """The work of render jobs, in this process."""
 
-from __future__ import annotations
-
 import json
 import sys
 

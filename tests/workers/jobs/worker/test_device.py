@@ -1,7 +1,5 @@
 """One job at a time on a device, whoever works for the host; who waits for a device leaves the jobs to others."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -94,20 +92,6 @@ def test_who_waits_for_a_device_takes_no_job_and_another_host_does(store, start_
     store.cancel(first.id)
     following = until(store.submit(train_job("following"))[0])
     assert (following.state, following.attempts) == (JobState.SUCCEEDED, 1)
-
-
-@pytest.mark.long
-def test_a_stopped_worker_loses_its_job_and_its_device(store, start_worker, until):
-    one = start_worker("one")
-    job, _ = store.submit(train_job("one", steps=600))
-    until(job, is_training)
-    process = one.job_process()
-    one.suspend()
-    start_worker("two")
-    job = until(job)
-    assert (job.state, job.worker, job.attempts) == (JobState.SUCCEEDED, "two", 2), job
-    assert one.process.wait(30) == -signal.SIGKILL
-    wait_until(lambda: not Path(f"/proc/{process}").exists())
 
 
 @pytest.mark.long

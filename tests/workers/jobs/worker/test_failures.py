@@ -1,7 +1,5 @@
 """What goes wrong for real: each such job fails with one reason that a person can read, and the next one runs."""
 
-from __future__ import annotations
-
 import os
 import resource
 import shutil

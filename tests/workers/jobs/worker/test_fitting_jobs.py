@@ -1,7 +1,5 @@
 """Jobs go only to workers that fit them, past those ahead of them in the queue, as soon as such a worker comes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -80,18 +78,6 @@ def test_a_job_that_nobody_can_take_says_so_and_starts_when_a_fitting_worker_com
     start_worker("second", labels={"site": "lab2"})
     job = until(job)
     assert (job.state, job.worker, job.progress.waits_for) == (JobState.SUCCEEDED, "second", None), job
-
-
-@pytest.mark.long
-def test_workers_tell_their_devices_and_labels(store, start_worker):
-    start_worker("one", labels={"site": "lab1"})
-    wait_until(is_there(store, "one"))
-    (worker,) = store.workers()
-    (device,) = worker.devices
-    assert (device.name, device.memory_bytes) == ("cpu", memory_bytes())
-    assert device.cores is not None
-    assert device.model
-    assert (worker.device, worker.labels) == ("cpu", {"site": "lab1"})
 
 
 @pytest.fixture
