@@ -127,12 +127,13 @@ def fork(path, function, arguments, *, environment, folder, files, kind=WarmProc
     return kind(int(connection.recv(16)), connection)
 
 
-WARM_WORK = WarmServer(
+WARM = WarmServer(
     "torch",
     "matplotlib.backends.backend_agg",
     "mpl_toolkits.mplot3d",
     "ultragray.datasets.checks",
     "ultragray.datasets.pictures",
+    "ultragray_service.__main__",
     "ultragray_service.cli.worker",
     "ultragray_workers.datasets.intake",
     "ultragray_workers.jobs.kinds.render_run",

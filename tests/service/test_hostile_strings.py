@@ -14,8 +14,8 @@ POSES = [np.eye(4).tolist()]
 
 
 @pytest.fixture(scope="module")
-def stored(start_service, postgres, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("artifacts")
+def stored(start_service, postgres, artifacts):
+    folder = artifacts
     store_dataset(folder, "tiny")
     return start_service(artifact_folder=folder, database_url=postgres.create_database())
 

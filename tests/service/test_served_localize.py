@@ -27,8 +27,8 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def phantom(start_service, folder, tmp_path_factory):
-    return start_service(data_folder=folder, artifact_folder=tmp_path_factory.mktemp("artifacts"))
+def phantom(start_service, folder, artifacts):
+    return start_service(data_folder=folder, artifact_folder=artifacts)
 
 
 @pytest.fixture(scope="module")

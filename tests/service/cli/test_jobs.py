@@ -22,9 +22,8 @@ from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.scenes import SceneStore
 
 from ...waiting import wait_until
+from ...workers.jobs.conftest import store_dataset
 from ..conftest import ROOT, SOURCE_FOLDERS
-from ..http.test_http_datasets import zipped
-from .command_line import noise_sweep
 
 WAIT_S = 120.0
 KEY = "0123456789abcdef-jobs"
@@ -42,20 +41,16 @@ def done(server, *arguments):
 
 
 @pytest.fixture(scope="module")
-def server(start_service, tmp_path_factory):
-    return start_service(
-        artifact_folder=tmp_path_factory.mktemp("artifacts"), embedded_worker=True, training_threads=1, api_keys=KEY
-    )
+def server(start_service, artifacts):
+    """A service with a worker, which holds the dataset `tiny`."""
+    artifacts = artifacts
+    store_dataset(artifacts, "tiny")
+    return start_service(artifact_folder=artifacts, embedded_worker=True, training_threads=1, api_keys=KEY)
 
 
 @pytest.fixture(scope="module")
-def client(server, tmp_path_factory):
-    """Knows the service, which holds the dataset `tiny`."""
+def client(server):
     with httpx.Client(base_url=server.http, headers={"X-API-Key": KEY}, timeout=WAIT_S) as client:
-        folder = noise_sweep(tmp_path_factory.mktemp("sweep") / "tiny")
-        content = zipped({path.name: path.read_bytes() for path in folder.iterdir()})
-        stored = client.put("/v1/datasets/tiny", content=content, headers={"Content-Type": "application/zip"})
-        assert stored.status_code == 201, stored.text
         yield client
 
 

@@ -17,8 +17,8 @@ KEY = "0123456789abcdef-remote"
 
 
 @pytest.fixture(scope="module")
-def server(start_service, tmp_path_factory):
-    return start_service(artifact_folder=tmp_path_factory.mktemp("artifacts"), api_keys=KEY)
+def server(start_service, artifacts):
+    return start_service(artifact_folder=artifacts, api_keys=KEY)
 
 
 def run(server, *arguments, key=KEY):

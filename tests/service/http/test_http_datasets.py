@@ -110,11 +110,6 @@ class HalfUpload:
 
 
 @pytest.fixture(scope="module")
-def artifacts(tmp_path_factory):
-    return tmp_path_factory.mktemp("artifacts")
-
-
-@pytest.fixture(scope="module")
 def service(start_service, artifacts):
     return start_service(
         artifact_folder=artifacts,

@@ -24,11 +24,6 @@ WAIT_S = 120.0
 
 
 @pytest.fixture(scope="module")
-def artifacts(tmp_path_factory):
-    return tmp_path_factory.mktemp("artifacts")
-
-
-@pytest.fixture(scope="module")
 def jobs_service(start_service, artifacts):
     """A service without a worker: what is submitted waits."""
     return start_service(artifact_folder=artifacts)

@@ -23,11 +23,6 @@ POSE = {"position_mm": {"x": 0, "y": 1, "z": 0}, "quaternion": {"w": 1, "x": 0, 
 
 
 @pytest.fixture(scope="module")
-def artifacts(tmp_path_factory):
-    return tmp_path_factory.mktemp("artifacts")
-
-
-@pytest.fixture(scope="module")
 def service(start_service, artifacts):
     return start_service(artifact_folder=artifacts, max_dataset_bytes=MAX_BYTES, max_body_bytes=1024)
 

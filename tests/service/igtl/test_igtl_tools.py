@@ -142,9 +142,9 @@ MARKER_TO_TRACKER = np.linalg.inv(TRACKER_TO_SCENE) @ POSE @ np.linalg.inv(PROBE
 
 
 @pytest.fixture(scope="module")
-def service(start_service, tmp_path_factory):
+def service(start_service, artifacts):
     """Tracks by `tracker` unless a client says otherwise."""
-    folder = tmp_path_factory.mktemp("artifacts")
+    folder = artifacts
     service = start_service(artifact_folder=folder, igtl_port=0, igtl_scene="demo", igtl_registration="tracker")
     with Client(service.grpc, timeout_s=60.0) as client:
         client.registrations.put("tracker", "demo", TRACKER_TO_SCENE, PROBE_TO_MARKER)

@@ -15,8 +15,8 @@ WAIT_S = 120.0
 
 
 @pytest.fixture(scope="module")
-def jobs_service(start_service, tmp_path_factory):
-    return start_service(artifact_folder=tmp_path_factory.mktemp("artifacts"), embedded_worker=False)
+def jobs_service(start_service, artifacts):
+    return start_service(artifact_folder=artifacts, embedded_worker=False)
 
 
 @pytest.fixture(scope="module")
