@@ -190,18 +190,18 @@ def service(path):
     return main()
 
 
-def work_warmly(path):
-    """From now on the helpers, the embedded worker and the jobs that this process starts are forked at `path`."""
-    warm = SimpleNamespace(
+def warm_subprocess(path):
+    """What the product uses of the module subprocess, with processes that are forked at `path`."""
+    return SimpleNamespace(
         Popen=lambda command, **options: popen(path, command, **options),
         **{name: getattr(subprocess, name) for name in ("PIPE", "DEVNULL", "TimeoutExpired")},
     )
-    for module in (
-        "ultragray_service.core.threads",
-        "ultragray_service.server",
-        "ultragray_workers.jobs.worker.process",
-    ):
-        importlib.import_module(module).subprocess = warm
+
+
+def work_warmly(path):
+    """From now on the helpers, the embedded worker and the jobs that this process starts are forked at `path`."""
+    for module in ("service.core.threads", "service.server", "workers.jobs.worker.process"):
+        importlib.import_module(f"ultragray_{module}").subprocess = warm_subprocess(path)
 
 
 def popen(path, command, *, env, stdout=None, stderr=None, pass_fds=(), **_):

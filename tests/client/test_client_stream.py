@@ -86,20 +86,6 @@ def test_refused_settings_are_told_first(client):
         client.stream("demo", mode="newest")
 
 
-def test_a_stream_may_be_used_by_two_threads(client):
-    with client.stream("demo", RenderSettings(height=8, width=8)) as stream:
-
-        def send():
-            for _ in range(300):
-                stream.send(moved(0.0))
-            stream.done_sending()
-
-        sender = threading.Thread(target=send)
-        sender.start()
-        assert [frame.sequence for frame in stream] == list(range(1, 301))
-        sender.join()
-
-
 def test_a_service_that_stops_ends_a_stream_that_is_not_to_reconnect(make_client, start_service):
     service = start_service()
     client = make_client(service.grpc)

@@ -1,6 +1,5 @@
 """The WebSocket streams of a real service, and those who watch the streams of others."""
 
-import base64
 import contextlib
 import json
 import socket
@@ -165,19 +164,6 @@ def test_a_message_beyond_the_limit_ends_the_stream_only(open_stream):
     assert other.ask(pose=at(0.0))[1]
 
 
-def test_keys_are_asked_for(start_service):
-    service = start_service(api_keys=KEY)
-    with pytest.raises(InvalidStatus) as refusal, connect(service.stream_url()):
-        pass
-    assert refusal.value.response.status_code == 401
-    with connect(service.stream_url(), additional_headers={"Authorization": f"Bearer {KEY}"}):
-        pass
-    offered = "ultragray.key." + base64.urlsafe_b64encode(KEY.encode()).decode().rstrip("=")
-    with connect(service.stream_url(), subprotocols=["ultragray.v1", offered]) as connection:
-        assert connection.subprotocol == "ultragray.v1"
-        assert Stream(connection).ask(pose=at(0.0))[1]
-
-
 def test_a_stop_ends_streams_after_their_frames(start_service):
     service = start_service()
     with connect(service.stream_url(), max_size=None) as connection:
@@ -294,18 +280,3 @@ def test_poses_are_assessed_as_frames_are_without_their_support(service, http):
     assert [one["distance_mm"] for one in found] == [one.distance_mm for one in told]
     assert found[1]["distance_mm"] == pytest.approx(frame.extrapolation.distance_mm)
     assert found[1]["supported_share"] is told[1].supported_share is None
-
-
-@pytest.mark.parametrize(
-    ("body", "reason", "field"),
-    [
-        ({}, "INVALID_ARGUMENT", "poses"),
-        ({"poses": [{"matrix": [[1]]}]}, "INVALID_POSE", "poses[0].matrix"),
-        ({"poses": [at(0.0)] * 1025}, "TOO_MANY_POSES", "poses"),
-        ({"poses": [at(0.0)], "probe": {"kind": "linear"}}, "INVALID_PROBE", "probe"),
-    ],
-)
-def test_what_cannot_be_assessed_is_refused(http, body, reason, field):
-    answer = http.post("/v1/scenes/demo:assess", json=body)
-    assert (answer.status_code, answer.json()["reason"]) == (422, reason)
-    assert answer.json()["field"].startswith(field)

@@ -35,6 +35,18 @@ def files(tmp_path):
 
 
 @pytest.fixture
+def drawn():
+    """Contact sheets are drawn, which takes most of a second."""
+
+
+@pytest.fixture(autouse=True)
+def blank_sheets(request, monkeypatch):
+    """Contact sheets are empty files, but for tests that want them `drawn`."""
+    if "drawn" not in request.fixturenames:
+        monkeypatch.setattr("ultragray.datasets.pictures.draw_dataset", lambda dataset, path: path.touch())
+
+
+@pytest.fixture
 def store(tmp_path):
     return DatasetStore(tmp_path / "artifacts")
 
@@ -69,7 +81,7 @@ def npy(tmp_path, array):
     return (tmp_path / "array.npy").read_bytes()
 
 
-def test_an_upload_becomes_a_dataset_that_training_reads(store, receive, files):
+def test_an_upload_becomes_a_dataset_that_training_reads(drawn, store, receive, files):
     incoming = receive(files)
     assert store.names() == []
     take_in(**arguments(incoming, train_frames="0:6"))
