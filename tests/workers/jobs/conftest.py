@@ -114,6 +114,10 @@ def train_job(scene, *, dataset="tiny", steps=20, max_run_s=None, **settings):
     return TrainJob(dataset=dataset, scene=scene, settings=values, device="cpu", max_run_s=max_run_s)
 
 
+def is_training(job):
+    return job.state is JobState.RUNNING and (job.progress.step or 0) > 0
+
+
 class RunningWorker:
     """A worker in a process of its own. `options` are those of `work`, and `host`: the name that its host has."""
 

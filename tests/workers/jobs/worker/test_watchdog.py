@@ -17,15 +17,11 @@ from ultragray_workers.jobs.worker import process as watchdog
 from ultragray_workers.jobs.worker.process import Watchdog, kill_group
 
 from ....waiting import wait_until
-from ..conftest import train_job
+from ..conftest import is_training, train_job
 
 FOR_EVER = 1_000_000  # steps
 LONGEST_S = 1000.0
 # Trainings of the scene `sleeps` never come to their second step.
-
-
-def is_training(job):
-    return job.state is JobState.RUNNING and (job.progress.step or 0) > 0
 
 
 @contextmanager
