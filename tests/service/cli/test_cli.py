@@ -88,7 +88,6 @@ def test_completion_knows_commands_and_options():
         return subprocess.run(python(program), env=environment, capture_output=True, text=True, check=False).stdout
 
     assert completed("ultragray re").split() == ["render", "registrations", "restore", "report"]
-    assert completed("ultragray scenes do").split() == ["download"]
     assert "--outputs" in completed("ultragray render --out").split()
 
 
