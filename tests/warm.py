@@ -20,6 +20,7 @@ import subprocess
 import sys
 import tempfile
 import time
+import weakref
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -36,9 +37,7 @@ class WarmProcess:
         self.pid = pid
         self.returncode = None
         self._connection = connection  # its end brings the exit code
-
-    def __del__(self):
-        self._connection.close()
+        weakref.finalize(self, connection.close)
 
     def poll(self):
         with contextlib.suppress(subprocess.TimeoutExpired):
@@ -281,6 +280,9 @@ def serve(path):
             request = json.loads(content)
             pid = os.fork()
             if pid == 0:
+                if request.get("session"):
+                    os.setsid()
+                connection.send(str(os.getpid()).encode())  # from now on its group can be killed
                 for ours in (listener, ended, wake, connection, *running.values()):
                     ours.close()
                 return begin(request, files)
@@ -289,7 +291,6 @@ def serve(path):
             running[pid] = connection
             if "end_with" in request:
                 bound[connection] = pid, request["end_with"]
-            connection.send(str(pid).encode())
         if sys.stdin in readable:
             return 0
 
@@ -302,8 +303,6 @@ def begin(request, files):
     os.environ.clear()
     os.environ.update(request["environment"])
     os.chdir(str(request["folder"]))
-    if request.get("session"):
-        os.setsid()
     for number, file in enumerate(files[:_STANDARD_FILES]):
         os.dup2(file, number)
         os.close(file)

@@ -43,7 +43,6 @@ def done(server, *arguments):
 @pytest.fixture(scope="module")
 def server(start_service, artifacts):
     """A service with a worker, which holds the dataset `tiny`."""
-    artifacts = artifacts
     store_dataset(artifacts, "tiny")
     return start_service(artifact_folder=artifacts, embedded_worker=True, training_threads=1, api_keys=KEY)
 

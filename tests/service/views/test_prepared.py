@@ -5,6 +5,7 @@ import fcntl
 import json
 import os
 import shutil
+import subprocess
 import time
 
 import numpy as np
@@ -159,7 +160,8 @@ def test_what_no_one_foresaw_is_a_failure_as_well(tmp_path, wanted, caplog):
     assert "FileExistsError" in caplog.text
 
 
-def test_a_disk_without_room_is_told(tmp_path, wanted):
+def test_a_disk_without_room_is_told(tmp_path, wanted, monkeypatch):
+    monkeypatch.setattr(threads, "subprocess", subprocess)  # has the limits of this process
     with files_of_at_most(DATASET.train.images.size):
         failed = asyncio.run(asyncio.wait_for(end_of(views(tmp_path), wanted), 30))
     assert isinstance(failed.error, StorageFull)
@@ -208,7 +210,6 @@ def test_what_dead_services_left_is_removed(tmp_path, monkeypatch):
 
 def test_one_helper_process_at_a_time(tmp_path, wanted, monkeypatch):
     started = []
-
     start = threads.subprocess.Popen
 
     def watched(*arguments, **options):
