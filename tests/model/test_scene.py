@@ -3,6 +3,7 @@
 import copy
 import hashlib
 import json
+import math
 import os
 import pickle
 import struct
@@ -84,7 +85,12 @@ def test_shn_may_be_left_out():
         ("scales", np.zeros((4, 3)), "floating tensor, got ndarray"),
         ("scales", torch.zeros(4, 3, dtype=torch.float64), "float32"),
         ("scales", torch.full((4, 3), float("nan")), "finite"),
+        ("scales", torch.tensor([[0.0] * 3, [60.0] * 3, [0.0, -60.0, 0.0], [0.0] * 3]), r"±20, .* Gaussian 1 \(2 are"),
+        ("transmittances", torch.full((4,), -1e30), "within ±1e"),
+        ("sh0", torch.full((4, 1, 1), 3e38), "within ±1e"),
+        ("means", torch.full((4, 3), 2e6), "within ±1e"),
         ("quats", torch.zeros(4, 4), "zero"),
+        ("quats", torch.full((4, 4), 1e-30), "zero"),
     ],
 )
 def test_splats_that_do_not_fit_are_refused_by_name(name, value, message):
@@ -95,6 +101,11 @@ def test_splats_that_do_not_fit_are_refused_by_name(name, value, message):
         raw[name] = value
     with pytest.raises(InvalidArgument, match=message):
         GaussianScene.from_splats(raw)
+
+
+def test_splats_hold_a_gaussian():
+    with pytest.raises(InvalidArgument, match="at least one Gaussian"):
+        GaussianScene.from_splats(splats(0))
 
 
 def test_a_file_brings_everything_back(tmp_path, random_scene, random_poses):
@@ -148,6 +159,11 @@ BAD_FILES = {
     "metadata_nests": bundle(info="[" * 100_000),
     "other_version": bundle(info=metadata(format_version=99)),
     "wrong_count": bundle(info=metadata(gaussian_count=5)),
+    "no_gaussians": bundle(lambda tensors: tensors.update(splats(0)), info=metadata(gaussian_count=0)),
+    "far_centre": bundle(info=metadata(centre_mm=[1e308, 0.0, 0.0])),
+    "nan_in_the_metadata": bundle(info=metadata(training={"loss": math.nan})),
+    "metrics_of_text": bundle(info=metadata(metrics={"psnr_db": "30"})),
+    "metrics_of_many_digits": bundle(info=metadata(metrics={"psnr_db": 10**400})),
     "huge_count": bundle(info=metadata(gaussian_count=10**18)),
     "degree_beyond": bundle(info=metadata(sh_degree=400)),
     "bad_probe": bundle(info=metadata(probe={"kind": "linear", "width_mm": -1, "near_mm": 0, "far_mm": 1})),
@@ -161,6 +177,13 @@ BAD_VALUES = {
     "nan": bundle(lambda t: t.update(means=torch.full((4, 3), float("nan")))),
     "zero_quaternion": bundle(lambda t: t.update(quats=torch.zeros(4, 4))),
 }
+
+
+def test_a_file_of_values_that_no_scene_has_is_refused(tmp_path):
+    path = tmp_path / "a.ugr"
+    path.write_bytes(bundle(lambda tensors: tensors.update(scales=torch.full((4, 3), 1000.0))))
+    with pytest.raises(SceneFileInvalid, match="a.ugr: .*'scales'.* must be finite and within ±20, got .*Gaussian 0"):
+        GaussianScene.load(path)
 
 
 @pytest.mark.parametrize("name", BAD_FILES)
@@ -228,7 +251,7 @@ def test_json_round_trip(info):
         ({"format_version": 2}, "format_version is 2"),
         ({"surprise": 1}, r"unknown keys \['surprise'\]"),
         ({"centre_mm": [1, 2]}, "centre_mm must be a list of 3 values"),
-        ({"centre_mm": [1, 2, float("inf")]}, r"centre_mm\[2\] must be a finite number"),
+        ({"centre_mm": [1, 2, float("inf")]}, "its metadata holds Infinity"),
         ({"intensity": "linear"}, "released, sigmoid"),
         ({"image_height": 0}, "image_height must be an integer of at least 1"),
         ({"training": None}, "training must be an object"),
