@@ -1,26 +1,23 @@
 """Samples of a registration that contradict each other: the worst is named, and the mistake that was made."""
 
-from __future__ import annotations
-
 import cv2
 import numpy as np
 import pytest
 
 from ultragray.geometry.contradictions import point_contradiction, pose_contradiction
-from ultragray.geometry.probe import FloatArray
 from ultragray.geometry.registration import register_points, register_poses, register_poses_and_mounting
 
 COUNT = 9
 
 
-def motion(random: np.random.Generator, spread_mm: float, turn: float) -> FloatArray:
+def motion(random, spread_mm, turn):
     pose = np.eye(4)
     pose[:3, :3] = cv2.Rodrigues(random.normal(0, turn, 3))[0]
     pose[:3, 3] = random.normal(0, spread_mm, 3)
     return pose
 
 
-def samples(seed: int, noise_mm: float, noise_deg: float) -> tuple[FloatArray, FloatArray, FloatArray]:
+def samples(seed, noise_mm, noise_deg):
     """Poses of a flange and of the probe that it holds, as a tracker measures them, and the mounting."""
     random = np.random.default_rng(seed)
     base_to_scene, mounting = motion(random, 300, 1), motion(random, 80, 1)
@@ -29,13 +26,13 @@ def samples(seed: int, noise_mm: float, noise_deg: float) -> tuple[FloatArray, F
     return flanges, base_to_scene @ flanges @ mounting @ errors, mounting
 
 
-def metres(poses: FloatArray) -> FloatArray:
+def metres(poses):
     poses = poses.copy()
     poses[..., :3, 3] /= 1000.0
     return poses
 
 
-def stale(poses: FloatArray) -> FloatArray:
+def stale(poses):
     poses = poses.copy()
     poses[4] = poses[3]
     return poses
@@ -44,10 +41,10 @@ def stale(poses: FloatArray) -> FloatArray:
 @pytest.mark.parametrize("noise", [(0.0, 0.0), (0.3, 0.2)])
 @pytest.mark.parametrize("seed", range(3))
 @pytest.mark.parametrize("is_mounting_given", [True, False])
-def test_each_mistake_is_named(seed: int, noise: tuple[float, float], is_mounting_given: bool) -> None:
+def test_each_mistake_is_named(seed, noise, is_mounting_given):
     flanges, probes, mounting = samples(seed, *noise)
 
-    def told(flanges: FloatArray, probes: FloatArray, mounting: FloatArray = mounting) -> str:
+    def told(flanges, probes, mounting=mounting):
         fit = (
             register_poses(flanges, probes, mounting)
             if is_mounting_given
@@ -72,12 +69,12 @@ def test_each_mistake_is_named(seed: int, noise: tuple[float, float], is_mountin
 
 
 @pytest.mark.parametrize("noise_mm", [0.0, 0.4])
-def test_points_that_contradict_each_other(noise_mm: float) -> None:
+def test_points_that_contradict_each_other(noise_mm):
     random = np.random.default_rng(4)
     in_base, true = random.normal(0, 60, (8, 3)), motion(random, 200, 1)
     in_scene = in_base @ true[:3, :3].T + true[:3, 3] + random.normal(0, noise_mm, (8, 3))
 
-    def told(in_base: FloatArray, in_scene: FloatArray) -> str:
+    def told(in_base, in_scene):
         return point_contradiction(register_points(in_base, in_scene), in_base, in_scene) or ""
 
     assert told(in_base, in_scene) == ""

@@ -1,7 +1,5 @@
 """Poses from calibrated images: Gram–Schmidt, scales, the origin at the top centre of the crop."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -15,13 +13,13 @@ PATH = Path("s.mha")
 CROP = CropBox(left=10, right=30, top=5, bottom=45)
 
 
-def image_transform(columns: tuple[float, ...], rows: tuple[float, ...], third: tuple[float, ...]) -> np.ndarray:
+def image_transform(columns, rows, third):
     transform = np.eye(4)
     transform[:3] = np.stack([columns, rows, third, (100.0, 200.0, 300.0)], axis=1)
     return transform[None]
 
 
-def test_pixels_become_millimetres() -> None:
+def test_pixels_become_millimetres():
     poses, probe = poses_from_image_transforms(
         image_transform((0.2, 0, 0), (0, 0, 0.1), (0, 1, 0)), CROP, np.arange(1), PATH
     )
@@ -31,7 +29,7 @@ def test_pixels_become_millimetres() -> None:
     np.testing.assert_allclose(poses[0, :3, 3], (100 + 0.2 * 19.5, 200, 300 + 0.1 * 4.5))
 
 
-def test_skewed_axes_keep_the_lateral_one() -> None:
+def test_skewed_axes_keep_the_lateral_one():
     poses, probe = poses_from_image_transforms(
         image_transform((0.2, 0, 0), (0.01, 0, 0.1), (0, 0, 0.05)), CROP, np.arange(1), PATH
     )
@@ -40,18 +38,18 @@ def test_skewed_axes_keep_the_lateral_one() -> None:
 
 
 @pytest.mark.parametrize("third", [(0, 1, 0), (0, -1, 0)])
-def test_the_third_axis_of_the_image_does_not_matter(third: tuple[float, ...]) -> None:
+def test_the_third_axis_of_the_image_does_not_matter(third):
     poses, _ = poses_from_image_transforms(image_transform((0, 0.2, 0), (0, 0, 0.1), third), CROP, np.arange(1), PATH)
     assert np.linalg.det(poses[0, :3, :3]) == pytest.approx(1.0)
     np.testing.assert_allclose(poses[0, :3, 1], (-1, 0, 0), atol=1e-15)  # z × x
 
 
-def test_images_that_are_no_plane_are_refused() -> None:
+def test_images_that_are_no_plane_are_refused():
     with pytest.raises(DatasetInvalid, match=r"s\.mha: frame 4: columns and rows .* nearly parallel"):
         poses_from_image_transforms(image_transform((0.2, 0, 0), (0.1, 0, 0.01), (0, 1, 0)), CROP, np.array([4]), PATH)
 
 
-def test_a_scale_that_changes_is_refused() -> None:
+def test_a_scale_that_changes_is_refused():
     usual = image_transform((0.2, 0, 0), (0, 0, 0.1), (0, 1, 0))
     other = image_transform((0.21, 0, 0), (0, 0, 0.1), (0, 1, 0))
     with pytest.raises(

@@ -1,7 +1,5 @@
 """Stored frames as grey uint8, crops and box resizing."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from skimage.transform import resize_local_mean
@@ -10,7 +8,7 @@ from ultragray.datasets.images import CropBox, grey_frames, parse_crop, parse_im
 from ultragray.errors import DatasetInvalid, InvalidArgument
 
 
-def test_every_layout_becomes_grey() -> None:
+def test_every_layout_becomes_grey():
     grey = np.random.default_rng(0).integers(0, 256, (3, 5, 7), dtype=np.uint8)
     for stored in (
         grey,
@@ -24,7 +22,7 @@ def test_every_layout_becomes_grey() -> None:
         np.testing.assert_array_equal(grey_frames(stored, "file"), grey)
 
 
-def test_colours_become_their_luma() -> None:
+def test_colours_become_their_luma():
     colours = np.zeros((3, 1, 2, 3), np.uint8)
     for channel in range(3):
         colours[channel, ..., channel] = 200
@@ -45,12 +43,12 @@ def test_colours_become_their_luma() -> None:
         (np.array([0.5, -0.1]).repeat(6).reshape(2, 2, 3), "frame 1 must be uint8 or lie in"),
     ],
 )
-def test_other_images_are_refused(frames: np.ndarray, message: str) -> None:
+def test_other_images_are_refused(frames, message):
     with pytest.raises(DatasetInvalid, match=f"^file: .*{message}"):
         grey_frames(frames, "file")
 
 
-def test_a_box_is_the_mean_of_what_it_covers() -> None:
+def test_a_box_is_the_mean_of_what_it_covers():
     image = np.zeros((1, 4, 6), np.uint8)
     image[0, :2, 3:6] = 90
     np.testing.assert_array_equal(resize_frames(image, 2, 2), [[[0, 90], [0, 0]]])
@@ -59,14 +57,14 @@ def test_a_box_is_the_mean_of_what_it_covers() -> None:
 
 
 @pytest.mark.parametrize("size", [(40, 30), (17, 23), (50, 7)])
-def test_boxes_are_those_of_scikit_image(size: tuple[int, int]) -> None:
+def test_boxes_are_those_of_scikit_image(size):
     image = np.random.default_rng(0).integers(0, 256, (60, 50), dtype=np.uint8)
     width, height = size
     expected = resize_local_mean(image, (height, width), preserve_range=True)
     np.testing.assert_allclose(resize_frames(image[None], width, height)[0], expected, atol=0.51)  # rounded to bytes
 
 
-def test_crops() -> None:
+def test_crops():
     assert parse_crop(None, 616, 820) == CropBox(0, 820, 0, 616)
     box = parse_crop("188:632, 12:600", 616, 820)
     assert box == CropBox(188, 632, 12, 600)
@@ -81,12 +79,12 @@ def test_crops() -> None:
         f"0:5,0:{'9' * 5000}",
     ],
 )
-def test_crops_outside_the_image_are_refused(text: str) -> None:
+def test_crops_outside_the_image_are_refused(text):
     with pytest.raises(InvalidArgument, match=r"^crop must"):
         parse_crop(text, 616, 820)
 
 
-def test_image_sizes() -> None:
+def test_image_sizes():
     assert parse_image_size("192x256") == (192, 256)
     for text in ("192", "0x5", "5x0", "x", "99999x9", "-1x5", f"5x{'9' * 5000}"):
         with pytest.raises(InvalidArgument, match=r"^image_size must be width x height"):

@@ -1,10 +1,6 @@
 """MetaImage sequences, as PLUS writes them and as they arrive damaged."""
 
-from __future__ import annotations
-
 import zlib
-from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,7 +12,7 @@ from ultragray.errors import DatasetInvalid
 
 @pytest.mark.parametrize("deflate", [True, False])
 @pytest.mark.parametrize("data_file", ["LOCAL", "pixels.raw", "pixels.zraw"])
-def test_pixels_and_fields(tmp_path: Path, plus_files: SimpleNamespace, deflate: bool, data_file: str) -> None:
+def test_pixels_and_fields(tmp_path, plus_files, deflate, data_file):
     stored = plus_files.speckle(3, 5, 7)
     fields = {"UltrasoundImageOrientation": "MFA", **plus_files.tracked_fields(4)}  # of one frame more than it has
     path = plus_files.write_mha(tmp_path / "s.mhd", stored, fields, deflate=deflate, data_file=data_file)
@@ -28,7 +24,7 @@ def test_pixels_and_fields(tmp_path: Path, plus_files: SimpleNamespace, deflate:
     assert sequence.frame_fields[2]["ProbeToTrackerTransformStatus"] == "OK"
 
 
-def test_colour_and_four_sizes(tmp_path: Path, plus_files: SimpleNamespace) -> None:
+def test_colour_and_four_sizes(tmp_path, plus_files):
     stored = plus_files.speckle(2, 5, 21).reshape(2, 5, 7, 3)
     np.testing.assert_array_equal(read_meta_image(plus_files.write_mha(tmp_path / "c.mha", stored, {})).pixels, stored)
     path = plus_files.write_mha(tmp_path / "v.mha", stored, {"DimSize": "7 5 1 2"})
@@ -56,9 +52,7 @@ def test_colour_and_four_sizes(tmp_path: Path, plus_files: SimpleNamespace) -> N
     ],
 )
 @pytest.mark.parametrize("deflate", [True, False])
-def test_headers_that_cannot_be_are_refused(
-    tmp_path: Path, plus_files: SimpleNamespace, changes: dict[str, str], message: str, deflate: bool
-) -> None:
+def test_headers_that_cannot_be_are_refused(tmp_path, plus_files, changes, message, deflate):
     fields = plus_files.tracked_fields(2) | changes
     path = plus_files.write_mha(tmp_path / "s.mha", plus_files.speckle(3, 5, 7), fields, deflate=deflate)
     with pytest.raises(DatasetInvalid, match=rf"s\.mha: .*({message})"):
@@ -66,7 +60,7 @@ def test_headers_that_cannot_be_are_refused(
 
 
 @pytest.mark.parametrize("word", ["True", "true", "T", "t", "1"])
-def test_booleans_as_metaio_takes_them(tmp_path: Path, plus_files: SimpleNamespace, word: str) -> None:
+def test_booleans_as_metaio_takes_them(tmp_path, plus_files, word):
     stored = plus_files.speckle(3, 5, 7).astype(np.uint16) * 200
     fields = {"ElementType": "MET_USHORT", "BinaryData": word, "CompressedData": word, "BinaryDataByteOrderMSB": word}
     path = plus_files.write_mha(tmp_path / "s.mha", stored.astype(">u2"), fields)
@@ -80,9 +74,7 @@ def test_booleans_as_metaio_takes_them(tmp_path: Path, plus_files: SimpleNamespa
 
 @pytest.mark.parametrize("is_local", [True, False])
 @pytest.mark.parametrize("header_size", ["-1", "exact"])
-def test_a_header_before_the_pixels_is_passed_over(
-    tmp_path: Path, plus_files: SimpleNamespace, is_local: bool, header_size: str
-) -> None:
+def test_a_header_before_the_pixels_is_passed_over(tmp_path, plus_files, is_local, header_size):
     stored = plus_files.speckle(3, 5, 7)
     text = (
         "ObjectType = Image\nNDims = 3\nBinaryData = True\nDimSize = 7 5 3\nElementType = MET_UCHAR\nHeaderSize = {}\n"
@@ -100,7 +92,7 @@ def test_a_header_before_the_pixels_is_passed_over(
 
 
 @pytest.mark.parametrize("files", ["LIST\nf1.raw\nf2.raw\nf3.raw", "f%d.raw 1 3 1", "f%01d.raw 1 3"])
-def test_pixels_in_a_file_a_frame(tmp_path: Path, plus_files: SimpleNamespace, files: str) -> None:
+def test_pixels_in_a_file_a_frame(tmp_path, plus_files, files):
     stored = plus_files.speckle(3, 5, 7)
     for number, frame in enumerate(stored):
         (tmp_path / f"f{number + 1}.raw").write_bytes(frame.tobytes())
@@ -116,7 +108,7 @@ def test_pixels_in_a_file_a_frame(tmp_path: Path, plus_files: SimpleNamespace, f
         read_meta_image(path)
 
 
-def test_16_bits_below_zero_are_told_to_be_rf(tmp_path: Path, plus_files: SimpleNamespace) -> None:
+def test_16_bits_below_zero_are_told_to_be_rf(tmp_path, plus_files):
     stored = (plus_files.speckle(3, 5, 7).astype(np.int16) - 120).astype("<i2")
     path = plus_files.write_mha(tmp_path / "s.mha", stored, {"ElementType": "MET_SHORT"})
     with pytest.raises(DatasetInvalid, match=r"the smallest is -120: RF data, not B-mode\?"):
@@ -124,7 +116,7 @@ def test_16_bits_below_zero_are_told_to_be_rf(tmp_path: Path, plus_files: Simple
 
 
 @pytest.mark.parametrize("data_file", ["../pixels.raw", "/etc/hosts", "missing.raw"])
-def test_pixels_lie_beside_the_header(tmp_path: Path, plus_files: SimpleNamespace, data_file: str) -> None:
+def test_pixels_lie_beside_the_header(tmp_path, plus_files, data_file):
     path = plus_files.write_mha(tmp_path / "s.mhd", plus_files.speckle(3, 5, 7), {}, data_file="pixels.raw")
     path.write_bytes(path.read_bytes().replace(b"pixels.raw", data_file.encode()))
     with pytest.raises(DatasetInvalid, match=r"s\.mhd: .*beside it"):
@@ -132,14 +124,14 @@ def test_pixels_lie_beside_the_header(tmp_path: Path, plus_files: SimpleNamespac
 
 
 @pytest.mark.parametrize("keep", [0, 10, 200, -20, -1])
-def test_truncated_files_are_refused(tmp_path: Path, plus_files: SimpleNamespace, keep: int) -> None:
+def test_truncated_files_are_refused(tmp_path, plus_files, keep):
     path = plus_files.write_mha(tmp_path / "s.mha", plus_files.speckle(3, 50, 70), {})
     path.write_bytes(path.read_bytes()[:keep])
     with pytest.raises(DatasetInvalid, match=r"s\.mha: (truncated|not a MetaImage file)"):
         read_meta_image(path)
 
 
-def test_damaged_and_foreign_files_are_refused(tmp_path: Path, plus_files: SimpleNamespace) -> None:
+def test_damaged_and_foreign_files_are_refused(tmp_path, plus_files):
     path = plus_files.write_mha(tmp_path / "s.mha", plus_files.speckle(3, 50, 70), {})
     data = bytearray(path.read_bytes())
     data[-3000] ^= 0xFF
@@ -152,21 +144,21 @@ def test_damaged_and_foreign_files_are_refused(tmp_path: Path, plus_files: Simpl
             read_meta_image(path)
 
 
-def test_a_bomb_is_not_inflated(tmp_path: Path, plus_files: SimpleNamespace, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_bomb_is_not_inflated(tmp_path, plus_files, monkeypatch):
     path = plus_files.write_mha(tmp_path / "s.mha", np.zeros((3, 2000, 1000), np.uint8), {"DimSize": "7 5 3"})
     inflated = []
     make = zlib.decompressobj
 
     class Watched:
-        def __init__(self, bits: int) -> None:
+        def __init__(self, bits):
             self.inner = make(bits)
 
-        def decompress(self, data: bytes, limit: int) -> bytes:
+        def decompress(self, data, limit):
             inflated.append(len(pixels := self.inner.decompress(data, limit)))
             return pixels
 
         @property
-        def eof(self) -> bool:
+        def eof(self):
             return self.inner.eof
 
     monkeypatch.setattr(zlib, "decompressobj", Watched)

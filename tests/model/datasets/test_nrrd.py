@@ -1,10 +1,5 @@
 """NRRD sequences, as PLUS and 3D Slicer write them."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import SimpleITK
@@ -17,7 +12,7 @@ from ultragray.errors import DatasetInvalid
     "changes",
     [{}, {"encoding": "raw"}, {"encoding": "gz"}, {"data file": "s.raw", "encoding": "raw"}, {"data file": "s.raw.gz"}],
 )
-def test_pixels_and_fields(tmp_path: Path, plus_files: SimpleNamespace, changes: dict[str, str]) -> None:
+def test_pixels_and_fields(tmp_path, plus_files, changes):
     stored = plus_files.speckle(3, 5, 7)
     fields = {"ultrasound image orientation": "MN", **plus_files.tracked_fields(3)}
     sequence = read_nrrd(plus_files.write_nrrd(tmp_path / "s.seq.nrrd", stored, fields, **changes))
@@ -26,7 +21,7 @@ def test_pixels_and_fields(tmp_path: Path, plus_files: SimpleNamespace, changes:
     assert sequence.frame_fields[1]["ProbeToTrackerTransformStatus"] == "OK"
 
 
-def test_colour_and_four_sizes(tmp_path: Path, plus_files: SimpleNamespace) -> None:
+def test_colour_and_four_sizes(tmp_path, plus_files):
     stored = plus_files.speckle(2, 5, 21).reshape(2, 5, 7, 3)
     np.testing.assert_array_equal(read_nrrd(plus_files.write_nrrd(tmp_path / "c.nrrd", stored, {})).pixels, stored)
     volumes = {"sizes": "7 5 1 2", "kinds": "domain domain domain list"}
@@ -52,9 +47,7 @@ def test_colour_and_four_sizes(tmp_path: Path, plus_files: SimpleNamespace) -> N
     ],
     ids=lambda value: " ".join(value.values()) if isinstance(value, dict) else None,
 )
-def test_the_axis_of_the_frames_is_found_wherever_it_is(
-    tmp_path: Path, plus_files: SimpleNamespace, order: tuple[int, ...], changes: dict[str, str]
-) -> None:
+def test_the_axis_of_the_frames_is_found_wherever_it_is(tmp_path, plus_files, order, changes):
     """3D Slicer writes the list first; `order` is that of frames, rows and columns in the file, the slowest first."""
     count = 12 if "12" in changes["sizes"] else 3
     stored = plus_files.speckle(count, 5, 7)
@@ -64,7 +57,7 @@ def test_the_axis_of_the_frames_is_found_wherever_it_is(
     np.testing.assert_array_equal(read_nrrd(path).pixels, stored)
 
 
-def test_frames_in_colour_between_other_axes(tmp_path: Path, plus_files: SimpleNamespace) -> None:
+def test_frames_in_colour_between_other_axes(tmp_path, plus_files):
     stored = plus_files.speckle(2, 5, 21).reshape(2, 5, 7, 3)
     changes = {"kinds": "RGB-color list domain domain", "sizes": "3 2 7 5"}
     in_file = np.ascontiguousarray(stored.transpose(1, 2, 0, 3)).reshape(stored.shape)
@@ -72,7 +65,7 @@ def test_frames_in_colour_between_other_axes(tmp_path: Path, plus_files: SimpleN
     np.testing.assert_array_equal(read_nrrd(path).pixels, stored)
 
 
-def test_sequences_agree_with_another_reader(tmp_path: Path, plus_files: SimpleNamespace) -> None:
+def test_sequences_agree_with_another_reader(tmp_path, plus_files):
     for name, changes in (
         ("a.nrrd", {"kinds": "domain domain list"}),
         ("b.nrrd", {"encoding": "raw"}),
@@ -85,7 +78,7 @@ def test_sequences_agree_with_another_reader(tmp_path: Path, plus_files: SimpleN
         np.testing.assert_array_equal(read_nrrd(path).pixels, expected)
 
 
-def test_a_list_of_files_and_bytes_to_skip(tmp_path: Path, plus_files: SimpleNamespace) -> None:
+def test_a_list_of_files_and_bytes_to_skip(tmp_path, plus_files):
     stored = plus_files.speckle(3, 5, 7)
     for number, frame in enumerate(stored):
         (tmp_path / f"f{number}.raw").write_bytes(b"head" + frame.tobytes())
@@ -111,16 +104,14 @@ def test_a_list_of_files_and_bytes_to_skip(tmp_path: Path, plus_files: SimpleNam
         ({"sizes": "0 0 93"}, "it holds no images: a recording of the tracker alone"),
     ],
 )
-def test_headers_that_cannot_be_are_refused(
-    tmp_path: Path, plus_files: SimpleNamespace, changes: dict[str, str], message: str
-) -> None:
+def test_headers_that_cannot_be_are_refused(tmp_path, plus_files, changes, message):
     path = plus_files.write_nrrd(tmp_path / "s.nrrd", plus_files.speckle(3, 5, 7), {}, **changes)
     with pytest.raises(DatasetInvalid, match=rf"s\.nrrd: .*{message}"):
         read_nrrd(path)
 
 
 @pytest.mark.parametrize("content", [b"", b"NRRD0004\nno colon\n\n", b"PNG\n", b"NRRD0004\n\n"])
-def test_foreign_files_are_refused(tmp_path: Path, content: bytes) -> None:
+def test_foreign_files_are_refused(tmp_path, content):
     path = tmp_path / "s.nrrd"
     path.write_bytes(content)
     with pytest.raises(DatasetInvalid, match=r"s\.nrrd: (not an NRRD file|pixels must|sizes must)"):

@@ -1,7 +1,5 @@
 """Stored orientations brought to x lateral, y depth."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np
@@ -32,11 +30,11 @@ MF = np.arange(12, dtype=np.uint8).reshape(1, 3, 4)  # rows: depth, columns: tow
         ("NU", MF.transpose(0, 2, 1)[:, ::-1, ::-1]),
     ],
 )
-def test_every_orientation_becomes_mf(orientation: str, stored: np.ndarray) -> None:
+def test_every_orientation_becomes_mf(orientation, stored):
     np.testing.assert_array_equal(orient_frames(stored, orientation, Path("s.mha")), MF)
 
 
 @pytest.mark.parametrize("orientation", ["AMF", "MM", "FN", "M", "MFX", "mf?"])
-def test_orientations_that_no_image_has_are_refused(orientation: str) -> None:
+def test_orientations_that_no_image_has_are_refused(orientation):
     with pytest.raises(DatasetInvalid, match=r"s\.mha: UltrasoundImageOrientation must be"):
         orient_frames(MF, orientation, Path("s.mha"))

@@ -1,21 +1,16 @@
 """The picture of a dataset shows its planes and its frames."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-
 import cv2
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from ultragray import ConvexProbe, LinearProbe, PhasedProbe, Probe
-from ultragray.datasets import Dataset, Sweep
+from ultragray import ConvexProbe, LinearProbe, PhasedProbe
+from ultragray.datasets import Dataset
 from ultragray.datasets.pictures import _draw_planes, draw_dataset
 
 
-def pixels_of(picture: np.ndarray, colour: tuple[int, int, int]) -> int:  # RGB
+def pixels_of(picture, colour):  # RGB
     return int((np.abs(picture.astype(int) - colour[::-1]).max(axis=-1) < 40).sum())
 
 
@@ -30,13 +25,12 @@ def pixels_of(picture: np.ndarray, colour: tuple[int, int, int]) -> int:  # RGB
     ],
     ids=["linear", "convex", "phased"],
 )
-def test_both_parts_are_drawn(make_sweep: Callable[..., Sweep], tmp_path: Path, probe: Probe) -> None:
+def test_both_parts_are_drawn(make_sweep, tmp_path, probe):
     sweep = make_sweep(12, probe=probe)
     blue, red = (31, 119, 180), (214, 39, 40)
     draw_dataset(Dataset("both", sweep.select(range(8)), sweep.select(range(8, 12))), tmp_path / "both.png")
     draw_dataset(Dataset("one", sweep, sweep.select([])), tmp_path / "one.png")
     both, one = (cv2.imread(str(tmp_path / f"{name}.png")) for name in ("both", "one"))
-    assert both is not None
     assert one is not None
     assert both.shape[1] == 1400
     assert pixels_of(both, blue) > 200
@@ -46,12 +40,11 @@ def test_both_parts_are_drawn(make_sweep: Callable[..., Sweep], tmp_path: Path, 
     assert both[-150:].std() > 20
 
 
-def test_at_most_sixteen_planes_of_a_part_are_drawn(make_sweep: Callable[..., Sweep]) -> None:
+def test_at_most_sixteen_planes_of_a_part_are_drawn(make_sweep):
     sweep = make_sweep(200)
     axes = Figure().add_subplot(projection="3d")
     _draw_planes(axes, Dataset("many", sweep, sweep.select(range(20))), 20.0, 30.0)
     legend = axes.get_legend()
-    assert legend is not None
     assert [text.get_text() for text in legend.get_texts()] == [
         "training: 16 of 200 planes",
         "held out: 16 of 20 planes",
@@ -63,7 +56,7 @@ def test_at_most_sixteen_planes_of_a_part_are_drawn(make_sweep: Callable[..., Sw
     assert set(np.diff(y_mm)) == {13.0, 14.0}
 
 
-def test_a_picture_that_fails_leaves_nothing(make_sweep: Callable[..., Sweep], tmp_path: Path) -> None:
+def test_a_picture_that_fails_leaves_nothing(make_sweep, tmp_path):
     sweep = make_sweep(3)
     with pytest.raises(OSError, match="missing"):
         draw_dataset(Dataset("one", sweep, sweep.select([])), tmp_path / "missing" / "one.png")

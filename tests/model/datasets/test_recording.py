@@ -1,10 +1,5 @@
 """PLUS sequences: poses as the toolkit defines them, and everything a recording may hold."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
@@ -32,8 +27,8 @@ TURN = np.array([[0.0, -1, 0, 3], [1, 0, 0, 4], [0, 0, 1, 5], [0, 0, 0, 1]])
     ],
 )
 def test_real_sequences_agree_with_the_sets_made_from_them(
-    data_folder: Path, sequence: str, xml: str, name: str, crop: str, size: str, train_frames: str | None, pixels: float
-) -> None:
+    data_folder, sequence, xml, name, crop, size, train_frames, pixels
+):
     folder = data_folder / "plus_original"
     options = SourceOptions(
         device_set=folder / f"PlusDeviceSet_{xml}.xml", crop=crop, image_size=size, train_frames=train_frames
@@ -52,7 +47,7 @@ def test_real_sequences_agree_with_the_sets_made_from_them(
         assert ours.val.frame_numbers.tolist() == [2, 7, 12, 17]
 
 
-def test_a_sequence_with_its_device_set(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+def test_a_sequence_with_its_device_set(tmp_path, plus_files, device_set):
     stored = plus_files.speckle(4, ROWS, COLUMNS)
     path = plus_files.write_mha(tmp_path / "s.igs.mha", stored, plus_files.tracked_fields(4))
     sweep, frame_count = read_plus_sweep(path, device_set=device_set, crop="2:12,3:23", frames="1:")
@@ -65,9 +60,7 @@ def test_a_sequence_with_its_device_set(tmp_path: Path, plus_files: SimpleNamesp
     np.testing.assert_allclose(sweep.poses[0, :3, 3], (10 - 3 + 0.2 * 6.5, 1 + 1, 2 + 0.1 * 2.5))
 
 
-def test_the_reference_is_the_frame_of_the_poses_where_it_is_tracked(
-    tmp_path: Path, plus_files: SimpleNamespace, device_set: Path
-) -> None:
+def test_the_reference_is_the_frame_of_the_poses_where_it_is_tracked(tmp_path, plus_files, device_set):
     stored, fields = plus_files.speckle(3, ROWS, COLUMNS), plus_files.tracked_fields(3)
     plain, _ = read_plus_sweep(plus_files.write_mha(tmp_path / "t.mha", stored, fields), device_set=device_set)
     fields |= {f"Seq_Frame{f:04d}_ReferenceToTrackerTransform": plus_files.numbers(TURN) for f in range(3)}
@@ -75,7 +68,7 @@ def test_the_reference_is_the_frame_of_the_poses_where_it_is_tracked(
     np.testing.assert_allclose(turned.poses, np.linalg.inv(TURN) @ plain.poses, atol=1e-12)
 
 
-def test_the_calibration_may_be_in_the_sequence(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+def test_the_calibration_may_be_in_the_sequence(tmp_path, plus_files, device_set):
     stored, fields = plus_files.speckle(2, ROWS, COLUMNS), plus_files.tracked_fields(2)
     expected, _ = read_plus_sweep(plus_files.write_mha(tmp_path / "a.mha", stored, fields), device_set=device_set)
     own = fields | {
@@ -95,9 +88,7 @@ def test_the_calibration_may_be_in_the_sequence(tmp_path: Path, plus_files: Simp
 
 @pytest.mark.parametrize("suffix", ["igs.mha", "seq.nrrd"])
 @pytest.mark.parametrize("orientation", ["MN", "FM", "NMA", "UF"])
-def test_stored_orientations_give_the_same_sweep(
-    tmp_path: Path, plus_files: SimpleNamespace, device_set: Path, orientation: str, suffix: str
-) -> None:
+def test_stored_orientations_give_the_same_sweep(tmp_path, plus_files, device_set, orientation, suffix):
     frames, fields = plus_files.speckle(3, ROWS, COLUMNS), plus_files.tracked_fields(3)
     expected, _ = read_plus_sweep(
         plus_files.write_mha(tmp_path / "mf.mha", frames, fields), device_set=device_set, crop="2:12,3:23"
@@ -119,7 +110,7 @@ def test_stored_orientations_give_the_same_sweep(
     np.testing.assert_array_equal(sweep.poses, expected.poses)
 
 
-def test_invalid_frames_are_left_out_and_told(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+def test_invalid_frames_are_left_out_and_told(tmp_path, plus_files, device_set):
     fields = plus_files.tracked_fields(6)
     fields["Seq_Frame0001_ProbeToTrackerTransform"] = plus_files.numbers(np.eye(4))
     fields["Seq_Frame0001_ProbeToTrackerTransformStatus"] = "INVALID"
@@ -137,9 +128,7 @@ def test_invalid_frames_are_left_out_and_told(tmp_path: Path, plus_files: Simple
     assert "the whole image of 20 x 30 pixels" in sweep.notes[2]
 
 
-def test_an_invalid_reference_does_not_change_the_frame_of_the_poses(
-    tmp_path: Path, plus_files: SimpleNamespace, device_set: Path
-) -> None:
+def test_an_invalid_reference_does_not_change_the_frame_of_the_poses(tmp_path, plus_files, device_set):
     fields = plus_files.tracked_fields(3)
     for frame, status in enumerate(("OK", "INVALID", "OK")):
         fields[f"Seq_Frame{frame:04d}_ReferenceToTrackerTransform"] = plus_files.numbers(TURN)
@@ -148,11 +137,11 @@ def test_an_invalid_reference_does_not_change_the_frame_of_the_poses(
     assert read_plus_sweep(path, device_set=device_set)[0].frame_numbers.tolist() == [0, 2]
 
 
-def test_bad_recordings_are_one_clear_error(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+def test_bad_recordings_are_one_clear_error(tmp_path, plus_files, device_set):
     stored, good = plus_files.speckle(3, ROWS, COLUMNS), plus_files.tracked_fields(3)
     key = "Seq_Frame0002_ProbeToTrackerTransform"
 
-    def refused(message: str, changes: dict[str, str], frames: np.ndarray = stored) -> None:
+    def refused(message, changes, frames=stored):
         path = plus_files.write_mha(tmp_path / "s.mha", frames, good | changes)
         with pytest.raises(DatasetInvalid, match=rf"s\.mha: {message}"):
             read_plus_sweep(path, device_set=device_set)
@@ -172,7 +161,7 @@ def test_bad_recordings_are_one_clear_error(tmp_path: Path, plus_files: SimpleNa
     )
 
 
-def test_what_is_missing_is_told(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+def test_what_is_missing_is_told(tmp_path, plus_files, device_set):
     stored = plus_files.speckle(3, ROWS, COLUMNS)
     path = plus_files.write_mha(tmp_path / "s.mha", stored, plus_files.tracked_fields(3))
     with pytest.raises(DatasetInvalid, match=r"no transforms lead .*there are ProbeToTracker .*give the device set"):

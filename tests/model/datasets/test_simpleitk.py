@@ -1,10 +1,5 @@
 """Sequences that SimpleITK wrote: colour, both formats, compressed or not, and fans with their geometry."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 import SimpleITK
@@ -15,7 +10,7 @@ from ultragray.datasets.plus import read_plus_sweep
 from .test_fan import FAN, of_both, screen
 
 
-def write(path: Path, frames: np.ndarray, fields: dict[str, str], *, compressed: bool = False) -> Path:
+def write(path, frames, fields, *, compressed=False):
     """Frames [F, rows, columns] or [F, rows, columns, 3] with the fields of a sequence."""
     image = SimpleITK.GetImageFromArray(frames, isVector=frames.ndim == 4)
     for key, value in fields.items():
@@ -24,7 +19,7 @@ def write(path: Path, frames: np.ndarray, fields: dict[str, str], *, compressed:
     return path
 
 
-def fields_of(plus_files: SimpleNamespace, frames: int) -> dict[str, str]:
+def fields_of(plus_files, frames):
     own = plus_files.tracked_fields(frames)
     return {key: value for key, value in own.items() if key.startswith(("Seq_Frame", "Ultrasound"))}
 
@@ -32,9 +27,7 @@ def fields_of(plus_files: SimpleNamespace, frames: int) -> dict[str, str]:
 @pytest.mark.parametrize("compressed", [False, True])
 @pytest.mark.parametrize("name", ["s.mha", "s.mhd", "s.nrrd", "s.nhdr"])
 @pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
-def test_colour_becomes_luma(
-    tmp_path: Path, plus_files: SimpleNamespace, device_set: Path, name: str, compressed: bool, dtype: type
-) -> None:
+def test_colour_becomes_luma(tmp_path, plus_files, device_set, name, compressed, dtype):
     colours = np.random.default_rng(2).integers(0, 256, (3, 24, 32, 3)).astype(dtype)
     colours[0, 0, 0] = 255
     fields = {**fields_of(plus_files, 3), "UltrasoundImageType": "RGB_COLOR"}
@@ -45,9 +38,7 @@ def test_colour_becomes_luma(
 
 
 @pytest.mark.parametrize("name", ["s.mha", "s.nrrd"])
-def test_a_fan_has_the_geometry_that_it_was_written_with(
-    tmp_path: Path, plus_files: SimpleNamespace, device_set: Path, name: str
-) -> None:
+def test_a_fan_has_the_geometry_that_it_was_written_with(tmp_path, plus_files, device_set, name):
     frames = np.stack([screen(of_both)] * 2)
     written = write(tmp_path / name, frames, fields_of(plus_files, 2))
     ours = plus_files.write_mha(tmp_path / "ours.mha", frames, plus_files.tracked_fields(2))

@@ -1,17 +1,13 @@
 """How far image planes lie from each other."""
 
-from __future__ import annotations
-
 import math
-from collections.abc import Callable
 
 import numpy as np
 
-from ultragray.datasets import Sweep
 from ultragray.learn.sweep import corner_distances_mm
 
 
-def test_distances_are_means_over_the_corners(make_sweep: Callable[..., Sweep]) -> None:
+def test_distances_are_means_over_the_corners(make_sweep):
     corners = make_sweep(5, step_mm=0.3).corners_mm()
     np.testing.assert_allclose(corner_distances_mm(corners[:-1], corners[1:]), [0.3] * 4)
     np.testing.assert_allclose(corner_distances_mm(corners, corners[1]), [0.3, 0.0, 0.3, 0.6, 0.9], atol=1e-12)
@@ -22,7 +18,7 @@ def test_distances_are_means_over_the_corners(make_sweep: Callable[..., Sweep]) 
     )
 
 
-def test_a_turn_about_the_probe_moves_its_far_corners_only(make_sweep: Callable[..., Sweep]) -> None:
+def test_a_turn_about_the_probe_moves_its_far_corners_only(make_sweep):
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, 1:3, 1:3] = [[0.0, -1.0], [1.0, 0.0]]  # about the lateral axis
     upright, turned = make_sweep(2, poses=poses).corners_mm()
