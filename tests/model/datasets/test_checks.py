@@ -1,17 +1,20 @@
 """What a report says about a sweep, and what it warns of."""
 
 import json
+import math
 import tracemalloc
 from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
-from ultragray import ConvexProbe, LinearProbe
+from ultragray import ConvexProbe, LinearProbe, PhasedProbe
 from ultragray.contract import to_dict
 from ultragray.datasets import Dataset, Sweep
-from ultragray.datasets.checks import check_dataset, check_sweep, without_names
+from ultragray.datasets.checks import MAX_VOXELS, check_dataset, check_sweep, swept_volume, without_names
+from ultragray.datasets.pictures import _draw_planes, draw_dataset
 from ultragray.datasets.source import load_dataset
 
 
@@ -252,3 +255,91 @@ def test_real_sets(data_folder, name, frames, tilt_deg, warnings):
 def test_one_frame_can_be_described(make_sweep):
     report = check_sweep(make_sweep(1, probe=LinearProbe(40, 0, 50)))
     assert (report.step_median_mm, report.tilt_deg) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(("step_mm", "coverage"), [(0.5, 1.0), (2.0, 0.5), (4.0, 0.25)])
+def test_coverage_falls_with_the_spacing(make_sweep, step_mm, coverage):
+    swept = swept_volume(make_sweep(round(40 / step_mm) + 1, step_mm=step_mm))
+    assert swept.voxel_mm == 1.0
+    assert swept.coverage == pytest.approx(coverage, abs=0.03)
+    assert swept.swept_ml == pytest.approx(40 * 40 * 50 * swept.coverage / 1000)
+
+
+def test_a_fan_crosses_the_voxels_of_its_sector(make_sweep):
+    probe = ConvexProbe(opening_angle_deg=60.0, near_mm=40.0, far_mm=100.0)
+    swept = swept_volume(make_sweep(21, step_mm=0.5, probe=probe))
+    assert swept.swept_ml == pytest.approx(math.radians(60) / 2 * (100**2 - 40**2) * 10 / 1000, rel=0.04)
+
+
+def test_it_does_not_depend_on_the_frame_of_the_tracker(make_sweep, random_poses):
+    sweep = make_sweep(21)
+    turned = make_sweep(21, poses=random_poses(1, tilt_deg=170.0) @ sweep.poses)
+    assert swept_volume(turned).swept_ml == pytest.approx(swept_volume(sweep).swept_ml, rel=0.02)
+
+
+def test_huge_volumes_get_larger_voxels(make_sweep):
+    swept = swept_volume(make_sweep(3, step_mm=100_000.0))
+    voxels = math.prod(math.ceil(side_mm / swept.voxel_mm) for side_mm in (40, 50, 200_000))
+    assert 0.9 * MAX_VOXELS < voxels <= MAX_VOXELS
+
+
+def test_flat_boxes_keep_the_limit_too(make_sweep):
+    """Two poses far off, in the plane of the others: one layer of voxels."""
+    poses = make_sweep(4, step_mm=0.0).poses.copy()
+    poses[2, 0, 3], poses[3, 2, 3] = 100_000.0, 100_000.0
+    swept = swept_volume(make_sweep(4, poses=poses))
+    voxels = math.prod(math.ceil(side_mm / swept.voxel_mm) for side_mm in (100_000, 100_000))
+    assert 0.9 * MAX_VOXELS < voxels <= MAX_VOXELS
+
+
+def pixels_of(picture, colour):  # RGB
+    return int((np.abs(picture.astype(int) - colour[::-1]).max(axis=-1) < 40).sum())
+
+
+@pytest.mark.long
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "probe",
+    [
+        LinearProbe(40, 0, 50),
+        ConvexProbe(opening_angle_deg=60, near_mm=20, far_mm=70),
+        PhasedProbe(opening_angle_deg=90, far_mm=70),
+    ],
+    ids=["linear", "convex", "phased"],
+)
+def test_both_parts_are_drawn(make_sweep, tmp_path, probe):
+    sweep = make_sweep(12, probe=probe)
+    blue, red = (31, 119, 180), (214, 39, 40)
+    draw_dataset(Dataset("both", sweep.select(range(8)), sweep.select(range(8, 12))), tmp_path / "both.png")
+    draw_dataset(Dataset("one", sweep, sweep.select([])), tmp_path / "one.png")
+    both, one = (cv2.imread(str(tmp_path / f"{name}.png")) for name in ("both", "one"))
+    assert one is not None
+    assert both.shape[1] == 1400
+    assert pixels_of(both, blue) > 200
+    assert pixels_of(both, red) > 200
+    assert pixels_of(one, red) < pixels_of(both, red) / 10
+    assert np.ptp(both[-150:], axis=-1).max() < 200  # the contact sheet lies below, grey but for the titles
+    assert both[-150:].std() > 20
+
+
+def test_at_most_sixteen_planes_of_a_part_are_drawn(make_sweep):
+    sweep = make_sweep(200)
+    axes = Figure().add_subplot(projection="3d")
+    _draw_planes(axes, Dataset("many", sweep, sweep.select(range(20))), 20.0, 30.0)
+    legend = axes.get_legend()
+    assert [text.get_text() for text in legend.get_texts()] == [
+        "training: 16 of 200 planes",
+        "held out: 16 of 20 planes",
+    ]
+    outlines = np.array(axes.get_lines()[1].get_data_3d())  # [3, 16 * 6]
+    assert outlines.shape[1] == 16 * 6
+    y_mm = outlines[1, ::6]
+    assert (y_mm[0], y_mm[-1]) == (0.0, 199.0)
+    assert set(np.diff(y_mm)) == {13.0, 14.0}
+
+
+def test_a_picture_that_fails_leaves_nothing(make_sweep, tmp_path):
+    sweep = make_sweep(3)
+    with pytest.raises(OSError, match="missing"):
+        draw_dataset(Dataset("one", sweep, sweep.select([])), tmp_path / "missing" / "one.png")
+    assert list(tmp_path.iterdir()) == []

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from ultragray import ConvexProbe, PhasedProbe
+from ultragray.datasets.fan import find_path, parse_matrix, read_device_set, transform_name
 from ultragray.datasets.plus import read_plus_sweep
 from ultragray.datasets.source import SourceOptions, load_dataset
 from ultragray.errors import DatasetInvalid, InvalidArgument
@@ -148,3 +149,75 @@ def test_values_below_zero_are_refused(tmp_path, plus_files, device_set):
     fields = plus_files.tracked_fields(2) | {"ElementType": "MET_SHORT", "DimSize": "20 30 2"}
     with pytest.raises(DatasetInvalid, match="16-bit pixels must not be below 0, the smallest is -1"):
         read_plus_sweep(plus_files.write_mha(tmp_path / "s.mha", wide, fields), device_set=device_set)
+
+
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("ProbeToTracker", ("Probe", "Tracker")),
+        ("ToolToTracker", ("Tool", "Tracker")),
+        ("PhantomToTorso", ("Phantom", "Torso")),
+        ("TransducerOriginPixelToTransducerOrigin", ("TransducerOriginPixel", "TransducerOrigin")),
+        ("Probe", None),
+        ("Total", None),
+        ("probetotracker", None),
+    ],
+)
+def test_names_of_transforms(text, name):
+    assert transform_name(text) == name
+
+
+def test_matrices():
+    matrix = parse_matrix("1 0 0 5\n 0 1 0 -8.23381e-005\n 0 0\t1 7  0 0 0 1", "here")
+    assert matrix[:3, 3].tolist() == [5, -8.23381e-5, 7]
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "1 2 3", "a b c d e f g h i j k l m n o p", "nan " * 16, "0 " * 15 + "1", "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 2"],
+)
+def test_matrices_that_cannot_be_are_refused(text):
+    with pytest.raises(DatasetInvalid, match=r"^here must be"):
+        parse_matrix(text, "here")
+
+
+def test_the_shortest_way():
+    names = [("Image", "Probe"), ("Probe", "Tracker"), ("Reference", "Tracker"), ("Stylus", "Tracker")]
+    assert find_path(names, "Image", "Reference") == [
+        (("Image", "Probe"), False),
+        (("Probe", "Tracker"), False),
+        (("Reference", "Tracker"), True),
+    ]
+    assert find_path([*names, ("Image", "Reference")], "Image", "Reference") == [(("Image", "Reference"), False)]
+    assert find_path(names, "Image", "World") is None
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "not XML"),
+        ("<a>", "not XML"),
+        ("<a/>", "no Transform"),
+        ('<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>', "no DOCTYPE"),
+        (
+            '<a><CoordinateDefinitions><Transform From="Image" To="Probe" Matrix="1 2"/></CoordinateDefinitions></a>',
+            "ImageToProbe must be sixteen finite numbers",
+        ),
+    ],
+)
+def test_device_sets_that_cannot_be_read_are_named(tmp_path, content, message):
+    path = tmp_path / "set.xml"
+    path.write_text(content)
+    with pytest.raises(DatasetInvalid, match=rf"set\.xml: .*{message}"):
+        read_device_set(path)
+
+
+def test_a_missing_device_set_is_named(tmp_path):
+    with pytest.raises(DatasetInvalid, match=r"set\.xml: no such file"):
+        read_device_set(tmp_path / "set.xml")
+
+
+def test_a_device_set(device_set):
+    transforms = read_device_set(device_set).transforms
+    assert list(transforms) == [("Image", "Probe")]
+    np.testing.assert_allclose(np.linalg.norm(transforms["Image", "Probe"][:3, :2], axis=0), [0.2, 0.1])

@@ -1,9 +1,12 @@
 """Which frames train and which are held out."""
 
+import math
+
+import numpy as np
 import pytest
 
 from ultragray.errors import InvalidArgument
-from ultragray.learn.sweep import parse_frame_ranges, split_parts, split_sequence
+from ultragray.learn.sweep import corner_distances_mm, parse_frame_ranges, split_parts, split_sequence
 
 
 def numbers(parts):
@@ -79,3 +82,21 @@ def test_ranges_that_cannot_be_are_refused(text, message):
     with pytest.raises(InvalidArgument, match=f"^frames.*{message}") as refused:
         parse_frame_ranges(text, 10, option="frames")
     assert len(str(refused.value)) < 200
+
+
+def test_distances_are_means_over_the_corners(make_sweep):
+    corners = make_sweep(5, step_mm=0.3).corners_mm()
+    np.testing.assert_allclose(corner_distances_mm(corners[:-1], corners[1:]), [0.3] * 4)
+    np.testing.assert_allclose(corner_distances_mm(corners, corners[1]), [0.3, 0.0, 0.3, 0.6, 0.9], atol=1e-12)
+    np.testing.assert_allclose(
+        corner_distances_mm(corners[:2, None], corners[None]),
+        0.3 * np.abs(np.arange(2)[:, None] - np.arange(5)),
+        atol=1e-12,
+    )
+
+
+def test_a_turn_about_the_probe_moves_its_far_corners_only(make_sweep):
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[1, 1:3, 1:3] = [[0.0, -1.0], [1.0, 0.0]]  # about the lateral axis
+    upright, turned = make_sweep(2, poses=poses).corners_mm()
+    np.testing.assert_allclose(corner_distances_mm(upright, turned), 50.0 * math.sqrt(2) / 2)

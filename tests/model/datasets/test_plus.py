@@ -2,12 +2,15 @@
 
 import numpy as np
 import pytest
+import SimpleITK
 
-from ultragray import LinearProbe
+from ultragray import ConvexProbe, LinearProbe
 from ultragray.datasets.plus import read_plus_sweep
 from ultragray.datasets.source import SourceOptions, load_dataset
 from ultragray.errors import DatasetInvalid, InvalidArgument
 from ultragray.geometry.pose import rotation_angles_deg
+
+from .test_fan import FAN, of_both, screen
 
 ROWS, COLUMNS = 30, 20
 TURN = np.array([[0.0, -1, 0, 3], [1, 0, 0, 4], [0, 0, 1, 5], [0, 0, 0, 1]])
@@ -174,3 +177,44 @@ def test_what_is_missing_is_told(tmp_path, plus_files, device_set):
         read_plus_sweep(path, device_set=device_set, crop="0:21,0:30")
     with pytest.raises(InvalidArgument, match=r"^frames.*only 3"):
         read_plus_sweep(path, device_set=device_set, frames="0:9")
+
+
+def written(path, frames, fields, *, compressed=False):
+    """Frames [F, rows, columns] or [F, rows, columns, 3] with the fields of a sequence."""
+    image = SimpleITK.GetImageFromArray(frames, isVector=frames.ndim == 4)
+    for key, value in fields.items():
+        image.SetMetaData(key, value)
+    SimpleITK.WriteImage(image, str(path), compressed)
+    return path
+
+
+def fields_of(plus_files, frames):
+    own = plus_files.tracked_fields(frames)
+    return {key: value for key, value in own.items() if key.startswith(("Seq_Frame", "Ultrasound"))}
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+@pytest.mark.parametrize("name", ["s.mha", "s.mhd", "s.nrrd", "s.nhdr"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_colour_becomes_luma(tmp_path, plus_files, device_set, name, compressed, dtype):
+    colours = np.random.default_rng(2).integers(0, 256, (3, 24, 32, 3)).astype(dtype)
+    colours[0, 0, 0] = 255
+    fields = {**fields_of(plus_files, 3), "UltrasoundImageType": "RGB_COLOR"}
+    stored = colours if dtype == np.uint8 else 256 * colours.astype(np.uint16)
+    sweep, count = read_plus_sweep(
+        written(tmp_path / name, stored, fields, compressed=compressed), device_set=device_set
+    )
+    assert (count, sweep.images.shape) == (3, (3, 24, 32))
+    assert np.abs(sweep.images - colours @ [0.299, 0.587, 0.114]).max() <= 1
+
+
+@pytest.mark.parametrize("name", ["s.mha", "s.nrrd"])
+def test_a_fan_has_the_geometry_that_it_was_written_with(tmp_path, plus_files, device_set, name):
+    frames = np.stack([screen(of_both)] * 2)
+    path = written(tmp_path / name, frames, fields_of(plus_files, 2))
+    ours = plus_files.write_mha(tmp_path / "ours.mha", frames, plus_files.tracked_fields(2))
+    sweep, _ = read_plus_sweep(path, device_set=device_set, fan=FAN)
+    expected, _ = read_plus_sweep(ours, device_set=device_set, fan=FAN)
+    assert sweep.probe == expected.probe == ConvexProbe(60.0, 10.0, 26.0)
+    np.testing.assert_array_equal(sweep.images, expected.images)
+    np.testing.assert_array_equal(sweep.poses, expected.poses)
