@@ -107,12 +107,6 @@ def test_fans_that_cannot_be_are_refused(tmp_path, plus_files, device_set, fan, 
         read_plus_sweep(path, device_set=device_set, fan=fan)
 
 
-def test_a_crop_and_a_fan_exclude_each_other(tmp_path, plus_files, device_set):
-    path = plus_files.write_mha(tmp_path / "s.mha", np.stack([screen(of_both)] * 2), plus_files.tracked_fields(2))
-    with pytest.raises(InvalidArgument, match="fan must be given without crop"):
-        read_plus_sweep(path, device_set=device_set, fan=FAN, crop="0:10,0:10")
-
-
 def test_a_tracker_is_chosen_among_several(tmp_path, plus_files, device_set):
     stored, fields = plus_files.speckle(3, 30, 20), plus_files.tracked_fields(3)
     other = np.eye(4)
@@ -141,14 +135,6 @@ def test_sixteen_bits_become_eight(tmp_path, plus_files, device_set, most_first)
     changes = {"type": "uint16", "sizes": "20 30 2", "endian": "big" if most_first else "little"}
     nrrd = plus_files.write_nrrd(tmp_path / "s.nrrd", wide, plus_files.tracked_fields(2), **changes)
     np.testing.assert_array_equal(read_plus_sweep(nrrd, device_set=device_set)[0].images, stored >> 3)
-
-
-def test_values_below_zero_are_refused(tmp_path, plus_files, device_set):
-    stored = np.full((2, 30, 20), -1, "<i2")
-    wide = np.frombuffer(stored.tobytes(), np.uint8).reshape(2, 30, 40)
-    fields = plus_files.tracked_fields(2) | {"ElementType": "MET_SHORT", "DimSize": "20 30 2"}
-    with pytest.raises(DatasetInvalid, match="16-bit pixels must not be below 0, the smallest is -1"):
-        read_plus_sweep(plus_files.write_mha(tmp_path / "s.mha", wide, fields), device_set=device_set)
 
 
 @pytest.mark.parametrize(
