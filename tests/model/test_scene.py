@@ -232,6 +232,7 @@ def test_json_round_trip(info):
         ({"label_names": {"0": "nothing"}}, "label_names must give labels from 1 to 255 a name each"),
         ({"beam": {"thickness_mm": -1.0}}, "thickness_mm must be a finite number from 0"),
         ({"beam": {"thickness_mm": 1.0, "focus_mm": 9.0}}, "depth_of_field_mm must be given"),
+        ({"beam": {"thickness_mm": 1.0, "depth_of_field_mm": 9.0}}, "focus_mm must be given"),
         ({"probe": {"kind": "linear"}}, "width_mm is required by kind linear"),
     ],
 )

@@ -19,7 +19,6 @@ from ultragray.learn.training.between import (
     ViewsBetween,
     blend_in_space,
     draw_places,
-    features_follow_probe,
     neighbours_of,
     smoothed_sizes,
 )
@@ -124,12 +123,6 @@ def test_places_fill_the_gaps_by_their_length(tiny_dataset):
     beyond = places.beyond_mm[places.beyond_mm != 0.0]
     assert (np.abs(beyond) <= neighbours.extent_mm + 1e-9).all()
     assert {float(np.sign(value)) for value in beyond} == {-1.0, 1.0}
-
-
-def test_frames_blend_where_their_features_are(tiny_dataset):
-    for with_probe in (True, False):
-        sweep = drifting(tiny_dataset().train, with_probe=with_probe)
-        assert features_follow_probe(sweep, neighbours_of(sweep)) is with_probe
 
 
 @pytest.mark.parametrize("with_probe", [True, False])

@@ -1,6 +1,5 @@
 """TrainingConfig: presets, overrides, and one sentence for what cannot be."""
 
-import json
 from dataclasses import replace
 
 import pytest
@@ -16,7 +15,7 @@ from ultragray.learn.training.config import (
     scaled_transmittance_rate,
 )
 from ultragray.learn.training.geometry import Geometry
-from ultragray.learn.training.run import EFFORTS_FILE, FITTING, choose_effort
+from ultragray.learn.training.run import EFFORTS_FILE, choose_effort
 from ultragray.learn.training.trainer import CHECKPOINT_FILE
 
 
@@ -35,7 +34,7 @@ def test_more_effort_is_more_steps_and_gaussians_unless_they_are_given(tiny_data
     assert (thrice.steps, thrice.max_gaussians) == (3 * (usual.steps or 0), 3 * (usual.max_gaussians or 0))
     given = TrainingConfig(effort=3.0, steps=7, max_gaussians=50).resolved(geometry)
     assert (given.steps, given.max_gaussians) == (7, 50)
-    assert TrainingConfig.preset("best").resolved(geometry) == usual  # the effort is chosen before, see test_effort.py
+    assert TrainingConfig.preset("best").resolved(geometry) == usual  # the effort is chosen before, see below
 
 
 def test_half_of_the_gaussians_start_where_only_the_end_is_given(tiny_dataset):
@@ -78,11 +77,6 @@ def test_an_unknown_setting_is_refused_with_the_known_ones():
     ) as caught:
         TrainingConfig.preset("fast", stepz=3)
     assert caught.value.field == "stepz"
-
-
-def test_survives_json():
-    config = TrainingConfig.preset("paper", steps=7, out_of_plane_mm=0)
-    assert TrainingConfig.from_dict(json.loads(json.dumps(config.to_dict()))) == config
 
 
 @pytest.mark.parametrize(
@@ -210,23 +204,9 @@ def trying(effort):
     return f"trying effort {effort:g} on a part of the frames"
 
 
-@pytest.mark.long
-def test_a_run_chooses_first_and_says_so(tiny_dataset, tmp_path):
-    dataset, seen = tiny_dataset(frames=40), list[Progress]()
-    config = TrainingConfig(effort=None, steps=12, batch_size=3)
-    scene = train(dataset, config, folder=tmp_path, report=seen.append)
-    chosen = scene.info.training["effort"]
-    told = list(dict.fromkeys(progress.beside for progress in seen))
-    assert told[:2] == [trying(1.0), trying(2.0)]
-    assert told[-2:] == [None, FITTING]
-    assert trying(chosen) in told
-    assert [progress.step for progress in seen if progress.beside is None][-1] == 12
-    assert scene.to_bytes() == train(dataset, replace(config, effort=chosen)).to_bytes()
-
-
 def test_a_run_whose_choice_is_stopped_goes_on_with_it(tiny_dataset, tmp_path):
     dataset, seen = tiny_dataset(frames=40), list[Progress]()
-    config = TrainingConfig(effort=None, steps=12, batch_size=3, confidence=False)
+    config = replace(OPEN, steps=12, confidence=False)
     stopped = train(
         dataset, config, folder=tmp_path, report=seen.append, should_stop=lambda: seen[-1].beside == trying(2.0)
     )

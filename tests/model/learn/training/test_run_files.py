@@ -46,13 +46,6 @@ def test_goes_on_after_the_checkpoint(tmp_path):
     assert steps_in(path) == []
 
 
-def test_half_a_line_is_dropped(tmp_path):
-    path = tmp_path / "metrics.jsonl"
-    path.write_text('{"step": 1}\n{"step": 2')
-    Journal(path, steps_done=9).close()
-    assert steps_in(path) == [1]
-
-
 @pytest.mark.parametrize(
     "damage", [b"{nonsense\n", b"\xff\xfe\n", b"3\n", b'{"loss": 0.5}\n', b'{"step": null}\n', b"\0" * 9]
 )
@@ -125,7 +118,7 @@ def test_refuses_what_is_no_checkpoint(tmp_path):
     with pytest.raises(TrainingStateInvalid, match="c: not a checkpoint of a training"):
         read_checkpoint(path)
     save_file({"a": torch.ones(1)}, path, metadata={METADATA_KEY: '{"format_version": 99}'})
-    with pytest.raises(TrainingStateInvalid, match="its format_version is 99, this release reads 2"):
+    with pytest.raises(TrainingStateInvalid, match=r"its format_version is 99, .* a newer release wrote it"):
         read_checkpoint(path)
     write_checkpoint(path, HEADER, {"a": torch.ones(100)})
     path.write_bytes(path.read_bytes()[:-7])
@@ -165,10 +158,3 @@ def test_refuses_another_run():
         check_same_run(path, HEADER, HEADER.config, "cd" * 32)
     with pytest.raises(TrainingStateInvalid, match="other settings: steps is 9 there, 10 here"):
         check_same_run(path, HEADER, replace(HEADER.config, steps=10), HEADER.dataset_sha256)
-
-
-def test_checkpoint_of_a_newer_release_says_what_to_do(tmp_path):
-    path = tmp_path / "checkpoint.safetensors"
-    save_file({"a": torch.ones(1)}, path, metadata={METADATA_KEY: '{"format_version": 3}'})
-    with pytest.raises(TrainingStateInvalid, match="a newer release wrote it, use that one or a newer one to read it"):
-        read_checkpoint_header(path)
