@@ -179,7 +179,7 @@ BAD_VALUES = {
 def test_a_file_of_values_that_no_scene_has_is_refused(tmp_path):
     path = tmp_path / "a.ugr"
     path.write_bytes(bundle(lambda tensors: tensors.update(scales=torch.full((4, 3), 1000.0))))
-    with pytest.raises(SceneFileInvalid, match="a.ugr: .*'scales'.* must be finite and within ±20, got .*Gaussian 0"):
+    with pytest.raises(SceneFileInvalid, match=r"a\.ugr: .*'scales'.* must be finite and within ±20, got .*Gaussian 0"):
         GaussianScene.load(path)
 
 
@@ -286,20 +286,20 @@ def test_a_header_is_read_alone(tmp_path, random_scene, random_poses):
     np.testing.assert_allclose(header.training_poses, poses, atol=1e-12)
 
 
-def write_without_gaussians(path, poses, **more_metadata):
-    tensors = {name: np.zeros(shape, np.float32) for name, shape in expected_shapes(0, 0).items()}
+def write_one_gaussian(path, poses, **more_metadata):
+    tensors = {name: np.zeros(shape, np.float32) for name, shape in expected_shapes(1, 0).items()}
     tensors["training_poses"] = np.tile(np.eye(4), (poses, 1, 1))
-    save_file(tensors, path, {"ultragray": info_to_json(SceneInfo()), **more_metadata})
+    save_file(tensors, path, {"ultragray": info_to_json(SceneInfo(gaussian_count=1)), **more_metadata})
 
 
 def test_a_description_has_limits(tmp_path):
     path = tmp_path / "large.ugr"
-    write_without_gaussians(path, MAX_TRAINING_POSES)
+    write_one_gaussian(path, MAX_TRAINING_POSES)
     assert len(read_header(path).training_poses) == MAX_TRAINING_POSES
-    write_without_gaussians(path, MAX_TRAINING_POSES + 1)
+    write_one_gaussian(path, MAX_TRAINING_POSES + 1)
     with pytest.raises(SceneFileInvalid, match="training_poses must be at most 100000, got 100001"):
         read_header(path)
-    write_without_gaussians(path, 1, more="x" * MAX_HEADER_BYTES)
+    write_one_gaussian(path, 1, more="x" * MAX_HEADER_BYTES)
     with pytest.raises(SceneFileInvalid, match="may have 4194304 bytes, it says 419"):
         read_header(path)
     with pytest.raises(InvalidArgument, match="at most 1000 entries, got 1001"):
@@ -308,13 +308,17 @@ def test_a_description_has_limits(tmp_path):
 
 def test_what_is_over_a_limit_is_not_read(tmp_path):
     path = tmp_path / "sparse.ugr"
-    write_without_gaussians(path, 0)
+    write_one_gaussian(path, 0)
     length = int.from_bytes(path.read_bytes()[:8], "little")
     header = json.loads(path.read_bytes()[8 : 8 + length])
-    header["training_poses"] = {"dtype": "F64", "shape": [1 << 29, 4, 4], "data_offsets": [0, 1 << 36]}
-    text = json.dumps(header).encode()
+    metadata, nothing, end = header.pop("__metadata__"), 1 << 36, 0
+    for entry in header.values():  # after 64 GiB of nothing
+        entry["data_offsets"] = [nothing + offset for offset in entry["data_offsets"]]
+        end = max(end, entry["data_offsets"][1])
+    header["training_poses"] = {"dtype": "F64", "shape": [1 << 29, 4, 4], "data_offsets": [0, nothing]}
+    text = json.dumps({**header, "__metadata__": metadata}).encode()
     path.write_bytes(len(text).to_bytes(8, "little") + text)
-    os.truncate(path, 8 + len(text) + (1 << 36))  # 64 GiB of nothing
+    os.truncate(path, 8 + len(text) + end)
     with pytest.raises(SceneFileInvalid, match="training_poses must be at most"):
         read_header(path)
 

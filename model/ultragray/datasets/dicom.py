@@ -362,13 +362,13 @@ def _read_frames(
             raise DatasetInvalid(
                 f"{path}: pixels compressed as {syntax.name} cannot be read without a decoder: {needed}"
             )
-        if syntax in JPEG and int(header.get("BitsStored", 8)) > 8 and "pylibjpeg" not in decoder.available_plugins:
+        surplus = max(0, int(header.get("BitsStored", 8)) - 8)
+        if decoder is not None and syntax in JPEG and surplus and "pylibjpeg" not in decoder.available_plugins:
             raise DatasetInvalid(
                 f"{path}: {header.BitsStored} bits compressed as {syntax.name} cannot be read: install "
                 "pylibjpeg-libjpeg (GPL), or save the file without compression"
             )
         pixels = iter_pixels(path, indices=[int(number) for number in chosen], raw=True)
-        surplus = max(0, int(header.get("BitsStored", 8)) - 8)
         is_ybr = interpretation in YBR
         for number, out in zip(chosen, frames, strict=True):
             with _in_our_words(f"{path}: frame {number}"):
@@ -417,7 +417,8 @@ def _read_jpeg(
     """
     frames, places = np.empty((len(chosen), *shape[1:]), np.uint8), {int(one): at for at, one in enumerate(chosen)}
     interpretation, is_rgb = str(header.PhotometricInterpretation), False
-    is_colour, notes = INTERPRETATIONS[interpretation] == 3, ()
+    is_colour = INTERPRETATIONS[interpretation] == 3
+    notes: tuple[str, ...] = ()
     flags = cv2.IMREAD_IGNORE_ORIENTATION | (cv2.IMREAD_COLOR_RGB if is_colour else cv2.IMREAD_GRAYSCALE)
     with _in_our_words(path), path.open("rb") as file:
         import pydicom

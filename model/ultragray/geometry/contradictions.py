@@ -105,7 +105,7 @@ def _mistakes(given: _Given, worst_first: np.ndarray) -> Iterator[tuple[str, Map
         for factor, unit in UNITS.items():
             yield f"the positions of {what} are in {unit}", {name: _scaled(given[name], factor) for name in names}
         if one.ndim == 3 and (mounting or names != both):  # with a mounting to be found, both agree all the same
-            yield f"the poses of {what} are inverted", {name: np.linalg.inv(given[name]) for name in names}
+            yield f"the poses of {what} are inverted", {name: _inverted(given[name]) for name in names}
     if len(one) > LEAST_TO_LEAVE_ONE_OUT:
         yield f"{one_name} is one sample late", {one_name: one[1:], other_name: other[:-1]}
         yield f"{one_name} is one sample early", {one_name: one[:-1], other_name: other[1:]}
@@ -122,6 +122,10 @@ def _mistakes(given: _Given, worst_first: np.ndarray) -> Iterator[tuple[str, Map
             if 0 <= near < len(one) and np.allclose(samples[near], samples[place], atol=1e-6)
         ]
         yield f"sample {place} alone is wrong{''.join(stale[:1])}", {one_name: one[kept], other_name: other[kept]}
+
+
+def _inverted(poses: FloatArray) -> FloatArray:  # [N, 4, 4]
+    return np.asarray(np.linalg.inv(poses), np.float64)
 
 
 def _scaled(samples: FloatArray, factor: float) -> FloatArray:  # [N, 4, 4] or [N, 3]
