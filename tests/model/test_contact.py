@@ -8,7 +8,6 @@ import torch
 
 from ultragray import ConvexProbe, LinearProbe, PhasedProbe, RadialProbe, SteeredProbe, render
 from ultragray.errors import InvalidArgument
-from ultragray.rendering.backends import cpu
 from ultragray.rendering.contact import COUPLING_MM, MARGIN_MM, Skin, Touch, at_rest
 from ultragray.rendering.outputs import PLANES
 from ultragray.rendering.settings import Contact
@@ -61,15 +60,6 @@ def test_scan_lines_in_the_air_are_dark_and_the_others_as_they_were(scene):
     in_air = judged["attenuation"][1]  # all of the beam ends at the face
     assert (in_air[0] == 1.0).all()
     assert (in_air[1:] == 0.0).all()
-
-
-@pytest.mark.parametrize("contact", Contact)
-def test_backends_agree(scene, contact, assert_agrees):
-    poses = np.stack([at(tilt_deg=10.0), at(z=2.5), at(z=-0.5), at(x=4.0, z=5.0, tilt_deg=-6.0)])
-    reference = render(scene.to(torch.float64), None, poses, **SIZE, contact=contact, backend="reference")
-    for backend in ("reference", *(["cpu"] if cpu.supports(scene) else [])):
-        fast = render(scene, None, poses, **SIZE, contact=contact, backend=backend)
-        assert_agrees(fast, {name: reference[name].numpy() for name in PLANES}, tolerance=5e-4)
 
 
 @pytest.mark.parametrize(

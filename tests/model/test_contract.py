@@ -78,10 +78,6 @@ def test_numbers_and_words_get_their_own_type():
     assert isinstance(drawing.colour, Colour)
 
 
-def test_a_member_prints_as_it_is_written():
-    assert repr(Square(3)) == "Square(side_mm=3.0)"
-
-
 def test_json_and_back():
     drawing = Drawing(Circle(2.0), Colour.BLUE, 3, (1.0,), True, "ruled")
     document = to_dict(drawing)

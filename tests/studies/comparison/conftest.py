@@ -42,13 +42,13 @@ class OneLevel(Learner):
 
 @dataclass(frozen=True)
 class LevelMethod(LearnedMethod):
-    """It learns one grey level, in a thousand steps where its author has time. Counts its fits."""
+    """It learns one grey level, in two hundred steps where its author has time. Counts its fits."""
 
     name: str = "level"
     fits: list[Path | None] = field(default_factory=list, compare=False)
 
     def describe(self):
-        return Description("one level", "a test & no paper", "Grey.", ("B = g_0",), ("g from 0.",), 1_000)
+        return Description("one level", "a test & no paper", "Grey.", ("B = g_0",), ("g from 0.",), 200)
 
     def learner(self, dataset, budget, seed, device):
         return OneLevel(dataset, seed, device)

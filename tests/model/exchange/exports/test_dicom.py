@@ -81,7 +81,7 @@ def header(**changes):
     return dataclasses.replace(one, **changes)
 
 
-def export(path, header):
+def exported(path, header):
     with export_to(path, "dicom", header) as add:
         shown = show({"bmode": torch.from_numpy(FRAMES)}, header.settings.probe, header.settings.display)[
             "bmode"
@@ -96,7 +96,7 @@ def export(path, header):
 
 @pytest.mark.parametrize("probe", [LINEAR, CONVEX])
 def test_all_that_the_standard_requires_is_there(tmp_path, probe):
-    data = export(tmp_path / "frames.dcm", header(probe=probe))
+    data = exported(tmp_path / "frames.dcm", header(probe=probe))
     assert data.file_meta.MediaStorageSOPClassUID == data.SOPClassUID == UltrasoundMultiFrameImageStorage
     assert data.file_meta.MediaStorageSOPInstanceUID == data.SOPInstanceUID
     assert data.file_meta.TransferSyntaxUID == ExplicitVRLittleEndian
@@ -138,7 +138,7 @@ def position_cm(region, column, row):
 
 
 def test_pixels_and_their_places_of_a_linear_probe(tmp_path):
-    data = export(tmp_path / "frames.dcm", header())
+    data = exported(tmp_path / "frames.dcm", header())
     np.testing.assert_array_equal(data.pixel_array, np.rint(FRAMES * 255))
     [region] = data.SequenceOfUltrasoundRegions
     assert (region.PhysicalDeltaX, region.PhysicalDeltaY) == pytest.approx((0.2, 5.0 / 21))
@@ -150,7 +150,7 @@ def test_pixels_and_their_places_of_a_linear_probe(tmp_path):
 
 
 def test_pixels_and_their_places_of_a_convex_probe(tmp_path):
-    data = export(tmp_path / "frames.dcm", header(probe=CONVEX))
+    data = exported(tmp_path / "frames.dcm", header(probe=CONVEX))
     [region] = data.SequenceOfUltrasoundRegions
     pixel_cm = 4.0 / 21
     assert (region.PhysicalDeltaX, region.PhysicalDeltaY) == pytest.approx((pixel_cm, pixel_cm))
@@ -167,21 +167,21 @@ def test_pixels_and_their_places_of_a_convex_probe(tmp_path):
 
 
 def test_poses_are_in_the_file_and_uids_follow_what_was_rendered(tmp_path):
-    one = export(tmp_path / "one.dcm", header())
+    one = exported(tmp_path / "one.dcm", header())
     poses = np.frombuffer(one.private_block(0x0019, "ULTRAGRAY")[0x01].value, "<f8").reshape(-1, 4, 4)
     np.testing.assert_array_equal(poses, POSES)
-    again = export(tmp_path / "again.dcm", header())
+    again = exported(tmp_path / "again.dcm", header())
     assert (again.SOPInstanceUID, again.SeriesInstanceUID) == (one.SOPInstanceUID, one.SeriesInstanceUID)
-    moved = export(tmp_path / "moved.dcm", header(poses=POSES + np.eye(4, k=3)))
+    moved = exported(tmp_path / "moved.dcm", header(poses=POSES + np.eye(4, k=3)))
     assert moved.SOPInstanceUID != one.SOPInstanceUID
     assert moved.StudyInstanceUID == one.StudyInstanceUID
-    other = export(tmp_path / "other.dcm", header(scene_sha256="1" * 64))
+    other = exported(tmp_path / "other.dcm", header(scene_sha256="1" * 64))
     assert other.StudyInstanceUID != one.StudyInstanceUID
     assert one.SOPInstanceUID != one.SeriesInstanceUID
 
 
 def test_figures_of_each_frame_are_beside_the_poses(tmp_path):
-    data = export(tmp_path / "frames.dcm", header())
+    data = exported(tmp_path / "frames.dcm", header())
     element = data.private_block(0x0019, "ULTRAGRAY")[0x02]
     assert element.VR == "OF"
     figures = np.frombuffer(element.value, "<f4").reshape(-1, 4)
@@ -191,7 +191,7 @@ def test_figures_of_each_frame_are_beside_the_poses(tmp_path):
 
 def test_the_origin_is_beside_the_poses(tmp_path):
     asked = header(probe=CONVEX)
-    data = export(tmp_path / "frames.dcm", asked)
+    data = exported(tmp_path / "frames.dcm", asked)
     origin = json.loads(data.private_block(0x0019, "ULTRAGRAY")[0x03].value)
     assert origin == json.loads(json.dumps(asked.origin()))
     assert origin["display"]["pixel_mm"] == asked.settings.display.pixel_mm

@@ -150,6 +150,7 @@ def test_a_calibration_that_does_not_go_with_the_probe_is_refused(tmp_path):
         read_plus_sweep(path)
 
 
+@pytest.mark.long
 def test_ten_thousand_frames_keep_their_order(tmp_path):
     many = np.tile(np.eye(4), (10_050, 1, 1))
     many[:, 1, 3] = np.arange(10_050)

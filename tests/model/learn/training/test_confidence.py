@@ -96,7 +96,7 @@ def test_the_same_training_ends_in_the_same_scene():
 
 
 def test_nothing_of_what_is_left_out_is_trained_from(tiny_dataset):
-    dataset, parts = tiny_dataset(frames=40), []
+    dataset, parts = tiny_dataset(frames=24), []
 
     def train_part(part):
         parts.append(part)
