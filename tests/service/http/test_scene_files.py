@@ -237,15 +237,3 @@ def test_corrected_training_poses(http):
     told = http.get("/v1/scenes/corrected/training-poses").json()
     assert (told["shift_mm"], told["turn_deg"]) == ([0.0, 2.0], [0.0, 0.0])
     http.delete("/v1/scenes/corrected")
-
-
-def without_gaussians(poses, **info):
-    tensors = {name: np.zeros(shape, np.float32) for name, shape in expected_shapes(0, 0).items()}
-    return save({**tensors, "training_poses": poses}, {"ultragray": info_to_json(SceneInfo(**info))})
-
-
-def test_metrics_that_are_no_numbers_are_left_out(http):
-    sent = without_gaussians(np.eye(4)[None], metrics={"psnr_db": 20.5, "huge": 10**400, "text": "x"})
-    assert http.put("/v1/scenes/odd", content=sent, headers=RAW).status_code == 201
-    assert http.get("/v1/scenes/odd").json()["metrics"] == {"psnr_db": 20.5}
-    assert http.delete("/v1/scenes/odd").status_code == 204
