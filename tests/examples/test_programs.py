@@ -16,11 +16,10 @@ from ultragray_client.errors import Unavailable
 from ultragray_studies.gym import STANDARD_PLANE
 
 from ..waiting import at_this_load
+from .conftest import EXAMPLES
 
 VESSEL = 4
 MM_PER_PIXEL = 60.0 / 128
-
-from .conftest import EXAMPLES
 
 
 @pytest.fixture(scope="module")
