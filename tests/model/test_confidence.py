@@ -189,12 +189,9 @@ def test_json_and_back():
     [
         ({"version": 3}, "version 2, got 3"),
         ({"support": {"gain": 0.0, "share": 0.5, "reach_mm": 1.0}}, "support must be positive"),
-        ({"support": 1.5}, "support must be an object"),
         ({"fitted_to_mm": -1.0}, "fitted_to_mm must be 1 numbers, at least 0"),
-        ({"weights": [1.0, 2.0]}, "weights must be 5 numbers"),
         ({"weights": [1.0, -2.0, 0, 0, 0]}, "at least 0"),
         ({"weights": [float("nan")] * 5}, "weights must be finite"),
-        ({"hardness": [float("inf")]}, "hardness must be finite"),
         ({"black_ms_ssim": 1.5}, r"in \[0, 1\], got 1.5"),
         ({"fitted_on": 0}, "fitted_on must be an integer of at least 1"),
         ({"more": 1}, "with the keys"),
