@@ -23,6 +23,7 @@ from ultragray import (
     render,
 )
 from ultragray.errors import BackendUnavailable, InvalidArgument
+from ultragray.rendering.backends import cuda
 from ultragray.rendering.frames import footprint_pixels
 from ultragray.rendering.outputs import PLANES, WEIGHT_SUM
 
@@ -118,6 +119,9 @@ def test_every_kind_of_probe_is_tested():
 @pytest.mark.parametrize("name", CASES)
 def test_matches_the_reference_in_float64(name, kernel, prepared, assert_agrees):
     case, scene, poses, expected, stable = prepared(name)
+    if kernel == "cuda" and cuda.interpreted():  # slow
+        poses, stable = poses[:2], stable[:2]
+        expected = {output: plane[:2] for output, plane in expected.items()}
     assert stable.mean() > 0.995
     assert (expected["coverage"] > 0.01).mean() > 0.002, "the case shows too little to test anything"
     frames = Frames(drawn(kernel, scene, case.probe, poses, case.beam, size=(case.height, case.width)))

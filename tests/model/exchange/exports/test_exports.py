@@ -30,7 +30,6 @@ POSES = np.tile(np.eye(4), (5, 1, 1))
 POSES[:, 1, 3] = np.arange(5) / 3.0
 OUTPUTS = ("bmode", "echo", "labels")
 TOLD = [Extrapolation(0.5 * number, 2.0 * number, 0.9 - 0.1 * number, 0.75) for number in range(5)]
-UNKNOWN = Extrapolation(None, None, None, 0.25)
 
 
 def header(outputs=OUTPUTS, dtype="float32"):
@@ -145,20 +144,6 @@ def test_tar_loads_with_the_standard_library(tmp_path):
     assert told["pose"] == POSES[2].tolist()
     assert {name: told[name] for name in FIGURES} == TOLD[2].figures()
     assert told["probe"] == to_dict(PROBE)
-
-
-def test_what_is_not_known(tmp_path):
-    frames = {"bmode": rendered()["bmode"]}
-    for format in ("npz", "tar"):
-        with export_to(tmp_path / format, format, header(("bmode",))) as add:
-            add(frames, [UNKNOWN] * 5)
-    with np.load(tmp_path / "npz") as archive:
-        assert np.isnan([archive[name] for name in FIGURES[:3]]).all()
-        assert (archive["supported_share"] == 0.25).all()
-    with tarfile.open(tmp_path / "tar") as tar:
-        file = tar.extractfile("000004.json")
-        told = json.load(file)
-    assert {name: told[name] for name in FIGURES} == UNKNOWN.figures()
 
 
 @pytest.mark.parametrize("format", FORMATS)

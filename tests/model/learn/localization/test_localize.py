@@ -49,7 +49,7 @@ def is_found(one, other, probe):
 
 def test_frames_of_a_scene_are_found_from_3_mm_and_5_degrees_away(demo):
     probe = demo.info.probe_or(None)
-    for seed, pose in enumerate(demo_poses(6)):
+    for seed, pose in enumerate(demo_poses(3)):
         start = displaced(pose, probe, 3.0, 5.0, seed)
         assert distance(start, pose, probe) == pytest.approx((3.0, 5.0), abs=1e-6)
         found = localize(demo, frame_of(demo, pose), start)

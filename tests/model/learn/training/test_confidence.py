@@ -290,7 +290,7 @@ def test_each_frame_is_predicted_from_either_side_and_ever_farther_away():
 
 def test_scores_fall_with_distance_where_anatomy_changes_and_only_there():
     for columns_per_frame, falls in ((1, True), (0, False)):
-        examples = one_sided_examples(drifting_sweep(FRAMES, columns_per_frame), np.zeros(FRAMES))
+        examples = one_sided_examples(drifting_sweep(12, columns_per_frame), np.zeros(12))
         distances = -examples.terms[:, 0, 2] * DISTANCE_MM
         near, far = (examples.ms_ssim[chosen].mean() for chosen in (distances < 1.5, distances > 8.0))
         assert (near - far > 0.2) if falls else (near == pytest.approx(far, abs=1e-6))
