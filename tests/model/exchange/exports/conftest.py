@@ -17,9 +17,7 @@ def header_of(format, settings, *, dtype="uint8", poses=POSES, scene_sha256="0" 
 def exported(path, format, header, frames, told):
     """Writes frames, [C, H, W] by output, as they are shown, in portions of two."""
     given = {name: torch.from_numpy(np.array(values)) for name, values in frames.items()}
-    shown = {
-        name: values.numpy() for name, values in show(given, header.settings.probe, header.settings.display).items()
-    }
+    shown = show(given, header.settings.probe, header.settings.display)
     with export_to(path, format, header) as add:
         for first in range(0, len(told), 2):
             add({name: values[first : first + 2].numpy() for name, values in shown.items()}, told[first : first + 2])
