@@ -1,5 +1,7 @@
 """Labels: what each backend says lies at a pixel, against sums over all Gaussians in float64; files that carry them."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -121,9 +123,11 @@ def test_other_outputs_do_not_change_and_none_is_made_in_vain(renderer, labelled
 
 
 def test_no_poses_and_no_gaussians_give_nothing(renderer, labelled):
-    none = renderer(labelled(), PROBES["linear"], np.zeros((0, 4, 4)), height=9, width=7, outputs=("labels",))
+    scene = labelled()
+    none = renderer(scene, PROBES["linear"], np.zeros((0, 4, 4)), height=9, width=7, outputs=("labels",))
     assert label_frames(none).shape == (0, 9, 7)
-    empty = renderer(labelled(0), PROBES["linear"], np.eye(4), height=9, width=7, outputs=("labels",))
+    nothing = replace(scene, labels=scene.labels[:0], **{name: one[:0] for name, one in scene.splats.items()})
+    empty = renderer(nothing, PROBES["linear"], np.eye(4), height=9, width=7, outputs=("labels",))
     np.testing.assert_array_equal(label_frames(empty), np.zeros((1, 9, 7)))
 
 

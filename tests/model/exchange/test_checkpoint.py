@@ -308,6 +308,11 @@ def test_checkpoints_of_something_else(dataset, name, monkeypatch, tmp_path):
         ("quats", None, "lack quats"),
         ("means", torch.zeros(20, 2), r"\[20, 3\]"),
         ("means", torch.full((20, 3), 1e300, dtype=torch.float64), "finite"),
+        (
+            "scales",
+            torch.full((20, 3), -60.0),
+            r"'scales'\] must .* within ±20, got .*Gaussian 0 \(20 are wrong\)",
+        ),
         ("sh0", [1.0], "sh0 must be a floating tensor, got list"),
         ("means", torch.zeros(20, 3).to_sparse(), "plain dense tensor"),
         ("means", torch.zeros(20, 3, device="meta"), "plain dense tensor"),
@@ -319,6 +324,11 @@ def test_splats_that_do_not_fit(dataset, name, value, message):
         del splats[name]
     torch.save({"splats": splats}, dataset.checkpoint)
     refused(dataset, message)
+
+
+def test_a_checkpoint_without_gaussians(dataset):
+    torch.save({"splats": {name: tensor[:0] for name, tensor in dataset.splats.items()}}, dataset.checkpoint)
+    refused(dataset, "at least one Gaussian")
 
 
 def refused(dataset, message):

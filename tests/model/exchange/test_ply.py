@@ -67,12 +67,6 @@ def test_a_scene_comes_back_to_the_bit(tmp_path, make_scene, sh_degree, intensit
     assert back.to_bytes() == scene.to_bytes()
 
 
-def test_a_scene_without_gaussians(tmp_path, make_scene):
-    scene = make_scene(0, poses=2)
-    write_ply(scene, tmp_path / "a.ply")
-    assert read_ply(tmp_path / "a.ply").to_bytes() == scene.to_bytes()
-
-
 def test_what_other_tools_find(tmp_path, make_scene):
     """Read as any reader of PLY would: by the types and names of the header alone."""
     scene = make_scene()
