@@ -151,6 +151,14 @@ def test_a_private_job_that_is_in_the_way_is_not_named(keyed, scene_bytes, datas
         assert keyed.http("alice", "POST", f"/v1/jobs/{job}:cancel").status_code == 200
 
 
+def test_metrics_name_no_private_scene(keyed, private):
+    for _ in range(2):
+        assert keyed.http("alice", "POST", "/v1/scenes/secret/render", json={"pose": POSE}).status_code == 200
+    told = keyed.http("reader", "GET", "/metrics").text
+    assert 'ultragray_frames_total{role="operator",scene=":private"} 2.0' in told
+    assert "secret" not in told
+
+
 def test_over_grpc_too(keyed, private):
     pose = geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=[float(one) for row in MATRIX for one in row]))
     asked = rendering_pb2.RenderStreamRequest(settings=rendering_pb2.RenderSettings(scene="secret"), pose=pose)
