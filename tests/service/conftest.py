@@ -92,10 +92,10 @@ class RunningService:
             self.process.wait()
             raise
 
-    def metric(self, name):
-        """The sum of all lines of /metrics that begin with `name`."""
+    def metric(self, *names):
+        """The sum of all lines of /metrics, at one moment, that begin with one of the names."""
         lines = httpx.get(f"{self.http}/metrics", timeout=60).text.splitlines()
-        return sum(float(line.rpartition(" ")[2]) for line in lines if line.startswith(name))
+        return sum(float(line.rpartition(" ")[2]) for line in lines if line.startswith(names))
 
     def stream_url(self, scene="demo"):
         """The WebSocket of a scene."""

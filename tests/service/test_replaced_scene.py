@@ -54,12 +54,14 @@ def service(start_service, changing, folder):
 
 
 def check(changing, ask):
-    """Both contents are seen while they are swapped, each with its own probe only."""
+    """Both contents are seen while they are swapped, at most once during an answer, each with its own probe only."""
     seen = set()
+    answered = threading.Semaphore(0)
     done = threading.Event()
 
     def swap():
         for _ in range(SWAPS):
+            assert answered.acquire(timeout=60)
             time.sleep(BETWEEN_SWAPS_S)
             changing.swap()
         done.set()
@@ -69,6 +71,7 @@ def check(changing, ask):
     try:
         while not done.is_set() or seen != changing.known:
             seen.update(ask())
+            answered.release()
             assert seen <= changing.known
             if done.is_set():
                 changing.swap()
