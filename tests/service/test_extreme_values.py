@@ -18,18 +18,16 @@ from ultragray.rendering.settings import RenderSettings
 from ..workers.jobs.conftest import store_dataset
 
 UNSTORABLE = {"nul": "a\0b", "surrogate": "a\ud800b", "long": "x" * 10_000}
-POSES = [np.eye(4).tolist()]
 
 
 @pytest.fixture(scope="module")
 def stored(start_service, postgres, artifacts):
-    folder = artifacts
-    store_dataset(folder, "tiny")
-    return start_service(artifact_folder=folder, database_url=postgres.create_database())
+    store_dataset(artifacts, "tiny")
+    return start_service(artifact_folder=artifacts, database_url=postgres.create_database())
 
 
 def bodies(text):
-    render = {"scene": "demo", "poses": POSES, "height": 8, "width": 8}
+    render = {"scene": "demo", "poses": [POSE["matrix"]], "height": 8, "width": 8}
     train = {"dataset": "tiny", "scene": "new", "settings": {"steps": 1}}
     evaluate = {"dataset": "tiny", "scene": "demo"}
     asked = [{"kind": "render", "specification": render, "request_id": text}, {"kind": text, "specification": render}]
