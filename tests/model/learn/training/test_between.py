@@ -1,4 +1,4 @@
-"""Views between frames and beyond the ends of a sweep: neighbours, places, blends."""
+"""Views between frames and beyond the ends of a sweep, and what a scene trained with them shows there."""
 
 from dataclasses import replace
 
