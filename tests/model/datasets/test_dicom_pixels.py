@@ -45,10 +45,10 @@ def echoes(seed=0):  # [10, 96, 128] smooth, black beside a sector
 
 
 def with_flow(grey):  # [10, 96, 128, 3]
-    """The same in colour: a box of red and blue, as flow is shown, and grey elsewhere."""
+    """The same in colour: a large box of red and blue, as flow is shown, and grey elsewhere."""
     colour = np.repeat(grey[..., None], 3, axis=-1)
-    colour[:, 30:50, 60:90] = (200, 30, 20)
-    colour[:, 50:60, 60:90] = (20, 40, 190)
+    colour[:, 20:50, 40:110] = (200, 30, 20)
+    colour[:, 50:80, 40:110] = (20, 40, 190)
     return colour
 
 
