@@ -202,6 +202,7 @@ def test_status_words_are_named(record, word):
     assert f"left out: 2 (1 in all: ProbeToTracker {word} in 1)" in sweep.notes[0]
 
 
+ONES = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
 CLIP = '<VolumeReconstruction ClipRectangleOrigin="{}" ClipRectangleSize="{}"/>'
 
 
@@ -242,6 +243,22 @@ def test_a_calibration_that_no_image_has_is_named_with_its_file(record, describe
     matrix[:3] *= scale
     with pytest.raises(DatasetInvalid, match=told):
         read_plus_sweep(record({"ProbeToTracker": TRACKED}), device_set=describe({("Image", "Probe"): matrix}))
+
+
+def test_a_device_set_that_contradicts_itself_is_refused(record, describe):
+    path, calibration = record({"ProbeToTracker": TRACKED}), {("Image", "Probe"): CALIBRATION}
+    agreeing = describe({**calibration, ("Probe", "Image"): np.linalg.inv(CALIBRATION)})
+    assert len(read_plus_sweep(path, device_set=agreeing)[0]) == FRAMES
+    other = CALIBRATION @ plus_translation(1.0)
+    twice = describe({**calibration, ("Probe", "Image"): np.linalg.inv(other)})
+    with pytest.raises(DatasetInvalid, match=r"set\.xml: it has ProbeToImage twice, with different matrices"):
+        read_plus_sweep(path, device_set=twice)
+    xml = describe(calibration)
+    xml.write_text(xml.read_text().replace("</Coord", f'<Transform From="Image" To="Probe" Matrix="{ONES}"/></Coord'))
+    with pytest.raises(DatasetInvalid, match=r"set\.xml: it has ImageToProbe twice, with different matrices"):
+        read_plus_sweep(path, device_set=xml)
+    sweep, _ = read_plus_sweep(path, device_set=describe({("Image", "Probe"): np.eye(4)}))
+    assert "ImageToProbe of set.xml is the identity: was the probe never calibrated?" in sweep.notes
 
 
 def test_a_depth_that_changes_on_the_way_is_told_with_frames_and_sizes(record):
