@@ -359,10 +359,7 @@ def _read_frames(
         except NotImplementedError:
             raise DatasetInvalid(f"{path}: pixels compressed as {syntax.name} cannot be read") from None
         if decoder is not None and not decoder.is_available:
-            needed = "; ".join(decoder.missing_dependencies)
-            raise DatasetInvalid(
-                f"{path}: pixels compressed as {syntax.name} cannot be read without a decoder: {needed}"
-            )
+            raise DatasetInvalid(f"{path}: pixels compressed as {syntax.name} cannot be read: install python-gdcm")
         surplus = max(0, int(header.get("BitsStored", 8)) - 8)
         if decoder is not None and syntax in JPEG and surplus and "pylibjpeg" not in decoder.available_plugins:
             raise DatasetInvalid(
