@@ -189,12 +189,9 @@ def test_json_and_back():
     [
         ({"version": 3}, "version 2, got 3"),
         ({"support": {"gain": 0.0, "share": 0.5, "reach_mm": 1.0}}, "support must be positive"),
-        ({"support": 1.5}, "support must be an object"),
         ({"fitted_to_mm": -1.0}, "fitted_to_mm must be 1 numbers, at least 0"),
-        ({"weights": [1.0, 2.0]}, "weights must be 5 numbers"),
         ({"weights": [1.0, -2.0, 0, 0, 0]}, "at least 0"),
         ({"weights": [float("nan")] * 5}, "weights must be finite"),
-        ({"hardness": [float("inf")]}, "hardness must be finite"),
         ({"black_ms_ssim": 1.5}, r"in \[0, 1\], got 1.5"),
         ({"fitted_on": 0}, "fitted_on must be an integer of at least 1"),
         ({"more": 1}, "with the keys"),
@@ -227,14 +224,6 @@ def in_plane(angle_deg):
     return pose[None]
 
 
-@pytest.mark.parametrize("probe", [PROBE, CONVEX, PHASED, RADIAL, STEERED])
-def test_a_training_view_is_no_distance_away(probe):
-    measured = TrainingViews(moved(0.0, 3.0), probe).measure(moved(3.0), probe)
-    for values in (measured.nearest_mm, measured.distance_mm, measured.interpolation_mm, measured.angle_deg):
-        assert values.shape == (1, POINTS_PER_SIDE**2)
-        assert values == pytest.approx(0.0, abs=1e-5)
-
-
 def averaged(measures):
     """The same with the mean over the points as the only one."""
     names = ("nearest_mm", "distance_mm", "interpolation_mm", "angle_deg")
@@ -244,13 +233,13 @@ def averaged(measures):
 
 @pytest.mark.parametrize(
     ("at_mm", "distance_mm", "interpolation_mm"),
-    [(2.0, 2.0, 1.0), (1.0, 1.0, 0.75), (7.0, 3.0, 3.0), (-5.0, 5.0, 5.0), (104.0, 20.0, 20.0)],
+    [(0.0, 0.0, 0.0), (2.0, 2.0, 1.0), (1.0, 1.0, 0.75), (7.0, 3.0, 3.0), (-5.0, 5.0, 5.0), (104.0, 20.0, 20.0)],
 )
 def test_between_two_views_counts_half_and_beyond_them_all(at_mm, distance_mm, interpolation_mm):
     measured = averaged(TrainingViews(moved(0.0, 4.0), PROBE).measure(moved(at_mm), PROBE))
-    assert measured.distance_mm[0] == pytest.approx([distance_mm])
-    assert measured.interpolation_mm[0] == pytest.approx([interpolation_mm], rel=1e-3)
-    assert measured.nearest_mm[0] == pytest.approx([min(abs(at_mm), abs(at_mm - 4.0))])
+    assert measured.distance_mm[0] == pytest.approx([distance_mm], abs=1e-5)
+    assert measured.interpolation_mm[0] == pytest.approx([interpolation_mm], rel=1e-3, abs=1e-5)
+    assert measured.nearest_mm[0] == pytest.approx([min(abs(at_mm), abs(at_mm - 4.0))], abs=1e-5)
 
 
 def test_a_view_of_a_probe_that_was_turned_round_is_on_the_same_side():

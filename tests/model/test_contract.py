@@ -49,7 +49,6 @@ class Drawing(Contract):
     [
         ({"copies": 0}, "copies", "copies must be an integer from 1 to 9, got 0"),
         ({"copies": True}, "copies", "copies must be an integer from 1 to 9, got true"),
-        ({"copies": 1.5}, "copies", "copies must be an integer from 1 to 9, got 1.5"),
         ({"offsets_mm": (1.0, 6.0)}, "offsets_mm[1]", r"offsets_mm\[1\] must be a finite number from -5 to 5, got 6.0"),
         ({"offsets_mm": (0.0,) * 4}, "offsets_mm", "offsets_mm must be a list of at most 3 values, got 4"),
         ({"offsets_mm": 3.0}, "offsets_mm", "offsets_mm must be a list, got 3.0"),

@@ -1,9 +1,8 @@
-"""The phantom's tissue map: what the anatomy promises lies where it should, and shapes are honest distances."""
+"""The phantom: its tissues, how its images form, the poses that it is scanned from, and the shadow of its bones."""
 
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from ultragray import ConvexProbe, LinearProbe
@@ -111,8 +110,6 @@ BoneShadow = benchmark("bone_shadow").BoneShadow
 PROBE = LinearProbe(width_mm=24.0, near_mm=0.0, far_mm=50.0)
 HEIGHT, WIDTH = 214, 102  # about the phantom's own pixels
 SIZE = {"probe": PROBE, "height": HEIGHT, "width": WIDTH}
-
-Image = npt.NDArray[np.uint8]
 
 
 def at(x=0.0, y=0.0, tilt_deg=0.0):

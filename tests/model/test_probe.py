@@ -148,13 +148,9 @@ def test_corners():
     [
         (lambda: LinearProbe(0.0, 0.0, 50.0), "width_mm"),
         (lambda: LinearProbe(math.nan, 0.0, 50.0), "width_mm"),
-        (lambda: LinearProbe(1e5, 0.0, 50.0), "width_mm"),
         (lambda: LinearProbe(40.0, -0.1, 50.0), "near_mm"),
         (lambda: LinearProbe(40.0, 50.0, 50.0), "far_mm"),
-        (lambda: LinearProbe(40.0, 0.0, 0.0), "far_mm"),
-        (lambda: ConvexProbe(near_mm=50.0, far_mm=150.0, opening_angle_deg=0.0), "opening_angle_deg"),
         (lambda: ConvexProbe(near_mm=50.0, far_mm=150.0, opening_angle_deg=175.1), "opening_angle_deg"),
-        (lambda: ConvexProbe(near_mm=50.0, far_mm=50.0, opening_angle_deg=60.0), "far_mm"),
         (lambda: PhasedProbe(opening_angle_deg=0.0, far_mm=120.0), "opening_angle_deg"),
         (lambda: PhasedProbe(opening_angle_deg=90.0, far_mm=0.0), "far_mm"),
     ],

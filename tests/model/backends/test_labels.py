@@ -12,6 +12,7 @@ from ultragray.exchange.checkpoint import export_checkpoint
 from ultragray.exchange.ply import read_ply, write_ply
 from ultragray.learn.sweep import pixel_positions_mm
 
+from ..weights import gaussian_weights
 from .conftest import CONVEX, HEIGHT, LINEAR, PHASED, WIDTH
 
 PROBES = {"linear": LINEAR, "convex": CONVEX, "phased": PHASED}
@@ -45,24 +46,13 @@ def label_frames(frames):  # [C, H, W]
     return frames.labels.cpu().numpy()
 
 
-def weights(scene, probe, pose):  # [4, N] -> [N, H·W]
-    """w of every Gaussian at every pixel, where it is not culled: its value in space, from its covariance."""
-    means, scales, quats = (scene.splats[name].double().numpy() for name in ("means", "scales", "quats"))
-    w, x, y, z = (quats / np.linalg.norm(quats, axis=1, keepdims=True)).T
-    axes = np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    ).transpose(2, 0, 1)  # [N, 3, 3]
+def weights(scene, probe, pose):  # [4, 4] mm -> [N, H·W]
+    """w of every Gaussian at every pixel, where it is not culled."""
     points = (pixel_positions_mm(probe, HEIGHT, WIDTH) @ pose[:3, :3].T + pose[:3, 3]) / 10.0
-    inside = np.einsum("nij,nip->njp", axes, points.T[None] - means[:, :, None]) / np.exp(scales)[:, :, None]
-    found = np.exp(-0.5 * (inside**2).sum(axis=1))
-    own = (10.0 * means - pose[:3, 3]) @ pose[:3, :3]  # mm, probe frame
+    own = (10.0 * scene.means.double().numpy() - pose[:3, 3]) @ pose[:3, :3]  # mm, probe frame
     depth = own[:, 2] if isinstance(probe, LinearProbe) else np.hypot(own[:, 0], own[:, 2])
     seen = (depth >= probe.near_mm) & (depth <= probe.cull_far_mm(HEIGHT)) & (own[:, 2] >= 0)
-    return found * seen[:, None]
+    return gaussian_weights(scene, points) * seen[:, None]
 
 
 @pytest.mark.parametrize("name", PROBES)

@@ -1,4 +1,4 @@
-"""MetaImage sequences, as PLUS writes them and as they arrive damaged."""
+"""MetaImage and NRRD sequences as PLUS and 3D Slicer write them and as they arrive damaged; stored orientations."""
 
 import zlib
 from pathlib import Path
@@ -38,9 +38,7 @@ def test_colour_and_four_sizes_of_a_meta_image(tmp_path, plus_files):
         ({"ElementType": "MET_FLOAT"}, "MET_UCHAR, MET_UCHAR_ARRAY, MET_USHORT, MET_SHORT, got ElementType MET_FLOAT"),
         ({"BinaryData": "False"}, "must be binary"),
         ({"DimSize": "7 5"}, "columns x rows x frames, got 7 x 5"),
-        ({"DimSize": "7 5 4 3"}, "columns x rows x frames"),
         ({"DimSize": "seven"}, "DimSize must be whole numbers"),
-        ({"DimSize": "-7 5 3"}, "DimSize must be whole numbers"),
         ({"DimSize": "0 5 3"}, "it holds no images: a recording of the tracker alone, of 3 frames"),
         ({"DimSize": "0 0 93", "ElementType": "MET_OTHER"}, "it holds no images: a recording of the tracker alone"),
         ({"UltrasoundImageType": "RF_REAL"}, "images must be B-mode .* RF_REAL .RF data"),
@@ -285,16 +283,12 @@ MF = np.arange(12, dtype=np.uint8).reshape(1, 3, 4)  # rows: depth, columns: tow
     ("orientation", "stored"),
     [
         ("MF", MF),
-        ("MFA", MF),
         ("MFD", MF),
-        ("XX", MF),
         ("", MF),
         ("UF", MF[:, :, ::-1]),
         ("MN", MF[:, ::-1]),
-        ("MNA", MF[:, ::-1]),
         ("UN", MF[:, ::-1, ::-1]),
         ("FM", MF.transpose(0, 2, 1)),
-        ("FMA", MF.transpose(0, 2, 1)),
         ("NM", MF.transpose(0, 2, 1)[:, :, ::-1]),  # columns go towards the transducer
         ("FU", MF.transpose(0, 2, 1)[:, ::-1]),
         ("NU", MF.transpose(0, 2, 1)[:, ::-1, ::-1]),

@@ -31,6 +31,18 @@ class Layout:
     def save(self, name, array):
         np.save(self.folder / name, array)
 
+    def change(self, name, place, value):
+        """Another value in an array that is there."""
+        array = np.load(self.folder / name)
+        array[place] = value
+        self.save(name, array)
+
+    def write(self, name, content):
+        (self.folder / name).write_bytes(content)
+
+    def cut(self, name, count):
+        self.write(name, (self.folder / name).read_bytes()[:-count])
+
 
 @pytest.fixture
 def layout(tmp_path, make_sweep):
@@ -106,61 +118,30 @@ def test_a_copied_folder_reads_its_own_files(layout):
     np.testing.assert_array_equal(read_released(copy).train.images, 255 - layout.images[:4])
 
 
-def nan_pose(layout):
-    layout.poses[2, 0, 3] = np.nan
-    layout.save("poses_train.npy", layout.poses[:4])
-
-
-def mirrored_pose(layout):
-    layout.poses[3, 0, 0] = -1.0
-    layout.save("poses_train.npy", layout.poses[:4])
-
-
-def constant_image(layout):
-    layout.images[1] = 7
-    layout.save("images_train.npy", layout.images[:4])
-
-
-def nan_image(layout):
-    floats = layout.images[:4] / 255.0
-    floats[3, 2, 1] = np.nan
-    layout.save("images_train.npy", floats)
-
-
-def truncated_images(layout):
-    path = layout.folder / "images_train.npy"
-    path.write_bytes(path.read_bytes()[:-100])
-
-
-def garbage_images(layout):
-    (layout.folder / "images_train.npy").write_bytes(b"garbage" * 99)
-
-
-def object_images(layout):
-    np.save(layout.folder / "images_train.npy", np.array([None, {}]), allow_pickle=True)
-
-
-def truncated_poses(layout):
-    path = layout.folder / "poses_val.npy"
-    path.write_bytes(path.read_bytes()[:-1])
-
-
 @pytest.mark.parametrize(
     ("spoil", "message"),
     [
-        (nan_pose, r"poses_train\.npy: frame 2: its pose must be finite"),
-        (mirrored_pose, r"poses_train\.npy: frame 3: its pose must .*mirrored"),
-        (constant_image, r"images_train\.npy: frame 1 is constant: every pixel is 7"),
-        (nan_image, r"images_train\.npy: frame 3 holds NaN"),
-        (truncated_images, r"images_train\.npy: not an array of images .*truncated: 100 bytes"),
-        (garbage_images, r"images_train\.npy: not an array of images .*: it does not start as a \.npy file does$"),
-        (object_images, r"images_train\.npy: not an array of images .*: it holds Python objects"),
+        (
+            lambda it: it.change("poses_train.npy", (2, 0, 3), np.nan),
+            r"train\.npy: frame 2: its pose must be finite",
+        ),
+        (
+            lambda it: it.change("poses_train.npy", (3, 0, 0), -1.0),
+            r"train\.npy: frame 3: its pose must .*mirrored",
+        ),
+        (lambda it: it.change("images_train.npy", 1, 7), r"images_train\.npy: frame 1 is constant: every pixel is 7"),
+        (
+            lambda it: it.save("images_train.npy", it.images[:4] / [[[255.0]], [[255.0]], [[255.0]], [[np.nan]]]),
+            "3 holds NaN",
+        ),
+        (
+            lambda it: it.cut("images_train.npy", 100),
+            r"images_train\.npy: not an array .*truncated: 100 bytes",
+        ),
         (lambda it: it.save("images_train.npy", it.images[:0]), r"images_train\.npy: it holds no frames$"),
-        (lambda it: it.save("images_val.npy", it.images[:0]), r"images_val\.npy: it holds no frames$"),
         (lambda it: it.configure(ultrasound_opening_width="3.8"), r"opening_width must be a finite number, got '3\.8'"),
-        (truncated_poses, r"poses_val\.npy: not a file of poses .*truncated: 1 bytes"),
+        (lambda it: it.cut("poses_val.npy", 1), r"poses_val\.npy: not a file of poses .*truncated: 1 bytes"),
         (lambda it: it.save("images_train.npy", it.images[0]), r"images_train\.npy: images must have shape"),
-        (lambda it: it.save("images_val.npy", it.images[0]), r"images_val\.npy: images must be \[N, H, W\]"),
         (
             lambda it: it.save("poses_train.npy", it.poses[:4, :2]),
             r"poses_train\.npy: poses must be .*\[4, 2, 4\]",
@@ -171,13 +152,11 @@ def truncated_poses(layout):
             lambda it: [it.save("images_train.npy", it.images[:1]), it.save("poses_train.npy", it.poses[:1])],
             r"images_train\.npy: a scene needs at least two training frames, got 1",
         ),
-        (lambda it: (it.folder / "poses_val.npy").unlink(), r"conf\.json: poses_file_val names .*not found"),
         (lambda it: (it.folder / "images_train.npy").unlink(), r"conf\.json: images_file_train names .*not found"),
         (lambda it: it.configure(poses_file_val=None), r"conf\.json: it lacks poses_file_val"),
-        (lambda it: it.configure(poses_file_train=None), r"conf\.json: it lacks poses_file_train"),
         (lambda it: it.configure(poses_file_val=3), r"conf\.json: poses_file_val must be a path"),
         (lambda it: it.configure(ultrasound_far_plane=0.1), r"conf\.json: far_mm must be greater"),
-        (lambda it: (it.folder / "conf.json").write_text("{"), r"conf\.json: not JSON"),
+        (lambda it: it.write("conf.json", b"{"), r"conf\.json: not JSON"),
         (lambda it: (it.folder / "conf.json").unlink(), r"conf\.json: no such file"),
     ],
 )

@@ -45,7 +45,7 @@ class MeanImage(LearnedMethod):
     name: str = "mean-image"
 
     def describe(self):
-        return Description("Mean image", "these tests", "One image for all poses.", published_steps=200)
+        return Description("Mean image", "these tests", "One image for all poses.", published_steps=100)
 
     def learner(self, dataset, budget, seed, device):
         return _Image(dataset, seed, device)

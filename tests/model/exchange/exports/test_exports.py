@@ -17,31 +17,21 @@ from zarr.storage import ZipStore
 from ultragray import LinearProbe
 from ultragray.contract import to_dict
 from ultragray.errors import ExtraMissing, InvalidArgument
-from ultragray.exchange.exports import FORMATS, ExportHeader, check_format, export_to
-from ultragray.exchange.exports.archives import NpzExporter
-from ultragray.exchange.exports.exporter import stored_pixels
+from ultragray.exchange.exports import FORMATS, check_format, export_to
 from ultragray.exchange.rendering import written_behind
 from ultragray.installation import install_advice
 from ultragray.rendering.settings import Contact, Resolved
 from ultragray.scene.confidence import FIGURES, Extrapolation, figure_arrays
 
+from .conftest import POSES, exported, header_of
+
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
-POSES = np.tile(np.eye(4), (5, 1, 1))
-POSES[:, 1, 3] = np.arange(5) / 3.0
 OUTPUTS = ("bmode", "echo", "labels")
 TOLD = [Extrapolation(0.5 * number, 2.0 * number, 0.9 - 0.1 * number, 0.75) for number in range(5)]
-UNKNOWN = Extrapolation(None, None, None, 0.25)
 
 
 def header(outputs=OUTPUTS, dtype="float32"):
-    return ExportHeader(
-        settings=Resolved(PROBE, 6, 7, outputs),
-        dtype=dtype,
-        poses=POSES,
-        scene="one",
-        scene_sha256="0" * 64,
-        renderer="ultragray/0 cpu",
-    )
+    return header_of("npz", Resolved(PROBE, 6, 7, outputs), dtype=dtype)
 
 
 def rendered(outputs=OUTPUTS):
@@ -55,9 +45,7 @@ def rendered(outputs=OUTPUTS):
 def export(path, format, header):
     """Writes five frames in portions of two; what the file must hold, by output."""
     frames = rendered(header.settings.outputs)
-    with export_to(path, format, header) as add:
-        for first in (0, 2, 4):
-            add({name: values[first : first + 2] for name, values in frames.items()}, TOLD[first : first + 2])
+    exported(path, format, header, frames, TOLD)
     assert [entry.name for entry in path.parent.iterdir()] == [path.name]
     if header.dtype == "float32":
         return frames
@@ -110,10 +98,7 @@ def test_the_share_of_contact_is_there_where_it_was_asked_for(tmp_path):
     for format, dtype in dtypes.items():
         asked = replace(judged, dtype=dtype)
         path = tmp_path / f"frames{FORMATS[format].suffix}"
-        stored = np.dtype("u1" if dtype == "uint8" else "<f4")
-        pixels = {"bmode": stored_pixels("bmode", rendered(("bmode",))["bmode"], stored)}
-        with export_to(path, format, asked) as add:
-            add(pixels, told)
+        exported(path, format, asked, rendered(("bmode",)), told)
     shares = [one.contact_share for one in told]
     with np.load(tmp_path / "frames.npz") as archive:
         assert archive["contact_share"].tolist() == shares
@@ -145,20 +130,6 @@ def test_tar_loads_with_the_standard_library(tmp_path):
     assert told["pose"] == POSES[2].tolist()
     assert {name: told[name] for name in FIGURES} == TOLD[2].figures()
     assert told["probe"] == to_dict(PROBE)
-
-
-def test_what_is_not_known(tmp_path):
-    frames = {"bmode": rendered()["bmode"]}
-    for format in ("npz", "tar"):
-        with export_to(tmp_path / format, format, header(("bmode",))) as add:
-            add(frames, [UNKNOWN] * 5)
-    with np.load(tmp_path / "npz") as archive:
-        assert np.isnan([archive[name] for name in FIGURES[:3]]).all()
-        assert (archive["supported_share"] == 0.25).all()
-    with tarfile.open(tmp_path / "tar") as tar:
-        file = tar.extractfile("000004.json")
-        told = json.load(file)
-    assert {name: told[name] for name in FIGURES} == UNKNOWN.figures()
 
 
 @pytest.mark.parametrize("format", FORMATS)
@@ -214,30 +185,6 @@ def test_a_portion_is_written_while_the_next_is_rendered():
     may_write.set()
     giving.join(10)
     assert written == [0, 1, 2, 3]
-
-
-def test_an_error_of_the_writer_ends_the_rendering(tmp_path, monkeypatch):
-    def write(self, frames, count):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(NpzExporter, "_write", write)
-    added = 0
-
-    def render_on():
-        nonlocal added
-        with export_to(tmp_path / "frames.npz", "npz", header(("bmode",))) as add:
-            while True:
-                add({"bmode": rendered()["bmode"][:1]}, TOLD[:1])
-                added += 1
-
-    with pytest.raises(OSError, match="No space"):
-        render_on()
-    assert added < 10_000
-    assert list(tmp_path.iterdir()) == []
-
-    with pytest.raises(OSError, match="No space"), export_to(tmp_path / "one.npz", "npz", header(("bmode",))) as add:
-        add({"bmode": rendered()["bmode"][:1]}, TOLD[:1])
-    assert list(tmp_path.iterdir()) == []
 
 
 FULL_DISK = """
