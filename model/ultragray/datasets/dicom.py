@@ -458,9 +458,8 @@ def _jpeg_colours(stream: bytes, interpretation: str) -> tuple[bool, tuple[str, 
     is_told = adobe is not None or b"JFIF\0" in begin[:32] or is_rgb
     if not is_told and len(sizes) == 1:
         is_rgb = interpretation in RGB
-        as_ybr, as_rgb = (
-            cv2.imdecode(np.frombuffer(one, np.uint8), cv2.IMREAD_COLOR) for one in (stream, _as_rgb(stream))
-        )
+        ways = [cv2.imdecode(np.frombuffer(one, np.uint8), cv2.IMREAD_COLOR) for one in (stream, _as_rgb(stream))]
+        as_ybr, as_rgb = (None if one is None else np.asarray(one, np.uint8) for one in ways)
         if as_ybr is not None and as_rgb is not None:
             is_rgb ^= _is_otherwise(*((as_rgb, as_ybr) if is_rgb else (as_ybr, as_rgb)))
     is_other = not is_told and is_rgb != (interpretation in RGB)
