@@ -19,6 +19,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import weakref
 from pathlib import Path
@@ -37,7 +38,8 @@ class WarmProcess:
         self.pid = pid
         self.returncode = None
         self._connection = connection  # its end brings the exit code
-        weakref.finalize(self, connection.close)
+        self._close = weakref.finalize(self, connection.close)
+        self._lock = threading.Lock()  # several threads may wait
 
     def poll(self):
         with contextlib.suppress(subprocess.TimeoutExpired):
@@ -50,8 +52,11 @@ class WarmProcess:
             ended.register(self._connection, select.POLLIN)
             if not ended.poll(None if timeout is None else 1000 * timeout):
                 raise subprocess.TimeoutExpired("a warm process", timeout)
-            told = self._connection.recv(16, socket.MSG_PEEK)  # several threads may wait
-            self.returncode = int(told) if told else -signal.SIGKILL  # the process that forks was ended with it
+            with self._lock:
+                if self.returncode is None:
+                    told = self._connection.recv(16)
+                    self.returncode = int(told) if told else -signal.SIGKILL  # the process that forks ended with it
+                    self._close()
         return self.returncode
 
     def send_signal(self, number):
