@@ -53,7 +53,7 @@ INTERPRETATIONS = {**dict.fromkeys(GREY, 1), **dict.fromkeys((*RGB, *YBR), 3)}  
 PERSON = ("PatientName", "PatientID", "PatientBirthDate", "OtherPatientIDs", "AccessionNumber")
 NOBODY = re.compile(r"(?i)\W*|.*(anon|unknown|phantom|test).*")
 GREY_LEVELS = 10  # by which the samples of a grey pixel may differ: of lossy JPEG they do
-MOSTLY_GREY = 0.25  # of the pixels: ultrasound beside its flow; read wrongly, less than this share of them stay grey
+LEAST_GREY = 0.25  # of the pixels of ultrasound beside its flow; read wrongly, less than half of them stay grey
 
 
 def read_dicom_sweep(
@@ -397,7 +397,7 @@ def _read_frames(
 def _is_otherwise(as_said: ByteArray, as_other: ByteArray) -> bool:  # [rows, columns, 3]
     """Whether an image is grey, as ultrasound mostly is, where it is read otherwise than its header says."""
     said, other = (float((np.ptp(one, axis=2) <= GREY_LEVELS).mean()) for one in (as_said, as_other))
-    return other > MOSTLY_GREY and said < MOSTLY_GREY * other
+    return other > LEAST_GREY and said < other / 2
 
 
 def _other_colours(said: str, found: str) -> str:
