@@ -10,6 +10,7 @@ The extra `dicom`.
 from __future__ import annotations
 
 import io
+import math
 import re
 import warnings
 from collections.abc import Iterator
@@ -366,6 +367,8 @@ def _read_frames(
                 f"{path}: {header.BitsStored} bits compressed as {syntax.name} cannot be read: install "
                 "pylibjpeg-libjpeg (GPL), or save the file without compression"
             )
+        if decoder is None and interpretation == "YBR_FULL_422" and path.stat().st_size < 3 * math.prod(shape):
+            raise DatasetInvalid(f"{path}: pixels that share their colours (YBR_FULL_422) cannot be read uncompressed")
         pixels = iter_pixels(path, indices=[int(number) for number in chosen], raw=True)
         is_ybr = interpretation in YBR
         for number, out in zip(chosen, frames, strict=True):
