@@ -39,9 +39,9 @@ def save_wide(folder, name, *, count, log_scale):
 
 @pytest.fixture
 def costly_folder(scene_folder):
-    """`minutes`: a frame of 512x512 pixels takes some; `hostile`: Gaussians of e^88 cm."""
+    """`minutes`: a frame of 512x512 pixels takes some; `hostile`: Gaussians of e^20 cm."""
     save_wide(scene_folder, "minutes", count=100_000, log_scale=2)
-    save_wide(scene_folder, "hostile", count=20_000, log_scale=88)
+    save_wide(scene_folder, "hostile", count=20_000, log_scale=20)
     return scene_folder
 
 
