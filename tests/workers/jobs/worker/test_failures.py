@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 
 from ultragray.phantom.demo import copy_demo_scene
+from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import StorageFull
 from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.progress import JobState
@@ -59,7 +60,7 @@ def assert_failed(job, error, *told):
 
 @pytest.mark.long
 def test_poisoned_datasets_and_diverging_trainings(store, artifact_folder, tmp_path, start_worker, until, monkeypatch):
-    images = store_dataset(artifact_folder, "images") / "files" / "images_train.npy"
+    images = store_dataset(artifact_folder, "images") / "images_train.npy"
     frames = np.load(images) / 255.0
     frames[2, 3, 4] = np.nan
     np.save(images, frames)
@@ -90,7 +91,7 @@ def test_dataset_deleted_while_it_is_trained_from_and_the_next_job_starts_within
     job, _ = store.submit(train_job("one", dataset="gone", steps=1_000_000))
     until(job, is_training)
     first = process_of(worker)
-    shutil.rmtree(artifact_folder / "datasets" / "gone")
+    DatasetStore(artifact_folder).delete("gone")
     os.kill(first, signal.SIGKILL)
     assert_failed(until(job), "DATASET_NOT_FOUND", "'gone'")
 
@@ -138,7 +139,7 @@ def test_full_disk(small_disk, tmp_path, start_worker):
     with (small_disk / "ballast").open("wb") as ballast:
         os.posix_fallocate(ballast.fileno(), 0, shutil.disk_usage(small_disk).free - 2**20)
     start_worker()
-    assert_failed(until(job), "STORAGE_FULL", "no room")
+    assert_failed(until(job), "STORAGE_FULL", "12 frames of 256x256 take up to 3 MB")
     (small_disk / "ballast").unlink()
     assert not (small_disk / "jobs" / job.id / "artifacts").exists()
     assert shutil.disk_usage(small_disk).free > DISK_BYTES // 2
