@@ -1,6 +1,6 @@
 """A polite client beside one that attacks: its 99th percentile is at most twice that without.
 
-The attacker has an address and a process of its own, of the lowest priority: what it computes is not the service's.
+The attacker has an address and a process of its own, of a lower priority: what it computes is not the service's.
 """
 
 import asyncio
@@ -191,7 +191,7 @@ def service(tmp_path_factory):
 @contextlib.contextmanager
 def attacked(service, name):
     command = [sys.executable, "-m", "tests.overload.test_polite_beside_attacks", name, service.http, service.grpc]
-    with subprocess.Popen(["nice", "-n", "19", *command], cwd=ROOT) as attacker:
+    with subprocess.Popen(["nice", "-n", "5", *command], cwd=ROOT) as attacker:
         time.sleep(3.0)  # its imports, and the beginning
         try:
             yield
