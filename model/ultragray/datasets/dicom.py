@@ -52,7 +52,8 @@ GREY, RGB, YBR = (
 INTERPRETATIONS = {**dict.fromkeys(GREY, 1), **dict.fromkeys((*RGB, *YBR), 3)}  # samples of a pixel
 PERSON = ("PatientName", "PatientID", "PatientBirthDate", "OtherPatientIDs", "AccessionNumber")
 NOBODY = re.compile(r"(?i)\W*|.*(anon|unknown|phantom|test).*")
-GREYER = 0.25  # of the colour that an image has as its header calls it: the other reading is right
+GREY_LEVELS = 10  # by which the samples of a grey pixel may differ: of lossy JPEG they do
+MOSTLY_GREY = 0.25  # of the pixels: ultrasound beside its flow; read wrongly, less than this share of them stay grey
 
 
 def read_dicom_sweep(
@@ -358,10 +359,7 @@ def _read_frames(
         except NotImplementedError:
             raise DatasetInvalid(f"{path}: pixels compressed as {syntax.name} cannot be read") from None
         if decoder is not None and not decoder.is_available:
-            needed = "; ".join(decoder.missing_dependencies)
-            raise DatasetInvalid(
-                f"{path}: pixels compressed as {syntax.name} cannot be read without a decoder: {needed}"
-            )
+            raise DatasetInvalid(f"{path}: pixels compressed as {syntax.name} cannot be read: install python-gdcm")
         surplus = max(0, int(header.get("BitsStored", 8)) - 8)
         if decoder is not None and syntax in JPEG and surplus and "pylibjpeg" not in decoder.available_plugins:
             raise DatasetInvalid(
@@ -383,7 +381,10 @@ def _read_frames(
                 )
             frame = np.asarray(frame >> surplus if surplus else frame, np.uint8)
             if number == chosen[0] and frame.ndim == 3 and interpretation != "PALETTE COLOR":
-                is_ybr, said = _is_ybr(frame, interpretation)
+                as_ybr = convert_color_space(frame, "YBR_FULL", "RGB")
+                if _is_otherwise(*((as_ybr, frame) if is_ybr else (frame, as_ybr))):
+                    is_ybr = not is_ybr
+                    said = (_other_colours(interpretation, "YBR_FULL" if is_ybr else "RGB"),)
             frame = convert_color_space(frame, "YBR_FULL", "RGB") if is_ybr else frame
             out[:] = grey_frames(frame[None], str(path))[0]
             if interpretation == "MONOCHROME1":
@@ -393,15 +394,10 @@ def _read_frames(
     return frames, said
 
 
-def _is_ybr(frame: ByteArray, interpretation: str) -> tuple[bool, tuple[str, ...]]:  # [rows, columns, 3] as decoded
-    """Whether the samples are luma and two differences of colour: an ultrasound image is mostly grey as one or the
-    other, whatever its header calls it."""
-    first, *others = (frame[..., channel].astype(np.int16) for channel in range(3))
-    as_ybr, as_rgb = (sum(float(np.abs(one - grey).mean()) for one in others) for grey in (128, first))
-    is_ybr = interpretation in YBR
-    if (as_rgb if is_ybr else as_ybr) < GREYER * (as_ybr if is_ybr else as_rgb):
-        return not is_ybr, (_other_colours(interpretation, "RGB" if is_ybr else "YBR_FULL"),)
-    return is_ybr, ()
+def _is_otherwise(as_said: ByteArray, as_other: ByteArray) -> bool:  # [rows, columns, 3]
+    """Whether an image is grey, as ultrasound mostly is, where it is read otherwise than its header says."""
+    said, other = (float((np.ptp(one, axis=2) <= GREY_LEVELS).mean()) for one in (as_said, as_other))
+    return other > MOSTLY_GREY and said < MOSTLY_GREY * other
 
 
 def _other_colours(said: str, found: str) -> str:
@@ -461,11 +457,11 @@ def _jpeg_colours(stream: bytes, interpretation: str) -> tuple[bool, tuple[str, 
     is_rgb = names in (b"RGB", b"rgb") if adobe is None else adobe[1] == b"\0"
     is_told = adobe is not None or b"JFIF\0" in begin[:32] or is_rgb
     if not is_told and len(sizes) == 1:
-        decoded = [cv2.imdecode(np.frombuffer(one, np.uint8), cv2.IMREAD_COLOR) for one in (stream, _as_rgb(stream))]
-        colours = [float(np.ptp(one.astype(np.int16), axis=2).mean()) for one in decoded if one is not None]
-        if len(colours) == 2:
-            ybr, rgb = colours
-            is_rgb = interpretation in RGB if GREYER < (rgb + 1) / (ybr + 1) < 1 / GREYER else rgb < ybr
+        is_rgb = interpretation in RGB
+        ways = [cv2.imdecode(np.frombuffer(one, np.uint8), cv2.IMREAD_COLOR) for one in (stream, _as_rgb(stream))]
+        as_ybr, as_rgb = (None if one is None else np.asarray(one, np.uint8) for one in ways)
+        if as_ybr is not None and as_rgb is not None:
+            is_rgb ^= _is_otherwise(*((as_rgb, as_ybr) if is_rgb else (as_ybr, as_rgb)))
     is_other = not is_told and is_rgb != (interpretation in RGB)
     notes = (_other_colours(interpretation, "RGB" if is_rgb else "YBR_FULL"),) if is_other else ()
     return is_rgb and not is_told, notes

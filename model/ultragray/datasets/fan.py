@@ -52,6 +52,9 @@ def parse_matrix(text: str, where: str) -> FloatArray:  # [4, 4]
     return matrix
 
 
+SAME_MATRIX = 1e-3  # mm, and of the entries of a rotation
+
+
 @dataclass(frozen=True)
 class DeviceSet:
     """A PLUS device set (XML)."""
@@ -74,11 +77,18 @@ def read_device_set(path: Path) -> DeviceSet:
         root = ElementTree.fromstring(data)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise DatasetInvalid(f"{path}: not XML that can be read: {error}") from error
-    transforms = {}
+    transforms: dict[TransformName, FloatArray] = {}
     for element in root.iterfind(".//CoordinateDefinitions/Transform"):
-        origin, target, matrix = (element.get(key, "") for key in ("From", "To", "Matrix"))
-        if origin and target:
-            transforms[origin, target] = parse_matrix(matrix, f"{path}: {origin}To{target}")
+        origin, target, text = (element.get(key, "") for key in ("From", "To", "Matrix"))
+        if not origin or not target:
+            continue
+        matrix = parse_matrix(text, f"{path}: {origin}To{target}")
+        there, back = transforms.get((origin, target)), transforms.get((target, origin))
+        if (there is not None and not np.allclose(there, matrix, atol=SAME_MATRIX)) or (
+            back is not None and not np.allclose(back @ matrix, np.eye(4), atol=SAME_MATRIX)
+        ):
+            raise DatasetInvalid(f"{path}: it has {origin}To{target} twice, with different matrices: leave one of them")
+        transforms[origin, target] = matrix
     if not transforms:
         raise DatasetInvalid(f"{path}: it has no Transform under CoordinateDefinitions")
     return DeviceSet(path, root, transforms)

@@ -1,4 +1,4 @@
-"""One suite for every backend and instruction set: each renders what the reference renders in float64."""
+"""Every backend and instruction set renders what the reference does in float64, and the released implementation."""
 
 from __future__ import annotations
 
