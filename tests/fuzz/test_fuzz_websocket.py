@@ -174,6 +174,8 @@ def conversation(pieces):
             continue
         sent += frame_bytes(opcode, payload, **wrong)
         code = code_expected(opcode, payload, wrong)
+        if opcode == CLOSE and begun and code != 1007:  # data may not follow a close: the message stays incomplete
+            code = 1002
         if code is not None:
             return sent, pongs, len(messages), code
         pongs += [payload] if opcode == PING else []

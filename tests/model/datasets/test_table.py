@@ -159,11 +159,11 @@ def test_what_cannot_be_used_is_one_clear_error(write, header, calibration, mess
 def test_pictures_that_do_not_go_with_it(write):
     rows = table(TIMES, PLACES, quaternions())
     folder = write("time,x_mm,y_mm,z_mm,qw,qx,qy,qz", rows)
+    with pytest.raises(InvalidArgument, match="fan must be given without crop"):
+        load_dataset(folder, SourceOptions(crop="0:9,0:9", fan="60,40,90,1,1"))
     cv2.imwrite(str(folder / "frame_5.png"), FRAMES[5][:20])
     with pytest.raises(DatasetInvalid, match=r"frame_5\.png: it has 60 x 20 pixels, frame_0\.png 60 x 40"):
         load_dataset(folder)
     (folder / "frame_5.png").write_bytes(b"no picture")
     with pytest.raises(DatasetInvalid, match=r"frame_5\.png: it cannot be read as a picture"):
         load_dataset(folder)
-    with pytest.raises(InvalidArgument, match="fan must be given without crop"):
-        load_dataset(folder, SourceOptions(crop="0:9,0:9", fan="60,40,90,1,1"))

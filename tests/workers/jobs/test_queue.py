@@ -1,7 +1,5 @@
 """Every change of a job's row, with no worker: who may take, change and end it; and that no question reads all rows."""
 
-from __future__ import annotations
-
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Jobs that go: deleted by hand, or old. And datasets that go while a job is submitted."""
 
-from __future__ import annotations
-
 import os
 import time
 

@@ -1,7 +1,5 @@
 """The order of what waits, without processes."""
 
-from __future__ import annotations
-
 import asyncio
 import time
 from dataclasses import replace
