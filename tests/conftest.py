@@ -46,6 +46,7 @@ forget_the_users_environment()
 hypothesis.configuration.set_hypothesis_home_dir(ROOT / ".hypothesis")  # else it is in the working folder of a test
 hypothesis.settings.register_profile("untimed", deadline=None)  # others may keep the machine busy
 hypothesis.settings.load_profile("untimed")
+torch.set_num_threads(1)  # also for fixtures of more than one test
 
 RUN = f"PYTEST_RUN={os.getpid()}\0"  # in the environment of every process that these tests start
 os.environ["PYTEST_RUN"] = str(os.getpid())

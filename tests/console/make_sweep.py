@@ -5,8 +5,6 @@ pose that is none, compared.ugr the demo scene as if it were trained from that s
 it were trained with a beam, corrected poses and an uncertainty.
 """
 
-from __future__ import annotations
-
 import sys
 import zipfile
 from dataclasses import replace
@@ -15,7 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from ultragray import ElevationBeam, GaussianScene, LinearProbe, render
+from ultragray import ElevationBeam, LinearProbe, render
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.released import write_released
 from ultragray.datasets.source import load_dataset
@@ -30,13 +28,12 @@ SHIFT_MM = 0.01  # of each training pose more than of the one before
 VARIANCES = {"floor": 1.0, "level": 0.1, "gap 1 mm": 0.6, "beyond": 0.4}
 
 
-def main(folder: Path) -> None:
+def main(folder):
     torch.set_num_threads(1)
     scene = load_demo_scene()
     refined(scene).save(folder / "refined.ugr")
     poses = demo_poses(33)
     rendered = render(scene, PROBE, poses, height=SIDE, width=SIDE, outputs=("bmode",)).bmode
-    assert rendered is not None
     images = np.rint(255.0 * rendered.detach().numpy()).astype(np.uint8)
     held_out = np.arange(len(poses)) % HELD_OUT_EVERY == HELD_OUT_EVERY // 2
     train, val = (
@@ -53,7 +50,7 @@ def main(folder: Path) -> None:
     pack(files, folder / "broken.zip")
 
 
-def refined(scene: GaussianScene) -> GaussianScene:
+def refined(scene):
     count = len(scene.training_poses)
     corrections = np.tile(np.eye(4), (count, 1, 1))
     corrections[:, 0, 3] = SHIFT_MM * np.arange(count)
@@ -64,7 +61,7 @@ def refined(scene: GaussianScene) -> GaussianScene:
     return replace(scene, info=info, pose_corrections=corrections)
 
 
-def pack(files: Path, path: Path) -> None:
+def pack(files, path):
     with zipfile.ZipFile(path, "w") as archive:
         for file in files.iterdir():
             archive.write(file, file.name)

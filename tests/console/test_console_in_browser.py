@@ -1,7 +1,5 @@
 """The console in Chromium against a real service: one view in `make test`, all of them in `make test-console`."""
 
-from __future__ import annotations
-
 import gzip
 import os
 import shutil
@@ -21,7 +19,7 @@ TIMEOUT_S = 600.0
 MIN_NODE = 20
 
 
-def missing() -> str | None:
+def missing():
     """What the tests need and this machine lacks, in words."""
     node = shutil.which("node")
     if node is None:
@@ -39,20 +37,20 @@ def missing() -> str | None:
 
 
 @pytest.fixture(autouse=True)
-def _needs() -> None:
+def _needs():
     reason = missing()
     if reason is not None:
         pytest.skip(reason)
 
 
-def test_bundle_is_small() -> None:
+def test_bundle_is_small():
     files = [path for path in BUILT.rglob("*") if path.is_file()]
     total = sum(len(gzip.compress(path.read_bytes())) for path in files)
     assert 0 < total < MAX_BUNDLE_BYTES
 
 
 @pytest.mark.slow
-def test_view_of_every_run() -> None:
+def test_view_of_every_run():
     outcome = subprocess.run(
         ["node", "--test", "--test-reporter=spec", str(HERE / IN_EVERY_RUN)],
         env={**os.environ, "ULTRAGRAY_TEST_PYTHON": sys.executable},

@@ -9,7 +9,7 @@ import torch
 from ultragray import GaussianScene
 
 
-def rotation(angles_deg: list[float]) -> np.ndarray:
+def rotation(angles_deg):
     turned = np.eye(3)
     for axis, angle in enumerate(np.radians(angles_deg)):
         one = np.eye(3)
@@ -19,12 +19,12 @@ def rotation(angles_deg: list[float]) -> np.ndarray:
     return turned
 
 
-def quaternion(matrix: np.ndarray) -> np.ndarray:
+def quaternion(matrix):
     _, vectors = np.linalg.eigh(_symmetric(matrix))
     return vectors[:, -1]
 
 
-def _symmetric(m: np.ndarray) -> np.ndarray:
+def _symmetric(m):
     """Of which the quaternion w, x, y, z of a rotation is the largest eigenvector (Bar-Itzhack)."""
     return np.array(
         [
@@ -36,7 +36,7 @@ def _symmetric(m: np.ndarray) -> np.ndarray:
     )
 
 
-def product(a: np.ndarray, b: torch.Tensor) -> torch.Tensor:
+def product(a, b):
     w, x, y, z = (float(value) for value in a)
     by = [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]]
     return b @ torch.tensor(by, dtype=b.dtype).T

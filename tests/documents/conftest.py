@@ -1,10 +1,7 @@
 """The generator of the site, and the run of a page."""
 
 import shutil
-from collections.abc import Callable
 from importlib import import_module
-from pathlib import Path
-from types import ModuleType
 
 import pytest
 
@@ -18,9 +15,6 @@ from .running import PageRun
 
 DEMO_SERVICE = "demo service"
 TUTORIAL = ROOT / "docs" / "tutorial.md"
-
-Generator = Callable[[str], ModuleType]
-RunPage = Callable[[Path], None]
 
 
 @pytest.fixture(scope="session")

@@ -1,4 +1,9 @@
-"""Runs the blocks of a page in a folder, one after another."""
+"""Runs the blocks of a page in a folder, one after another.
+
+    python -m tests.documents.running PAGE FOLDER
+
+does so against the service on the ports that the documents name.
+"""
 
 import ast
 import contextlib
@@ -18,7 +23,7 @@ from pathlib import Path
 import yaml
 
 from ..waiting import Deadline
-from .blocks import SHELL
+from .blocks import SHELL, read_page
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -161,3 +166,16 @@ def _answers(port):
         return True
     except OSError:
         return False
+
+
+def main(page, folder):
+    folder.mkdir()
+    os.chdir(folder)
+    with PageRun(read_page(page), folder, {door: int(port) for port, door in PORTS.items()}) as run:
+        os.environ.update(run.environment())
+        for block in run.page.runs:
+            run.run(block)
+
+
+if __name__ == "__main__":
+    main(*map(Path, sys.argv[1:]))

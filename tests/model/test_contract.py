@@ -49,7 +49,6 @@ class Drawing(Contract):
     [
         ({"copies": 0}, "copies", "copies must be an integer from 1 to 9, got 0"),
         ({"copies": True}, "copies", "copies must be an integer from 1 to 9, got true"),
-        ({"copies": 1.5}, "copies", "copies must be an integer from 1 to 9, got 1.5"),
         ({"offsets_mm": (1.0, 6.0)}, "offsets_mm[1]", r"offsets_mm\[1\] must be a finite number from -5 to 5, got 6.0"),
         ({"offsets_mm": (0.0,) * 4}, "offsets_mm", "offsets_mm must be a list of at most 3 values, got 4"),
         ({"offsets_mm": 3.0}, "offsets_mm", "offsets_mm must be a list, got 3.0"),
@@ -76,10 +75,6 @@ def test_numbers_and_words_get_their_own_type():
     assert drawing == Drawing(offsets_mm=(1.0, 2.0), colour=Colour.BLUE)
     assert isinstance(drawing.offsets_mm[0], float)
     assert isinstance(drawing.colour, Colour)
-
-
-def test_a_member_prints_as_it_is_written():
-    assert repr(Square(3)) == "Square(side_mm=3.0)"
 
 
 def test_json_and_back():

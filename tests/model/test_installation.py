@@ -52,8 +52,8 @@ def test_they_sleep_unless_the_environment_says_otherwise(given, expected):
 
 # What the service's own process and the command line import, before anything is rendered.
 WITHOUT_TORCH = (
-    "import ultragray; ultragray.read_header",
     "from ultragray.phantom.demo import copy_demo_scene; copy_demo_scene('copy.ugr')",
+    "import ultragray; ultragray.read_header('copy.ugr')",
     "from ultragray.learn.training import TrainingConfig; TrainingConfig.preset('fast', steps=3)",
     "from ultragray.learn.evaluation.methods import ComparisonSettings; ComparisonSettings(methods=('median',))",
     "import ultragray.samplers",

@@ -43,15 +43,8 @@ def test_no_poses_are_fine():
 def test_a_nearly_exact_rotation_is_made_exact():
     noisy = turned_about_z(30.0)
     noisy[:3, :3] *= 1 + 4e-4
-    checked = check_poses(noisy)[0]
-    np.testing.assert_allclose(checked, turned_about_z(30.0), atol=1e-12)
-
-
-def test_the_input_is_not_changed():
-    noisy = turned_about_z(30.0)
-    noisy[:3, :3] *= 1 + 4e-4
     before = noisy.copy()
-    check_poses(noisy)
+    np.testing.assert_allclose(check_poses(noisy)[0], turned_about_z(30.0), atol=1e-12)
     np.testing.assert_array_equal(noisy, before)
 
 
@@ -64,12 +57,9 @@ def test_the_input_is_not_changed():
         (np.zeros((4, 4)), "0 0 0 1"),
         (changed((3, 3), 2.0), "0 0 0 1"),
         (changed((0, 3), math.nan), "finite"),
-        (changed((0, 0), math.inf), "finite"),
         (changed((2, 3), 2e6), "within 1e"),
         (np.eye(3), r"shape \[C, 4, 4\]"),
-        (np.eye(4)[:3], r"shape \[C, 4, 4\]"),
         (np.eye(4, dtype=bool), "real numbers"),
-        ([["a"] * 4] * 4, "real numbers"),
         ([[1.0], [2.0, 3.0]], "ragged"),
         (None, "real numbers"),
     ],
@@ -107,9 +97,6 @@ def test_a_quaternion_of_another_norm_is_refused(norm):
 
 def test_a_quaternion_within_tolerance_is_made_exact():
     np.testing.assert_array_equal(pose_from_position_quaternion((0, 0, 0), (1.0005, 0, 0, 0)), np.eye(4))
-
-
-def test_a_position_that_is_not_finite_is_refused():
     with pytest.raises(InvalidPose, match="finite"):
         pose_from_position_quaternion((math.nan, 0, 0), (1, 0, 0, 0))
 

@@ -13,7 +13,6 @@ from ultragray import ConvexProbe, ElevationBeam, LinearProbe, PhasedProbe, Radi
 from ultragray.contract import from_dict, to_dict
 from ultragray.errors import InvalidArgument, UnknownOutput
 from ultragray.geometry.pose import pose_from_position_quaternion
-from ultragray.rendering.backends import cpu
 from ultragray.rendering.outputs import PLANES
 from ultragray.rendering.settings import Contact, FrameSettings
 from ultragray.rendering.tools import MAX_TOOLS, Box, Cylinder, Needle, ScanView, ToolFrame, load_tools
@@ -82,25 +81,30 @@ def test_what_is_no_file_of_tools_is_refused(tmp_path, text, words):
         load_tools(tmp_path / "other.json")
 
 
-def test_settings_refuse_what_is_no_tool_and_too_many():
-    with pytest.raises(InvalidArgument, match=f"tools must be a list of at most {MAX_TOOLS} values, got 9"):
-        FrameSettings(tools=TOOLS * 3)
-    for wrong in (None, "needle", {"kind": "needle"}):
-        with pytest.raises(InvalidArgument, match=r"tools\[1\] must be a Tool"):
-            FrameSettings(tools=(TOOLS[0], wrong))
-    with pytest.raises(InvalidArgument, match=r"tools\[0\].opacity must be a finite number from 0 to 0.999"):
-        from_dict(FrameSettings, {"tools": [to_dict(TOOLS[0]) | {"opacity": 1.0}]})
-    with pytest.raises(InvalidArgument, match="ghost must be a finite number from 0 to 1"):
-        FrameSettings(ghost=1.5)
+@pytest.mark.parametrize(
+    ("make", "told"),
+    [
+        (lambda: FrameSettings(tools=TOOLS * 3), f"tools must be a list of at most {MAX_TOOLS} values, got 9"),
+        (lambda: FrameSettings(tools=(TOOLS[0], None)), r"tools\[1\] must be a Tool"),
+        (lambda: FrameSettings(tools=(TOOLS[0], {"kind": "needle"})), r"tools\[1\] must be a Tool"),
+        (lambda: from_dict(FrameSettings, {"tools": [to_dict(TOOLS[0]) | {"opacity": 1.0}]}), "a .* from 0 to 0.999"),
+        (lambda: FrameSettings(ghost=1.5), "ghost must be a finite number from 0 to 1"),
+        (lambda: Needle(tip_mm=(1.0, 2.0, 3.0), hub_mm=(1.0, 2.0, 3.0)), "hub_mm must differ from tip_mm"),
+        (lambda: replace(TOOLS[2], quaternion=(0.5, 0.0, 0.0, 0.0)), r"quaternion must have norm 1 .*, got norm 0\.5"),
+    ],
+)
+def test_tools_that_cannot_be_are_refused(make, told):
+    with pytest.raises(InvalidArgument, match=told):
+        make()
 
 
 SIDE = 128
-POSES_PER_PROBE = 40  # times five probes: 200
+POSES_PER_PROBE = 12
 OUTPUTS = ("bmode", "echo", "transmittance", "labels")
 
 
-def shown(scene, *needles, probe=LINEAR, side=SIDE, **more):
-    return render(scene, probe, np.eye(4), height=side, width=side, outputs=OUTPUTS, tools=needles, **more)
+def shown(scene, *tools, probe=LINEAR, pose=ORIGIN, side=SIDE, **more):
+    return render(scene, probe, pose, height=side, width=side, outputs=OUTPUTS, tools=tools, **more)
 
 
 def tilted(angle_deg, depth_mm=20.0, **material):
@@ -147,16 +151,6 @@ def test_a_needle_beside_the_slice_is_not_seen_and_a_thick_slice_shows_it(empty_
     assert focused["bmode"].max() > 0.1
     sharp = shown(empty_scene, beside, beam=ElevationBeam(1.0, focus_mm=20.0, depth_of_field_mm=5.0))
     assert sharp["bmode"].max() < 0.1
-
-
-def test_a_needle_through_the_plane_is_a_dot_with_a_shadow(empty_scene):
-    through = Needle(tip_mm=(4.0, 10.0, 20.0), hub_mm=(4.0, -10.0, 20.0), diameter_mm=1.0)
-    frames = shown(empty_scene, through, side=200)
-    rows, columns = torch.nonzero(frames["labels"][0] == through.label, as_tuple=True)
-    assert (columns.double().mean() + 0.5) * 0.2 - 20.0 == pytest.approx(4.0, abs=0.1)
-    assert (rows.double().mean() + 0.5) * 0.25 == pytest.approx(20.0, abs=0.13)
-    assert 4 <= columns.unique().numel() <= 6  # 1 mm of columns of 0.2 mm
-    assert frames["transmittance"][0, -1].min() == pytest.approx(0.4, abs=1e-5)
 
 
 def test_brightness_falls_off_away_from_perpendicular(empty_scene):
@@ -207,21 +201,12 @@ def test_labels_are_as_thick_as_the_shaft_and_end_where_it_ends(empty_scene, ang
     assert len(rows) * 0.2 * 0.25 == pytest.approx(30.0 * 3.0, rel=0.15)
 
 
-def test_a_needle_without_direction_is_refused():
-    with pytest.raises(InvalidArgument, match="hub_mm must differ from tip_mm"):
-        Needle(tip_mm=(1.0, 2.0, 3.0), hub_mm=(1.0, 2.0, 3.0))
-    with pytest.raises(InvalidArgument, match=r"tip_mm must be a list of 3 values"):
-        Needle(tip_mm=(1.0, 2.0), hub_mm=(1.0, 2.0, 3.0))
-    with pytest.raises(InvalidArgument, match="diameter_mm must be a finite number"):
-        Needle(tip_mm=(1.0, 2.0, 3.0), hub_mm=(0.0, 0.0, 0.0), diameter_mm=0.0)
-
-
 SOLID_SIDE = 200
 DEPTHS, COLUMNS = LINEAR.depths_mm(SOLID_SIDE), (np.arange(SOLID_SIDE) + 0.5) / SOLID_SIDE * 40.0 - 20.0
 
 
-def solids_shown(scene, *tools, probe=LINEAR, pose=ORIGIN, **more):
-    return render(scene, probe, pose, height=SOLID_SIDE, width=SOLID_SIDE, outputs=OUTPUTS, tools=tools, **more)
+def solids_shown(scene, *tools, **more):
+    return shown(scene, *tools, side=SOLID_SIDE, **more)
 
 
 def labelled(frames, tool):  # [H, W]
@@ -253,9 +238,7 @@ def test_a_moved_tool_looks_as_its_frame_does_from_where_it_was(empty_scene, kin
         tool = Cylinder(tip_mm=(4.0, 0.0, 25.0), hub_mm=(-9.0, 2.0, 20.0), diameter_mm=4.0)
     pose = pose_from_position_quaternion((400.0, -30.0, 90.0), (0.5, 0.5, -0.1, math.sqrt(0.49)))
     expected = solids_shown(empty_scene, tool)
-    led = render(
-        empty_scene, LINEAR, pose, height=SOLID_SIDE, width=SOLID_SIDE, outputs=OUTPUTS, tools=(tool.moved(pose),)
-    )
+    led = solids_shown(empty_scene, tool.moved(pose), pose=pose)
     torch.testing.assert_close(led["labels"], expected["labels"])
     torch.testing.assert_close(led["echo"], expected["echo"], atol=1e-4, rtol=1e-4)
     assert labelled(led, tool).any()
@@ -293,14 +276,6 @@ def test_a_face_within_a_box_sees_nothing_else():
     crossing = box.crossing(ScanView(probe, np.eye(4)[None], 8))
     assert (crossing.first_mm == 0.0).all()
     assert crossing.cover.sum(axis=0) == pytest.approx(1.0)
-
-
-def test_a_box_that_is_not_turned_rightly_is_refused():
-    with pytest.raises(InvalidArgument, match=r"quaternion must have norm 1 within 0\.001, got norm 0\.5") as told:
-        Box(centre_mm=(0.0, 0.0, 0.0), size_mm=(1.0, 1.0, 1.0), quaternion=(0.5, 0.0, 0.0, 0.0))
-    assert told.value.field == "quaternion"
-    with pytest.raises(InvalidArgument, match=r"size_mm\[1\] must be a finite number from 0.05"):
-        Box(centre_mm=(0.0, 0.0, 0.0), size_mm=(1.0, 0.0, 1.0))
 
 
 def test_tools_behind_each_other_share_the_beam(empty_scene):
@@ -367,16 +342,6 @@ def test_lines_that_meet_no_tool_keep_their_bytes(scene):
     for name in PLANES:
         assert torch.equal(frames[name][:, :, beside], plain[name][:, :, beside])
         assert not torch.equal(frames[name], plain[name])
-
-
-@pytest.mark.parametrize("ghost", [0.0, 0.6])
-def test_backends_agree(scene, random_poses, assert_agrees, ghost):
-    poses, more = random_poses(3), {"tools": tools_of(LINEAR), "ghost": ghost}
-    reference = render(scene.to(torch.float64), LINEAR, poses, **SIZE, **more, backend="reference")
-    assert reference["bmode"].dtype == torch.float64
-    for backend in ("reference", *(["cpu"] if cpu.supports(scene) else [])):
-        fast = render(scene, LINEAR, poses, **SIZE, **more, backend=backend)
-        assert_agrees(fast, {name: reference[name].numpy() for name in PLANES}, tolerance=5e-4)
 
 
 @pytest.mark.slow

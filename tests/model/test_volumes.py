@@ -8,7 +8,7 @@ import pytest
 import SimpleITK
 import torch
 
-from ultragray import GaussianScene, LinearProbe, render
+from ultragray import GaussianScene
 from ultragray.errors import FrameTooCostly, InvalidArgument
 from ultragray.geometry.pose import check_poses
 from ultragray.rendering import volume_fields as fields_module
@@ -16,6 +16,8 @@ from ultragray.rendering.limits import GivenUp, Limits
 from ultragray.rendering.settings import Encoding
 from ultragray.rendering.volume_fields import sample_slice, sample_volume, write_slice, write_volume
 from ultragray.rendering.volumes import MAX_VOXELS, VOLUME_FIELDS, SliceSettings, VolumeGrid, parse_box, parse_numbers
+
+from .weights import gaussian_weights
 
 CENTRE_MM = (12.0, -34.0, 56.0)
 GRID = VolumeGrid.over_box((-4, -38, 70), (28, -29, 84.5), 1.5)  # 22 x 6 x 10
@@ -31,36 +33,18 @@ def scene(random_scene):
 
 
 def expected_at(scene, field, points_mm):  # [P, 3] -> [P]
-    """The sums as the module's docstring writes them, one Gaussian after the other."""
-    splats = {name: tensor.double().numpy() for name, tensor in scene.splats.items()}
-    points = (points_mm - np.array(CENTRE_MM)) / 10.0
-    sums, weighted, absorbed = (np.zeros(len(points)) for _ in range(3))
-    by_label = np.zeros((256, len(points)))
-    for n in range(len(splats["means"])):
-        w, x, y, z = splats["quats"][n] / np.linalg.norm(splats["quats"][n])
-        turn = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
-        precision = turn @ np.diag(np.exp(-2 * splats["scales"][n])) @ turn.T
-        offset = points - splats["means"][n]
-        weight = np.minimum(np.exp(-0.5 * np.einsum("pi,ij,pj->p", offset, precision, offset)), 0.999)
-        weight[weight < 1 / 255] = 0.0
-        raw = 0.5 / np.sqrt(np.pi) * splats["sh0"][n, 0, 0]
-        brightness = np.clip(raw + 1, 0.5, 0.999)
-        sums += weight
-        weighted += brightness * weight
-        absorbed += weight / (1 + np.exp(splats["transmittances"][n])) / 10.0
-        by_label[int(scene.labels[n])] += weight
+    """The sums as the module's docstring writes them."""
+    weights = np.minimum(gaussian_weights(scene, (points_mm - np.array(CENTRE_MM)) / 10.0), 0.999)
+    weights[weights < 1 / 255] = 0.0
     if field == "labels":
+        by_label = np.stack([weights[scene.labels.numpy() == label].sum(axis=0) for label in range(256)])
         return np.where(by_label.max(axis=0) >= 1 / 255, by_label.argmax(axis=0), 0)
+    sh0, logits = (scene.splats[name].double().numpy().ravel() for name in ("sh0", "transmittances"))
+    brightness, sums = np.clip(0.5 / np.sqrt(np.pi) * sh0 + 1, 0.5, 0.999), weights.sum(axis=0)
     values = {
         "coverage": 1 - np.exp(-sums),
-        "echo": (1 - np.exp(-sums)) * weighted / (sums + 1e-8),
-        "attenuation": absorbed,
+        "echo": (1 - np.exp(-sums)) * (brightness @ weights) / (sums + 1e-8),
+        "attenuation": 1 / (1 + np.exp(logits)) @ weights / 10.0,
     }
     return values[field]
 
@@ -87,15 +71,6 @@ def test_small_portions_give_the_same(scene, field, monkeypatch):
     slabs = list(sample_volume(scene, field, GRID))
     assert [len(slab) for slab in slabs] == [2] * 5
     np.testing.assert_allclose(np.concatenate(slabs), whole, atol=1e-6)
-
-
-def test_coverage_is_what_a_probe_sees_there(random_scene):
-    scene = random_scene(40, sh_degree=0, dtype=torch.float64, extent_cm=(2.0, 0.4, 2.0))
-    probe, pose = LinearProbe(30.0, 0.0, 40.0), np.eye(4)
-    frame = render(scene, probe, pose[None], height=40, width=30, outputs=("coverage",), backend="reference")
-    grid = VolumeGrid.on_plane((-15, 0, 0), (1, 0, 0), (0, 0, 1), (30, 40), 1.0)
-    # a renderer also counts w below 1/255 where the Gaussian absorbs: a few tails of at most 1/255
-    np.testing.assert_allclose(sample_slice(scene, "coverage", grid), frame.coverage[0].numpy(), atol=2 / 255)
 
 
 @pytest.mark.parametrize("suffix", [".nii.gz", ".nii"])
@@ -198,13 +173,10 @@ def test_the_pose_of_a_slice_leads_back_to_its_pixels():
     [
         ({"field": "bmode"}, "field"),
         ({"right": (0, 0, 1)}, "down"),
-        ({"down": (0, 0, 0)}, "down"),
         ({"size_mm": (0, 1)}, "size_mm"),
         ({"size_mm": (3.8e16, 3.1e299)}, "size_mm"),
         ({"size_mm": (1e6, 1e6)}, "spacing_mm"),
         ({"origin_mm": (0, -1e308, 0)}, "origin_mm"),
-        ({"spacing_mm": 1e-9}, "spacing_mm"),
-        ({"origin_mm": (0, 0)}, "origin_mm"),
         ({"origin_mm": (0, 0, float("nan"))}, "origin_mm[2]"),
     ],
 )

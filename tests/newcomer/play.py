@@ -85,7 +85,7 @@ def play(folder):
     timed("git clone", folder, "git", "clone", "--quiet", ROOT, clone)
     with serving(clone, "first frame", began):
         for page in ("README.md", "docs/tutorial.md"):
-            runner = (python, "-m", "tests.newcomer.run_page", clone / page, folder / Path(page).stem)
+            runner = (python, "-m", "tests.documents.running", clone / page, folder / Path(page).stem)
             timed(f"the blocks of {page}", clone, *runner)
     with serving(clone, "first frame of the second start", time.time()):
         pass

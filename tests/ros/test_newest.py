@@ -34,7 +34,6 @@ def test_no_default_is_of_a_type_that_ros_lacks():
     ("given", "expected"),
     [
         ({"height": 128, "outputs": ["bmode", "echo"]}, RenderSettings(height=128, outputs=("bmode", "echo"))),
-        ({"slice_thickness_mm": 0.0}, RenderSettings(slice_thickness_mm=0.0)),
         (
             {"min_confidence": 0.5, "below_min_confidence": "mask"},
             RenderSettings(min_confidence=0.5, below_min_confidence=Below.MASK),
@@ -68,11 +67,8 @@ def test_what_parameters_stand_for(given, expected):
         ({"contact": "firm"}, "contact must be one of air, pressure, got 'firm'"),
         ({"probe": "convex"}, "probe must be JSON with a kind"),
         ({"probe": '{"kind": "square"}'}, "one of convex, linear, phased, radial, steered, and its numbers"),
-        ({"probe": '{"kind": "linear"}'}, "probe must be JSON with a kind"),
-        ({"probe": "[]"}, "probe must be JSON with a kind"),
         ({"tools": "needle"}, "tools must be JSON with a kind, one of box, cylinder, needle"),
         ({"tools": '{"kind": "needle"}'}, "it is no list"),
-        ({"tools": '[{"kind": "scalpel"}]'}, "tools must be JSON with a kind"),
         (
             {"tools": '[{"kind": "needle", "tip_mm": [0, 0, 1], "hub_mm": [0, 0, 2], "frame": "base"}]'},
             "tools: frame must be one of scene, probe, got 'base'",

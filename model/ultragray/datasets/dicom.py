@@ -351,7 +351,7 @@ def _read_frames(
         return _read_jpeg(path, header, shape, chosen)
     said: tuple[str, ...] = ()
     with _in_our_words(path):
-        from pydicom.pixels import apply_color_lut, get_decoder, iter_pixels
+        from pydicom.pixels import apply_color_lut, convert_color_space, get_decoder, iter_pixels
 
         try:
             decoder = get_decoder(syntax) if syntax.is_compressed else None
@@ -362,8 +362,13 @@ def _read_frames(
             raise DatasetInvalid(
                 f"{path}: pixels compressed as {syntax.name} cannot be read without a decoder: {needed}"
             )
-        pixels = iter_pixels(path, indices=[int(number) for number in chosen], raw=True)
         surplus = max(0, int(header.get("BitsStored", 8)) - 8)
+        if decoder is not None and syntax in JPEG and surplus and "pylibjpeg" not in decoder.available_plugins:
+            raise DatasetInvalid(
+                f"{path}: {header.BitsStored} bits compressed as {syntax.name} cannot be read: install "
+                "pylibjpeg-libjpeg (GPL), or save the file without compression"
+            )
+        pixels = iter_pixels(path, indices=[int(number) for number in chosen], raw=True)
         is_ybr = interpretation in YBR
         for number, out in zip(chosen, frames, strict=True):
             with _in_our_words(f"{path}: frame {number}"):
@@ -379,7 +384,8 @@ def _read_frames(
             frame = np.asarray(frame >> surplus if surplus else frame, np.uint8)
             if number == chosen[0] and frame.ndim == 3 and interpretation != "PALETTE COLOR":
                 is_ybr, said = _is_ybr(frame, interpretation)
-            out[:] = frame[..., 0] if is_ybr else grey_frames(frame[None], str(path))[0]
+            frame = convert_color_space(frame, "YBR_FULL", "RGB") if is_ybr else frame
+            out[:] = grey_frames(frame[None], str(path))[0]
             if interpretation == "MONOCHROME1":
                 np.subtract(255, out, out=out)
     if surplus:
@@ -405,10 +411,15 @@ def _other_colours(said: str, found: str) -> str:
 def _read_jpeg(
     path: Path, header: Any, shape: tuple[int, int, int], chosen: IntArray
 ) -> tuple[ByteArray, tuple[str, ...]]:
-    """Frames of JPEG streams of 8 bits, whose own markers say what their colours are."""
+    """Frames of JPEG streams of 8 bits, whose own markers say what their colours are.
+
+    Colours are decoded before their luma is taken: the stream's own luma is that of colours that no screen shows.
+    """
     frames, places = np.empty((len(chosen), *shape[1:]), np.uint8), {int(one): at for at, one in enumerate(chosen)}
     interpretation, is_rgb = str(header.PhotometricInterpretation), False
+    is_colour = INTERPRETATIONS[interpretation] == 3
     notes: tuple[str, ...] = ()
+    flags = cv2.IMREAD_IGNORE_ORIENTATION | (cv2.IMREAD_COLOR_RGB if is_colour else cv2.IMREAD_GRAYSCALE)
     with _in_our_words(path), path.open("rb") as file:
         import pydicom
         from pydicom.encaps import generate_frames
@@ -421,17 +432,17 @@ def _read_jpeg(
                 stream = next(streams)
             if number not in places:
                 continue
-            if number == chosen[0] and INTERPRETATIONS[interpretation] == 3:
+            if number == chosen[0] and is_colour:
                 is_rgb, notes = _jpeg_colours(stream, interpretation)
-            flags = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
             size = re.search(rb"\xff[\xc0-\xc3]...(..)(..)", stream, re.DOTALL)  # never more than the header says
             frame = None
             if size is not None and tuple(int.from_bytes(side, "big") for side in size.groups()) == shape[1:]:
                 frame = cv2.imdecode(np.frombuffer(_as_rgb(stream) if is_rgb else stream, np.uint8), flags)
-            if frame is None or frame.shape != shape[1:]:
+            if frame is None or frame.shape[:2] != shape[1:]:
                 raise DatasetInvalid(
                     f"{path}: frame {number}: it cannot be read as JPEG of {shape[2]} x {shape[1]} pixels"
                 )
+            frame = grey_frames(frame[None], str(path))[0]
             frames[places[number]] = 255 - frame if interpretation == "MONOCHROME1" else frame
     return frames, notes
 

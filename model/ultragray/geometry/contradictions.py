@@ -25,6 +25,7 @@ from ultragray.geometry.registration import (
 
 LARGEST_MM, LARGEST_DEG = 5.0, 3.0  # residuals of samples that agree, as hands and trackers measure
 SMALLEST_MM, SMALLEST_DEG = 0.5, 0.5  # below which nothing is doubted
+SMALLEST_SPAN_MM = 2.0  # of the samples: a metre of a robot's way, taken as millimetres, is less
 CURED = 0.2  # of the residuals: a mistake whose undoing leaves no more is the likely cause
 MOST_EXCHANGED = 12  # samples, the worst, among which two exchanged ones are looked for
 LEAST_TO_LEAVE_ONE_OUT = 5
@@ -32,6 +33,7 @@ FLOOR_MM = 1e-3  # residuals below it are alike
 UNITS = {1000.0: "metres", 10.0: "centimetres"}
 
 _Given = dict[str, FloatArray]
+_Score = tuple[float, float]  # what is left, and how far off the flange the probe would be: of two as good, the nearer
 
 
 def pose_contradiction(
@@ -42,14 +44,15 @@ def pose_contradiction(
     if is_mounting_given:
         given["probe_to_flange"] = fit.probe_to_flange[None]
 
-    def score(given: _Given) -> float:
+    def score(given: _Given) -> _Score:
         poses = given["flange"], given["probe"]
         found = (
             register_poses(*poses, given["probe_to_flange"][0])
             if is_mounting_given
             else register_poses_and_mounting(*poses)
         )
-        return _root_mean_square(found.residuals_mm, found.residuals_deg)
+        mounted_mm = float(np.linalg.norm(found.probe_to_flange[:3, 3]))
+        return _root_mean_square(found.residuals_mm, found.residuals_deg), mounted_mm
 
     return _explained(given, fit.residuals_mm, fit.residuals_deg, score)
 
@@ -59,7 +62,7 @@ def point_contradiction(fit: PointFit, in_base: Any, in_scene: Any) -> str | Non
     given = {"base": np.asarray(in_base, np.float64), "scene": np.asarray(in_scene, np.float64)}
     nothing = np.zeros_like(fit.residuals_mm)
     return _explained(
-        given, fit.residuals_mm, nothing, lambda given: register_points(given["base"], given["scene"]).rms_mm
+        given, fit.residuals_mm, nothing, lambda given: (register_points(given["base"], given["scene"]).rms_mm, 0.0)
     )
 
 
@@ -67,23 +70,26 @@ def _root_mean_square(mm: FloatArray, deg: FloatArray) -> float:
     return float(np.sqrt(np.mean(mm**2 + (LEVER_MM * np.radians(deg)) ** 2)))
 
 
-def _explained(given: _Given, mm: FloatArray, deg: FloatArray, score: Callable[[_Given], float]) -> str | None:
+def _explained(given: _Given, mm: FloatArray, deg: FloatArray, score: Callable[[_Given], _Score]) -> str | None:
+    spans_mm = [float(np.ptp(_positions(samples), axis=0).max()) for samples in list(given.values())[:2]]
+    if max(spans_mm) < SMALLEST_SPAN_MM:
+        return f"all samples lie within {max(spans_mm):.2g} mm: are their positions in metres?"
     if mm.max() < SMALLEST_MM and deg.max() < SMALLEST_DEG:
         return None
     weights = mm**2 + (LEVER_MM * np.radians(deg)) ** 2
-    best, cause = CURED * _root_mean_square(mm, deg), ""
+    best, cause = (CURED * _root_mean_square(mm, deg), 0.0), ""
     for text, changes in _mistakes(given, np.argsort(-weights)):
         try:
-            left = max(FLOOR_MM, score({**given, **changes}))
+            left, mounted_mm = score({**given, **changes})
         except UltragrayError:  # what is left cannot be fitted
             continue
-        if left < best:
-            best, cause = left, text
+        if (max(FLOOR_MM, left), mounted_mm) < best:
+            best, cause = (max(FLOOR_MM, left), mounted_mm), text
     if not cause and mm.max() <= LARGEST_MM and deg.max() <= LARGEST_DEG:
         return None
     worst = int(weights.argmax())
     angle = f" and {deg[worst]:.2g}°" if deg.any() else ""
-    likely = f"likely {cause} (without it {best:.2g} mm are left)" if cause else "no single mistake explains it"
+    likely = f"likely {cause} (without it {best[0]:.2g} mm are left)" if cause else "no single mistake explains it"
     return (
         f"the samples contradict each other: sample {worst}, the worst (counted from 0), is {mm[worst]:.3g} mm{angle} "
         f"off; {likely}"
@@ -93,17 +99,13 @@ def _explained(given: _Given, mm: FloatArray, deg: FloatArray, score: Callable[[
 def _mistakes(given: _Given, worst_first: np.ndarray) -> Iterator[tuple[str, Mapping[str, FloatArray]]]:
     """Each likely mistake, and what was given as it would be without it."""
     (one_name, one), (other_name, other), *mounting = given.items()
-    for factor, unit in UNITS.items():  # only the ratio of both units shows
-        yield f"the positions of {one_name} are in {unit}", {one_name: _scaled(one, factor)}
-        yield (
-            f"the positions of {other_name} are in {unit}",
-            {name: _scaled(samples, 1 / factor) for name, samples in ((one_name, one), *mounting)},
-        )
-        for name, samples in mounting:
-            yield f"the position of {name} is in {unit}", {name: _scaled(samples, factor)}
-    for name, samples in given.items():
-        if samples.ndim == 3:
-            yield f"the poses of {name} are inverted", {name: np.asarray(np.linalg.inv(samples), np.float64)}
+    both = (one_name, other_name)
+    for names in (*((name,) for name in given), both):
+        what = " and ".join(names)
+        for factor, unit in UNITS.items():
+            yield f"the positions of {what} are in {unit}", {name: _scaled(given[name], factor) for name in names}
+        if one.ndim == 3 and (mounting or names != both):  # with a mounting to be found, both agree all the same
+            yield f"the poses of {what} are inverted", {name: _inverted(given[name]) for name in names}
     if len(one) > LEAST_TO_LEAVE_ONE_OUT:
         yield f"{one_name} is one sample late", {one_name: one[1:], other_name: other[:-1]}
         yield f"{one_name} is one sample early", {one_name: one[:-1], other_name: other[1:]}
@@ -122,8 +124,15 @@ def _mistakes(given: _Given, worst_first: np.ndarray) -> Iterator[tuple[str, Map
         yield f"sample {place} alone is wrong{''.join(stale[:1])}", {one_name: one[kept], other_name: other[kept]}
 
 
+def _inverted(poses: FloatArray) -> FloatArray:  # [N, 4, 4]
+    return np.asarray(np.linalg.inv(poses), np.float64)
+
+
 def _scaled(samples: FloatArray, factor: float) -> FloatArray:  # [N, 4, 4] or [N, 3]
     scaled = samples.copy()
-    places = scaled[:, :3, 3] if samples.ndim == 3 else scaled
-    places *= factor
+    _positions(scaled)[:] *= factor
     return scaled
+
+
+def _positions(samples: FloatArray) -> FloatArray:  # [N, 3], a view
+    return samples[:, :3, 3] if samples.ndim == 3 else samples

@@ -36,9 +36,9 @@ from ultragray.scene.info import (
     with_summary,
 )
 
-MAX_POSITION_CM = 1e6
 PARAMETERS = ("means", "scales", "quats", "transmittances", "sh0", "shN")
-
+LARGEST = {"means": 1e6, "scales": 20.0} | dict.fromkeys(("quats", "transmittances", "sh0", "shN"), 1e6)
+LEAST_NORM = 1e-6  # of a quaternion: squares of smaller ones vanish in float32
 
 Prepared = TypeVar("Prepared")
 
@@ -93,8 +93,8 @@ class GaussianScene:
         """A scene of raw released parameters, lengths in cm; the graph of the tensors is kept.
 
         Labels that `info.label_names` does not name are called after their number.
-        Raises InvalidArgument, naming the tensor, for a missing key, a wrong shape, mixed dtypes or devices, or
-        values that are not finite.
+        Raises InvalidArgument, naming the tensor, for a missing key, a wrong shape, mixed dtypes or devices, no
+        Gaussian at all, and values that no scene has: not finite, beyond LARGEST, quaternions of no length.
         """
         missing = [name for name in PARAMETERS if name not in splats and name != "shN"]
         if missing:
@@ -130,12 +130,9 @@ class GaussianScene:
                     f"{tensor.device}",
                     field=name,
                 )
-            if not bool(torch.isfinite(tensor).all()):
-                raise InvalidArgument(f"splats[{name!r}] must be finite, got NaN or infinity", field=name)
-        if count and float(means.detach().abs().max()) > MAX_POSITION_CM:
-            raise InvalidArgument(f"splats['means'] must lie within {MAX_POSITION_CM:g} cm", field="means")
-        if count and bool((tensors["quats"].detach().norm(dim=-1) == 0).any()):
-            raise InvalidArgument("splats['quats'] must not be zero", field="quats")
+            _check_values(name, tensor.detach())
+        if count == 0:
+            raise InvalidArgument("splats must hold at least one Gaussian", field="splats")
         poses = np.zeros((0, 4, 4)) if training_poses is None else check_poses(training_poses, field="training_poses")
         check_training_pose_count(len(poses))
         summary = with_summary(info or SceneInfo(), means.detach().cpu().double().numpy(), degree)
@@ -231,6 +228,22 @@ class GaussianScene:
             )
         except (OSError, SafetensorError, ValueError) as error:
             raise scene_file_invalid(path, error) from error
+
+
+def _check_values(name: str, tensor: Tensor) -> None:  # [N, ...]
+    """Raises InvalidArgument, naming the first Gaussian whose values cannot be rendered, and how many there are."""
+    values = tensor.flatten(1) if tensor.ndim > 1 else tensor[:, None]
+    wrong = ~(values.abs() <= LARGEST[name]).all(dim=1)  # NaN is not
+    expected = f"be finite and within ±{LARGEST[name]:g}"
+    if name == "quats" and not wrong.any():
+        wrong, expected = values.norm(dim=1) < LEAST_NORM, "not be zero"
+    if wrong.any():
+        first = int(wrong.nonzero()[0])
+        got = ", ".join(f"{value:.6g}" for value in values[first].tolist())
+        raise InvalidArgument(
+            f"splats[{name!r}] must {expected}, got [{got}] for Gaussian {first} ({int(wrong.sum())} are wrong)",
+            field=name,
+        )
 
 
 def _names_of_labels(labels: Any, means: Tensor, known: Mapping[int, str]) -> dict[int, str]:

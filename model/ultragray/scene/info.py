@@ -16,11 +16,11 @@ from typing import Any
 import numpy as np
 from safetensors import SafetensorError, safe_open
 
-from ultragray.contract import Contract, described, from_dict, to_dict
+from ultragray.contract import Contract, checked_number, described, from_dict, to_dict, under
 from ultragray.errors import InvalidArgument, InvalidProbe, SceneFileInvalid
 from ultragray.files import require_version
 from ultragray.geometry.image_size import DEFAULT_IMAGE_SIDE
-from ultragray.geometry.pose import check_poses
+from ultragray.geometry.pose import MAX_POSITION_MM, check_poses
 from ultragray.geometry.probe import PLANE, ElevationBeam, FloatArray, Probe
 from ultragray.scene.confidence import read_model
 
@@ -44,7 +44,7 @@ Vector = tuple[float, float, float]
 class SceneInfo(Contract):
     """A scene's own description. Positions are in mm; `bounds` and `centre` in the frame of the training sweep."""
 
-    centre_mm: Vector = (0.0, 0.0, 0.0)
+    centre_mm: Vector = described("0 of the Gaussians.", (0.0,) * 3, low=-MAX_POSITION_MM, high=MAX_POSITION_MM)
     probe: Probe | None = None
     image_height: int | None = described("H of the training images.", None, low=1)
     image_width: int | None = described("W of the training images.", None, low=1)
@@ -64,6 +64,9 @@ class SceneInfo(Contract):
     def __post_init__(self) -> None:
         object.__setattr__(self, "label_names", _label_names(self.label_names))
         super().__post_init__()
+        for name, value in self.metrics.items():
+            with under(f"metrics.{name}"):
+                checked_number(value, float)
 
     def probe_or(self, asked: Probe | None) -> Probe:
         """The probe asked for, else the one the scene was trained with.
@@ -114,9 +117,13 @@ def info_to_json(info: SceneInfo) -> str:
     return json.dumps(document, allow_nan=False, sort_keys=True)
 
 
+def _refuse_constant(constant: str) -> None:
+    raise ValueError(f"its metadata holds {constant}, which JSON does not have")
+
+
 def info_from_json(text: str) -> SceneInfo:
     """Inverse of `info_to_json`. Raises ValueError (InvalidArgument among them), saying what is wrong."""
-    document = json.loads(text)
+    document = json.loads(text, parse_constant=_refuse_constant)
     if not isinstance(document, dict):
         raise ValueError("its metadata is not a JSON object")
     require_version(document.pop("format_version", None), FORMAT_VERSION)
@@ -207,6 +214,8 @@ def check_training_pose_count(count: int) -> None:
 
 
 def _check_tensors(bundle: Any, info: SceneInfo) -> None:
+    if not info.gaussian_count:
+        raise ValueError("it holds no Gaussians")
     names = set(bundle.keys())
     shapes = expected_shapes(info.gaussian_count, info.sh_degree)
     if info.label_names:

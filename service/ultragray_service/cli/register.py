@@ -132,7 +132,7 @@ def points(
     json: Json = False,
 ) -> None:
     """From three or more points that are known in both frames, not on a line. Exit status 1: they contradict each
-    other."""
+    other, and nothing is written."""
     check_file(output, SUFFIXES, force=force)
     mounting = _mounting(probe_to_flange)
     import numpy as np
@@ -172,7 +172,7 @@ def poses(
 ) -> None:
     """From poses of the flange and where the probe was in the scene: registration, and hand–eye calibration.
 
-    Exit status 1: they contradict each other; the worst sample and the likely cause are named.
+    Exit status 1: they contradict each other, and nothing is written; the worst sample and the likely cause are named.
     """
     check_file(output, SUFFIXES, force=force)
     if find_mounting and probe_to_flange is not None:
@@ -296,13 +296,14 @@ def _write(
     from ultragray.contract import to_dict
     from ultragray.geometry.registration import save_registration
 
-    save_registration(path, registration)
+    if doubt is None:
+        save_registration(path, registration)
     document = to_dict(registration) | {"residuals_mm": residuals_mm, "residuals_deg": residuals_deg}
     document["warnings"] = [] if doubt is None else [doubt]
     if left_out is not None:
         document["left_out"] = left_out
     sentences = [
-        f"wrote {path}, from {len(residuals_mm)} {what}",
+        f"{'wrote' if doubt is None else 'did not write'} {path}, from {len(residuals_mm)} {what}",
         f"residuals: {_range(residuals_mm)} mm" + (f", {_range(residuals_deg)}°" if residuals_deg else ""),
     ]
     if registration.position_std_mm is not None and registration.angle_std_deg is not None:
@@ -315,7 +316,7 @@ def _write(
         sentences.append(f"left out, as they were not found or do not fit the others: {', '.join(map(str, left_out))}")
     tell("\n".join(sentences), document, as_json=as_json)
     if doubt is not None:
-        warn(f"{doubt}: {path} is not to be trusted")
+        warn(doubt)
         raise typer.Exit(1)
 
 

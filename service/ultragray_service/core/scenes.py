@@ -5,7 +5,6 @@ from __future__ import annotations
 import asyncio
 import base64
 import binascii
-import math
 import re
 from bisect import bisect_right
 from collections.abc import Awaitable, Callable, Iterator, Sequence
@@ -211,16 +210,6 @@ def scene_to_blame() -> Iterator[None]:
         raise type(error)(_FOLDERS.sub("", error.detail), field=error.field or "scene") from error
 
 
-def finite_metrics(header: SceneHeader) -> dict[str, float]:
-    """The scene's metrics that are numbers (a file may claim anything)."""
-    found = {}
-    for name, value in header.info.metrics.items():
-        with suppress(OverflowError):  # an integer beyond all floats
-            if isinstance(value, (int, float)) and math.isfinite(value):
-                found[name] = float(value)
-    return found
-
-
 @dataclass(frozen=True)
 class SceneEntry:
     """A scene in the list. A file that cannot be read has `error`, and null for what is in the file."""
@@ -343,7 +332,7 @@ class Scene:
             image_height=info.image_height,
             image_width=info.image_width,
             training_poses=TrainingPoses.of(header),
-            metrics=finite_metrics(header),
+            metrics=header.info.metrics,
             dataset_name=None if info.dataset_name is None else str(info.dataset_name),
             dataset_sha256=None if info.dataset_sha256 is None else str(info.dataset_sha256),
             outputs=[name for name, output in OUTPUTS.items() if output.lacks(info) is None],
@@ -426,6 +415,6 @@ def _entry(entry: CatalogEntry, loaded: bool, removable: bool, ownership: Owners
         owner=owner,
         private=private,
         probe_kind=None if info.probe is None else info.probe.kind,
-        metrics=finite_metrics(entry.header),
+        metrics=entry.header.info.metrics,
         changed_at=None if entry.changed_at_s is None else iso_time(entry.changed_at_s),
     )

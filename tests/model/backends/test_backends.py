@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 import pytest
@@ -19,72 +16,14 @@ from ultragray import (
     LinearProbe,
     PhasedProbe,
     Probe,
-    SteeredProbe,
     render,
 )
-from ultragray.errors import BackendUnavailable
-from ultragray.rendering.outputs import PLANES
+from ultragray.errors import BackendUnavailable, InvalidArgument
+from ultragray.rendering.backends import cuda
+from ultragray.rendering.frames import footprint_pixels
+from ultragray.rendering.outputs import PLANES, WEIGHT_SUM
 
-from .conftest import CONVEX, HEIGHT, KERNELS, LINEAR, PHASED, RADIAL, STEERED, WIDTH, drawn
-
-FOCUSED = ElevationBeam(thickness_mm=2.0, focus_mm=15.0, depth_of_field_mm=12.0)
-
-
-@dataclass(frozen=True)
-class Case:
-    """A scene, a probe and poses; images are small, poses many, so that strips and batches are crossed."""
-
-    scene: Mapping[str, Any] = field(default_factory=dict)
-    probe: Probe = LINEAR
-    height: int = HEIGHT
-    width: int = WIDTH
-    poses: int = 6
-    tilt_deg: float = 20.0
-    beam: ElevationBeam | None = None
-
-
-CASES = {
-    "linear": Case(),
-    "convex": Case(probe=CONVEX),
-    "wide_fan": Case(probe=ConvexProbe(opening_angle_deg=150.0, near_mm=5.0, far_mm=50.0)),
-    "face_beyond_apex_zero": Case(probe=ConvexProbe(opening_angle_deg=45.0, near_mm=0.0, far_mm=50.0)),
-    "phased": Case(probe=PHASED),
-    "phased_at_the_face": Case({"centre_cm": (0, 0, 0.3), "extent_cm": (1, 0.4, 0.8)}, probe=PHASED),
-    "radial": Case({"centre_cm": (0, 0, 0)}, probe=RADIAL),
-    "radial_about_the_centre": Case({"centre_cm": (0, 0, 0), "extent_cm": (1, 1, 1), "sigma_cm": (0.02, 0.4)}, RADIAL),
-    "radial_of_few_lines": Case({"centre_cm": (0, 0, 0)}, probe=RADIAL, width=5),
-    "radial_of_many_lines": Case({"centre_cm": (0, 0, 0), "count": 600}, probe=RADIAL, width=301, poses=1),
-    "steered": Case(probe=SteeredProbe(width_mm=40.0, steering_deg=25.0, near_mm=0.0, far_mm=50.0)),
-    "steered_back": Case(probe=SteeredProbe(width_mm=30.0, steering_deg=-40.0, near_mm=5.0, far_mm=50.0)),
-    "near_plane_inside": Case(probe=LinearProbe(width_mm=30.0, near_mm=15.0, far_mm=35.0)),
-    "at_the_face": Case({"centre_cm": (0, 0, 0.02), "extent_cm": (3, 0.2, 0.3), "sigma_cm": (0.02, 0.3)}, tilt_deg=3.0),
-    "large": Case({"count": 40, "sigma_cm": (1.0, 3.0)}),
-    "smaller_than_a_pixel": Case({"count": 4000, "sigma_cm": (0.002, 0.01), "extent_cm": (4, 0.6, 5)}, tilt_deg=0.2),
-    "needles": Case({"sigma_cm": (0.005, 1.0)}, tilt_deg=90.0),
-    "needles_convex": Case({"sigma_cm": (0.005, 1.0)}, probe=CONVEX, tilt_deg=60.0),
-    "dense_and_absorbing": Case({"count": 1200, "transmittance_logit": (-6, 0), "sigma_cm": (0.1, 0.3)}, poses=3),
-    "transparent": Case({"transmittance_logit": (18.0, 20.0)}),
-    "degree_0": Case({"sh_degree": 0}),
-    "degree_2": Case({"sh_degree": 2}),
-    "degree_3": Case({"sh_degree": 3}),
-    "sigmoid": Case({"intensity": "sigmoid", "sh_degree": 1}),
-    "sigmoid_degree_3": Case({"intensity": "sigmoid", "sh_degree": 3}, probe=CONVEX),
-    "one_pixel": Case({"sigma_cm": (0.2, 0.5)}, height=1, width=1, poses=60),
-    "one_row": Case(height=1, width=97, poses=20),
-    "one_column": Case(height=97, width=1, poses=20),
-    "one_row_convex": Case(probe=CONVEX, height=1, width=97, poses=20),
-    "tall": Case(height=301, width=7, poses=2),
-    "broad": Case(height=5, width=301, poses=2),
-    "many_poses": Case({"count": 60}, height=16, width=16, poses=50, tilt_deg=180.0),
-    "linear, focused": Case(beam=FOCUSED),
-    "linear, constant": Case(beam=ElevationBeam(thickness_mm=3.0)),
-    "convex, focused": Case(probe=CONVEX, beam=FOCUSED),
-    "phased, focused": Case({"centre_cm": (0, 0, 1.5)}, probe=PHASED, beam=FOCUSED),
-    "radial, focused": Case({"centre_cm": (0, 0, 0)}, probe=RADIAL, beam=FOCUSED),
-    "steered, focused": Case(probe=STEERED, beam=FOCUSED),
-    "needles, focused": Case({"sigma_cm": (0.01, 1.0)}, beam=FOCUSED),
-    "much thicker than the Gaussians": Case({"count": 900}, beam=ElevationBeam(thickness_mm=20.0), poses=2),
-}
+from .conftest import CASES, CONVEX, FOCUSED, KERNELS, LINEAR, PHASED, drawn
 
 
 @pytest.fixture(scope="session")
@@ -117,6 +56,9 @@ def test_every_kind_of_probe_is_tested():
 @pytest.mark.parametrize("name", CASES)
 def test_matches_the_reference_in_float64(name, kernel, prepared, assert_agrees):
     case, scene, poses, expected, stable = prepared(name)
+    if kernel == "cuda" and cuda.interpreted():  # slow
+        poses, stable = poses[:2], stable[:2]
+        expected = {output: plane[:2] for output, plane in expected.items()}
     assert stable.mean() > 0.995
     assert (expected["coverage"] > 0.01).mean() > 0.002, "the case shows too little to test anything"
     frames = Frames(drawn(kernel, scene, case.probe, poses, case.beam, size=(case.height, case.width)))
@@ -232,8 +174,6 @@ def test_extreme_parameters_stay_exact(kernel, random_scene, random_poses, asser
         (ConvexProbe(opening_angle_deg=60, near_mm=10, far_mm=50), 4.601, False),
         (PhasedProbe(opening_angle_deg=60, far_mm=50), 0.001, True),
         (PhasedProbe(opening_angle_deg=60, far_mm=50), -0.001, False),
-        (PhasedProbe(opening_angle_deg=60, far_mm=50), 4.499, True),
-        (PhasedProbe(opening_angle_deg=60, far_mm=50), 4.501, False),
     ],
 )
 def test_the_depth_cull_is_by_the_mean(planes, probe, depth_cm, visible):
@@ -256,17 +196,6 @@ def test_a_phased_probe_sees_what_a_convex_one_without_a_radius_sees(planes, ran
         planes(random_scene(120), probe, random_poses(3), 33, 41) for probe in (PHASED, convex)
     )
     np.testing.assert_array_equal(phased_frames, convex_frames)
-
-
-def test_auto_keeps_the_dtype_and_the_gradient(random_scene):
-    scene = random_scene(20)
-    size = {"height": 12, "width": 10}
-    double = render(scene.to(torch.float64), LINEAR, np.eye(4), **size)
-    assert double.bmode.dtype == torch.float64
-    scene.sh0.requires_grad_()
-    frames = render(scene, LINEAR, np.eye(4), **size)
-    frames.bmode.sum().backward()
-    assert scene.sh0.grad.abs().sum() > 0
 
 
 def test_an_unknown_backend_is_named(random_scene):
@@ -307,3 +236,86 @@ def test_extreme_gaussians(name, kernel, assert_agrees):
     view = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=80.0), np.eye(4)[None]
     exact = drawn("reference", EXTREMES[name].to(torch.float64), *view, size=(40, 40))
     assert_agrees(Frames(drawn(kernel, EXTREMES[name], *view, size=(40, 40))), exact, tolerance=5e-4)
+
+
+# Of the released implementation, in ../shared/golden; the reference takes a minute for a scene of 5,000 Gaussians.
+GOLDEN = [
+    pytest.param(
+        name, backend, id=f"{backend}-{name}", marks=[pytest.mark.long] * ((name, backend) == ("g06", "reference"))
+    )
+    for name in ("g01", "g03", "g05", "g06", "g08")
+    for backend in ("reference", "cpu", "cuda")
+]
+
+
+@pytest.mark.parametrize(("name", "backend"), GOLDEN)
+def test_all_outputs_match(golden, assert_agrees, on_device, name, backend):
+    file, is_exact = golden(name), backend == "reference"
+    scene = file.scene(torch.float64 if is_exact else torch.float32)
+    scene = on_device(scene) if backend == "cuda" else scene
+    frames = render(scene, file.probe, file.poses, height=file.height, width=file.width, backend=backend)
+    assert frames.bmode.dtype == scene.means.dtype
+    assert_agrees(frames, file.expected, tolerance=5e-5 if is_exact else 5e-4, stable=file.stable)
+
+
+CONSTANT = ElevationBeam(thickness_mm=3.0)
+
+
+def shifted_along_elevation(pose, shift_mm):  # [4, 4], [K] -> [K, 4, 4]
+    poses = np.repeat(pose[None], len(shift_mm), axis=0)
+    poses[:, :3, 3] += shift_mm[:, None] * pose[:3, 1]
+    return poses
+
+
+def weight_sums(scene, poses, beam):  # [C, H, W]
+    return drawn("reference", scene, LINEAR, poses, beam, outputs=(WEIGHT_SUM,))[WEIGHT_SUM]
+
+
+def test_a_constant_beam_is_the_mean_of_thin_slices(random_scene, random_poses):
+    scene = random_scene(4, seed=1, sigma_cm=(0.2, 0.6), dtype=torch.float64)
+    (pose,) = random_poses(1, seed=2)
+    nodes, weights = np.polynomial.hermite_e.hermegauss(31)
+    sigma_mm = CONSTANT.thickness_mm / 2.3548
+    slices = weight_sums(scene, shifted_along_elevation(pose, nodes * sigma_mm), None)
+    mean = torch.einsum("k,khw->hw", torch.from_numpy(weights / weights.sum()), slices)
+    thick = weight_sums(scene, pose[None], CONSTANT)[0]
+    assert thick.max() > 0.2
+    assert (thick - mean).abs().max() < 4 / 255  # of each Gaussian, weights below 1/255 may be left out
+
+
+def test_a_beam_conserves_the_weight_that_lies_across_elevation(random_scene):
+    scene = random_scene(4, seed=1, sigma_cm=(0.1, 0.3), dtype=torch.float64)
+    across = np.linspace(-25.0, 25.0, 101)
+    poses = shifted_along_elevation(np.eye(4), across)
+    thin, thick = (weight_sums(scene, poses, beam).sum() for beam in (None, ElevationBeam(thickness_mm=4.0)))
+    assert thick == pytest.approx(float(thin), rel=0.1)
+
+
+def test_a_thickness_grows_by_the_square_root_of_two_within_half_the_depth_of_field():
+    for offset in (-6.0, 6.0):
+        assert FOCUSED.thickness_at_mm(15.0 + offset) == pytest.approx(2.0 * np.sqrt(2.0))
+    assert CONSTANT.thickness_at_mm(40.0) == 3.0
+
+
+def test_the_beam_of_the_scene_holds_unless_another_is_asked_for(random_scene):
+    scene, thick = random_scene(100), random_scene(100, info={"beam": CONSTANT})
+
+    def frame(scene, beam=None):
+        return render(scene, LINEAR, np.eye(4), height=32, width=32, beam=beam).bmode
+
+    assert torch.equal(frame(thick), frame(scene, CONSTANT))
+    assert not torch.equal(frame(thick), frame(scene))
+    assert torch.equal(frame(thick, ElevationBeam(thickness_mm=0.0)), frame(scene))
+
+
+def test_a_thick_slice_cuts_more_gaussians_and_costs_more(random_scene):
+    scene = random_scene(2000, sigma_cm=(0.02, 0.05))
+    thin, thick = (
+        footprint_pixels(scene, LINEAR, np.eye(4), height=64, width=64, beam=beam)[0] for beam in (None, CONSTANT)
+    )
+    assert thick > 2 * thin
+
+
+def test_a_beam_of_another_shape_is_refused(random_scene):
+    with pytest.raises(InvalidArgument, match=r"an ElevationBeam or a tensor \[3\]"):
+        render(random_scene(2), LINEAR, np.eye(4), height=8, width=8, beam=torch.ones(2))

@@ -87,7 +87,7 @@ def test_other_python_threads_run_while_it_renders(random_scene):
     beating = threading.Thread(target=beat)
     beating.start()
     started = time.perf_counter()
-    render(scene, PROBE, np.repeat(poses(1), 64, axis=0), height=512, width=256, outputs=("bmode",))
+    render(scene, PROBE, np.repeat(poses(1), 24, axis=0), height=512, width=256, outputs=("bmode",))
     ended = time.perf_counter()
     done.set()
     beating.join()

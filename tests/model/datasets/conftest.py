@@ -1,13 +1,8 @@
 """Small sweeps, and PLUS sequence files of them, made by hand."""
 
-from __future__ import annotations
-
 import gzip
 import zlib
-from collections.abc import Callable, Mapping
-from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -21,21 +16,21 @@ DEVICE_SET = """<PlusConfiguration version="2.1"><CoordinateDefinitions>
 </CoordinateDefinitions></PlusConfiguration>"""
 
 
-def numbers(matrix: np.ndarray) -> str:
+def numbers(matrix):
     return " ".join(repr(float(value)) for value in matrix.ravel())
 
 
-def translation(*offset: float) -> np.ndarray:
+def translation(*offset):
     matrix = np.eye(4)
     matrix[:3, 3] = offset
     return matrix
 
 
-def speckle(count: int, height: int, width: int, seed: int = 0) -> np.ndarray:  # [count, height, width]
+def speckle(count, height, width, seed=0):  # [count, height, width]
     return np.random.default_rng(seed).integers(0, 250, (count, height, width), dtype=np.uint8)
 
 
-def tracked_fields(count: int) -> dict[str, str]:
+def tracked_fields(count):
     """A probe that moves 1 mm a frame along the tracker's y, as the fields of its frames."""
     return {
         key: value
@@ -47,9 +42,7 @@ def tracked_fields(count: int) -> dict[str, str]:
     }
 
 
-def write_mha(
-    path: Path, stored: np.ndarray, fields: Mapping[str, str], *, deflate: bool = True, data_file: str = "LOCAL"
-) -> Path:
+def write_mha(path, stored, fields, *, deflate=True, data_file="LOCAL"):
     """Stored frames [F, rows, columns] or [F, rows, columns, 3] as MetaImage."""
     payload = zlib.compress(stored.tobytes()) if deflate else stored.tobytes()
     count, rows, columns, *channels = stored.shape
@@ -75,7 +68,7 @@ def write_mha(
     return path
 
 
-def write_nrrd(path: Path, stored: np.ndarray, fields: Mapping[str, str], **changes: str) -> Path:
+def write_nrrd(path, stored, fields, **changes):
     """The same as NRRD, gzip unless `encoding` says raw."""
     count, rows, columns, *channels = stored.shape
     header = {
@@ -99,7 +92,7 @@ def write_nrrd(path: Path, stored: np.ndarray, fields: Mapping[str, str], **chan
 
 
 @pytest.fixture
-def plus_files() -> SimpleNamespace:
+def plus_files():
     """The writers above, for tests."""
     return SimpleNamespace(
         image_to_probe=IMAGE_TO_PROBE,
@@ -113,19 +106,19 @@ def plus_files() -> SimpleNamespace:
 
 
 @pytest.fixture
-def device_set(tmp_path: Path) -> Path:
+def device_set(tmp_path):
     path = tmp_path / "device_set.xml"
     path.write_text(DEVICE_SET.format(matrix=numbers(IMAGE_TO_PROBE)))
     return path
 
 
 @pytest.fixture
-def make_sweep() -> Callable[..., Sweep]:
-    def make(count: int = 10, *, step_mm: float = 1.0, **changes: Any) -> Sweep:
+def make_sweep():
+    def make(count=10, *, step_mm=1.0, **changes):
         """Frames 40 mm wide and 50 mm deep that move along the elevation."""
         poses = np.tile(np.eye(4), (count, 1, 1))
         poses[:, :3, 3] = [(5.0, frame * step_mm, 7.0) for frame in range(count)]
-        values: dict[str, Any] = {
+        values = {
             "images": speckle(count, 20, 16),
             "poses": poses,
             "probe": LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0),

@@ -1,25 +1,24 @@
 """What a report says about a sweep, and what it warns of."""
 
-from __future__ import annotations
-
 import json
+import math
 import tracemalloc
-from collections.abc import Callable
 from dataclasses import replace
-from pathlib import Path
 
 import cv2
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
-from ultragray import ConvexProbe, LinearProbe, Probe
+from ultragray import ConvexProbe, LinearProbe, PhasedProbe
 from ultragray.contract import to_dict
 from ultragray.datasets import Dataset, Sweep
-from ultragray.datasets.checks import check_dataset, check_sweep, without_names
+from ultragray.datasets.checks import MAX_VOXELS, check_dataset, check_sweep, swept_volume, without_names
+from ultragray.datasets.pictures import _draw_planes, draw_dataset
 from ultragray.datasets.source import load_dataset
 
 
-def test_a_straight_sweep(make_sweep: Callable[..., Sweep]) -> None:
+def test_a_straight_sweep(make_sweep):
     report = check_sweep(make_sweep(11, step_mm=0.5))
     assert (report.frames, report.height, report.width) == (11, 20, 16)
     assert report.pixel_axial_mm == pytest.approx(2.5)
@@ -34,7 +33,7 @@ def test_a_straight_sweep(make_sweep: Callable[..., Sweep]) -> None:
     assert report.warnings == ()
 
 
-def test_tilts_are_told_by_axis(make_sweep: Callable[..., Sweep]) -> None:
+def test_tilts_are_told_by_axis(make_sweep):
     poses = np.tile(np.eye(4), (5, 1, 1))
     for pose, degrees in zip(poses, (-20, -10, 0, 10, 15), strict=True):
         angle = np.radians(degrees)
@@ -45,11 +44,11 @@ def test_tilts_are_told_by_axis(make_sweep: Callable[..., Sweep]) -> None:
     assert report.step_max_deg == pytest.approx(10)
 
 
-def warnings_of(sweep: Sweep) -> str:
+def warnings_of(sweep):
     return "\n".join(check_sweep(sweep).warnings)
 
 
-def test_a_pose_off_its_neighbours_is_named(make_sweep: Callable[..., Sweep]) -> None:
+def test_a_pose_off_its_neighbours_is_named(make_sweep):
     poses = make_sweep(12).poses.copy()
     poses[7, 0, 3] += 20.0
     text = warnings_of(make_sweep(12, poses=poses, frame_numbers=np.arange(100, 112)))
@@ -57,7 +56,7 @@ def test_a_pose_off_its_neighbours_is_named(make_sweep: Callable[..., Sweep]) ->
     assert "\n" not in text
 
 
-def test_a_lost_pose_is_named_whichever_part_it_is_in(make_sweep: Callable[..., Sweep]) -> None:
+def test_a_lost_pose_is_named_whichever_part_it_is_in(make_sweep):
     """A tracker that lost the probe says that it lies at its own origin, 2 m away."""
     for lost in (4, 7, 0):
         poses = make_sweep(30).poses.copy()
@@ -72,7 +71,7 @@ def test_a_lost_pose_is_named_whichever_part_it_is_in(make_sweep: Callable[..., 
         assert {report.train.voxel_mm > 1.0, report.val is not None and report.val.voxel_mm > 1.0} == {True, False}
 
 
-def test_positions_in_millimetres_where_metres_are_expected_are_named(make_sweep: Callable[..., Sweep]) -> None:
+def test_positions_in_millimetres_where_metres_are_expected_are_named(make_sweep):
     sweep = make_sweep(24, step_mm=1000.0)
     (told,) = check_dataset(Dataset("one", sweep, sweep.select([]))).warnings
     assert told == (
@@ -80,7 +79,7 @@ def test_positions_in_millimetres_where_metres_are_expected_are_named(make_sweep
     )
 
 
-def moving_texture(count: int = 20) -> np.ndarray:  # [count, 96, 128]
+def moving_texture(count=20):  # [count, 96, 128]
     """Texture that changes slowly from frame to frame."""
     random = np.random.default_rng(1)
     ends = [cv2.GaussianBlur(random.normal(size=(96, 128)).astype(np.float32), (0, 0), 2.0) for _ in range(3)]
@@ -90,9 +89,7 @@ def moving_texture(count: int = 20) -> np.ndarray:  # [count, 96, 128]
 
 
 @pytest.mark.parametrize("height", [12, 24])
-def test_text_that_is_burnt_in_is_named_with_its_place_and_made_black(
-    make_sweep: Callable[..., Sweep], height: int
-) -> None:
+def test_text_that_is_burnt_in_is_named_with_its_place_and_made_black(make_sweep, height):
     plain = moving_texture()
     images = plain.copy()
     for image in images:
@@ -115,11 +112,11 @@ def test_text_that_is_burnt_in_is_named_with_its_place_and_made_black(
     ]
 
 
-def sweep_of(sweep: Sweep, images: np.ndarray) -> Sweep:
+def sweep_of(sweep, images):
     return replace(sweep.select(range(15)), images=images[:15])
 
 
-def test_a_picture_that_changes_at_once_is_named(make_sweep: Callable[..., Sweep]) -> None:
+def test_a_picture_that_changes_at_once_is_named(make_sweep):
     images = moving_texture()
     assert not [text for text in warnings_of(make_sweep(20, images=images)).splitlines() if "at once" in text]
     for frame in range(12, 20):  # half the depth from there on
@@ -130,14 +127,14 @@ def test_a_picture_that_changes_at_once_is_named(make_sweep: Callable[..., Sweep
     assert told.count("at once") == 1
 
 
-def test_a_gap_is_named_but_frames_that_were_left_out_are_none(make_sweep: Callable[..., Sweep]) -> None:
+def test_a_gap_is_named_but_frames_that_were_left_out_are_none(make_sweep):
     sweep = make_sweep(40)
     assert check_sweep(sweep.select([*range(10), *range(25, 40)])).warnings == ()  # fifteen frames, fifteen millimetres
     gap = make_sweep(25, poses=sweep.poses[[*range(10), *range(25, 40)]])
     assert warnings_of(gap).startswith("a jump of 16.0 mm from frame 9 to 10, where 1 mm are usual")
 
 
-def test_repeats_are_named(make_sweep: Callable[..., Sweep]) -> None:
+def test_repeats_are_named(make_sweep):
     sweep = make_sweep(8)
     stalled = sweep.poses.copy()
     stalled[5] = stalled[4]
@@ -152,7 +149,7 @@ def test_repeats_are_named(make_sweep: Callable[..., Sweep]) -> None:
     assert warnings_of(sweep.select([0, 1, 2, 2, 3])) == "frames 2, 2 are the same frame: one pose, one image"
 
 
-def test_dark_and_saturated_images_are_named(make_sweep: Callable[..., Sweep]) -> None:
+def test_dark_and_saturated_images_are_named(make_sweep):
     images = make_sweep(6).images.copy()
     images[1] //= 32
     images[4][:2] = 255
@@ -162,7 +159,7 @@ def test_dark_and_saturated_images_are_named(make_sweep: Callable[..., Sweep]) -
     )
 
 
-def test_held_out_frames_are_measured_from_the_nearest_training_frame(make_sweep: Callable[..., Sweep]) -> None:
+def test_held_out_frames_are_measured_from_the_nearest_training_frame(make_sweep):
     sweep = make_sweep(10, notes=("something was assumed",))
     report = check_dataset(Dataset("one", sweep.select([0, 1, 2, 3, 9]), sweep.select([3, 5, 6])))
     assert report.val_distance_median_mm == pytest.approx(2.0)
@@ -190,7 +187,7 @@ def test_held_out_frames_are_measured_from_the_nearest_training_frame(make_sweep
         (ConvexProbe(1.05, 50, 200), "the fan opens by 1.05°, where 5° and more are usual: an angle in radians?"),
     ],
 )
-def test_a_probe_in_other_units_is_named(make_sweep: Callable[..., Sweep], probe: Probe, told: str) -> None:
+def test_a_probe_in_other_units_is_named(make_sweep, probe, told):
     sweep = make_sweep(10, probe=probe)
     warnings = check_dataset(Dataset("one", sweep, sweep.select([]))).warnings
     assert [text[: len(told)] for text in warnings] == [told]
@@ -206,9 +203,7 @@ def test_a_probe_in_other_units_is_named(make_sweep: Callable[..., Sweep], probe
         (0.001, 30.0, "lie within 0.039 mm and turn by 30°: a probe tilted in place, or positions not in millimetres?"),
     ],
 )
-def test_poses_in_other_units_are_named(
-    make_sweep: Callable[..., Sweep], scale: float, turn_deg: float, told: str | None
-) -> None:
+def test_poses_in_other_units_are_named(make_sweep, scale, turn_deg, told):
     poses = make_sweep(40).poses.copy()
     poses[:, :3, 3] *= scale
     for pose, angle in zip(poses, np.radians(np.linspace(0, turn_deg, 40)), strict=True):
@@ -218,15 +213,7 @@ def test_poses_in_other_units_are_named(
     assert warnings == (() if told is None else (f"the poses of all 40 training frames {told}",))
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("name", ["liver_convex", "nwire_phantom", "spine_phantom", "ultranerf_liver"])
-def test_real_units_are_usual(data_folder: Path, name: str) -> None:
-    dataset = load_dataset(data_folder / name)
-    warnings = check_dataset(dataset).warnings
-    assert not [text for text in warnings if ("usual:" in text and "unit" in text) or "positions" in text]
-
-
-def test_images_are_compared_without_a_copy_of_them(make_sweep: Callable[..., Sweep]) -> None:
+def test_images_are_compared_without_a_copy_of_them(make_sweep):
     images = np.random.default_rng(0).integers(0, 250, (64, 256, 256), dtype=np.uint8)
     small = LinearProbe(width_mm=4.0, near_mm=0.0, far_mm=5.0)
     sweep = make_sweep(64, images=images, probe=small, step_mm=0.1)
@@ -239,24 +226,92 @@ def test_images_are_compared_without_a_copy_of_them(make_sweep: Callable[..., Sw
     assert peak < images.nbytes / 4
 
 
-def test_nothing_held_out(make_sweep: Callable[..., Sweep]) -> None:
-    sweep = make_sweep(4)
-    report = check_dataset(Dataset("one", sweep, sweep.select([])))
-    assert report.val is None
-    assert report.val_distance_max_mm is None
-
-
 @pytest.mark.parametrize(
     ("name", "frames", "tilt_deg", "warnings"),
     [("spine_phantom", 17, 2.0, 0), ("ultranerf_liver", 180, 14.9, 1)],  # the latter is two sweeps: one jump
 )
-def test_real_sets(data_folder: Path, name: str, frames: int, tilt_deg: float, warnings: int) -> None:
+def test_real_sets(data_folder, name, frames, tilt_deg, warnings):
     report = check_dataset(load_dataset(data_folder / name)).train
     assert report.frames == frames
     assert report.tilt_deg == pytest.approx(tilt_deg, abs=0.1)
     assert len(report.warnings) == warnings
 
 
-def test_one_frame_can_be_described(make_sweep: Callable[..., Sweep]) -> None:
+def test_one_frame_can_be_described(make_sweep):
     report = check_sweep(make_sweep(1, probe=LinearProbe(40, 0, 50)))
     assert (report.step_median_mm, report.tilt_deg) == (0.0, 0.0)
+
+
+@pytest.mark.parametrize(("step_mm", "coverage"), [(0.5, 1.0), (2.0, 0.5), (4.0, 0.25)])
+def test_coverage_falls_with_the_spacing(make_sweep, step_mm, coverage):
+    swept = swept_volume(make_sweep(round(40 / step_mm) + 1, step_mm=step_mm))
+    assert swept.voxel_mm == 1.0
+    assert swept.coverage == pytest.approx(coverage, abs=0.03)
+    assert swept.swept_ml == pytest.approx(40 * 40 * 50 * swept.coverage / 1000)
+
+
+def test_a_fan_crosses_the_voxels_of_its_sector(make_sweep):
+    probe = ConvexProbe(opening_angle_deg=60.0, near_mm=40.0, far_mm=100.0)
+    swept = swept_volume(make_sweep(21, step_mm=0.5, probe=probe))
+    assert swept.swept_ml == pytest.approx(math.radians(60) / 2 * (100**2 - 40**2) * 10 / 1000, rel=0.04)
+
+
+def test_it_does_not_depend_on_the_frame_of_the_tracker(make_sweep, random_poses):
+    sweep = make_sweep(21)
+    turned = make_sweep(21, poses=random_poses(1, tilt_deg=170.0) @ sweep.poses)
+    assert swept_volume(turned).swept_ml == pytest.approx(swept_volume(sweep).swept_ml, rel=0.02)
+
+
+def test_flat_boxes_keep_the_limit_too(make_sweep):
+    """Two poses far off, in the plane of the others: one layer of voxels."""
+    poses = make_sweep(4, step_mm=0.0).poses.copy()
+    poses[2, 0, 3], poses[3, 2, 3] = 100_000.0, 100_000.0
+    swept = swept_volume(make_sweep(4, poses=poses))
+    voxels = math.prod(math.ceil(side_mm / swept.voxel_mm) for side_mm in (100_000, 100_000))
+    assert 0.9 * MAX_VOXELS < voxels <= MAX_VOXELS
+
+
+def pixels_of(picture, colour):  # RGB
+    return int((np.abs(picture.astype(int) - colour[::-1]).max(axis=-1) < 40).sum())
+
+
+@pytest.mark.long
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "probe",
+    [
+        LinearProbe(40, 0, 50),
+        ConvexProbe(opening_angle_deg=60, near_mm=20, far_mm=70),
+        PhasedProbe(opening_angle_deg=90, far_mm=70),
+    ],
+    ids=["linear", "convex", "phased"],
+)
+def test_both_parts_are_drawn(make_sweep, tmp_path, probe):
+    sweep = make_sweep(12, probe=probe)
+    blue, red = (31, 119, 180), (214, 39, 40)
+    draw_dataset(Dataset("both", sweep.select(range(8)), sweep.select(range(8, 12))), tmp_path / "both.png")
+    draw_dataset(Dataset("one", sweep, sweep.select([])), tmp_path / "one.png")
+    both, one = (cv2.imread(str(tmp_path / f"{name}.png")) for name in ("both", "one"))
+    assert one is not None
+    assert both.shape[1] == 1400
+    assert pixels_of(both, blue) > 200
+    assert pixels_of(both, red) > 200
+    assert pixels_of(one, red) < pixels_of(both, red) / 10
+    assert np.ptp(both[-150:], axis=-1).max() < 200  # the contact sheet lies below, grey but for the titles
+    assert both[-150:].std() > 20
+
+
+def test_at_most_sixteen_planes_of_a_part_are_drawn(make_sweep):
+    sweep = make_sweep(200)
+    axes = Figure().add_subplot(projection="3d")
+    _draw_planes(axes, Dataset("many", sweep, sweep.select(range(20))), 20.0, 30.0)
+    legend = axes.get_legend()
+    assert [text.get_text() for text in legend.get_texts()] == [
+        "training: 16 of 200 planes",
+        "held out: 16 of 20 planes",
+    ]
+    outlines = np.array(axes.get_lines()[1].get_data_3d())  # [3, 16 * 6]
+    assert outlines.shape[1] == 16 * 6
+    y_mm = outlines[1, ::6]
+    assert (y_mm[0], y_mm[-1]) == (0.0, 199.0)
+    assert set(np.diff(y_mm)) == {13.0, 14.0}

@@ -1,18 +1,12 @@
 """Clocks of images and poses: what is wrong with them is told with its number, and corrected by one option."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-from types import SimpleNamespace
-
 import cv2
 import numpy as np
 import pytest
 
 from ultragray import LinearProbe
 from ultragray.datasets import Dataset, Sweep
-from ultragray.datasets.checks import DatasetReport, check_dataset
+from ultragray.datasets.checks import check_dataset
 from ultragray.datasets.clocks import PoseTrack, clock_warnings, parse_delay_ns
 from ultragray.datasets.plus import read_plus_sweep
 from ultragray.datasets.source import SourceOptions, load_dataset
@@ -25,20 +19,20 @@ PROBE = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=40.0)
 RATE_HZ = 20.0
 
 
-def there_and_back(times_s: np.ndarray) -> np.ndarray:
+def there_and_back(times_s):
     """A hand along the elevation: 15 mm there and back again within six seconds."""
     return 7.5 * (1 - np.cos(2 * np.pi * times_s / 6.0))
 
 
-def one_way_and_unevenly(times_s: np.ndarray) -> np.ndarray:
+def one_way_and_unevenly(times_s):
     return 4.0 * times_s + 2.5 * np.sin(2.2 * times_s) + 1.2 * np.sin(5.1 * times_s + 1)
 
 
-def evenly(times_s: np.ndarray) -> np.ndarray:
+def evenly(times_s):
     return 3.0 * times_s
 
 
-def tissue(places_mm: np.ndarray, seed: int = 0) -> np.ndarray:  # [F, 48, 36] uint8
+def tissue(places_mm, seed=0):  # [F, 48, 36] uint8
     """What planes at these places along the elevation show: texture of 2 mm, and noise."""
     random = np.random.default_rng(seed)
     volume = random.normal(size=(60, 48, 36)).astype(np.float32)
@@ -50,7 +44,7 @@ def tissue(places_mm: np.ndarray, seed: int = 0) -> np.ndarray:  # [F, 48, 36] u
     return np.clip(planes, 1, 255).astype(np.uint8)
 
 
-def recorded(motion: Callable[[np.ndarray], np.ndarray], delay_s: float, count: int = 160) -> Sweep:
+def recorded(motion, delay_s, count=160):
     """Frames whose images were taken `delay_s` before their stamps, at which the poses are."""
     times_s = np.arange(count) / RATE_HZ
     poses = np.tile(np.eye(4), (count, 1, 1))
@@ -58,14 +52,14 @@ def recorded(motion: Callable[[np.ndarray], np.ndarray], delay_s: float, count: 
     return Sweep(tissue(motion(times_s - delay_s)), poses, PROBE, np.arange(count), "it", times_s=times_s)
 
 
-def report_of(sweep: Sweep) -> DatasetReport:
+def report_of(sweep):
     held_out = np.arange(len(sweep)) % 5 == 2
     return check_dataset(Dataset("it", sweep.select(np.flatnonzero(~held_out)), sweep.select(np.flatnonzero(held_out))))
 
 
 @pytest.mark.parametrize("motion", [there_and_back, one_way_and_unevenly])
 @pytest.mark.parametrize("delay_ms", [-180, -70, 50, 120, 300])
-def test_the_delay_of_the_images_is_told_with_its_number(motion: Callable[..., np.ndarray], delay_ms: int) -> None:
+def test_the_delay_of_the_images_is_told_with_its_number(motion, delay_ms):
     report = report_of(recorded(motion, delay_ms / 1000))
     assert report.image_delay_ms == pytest.approx(delay_ms, abs=12)
     (told,) = (text for text in report.warnings if "--image-delay-ms" in text)
@@ -74,15 +68,15 @@ def test_the_delay_of_the_images_is_told_with_its_number(motion: Callable[..., n
 
 
 @pytest.mark.parametrize("motion", [there_and_back, one_way_and_unevenly, evenly])
-def test_no_delay_is_told_where_there_is_none(motion: Callable[..., np.ndarray]) -> None:
+def test_no_delay_is_told_where_there_is_none(motion):
     assert report_of(recorded(motion, 0.0)).image_delay_ms is None
 
 
-def test_an_even_motion_tells_no_delay() -> None:
+def test_an_even_motion_tells_no_delay():
     assert report_of(recorded(evenly, 0.15)).image_delay_ms is None
 
 
-def test_steps_back_and_stamps_that_come_twice() -> None:
+def test_steps_back_and_stamps_that_come_twice():
     times_s = np.array([0.0, 0.1, 0.2, 0.15, 0.3, 0.3, 0.4])
     assert list(clock_warnings(times_s, np.arange(10, 17))) == [
         "the time steps back at frame 13, by up to 50 ms: another clock, or frames in a wrong order?",
@@ -91,7 +85,7 @@ def test_steps_back_and_stamps_that_come_twice() -> None:
     assert list(clock_warnings(np.arange(5) / 10, np.arange(5))) == []
 
 
-def moving(seconds: float) -> np.ndarray:
+def moving(seconds):
     pose = np.eye(4)
     angle = 0.3 * seconds
     pose[:3, :3] = [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1]]
@@ -99,19 +93,17 @@ def moving(seconds: float) -> np.ndarray:
     return pose
 
 
-def plus_sequence(folder: Path, plus_files: SimpleNamespace, stamps: list[float]) -> Path:
+def plus_sequence(folder, plus_files, stamps):
     fields = {"UltrasoundImageOrientation": "MF"}
     for frame, stamp in enumerate(stamps):
         fields[f"Seq_Frame{frame:04d}_ProbeToTrackerTransform"] = plus_files.numbers(moving(stamp))
         fields[f"Seq_Frame{frame:04d}_Timestamp"] = repr(stamp)
-    path: Path = plus_files.write_mha(folder / "s.mha", plus_files.speckle(len(stamps), 30, 20), fields)
+    path = plus_files.write_mha(folder / "s.mha", plus_files.speckle(len(stamps), 30, 20), fields)
     return path
 
 
 @pytest.mark.parametrize("delay_ms", [40.0, -25.0, 100.0])
-def test_a_plus_sequence_gets_the_poses_of_the_time_of_its_images(
-    tmp_path: Path, plus_files: SimpleNamespace, device_set: Path, delay_ms: float
-) -> None:
+def test_a_plus_sequence_gets_the_poses_of_the_time_of_its_images(tmp_path, plus_files, device_set, delay_ms):
     stamps = [7.0 + 0.05 * frame for frame in range(30)]
     path = plus_sequence(tmp_path, plus_files, stamps)
     sweep, _ = read_plus_sweep(path, device_set=device_set, image_delay_ms=str(delay_ms), frames="3:27")
@@ -126,7 +118,7 @@ def test_a_plus_sequence_gets_the_poses_of_the_time_of_its_images(
     np.testing.assert_allclose(sweep.times_s, [stamps[number] for number in sweep.frame_numbers], atol=1e-9)
 
 
-def test_a_sequence_names_its_clock(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+def test_a_sequence_names_its_clock(tmp_path, plus_files, device_set):
     path = plus_sequence(tmp_path, plus_files, [0.0, 0.1, 0.2, 0.15, 0.3, 0.3, 0.4, 0.5])
     warnings = check_dataset(load_dataset(path, SourceOptions(device_set=device_set))).warnings
     assert any("the time steps back at frame 3, by up to 50 ms" in text for text in warnings)
@@ -139,19 +131,19 @@ def test_a_sequence_names_its_clock(tmp_path: Path, plus_files: SimpleNamespace,
 
 
 @pytest.mark.parametrize("text", ["fast", "nan", "inf", "1e13"])
-def test_a_delay_must_be_milliseconds(text: str) -> None:
+def test_a_delay_must_be_milliseconds(text):
     with pytest.raises(InvalidArgument, match="image_delay_ms must be milliseconds"):
         parse_delay_ns(text)
 
 
-def test_tracks_that_have_one_pose_or_none_near() -> None:
+def test_tracks_that_have_one_pose_or_none_near():
     track = PoseTrack(np.array([0, 100_000_000, 500_000_000]), np.stack([moving(0), moving(0.1), moving(0.5)]))
     poses, known = track.at(np.array([50_000_000, 300_000_000, 500_000_000, 600_000_000]))
     assert known.tolist() == [True, False, True, False]
     np.testing.assert_allclose(poses[0], moving(0.05), atol=1e-9)
 
 
-def bag_of(path: Path, image_offset_ns: int, log_lag_ns: int) -> Path:
+def bag_of(path, image_offset_ns, log_lag_ns):
     """Images at 20 Hz whose stamps are those of another clock, and that are written when they come."""
     bag = Bag(path)
     bag.geometry()
@@ -165,7 +157,7 @@ def bag_of(path: Path, image_offset_ns: int, log_lag_ns: int) -> Path:
     return bag.finish()
 
 
-def test_clocks_of_a_recording_that_are_apart_are_told_and_corrected(tmp_path: Path) -> None:
+def test_clocks_of_a_recording_that_are_apart_are_told_and_corrected(tmp_path):
     path = bag_of(tmp_path / "a.mcap", 130_000_000, 0)
     apart = load_dataset(path)
     (told,) = (note for note in apart.train.notes if "image-delay-ms" in note)
@@ -179,7 +171,7 @@ def test_clocks_of_a_recording_that_are_apart_are_told_and_corrected(tmp_path: P
     assert len(load_dataset(far, SourceOptions(image_delay_ms="3600000")).train) == 16
 
 
-def test_poses_with_stamps_that_come_twice_or_step_back(tmp_path: Path) -> None:
+def test_poses_with_stamps_that_come_twice_or_step_back(tmp_path):
     bag = Bag(tmp_path / "c.mcap")
     bag.geometry()
     for number in range(60):

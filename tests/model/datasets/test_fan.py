@@ -1,15 +1,10 @@
 """Images of convex and phased probes on a screen, read as scan lines."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
-from pathlib import Path
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
 
 from ultragray import ConvexProbe, PhasedProbe
+from ultragray.datasets.fan import find_path, parse_matrix, read_device_set, transform_name
 from ultragray.datasets.plus import read_plus_sweep
 from ultragray.datasets.source import SourceOptions, load_dataset
 from ultragray.errors import DatasetInvalid, InvalidArgument
@@ -21,9 +16,7 @@ APEX = (149.5, -40.0)  # column, row
 FAN = "60,10,26,149.5,-40"
 
 
-def screen(
-    value: Callable[[np.ndarray, np.ndarray], np.ndarray], apex: tuple[float, float] = APEX
-) -> np.ndarray:  # [rows, columns]
+def screen(value, apex=APEX):  # [rows, columns]
     """An image whose pixels hold a value of the angle in degrees and the radius in mm; 7 beyond the fan."""
     row, column = np.indices((ROWS, COLUMNS))
     x, z = (column - apex[0]) * PIXEL_MM[0], (row - apex[1]) * PIXEL_MM[1]
@@ -32,11 +25,11 @@ def screen(
     return np.where(within, np.rint(value(angle, radius)), 7).astype(np.uint8)
 
 
-def of_both(angle: np.ndarray, radius: np.ndarray) -> np.ndarray:
+def of_both(angle, radius):
     return 70 + 2 * angle + 3 * (radius - NEAR_MM)
 
 
-def test_a_fan_becomes_scan_lines(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+def test_a_fan_becomes_scan_lines(tmp_path, plus_files, device_set):
     path = plus_files.write_mha(tmp_path / "s.mha", np.stack([screen(of_both)] * 2), plus_files.tracked_fields(2))
     sweep, _ = read_plus_sweep(path, device_set=device_set, fan=FAN)
     assert sweep.probe == ConvexProbe(OPENING_DEG, NEAR_MM, FAR_MM)
@@ -48,7 +41,7 @@ def test_a_fan_becomes_scan_lines(tmp_path: Path, plus_files: SimpleNamespace, d
     np.testing.assert_allclose(sweep.images[1], expected, atol=1.1)  # one grey value of rounding, twice
 
 
-def test_its_pose_is_that_of_the_apex(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+def test_its_pose_is_that_of_the_apex(tmp_path, plus_files, device_set):
     """A point of the image is where the probe's own geometry has it, also in a fan that leans."""
     stored, fields = np.stack([screen(of_both)] * 2), plus_files.tracked_fields(2)
     path = plus_files.write_mha(tmp_path / "s.mha", stored, fields)
@@ -72,13 +65,13 @@ def test_its_pose_is_that_of_the_apex(tmp_path: Path, plus_files: SimpleNamespac
         np.testing.assert_allclose(sweep.poses[0] @ in_probe, plain.poses[0] @ top_centre, atol=1e-9)
 
 
-def test_a_fan_from_a_point_is_a_phased_probe(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+def test_a_fan_from_a_point_is_a_phased_probe(tmp_path, plus_files, device_set):
     path = plus_files.write_mha(tmp_path / "s.mha", np.stack([screen(of_both)] * 2), plus_files.tracked_fields(2))
     dataset = load_dataset(path, SourceOptions(device_set=device_set, fan="60,0,20,149.5,0"))
     assert dataset.probe == PhasedProbe(60.0, 20.0)
 
 
-def test_the_fan_that_plus_clips_to(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+def test_the_fan_that_plus_clips_to(tmp_path, plus_files, device_set):
     path = plus_files.write_mha(tmp_path / "s.mha", np.stack([screen(of_both)] * 2), plus_files.tracked_fields(2))
     clip = (
         '<VolumeReconstruction FanAnglesDeg="-30 30" FanOriginPixel="149.5 -40" FanRadiusStartPixel="100" '
@@ -108,21 +101,13 @@ def test_the_fan_that_plus_clips_to(tmp_path: Path, plus_files: SimpleNamespace,
         ("60,10,26,1490,-40", r"image of 300 x 240 pixels, of 0\.2 x 0\.1 mm each, at least by half: 0%"),
     ],
 )
-def test_fans_that_cannot_be_are_refused(
-    tmp_path: Path, plus_files: SimpleNamespace, device_set: Path, fan: str, message: str
-) -> None:
+def test_fans_that_cannot_be_are_refused(tmp_path, plus_files, device_set, fan, message):
     path = plus_files.write_mha(tmp_path / "s.mha", np.stack([screen(of_both)] * 2), plus_files.tracked_fields(2))
     with pytest.raises(InvalidArgument, match=message):
         read_plus_sweep(path, device_set=device_set, fan=fan)
 
 
-def test_a_crop_and_a_fan_exclude_each_other(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
-    path = plus_files.write_mha(tmp_path / "s.mha", np.stack([screen(of_both)] * 2), plus_files.tracked_fields(2))
-    with pytest.raises(InvalidArgument, match="fan must be given without crop"):
-        read_plus_sweep(path, device_set=device_set, fan=FAN, crop="0:10,0:10")
-
-
-def test_a_tracker_is_chosen_among_several(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+def test_a_tracker_is_chosen_among_several(tmp_path, plus_files, device_set):
     stored, fields = plus_files.speckle(3, 30, 20), plus_files.tracked_fields(3)
     other = np.eye(4)
     for frame in range(3):
@@ -138,9 +123,7 @@ def test_a_tracker_is_chosen_among_several(tmp_path: Path, plus_files: SimpleNam
 
 
 @pytest.mark.parametrize("most_first", [False, True])
-def test_sixteen_bits_become_eight(
-    tmp_path: Path, plus_files: SimpleNamespace, device_set: Path, most_first: bool
-) -> None:
+def test_sixteen_bits_become_eight(tmp_path, plus_files, device_set, most_first):
     stored = np.arange(2 * 30 * 20).reshape(2, 30, 20)  # up to 1199: 11 bits
     order = ">" if most_first else "<"
     wide = np.frombuffer(stored.astype(f"{order}u2").tobytes(), np.uint8).reshape(2, 30, 40)
@@ -154,9 +137,73 @@ def test_sixteen_bits_become_eight(
     np.testing.assert_array_equal(read_plus_sweep(nrrd, device_set=device_set)[0].images, stored >> 3)
 
 
-def test_values_below_zero_are_refused(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
-    stored = np.full((2, 30, 20), -1, "<i2")
-    wide = np.frombuffer(stored.tobytes(), np.uint8).reshape(2, 30, 40)
-    fields = plus_files.tracked_fields(2) | {"ElementType": "MET_SHORT", "DimSize": "20 30 2"}
-    with pytest.raises(DatasetInvalid, match="16-bit pixels must not be below 0, the smallest is -1"):
-        read_plus_sweep(plus_files.write_mha(tmp_path / "s.mha", wide, fields), device_set=device_set)
+@pytest.mark.parametrize(
+    ("text", "name"),
+    [
+        ("ProbeToTracker", ("Probe", "Tracker")),
+        ("ToolToTracker", ("Tool", "Tracker")),
+        ("PhantomToTorso", ("Phantom", "Torso")),
+        ("TransducerOriginPixelToTransducerOrigin", ("TransducerOriginPixel", "TransducerOrigin")),
+        ("Probe", None),
+        ("Total", None),
+        ("probetotracker", None),
+    ],
+)
+def test_names_of_transforms(text, name):
+    assert transform_name(text) == name
+
+
+def test_matrices():
+    matrix = parse_matrix("1 0 0 5\n 0 1 0 -8.23381e-005\n 0 0\t1 7  0 0 0 1", "here")
+    assert matrix[:3, 3].tolist() == [5, -8.23381e-5, 7]
+
+
+@pytest.mark.parametrize(
+    "text",
+    ["", "1 2 3", "a b c d e f g h i j k l m n o p", "nan " * 16, "0 " * 15 + "1", "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 2"],
+)
+def test_matrices_that_cannot_be_are_refused(text):
+    with pytest.raises(DatasetInvalid, match=r"^here must be"):
+        parse_matrix(text, "here")
+
+
+def test_the_shortest_way():
+    names = [("Image", "Probe"), ("Probe", "Tracker"), ("Reference", "Tracker"), ("Stylus", "Tracker")]
+    assert find_path(names, "Image", "Reference") == [
+        (("Image", "Probe"), False),
+        (("Probe", "Tracker"), False),
+        (("Reference", "Tracker"), True),
+    ]
+    assert find_path([*names, ("Image", "Reference")], "Image", "Reference") == [(("Image", "Reference"), False)]
+    assert find_path(names, "Image", "World") is None
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        ("", "not XML"),
+        ("<a>", "not XML"),
+        ("<a/>", "no Transform"),
+        ('<!DOCTYPE a [<!ENTITY b "c">]><a>&b;</a>', "no DOCTYPE"),
+        (
+            '<a><CoordinateDefinitions><Transform From="Image" To="Probe" Matrix="1 2"/></CoordinateDefinitions></a>',
+            "ImageToProbe must be sixteen finite numbers",
+        ),
+    ],
+)
+def test_device_sets_that_cannot_be_read_are_named(tmp_path, content, message):
+    path = tmp_path / "set.xml"
+    path.write_text(content)
+    with pytest.raises(DatasetInvalid, match=rf"set\.xml: .*{message}"):
+        read_device_set(path)
+
+
+def test_a_missing_device_set_is_named(tmp_path):
+    with pytest.raises(DatasetInvalid, match=r"set\.xml: no such file"):
+        read_device_set(tmp_path / "set.xml")
+
+
+def test_a_device_set(device_set):
+    transforms = read_device_set(device_set).transforms
+    assert list(transforms) == [("Image", "Probe")]
+    np.testing.assert_allclose(np.linalg.norm(transforms["Image", "Probe"][:3, :2], axis=0), [0.2, 0.1])

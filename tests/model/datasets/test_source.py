@@ -1,30 +1,25 @@
 """Every kind of source behind one call."""
 
-from __future__ import annotations
-
-from collections.abc import Callable
 from dataclasses import fields
-from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from ultragray import phantom
-from ultragray.datasets import Dataset, Sweep
+from ultragray.datasets import Dataset
 from ultragray.datasets.released import write_released
 from ultragray.datasets.source import EVERY_FORMAT_TAKES, FORMATS, SourceOptions, load_dataset
 from ultragray.errors import DatasetInvalid, InvalidArgument
 
 
 @pytest.fixture
-def folder(tmp_path: Path, make_sweep: Callable[..., Sweep]) -> Path:
+def folder(tmp_path, make_sweep):
     sweep = make_sweep(10)
     write_released(Dataset("made", sweep.select(range(8)), sweep.select([8, 9])), tmp_path / "tiny")
     return tmp_path / "tiny"
 
 
-def test_the_released_layout(folder: Path) -> None:
+def test_the_released_layout(folder):
     dataset = load_dataset(folder)
     assert (dataset.name, len(dataset.train), len(dataset.val)) == ("tiny", 8, 2)
     assert load_dataset(str(folder / "conf.json")).sha256 == dataset.sha256
@@ -35,7 +30,7 @@ def test_the_released_layout(folder: Path) -> None:
     assert split.probe == dataset.probe
 
 
-def test_a_sequence(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+def test_a_sequence(tmp_path, plus_files, device_set):
     stored = plus_files.speckle(12, 30, 20)
     path = plus_files.write_mha(tmp_path / "name.igs.mha", stored, plus_files.tracked_fields(12))
     dataset = load_dataset(path, SourceOptions(device_set=device_set, crop="0:20,10:30", image_size="10x20"))
@@ -49,14 +44,14 @@ def test_a_sequence(tmp_path: Path, plus_files: SimpleNamespace, device_set: Pat
     assert chosen.val.frame_numbers.tolist() == [6, 7]
 
 
-def test_the_word_phantom(monkeypatch: pytest.MonkeyPatch, make_sweep: Callable[..., Sweep]) -> None:
+def test_the_word_phantom(monkeypatch, make_sweep):
     made = Dataset("phantom", make_sweep(6), make_sweep(2))
     monkeypatch.setattr(phantom, "load_phantom", lambda: made)
     assert load_dataset("phantom").sha256 == made.sha256
     assert len(load_dataset("phantom", SourceOptions(train_frames="0:3")).train) == 3
 
 
-def test_sources_that_are_none_are_refused(folder: Path, tmp_path: Path) -> None:
+def test_sources_that_are_none_are_refused(folder, tmp_path):
     with pytest.raises(DatasetInvalid, match="nowhere: no such file or folder"):
         load_dataset(tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
@@ -71,19 +66,19 @@ def test_sources_that_are_none_are_refused(folder: Path, tmp_path: Path) -> None
             load_dataset(folder, options)
 
 
-def test_one_training_frame_is_not_enough(folder: Path) -> None:
+def test_one_training_frame_is_not_enough(folder):
     with pytest.raises(DatasetInvalid, match="at least two training frames, got 1"):
         load_dataset(folder, SourceOptions(train_frames="3"))
 
 
-def test_options_are_texts_of_bounded_length() -> None:
+def test_options_are_texts_of_bounded_length():
     for given in ("x" * 1001, "0:2\n"):
         with pytest.raises(InvalidArgument, match="train_frames must be at most 1000 characters") as refused:
             SourceOptions(train_frames=given)
         assert refused.value.field == "train_frames"
 
 
-def test_each_format_names_options_that_there_are() -> None:
+def test_each_format_names_options_that_there_are():
     known = {item.name for item in fields(SourceOptions)}
     for one in FORMATS.values():
         assert {*one.options, *one.companions, *EVERY_FORMAT_TAKES} <= known

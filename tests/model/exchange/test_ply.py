@@ -67,12 +67,6 @@ def test_a_scene_comes_back_to_the_bit(tmp_path, make_scene, sh_degree, intensit
     assert back.to_bytes() == scene.to_bytes()
 
 
-def test_a_scene_without_gaussians(tmp_path, make_scene):
-    scene = make_scene(0, poses=2)
-    write_ply(scene, tmp_path / "a.ply")
-    assert read_ply(tmp_path / "a.ply").to_bytes() == scene.to_bytes()
-
-
 def test_what_other_tools_find(tmp_path, make_scene):
     """Read as any reader of PLY would: by the types and names of the header alone."""
     scene = make_scene()
@@ -118,9 +112,7 @@ def test_a_tool_may_reorder_and_take_gaussians_away(tmp_path, make_scene):
         (b"property float opacity\n", b"property float opacity\nproperty float nx\n", "its vertex has nx"),
         (b"property float x\n", b"property double x\n", "its vertex property x is double, expected float"),
         (b"property float x\n", b"property list uchar int x\n", "a line that it cannot have"),
-        (b"element vertex 7\n", b"", "a line that it cannot have|lacks"),
         (b"element vertex 7\n", b"element vertex 8\n", "it is truncated"),
-        (b"element vertex 7\n", b"element vertex " + b"9" * 5000 + b"\n", "a line that it cannot have"),
         (b"element vertex 7\n", b"element face 9\nelement vertex 7\n", "it has an element 'face'"),
         (b"element vertex 7\n", b"element vertex 6\n", "longer than its header says"),
         (b"end_header\n", b"", "its header has no end"),

@@ -290,6 +290,7 @@ def test_samples_that_contradict_each_other_end_with_a_status_that_a_script_sees
     assert told.startswith("the samples contradict each other: sample ")
     assert "samples 1 and 3 are exchanged" in told
     assert told in result.stderr
+    assert not (tmp_path / "robot.json").exists()
     points = 50.0 * rng.normal(size=(6, 3))
     np.save(tmp_path / "base.npy", points)
     np.save(tmp_path / "scene.npy", (points @ base_to_scene[:3, :3].T)[[0, 1, 2, 4, 3, 5]])

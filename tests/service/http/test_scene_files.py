@@ -8,10 +8,9 @@ from pathlib import Path
 import httpx
 import numpy as np
 import pytest
-from safetensors.numpy import save
+from safetensors.numpy import load, save
 
-from ultragray import GaussianScene, SceneInfo
-from ultragray.scene.info import expected_shapes, info_to_json
+from ultragray import GaussianScene
 from ultragray_service.core.scene_points import even_selection
 
 from ...waiting import wait_until
@@ -205,16 +204,24 @@ def test_who_stops_during_the_check_gets_no_scene(service, http, artifacts):
     assert http.delete("/v1/scenes/stopped").status_code == 204
 
 
-def without_gaussians(poses, **info):
-    tensors = {name: np.zeros(shape, np.float32) for name, shape in expected_shapes(0, 0).items()}
-    return save({**tensors, "training_poses": poses}, {"ultragray": info_to_json(SceneInfo(**info))})
+def changed(whole, metadata=None, **tensors):
+    """The scene file with other metadata and tensors."""
+    length = int.from_bytes(whole[:8], "little")
+    info = json.loads(json.loads(whole[8 : 8 + length])["__metadata__"]["ultragray"])
+    return save({**load(whole), **tensors}, {"ultragray": json.dumps({**info, **(metadata or {})})})
 
 
-def test_metrics_that_are_no_numbers_are_left_out(http):
-    sent = without_gaussians(np.eye(4)[None], metrics={"psnr_db": 20.5, "huge": 10**400, "text": "x"})
-    assert http.put("/v1/scenes/odd", content=sent, headers=RAW).status_code == 201
-    assert http.get("/v1/scenes/odd").json()["metrics"] == {"psnr_db": 20.5}
-    assert http.delete("/v1/scenes/odd").status_code == 204
+def test_values_that_no_scene_has_are_refused_at_the_door(http):
+    whole = make_scene(probe=DEMO_PROBE).to_bytes()
+    scales = np.full_like(load(whole)["scales"], 1000.0)
+    for sent, said in (
+        (changed(whole, scales=scales), "'scales'] must be finite and within ±20"),
+        (changed(whole, {"centre_mm": [1e308, 0.0, 0.0]}), "centre_mm[0] must be a finite number from -1e+06"),
+        (changed(whole, {"metrics": {"psnr_db": 10**400}}), "metrics.psnr_db must be a finite number"),
+    ):
+        answer = http.put("/v1/scenes/odd", content=sent, headers=RAW)
+        assert answer.status_code == 422
+        assert said in answer.json()["detail"]
 
 
 def test_what_a_killed_service_left_goes_at_once(start_service, tmp_path):

@@ -6,16 +6,15 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import pytest
-import torch
 
 from ultragray.errors import MemoryExceeded
 from ultragray_studies.comparison.run import EQUAL_TIME
 from ultragray_studies.methods.classical import Compounding, FromFrames
 from ultragray_studies.methods.gaussians import SceneMethod
-from ultragray_studies.methods.learner import LearnedMethod, Learner
 from ultragray_studies.methods.method import Description, Method, Pace, Paces
 
 from ...model.learn.conftest import make_tiny_dataset
+from ..methods.conftest import MeanImage
 
 
 @pytest.fixture
@@ -23,35 +22,15 @@ def dataset():
     return replace(make_tiny_dataset(frames=16, height=16, width=16), name="50 % of <tiny>")
 
 
-class OneLevel(Learner):
-    """A single grey level for all pixels of all frames."""
-
-    def __init__(self, dataset, seed, device):
-        super().__init__(dataset, seed, device)
-        self.level = torch.nn.Parameter(torch.zeros(1, device=device))
-        self.module = torch.nn.ParameterList([self.level])
-        self.optimizers = {"level": torch.optim.Adam(self.module.parameters(), lr=0.02)}
-
-    def loss(self, step, steps):
-        place = torch.randint(len(self.images), (1,), generator=self.generator)
-        return (self.image(int(place)) - self.level).square().mean()
-
-    def frame(self, probe, pose, height, width):
-        return self.level.detach().expand(height, width)
-
-
 @dataclass(frozen=True)
-class LevelMethod(LearnedMethod):
-    """It learns one grey level, in a thousand steps where its author has time. Counts its fits."""
+class LevelMethod(MeanImage):
+    """It learns one image, in two hundred steps where its author has time. Counts its fits."""
 
     name: str = "level"
     fits: list[Path | None] = field(default_factory=list, compare=False)
 
     def describe(self):
-        return Description("one level", "a test & no paper", "Grey.", ("B = g_0",), ("g from 0.",), 1_000)
-
-    def learner(self, dataset, budget, seed, device):
-        return OneLevel(dataset, seed, device)
+        return Description("one level", "a test & no paper", "Grey.", ("B = g_0",), ("g from 0.",), 200)
 
     def fit(self, dataset, budget, run=None):
         self.fits.append(None if run is None else run.folder)

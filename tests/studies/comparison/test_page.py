@@ -50,8 +50,8 @@ def test_the_page_has_every_method_and_needs_nothing_else(dataset, methods, pace
             assert shown.count(row.title) == shown.count(f"difference of {row.title}") == 3
             assert f"{row.evaluation.mean.psnr_db:.2f} ± {row.evaluation.std.psnr_db:.2f}" in text
     assert '<td class="failure" colspan="9">it needs 9 GB &amp; more</td>' in text
-    assert "<td>40 of 1,000</td>" in text
-    assert "Short: 40 of 1,000 steps of its author&#39;s recipe (4 %)." in text
+    assert "<td>40 of 200</td>" in text
+    assert "Short: 40 of 200 steps of its author&#39;s recipe (20 %)." in text
     assert "B = g_0" in text
     assert "g from 0." in text
 

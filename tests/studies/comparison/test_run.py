@@ -34,7 +34,7 @@ def test_each_method_is_a_row_and_one_that_fails_says_why(dataset, methods, pace
     assert list(found.measured) == ["scene", "median", "nearest", "level"]
     assert found.budget_s == 2.0
     level = found.results[3]
-    assert (level.title, level.cost.steps, level.cost.of_steps) == ("one level, short", 40, 1_000)
+    assert (level.title, level.cost.steps, level.cost.of_steps) == ("one level, short", 40, 200)
     assert level.frame_ms > 0.0
     assert [state.method for state in seen if state.fit is None] == list(methods)
     assert {(state.number, state.of) for state in seen} == {(number, 5) for number in range(1, 6)}
@@ -126,7 +126,7 @@ def test_where_the_scene_fails_there_is_no_equal_time(dataset, level, tmp_path):
 
 def test_the_authors_steps_are_those_of_the_author(dataset, level, tmp_path):
     found = compare_methods(dataset, {"level": level}, ComparisonSettings(budget="author"), folder=tmp_path)
-    assert (found.results[0].cost.steps, found.results[0].title, found.budget_s) == (1_000, "one level", None)
+    assert (found.results[0].cost.steps, found.results[0].title, found.budget_s) == (200, "one level", None)
 
 
 def test_without_held_out_frames_nothing_begins(dataset, tmp_path):

@@ -26,10 +26,10 @@ def test_a_fit_learns_and_tells_its_cost(mean_image, make_dataset):
     dataset = make_dataset()
     told = []
     fitted = mean_image.fit(dataset, AUTHOR, FitRun(report=told.append))
-    assert (fitted.cost.steps, fitted.cost.of_steps, fitted.cost.is_short) == (200, 200, False)
+    assert (fitted.cost.steps, fitted.cost.of_steps, fitted.cost.is_short) == (100, 100, False)
     assert fitted.cost.model_bytes == 4 * SIDE * SIDE
     assert fitted.cost.seconds > 0.0
-    assert [one.step for one in told] == list(range(1, 201))
+    assert [one.step for one in told] == list(range(1, 101))
     assert told[-1].loss < 0.1 * told[0].loss
     assert told[-1].seconds_left == 0.0
     frames = fitted.render(dataset.probe, dataset.val.poses, SIDE, SIDE)
@@ -39,7 +39,7 @@ def test_a_fit_learns_and_tells_its_cost(mean_image, make_dataset):
 
 def test_a_stopped_fit_ends_in_the_model_of_an_undisturbed_one(mean_image, make_dataset, tmp_path):
     dataset = make_dataset()
-    for stop in (30, 90):
+    for stop in (20, 50):
         assert mean_image.fit(dataset, AUTHOR, stopping_after(stop, [], folder=tmp_path)) is None
         assert [path.name for path in tmp_path.iterdir()] == [STATE_FILE]
     ended = frames_of(mean_image, dataset, FitRun(folder=tmp_path))

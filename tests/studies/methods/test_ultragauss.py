@@ -28,7 +28,7 @@ from ultragray_studies.methods.ultragauss import (
 )
 
 from ...model.learn.conftest import make_tiny_dataset
-from .volumes import steps_of
+from .conftest import steps_of
 
 LINEAR = LinearProbe(width_mm=20.0, near_mm=5.0, far_mm=25.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0)

@@ -6,21 +6,19 @@ import json
 import numpy as np
 import pydicom
 import pytest
-import torch
 from pydicom.uid import ExplicitVRLittleEndian, UltrasoundMultiFrameImageStorage
 
 from ultragray import ConvexProbe, LinearProbe
 from ultragray.errors import InvalidArgument
-from ultragray.exchange.exports import FORMATS, ExportHeader, export_to
+from ultragray.exchange.exports import export_to
 from ultragray.geometry.scan_conversion import scan_convert
-from ultragray.rendering.frames import show
 from ultragray.rendering.settings import Resolved
 from ultragray.scene.confidence import Extrapolation
 
+from .conftest import POSES, exported, header_of
+
 LINEAR = LinearProbe(width_mm=38.0, near_mm=2.0, far_mm=52.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0)
-POSES = np.tile(np.eye(4), (5, 1, 1))
-POSES[:, 1, 3] = np.arange(5) / 3.0
 FRAMES = np.random.default_rng(0).random((5, 21, 19), np.float32)
 TOLD = [Extrapolation(0.5 * number, 2.0, None, 0.25) for number in range(5)]
 
@@ -75,19 +73,12 @@ def strict_reading(monkeypatch):
     pydicom.config.settings.reading_validation_mode = before
 
 
-def header(**changes):
-    settings = Resolved(probe=changes.pop("probe", LINEAR), height=21, width=19)
-    one = ExportHeader(FORMATS["dicom"].shown(settings), "uint8", POSES, "one", "0" * 64, "ultragray/0 cpu")
-    return dataclasses.replace(one, **changes)
+def header(probe=LINEAR, **changes):
+    return header_of("dicom", Resolved(probe=probe, height=21, width=19), **changes)
 
 
-def export(path, header):
-    with export_to(path, "dicom", header) as add:
-        shown = show({"bmode": torch.from_numpy(FRAMES)}, header.settings.probe, header.settings.display)[
-            "bmode"
-        ].numpy()
-        add({"bmode": shown[:2]}, TOLD[:2])
-        add({"bmode": shown[2:]}, TOLD[2:])
+def written(path, header):
+    exported(path, "dicom", header, {"bmode": FRAMES}, TOLD)
     data = pydicom.dcmread(path)
     for _ in data.iterall():  # reads and checks every value
         pass
@@ -96,7 +87,7 @@ def export(path, header):
 
 @pytest.mark.parametrize("probe", [LINEAR, CONVEX])
 def test_all_that_the_standard_requires_is_there(tmp_path, probe):
-    data = export(tmp_path / "frames.dcm", header(probe=probe))
+    data = written(tmp_path / "frames.dcm", header(probe=probe))
     assert data.file_meta.MediaStorageSOPClassUID == data.SOPClassUID == UltrasoundMultiFrameImageStorage
     assert data.file_meta.MediaStorageSOPInstanceUID == data.SOPInstanceUID
     assert data.file_meta.TransferSyntaxUID == ExplicitVRLittleEndian
@@ -138,7 +129,7 @@ def position_cm(region, column, row):
 
 
 def test_pixels_and_their_places_of_a_linear_probe(tmp_path):
-    data = export(tmp_path / "frames.dcm", header())
+    data = written(tmp_path / "frames.dcm", header())
     np.testing.assert_array_equal(data.pixel_array, np.rint(FRAMES * 255))
     [region] = data.SequenceOfUltrasoundRegions
     assert (region.PhysicalDeltaX, region.PhysicalDeltaY) == pytest.approx((0.2, 5.0 / 21))
@@ -150,7 +141,7 @@ def test_pixels_and_their_places_of_a_linear_probe(tmp_path):
 
 
 def test_pixels_and_their_places_of_a_convex_probe(tmp_path):
-    data = export(tmp_path / "frames.dcm", header(probe=CONVEX))
+    data = written(tmp_path / "frames.dcm", header(probe=CONVEX))
     [region] = data.SequenceOfUltrasoundRegions
     pixel_cm = 4.0 / 21
     assert (region.PhysicalDeltaX, region.PhysicalDeltaY) == pytest.approx((pixel_cm, pixel_cm))
@@ -167,21 +158,21 @@ def test_pixels_and_their_places_of_a_convex_probe(tmp_path):
 
 
 def test_poses_are_in_the_file_and_uids_follow_what_was_rendered(tmp_path):
-    one = export(tmp_path / "one.dcm", header())
+    one = written(tmp_path / "one.dcm", header())
     poses = np.frombuffer(one.private_block(0x0019, "ULTRAGRAY")[0x01].value, "<f8").reshape(-1, 4, 4)
     np.testing.assert_array_equal(poses, POSES)
-    again = export(tmp_path / "again.dcm", header())
+    again = written(tmp_path / "again.dcm", header())
     assert (again.SOPInstanceUID, again.SeriesInstanceUID) == (one.SOPInstanceUID, one.SeriesInstanceUID)
-    moved = export(tmp_path / "moved.dcm", header(poses=POSES + np.eye(4, k=3)))
+    moved = written(tmp_path / "moved.dcm", header(poses=POSES + np.eye(4, k=3)))
     assert moved.SOPInstanceUID != one.SOPInstanceUID
     assert moved.StudyInstanceUID == one.StudyInstanceUID
-    other = export(tmp_path / "other.dcm", header(scene_sha256="1" * 64))
+    other = written(tmp_path / "other.dcm", header(scene_sha256="1" * 64))
     assert other.StudyInstanceUID != one.StudyInstanceUID
     assert one.SOPInstanceUID != one.SeriesInstanceUID
 
 
 def test_figures_of_each_frame_are_beside_the_poses(tmp_path):
-    data = export(tmp_path / "frames.dcm", header())
+    data = written(tmp_path / "frames.dcm", header())
     element = data.private_block(0x0019, "ULTRAGRAY")[0x02]
     assert element.VR == "OF"
     figures = np.frombuffer(element.value, "<f4").reshape(-1, 4)
@@ -191,7 +182,7 @@ def test_figures_of_each_frame_are_beside_the_poses(tmp_path):
 
 def test_the_origin_is_beside_the_poses(tmp_path):
     asked = header(probe=CONVEX)
-    data = export(tmp_path / "frames.dcm", asked)
+    data = written(tmp_path / "frames.dcm", asked)
     origin = json.loads(data.private_block(0x0019, "ULTRAGRAY")[0x03].value)
     assert origin == json.loads(json.dumps(asked.origin()))
     assert origin["display"]["pixel_mm"] == asked.settings.display.pixel_mm

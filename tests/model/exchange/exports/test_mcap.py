@@ -9,18 +9,14 @@ from mcap_ros2.decoder import DecoderFactory
 
 from ultragray import LinearProbe
 from ultragray.contract import to_dict
-from ultragray.exchange.exports import ExportHeader, export_to
 from ultragray.exchange.poses import load_poses
 from ultragray.rendering.settings import Resolved
 from ultragray.scene.confidence import FIGURES, Extrapolation
 
+from .conftest import exported, header_of
+
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 FRAMES = 3
-
-
-def header(poses, dtype):
-    settings = Resolved(PROBE, 6, 7, ("bmode", "labels"))
-    return ExportHeader(settings, dtype, poses, "one", "0" * 64, "ultragray/0 cpu")
 
 
 def written(path, poses, dtype):
@@ -30,8 +26,8 @@ def written(path, poses, dtype):
         "labels": random.integers(0, 5, (FRAMES, 6, 7), np.uint8),
     }
     told = [Extrapolation(0.5, 2.0, 0.9 - 0.1 * number, 0.75) for number in range(FRAMES - 1)]
-    with export_to(path, "mcap", header(poses, dtype)) as add:
-        add(frames, [*told, Extrapolation(None, None, None, 0.25)])
+    header = header_of("mcap", Resolved(PROBE, 6, 7, ("bmode", "labels")), dtype=dtype, poses=poses)
+    exported(path, "mcap", header, frames, [*told, Extrapolation(None, None, None, 0.25)])
     return frames
 
 

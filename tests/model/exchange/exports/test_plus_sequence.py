@@ -4,20 +4,20 @@ import re
 import cv2
 import numpy as np
 import pytest
-import torch
 
 from ultragray import ConvexProbe, LinearProbe, PhasedProbe
 from ultragray.datasets.fan import parse_matrix
 from ultragray.datasets.plus import read_plus_sweep
 from ultragray.datasets.plus_files import read_meta_image
 from ultragray.errors import DatasetInvalid
-from ultragray.exchange.exports import FORMATS, ExportHeader, export_to
+from ultragray.exchange.exports import export_to
 from ultragray.geometry.pose import pose_from_position_quaternion
 from ultragray.geometry.scan_conversion import scan_convert
 from ultragray.rendering.display import Display
-from ultragray.rendering.frames import show
 from ultragray.rendering.settings import Resolved
 from ultragray.scene.confidence import Extrapolation
+
+from .conftest import exported, header_of
 
 FRAMES = np.random.default_rng(0).random((12, 20, 16), np.float32)
 TOLD = [Extrapolation(number / 3.0, 1234.5, None, 1e-4 * number) for number in range(12)]
@@ -35,12 +35,8 @@ def poses(count):
 
 
 def export(path, probe):
-    settings = FORMATS["plus"].shown(Resolved(probe, 20, 16))
-    header = ExportHeader(settings, "uint8", poses(12), "one", "0" * 64, "ultragray/0 cpu")
-    shown = show({"bmode": torch.from_numpy(FRAMES)}, probe, settings.display)["bmode"].numpy()
-    with export_to(path, "plus", header) as add:
-        add({"bmode": shown[:7]}, TOLD[:7])
-        add({"bmode": shown[7:]}, TOLD[7:])
+    header = header_of("plus", Resolved(probe, 20, 16), poses=poses(12))
+    exported(path, "plus", header, {"bmode": FRAMES}, TOLD)
     return header
 
 
@@ -121,11 +117,8 @@ def test_our_reader_brings_a_fan_back_to_scan_lines(tmp_path, probe, display):
     height, width = 200, 160
     rows, lines = np.meshgrid(np.linspace(0.2, 0.9, height), np.linspace(0.3, 1.0, width), indexing="ij")
     smooth = np.broadcast_to((rows * lines).astype(np.float32), (12, height, width))
-    settings = FORMATS["plus"].shown(Resolved(probe, height, width, display=display))
-    header = ExportHeader(settings, "uint8", poses(12), "one", "0" * 64, "ultragray/0 cpu")
-    shown = show({"bmode": torch.from_numpy(smooth.copy())}, probe, settings.display)["bmode"].numpy()
-    with export_to(tmp_path / "sweep.igs.mha", "plus", header) as add:
-        add({"bmode": shown}, TOLD)
+    header = header_of("plus", Resolved(probe, height, width, display=display), poses=poses(12))
+    exported(tmp_path / "sweep.igs.mha", "plus", header, {"bmode": smooth}, TOLD)
     sweep, _ = read_plus_sweep(tmp_path / "sweep.igs.mha")
     depth = display.depth_mm
     assert sweep.probe == (probe if depth is None else probe.ending_at(probe.face_depth_mm + depth))
@@ -150,6 +143,7 @@ def test_a_calibration_that_does_not_go_with_the_probe_is_refused(tmp_path):
         read_plus_sweep(path)
 
 
+@pytest.mark.long
 def test_ten_thousand_frames_keep_their_order(tmp_path):
     many = np.tile(np.eye(4), (10_050, 1, 1))
     many[:, 1, 3] = np.arange(10_050)

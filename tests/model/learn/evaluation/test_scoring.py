@@ -3,10 +3,11 @@
 import json
 from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
-from ultragray import ConvexProbe, LinearProbe, render
+from ultragray import ConvexProbe, LinearProbe, PhasedProbe, render
 from ultragray.datasets import Sweep
 from ultragray.errors import DatasetInvalid, InvalidArgument
 from ultragray.learn.evaluation import scoring as evaluation
@@ -18,6 +19,7 @@ from ultragray.learn.evaluation.scoring import (
     measure_reliability,
     render_sweep,
 )
+from ultragray.learn.evaluation.side_by_side import as_picture, side_by_side_panels, write_side_by_side
 from ultragray.scene.confidence import DEPTHS, VARIANCE_TERMS, ConfidenceModel, DepthBands, Uncertainty
 
 
@@ -142,3 +144,47 @@ def test_of_a_scene(random_scene):
     assert measure_reliability(random_scene(20), sweep) is None
     with pytest.raises(DatasetInvalid, match="no frames to measure with"):
         measure_reliability(scene, sweep.select([]))
+
+
+LINEAR = LinearProbe(width_mm=30.0, near_mm=0.0, far_mm=60.0)
+CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=50.0)
+PHASED = PhasedProbe(opening_angle_deg=60.0, far_mm=50.0)
+
+
+def random_sweep(probe, poses):
+    images = np.random.default_rng(0).integers(0, 200, (len(poses), 24, 20), dtype=np.uint8)
+    return Sweep(images, poses, probe, np.arange(len(poses)) + 40, "made")
+
+
+@pytest.mark.parametrize("probe", [LINEAR, CONVEX, PHASED], ids=["linear", "convex", "phased"])
+def test_one_picture_a_frame(tmp_path, random_scene, random_poses, probe):
+    scene, sweep = random_scene(80), random_sweep(probe, random_poses(3))
+    paths = write_side_by_side(scene, sweep, evaluate(scene, sweep).frames, tmp_path / "new" / "pictures")
+    assert [path.name for path in paths] == ["frame_00040.png", "frame_00041.png", "frame_00042.png"]
+    height, width = as_picture(sweep.images[0] / 255.0, sweep).shape
+    for place, path in enumerate(paths):
+        picture = cv2.imread(str(path), cv2.IMREAD_GRAYSCALE)
+        assert picture.shape == (height + 44, 5 * width + 24)
+        truth = as_picture((sweep.images[place] / 255.0).astype(np.float32), sweep)
+        np.testing.assert_array_equal(picture[22 : 22 + height, :width], truth)
+        assert (picture[:22] < 128).any()
+        assert (picture[-22:] < 128).any()
+
+
+def test_panels(random_scene, random_poses):
+    scene, sweep = random_scene(80), random_sweep(LINEAR, random_poses(2))
+    truth, rendering, difference, echo, transmittance = side_by_side_panels(scene, sweep).values()
+    np.testing.assert_allclose(difference, np.minimum(3 * np.abs(rendering - truth), 1.0), atol=1e-6)
+    np.testing.assert_allclose(rendering, echo * transmittance, atol=1e-5)
+    np.testing.assert_array_equal(rendering, render_sweep(scene, sweep))
+
+
+def test_a_picture_has_square_pixels():
+    frame = np.zeros((24, 20), np.float32)
+    frame[:12] = 1.0
+    tall = as_picture(frame, random_sweep(LINEAR, np.eye(4)[None]), 100)
+    assert tall.shape == (100, 50)
+    assert tall[:45].min() == 255
+    assert tall[55:].max() == 0
+    wide = as_picture(frame, random_sweep(LinearProbe(60.0, 0.0, 30.0), np.eye(4)[None]), 100)
+    assert wide.shape == (50, 100)

@@ -71,7 +71,6 @@ def test_the_page_of_a_scene_alone_with_frames_from_end_to_end(page, tmp_path):
     first, last = page.dataset.val.frame_numbers[[0, -1]]
     assert re.findall(r"<figcaption>Frame (\d+)</figcaption>", text) == [str(first), str(last)]
     assert text.count("<img ") == 2 * 5  # truth, the scene and how far it is off, what it is made of
-    assert render_page(replace(page, spread=24)).count("<img ") == len(page.dataset.val) * 5
     read_from_a_file = render_page(replace(page, course=None))
     assert re.findall(r"<h2>(.*?)</h2>", read_from_a_file) == ["Held-out frames", "Pictures"]
     assert page.course is not None

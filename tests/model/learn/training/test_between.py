@@ -9,22 +9,23 @@ from torch.nn import functional
 
 from ultragray.geometry.pose import pose_from_position_quaternion, rotation_angles_deg
 from ultragray.geometry.probe import ConvexProbe, LinearProbe, PhasedProbe, RadialProbe, SteeredProbe
-from ultragray.learn.evaluation.baselines import interpolate_planes
+from ultragray.learn.evaluation.baselines import interpolate_planes, predict
+from ultragray.learn.evaluation.scoring import render_sweep
 from ultragray.learn.sweep import Sweep
+from ultragray.learn.training import train
 from ultragray.learn.training.between import (
     SMOOTHED,
     Places,
     ViewsBetween,
     blend_in_space,
     draw_places,
-    features_follow_probe,
     neighbours_of,
     smoothed_sizes,
 )
 from ultragray.learn.training.losses import image_loss
 
 
-def moved(sweep, y_mm, *, x_mm=None):
+def placed(sweep, y_mm, *, x_mm=None):
     poses = np.tile(sweep.poses[0], (len(y_mm), 1, 1))
     poses[:, 1, 3] += y_mm
     poses[:, 0, 3] += x_mm or 0.0
@@ -33,7 +34,7 @@ def moved(sweep, y_mm, *, x_mm=None):
 
 
 def test_neighbours_are_the_nearest_on_either_side_whatever_the_order(tiny_dataset):
-    neighbours = neighbours_of(moved(tiny_dataset().train, [0.0, 2.0, 1.0, 9.0]))
+    neighbours = neighbours_of(placed(tiny_dataset().train, [0.0, 2.0, 1.0, 9.0]))
     found = {tuple(pair): gap for pair, gap in zip(neighbours.pairs.tolist(), neighbours.gaps_mm, strict=True)}
     assert found == {(0, 2): pytest.approx(1.0), (1, 2): pytest.approx(1.0), (1, 3): pytest.approx(7.0)}
     assert neighbours.spacing_mm == pytest.approx(1.0)
@@ -41,7 +42,7 @@ def test_neighbours_are_the_nearest_on_either_side_whatever_the_order(tiny_datas
 
 
 def test_a_gap_weighs_as_much_as_it_is_long_and_never_less_than_the_usual_one(tiny_dataset):
-    neighbours = neighbours_of(moved(tiny_dataset().train, [0.0, 1.0, 2.0, 2.2, 7.2]))
+    neighbours = neighbours_of(placed(tiny_dataset().train, [0.0, 1.0, 2.0, 2.2, 7.2]))
     weights = neighbours.weights
     assert weights.sum() == pytest.approx(1.0)
     assert (weights[:4] / weights[0]).tolist() == pytest.approx([1.0, 1.0, 1.0, 5.0])
@@ -50,14 +51,14 @@ def test_a_gap_weighs_as_much_as_it_is_long_and_never_less_than_the_usual_one(ti
 
 
 def test_a_frame_beside_is_no_neighbour_and_hides_no_end(tiny_dataset):
-    sweep = moved(tiny_dataset().train, [0.0, 1.0, 0.5, 1.5], x_mm=[0.0, 0.0, 60.0, 60.0])
+    sweep = placed(tiny_dataset().train, [0.0, 1.0, 0.5, 1.5], x_mm=[0.0, 0.0, 60.0, 60.0])
     neighbours = neighbours_of(sweep)
     assert neighbours.pairs.tolist() == [[0, 1], [2, 3]]
     assert len(neighbours.ends) == 4
 
 
 def test_a_probe_held_still_has_no_gaps_but_every_frame_takes_part(tiny_dataset):
-    neighbours = neighbours_of(moved(tiny_dataset().train, [0.0, 0.0, 0.0]))
+    neighbours = neighbours_of(placed(tiny_dataset().train, [0.0, 0.0, 0.0]))
     assert neighbours.spacing_mm == 0.0
     assert neighbours.pairs.tolist() == [[0, 0], [1, 1], [2, 2]]
     assert neighbours.weights[:3].min() > 0.0
@@ -65,7 +66,7 @@ def test_a_probe_held_still_has_no_gaps_but_every_frame_takes_part(tiny_dataset)
 
 
 def test_frames_of_a_probe_that_turns_in_place_are_neighbours_by_their_turn(tiny_dataset):
-    sweep = moved(tiny_dataset().train, [0.0] * 12)
+    sweep = placed(tiny_dataset().train, [0.0] * 12)
     poses = sweep.poses.copy()
     angles = np.radians(4.0 * np.arange(12))
     poses[:, 0, 0] = poses[:, 1, 1] = np.cos(angles)
@@ -77,7 +78,7 @@ def test_frames_of_a_probe_that_turns_in_place_are_neighbours_by_their_turn(tiny
 
 
 def test_a_frame_that_only_slides_sideways_is_paired_with_itself(tiny_dataset):
-    sweep = moved(tiny_dataset().train, [0.0, 0.1, -0.1], x_mm=[0.0, 8.0, -8.0])
+    sweep = placed(tiny_dataset().train, [0.0, 0.1, -0.1], x_mm=[0.0, 8.0, -8.0])
     neighbours = neighbours_of(sweep)
     used = {*neighbours.pairs.flatten().tolist(), *neighbours.ends.tolist()}
     assert used == {0, 1, 2}
@@ -124,12 +125,6 @@ def test_places_fill_the_gaps_by_their_length(tiny_dataset):
     assert {float(np.sign(value)) for value in beyond} == {-1.0, 1.0}
 
 
-def test_frames_blend_where_their_features_are(tiny_dataset):
-    for with_probe in (True, False):
-        sweep = drifting(tiny_dataset().train, with_probe=with_probe)
-        assert features_follow_probe(sweep, neighbours_of(sweep)) is with_probe
-
-
 @pytest.mark.parametrize("with_probe", [True, False])
 def test_images_between_show_what_is_there(tiny_dataset, with_probe):
     sweep = drifting(tiny_dataset().train, with_probe=with_probe)
@@ -144,7 +139,7 @@ def test_images_between_show_what_is_there(tiny_dataset, with_probe):
     assert float(errors.max()) < 0.08
 
 
-def test_beyond_an_end_the_last_frame_goes_on(tiny_dataset):
+def test_beyond_an_end_views_are_those_of_the_last_frame(tiny_dataset):
     sweep = tiny_dataset().train
     views = ViewsBetween(sweep, neighbours_of(sweep), torch.tensor(sweep.images))
     _, poses, images, _ = views.draw(100, torch.Generator().manual_seed(2))
@@ -238,3 +233,62 @@ def test_what_no_frame_shows_is_black_and_what_one_shows_is_its():
     assert far.max() == 0.0
     assert near[:, -SIZE // 4 :].max() == 0.0
     assert near[:, : SIZE // 4].min() > 0.0
+
+
+def psnr_db(images, truth):
+    return float((-10.0 * np.log10(np.square(images - truth / 255.0).mean(axis=(1, 2)))).mean())
+
+
+def with_gap(dataset, first, last):
+    """The frames from `first` to `last` of all are held out, no others."""
+    places = np.arange(len(dataset.train))
+    held_out = (places >= first) & (places <= last)
+    return replace(dataset, train=dataset.train.select(places[~held_out]), val=dataset.train.select(places[held_out]))
+
+
+def test_a_gap_is_as_bright_as_its_edges_tell(tiny_dataset, tiny_config):
+    dataset = with_gap(tiny_dataset(frames=40, height=40, width=32, spacing_mm=0.4), 12, 19)
+    settings = {"steps": 150, "max_gaussians": 1500, "refinements": 0, "batch_size": 8}
+    filled = train(dataset, tiny_config(**settings))
+    alone = train(dataset, tiny_config(**settings, views_between=0.0))
+    linear = psnr_db(predict(dataset.train, dataset.val.poses, "linear"), dataset.val.images)
+    found = [psnr_db(render_sweep(scene, dataset.val), dataset.val.images) for scene in (filled, alone)]
+    assert found[0] > linear - 0.5
+    assert found[0] > found[1] + 1.0
+
+
+def test_beyond_an_end_the_last_frame_goes_on(tiny_dataset, tiny_config):
+    dataset = with_gap(tiny_dataset(frames=24, height=40, width=32, spacing_mm=0.5), 14, 17)
+    scene = train(dataset, tiny_config(steps=100, max_gaussians=1500, refinements=0, batch_size=8))
+    assert dataset.val.poses[-1, 1, 3] - dataset.train.poses[-1, 1, 3] > 2.0
+    assert psnr_db(render_sweep(scene, dataset.val), dataset.val.images) > 20.0
+
+
+def test_darkness_that_is_no_shadow_is_not_explained_by_absorption(tiny_dataset, tiny_config):
+    dataset = tiny_dataset(frames=16, height=60, width=48)
+    rows, columns = np.mgrid[:60, :48]
+    spots = [
+        np.exp(-((rows - 15) ** 2 + (columns - 10 - place) ** 2) / 8.0)
+        + np.exp(-((rows - 35) ** 2 + (columns - 30) ** 2) / 8.0)
+        for place in range(len(dataset.train))
+    ]
+    images = (230.0 * np.array(spots)).astype(np.uint8)
+    dataset = replace(dataset, train=replace(dataset.train, images=images), val=dataset.val.select([]))
+    settings = {"steps": 150, "max_gaussians": 1500, "refinements": 0, "batch_size": 8}
+    scene = train(dataset, tiny_config(**settings))
+    assert render_sweep(scene, dataset.train, output="transmittance").mean() > 0.9
+
+
+@pytest.mark.long
+def test_absorption_costs_nothing_where_frames_show_a_shadow(tiny_dataset, tiny_config):
+    dataset = tiny_dataset(frames=16, height=60, width=48)
+    speckle = np.random.default_rng(0).gamma(4.0, 22.0, (len(dataset.train), 60, 48))
+    speckle[:, 18:22, 15:30] = 230.0
+    speckle[:, 22:, 15:30] /= 20.0
+    images = np.clip(speckle, 0, 255).astype(np.uint8)
+    dataset = replace(dataset, train=replace(dataset.train, images=images), val=dataset.val.select([]))
+    settings = {"steps": 150, "max_gaussians": 1500, "refinements": 0, "batch_size": 8}
+    scene = train(dataset, tiny_config(**settings, absorption_penalty=1.0))
+    transmittance = render_sweep(scene, dataset.train, output="transmittance")
+    assert transmittance[:, 35:, 18:27].mean() < 0.3
+    assert transmittance[:, :, 38:].mean() > 0.97

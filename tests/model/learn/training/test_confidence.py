@@ -38,7 +38,6 @@ from ultragray.scene.confidence import (
     DISTANCE_MM,
     VARIANCE_TERMS,
     Assessor,
-    ConfidenceModel,
     TrainingViews,
     ViewMeasures,
     predicted,
@@ -84,19 +83,8 @@ def test_it_tells_what_frames_will_reach():
     assert np.abs(told - actual).mean() < 0.1
 
 
-@pytest.mark.long
-def test_the_same_training_ends_in_the_same_scene():
-    dataset, _ = phantom()
-    again = train(dataset, TrainingConfig.preset("fast", steps=120, max_gaussians=4_000))
-    assert again.to_bytes() == trained().to_bytes()
-    model = ConfidenceModel.from_dict(trained().info.confidence)
-    assert len(model.hardness) == len(dataset.train)
-    assert 10 <= model.fitted_on < 0.5 * len(dataset.train)
-    assert 0.0 < model.error < 0.15
-
-
 def test_nothing_of_what_is_left_out_is_trained_from(tiny_dataset):
-    dataset, parts = tiny_dataset(frames=40), []
+    dataset, parts = tiny_dataset(frames=24), []
 
     def train_part(part):
         parts.append(part)
@@ -302,7 +290,7 @@ def test_each_frame_is_predicted_from_either_side_and_ever_farther_away():
 
 def test_scores_fall_with_distance_where_anatomy_changes_and_only_there():
     for columns_per_frame, falls in ((1, True), (0, False)):
-        examples = one_sided_examples(drifting_sweep(FRAMES, columns_per_frame), np.zeros(FRAMES))
+        examples = one_sided_examples(drifting_sweep(12, columns_per_frame), np.zeros(12))
         distances = -examples.terms[:, 0, 2] * DISTANCE_MM
         near, far = (examples.ms_ssim[chosen].mean() for chosen in (distances < 1.5, distances > 8.0))
         assert (near - far > 0.2) if falls else (near == pytest.approx(far, abs=1e-6))

@@ -42,7 +42,7 @@ def test_learns_what_the_cpu_learns(dataset, config):
 
 
 @pytest.mark.long
-def test_resumed_run_ends_in_the_same_scene(dataset, config, tmp_path):
+def test_a_resumed_run_on_cuda_ends_in_the_same_scene(dataset, config, tmp_path):
     expected = train(dataset, config, device="cuda", backend="cuda").to_bytes()
     steps = iter(range(100))
     for resume in (False, True):

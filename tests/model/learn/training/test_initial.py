@@ -1,16 +1,26 @@
 """Where the Gaussians begin, and sh0 for an intensity."""
 
 import math
+from collections import Counter
 from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
-from ultragray import GaussianScene, SceneInfo
+from ultragray import GaussianScene, LinearProbe, SceneInfo
+from ultragray.learn.sweep import Sweep
 from ultragray.learn.training import TrainingConfig
 from ultragray.learn.training.between import neighbours_of
-from ultragray.learn.training.geometry import Geometry, Shadows
+from ultragray.learn.training.geometry import (
+    BatchSampler,
+    Geometry,
+    Shadows,
+    frame_spacing_mm,
+    out_of_plane_range_mm,
+    out_of_plane_shift_mm,
+    shift_out_of_plane,
+)
 from ultragray.learn.training.initial import initial_parameters
 from ultragray.learn.training.intensity import project_sh0, sh0_of_intensity
 from ultragray.learn.training.optimizer import rotate
@@ -158,3 +168,152 @@ def test_a_floor_is_the_least_intensity(name):
     project_sh0(sh0, name, torch.tensor([0.6, 0.6, 0.0]))
     assert intensity_of(sh0, name)[0].item() == pytest.approx(0.6)
     assert torch.equal(sh0[1:], free[1:])
+
+
+def test_lengths_of_a_straight_sweep(tiny_dataset):
+    dataset = tiny_dataset(frames=9, spacing_mm=2.0)  # frames 2 and 6 are held out: 0 1 3 4 5 7 8 are left
+    geometry = Geometry.of(dataset)
+    assert geometry.frame_spacing_mm == pytest.approx(2.0)
+    reach_mm = math.hypot(10.0, 8.0, 12.5)
+    assert geometry.scene_scale_cm == pytest.approx(1.1 * reach_mm / 10.0)
+    assert geometry.pixel_mm == pytest.approx(1.25)
+    assert geometry.initial_scale_mm == pytest.approx(1.25)  # a pixel is more than half a spacing
+    assert geometry.out_of_plane_mm == 0.0  # six frames cannot tell
+    assert geometry.least_out_of_plane_mm(views_between=0.0) == pytest.approx(3.0)
+    assert geometry.least_out_of_plane_mm(views_between=0.5) == 0.0
+    assert (geometry.steps(0.75), geometry.steps(0.0)) == (500, 250)
+    assert Geometry.of(tiny_dataset(frames=40)).steps(0.75) == 2 * 15 * 30
+    assert geometry.initial_elevation_mm(0.0) == pytest.approx(2.0)
+    assert geometry.initial_elevation_mm(9.0) == pytest.approx(4.5)
+
+
+def test_spacing_of_a_raster_is_that_across_the_frames(tiny_dataset):
+    """Frames of the next lane lie in almost the same planes, but they are not neighbours."""
+    sweep = tiny_dataset(frames=12, spacing_mm=1.0).train
+    poses = np.concatenate([sweep.poses, sweep.poses])
+    poses[len(sweep) :, 0, 3] += 30.0
+    poses[len(sweep) :, 1, 3] += 0.1
+    images = np.concatenate([sweep.images, sweep.images])
+    both = replace(sweep, images=images, poses=poses, frame_numbers=np.arange(len(poses)))
+    assert frame_spacing_mm(both) == pytest.approx(1.0)
+
+
+def test_spacing_of_a_tilt_is_that_of_the_image_points(tiny_dataset):
+    sweep = tiny_dataset(probe=LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=40.0)).train
+    poses = np.tile(np.eye(4), (len(sweep), 1, 1))
+    step = math.radians(1.0)
+    for number, pose in enumerate(poses):
+        c, s = math.cos(number * step), math.sin(number * step)
+        pose[1:3, 1:3] = [[c, -s], [s, c]]
+    expected = 20.0 * math.sin(step)  # mean of nothing at the face and 40 mm · sin at the far edge
+    assert frame_spacing_mm(replace(sweep, poses=poses)) == pytest.approx(expected, rel=1e-3)
+
+
+def test_every_frame_is_seen_equally_often():
+    sampler = BatchSampler(10, 4, torch.Generator().manual_seed(0))
+    batches = [sampler.next_batch() for _ in range(5)]
+    assert [len(batch) for batch in batches] == [4] * 5
+    assert Counter(torch.cat(batches).tolist()) == dict.fromkeys(range(10), 2)
+    assert torch.cat(batches[:2]).tolist() != sorted(torch.cat(batches[:2]).tolist())
+
+
+def test_batch_holds_each_frame_once_at_most():
+    assert sorted(BatchSampler(3, 8, torch.Generator()).next_batch().tolist()) == [0, 1, 2]
+
+
+def test_shifts_follow_the_squared_cosine():
+    generator = torch.Generator().manual_seed(0)
+    shifts = np.array([out_of_plane_shift_mm(2.0, generator) for _ in range(4000)])
+    assert np.abs(shifts).max() <= 1.0
+    assert abs(shifts.mean()) < 0.03
+    # The density 2·cos²(πx) on [−½, ½] has the variance 1/12 − 1/(2π²); the full range is 2 mm.
+    assert shifts.std() == pytest.approx(2.0 * (1 / 12 - 1 / (2 * np.pi**2)) ** 0.5, rel=0.05)
+
+
+def test_shift_is_along_elevation(random_poses):
+    poses = random_poses(4)
+    shifted = shift_out_of_plane(poses, 1.5)
+    in_probe = np.einsum("cji,cj->ci", poses[:, :3, :3], shifted[:, :3, 3] - poses[:, :3, 3])
+    assert np.allclose(in_probe, (0.0, 1.5, 0.0))
+    assert np.array_equal(shifted[:, :3, :3], poses[:, :3, :3])
+
+
+@pytest.mark.parametrize("blur_mm", [4.0, 8.0])
+def test_out_of_plane_range_follows_the_blur_of_the_frames(blur_mm):
+    """Noisy slices through a field that is smooth over `blur_mm`: noise widens the range, detail narrows it."""
+    rng = np.random.default_rng(5)
+    y = 0.5 * np.arange(80)
+    phases, rates = rng.uniform(0, 2 * np.pi, 400), 2 * np.pi / (blur_mm * rng.uniform(2.0, 4.0, 400))
+    images = 128 + 40 * np.sin(np.outer(y, rates) + phases) + rng.normal(0.0, 20.0, (80, 400))
+    poses = np.tile(np.eye(4), (80, 1, 1))
+    poses[:, 1, 3] = y
+    frames = np.clip(images, 0, 255).astype(np.uint8).reshape(80, 20, 20)
+    sweep = Sweep(frames, poses, LinearProbe(20.0, 0.0, 20.0), np.arange(80), "waves")
+    assert blur_mm / 4 <= out_of_plane_range_mm(sweep) <= 0.75 * blur_mm
+
+
+def test_frames_far_apart_tell_no_out_of_plane_range(tiny_dataset):
+    assert out_of_plane_range_mm(tiny_dataset(spacing_mm=30.0).train) == 0.0
+    still = tiny_dataset(spacing_mm=0.0).train
+    assert out_of_plane_range_mm(still) == 0.0
+
+
+@pytest.mark.parametrize(("frames", "spacing_mm"), [(3, 10.0), (6, 5.0), (12, 3.0), (20, 1.5), (3, 80.0)])
+def test_out_of_plane_range_does_not_run_away_where_speckle_tells_nothing(frames, spacing_mm):
+    """Frames of pure speckle are best predicted by the mean of them all, however far they lie apart."""
+    speckle = np.random.default_rng(2).rayleigh(40.0, (frames, 20, 20)).clip(0, 255).astype(np.uint8)
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    poses[:, 1, 3] = spacing_mm * np.arange(frames)
+    sweep = Sweep(speckle, poses, LinearProbe(20.0, 0.0, 20.0), np.arange(frames), "speckle")
+    assert out_of_plane_range_mm(sweep) <= 8.0
+
+
+HEIGHT, WIDTH = 100, 60
+
+
+def speckled(sweep, level=90.0):
+    noise = np.random.default_rng(0).gamma(4.0, level / 4.0, (len(sweep), HEIGHT, WIDTH))
+    return np.clip(noise, 0, 255).astype(np.uint8)
+
+
+def evidence(sweep, images):
+    return Shadows(replace(sweep, images=images))
+
+
+def test_a_shadow_lasts_to_the_end_of_the_line_and_a_vessel_does_not(tiny_dataset):
+    sweep = tiny_dataset().train
+    images = speckled(sweep)
+    images[:, 30:, 10:20] //= 20
+    images[:, 30:60, 40:50] //= 20
+    beam = evidence(sweep, images).of(0)
+    assert beam.left[35:, 12:18].mean() < 0.2
+    assert beam.left[:25, 12:18].mean() > 0.9
+    assert beam.left[:, 40:50].mean() > 0.9
+    assert beam.echo[35:, 12:18].mean() == pytest.approx(90 / 255, rel=0.2), "as bright as tissue with the whole beam"
+
+
+def test_half_of_the_beam_is_told(tiny_dataset):
+    sweep = tiny_dataset().train
+    images = speckled(sweep)
+    images[:, 30:, 10:20] //= 2
+    left = evidence(sweep, images).of(0).left
+    assert left[35:85, 12:18].mean() == pytest.approx(0.5, abs=0.12)
+
+
+def test_a_depth_that_is_dark_everywhere_is_no_evidence(tiny_dataset):
+    sweep = tiny_dataset().train
+    dots = np.zeros((len(sweep), HEIGHT, WIDTH), np.uint8)
+    dots[:, 40:43, 20:24] = 250
+    dots[:, 0, 0] = 1
+    assert not evidence(sweep, dots).of(0).is_shadowed.any()
+    fading = speckled(sweep)
+    fading[:, 60:] = 2
+    assert evidence(sweep, fading).of(0).left[:, 5:-5].mean() > 0.95
+
+
+@pytest.mark.parametrize("level", [0, 1])
+def test_a_line_without_contact_casts_no_shadow(tiny_dataset, level):
+    sweep = tiny_dataset().train
+    images = speckled(sweep)
+    images[:, :, 10:20] = level
+    assert not evidence(sweep, images).of(0).is_shadowed[:, 14:16].any()

@@ -156,35 +156,38 @@ def no_gpu(monkeypatch):
 @pytest.mark.parametrize("backend", ["auto", "cuda", "reference"])
 @pytest.mark.usefixtures("one_gpu")
 def test_gpus_by_number(backend):
-    assert training_device("cuda", backend) == torch.device("cuda", 0)
-    assert training_device("cuda:0", backend) == torch.device("cuda", 0)
-    with pytest.raises(BackendUnavailable, match="CUDA device 7 was asked for, but there are 1"):
-        training_device("cuda:7", backend)
+    assert training_device("cuda", backend) == training_device("cuda:0", backend) == torch.device("cuda", 0)
 
 
-@pytest.mark.usefixtures("one_gpu")
-def test_a_backend_that_renders_elsewhere_is_refused():
-    with pytest.raises(
-        BackendUnavailable, match="backend cuda renders on a GPU, but the device is cpu: give device cu"
-    ):
-        training_device("cpu", "cuda")
-    with pytest.raises(BackendUnavailable, match="backend cpu renders on the CPU, but the device is cuda:0: give devi"):
-        training_device("cuda:0", "cpu")
+NO_GPU = "backend cuda needs an NVIDIA GPU and torch's CUDA build, but"
+NO_NAME = "device must be cpu, cuda or cuda:N, got"
+
+
+@pytest.mark.parametrize(
+    ("machine", "device", "backend", "told"),
+    [
+        ("one_gpu", "cuda:7", "auto", "CUDA device 7 was asked for, but there are 1"),
+        ("one_gpu", "cpu", "cuda", "backend cuda renders on a GPU, but the device is cpu: give device cu"),
+        ("one_gpu", "cuda:0", "cpu", "backend cpu renders on the CPU, but the device is cuda:0: give devi"),
+        *(
+            ("no_gpu", *asked, NO_GPU)
+            for asked in (("cuda", "auto"), ("cuda:7", "auto"), ("cpu", "cuda"), ("cuda", "cpu"))
+        ),
+        *(
+            ("one_gpu", name, "auto", NO_NAME)
+            for name in ("", "warp", "cuda:", "cuda:x", "cuda:-1", "cuda:²", "cpu:1", "mps")
+        ),
+    ],
+)
+def test_devices_that_cannot_be_are_refused(machine, device, backend, told, request):
+    request.getfixturevalue(machine)
+    with pytest.raises(BackendUnavailable, match=told):
+        training_device(device, backend)
 
 
 @pytest.mark.usefixtures("no_gpu")
-def test_says_what_is_missing_without_a_gpu():
-    for device, backend in (("cuda", "auto"), ("cuda:7", "auto"), ("cpu", "cuda"), ("cuda", "cpu")):
-        with pytest.raises(BackendUnavailable, match="backend cuda needs an NVIDIA GPU and torch's CUDA build, but"):
-            training_device(device, backend)
+def test_without_a_gpu_the_cpu_is_taken():
     assert training_device("cpu", "auto") == torch.device("cpu")
-
-
-@pytest.mark.usefixtures("one_gpu")
-@pytest.mark.parametrize("name", ["", "warp", "cuda:", "cuda:x", "cuda:-1", "cuda:²", "cudaX", "cpu:1", "meta", "mps"])
-def test_other_names_are_refused(name):
-    with pytest.raises(BackendUnavailable, match="device must be cpu, cuda or cuda:N, got"):
-        training_device(name, "auto")
 
 
 def test_kernels_that_are_interpreted_train_on_the_cpu(monkeypatch):

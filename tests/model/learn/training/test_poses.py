@@ -10,7 +10,6 @@ from ultragray import GaussianScene, LinearProbe, render
 from ultragray.geometry.rotations import rotations_of
 from ultragray.learn.report.sizes import CorrectionSizes
 from ultragray.learn.sweep import Dataset, Sweep
-from ultragray.learn.training import alignment as overlap
 from ultragray.learn.training import poses as trained
 from ultragray.learn.training import train
 from ultragray.learn.training.alignment import (
@@ -106,24 +105,6 @@ def test_an_error_that_changes_slowly_is_taken_for_the_path():
     moved = without_noise(given, [range(120)]) - given
     assert np.abs(moved[:, :3, 3]).max() < 0.05
     assert np.abs(moved[:, :3, :3]).max() < np.radians(0.05)
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("frames", [overlap.FRAMES, 20])
-def test_a_sweep_that_is_off_as_a_whole_finds_its_place(frames, monkeypatch):
-    """By all of its frames, and by every other where there are more than are compared."""
-    monkeypatch.setattr(overlap, "FRAMES", frames)
-    true = np.concatenate([freehand_path(40, tilt_deg=-6.0), freehand_path(40, start_mm=2.0, tilt_deg=6.0)])
-    sweep, ranges = seen(true), [range(40), range(40, 80)]
-    error = poses_of(np.array([[1.5, -1.0, 1.0]]), np.array([[2.0, 1.5, -2.0]]))[0]
-    given = true.copy()
-    given[40:] = error @ true[40:]
-    first, second = register_sweeps(replace(sweep, poses=given), ranges)
-    np.testing.assert_array_equal(first, np.eye(4))
-    left = second @ error
-    middle = np.append(sweep.corners_mm()[40:].mean(axis=(0, 1)), 1.0)
-    assert np.linalg.norm((left @ middle - middle)[:3]) < 0.2 * np.linalg.norm((error @ middle - middle)[:3])
-    assert angle_deg(left[:3, :3]) < 0.2 * angle_deg(error[:3, :3])
 
 
 def test_sweeps_that_overlap_little_are_left_alone():

@@ -25,7 +25,7 @@ export const train = {
     hint: "Drop or choose its files, or an archive of them (.zip, .tar, .tar.gz)",
     files: (count: number): string => `${count} files`,
     name: "Name",
-    options: "Choose frames, crop, resize",
+    options: "Choose frames, crop, correct times",
     send: "Upload and check",
     discard: "Discard",
     label: "Upload",

@@ -1,15 +1,19 @@
-"""The robot finds the vessel and stays on it, judged by the labels of the scene, which it never sees."""
+"""The examples: a robot that servos, a data set of simulated frames, an agent that climbs; and each as a program."""
 
 import asyncio
 import subprocess
 import sys
 import time
 
+import gymnasium
 import numpy as np
 import pytest
+import torch
 
+from ultragray.phantom.demo import DEMO_FILE
 from ultragray_client import Client, LinearProbe, RenderSettings
 from ultragray_client.errors import Unavailable
+from ultragray_studies.gym import STANDARD_PLANE
 
 from ..waiting import at_this_load
 from .conftest import EXAMPLES
@@ -76,12 +80,72 @@ def test_the_robot_converges_and_follows(servo, demo_service):
     assert f"in {len(record.errors_mm)} frames" in record.tell()
 
 
+@pytest.fixture(scope="module")
+def augment(load_example):
+    return load_example("augment_pytorch")
+
+
+def test_an_epoch_is_the_same_whoever_loads_it(augment, demo_service):
+    frames = augment.SimulatedFrames(demo_service.grpc, "demo", 5, labels=False, seed=3)
+    first, again = list(frames), list(frames)
+    assert len(first) == 5
+    for one, other in zip(first, again, strict=True):
+        assert one["bmode"].shape == (1, 256, 256)
+        assert one["bmode"].dtype == torch.float32
+        assert 0.1 < float(one["bmode"].max()) <= 1.0
+        assert torch.equal(one["bmode"], other["bmode"])
+    assert not torch.equal(first[0]["pose"], first[1]["pose"])
+    frames.epoch = 1
+    assert not torch.equal(next(iter(frames))["pose"], first[0]["pose"])
+
+
+def test_labels_come_along_if_asked_for(augment, demo_service):
+    sample = next(iter(augment.SimulatedFrames(demo_service.grpc, "demo", 1, labels=True, seed=0)))
+    assert sample["labels"].shape == (256, 256)
+    assert sample["labels"].dtype == torch.int64
+    assert set(sample["labels"].unique().tolist()) <= {0, 1, 2, 3, 4}
+
+
+@pytest.fixture(scope="module")
+def plane(load_example):
+    return load_example("standard_plane")
+
+
+def test_the_agent_takes_back_what_did_not_help(plane):
+    agent = plane.Climber(np.random.default_rng(0))
+    agent.act(-1.0)
+    agent.last = np.array([1.0, 0.0, 0.0, 0.0, 0.0, 0.0])
+    assert agent.act(-0.5)[0] == 1.0  # it helped: once more
+    assert agent.act(-0.6)[0] == -1.0  # it did not: back
+    assert agent.act(-0.5).any()  # something else
+    assert agent.best == -0.5
+
+
+@pytest.mark.slow
+def test_it_comes_nearer_to_the_plane(plane):
+    env = gymnasium.make(STANDARD_PLANE, scene=DEMO_FILE, height=64, width=64, start_mm=4.0, start_deg=4.0)
+    episodes = [plane.scan(env, seed) for seed in range(2)]
+    first, last = (np.mean([getattr(one, when)["similarity"] for one in episodes]) for when in ("first", "last"))
+    assert last > first + 0.2
+    off = [[getattr(one, when)["distance_mm"] for one in episodes] for when in ("first", "last")]
+    assert np.mean(off[1]) < np.mean(off[0])
+
+
 @pytest.mark.long
-def test_as_a_program(demo_service):
-    command = [sys.executable, EXAMPLES / "robot_servo.py", "--address", demo_service.grpc, "--seconds", "2.5"]
-    told = subprocess.run(command, check=True, capture_output=True, text=True, timeout=60).stdout
-    assert "latency p50" in told
-    assert "off centre by" in told
+@pytest.mark.parametrize(
+    ("example", "options", "told"),
+    [
+        ("robot_servo", "--seconds 2.5", ["latency p50", "off centre by"]),
+        ("augment_pytorch", "--frames 24 --batch-size 8 --workers 0", ["bmode [8, 1, 256, 256], pose", "24 frames"]),
+        ("augment_pytorch", "--frames 24 --batch-size 8 --workers 2", ["bmode [8, 1, 256, 256], pose", "24 frames"]),
+        ("standard_plane", "--episodes 1 --start-mm 2 --start-deg 2", ["similarity", "of 1 reached the plane"]),
+    ],
+)
+def test_as_a_program(demo_service, example, options, told):
+    address = [] if example == "standard_plane" else ["--address", demo_service.grpc]
+    command = [sys.executable, EXAMPLES / f"{example}.py", *address, *options.split()]
+    printed = subprocess.run(command, check=True, capture_output=True, text=True, timeout=120).stdout
+    assert [words for words in told if words not in printed] == []
 
 
 @pytest.mark.long

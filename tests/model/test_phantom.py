@@ -1,27 +1,115 @@
-"""The phantom's image formation: speckle, specular interfaces, shadows; the same scatterers in every frame."""
+"""The phantom's tissue map: what the anatomy promises lies where it should, and shapes are honest distances."""
 
 from dataclasses import replace
 
 import numpy as np
-import numpy.typing as npt
 import pytest
 
 from ultragray import ConvexProbe, LinearProbe
 from ultragray.datasets import Sweep
-from ultragray.errors import DatasetInvalid, InvalidPose
-from ultragray.phantom import Tissue, anatomy, bone_attenuation_db, imaging, simulate, tissue_at, tissues
-from ultragray.phantom import anatomy as bone
-from ultragray.phantom.anatomy import ACOUSTICS, FREQUENCY_MHZ
+from ultragray.errors import DatasetInvalid, InvalidArgument, InvalidPose
+from ultragray.geometry.pose import check_poses
+from ultragray.phantom import (
+    PHANTOM_PROBE,
+    Tissue,
+    anatomy,
+    bone_attenuation_db,
+    freehand_poses,
+    imaging,
+    load_phantom,
+    simulate,
+    sweeps,
+    tissue_at,
+    tissues,
+)
+from ultragray.phantom.anatomy import ACOUSTICS, FREQUENCY_MHZ, INTERFACES, LatticeNoise
 from ultragray.phantom.imaging import NOTHING, PER_MM3, ScattererField, Scatterers
 
-from ...scripts import benchmark
+from ..scripts import benchmark
+
+
+@pytest.mark.parametrize(
+    ("tissue", "point_mm"),
+    [
+        (Tissue.OUTSIDE, (0.0, 0.0, -0.5)),
+        (Tissue.SKIN, (5.0, 0.0, 1.0)),
+        (Tissue.FAT, (14.0, 0.0, 5.0)),
+        (Tissue.MUSCLE, (-14.0, 0.0, 22.0)),
+        (Tissue.BONE, (0.0, 4.0, 20.0)),  # spinous process
+        (Tissue.BONE, (9.0, 2.0, 35.0)),  # lamina
+        (Tissue.LIGAMENT, (0.0, 18.0, 25.0)),  # between two spinous processes
+        (Tissue.BLOOD, (21.0, 0.0, 23.0)),
+        (Tissue.FLUID, (0.0, 18.0, 47.0)),  # dural sac
+        (Tissue.FAT, (0.0, 18.0, 39.5)),  # epidural
+        (Tissue.DISC, (0.0, 17.5, 60.0)),
+        (Tissue.BONE, (0.0, 0.0, 60.0)),  # vertebral body
+    ],
+)
+def test_tissue_at_landmarks(tissue, point_mm):
+    assert tissue_at(np.array([point_mm]))[0] == tissue
+
+
+def test_fascia_is_a_thin_layer_between_fat_and_muscle():
+    depth = np.arange(5.0, 15.0, 0.02)
+    line = np.stack([np.full_like(depth, 14.0), np.zeros_like(depth), depth], axis=1)
+    labels = tissue_at(line)
+    assert list(dict.fromkeys(labels.tolist())) == [Tissue.FAT, Tissue.FASCIA, Tissue.MUSCLE]
+    assert 0.7 < 0.02 * (labels == Tissue.FASCIA).sum() < 1.4
+
+
+def test_tissue_at_keeps_to_uint8_and_refuses_other_shapes():
+    assert tissue_at(np.zeros((0, 3))).dtype == np.uint8
+    for shape in ((3,), (2, 4), (1, 2, 3)):
+        with pytest.raises(InvalidArgument, match="points_mm must be"):
+            tissue_at(np.zeros(shape))
+
+
+def test_the_skin_is_flat_under_the_probe():
+    points = np.random.default_rng(0).uniform((-30, -40, 0), (30, 40, 0), (200, 3))
+    np.testing.assert_array_equal(anatomy.straightened(points), points)
+
+
+def test_bone_distance_never_promises_more_than_there_is():
+    rng = np.random.default_rng(2)
+    points = rng.uniform((-30, -15, 10), (30, 15, 65), (4000, 3))
+    steps = rng.normal(size=points.shape)
+    steps *= 0.01 / np.linalg.norm(steps, axis=1, keepdims=True)
+    slope = np.abs(anatomy.distance_mm(points + steps) - anatomy.distance_mm(points)) / 0.01
+    assert slope.max() < 1.15
+    assert (slope > 0.5).mean() > 0.3
+
+
+def test_every_interface_is_met_somewhere_and_carries_a_sign_change():
+    points = np.random.default_rng(3).uniform((-30, -18, 0), (30, 18, 62), (60_000, 3)).astype(np.float32)
+    drawn = anatomy.straightened(points)
+    for interface in INTERFACES:
+        low, high = interface.depths_mm
+        inside = (points[:, 2] > low) & (points[:, 2] < high)
+        here = drawn[inside]
+        here = here[interface.present(here)]
+        level = interface.level(here)
+        assert 0.0 < (level < 0.0).mean() < 1.0
+        assert (np.abs(level) < 0.4).sum() > 20
+
+
+def test_noise_is_smooth_seeded_and_of_its_own_scale():
+    noise = LatticeNoise(5, (2.0, 10.0, 1.0))
+    points = np.random.default_rng(4).uniform(-50, 50, (20_000, 3))
+    values = noise(points)
+    assert np.abs(values).max() <= 1.0
+    assert values.std() > 0.2
+    np.testing.assert_array_equal(LatticeNoise(5, (2.0, 10.0, 1.0))(points), values)
+    assert np.abs(np.corrcoef(LatticeNoise(6, (2.0, 10.0, 1.0))(points), values)[0, 1]) < 0.1
+    change = [np.abs(noise(points + 0.01 * axis) - values).max() / 0.01 for axis in np.eye(3)]
+    assert change[1] < 0.4  # at most 3 per cell: 2 (the range) × 1.5 (the smoothest step)
+    assert change[0] < 1.6
+    assert change[1] < change[0] < change[2] < 3.1
+
 
 BoneShadow = benchmark("bone_shadow").BoneShadow
 PROBE = LinearProbe(width_mm=24.0, near_mm=0.0, far_mm=50.0)
 HEIGHT, WIDTH = 214, 102  # about the phantom's own pixels
 SIZE = {"probe": PROBE, "height": HEIGHT, "width": WIDTH}
-
-Image = npt.NDArray[np.uint8]
 
 
 def at(x=0.0, y=0.0, tilt_deg=0.0):
@@ -113,7 +201,7 @@ def test_bone_attenuation_starts_at_the_bone_and_only_grows():
     middle = attenuation[:, WIDTH // 2]
     fine = np.arange(10.0, 20.0, 0.01)
     points = np.stack([np.full_like(fine, 0.12), np.zeros_like(fine), fine], axis=1)
-    first = fine[np.argmax(bone.distance_mm(anatomy.straightened(points)) < 0.0)]
+    first = fine[np.argmax(anatomy.distance_mm(anatomy.straightened(points)) < 0.0)]
     assert middle[depth < first - 0.3].max() == 0.0
     per_mm = 0.2 * FREQUENCY_MHZ * ACOUSTICS[Tissue.BONE].attenuation
     assert per_mm > 15.0
@@ -218,3 +306,51 @@ def test_sweeps_that_cannot_tell_are_refused():
         BoneShadow.of(sweep_at(90.0))
     with pytest.raises(DatasetInvalid, match="noise: the phantom is scanned along upright lines, got convex probe"):
         BoneShadow.of(sweep_at(0.0, ConvexProbe(opening_angle_deg=60.0, near_mm=10.0, far_mm=50.0)))
+
+
+def tilts_deg(poses):
+    """Angle of each beam from the depth axis along the spine."""
+    return np.degrees(np.arctan2(-poses[:, 1, 2], poses[:, 2, 2]))
+
+
+def test_the_straight_sweep_is_rigid_even_and_centred():
+    poses = freehand_poses(91)
+    np.testing.assert_allclose(check_poses(poses), poses, atol=1e-12)
+    np.testing.assert_allclose(np.diff(poses[:, 1, 3]), 72.0 / 90, atol=1e-9)
+    np.testing.assert_allclose(poses[45], np.eye(4), atol=1e-12)
+    assert np.abs(tilts_deg(poses)).max() < 5.0
+
+
+def test_tilt_and_offset_are_what_was_asked_for():
+    poses = freehand_poses(61, tilt_deg=9.0, offset_mm=2.0)
+    assert tilts_deg(poses).mean() == pytest.approx(9.0, abs=0.5)
+    assert poses[:, 0, 3].mean() == pytest.approx(2.0, abs=0.1)
+    swayed = freehand_poses(61, tilt_deg=9.0, offset_mm=2.0, unrest=1.0)
+    assert np.abs(swayed - poses).max() > 0.5
+
+
+def test_counts():
+    assert [freehand_poses(count).shape for count in (0, 1, 8)] == [(0, 4, 4), (1, 4, 4), (8, 4, 4)]
+    with pytest.raises(InvalidArgument, match="count"):
+        freehand_poses(-1)
+
+
+def test_load_phantom_holds_out_a_sweep_at_a_tilt_of_its_own(monkeypatch):
+    def numbered(poses, *, height, width, **_):
+        frames = np.zeros((len(poses), height, width), dtype=np.uint8)
+        frames[:, 0, 0] = 1 + np.arange(len(poses)) % 255
+        return frames
+
+    monkeypatch.setattr(sweeps, "simulate", numbered)
+    dataset = load_phantom()
+    assert (dataset.name, dataset.probe) == ("phantom", PHANTOM_PROBE)
+    assert (len(dataset.train), len(dataset.val)) == (211, 24)
+    assert (dataset.train.height, dataset.train.width) == (256, 256)
+    together = np.concatenate([dataset.train.images[:, 0, 0], dataset.val.images[:, 0, 0]])
+    np.testing.assert_array_equal(together, 1 + np.arange(235))
+    parts = np.split(dataset.train.poses, [91, 151])
+    tilts = [float(tilts_deg(part).mean()) for part in (*parts, dataset.val.poses)]
+    np.testing.assert_allclose(tilts, [0.0, 9.0, -9.0, 5.0], atol=1.0)
+    # no held-out plane is one of the training planes
+    apart = np.abs(dataset.train.poses[:, None] - dataset.val.poses).max(axis=(2, 3))
+    assert apart.min() > 0.05

@@ -1,18 +1,16 @@
 """PLUS sequences: poses as the toolkit defines them, and everything a recording may hold."""
 
-from __future__ import annotations
-
-from pathlib import Path
-from types import SimpleNamespace
-
 import numpy as np
 import pytest
+import SimpleITK
 
-from ultragray import LinearProbe
+from ultragray import ConvexProbe, LinearProbe
 from ultragray.datasets.plus import read_plus_sweep
 from ultragray.datasets.source import SourceOptions, load_dataset
 from ultragray.errors import DatasetInvalid, InvalidArgument
 from ultragray.geometry.pose import rotation_angles_deg
+
+from .test_fan import FAN, of_both, screen
 
 ROWS, COLUMNS = 30, 20
 TURN = np.array([[0.0, -1, 0, 3], [1, 0, 0, 4], [0, 0, 1, 5], [0, 0, 0, 1]])
@@ -32,8 +30,8 @@ TURN = np.array([[0.0, -1, 0, 3], [1, 0, 0, 4], [0, 0, 1, 5], [0, 0, 0, 1]])
     ],
 )
 def test_real_sequences_agree_with_the_sets_made_from_them(
-    data_folder: Path, sequence: str, xml: str, name: str, crop: str, size: str, train_frames: str | None, pixels: float
-) -> None:
+    data_folder, sequence, xml, name, crop, size, train_frames, pixels
+):
     folder = data_folder / "plus_original"
     options = SourceOptions(
         device_set=folder / f"PlusDeviceSet_{xml}.xml", crop=crop, image_size=size, train_frames=train_frames
@@ -52,7 +50,7 @@ def test_real_sequences_agree_with_the_sets_made_from_them(
         assert ours.val.frame_numbers.tolist() == [2, 7, 12, 17]
 
 
-def test_a_sequence_with_its_device_set(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+def test_a_sequence_with_its_device_set(tmp_path, plus_files, device_set):
     stored = plus_files.speckle(4, ROWS, COLUMNS)
     path = plus_files.write_mha(tmp_path / "s.igs.mha", stored, plus_files.tracked_fields(4))
     sweep, frame_count = read_plus_sweep(path, device_set=device_set, crop="2:12,3:23", frames="1:")
@@ -65,9 +63,7 @@ def test_a_sequence_with_its_device_set(tmp_path: Path, plus_files: SimpleNamesp
     np.testing.assert_allclose(sweep.poses[0, :3, 3], (10 - 3 + 0.2 * 6.5, 1 + 1, 2 + 0.1 * 2.5))
 
 
-def test_the_reference_is_the_frame_of_the_poses_where_it_is_tracked(
-    tmp_path: Path, plus_files: SimpleNamespace, device_set: Path
-) -> None:
+def test_the_reference_is_the_frame_of_the_poses_where_it_is_tracked(tmp_path, plus_files, device_set):
     stored, fields = plus_files.speckle(3, ROWS, COLUMNS), plus_files.tracked_fields(3)
     plain, _ = read_plus_sweep(plus_files.write_mha(tmp_path / "t.mha", stored, fields), device_set=device_set)
     fields |= {f"Seq_Frame{f:04d}_ReferenceToTrackerTransform": plus_files.numbers(TURN) for f in range(3)}
@@ -75,7 +71,7 @@ def test_the_reference_is_the_frame_of_the_poses_where_it_is_tracked(
     np.testing.assert_allclose(turned.poses, np.linalg.inv(TURN) @ plain.poses, atol=1e-12)
 
 
-def test_the_calibration_may_be_in_the_sequence(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+def test_the_calibration_may_be_in_the_sequence(tmp_path, plus_files, device_set):
     stored, fields = plus_files.speckle(2, ROWS, COLUMNS), plus_files.tracked_fields(2)
     expected, _ = read_plus_sweep(plus_files.write_mha(tmp_path / "a.mha", stored, fields), device_set=device_set)
     own = fields | {
@@ -95,9 +91,7 @@ def test_the_calibration_may_be_in_the_sequence(tmp_path: Path, plus_files: Simp
 
 @pytest.mark.parametrize("suffix", ["igs.mha", "seq.nrrd"])
 @pytest.mark.parametrize("orientation", ["MN", "FM", "NMA", "UF"])
-def test_stored_orientations_give_the_same_sweep(
-    tmp_path: Path, plus_files: SimpleNamespace, device_set: Path, orientation: str, suffix: str
-) -> None:
+def test_stored_orientations_give_the_same_sweep(tmp_path, plus_files, device_set, orientation, suffix):
     frames, fields = plus_files.speckle(3, ROWS, COLUMNS), plus_files.tracked_fields(3)
     expected, _ = read_plus_sweep(
         plus_files.write_mha(tmp_path / "mf.mha", frames, fields), device_set=device_set, crop="2:12,3:23"
@@ -119,7 +113,7 @@ def test_stored_orientations_give_the_same_sweep(
     np.testing.assert_array_equal(sweep.poses, expected.poses)
 
 
-def test_invalid_frames_are_left_out_and_told(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+def test_invalid_frames_are_left_out_and_told(tmp_path, plus_files, device_set):
     fields = plus_files.tracked_fields(6)
     fields["Seq_Frame0001_ProbeToTrackerTransform"] = plus_files.numbers(np.eye(4))
     fields["Seq_Frame0001_ProbeToTrackerTransformStatus"] = "INVALID"
@@ -137,9 +131,7 @@ def test_invalid_frames_are_left_out_and_told(tmp_path: Path, plus_files: Simple
     assert "the whole image of 20 x 30 pixels" in sweep.notes[2]
 
 
-def test_an_invalid_reference_does_not_change_the_frame_of_the_poses(
-    tmp_path: Path, plus_files: SimpleNamespace, device_set: Path
-) -> None:
+def test_an_invalid_reference_does_not_change_the_frame_of_the_poses(tmp_path, plus_files, device_set):
     fields = plus_files.tracked_fields(3)
     for frame, status in enumerate(("OK", "INVALID", "OK")):
         fields[f"Seq_Frame{frame:04d}_ReferenceToTrackerTransform"] = plus_files.numbers(TURN)
@@ -148,11 +140,11 @@ def test_an_invalid_reference_does_not_change_the_frame_of_the_poses(
     assert read_plus_sweep(path, device_set=device_set)[0].frame_numbers.tolist() == [0, 2]
 
 
-def test_bad_recordings_are_one_clear_error(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+def test_bad_recordings_are_one_clear_error(tmp_path, plus_files, device_set):
     stored, good = plus_files.speckle(3, ROWS, COLUMNS), plus_files.tracked_fields(3)
     key = "Seq_Frame0002_ProbeToTrackerTransform"
 
-    def refused(message: str, changes: dict[str, str], frames: np.ndarray = stored) -> None:
+    def refused(message, changes, frames=stored):
         path = plus_files.write_mha(tmp_path / "s.mha", frames, good | changes)
         with pytest.raises(DatasetInvalid, match=rf"s\.mha: {message}"):
             read_plus_sweep(path, device_set=device_set)
@@ -172,7 +164,7 @@ def test_bad_recordings_are_one_clear_error(tmp_path: Path, plus_files: SimpleNa
     )
 
 
-def test_what_is_missing_is_told(tmp_path: Path, plus_files: SimpleNamespace, device_set: Path) -> None:
+def test_what_is_missing_is_told(tmp_path, plus_files, device_set):
     stored = plus_files.speckle(3, ROWS, COLUMNS)
     path = plus_files.write_mha(tmp_path / "s.mha", stored, plus_files.tracked_fields(3))
     with pytest.raises(DatasetInvalid, match=r"no transforms lead .*there are ProbeToTracker .*give the device set"):
@@ -185,3 +177,44 @@ def test_what_is_missing_is_told(tmp_path: Path, plus_files: SimpleNamespace, de
         read_plus_sweep(path, device_set=device_set, crop="0:21,0:30")
     with pytest.raises(InvalidArgument, match=r"^frames.*only 3"):
         read_plus_sweep(path, device_set=device_set, frames="0:9")
+
+
+def written(path, frames, fields, *, compressed=False):
+    """Frames [F, rows, columns] or [F, rows, columns, 3] with the fields of a sequence."""
+    image = SimpleITK.GetImageFromArray(frames, isVector=frames.ndim == 4)
+    for key, value in fields.items():
+        image.SetMetaData(key, value)
+    SimpleITK.WriteImage(image, str(path), compressed)
+    return path
+
+
+def fields_of(plus_files, frames):
+    own = plus_files.tracked_fields(frames)
+    return {key: value for key, value in own.items() if key.startswith(("Seq_Frame", "Ultrasound"))}
+
+
+@pytest.mark.parametrize("compressed", [False, True])
+@pytest.mark.parametrize("name", ["s.mha", "s.mhd", "s.nrrd", "s.nhdr"])
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_colour_becomes_luma(tmp_path, plus_files, device_set, name, compressed, dtype):
+    colours = np.random.default_rng(2).integers(0, 256, (3, 24, 32, 3)).astype(dtype)
+    colours[0, 0, 0] = 255
+    fields = {**fields_of(plus_files, 3), "UltrasoundImageType": "RGB_COLOR"}
+    stored = colours if dtype == np.uint8 else 256 * colours.astype(np.uint16)
+    sweep, count = read_plus_sweep(
+        written(tmp_path / name, stored, fields, compressed=compressed), device_set=device_set
+    )
+    assert (count, sweep.images.shape) == (3, (3, 24, 32))
+    assert np.abs(sweep.images - colours @ [0.299, 0.587, 0.114]).max() <= 1
+
+
+@pytest.mark.parametrize("name", ["s.mha", "s.nrrd"])
+def test_a_fan_has_the_geometry_that_it_was_written_with(tmp_path, plus_files, device_set, name):
+    frames = np.stack([screen(of_both)] * 2)
+    path = written(tmp_path / name, frames, fields_of(plus_files, 2))
+    ours = plus_files.write_mha(tmp_path / "ours.mha", frames, plus_files.tracked_fields(2))
+    sweep, _ = read_plus_sweep(path, device_set=device_set, fan=FAN)
+    expected, _ = read_plus_sweep(ours, device_set=device_set, fan=FAN)
+    assert sweep.probe == expected.probe == ConvexProbe(60.0, 10.0, 26.0)
+    np.testing.assert_array_equal(sweep.images, expected.images)
+    np.testing.assert_array_equal(sweep.poses, expected.poses)
