@@ -2,7 +2,8 @@
 
 A tracker errs from frame to frame, and tissue goes along with the probe that presses and drags it. Both make an image
 move less from one frame to the next, within its plane, than the poses say. Which path is right the images tell: each
-frame is predicted from the two beside it in its sweep, in space, and of these paths the one is taken that predicts best:
+frame is predicted from the two beside it in its sweep, in space, and of these paths that one is taken that predicts
+best:
 
 - as tracked;
 - without the tracker's noise (`alignment.without_noise`);
@@ -21,7 +22,6 @@ from dataclasses import dataclass, replace
 from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.geometry.registration import register_points
@@ -30,7 +30,7 @@ from ultragray.geometry.scan_conversion import interpolated_frames, pixel_places
 from ultragray.learn.sweep import Dataset, IntArray, Sweep, corner_distances_mm, spread_places
 from ultragray.learn.training.alignment import TrackerNoise, sweep_ranges, tracker_noise, without_noise
 
-FRAMES, PIXELS = 96, 4096  # that are predicted, of each: enough to tell one path from another
+FRAMES, PIXELS = 96, 2048  # that are predicted, of each: enough to tell one path from another
 ON_PLANE_MM = 1e-6  # distances are at least that: the nearer frame then has all the weight
 LEAST_GAIN_DB = 0.05  # of a path without noise
 GAIN_OF_SHARES_DB = 0.3  # tissue is rigid unless the images say clearly that it is not
@@ -40,13 +40,16 @@ Shares: TypeAlias = tuple[float, float, float]  # of the motion within the plane
 RIGID: Shares = (1.0, 1.0, 1.0)
 
 
-@dataclass(frozen=True)
-class Agreement:
-    """How well frames are predicted by the two beside them, mean PSNR in dB."""
+@dataclass(frozen=True, eq=False)
+class AgreedPath:
+    """Poses of the training and the held-out frames, mm, and how well training frames are predicted by the two beside
+    them, mean PSNR in dB."""
 
+    train: FloatArray  # [F, 4, 4]
+    val: FloatArray  # [V, 4, 4] of which no image was used
     in_time_db: float  # pixel by pixel, whatever the poses say
     tracked_db: float  # in space, as tracked
-    found_db: float  # in space, on the path that was found
+    found_db: float  # in space, on this path
     shares: Shares  # of the motion within the plane that it has
     noise: TrackerNoise  # of the tracker
 
@@ -54,56 +57,51 @@ class Agreement:
 def on_agreed_path(dataset: Dataset) -> Dataset:
     """The same with the poses of `agreed_path`; the dataset itself where these are as tracked."""
     path = agreed_path(dataset)
-    if path.train is dataset.train.poses:
+    if path is None or path.train is dataset.train.poses:
         return dataset
-    return replace(dataset, train=replace(dataset.train, poses=path.train), val=replace(dataset.val, poses=path.val))
+    train, val = replace(dataset.train, poses=path.train), replace(dataset.val, poses=path.val)
+    return replace(dataset, train=train, val=val)
 
 
-@dataclass(frozen=True, eq=False)
-class AgreedPath:
-    """Poses of the training and the held-out frames (mm); as tracked where no other path agrees better."""
+def agreed_path(dataset: Dataset) -> AgreedPath | None:
+    """The path of all frames, judged by the training frames alone; None where no sweep has three frames in a row.
 
-    train: FloatArray  # [F, 4, 4]
-    val: FloatArray  # [V, 4, 4] of which no image was used
-    agreement: Agreement | None  # None: no sweep has three frames in a row
-
-
-def agreed_path(dataset: Dataset) -> AgreedPath:
-    """The path of all frames, judged by the training frames alone.
-
-    Held-out frames of the same recording take part in the path by their poses. Those of another file are moved as the
-    training frames about them are.
+    Poses are those of the dataset where no other path agrees better. Held-out frames of the same recording take part in
+    the path by their poses. Those of another file are moved as the training frames about them are.
     """
     train, val = dataset.train, dataset.val
-    tracked = AgreedPath(train.poses, val.poses, None)
     if (judge := _Judge.of(train, sweep_ranges(train))) is None:
-        return tracked
-    is_one = train.source == val.source and not set(train.frame_numbers) & set(val.frame_numbers)
-    numbers = np.concatenate([train.frame_numbers, val.frame_numbers if is_one else []])
-    order = np.argsort(numbers, kind="stable")
-    place = np.argsort(order, kind="stable")  # of each frame on the path
-    given = np.concatenate([train.poses, val.poses])[order] if is_one else train.poses
-    places = place[: len(train)] if is_one else np.arange(len(train))
-    ranges = sweep_ranges(replace(train, images=_one_each(given), poses=given, frame_numbers=np.arange(len(given))))
-    best, best_db = given, (tracked_db := judge.psnr_db(train.poses))
+        return None
+    whole = [train, val] if dataset.is_one_recording else [train]
+    order = np.argsort(np.concatenate([part.frame_numbers for part in whole]), kind="stable")
+    places = np.argsort(order, kind="stable")  # of each frame on the path
+    on_path = places[: len(train)]
+    given = np.concatenate([part.poses for part in whole])[order]
+    ranges = sweep_ranges(Sweep(_one_each(given), given, train.probe, np.arange(len(given)), train.source))
+    found, found_db = given, (tracked_db := judge.psnr_db(train.poses))
     cleaned = without_noise(given, ranges)
-    if (db := judge.psnr_db(cleaned[places])) > best_db + LEAST_GAIN_DB:
-        best, best_db = cleaned, db
-    shares, moved, db = _best_shares(judge, best, ranges, train.probe, places, best_db)
-    if db < best_db + GAIN_OF_SHARES_DB:
-        shares, moved, db = RIGID, best, best_db
-    agreement = Agreement(judge.in_time_db(), tracked_db, db, shares, tracker_noise(given, ranges))
-    if moved is given:
-        return replace(tracked, agreement=agreement)
-    held_out = moved[place[len(train) :]] if is_one else _carried(val.poses, best, moved, ranges, train.probe)
-    return AgreedPath(moved[places], held_out, agreement)
+    if (db := judge.psnr_db(cleaned[on_path])) > found_db + LEAST_GAIN_DB:
+        found, found_db = cleaned, db
+    rigid = found
+    shares, moved, db = _best_shares(judge, rigid, ranges, on_path, found_db)
+    if db < found_db + GAIN_OF_SHARES_DB:
+        shares = RIGID
+    else:
+        found, found_db = moved, db
+    figures = judge.in_time_db(), tracked_db, found_db, shares, tracker_noise(given, ranges)
+    if found is given:
+        return AgreedPath(train.poses, val.poses, *figures)
+    if dataset.is_one_recording:
+        return AgreedPath(found[on_path], found[places[len(train) :]], *figures)
+    return AgreedPath(found[on_path], _carried(val.poses, rigid, found, ranges, train.probe), *figures)
 
 
 def _best_shares(
-    judge: _Judge, poses: FloatArray, ranges: Sequence[range], probe: Probe, places: IntArray, rigid_db: float
+    judge: _Judge, poses: FloatArray, ranges: Sequence[range], places: IntArray, rigid_db: float
 ) -> tuple[Shares, FloatArray, float]:
     """The shares of the best prediction, the path with them, and its PSNR: first alike for all three, then each."""
     tried: dict[Shares, float] = {RIGID: rigid_db}
+    probe = judge.sweep.probe
 
     def psnr_db(shares: Shares) -> float:
         if shares not in tried:
@@ -183,21 +181,15 @@ def _one_each(poses: FloatArray) -> np.ndarray:  # [F, 1, 2] uint8
 
 @dataclass(frozen=True, eq=False)
 class _Judge:
-    """Pixels of frames that are predicted from the two frames beside them in their sweep."""
+    """Pixels of frames that are predicted from the two frames beside them in their sweep; mean PSNR of the frames."""
 
     sweep: Sweep
     frames: IntArray  # [P] their places
-    rows: IntArray  # [P, N] of the pixels
-    columns: IntArray  # [P, N]
 
     @classmethod
     def of(cls, sweep: Sweep, ranges: Sequence[range]) -> _Judge | None:
         frames = np.concatenate([np.arange(some.start + 1, some.stop - 1) for some in ranges])
-        if not len(frames):
-            return None
-        chosen, random = frames[spread_places(len(frames), FRAMES)], np.random.default_rng(0)
-        rows, columns = (random.integers(size, size=(len(chosen), PIXELS)) for size in (sweep.height, sweep.width))
-        return cls(sweep, chosen, rows, columns)
+        return cls(sweep, frames[spread_places(len(frames), FRAMES)]) if len(frames) else None
 
     def psnr_db(self, poses: FloatArray) -> float:  # [F, 4, 4] mm
         """Of the pixels as predicted in space by these poses.
@@ -205,32 +197,41 @@ class _Judge:
         A pixel is projected onto both planes along their normals; what these show there counts in inverse proportion to
         the distances. One that is projected beside an image is predicted by the other alone, or left out.
         """
-        sweep, probe = self.sweep, self.sweep.probe
-        local = probe.points_mm((self.rows + 0.5) / sweep.height, (self.columns + 0.5) / sweep.width)  # [P, N, 3]
-        values, weights = [], []
-        for beside in (self.frames - 1, self.frames + 1):
-            across = np.linalg.inv(poses[beside]) @ poses[self.frames]
-            seen = np.einsum("pij,pnj->pni", across[:, :3, :3], local) + across[:, None, :3, 3]
-            rows, columns = probe.image_coordinates(seen[..., 0], seen[..., 2])
-            is_in = ~np.isnan(rows)
-            places = pixel_places(
-                probe, sweep.images.shape[1:], *(np.where(is_in, one, 0.0) for one in (rows, columns))
-            )
-            values.append(interpolated_frames(sweep.images, beside[:, None], *places))
-            weights.append(is_in / np.maximum(np.abs(seen[..., 1]), ON_PLANE_MM))
-        total = sum(weights)
-        predicted = (values[0] * weights[0] + values[1] * weights[1]) / np.maximum(total, 1e-9)
-        return self._mean_psnr_db(predicted, total > 0.0)
+        return float(np.mean([self._predicted_db(poses, frame) for frame in self.frames]))
+
+    def _predicted_db(self, poses: FloatArray, frame: int) -> float:
+        images, probe = self.sweep.images, self.sweep.probe
+        (height, width), (rows, columns) = images.shape[1:], self._pixels(frame)
+        local = probe.points_mm((rows + 0.5) / height, (columns + 0.5) / width)  # [N, 3]
+        values, weights = np.zeros((2, 2, len(local)))
+        for side, beside in enumerate((frame - 1, frame + 1)):
+            onto = np.linalg.inv(poses[beside]) @ poses[frame]
+            x, y, z = onto[:3, :3] @ local.T + onto[:3, 3:]
+            (is_in,) = np.nonzero(~np.isnan(probe.image_coordinates(x, z)[0]))
+            shares = probe.image_coordinates(x[is_in], z[is_in])
+            values[side, is_in] = interpolated_frames(images, beside, *pixel_places(probe, (height, width), *shares))
+            weights[side, is_in] = 1.0 / np.maximum(np.abs(y[is_in]), ON_PLANE_MM)
+        known = weights.sum(axis=0) > 0.0
+        predicted = (values * weights)[:, known].sum(axis=0) / weights[:, known].sum(axis=0)
+        return _psnr_db(predicted, self._shown(frame, rows, columns)[known])
 
     def in_time_db(self) -> float:
         """Of the pixels as the mean of the same pixels of the two frames."""
-        before, after = (self._shown(beside) for beside in (self.frames - 1, self.frames + 1))
-        return self._mean_psnr_db((before + after) / 2.0, np.ones(self.rows.shape, bool))
+        found = []
+        for frame in self.frames:
+            before, shown, after = (self._shown(one, *self._pixels(frame)) for one in (frame - 1, frame, frame + 1))
+            found.append(_psnr_db((before + after) / 2.0, shown))
+        return float(np.mean(found))
 
-    def _shown(self, frames: IntArray) -> FloatArray:  # [P] -> [P, N]
-        return self.sweep.images[frames[:, None], self.rows, self.columns].astype(np.float64)
+    def _pixels(self, frame: int) -> tuple[IntArray, IntArray]:  # [N] rows, [N] columns
+        random = np.random.default_rng(frame)
+        return random.integers(self.sweep.height, size=PIXELS), random.integers(self.sweep.width, size=PIXELS)
 
-    def _mean_psnr_db(self, predicted: FloatArray, is_known: npt.NDArray[np.bool_]) -> float:  # [P, N] both
-        squared = np.square(predicted - self._shown(self.frames)) * is_known
-        errors = squared.sum(axis=1) / np.maximum(is_known.sum(axis=1), 1) / 255.0**2
-        return float(np.mean(-10.0 * np.log10(np.maximum(errors, 1e-10))))
+    def _shown(self, frame: int, rows: IntArray, columns: IntArray) -> FloatArray:  # [N]
+        shown: FloatArray = self.sweep.images[frame, rows, columns].astype(np.float64)
+        return shown
+
+
+def _psnr_db(predicted: FloatArray, true: FloatArray) -> float:  # [N] of 255, both; none: 0 dB
+    squared = np.square(predicted - true).mean() if len(true) else 255.0**2
+    return float(-10.0 * np.log10(max(squared / 255.0**2, 1e-10)))

@@ -27,10 +27,12 @@ from ultragray.learn.training.losses import SSIM_WINDOW, image_loss
 from ultragray.rendering.backends.inputs import ScenePoses
 from ultragray.rendering.frames import render
 from ultragray.scene.gaussians import GaussianScene
+from ultragray.scene.info import SceneInfo
 
 START = 0.1  # share of the run: before, there is no anatomy to compare with
 RATE = 0.01  # mm a step: at the end of a long run some tenths of a mm from where it began
 WITHIN_THE_PLANE = (0.1, 1.0, 0.1, 1.0, 0.1, 1.0)  # a frame's own image hardly shows moves out of its plane
+WITH_PATH = ("path", "frames")  # refinements that begin with the path that frames agree with
 SMOOTHNESS = 1e-3  # weight of the squared second differences of neighbouring corrections, mm²
 
 
@@ -154,7 +156,7 @@ class PoseRefinement:
         stay and none is trained.
         """
         tracked = dataset.train.poses
-        if mode in ("path", "frames"):
+        if mode in WITH_PATH:
             dataset = on_agreed_path(dataset)
         if mode in ("none", "path"):
             return cls(dataset, tracked, None)
@@ -196,6 +198,17 @@ class PoseRefinement:
     def load(self, tensors: Mapping[str, Tensor]) -> None:
         if self._trained is not None:
             self._trained.load(tensors)
+
+
+def held_out_on_path(dataset: Dataset, info: SceneInfo) -> Sweep | None:
+    """The held-out frames of the dataset that a scene was trained from, with the poses of the path it was trained on.
+
+    None where these are the poses of the dataset, where the scene is of another, or where nothing is held out.
+    """
+    if info.dataset_sha256 != dataset.sha256 or info.training.get("refine_poses") not in WITH_PATH:
+        return None
+    placed = on_agreed_path(dataset)
+    return None if placed is dataset or not len(placed.val) else placed.val
 
 
 # Scores of held-out frames whose poses may be wrong: each is registered by one half and scored on the other half.

@@ -5,9 +5,13 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ultragray.datasets.checks import check_dataset
 from ultragray.geometry.rotations import turns_of
+from ultragray.learn.evaluation.scoring import evaluate
 from ultragray.learn.sweep import Dataset, corner_distances_mm
+from ultragray.learn.training import train
 from ultragray.learn.training.agreement import RIGID, agreed_path, on_agreed_path, with_shares
+from ultragray.learn.training.poses import held_out_on_path
 
 from .test_poses import PROBE, poses_of, seen, shaken
 
@@ -39,8 +43,8 @@ def test_a_shaking_tracker_is_smoothed_also_where_frames_are_held_out(mm, deg):
     truth = hand_path()
     given = recording(truth, shaken(truth, mm, deg))
     path = agreed_path(given)
-    assert path.agreement.shares == RIGID
-    assert path.agreement.found_db > path.agreement.tracked_db + 0.2
+    assert path.shares == RIGID
+    assert path.found_db > path.tracked_db + 0.2
     for poses, tracked, true in ((path.train, given.train, truth[::2]), (path.val, given.val, truth[1::2])):
         assert error_mm(poses, true) < 0.6 * error_mm(tracked.poses, true)
 
@@ -58,16 +62,40 @@ def test_tissue_that_follows_the_probe_is_found(share):
     shown = with_shares(tracked, [range(FRAMES)], PROBE, (share,) * 3)
     given = recording(shown, tracked)
     path = agreed_path(given)
-    assert path.agreement.shares == pytest.approx((share,) * 3, abs=0.3)
-    assert path.agreement.in_time_db > path.agreement.tracked_db
+    assert path.shares == pytest.approx((share,) * 3, abs=0.3)
+    assert path.in_time_db > path.tracked_db
     assert error_mm(path.train, shown[::2]) < 0.35 * error_mm(given.train.poses, shown[::2])
+
+
+def test_a_check_tells_of_it():
+    truth = hand_path()
+    given = recording(with_shares(truth, [range(FRAMES)], PROBE, (0.0, 0.0, 0.0)), shaken(truth, 0.3, 0.2))
+    (told,) = (text for text in check_dataset(given).warnings if "neighbours in time" in text)
+    path = agreed_path(given)
+    assert f"{path.in_time_db - path.tracked_db:.1f} dB better than by their poses" in told
+    assert f"shakes (by {path.noise.position_mm:.2f} mm and {path.noise.turn_deg:.2f}°" in told
+    assert not any("neighbours in time" in text for text in check_dataset(recording(truth, truth)).warnings)
+
+
+def test_a_scene_is_trained_and_measured_on_the_path(tiny_config):
+    tracked = hand_path()
+    given = recording(with_shares(tracked, [range(FRAMES)], PROBE, (0.0, 0.0, 0.0)), tracked)
+    scene = train(given, tiny_config(refine_poses="path"))
+    path = agreed_path(given)
+    np.testing.assert_allclose(scene.training_poses, path.train, atol=1e-12)
+    np.testing.assert_allclose(scene.pose_corrections @ given.train.poses, path.train, atol=1e-9)
+    placed = held_out_on_path(given, scene.info)
+    np.testing.assert_array_equal(placed.poses, path.val)
+    assert scene.info.metrics == evaluate(scene, placed).mean.to_dict()
+    assert held_out_on_path(replace(given, train=given.train.select(range(20))), scene.info) is None
+    assert held_out_on_path(given, train(given, tiny_config()).info) is None
 
 
 def test_exact_poses_of_rigid_tissue_stay():
     truth = hand_path()
     given = recording(truth, truth)
     assert on_agreed_path(given) is given
-    assert agreed_path(given).agreement.shares == RIGID
+    assert agreed_path(given).shares == RIGID
 
 
 def test_held_out_frames_of_another_file_move_with_the_frames_about_them():
@@ -103,4 +131,4 @@ def test_sweeps_too_short_to_be_predicted_stay():
     given = seen(poses)
     short = Dataset("short", given, given.select([]))
     assert on_agreed_path(short) is short
-    assert agreed_path(short).agreement is None
+    assert agreed_path(short) is None
