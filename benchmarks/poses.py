@@ -18,7 +18,6 @@ from ultragray.learn.training import TrainingConfig
 from ultragray.learn.training.alignment import sweep_ranges
 from ultragray_studies.report import train_and_evaluate
 
-MODES = ("none", "path", "frames")
 SHAKEN, MOVED, RECORDED = "each frame by 1 mm and 1°", "the second sweep by 8 mm and 4°", "poses as recorded"
 CASES = (  # sets, and the errors that are added
     ("ultranerf_liver", RECORDED),
@@ -32,21 +31,22 @@ CASES = (  # sets, and the errors that are added
 
 
 def measure(name: str, error: str, seed: int, data_folder: Path) -> Document:
-    """Trainings from the same poses, without refinement and with each kind; what is left of the errors after it.
-
-    Held-out frames have the poses of the path that the training found.
-    """
+    """Two trainings from the same poses, one that refines them; what is left of the errors after the second."""
     dataset = load_dataset(data_folder / name)
     true = dataset.train
     given = replace(true, poses=with_errors(true, error, seed))
-    found: Document = {"added": deviation(true, given.poses)}
-    for mode in MODES:
+    scores, refined = {}, given.poses
+    for mode in ("none", "frames"):
         config = TrainingConfig.preset("fast", refine_poses=mode, confidence=False, seed=seed)
         trained = train_and_evaluate(replace(dataset, train=given), config)
-        metrics = {key: trained.scene.info.metrics[key] for key in ("psnr_db", "ms_ssim")}
-        left = deviation(true, trained.scene.training_poses)
-        found[mode] = {**metrics, "left": left, "seconds": round(trained.course.seconds)}
-    return found
+        mean = trained.evaluation.mean
+        scores[mode] = {"psnr_db": mean.psnr_db, "ms_ssim": mean.ms_ssim, "seconds": round(trained.course.seconds)}
+        refined = trained.scene.training_poses
+    return {
+        **{f"{key}_{mode}": value for mode, score in scores.items() for key, value in score.items()},
+        "added": deviation(true, given.poses),
+        "left": deviation(true, refined),
+    }
 
 
 def with_errors(sweep: Sweep, error: str, seed: int) -> FloatArray:  # [F, 4, 4] mm
@@ -92,18 +92,22 @@ RUNS = {f"{name}, {error}, seed 0": partial(measure, name, error, 0) for name, e
 def refined_poses(figures: Document) -> Lines:
     """Trainings from poses with errors, with and without refinement."""
     rows = []
-    for key, run in figures.items():
-        name, error, _ = key.split(", ")
-        scores = (f"{run[mode]['psnr_db']:.2f} dB / {run[mode]['ms_ssim']:.3f}" for mode in MODES)
-        left = (_left(run["added"], run[mode]["left"]) if error != RECORDED else "" for mode in MODES[1:])
-        rows.append((name, error, *scores, *left))
-    head = ("set", "errors", *(f"`{mode}`" for mode in MODES), *(f"left by `{mode}`" for mode in MODES[1:]))
+    for name, error in CASES:
+        runs = [run for key, run in figures.items() if key.startswith(f"{name}, {error}, ")]
+        if not runs:
+            continue
+        mean = {
+            key: float(np.mean([run[key] for run in runs])) for key in runs[0] if "_none" in key or "_frames" in key
+        }
+        scores = (f"{mean[f'psnr_db_{mode}']:.2f} dB / {mean[f'ms_ssim_{mode}']:.3f}" for mode in ("none", "frames"))
+        added_mm, added_deg, left_mm, left_deg = (
+            float(np.mean([run[which][unit] for run in runs])) for which in ("added", "left") for unit in ("mm", "deg")
+        )
+        removed = f"{1 - left_mm / added_mm:.0%}, {1 - left_deg / added_deg:.0%}" if error != RECORDED else ""
+        seeds = f" ({len(runs)} seeds)" if len(runs) > 1 else ""
+        rows.append((name, f"{error}{seeds}", *scores, f"{left_mm:.2f} mm, {left_deg:.2f}°", removed))
+    head = ("set", "errors", "PSNR and MS-SSIM without refinement", "with it", "error left over", "removed")
     return table(head, rows)
-
-
-def _left(added: dict[str, float], left: dict[str, float]) -> str:
-    shares = ", ".join(f"{1 - left[unit] / added[unit]:.0%}" for unit in ("mm", "deg"))
-    return f"{left['mm']:.2f} mm, {left['deg']:.2f}° ({shares} removed)"
 
 
 if __name__ == "__main__":
