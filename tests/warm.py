@@ -11,6 +11,7 @@ import gc
 import importlib
 import json
 import os
+import re
 import select
 import shutil
 import signal
@@ -18,8 +19,11 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 import time
+import weakref
 from pathlib import Path
+from types import SimpleNamespace
 
 SOURCE_FOLDERS = ("model", "proto", "workers", "service", "client", "studies")
 _MAX_REQUEST_BYTES = 2**17
@@ -28,12 +32,14 @@ _START_TIMEOUT_S = 120.0
 
 
 class WarmProcess:
-    """A process forked for us, with the methods of subprocess.Popen that the tests use."""
+    """A process forked for us, with the methods of subprocess.Popen that are used of one."""
 
     def __init__(self, pid, connection):
         self.pid = pid
         self.returncode = None
         self._connection = connection  # its end brings the exit code
+        self._close = weakref.finalize(self, connection.close)
+        self._lock = threading.Lock()  # several threads may wait
 
     def poll(self):
         with contextlib.suppress(subprocess.TimeoutExpired):
@@ -42,13 +48,15 @@ class WarmProcess:
 
     def wait(self, timeout=None):
         if self.returncode is None:
-            self._connection.settimeout(timeout)
-            try:
-                told = self._connection.recv(16)
-            except (BlockingIOError, TimeoutError):
-                raise subprocess.TimeoutExpired("a warm process", timeout or 0) from None
-            self._connection.close()
-            self.returncode = int(told) if told else -signal.SIGKILL  # the process that forks was ended with it
+            ended = select.poll()
+            ended.register(self._connection, select.POLLIN)
+            if not ended.poll(None if timeout is None else 1000 * timeout):
+                raise subprocess.TimeoutExpired("a warm process", timeout)
+            with self._lock:
+                if self.returncode is None:
+                    told = self._connection.recv(16)
+                    self.returncode = int(told) if told else -signal.SIGKILL  # the process that forks ended with it
+                    self._close()
         return self.returncode
 
     def send_signal(self, number):
@@ -60,6 +68,19 @@ class WarmProcess:
 
     def kill(self):
         self.send_signal(signal.SIGKILL)
+
+
+class WarmHelper(WarmProcess):
+    """A process that reads a request and writes an answer, each as a whole."""
+
+    stdin = stdout = stderr = None
+
+    def communicate(self, request):
+        with contextlib.suppress(BrokenPipeError), self.stdin:
+            self.stdin.write(request)
+        self.wait()
+        with self.stdout, self.stderr:
+            return tuple(file.seek(0) or file.read() for file in (self.stdout, self.stderr))
 
 
 class WarmServer:
@@ -78,6 +99,7 @@ class WarmServer:
                 stdin=subprocess.PIPE,  # its end is that of the process
                 env={
                     **os.environ,
+                    "OMP_NUM_THREADS": "1",
                     "OPENBLAS_NUM_THREADS": "1",  # a process with threads must not be forked
                     "PYTHONPATH": os.pathsep.join(str(Path(__file__).parents[1] / folder) for folder in SOURCE_FOLDERS),
                 },
@@ -96,19 +118,35 @@ class WarmServer:
         shutil.rmtree(folder)
 
 
-def fork(path, function, arguments, *, environment, folder, files):
+def fork(path, function, arguments, *, environment, folder, files, kind=WarmProcess, **more):
     """Has the process that listens at `path` fork one that calls `function` of this module.
 
     `files` are descriptors: stdin, stdout, stderr, and more, which the function gets after its `arguments`.
+    `end_with`: the signal that it gets when this process ends; `session`: whether it leads one of its own.
     """
     connection = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     connection.connect(str(path))
     request = {"function": function, "arguments": arguments, "environment": dict(environment), "folder": str(folder)}
-    socket.send_fds(connection, [json.dumps(request).encode()], files)
-    return WarmProcess(int(connection.recv(16)), connection)
+    socket.send_fds(connection, [json.dumps(request | more).encode()], files)
+    return kind(int(connection.recv(16)), connection)
 
 
-WARM_TEMPLATES = WarmServer("torch", "ultragray_workers.pool.worker")
+WARM = WarmServer(
+    "torch",
+    "matplotlib.backends.backend_agg",
+    "mpl_toolkits.mplot3d",
+    "ultragray.datasets.checks",
+    "ultragray.datasets.pictures",
+    "ultragray_service.__main__",
+    "ultragray_service.cli.worker",
+    "ultragray_workers.datasets.intake",
+    "ultragray_workers.jobs.kinds.render_run",
+    "ultragray_workers.jobs.kinds.train_run",
+    "ultragray_workers.jobs.worker.run_job",
+    "ultragray_workers.jobs.worker.worker",
+    "ultragray_workers.pool.worker",
+    "ultragray_workers.views",
+)
 
 
 def start_template(path, descriptor):
@@ -141,8 +179,8 @@ SHORT_WAITS = {
 }
 
 
-def service(templates):
-    """The service, whose pool has its template forked as well."""
+def service(path):
+    """The service, whose processes are forked at `path`."""
     from ultragray_service.__main__ import main
     from ultragray_workers.pool import processes as launcher
 
@@ -151,16 +189,76 @@ def service(templates):
         owner = importlib.import_module(f"ultragray_service.{module}")
         assert isinstance(getattr(owner, name), float), place
         setattr(owner, name, seconds)
-    launcher.start_template = lambda descriptor: start_template(Path(templates), descriptor)
+    launcher.start_template = lambda descriptor: start_template(path, descriptor)
+    work_warmly(path)
     return main()
 
 
-FUNCTIONS = {"template": template, "service": service}
+def warm_subprocess(path):
+    """What the product uses of the module subprocess, with processes that are forked at `path`."""
+    return SimpleNamespace(
+        Popen=lambda command, **options: popen(path, command, **options),
+        **{name: getattr(subprocess, name) for name in ("PIPE", "DEVNULL", "TimeoutExpired")},
+    )
+
+
+def work_warmly(path):
+    """From now on the helpers, the embedded worker and the jobs that this process starts are forked at `path`."""
+    for module in ("service.core.threads", "service.server", "workers.jobs.worker.process"):
+        importlib.import_module(f"ultragray_{module}").subprocess = warm_subprocess(path)
+
+
+def popen(path, command, *, env, stdout=None, stderr=None, pass_fds=(), **_):
+    """As subprocess.Popen, for the commands of which the product has three."""
+    common = {"environment": env, "folder": Path.cwd(), "session": True}
+    if command[1] == "-c":
+        module, work = re.findall(r"from (\S+) import (\w+)", command[2])[-1]
+        out, err = tempfile.TemporaryFile(), tempfile.TemporaryFile()  # noqa: SIM115
+        reading, writing = os.pipe()
+        files = (reading, out.fileno(), err.fileno())
+        common |= {"session": False, "end_with": signal.SIGKILL}
+        process = fork(path, "helper", [module, work], files=files, kind=WarmHelper, **common)
+        os.close(reading)
+        process.stdin, process.stdout, process.stderr = os.fdopen(writing, "wb"), out, err
+        return process
+    with open(os.devnull, "rb") as nothing:
+        if command[2] == "ultragray_service.cli.worker":
+            files = (nothing.fileno(), 1, 2)
+            return fork(path, "worker", [str(path)], files=files, end_with=signal.SIGTERM, **common)
+        files = (nothing.fileno(), stdout.fileno(), stderr.fileno(), *pass_fds)
+        return fork(path, "job", [command[3]], files=files, end_with=signal.SIGKILL, **common)
+
+
+def helper(module, work):
+    """A helper process of a service, which is called by its work."""
+    from ultragray_workers.helpers import answer_request
+
+    Path("/proc/self/comm").write_text(work)
+    answer_request(getattr(importlib.import_module(module), work))
+    return 0
+
+
+def worker(path):
+    """The worker within a service."""
+    from ultragray_service.cli.worker import main
+
+    work_warmly(path)
+    return main(str(os.getppid()))
+
+
+def job(folder, device_lock, *descriptors):
+    """The process of a job, which holds the lock of its device."""
+    from ultragray_workers.jobs.worker.run_job import main
+
+    return main(folder, str(os.getppid()), *map(str, descriptors))
+
+
+FUNCTIONS = {one.__name__: one for one in (template, service, helper, worker, job)}
 
 
 def serve(path):
     """Forks for whoever connects, until stdin ends. In a fork, the exit code of what it was forked for."""
-    running = {}
+    running, bound = {}, {}  # connections by process; processes that end with those who asked for them
     ended, wake = socket.socketpair()
     wake.setblocking(False)
     signal.set_wakeup_fd(wake.fileno(), warn_on_full_buffer=False)
@@ -171,25 +269,33 @@ def serve(path):
     listener.listen(64)
     os.rename(f"{path}.new", path)
     while True:
-        readable = select.select([sys.stdin, listener, ended], [], [])[0]
+        readable = select.select([sys.stdin, listener, ended, *bound], [], [])[0]
         if ended in readable:
             ended.recv(4096)
             with contextlib.suppress(ChildProcessError):
                 while (found := os.waitpid(-1, os.WNOHANG))[0]:
                     with running.pop(found[0]) as connection, contextlib.suppress(OSError):
+                        bound.pop(connection, None)
                         connection.send(str(os.waitstatus_to_exitcode(found[1])).encode())
+        for connection in bound.keys() & set(readable):  # whoever asked is gone
+            os.kill(*bound.pop(connection))
         if listener in readable:
             connection, _ = listener.accept()
-            request, files, _, _ = socket.recv_fds(connection, _MAX_REQUEST_BYTES, 8)
+            content, files, _, _ = socket.recv_fds(connection, _MAX_REQUEST_BYTES, 8)
+            request = json.loads(content)
             pid = os.fork()
             if pid == 0:
+                if request.get("session"):
+                    os.setsid()
+                connection.send(str(os.getpid()).encode())  # from now on its group can be killed
                 for ours in (listener, ended, wake, connection, *running.values()):
                     ours.close()
-                return begin(json.loads(request), files)
+                return begin(request, files)
             for file in files:
                 os.close(file)
             running[pid] = connection
-            connection.send(str(pid).encode())
+            if "end_with" in request:
+                bound[connection] = pid, request["end_with"]
         if sys.stdin in readable:
             return 0
 

@@ -40,11 +40,12 @@ from ultragray_workers.storage.location import open_storage
 
 
 def make_service(settings: Settings) -> Service:
-    life, metrics, tracing = Life(), Metrics(), start_tracing("service")
+    life, owners, tracing = Life(), Owners(), start_tracing("service")
+    metrics = Metrics(lambda scene: owners.known(Kind.SCENE, scene).private)
 
     keys, tokens = KnownKeys(), oidc_tokens(settings)
     guard = Guard([keys, EnvironmentKeys(settings.api_keys), *([] if tokens is None else [tokens])])
-    sessions, audit, owners = Sessions(guard), AuditLog(), Owners()
+    sessions, audit = Sessions(guard), AuditLog()
     limits = Limits(settings.allowance, metrics.count_limited)
 
     places = ScenePlaces(settings)

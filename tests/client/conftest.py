@@ -20,9 +20,9 @@ SETTINGS = {"max_poses_per_request": MAX_POSES, "max_image_side": 600, "api_keys
 
 
 def pytest_collection_modifyitems(items):
-    """Of uploads and jobs, `make test` has those of the client for threads: both carry out the same descriptions."""
+    """Of uploads, jobs and TLS, `make test` has those of the client for threads: both act on the same descriptions."""
     for item in items:
-        if item.path.name == "test_client_resources.py" and "[asyncio" in item.name:
+        if item.path.stem in ("test_client_resources", "test_client_tls") and "[asyncio" in item.name:
             item.add_marker(pytest.mark.long)
 
 

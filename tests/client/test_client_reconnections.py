@@ -102,7 +102,11 @@ def test_a_stream_with_shared_memory_goes_on_with_new_memory(far_client, proxy, 
         np.testing.assert_array_equal(frame["bmode"], pixels)
 
 
-@pytest.mark.parametrize(("number", "mode"), [(signal.SIGKILL, "ordered"), (signal.SIGTERM, "latest")])
+@pytest.mark.parametrize(
+    ("make_client", "number", "mode"),
+    [("sync", signal.SIGKILL, "ordered"), ("asyncio", signal.SIGTERM, "latest")],
+    indirect=["make_client"],
+)
 def test_a_stream_goes_on_at_another_service(make_client, start_service, number, mode):
     first, second = start_service(), start_service()
     proxy = Proxy(first.grpc)

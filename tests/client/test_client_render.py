@@ -83,10 +83,7 @@ def given(**settings):
     [
         ({"scene": "gone"}, errors.SceneNotFound, "settings.scene"),
         ({"pose": 2 * np.eye(4)}, errors.InvalidPose, "pose.matrix"),
-        ({"pose": "here"}, errors.InvalidPose, "pose"),
-        (given(height=601), errors.InvalidImageSize, "settings.height"),
         (given(probe=LinearProbe(-1, 0, 1)), errors.InvalidProbe, "settings.probe.linear.width_mm"),
-        (given(outputs=("shadow",)), errors.UnknownOutput, "outputs"),
         (given(encoding=Encoding.PNG), errors.InvalidArgument, "encoding"),
         ({"timeout_s": 0.0}, errors.InvalidArgument, "timeout_s"),
     ],

@@ -19,7 +19,6 @@ from ultragray_client.exchange import SLOTS, PoseExchange, SharedMemory
 from ultragray_client.frames import settings_message
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, scenes_pb2
 
-from ..freshness import check_fresh
 from ..service.conftest import ROOT
 from ..waiting import Deadline, wait_until
 from .test_client_render import moved
@@ -87,20 +86,6 @@ def test_refused_settings_are_told_first(client):
         client.stream("demo", mode="newest")
 
 
-def test_a_stream_may_be_used_by_two_threads(client):
-    with client.stream("demo", RenderSettings(height=8, width=8)) as stream:
-
-        def send():
-            for _ in range(300):
-                stream.send(moved(0.0))
-            stream.done_sending()
-
-        sender = threading.Thread(target=send)
-        sender.start()
-        assert [frame.sequence for frame in stream] == list(range(1, 301))
-        sender.join()
-
-
 def test_a_service_that_stops_ends_a_stream_that_is_not_to_reconnect(make_client, start_service):
     service = start_service()
     client = make_client(service.grpc)
@@ -135,26 +120,6 @@ def test_what_was_dropped_before_an_error_is_told_with_the_next_frame():
     )
     assert exchange.frame(exchange.arrived(answer), dropped_here=4).dropped == 7
     assert exchange.frame(exchange.arrived(answer)).dropped == 1
-
-
-class ClientDoor:
-    """A latest stream of either client."""
-
-    def __init__(self, stream):
-        self._stream = stream
-
-    def send(self):
-        self._stream.send(moved(0.0))
-
-    def receive(self):
-        frame = self._stream.receive()
-        return time.monotonic() - float(frame.latency_ms) / 1000
-
-
-@pytest.mark.parametrize("make_client", ["sync"], indirect=True)
-def test_a_latest_stream_gives_no_old_frame(client):
-    with client.stream("demo", RenderSettings(height=128, width=128), mode="latest") as stream:
-        check_fresh(ClientDoor(stream))
 
 
 def test_a_latest_stream_may_be_read_before_anything_is_sent(client):

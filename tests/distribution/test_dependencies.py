@@ -1,4 +1,4 @@
-"""Every module that is imported comes with the core's dependencies or with an extra that errors name."""
+"""What the projects say about themselves, and which extra or dependency brings each module that is imported."""
 
 import ast
 import re

@@ -1,4 +1,4 @@
-"""The site: every page is in it, every part is made and used, and nothing is loaded from elsewhere."""
+"""Every page is in the site, every link leads somewhere, every stop of the tour is there."""
 
 import ast
 import re

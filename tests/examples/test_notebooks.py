@@ -1,4 +1,4 @@
-"""The notebooks: each runs from top to bottom in a kernel of its own, and their files are in one form."""
+"""The notebooks, from top to bottom in a kernel of their own, their form, and the modules beside them."""
 
 import nbformat
 import pytest

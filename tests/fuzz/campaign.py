@@ -20,7 +20,7 @@ SHARES = {  # of the inputs, by door: about as many as each takes in its part of
     "http bodies": 0.10,
     "http paths": 0.07,
     "http bytes": 0.05,
-    "websocket": 0.18,
+    "websocket": 0.12,
     "websocket paths": 0.01,
     "grpc messages": 0.08,
     "grpc bytes": 0.08,
@@ -39,6 +39,10 @@ SHARES = {  # of the inputs, by door: about as many as each takes in its part of
     "tables of poses": 0.01,
     "scans of TUS-REC": 0.01,
     "archives": 0.03,
+    "transform chains": 0.04,
+    "clocks": 0.03,
+    "photometric words": 0.04,
+    "control frames": 0.02,
 }
 FAILED_FOLDER = ROOT / "build" / "fuzz"
 

@@ -1,12 +1,10 @@
 """Datasets and jobs of several hosts over a bucket: each host sees all of them, and a job goes on elsewhere."""
 
-import hashlib
 import io
 import json
 import os
 import subprocess
 import sys
-import tarfile
 import time
 import zipfile
 from dataclasses import replace
@@ -18,7 +16,6 @@ from ultragray.datasets.released import write_released
 from ultragray.datasets.source import load_dataset
 from ultragray.learn.training import TrainingConfig, train
 from ultragray.phantom.demo import copy_demo_scene
-from ultragray_workers.storage.location import open_storage
 
 from ..faults.machine import PATCHES, SERVE, WORK
 from ..object_storage import AWAY_S
@@ -197,40 +194,3 @@ def test_a_training_goes_on_at_another_host_to_the_same_scene(new_host, object_p
         journal = get(http, f"jobs/{job}/artifacts/metrics.jsonl").text.splitlines()
         assert [json.loads(line)["step"] for line in journal] == list(range(1, STEPS + 1))
         assert len(get(http, f"jobs/{job}/curve").json()["points"]) == 500
-
-
-@pytest.mark.long
-def test_hosts_make_the_shards_of_a_batch_together(new_host, bucket, object_proxy):
-    one, two = new_host("one"), new_host("two")
-    http, _ = one.serve()
-    workers = [one.work(), two.work()]
-    sampler = {"kind": "around", "count": 6_000, "seed": SEED}
-    specification = {"scene": "demo", "sampler": sampler, "height": 16, "width": 12, "shard_frames": 250}
-    job = httpx.post(f"{http}/v1/jobs", json={"kind": "render", "specification": specification}, timeout=60).json()
-    job = job["id"]
-
-    def told():
-        return one.told() + two.told()
-
-    def found():
-        return dict(get(http, f"jobs/{job}").json())
-
-    wait_until(lambda: found()["progress"]["frames_done"], within_s=240, every_s=0.2)
-    object_proxy.away = True
-    time.sleep(AWAY_S)
-    object_proxy.away = False
-    workers[0].kill()
-    ended = wait_until(lambda: (it := found())["state"] in ("succeeded", "failed") and it, within_s=400, every_s=0.5)
-    assert ended["state"] == "succeeded", (ended, told())
-    manifest = get(http, f"jobs/{job}/artifacts/manifest.json").json()
-    assert sum(shard["frames"] for shard in manifest["shards"]) == 6_000
-    keys = []
-    for shard in manifest["shards"]:
-        content = get(http, f"jobs/{job}/artifacts/{shard['file']}").content
-        assert hashlib.sha256(content).hexdigest() == shard["sha256"]
-        with tarfile.open(fileobj=io.BytesIO(content)) as tar:
-            keys += [name.partition(".")[0] for name in tar.getnames() if name.endswith("bmode.npy")]
-    assert len(keys) == len(set(keys)) == 6_000
-    assert httpx.delete(f"{http}/v1/jobs/{job}", timeout=60).status_code == 204
-    left = [entry.key for entry in open_storage(f"{bucket}/artifacts").entries(f"jobs/{job}")]
-    assert left == []

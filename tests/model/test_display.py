@@ -1,17 +1,20 @@
-"""Display settings: what is shown, where its pixels lie, and their bytes."""
+"""Settings of frames and of their display: completed for a scene, what is shown, where its pixels lie, their bytes."""
+
+from dataclasses import replace
 
 import cv2
 import numpy as np
 import pytest
 import torch
 
-from ultragray import ConvexProbe, LinearProbe, PhasedProbe, RadialProbe, SteeredProbe
+from ultragray import ConvexProbe, ElevationBeam, LinearProbe, PhasedProbe, RadialProbe, SceneInfo, SteeredProbe
 from ultragray.errors import InvalidArgument, InvalidImageSize
+from ultragray.geometry.image_size import MAX_IMAGE_SIDE, check_image_size
 from ultragray.geometry.scan_conversion import scan_convert, scan_convert_labels
 from ultragray.rendering.display import Display
 from ultragray.rendering.frames import show
 from ultragray.rendering.pixels import encoded_image, in_type, to_uint8
-from ultragray.rendering.settings import Encoding
+from ultragray.rendering.settings import Encoding, FrameSettings
 
 LINEAR = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=40.0, far_mm=100.0)
@@ -151,3 +154,59 @@ def test_bytes_are_taken_as_they_are():
     floats = in_type(frame[None], Encoding.FLOAT32.pixel_type)
     assert (floats.dtype.str, floats.tolist()) == ("<f4", [frame.tolist()])
     assert cv2.imdecode(encoded_image(frame, Encoding.PNG), cv2.IMREAD_UNCHANGED).tolist() == frame.tolist()
+
+
+FOCUSED = ElevationBeam(thickness_mm=2.0, focus_mm=30.0, depth_of_field_mm=20.0)
+PLANE = ElevationBeam(thickness_mm=0.0)
+
+
+def resolved(beam, thickness_mm):
+    info = SceneInfo(probe=LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0), beam=beam)
+    return FrameSettings(slice_thickness_mm=thickness_mm).resolved(info, Encoding.UINT8)
+
+
+@pytest.mark.parametrize(
+    ("beam", "thickness_mm", "used"),
+    [
+        (None, None, PLANE),
+        (None, 0.0, PLANE),
+        (None, 3.0, ElevationBeam(thickness_mm=3.0)),
+        (FOCUSED, None, FOCUSED),
+        (FOCUSED, 0.0, replace(FOCUSED, thickness_mm=0.0)),
+        (FOCUSED, 3.0, ElevationBeam(thickness_mm=3.0, focus_mm=30.0, depth_of_field_mm=20.0)),
+    ],
+)
+def test_a_slice_has_the_shape_of_the_scenes_beam(beam, thickness_mm, used):
+    found = resolved(beam, thickness_mm)
+    assert found.beam == used
+    assert resolved(beam, found.beam.thickness_mm).beam == used  # what a frame tells renders it again
+
+
+def test_frames_of_different_thickness_are_not_rendered_together():
+    assert resolved(FOCUSED, None).view == resolved(FOCUSED, 2.0).view
+    assert resolved(FOCUSED, None).view != resolved(FOCUSED, 2.5).view
+
+
+@pytest.mark.parametrize("thickness_mm", [-0.1, 100.1, float("nan")])
+def test_a_thickness_has_limits(thickness_mm):
+    with pytest.raises(InvalidArgument, match="slice_thickness_mm must be a finite number from 0 to 100"):
+        FrameSettings(slice_thickness_mm=thickness_mm)
+
+
+@pytest.mark.parametrize("side", [1, 512, MAX_IMAGE_SIDE, np.int64(7)])
+def test_sizes_within_the_limit(side):
+    check_image_size(side, 1)
+    check_image_size(1, side)
+
+
+@pytest.mark.parametrize("side", [0, -1, MAX_IMAGE_SIDE + 1, 1.0, "512", None, True, float("nan")])
+@pytest.mark.parametrize("field", ["height", "width"])
+def test_other_sizes_are_refused_by_name(side, field):
+    with pytest.raises(InvalidImageSize, match=f"^{field} must be an integer from 1 to {MAX_IMAGE_SIDE}") as caught:
+        check_image_size(**{"height": 8, "width": 8, field: side})
+    assert caught.value.field == field
+
+
+def test_a_service_may_set_a_lower_limit():
+    with pytest.raises(InvalidImageSize, match="from 1 to 100"):
+        check_image_size(101, 8, limit=100)

@@ -1,4 +1,4 @@
-"""The phantom's tissue map: what the anatomy promises lies where it should, and shapes are honest distances."""
+"""The phantom: its tissues, how its images form, the poses that it is scanned from, and the shadow of its bones."""
 
 from dataclasses import replace
 

@@ -1,4 +1,4 @@
-"""Registrations from points, poses and frames: exact where the input is, told where it cannot be."""
+"""Registrations from points, poses and frames; what contradicts itself is told with its likely cause."""
 
 import json
 

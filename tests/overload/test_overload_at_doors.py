@@ -195,19 +195,22 @@ class GrpcStream(_Stream):
 
     def __init__(self, channel):
         self._call = rendering_pb2_grpc.RenderServiceStub(channel).RenderStream()
-        self._first = {"settings": SETTINGS, "mode": rendering_pb2.STREAM_MODE_LATEST}
+        self._sequence = 0
+        self._first = {"settings": SETTINGS, "mode": rendering_pb2.STREAM_MODE_LATEST, "window": 2}
 
     @classmethod
     async def open(cls, service, place):
         return cls(place.channel(service))
 
     async def send(self):
-        message = rendering_pb2.RenderStreamRequest(pose=MESSAGE, client_time_ns=time.monotonic_ns(), **self._first)
+        self._sequence += 1
+        about = {"sequence": self._sequence, "client_time_ns": time.monotonic_ns(), **self._first}
         self._first = {}
-        await self._call.write(message)
+        await self._call.write(rendering_pb2.RenderStreamRequest(pose=MESSAGE, **about))
 
     async def receive(self):
         frame = await self._call.read()
+        await self._call.write(rendering_pb2.RenderStreamRequest(acknowledged=frame.sequence))
         if frame.error.reason:
             raise Refused(frame.error.reason)
         return int(frame.client_time_ns)

@@ -1,4 +1,4 @@
-"""The node between a real service and a real publisher and subscriber."""
+"""The node between a real service and a real publisher; poses from transforms, by a stand-in of tf2."""
 
 import io
 import json

@@ -19,13 +19,12 @@ from ultragray import GaussianScene, LinearProbe, SceneInfo
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc, scenes_pb2_grpc
 
 from ..waiting import Deadline
-from ..warm import SOURCE_FOLDERS, WARM_TEMPLATES, WarmProcess, WarmServer, fork
+from ..warm import SOURCE_FOLDERS, WARM, WarmProcess, fork
 
 ROOT = Path(__file__).resolve().parents[2]
 START_TIMEOUT_S = 120.0
 STOP_TIMEOUT_S = 60.0
 
-WARM_SERVICES = WarmServer("ultragray_service.__main__")
 HEIGHT, WIDTH = 64, 48  # of the training images of the test scene
 
 
@@ -55,11 +54,8 @@ class RunningService:
                 command = [sys.executable, "-m", "ultragray_service"]
                 self.process = subprocess.Popen(command, env=whole, stdin=nothing, stderr=log, cwd=folder)
             else:
-                files = (nothing.fileno(), log.fileno(), log.fileno())
-                arguments = [str(WARM_TEMPLATES.path())]
-                self.process = fork(
-                    WARM_SERVICES.path(), "service", arguments, environment=whole, folder=folder, files=files
-                )
+                path, files = str(WARM.path()), (nothing.fileno(), log.fileno(), log.fileno())
+                self.process = fork(path, "service", [path], environment=whole, folder=folder, files=files)
 
     def __enter__(self):
         return self
@@ -192,6 +188,12 @@ def start_service(tmp_path_factory, data_folder):
 def start_shared_service(tmp_path_factory, data_folder):
     """Starts services that live until all tests have ended: for those that tests only read from."""
     yield from service_starter(tmp_path_factory, data_folder)
+
+
+@pytest.fixture(scope="module")
+def artifacts(tmp_path_factory):
+    """An empty artifact folder of the module."""
+    return tmp_path_factory.mktemp("artifacts")
 
 
 @pytest.fixture(scope="session")

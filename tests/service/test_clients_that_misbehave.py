@@ -58,7 +58,7 @@ def test_a_batch_whose_reader_stops_waits_for_him(service, renders):
 
 def test_a_stream_whose_reader_stops_waits_for_him(service, renders):
     def messages():
-        yield rendering_pb2.RenderStreamRequest(settings=LARGE, mode=rendering_pb2.STREAM_MODE_LATEST)
+        yield rendering_pb2.RenderStreamRequest(settings=LARGE)
         for sequence in range(5000):
             yield rendering_pb2.RenderStreamRequest(sequence=sequence, pose=IDENTITY)
 

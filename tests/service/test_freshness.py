@@ -109,6 +109,8 @@ def test_no_more_answers_come_than_the_window_has_room_for(open_grpc, service):
     assert door.take().sequence == 23
 
 
-def test_a_window_beyond_the_limit_ends_the_stream(open_grpc):
-    with pytest.raises(grpc.RpcError, match="window must be at most 16"):
-        open_grpc(SMALL, window=17).take()
+@pytest.mark.parametrize("window", [None, 17])
+def test_a_latest_call_needs_a_window_within_the_limit(open_grpc, window):
+    with pytest.raises(grpc.RpcError, match="needs a window of 1 to 16 answers") as refused:
+        open_grpc(SMALL, window).take()
+    assert refused.value.code() is grpc.StatusCode.INVALID_ARGUMENT

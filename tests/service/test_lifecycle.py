@@ -149,14 +149,14 @@ def test_a_full_queue_is_told_with_a_time_to_retry(start_service):
         with service.channel() as channel:
             stub = rendering_pb2_grpc.RenderServiceStub(channel)
             settings = rendering_pb2.RenderSettings(scene="demo", **SMALL)
-            batch = rendering_pb2.RenderBatchRequest(settings=settings, poses=[moved(0)] * 10)
-            assert len(list(stub.RenderBatch(batch, timeout=60))) == 10  # a batch waits for room by itself
+            batch = rendering_pb2.RenderBatchRequest(settings=settings, poses=[moved(0)] * 4)
+            assert len(list(stub.RenderBatch(batch, timeout=60))) == 4  # a batch waits for room by itself
             stream = Conversation(stub)
             stream.send(settings=settings)
-            for sequence in range(8):
+            for sequence in range(6):
                 stream.send(sequence, pose=moved(0))
             frames = stream.finish()
-            assert [frame.sequence for frame in frames] == list(range(8))
+            assert [frame.sequence for frame in frames] == list(range(6))
             assert {frame.error.reason for frame in frames} == {"", "QUEUE_FULL"}
         assert render(service, client).status_code == 200
 
@@ -201,7 +201,7 @@ def test_interactive_frames_go_before_a_batch(slow):
 def test_a_port_in_use_is_one_clear_error(start_service, service):
     http_port, grpc_port = service.http.rsplit(":", 1)[1], service.grpc.rsplit(":", 1)[1]
     for settings, name in (({"http_port": http_port}, "HTTP"), ({"grpc_port": grpc_port}, "gRPC")):
-        second = start_service(wait=False, cold=name == "HTTP", **settings)
+        second = start_service(wait=False, **settings)
         assert second.process.wait(60) == 1
         said = second.log_path.read_text().splitlines()
         assert f"{name} cannot listen on 127.0.0.1:" in said[-1]
@@ -225,7 +225,11 @@ def test_bad_settings_are_one_clear_error(start_service, settings, expected):
 
 
 @pytest.mark.slow
-def test_the_service_process_never_imports_torch():
-    code = "import sys, ultragray_service.server; sys.exit('torch' in sys.modules)"
+def test_neither_service_nor_worker_nor_intake_import_torch():
+    code = (
+        "import sys, ultragray_service.server, ultragray_workers.datasets.intake, "
+        "ultragray_workers.jobs.worker.worker; from ultragray_workers.jobs.kinds import CompareJob; "
+        "CompareJob(dataset='tiny', methods=('median',)); sys.exit('torch' in sys.modules)"
+    )
     path = os.pathsep.join(str(ROOT / folder) for folder in SOURCE_FOLDERS)
     subprocess.run([sys.executable, "-c", code], env={**os.environ, "PYTHONPATH": path}, check=True)

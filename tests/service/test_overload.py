@@ -2,7 +2,6 @@
 
 import contextlib
 import threading
-import time
 
 import grpc
 import httpx
@@ -12,7 +11,7 @@ import torch
 from ultragray import GaussianScene, SceneInfo
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 
-from ..waiting import at_this_load, wait_until
+from ..waiting import wait_until
 from .conftest import DEMO_PROBE, make_scene
 from .rpc.test_grpc_render import error_info, moved
 
@@ -22,10 +21,10 @@ LARGE = {"height": 512, "width": 512}
 
 @pytest.fixture(scope="module")
 def scenes(tmp_path_factory):
-    """`demo`, and scenes of 20,000 Gaussians of 148 cm and of e^88 cm before the probe."""
+    """`demo`, and scenes of 20,000 Gaussians of 148 cm and of e^20 cm before the probe."""
     folder = tmp_path_factory.mktemp("scenes")
     make_scene(probe=DEMO_PROBE).save(folder / "demo.ugr")
-    for name, log_scale in (("wide", 5.0), ("endless", 88.0)):
+    for name, log_scale in (("wide", 5.0), ("endless", 20.0)):
         random = torch.Generator().manual_seed(0)
         splats = {
             "means": torch.rand(20_000, 3, generator=random) + torch.tensor([0.0, 0.0, 1.0]),
@@ -66,21 +65,11 @@ def test_a_scene_that_would_take_minutes_is_refused_by_both_doors(strict, scene)
         with pytest.raises(grpc.RpcError) as caught:
             list(stub.RenderBatch(rendering_pb2.RenderBatchRequest(settings=settings, poses=[moved(0)]), timeout=60))
         assert error_info(caught.value)[0].metadata["field"] == "poses[0]"
+        plane = {"origin_mm": [-20, 0, 0], "size_mm": [40.96, 40.96], "spacing_mm": 0.02}
+        refused = client.post(f"/v1/scenes/{scene}:slice", json=plane)
+        assert (refused.json()["reason"], refused.json()["field"]) == ("FRAME_TOO_COSTLY", "spacing_mm")
         assert render(client, "demo").status_code == 200
     assert strict.metric("ultragray_process_restarts_total") == strict.metric("ultragray_watchdog_kills_total") == 0
-
-
-def test_a_frame_past_its_deadline_frees_the_worker(start_service, scenes):
-    service = start_service(data_folder=scenes, max_footprint_pixels=2**62)
-    with httpx.Client(base_url=service.http, timeout=60) as client:
-        assert render(client, "wide", height=16, width=16).status_code == 200
-        began = time.monotonic()
-        late = render(client, "wide", timeout_ms=500, **LARGE)
-        assert (late.status_code, late.json()["reason"]) == (504, "DEADLINE_EXCEEDED")
-        assert render(client, "demo").status_code == 200
-        assert time.monotonic() - began < at_this_load(5.0)  # without it: minutes
-        assert client.get("/v1/health/ready").status_code == 200
-    assert service.metric("ultragray_watchdog_kills_total") == 0
 
 
 @pytest.mark.long

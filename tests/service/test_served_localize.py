@@ -27,8 +27,8 @@ def folder(tmp_path_factory):
 
 
 @pytest.fixture(scope="module")
-def phantom(start_service, folder, tmp_path_factory):
-    return start_service(data_folder=folder, artifact_folder=tmp_path_factory.mktemp("artifacts"))
+def phantom(start_service, folder, artifacts):
+    return start_service(data_folder=folder, artifact_folder=artifacts)
 
 
 @pytest.fixture(scope="module")
@@ -116,11 +116,8 @@ def test_a_frame_of_something_else_is_told_as_not_found(http):
     ("change", "field", "told"),
     [
         ({"image": "no base64!"}, "image", "image must be base64"),
-        ({"image": base64.b64encode(b"GIF89a").decode()}, "image", "image must be a PNG file"),
         ({"image_height": 64, "image_width": 64}, "image", "must hold image_height x image_width = 4096 bytes"),
-        ({"start": {"matrix": np.ones((4, 4)).tolist()}}, "start.matrix", "row 0 0 0 1"),
         ({"within_mm": 21}, "within_mm", "above 0 and at most 20"),
-        ({"probe": {"kind": "linear", "width_mm": -1, "near_mm": 0, "far_mm": 40}}, "probe.width_mm", "above 0"),
     ],
 )
 def test_each_mistake_gets_one_error(http, png, change, field, told):

@@ -34,8 +34,8 @@ FLANGE = np.linalg.inv(BASE_TO_SCENE) @ POSE @ np.linalg.inv(MOUNTING)
 
 
 @pytest.fixture(scope="module")
-def kept(start_service, tmp_path_factory):
-    return start_service(artifact_folder=tmp_path_factory.mktemp("artifacts"))
+def kept(start_service, artifacts):
+    return start_service(artifact_folder=artifacts)
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,5 @@
 """The process of a service and those around it: systemd, a terminal, its worker, the modes of its files."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 import os

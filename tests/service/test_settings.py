@@ -28,12 +28,8 @@ def test_defaults():
 @pytest.mark.parametrize(
     ("name", "value"),
     [
-        ("http_port", "65536"),
         ("http_port", "eighty"),
-        ("processes", "-1"),
         ("default_timeout_s", "0"),
-        ("max_image_side", "99999"),
-        ("max_batch_poses", "0"),
         ("backend", "gpu"),
         ("log_level", "loud"),
     ],

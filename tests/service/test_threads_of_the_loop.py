@@ -9,7 +9,7 @@ import pytest
 from ultragray_service.access.principals import LOCAL, act_as
 from ultragray_service.core import scenes as catalog
 from ultragray_service.core import uploads as scene_imports
-from ultragray_service.core.threads import HelperProcesses
+from ultragray_service.core.threads import HelperProcesses, in_own_thread
 from ultragray_service.settings import load_settings
 from ultragray_service.wiring import make_service
 from ultragray_workers.jobs.store import JobStore
@@ -83,3 +83,16 @@ def test_long_work_leaves_the_threads_of_the_loop(name, tmp_path, demo_scene, bl
         await service.jobs.close()
 
     asyncio.run(main())
+
+
+def test_many_may_wait_and_none_keeps_the_loop_from_ending():
+    never = threading.Event()
+
+    async def run():
+        waiting = [asyncio.ensure_future(in_own_thread(never.wait)) for _ in range(50)]
+        result = await in_own_thread(lambda: 7)
+        assert not any(task.done() for task in waiting)
+        return result
+
+    assert asyncio.run(run()) == 7
+    never.set()

@@ -1,7 +1,5 @@
 """Requests for frames of the small scenes of these tests."""
 
-from __future__ import annotations
-
 from ultragray import LinearProbe
 from ultragray.rendering.settings import Resolved
 from ultragray_workers import Priority, RenderRequest

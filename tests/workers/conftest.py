@@ -1,7 +1,5 @@
 """Scenes in a folder, pools over them, and a look at which processes there are."""
 
-from __future__ import annotations
-
 import asyncio
 import contextlib
 import io
@@ -21,7 +19,7 @@ from ultragray_workers.pool import processes as launcher
 
 from ..conftest import RUN
 from ..waiting import Deadline, wait_until
-from ..warm import WARM_TEMPLATES, start_template
+from ..warm import WARM, start_template
 from .asking import HEIGHT, PROBE, WIDTH
 
 TIME_LIMIT_S = 180.0
@@ -32,7 +30,7 @@ T = TypeVar("T")
 @pytest.fixture(autouse=True)
 def warm_templates(monkeypatch):
     """Pools of this process have their templates forked, but for tests that ask for `cold_templates`."""
-    monkeypatch.setattr(launcher, "start_template", lambda channel: start_template(WARM_TEMPLATES.path(), channel))
+    monkeypatch.setattr(launcher, "start_template", lambda channel: start_template(WARM.path(), channel))
 
 
 _START_COLD = launcher.start_template

@@ -1,7 +1,5 @@
 """Folders that are made whole: claimed while their maker lives, removed when it has died."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

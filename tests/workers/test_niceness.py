@@ -1,7 +1,5 @@
 """Jobs and helpers let frames go first, also where the kernel shares processors among sessions."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

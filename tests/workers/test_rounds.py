@@ -1,7 +1,5 @@
 """Loops that go on whatever a round raises."""
 
-from __future__ import annotations
-
 import asyncio
 import logging
 

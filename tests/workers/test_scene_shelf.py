@@ -1,7 +1,5 @@
 """Scenes of a bucket: named once, fetched once, served while the bucket is away, and removed."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import os

@@ -1,16 +1,14 @@
 """The folder of scene files."""
 
-from __future__ import annotations
-
-import hashlib
 import weakref
 
 import pytest
 
-from ultragray.errors import SceneFileInvalid
+from ultragray.errors import InvalidArgument, SceneFileInvalid
 from ultragray_workers import SceneStore
 from ultragray_workers import scene_shelf as headers
 from ultragray_workers.errors import SceneNotFound
+from ultragray_workers.scene_names import SceneReference, base_name, check_scene_name, check_scene_reference
 from ultragray_workers.scene_shelf import SceneShelf
 from ultragray_workers.scenes import resident_bytes
 
@@ -116,22 +114,6 @@ def test_what_is_described_is_all_but_the_gaussians(scene_folder):
     assert headers._described_bytes(header) == 30 * (8 + length) + header.training_poses.nbytes
 
 
-def test_a_pin_asks_for_one_content_of_a_file(scene_folder):
-    store = SceneStore(scene_folder)
-    content, other = (hashlib.sha256((scene_folder / f"{name}.ugr").read_bytes()).hexdigest() for name in "ab")
-    for pin in (content, content[:12]):
-        version, header = store.versioned_header(f"a@{pin}")
-        assert store.cached_versioned_header(f"a@{pin}") == (version, header)
-        assert store.header(f"a@{pin}") is header
-    with pytest.raises(SceneNotFound, match=f"no longer has the content {other}; it is now a@{content}"):
-        store.versioned_header(f"a@{other}")
-    (scene_folder / "b.ugr").replace(scene_folder / "a.ugr")
-    assert store.cached_versioned_header(f"a@{content}") is None
-    with pytest.raises(SceneNotFound, match=f"it is now a@{other}"):
-        store.path(f"a@{content}")
-    assert store.path(f"a@{other}") == scene_folder / "a.ugr"
-
-
 def test_a_pin_hides_nothing_and_shows_nothing(scene_folder):
     store = SceneStore(scene_folder)
     content = store.sha256("a")
@@ -156,3 +138,43 @@ def test_a_file_that_is_replaced_between_the_looks_at_it_is_looked_at_again(scen
     monkeypatch.setattr(SceneShelf, "fetch", replace_first)
     with pytest.raises(SceneNotFound, match="no longer has the content"):
         store.versioned_header(f"a@{content}")
+
+
+HASH = "0123456789abcdef" * 4
+
+
+@pytest.mark.parametrize(
+    ("text", "reference"),
+    [
+        ("liver", SceneReference("liver")),
+        (f"liver@{HASH}", SceneReference("liver", HASH)),
+        (f"liver@{HASH[:12]}", SceneReference("liver", HASH[:12])),
+        (f"liver@{HASH[:11]}", None),
+        (f"liver@{HASH}0", None),
+        (f"liver@{HASH.upper()}", None),
+        ("liver@", None),
+        (f"@{HASH}", None),
+        (f"a b@{HASH}", None),
+        (f"liver@{HASH}@{HASH}", None),
+        ("../liver", None),
+    ],
+)
+def test_a_reference_is_a_name_and_perhaps_a_pin(text, reference):
+    assert SceneReference.of(text) == reference
+    if reference is None:
+        with pytest.raises(InvalidArgument, match="scene must be"):
+            check_scene_reference(text)
+    else:
+        check_scene_reference(text)
+        assert base_name(text) == reference.name
+
+
+def test_a_pin_fits_what_begins_with_it():
+    assert SceneReference("liver").fits(HASH)
+    assert SceneReference("liver", HASH[:12]).fits(HASH)
+    assert not SceneReference("liver", "f" * 12).fits(HASH)
+
+
+def test_nothing_new_is_named_with_a_pin():
+    with pytest.raises(InvalidArgument, match="letters, digits"):
+        check_scene_name(f"liver@{HASH}")

@@ -1,7 +1,5 @@
 """The artifact folder: it gets a version, and one of another is refused, and a restore is alone in it."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

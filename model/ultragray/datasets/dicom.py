@@ -10,6 +10,7 @@ The extra `dicom`.
 from __future__ import annotations
 
 import io
+import math
 import re
 import warnings
 from collections.abc import Iterator
@@ -22,18 +23,16 @@ import cv2
 import numpy as np
 
 from ultragray.datasets.clocks import delay_note, parse_delay_ns, poses_before
-from ultragray.datasets.fan import FanGeometry, FanLines, parse_fan
+from ultragray.datasets.fan import parse_fan, tracked_sweep
 from ultragray.datasets.images import (
     MAX_PIXEL_BYTES,
     CropBox,
     check_pixel_mm,
     grey_frames,
     parse_crop,
-    poses_from_image_transforms,
-    region_of,
 )
 from ultragray.datasets.released import no_pose_note
-from ultragray.errors import DatasetInvalid, InvalidArgument, InvalidPose
+from ultragray.errors import DatasetInvalid, InvalidPose
 from ultragray.exchange.poses import frames_with_pose, read_frame_poses
 from ultragray.geometry.probe import FloatArray
 from ultragray.installation import missing_extra
@@ -52,7 +51,8 @@ GREY, RGB, YBR = (
 INTERPRETATIONS = {**dict.fromkeys(GREY, 1), **dict.fromkeys((*RGB, *YBR), 3)}  # samples of a pixel
 PERSON = ("PatientName", "PatientID", "PatientBirthDate", "OtherPatientIDs", "AccessionNumber")
 NOBODY = re.compile(r"(?i)\W*|.*(anon|unknown|phantom|test).*")
-GREYER = 0.25  # of the colour that an image has as its header calls it: the other reading is right
+GREY_LEVELS = 10  # by which the samples of a grey pixel may differ: of lossy JPEG they do
+LEAST_GREY = 0.25  # of the pixels of ultrasound beside its flow; read wrongly, less than half of them stay grey
 
 
 def read_dicom_sweep(
@@ -71,8 +71,6 @@ def read_dicom_sweep(
     the poses. Colour becomes luma. Raises DatasetInvalid, naming the file, the frame and the reason; InvalidArgument
     for options that do not fit; ExtraMissing without pydicom.
     """
-    if fan is not None and crop is not None:
-        raise InvalidArgument("fan must be given without crop: it says where the image lies", field="fan")
     delay_ns = parse_delay_ns(image_delay_ms)
     header = _read_header(path)
     shape = _shape(path, header, is_fan=fan is not None)
@@ -97,24 +95,35 @@ def read_dicom_sweep(
             Link("region", "Tracker", "pose", poses_path.name, is_tracked=True),
         )
     )
-    if fan is not None:
-        sweep = _fan_sweep(path, stored, poses, parse_fan(fan), region.pixel_mm, numbers)
+    lateral_mm, axial_mm = region.pixel_mm
+    if fan is None:
+        column, row = (region.box.left + region.box.right - 1) / 2, region.box.top - 0.5
+        crop = crop or region.crop
     else:
-        box = region.box if crop is None else parse_crop(crop, *shape[1:])
-        lateral_mm, axial_mm = region.pixel_mm
-        image_to_probe = np.array(
-            [
-                [lateral_mm, 0.0, 0.0, -lateral_mm * (region.box.left + region.box.right - 1) / 2],
-                [0.0, 0.0, 1.0, 0.0],
-                [0.0, axial_mm, 0.0, -axial_mm * (region.box.top - 0.5)],
-                [0.0, 0.0, 0.0, 1.0],
-            ]
-        )
-        box_poses, probe = poses_from_image_transforms(poses @ image_to_probe, box, numbers, path)
-        images = np.ascontiguousarray(stored[:, box.top : box.bottom, box.left : box.right])
-        shown = region_of(shape[1:], box, region.pixel_mm, image_to_probe)
-        sweep = Sweep(images, box_poses, probe, numbers, str(path), (), shown)
-    return replace(sweep, notes=notes, chain=chain, times_s=None if times_s is None else times_s[numbers]), shape[0]
+        geometry = parse_fan(fan)
+        column, row = geometry.apex_column, geometry.apex_row
+    image_to_probe = np.array(
+        [
+            [lateral_mm, 0.0, 0.0, -lateral_mm * column],
+            [0.0, 0.0, 1.0, 0.0],
+            [0.0, axial_mm, 0.0, -axial_mm * row],
+            [0.0, 0.0, 0.0, 1.0],
+        ]
+    )
+    sweep = tracked_sweep(
+        stored,
+        poses,
+        image_to_probe,
+        numbers,
+        path,
+        crop=crop,
+        fan=fan,
+        calibration=f"{path}: {region.source}",
+        chain=chain,
+        notes=notes,
+        times_s=None if times_s is None else times_s[numbers],
+    )
+    return sweep, shape[0]
 
 
 def _times(path: Path, header: Any, count: int) -> FloatArray | None:  # [F] s
@@ -138,29 +147,6 @@ def _header_notes(path: Path, header: Any) -> tuple[str, ...]:
         "the file says that its pixels name a person (BurnedInAnnotation YES): crop them" if is_burnt_in else "",
     )
     return tuple(note for note in notes if note)
-
-
-def _fan_sweep(
-    path: Path,
-    stored: ByteArray,  # [F, rows, columns]
-    poses: FloatArray,  # [F, 4, 4]
-    geometry: FanGeometry,
-    pixel_mm: tuple[float, float],
-    numbers: IntArray,
-) -> Sweep:
-    """The scan lines of a fan on the screen. Raises InvalidArgument for one that does not lie in the image."""
-    size, (lateral_mm, axial_mm) = (stored.shape[1], stored.shape[2]), pixel_mm
-    lines = FanLines(geometry, size, pixel_mm)
-    image_to_probe = np.array(
-        [
-            [lateral_mm, 0.0, 0.0, -lateral_mm * geometry.apex_column],
-            [0.0, 0.0, 1.0, 0.0],
-            [0.0, axial_mm, 0.0, -axial_mm * geometry.apex_row],
-            [0.0, 0.0, 0.0, 1.0],
-        ]
-    )
-    region = region_of(size, lines.box, pixel_mm, image_to_probe)
-    return Sweep(lines.frames(stored), poses, geometry.probe(), numbers, str(path), (), region)
 
 
 @contextmanager
@@ -358,16 +344,15 @@ def _read_frames(
         except NotImplementedError:
             raise DatasetInvalid(f"{path}: pixels compressed as {syntax.name} cannot be read") from None
         if decoder is not None and not decoder.is_available:
-            needed = "; ".join(decoder.missing_dependencies)
-            raise DatasetInvalid(
-                f"{path}: pixels compressed as {syntax.name} cannot be read without a decoder: {needed}"
-            )
+            raise DatasetInvalid(f"{path}: pixels compressed as {syntax.name} cannot be read: install python-gdcm")
         surplus = max(0, int(header.get("BitsStored", 8)) - 8)
         if decoder is not None and syntax in JPEG and surplus and "pylibjpeg" not in decoder.available_plugins:
             raise DatasetInvalid(
                 f"{path}: {header.BitsStored} bits compressed as {syntax.name} cannot be read: install "
                 "pylibjpeg-libjpeg (GPL), or save the file without compression"
             )
+        if decoder is None and interpretation == "YBR_FULL_422" and path.stat().st_size < 3 * math.prod(shape):
+            raise DatasetInvalid(f"{path}: pixels that share their colours (YBR_FULL_422) cannot be read uncompressed")
         pixels = iter_pixels(path, indices=[int(number) for number in chosen], raw=True)
         is_ybr = interpretation in YBR
         for number, out in zip(chosen, frames, strict=True):
@@ -383,7 +368,10 @@ def _read_frames(
                 )
             frame = np.asarray(frame >> surplus if surplus else frame, np.uint8)
             if number == chosen[0] and frame.ndim == 3 and interpretation != "PALETTE COLOR":
-                is_ybr, said = _is_ybr(frame, interpretation)
+                as_ybr = convert_color_space(frame, "YBR_FULL", "RGB")
+                if _is_otherwise(*((as_ybr, frame) if is_ybr else (frame, as_ybr))):
+                    is_ybr = not is_ybr
+                    said = (_other_colours(interpretation, "YBR_FULL" if is_ybr else "RGB"),)
             frame = convert_color_space(frame, "YBR_FULL", "RGB") if is_ybr else frame
             out[:] = grey_frames(frame[None], str(path))[0]
             if interpretation == "MONOCHROME1":
@@ -393,15 +381,10 @@ def _read_frames(
     return frames, said
 
 
-def _is_ybr(frame: ByteArray, interpretation: str) -> tuple[bool, tuple[str, ...]]:  # [rows, columns, 3] as decoded
-    """Whether the samples are luma and two differences of colour: an ultrasound image is mostly grey as one or the
-    other, whatever its header calls it."""
-    first, *others = (frame[..., channel].astype(np.int16) for channel in range(3))
-    as_ybr, as_rgb = (sum(float(np.abs(one - grey).mean()) for one in others) for grey in (128, first))
-    is_ybr = interpretation in YBR
-    if (as_rgb if is_ybr else as_ybr) < GREYER * (as_ybr if is_ybr else as_rgb):
-        return not is_ybr, (_other_colours(interpretation, "RGB" if is_ybr else "YBR_FULL"),)
-    return is_ybr, ()
+def _is_otherwise(as_said: ByteArray, as_other: ByteArray) -> bool:  # [rows, columns, 3]
+    """Whether an image is grey, as ultrasound mostly is, where it is read otherwise than its header says."""
+    said, other = (float((np.ptp(one, axis=2) <= GREY_LEVELS).mean()) for one in (as_said, as_other))
+    return other > LEAST_GREY and said < other / 2
 
 
 def _other_colours(said: str, found: str) -> str:
@@ -461,11 +444,11 @@ def _jpeg_colours(stream: bytes, interpretation: str) -> tuple[bool, tuple[str, 
     is_rgb = names in (b"RGB", b"rgb") if adobe is None else adobe[1] == b"\0"
     is_told = adobe is not None or b"JFIF\0" in begin[:32] or is_rgb
     if not is_told and len(sizes) == 1:
-        decoded = [cv2.imdecode(np.frombuffer(one, np.uint8), cv2.IMREAD_COLOR) for one in (stream, _as_rgb(stream))]
-        colours = [float(np.ptp(one.astype(np.int16), axis=2).mean()) for one in decoded if one is not None]
-        if len(colours) == 2:
-            ybr, rgb = colours
-            is_rgb = interpretation in RGB if GREYER < (rgb + 1) / (ybr + 1) < 1 / GREYER else rgb < ybr
+        is_rgb = interpretation in RGB
+        ways = [cv2.imdecode(np.frombuffer(one, np.uint8), cv2.IMREAD_COLOR) for one in (stream, _as_rgb(stream))]
+        as_ybr, as_rgb = (None if one is None else np.asarray(one, np.uint8) for one in ways)
+        if as_ybr is not None and as_rgb is not None:
+            is_rgb ^= _is_otherwise(*((as_rgb, as_ybr) if is_rgb else (as_ybr, as_rgb)))
     is_other = not is_told and is_rgb != (interpretation in RGB)
     notes = (_other_colours(interpretation, "RGB" if is_rgb else "YBR_FULL"),) if is_other else ()
     return is_rgb and not is_told, notes

@@ -19,11 +19,18 @@ import cv2
 import numpy as np
 
 from ultragray.contract import from_dict
-from ultragray.datasets.images import CropBox
+from ultragray.datasets.images import (
+    CropBox,
+    check_pixel_mm,
+    parse_crop,
+    pixel_size_mm,
+    poses_from_image_transforms,
+    region_of,
+)
 from ultragray.errors import DatasetInvalid, InvalidArgument
 from ultragray.geometry.image_size import MAX_IMAGE_SIDE
 from ultragray.geometry.probe import LARGEST_OPENING_DEG, ConvexProbe, Fan, FloatArray, PhasedProbe, Probe
-from ultragray.learn.sweep import ByteArray
+from ultragray.learn.sweep import ByteArray, Chain, IntArray, Sweep
 from ultragray.rendering.display import Display
 
 MAX_DEVICE_SET_BYTES = 8 << 20
@@ -52,6 +59,9 @@ def parse_matrix(text: str, where: str) -> FloatArray:  # [4, 4]
     return matrix
 
 
+SAME_MATRIX = 1e-3  # mm, and of the entries of a rotation
+
+
 @dataclass(frozen=True)
 class DeviceSet:
     """A PLUS device set (XML)."""
@@ -74,11 +84,18 @@ def read_device_set(path: Path) -> DeviceSet:
         root = ElementTree.fromstring(data)
     except (ElementTree.ParseError, ValueError, LookupError) as error:
         raise DatasetInvalid(f"{path}: not XML that can be read: {error}") from error
-    transforms = {}
+    transforms: dict[TransformName, FloatArray] = {}
     for element in root.iterfind(".//CoordinateDefinitions/Transform"):
-        origin, target, matrix = (element.get(key, "") for key in ("From", "To", "Matrix"))
-        if origin and target:
-            transforms[origin, target] = parse_matrix(matrix, f"{path}: {origin}To{target}")
+        origin, target, text = (element.get(key, "") for key in ("From", "To", "Matrix"))
+        if not origin or not target:
+            continue
+        matrix = parse_matrix(text, f"{path}: {origin}To{target}")
+        there, back = transforms.get((origin, target)), transforms.get((target, origin))
+        if (there is not None and not np.allclose(there, matrix, atol=SAME_MATRIX)) or (
+            back is not None and not np.allclose(back @ matrix, np.eye(4), atol=SAME_MATRIX)
+        ):
+            raise DatasetInvalid(f"{path}: it has {origin}To{target} twice, with different matrices: leave one of them")
+        transforms[origin, target] = matrix
     if not transforms:
         raise DatasetInvalid(f"{path}: it has no Transform under CoordinateDefinitions")
     return DeviceSet(path, root, transforms)
@@ -353,3 +370,37 @@ def shown_frames(
     beyond = 1.0 - lines.share
     notes = (f"{beyond:.1%} of the fan lies beyond the image and is black",) if beyond > 1e-3 else ()
     return ShownFrames(lines.frames(images), poses, fan.probe(), lines.box, notes)
+
+
+def tracked_sweep(
+    images: ByteArray,  # [F, rows, columns]
+    poses: FloatArray,  # [F, 4, 4] sensor→tracker, mm
+    image_to_sensor: FloatArray,  # [4, 4] pixels→mm
+    numbers: IntArray,  # [F]
+    path: Path,
+    *,
+    crop: str | None,
+    fan: str | None,
+    calibration: str,
+    chain: Chain,
+    notes: tuple[str, ...],
+    times_s: FloatArray | None = None,
+) -> Sweep:
+    """The crop of images whose sensor was tracked, or the scan lines of their fan.
+
+    `calibration` names what says how large a pixel is. Raises DatasetInvalid, and InvalidArgument for options that do
+    not fit.
+    """
+    if fan is not None and crop is not None:
+        raise InvalidArgument("fan must be given without crop: it says where the image lies", field="fan")
+    size = images.shape[1], images.shape[2]
+    transforms, box = poses @ image_to_sensor, parse_crop(crop, *size)
+    pixel_mm = pixel_size_mm(transforms)
+    check_pixel_mm(pixel_mm, min(size), calibration)
+    top_centres, linear = poses_from_image_transforms(transforms, box, numbers, path)
+    shown = shown_frames(images, top_centres, linear, box, None if fan is None else parse_fan(fan), pixel_mm)
+    if crop is None and fan is None:
+        notes += (f"no crop was given: the whole image of {size[1]} x {size[0]} pixels is taken as ultrasound",)
+    region = region_of(size, shown.box, pixel_mm, image_to_sensor)
+    notes = (*notes, *shown.notes)
+    return Sweep(shown.frames, shown.poses, shown.probe, numbers, str(path), notes, region, chain, times_s)

@@ -511,10 +511,11 @@ class _ImageTimes:
     """The times of images, [F] each, and the frame that they are in."""
 
     def __init__(self, file: MessageFile, topic: str, numbers: Any) -> None:
-        found, frames = [], Counter[str]()
+        found, frames, self.without_stamp = [], Counter[str](), 0
         for number, message in _chosen_images(file, topic, numbers):
             header = message.decode().header
             frames[header.frame_id.lstrip("/")] += 1
+            self.without_stamp += time_of(header, 0) == 0
             found.append((number, time_of(header, message.log_time_ns), message.log_time_ns))
         if len(frames) > 1:
             listed = " and ".join(f"{name!r} ({count} images)" for name, count in sorted(frames.items()))
@@ -567,6 +568,8 @@ def _why_none(times: _ImageTimes, delay_ns: int, way: Way) -> str:
 
 def _path_notes(times: _ImageTimes, way: Way) -> tuple[str, ...]:
     """What the times of writing tell of the two clocks."""
+    if times.without_stamp:
+        return (f"{times.without_stamp} images have no stamp: taken for those of the time that they were written at",)
     apart_ms = (way.written_ns - times.written_ns) / NS_PER_MS
     if abs(apart_ms) <= SLOW_PATH_NS / NS_PER_MS:
         return ()

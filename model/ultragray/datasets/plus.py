@@ -190,6 +190,8 @@ class _Way:
                 if (found := _difference(stored, same, matrix if same == name else _inverse(matrix))) is not None:
                     notes.append(f"{'To'.join(same)} of the sequence is left out, {where} has another one: {found}")
             sources[name], fixed[name] = where, matrix
+            if IMAGE in name and np.array_equal(matrix, np.eye(4)):
+                notes.append(f"{'To'.join(name)} of {where} is the identity: was the probe never calibrated?")
         pixels = _pixel_frame(stored, sources, fixed)
         steps = _steps(stored, pixels, sources, device_set, transform)
         return cls(stored, steps, fixed, sources, (*notes, *_contradictions(stored, steps, sources, fixed)))

@@ -20,17 +20,9 @@ import numpy as np
 
 from ultragray.contract import Contract, described, from_dict
 from ultragray.datasets.clocks import NS_PER_S, BoolArray, PoseTrack, delay_note, parse_delay_ns
-from ultragray.datasets.fan import parse_fan, shown_frames
-from ultragray.datasets.images import (
-    MAX_PIXEL_BYTES,
-    check_pixel_mm,
-    grey_frames,
-    parse_crop,
-    pixel_size_mm,
-    poses_from_image_transforms,
-    region_of,
-)
-from ultragray.errors import DatasetInvalid, InvalidArgument, InvalidPose
+from ultragray.datasets.fan import tracked_sweep
+from ultragray.datasets.images import MAX_PIXEL_BYTES, grey_frames
+from ultragray.errors import DatasetInvalid, InvalidPose
 from ultragray.geometry.pose import pose_from_position_quaternion
 from ultragray.geometry.probe import FloatArray
 from ultragray.learn.sweep import ByteArray, Chain, IntArray, Link, Sweep, frame_list, parse_frame_ranges
@@ -79,8 +71,6 @@ def read_table_sweep(
     names. `image_delay_ms` is by how much pictures are stamped later than poses. Raises DatasetInvalid, naming file and
     row; InvalidArgument for options that do not fit.
     """
-    if fan is not None and crop is not None:
-        raise InvalidArgument("fan must be given without crop: it says where the image lies", field="fan")
     delay_ns = parse_delay_ns(image_delay_ms)
     table_path = path / POSES if path.is_dir() else path
     folder = table_path.parent
@@ -94,35 +84,27 @@ def read_table_sweep(
     left_out, numbers = numbers[~has_pose[numbers]], numbers[has_pose[numbers]]
     if not len(numbers):
         raise DatasetInvalid(f"{table_path}: none of {count} pictures has a pose")
-    images = _read_pictures([pictures[number] for number in numbers])
-    size = images.shape[1], images.shape[2]
-    image_to_sensor = np.array(known.image_to_sensor).reshape(4, 4)
-    transforms, box = poses[numbers] @ image_to_sensor, parse_crop(crop, *size)
-    pixel_mm = pixel_size_mm(transforms)
-    calibration_name = (calibration or folder / CALIBRATION).name
-    check_pixel_mm(pixel_mm, min(size), f"{calibration_name}: image_to_sensor")
-    top_centres, linear = poses_from_image_transforms(transforms, box, numbers, table_path)
-    shown = shown_frames(images, top_centres, linear, box, None if fan is None else parse_fan(fan), pixel_mm)
-    notes = [*shown.notes, *delay_note(delay_ns)]
+    notes = delay_note(delay_ns)
     if len(left_out):
-        notes.append(f"pictures without a pose were left out: {frame_list(left_out)} ({len(left_out)} in all)")
-    if crop is None and fan is None:
-        notes.append(f"no crop was given: the whole image of {size[1]} x {size[0]} pixels is taken as ultrasound")
+        notes += (f"pictures without a pose were left out: {frame_list(left_out)} ({len(left_out)} in all)",)
+    calibration_name = (calibration or folder / CALIBRATION).name
     chain = Chain(
         (
             Link("pixels", "sensor", "image_to_sensor", calibration_name),
             Link("sensor", "tracker", f"pose ({table.words(known)})", table_path.name, is_tracked=True),
         )
     )
-    sweep = Sweep(
-        images=shown.frames,
-        poses=shown.poses,
-        probe=shown.probe,
-        frame_numbers=numbers,
-        source=str(table_path),
-        notes=tuple(notes),
-        region=region_of(size, shown.box, pixel_mm, image_to_sensor),
+    sweep = tracked_sweep(
+        _read_pictures([pictures[number] for number in numbers]),
+        poses[numbers],
+        np.array(known.image_to_sensor).reshape(4, 4),
+        numbers,
+        table_path,
+        crop=crop,
+        fan=fan,
+        calibration=f"{calibration_name}: image_to_sensor",
         chain=chain,
+        notes=notes,
         times_s=None if image_times_s is None or not np.isfinite(image_times_s).all() else image_times_s[numbers],
     )
     return sweep, count

@@ -11,16 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from ultragray.datasets.fan import parse_fan, parse_matrix, shown_frames
-from ultragray.datasets.images import (
-    MAX_PIXEL_BYTES,
-    check_pixel_mm,
-    grey_frames,
-    parse_crop,
-    pixel_size_mm,
-    poses_from_image_transforms,
-    region_of,
-)
+from ultragray.datasets.fan import parse_matrix, tracked_sweep
+from ultragray.datasets.images import MAX_PIXEL_BYTES, grey_frames
 from ultragray.datasets.released import no_pose_note
 from ultragray.errors import DatasetInvalid, InvalidArgument
 from ultragray.exchange.poses import frames_with_pose
@@ -46,8 +38,6 @@ def read_tusrec_sweep(
     `frames`, `crop` and `fan` as of a DICOM loop. Raises DatasetInvalid, naming the file and the reason;
     InvalidArgument for options that do not fit; ExtraMissing without h5py.
     """
-    if fan is not None and crop is not None:
-        raise InvalidArgument("fan must be given without crop: it says where the image lies", field="fan")
     found = calibration or _calibration_near(path)
     to_mm, to_tool = _read_calibration(found)
     from_one = np.eye(4)
@@ -58,15 +48,6 @@ def read_tusrec_sweep(
     known = frames_with_pose(tforms)
     notes = no_pose_note(numbers[known], count, path) if frames is None else ()
     stored, numbers, tforms = stored[known], numbers[known], check_frame_poses(tforms[known], numbers[known], str(path))
-    images = grey_frames(stored, str(path))
-    size = images.shape[1], images.shape[2]
-    transforms, box = tforms @ image_to_tool, parse_crop(crop, *size)
-    pixel_mm = pixel_size_mm(transforms)
-    check_pixel_mm(pixel_mm, min(size), str(found))
-    poses, linear = poses_from_image_transforms(transforms, box, numbers, path)
-    shown = shown_frames(images, poses, linear, box, None if fan is None else parse_fan(fan), pixel_mm)
-    if crop is None and fan is None:
-        notes += (f"no crop was given: the whole image of {size[1]} x {size[0]} pixels is taken as ultrasound",)
     chain = Chain(
         (
             Link("pixels from 1", "image in mm", "scaling_from_pixel_to_mm", found.name),
@@ -74,9 +55,19 @@ def read_tusrec_sweep(
             Link("tool", "camera", "tforms", path.name, is_tracked=True),
         )
     )
-    region = region_of(size, shown.box, pixel_mm, image_to_tool)
-    source, notes = str(path), (*notes, *shown.notes)
-    return Sweep(shown.frames, shown.poses, shown.probe, numbers, source, notes, region, chain), count
+    sweep = tracked_sweep(
+        grey_frames(stored, str(path)),
+        tforms,
+        image_to_tool,
+        numbers,
+        path,
+        crop=crop,
+        fan=fan,
+        calibration=str(found),
+        chain=chain,
+        notes=notes,
+    )
+    return sweep, count
 
 
 def _calibration_near(path: Path) -> Path:

@@ -114,13 +114,12 @@ class RenderServiceServicer:
         that of the stream. ORDERED answers every pose, several in flight (8; then the stream stops reading). LATEST is for
         control loops: a newer pose takes the place in the queue of one that still waits, which gets no frame and is counted
         in `dropped`; the stream is read without pause. So that a slow reader gets fewer frames, not older ones, its client
-        opens a `window` and acknowledges each answer when it takes it: a frame is then at most as old as the reader's own
-        period and what one frame takes. Without acknowledgements one frame at a time is handed to the transport, and whatever
-        HTTP/2's flow control lets through (some megabytes) waits for the reader and grows old. A message that cannot be answered (a bad pose, an unknown scene, a full
+        must open a `window` and acknowledge each answer when it takes it: a frame is then at most as old as the reader's own
+        period and what one frame takes. A message that cannot be answered (a bad pose, an unknown scene, a full
         queue, a deadline) gets a Frame with its sequence and `error` set, and the stream goes on; refused settings
         change nothing. The call itself fails only where it cannot go on: UNAVAILABLE with reason DRAINING when the service
-        stops (after the frames in flight), UNAUTHENTICATED, or INVALID_ARGUMENT for an unknown mode or for shared_memory that is
-        refused.
+        stops (after the frames in flight), UNAUTHENTICATED, or INVALID_ARGUMENT for an unknown mode, a LATEST stream without
+        a window, or shared_memory that is refused.
         """
         context.set_code(grpc.StatusCode.UNIMPLEMENTED)
         context.set_details('Method not implemented!')

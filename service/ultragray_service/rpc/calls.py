@@ -156,15 +156,11 @@ class CallContext(grpc.aio.ServerInterceptor):  # type: ignore[misc]
         except UltragrayError as error:
             method = self._refusing(operation, error)
         else:
-            if not is_own:
-                return handler
-            method = method_of(handler)
-            if is_own and self._service.tracing is not None:
+            method = method_of(handler) if is_own else _writing(method_of(handler))
+            if self._service.tracing is not None:
                 method = _traced(self._service.tracing, details.method.removeprefix("/"), headers, method)
             method = self._permitted(principal, credential, operation, method)
-        handler = with_method(handler, method)
-        if is_own:
-            handler = refusing_what_is_no_message(handler)
+        handler = refusing_what_is_no_message(with_method(handler, method))
         return with_method(handler, self._wrap(details.method, method_of(handler), headers))
 
     def _permitted(self, principal: Principal, credential: str | None, operation: Operation, method: Method) -> Method:
@@ -222,6 +218,16 @@ def _traced(tracing: Tracing, name: str, headers: dict[str, str], method: Method
     async def call(request: Any, context: grpc.aio.ServicerContext) -> Any:
         with tracing.call(name, headers):
             return await method(request, context)
+
+    return call
+
+
+def _writing(method: Callable[[Any, Any], Any]) -> Method:
+    """The reflection of the gRPC library, which yields its answers, as a method that can be ended with its key."""
+
+    async def call(requests: Any, context: grpc.aio.ServicerContext) -> None:
+        async for answer in method(requests, context):
+            await context.write(answer)
 
     return call
 

@@ -84,15 +84,18 @@ class CallTransport:
     def _begun(self, first: rendering_pb2.RenderStreamRequest) -> StreamMode:
         """The mode that the first message asks for; opens the memory that the client shares, too.
 
-        Raises InvalidArgument for a mode that does not exist, a window beyond the limit, and memory that is refused.
+        Raises InvalidArgument for a mode that does not exist, a latest stream without a window or with one beyond the
+        limit, and memory that is refused.
         """
         mode = StreamMode(read_word(first, "mode") or StreamMode.ORDERED)
+        if mode is StreamMode.LATEST and not 1 <= first.window <= MAX_WINDOW:
+            raise InvalidArgument(
+                f"a latest stream needs a window of 1 to {MAX_WINDOW} answers, each acknowledged when it is taken "
+                f"(HTTP/2 would hold seconds of unread frames), got {first.window}",
+                field="window",
+            )
         if first.HasField("shared_memory"):
             self.destination = SharedMemory(first.shared_memory, self._context.peer())
-        if first.window > MAX_WINDOW:
-            raise InvalidArgument(
-                f"window must be at most {MAX_WINDOW}, 0 for none, got {first.window}", field="window"
-            )
         return mode
 
     async def send(self, answer: StreamAnswer) -> None:
@@ -105,7 +108,7 @@ class CallTransport:
         else:
             await self._context.write(frame_message(answer.outcome, answer.sequence, **about))
 
-    hand_over = send  # flow control tells the client's library what was taken, not the service
+    hand_over = send  # of streams without a window, which are ordered ones here
 
 
 _RETRY_S = 0.02
@@ -189,7 +192,7 @@ class RenderService:
             asked = read(request.slice, SliceSettings)
         plan = await self._service.planner.plan_slice(request.scene, asked, asked.numbers, path="slice")
         await self._service.limits.take_frames(1, deadline)
-        result = await self._service.rendering.render(plan, asked.pose()[None], deadline=deadline)
+        result = await self._service.rendering.render_slice(plan, asked.pose(), deadline=deadline)
         return slice_message(result)
 
     async def Localize(

@@ -162,7 +162,7 @@ _SECONDS = tuple(ms / 1000 for ms in _MILLISECONDS)
 _OVERLOADED = ("429", "RESOURCE_EXHAUSTED", "UNAVAILABLE", "DEADLINE_EXCEEDED", "INTERNAL")
 _HEALTH_ROUTES = "/v1/health/"  # not ready is what they are asked for
 MAX_SCENE_LABELS = 1000
-OTHER_SCENES = ":other"  # no scene can have this name
+OTHER_SCENES, PRIVATE_SCENES = ":other", ":private"  # no scene can have these names
 _POSES = (1, 2, 4, 8, 16, 32, 64, 128, 256, 512, 1024)
 
 
@@ -218,7 +218,9 @@ def _role() -> str:
 
 
 class Metrics:
-    def __init__(self) -> None:
+    def __init__(self, is_private: Callable[[str], bool]) -> None:
+        """`is_private`: whether a scene has an owner who keeps it to themselves, so that nobody reads its name here."""
+        self._is_private = is_private
         self.registry = CollectorRegistry()
         self.statistics = Statistics()
         counter = partial(Counter, registry=self.registry)
@@ -295,7 +297,9 @@ class Metrics:
         self._search.observe(result.search_ms / 1000)
 
     def _label_of(self, scene: str) -> str:
-        """The name of a scene; OTHER_SCENES once so many had a label that more would fill the memory."""
+        """The name of a public scene; OTHER_SCENES once so many had a label that more would fill the memory."""
+        if self._is_private(scene):
+            return PRIVATE_SCENES
         if scene not in self._scenes:
             if len(self._scenes) == MAX_SCENE_LABELS:
                 return OTHER_SCENES

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from itertools import pairwise
-from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from ultragray.datasets import Dataset, Sweep
+from ultragray.datasets import Dataset
 from ultragray.datasets.checks import check_dataset
 from ultragray.datasets.plus import read_plus_sweep
 from ultragray.errors import DatasetInvalid
@@ -20,7 +17,7 @@ ROWS, COLUMNS, FRAMES = 30, 20, 5
 CALIBRATION = np.array([[0.2, 0.0, 0, -3.0], [0.0, 0.0, 1, 1.0], [0.0, 0.1, 0, 2.0], [0, 0, 0, 1.0]])
 
 
-def rigid(seed: int) -> np.ndarray:
+def rigid(seed):
     random = np.random.default_rng(seed)
     pose = np.eye(4)
     pose[:3, :3] = rotations_of(random.normal(0, 1, (1, 3)))[0]
@@ -28,17 +25,17 @@ def rigid(seed: int) -> np.ndarray:
     return pose
 
 
-def crop_of(left: float, top: float, scale: tuple[float, float] = (1.0, 1.0)) -> np.ndarray:
+def crop_of(left, top, scale=(1.0, 1.0)):
     matrix = np.diag([*scale, 1.0, 1.0])
     matrix[:2, 3] = -left * scale[0], -top * scale[1]
     return matrix
 
 
 @pytest.fixture
-def record(tmp_path: Path, plus_files: SimpleNamespace) -> Callable[..., Path]:
+def record(tmp_path, plus_files):
     """Write a sequence whose frames have these transforms: one matrix, or one a frame (None: missing)."""
 
-    def write(transforms: dict[str, object], name: str = "s.mha", count: int = FRAMES, **fields: str) -> Path:
+    def write(transforms, name="s.mha", count=FRAMES, **fields):
         written = {"UltrasoundImageOrientation": "MF"}
         for key, given in transforms.items():
             matrices = given if isinstance(given, list) else [given] * count
@@ -47,17 +44,17 @@ def record(tmp_path: Path, plus_files: SimpleNamespace) -> Callable[..., Path]:
                     written[f"Seq_Frame{frame:04d}_{key}Transform"] = plus_files.numbers(matrix)
                     written[f"Seq_Frame{frame:04d}_{key}TransformStatus"] = "OK"
         stored = plus_files.speckle(count, ROWS, COLUMNS)
-        path: Path = plus_files.write_mha(tmp_path / name, stored, {**written, **fields})
+        path = plus_files.write_mha(tmp_path / name, stored, {**written, **fields})
         return path
 
     return write
 
 
 @pytest.fixture
-def describe(tmp_path: Path, plus_files: SimpleNamespace) -> Callable[..., Path]:
+def describe(tmp_path, plus_files):
     """Write a device set."""
 
-    def write(transforms: dict[tuple[str, str], np.ndarray], others: str = "") -> Path:
+    def write(transforms, others=""):
         lines = [
             f'<Transform From="{a}" To="{b}" Matrix="{plus_files.numbers(m)}"/>' for (a, b), m in transforms.items()
         ]
@@ -74,17 +71,17 @@ def describe(tmp_path: Path, plus_files: SimpleNamespace) -> Callable[..., Path]
 TRACKED = [rigid(10 + frame) for frame in range(FRAMES)]
 
 
-def plus_translation(x_mm: float) -> np.ndarray:
+def plus_translation(x_mm):
     matrix = np.eye(4)
     matrix[0, 3] = x_mm
     return matrix
 
 
-def top_centres(transforms: list[np.ndarray], columns: int = COLUMNS) -> np.ndarray:
+def top_centres(transforms, columns=COLUMNS):
     return np.array([(transform @ ((columns - 1) / 2, -0.5, 0, 1))[:3] for transform in transforms])
 
 
-def test_a_recording_that_plus_cropped_is_the_crop_of_the_whole_one(record: Callable[..., Path]) -> None:
+def test_a_recording_that_plus_cropped_is_the_crop_of_the_whole_one(record):
     """PLUS writes ImageToCroppedImage into every frame that its tool crops."""
     whole = record({"ImageToProbe": CALIBRATION, "ProbeToTracker": TRACKED}, "whole.mha")
     expected, _ = read_plus_sweep(whole, crop="4:14,6:26")
@@ -115,7 +112,7 @@ def test_a_recording_that_plus_cropped_is_the_crop_of_the_whole_one(record: Call
     ],
     ids=lambda transforms: next(iter(transforms)),
 )
-def test_every_frame_of_pixels_takes_part(record: Callable[..., Path], transforms: dict[str, np.ndarray]) -> None:
+def test_every_frame_of_pixels_takes_part(record, transforms):
     path = record({"ImageToProbe": CALIBRATION, "ProbeToTracker": TRACKED, **transforms})
     sweep, _ = read_plus_sweep(path)
     to_image = np.eye(4)
@@ -127,7 +124,7 @@ def test_every_frame_of_pixels_takes_part(record: Callable[..., Path], transform
     assert sweep.chain.left_out == ()
 
 
-def test_what_is_no_frame_of_the_pixels_is_named(record: Callable[..., Path]) -> None:
+def test_what_is_no_frame_of_the_pixels_is_named(record):
     plain, _ = read_plus_sweep(record({"ImageToProbe": CALIBRATION, "ProbeToTracker": TRACKED}, "plain.mha"))
     path = record({"ImageToProbe": CALIBRATION, "ProbeToTracker": TRACKED, "ImageToMRImage": rigid(3)})
     sweep, _ = read_plus_sweep(path)
@@ -138,9 +135,7 @@ def test_what_is_no_frame_of_the_pixels_is_named(record: Callable[..., Path]) ->
         read_plus_sweep(record({"ImageToProbe": CALIBRATION, "ProbeToTracker": TRACKED, **both}))
 
 
-def test_a_tracked_transform_goes_before_a_fixed_one_of_its_name(
-    record: Callable[..., Path], describe: Callable[..., Path]
-) -> None:
+def test_a_tracked_transform_goes_before_a_fixed_one_of_its_name(record, describe):
     path = record({"ProbeToTracker": TRACKED})
     expected, _ = read_plus_sweep(path, device_set=describe({("Image", "Probe"): CALIBRATION}))
     for pair in (("Probe", "Tracker"), ("Tracker", "Probe")):
@@ -159,9 +154,7 @@ def test_a_tracked_transform_goes_before_a_fixed_one_of_its_name(
     np.testing.assert_allclose(fixed.poses, np.linalg.inv(rigid(2)) @ expected.poses, atol=1e-9)
 
 
-def test_a_calibration_of_the_device_set_goes_before_that_of_the_sequence(
-    record: Callable[..., Path], describe: Callable[..., Path]
-) -> None:
+def test_a_calibration_of_the_device_set_goes_before_that_of_the_sequence(record, describe):
     other = CALIBRATION.copy()
     other[0, 3] += 7.0
     path = record({"ImageToProbe": other, "ProbeToTracker": TRACKED})
@@ -172,7 +165,7 @@ def test_a_calibration_of_the_device_set_goes_before_that_of_the_sequence(
     assert "origins 7 mm apart" in told
 
 
-def test_transforms_in_some_frames_only(record: Callable[..., Path]) -> None:
+def test_transforms_in_some_frames_only(record):
     reference = [rigid(1), None, rigid(1), rigid(2), None]
     once = [CALIBRATION, None, None, None, None]
     sweep, _ = read_plus_sweep(
@@ -185,7 +178,7 @@ def test_transforms_in_some_frames_only(record: Callable[..., Path]) -> None:
     assert "left out: 1, 4 (2 in all: ReferenceToTracker missing in 2)" in "".join(sweep.notes)
 
 
-def test_another_way_that_leads_elsewhere_is_named(record: Callable[..., Path]) -> None:
+def test_another_way_that_leads_elsewhere_is_named(record):
     direct = [pose @ CALIBRATION for pose in TRACKED]
     transforms = {"ImageToProbe": CALIBRATION, "ProbeToTracker": TRACKED}
     agreeing, _ = read_plus_sweep(record({**transforms, "ImageToTracker": direct}))
@@ -199,7 +192,7 @@ def test_another_way_that_leads_elsewhere_is_named(record: Callable[..., Path]) 
 
 
 @pytest.mark.parametrize("word", ["INVALID", "MISSING", "OUT_OF_VIEW", "OUT_OF_VOLUME", "REQ_TIMEOUT", "SWITCH1_IS_ON"])
-def test_status_words_are_named(record: Callable[..., Path], word: str) -> None:
+def test_status_words_are_named(record, word):
     path = record(
         {"ImageToProbe": CALIBRATION, "ProbeToTracker": TRACKED},
         Seq_Frame0002_ProbeToTrackerTransformStatus=word,
@@ -209,12 +202,11 @@ def test_status_words_are_named(record: Callable[..., Path], word: str) -> None:
     assert f"left out: 2 (1 in all: ProbeToTracker {word} in 1)" in sweep.notes[0]
 
 
+ONES = "1 0 0 0 0 1 0 0 0 0 1 0 0 0 0 1"
 CLIP = '<VolumeReconstruction ClipRectangleOrigin="{}" ClipRectangleSize="{}"/>'
 
 
-def test_the_rectangle_of_the_device_set_is_the_crop(
-    record: Callable[..., Path], describe: Callable[..., Path]
-) -> None:
+def test_the_rectangle_of_the_device_set_is_the_crop(record, describe):
     path = record({"ProbeToTracker": TRACKED})
     calibration = {("Image", "Probe"): CALIBRATION}
     xml = describe(calibration, CLIP.format("4 6", "10 20"))
@@ -246,16 +238,30 @@ def test_the_rectangle_of_the_device_set_is_the_crop(
         (1e3, r"set\.xml: ImageToProbe makes a pixel 200 x 100 mm"),
     ],
 )
-def test_a_calibration_that_no_image_has_is_named_with_its_file(
-    record: Callable[..., Path], describe: Callable[..., Path], scale: float, told: str
-) -> None:
+def test_a_calibration_that_no_image_has_is_named_with_its_file(record, describe, scale, told):
     matrix = CALIBRATION.copy()
     matrix[:3] *= scale
     with pytest.raises(DatasetInvalid, match=told):
         read_plus_sweep(record({"ProbeToTracker": TRACKED}), device_set=describe({("Image", "Probe"): matrix}))
 
 
-def test_a_depth_that_changes_on_the_way_is_told_with_frames_and_sizes(record: Callable[..., Path]) -> None:
+def test_a_device_set_that_contradicts_itself_is_refused(record, describe):
+    path, calibration = record({"ProbeToTracker": TRACKED}), {("Image", "Probe"): CALIBRATION}
+    agreeing = describe({**calibration, ("Probe", "Image"): np.linalg.inv(CALIBRATION)})
+    assert len(read_plus_sweep(path, device_set=agreeing)[0]) == FRAMES
+    other = CALIBRATION @ plus_translation(1.0)
+    twice = describe({**calibration, ("Probe", "Image"): np.linalg.inv(other)})
+    with pytest.raises(DatasetInvalid, match=r"set\.xml: it has ProbeToImage twice, with different matrices"):
+        read_plus_sweep(path, device_set=twice)
+    xml = describe(calibration)
+    xml.write_text(xml.read_text().replace("</Coord", f'<Transform From="Image" To="Probe" Matrix="{ONES}"/></Coord'))
+    with pytest.raises(DatasetInvalid, match=r"set\.xml: it has ImageToProbe twice, with different matrices"):
+        read_plus_sweep(path, device_set=xml)
+    sweep, _ = read_plus_sweep(path, device_set=describe({("Image", "Probe"): np.eye(4)}))
+    assert "ImageToProbe of set.xml is the identity: was the probe never calibrated?" in sweep.notes
+
+
+def test_a_depth_that_changes_on_the_way_is_told_with_frames_and_sizes(record):
     deeper = CALIBRATION @ np.diag([2.0, 2.0, 1.0, 1.0])
     path = record({"ImageToProbe": [CALIBRATION] * 3 + [deeper] * 2, "ProbeToTracker": TRACKED})
     with pytest.raises(
@@ -269,7 +275,7 @@ def test_a_depth_that_changes_on_the_way_is_told_with_frames_and_sizes(record: C
     assert len(read_plus_sweep(path, frames="0:3")[0]) == 3
 
 
-def test_names_in_the_header_are_told(record: Callable[..., Path]) -> None:
+def test_names_in_the_header_are_told(record):
     path = record({"ImageToProbe": CALIBRATION, "ProbeToTracker": TRACKED}, PatientName="Doe", OperatorComment="x")
     assert "its header names a person (PatientName): convert --anonymize" in "".join(read_plus_sweep(path)[0].notes)
 
@@ -277,16 +283,12 @@ def test_names_in_the_header_are_told(record: Callable[..., Path]) -> None:
 FRAMES_OF = ["Image", "TransducerOriginPixel", "TransducerOrigin", "Probe", "Holder", "Tracker", "Reference"]
 
 
-@pytest.mark.parametrize("seed", range(40))
-def test_random_chains_agree_with_their_product(
-    seed: int, record: Callable[..., Path], describe: Callable[..., Path]
-) -> None:
-    """Each link in the sequence or in the device set, either way round, tracked or fixed, with frames of no concern."""
-    random = np.random.default_rng(seed)
+def random_chain(random):
+    """Links in the sequence or in the device set, either way round, tracked or fixed: those of each, and the product of
+    each frame [4, 4]."""
     between = [name for name in FRAMES_OF[1:-2] if random.random() < 0.5 or name == "Probe"]
     frames = ["Image", *between, "Tracker", *(["Reference"] if random.random() < 0.5 else [])]
-    inside: dict[str, object] = {}
-    outside: dict[tuple[str, str], np.ndarray] = {}
+    inside, outside = {}, {}
     products = [np.eye(4) for _ in range(FRAMES)]
     for place, (origin, target) in enumerate(pairwise(frames)):
         is_tracked = origin == between[-1] or target == "Reference"
@@ -308,19 +310,31 @@ def test_random_chains_agree_with_their_product(
         inside["ImageToCroppedImage"] = crop
         products = [product @ np.linalg.inv(crop) for product in products]
     inside["StylusToTracker"] = rigid(5)
-    xml = describe({**outside, ("Phantom", "Table"): rigid(6)})
-    sweep, _ = read_plus_sweep(record(inside), device_set=xml)
-    assert np.abs(sweep.poses[:, :3, 3] - top_centres(products)).max() < 0.02
+    return inside, outside | {("Phantom", "Table"): rigid(6)}, products
+
+
+def check_poses(sweep, products, left=0, right=COLUMNS, top=0):
+    """Asserts that the poses are those of these products, at the top centre of the part of the image."""
     for pose, product in zip(sweep.poses, products, strict=True):
+        top_centre = product @ ((left + right - 1) / 2, top - 0.5, 0, 1)
+        assert np.abs(pose[:3, 3] - top_centre[:3]).max() < 0.02
         np.testing.assert_allclose(pose[:3, 0], product[:3, 0] / np.linalg.norm(product[:3, 0]), atol=1e-6)
         assert pose[:3, 2] @ product[:3, 1] == pytest.approx(np.linalg.norm(product[:3, 1]), rel=1e-6)
-    assert len(sweep.chain.links) == len(frames) - 1 + ("ImageToCroppedImage" in inside)
+    assert sweep.probe.width_mm == pytest.approx((right - left) * np.linalg.norm(products[0][:3, 0]), rel=1e-6)
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_random_chains_agree_with_their_product(seed, record, describe):
+    inside, outside, products = random_chain(np.random.default_rng(seed))
+    sweep, _ = read_plus_sweep(record(inside), device_set=describe(outside))
+    check_poses(sweep, products)
+    assert len(sweep.chain.links) == len(inside) + len(outside) - 2
     assert sweep.chain.left_out == ("PhantomToTable of set.xml", "StylusToTracker of s.mha")
     report = check_dataset(Dataset("s", sweep, sweep.select([])))
     assert report.chain == sweep.chain
 
 
-def test_the_chain_goes_with_frames_that_are_chosen(make_sweep: Callable[..., Sweep]) -> None:
+def test_the_chain_goes_with_frames_that_are_chosen(make_sweep):
     sweep = make_sweep(6, times_s=np.arange(6) / 10)
     chosen = sweep.select([1, 4])
     assert chosen.times_s is not None

@@ -1,4 +1,4 @@
-"""What a report says about a sweep, and what it warns of."""
+"""What a report says about a sweep and warns of, the voxels that its planes cross, and its picture."""
 
 import json
 import math

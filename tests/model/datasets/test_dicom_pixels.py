@@ -6,7 +6,6 @@ import io
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -26,7 +25,7 @@ SIZE = (96, 128)
 
 
 @pytest.fixture
-def write(tmp_path: Path) -> Write:
+def write(tmp_path):
     return partial(
         write_cine,
         tmp_path,
@@ -37,7 +36,7 @@ def write(tmp_path: Path) -> Write:
     )
 
 
-def echoes(seed: int = 0) -> np.ndarray:  # [10, 96, 128] smooth, black beside a sector
+def echoes(seed=0):  # [10, 96, 128] smooth, black beside a sector
     random = np.random.default_rng(seed)
     frames = random.integers(20, 235, (10, 12, 16)).astype(np.uint8)
     grown = np.stack([cv2.resize(frame, SIZE[::-1], interpolation=cv2.INTER_CUBIC) for frame in frames])
@@ -45,39 +44,39 @@ def echoes(seed: int = 0) -> np.ndarray:  # [10, 96, 128] smooth, black beside a
     return grown
 
 
-def with_flow(grey: np.ndarray) -> np.ndarray:  # [10, 96, 128, 3]
-    """The same in colour: a box of red and blue, as flow is shown, and grey elsewhere."""
+def with_flow(grey):  # [10, 96, 128, 3]
+    """The same in colour: a large box of red and blue, as flow is shown, and grey elsewhere."""
     colour = np.repeat(grey[..., None], 3, axis=-1)
-    colour[:, 30:50, 60:90] = (200, 30, 20)
-    colour[:, 50:60, 60:90] = (20, 40, 190)
+    colour[:, 20:50, 40:110] = (200, 30, 20)
+    colour[:, 50:80, 40:110] = (20, 40, 190)
     return colour
 
 
-def luma(colour: np.ndarray) -> np.ndarray:
+def luma(colour):
     return colour @ [0.299, 0.587, 0.114]
 
 
-def without_markers(stream: bytes) -> bytes:
+def without_markers(stream):
     """A JPEG stream without JFIF's marker, as many scanners write it."""
     length = int.from_bytes(stream[4:6], "big")
     assert stream[2:4] == b"\xff\xe0"
     return stream[:2] + stream[4 + length :]
 
 
-def ycbcr_jpeg(colour: np.ndarray, *, subsampled: bool = True) -> bytes:
+def ycbcr_jpeg(colour, *, subsampled=True):
     out = io.BytesIO()
     Image.fromarray(colour).save(out, "JPEG", quality=98, subsampling=2 if subsampled else 0)
     return out.getvalue()
 
 
-def rgb_jpeg(colour: np.ndarray) -> bytes:
+def rgb_jpeg(colour):
     """RGB as it is, named so by Adobe's marker."""
     out = io.BytesIO()
     Image.fromarray(colour).save(out, "JPEG", quality=98, keep_rgb=True, subsampling=0)
     return out.getvalue()
 
 
-def without_adobe(stream: bytes) -> bytes:
+def without_adobe(stream):
     """RGB that nothing names: neither a marker nor the components, which are 1, 2 and 3."""
     place = stream.find(b"\xff\xee")
     if place >= 0:
@@ -92,7 +91,7 @@ def without_adobe(stream: bytes) -> bytes:
     return stream
 
 
-STREAMS: dict[str, Callable[[np.ndarray], bytes]] = {
+STREAMS = {
     "YCbCr with JFIF": ycbcr_jpeg,
     "YCbCr bare": lambda frame: without_markers(ycbcr_jpeg(frame)),
     "YCbCr bare, not subsampled": lambda frame: without_markers(ycbcr_jpeg(frame, subsampled=False)),
@@ -132,11 +131,10 @@ def compressed(path, syntax):
 
 
 COLOUR = {"SamplesPerPixel": 3, "PhotometricInterpretation": "RGB", "PlanarConfiguration": 0}
-SYNTAXES = ("JPEGLosslessProcess14", "JPEGLosslessProcess14_1", "JPEGLSLossless", "JPEG2000Lossless", "RLELossless")
 
 
-@pytest.mark.parametrize("syntax", SYNTAXES)
-@pytest.mark.parametrize("bits", [8, 12, 16, 24])
+@pytest.mark.parametrize("syntax", ["JPEGLosslessProcess14_1", "JPEGLSLossless"])
+@pytest.mark.parametrize("bits", [8, 12, 24])
 def test_compressions_without_loss(write, syntax, bits):
     if bits == 24:
         described = {**COLOUR, "data": with_flow(echoes()).tobytes()}
@@ -158,7 +156,7 @@ def test_lossy_jpeg_of_12_bits_is_refused_in_words(write):
 
 
 @pytest.mark.parametrize("word", ["MONOCHROME1", "MONOCHROME2"])
-def test_grey_jpeg(write: Write, word: str) -> None:
+def test_grey_jpeg(write, word):
     grey = echoes()
     shown = 255 - grey if word == "MONOCHROME1" else grey
     data = encapsulate([cv2.imencode(".jpg", frame, [cv2.IMWRITE_JPEG_QUALITY, 98])[1].tobytes() for frame in grey])
@@ -167,7 +165,7 @@ def test_grey_jpeg(write: Write, word: str) -> None:
     assert np.abs(found.astype(int) - shown[[2, 7]]).mean() <= 1
 
 
-def test_a_stream_of_another_size_is_not_decoded(write: Write, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_stream_of_another_size_is_not_decoded(write, monkeypatch):
     large = cv2.imencode(".jpg", np.full((2000, 2000), 90, np.uint8))[1].tobytes()
     path = write(syntax=JPEGBaseline8Bit, data=encapsulate([large] * 10))
     monkeypatch.setattr(cv2, "imdecode", lambda *_: pytest.fail("it was decoded"))
@@ -177,7 +175,7 @@ def test_a_stream_of_another_size_is_not_decoded(write: Write, monkeypatch: pyte
 
 @pytest.mark.parametrize("word", ["RGB", "YBR_FULL"])
 @pytest.mark.parametrize("stored", ["RGB", "YBR_FULL"])
-def test_raw_colours_are_read_as_they_are(write: Write, word: str, stored: str) -> None:
+def test_raw_colours_are_read_as_they_are(write, word, stored):
     colour = with_flow(echoes())
     data = colour if stored == "RGB" else convert_color_space(colour, "RGB", "YBR_FULL")
     path = write(SamplesPerPixel=3, PhotometricInterpretation=word, PlanarConfiguration=0, data=data.tobytes())
@@ -187,8 +185,19 @@ def test_raw_colours_are_read_as_they_are(write: Write, word: str, stored: str) 
     assert np.abs(sweep.images - luma(right)[[2, 7]]).max() <= 1
 
 
+def test_pixels_that_share_their_colours_are_refused(write):
+    """As PS3.3 C.7.6.3.1.2 stores YBR_FULL_422: pydicom would take the bytes of one frame for those of another."""
+    lumas, blue, red = np.moveaxis(convert_color_space(with_flow(echoes()), "RGB", "YBR_FULL"), -1, 0)
+    data = np.stack([lumas[..., ::2], lumas[..., 1::2], blue[..., ::2], red[..., ::2]], axis=-1)
+    path = write(
+        SamplesPerPixel=3, PhotometricInterpretation="YBR_FULL_422", PlanarConfiguration=0, data=data.tobytes()
+    )
+    with pytest.raises(DatasetInvalid, match="share their colours"):
+        load_dataset(path, SourceOptions(frames="0:3"))
+
+
 @pytest.mark.parametrize("planar", [0, 1])
-def test_planes_of_colour(write: Write, planar: int) -> None:
+def test_planes_of_colour(write, planar):
     colour = with_flow(echoes())
     data = colour if planar == 0 else colour.transpose(0, 3, 1, 2)
     path = write(
@@ -201,7 +210,7 @@ def test_planes_of_colour(write: Write, planar: int) -> None:
 
 
 @pytest.mark.parametrize("word", ["RGB", "YBR_RCT", "YBR_ICT"])
-def test_colour_jpeg_2000(write: Write, word: str) -> None:
+def test_colour_jpeg_2000(write, word):
     colour = with_flow(echoes())
     streams = []
     for frame in colour:
@@ -218,10 +227,10 @@ def test_colour_jpeg_2000(write: Write, word: str) -> None:
     assert np.abs(load_dataset(path).val.images - luma(pixel_array(path))[[2, 7]]).max() <= 1
 
 
-def test_a_palette(write: Write) -> None:
+def test_a_palette(write):
     indices = echoes()
     table = np.random.default_rng(1).integers(0, 256, (256, 3))
-    luts: dict[str, Any] = {}
+    luts = {}
     for channel, name in enumerate(("Red", "Green", "Blue")):
         luts[f"{name}PaletteColorLookupTableDescriptor"] = [256, 0, 16]
         luts[f"{name}PaletteColorLookupTableData"] = (table[:, channel].astype("<u2") * 257).tobytes()
@@ -229,7 +238,7 @@ def test_a_palette(write: Write) -> None:
     assert np.abs(load_dataset(path).val.images - luma(table[indices])[[2, 7]]).max() <= 1
 
 
-def test_more_bits_are_made_eight(write: Write) -> None:
+def test_more_bits_are_made_eight(write):
     stored = echoes().astype(np.uint16) * 16 + 5
     path = write(BitsAllocated=16, BitsStored=12, HighBit=11, data=stored.astype("<u2").tobytes())
     sweep = load_dataset(path).val
@@ -237,11 +246,11 @@ def test_more_bits_are_made_eight(write: Write) -> None:
     assert "pixels of 12 bits were made 8: 4095 became 255" in sweep.notes
 
 
-SMALL: dict[str, Any] = {"Rows": FRAMES.shape[1], "Columns": FRAMES.shape[2], "PixelSpacing": None}
+SMALL = {"Rows": FRAMES.shape[1], "Columns": FRAMES.shape[2], "PixelSpacing": None}
 
 
 @pytest.mark.parametrize("end", [{"RegionLocationMaxX1": 32}, {"RegionLocationMaxY1": 24}])
-def test_a_region_that_ends_one_pixel_beyond_is_clipped_by_it(write: Write, end: dict[str, int]) -> None:
+def test_a_region_that_ends_one_pixel_beyond_is_clipped_by_it(write, end):
     whole = {"RegionLocationMaxX1": 31, "RegionLocationMaxY1": 23}
     expected = load_dataset(write(**SMALL, SequenceOfUltrasoundRegions=[region(**whole)]))
     found = load_dataset(write(**SMALL, SequenceOfUltrasoundRegions=[region(**{**whole, **end})]))
@@ -251,7 +260,7 @@ def test_a_region_that_ends_one_pixel_beyond_is_clipped_by_it(write: Write, end:
     assert not expected.val.notes
 
 
-def test_several_regions_are_listed_and_one_is_chosen_by_a_crop(write: Write) -> None:
+def test_several_regions_are_listed_and_one_is_chosen_by_a_crop(write):
     left, right = region(RegionLocationMaxX1=13), region(RegionLocationMinX0=16, PhysicalDeltaX=0.1)
     path = write(**SMALL, SequenceOfUltrasoundRegions=[left, right])
     with pytest.raises(DatasetInvalid, match=r"one with crop: 4:14,2:22 \(pixels .*; 16:24,2:22 \(pixels of 1 x"):
@@ -269,7 +278,7 @@ def test_several_regions_are_listed_and_one_is_chosen_by_a_crop(write: Write) ->
 
 
 @pytest.mark.parametrize("kind", ["null", "NaN"])
-def test_a_frame_without_a_pose_is_left_out_and_named(write: Write, tmp_path: Path, kind: str) -> None:
+def test_a_frame_without_a_pose_is_left_out_and_named(write, tmp_path, kind):
     path = write(
         data=echoes().tobytes(),
         poses=None if kind == "null" else np.where(np.isin(np.arange(10), [3, 7])[:, None, None], np.nan, POSES),
@@ -284,7 +293,7 @@ def test_a_frame_without_a_pose_is_left_out_and_named(write: Write, tmp_path: Pa
     np.testing.assert_array_equal(sweep.val.images, echoes()[sweep.val.frame_numbers])
 
 
-def test_names_and_burnt_in_text_are_told(write: Write) -> None:
+def test_names_and_burnt_in_text_are_told(write):
     notes = load_dataset(write(data=echoes().tobytes(), PatientName="Doe^Jane", BurnedInAnnotation="YES")).train.notes
     assert "its header names a person (PatientName): convert --anonymize leaves it out" in notes
     assert any("BurnedInAnnotation YES" in note for note in notes)
@@ -294,7 +303,7 @@ def test_names_and_burnt_in_text_are_told(write: Write) -> None:
 TOP_CENTRE = np.array([0.0, 0.0, 0.0, 1.0])
 
 
-def test_a_delay_of_the_images_by_the_times_of_the_frames(write: Write) -> None:
+def test_a_delay_of_the_images_by_the_times_of_the_frames(write):
     path = write(data=echoes().tobytes(), FrameTime=40.0)
     found = load_dataset(path, SourceOptions(image_delay_ms="20"))
     numbers = [*found.train.frame_numbers, *found.val.frame_numbers]

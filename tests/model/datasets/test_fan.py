@@ -1,4 +1,4 @@
-"""Images of convex and phased probes on a screen, read as scan lines."""
+"""Named transforms and the way between frames; images of convex and phased probes, read as scan lines."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""Stored frames as grey uint8, crops and box resizing."""
+"""Stored frames as grey uint8, crops, box resizing, and poses from calibrated images."""
 
 from pathlib import Path
 

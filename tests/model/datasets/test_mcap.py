@@ -137,7 +137,10 @@ def test_the_time_of_writing_stands_for_a_stamp_that_is_missing(bag):
     track(bag, "/pose", ros.POSE, lambda pose, time_ns: pose_message(pose, 0))
     for number in range(COUNT):
         bag.write("/us/image", ros.IMAGE, image_message(image_at(number), 0), image_time_ns(number))
-    check_whole(load_dataset(bag.finish()))
+    dataset = load_dataset(bag.finish())
+    check_whole(dataset)
+    (told,) = dataset.train.notes
+    assert told == f"{COUNT} images have no stamp: taken for those of the time that they were written at"
 
 
 GREY = image_at(3)

@@ -1,4 +1,4 @@
-"""PLUS sequences: poses as the toolkit defines them, and everything a recording may hold."""
+"""PLUS sequences: poses as the toolkit defines them, everything a recording may hold, files that SimpleITK wrote."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""MetaImage sequences, as PLUS writes them and as they arrive damaged."""
+"""MetaImage and NRRD sequences as PLUS and 3D Slicer write them and as they arrive damaged; stored orientations."""
 
 import zlib
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Which frames train and which are held out."""
+"""Which frames train and which are held out, and how far image planes lie from each other."""
 
 import math
 

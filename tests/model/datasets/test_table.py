@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
-from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -25,10 +22,8 @@ CALIBRATION = np.array([[0.2, 0.0, 0.0, -6.0], [0.0, 0.0, 1.0, 0.5], [0.0, 0.25,
 
 
 @pytest.fixture
-def write(tmp_path: Path) -> Callable[..., Path]:
-    def write(
-        header: str, rows: np.ndarray, *, pictures: str = ".", names: str = "frame_{}.png", **calibration: Any
-    ) -> Path:
+def write(tmp_path):
+    def write(header, rows, *, pictures=".", names="frame_{}.png", **calibration):
         folder = tmp_path / "sweep"
         (folder / pictures).mkdir(parents=True, exist_ok=True)
         for number, frame in enumerate(FRAMES):
@@ -42,15 +37,15 @@ def write(tmp_path: Path) -> Callable[..., Path]:
     return write
 
 
-def quaternions() -> np.ndarray:  # [N, 4] w, x, y, z
+def quaternions():  # [N, 4] w, x, y, z
     return np.roll(TURNS.as_quat(), 1, axis=1)
 
 
-def table(*columns: np.ndarray) -> list[list[Any]]:
+def table(*columns):
     return [list(row) for row in np.concatenate([np.atleast_2d(one.T).T for one in columns], axis=1).tolist()]
 
 
-def check(folder: Path, options: SourceOptions | None = None, shift_s: float = 0.0) -> None:
+def check(folder, options=None, shift_s=0.0):
     dataset = load_dataset(folder, options)
     for part in (dataset.train, dataset.val):
         np.testing.assert_array_equal(part.images, FRAMES[part.frame_numbers])
@@ -68,9 +63,7 @@ def check(folder: Path, options: SourceOptions | None = None, shift_s: float = 0
 
 @pytest.mark.parametrize(("unit", "scale"), [("mm", 1.0), ("cm", 0.1), ("m", 0.001)])
 @pytest.mark.parametrize("is_in_name", [True, False])
-def test_positions_in_their_unit_and_quaternions(
-    write: Callable[..., Path], unit: str, scale: float, is_in_name: bool
-) -> None:
+def test_positions_in_their_unit_and_quaternions(write, unit, scale, is_in_name):
     suffix = f"_{unit}" if is_in_name else ""
     header = f"time,x{suffix},y{suffix},z{suffix},qw,qx,qy,qz"
     folder = write(
@@ -84,7 +77,7 @@ def test_positions_in_their_unit_and_quaternions(
 
 @pytest.mark.parametrize("order", ["ZYX", "XYZ", "xyz", "zyx", "YXZ", "ZXZ"[:2] + "Y"])
 @pytest.mark.parametrize("unit", ["deg", "rad"])
-def test_angles_in_their_order_and_unit(write: Callable[..., Path], order: str, unit: str) -> None:
+def test_angles_in_their_order_and_unit(write, order, unit):
     angles = TURNS.as_euler(order, degrees=unit == "deg")
     by_axis = np.empty_like(angles)
     for place, axis in enumerate(order.upper()):
@@ -93,14 +86,14 @@ def test_angles_in_their_order_and_unit(write: Callable[..., Path], order: str, 
     check(write(header, table(TIMES, PLACES, by_axis), euler_order=order))
 
 
-def test_turns_agree_with_another_library() -> None:
+def test_turns_agree_with_another_library():
     angles = np.array([0.3, -0.8, 1.2])
     for order in ("XYZ", "ZYX", "YZX", "xyz", "zxy"):
         theirs = Rotation.from_euler(order, [angles["XYZ".index(axis)] for axis in order.upper()]).as_matrix()
         np.testing.assert_allclose(rotation_of_angles(angles, order), theirs, atol=1e-12)
 
 
-def test_rows_name_their_pictures(write: Callable[..., Path], tmp_path: Path) -> None:
+def test_rows_name_their_pictures(write, tmp_path):
     rows = table(TIMES, PLACES, quaternions())
     named = [[*row, f"images/us{number}.jpg.png"] for number, row in enumerate(rows)]
     folder = write("time,x_mm,y_mm,z_mm,qw,qx,qy,qz,file", named, pictures="images", names="us{}.jpg.png")
@@ -110,7 +103,7 @@ def test_rows_name_their_pictures(write: Callable[..., Path], tmp_path: Path) ->
         load_dataset(folder)
 
 
-def test_poses_between_rows_at_the_times_of_pictures(write: Callable[..., Path]) -> None:
+def test_poses_between_rows_at_the_times_of_pictures(write):
     dense = np.linspace(TIMES[0] - 0.2, TIMES[-1] + 0.2, 60)
     share = (dense - TIMES[0]) / (TIMES[-1] - TIMES[0])
     places = share[:, None] * [4.0, 20.0, -3.0] + [100.0, -50.0, 30.0]
@@ -126,7 +119,7 @@ def test_poses_between_rows_at_the_times_of_pictures(write: Callable[..., Path])
     check(folder, SourceOptions(image_delay_ms="-35"), shift_s=-0.035)
 
 
-def test_rows_without_a_pose_are_left_out(write: Callable[..., Path]) -> None:
+def test_rows_without_a_pose_are_left_out(write):
     rows = table(TIMES, PLACES, quaternions())
     rows[4][1:4] = [None, None, None]
     rows[8][4] = "nan"
@@ -154,9 +147,7 @@ def test_rows_without_a_pose_are_left_out(write: Callable[..., Path]) -> None:
         ),
     ],
 )
-def test_what_cannot_be_used_is_one_clear_error(
-    write: Callable[..., Path], header: str, calibration: dict[str, Any], message: str | None
-) -> None:
+def test_what_cannot_be_used_is_one_clear_error(write, header, calibration, message):
     folder = write(header, table(TIMES, PLACES, quaternions()), **calibration)
     if message is None:  # any order of columns
         assert len(load_dataset(folder).train) > 0
@@ -165,14 +156,14 @@ def test_what_cannot_be_used_is_one_clear_error(
         load_dataset(folder)
 
 
-def test_pictures_that_do_not_go_with_it(write: Callable[..., Path]) -> None:
+def test_pictures_that_do_not_go_with_it(write):
     rows = table(TIMES, PLACES, quaternions())
     folder = write("time,x_mm,y_mm,z_mm,qw,qx,qy,qz", rows)
+    with pytest.raises(InvalidArgument, match="fan must be given without crop"):
+        load_dataset(folder, SourceOptions(crop="0:9,0:9", fan="60,40,90,1,1"))
     cv2.imwrite(str(folder / "frame_5.png"), FRAMES[5][:20])
     with pytest.raises(DatasetInvalid, match=r"frame_5\.png: it has 60 x 20 pixels, frame_0\.png 60 x 40"):
         load_dataset(folder)
     (folder / "frame_5.png").write_bytes(b"no picture")
     with pytest.raises(DatasetInvalid, match=r"frame_5\.png: it cannot be read as a picture"):
         load_dataset(folder)
-    with pytest.raises(InvalidArgument, match="fan must be given without crop"):
-        load_dataset(folder, SourceOptions(crop="0:9,0:9", fan="60,40,90,1,1"))

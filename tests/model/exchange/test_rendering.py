@@ -100,15 +100,6 @@ def test_a_least_confidence_holds_for_what_a_frame_says_of_itself(thin, tmp_path
             assert (pixels[some < SUPPORT_COVERAGE] == 0.0).all() == (confidence < 0.5)
 
 
-def test_what_is_stopped_leaves_nothing(tmp_path, random_scene):
-    def stop(done):
-        raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        written(tmp_path / "frames.npz", random_scene(3), settings(Display()), before_portion=stop)
-    assert list(tmp_path.iterdir()) == []
-
-
 @pytest.mark.parametrize("failing", [1, len(CONFIDENCES)])
 def test_a_portion_that_cannot_be_written_ends_it_and_leaves_nothing(tmp_path, random_scene, monkeypatch, failing):
     portions = 0

@@ -44,8 +44,8 @@ class Keyed:
 
 
 @pytest.fixture(scope="module")
-def keyed(start_service, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("artifacts")
+def keyed(start_service, artifacts):
+    folder = artifacts
     database = JobDatabase(folder, None)
     store = KeyStore(database.engine)
     keys = {"nobody": None, "wrong": "ultragray_" + 43 * "0"}

@@ -1,11 +1,13 @@
 """The audit log of a service at work, and streams that end with their key."""
 
 import json
+import threading
 import time
 
 import grpc
 import httpx
 import pytest
+from grpc_reflection.v1alpha import reflection_pb2, reflection_pb2_grpc
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 
@@ -183,11 +185,21 @@ def test_streams_and_watches_end_with_their_key(start_service, tmp_path, databas
     with service.channel() as channel, connect(address, additional_headers={"X-API-Key": key}) as socket:
         stub = jobs_pb2_grpc.JobServiceStub(channel)
         watch = stub.WatchJob(jobs_pb2.WatchJobRequest(job=job), metadata=(("x-api-key", key),))
-        next(watch)
+        over = threading.Event()
+
+        def asked():
+            yield reflection_pb2.ServerReflectionRequest(list_services="*")
+            over.wait(60)
+
+        reflection = reflection_pb2_grpc.ServerReflectionStub(channel).ServerReflectionInfo
+        names = reflection(asked(), metadata=(("x-api-key", key),))
+        next(watch), next(names)
         store.revoke("alice")
-        with pytest.raises(grpc.RpcError) as refused:
-            list(watch)
-        assert refused.value.code() is grpc.StatusCode.UNAUTHENTICATED
+        for call in (watch, names):
+            with pytest.raises(grpc.RpcError) as refused:
+                list(call)
+            assert refused.value.code() is grpc.StatusCode.UNAUTHENTICATED
+        over.set()
         with pytest.raises(ConnectionClosed) as closed:
             socket.recv(timeout=60)
         assert (closed.value.rcvd.code, closed.value.rcvd.reason) == (1008, "UNAUTHENTICATED")

@@ -12,7 +12,6 @@ from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.tables import OWNERS
 
 from ...waiting import wait_until
-from ..conftest import DEMO_PROBE, make_scene
 
 
 @pytest.fixture(scope="module")
@@ -61,32 +60,6 @@ def dataset(keyed, dataset_bytes):
     answer = keyed.http("alice", "PUT", "/v1/datasets/common", content=dataset_bytes)
     assert answer.status_code == 201, answer.text
     return "common"
-
-
-@pytest.fixture(scope="module")
-def other_scene_bytes(tmp_path_factory):
-    path = tmp_path_factory.mktemp("scene") / "scene.ugr"
-    make_scene(30, seed=6, probe=DEMO_PROBE).save(path)
-    return path.read_bytes()
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("is_same_content", [False, True])
-@pytest.mark.parametrize("private", ["false", "true"])
-def test_a_slow_import_takes_nobodys_scene_over(
-    keyed, database, scene_bytes, other_scene_bytes, private, is_same_content
-):
-    name = f"liver-{private}-{is_same_content}"
-    path = f"/v1/scenes/{name}?private={private}"
-    with held_back(keyed, "bob", path, scene_bytes if is_same_content else other_scene_bytes) as late:
-        assert keyed.http("alice", "PUT", path, content=scene_bytes).status_code == 201
-    assert (late.result().status_code, late.result().json()["reason"]) == (409, "SCENE_EXISTS")
-    assert owner_of(database, "scene", name) == "alice"
-    seen = keyed.http("alice", "GET", path).json()
-    assert (seen["owner"], seen["private"]) == ("alice", private == "true")
-    assert keyed.http("bob", "GET", path).status_code == (404 if private == "true" else 200)
-    assert keyed.http("bob", "DELETE", path).status_code == (404 if private == "true" else 403)
-    assert keyed.http("alice", "DELETE", path).status_code == 204
 
 
 def test_a_slow_import_takes_no_training_over(keyed, database, dataset, scene_bytes):

@@ -12,6 +12,8 @@ import httpx
 import pytest
 import sqlalchemy as sa
 from grpc_health.v1 import health_pb2, health_pb2_grpc
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
 
 from ultragray.errors import InvalidArgument
 from ultragray_proto.v1 import access_pb2, access_pb2_grpc
@@ -139,6 +141,15 @@ def test_subprotocols_that_are_none_are_refused_with_a_problem(guarded, offered,
     head = answer.partition(b"\r\n\r\n")[0].lower()
     assert head.startswith(b"http/1.1 %d " % status)
     assert b"content-type: application/problem+json" in head
+
+
+def test_a_page_sends_its_key_as_a_subprotocol(guarded):
+    with pytest.raises(InvalidStatus) as refused, connect(guarded.stream_url()):
+        pass
+    assert refused.value.response.status_code == 401
+    offered = "ultragray.key." + base64.urlsafe_b64encode(KEY.encode()).decode().rstrip("=")
+    with connect(guarded.stream_url(), subprotocols=["ultragray.v1", offered]) as connection:
+        assert connection.subprotocol == "ultragray.v1"
 
 
 def test_health_lists_every_service_without_a_key(guarded):

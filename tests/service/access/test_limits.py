@@ -180,8 +180,8 @@ class Limited:
 
 
 @pytest.fixture(scope="module")
-def limited(start_service, tmp_path_factory):
-    folder = tmp_path_factory.mktemp("artifacts")
+def limited(start_service, artifacts):
+    folder = artifacts
     database = JobDatabase(folder, None)
     store = KeyStore(database.engine)
     keys = {name: store.create(name, Role.OPERATOR, None, read_limits([limit]))[1] for name, limit in LIMITS.items()}

@@ -6,7 +6,6 @@ import hmac
 import json
 import threading
 import time
-from concurrent.futures import ThreadPoolExecutor
 from contextlib import asynccontextmanager
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
@@ -20,16 +19,13 @@ from jwt.algorithms import ECAlgorithm, OKPAlgorithm, RSAAlgorithm
 from ultragray.errors import InvalidArgument, UltragrayError
 from ultragray_client import Client
 from ultragray_service.access import oidc as issuer_module
-from ultragray_service.access.keys import KeyStore
 from ultragray_service.access.oidc import LEEWAY_S, MAX_TOKEN_BYTES, claim_at, parse_roles
 from ultragray_service.access.principals import Role
 from ultragray_service.errors import IssuerUnavailable
 from ultragray_service.settings import load_settings
 from ultragray_service.wiring import oidc_tokens
-from ultragray_workers.jobs.database import JobDatabase
 
 from ...waiting import Deadline, wait_until
-from .conftest import MATRIX
 
 AUDIENCE = "ultragray"
 _KINDS = {
@@ -427,63 +423,6 @@ def test_a_token_opens_both_doors(guarded, issuer):
         assert client.scenes.list()
         with pytest.raises(Exception, match="UNAUTHENTICATED: the token has expired"):
             client.scenes.list()
-
-
-@pytest.mark.long
-def test_an_issuer_that_is_away_shuts_out_only_its_tokens(start_service):
-    issuer = IdentityProvider()
-    issuer.add_key("one")
-    issuer.up = False
-    try:
-        service = start_service(**issuer.settings(), api_keys=KEY)
-        assert ask(service, KEY).status_code == 200
-        refused = ask(service, issuer.token())
-        assert (refused.status_code, refused.json()["reason"]) == (503, "ISSUER_UNAVAILABLE")
-        assert int(refused.headers["retry-after"]) >= 1
-        assert identity_provider(service) == "unavailable"
-        wait_until(lambda: any("cannot be checked" in record["message"] for record in service.log()))
-        issuer.up = True
-        wait_until(lambda: ask(service, issuer.token()).status_code == 200)
-        assert identity_provider(service) == "available"
-    finally:
-        issuer.close()
-
-
-@pytest.mark.long
-def test_a_rotation_of_keys_leaves_sessions_and_their_revocation_alone(start_service, tmp_path):
-    issuer = IdentityProvider()
-    issuer.add_key("one")
-    database = JobDatabase(tmp_path, None)
-    store = KeyStore(database.engine)
-    _, bob = store.create("bob", Role.OPERATOR, None)
-    try:
-        service = start_service(**issuer.settings(), artifact_folder=tmp_path)
-        wait_until(lambda: identity_provider(service) == "available")
-        with ThreadPoolExecutor() as threads, httpx.Client(base_url=service.http, timeout=None) as client:
-            body = {"kind": "render", "specification": {"scene": "demo", "poses": [MATRIX]}}
-            job = client.post("/v1/jobs", json=body, headers={"X-API-Key": bob}).json()["id"]  # no worker takes it
-            opened = []
-
-            def watch(credential):
-                headers = {"Authorization": f"Bearer {credential}"}
-                with client.stream("GET", f"/v1/jobs/{job}/events", headers=headers) as events:
-                    opened.append(credential)
-                    with pytest.raises(httpx.RemoteProtocolError):  # cut
-                        events.read()
-
-            of_token = threads.submit(watch, issuer.token("one"))
-            of_key = threads.submit(watch, bob)
-            wait_until(lambda: len(opened) == 2)
-            issuer.add_key("two")
-            issuer.remove_key("one")
-            wait_until(lambda: ask(service, issuer.token("two")).status_code == 200)
-            assert not of_key.done()
-            store.revoke("bob")
-            of_key.result(60)
-            of_token.result(60)  # its key is gone for good
-    finally:
-        database.close()
-        issuer.close()
 
 
 def test_the_page_is_told_where_people_sign_in(start_service):

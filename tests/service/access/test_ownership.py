@@ -1,27 +1,24 @@
 """What is private is not there for others, at any door; what is not can be read by all, and changed by its owner."""
 
+import json
 import time
-from functools import partial
 
 import grpc
 import pytest
 import sqlalchemy as sa
+from websockets.exceptions import InvalidStatus
+from websockets.sync.client import connect
 
-from ultragray_proto.v1 import (
-    geometry_pb2,
-    jobs_pb2,
-    jobs_pb2_grpc,
-    rendering_pb2,
-    rendering_pb2_grpc,
-    scenes_pb2,
-    scenes_pb2_grpc,
-)
+from ultragray_proto.v1 import geometry_pb2, rendering_pb2
+from ultragray_service.access.rules import GRPC_OPERATIONS, WEBSOCKET, HttpRules
 from ultragray_workers.jobs.database import JobDatabase
+from ultragray_workers.jobs.owners import Kind
 from ultragray_workers.jobs.tables import WORKERS
 
 from ...waiting import wait_until
 from .conftest import MATRIX, POSE
 from .test_audit import entries
+from .test_matrix import call
 
 
 @pytest.fixture(scope="module")
@@ -31,6 +28,8 @@ def private(keyed, scene_bytes, dataset_bytes):
     assert (answer.status_code, answer.json()["owner"], answer.json()["private"]) == (201, "alice", True)
     answer = keyed.http("alice", "PUT", "/v1/datasets/secret?private=true", content=dataset_bytes)
     assert (answer.status_code, answer.json()["owner"], answer.json()["private"]) == (201, "alice", True)
+    registration = {"scene": "secret", "base_to_scene": MATRIX}
+    assert keyed.http("alice", "PUT", "/v1/registrations/secret", json=registration).status_code == 200
     answer = keyed.submit("alice", private=True, scene="secret")
     assert (answer.status_code, answer.json()["owner"], answer.json()["private"]) == (201, "alice", True)
     return str(answer.json()["id"])
@@ -42,7 +41,8 @@ def names(keyed, who, what):
 
 
 def test_lists_leave_out_what_others_keep_to_themselves(keyed, private):
-    for what, name in {"scenes": "secret", "datasets": "secret", "jobs": private}.items():
+    for what in ("scenes", "datasets", "registrations", "jobs"):
+        name = private if what == "jobs" else "secret"
         seen = {who: name in names(keyed, who, what) for who in ("alice", "admin", "bob", "reader")}
         assert seen == {"alice": True, "admin": True, "bob": False, "reader": False}, what
 
@@ -62,45 +62,51 @@ def test_a_page_of_jobs_is_full_though_others_are_left_out(keyed):
     assert everything == [job["id"] for job in keyed.http("bob", "GET", "/v1/jobs").json()["jobs"]]
 
 
-ROUTES = [
-    ("GET", "/v1/scenes/{name}", None),
-    ("GET", "/v1/scenes/{name}/file", None),
-    ("GET", "/v1/scenes/{name}/gaussians", None),
-    ("GET", "/v1/scenes/{name}/training-poses", None),
-    ("GET", "/v1/scenes/{name}/comparison", None),
-    ("POST", "/v1/scenes/{name}/render", {"pose": POSE}),
-    ("POST", "/v1/scenes/{name}:load", None),
-    ("POST", "/v1/scenes/{name}:unload", None),
-    ("DELETE", "/v1/scenes/{name}", None),
-    ("GET", "/v1/datasets/{name}", None),
-    ("GET", "/v1/datasets/{name}/contact-sheet", None),
-    ("GET", "/v1/datasets/{name}/poses", None),
-    ("GET", "/v1/datasets/{name}/frames/train/0", None),
-    ("DELETE", "/v1/datasets/{name}", None),
+BODIES = {
+    "render": {"pose": POSE},
+    "slice": {"origin_mm": [0, 0, 0], "size_mm": [1, 1]},
+    "scene}:localize": {"image": "", "start": POSE},
+    "scene}:assess": {"poses": [POSE]},
+}
+NAMING = [
     ("POST", "/v1/jobs", {"kind": "train", "specification": {"dataset": "{name}", "scene": "mine"}}),
     ("POST", "/v1/jobs", {"kind": "render", "specification": {"scene": "{name}", "poses": [MATRIX]}}),
+    ("POST", "/v1/jobs", {"kind": "evaluate", "specification": {"scene": "{name}", "dataset": "{name}"}}),
+    ("POST", "/v1/jobs", {"kind": "compare", "specification": {"dataset": "{name}"}}),
+    ("POST", "/v1/jobs", {"kind": "voxelize", "specification": {"scene": "{name}", "spacing_mm": 1}}),
+    ("POST", "/v1/jobs:estimate", {"kind": "render", "specification": {"scene": "{name}", "poses": [MATRIX]}}),
+    ("PUT", "/v1/registrations/mine", {"scene": "{name}", "base_to_scene": MATRIX}),
+    ("POST", "/v1/scenes/demo/render", {"pose": POSE, "registration": "{name}"}),
 ]
+PRIVATE = (Kind.SCENE, Kind.DATASET, Kind.REGISTRATION)
 
 
-@pytest.mark.parametrize(("method", "path", "body"), ROUTES)
-def test_private_things_answer_as_if_they_were_not_there(keyed, private, method, path, body):
+def requests_about(name):
+    """Of each route that a thing can be asked for by its name, and of those that take the name in their body."""
+    named = dict.fromkeys([kind.value for kind in PRIVATE], name) | {"index": 0, "what": "truth", "part": "train"}
+    for method, template, operation in HttpRules().routes():
+        if operation.about in PRIVATE and method not in ("PUT", WEBSOCKET):
+            body = next((one for end, one in BODIES.items() if template.endswith(end)), None)
+            yield method, template.format(**named), body
+    for method, path, body in NAMING:
+        yield method, path, json.loads(json.dumps(body).replace("{name}", name))
+
+
+def test_private_things_answer_at_every_route_as_if_they_were_not_there(keyed, private):
     def ask(name):
-        filled = None if body is None else filled_in(body, name)
-        answer = keyed.http("bob", method, path.format(name=name), json=filled)
-        document = {**answer.json(), "request_id": ""}
-        return answer.status_code, str(document).replace(name, "NAME")
+        for method, path, body in requests_about(name):
+            answer = keyed.http("bob", method, path, json=body)
+            yield f"{method} {path} {answer.status_code} {dict(answer.json(), request_id='')}".replace(name, "NAME")
 
-    status, text = ask("secret")
-    assert status == 404
-    assert (status, text) == ask("absent")
+    told = list(ask("secret"))
+    assert told == list(ask("absent"))
+    assert not [one for one in told if " 404 " not in one]
 
 
-def filled_in(value, name):
-    if isinstance(value, dict):
-        return {key: filled_in(one, name) for key, one in value.items()}
-    if isinstance(value, list):
-        return [filled_in(one, name) for one in value]
-    return value.replace("{name}", name) if isinstance(value, str) else value
+def test_a_private_scene_has_no_stream_for_others(keyed, private):
+    with pytest.raises(InvalidStatus) as refused:
+        connect(keyed.service.stream_url("secret"), additional_headers=keyed.headers("bob"))
+    assert refused.value.response.status_code == 404
 
 
 JOB_ROUTES = [
@@ -151,26 +157,31 @@ def test_a_private_job_that_is_in_the_way_is_not_named(keyed, scene_bytes, datas
         assert keyed.http("alice", "POST", f"/v1/jobs/{job}:cancel").status_code == 200
 
 
-def test_over_grpc_too(keyed, private):
+def test_metrics_name_no_private_scene(keyed, private):
+    for _ in range(2):
+        assert keyed.http("alice", "POST", "/v1/scenes/secret/render", json={"pose": POSE}).status_code == 200
+    told = keyed.http("reader", "GET", "/metrics").text
+    assert 'ultragray_frames_total{role="operator",scene=":private"} 2.0' in told
+    assert "secret" not in told
+
+
+def test_private_things_answer_at_every_method_as_if_they_were_not_there(keyed, private):
     pose = geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=[float(one) for row in MATRIX for one in row]))
-    asked = rendering_pb2.RenderStreamRequest(settings=rendering_pb2.RenderSettings(scene="secret"), pose=pose)
+    plane = {"origin_mm": geometry_pb2.Position(), "size_mm": rendering_pb2.SliceSize(width=1, height=1)}
+    given = {"pose": pose, "start": pose, "poses": [pose], "slice": rendering_pb2.SliceSettings(**plane)}
+
+    def ask(channel, name, job):
+        things = {**given, **dict.fromkeys([kind.value for kind in PRIVATE], name), "job": job}
+        for method, operation in GRPC_OPERATIONS.items():
+            if operation.about in (*PRIVATE, Kind.JOB) and operation.name not in ("registration.put", "dataset.upload"):
+                told = call(channel, method, things, tuple(keyed.headers("bob").items()))
+                told = told.details() if isinstance(told, grpc.RpcError) else str(told)
+                yield f"{method} {told}".replace(name, "NAME").replace(job, "JOB")
+
     with keyed.service.channel() as channel:
-        scenes, jobs = scenes_pb2_grpc.SceneServiceStub(channel), jobs_pb2_grpc.JobServiceStub(channel)
-        renders = rendering_pb2_grpc.RenderServiceStub(channel)
-        for who, reason in (("alice", ""), ("bob", "SCENE_NOT_FOUND")):
-            metadata = tuple(keyed.headers(who).items())
-            for call in (
-                partial(scenes.GetScene, scenes_pb2.GetSceneRequest(scene="secret")),
-                partial(jobs.GetJob, jobs_pb2.GetJobRequest(job=private)),
-            ):
-                if who == "alice":
-                    call(metadata=metadata)
-                    continue
-                with pytest.raises(grpc.RpcError) as caught:
-                    call(metadata=metadata)
-                assert caught.value.code() is grpc.StatusCode.NOT_FOUND
-            (frame,) = renders.RenderStream(iter([asked]), metadata=metadata)
-            assert frame.error.reason == reason
+        told = list(ask(channel, "secret", private))
+        assert told == list(ask(channel, "absent", "0" * 24))
+    assert not [one for one in told if "there is no" not in one]
 
 
 def test_a_key_tells_whose_it_is(keyed):

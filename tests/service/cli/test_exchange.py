@@ -110,16 +110,6 @@ def test_convert_leaves_names_out(folder):
     assert np.load(output / "images_train.npy")[:, 2:5, 3:14].max() == 0
 
 
-def test_check_as_json(folder):
-    result = run("check", folder, "--json")
-    document = json.loads(result.output)
-    assert document["name"] == "tiny"
-    assert document["sha256"] == load_dataset(folder).sha256
-    assert document["train"]["step_median_mm"] == pytest.approx(1.0)
-    assert document["val"]["frames"] == 2
-    assert document["warnings"] == []
-
-
 def test_bad_data_is_one_line_and_exit_code_two(folder):
     images = np.load(folder / "images_train.npy")
     images[3] = 0

@@ -22,9 +22,8 @@ from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.scenes import SceneStore
 
 from ...waiting import wait_until
+from ...workers.jobs.conftest import store_dataset
 from ..conftest import ROOT, SOURCE_FOLDERS
-from ..http.test_http_datasets import zipped
-from .command_line import noise_sweep
 
 WAIT_S = 120.0
 KEY = "0123456789abcdef-jobs"
@@ -42,20 +41,15 @@ def done(server, *arguments):
 
 
 @pytest.fixture(scope="module")
-def server(start_service, tmp_path_factory):
-    return start_service(
-        artifact_folder=tmp_path_factory.mktemp("artifacts"), embedded_worker=True, training_threads=1, api_keys=KEY
-    )
+def server(start_service, artifacts):
+    """A service with a worker, which holds the dataset `tiny`."""
+    store_dataset(artifacts, "tiny")
+    return start_service(artifact_folder=artifacts, embedded_worker=True, training_threads=1, api_keys=KEY)
 
 
 @pytest.fixture(scope="module")
-def client(server, tmp_path_factory):
-    """Knows the service, which holds the dataset `tiny`."""
+def client(server):
     with httpx.Client(base_url=server.http, headers={"X-API-Key": KEY}, timeout=WAIT_S) as client:
-        folder = noise_sweep(tmp_path_factory.mktemp("sweep") / "tiny")
-        content = zipped({path.name: path.read_bytes() for path in folder.iterdir()})
-        stored = client.put("/v1/datasets/tiny", content=content, headers={"Content-Type": "application/zip"})
-        assert stored.status_code == 201, stored.text
         yield client
 
 
@@ -70,39 +64,6 @@ def test_a_job_that_no_worker_can_take_is_submitted_with_a_warning(server):
     assert " ".join(result.stderr.split()).startswith(f"warning: {job} waits for {wanted}")
     assert told["progress"]["waits_for"].startswith(wanted)
     done(server, "cancel", job)
-
-
-def test_a_scene_is_trained_watched_and_served(server, client, tmp_path):
-    settings = ("--set", "steps=12", "--set", "max_gaussians=60", "--device", "cpu")
-    options = (*settings, "--request-id", "first", "--wait")
-    result = run(server, "submit", "train", "tiny", "--scene", "trained", *options)
-    assert result.exit_code == 0, result.output
-    job, summary = result.stdout.splitlines()
-    assert summary.startswith(f"{job} succeeded; psnr_db ")
-    assert f"{job} queued" in result.stderr or f"{job} running" in result.stderr
-    assert "12 of 12 steps" in result.stderr
-    assert client.get("/v1/scenes/trained").json()["gaussian_count"] == 60
-    told = client.get(f"/v1/jobs/{job}").json()
-    assert told["specification"]["settings"] == {"steps": 12, "max_gaussians": 60}
-    assert told["metrics"]["psnr_db"] > 0
-
-    assert done(server, "submit", "train", "tiny", "--scene", "trained", *options).splitlines()[0] == job
-    types = {name: client.get(f"/v1/jobs/{job}/artifacts/{name}").headers["content-type"] for name in told["artifacts"]}
-    assert types["training_curve.png"] == "image/png"
-    assert types["metrics.json"] == "application/json"
-    assert types["trained.ugr"] == "application/octet-stream"
-    curve = tmp_path / "curve.png"
-    done(server, "download", job, "training_curve.png", "-o", curve)
-    assert curve.read_bytes().startswith(b"\x89PNG")
-    assert [path.name for path in tmp_path.iterdir()] == ["curve.png"]
-    part = client.get(f"/v1/jobs/{job}/artifacts/training_curve.png", headers={"Range": "bytes=0-7"})
-    assert (part.status_code, part.content) == (206, curve.read_bytes()[:8])
-
-    events = client.get(f"/v1/jobs/{job}/events").text
-    log = done(server, "logs", job)
-    assert log
-    assert events.partition("\ndata: ")[2].startswith(log.splitlines()[0])
-    assert json.loads(events.rpartition("\ndata: ")[2])["state"] == "succeeded"
 
 
 def test_poses_of_a_file_become_an_archive(server, client, tmp_path):

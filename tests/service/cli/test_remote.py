@@ -17,8 +17,8 @@ KEY = "0123456789abcdef-remote"
 
 
 @pytest.fixture(scope="module")
-def server(start_service, tmp_path_factory):
-    return start_service(artifact_folder=tmp_path_factory.mktemp("artifacts"), api_keys=KEY)
+def server(start_service, artifacts):
+    return start_service(artifact_folder=artifacts, api_keys=KEY)
 
 
 def run(server, *arguments, key=KEY):
@@ -138,8 +138,10 @@ def test_a_large_upload_that_is_refused_at_once_tells_why(server, tmp_path):
 def test_a_registration_goes_up_and_is_listed_shown_and_deleted(server, tmp_path):
     base_to_scene = np.eye(4)
     base_to_scene[:3, 3] = (1.0, 2.0, 3.0)
-    np.save(tmp_path / "flange.npy", np.eye(4)[None])
-    np.save(tmp_path / "probe.npy", base_to_scene[None])
+    flange = np.tile(np.eye(4), (3, 1, 1))
+    flange[:, :3, 3] = np.diag([50.0, 60.0, 70.0])
+    np.save(tmp_path / "flange.npy", flange)
+    np.save(tmp_path / "probe.npy", base_to_scene @ flange)
     file = tmp_path / "robot.json"
     done(server, "calibrate", "poses", tmp_path / "flange.npy", tmp_path / "probe.npy", "-o", file)
     assert done(server, "registrations", "upload", file, "--scene", "demo") == "uploaded robot, of the scene demo\n"

@@ -138,11 +138,6 @@ def test_render_keeps_to_a_least_confidence(knowing_file, scene_file, tmp_path):
     assert kept.exit_code == 0, kept.output
     with np.load(tmp_path / "f.npz") as frames:
         np.testing.assert_array_equal(frames["poses"], poses[[0, 1, 2, 4]])
-    told = figure_arrays(Assessor(scene.info, scene.training_poses).assess(scene.training_poses))["confidence"]
-    some = run("render", knowing_file, "-o", tmp_path / "f.npz", "--force", "--min-confidence", np.median(told))
-    assert "wrote" in some.output
-    with np.load(tmp_path / "f.npz") as frames:
-        np.testing.assert_array_equal(frames["poses"], scene.training_poses[told >= np.median(told)])
     assert "needs a scene that knows" in refused("render", scene_file, *arguments[2:])
 
 

@@ -119,21 +119,16 @@ def refusal(server, **environment):
 
 
 def test_jobs_are_asked_over_tls(start_service, mounted, tmp_path):
-    service = start_service(**mounted.settings())
-    assert listed(service.http, ca=mounted.root).exit_code == 0
-    stranger = tmp_path / "stranger.pem"
-    trustme.CA().cert_pem.write_to_path(stranger)
-    assert "a certificate that is not to be trusted" in refusal(service.http, ca=stranger)
-    assert "name its authority with --ca" in refusal(service.http)
-    assert "if it speaks TLS, name it with https://" in refusal(service.http.replace("https", "http"))
-
-
-def test_mutual_tls(start_service, mounted, tmp_path):
     service = start_service(**mounted.settings(mutual=True))
     certificate, key = write_client(mounted.authority, tmp_path)
-    own = {"ca": mounted.root, "client_certificate": certificate, "client_key": key}
-    assert listed(service.http, **own).exit_code == 0
+    own = {"client_certificate": certificate, "client_key": key}
+    assert listed(service.http, ca=mounted.root, **own).exit_code == 0
+    stranger = tmp_path / "stranger.pem"
+    trustme.CA().cert_pem.write_to_path(stranger)
     assert "--client-certificate" in refusal(service.http, ca=mounted.root)
+    assert "a certificate that is not to be trusted" in refusal(service.http, ca=stranger, **own)
+    assert "name its authority with --ca" in refusal(service.http, **own)
+    assert "if it speaks TLS, name it with https://" in refusal(service.http.replace("https", "http"))
 
 
 def test_tls_to_a_service_without_it(service):

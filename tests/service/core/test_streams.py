@@ -1,7 +1,5 @@
 """Streams whose client or transport fails, and open streams and their watchers, without a door."""
 
-from __future__ import annotations
-
 import asyncio
 import gc
 

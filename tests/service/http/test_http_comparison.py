@@ -45,11 +45,6 @@ def scene_of(dataset, seed=3):
 
 
 @pytest.fixture(scope="module")
-def artifacts(tmp_path_factory):
-    return tmp_path_factory.mktemp("artifacts")
-
-
-@pytest.fixture(scope="module")
 def service(start_service, artifacts):
     return start_service(artifact_folder=artifacts)
 

@@ -24,11 +24,6 @@ WAIT_S = 120.0
 
 
 @pytest.fixture(scope="module")
-def artifacts(tmp_path_factory):
-    return tmp_path_factory.mktemp("artifacts")
-
-
-@pytest.fixture(scope="module")
 def jobs_service(start_service, artifacts):
     """A service without a worker: what is submitted waits."""
     return start_service(artifact_folder=artifacts)
@@ -52,16 +47,49 @@ def problem(answer):
     return answer.status_code, document["reason"], document["field"]
 
 
-def test_a_submitted_job_waits_and_tells_what_it_is(client):
-    job = submit(client, priority=3)
+def test_the_life_of_a_job_that_no_worker_takes(client):
+    body = RENDER | {"request_id": "mine/1", "priority": 3}
+    first, again = client.post("/v1/jobs", json=body), client.post("/v1/jobs", json=body)
+    assert (first.status_code, again.status_code, again.json()) == (201, 200, first.json())
+    job = first.json()
+    route = f"/v1/jobs/{job['id']}"
     assert (job["state"], job["kind"], job["priority"], job["attempts"]) == ("queued", "render", 3, 0)
     assert job["specification"]["scene"] == "demo"
-    assert job["started_at"] is job["finished_at"] is job["reason"] is job["request_id"] is None
-    assert job["artifacts"] == []
-    assert {name: value for name, value in job["progress"].items() if value is not None} == {
-        "waits_for": "a worker: none is running"
-    }
-    assert client.get(f"/v1/jobs/{job['id']}").json() == job
+    assert job["started_at"] is job["finished_at"] is job["reason"] is None
+    told = {name: value for name, value in job["progress"].items() if value is not None}
+    assert told == {"waits_for": "a worker: none is running"}
+    assert client.get(route).json() == job
+    assert problem(client.post("/v1/jobs", json=body | {"priority": 1})) == (409, "REQUEST_ID_CONFLICT", "request_id")
+    log = client.get(f"{route}/log")
+    assert (log.status_code, log.text, log.headers["content-type"][:10]) == (200, "", "text/plain")
+    for name, reason in (("..%2fjob.json", "ROUTE_NOT_FOUND"), ("metrics.json", "ARTIFACT_NOT_FOUND")):
+        assert problem(client.get(f"{route}/artifacts/{name}"))[:2] == (404, reason)
+    assert problem(client.post(f"{route}:retry")) == (409, "JOB_NOT_FINISHED", "job")
+    assert problem(client.delete(route)) == (409, "JOB_IN_USE", "job")
+    for _ in range(2):
+        cancelled = client.post(f"{route}:cancel")
+        assert (cancelled.status_code, cancelled.json()["state"]) == (200, "cancelled")
+    retried = [client.post(f"{route}:retry") for _ in range(2)]
+    assert [(one.status_code, one.json()["retry_of"]) for one in retried] == [(201, job["id"]), (200, job["id"])]
+    successor = f"/v1/jobs/{retried[0].json()['id']}"
+    for gone in (successor, route):
+        client.post(f"{gone}:cancel")
+        assert client.delete(gone).status_code == 204
+        for answer in (client.get(gone), client.delete(gone)):
+            assert problem(answer) == (404, "JOB_NOT_FOUND", "job")
+
+
+def test_pages_join_to_the_whole_list(client):
+    made = [submit(client)["id"] for _ in range(3)]
+    found, token = [], ""
+    while token or not found:
+        page = client.get("/v1/jobs", params={"page_size": 2, "page_token": token, "state": "queued"}).json()
+        found += [job["id"] for job in page["jobs"]]
+        token = page["next_page_token"]
+    assert (found[:3], len(set(found))) == (made[::-1], len(found))
+    assert client.get("/v1/jobs", params={"kind": "train"}).json() == {"jobs": [], "next_page_token": ""}
+    for name, value in (("page_token", "made-up"), ("state", "asleep")):
+        assert problem(client.get("/v1/jobs", params={name: value}))[1:] == ("INVALID_ARGUMENT", name)
 
 
 def test_a_render_job_is_estimated_and_not_submitted(client):
@@ -92,15 +120,6 @@ def test_a_render_job_is_estimated_and_not_submitted(client):
 )
 def test_what_cannot_be_estimated(client, kind, specification, expected):
     assert problem(client.post("/v1/jobs:estimate", json={"kind": kind, "specification": specification})) == expected
-
-
-def test_the_same_request_id_gives_the_same_job_and_another_body_a_conflict(client):
-    body = RENDER | {"request_id": "mine/1"}
-    first, again = client.post("/v1/jobs", json=body), client.post("/v1/jobs", json=body)
-    assert (first.status_code, again.status_code) == (201, 200)
-    assert first.json() == again.json()
-    assert first.json()["request_id"] == "mine/1"
-    assert problem(client.post("/v1/jobs", json=body | {"priority": 1})) == (409, "REQUEST_ID_CONFLICT", "request_id")
 
 
 @pytest.mark.parametrize(
@@ -135,64 +154,11 @@ def test_what_cannot_be_run_is_refused_by_name(client, body, status, reason, fie
     assert problem(client.post("/v1/jobs", json=body)) == (status, reason, field)
 
 
-def test_pages_join_to_the_whole_list_newest_first(client):
-    made = [submit(client)["id"] for _ in range(5)]
-    found = []
-    token = ""
-    while True:
-        page = client.get("/v1/jobs", params={"page_size": 2, "page_token": token, "state": "queued"}).json()
-        found += [job["id"] for job in page["jobs"]]
-        token = page["next_page_token"]
-        if not token:
-            break
-    assert found[:5] == made[::-1]
-    assert len(set(found)) == len(found)
-    whole = client.get("/v1/jobs", params={"kind": "render", "page_size": 1000}).json()
-    assert set(found) <= {job["id"] for job in whole["jobs"]}
-    assert client.get("/v1/jobs", params={"kind": "train"}).json() == {"jobs": [], "next_page_token": ""}
-    assert problem(client.get("/v1/jobs", params={"page_token": "made-up"}))[1:] == ("INVALID_ARGUMENT", "page_token")
-    assert problem(client.get("/v1/jobs", params={"state": "asleep"}))[1:] == ("INVALID_ARGUMENT", "state")
-
-
-def test_cancel_is_idempotent_and_retry_makes_a_successor(client):
-    job = submit(client)
-    assert problem(client.post(f"/v1/jobs/{job['id']}:retry")) == (409, "JOB_NOT_FINISHED", "job")
-    for _ in range(2):
-        cancelled = client.post(f"/v1/jobs/{job['id']}:cancel")
-        assert (cancelled.status_code, cancelled.json()["state"]) == (200, "cancelled")
-    retried = client.post(f"/v1/jobs/{job['id']}:retry")
-    assert retried.status_code == 201
-    again = client.post(f"/v1/jobs/{job['id']}:retry")
-    assert (again.status_code, again.json()) == (200, retried.json())
-    assert (retried.json()["state"], retried.json()["retry_of"]) == ("queued", job["id"])
-    assert retried.json()["id"] != job["id"]
-
-
-def test_a_finished_job_is_deleted_and_others_are_not(client):
-    route = f"/v1/jobs/{submit(client)['id']}"
-    assert problem(client.delete(route)) == (409, "JOB_IN_USE", "job")
-    client.post(f"{route}:cancel")
-    deleted = client.delete(route)
-    assert (deleted.status_code, deleted.content) == (204, b"")
-    for answer in (client.get(route), client.delete(route)):
-        assert problem(answer) == (404, "JOB_NOT_FOUND", "job")
-
-
 def test_jobs_are_counted_for_prometheus(client, jobs_service):
     before = len(client.get("/v1/jobs", params={"state": "queued", "page_size": 1000}).json()["jobs"])
     submit(client)
     wait_until(lambda: jobs_service.metric('ultragray_jobs{state="queued"}') == before + 1)
     assert jobs_service.metric('ultragray_jobs{state="failed"}') == 0
-
-
-def test_a_job_that_waits_has_an_empty_log_and_no_artifacts(client):
-    job = submit(client)
-    log = client.get(f"/v1/jobs/{job['id']}/log")
-    assert (log.status_code, log.text) == (200, "")
-    assert log.headers["content-type"].startswith("text/plain")
-    assert problem(client.get(f"/v1/jobs/{job['id']}/artifacts/..%2fjob.json"))[0] == 404
-    answer = client.get(f"/v1/jobs/{job['id']}/artifacts/metrics.json")
-    assert problem(answer) == (404, "ARTIFACT_NOT_FOUND", "name")
 
 
 def test_each_kind_has_a_documented_specification():

@@ -1,6 +1,5 @@
 """Scene files over HTTP: looked into, downloaded, imported, deleted."""
 
-import contextlib
 import json
 import socket
 from pathlib import Path
@@ -15,15 +14,11 @@ from ultragray_service.core.scene_points import even_selection
 
 from ...waiting import wait_until
 from ..conftest import DEMO_PROBE, make_scene
+from .test_http_datasets import helper_process
 
 MAX_BYTES = 20_000_000
 RAW = {"Content-Type": "application/octet-stream"}
 POSE = {"position_mm": {"x": 0, "y": 1, "z": 0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}
-
-
-@pytest.fixture(scope="module")
-def artifacts(tmp_path_factory):
-    return tmp_path_factory.mktemp("artifacts")
 
 
 @pytest.fixture(scope="module")
@@ -96,19 +91,6 @@ def test_training_poses(http, demo_scene):
     told = http.get("/v1/scenes/demo/training-poses").json()
     np.testing.assert_array_equal(np.array(told["poses"]).reshape(-1, 4, 4), demo_scene.training_poses)
     assert told["shift_mm"] is told["turn_deg"] is None
-
-
-def test_corrected_training_poses(http):
-    plain = make_scene(probe=DEMO_PROBE, seed=6)
-    corrections = np.tile(np.eye(4), (2, 1, 1))
-    corrections[1, 0, 3] = 2.0
-    scene = GaussianScene.from_splats(
-        plain.splats, info=plain.info, training_poses=np.tile(np.eye(4), (2, 1, 1)), pose_corrections=corrections
-    )
-    assert http.put("/v1/scenes/corrected", content=scene.to_bytes(), headers=RAW).status_code == 201
-    told = http.get("/v1/scenes/corrected/training-poses").json()
-    assert (told["shift_mm"], told["turn_deg"]) == ([0.0, 2.0], [0.0, 0.0])
-    http.delete("/v1/scenes/corrected")
 
 
 def test_the_life_of_an_imported_scene(http, artifacts):
@@ -196,7 +178,7 @@ def test_who_stops_during_the_check_gets_no_scene(service, http, artifacts):
     with socket.create_connection((url.host, url.port)) as connection:
         head = f"PUT /v1/scenes/stopped HTTP/1.1\r\nHost: {url.host}\r\nContent-Length: {len(whole)}\r\n\r\n"
         connection.sendall(head.encode() + whole)
-        (checking,) = wait_until(lambda: helpers_of(service))
+        checking = wait_until(lambda: helper_process("check_scene_file"))
     wait_until(lambda: not Path(f"/proc/{checking}").exists(), within_s=20)
     wait_until(lambda: not list((artifacts / "scenes").glob(".*")))
     assert http.get("/v1/scenes/stopped").status_code == 404
@@ -244,12 +226,14 @@ def test_what_a_killed_service_left_goes_at_once(start_service, tmp_path):
     assert not received()
 
 
-def helpers_of(service):
-    """Its processes that check scene files."""
-    found = []
-    for folder in Path("/proc").glob("[0-9]*"):
-        with contextlib.suppress(OSError):
-            parent = int((folder / "stat").read_text().rpartition(")")[2].split()[1])
-            if parent == service.process.pid and "check_scene_file" in (folder / "cmdline").read_text():
-                found.append(int(folder.name))
-    return found
+def test_corrected_training_poses(http):
+    plain = make_scene(probe=DEMO_PROBE, seed=6)
+    corrections = np.tile(np.eye(4), (2, 1, 1))
+    corrections[1, 0, 3] = 2.0
+    scene = GaussianScene.from_splats(
+        plain.splats, info=plain.info, training_poses=np.tile(np.eye(4), (2, 1, 1)), pose_corrections=corrections
+    )
+    assert http.put("/v1/scenes/corrected", content=scene.to_bytes(), headers=RAW).status_code == 201
+    told = http.get("/v1/scenes/corrected/training-poses").json()
+    assert (told["shift_mm"], told["turn_deg"]) == ([0.0, 2.0], [0.0, 0.0])
+    http.delete("/v1/scenes/corrected")

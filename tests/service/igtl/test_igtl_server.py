@@ -74,15 +74,6 @@ def test_every_type_of_pose_gets_the_same_frame(peer, igtl_service):
         assert np.array_equal(unpack_image(answer.content).pixels, expected)
 
 
-def test_tools_named_like_scenes_get_a_frame_each(peer, igtl_service):
-    tools = [Instrument("Needle", moved(1)), Instrument("second", moved(2)), Instrument("ProbeTodemo", moved(3))]
-    peer.send("TDATA", "Tracker", pack_instruments("TDATA", tools))
-    for name, pose in (("second", moved(2)), ("demo", moved(3))):
-        answer = peer.receive()
-        assert answer.device_name == f"Image_{name}"
-        assert np.array_equal(unpack_image(answer.content).pixels, over_grpc(igtl_service, name, pose))
-
-
 def test_an_answer_repeats_what_identifies_its_question(peer):
     peer.send_pose(np.eye(4), "demo", timestamp=77, version=2, message_id=5)
     answer = peer.receive()
@@ -145,16 +136,6 @@ def test_queries_tell_the_newest_frame_of_any_client(connect, igtl_service):
     assert tool.pose == pytest.approx(exact, abs=1e-6)
 
 
-def test_without_a_frame_yet_queries_get_no_content(start_service, igtl_folder, connect):
-    service = start_service(data_folder=igtl_folder, igtl_port=0)
-    peer = connect(address_of(service))
-    for query, answer in (("GET_IMAGE", "IMAGE"), ("GET_QTDATA", "QTDATA"), ("GET_TRANS", "TRANSFORM")):
-        reply = peer.ask(query, "Probe")
-        assert (reply.type_name, reply.device_name, reply.content) == (answer, "Probe", b"")
-    peer.send_pose(np.eye(4), "Probe")
-    assert "ULTRAGRAY_IGTL_SCENE" in peer.status().text  # several scenes, none named
-
-
 def test_a_viewer_is_sent_what_the_robot_sees(connect):
     robot, viewer, other = connect(), connect(), connect()
     for query in ("STT_IMAGE", "STT_TRANSFOR"):
@@ -183,11 +164,6 @@ def test_the_robot_is_told_its_own_poses(peer):
     assert {peer.receive().type_name, peer.receive().type_name} == {"IMAGE", "QTDATA"}
     peer.send("STP_QTDATA")
     assert peer.receive().type_name == "RTS_QTDATA"
-
-
-def test_streams_that_we_cannot_give_are_refused(peer):
-    receipt = peer.ask("STT_POLYDATA", "x")
-    assert (receipt.type_name, receipt.device_name, receipt.content) == ("RTS_POLYDATA", "x", b"\1")
 
 
 # Life of the service

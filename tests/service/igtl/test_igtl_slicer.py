@@ -5,22 +5,17 @@ STATUS with metadata, so that headers of version 2 are understood, then the node
 """
 
 import json
-import struct
 from dataclasses import dataclass
 from xml.etree import ElementTree
 
 import numpy as np
-import pyigtl
 import pytest
 
-from ultragray.geometry.pose import check_poses
 from ultragray.scene.info import read_header
 
 from ..cli.command_line import refused, run
-from ..conftest import DEMO_PROBE, HEIGHT, WIDTH, make_scene
-from .conftest import address_of, moved, pyigtl_client
-from .test_igtl_commands import _CommandMessage, command
-from .test_igtl_server import over_grpc
+from ..conftest import make_scene
+from .conftest import address_of
 
 
 @dataclass(frozen=True)
@@ -72,51 +67,6 @@ def test_the_connector_resumes_and_pushes_the_pose_of_a_training_view(written, i
     assert written.attributes("LinearTransform")["OpenIGTLinkIF.pushOnConnect"] == "true"
     poses = read_header(igtl_folder / "demo.ugr").training_poses
     np.testing.assert_array_equal(written.pose, poses[len(poses) // 2])
-
-
-class _Plain(pyigtl.messages.MessageBase):
-    """A message of a type that pyigtl has no class for."""
-
-    def __init__(self, type_name, device_name, content=b"", **metadata):
-        super().__init__(device_name=device_name)
-        self._message_type, self._content, self._valid_message = type_name, content, True
-        self.metadata, self.header_version = metadata, 2 if metadata else 1
-
-    def _pack_content(self):
-        return self._content
-
-
-def test_a_connector_of_slicer_sees_the_scene_live(written, monkeypatch, igtl_service):
-    monkeypatch.setitem(pyigtl.messages.message_type_to_class_constructor, "RTS_COMMAND", _CommandMessage)
-    connector, device = written.node("IGTLConnector"), written.node("LinearTransform")["name"]
-    with pyigtl_client(f"{connector['serverHostname']}:{connector['serverPort']}") as client:
-        status = struct.pack(">Hq20s", 1, 0, b"") + b"\0"
-        client.send_message(_Plain("STATUS", "", status, dummy="dummy"))  # as on every connection
-        push(client, device, written.pose)
-        image = client.wait_for_message("Image_demo", timeout=60)
-        assert image.header_version == 2
-        assert np.array_equal(image.image[0], over_grpc(igtl_service, "demo", written.pose))
-        # Where the image lies, the volume node does: its corners are those of the probe at the pose.
-        edges = np.array([(i, j, 0, 1) for j in (-0.5, HEIGHT - 0.5) for i in (-0.5, WIDTH - 0.5)])
-        corners = np.c_[DEMO_PROBE.corners_mm(), np.ones(4)] @ check_poses(written.pose)[0].T
-        assert edges @ image.ijk_to_world_matrix.T == pytest.approx(corners, abs=1e-4)
-
-        push(client, device, written.pose @ moved(3))  # the transform is dragged
-        dragged = client.wait_for_message("Image_demo", timeout=60)
-        assert np.array_equal(dragged.image[0], over_grpc(igtl_service, "demo", written.pose @ moved(3)))
-
-        asked = _CommandMessage(device_name="Scanner")  # as its command console sends it
-        asked.number, asked.name, asked.text = 1, "SetUsParameter", command("SetUsParameter", ("DepthMm", "20"))
-        client.send_message(asked)
-        assert client.wait_for_message("Scanner", timeout=60).metadata["Status"] == "SUCCESS"
-        push(client, device, written.pose)
-        assert len(client.wait_for_message("Image_demo", timeout=60).image[0]) == HEIGHT // 2
-
-
-def push(client, device, pose):
-    message = pyigtl.TransformMessage(pose, device_name=device)
-    message.header_version = 2
-    client.send_message(message)
 
 
 def test_what_cannot_be_written_is_told_before_the_work(tmp_path):

@@ -59,16 +59,16 @@ def open_socket(service, source="127.0.0.1", **options):
 
 def answer(opened):
     """Head and body of one answer; empty where the server closed without one."""
-    data = b""
-    while b"\r\n\r\n" not in data:
-        if not (block := opened.recv(65536)):
-            return data
-        data += block
-    head, _, body = data.partition(b"\r\n\r\n")
+    head = b""
+    while not head.endswith(b"\r\n\r\n"):
+        if not (byte := opened.recv(1)):  # what follows is another answer's
+            return head
+        head += byte
     length = next((int(line[15:]) for line in head.lower().split(b"\r\n") if line.startswith(b"content-length:")), 0)
+    body = b""
     while len(body) < length:
-        body += opened.recv(65536)
-    return head + b"\r\n\r\n" + body
+        body += opened.recv(length - len(body))
+    return head + body
 
 
 def status_of(data):

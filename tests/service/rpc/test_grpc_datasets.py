@@ -16,11 +16,6 @@ Message = datasets_pb2.UploadDatasetRequest
 
 
 @pytest.fixture(scope="module")
-def artifacts(tmp_path_factory):
-    return tmp_path_factory.mktemp("artifacts")
-
-
-@pytest.fixture(scope="module")
 def service(start_service, artifacts):
     return start_service(
         artifact_folder=artifacts, max_dataset_bytes=LIMIT_BYTES, upload_idle_timeout_s=IDLE_TIMEOUT_S, api_keys=KEY

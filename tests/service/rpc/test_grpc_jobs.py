@@ -15,8 +15,8 @@ WAIT_S = 120.0
 
 
 @pytest.fixture(scope="module")
-def jobs_service(start_service, tmp_path_factory):
-    return start_service(artifact_folder=tmp_path_factory.mktemp("artifacts"), embedded_worker=False)
+def jobs_service(start_service, artifacts):
+    return start_service(artifact_folder=artifacts, embedded_worker=False)
 
 
 @pytest.fixture(scope="module")
@@ -74,40 +74,17 @@ def test_what_cannot_be_run_is_refused_by_name(jobs, request_message, expected):
     assert refusal(lambda: jobs.SubmitJob(request_message)) == expected
 
 
-def test_log_and_artifacts_of_a_job(start_service, tmp_path):
-    service = start_service(artifact_folder=tmp_path, embedded_worker=True, training_threads=1)
-    with service.channel() as channel:
-        jobs = jobs_pb2_grpc.JobServiceStub(channel)
-        sampler = jobs_pb2.PoseSampler(kind="around", count=60)
-        render = jobs_pb2.RenderJob(scene="demo", sampler=sampler, height=64, width=128)
-        job = jobs.SubmitJob(jobs_pb2.SubmitJobRequest(render=render)).job
-        *_, last = jobs.WatchJob(jobs_pb2.WatchJobRequest(job=job.id), timeout=60)
-        assert last.job.state == jobs_pb2.JOB_STATE_SUCCEEDED, last
-        (told,) = (tmp_path / "jobs" / job.id).glob("*/log-00000")
-        log = told.read_text()
-        assert jobs.GetJobLog(jobs_pb2.GetJobLogRequest(job=job.id)).log == log
-        assert jobs.GetJobLog(jobs_pb2.GetJobLogRequest(job=job.id, max_bytes=7)).log == log[-7:]
-
-        (file,) = (tmp_path / "jobs" / job.id).glob("*/artifacts/frames.npz")
-        content = file.read_bytes()
-        chunks = list(jobs.DownloadArtifact(jobs_pb2.DownloadArtifactRequest(job=job.id, name="frames.npz")))
-        assert b"".join(chunk.data for chunk in chunks) == content
-        assert len(chunks) == 2
-        assert {chunk.file_bytes for chunk in chunks} == {len(content)}
-        for offset in (len(content) - 5, len(content)):
-            rest = jobs_pb2.DownloadArtifactRequest(job=job.id, name="frames.npz", offset=offset)
-            assert [chunk.data for chunk in jobs.DownloadArtifact(rest)] == [content[offset:]]
-
-        def refused(**changes):
-            asked = {"job": job.id, "name": "frames.npz"} | changes
-            return refusal(lambda: list(jobs.DownloadArtifact(jobs_pb2.DownloadArtifactRequest(**asked))))
-
-        assert refused(name="../job.json") == ("NOT_FOUND", "ARTIFACT_NOT_FOUND", "name")
-        assert refused(job="0" * 24) == ("NOT_FOUND", "JOB_NOT_FOUND", "job")
-        for offset in (-1, len(content) + 1):
-            assert refused(offset=offset) == ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "offset")
-        log_request = jobs_pb2.GetJobLogRequest(job=job.id, max_bytes=-1)
-        assert refusal(lambda: jobs.GetJobLog(log_request)) == ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "max_bytes")
+def test_logs_and_artifacts_that_there_are_none_of(jobs):
+    job = jobs.SubmitJob(training_poses()).job.id
+    assert jobs.GetJobLog(jobs_pb2.GetJobLogRequest(job=job)).log == ""
+    log_request = jobs_pb2.GetJobLogRequest(job=job, max_bytes=-1)
+    assert refusal(lambda: jobs.GetJobLog(log_request)) == ("INVALID_ARGUMENT", "INVALID_ARGUMENT", "max_bytes")
+    for asked, expected in (
+        ({"job": job, "name": "../job.json"}, ("NOT_FOUND", "ARTIFACT_NOT_FOUND", "name")),
+        ({"job": "0" * 24, "name": "frames.npz"}, ("NOT_FOUND", "JOB_NOT_FOUND", "job")),
+    ):
+        request = jobs_pb2.DownloadArtifactRequest(**asked)
+        assert refusal(lambda request=request: list(jobs.DownloadArtifact(request))) == expected
 
 
 def test_a_stopping_service_tells_its_watchers_to_come_again(start_service, tmp_path):

@@ -137,22 +137,12 @@ def quaternion(w):
     )
 
 
-INVALID, CONDITION, PNG = (
-    grpc.StatusCode.INVALID_ARGUMENT,
-    grpc.StatusCode.FAILED_PRECONDITION,
-    rendering_pb2.ENCODING_PNG,
-)
-FLAT = geometry_pb2.Probe(linear=geometry_pb2.LinearProbe(width_mm=1, near_mm=2, far_mm=2))
+INVALID = grpc.StatusCode.INVALID_ARGUMENT
 
 BAD_REQUESTS = {
     "norm": (bad(pose=quaternion(3.0)), INVALID, "INVALID_POSE", "pose.placement.quaternion"),
     "no pose": (bad(pose=None), INVALID, "INVALID_ARGUMENT", "pose"),
-    "no settings": (rendering_pb2.RenderRequest, INVALID, "INVALID_ARGUMENT", "settings"),
     "scene": (bad(scene="nowhere"), grpc.StatusCode.NOT_FOUND, "SCENE_NOT_FOUND", "settings.scene"),
-    "truncated": (bad(scene="truncated"), CONDITION, "SCENE_FILE_INVALID", "settings.scene"),
-    "png of two": (bad(outputs=[1, 2], encoding=PNG), INVALID, "INVALID_ARGUMENT", "settings.encoding"),
-    "far at near": (bad(probe=FLAT), INVALID, "INVALID_PROBE", "settings.probe.linear.far_mm"),
-    "probe of no kind": (bad(probe=geometry_pb2.Probe()), INVALID, "INVALID_PROBE", "settings.probe.kind"),
 }
 
 

@@ -1,7 +1,5 @@
 """TLS: certificate files and what is said of them, and both doors of a real service while they are replaced."""
 
-from __future__ import annotations
-
 import base64
 import os
 import re

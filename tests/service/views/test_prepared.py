@@ -11,29 +11,27 @@ import time
 import numpy as np
 import pytest
 
-from ultragray.datasets.released import write_released
+from ultragray_service.core import threads
 from ultragray_service.core.threads import HelperProcesses
 from ultragray_service.settings import Settings
 from ultragray_service.views import prepared
 from ultragray_service.views.prepared import Prepared
 from ultragray_workers import claims
-from ultragray_workers.datasets.intake import check_files
-from ultragray_workers.datasets.store import DatasetStore, write_manifest
 from ultragray_workers.errors import ArtifactNotFound, DatasetNotFound, DeadlineExceeded, Draining, StorageFull
 from ultragray_workers.views import lay_out
 
 from ...file_sizes import files_of_at_most
-from ..http.test_http_comparison import DATASET
+from ...warm import WARM, warm_subprocess
+from ...workers.jobs.conftest import store_dataset, tiny_dataset
+
+DATASET = tiny_dataset()
 
 
 @pytest.fixture
-def wanted(tmp_path):
-    """A dataset `tiny` in the artifact folder, as it is asked for."""
-    folder = DatasetStore(tmp_path).folder / "tiny"
-    (folder / "files").mkdir(parents=True)
-    write_released(DATASET, folder / "files")
-    write_manifest(check_files(folder / "files", "tiny", {}, folder / "contact_sheet.png"), folder)
-    DatasetStore(tmp_path).add(folder, "tiny")
+def wanted(tmp_path, monkeypatch):
+    """A dataset `tiny` in the artifact folder, as it is asked for; helper processes are forked."""
+    monkeypatch.setattr(threads, "subprocess", warm_subprocess(WARM.path()))
+    store_dataset(tmp_path, "tiny")
     return {"dataset": "tiny"}
 
 
@@ -74,7 +72,6 @@ def aged(tmp_path, name, age_s, size_bytes=0):
     return folder
 
 
-@pytest.mark.long
 @pytest.mark.parametrize(("kept_folders", "size_bytes"), [(2, 0), (32, 600)], ids=["by number", "by bytes"])
 def test_the_folder_not_asked_for_the_longest_goes(tmp_path, wanted, monkeypatch, kept_folders, size_bytes):
     monkeypatch.setattr(prepared, "KEPT_FOLDERS", kept_folders)
@@ -134,7 +131,6 @@ def test_that_a_name_is_gone_says_nothing_of_the_content(tmp_path, wanted):
     asyncio.run(ask())
 
 
-@pytest.mark.long
 def test_who_waits_for_what_is_being_made_sees_its_end(tmp_path, wanted):
     async def ask():
         made = views(tmp_path)
@@ -164,7 +160,8 @@ def test_what_no_one_foresaw_is_a_failure_as_well(tmp_path, wanted, caplog):
     assert "FileExistsError" in caplog.text
 
 
-def test_a_disk_without_room_is_told(tmp_path, wanted):
+def test_a_disk_without_room_is_told(tmp_path, wanted, monkeypatch):
+    monkeypatch.setattr(threads, "subprocess", subprocess)  # has the limits of this process
     with files_of_at_most(DATASET.train.images.size):
         failed = asyncio.run(asyncio.wait_for(end_of(views(tmp_path), wanted), 30))
     assert isinstance(failed.error, StorageFull)
@@ -211,17 +208,16 @@ def test_what_dead_services_left_is_removed(tmp_path, monkeypatch):
     assert names(tmp_path) == [".making-alive", "kept"]
 
 
-@pytest.mark.long
 def test_one_helper_process_at_a_time(tmp_path, wanted, monkeypatch):
     started = []
+    start = threads.subprocess.Popen
 
-    class Watched(subprocess.Popen[bytes]):
-        def __init__(self, *arguments, **options):
-            assert all(process.returncode is not None for process in started)
-            super().__init__(*arguments, **options)
-            started.append(self)
+    def watched(*arguments, **options):
+        assert all(process.returncode is not None for process in started)
+        started.append(start(*arguments, **options))
+        return started[-1]
 
-    monkeypatch.setattr(subprocess, "Popen", Watched)
+    monkeypatch.setattr(threads.subprocess, "Popen", watched)
 
     async def ask():
         processes = HelperProcesses(4 << 30)

@@ -18,11 +18,6 @@ STEPS = 40_000  # more than are done here
 
 
 @pytest.fixture(scope="module")
-def artifacts(tmp_path_factory):
-    return tmp_path_factory.mktemp("artifacts")
-
-
-@pytest.fixture(scope="module")
 def http(start_service, tmp_path_factory, artifacts):
     folder = tmp_path_factory.mktemp("dataset")
     write_released(DATASET, folder)

@@ -1,4 +1,4 @@
-"""ImplicitVol: its network, its schedules and restarts, its refined poses."""
+"""Fields learned from slices: ImplicitVol, RapidVol, what they share; and the methods by name."""
 
 import math
 

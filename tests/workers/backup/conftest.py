@@ -1,7 +1,5 @@
 """An installation with a scene, a dataset and jobs, on either database."""
 
-from __future__ import annotations
-
 import pytest
 
 from ultragray.phantom.demo import copy_demo_scene

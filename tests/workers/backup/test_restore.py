@@ -1,7 +1,5 @@
 """A restore: over nothing unasked, under nobody's feet, and to its end however often it is interrupted."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 

@@ -1,7 +1,5 @@
 """Batches on a real Ray cluster of this machine."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

@@ -1,7 +1,5 @@
 """The place of a batch, in a folder and in a bucket."""
 
-from __future__ import annotations
-
 import json
 
 import pytest

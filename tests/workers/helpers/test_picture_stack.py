@@ -1,7 +1,5 @@
 """Frames that are kept as the probe samples them, and read as pictures."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

@@ -1,7 +1,5 @@
 """Jobs with real workers, each a process of its own, on datasets that train within a second."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil
@@ -114,6 +112,10 @@ def path_of(artifact):
 def train_job(scene, *, dataset="tiny", steps=20, max_run_s=None, **settings):
     values = {"steps": steps, "max_gaussians": 40, "batch_size": 2, **settings}
     return TrainJob(dataset=dataset, scene=scene, settings=values, device="cpu", max_run_s=max_run_s)
+
+
+def is_training(job):
+    return job.state is JobState.RUNNING and (job.progress.step or 0) > 0
 
 
 class RunningWorker:

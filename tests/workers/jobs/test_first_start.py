@@ -1,7 +1,5 @@
 """Workers that start at the same moment on a database in which there is nothing yet."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

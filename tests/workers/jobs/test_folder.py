@@ -1,7 +1,5 @@
 """The folder of a job after its process was killed."""
 
-from __future__ import annotations
-
 import os
 from multiprocessing import get_context
 

@@ -1,19 +1,13 @@
 """A folder that is not the one that the jobs belong to: nobody works in it, whether at the start or later."""
 
-from __future__ import annotations
-
 import pytest
 import sqlalchemy as sa
 
 from ultragray_workers.errors import ArtifactFolderUnavailable, DatabaseUnavailable, StartupFailed, StorageUnavailable
 from ultragray_workers.jobs.database import KEY as FILE
 from ultragray_workers.jobs.database import SQLITE_FILE, JobDatabase
-from ultragray_workers.jobs.progress import JobState
 from ultragray_workers.jobs.tables import WORKERS
 from ultragray_workers.storage.local import LocalStorage
-
-from ...waiting import wait_until
-from .conftest import train_job
 
 
 @pytest.fixture
@@ -48,32 +42,6 @@ def test_a_database_within_the_folder_is_at_home_there(store, artifact_folder):
     (artifact_folder / FILE).unlink()
     JobDatabase(artifact_folder, None).close()
     assert (artifact_folder / FILE).read_text() == before
-
-
-@pytest.mark.long
-def test_a_share_that_vanishes_costs_no_job(store, artifact_folder, tmp_path, start_worker, until):
-    """It is gone while a job runs, an empty folder of its name is there, and later it is back."""
-    worker = start_worker()
-    running, _ = store.submit(train_job("one", steps=3000))
-    until(running, lambda job: (job.progress.step or 0) > 0)
-    waiting = [store.submit(train_job(f"scene-{number}"))[0] for number in range(2)]
-    away = tmp_path / "away"
-    artifact_folder.rename(away)
-    artifact_folder.mkdir()
-    process = worker.job_process()
-    assert process is not None
-    wait_until(lambda: store.get(running.id).state is JobState.QUEUED, within_s=240)
-    with pytest.raises(ArtifactFolderUnavailable):
-        store.submit(train_job("refused"))
-    wait_until(lambda: "no job is taken" in (tmp_path / "one.log").read_text())
-    assert {store.get(job.id).attempts for job in waiting} == {0}
-    for path in artifact_folder.rglob("*"):
-        assert path.is_dir()  # nobody has worked here
-    wait_until(lambda: worker.job_process() is None)
-    artifact_folder.rename(tmp_path / "mountpoint")
-    away.rename(artifact_folder)
-    done = [until(job) for job in (running, *waiting)]
-    assert {job.state for job in done} == {JobState.SUCCEEDED}, done
 
 
 def test_a_storage_that_belongs_to_another_database_is_refused(artifact_folder, postgres, tmp_path):

@@ -1,7 +1,5 @@
 """Which worker fits which job, and the words for a job that no worker fits; without any worker."""
 
-from __future__ import annotations
-
 import pytest
 
 from ultragray.errors import InvalidArgument

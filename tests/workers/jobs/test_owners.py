@@ -1,7 +1,5 @@
 """Names in the table of owners: taken by the first, and forgotten only by whose they are."""
 
-from __future__ import annotations
-
 import pytest
 
 from ultragray_workers.jobs.owners import (

@@ -1,7 +1,5 @@
 """Every change of a job's row, with no worker: who may take, change and end it; and that no question reads all rows."""
 
-from __future__ import annotations
-
 import threading
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
@@ -200,10 +198,10 @@ def test_answers_about_jobs_that_wait_or_run(store, engine):
     found = queue.find(engine, needs_dataset="tiny")
     assert found.id in {waiting.id, running.id, after.id}
     assert queue.successor(engine, over.id) == after.id
-    assert queue.finished_before(engine, 1e11, set(), 10) == []  # a job goes on from it
+    assert queue.finished_ago(engine, -1e9, set(), 10) == []  # a job goes on from it
     store.cancel(after.id)
-    assert set(queue.finished_before(engine, 1e11, set(), 10)) == {over.id, after.id}
-    assert queue.finished_before(engine, 1e11, {over.id, after.id}, 10) == []
+    assert set(queue.finished_ago(engine, -1e9, set(), 10)) == {over.id, after.id}
+    assert queue.finished_ago(engine, -1e9, {over.id, after.id}, 10) == []
 
 
 def test_the_demands_that_wait_are_told_once_each(store, engine):

@@ -1,7 +1,5 @@
 """Jobs that go: deleted by hand, or old. And datasets that go while a job is submitted."""
 
-from __future__ import annotations
-
 import os
 import time
 
@@ -119,6 +117,13 @@ def test_old_jobs_go_and_what_is_needed_stays(store, jobs, artifact_folder, fini
     store.cancel(successor.id)
     assert keep_house() == 1
     assert source.id not in left(artifact_folder)
+
+
+def test_a_host_whose_clock_is_ahead_removes_no_job(jobs, artifact_folder, finished, monkeypatch):
+    finished("young", 29)
+    ahead_s = time.time() + 2 * DAY_S
+    monkeypatch.setattr(time, "time", lambda: ahead_s)
+    assert Housekeeper(jobs, artifact_folder, LocalStorage(artifact_folder), 30).keep_house() == 0
 
 
 def test_a_deletion_and_a_submission_at_once_never_both_succeed(store, artifact_folder, monkeypatch):

@@ -1,7 +1,5 @@
 """Render jobs that could not be done are refused; the scene of the others is kept as it is."""
 
-from __future__ import annotations
-
 import errno
 
 import numpy as np
@@ -13,7 +11,7 @@ from ultragray.samplers import AroundSampler, SplineSampler, TrainingSampler
 from ultragray.scene.confidence import ConfidenceModel
 from ultragray_workers.errors import DatabaseUnavailable, SceneNotFound, StorageFull
 from ultragray_workers.jobs import queue
-from ultragray_workers.jobs.kinds import RenderJob, render
+from ultragray_workers.jobs.kinds import RenderJob, TrainJob, render, train
 from ultragray_workers.jobs.kinds.base import Surroundings
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.scenes import SceneStore
@@ -158,3 +156,22 @@ def test_scene_that_goes_meanwhile_and_a_disk_that_is_full(save, rendering_store
         rendering_store.submit(RenderJob(scene="one", poses=POSES))
     assert not (tmp_path / "one.ugr").exists()
     rendering_store.close()
+
+
+def test_a_training_may_not_have_more_memory_than_the_host(tmp_path, monkeypatch):
+    monkeypatch.setattr(train, "memory_bytes", lambda: 8 << 30)
+
+    def check(device, memory_gb):
+        TrainJob("liver", "new", settings={"memory_gb": memory_gb}, device=device).check(
+            Surroundings(None, tmp_path, 512)
+        )
+
+    for device in ("cpu", "auto"):
+        with pytest.raises(
+            InvalidArgument, match=r"memory_gb must be at most the 8\.0 GiB of the host, got 8\.5"
+        ) as told:
+            check(device, 8.5)
+        assert told.value.field == "settings.memory_gb"
+        check(device, 8.0)
+        check(device, None)
+    check("cuda:0", 80.0)  # of the GPU, which the worker knows

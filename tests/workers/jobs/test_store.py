@@ -1,9 +1,5 @@
 """The store without a worker: jobs stay queued."""
 
-from __future__ import annotations
-
-import subprocess
-import sys
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 
@@ -205,13 +201,3 @@ def test_database_that_cannot_be_reached_is_told_without_the_password(tmp_path):
     with pytest.raises(StartupFailed, match="database") as caught:
         JobStore(tmp_path, "postgresql://me:secret@127.0.0.1:1/jobs")
     assert "secret" not in str(caught.value)
-
-
-def test_importing_the_store_and_the_worker_needs_no_torch():
-    program = (
-        f"import sys; sys.path[:] = {sys.path!r}; import ultragray_workers.jobs.store; "
-        "import ultragray_workers.jobs.worker.worker; "
-        "print('torch' in sys.modules)"
-    )
-    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout
-    assert told.strip() == "False"

@@ -1,7 +1,5 @@
 """Processes that die: nothing is lost, nothing is wrong, nothing is left."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import signal

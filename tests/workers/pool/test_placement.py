@@ -1,7 +1,5 @@
 """Where scenes are put."""
 
-from __future__ import annotations
-
 import pytest
 import torch
 

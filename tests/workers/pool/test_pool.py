@@ -1,13 +1,8 @@
 """RenderPool against direct renders, in real worker processes."""
 
-from __future__ import annotations
-
 import asyncio
 import os
 import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -17,8 +12,8 @@ from ultragray import ConvexProbe
 from ultragray.errors import BackendUnavailable, InvalidArgument, SceneFileInvalid
 from ultragray.files import file_sha256
 from ultragray.rendering.settings import Encoding
-from ultragray_workers import PoolConfig, Priority, RenderPool, SceneStore
-from ultragray_workers.errors import DeadlineExceeded, Draining, NotReady, QueueFull, SceneNotFound, SceneTooLarge
+from ultragray_workers import PoolConfig, RenderPool, SceneStore
+from ultragray_workers.errors import Draining, NotReady, SceneNotFound, SceneTooLarge
 
 from ..asking import asking
 
@@ -75,55 +70,6 @@ async def test_waiting_requests_of_one_kind_are_rendered_together(open_pool, ran
     assert [result.batch_size for result in results] == [5, 5, 5, 5, 5, 1]
     for request, result in zip([*alike, other], results, strict=True):
         expect_frames(request, result)
-
-
-async def test_interactive_requests_go_before_batches_and_between_their_parts(open_pool, random_poses, until):
-    order = []
-    async with open_pool(max_batch_poses=8) as pool:  # 2 for batches
-        pool.on_rendered = lambda result: order.append(result.scene)
-        (worker,) = pool.statistics().pids
-        os.kill(worker, signal.SIGSTOP)
-        batch = asking("a", random_poses(40), encoding=Encoding.FLOAT32, priority=Priority.BATCH)
-        tasks = [asyncio.create_task(pool.render(batch))]
-        await until(lambda: pool.statistics().waiting_frames == 38)  # its first part is under way
-        tasks.append(asyncio.create_task(pool.render(asking("b", random_poses(1)))))
-        await until(lambda: pool.statistics().waiting_frames == 39)
-        os.kill(worker, signal.SIGCONT)
-        await asyncio.gather(*tasks)
-    assert order == ["b", "a"]
-
-
-async def test_a_full_queue_refuses_more_but_keeps_room_for_interactive_requests(open_pool, random_poses, until):
-    async with open_pool(queue_limit_frames=4) as pool:
-        (worker,) = pool.statistics().pids
-        os.kill(worker, signal.SIGSTOP)
-        batch = asking("a", random_poses(2), priority=Priority.BATCH)
-        tasks = [asyncio.create_task(pool.render(batch))]
-        await until(lambda: pool.statistics().busy == 1)
-        tasks += [asyncio.create_task(pool.render(batch)) for _ in range(2)]
-        await until(lambda: pool.statistics().waiting_frames == 4)
-        with pytest.raises(QueueFull):
-            await pool.render(batch)
-        tasks.append(asyncio.create_task(pool.render(asking("a", random_poses(1)))))
-        await until(lambda: pool.statistics().waiting_frames == 5)
-        os.kill(worker, signal.SIGCONT)
-        await asyncio.gather(*tasks)
-
-
-async def test_a_request_past_its_deadline_is_dropped_while_the_worker_is_busy(open_pool, random_poses, until):
-    async with open_pool() as pool:
-        (worker,) = pool.statistics().pids
-        os.kill(worker, signal.SIGSTOP)
-        first = asyncio.create_task(pool.render(asking("a", random_poses(1))))
-        await until(lambda: pool.statistics().busy == 1)
-        with pytest.raises(DeadlineExceeded):
-            await pool.render(asking("a", random_poses(3), deadline=time.monotonic() + 0.05))
-        assert pool.statistics().waiting_frames == 0
-        os.kill(worker, signal.SIGCONT)
-        await first
-        with pytest.raises(DeadlineExceeded):
-            await pool.render(asking("a", random_poses(1), deadline=time.monotonic() - 1.0))
-        await pool.render(asking("a", random_poses(1), deadline=time.monotonic() + 30.0))
 
 
 async def test_a_cancelled_request_leaves_the_queue(open_pool, random_poses, until):
@@ -252,14 +198,6 @@ async def test_a_start_that_is_cancelled_leaves_no_process(cold_templates, scene
 def test_impossible_sizes_are_refused(settings):
     with pytest.raises(InvalidArgument, match=next(iter(settings))):
         PoolConfig(**settings)
-
-
-def test_the_service_side_does_not_import_torch():
-    program = (
-        "import sys, ultragray_workers.pool.pool, ultragray_workers.scenes; assert 'torch' not in sys.modules, 'torch'"
-    )
-    environment = {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
-    subprocess.run([sys.executable, "-c", program], check=True, env=environment)
 
 
 def test_it_works_on_uvloop(open_pool, random_poses, expect_frames):

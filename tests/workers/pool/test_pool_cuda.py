@@ -1,7 +1,5 @@
 """The pool with the CUDA backend: its kernels through Triton's interpreter, its failures as torch tells them."""
 
-from __future__ import annotations
-
 import asyncio
 import importlib.util
 import os

@@ -1,8 +1,7 @@
 """Scenes in a worker's memory."""
 
-from __future__ import annotations
-
 import shutil
+from typing import get_args
 
 import pytest
 import torch
@@ -10,10 +9,11 @@ import torch
 from ultragray import GaussianScene
 from ultragray.errors import MemoryExceeded, SceneFileInvalid
 from ultragray.files import file_sha256
+from ultragray.geometry.probe import Lines
 from ultragray_workers import SceneStore
 from ultragray_workers.errors import SceneTooLarge
 from ultragray_workers.pool import worker as scene_cache
-from ultragray_workers.pool.worker import SceneCache
+from ultragray_workers.pool.worker import SceneCache, example_probes
 from ultragray_workers.scenes import resident_bytes
 
 CPU = torch.device("cpu")
@@ -85,3 +85,7 @@ def test_a_device_without_room_is_an_error_and_keeps_what_it_holds(scene_folder,
     with pytest.raises(MemoryExceeded, match=r"scene 'b' of 0\.0 MiB"):
         cache.get("b", str(scene_folder / "b.ugr"))
     assert cache.names() == ("a",)
+
+
+def test_every_bundle_of_scan_lines_is_warmed_up():
+    assert {type(probe.lines) for probe in example_probes()} == set(get_args(Lines))

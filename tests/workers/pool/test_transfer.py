@@ -1,7 +1,5 @@
 """Frames on their way from where they are rendered to the encoder."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 import torch

@@ -1,7 +1,5 @@
 """Fair turns between clients and their connections, and the refusal of what would wait too long: without processes."""
 
-from __future__ import annotations
-
 import asyncio
 import itertools
 import math

@@ -1,7 +1,5 @@
 """A storage of each kind."""
 
-from __future__ import annotations
-
 import pytest
 
 from ultragray_workers.storage.location import open_storage

@@ -1,7 +1,5 @@
 """The cache of fetched objects: bounded, shared, never half, and never without what is in use."""
 
-from __future__ import annotations
-
 import hashlib
 import subprocess
 import sys

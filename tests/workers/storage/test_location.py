@@ -1,7 +1,5 @@
 """Places of storages: what is taken, and the one sentence for what is not."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import pytest

@@ -1,7 +1,5 @@
 """A bucket that fails: requests are repeated, and what cannot be told is a StorageUnavailable without secrets."""
 
-from __future__ import annotations
-
 import os
 import sys
 import time
@@ -80,7 +78,8 @@ def test_a_server_that_is_silent_is_asked_again(new_bucket, object_proxy, monkey
     assert 1 <= time.monotonic() - began < 5
 
 
-def test_a_server_that_is_away_is_a_retryable_error(bucket, object_proxy, tmp_path):
+def test_a_server_that_is_away_is_a_retryable_error(new_bucket, object_proxy, tmp_path):
+    bucket = open_storage(new_bucket(), patience_s=0.3)
     bucket.write("a", b"one")
     object_proxy.away = True
     (tmp_path / "file").write_bytes(b"x")

@@ -1,7 +1,5 @@
 """What a folder and a bucket promise alike."""
 
-from __future__ import annotations
-
 import errno
 import os
 from concurrent.futures import ThreadPoolExecutor

@@ -319,11 +319,14 @@ def ids_of_owner(engine: sa.Engine, owner: str) -> list[str]:
         return list(connection.execute(sa.select(JOBS.c.id).where(_IS_JOB, JOBS.c.owner == owner)).scalars())
 
 
-def finished_before(engine: sa.Engine, epoch_s: float, but: set[str], limit: int) -> list[str]:
-    """Jobs that ended before a time and that no unfinished one goes on from, without `but`."""
+def finished_ago(engine: sa.Engine, age_s: float, but: set[str], limit: int) -> list[str]:
+    """Jobs that ended so long ago and that no unfinished one goes on from, without `but`.
+
+    The clock is the database's: a host whose own is wrong would remove what others still need.
+    """
     other = JOBS.alias()
     goes_on = sa.select(other.c.id).where(other.c.retry_of == JOBS.c.id, other.c.state.in_([_QUEUED, _RUNNING]))
-    old = sa.select(JOBS.c.id).where(_IS_JOB, JOBS.c.finished_ms < int(epoch_s * 1000), ~goes_on.exists())
+    old = sa.select(JOBS.c.id).where(_IS_JOB, JOBS.c.finished_ms < 1000 * (now_s(engine) - age_s), ~goes_on.exists())
     with engine.connect() as connection:
         return list(connection.execute(old.where(JOBS.c.id.not_in(but)).limit(limit)).scalars())
 

@@ -18,7 +18,6 @@ from ultragray import LinearProbe
 from ultragray.contract import to_dict
 from ultragray.errors import ExtraMissing, InvalidArgument
 from ultragray.exchange.exports import FORMATS, check_format, export_to
-from ultragray.exchange.exports.archives import NpzExporter
 from ultragray.exchange.rendering import written_behind
 from ultragray.installation import install_advice
 from ultragray.rendering.settings import Contact, Resolved
@@ -186,30 +185,6 @@ def test_a_portion_is_written_while_the_next_is_rendered():
     may_write.set()
     giving.join(10)
     assert written == [0, 1, 2, 3]
-
-
-def test_an_error_of_the_writer_ends_the_rendering(tmp_path, monkeypatch):
-    def write(self, frames, count):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr(NpzExporter, "_write", write)
-    added = 0
-
-    def render_on():
-        nonlocal added
-        with export_to(tmp_path / "frames.npz", "npz", header(("bmode",))) as add:
-            while True:
-                add({"bmode": rendered()["bmode"][:1]}, TOLD[:1])
-                added += 1
-
-    with pytest.raises(OSError, match="No space"):
-        render_on()
-    assert added < 10_000
-    assert list(tmp_path.iterdir()) == []
-
-    with pytest.raises(OSError, match="No space"), export_to(tmp_path / "one.npz", "npz", header(("bmode",))) as add:
-        add({"bmode": rendered()["bmode"][:1]}, TOLD[:1])
-    assert list(tmp_path.iterdir()) == []
 
 
 FULL_DISK = """

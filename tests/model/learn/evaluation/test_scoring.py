@@ -1,4 +1,4 @@
-"""A scene measured on its own frames, and expected against actual errors."""
+"""A scene measured on its own frames, expected against actual errors, and pictures of both side by side."""
 
 import json
 from dataclasses import replace

@@ -17,13 +17,17 @@ VOID = {"meta", "img", "link", "br"}
 
 
 class Checked(HTMLParser):
-    """Tags that are closed in order, ids, and every address that the page refers to."""
+    """A page whose tags are closed in order, and that loads nothing from elsewhere; its ids and addresses."""
 
     def __init__(self, text):
         super().__init__()
         self.open_tags = []
         self.addresses, self.ids = [], set()
         self.feed(text)
+        assert self.open_tags == []
+        assert all(address.startswith(("data:image/png;base64,", "#")) for address in self.addresses)
+        assert "<script" not in text
+        assert "url(http" not in text
 
     def handle_starttag(self, tag, attrs):
         self.ids |= {value or "" for name, value in attrs if name == "id"}
@@ -57,11 +61,7 @@ def page(tiny_dataset, tiny_config, tmp_path):
 
 def test_the_page_of_a_scene_alone_with_frames_from_end_to_end(page, tmp_path):
     text = render_page(page)
-    checked = Checked(text)
-    assert checked.open_tags == []
-    assert all(address.startswith(("data:image/png;base64,", "#")) for address in checked.addresses)
-    assert "<script" not in text
-    assert "url(http" not in text
+    Checked(text)
     assert "tiny &lt;sweep&gt;" in text
     assert re.findall(r"<h2>(.*?)</h2>", text) == ["Held-out frames", "Pictures", "Training"]
     assert "<dt>Scene</dt><dd>ball &amp; &lt;noise&gt;</dd>" in text

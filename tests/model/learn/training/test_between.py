@@ -1,4 +1,4 @@
-"""Views between frames and beyond the ends of a sweep: neighbours, places, blends."""
+"""Views between frames and beyond the ends of a sweep, and what a scene trained with them shows there."""
 
 from dataclasses import replace
 
@@ -248,7 +248,7 @@ def with_gap(dataset, first, last):
 
 def test_a_gap_is_as_bright_as_its_edges_tell(tiny_dataset, tiny_config):
     dataset = with_gap(tiny_dataset(frames=40, height=40, width=32, spacing_mm=0.4), 12, 19)
-    settings = {"steps": 150, "max_gaussians": 1500, "refinements": 0, "batch_size": 8}
+    settings = {"steps": 100, "max_gaussians": 1000, "refinements": 0, "batch_size": 8}
     filled = train(dataset, tiny_config(**settings))
     alone = train(dataset, tiny_config(**settings, views_between=0.0))
     linear = psnr_db(predict(dataset.train, dataset.val.poses, "linear"), dataset.val.images)
@@ -259,7 +259,7 @@ def test_a_gap_is_as_bright_as_its_edges_tell(tiny_dataset, tiny_config):
 
 def test_beyond_an_end_the_last_frame_goes_on(tiny_dataset, tiny_config):
     dataset = with_gap(tiny_dataset(frames=24, height=40, width=32, spacing_mm=0.5), 14, 17)
-    scene = train(dataset, tiny_config(steps=100, max_gaussians=1500, refinements=0, batch_size=8))
+    scene = train(dataset, tiny_config(steps=60, max_gaussians=1000, refinements=0, batch_size=8))
     assert dataset.val.poses[-1, 1, 3] - dataset.train.poses[-1, 1, 3] > 2.0
     assert psnr_db(render_sweep(scene, dataset.val), dataset.val.images) > 20.0
 
@@ -274,9 +274,9 @@ def test_darkness_that_is_no_shadow_is_not_explained_by_absorption(tiny_dataset,
     ]
     images = (230.0 * np.array(spots)).astype(np.uint8)
     dataset = replace(dataset, train=replace(dataset.train, images=images), val=dataset.val.select([]))
-    settings = {"steps": 150, "max_gaussians": 1500, "refinements": 0, "batch_size": 8}
+    settings = {"steps": 100, "max_gaussians": 1000, "refinements": 0, "batch_size": 8}
     scene = train(dataset, tiny_config(**settings))
-    assert render_sweep(scene, dataset.train, output="transmittance").mean() > 0.9
+    assert render_sweep(scene, dataset.train, output="transmittance").mean() > 0.97
 
 
 @pytest.mark.long

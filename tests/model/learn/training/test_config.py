@@ -1,4 +1,4 @@
-"""TrainingConfig: presets, overrides, and one sentence for what cannot be."""
+"""TrainingConfig: presets, overrides, one sentence for what cannot be; the effort that a training chooses itself."""
 
 from dataclasses import replace
 

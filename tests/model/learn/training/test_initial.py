@@ -1,4 +1,4 @@
-"""Where the Gaussians begin, and sh0 for an intensity."""
+"""Where the Gaussians begin, the lengths that training follows, its batches, and the evidence for shadows."""
 
 import math
 from collections import Counter

@@ -72,20 +72,6 @@ def test_moments_follow_the_gaussians():
     assert bool((grown["means"].detach()[2:] != 0).all())
 
 
-def test_goes_on_bit_for_bit_from_its_tensors():
-    first = parameters()
-    optimizer = Optimizer(first, batch_size=4)
-    set_gradients(first, 1)
-    optimizer.step(RATES)
-    second = {name: value.detach().clone().requires_grad_(value.requires_grad) for name, value in first.items()}
-    resumed = Optimizer(second, batch_size=4)
-    resumed.load({name: value.clone() for name, value in optimizer.tensors().items()})
-    for tensors, one in ((first, optimizer), (second, resumed)):
-        set_gradients(tensors, 2)
-        one.step(RATES)
-    assert all(torch.equal(first[name], second[name]) for name in first)
-
-
 def test_moments_are_taken_to_the_device_of_the_parameters():
     first = parameters()
     optimizer = Optimizer(first, batch_size=4)

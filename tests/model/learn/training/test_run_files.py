@@ -1,4 +1,4 @@
-"""The journal never holds a step twice; TensorBoard shows its numbers."""
+"""Files of a run: a journal that never holds a step twice, TensorBoard, checkpoints that are whole and of one run."""
 
 import json
 import math
@@ -26,13 +26,6 @@ from ultragray.learn.training.progress import Board, Journal, StepTimer
 
 def steps_in(path):
     return [json.loads(line)["step"] for line in path.read_text().splitlines()]
-
-
-def test_lines_are_there_at_once(tmp_path):
-    journal = Journal(tmp_path / "metrics.jsonl", steps_done=0)
-    journal.write({"step": 1, "loss": 0.5})
-    assert steps_in(tmp_path / "metrics.jsonl") == [1]
-    journal.close()
 
 
 def test_goes_on_after_the_checkpoint(tmp_path):

@@ -1,7 +1,5 @@
 """The work of evaluations, in this process, and what the queue makes of them."""
 
-from __future__ import annotations
-
 import json
 
 import numpy as np
@@ -16,7 +14,6 @@ from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import DatasetNotFound, SceneNotFound
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.kinds import EvaluateJob, evaluate_run
-from ultragray_workers.jobs.progress import JobState
 from ultragray_workers.jobs.specification import from_dict, to_dict
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
@@ -88,16 +85,3 @@ def test_the_queue_keeps_its_scene_and_its_dataset(artifact_folder, tmp_path, ra
     with pytest.raises(SceneNotFound):
         store.submit(EvaluateJob("tiny", "gone"))
     store.close()
-
-
-@pytest.mark.long
-def test_a_worker_does_it(store, artifact_folder, start_worker, until, random_scene):
-    (artifact_folder / "scenes").mkdir()
-    random_scene(20, info={"probe": PROBE}).save(artifact_folder / "scenes" / "one.ugr")
-    job, _ = store.submit(JOB)
-    start_worker("one")
-    done = until(job)
-    assert (done.state, done.kind) == (JobState.SUCCEEDED, "evaluate"), done.reason
-    assert "evaluation.json" in done.artifacts
-    assert done.metrics["psnr_db"] > 0
-    assert [path.name for path in (artifact_folder / "scenes").iterdir()] == ["one.ugr"]

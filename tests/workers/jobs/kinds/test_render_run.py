@@ -1,7 +1,5 @@
 """The work of render jobs, in this process."""
 
-from __future__ import annotations
-
 import json
 import sys
 
@@ -12,10 +10,8 @@ import torch
 
 from ultragray import ConvexProbe, ElevationBeam, GaussianScene, LinearProbe, render
 from ultragray.contract import to_dict as to_json
-from ultragray.datasets.plus import read_plus_sweep
 from ultragray.errors import ExtraMissing, FrameTooCostly, InvalidArgument, InvalidProbe, LowConfidence
 from ultragray.exchange import rendering
-from ultragray.exchange.poses import load_poses
 from ultragray.rendering.display import Display
 from ultragray.rendering.frames import show
 from ultragray.rendering.settings import Below
@@ -105,23 +101,6 @@ def test_dicom_of_given_poses_in_a_fan(work):
     assert data.pixel_array.shape == (6, 16, 12)
     poses = np.frombuffer(data.private_block(0x0019, "ULTRAGRAY")[0x01].value, "<f8").reshape(-1, 4, 4)
     np.testing.assert_array_equal(poses, FanSampler(5, 5).poses(TRAINING[:2], PROBE))
-
-
-def test_plus_sequence_of_the_spline(work):
-    job = RenderJob(scene="one", sampler=SplineSampler(spacing_mm=0.5), format="plus")
-    asked = work(job)
-    assert render_run.run(asked, job).artifacts == ("frames.igs.mha",)
-    sweep, count = read_plus_sweep(asked.folder.artifacts / "frames.igs.mha")
-    assert (count, sweep.probe) == (11, PROBE)
-    np.testing.assert_allclose(sweep.poses[:, 1, 3], np.arange(11) / 2, atol=1e-9)
-
-
-def test_messages_of_ros_whose_poses_are_read_back(work):
-    job = RenderJob(scene="one", sampler=SplineSampler(spacing_mm=0.5), format="mcap")
-    asked = work(job)
-    assert render_run.run(asked, job).artifacts == ("frames.mcap",)
-    poses = load_poses(asked.folder.artifacts / "frames.mcap")
-    np.testing.assert_allclose(poses, SplineSampler(spacing_mm=0.5).poses(TRAINING, PROBE), atol=1e-9)
 
 
 def test_figures_of_each_frame_are_in_the_archive(work, monkeypatch):

@@ -1,12 +1,9 @@
 """One job at a time on a device, whoever works for the host; who waits for a device leaves the jobs to others."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
 import sys
-import time
 from pathlib import Path
 
 import pytest
@@ -19,7 +16,7 @@ from ultragray_workers.jobs.worker.device import DeviceLock, HostDevice, devices
 from ultragray_workers.jobs.worker.process import holder_of
 
 from ....waiting import wait_until
-from ..conftest import train_job
+from ..conftest import is_training, train_job
 
 
 def device(name, lock_name):
@@ -35,10 +32,6 @@ def database_url(request):
         return None
     server = request.getfixturevalue("postgres")
     return server.create_database()
-
-
-def is_training(job):
-    return job.state is JobState.RUNNING and (job.progress.step or 0) > 0
 
 
 def test_lock_is_of_one_worker_until_both_it_and_its_process_let_go(tmp_path):
@@ -75,39 +68,6 @@ def test_a_worker_does_not_start_for_a_device_that_its_host_does_not_have(asked)
     with pytest.raises(StartupFailed, match=r"device must be .*got '(cuda:99|tpu)'") as caught:
         devices_of(asked)
     assert caught.value.field == "device"
-
-
-@pytest.mark.long
-def test_who_waits_for_a_device_takes_no_job_and_another_host_does(store, start_worker, until):
-    """Three workers of one host, whose device is in use, and later one of another: of four jobs, it does the rest."""
-    for name in ("one", "two", "three"):
-        start_worker(name)
-    first, _ = store.submit(train_job("first", steps=1_000_000))
-    first = until(first, is_training)
-    rest = [store.submit(train_job(f"scene-{number}"))[0] for number in range(3)]
-    time.sleep(2.0)  # eight looks of each worker
-    assert {store.get(job.id).state for job in rest} == {JobState.QUEUED}
-    assert {store.get(job.id).attempts for job in rest} == {0}
-    start_worker("elsewhere", host="elsewhere")
-    done = [until(job) for job in rest]
-    assert {(job.state, job.worker) for job in done} == {(JobState.SUCCEEDED, "elsewhere")}, done
-    store.cancel(first.id)
-    following = until(store.submit(train_job("following"))[0])
-    assert (following.state, following.attempts) == (JobState.SUCCEEDED, 1)
-
-
-@pytest.mark.long
-def test_a_stopped_worker_loses_its_job_and_its_device(store, start_worker, until):
-    one = start_worker("one")
-    job, _ = store.submit(train_job("one", steps=600))
-    until(job, is_training)
-    process = one.job_process()
-    one.suspend()
-    start_worker("two")
-    job = until(job)
-    assert (job.state, job.worker, job.attempts) == (JobState.SUCCEEDED, "two", 2), job
-    assert one.process.wait(30) == -signal.SIGKILL
-    wait_until(lambda: not Path(f"/proc/{process}").exists())
 
 
 @pytest.mark.long

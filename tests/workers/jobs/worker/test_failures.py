@@ -1,7 +1,5 @@
 """What goes wrong for real: each such job fails with one reason that a person can read, and the next one runs."""
 
-from __future__ import annotations
-
 import os
 import resource
 import shutil
@@ -21,7 +19,7 @@ from ultragray_workers.jobs.progress import JobState
 from ultragray_workers.jobs.store import JobStore
 
 from ....waiting import Deadline, at_this_load
-from ..conftest import FINAL, store_dataset, train_job
+from ..conftest import FINAL, is_training, store_dataset, train_job
 
 DISK_BYTES = 8 * 2**20
 # The loss of trainings with batches of three is NaN from the third step on.
@@ -39,10 +37,6 @@ if "ultragray_workers.jobs.worker.run_job" in sys.orig_argv:
 
 def poses(count):
     return np.tile(np.eye(4), (count, 1, 1)).tolist()  # type: ignore[no-any-return]
-
-
-def is_training(job):
-    return job.state is JobState.RUNNING and (job.progress.step or 0) > 0
 
 
 def process_of(worker, *, not_=None, timeout_s=60.0):

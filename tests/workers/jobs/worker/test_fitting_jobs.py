@@ -1,7 +1,5 @@
 """Jobs go only to workers that fit them, past those ahead of them in the queue, as soon as such a worker comes."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import pytest
@@ -31,31 +29,6 @@ def is_there(store, worker):
 
 
 @pytest.mark.long
-def test_each_job_goes_to_a_worker_that_fits_it_and_holds_nobody_up(store, start_worker, until):
-    """Jobs that nobody can take are first in the queue; those behind them are done in their order, by who fits."""
-    too_large = submit(store, "too-large", memory_gb=memory_bytes() // 10**9 + 1)
-    for_gpu = submit(store, "for-gpu", device="cuda")
-    elsewhere = submit(store, "elsewhere", site="lab3")
-    one = [submit(store, f"one-{number}", site="lab1") for number in range(2)]
-    two = [submit(store, "two", site="lab2", rack="4")]
-    anywhere = submit(store, "anywhere", device="auto", memory_gb=1)
-    start_worker("first", host="first", labels={"site": "lab1"})
-    start_worker("second", host="second", labels={"site": "lab2", "rack": "4"})
-
-    assert [until(job).worker for job in one] == ["first", "first"]
-    assert [until(job).worker for job in two] == ["second"]
-    assert until(anywhere).state is JobState.SUCCEEDED
-    done = [store.get(job.id) for job in (*one, *two)]
-    assert (done[0].started_at or "") < (done[1].started_at or "")
-    assert {job.state for job in done} == {JobState.SUCCEEDED}
-    left = [store.get(job.id) for job in (too_large, for_gpu, elsewhere)]
-    assert {(job.state, job.attempts, job.worker) for job in left} == {(JobState.QUEUED, 0, None)}
-
-    start_worker("third", host="third", labels={"site": "lab3"})
-    assert until(elsewhere).worker == "third"
-
-
-@pytest.mark.long
 def test_a_job_that_nobody_can_take_says_so_and_starts_when_a_fitting_worker_comes(store, start_worker, until):
     job = submit(store, "made", site="lab2")
     asked = "a worker with the device cpu and the label site=lab2"
@@ -80,18 +53,6 @@ def test_a_job_that_nobody_can_take_says_so_and_starts_when_a_fitting_worker_com
     start_worker("second", labels={"site": "lab2"})
     job = until(job)
     assert (job.state, job.worker, job.progress.waits_for) == (JobState.SUCCEEDED, "second", None), job
-
-
-@pytest.mark.long
-def test_workers_tell_their_devices_and_labels(store, start_worker):
-    start_worker("one", labels={"site": "lab1"})
-    wait_until(is_there(store, "one"))
-    (worker,) = store.workers()
-    (device,) = worker.devices
-    assert (device.name, device.memory_bytes) == ("cpu", memory_bytes())
-    assert device.cores is not None
-    assert device.model
-    assert (worker.device, worker.labels) == ("cpu", {"site": "lab1"})
 
 
 @pytest.fixture

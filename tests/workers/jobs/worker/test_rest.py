@@ -1,7 +1,5 @@
 """Workers that are to rest: paused, drained, resumed, and stopped by a service manager."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

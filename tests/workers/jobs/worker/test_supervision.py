@@ -1,7 +1,5 @@
 """Jobs whose process had finished when their worker died: another worker says how they ended."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

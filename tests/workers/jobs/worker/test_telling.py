@@ -1,7 +1,5 @@
 """What a worker tells others of its job: whole checkpoints, all of the log, and nothing once it was cut off."""
 
-from __future__ import annotations
-
 import pytest
 
 from ultragray_workers.errors import StorageUnavailable

@@ -1,7 +1,5 @@
 """Jobs that get stuck, and jobs that take too long."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess
@@ -19,26 +17,11 @@ from ultragray_workers.jobs.worker import process as watchdog
 from ultragray_workers.jobs.worker.process import Watchdog, kill_group
 
 from ....waiting import wait_until
-from ..conftest import train_job
+from ..conftest import is_training, train_job
 
 FOR_EVER = 1_000_000  # steps
 LONGEST_S = 1000.0
 # Trainings of the scene `sleeps` never come to their second step.
-SLEEP = """
-import sys, time
-if "ultragray_workers.jobs.worker.run_job" in sys.orig_argv:
-    from ultragray_workers.jobs.kinds import train_run
-    report = train_run._report
-    def sleep(job_run, *told):
-        report(job_run, *told)
-        if job_run.request.specification["scene"] == "sleeps":
-            time.sleep(3600)
-    train_run._report = sleep
-"""
-
-
-def is_training(job):
-    return job.state is JobState.RUNNING and (job.progress.step or 0) > 0
 
 
 @contextmanager
@@ -115,16 +98,6 @@ def test_a_stopped_process_is_noticed_and_keeps_no_device(store, start_worker, u
     successor, _ = store.retry(job.id)
     until(successor, lambda job: "from a checkpoint" in store.log_tail(job.id))
     store.cancel(successor.id)
-
-
-@pytest.mark.long
-def test_a_process_that_waits_for_ever_is_noticed(store, start_worker, until, tmp_path, monkeypatch):
-    (tmp_path / "sitecustomize.py").write_text(SLEEP)
-    monkeypatch.syspath_prepend(str(tmp_path))
-    start_worker(stall_timeout_s=3.0)
-    sleeps, good = (store.submit(train_job(scene))[0] for scene in ("sleeps", "good"))
-    assert until(sleeps).error == "JOB_STALLED"
-    assert until(good).state is JobState.SUCCEEDED
 
 
 @pytest.mark.long

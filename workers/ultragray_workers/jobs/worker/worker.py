@@ -232,8 +232,7 @@ class Housekeeper:
         """One round: how many jobs and folders were removed. Raises UltragrayError where the database is away."""
         removed, kept = 0, set[str]()
         while not self._stop.is_set():
-            finished_before_s = time.time() - self._retention_s
-            if not (old := queue.finished_before(self._engine, finished_before_s, kept, AT_ONCE)):
+            if not (old := queue.finished_ago(self._engine, self._retention_s, kept, AT_ONCE)):
                 break
             for job_id in old:
                 try:

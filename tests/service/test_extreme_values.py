@@ -1,11 +1,12 @@
-"""Numbers at the edge of what a float or an integer can be, in every field of the contract, through every door."""
+"""Strings that no database or file system holds, and numbers at the edge of what a float or an integer can be."""
 
 import json
-import queue
 import sys
 from dataclasses import MISSING
 from typing import get_args, get_origin
+from urllib.parse import quote
 
+import httpx
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
@@ -13,7 +14,54 @@ from hypothesis import strategies as st
 
 from ultragray.contract import Contract, Family, annotated_fields, optional_of
 from ultragray.rendering.settings import RenderSettings
-from ultragray_proto.v1 import geometry_pb2, rendering_pb2
+
+from ..workers.jobs.conftest import store_dataset
+
+UNSTORABLE = {"nul": "a\0b", "surrogate": "a\ud800b", "long": "x" * 10_000}
+
+
+@pytest.fixture(scope="module")
+def stored(start_service, postgres, artifacts):
+    store_dataset(artifacts, "tiny")
+    return start_service(artifact_folder=artifacts, database_url=postgres.create_database())
+
+
+def bodies(text):
+    render = {"scene": "demo", "poses": [POSE["matrix"]], "height": 8, "width": 8}
+    train = {"dataset": "tiny", "scene": "new", "settings": {"steps": 1}}
+    evaluate = {"dataset": "tiny", "scene": "demo"}
+    asked = [{"kind": "render", "specification": render, "request_id": text}, {"kind": text, "specification": render}]
+    for kind, whole in (("render", render), ("train", train), ("evaluate", evaluate), ("compare", {"dataset": "tiny"})):
+        for name in {*whole, "scene", "dataset", "format", "dtype", "device", "preset", "budget"} - {"poses"}:
+            asked.append({"kind": kind, "specification": {**whole, name: text}})
+    asked.append({"kind": "render", "specification": render, "priority": text})
+    asked.append({"kind": "train", "specification": {**train, "settings": {text: 1}}})
+    return asked
+
+
+@pytest.mark.parametrize("text", UNSTORABLE.values(), ids=UNSTORABLE)
+def test_strings(stored, text):
+    with httpx.Client(base_url=stored.http, timeout=60) as http:
+        for body in bodies(text):
+            answer = http.post("/v1/jobs", content=json.dumps(body))
+            assert answer.status_code in (400, 404, 413, 422), (body, answer.text)
+            assert answer.json()["reason"]
+        name = quote(text.encode("utf-8", "surrogatepass"), safe="")
+        for path in ("jobs", "scenes", "datasets"):
+            answer = http.get(f"/v1/{path}/{name}")
+            assert 400 <= answer.status_code < 500, answer.text
+            answer = http.get(f"/v1/{path}?page_token={name}")
+            assert 400 <= answer.status_code < 500, answer.text
+        for path in (f"/v1/jobs?state={name}", f"/v1/jobs/{name}/artifacts/{name}", f"/v1/jobs/{name}/log"):
+            assert 400 <= http.get(path).status_code < 500
+        for path in (f"/v1/datasets/{name}", f"/v1/scenes/{name}"):
+            assert 400 <= http.put(path, content=b"x").status_code < 500
+            assert 400 <= http.delete(path).status_code < 500
+
+
+def test_the_log_has_no_fault(stored):
+    assert not [record for record in stored.log() if record["level"] == "error"]
+
 
 TIMEOUT_S = 60.0
 MANY = settings(deadline=None, max_examples=150, suppress_health_check=[HealthCheck.function_scoped_fixture])
@@ -87,55 +135,7 @@ EXTREME = given(asked=documents(RenderSettings), pose=st.just(POSE) | POSES)
 @EXTREME
 @example(asked=DEEP, pose=POSE)
 @MANY
-def test_http(http, asked, pose):
+def test_numbers(http, asked, pose):
     answer = http.post("/v1/scenes/demo/render", content=json.dumps({**asked, "pose": pose}), timeout=TIMEOUT_S)
     assert answer.status_code in (200, 422), answer.text
     assert answer.status_code == 200 or answer.json()["field"], answer.text
-
-
-class Stream:
-    """A stream that must outlive all that is asked of it."""
-
-    def __init__(self, renders):
-        self._messages = queue.Queue()
-        self._frames = renders.RenderStream(iter(self._messages.get, None))
-
-    def ask(self, message):
-        self._messages.put(message)
-        return next(self._frames)
-
-    def end(self):
-        self._messages.put(None)
-
-
-@pytest.fixture(scope="module")
-def grpc_stream(renders):
-    stream = Stream(renders)
-    yield stream
-    stream.end()
-
-
-@EXTREME
-@example(asked=DEEP, pose=POSE)
-@MANY
-def test_grpc_stream(grpc_stream, asked, pose):
-    try:
-        message = rendering_pb2.RenderStreamRequest(settings=settings_message(asked), pose=pose_message(pose))
-    except (ValueError, OverflowError):  # an integer that the message has no room for
-        return
-    error = grpc_stream.ask(message).error
-    assert not error.reason or error.field, error
-
-
-def settings_message(asked):
-    given = dict(asked)
-    if (probe := given.pop("probe", None)) is not None:
-        inner = {name: value for name, value in probe.items() if name != "kind"}
-        given["probe"] = geometry_pb2.Probe(**{probe["kind"]: inner})
-    return rendering_pb2.RenderSettings(scene="demo", **given)
-
-
-def pose_message(pose):
-    if "matrix" in pose:
-        return geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=np.ravel(pose["matrix"])))
-    return geometry_pb2.Pose(placement=geometry_pb2.Placement(**pose))
