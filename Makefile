@@ -72,7 +72,7 @@ test-soak: $(VENV)/installed-dev  ## clients of all kinds for MINUTES (30) while
 	ULTRAGRAY_SOAK_SECONDS=$$(($(MINUTES) * 60)) ULTRAGRAY_SOAK_RECORD=$(FIGURES)/soak-run.json $(BIN)/pytest tests/soak $(ARGS)
 	$(KEEP) soak-run
 
-test-overload: $(VENV)/installed-dev  ## ten times the capacity for a minute at each door (RECORD=1: the figures to tests/overload-run.json)
+test-overload: $(VENV)/installed-dev  ## ten times the capacity for a minute at each door, and a polite client beside attacks (RECORD=1: the figures to tests/overload-run.json)
 	$(READY)
 	@rm -f $(FIGURES)/overload-run.json
 	ULTRAGRAY_OVERLOAD_SECONDS=60 ULTRAGRAY_OVERLOAD_RECORD=$(FIGURES)/overload-run.json $(BIN)/pytest tests/overload $(ARGS)

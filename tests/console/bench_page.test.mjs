@@ -72,6 +72,7 @@ describe("the crop of a sequence", () => {
     await delay.fill("fast");
     await page.getByRole("button", { name: "Upload and check" }).click();
     await page.getByText("image_delay_ms must be milliseconds, got 'fast'").waitFor();
+    assert.match(page.faults.splice(0).join(), /^Failed to load resource: .* 422 .*image_delay_ms=fast\)$/);
     await delay.fill("");
     await page.getByRole("button", { name: "Upload and check" }).click();
     const dataset = page.getByTestId("dataset");

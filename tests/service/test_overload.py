@@ -65,6 +65,9 @@ def test_a_scene_that_would_take_minutes_is_refused_by_both_doors(strict, scene)
         with pytest.raises(grpc.RpcError) as caught:
             list(stub.RenderBatch(rendering_pb2.RenderBatchRequest(settings=settings, poses=[moved(0)]), timeout=60))
         assert error_info(caught.value)[0].metadata["field"] == "poses[0]"
+        plane = {"origin_mm": [-20, 0, 0], "size_mm": [40.96, 40.96], "spacing_mm": 0.02}
+        refused = client.post(f"/v1/scenes/{scene}:slice", json=plane)
+        assert (refused.json()["reason"], refused.json()["field"]) == ("FRAME_TOO_COSTLY", "spacing_mm")
         assert render(client, "demo").status_code == 200
     assert strict.metric("ultragray_process_restarts_total") == strict.metric("ultragray_watchdog_kills_total") == 0
 

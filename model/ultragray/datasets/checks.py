@@ -21,6 +21,7 @@ from ultragray.geometry.pose import rotation_angles_deg
 from ultragray.geometry.probe import Fan, FloatArray, Probe
 from ultragray.geometry.rotations import turns_of
 from ultragray.learn.sweep import Chain, Dataset, Distances, Sweep, corner_distances_mm, frame_list
+from ultragray.learn.training.agreement import agreed_path
 
 VOXEL_MM = 1.0
 MAX_VOXELS = 8_000_000
@@ -83,6 +84,7 @@ SMALLEST_JUMP_MM = 1.0
 SATURATED_SHARE = 0.05
 DARKEST_PEAK = 16  # of 255
 SAME_POSE_MM = 1e-6
+SHAKEN_DB = 1.0  # by which frames must be predicted better in time than in space
 SHORTEST_TRAVEL = 0.1  # of the length of the scan lines
 TURN_IN_PLACE_DEG = 5.0
 LONGEST_USUAL_STEP_MM = 50.0
@@ -145,11 +147,10 @@ def check_dataset(dataset: Dataset) -> DatasetReport:
     away = Distances.of(dataset)
     distances, angles = away.mm, away.deg
     train, val = dataset.train, dataset.val
-    is_one = train.source == val.source and not set(train.frame_numbers) & set(val.frame_numbers)
-    recording = _Frames(train, val) if is_one else _Frames(train)
+    recording = _Frames(train, val) if dataset.is_one_recording else _Frames(train)
     delay = recording.delay()
     reports = {"train": check_sweep(train), **({"val": check_sweep(val)} if len(val) else {})}
-    if is_one:
+    if dataset.is_one_recording:
         found = list(_warnings(recording))
         reports = {name: replace(report, warnings=()) for name, report in reports.items()}
     else:
@@ -426,6 +427,7 @@ def _dataset_warnings(dataset: Dataset) -> list[str]:
     found = [
         *dict.fromkeys((*dataset.train.notes, *dataset.val.notes)),
         *(list(dataset.probe.oddities()) or _hardly_moved(dataset.train)),
+        *_shaken(dataset),
     ]
     known = set(_contents(dataset.train))
     leaked = [place for place, frame in enumerate(_contents(dataset.val)) if frame in known]
@@ -433,6 +435,19 @@ def _dataset_warnings(dataset: Dataset) -> list[str]:
         listed = frame_list(dataset.val.frame_numbers[leaked])
         found.append(f"held-out frames {listed} are also training frames: metrics will flatter")
     return found
+
+
+def _shaken(dataset: Dataset) -> list[str]:
+    """Poses that predict a frame from those beside it worse than no poses at all."""
+    path = agreed_path(dataset)
+    if path is None or path.in_time_db < path.tracked_db + SHAKEN_DB:
+        return []
+    noise = path.noise
+    return [
+        f"the two neighbours in time predict a frame {path.in_time_db - path.tracked_db:.1f} dB better than by their "
+        f"poses: the tracker shakes (by {noise.position_mm:.2f} mm and {noise.turn_deg:.2f}°, as the path has it), or "
+        f"tissue moves with the probe; --refine-poses path wins {path.found_db - path.tracked_db:.1f} dB"
+    ]
 
 
 def _hardly_moved(sweep: Sweep) -> list[str]:

@@ -236,6 +236,11 @@ class Dataset:
         return self.train.probe
 
     @property
+    def is_one_recording(self) -> bool:
+        """Whether both parts are frames of one recording, in the order of their numbers."""
+        return self.train.source == self.val.source and not set(self.train.frame_numbers) & set(self.val.frame_numbers)
+
+    @property
     def centre_mm(self) -> FloatArray:  # [3]
         """Origin of the scene: the mean of the corners of the training frames (docs/physics.md §6)."""
         mean: FloatArray = self.train.corners_mm().mean(axis=(0, 1))

@@ -26,7 +26,7 @@ from ultragray.rendering.backends import cpu
 from ultragray.rendering.derived import heaviest_labels, label_parts
 from ultragray.rendering.limits import UNLIMITED, Limits
 from ultragray.rendering.pixels import image_file
-from ultragray.rendering.volumes import SLICE_SUFFIXES, VOLUME_SUFFIXES, VolumeGrid, check_field
+from ultragray.rendering.volumes import SLICE_SUFFIXES, VOLUME_SUFFIXES, VolumeGrid, as_grey, check_field
 from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.info import SceneInfo
 
@@ -168,11 +168,6 @@ def write_slice(path: str | Path, scene: GaussianScene, field: str, grid: Volume
     pixels = sample_slice(scene, field, grid)
     is_picture = path.suffix == ".png"
     write_whole(path, image_file(as_grey(pixels, field), ".png").tobytes() if is_picture else npy_bytes(pixels))
-
-
-def as_grey(pixels: npt.NDArray[Any], field: str) -> npt.NDArray[Any]:  # [J, I] -> [J, I]
-    """A slice as a picture shows it: white is 1, of attenuation its largest value; labels keep their numbers."""
-    return pixels / pixels.max() if field == "attenuation" and pixels.any() else pixels
 
 
 def volume_facts(info: SceneInfo, field: str, grid: VolumeGrid) -> dict[str, Any]:

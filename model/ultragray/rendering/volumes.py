@@ -12,6 +12,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from ultragray.contract import Contract, described
 from ultragray.errors import InvalidArgument
@@ -19,6 +20,10 @@ from ultragray.geometry.pose import MAX_POSITION_MM
 from ultragray.geometry.probe import FloatArray, Picture
 from ultragray.rendering.settings import Encoding
 from ultragray.scene.info import SceneInfo
+
+PIECE_PIXELS = 1 << 17  # of a slice, which is sampled in pieces between which frames go
+MOST_PIECES = 128
+LESS_FOR_A_PIECE = 8  # so many times less than a frame may it cost
 
 VOLUME_FIELDS = ("echo", "coverage", "attenuation", "labels")
 VOLUME_SUFFIXES = (".nii.gz", ".nii", ".nrrd")
@@ -31,6 +36,16 @@ def check_field(field: str, *, has_labels: bool) -> None:
         raise InvalidArgument(f"field must be one of {', '.join(VOLUME_FIELDS)}, got {field[:40]!r}", field="field")
     if field == "labels" and not has_labels:
         raise InvalidArgument("labels are for scenes whose Gaussians carry them, this one's carry none", field="field")
+
+
+def numbers_of(field: str) -> Encoding:
+    """The encoding that keeps the values of a slice: float32, of labels uint8."""
+    return Encoding.UINT8 if field == "labels" else Encoding.FLOAT32
+
+
+def as_grey(pixels: npt.NDArray[Any], field: str) -> npt.NDArray[Any]:  # [J, I] -> [J, I]
+    """A slice as a picture shows it: white is 1, of attenuation its largest value; labels keep their numbers."""
+    return pixels / pixels.max() if field == "attenuation" and pixels.any() else pixels
 
 
 def voxel_bytes(field: str) -> int:
@@ -222,8 +237,7 @@ class SliceSettings(Contract):
 
     @property
     def numbers(self) -> Encoding:
-        """The encoding that keeps its values: float32, of labels uint8."""
-        return Encoding.UINT8 if self.field == "labels" else Encoding.FLOAT32
+        return numbers_of(self.field)
 
     def view(self, encoding: Encoding) -> SliceView:
         width, height, _ = self.grid().shape

@@ -77,6 +77,7 @@ def evaluate(
 
     from ultragray.learn.evaluation.scoring import evaluate as evaluate_scene
     from ultragray.learn.evaluation.scoring import measure_reliability, require_frames
+    from ultragray.learn.training.poses import held_out_on_path
     from ultragray.rendering.backends.registry import render_device
     from ultragray.scene.gaussians import GaussianScene
 
@@ -89,12 +90,15 @@ def evaluate(
         evaluation = evaluate_scene(loaded, frames, backend=backend)
         reliability = measure_reliability(loaded, frames, backend=backend)
         poses = _pose_figures(loaded, frames if register else None, backend)
+        placed = held_out_on_path(read, loaded.info) if split is Split.VAL else None
+        on_path = {} if placed is None else {"on_path": evaluate_scene(loaded, placed, backend=backend)}
     if json:
         figures = evaluation.to_dict() | {"uncertainty": None if reliability is None else reliability.to_dict()}
-        figures |= {name: value.to_dict() for name, value in poses.items()}
+        figures |= {name: value.to_dict() for name, value in (poses | on_path).items()}
         typer.echo(to_json({"scene": str(scene), "dataset": read.name, "split": split.value, **figures}))
     else:
-        print_metrics(f"{read.name}, {len(frames)} {split.value} frames", {scene.stem: evaluation})
+        named = {f"{scene.stem}, frames on the path of the training": one for one in on_path.values()}
+        print_metrics(f"{read.name}, {len(frames)} {split.value} frames", {scene.stem: evaluation, **named})
         print_speckle({scene.stem: evaluation})
         if reliability is not None:
             typer.echo(_in_words(reliability))

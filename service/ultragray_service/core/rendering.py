@@ -6,6 +6,7 @@ A door reads a request into settings and poses; `RequestPlanner` resolves the se
 
 from __future__ import annotations
 
+import asyncio
 import time
 from collections.abc import Awaitable, Callable
 from contextlib import nullcontext
@@ -13,12 +14,23 @@ from dataclasses import replace
 from functools import lru_cache
 from typing import Generic
 
+import numpy as np
+
 from ultragray.contract import join, under
-from ultragray.errors import InvalidImageSize, RenderFailed, TooManyPoses
+from ultragray.errors import FrameTooCostly, InvalidImageSize, RenderFailed, TooManyPoses
 from ultragray.geometry.probe import FloatArray
 from ultragray.geometry.registration import Registration
+from ultragray.rendering.pixels import encoded_image
 from ultragray.rendering.settings import Encoding, FrameSettings, Resolved
-from ultragray.rendering.volumes import SliceSettings, SliceView, check_field
+from ultragray.rendering.volumes import (
+    MOST_PIECES,
+    PIECE_PIXELS,
+    SliceSettings,
+    SliceView,
+    as_grey,
+    check_field,
+    numbers_of,
+)
 from ultragray.scene.info import SceneHeader, SceneInfo
 from ultragray_service.access.audit import account
 from ultragray_service.access.limits import Limits
@@ -194,6 +206,7 @@ class Rendering:
         turn: Turn | None = None,
         begin_by: float | None = None,  # time.monotonic() in seconds; else it is refused
         destination: Destination | None = None,
+        settings: S | None = None,  # in place of the plan's: a part of it
     ) -> RenderResult[S]:
         """Renders for the scene that is there by then. Raises what RenderPool.render and Plan.renew raise."""
         self.life.require_serving()
@@ -205,7 +218,15 @@ class Rendering:
         turn = turn or Turn()
         for _ in range(MAX_SCENE_CHANGES):
             request = RenderRequest(
-                plan.scene, plan.settings, poses, priority, deadline, plan.version, caller(), begin_by, destination
+                plan.scene,
+                settings or plan.settings,
+                poses,
+                priority,
+                deadline,
+                plan.version,
+                caller(),
+                begin_by,
+                destination,
             )
             try:
                 with scene_to_blame():
@@ -215,6 +236,53 @@ class Rendering:
                     poses, deadline = turn.ticket.request.poses, turn.ticket.request.deadline
                 await plan.renew()
         raise RenderFailed(f"scene {plan.scene!r} kept changing while it was being rendered", field="scene")
+
+    async def render_slice(
+        self, plan: Plan[SliceView], pose: FloatArray, *, deadline: float | None
+    ) -> RenderResult[SliceView]:
+        """A slice at a pose [4, 4] mm, some rows at a time: frames of others go between.
+
+        Rows that cost too much for one piece come in smaller ones. Raises FrameTooCostly where these would be more than
+        MOST_PIECES, and what `render` raises.
+        """
+        view, numbers = plan.settings, numbers_of(plan.settings.field)
+        rows, first = max(1, PIECE_PIXELS // view.width), 0
+        pieces: list[RenderResult[SliceView]] = []
+        while first < view.height:
+            piece = replace(view, height=min(rows, view.height - first), encoding=numbers)
+            place = pose.copy()
+            place[:3, 3] += first * view.spacing_mm * pose[:3, 2]
+            try:
+                result = await self.render(plan, place[None], deadline=deadline, settings=piece)
+            except FrameTooCostly as error:
+                rows = piece.height // 2
+                if len(pieces) * rows + view.height - first > MOST_PIECES * rows:
+                    raise FrameTooCostly(
+                        "the Gaussians are too wide for the size of this slice; ask for fewer pixels", field=error.field
+                    ) from None
+                continue
+            if pieces and result.scene_sha256 != pieces[0].scene_sha256:
+                pieces, first = [], 0
+                continue
+            pieces.append(result)
+            first += piece.height
+        data, began = b"".join(piece.data for piece in pieces), time.monotonic()
+        if view.encoding is Encoding.PNG:
+            data = await asyncio.to_thread(_png_of, view, data)
+        return replace(
+            pieces[0],
+            settings=view,
+            poses=pose[None],
+            data=data,
+            queue_ms=sum(piece.queue_ms for piece in pieces),
+            render_ms=sum(piece.render_ms for piece in pieces),
+            encode_ms=1000 * (time.monotonic() - began),
+        )
+
+
+def _png_of(view: SliceView, data: bytes) -> bytes:
+    values = np.frombuffer(data, numbers_of(view.field).pixel_type).reshape(view.height, view.width)
+    return encoded_image(as_grey(values, view.field), Encoding.PNG).tobytes()
 
 
 @lru_cache(maxsize=256)

@@ -14,6 +14,7 @@ from collections.abc import Callable, Iterator
 from functools import partial
 from typing import Any
 
+import httptools
 import uvicorn
 from starlette.types import ASGIApp
 from uvicorn.protocols.http.httptools_impl import STATUS_LINE, HttpToolsProtocol
@@ -168,9 +169,23 @@ class BoundedHttp(HttpToolsProtocol):
         if self._is_over or self.transport.is_closing():
             return
         self._idle_bytes += len(data)
-        super().data_received(data)
+        self._unset_keepalive_if_required()
+        self._parse(data)
         if self._idle_bytes > self._limits.max_header_bytes and not self._is_over:
             self._refuse(self._head_too_large())
+
+    def _parse(self, data: bytes) -> None:
+        try:
+            self.parser.feed_data(data)
+        except httptools.HttpParserError:
+            self.send_400_response("")
+        except httptools.HttpParserUpgrade as pause:
+            if self._should_upgrade():
+                self.handle_websocket_upgrade()
+            elif not _has_body(self.headers):  # an ordinary request; uvicorn would forget what came behind it
+                self._parse(data[pause.args[0] :])
+            else:  # the parser takes no body of a handshake
+                self.cycle.keep_alive = False
 
     def on_message_begin(self) -> None:
         if self._head_since is None:  # it came with the end of the request before

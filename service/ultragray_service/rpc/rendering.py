@@ -192,7 +192,7 @@ class RenderService:
             asked = read(request.slice, SliceSettings)
         plan = await self._service.planner.plan_slice(request.scene, asked, asked.numbers, path="slice")
         await self._service.limits.take_frames(1, deadline)
-        result = await self._service.rendering.render(plan, asked.pose()[None], deadline=deadline)
+        result = await self._service.rendering.render_slice(plan, asked.pose(), deadline=deadline)
         return slice_message(result)
 
     async def Localize(

@@ -69,5 +69,5 @@ def test_a_handshake_with_a_body_is_an_ordinary_request(opened, body):
 
 
 def test_answers_that_are_due_before_a_handshake_come_before_its_own(opened):
-    opened.sendall(REQUEST + REQUEST + HANDSHAKE + b"\r\n")
-    assert statuses(opened, 3) == [200, 200, 404]
+    opened.sendall(REQUEST + REQUEST + HANDSHAKE + b"\r\n" + REQUEST)
+    assert statuses(opened, 4) == [200, 200, 404, 200]

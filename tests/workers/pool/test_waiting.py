@@ -7,6 +7,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ultragray.rendering.settings import Encoding
+from ultragray.rendering.volumes import SliceView
 from ultragray_workers import Priority
 from ultragray_workers.errors import DeadlineExceeded, QueueFull
 from ultragray_workers.pool import waiting
@@ -91,6 +93,16 @@ def test_slow_batches_let_interactive_requests_pass_between_their_parts(make_tic
         monkeypatch.setattr(waiting.time, "monotonic", lambda second=second: now + second)
         order += [part.ticket for part in queue.take_batch()]
     assert order == [batch, interactive[0], batch, interactive[1], batch]
+
+
+def test_pieces_of_slices_go_alone(make_ticket):
+    queue = WaitingQueue(limit_frames=100, max_batch_poses=4)
+    for _ in range(2):
+        ticket = make_ticket()
+        piece = SliceView("echo", 8, 8, 0.1, Encoding.FLOAT32)
+        ticket.request = replace(ticket.request, settings=piece)
+        queue.add(ticket)
+    assert [len(queue.take_batch()) for _ in range(3)] == [1, 1, 0]
 
 
 def test_large_images_make_smaller_batches(make_ticket):

@@ -335,7 +335,7 @@ class WaitingQueue:
         """The number of poses in a full batch: fewer for images of more than 512x512 pixels, and for slow ones."""
         share = _BATCH_PRIORITY_SHARE if ticket.request.priority is Priority.BATCH else 1
         settings: Resolved | SliceView | Sought = ticket.request.settings
-        if isinstance(settings, Sought):
+        if isinstance(settings, Sought | SliceView):
             return 1
         pixels = settings.height * settings.width * len(settings.outputs)
         fitting = self._max_batch_poses * _FULL_BATCH_PIXELS_PER_POSE // pixels

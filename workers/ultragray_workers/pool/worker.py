@@ -35,8 +35,8 @@ from ultragray.rendering.frames import render_shown
 from ultragray.rendering.limits import UNLIMITED, GivenUp, Limits
 from ultragray.rendering.pixels import encoded_image, in_type
 from ultragray.rendering.settings import Encoding, Resolved
-from ultragray.rendering.volume_fields import as_grey, sample_slice
-from ultragray.rendering.volumes import SliceView
+from ultragray.rendering.volume_fields import sample_slice
+from ultragray.rendering.volumes import LESS_FOR_A_PIECE, SliceView
 from ultragray.scene.confidence import Assessor, require_confidence
 from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.info import read_header, scene_file_invalid
@@ -271,10 +271,11 @@ class _Worker:
     def _sample(self, task: Task[SliceView], part: TaskPart[SliceView], memory: int) -> Rendered:
         loaded, view = self._scene_of(task), part.settings
         started, size = time.monotonic(), 0
+        limits = replace(
+            self._limits(lambda _: "spacing_mm"), footprint_pixels=self._max_footprint_pixels // LESS_FOR_A_PIECE
+        )
         for number, pose in enumerate(part.poses, part.first):
-            pixels = sample_slice(loaded.scene, view.field, view.grid(pose), self._limits(lambda _: "spacing_mm"))
-            if view.encoding is Encoding.PNG:
-                pixels = encoded_image(as_grey(pixels, view.field), Encoding.PNG)
+            pixels = sample_slice(loaded.scene, view.field, view.grid(pose), limits)
             data = np.ascontiguousarray(pixels, pixels.dtype.newbyteorder("<"))
             write_at(memory, data.data.cast("B"), number * data.nbytes)
             size = part.total * data.nbytes

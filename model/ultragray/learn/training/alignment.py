@@ -80,7 +80,6 @@ JUMP = 6.0  # median steps: a longer step begins a new sweep
 LEAST_FRAMES = 5  # of a sweep: fewer are not a path
 RATIOS = 10.0 ** np.arange(-6.0, 6.01, 0.25)  # of the variances q/r that are tried
 TINY = 1e-300  # a variance whose logarithm is finite
-GOOD_MM, GOOD_DEG = 0.2, 0.2  # a tracker's error below these, standard deviation along an axis, is left alone
 _NUMBERS = 6
 
 
@@ -90,10 +89,6 @@ class TrackerNoise:
 
     position_mm: float
     turn_deg: float
-
-    @property
-    def is_small(self) -> bool:
-        return self.position_mm < GOOD_MM and self.turn_deg < GOOD_DEG
 
 
 def sweep_ranges(sweep: Sweep) -> list[range]:

@@ -36,7 +36,7 @@ TEXTURE, TEXTURE_OF_LEARNED_BEAM = 0.05, 0.2  # with less a search that starts t
 MAX_RANGE_MM = 100.0  # frames further apart have nothing to say about what lies between
 STARTS = ("informed", "random")
 GROWTHS = ("even", "threshold")
-REFINEMENTS = ("none", "sweeps", "frames")
+REFINEMENTS = ("none", "path", "sweeps", "frames")
 
 
 @dataclass(frozen=True)
@@ -129,8 +129,8 @@ class TrainingConfig(Contract):
         False,
     )
     refine_poses: str = described(
-        "Correction of the training poses (docs/poses.md): none; sweeps: each sweep as a whole; frames: each frame "
-        "too. Good poses are left alone.",
+        "Correction of the poses (docs/poses.md): none; path: that which neighbouring frames agree with; sweeps: each "
+        "sweep as a whole; frames: all of it. Good poses are left alone.",
         "none",
         choices=REFINEMENTS,
     )

@@ -123,7 +123,7 @@ def _gaussian_bytes(config: TrainingConfig) -> int:
 def comparison_bytes(dataset: Dataset, config: TrainingConfig) -> int:
     """An upper bound of what Geometry.of and the registration of sweeps take to compare the training frames."""
     count, registered = len(dataset.train), 0
-    if config.refine_poses != "none":
+    if config.refine_poses not in ("none", "path"):
         registered = min(count, 2 * overlap.FRAMES) * dataset.train.height * dataset.train.width
     return max(8 * count**2 + COMPARED_BYTES * count, REGISTERED_BYTES * registered)
 

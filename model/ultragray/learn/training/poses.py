@@ -1,10 +1,10 @@
 """Poses that are trained with the scene, and scores of held-out frames whose own poses may be wrong.
 
-`PoseRefinement` begins with what `alignment` finds. Then each group of frames, one frame or a whole sweep, has a twist
-ξ = (ω, t) in mm along the axes of its probe, and its poses are corrected by the motion exp(ω̂ / lever) about the middle
-of its images, then the shift t. The gradient of the loss with respect to ξ is that of the renderer (docs/physics.md
-§4). A common motion of all frames changes no image, so the mean of the corrections, or that of the first sweep, is
-taken to be none.
+`PoseRefinement` begins with what `agreement` and `alignment` find. Then each group of frames, one frame or a whole
+sweep, has a twist ξ = (ω, t) in mm along the axes of its probe, and its poses are corrected by the motion
+exp(ω̂ / lever) about the middle of its images, then the shift t. The gradient of the loss with respect to ξ is that of
+the renderer (docs/physics.md §4). A common motion of all frames changes no image, so the mean of the corrections, or
+that of the first sweep, is taken to be none.
 """
 
 from __future__ import annotations
@@ -21,15 +21,18 @@ from ultragray.errors import DatasetInvalid
 from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation.scoring import frames_at_once, require_frames
 from ultragray.learn.sweep import Dataset, Sweep
-from ultragray.learn.training.alignment import register_sweeps, sweep_ranges, tracker_noise, without_noise
+from ultragray.learn.training.agreement import on_agreed_path
+from ultragray.learn.training.alignment import register_sweeps, sweep_ranges
 from ultragray.learn.training.losses import SSIM_WINDOW, image_loss
 from ultragray.rendering.backends.inputs import ScenePoses
 from ultragray.rendering.frames import render
 from ultragray.scene.gaussians import GaussianScene
+from ultragray.scene.info import SceneInfo
 
 START = 0.1  # share of the run: before, there is no anatomy to compare with
 RATE = 0.01  # mm a step: at the end of a long run some tenths of a mm from where it began
 WITHIN_THE_PLANE = (0.1, 1.0, 0.1, 1.0, 0.1, 1.0)  # a frame's own image hardly shows moves out of its plane
+WITH_PATH = ("path", "frames")  # refinements that begin with the path that frames agree with
 SMOOTHNESS = 1e-3  # weight of the squared second differences of neighbouring corrections, mm²
 
 
@@ -145,20 +148,21 @@ class PoseRefinement:
 
     @classmethod
     def of(cls, dataset: Dataset, mode: str) -> PoseRefinement:
-        """Estimates the poses that the training begins with.
+        """Estimates the poses that the training begins with, and those of the held-out frames.
 
-        `frames`: the tracker's noise is taken out of each sweep, each sweep is registered as a whole to those that it
-        crosses, and in the training every frame has a correction of its own. `sweeps`: only whole sweeps move. With
-        `none`, and where the poses are good (little noise, sweeps agree), they stay and none is trained.
+        `path`: frames lie on the path that their neighbours agree with. `sweeps`: each sweep is registered as a whole
+        to those that it crosses, and in the training it has a correction. `frames`: both, and in the training every
+        frame has a correction of its own. With `none`, and where the poses are good (neighbours and sweeps agree), they
+        stay and none is trained.
         """
         tracked = dataset.train.poses
-        if mode == "none":
+        if mode in WITH_PATH:
+            dataset = on_agreed_path(dataset)
+        if mode in ("none", "path"):
             return cls(dataset, tracked, None)
         ranges = sweep_ranges(dataset.train)
-        poses = tracked.copy()
-        if mode == "frames" and not tracker_noise(poses, ranges).is_small:
-            poses = without_noise(poses, ranges)
-        for frames, motion in zip(ranges, register_sweeps(replace(dataset.train, poses=poses), ranges), strict=True):
+        poses = dataset.train.poses.copy()
+        for frames, motion in zip(ranges, register_sweeps(dataset.train, ranges), strict=True):
             poses[frames] = motion @ poses[frames]
         if np.array_equal(poses, tracked):
             return cls(dataset, tracked, None)
@@ -185,7 +189,8 @@ class PoseRefinement:
 
     def corrections(self) -> FloatArray | None:  # [F, 4, 4]
         """The motions that are left-multiplied to the tracker's poses; None where these stay."""
-        return None if self._trained is None else self.poses() @ np.linalg.inv(self._tracked)
+        poses = self.poses()
+        return None if np.array_equal(poses, self._tracked) else poses @ np.linalg.inv(self._tracked)
 
     def tensors(self) -> dict[str, Tensor]:
         return {} if self._trained is None else self._trained.tensors()
@@ -193,6 +198,17 @@ class PoseRefinement:
     def load(self, tensors: Mapping[str, Tensor]) -> None:
         if self._trained is not None:
             self._trained.load(tensors)
+
+
+def held_out_on_path(dataset: Dataset, info: SceneInfo) -> Sweep | None:
+    """The held-out frames of the dataset that a scene was trained from, with the poses of the path it was trained on.
+
+    None where these are the poses of the dataset, where the scene is of another, or where nothing is held out.
+    """
+    if info.dataset_sha256 != dataset.sha256 or info.training.get("refine_poses") not in WITH_PATH:
+        return None
+    placed = on_agreed_path(dataset)
+    return None if placed is dataset or not len(placed.val) else placed.val
 
 
 # Scores of held-out frames whose poses may be wrong: each is registered by one half and scored on the other half.

@@ -187,7 +187,7 @@ async def render_slice(request: Request, service: ServiceDep, scene: SceneName) 
 
     async def rendered() -> RenderResult[SliceView]:
         await service.limits.take_frames(1, deadline)
-        return await service.rendering.render(plan, asked.pose()[None], deadline=deadline)
+        return await service.rendering.render_slice(plan, asked.pose(), deadline=deadline)
 
     result = await finish_or_abandon(rendered(), request.receive, deadline)
     data = _npy_of(result) if media_type == NPY else result.data

@@ -1,0 +1,237 @@
+"""The path of a sweep that its neighbouring frames agree with. Read after `alignment`; `poses` calls it.
+
+A tracker errs from frame to frame, and tissue goes along with the probe that presses and drags it. Both make an image
+move less from one frame to the next, within its plane, than the poses say. Which path is right the images tell: each
+frame is predicted from the two beside it in its sweep, in space, and of these paths that one is taken that predicts
+best:
+
+- as tracked;
+- without the tracker's noise (`alignment.without_noise`);
+- that, but of the motion within the image plane only a share: of the shifts along the lateral and the axial axis, and
+  of the turn about the elevation axis. 1: tissue is rigid; 0: it stays where it is in the image, and the frames are a
+  straight stack along their path.
+
+Another path than the tracked one has to predict better, by LEAST_GAIN_DB or GAIN_OF_SHARES_DB. Of motion across the
+plane the images of one sweep say little: there the smoothness of the path is the only evidence.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+
+from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.geometry.registration import register_points
+from ultragray.geometry.rotations import blended, rotations_of, turns_of
+from ultragray.geometry.scan_conversion import interpolated_frames, pixel_places
+from ultragray.learn.sweep import Dataset, IntArray, Sweep, corner_distances_mm, spread_places
+from ultragray.learn.training.alignment import TrackerNoise, sweep_ranges, tracker_noise, without_noise
+
+FRAMES, PIXELS = 96, 2048  # that are predicted, of each: enough to tell one path from another
+ON_PLANE_MM = 1e-6  # distances are at least that: the nearer frame then has all the weight
+LEAST_GAIN_DB = 0.05  # of a path without noise
+GAIN_OF_SHARES_DB = 0.3  # tissue is rigid unless the images say clearly that it is not
+SHARE_STEP = 0.25
+
+Shares: TypeAlias = tuple[float, float, float]  # of the motion within the plane: lateral, axial, turn
+RIGID: Shares = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class AgreedPath:
+    """Poses of the training and the held-out frames, mm, and how well training frames are predicted by the two beside
+    them, mean PSNR in dB."""
+
+    train: FloatArray  # [F, 4, 4]
+    val: FloatArray  # [V, 4, 4] of which no image was used
+    in_time_db: float  # pixel by pixel, whatever the poses say
+    tracked_db: float  # in space, as tracked
+    found_db: float  # in space, on this path
+    shares: Shares  # of the motion within the plane that it has
+    noise: TrackerNoise  # of the tracker
+
+
+def on_agreed_path(dataset: Dataset) -> Dataset:
+    """The same with the poses of `agreed_path`; the dataset itself where these are as tracked."""
+    path = agreed_path(dataset)
+    if path is None or path.train is dataset.train.poses:
+        return dataset
+    train, val = replace(dataset.train, poses=path.train), replace(dataset.val, poses=path.val)
+    return replace(dataset, train=train, val=val)
+
+
+def agreed_path(dataset: Dataset) -> AgreedPath | None:
+    """The path of all frames, judged by the training frames alone; None where no sweep has three frames in a row.
+
+    Poses are those of the dataset where no other path agrees better. Held-out frames of the same recording take part in
+    the path by their poses. Those of another file are moved as the training frames about them are.
+    """
+    train, val = dataset.train, dataset.val
+    if (judge := _Judge.of(train, sweep_ranges(train))) is None:
+        return None
+    whole = [train, val] if dataset.is_one_recording else [train]
+    order = np.argsort(np.concatenate([part.frame_numbers for part in whole]), kind="stable")
+    places = np.argsort(order, kind="stable")  # of each frame on the path
+    on_path = places[: len(train)]
+    given = np.concatenate([part.poses for part in whole])[order]
+    ranges = sweep_ranges(Sweep(_one_each(given), given, train.probe, np.arange(len(given)), train.source))
+    found, found_db = given, (tracked_db := judge.psnr_db(train.poses))
+    cleaned = without_noise(given, ranges)
+    if (db := judge.psnr_db(cleaned[on_path])) > found_db + LEAST_GAIN_DB:
+        found, found_db = cleaned, db
+    rigid = found
+    shares, moved, db = _best_shares(judge, rigid, ranges, on_path, found_db)
+    if db < found_db + GAIN_OF_SHARES_DB:
+        shares = RIGID
+    else:
+        found, found_db = moved, db
+    figures = judge.in_time_db(), tracked_db, found_db, shares, tracker_noise(given, ranges)
+    if found is given:
+        return AgreedPath(train.poses, val.poses, *figures)
+    if dataset.is_one_recording:
+        return AgreedPath(found[on_path], found[places[len(train) :]], *figures)
+    return AgreedPath(found[on_path], _carried(val.poses, rigid, found, ranges, train.probe), *figures)
+
+
+def _best_shares(
+    judge: _Judge, poses: FloatArray, ranges: Sequence[range], places: IntArray, rigid_db: float
+) -> tuple[Shares, FloatArray, float]:
+    """The shares of the best prediction, the path with them, and its PSNR: first alike for all three, then each."""
+    tried: dict[Shares, float] = {RIGID: rigid_db}
+    probe = judge.sweep.probe
+
+    def psnr_db(shares: Shares) -> float:
+        if shares not in tried:
+            tried[shares] = judge.psnr_db(with_shares(poses, ranges, probe, shares)[places])
+        return tried[shares]
+
+    common = np.arange(1.0, -SHARE_STEP / 2, -SHARE_STEP).tolist()
+    best: Shares = max(((share, share, share) for share in common), key=psnr_db)
+    for number in range(3):
+        for step in (SHARE_STEP, -SHARE_STEP):
+            other = _stepped(best, number, step)
+            while psnr_db(other) > psnr_db(best):
+                best, other = other, _stepped(other, number, step)
+    return best, with_shares(poses, ranges, probe, best), psnr_db(best)
+
+
+def _stepped(shares: Shares, number: int, step: float) -> Shares:
+    changed = [min(max(share + step * (i == number), 0.0), 1.0) for i, share in enumerate(shares)]
+    return changed[0], changed[1], changed[2]
+
+
+def with_shares(poses: FloatArray, ranges: Sequence[range], probe: Probe, shares: Shares) -> FloatArray:
+    """The paths [F, 4, 4], mm, with a share of their motion within the image plane; each sweep lies where it lay.
+
+    The motion from one frame to the next is a turn and a shift of the middle of the image along the probe's axes.
+    """
+    if shares == RIGID:
+        return poses
+    middle, corners = probe.corners_mm().mean(axis=0), probe.corners_mm()
+    lateral, axial, turn = shares
+    found = poses.copy()
+    for frames in ranges:
+        own = poses[frames.start : frames.stop]
+        steps = np.linalg.inv(own[:-1]) @ own[1:]
+        shifts = steps[:, :3, :3] @ middle + steps[:, :3, 3] - middle
+        steps[:, :3, :3] = rotations_of(turns_of(steps[:, :3, :3]) * (1.0, turn, 1.0))
+        steps[:, :3, 3] = middle + shifts * (lateral, 1.0, axial) - steps[:, :3, :3] @ middle
+        moved = own.copy()
+        for place, step in enumerate(steps):
+            moved[place + 1] = moved[place] @ step
+        of_all = [np.einsum("fij,cj->fci", p[:, :3, :3], corners) + p[:, None, :3, 3] for p in (moved, own)]
+        back = register_points(*(points.reshape(-1, 3) for points in of_all)).transform
+        found[frames.start : frames.stop] = back @ moved
+    return found
+
+
+def _carried(
+    poses: FloatArray,  # [V, 4, 4] mm
+    before: FloatArray,  # [F, 4, 4] mm
+    after: FloatArray,  # [F, 4, 4] mm
+    ranges: Sequence[range],
+    probe: Probe,
+) -> FloatArray:  # [V, 4, 4] mm
+    """Poses moved as the two frames of the nearest sweep are between which they lie, by the distances from them."""
+    corners, middle = probe.corners_from(before), np.append(probe.corners_mm().mean(axis=0), 1.0)
+    motions = after @ np.linalg.inv(before)
+    sweep_of = np.repeat(np.arange(len(ranges)), [len(frames) for frames in ranges])
+    found = poses.copy()
+    for place, own in enumerate(probe.corners_from(poses)):
+        distances = corner_distances_mm(corners, own)
+        nearest = int(distances.argmin())
+        beside = [i for i in (nearest - 1, nearest + 1) if 0 <= i < len(before) and sweep_of[i] == sweep_of[nearest]]
+        other = min(beside, key=distances.__getitem__, default=nearest)
+        share = distances[nearest] / max(distances[nearest] + distances[other], 1e-9)
+        both = motions[[nearest, other]]
+        there = (both @ poses[place] @ middle)[:, :3]
+        turn = blended(both[:1, :3, :3], both[1:, :3, :3], np.array([share]))[0]
+        found[place, :3, :3] = turn @ poses[place, :3, :3]
+        found[place, :3, 3] = (1.0 - share) * there[0] + share * there[1] - found[place, :3, :3] @ middle[:3]
+    return found
+
+
+def _one_each(poses: FloatArray) -> np.ndarray:  # [F, 1, 2] uint8
+    """Images that a sweep takes where its path alone counts."""
+    return np.tile(np.array([0, 1], np.uint8), (len(poses), 1, 1))
+
+
+@dataclass(frozen=True, eq=False)
+class _Judge:
+    """Pixels of frames that are predicted from the two frames beside them in their sweep; mean PSNR of the frames."""
+
+    sweep: Sweep
+    frames: IntArray  # [P] their places
+
+    @classmethod
+    def of(cls, sweep: Sweep, ranges: Sequence[range]) -> _Judge | None:
+        frames = np.concatenate([np.arange(some.start + 1, some.stop - 1) for some in ranges])
+        return cls(sweep, frames[spread_places(len(frames), FRAMES)]) if len(frames) else None
+
+    def psnr_db(self, poses: FloatArray) -> float:  # [F, 4, 4] mm
+        """Of the pixels as predicted in space by these poses.
+
+        A pixel is projected onto both planes along their normals; what these show there counts in inverse proportion to
+        the distances. One that is projected beside an image is predicted by the other alone, or left out.
+        """
+        return float(np.mean([self._predicted_db(poses, frame) for frame in self.frames]))
+
+    def _predicted_db(self, poses: FloatArray, frame: int) -> float:
+        images, probe = self.sweep.images, self.sweep.probe
+        (height, width), (rows, columns) = images.shape[1:], self._pixels(frame)
+        local = probe.points_mm((rows + 0.5) / height, (columns + 0.5) / width)  # [N, 3]
+        values, weights = np.zeros((2, 2, len(local)))
+        for side, beside in enumerate((frame - 1, frame + 1)):
+            onto = np.linalg.inv(poses[beside]) @ poses[frame]
+            x, y, z = onto[:3, :3] @ local.T + onto[:3, 3:]
+            (is_in,) = np.nonzero(~np.isnan(probe.image_coordinates(x, z)[0]))
+            shares = probe.image_coordinates(x[is_in], z[is_in])
+            values[side, is_in] = interpolated_frames(images, beside, *pixel_places(probe, (height, width), *shares))
+            weights[side, is_in] = 1.0 / np.maximum(np.abs(y[is_in]), ON_PLANE_MM)
+        known = weights.sum(axis=0) > 0.0
+        predicted = (values * weights)[:, known].sum(axis=0) / weights[:, known].sum(axis=0)
+        return _psnr_db(predicted, self._shown(frame, rows, columns)[known])
+
+    def in_time_db(self) -> float:
+        """Of the pixels as the mean of the same pixels of the two frames."""
+        found = []
+        for frame in self.frames:
+            before, shown, after = (self._shown(one, *self._pixels(frame)) for one in (frame - 1, frame, frame + 1))
+            found.append(_psnr_db((before + after) / 2.0, shown))
+        return float(np.mean(found))
+
+    def _pixels(self, frame: int) -> tuple[IntArray, IntArray]:  # [N] rows, [N] columns
+        random = np.random.default_rng(frame)
+        return random.integers(self.sweep.height, size=PIXELS), random.integers(self.sweep.width, size=PIXELS)
+
+    def _shown(self, frame: int, rows: IntArray, columns: IntArray) -> FloatArray:  # [N]
+        shown: FloatArray = self.sweep.images[frame, rows, columns].astype(np.float64)
+        return shown
+
+
+def _psnr_db(predicted: FloatArray, true: FloatArray) -> float:  # [N] of 255, both; none: 0 dB
+    squared = np.square(predicted - true).mean() if len(true) else 255.0**2
+    return float(-10.0 * np.log10(max(squared / 255.0**2, 1e-10)))

@@ -1,0 +1,134 @@
+"""The path that neighbouring frames agree with: shaking and dragging come out, exact poses of rigid tissue stay."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from ultragray.datasets.checks import check_dataset
+from ultragray.geometry.rotations import turns_of
+from ultragray.learn.evaluation.scoring import evaluate
+from ultragray.learn.sweep import Dataset, corner_distances_mm
+from ultragray.learn.training import train
+from ultragray.learn.training.agreement import RIGID, agreed_path, on_agreed_path, with_shares
+from ultragray.learn.training.poses import held_out_on_path
+
+from .test_poses import PROBE, poses_of, seen, shaken
+
+FRAMES = 60
+
+
+def hand_path(count=FRAMES):  # [F, 4, 4]
+    """Along y by 0.5 mm a frame, swaying by some millimetres and degrees in all directions."""
+    t = np.arange(count)
+    turns = np.stack([np.sin(t / 9.0), 1.5 * np.sin(t / 7.0), np.cos(t / 11.0)], axis=1)
+    places = np.stack([1.5 * np.sin(t / 8.0), 0.5 * t, np.sin(t / 6.0)], axis=1)
+    return poses_of(turns, places)
+
+
+def recording(shown, tracked):
+    """A sweep of tissue seen from one path and tracked on another; every second frame is held out."""
+    whole = replace(seen(shown), poses=tracked)
+    return Dataset("hand", train=whole.select(np.arange(0, FRAMES, 2)), val=whole.select(np.arange(1, FRAMES, 2)))
+
+
+def error_mm(poses, truth):
+    """The mean error of the steps from frame to frame, which no common motion of all changes."""
+    steps = [np.linalg.inv(some[:-1]) @ some[1:] for some in (poses, truth)]
+    return corner_distances_mm(*(PROBE.corners_from(one) for one in steps)).mean()
+
+
+@pytest.mark.parametrize(("mm", "deg"), [(0.1, 0.1), (0.3, 0.2)])
+def test_a_shaking_tracker_is_smoothed_also_where_frames_are_held_out(mm, deg):
+    truth = hand_path()
+    given = recording(truth, shaken(truth, mm, deg))
+    path = agreed_path(given)
+    assert path.shares == RIGID
+    assert path.found_db > path.tracked_db + 0.2
+    for poses, tracked, true in ((path.train, given.train, truth[::2]), (path.val, given.val, truth[1::2])):
+        assert error_mm(poses, true) < 0.6 * error_mm(tracked.poses, true)
+
+
+def test_no_image_of_a_held_out_frame_is_used():
+    truth = hand_path()
+    given = recording(truth, shaken(truth, 0.3, 0.2))
+    changed = replace(given, val=replace(given.val, images=given.val.images[::-1]))
+    np.testing.assert_array_equal(agreed_path(changed).val, agreed_path(given).val)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.25])
+def test_tissue_that_follows_the_probe_is_found(share):
+    tracked = hand_path()
+    shown = with_shares(tracked, [range(FRAMES)], PROBE, (share,) * 3)
+    given = recording(shown, tracked)
+    path = agreed_path(given)
+    assert path.shares == pytest.approx((share,) * 3, abs=0.3)
+    assert path.in_time_db > path.tracked_db
+    assert error_mm(path.train, shown[::2]) < 0.35 * error_mm(given.train.poses, shown[::2])
+
+
+def test_a_check_tells_of_it():
+    truth = hand_path()
+    given = recording(with_shares(truth, [range(FRAMES)], PROBE, (0.0, 0.0, 0.0)), shaken(truth, 0.3, 0.2))
+    (told,) = (text for text in check_dataset(given).warnings if "neighbours in time" in text)
+    path = agreed_path(given)
+    assert f"{path.in_time_db - path.tracked_db:.1f} dB better than by their poses" in told
+    assert f"shakes (by {path.noise.position_mm:.2f} mm and {path.noise.turn_deg:.2f}°" in told
+    assert not any("neighbours in time" in text for text in check_dataset(recording(truth, truth)).warnings)
+
+
+def test_a_scene_is_trained_and_measured_on_the_path(tiny_config):
+    tracked = hand_path()
+    given = recording(with_shares(tracked, [range(FRAMES)], PROBE, (0.0, 0.0, 0.0)), tracked)
+    scene = train(given, tiny_config(refine_poses="path"))
+    path = agreed_path(given)
+    np.testing.assert_allclose(scene.training_poses, path.train, atol=1e-12)
+    np.testing.assert_allclose(scene.pose_corrections @ given.train.poses, path.train, atol=1e-9)
+    placed = held_out_on_path(given, scene.info)
+    np.testing.assert_array_equal(placed.poses, path.val)
+    assert scene.info.metrics == evaluate(scene, placed).mean.to_dict()
+    assert held_out_on_path(replace(given, train=given.train.select(range(20))), scene.info) is None
+    assert held_out_on_path(given, train(given, tiny_config()).info) is None
+
+
+def test_exact_poses_of_rigid_tissue_stay():
+    truth = hand_path()
+    given = recording(truth, truth)
+    assert on_agreed_path(given) is given
+    assert agreed_path(given).shares == RIGID
+
+
+def test_held_out_frames_of_another_file_move_with_the_frames_about_them():
+    tracked = hand_path()
+    given = recording(with_shares(tracked, [range(FRAMES)], PROBE, (0.0, 0.0, 0.0)), tracked)
+    together = agreed_path(given)
+    apart = agreed_path(replace(given, val=replace(given.val, source="another file")))
+    assert error_mm(apart.val, together.val) < 0.1 * error_mm(given.val.poses, together.val)
+    np.testing.assert_allclose(apart.train, agreed_path(replace(given, val=given.val.select([]))).train)
+
+
+def test_a_share_of_the_motion_within_the_plane():
+    poses = hand_path(20)
+    middle = PROBE.corners_mm().mean(axis=0)
+
+    def motions(path):  # [F − 1, 6] turns and shifts of the middle from frame to frame
+        steps = np.linalg.inv(path[:-1]) @ path[1:]
+        return np.concatenate(
+            [turns_of(steps[:, :3, :3]), steps[:, :3, :3] @ middle + steps[:, :3, 3] - middle], axis=1
+        )
+
+    moved = with_shares(poses, [range(8), range(8, 20)], PROBE, (0.5, 0.25, 0.0))
+    for sweep in (slice(0, 8), slice(8, 20)):
+        expected = motions(poses[sweep]) * (1.0, 0.0, 1.0, 0.5, 1.0, 0.25)
+        np.testing.assert_allclose(motions(moved[sweep]), expected, atol=1e-9)
+        corners = [PROBE.corners_from(path[sweep]).reshape(-1, 3) for path in (moved, poses)]
+        np.testing.assert_allclose(*(points.mean(axis=0) for points in corners), atol=1e-9)
+    assert with_shares(poses, [range(20)], PROBE, RIGID) is poses
+
+
+def test_sweeps_too_short_to_be_predicted_stay():
+    poses = poses_of(np.zeros((2, 3)), [[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
+    given = seen(poses)
+    short = Dataset("short", given, given.select([]))
+    assert on_agreed_path(short) is short
+    assert agreed_path(short) is None
