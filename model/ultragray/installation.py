@@ -19,7 +19,7 @@ MODULES_OF_EXTRAS = {
     "serve": (
         *("cryptography", "fastapi", "fastapi_offline", "google", "grpc", "grpc_health", "grpc_reflection"),
         *("jwt", "limits", "opentelemetry", "prometheus_client", "psycopg", "python_multipart", "sqlalchemy"),
-        *("fastcrc", "starlette", "ultragray_proto", "uvicorn", "uvloop", "websockets"),
+        *("fastcrc", "httptools", "starlette", "ultragray_proto", "uvicorn", "uvloop", "websockets"),
     ),
     "train": ("jinja2", "matplotlib"),
     "dicom": ("pydicom",),

@@ -21,6 +21,7 @@ BESIDE_TORCH = {"triton"}  # comes with torch's CUDA build, and is asked for by 
 BROUGHT_BY = {  # modules that are used with, and come with, what is required
     "starlette": "fastapi",
     "typing_extensions": "pydantic",
+    "httptools": "uvicorn",
     "uvloop": "uvicorn",
     "websockets": "uvicorn",
 }

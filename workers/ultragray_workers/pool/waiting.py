@@ -21,7 +21,7 @@ _FULL_BATCH_PIXELS_PER_POSE = 512 * 512
 _ATTEMPTS_IN_COMPANY = 2
 _BATCH_PRIORITY_SHARE = 4  # an interactive request may have to wait for a part of a batch: a smaller one
 _BATCH_PATIENCE_S = 1.0
-_LONGEST_BATCH_S = 1.0  # that others may have to wait for, where that is known
+_LONGEST_BATCH_S = 0.05  # that others may have to wait for, where that is known
 _LEAST_RETRY_S = 0.1
 
 

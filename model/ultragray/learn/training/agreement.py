@@ -24,10 +24,9 @@ from typing import TypeAlias
 import numpy as np
 
 from ultragray.geometry.probe import FloatArray, Probe
-from ultragray.geometry.registration import register_points
 from ultragray.geometry.rotations import blended, rotations_of, turns_of
 from ultragray.geometry.scan_conversion import interpolated_frames, pixel_places
-from ultragray.learn.sweep import Dataset, IntArray, Sweep, corner_distances_mm, spread_places
+from ultragray.learn.sweep import Dataset, IntArray, Sweep, corner_distances_mm, mean_axes, spread_places
 from ultragray.learn.training.alignment import TrackerNoise, sweep_ranges, tracker_noise, without_noise
 
 FRAMES, PIXELS = 96, 2048  # that are predicted, of each: enough to tell one path from another
@@ -124,13 +123,14 @@ def _stepped(shares: Shares, number: int, step: float) -> Shares:
 
 
 def with_shares(poses: FloatArray, ranges: Sequence[range], probe: Probe, shares: Shares) -> FloatArray:
-    """The paths [F, 4, 4], mm, with a share of their motion within the image plane; each sweep lies where it lay.
+    """The paths [F, 4, 4], mm, with a share of their motion within the image plane.
 
-    The motion from one frame to the next is a turn and a shift of the middle of the image along the probe's axes.
+    The motion from one frame to the next is a turn and a shift of the middle of the image along the probe's axes. The
+    middle of all images and their mean orientation stay for each sweep.
     """
     if shares == RIGID:
         return poses
-    middle, corners = probe.corners_mm().mean(axis=0), probe.corners_mm()
+    middle = probe.corners_mm().mean(axis=0)
     lateral, axial, turn = shares
     found = poses.copy()
     for frames in ranges:
@@ -142,8 +142,10 @@ def with_shares(poses: FloatArray, ranges: Sequence[range], probe: Probe, shares
         moved = own.copy()
         for place, step in enumerate(steps):
             moved[place + 1] = moved[place] @ step
-        of_all = [np.einsum("fij,cj->fci", p[:, :3, :3], corners) + p[:, None, :3, 3] for p in (moved, own)]
-        back = register_points(*(points.reshape(-1, 3) for points in of_all)).transform
+        back = np.eye(4)
+        back[:3, :3] = mean_axes(own @ np.linalg.inv(moved))
+        from_middle, to_middle = ((path[:, :3, :3] @ middle + path[:, :3, 3]).mean(axis=0) for path in (moved, own))
+        back[:3, 3] = to_middle - back[:3, :3] @ from_middle
         found[frames.start : frames.stop] = back @ moved
     return found
 

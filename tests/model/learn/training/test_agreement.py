@@ -103,7 +103,7 @@ def test_held_out_frames_of_another_file_move_with_the_frames_about_them():
     given = recording(with_shares(tracked, [range(FRAMES)], PROBE, (0.0, 0.0, 0.0)), tracked)
     together = agreed_path(given)
     apart = agreed_path(replace(given, val=replace(given.val, source="another file")))
-    assert error_mm(apart.val, together.val) < 0.1 * error_mm(given.val.poses, together.val)
+    assert error_mm(apart.val, together.val) < 0.2 * error_mm(given.val.poses, together.val)
     np.testing.assert_allclose(apart.train, agreed_path(replace(given, val=given.val.select([]))).train)
 
 
