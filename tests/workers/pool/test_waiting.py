@@ -112,6 +112,19 @@ def test_large_images_make_smaller_batches(make_ticket):
     assert taken(queue) == [(ticket, 0, 2)]
 
 
+@pytest.mark.parametrize(
+    ("priority", "frame_s", "together"), [("INTERACTIVE", 0.02, 2), ("BATCH", 0.02, 2), ("BATCH", 0.002, 4)]
+)
+def test_slow_frames_make_smaller_batches(make_ticket, priority, frame_s, together):
+    queue = WaitingQueue(limit_frames=100, max_batch_poses=16)
+    before, ticket = (make_ticket(poses, priority=Priority[priority]) for poses in (1, 32))
+    queue.add(before)
+    for _ in range(30):
+        queue.settle(queue.take_batch() or [Part(before, 0, 1)], frame_s, typical=True)
+    queue.add(ticket)
+    assert taken(queue) == [(ticket, 0, together)]
+
+
 def test_the_limit_counts_poses_of_each_priority(make_ticket):
     queue = WaitingQueue(limit_frames=4, max_batch_poses=4)
     queue.add(make_ticket(10))  # larger than the limit, but nothing else waits

@@ -341,7 +341,7 @@ class WaitingQueue:
         fitting = self._max_batch_poses * _FULL_BATCH_PIXELS_PER_POSE // pixels
         if (frame_s := self._forecast.frame_s(ticket.batch_key)) > 0.0:
             fitting = min(fitting, int(_LONGEST_BATCH_S / frame_s))
-        return max(1, min(self._max_batch_poses, fitting) // share)
+        return max(1, min(self._max_batch_poses // share, fitting))
 
 
 def _sum_of(steps: Iterable[Part]) -> tuple[int, float]:
