@@ -16,6 +16,7 @@ from ultragray.rendering.settings import Encoding
 from ultragray.scene.confidence import FIGURES
 from ultragray_workers import PoolConfig, RenderPool, SceneStore
 from ultragray_workers.pool import processes as launcher
+from ultragray_workers.pool import waiting
 
 from ..conftest import RUN
 from ..waiting import Deadline, wait_until
@@ -25,6 +26,12 @@ from .asking import HEIGHT, PROBE, WIDTH
 TIME_LIMIT_S = 180.0
 
 T = TypeVar("T")
+
+
+@pytest.fixture
+def batches_of_any_length(monkeypatch):
+    """However long others wait for them."""
+    monkeypatch.setattr(waiting, "_LONGEST_BATCH_S", 60.0)
 
 
 @pytest.fixture(autouse=True)

@@ -72,6 +72,7 @@ async def test_a_hostile_scene_is_refused_and_the_next_request_served(open_pool,
         assert pool.statistics().restarts_total == pool.statistics().kills_total == 0
 
 
+@pytest.mark.usefixtures("batches_of_any_length")
 async def test_company_of_a_frame_that_is_too_costly_is_rendered(open_pool, costly_folder, until):
     async with open_pool() as pool:
         (worker,) = pool.statistics().pids

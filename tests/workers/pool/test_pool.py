@@ -18,6 +18,7 @@ from ultragray_workers.errors import Draining, NotReady, SceneNotFound, SceneToo
 from ..asking import asking
 
 
+@pytest.mark.usefixtures("batches_of_any_length")
 def test_results_equal_a_direct_render(run, open_pool, random_poses, expect_frames, scene_folder):
     convex = ConvexProbe(opening_angle_deg=60.0, near_mm=5.0, far_mm=40.0)
     one_frame = asking("a", random_poses(1))
@@ -54,6 +55,7 @@ async def test_image_files_hold_the_frame_of_one_pose(open_pool, random_poses):
             await pool.render(asking("a", np.zeros((0, 4, 4))))
 
 
+@pytest.mark.usefixtures("batches_of_any_length")
 async def test_waiting_requests_of_one_kind_are_rendered_together(open_pool, random_poses, expect_frames, until):
     alike = [asking("a", random_poses(1, seed=seed)) for seed in range(5)]
     other = asking("a", random_poses(1), height=10)

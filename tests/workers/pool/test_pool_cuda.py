@@ -124,6 +124,7 @@ frames.render = render_few
 """
 
 
+@pytest.mark.usefixtures("batches_of_any_length")
 async def test_out_of_memory_fails_the_request_and_no_more(
     open_pool, random_poses, expect_frames, until, patch_workers
 ):
