@@ -12,7 +12,8 @@ best:
   straight stack along their path.
 
 Another path than the tracked one has to predict better, by LEAST_GAIN_DB or GAIN_OF_SHARES_DB. Of motion across the
-plane the images of one sweep say little: there the smoothness of the path is the only evidence.
+plane the images of one sweep say little: there the smoothness of the path is the only evidence. Free of torch, since
+data sets are checked without it.
 """
 
 from __future__ import annotations
@@ -27,7 +28,7 @@ from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.geometry.rotations import blended, rotations_of, turns_of
 from ultragray.geometry.scan_conversion import interpolated_frames, pixel_places
 from ultragray.learn.sweep import Dataset, IntArray, Sweep, corner_distances_mm, mean_axes, spread_places
-from ultragray.learn.training.alignment import TrackerNoise, sweep_ranges, tracker_noise, without_noise
+from ultragray.learn.training.alignment import TrackerNoise, path_ranges, sweep_ranges, tracker_noise, without_noise
 
 FRAMES, PIXELS = 96, 2048  # that are predicted, of each: enough to tell one path from another
 ON_PLANE_MM = 1e-6  # distances are at least that: the nearer frame then has all the weight
@@ -76,7 +77,7 @@ def agreed_path(dataset: Dataset) -> AgreedPath | None:
     places = np.argsort(order, kind="stable")  # of each frame on the path
     on_path = places[: len(train)]
     given = np.concatenate([part.poses for part in whole])[order]
-    ranges = sweep_ranges(Sweep(_one_each(given), given, train.probe, np.arange(len(given)), train.source))
+    ranges = path_ranges(train.probe.corners_from(given))
     found, found_db = given, (tracked_db := judge.psnr_db(train.poses))
     cleaned = without_noise(given, ranges)
     if (db := judge.psnr_db(cleaned[on_path])) > found_db + LEAST_GAIN_DB:
@@ -174,11 +175,6 @@ def _carried(
         found[place, :3, :3] = turn @ poses[place, :3, :3]
         found[place, :3, 3] = (1.0 - share) * there[0] + share * there[1] - found[place, :3, :3] @ middle[:3]
     return found
-
-
-def _one_each(poses: FloatArray) -> np.ndarray:  # [F, 1, 2] uint8
-    """Images that a sweep takes where its path alone counts."""
-    return np.tile(np.array([0, 1], np.uint8), (len(poses), 1, 1))
 
 
 @dataclass(frozen=True, eq=False)

@@ -93,14 +93,18 @@ class TrackerNoise:
 
 def sweep_ranges(sweep: Sweep) -> list[range]:
     """The places of the frames of each sweep, in order: a new one begins where the path jumps."""
-    corners = sweep.corners_mm()
+    return path_ranges(sweep.corners_mm())
+
+
+def path_ranges(corners: FloatArray) -> list[range]:  # [F, K, 3] mm
+    """The same of a path, by the corners of its images."""
     steps = corner_distances_mm(corners[1:], corners[:-1])
     starts = [0]
     moves = steps[steps > 0.0]  # a tracker may repeat its last pose
     for place in np.flatnonzero(steps > JUMP * np.median(moves)) + 1 if len(moves) else ():
-        if place - starts[-1] >= LEAST_FRAMES and len(sweep) - place >= LEAST_FRAMES:
+        if place - starts[-1] >= LEAST_FRAMES and len(corners) - place >= LEAST_FRAMES:
             starts.append(int(place))
-    return [range(first, last) for first, last in pairwise([*starts, len(sweep)])]
+    return [range(first, last) for first, last in pairwise([*starts, len(corners)])]
 
 
 def tracker_noise(poses: FloatArray, ranges: Sequence[range]) -> TrackerNoise:  # [F, 4, 4] mm
