@@ -97,7 +97,7 @@ def evaluate(
         figures |= {name: value.to_dict() for name, value in (poses | on_path).items()}
         typer.echo(to_json({"scene": str(scene), "dataset": read.name, "split": split.value, **figures}))
     else:
-        named = {f"{scene.stem}, frames on the path of the training": one for one in on_path.values()}
+        named = {f"{scene.stem}, on its path": one for one in on_path.values()}
         print_metrics(f"{read.name}, {len(frames)} {split.value} frames", {scene.stem: evaluation, **named})
         print_speckle({scene.stem: evaluation})
         if reliability is not None:
