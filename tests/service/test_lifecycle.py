@@ -101,7 +101,7 @@ def test_a_service_that_leaves_is_not_ready_and_answers_until_it_stops(start_ser
         )
         began = time.monotonic()
         service.process.send_signal(signal.SIGTERM)
-        readiness = wait_until(lambda: not_ready(service, client))
+        readiness = wait_until(lambda: not_ready(service, client), within_s=2)
         assert (readiness["reason"], readiness["components"]["frames"]["ready"]) == ("DRAINING", False)
         wait_until(
             lambda: health.Check(health_pb2.HealthCheckRequest()).status == health_pb2.HealthCheckResponse.NOT_SERVING

@@ -442,11 +442,12 @@ def _shaken(dataset: Dataset) -> list[str]:
     path = agreed_path(dataset)
     if path is None or path.in_time_db < path.tracked_db + SHAKEN_DB:
         return []
-    noise = path.noise
+    noise, gain_db = path.noise, path.found_db - path.tracked_db
+    remedy = f"; on another path their poses do {gain_db:.1f} dB better (--refine-poses path)" if gain_db else ""
     return [
         f"the two neighbours in time predict a frame {path.in_time_db - path.tracked_db:.1f} dB better than by their "
         f"poses: the tracker shakes (by {noise.position_mm:.2f} mm and {noise.turn_deg:.2f}°, as the path has it), or "
-        f"tissue moves with the probe; --refine-poses path wins {path.found_db - path.tracked_db:.1f} dB"
+        f"tissue moves with the probe{remedy}"
     ]
 
 

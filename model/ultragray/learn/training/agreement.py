@@ -205,9 +205,10 @@ class _Judge:
         for side, beside in enumerate((frame - 1, frame + 1)):
             onto = np.linalg.inv(poses[beside]) @ poses[frame]
             x, y, z = onto[:3, :3] @ local.T + onto[:3, 3:]
-            (is_in,) = np.nonzero(~np.isnan(probe.image_coordinates(x, z)[0]))
-            shares = probe.image_coordinates(x[is_in], z[is_in])
-            values[side, is_in] = interpolated_frames(images, beside, *pixel_places(probe, (height, width), *shares))
+            coordinates = np.stack(probe.image_coordinates(x, z))
+            (is_in,) = np.nonzero(~np.isnan(coordinates[0]))
+            places = pixel_places(probe, (height, width), *coordinates[:, is_in])
+            values[side, is_in] = interpolated_frames(images, beside, *places)
             weights[side, is_in] = 1.0 / np.maximum(np.abs(y[is_in]), ON_PLANE_MM)
         known = weights.sum(axis=0) > 0.0
         predicted = (values * weights)[:, known].sum(axis=0) / weights[:, known].sum(axis=0)
