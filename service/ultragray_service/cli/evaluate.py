@@ -91,7 +91,7 @@ def evaluate(
         reliability = measure_reliability(loaded, frames, backend=backend)
         poses = _pose_figures(loaded, frames if register else None, backend)
         placed = held_out_on_path(read, loaded.info) if split is Split.VAL else None
-        on_path = {} if placed is None else {"on_path": evaluate_scene(loaded, placed, backend=backend)}
+        on_path = {} if placed is None else {"on_path": evaluate_scene(loaded.at_rest(), placed, backend=backend)}
     if json:
         figures = evaluation.to_dict() | {"uncertainty": None if reliability is None else reliability.to_dict()}
         figures |= {name: value.to_dict() for name, value in (poses | on_path).items()}

@@ -42,25 +42,26 @@ RIGID: Shares = (1.0, 1.0, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class AgreedPath:
-    """Poses of the training and the held-out frames, mm, and how well training frames are predicted by the two beside
-    them, mean PSNR in dB."""
+    """Poses of the training and the held-out frames in the tissue at rest, mm, and how well training frames are
+    predicted by the two beside them, mean PSNR in dB."""
 
     train: FloatArray  # [F, 4, 4]
     val: FloatArray  # [V, 4, 4] of which no image was used
+    tracked: (
+        FloatArray  # [F, 4, 4] of the training frames with all motion within the plane, without the tracker's noise
+    )
     in_time_db: float  # pixel by pixel, whatever the poses say
     tracked_db: float  # in space, as tracked
     found_db: float  # in space, on this path
     shares: Shares  # of the motion within the plane that it has
     noise: TrackerNoise  # of the tracker
 
-
-def on_agreed_path(dataset: Dataset) -> Dataset:
-    """The same with the poses of `agreed_path`; the dataset itself where these are as tracked."""
-    path = agreed_path(dataset)
-    if path is None or path.train is dataset.train.poses:
-        return dataset
-    train, val = replace(dataset.train, poses=path.train), replace(dataset.val, poses=path.val)
-    return replace(dataset, train=train, val=val)
+    def of(self, dataset: Dataset) -> Dataset:
+        """The same frames on this path; the dataset itself where that is as tracked."""
+        if self.train is dataset.train.poses:
+            return dataset
+        train, val = replace(dataset.train, poses=self.train), replace(dataset.val, poses=self.val)
+        return replace(dataset, train=train, val=val)
 
 
 def agreed_path(dataset: Dataset) -> AgreedPath | None:
@@ -90,10 +91,11 @@ def agreed_path(dataset: Dataset) -> AgreedPath | None:
         found, found_db = moved, db
     figures = judge.in_time_db(), tracked_db, found_db, shares, tracker_noise(given, ranges)
     if found is given:
-        return AgreedPath(train.poses, val.poses, *figures)
+        return AgreedPath(train.poses, val.poses, train.poses, *figures)
     if dataset.is_one_recording:
-        return AgreedPath(found[on_path], found[places[len(train) :]], *figures)
-    return AgreedPath(found[on_path], _carried(val.poses, rigid, found, ranges, train.probe), *figures)
+        return AgreedPath(found[on_path], found[places[len(train) :]], rigid[on_path], *figures)
+    carried = _carried(val.poses, rigid, found, ranges, train.probe)
+    return AgreedPath(found[on_path], carried, rigid[on_path], *figures)
 
 
 def _best_shares(

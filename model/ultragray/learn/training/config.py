@@ -131,7 +131,7 @@ class TrainingConfig(Contract):
     refine_poses: str = described(
         "Correction of the poses (docs/poses.md): none; path: that which neighbouring frames agree with; sweeps: each "
         "sweep as a whole; frames: all of it. Good poses are left alone.",
-        "none",
+        "path",
         choices=REFINEMENTS,
     )
     means_rate: float = described("Learning rate of the means, times the scene's scale in cm.", 2e-4, low=0.0, high=1.0)

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -21,7 +21,7 @@ from ultragray.errors import DatasetInvalid
 from ultragray.geometry.probe import FloatArray
 from ultragray.learn.evaluation.scoring import frames_at_once, require_frames
 from ultragray.learn.sweep import Dataset, Sweep
-from ultragray.learn.training.agreement import on_agreed_path
+from ultragray.learn.training.agreement import RIGID, Shares, agreed_path
 from ultragray.learn.training.alignment import register_sweeps, sweep_ranges
 from ultragray.learn.training.losses import SSIM_WINDOW, image_loss
 from ultragray.rendering.backends.inputs import ScenePoses
@@ -140,11 +140,14 @@ _TRAINED: dict[str, type[TrainedCorrections]] = {"frames": FrameCorrections, "sw
 
 
 class PoseRefinement:
-    """The corrections of the training frames, left-multiplied to their poses; `dataset` is the one to train from."""
+    """The poses of the training frames, as tracked and in the tissue at rest; `dataset`, the one to train from, has
+    those at rest that the training begins with."""
 
-    def __init__(self, dataset: Dataset, tracked: FloatArray, trained: TrainedCorrections | None) -> None:
-        """`dataset` has the poses that the training begins with, `tracked` [F, 4, 4] (mm) are those of its frames."""
-        self.dataset, self._tracked, self._trained = dataset, tracked, trained
+    def __init__(self, dataset: Dataset, told: FloatArray) -> None:  # [F, 4, 4] mm, by the tracker
+        self.dataset, self._told = dataset, told
+        self._trained: TrainedCorrections | None = None
+        self._shares: Shares = RIGID
+        self._tracked = told  # without the tracker's noise, where tissue followed the probe
 
     @classmethod
     def of(cls, dataset: Dataset, mode: str) -> PoseRefinement:
@@ -155,19 +158,20 @@ class PoseRefinement:
         frame has a correction of its own. With `none`, and where the poses are good (neighbours and sweeps agree), they
         stay and none is trained.
         """
-        tracked = dataset.train.poses
-        if mode in WITH_PATH:
-            dataset = on_agreed_path(dataset)
+        found = cls(dataset, dataset.train.poses)
+        if mode in WITH_PATH and (path := agreed_path(dataset)) is not None:
+            found.dataset, found._tracked, found._shares = path.of(dataset), path.tracked, path.shares
         if mode in ("none", "path"):
-            return cls(dataset, tracked, None)
-        ranges = sweep_ranges(dataset.train)
-        poses = dataset.train.poses.copy()
-        for frames, motion in zip(ranges, register_sweeps(dataset.train, ranges), strict=True):
+            return found
+        train = found.dataset.train
+        ranges = sweep_ranges(train)
+        poses = train.poses.copy()
+        for frames, motion in zip(ranges, register_sweeps(train, ranges), strict=True):
             poses[frames] = motion @ poses[frames]
-        if np.array_equal(poses, tracked):
-            return cls(dataset, tracked, None)
-        train = replace(dataset.train, poses=poses)
-        return cls(replace(dataset, train=train), tracked, _TRAINED[mode](train, ranges))
+        if not np.array_equal(poses, found._told):
+            found.dataset = replace(found.dataset, train=replace(train, poses=poses))
+            found._trained = _TRAINED[mode](found.dataset.train, ranges)
+        return found
 
     @property
     def group_count(self) -> int:
@@ -182,15 +186,23 @@ class PoseRefinement:
         if self._trained is not None:
             self._trained.step(done)
 
-    def poses(self) -> FloatArray:  # [F, 4, 4] mm
-        """The corrected poses of all training frames, as they are by now."""
-        poses = self.dataset.train.poses
-        return poses if self._trained is None else self._trained.all_motions() @ poses
+    def of_scene(self) -> dict[str, Any]:
+        """What a scene keeps of the poses, as they are by now: arguments of `GaussianScene.from_splats`."""
+        at_rest = self.dataset.train.poses
+        if self._trained is not None:
+            at_rest = self._trained.all_motions() @ at_rest
+        follows = self._shares != RIGID
+        poses = self._tracked if follows else at_rest
+        is_told = np.array_equal(poses, self._told)
+        return {
+            "training_poses": poses,
+            "pose_corrections": None if is_told else poses @ np.linalg.inv(self._told),
+            "rest_poses": at_rest if follows else None,
+        }
 
-    def corrections(self) -> FloatArray | None:  # [F, 4, 4]
-        """The motions that are left-multiplied to the tracker's poses; None where these stay."""
-        poses = self.poses()
-        return None if np.array_equal(poses, self._tracked) else poses @ np.linalg.inv(self._tracked)
+    @property
+    def tissue_shares(self) -> Shares | None:
+        return None if self._shares == RIGID else self._shares
 
     def tensors(self) -> dict[str, Tensor]:
         return {} if self._trained is None else self._trained.tensors()
@@ -207,8 +219,8 @@ def held_out_on_path(dataset: Dataset, info: SceneInfo) -> Sweep | None:
     """
     if info.dataset_sha256 != dataset.sha256 or info.training.get("refine_poses") not in WITH_PATH:
         return None
-    placed = on_agreed_path(dataset)
-    return None if placed is dataset or not len(placed.val) else placed.val
+    path = agreed_path(dataset)
+    return None if path is None or path.of(dataset) is dataset or not len(dataset.val) else path.of(dataset).val
 
 
 # Scores of held-out frames whose poses may be wrong: each is registered by one half and scored on the other half.
@@ -249,6 +261,7 @@ def score_halves(scene: GaussianScene, sweep: Sweep, *, backend: str = "auto") -
             f"{sweep.source}: to be registered by halves, frames must have at least {SSIM_WINDOW} rows and "
             f"{2 * SSIM_WINDOW} columns, got {sweep.height}x{sweep.width}"
         )
+    scene, sweep = scene.at_rest(), replace(sweep, poses=scene.poses_at_rest(sweep.poses))
     halves = (slice(0, middle), slice(middle, sweep.width))
     given, registered, moved = [], [], []
     count = frames_at_once(sweep.height, sweep.width)
