@@ -443,7 +443,7 @@ def _shaken(dataset: Dataset) -> list[str]:
     if path is None or path.in_time_db < path.tracked_db + SHAKEN_DB:
         return []
     noise, gain_db = path.noise, path.found_db - path.tracked_db
-    remedy = f"; on another path their poses do {gain_db:.1f} dB better (--refine-poses path)" if gain_db else ""
+    remedy = f"; a training corrects {gain_db:.1f} dB of it" if gain_db else ""
     return [
         f"the two neighbours in time predict a frame {path.in_time_db - path.tracked_db:.1f} dB better than by their "
         f"poses: the tracker shakes (by {noise.position_mm:.2f} mm and {noise.turn_deg:.2f}°, as the path has it), or "
