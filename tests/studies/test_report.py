@@ -166,6 +166,7 @@ def test_the_page_is_whole_and_needs_nothing_else(content):
         "maximum compounding, 0.5 mm",
         "linear between frames",
         "nearest training frame",
+        "neighbours in time",
     ]
     assert rows == [
         *("this scene", *classical),
