@@ -83,6 +83,17 @@ def test_tissue_sticks_to_a_probe_that_is_off_its_path_by_no_more_than_the_track
     assert errors[1] - errors[0] < 0.75 * apart_mm(told[inner], tracked[inner]).mean()
 
 
+def test_another_calibration_holds_for_every_pose():
+    tracked, calibration = hand_path(), np.eye(4)
+    calibration[:3, :3] = rotations_of(np.radians([[0.0, 0.0, 2.0]]))[0]
+    calibration[:3, 3] = 0.5, 0.3, -0.8
+    tissue = FollowingTissue(tracked, tracked @ calibration, None, (1.0, 1.0, 1.0), PROBE)
+    for shift in ((0.0, 0.0, 0.0), (2.0, 0.0, 0.0), (0.0, 0.4, 1.0)):
+        asked = beside(tracked[5:35], shift)
+        assert apart_mm(tissue.at_rest(asked), asked @ calibration).max() < 0.03 * (1.0 + np.linalg.norm(shift)), shift
+        assert apart_mm(tissue.tracked(asked @ calibration), asked).max() < 0.03 * (1.0 + np.linalg.norm(shift)), shift
+
+
 @pytest.fixture
 def followed(random_scene):
     scene = random_scene(count=200)

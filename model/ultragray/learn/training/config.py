@@ -300,8 +300,8 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 
 PRESET_MEANINGS = (
-    "fast: minutes on two cores; best: fast, with the effort that frames left out ask for, in half an hour or more; paper: "
-    "the released recipe."
+    "fast: minutes on two cores; best: fast, with the effort that frames left out ask for, in half an hour or more; "
+    "paper: the released recipe."
 )
 
 
