@@ -10,7 +10,10 @@ Free of torch.
 
 from __future__ import annotations
 
+from typing import TypeAlias
+
 import numpy as np
+import numpy.typing as npt
 
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.geometry.rotations import rotations_of, turns_of
@@ -18,7 +21,12 @@ from ultragray.geometry.rotations import rotations_of, turns_of
 NEIGHBOURS = 8  # frames of which a place is told
 STICKING = 3.0  # standard deviations of the tracker's errors: as far does tissue go along with a pose off the path
 LEAST_SPACING_MM = 1e-3
+POLAR_STEPS = 3  # of Newton's iteration for the rotation nearest to a matrix that is nearly one
+PAIRS_AT_ONCE = 2**22  # of poses and training frames: bounds the memory
 _WITHIN_THE_PLANE = (0, 2, 4)  # of a way: shift along the lateral and the axial axis, turn about the elevation axis
+
+
+IntArray: TypeAlias = npt.NDArray[np.int64]
 
 
 class FollowingTissue:
@@ -32,53 +40,79 @@ class FollowingTissue:
         shares: tuple[float, float, float],  # of the motion within the plane (lateral, axial, turn) that tissue sees
         probe: Probe,
     ) -> None:
-        self._tracked, self._at_rest, self._shares = tracked, at_rest, np.asarray(shares)
-        self._probe, self._middle = probe, probe.corners_mm().mean(axis=0)
+        self._shares, self._middle = np.asarray(shares), probe.corners_mm().mean(axis=0)
+        self._tracked, self._at_rest = _Path(tracked, probe), _Path(at_rest, probe)
         self._sticking = np.zeros(3)
         if errors is not None:
             told = np.linalg.inv(errors) @ tracked
-            ways = self._ways(self._beside(told, tracked, tracked), told)[:, _WITHIN_THE_PLANE]
+            beside = self._tracked.at(*self._tracked.nearest(told))
+            ways = self._ways(beside, told)[:, _WITHIN_THE_PLANE]
             self._sticking = STICKING * np.sqrt(np.square(ways).mean(axis=0))
 
     def at_rest(self, poses: FloatArray) -> FloatArray:  # [C, 4, 4] mm -> [C, 4, 4] mm
         """Where the tissue at rest looks as it does from these poses, as tracked."""
-        ways = self._ways(self._beside(poses, self._tracked, self._tracked), poses)
+        place = self._tracked.nearest(poses)
+        ways = self._ways(self._tracked.at(*place), poses)
         within = ways[:, _WITHIN_THE_PLANE]
         stuck = np.clip(within, -self._sticking, self._sticking)
         ways[:, _WITHIN_THE_PLANE] = within - (1.0 - self._shares) * stuck
-        return self._moved(self._beside(poses, self._tracked, self._at_rest), ways)
+        return self._moved(self._at_rest.at(*place), ways)
 
     def tracked(self, poses: FloatArray) -> FloatArray:  # [C, 4, 4] mm -> [C, 4, 4] mm
         """The other way: poses as tracked, of poses in the tissue at rest over which the probe slides."""
-        ways = self._ways(self._beside(poses, self._at_rest, self._at_rest), poses)
-        return self._moved(self._beside(poses, self._at_rest, self._tracked), ways)
-
-    def _beside(self, poses: FloatArray, path: FloatArray, wanted: FloatArray) -> FloatArray:  # [C, 4, 4] mm
-        """The poses of `wanted` [P, 4, 4] where `path` [P, 4, 4] is nearest: means in which near frames weigh most."""
-        corners, asked = self._probe.corners_from(path), self._probe.corners_from(poses)
-        squares = np.square(asked[:, None] - corners).sum(axis=-1).mean(axis=-1)  # [C, P]
-        nearest = np.argsort(squares, axis=1, kind="stable")[:, :NEIGHBOURS]  # [C, n]
-        squares = np.take_along_axis(squares, nearest, axis=1)
-        weights = np.exp(-0.5 * (squares - squares[:, :1]) / self._spacing_mm(corners) ** 2)
-        weights /= weights.sum(axis=1, keepdims=True)
-        chosen = wanted[nearest]  # [C, n, 4, 4]
-        ways = self._ways(np.repeat(chosen[:, 0], nearest.shape[1], axis=0), chosen.reshape(-1, 4, 4))
-        return self._moved(chosen[:, 0], (weights[..., None] * ways.reshape(*nearest.shape, 6)).sum(axis=1))
-
-    @staticmethod
-    def _spacing_mm(corners: FloatArray) -> float:  # [P, K, 3]
-        steps = np.sqrt(np.square(np.diff(corners, axis=0)).sum(axis=-1).mean(axis=-1))
-        return max(float(np.median(steps)), LEAST_SPACING_MM) if len(steps) else LEAST_SPACING_MM
+        place = self._at_rest.nearest(poses)
+        return self._moved(self._tracked.at(*place), self._ways(self._at_rest.at(*place), poses))
 
     def _ways(self, before: FloatArray, after: FloatArray) -> FloatArray:  # [C, 4, 4] both -> [C, 6]
         """From one pose to another along the axes of the first: shift of the middle of the image, mm, and turn, rad."""
-        motions = np.linalg.inv(before) @ after
-        shifts = motions[:, :3, :3] @ self._middle + motions[:, :3, 3] - self._middle
-        return np.concatenate([shifts, turns_of(motions[:, :3, :3])], axis=1)
+        back = before[:, :3, :3].transpose(0, 2, 1)
+        shifts = back @ (_points(after, self._middle) - _points(before, self._middle))[..., None]
+        return np.concatenate([shifts[..., 0], turns_of(back @ after[:, :3, :3])], axis=1)
 
     def _moved(self, poses: FloatArray, ways: FloatArray) -> FloatArray:  # [C, 4, 4], [C, 6] -> [C, 4, 4]
-        motions = np.tile(np.eye(4), (len(poses), 1, 1))
-        motions[:, :3, :3] = rotations_of(ways[:, 3:])
-        motions[:, :3, 3] = self._middle + ways[:, :3] - motions[:, :3, :3] @ self._middle
-        moved: FloatArray = poses @ motions
+        moved = poses.copy()
+        moved[:, :3, :3] = poses[:, :3, :3] @ rotations_of(ways[:, 3:])
+        middles = _points(poses, self._middle + ways[:, :3])
+        moved[:, :3, 3] = middles - moved[:, :3, :3] @ self._middle
         return moved
+
+
+def _points(poses: FloatArray, local: FloatArray) -> FloatArray:  # [C, 4, 4], [3] or [C, 3] -> [C, 3]
+    points: FloatArray = (poses[:, :3, :3] @ local[..., None])[..., 0] + poses[:, :3, 3]
+    return points
+
+
+class _Path:
+    """Poses [P, 4, 4] (mm) of frames, and places beside them, told by the corners of the images."""
+
+    def __init__(self, poses: FloatArray, probe: Probe) -> None:
+        self._poses, self._probe = poses, probe
+        corners = probe.corners_from(poses)  # [P, K, 3]
+        self._centre, self._corner_count = corners.mean(axis=(0, 1)), corners.shape[1]
+        self._corners = (corners - self._centre).reshape(len(poses), -1)
+        self._squares = np.square(self._corners).sum(axis=1)
+        steps = np.sqrt(np.square(np.diff(self._corners, axis=0)).sum(axis=1) / self._corner_count)
+        self._spacing_mm = max(float(np.median(steps)) if len(steps) else 0.0, LEAST_SPACING_MM)
+
+    def nearest(self, poses: FloatArray) -> tuple[IntArray, FloatArray]:  # [C, 4, 4] mm -> [C, n] both
+        """The frames nearest to each pose, and their weights, of which the sum is 1."""
+        count = min(NEIGHBOURS, len(self._poses))
+        frames, squares = np.empty((len(poses), count), np.int64), np.empty((len(poses), count))
+        at_once = max(1, PAIRS_AT_ONCE // len(self._poses))
+        for first in range(0, len(poses), at_once):
+            some = slice(first, first + at_once)
+            asked = (self._probe.corners_from(poses[some]) - self._centre).reshape(-1, self._corners.shape[1])
+            distances = self._squares - 2.0 * asked @ self._corners.T  # squared, less a number that each pose has
+            frames[some] = np.argpartition(distances, count - 1, axis=1)[:, :count]
+            squares[some] = np.take_along_axis(distances, frames[some], axis=1) / self._corner_count
+        squares -= squares.min(axis=1, keepdims=True)
+        weights = np.exp(-0.5 * squares / self._spacing_mm**2)
+        return frames, weights / weights.sum(axis=1, keepdims=True)
+
+    def at(self, frames: IntArray, weights: FloatArray) -> FloatArray:  # [C, n] both -> [C, 4, 4] mm
+        """The weighted means of frames that are turned nearly alike."""
+        poses: FloatArray = np.einsum("cn,cnij->cij", weights, self._poses[frames])
+        for _ in range(POLAR_STEPS):
+            turn = poses[:, :3, :3]
+            poses[:, :3, :3] = 1.5 * turn - 0.5 * turn @ turn.transpose(0, 2, 1) @ turn
+        return poses
