@@ -69,6 +69,17 @@ def test_informed_start_lies_on_pixels_of_that_brightness(tiny_dataset, tiny_con
     assert shares.min() > 0.6 * shares.mean(), "no gap stays empty"
 
 
+def test_where_frames_show_detail_gaussians_begin_more_densely(tiny_dataset, tiny_config):
+    dataset = tiny_dataset(height=40, width=40)
+    images = np.full_like(dataset.train.images, 128)
+    images[..., 20:] = np.random.default_rng(0).integers(64, 192, size=(*images.shape[:2], 20))
+    dataset = replace(dataset, train=replace(dataset.train, images=images))
+    parameters = start_of(dataset, tiny_config(max_gaussians=2_000, transmittance=False))
+    x = parameters["means"][:, 0].numpy() * 10.0 + Geometry.of(dataset).centre_mm[0] - dataset.train.poses[0, 0, 3]
+    share = (x > 0.0).mean()
+    assert 0.68 < share < 0.8, "of those with detail; three candidates for each keep the calm half from being empty"
+
+
 def test_random_start_is_the_released_cube(tiny_dataset, tiny_config):
     dataset = tiny_dataset()
     half_side = 0.8 * Geometry.of(dataset).scene_scale_cm
@@ -185,6 +196,25 @@ def test_lengths_of_a_straight_sweep(tiny_dataset):
     assert Geometry.of(tiny_dataset(frames=40)).steps(0.75) == 2 * 15 * 30
     assert geometry.initial_elevation_mm(0.0) == pytest.approx(2.0)
     assert geometry.initial_elevation_mm(9.0) == pytest.approx(4.5)
+
+
+def test_a_large_volume_that_is_seen_finely_gets_more_gaussians_and_steps():
+    usual = Geometry(np.zeros(3), 10.0, 1.0, 0.2, 0.0, pixel_count=14_000_000, distinct_pixels=0, frame_count=200)
+    assert (usual.gaussian_count(0.5), usual.steps(0.5)) == (150_000, 1_500)
+    large = replace(usual, distinct_pixels=12_000_000)
+    assert (large.gaussian_count(0.5), large.steps(0.5)) == (600_000, 3_000)
+    assert large.gaussian_count(0.0) == 480_000
+    assert replace(large, distinct_pixels=3_000_000).gaussian_count(0.5) == 240_000
+    assert replace(large, frame_count=20).steps(0.5) == 600
+
+
+def test_pixels_that_are_black_or_seen_again_are_not_distinct(tiny_dataset, monkeypatch):
+    dataset = tiny_dataset(frames=9, spacing_mm=0.5)
+    dataset.train.images[:, : dataset.train.height // 2] = 0
+    lit = np.count_nonzero(dataset.train.images >= 8)
+    assert Geometry.of(dataset).distinct_pixels == lit
+    monkeypatch.setattr("ultragray.learn.training.geometry.out_of_plane_range_mm", lambda sweep: 4.0)
+    assert Geometry.of(dataset).distinct_pixels == lit // 4
 
 
 def test_spacing_of_a_raster_is_that_across_the_frames(tiny_dataset):
