@@ -1,4 +1,4 @@
-"""The sweep of a hand, in silico: what each error of its poses costs, and how much the agreed path regains: `make hand`."""
+"""The sweep of a hand, in silico: what each error of its poses costs, and what the agreed path regains: `make hand`."""
 
 from __future__ import annotations
 
