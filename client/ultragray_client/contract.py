@@ -545,8 +545,8 @@ class TrainJob:
 
     dataset: str  # Name of an uploaded dataset.
     scene: str  # Name that the scene will be served under.
-    # fast: minutes on two cores; best: fast, with the effort that frames left out ask for, in half an hour; paper:
-    # the released recipe.
+    # fast: minutes on two cores; best: fast, with the effort that frames left out ask for, in half an hour or more;
+    # paper: the released recipe.
     preset: str = "fast"
     settings: dict[str, Any] = field_of(default_factory=dict)  # Any training settings instead of the preset's.
     kind: Literal["train"] = field_of(default="train", repr=False, kw_only=True)

@@ -9,7 +9,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -85,9 +85,10 @@ def score_held_out(
     Raises as `evaluate` and `register_halves` do.
     """
     placed = held_out_on_path(dataset, scene.info)
-    on_path = None if placed is None else evaluate(scene, placed, backend=backend)
-    start = dataset.val if placed is None else placed
-    return HeldOutScores(as_given, on_path, register_halves(scene, start, backend=backend) if register else None)
+    at_rest = scene.at_rest()
+    on_path = None if placed is None else evaluate(at_rest, placed, backend=backend)
+    start = replace(dataset.val, poses=scene.poses_at_rest(dataset.val.poses)) if placed is None else placed
+    return HeldOutScores(as_given, on_path, register_halves(at_rest, start, backend=backend) if register else None)
 
 
 def register_halves(scene: GaussianScene, sweep: Sweep, *, backend: str = "auto") -> Registered:

@@ -51,11 +51,12 @@ RIGID: Shares = (1.0, 1.0, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class AgreedPath:
-    """Poses of the training and the held-out frames, mm, and how well training frames are predicted by the two beside
-    them, mean PSNR in dB."""
+    """Poses of the training and the held-out frames in the tissue at rest, mm, and how well training frames are
+    predicted by the two beside them, mean PSNR in dB."""
 
     train: FloatArray  # [F, 4, 4]
     val: FloatArray  # [V, 4, 4] of which no image was used
+    tracked: FloatArray  # [F, 4, 4] of the training frames in the tracker's frame, without its noise and the delay
     in_time_db: float  # pixel by pixel, whatever the poses say
     tracked_db: float  # in space, as tracked
     found_db: float  # in space, on this path
@@ -64,14 +65,12 @@ class AgreedPath:
     delay_s: float  # of the images behind their poses, which is taken off
     calibration: FloatArray  # [4, 4] right-multiplied to the poses, mm: the identity where none is better
 
-
-def on_agreed_path(dataset: Dataset) -> Dataset:
-    """The same with the poses of `agreed_path`; the dataset itself where these are as tracked."""
-    path = agreed_path(dataset)
-    if path is None or path.train is dataset.train.poses:
-        return dataset
-    train, val = replace(dataset.train, poses=path.train), replace(dataset.val, poses=path.val)
-    return replace(dataset, train=train, val=val)
+    def of(self, dataset: Dataset) -> Dataset:
+        """The same frames on this path; the dataset itself where that is as tracked."""
+        if self.train is dataset.train.poses:
+            return dataset
+        train, val = replace(dataset.train, poses=self.train), replace(dataset.val, poses=self.val)
+        return replace(dataset, train=train, val=val)
 
 
 def agreed_path(dataset: Dataset) -> AgreedPath | None:
@@ -108,13 +107,14 @@ def agreed_path(dataset: Dataset) -> AgreedPath | None:
     noise = tracker_noise(given, ranges)
     figures = judge.in_time_db(), tracked_db, found_db, shares, noise, delay_s, calibration
     if found is given:
-        return AgreedPath(train.poses, val.poses, *figures)
+        return AgreedPath(train.poses, val.poses, train.poses, *figures)
     if dataset.is_one_recording:
-        return AgreedPath(found[on_path], found[places[len(train) :]], *figures)
+        return AgreedPath(found[on_path], found[places[len(train) :]], tracked[on_path], *figures)
     held_out = val.poses
     if delay_s and val.times_s is not None:
         held_out = with_delay(held_out, val.times_s, sweep_ranges(val), delay_s)
-    return AgreedPath(found[on_path], _carried(held_out, tracked, found, ranges, train.probe), *figures)
+    carried = _carried(held_out, tracked, found, ranges, train.probe)
+    return AgreedPath(found[on_path], carried, tracked[on_path], *figures)
 
 
 def _times_of(parts: Sequence[Sweep]) -> FloatArray | None:  # [F] s

@@ -11,7 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
@@ -19,7 +19,7 @@ from torch import Tensor
 
 from ultragray.geometry.probe import FloatArray
 from ultragray.learn.sweep import Dataset, Sweep
-from ultragray.learn.training.agreement import on_agreed_path
+from ultragray.learn.training.agreement import AgreedPath, Shares, agreed_path
 from ultragray.learn.training.alignment import register_sweeps, sweep_ranges
 from ultragray.rendering.backends.inputs import ScenePoses
 from ultragray.scene.info import SceneInfo
@@ -135,11 +135,13 @@ _TRAINED: dict[str, type[TrainedCorrections]] = {"frames": FrameCorrections, "sw
 
 
 class PoseRefinement:
-    """The corrections of the training frames, left-multiplied to their poses; `dataset` is the one to train from."""
+    """The poses of the training frames, as tracked and in the tissue at rest; `dataset`, the one to train from, has
+    those at rest that the training begins with."""
 
-    def __init__(self, dataset: Dataset, tracked: FloatArray, trained: TrainedCorrections | None) -> None:
-        """`dataset` has the poses that the training begins with, `tracked` [F, 4, 4] (mm) are those of its frames."""
-        self.dataset, self._tracked, self._trained = dataset, tracked, trained
+    def __init__(self, dataset: Dataset, told: FloatArray) -> None:  # [F, 4, 4] mm, by the tracker
+        self.dataset, self._told = dataset, told
+        self._trained: TrainedCorrections | None = None
+        self._path: AgreedPath | None = None  # where tissue followed the probe, or the calibration was off
 
     @classmethod
     def of(cls, dataset: Dataset, mode: str) -> PoseRefinement:
@@ -150,19 +152,21 @@ class PoseRefinement:
         frame has a correction of its own. With `none`, and where the poses are good (neighbours and sweeps agree), they
         stay and none is trained.
         """
-        tracked = dataset.train.poses
-        if mode in WITH_PATH:
-            dataset = on_agreed_path(dataset)
+        found = cls(dataset, dataset.train.poses)
+        if mode in WITH_PATH and (path := agreed_path(dataset)) is not None:
+            found.dataset = path.of(dataset)
+            found._path = None if np.array_equal(path.train, path.tracked) else path
         if mode in ("none", "path"):
-            return cls(dataset, tracked, None)
-        ranges = sweep_ranges(dataset.train)
-        poses = dataset.train.poses.copy()
-        for frames, motion in zip(ranges, register_sweeps(dataset.train, ranges), strict=True):
+            return found
+        train = found.dataset.train
+        ranges = sweep_ranges(train)
+        poses = train.poses.copy()
+        for frames, motion in zip(ranges, register_sweeps(train, ranges), strict=True):
             poses[frames] = motion @ poses[frames]
-        if np.array_equal(poses, tracked):
-            return cls(dataset, tracked, None)
-        train = replace(dataset.train, poses=poses)
-        return cls(replace(dataset, train=train), tracked, _TRAINED[mode](train, ranges))
+        if not np.array_equal(poses, found._told):
+            found.dataset = replace(found.dataset, train=replace(train, poses=poses))
+            found._trained = _TRAINED[mode](found.dataset.train, ranges)
+        return found
 
     @property
     def group_count(self) -> int:
@@ -177,15 +181,22 @@ class PoseRefinement:
         if self._trained is not None:
             self._trained.step(done)
 
-    def poses(self) -> FloatArray:  # [F, 4, 4] mm
-        """The corrected poses of all training frames, as they are by now."""
-        poses = self.dataset.train.poses
-        return poses if self._trained is None else self._trained.all_motions() @ poses
+    def of_scene(self) -> dict[str, Any]:
+        """What a scene keeps of the poses, as they are by now: arguments of `GaussianScene.from_splats`."""
+        at_rest = self.dataset.train.poses
+        if self._trained is not None:
+            at_rest = self._trained.all_motions() @ at_rest
+        poses = at_rest if self._path is None else self._path.tracked
+        is_told = np.array_equal(poses, self._told)
+        return {
+            "training_poses": poses,
+            "pose_corrections": None if is_told else poses @ np.linalg.inv(self._told),
+            "rest_poses": None if self._path is None else at_rest,
+        }
 
-    def corrections(self) -> FloatArray | None:  # [F, 4, 4]
-        """The motions that are left-multiplied to the tracker's poses; None where these stay."""
-        poses = self.poses()
-        return None if np.array_equal(poses, self._tracked) else poses @ np.linalg.inv(self._tracked)
+    @property
+    def tissue_shares(self) -> Shares | None:
+        return None if self._path is None else self._path.shares
 
     def tensors(self) -> dict[str, Tensor]:
         return {} if self._trained is None else self._trained.tensors()
@@ -202,5 +213,5 @@ def held_out_on_path(dataset: Dataset, info: SceneInfo) -> Sweep | None:
     """
     if info.dataset_sha256 != dataset.sha256 or info.training.get("refine_poses") not in WITH_PATH:
         return None
-    placed = on_agreed_path(dataset)
-    return None if placed is dataset or not len(placed.val) else placed.val
+    path = agreed_path(dataset)
+    return None if path is None or path.of(dataset) is dataset or not len(dataset.val) else path.of(dataset).val

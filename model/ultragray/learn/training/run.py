@@ -152,7 +152,7 @@ def train(
         scene, is_finished, resolved = trainer.scene(), trainer.is_finished, trainer.config
     if resolved.confidence and is_finished:
         del trainer  # what it takes of the memory is free for the second training
-        refined = replace(dataset, train=replace(dataset.train, poses=scene.training_poses))
+        refined = replace(dataset, train=replace(dataset.train, poses=scene.at_rest().training_poses))
         settled = replace(resolved, refine_poses="none")
         scene.info.confidence.update(_fitted_confidence(refined, settled, apart))
     return scene

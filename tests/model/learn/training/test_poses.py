@@ -117,7 +117,7 @@ def test_good_poses_are_left_alone(tiny_dataset):
     dataset = tiny_dataset(frames=24)
     refinement = PoseRefinement.of(dataset, "frames")
     assert refinement.dataset is dataset
-    assert refinement.corrections() is None
+    assert refinement.of_scene()["pose_corrections"] is None
     assert refinement.group_count == 0
 
 
@@ -130,7 +130,7 @@ def test_corrections_are_trained_and_stored(tiny_dataset, tiny_config, tmp_path)
     scene = train(dataset, tiny_config(refine_poses="frames"))
     assert scene.pose_corrections is not None
     np.testing.assert_allclose(scene.pose_corrections @ dataset.train.poses, scene.training_poses, atol=1e-9)
-    before_training = PoseRefinement.of(dataset, "frames").poses()
+    before_training = PoseRefinement.of(dataset, "frames").of_scene()["training_poses"]
     assert np.abs(scene.training_poses - before_training).max() > 1e-5
     scene.save(tmp_path / "scene.ugr")
     again = GaussianScene.load(tmp_path / "scene.ugr")
@@ -165,7 +165,7 @@ def test_a_run_brings_back_a_sweep_that_is_off_as_a_whole(tiny_config):
     dataset = Dataset("tissue", train_part, train_part.select([]))
     scene = train(dataset, tiny_config(refine_poses="sweeps"))
     assert scene.pose_corrections is not None
-    before_training = PoseRefinement.of(dataset, "sweeps").poses()
+    before_training = PoseRefinement.of(dataset, "sweeps").of_scene()["training_poses"]
     assert np.abs(scene.training_poses[40:] - before_training[40:]).max() > 1e-5
     np.testing.assert_array_equal(scene.training_poses[:40], given[:40])
     middles = replace(train_part, poses=true).corners_mm()[40:].mean(axis=1)
