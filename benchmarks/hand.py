@@ -17,7 +17,7 @@ from ultragray.learn.evaluation.held_out import score_held_out
 from ultragray.learn.evaluation.metrics import frame_metrics, mean_and_std
 from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import TrainingConfig
-from ultragray.learn.training.agreement import agreed_path, on_agreed_path
+from ultragray.learn.training.agreement import agreed_path
 from ultragray_studies.hand import Errors, HandSweep
 from ultragray_studies.report import train_and_evaluate
 
@@ -36,7 +36,7 @@ ERRORS = {
     "all together": ALL,
 }
 LEAST_COST_DB = 0.1  # of a smaller one no share is told
-UNITS = (("mm", "mm"), ("deg", "°"))
+UNITS = (("mm", " mm"), ("deg", "°"))
 TRAINED = {"none", "noise of 0.13 mm and 0.1°", "all together"}
 
 
@@ -55,7 +55,7 @@ def measure(sweep: str, error: str, data_folder: Path) -> Document:
     )
     return {
         "as_given": _scores(given, "linear"),
-        "on_path": _scores(on_agreed_path(given), "linear"),
+        "on_path": _scores(path.of(given), "linear"),
         "true_poses": _scores(with_true, "linear"),
         "without_error": _scores_without_error(sweep),
         "in_time": _scores(given, IN_TIME),
@@ -121,7 +121,7 @@ def predicted(figures: Document) -> Lines:
             cost_db = best - before
             regained = f"{(after - before) / cost_db:.0%}" if cost_db >= LEAST_COST_DB else ""
             scores = [f"{before:.2f} / {run['as_given']['gmsd']:.3f}", f"{after:.2f} / {run['on_path']['gmsd']:.3f}"]
-            left = ", ".join(f"{run['error'][unit]:.2f} → {run['left'][unit]:.2f} {name}" for unit, name in UNITS)
+            left = ", ".join(f"{run['error'][unit]:.2f} → {run['left'][unit]:.2f}{name}" for unit, name in UNITS)
             rows.append((sweep, error, *scores, f"{true:.2f}", regained, left, f"{run['in_time']['psnr_db']:.2f}"))
     head = ("sweep", "error", "as given", "on the path", "true poses", "regained", "error of poses", "in time")
     return table(head, rows)

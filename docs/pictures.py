@@ -41,7 +41,7 @@ from ultragray.geometry.pose import pose_from_position_quaternion
 from ultragray.geometry.probe import LinearProbe
 from ultragray.learn.evaluation.baselines import compound
 from ultragray.learn.registration import register_frames
-from ultragray.learn.training.agreement import on_agreed_path
+from ultragray.learn.training.agreement import agreed_path
 from ultragray.phantom import PHANTOM_PROBE, freehand_poses, simulate
 from ultragray.phantom.demo import DEMO_FILE
 from ultragray.rendering.display import Display
@@ -471,7 +471,9 @@ def draw_hand(path: Path) -> None:
     for row, (name, (passes, errors)) in enumerate(rows.items()):
         sweep = HandSweep.of(*passes)
         given = sweep.recorded(errors)
-        sweeps = [one.train for one in (given, on_agreed_path(given), sweep.recorded(Errors()))]
+        path = agreed_path(given)
+        on_path = given if path is None else path.of(given)
+        sweeps = [one.train for one in (given, on_path, sweep.recorded(Errors()))]
         for column, (title, one) in enumerate(zip(titles, sweeps, strict=True)):
             panel = panels[row * len(titles) + column]
             image = compound(one, "mean", 0.25).reslice(probe, along[None], SIDE, SIDE)[0]

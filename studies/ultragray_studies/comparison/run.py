@@ -29,7 +29,7 @@ from ultragray.learn.evaluation.methods import BudgetKind, ComparisonSettings
 from ultragray.learn.evaluation.scoring import evaluate_frames, require_frames
 from ultragray.learn.report.tables import DatasetFacts
 from ultragray.learn.sweep import ByteArray, Dataset, Distances, Sweep, spread_places
-from ultragray.learn.training.agreement import on_agreed_path
+from ultragray.learn.training.agreement import agreed_path
 from ultragray.learn.training.memory import machine_in_words, training_device
 from ultragray.rendering.pixels import to_uint8
 from ultragray_studies.comparison.result import FORMAT_VERSION, Comparison, MethodResult
@@ -139,7 +139,8 @@ def compare_methods(
         if SCENE in methods or seconds is None:
             methods = {SCENE: SceneMethod(), **methods}
     results = []
-    placed = on_agreed_path(dataset)
+    path = agreed_path(dataset)
+    placed = dataset if path is None else path.of(dataset)
     for number, (name, method) in enumerate(methods.items(), 1):
         if should_stop():
             return None
