@@ -24,10 +24,11 @@ from typing import TypeAlias
 
 import numpy as np
 
+from ultragray.geometry.pose import mean_axes
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.geometry.rotations import blended, rotations_of, turns_of
 from ultragray.geometry.scan_conversion import interpolated_frames, pixel_places
-from ultragray.learn.sweep import Dataset, IntArray, Sweep, corner_distances_mm, mean_axes, spread_places
+from ultragray.learn.sweep import Dataset, IntArray, Sweep, corner_distances_mm, spread_places
 from ultragray.learn.training.alignment import TrackerNoise, path_ranges, sweep_ranges, tracker_noise, without_noise
 
 FRAMES, PIXELS = 96, 2048  # that are predicted, of each: enough to tell one path from another
