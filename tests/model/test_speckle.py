@@ -10,6 +10,7 @@ from ultragray import ConvexProbe, GaussianScene, LinearProbe, RadialProbe, Scen
 from ultragray.contract import to_dict
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.rotations import rotations_of
+from ultragray.learn.evaluation.scoring import evaluate
 from ultragray.learn.evaluation.speckle import compare_speckle, summarize
 from ultragray.learn.sweep import Sweep
 from ultragray.learn.training.speckle import fit_speckle
@@ -250,6 +251,21 @@ def test_the_fit_finds_the_speckle_of_a_sweep():
     summary = summarize(compare_speckle(drawn_again, images.astype(np.float32) / 255.0, LINEAR))
     for name, value in to_dict(summary.true).items():
         assert abs(to_dict(summary.rendered)[name] / value - 1.0) < 0.1, name
+
+
+def test_metrics_are_without_speckle_and_its_statistics_are_told_beside(scene):
+    poses = np.stack([pose_at(y=0.5 * number) for number in range(3)])
+    images = render(scene, None, poses, **SIZE, outputs=("bmode",), speckle="natural")["bmode"]
+    sweep = Sweep((images * 255.0).round().byte().numpy(), poses, LINEAR, np.arange(3), "speckled")
+    found = evaluate(scene, sweep)
+    scene.info = replace(scene.info, speckle=None)
+    without = evaluate(scene, sweep)
+    assert found.frames == without.frames
+    assert found.speckle == without.speckle
+    assert found.natural.histogram_distance < 0.2 * found.speckle.histogram_distance
+    assert found.to_dict()["natural"] == found.natural.to_dict()
+    assert without.natural is None
+    assert "natural" not in without.to_dict()
 
 
 def test_frames_without_texture_have_no_speckle_to_find():

@@ -14,6 +14,8 @@ A mean over many looks can reach the best PSNR and yet look like no scanner's im
   lines, the mean of each window taken away, from covariances averaged over the windows; pixels become mm by the mean
   distance of rows, or of scan lines, in these windows. At most a window wide; speckle of a third of a window looks a
   sixth narrower than it is, in both frames alike.
+- axial_gradient, lateral_gradient: mean difference of grey values from row to row, and from scan line to scan line,
+  all pixels.
 - histogram_distance: 1-Wasserstein distance between the grey values of the two frames, all pixels, in [0, 1].
 """
 
@@ -45,6 +47,8 @@ class Speckle:
     contrast: float
     axial_mm: float
     lateral_mm: float
+    axial_gradient: float
+    lateral_gradient: float
 
 
 @dataclass(frozen=True)
@@ -86,11 +90,9 @@ def compare_speckle(rendered: FrameArray, truth: FrameArray, probe: Probe) -> li
     tiles_mm = _pixels_mm(probe, *truth.shape[1:])
     found = []
     for shown, true in zip(rendered, truth, strict=True):
-        calm = _calmest(tiles_of(true))
+        calm = calmest(tiles_of(true))
         distance = float(np.abs(np.sort(shown, axis=None) - np.sort(true, axis=None)).mean())
-        of_shown, of_true = (
-            _speckle(tiles_of(frame)[calm], tiles_mm[calm]) if len(calm) else None for frame in (shown, true)
-        )
+        of_shown, of_true = (_speckle(frame, calm, tiles_mm[calm]) if len(calm) else None for frame in (shown, true))
         found.append(FrameSpeckle(of_true, of_shown, distance))
     return found
 
@@ -127,7 +129,7 @@ def _pixels_mm(probe: Probe, height: int, width: int) -> FloatArray:  # [T, 2]
     return np.stack([axial, np.linalg.norm(apart, axis=-1)], axis=1)
 
 
-def _calmest(tiles: FloatArray, share: float = CALM_SHARE) -> npt.NDArray[np.intp]:  # [T, n, n] -> places
+def calmest(tiles: FloatArray, share: float = CALM_SHARE) -> npt.NDArray[np.intp]:  # [T, n, n] -> places
     """A share of the tiles that are neither black nor saturated: the calmest."""
     stray = ((tiles < BLACK) | (tiles > SATURATED)).mean(axis=(1, 2))
     lit = np.flatnonzero(stray <= STRAY_SHARE)
@@ -142,8 +144,8 @@ def unrest(tiles: FloatArray) -> FloatArray:  # [T, n, n] -> [T]
     return differences
 
 
-def _speckle(tiles: FloatArray, pixels_mm: FloatArray) -> Speckle:  # [T, n, n], [T, 2]
-    envelope = 10.0 ** (FRAME_RANGE_DB / 20.0 * (tiles - 1.0))
+def _speckle(frame: FrameArray, calm: npt.NDArray[np.intp], pixels_mm: FloatArray) -> Speckle:  # [H, W], [T], [T, 2]
+    envelope = 10.0 ** (FRAME_RANGE_DB / 20.0 * (tiles_of(frame)[calm] - 1.0))
     means = envelope.mean(axis=(1, 2))
     unit = envelope / means[:, None, None] - 1.0  # so that bright windows weigh no more than dark ones
     axial_mm, lateral_mm = pixels_mm.mean(axis=0)
@@ -151,6 +153,8 @@ def _speckle(tiles: FloatArray, pixels_mm: FloatArray) -> Speckle:  # [T, n, n],
         contrast=float(unit.std(axis=(1, 2)).mean()),
         axial_mm=_width_pixels(unit) * float(axial_mm),
         lateral_mm=_width_pixels(unit.swapaxes(1, 2)) * float(lateral_mm),
+        axial_gradient=float(np.abs(np.diff(frame, axis=0)).mean()),
+        lateral_gradient=float(np.abs(np.diff(frame, axis=1)).mean()),
     )
 
 
@@ -191,7 +195,7 @@ class WindowPairs:
         points = probe.points_mm(middle[:, 0] / height, middle[:, 1] / width)
         found: list[tuple[FloatArray, ...]] = []
         for first, second in pairs:
-            calm = _calmest(tiles_of(images[first]), CALM_PAIRED_SHARE)
+            calm = calmest(tiles_of(images[first]), CALM_PAIRED_SHARE)
             there = np.linalg.inv(poses[second]) @ poses[first]
             local = points[calm] @ there[:3, :3].T + there[:3, 3]
             at = np.stack(probe.image_coordinates(local[:, 0], local[:, 2]), axis=1) * (height, width)
