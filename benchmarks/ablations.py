@@ -31,6 +31,7 @@ WITHOUT: Mapping[str, Mapping[str, Any]] = {
     "absorption has no price": {"absorption_penalty": 0.0},
     "no absorption": {"transmittance": False},
     "random start": {"start": "random"},
+    "poses as tracked": {"refine_poses": "none"},
 }
 CURVE: Mapping[str, Mapping[str, Any]] = {
     AS_IT_IS if value == TEXTURE else f"texture {value:g}": {} if value == TEXTURE else {"texture": value}

@@ -15,7 +15,7 @@ from bone_shadow import SHADOW_DB, BoneShadow
 from in_silico import IN_SILICO
 from measuring import Document, Lines, columns, measure_runs, table, teller
 from ultragray.datasets.source import PHANTOM, SourceOptions, load_dataset
-from ultragray.learn.evaluation.baselines import BASELINES, affordable_voxel_mm, evaluate_baselines, predict
+from ultragray.learn.evaluation.baselines import BASELINES, IN_TIME, affordable_voxel_mm, evaluate_baselines, predict
 from ultragray.learn.evaluation.scoring import render_sweep
 from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import TrainingConfig
@@ -126,6 +126,7 @@ ROW_NAMES = {
     "maximum": "maximum compounding",
     "linear": "linear between frames",
     "nearest": "nearest training frame",
+    IN_TIME: "neighbours in time",
 }
 README_ROWS = {
     "ultranerf_liver": "simulated liver, trained on two sweeps",
@@ -188,9 +189,10 @@ def _digits(key: str) -> int:
 
 
 def _metrics(run: Document) -> Iterator[list[str]]:
-    means = {method: run["metrics"][method]["mean"] for method in ROW_NAMES}
+    known = {method: name for method, name in ROW_NAMES.items() if method in run["metrics"]}
+    means = {method: run["metrics"][method]["mean"] for method in known}
     best = {key: (min if key == _LESS_IS_BETTER else max)(mean[key] for mean in means.values()) for key in _HEADS}
-    for method, row_name in ROW_NAMES.items():
+    for method, row_name in known.items():
         cells = [row_name]
         for key in _HEADS:
             mean = f"{means[method][key]:.{_digits(key)}f}"

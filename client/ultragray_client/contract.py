@@ -394,8 +394,8 @@ class ComparisonSettings:
     """Settings of a comparison."""
 
     # Methods to compare, some of scene, median, mean, maximum, median-0.25mm, mean-0.25mm, maximum-0.25mm, linear,
-    # nearest, ultranerf-released, ultranerf-unit, ultranerf-mean, implicitvol, implicitvol-refined, rapidvol,
-    # ultragauss, ultragauss-shadow; all: each of them.
+    # nearest, in-time, ultranerf-released, ultranerf-unit, ultranerf-mean, implicitvol, implicitvol-refined,
+    # rapidvol, ultragauss, ultragauss-shadow; all: each of them.
     methods: tuple[str, ...] = ("all",)
     # equal: every method learns as long as the scene does with the preset fast on this machine; author: the steps
     # of each author's recipe, however long they take.
@@ -427,12 +427,15 @@ class CompareJob(ComparisonSettings):
 class EvaluateJob:
     """A scene is scored on the held-out frames of a dataset: PSNR, MS-SSIM, GMS and GMSD.
 
-    The means are the metrics of the job; evaluation.json has those of every frame.
+    At the poses of the dataset, and on the path that the scene was trained on. The means are the metrics of the job;
+    evaluation.json has those of every frame.
     """
 
     dataset: str  # Name of an uploaded dataset, which need not be the one that the scene was trained from.
     scene: str  # Name of a scene.
-    baselines: bool = False  # Also score compounding of the training frames: the classical way.
+    # Also score classical predictions from the training frames: compounding, and blends of neighbours.
+    baselines: bool = False
+    register: bool = False  # Also move each frame by one half of it, and score the other half: minutes.
     kind: Literal["evaluate"] = field_of(default="evaluate", repr=False, kw_only=True)
     # Longest time that the job may run in all, s; then it fails, and a retry goes on. None: the service's longest.
     max_run_s: float | None = field_of(default=None, kw_only=True)
@@ -554,8 +557,8 @@ class TrainJob:
 
     dataset: str  # Name of an uploaded dataset.
     scene: str  # Name that the scene will be served under.
-    # fast: minutes on two cores; best: fast, with the effort that frames left out ask for, in half an hour; paper:
-    # the released recipe.
+    # fast: minutes on two cores; best: fast, with the effort that frames left out ask for, in half an hour or more;
+    # paper: the released recipe.
     preset: str = "fast"
     settings: dict[str, Any] = field_of(default_factory=dict)  # Any training settings instead of the preset's.
     kind: Literal["train"] = field_of(default="train", repr=False, kw_only=True)

@@ -31,7 +31,7 @@ from ultragray.scene.info import read_header
 from ultragray_studies.comparison.page import plot_counts, plot_distances, plot_tilt
 from ultragray_studies.comparison.result import Comparison, MethodResult
 from ultragray_studies.comparison.run import SCENE, frames_of
-from ultragray_studies.methods.classical import Compounding, FromFrames
+from ultragray_studies.methods.classical import Compounding, FromFrames, InTime
 from ultragray_studies.methods.gaussians import SCENE_FILE, SceneMethod
 from ultragray_studies.methods.method import Method
 
@@ -121,8 +121,8 @@ def ablations(config: TrainingConfig, gaussian_count: int) -> dict[str, Training
 
 def baselines(voxel_mm: float) -> dict[str, Method]:
     """The classical methods of a report by name, with voxels of one size."""
-    methods = (*(Compounding(fold, voxel_mm) for fold in VOLUME_METHODS), FromFrames("linear"), FromFrames("nearest"))
-    return {method.name: method for method in methods}
+    frames = (FromFrames("linear"), FromFrames("nearest"), InTime())
+    return {method.name: method for method in (*(Compounding(fold, voxel_mm) for fold in VOLUME_METHODS), *frames)}
 
 
 def ablation_methods(config: TrainingConfig, gaussian_count: int) -> dict[str, Method]:

@@ -153,7 +153,7 @@ def with_failures(content, reason, *names):
 def test_the_page_is_whole_and_needs_nothing_else(content):
     text = render_report(content)
     Checked(text)
-    assert text.count("<img ") == 3 * (1 + 2 + 2 + 5 * 2)  # truth, the scene, what it is made of, the baselines
+    assert text.count("<img ") == 3 * (1 + 2 + 2 + 6 * 2)  # truth, the scene, what it is made of, the baselines
     assert text.count("<svg ") == 5
     assert "turning &lt;sweep&gt;" in text
     assert "turning <sweep>" not in text
@@ -166,6 +166,7 @@ def test_the_page_is_whole_and_needs_nothing_else(content):
         "maximum compounding, 0.5 mm",
         "linear between frames",
         "nearest training frame",
+        "neighbours in time",
     ]
     assert rows == [
         *("this scene", *classical),

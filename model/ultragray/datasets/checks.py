@@ -438,17 +438,34 @@ def _dataset_warnings(dataset: Dataset) -> list[str]:
 
 
 def _shaken(dataset: Dataset) -> list[str]:
-    """Poses that predict a frame from those beside it worse than no poses at all."""
+    """Poses that are of another time, calibrated wrongly, or predict a frame worse than its neighbours in time do."""
     path = agreed_path(dataset)
-    if path is None or path.in_time_db < path.tracked_db + SHAKEN_DB:
+    if path is None:
         return []
+    found = []
+    if path.delay_s:
+        found.append(
+            f"images seem to be {1000.0 * path.delay_s:.0f} ms later than their poses: with poses of that time before, "
+            "neighbouring frames predict each other best (a training takes it off, image_delay_ms as well)"
+        )
+    if not np.array_equal(path.calibration, np.eye(4)):
+        middle = np.append(dataset.probe.corners_mm().mean(axis=0), 1.0)
+        shift_mm = float(np.linalg.norm(path.calibration @ middle - middle))
+        turn_deg = float(rotation_angles_deg(path.calibration[None], np.eye(4)[None])[0, 0])
+        found.append(
+            f"the calibration from the image to the probe seems to be off by {shift_mm:.1f} mm in the middle of the "
+            f"image and {turn_deg:.1f}°: with another one, which a training takes, sweeps that cross agree better"
+        )
+    if path.in_time_db < path.tracked_db + SHAKEN_DB:
+        return found
     noise, gain_db = path.noise, path.found_db - path.tracked_db
-    remedy = f"; on another path their poses do {gain_db:.1f} dB better (--refine-poses path)" if gain_db else ""
-    return [
+    remedy = f"; a training corrects {gain_db:.1f} dB of it" if gain_db else ""
+    found.append(
         f"the two neighbours in time predict a frame {path.in_time_db - path.tracked_db:.1f} dB better than by their "
         f"poses: the tracker shakes (by {noise.position_mm:.2f} mm and {noise.turn_deg:.2f}°, as the path has it), or "
         f"tissue moves with the probe{remedy}"
-    ]
+    )
+    return found
 
 
 def _hardly_moved(sweep: Sweep) -> list[str]:

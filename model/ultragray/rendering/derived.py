@@ -57,7 +57,7 @@ class Drawing:
 
     @property
     def poses_mm(self) -> FloatArray:
-        """[C, 4, 4] mm, in the frame of the sweep that the scene was trained from."""
+        """[C, 4, 4] mm, in the tissue at rest."""
         return in_mm(self.scene, self._view[1])
 
     def draw(self, planes: Sequence[str]) -> None:
@@ -106,7 +106,7 @@ class Drawing:
 
 
 def in_mm(scene: GaussianScene, poses: ScenePoses) -> FloatArray:  # [C, 4, 4] cm -> [C, 4, 4] mm
-    """Poses of the scene's frame in that of the sweep that it was trained from."""
+    """Poses of the scene's frame in the tissue at rest."""
     moved = as_array(poses).copy()
     moved[:, :3, 3] = 10.0 * moved[:, :3, 3] + np.asarray(scene.info.centre_mm)
     return moved
@@ -184,7 +184,7 @@ def deviations(drawing: Drawing, names: Sequence[str]) -> Tensor:  # [C, H, W]
     model = read_model(scene.info.confidence, len(scene.training_poses))
     assert model is not None
     assert model.uncertainty is not None
-    views = TrainingViews(scene.training_poses, scene.info.probe_or(None))
+    views = TrainingViews(scene.at_rest().training_poses, scene.info.probe_or(None))
     terms = variance_terms(planes, view_distances(views, drawing.poses_mm, drawing.probe), model.uncertainty.bands)
     weighted = [weight * term for weight, term in zip(model.uncertainty.variances, terms, strict=True)]
     deviation = torch.stack(weighted).sum(dim=0).clamp(0.0, 1.0).sqrt()

@@ -18,6 +18,7 @@ from torch.nn.functional import avg_pool2d, grid_sample, pad
 
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.image_size import check_image_size
+from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import BoolArray, ElevationBeam, FloatArray, Probe
 from ultragray.geometry.scan_conversion import samples
 from ultragray.rendering.backends import cpu
@@ -25,7 +26,7 @@ from ultragray.rendering.backends.inputs import as_array, beam_cm, scene_poses
 from ultragray.rendering.backends.registry import BACKENDS, choose_backend
 from ultragray.rendering.confidence import SupportWatch
 from ultragray.rendering.contact import Skin, Touch, at_rest
-from ultragray.rendering.derived import Drawing, View, in_mm
+from ultragray.rendering.derived import Drawing, View
 from ultragray.rendering.display import AS_RENDERED, FRAME_RANGE_DB, Display
 from ultragray.rendering.limits import UNLIMITED, Limits
 from ultragray.rendering.outputs import OUTPUTS, PLANES, check_available, check_outputs
@@ -86,7 +87,8 @@ def render(
 ) -> Frames:
     """Frames [C, height, width] of a scene seen by `probe` (None: the probe the scene was trained with) from `poses`.
 
-    Poses are rigid probe→scene transforms in mm, in the frame of the sweep that the scene was trained from.
+    Poses are rigid probe→scene transforms in mm, in the frame of the sweep that the scene was trained from; where
+    tissue followed its probe (`scene.tissue`), it does so in frames; `scene.at_rest()` takes poses in tissue at rest.
     Backends: `reference` computes in the dtype of the scene's tensors, where they are; `cpu` in float32 on as many
     threads as torch.get_num_threads(); `cuda` in float32 on the GPU that holds the scene (`scene.to("cuda")`). `auto`
     takes the fast one for where the scene is. All are differentiable with respect to the scene's tensors, and to poses
@@ -125,7 +127,7 @@ def render(
     drawn = []
     for first, seen, touching in _views(view, touch, compressed=contact is Contact.PRESSURE):
         shown = beam_cm(scene.info.beam if beam is None else beam, seen[0])
-        sight = _tools_in_view(tools, view, slice(first, first + len(seen[1])), scene, shown)
+        sight = _tools_in_view(tools, view, poses, slice(first, first + len(seen[1])), shown)
         drawing = Drawing(draw, scene, seen, limits.after(first), shown, touching, sight, ghost, speckle_by)
         drawing.draw(planes)
         drawn.append({name: OUTPUTS[name].derive(drawing) for name in chosen})
@@ -134,13 +136,12 @@ def render(
 
 
 def _tools_in_view(
-    tools: Sequence[Tool], view: View, places: slice, scene: GaussianScene, beam: Tensor | None
+    tools: Sequence[Tool], view: View, poses: Any, places: slice, beam: Tensor | None
 ) -> ToolsInView | None:
-    """Tools as some poses of a view see them: rigid, where they are, whatever pressure does to the tissue."""
+    """Tools as some poses of a view see them: rigid, where they are, whatever the probe does to the tissue."""
     if not tools:
         return None
-    probe, poses, _, width = view
-    poses_mm = in_mm(scene, poses)[places]
+    (probe, _, _, width), poses_mm = view, check_poses(poses)[places]
     if beam is None:
         return ToolsInView(tools, ScanView(probe, poses_mm, width))
     sigma, focus, rayleigh = (10.0 * beam.detach()).tolist()

@@ -307,7 +307,7 @@ def with_speckle(
     scene: GaussianScene,
     bmode: Tensor,  # [C, H, W]
     probe: Probe,
-    poses: FloatArray,  # [C, 4, 4] mm
+    poses: FloatArray,  # [C, 4, 4] mm, in the tissue at rest
     *,
     backend: str,
 ) -> Tensor:  # [C, H, W]
@@ -317,7 +317,7 @@ def with_speckle(
     """
     model = scene.info.speckle
     assert model is not None
-    axes = scene.prepared("speckle axes", lambda: sweep_axes(scene.training_poses))
+    axes = scene.prepared("speckle axes", lambda: sweep_axes(scene.at_rest().training_poses))
     plain = bmode.detach()
     size = (int(bmode.shape[1]), int(bmode.shape[2]))
     if backend == "reference":

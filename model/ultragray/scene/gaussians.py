@@ -22,12 +22,14 @@ from ultragray.files import write_whole
 from ultragray.geometry.pose import check_poses
 from ultragray.geometry.probe import FloatArray
 from ultragray.scene.info import (
-    CORRECTIONS_TENSOR,
+    BESIDE,
     LABELS_TENSOR,
     METADATA_KEY,
+    REST_TENSOR,
     SceneInfo,
-    check_corrections,
+    check_beside,
     check_header_size,
+    check_tissue,
     check_training_pose_count,
     expected_shapes,
     info_to_json,
@@ -35,6 +37,7 @@ from ultragray.scene.info import (
     scene_file_invalid,
     with_summary,
 )
+from ultragray.scene.tissue import FollowingTissue
 
 PARAMETERS = ("means", "scales", "quats", "transmittances", "sh0", "shN")
 LARGEST = {"means": 1e6, "scales": 20.0} | dict.fromkeys(("quats", "transmittances", "sh0", "shN"), 1e6)
@@ -70,6 +73,7 @@ class GaussianScene:
     training_poses: FloatArray = field(default_factory=lambda: np.zeros((0, 4, 4)))  # [P, 4, 4] mm
     labels: Tensor | None = None  # [N] uint8
     pose_corrections: FloatArray | None = None  # [P, 4, 4] mm: training poses = corrections · poses of the tracker
+    rest_poses: FloatArray | None = None  # [P, 4, 4] mm: where the tissue at rest looks as training frames do
     _prepared: dict[str, _Kept] = field(default_factory=dict, init=False, repr=False)
 
     def __repr__(self) -> str:
@@ -89,6 +93,7 @@ class GaussianScene:
         training_poses: Any = None,  # [P, 4, 4] mm
         labels: Tensor | None = None,  # [N] uint8
         pose_corrections: Any = None,  # [P, 4, 4] mm
+        rest_poses: Any = None,  # [P, 4, 4] mm
     ) -> GaussianScene:
         """A scene of raw released parameters, lengths in cm; the graph of the tensors is kept.
 
@@ -137,13 +142,17 @@ class GaussianScene:
         check_training_pose_count(len(poses))
         summary = with_summary(info or SceneInfo(), means.detach().cpu().double().numpy(), degree)
         names = _names_of_labels(labels, means, summary.label_names)
-        corrections = None if pose_corrections is None else check_corrections(pose_corrections, len(poses))
+        beside: dict[str, Any] = {
+            name: None if motions is None else check_beside(name, motions, len(poses))
+            for name, motions in zip(BESIDE, (pose_corrections, rest_poses), strict=True)
+        }
+        check_tissue(summary, beside[REST_TENSOR])
         return cls(
             **tensors,
             info=replace(summary, label_names=names),
             training_poses=poses,
             labels=labels,
-            pose_corrections=corrections,
+            **beside,
         )
 
     @property
@@ -186,8 +195,36 @@ class GaussianScene:
         made: Prepared = kept.made
         return made
 
+    @property
+    def tissue(self) -> FollowingTissue | None:
+        """The way from poses as tracked to the tissue at rest; None where they are the same."""
+        rest, shares = self.rest_poses, self.info.tissue_shares
+        if rest is None or shares is None:
+            return None
+        return self.prepared(
+            "tissue",
+            lambda: FollowingTissue(self.training_poses, rest, self.pose_corrections, shares, self.info.probe_or(None)),
+        )
+
+    def poses_at_rest(self, poses: FloatArray) -> FloatArray:  # [C, 4, 4] mm -> [C, 4, 4] mm
+        """Poses as tracked, in the tissue at rest."""
+        return poses if self.tissue is None else self.tissue.at_rest(poses)
+
+    def poses_as_tracked(self, poses: FloatArray) -> FloatArray:  # [C, 4, 4] mm -> [C, 4, 4] mm
+        """Poses in the tissue at rest, as tracked."""
+        return poses if self.tissue is None else self.tissue.tracked(poses)
+
+    def at_rest(self) -> GaussianScene:
+        """The same for poses in the tissue at rest, its training poses among them; itself where tissue is rigid."""
+        if (rest := self.rest_poses) is None:
+            return self
+        info = replace(self.info, tissue_shares=None)
+        return self.prepared(
+            "at rest", lambda: replace(self, info=info, training_poses=rest, rest_poses=None, pose_corrections=None)
+        )
+
     def poses_to_scene_cm(self, poses: FloatArray) -> FloatArray:  # [C, 4, 4] mm -> [C, 4, 4] cm
-        """Poses in the sweep's frame (mm) as poses in the scene's own (cm, about its centre)."""
+        """Poses in the tissue at rest (mm) as poses in the scene's own frame (cm, about its centre)."""
         inside: FloatArray = poses.copy()
         inside[:, :3, 3] = (poses[:, :3, 3] - np.asarray(self.info.centre_mm)) / 10.0
         return inside
@@ -201,8 +238,9 @@ class GaussianScene:
         if self.labels is not None:
             tensors[LABELS_TENSOR] = self.labels.cpu().contiguous()
         tensors["training_poses"] = torch.from_numpy(np.ascontiguousarray(self.training_poses))
-        if self.pose_corrections is not None:
-            tensors[CORRECTIONS_TENSOR] = torch.from_numpy(np.ascontiguousarray(self.pose_corrections))
+        for name in BESIDE:
+            if (motions := getattr(self, name)) is not None:
+                tensors[name] = torch.from_numpy(np.ascontiguousarray(motions))
         data: bytes = save(tensors, metadata={METADATA_KEY: info_to_json(self.info)})
         check_header_size(data)
         return data
@@ -225,6 +263,7 @@ class GaussianScene:
                 training_poses=header.training_poses,
                 labels=labels,
                 pose_corrections=header.pose_corrections,
+                rest_poses=header.rest_poses,
             )
         except (OSError, SafetensorError, ValueError) as error:
             raise scene_file_invalid(path, error) from error

@@ -1,8 +1,9 @@
 """A scene file's description of itself, readable without torch: the header of the safetensors bundle.
 
 The file is one safetensors bundle. Tensors: means [N, 3] cm, scales [N, 3] log cm, quats [N, 4] wxyz, transmittances
-[N] logit, sh0 [N, 1, 1], shN [N, K−1, 1], all float32, training_poses [P, 4, 4] float64 mm, and, where the Gaussians
-carry labels, labels [N] uint8. Its metadata holds one entry, `ultragray`, a JSON object with the fields of SceneInfo.
+[N] logit, sh0 [N, 1, 1], shN [N, K−1, 1], all float32, training_poses [P, 4, 4] float64 mm; where these were corrected,
+pose_corrections likewise; where tissue followed the probe, rest_poses likewise; and, where the Gaussians carry labels,
+labels [N] uint8. Its metadata holds one entry, `ultragray`, a JSON object with the fields of SceneInfo.
 All but the Gaussians is bounded, so that the description of any file is read in little memory and time.
 """
 
@@ -36,6 +37,8 @@ MAX_TRAINING_POSES = 100_000
 MAX_METRICS = 1000
 LABELS_TENSOR = "labels"
 CORRECTIONS_TENSOR = "pose_corrections"
+REST_TENSOR = "rest_poses"
+BESIDE = (CORRECTIONS_TENSOR, REST_TENSOR)  # tensors that a scene may have beside its training poses
 _LENGTH_BYTES = 8  # a safetensors bundle starts with the length of its header, little endian
 
 Vector = tuple[float, float, float]
@@ -62,6 +65,13 @@ class SceneInfo(Contract):
     label_names: dict[int, str] = described("By label, 1 to 255; empty: the scene carries none.", factory=dict)
     beam: ElevationBeam | None = described("Of the frames it was trained on; none: as thick as its Gaussians.", None)
     speckle: SpeckleModel | None = described("Of the frames it was trained on; none: not known.", None)
+    tissue_shares: Vector | None = described(
+        "Of the probe's motion within the image plane (lateral, axial, turn) that tissue did not go along with, each "
+        "from 0 to 1; none: tissue is rigid, and poses lead into it as they are.",
+        None,
+        low=0.0,
+        high=1.0,
+    )
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "label_names", _label_names(self.label_names))
@@ -113,7 +123,7 @@ def _label_names(names: Any) -> dict[int, str]:
 
 def info_to_json(info: SceneInfo) -> str:
     document = {"format_version": FORMAT_VERSION, **to_dict(info)}
-    for name in ("label_names", "beam", "speckle"):
+    for name in ("label_names", "beam", "speckle", "tissue_shares"):
         if not document[name]:
             del document[name]  # a scene without them keeps its bytes, and its hash
     return json.dumps(document, allow_nan=False, sort_keys=True)
@@ -162,6 +172,8 @@ class SceneHeader:
     file_bytes: int
     # [P, 4, 4] mm: training poses = corrections · poses of the tracker
     pose_corrections: FloatArray | None = field(default=None, repr=False)
+    # [P, 4, 4] mm: where the tissue at rest looks as the training frames do; None: at the training poses
+    rest_poses: FloatArray | None = field(default=None, repr=False)
 
 
 def read_header(path: str | Path) -> SceneHeader:
@@ -181,24 +193,33 @@ def read_header(path: str | Path) -> SceneHeader:
             info = info_from_json(metadata[METADATA_KEY])
             _check_tensors(bundle, info)
             poses = check_poses(bundle.get_tensor("training_poses"), field="training_poses")
-            corrections = None
-            if CORRECTIONS_TENSOR in bundle.keys():  # noqa: SIM118
-                corrections = check_corrections(bundle.get_tensor(CORRECTIONS_TENSOR), len(poses))
+            beside = {
+                name: check_beside(name, bundle.get_tensor(name), len(poses)) if name in bundle.keys() else None  # noqa: SIM118
+                for name in BESIDE
+            }
+            check_tissue(info, beside[REST_TENSOR])
             read_model(info.confidence, len(poses))
     except (OSError, SafetensorError, ValueError, TypeError, RecursionError) as error:
         raise scene_file_invalid(path, error) from error
-    return SceneHeader(info=info, training_poses=poses, file_bytes=size, pose_corrections=corrections)
+    return SceneHeader(info=info, training_poses=poses, file_bytes=size, **beside)
 
 
-def check_corrections(corrections: Any, count: int) -> FloatArray:  # [P, 4, 4] mm
+def check_beside(name: str, motions: Any, count: int) -> FloatArray:  # [P, 4, 4] mm
     """Rigid motions, one for each of `count` training poses. Raises InvalidPose and InvalidArgument."""
-    exact = check_poses(corrections, field=CORRECTIONS_TENSOR)
+    exact = check_poses(motions, field=name)
     if len(exact) != count:
-        raise InvalidArgument(
-            f"{CORRECTIONS_TENSOR} must be {count}, one for each training pose, got {len(exact)}",
-            field=CORRECTIONS_TENSOR,
-        )
+        raise InvalidArgument(f"{name} must be {count}, one for each training pose, got {len(exact)}", field=name)
     return exact
+
+
+def check_tissue(info: SceneInfo, rest_poses: FloatArray | None) -> None:
+    """Raises InvalidArgument where only one is known of the two that say how tissue follows, or no probe is."""
+    if (info.tissue_shares is None) != (rest_poses is None) or (rest_poses is not None and info.probe is None):
+        raise InvalidArgument(
+            f"tissue_shares, {REST_TENSOR} and a probe belong together: a scene has all three, or neither of the first "
+            "two",
+            field="tissue_shares",
+        )
 
 
 def check_header_size(start: bytes) -> None:
@@ -224,7 +245,7 @@ def _check_tensors(bundle: Any, info: SceneInfo) -> None:
     shapes = expected_shapes(info.gaussian_count, info.sh_degree)
     if info.label_names:
         shapes[LABELS_TENSOR] = (info.gaussian_count,)
-    if names - {CORRECTIONS_TENSOR} != {*shapes, "training_poses"}:
+    if names - set(BESIDE) != {*shapes, "training_poses"}:
         raise ValueError(f"its tensors are {sorted(names)}, expected {sorted([*shapes, 'training_poses'])}")
     for name, shape in shapes.items():
         part, dtype = bundle.get_slice(name), "U8" if name == LABELS_TENSOR else "F32"

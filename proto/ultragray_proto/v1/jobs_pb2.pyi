@@ -71,7 +71,7 @@ class CompareJob(_message.Message):
     def __init__(self, dataset: _Optional[str] = ..., methods: _Optional[_Iterable[str]] = ..., budget: _Optional[str] = ..., times: _Optional[float] = ..., seed: _Optional[int] = ..., max_run_s: _Optional[float] = ..., device: _Optional[str] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ...) -> None: ...
 
 class EvaluateJob(_message.Message):
-    __slots__ = ("dataset", "scene", "baselines", "max_run_s", "device", "min_memory_gb", "worker_labels")
+    __slots__ = ("dataset", "scene", "baselines", "max_run_s", "device", "min_memory_gb", "worker_labels", "register")
     class WorkerLabelsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -86,6 +86,7 @@ class EvaluateJob(_message.Message):
     DEVICE_FIELD_NUMBER: _ClassVar[int]
     MIN_MEMORY_GB_FIELD_NUMBER: _ClassVar[int]
     WORKER_LABELS_FIELD_NUMBER: _ClassVar[int]
+    REGISTER_FIELD_NUMBER: _ClassVar[int]
     dataset: str
     scene: str
     baselines: bool
@@ -93,7 +94,8 @@ class EvaluateJob(_message.Message):
     device: str
     min_memory_gb: int
     worker_labels: _containers.ScalarMap[str, str]
-    def __init__(self, dataset: _Optional[str] = ..., scene: _Optional[str] = ..., baselines: _Optional[bool] = ..., max_run_s: _Optional[float] = ..., device: _Optional[str] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ...) -> None: ...
+    register: bool
+    def __init__(self, dataset: _Optional[str] = ..., scene: _Optional[str] = ..., baselines: _Optional[bool] = ..., max_run_s: _Optional[float] = ..., device: _Optional[str] = ..., min_memory_gb: _Optional[int] = ..., worker_labels: _Optional[_Mapping[str, str]] = ..., register: _Optional[bool] = ...) -> None: ...
 
 class TrainJob(_message.Message):
     __slots__ = ("dataset", "scene", "preset", "settings", "device", "max_run_s", "min_memory_gb", "worker_labels")

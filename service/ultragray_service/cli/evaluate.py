@@ -6,11 +6,12 @@ import enum
 from collections.abc import Mapping
 from dataclasses import astuple
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from ultragray.datasets.source import SourceOptions
+from ultragray.errors import InvalidArgument
 from ultragray.scene.info import read_header
 from ultragray_service.cli.options import with_options
 from ultragray_service.cli.sweeps import SweepArgument, check_scene_fits, check_source, read_dataset
@@ -32,8 +33,6 @@ if TYPE_CHECKING:
     from rich.table import Table
 
     from ultragray.learn.evaluation.scoring import Evaluation, Reliability
-    from ultragray.learn.sweep import Sweep
-    from ultragray.scene.gaussians import GaussianScene
 
 
 class Split(str, enum.Enum):
@@ -63,21 +62,27 @@ def evaluate(
     json: Json = False,
     split: Annotated[Split, option("Frames to measure on.")] = Split.VAL,
     register: Annotated[
-        bool, option("Also move each frame by one half of it, and score the other half.", "--register")
+        bool, option("Also move each held-out frame by one half of it, and score the other half.", "--register")
     ] = False,
     backend: Backend = "auto",
     *,
     source: SourceOptions,
 ) -> None:
-    """The figures: PSNR, MS-SSIM, GMS, GMSD, speckle statistics, and how well the scene knows its own errors."""
+    """The figures: PSNR, MS-SSIM, GMS, GMSD, speckle statistics, and how well the scene knows its own errors.
+
+    Held-out frames are scored as given, and on the path that the scene was trained on.
+    """
+    if register and split is Split.TRAIN:
+        raise InvalidArgument("--register is for held-out frames: leave out --split train", field="register")
     if output is not None:
         check_folder(output, force=force)
     read_header(scene)
     check_source(sweep)
 
+    from ultragray.learn.evaluation.held_out import score_held_out
     from ultragray.learn.evaluation.scoring import evaluate as evaluate_scene
     from ultragray.learn.evaluation.scoring import measure_reliability, require_frames
-    from ultragray.learn.training.poses import held_out_on_path
+    from ultragray.learn.report.sizes import CorrectionSizes
     from ultragray.rendering.backends.registry import render_device
     from ultragray.scene.gaussians import GaussianScene
 
@@ -89,21 +94,25 @@ def evaluate(
     with working(f"measuring {len(frames)} frames …"):
         evaluation = evaluate_scene(loaded, frames, backend=backend)
         reliability = measure_reliability(loaded, frames, backend=backend)
-        poses = _pose_figures(loaded, frames if register else None, backend)
-        placed = held_out_on_path(read, loaded.info) if split is Split.VAL else None
-        on_path = {} if placed is None else {"on_path": evaluate_scene(loaded, placed, backend=backend)}
+        corrections = loaded.pose_corrections
+        sizes = None if corrections is None else CorrectionSizes.of(corrections, loaded.training_poses)
+        held_out = None
+        if split is Split.VAL:
+            held_out = score_held_out(loaded, read, evaluation, register=register, backend=backend)
     if json:
         figures = evaluation.to_dict() | {"uncertainty": None if reliability is None else reliability.to_dict()}
-        figures |= {name: value.to_dict() for name, value in (poses | on_path).items()}
+        figures |= {} if sizes is None else {"pose_corrections": sizes.to_dict()}
+        figures |= {} if held_out is None else {"held_out": held_out.to_dict()}
         typer.echo(to_json({"scene": str(scene), "dataset": read.name, "split": split.value, **figures}))
     else:
-        named = {f"{scene.stem}, on its path": one for one in on_path.values()}
-        print_metrics(f"{read.name}, {len(frames)} {split.value} frames", {scene.stem: evaluation, **named})
+        rows = {} if held_out is None else {f"{scene.stem}, {name}": one for name, one in held_out.rows.items()}
+        shown = rows if len(rows) > 1 else {scene.stem: evaluation}
+        print_metrics(f"{read.name}, {len(frames)} {split.value} frames", shown)
         print_speckle({scene.stem: evaluation})
         if reliability is not None:
             typer.echo(_in_words(reliability))
-        for value in poses.values():
-            typer.echo(str(value))
+        if sizes is not None:
+            typer.echo(str(sizes))
     if output is not None:
         from ultragray.files import write_whole
         from ultragray.learn.evaluation.side_by_side import write_side_by_side
@@ -114,22 +123,10 @@ def evaluate(
         if reliability is not None:
             paths.append(output / "uncertainty.svg")
             write_whole(paths[-1], plot_reliability(reliability))
-        if (corrections := poses.get("pose_corrections")) is not None:
+        if sizes is not None:
             paths.append(output / "pose_corrections.svg")
-            write_whole(paths[-1], plot_corrections(corrections.shift_mm, corrections.turn_deg))
+            write_whole(paths[-1], plot_corrections(sizes.shift_mm, sizes.turn_deg))
         typer.echo(f"wrote {len(paths)} pictures into {output}", err=json)
-
-
-def _pose_figures(scene: GaussianScene, registered: Sweep | None, backend: str) -> dict[str, Any]:
-    from ultragray.learn.report.sizes import CorrectionSizes
-    from ultragray.learn.training.poses import score_halves
-
-    found: dict[str, Any] = {}
-    if scene.pose_corrections is not None:
-        found["pose_corrections"] = CorrectionSizes.of(scene.pose_corrections, scene.training_poses)
-    if registered is not None:
-        found["halves"] = score_halves(scene, registered, backend=backend)
-    return found
 
 
 def _in_words(reliability: Reliability) -> str:

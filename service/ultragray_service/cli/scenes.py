@@ -152,16 +152,18 @@ def export(
     if output.suffix == ".ply":
         from ultragray.exchange.ply import write_ply
 
-        write_ply(loaded, output)
+        write_ply(loaded.at_rest(), output)
         facts["training_poses"] = len(loaded.training_poses)
         place = f", {facts['training_poses']} training poses"
     else:
         from ultragray.exchange.checkpoint import export_checkpoint
 
-        written = export_checkpoint(loaded, output, replace=force)
+        written = export_checkpoint(loaded.at_rest(), output, replace=force)
         x, y, z = written.centre_mm
         facts |= {"files": [*map(str, written.files)], "centre_mm": [*map(float, (x, y, z))], "notes": [*written.notes]}
         place = f" about ({x:.2f}, {y:.2f}, {z:.2f}) mm"
+    if loaded.tissue is not None:
+        facts["notes"].append("its poses are those in the tissue at rest: how tissue followed the probe is left out")
     for note in facts["notes"]:
         typer.secho(f"note: {note}", fg=typer.colors.YELLOW, err=True)
     tell(f"wrote {', '.join(facts['files'])}: {loaded.gaussian_count:,} Gaussians{place}", facts, as_json=json)

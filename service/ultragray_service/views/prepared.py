@@ -317,7 +317,8 @@ class TrainingCurve:
     points: list[CurvePoint] = described(f"At most {MAX_POINTS}; none before the first step.")
     baselines: dict[str, float] = described(
         "PSNR in dB of classical methods on the frames of val_psnr_db, by name (linear: between the nearest frames; "
-        "median: compounded); empty where they were not measured."
+        "median: compounded; in-time: of the neighbours in time, in the same recording); empty where they were not "
+        "measured."
     )
 
 

@@ -224,7 +224,7 @@ def measure(name: str, method: Method, fitted: Fitted, sweep: Sweep, machine: st
 
     Raises TrainingDiverged where they are not finite.
     """
-    frames = fitted.render(sweep.probe, sweep.poses, sweep.height, sweep.width)
+    frames = fitted.predict(sweep)
     if not np.isfinite(frames).all():
         raise TrainingDiverged("frames that it expects are not finite")
     frames = np.clip(frames, 0.0, 1.0)
@@ -235,10 +235,10 @@ def measure(name: str, method: Method, fitted: Fitted, sweep: Sweep, machine: st
 
 def _frame_ms(fitted: Fitted, sweep: Sweep) -> float:
     """The median time of one frame rendered alone, after the first, which may build what later ones use."""
-    chosen = sweep.poses[spread_places(len(sweep), TIMED_FRAMES)]
+    chosen = spread_places(len(sweep), TIMED_FRAMES)
     seconds = []
     for place in range(TIMED_FRAMES + 1):
         began_s = time.perf_counter()
-        fitted.render(sweep.probe, chosen[place % len(chosen)][None], sweep.height, sweep.width)
+        fitted.predict(sweep.select(chosen[[place % len(chosen)]]))
         seconds.append(time.perf_counter() - began_s)
     return 1000.0 * float(np.median(seconds[1:]))

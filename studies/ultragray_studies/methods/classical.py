@@ -7,7 +7,16 @@ from dataclasses import dataclass
 
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.probe import FloatArray, Probe
-from ultragray.learn.evaluation.baselines import FrameArray, Volume, affordable_voxel_mm, compound, predict
+from ultragray.learn.evaluation.baselines import (
+    IN_TIME,
+    FrameArray,
+    Volume,
+    affordable_voxel_mm,
+    compound,
+    predict,
+    predict_held_out,
+)
+from ultragray.learn.prediction import NeighboursInTime
 from ultragray.learn.sweep import Dataset, Sweep
 from ultragray_studies.methods.method import Budget, Cost, Description, FitRun, Fitted, Method
 
@@ -55,7 +64,7 @@ class _Compounded(Fitted):
 class FromFrames(Method):
     """A frame taken from the training frames at once: linear between those that enclose a pixel, or the nearest."""
 
-    name: str  # of ultragray.learn.evaluation.baselines.BASELINES
+    name: str  # linear or nearest
 
     def describe(self) -> Description:
         titles = {"linear": "linear between frames", "nearest": "nearest training frame"}
@@ -81,3 +90,39 @@ class _Frames(Fitted):
         if (probe, height, width) != own:
             raise InvalidArgument(f"{self.method} renders frames of its own sweep only, {own}", field="probe")
         return predict(self.sweep, poses, self.method)
+
+
+@dataclass(frozen=True)
+class InTime(Method):
+    """A held-out frame as the blend of the training frames before and after it, whatever the poses say."""
+
+    name = IN_TIME
+
+    def describe(self) -> Description:
+        return Description(
+            "neighbours in time",
+            "docs/concepts/baselines.md",
+            "Each pixel from the same pixel of the training frames before and after it in its recording, by their "
+            "times: what poses are worth shows beside it.",
+            choices=("At an end of the recording the one neighbour.", "It has frames of its own recording only."),
+        )
+
+    def fit(self, dataset: Dataset, budget: Budget, run: FitRun | None = None) -> _BlendsInTime:
+        """Raises DatasetInvalid where held-out frames have no neighbours in time."""
+        NeighboursInTime.of(dataset)
+        return _BlendsInTime(dataset.train, Cost(0.0, 0, None, dataset.train.images.nbytes))
+
+
+@dataclass(frozen=True, eq=False)
+class _BlendsInTime(Fitted):
+    sweep: Sweep
+    cost: Cost
+
+    def render(self, probe: Probe, poses: FloatArray, height: int, width: int) -> FrameArray:
+        """Raises InvalidArgument: a pose has no neighbours in time."""
+        raise InvalidArgument(
+            f"{IN_TIME} predicts frames of its own recording by their times, not poses", field="poses"
+        )
+
+    def predict(self, sweep: Sweep) -> FrameArray:
+        return predict_held_out(Dataset(self.sweep.source, self.sweep, sweep), IN_TIME)

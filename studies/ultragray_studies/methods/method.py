@@ -26,7 +26,7 @@ from ultragray.errors import InvalidArgument
 from ultragray.files import write_whole
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.evaluation.methods import BudgetKind
-from ultragray.learn.sweep import Dataset
+from ultragray.learn.sweep import Dataset, Sweep
 
 USED_SHARE = 0.8  # of an equal time: a fit that took less was promised too few steps
 
@@ -193,6 +193,10 @@ class Fitted(ABC):
     @abstractmethod
     def render(self, probe: Probe, poses: FloatArray, height: int, width: int) -> FrameArray:
         """The frames [C, H, W] in [0, 1] that it expects at poses [C, 4, 4] (mm, probe→tracker)."""
+
+    def predict(self, sweep: Sweep) -> FrameArray:
+        """The frames [F, H, W] that it expects in the place of those of a sweep: at their poses."""
+        return self.render(sweep.probe, sweep.poses, sweep.height, sweep.width)
 
 
 class Method(ABC):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 from ultragray.learn.evaluation.methods import chosen_names
-from ultragray_studies.methods.classical import PAPER_VOXEL_MM, Compounding, FromFrames
+from ultragray_studies.methods.classical import PAPER_VOXEL_MM, Compounding, FromFrames, InTime
 from ultragray_studies.methods.gaussians import SceneMethod
 from ultragray_studies.methods.implicitvol import ImplicitVol
 from ultragray_studies.methods.method import Method
@@ -21,6 +21,7 @@ METHODS: dict[str, Method] = {
         *(Compounding(fold, PAPER_VOXEL_MM) for fold in ("median", "mean", "maximum")),
         FromFrames("linear"),
         FromFrames("nearest"),
+        InTime(),
         *ULTRANERF,
         ImplicitVol(),
         ImplicitVol(refines=True),

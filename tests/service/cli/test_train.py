@@ -210,7 +210,10 @@ def test_eval_prints_what_the_library_measures(dataset, scene):
     reliability = measure_reliability(GaussianScene.load(scene), read_released(dataset).val)
     document = printed_json("eval", scene, dataset, "--json")
     figures = {**expected.to_dict(), "uncertainty": json.loads(json.dumps(reliability.to_dict()))}
-    assert document == {"scene": str(scene), "dataset": "ball", "split": "val", **figures}
+    means = {"mean": expected.mean.to_dict(), "std": expected.std.to_dict()}
+    held_out = {"as_given": means, "on_path": None, "registered": None}
+    assert document == {"scene": str(scene), "dataset": "ball", "split": "val", **figures, "held_out": held_out}
+    assert "is for held-out frames" in refused("eval", scene, dataset, "--split", "train", "--register")
     result = run("eval", scene, dataset)
     assert result.exit_code == 0
     mean, std = expected.mean, expected.std

@@ -1,4 +1,5 @@
-"""Classical predictions of a frame, without learning: a compounded volume, the nearest frame, linear between frames.
+"""Classical predictions of a frame, without learning: a compounded volume, the nearest frame, linear between frames,
+neighbours in time.
 
 Compounding: every pixel of every frame goes to its nearest voxel of an isotropic grid, which keeps the median, mean or
 maximum of what it received. Empty voxels in the gaps between frames are filled from their neighbours, layer by layer;
@@ -22,8 +23,8 @@ from torch.nn import functional
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.pose import check_poses, mean_axes
 from ultragray.geometry.probe import FloatArray, Probe
-from ultragray.geometry.scan_conversion import interpolated, pixel_places
 from ultragray.learn.evaluation.scoring import Evaluation, evaluate_frames, require_frames
+from ultragray.learn.prediction import NeighboursInTime, blend_by_distance, seen_by_frame
 from ultragray.learn.sweep import (
     ByteArray,
     Dataset,
@@ -215,17 +216,19 @@ def _spread(grid: Tensor) -> Tensor:  # [X, Y, Z]
 
 
 FrameArray = npt.NDArray[np.float32]
-BASELINES = (*FOLDS, "linear", "nearest")
+BY_POSE = (*FOLDS, "linear", "nearest")
+IN_TIME = "in-time"
+BASELINES = (*BY_POSE, IN_TIME)
 
 
 def predict(sweep: Sweep, poses: FloatArray, method: str, *, voxel_mm: float = VOXEL_MM) -> FrameArray:  # [C, H, W]
-    """The frames, in [0, 1], that one of BASELINES expects at poses [C, 4, 4] (mm) of the sweep's own probe.
+    """The frames, in [0, 1], that one of BY_POSE expects at poses [C, 4, 4] (mm) of the sweep's own probe.
 
     `nearest`: the frame whose corners lie nearest on average. `linear`: `interpolate_planes`. The others: a compounded
     volume of voxels of `voxel_mm`, re-sliced. Raises InvalidArgument for an unknown method, and as `compound` does.
     """
-    if method not in BASELINES:
-        raise InvalidArgument(f"method must be one of {', '.join(BASELINES)}, got {method!r}", field="method")
+    if method not in BY_POSE:
+        raise InvalidArgument(f"method must be one of {', '.join(BY_POSE)}, got {method!r}", field="method")
     if method == "nearest":
         return (sweep.images[nearest_frames(sweep, poses)] / 255.0).astype(np.float32)
     if method == "linear":
@@ -233,13 +236,29 @@ def predict(sweep: Sweep, poses: FloatArray, method: str, *, voxel_mm: float = V
     return compound(sweep, method, voxel_mm).reslice(sweep.probe, poses, sweep.height, sweep.width)
 
 
+def predict_held_out(dataset: Dataset, method: str, *, voxel_mm: float = VOXEL_MM) -> FrameArray:  # [V, H, W]
+    """The held-out frames, in [0, 1], that one of BASELINES expects.
+
+    `in-time`: each is the blend of the training frames before and after it, by their times and pixel by pixel, whatever
+    the poses. Raises DatasetInvalid where frames have no neighbours in time, and as `predict` does.
+    """
+    if method == IN_TIME:
+        return NeighboursInTime.of(dataset).frames_of(dataset.train)
+    return predict(dataset.train, dataset.val.poses, method, voxel_mm=voxel_mm)
+
+
 def evaluate_baselines(
     dataset: Dataset, methods: Sequence[str] = BASELINES, voxel_mm: float = VOXEL_MM
 ) -> dict[str, Evaluation]:
+    """The scores of these methods on the held-out frames, without `in-time` where frames have no neighbours in time.
+
+    Raises DatasetInvalid where nothing is held out.
+    """
     require_frames(dataset.val)
     return {
-        method: evaluate_frames(predict(dataset.train, dataset.val.poses, method, voxel_mm=voxel_mm), dataset.val)
+        method: evaluate_frames(predict_held_out(dataset, method, voxel_mm=voxel_mm), dataset.val)
         for method in methods
+        if method != IN_TIME or dataset.is_one_recording
     }
 
 
@@ -269,20 +288,7 @@ def _between(sweep: Sweep, points: FloatArray, frames: IntArray) -> FloatArray: 
             height = elevation if side == 0 else -elevation
             nearer = np.flatnonzero((height >= 0) & (height < distances[side]))
             if len(nearer):
-                local = (points[nearer] - pose[:3, 3]) @ pose[:3, :3]
-                inside, sampled = _sample(sweep, frame, local)
+                inside, seen = seen_by_frame(sweep, frame, (points[nearer] - pose[:3, 3]) @ pose[:3, :3])
                 distances[side, nearer[inside]] = height[nearer[inside]]
-                values[side, nearer[inside]] = sampled
-    weights = 1.0 / np.maximum(distances, 1e-9)  # 0 for a side without a frame
-    total = weights.sum(axis=0)
-    mean: FloatArray = (weights * values).sum(axis=0) / np.where(total > 0, total, 1.0)
-    return mean
-
-
-def _sample(sweep: Sweep, frame: int, local: FloatArray) -> tuple[npt.NDArray[np.bool_], FloatArray]:  # [P, 3] mm
-    """A mask of the points that fall into the image when projected onto y = 0, and their bilinear values in [0, 1]."""
-    rows, columns = sweep.probe.image_coordinates(local[:, 0], local[:, 2])
-    inside = ~np.isnan(rows)
-    image = sweep.images[frame]
-    places = pixel_places(sweep.probe, image.shape, rows[inside], columns[inside])
-    return inside, interpolated(image, *places) / 255.0
+                values[side, nearer[inside]] = seen
+    return np.nan_to_num(blend_by_distance(values, distances)) / 255.0

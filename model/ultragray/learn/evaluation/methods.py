@@ -24,7 +24,7 @@ NAMES = (
     "scene",
     *("median", "mean", "maximum"),
     *("median-0.25mm", "mean-0.25mm", "maximum-0.25mm"),
-    *("linear", "nearest"),
+    *("linear", "nearest", "in-time"),
     *("ultranerf-released", "ultranerf-unit", "ultranerf-mean"),
     *("implicitvol", "implicitvol-refined"),
     "rapidvol",

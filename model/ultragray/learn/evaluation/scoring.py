@@ -78,7 +78,7 @@ def evaluate(scene: GaussianScene, sweep: Sweep, *, backend: str = "auto") -> Ev
         for some, frames in rendered_parts(scene, sweep, ("bmode",), backend):
             bmode = frames["bmode"].float().cpu()
             if scene.info.speckle is not None:
-                shown = with_speckle(scene, bmode, some.probe, some.poses, backend=backend)
+                shown = with_speckle(scene, bmode, some.probe, scene.poses_at_rest(some.poses), backend=backend)
                 natural.extend(compare_speckle(shown.numpy(), some.images.astype(np.float32) / 255.0, some.probe))
             yield bmode.numpy()
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from typing import Any
 
@@ -233,15 +233,23 @@ def localize(
     """
     frame = _checked_image(image)
     LocalizationSettings(within_mm=within_mm, within_deg=within_deg)
-    first = torch.from_numpy(check_poses(start, field="start"))
-    if len(first) != 1:
-        raise InvalidArgument(f"start must be one pose, got {len(first)}", field="start")
+    told = check_poses(start, field="start")
+    if len(told) != 1:
+        raise InvalidArgument(f"start must be one pose, got {len(told)}", field="start")
+    first, at_rest = torch.from_numpy(scene.poses_at_rest(told)), scene.at_rest()
     known = scene.info.probe_or(probe)
     motions = Motions.of(known)
 
     def rendered(poses: Tensor, rows: int, columns: int) -> Tensor:
         frames = render(
-            scene, known, poses.numpy(), height=rows, width=columns, outputs=("bmode",), backend=backend, limits=limits
+            at_rest,
+            known,
+            poses.numpy(),
+            height=rows,
+            width=columns,
+            outputs=("bmode",),
+            backend=backend,
+            limits=limits,
         )
         return frames["bmode"].detach().cpu()
 
@@ -249,7 +257,8 @@ def localize(
     poses = search.begin(_starts(first[0], motions, within_mm, within_deg))
     for stage in STAGES:
         poses = search.improve(poses, stage)
-    return search.result(poses[0], first[0])
+    found = search.result(poses[0], first[0])
+    return replace(found, pose=scene.poses_as_tracked(found.pose[None])[0])
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,6 +7,8 @@ best:
 
 - as tracked;
 - without the tracker's noise (`alignment.without_noise`);
+- that, a delay of the images earlier (`delay`), where their times are known;
+- that, with another calibration from the image to the probe, where sweeps cross (`alignment.found_calibration`);
 - that, but of the motion within the image plane only a share: of the shifts along the lateral and the axial axis, and
   of the turn about the elevation axis. 1: tissue is rigid; 0: it stays where it is in the image, and the frames are a
   straight stack along their path.
@@ -27,12 +29,19 @@ import numpy as np
 from ultragray.geometry.pose import mean_axes
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.geometry.rotations import blended, rotations_of, turns_of
-from ultragray.geometry.scan_conversion import interpolated_frames, pixel_places
+from ultragray.learn.prediction import blend_by_distance, blend_in_time, frame_times, seen_by_frame
 from ultragray.learn.sweep import Dataset, IntArray, Sweep, corner_distances_mm, spread_places
-from ultragray.learn.training.alignment import TrackerNoise, path_ranges, sweep_ranges, tracker_noise, without_noise
+from ultragray.learn.training.alignment import (
+    TrackerNoise,
+    found_calibration,
+    path_ranges,
+    sweep_ranges,
+    tracker_noise,
+    without_noise,
+)
+from ultragray.learn.training.delay import found_delay_s, with_delay
 
 FRAMES, PIXELS = 96, 2048  # that are predicted, of each: enough to tell one path from another
-ON_PLANE_MM = 1e-6  # distances are at least that: the nearer frame then has all the weight
 LEAST_GAIN_DB = 0.05  # of a path without noise
 GAIN_OF_SHARES_DB = 0.3  # tissue is rigid unless the images say clearly that it is not
 SHARE_STEP = 0.25
@@ -43,25 +52,26 @@ RIGID: Shares = (1.0, 1.0, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class AgreedPath:
-    """Poses of the training and the held-out frames, mm, and how well training frames are predicted by the two beside
-    them, mean PSNR in dB."""
+    """Poses of the training and the held-out frames in the tissue at rest, mm, and how well training frames are
+    predicted by the two beside them, mean PSNR in dB."""
 
     train: FloatArray  # [F, 4, 4]
     val: FloatArray  # [V, 4, 4] of which no image was used
+    tracked: FloatArray  # [F, 4, 4] of the training frames in the tracker's frame, without its noise and the delay
     in_time_db: float  # pixel by pixel, whatever the poses say
     tracked_db: float  # in space, as tracked
     found_db: float  # in space, on this path
     shares: Shares  # of the motion within the plane that it has
     noise: TrackerNoise  # of the tracker
+    delay_s: float  # of the images behind their poses, which is taken off
+    calibration: FloatArray  # [4, 4] right-multiplied to the poses, mm: the identity where none is better
 
-
-def on_agreed_path(dataset: Dataset) -> Dataset:
-    """The same with the poses of `agreed_path`; the dataset itself where these are as tracked."""
-    path = agreed_path(dataset)
-    if path is None or path.train is dataset.train.poses:
-        return dataset
-    train, val = replace(dataset.train, poses=path.train), replace(dataset.val, poses=path.val)
-    return replace(dataset, train=train, val=val)
+    def of(self, dataset: Dataset) -> Dataset:
+        """The same frames on this path; the dataset itself where that is as tracked."""
+        if self.train is dataset.train.poses:
+            return dataset
+        train, val = replace(dataset.train, poses=self.train), replace(dataset.val, poses=self.val)
+        return replace(dataset, train=train, val=val)
 
 
 def agreed_path(dataset: Dataset) -> AgreedPath | None:
@@ -83,18 +93,53 @@ def agreed_path(dataset: Dataset) -> AgreedPath | None:
     cleaned = without_noise(given, ranges)
     if (db := judge.psnr_db(cleaned[on_path])) > found_db + LEAST_GAIN_DB:
         found, found_db = cleaned, db
+    delay_s, found = _without_delay(judge, found, _times_of(whole), order, ranges, on_path)
+    tracked = found  # in the tracker's frame, by the calibration that was given
+    calibration = found_calibration(replace(train, poses=found[on_path]), sweep_ranges(train))
+    if delay_s or not np.array_equal(calibration, np.eye(4)):
+        found = found @ calibration
+        found_db = judge.psnr_db(found[on_path])
     rigid = found
     shares, moved, db = _best_shares(judge, rigid, ranges, on_path, found_db)
     if db < found_db + GAIN_OF_SHARES_DB:
         shares = RIGID
     else:
         found, found_db = moved, db
-    figures = judge.in_time_db(), tracked_db, found_db, shares, tracker_noise(given, ranges)
+    noise = tracker_noise(given, ranges)
+    figures = judge.in_time_db(), tracked_db, found_db, shares, noise, delay_s, calibration
     if found is given:
-        return AgreedPath(train.poses, val.poses, *figures)
+        return AgreedPath(train.poses, val.poses, train.poses, *figures)
     if dataset.is_one_recording:
-        return AgreedPath(found[on_path], found[places[len(train) :]], *figures)
-    return AgreedPath(found[on_path], _carried(val.poses, rigid, found, ranges, train.probe), *figures)
+        return AgreedPath(found[on_path], found[places[len(train) :]], tracked[on_path], *figures)
+    held_out = val.poses
+    if delay_s and val.times_s is not None:
+        held_out = with_delay(held_out, val.times_s, sweep_ranges(val), delay_s)
+    carried = _carried(held_out, tracked, found, ranges, train.probe)
+    return AgreedPath(found[on_path], carried, tracked[on_path], *figures)
+
+
+def _times_of(parts: Sequence[Sweep]) -> FloatArray | None:  # [F] s
+    """Of all frames; None where some have none."""
+    times = [part.times_s for part in parts if part.times_s is not None]
+    return np.concatenate(times) if len(times) == len(parts) else None
+
+
+def _without_delay(
+    judge: _Judge,
+    poses: FloatArray,  # [F, 4, 4] mm
+    times_s: FloatArray | None,  # [F], not in the order of the path
+    order: IntArray,
+    ranges: Sequence[range],
+    places: IntArray,
+) -> tuple[float, FloatArray]:
+    """The delay of the images, s, and the path without it."""
+    if times_s is None:
+        return 0.0, poses
+    ordered_s = times_s[order]
+    delay_s = found_delay_s(
+        lambda one: judge.psnr_db(with_delay(poses, ordered_s, ranges, one)[places]), ordered_s, ranges
+    )
+    return delay_s, with_delay(poses, ordered_s, ranges, delay_s) if delay_s else poses
 
 
 def _best_shares(
@@ -199,28 +244,27 @@ class _Judge:
         return float(np.mean([self._predicted_db(poses, frame) for frame in self.frames]))
 
     def _predicted_db(self, poses: FloatArray, frame: int) -> float:
-        images, probe = self.sweep.images, self.sweep.probe
-        (height, width), (rows, columns) = images.shape[1:], self._pixels(frame)
-        local = probe.points_mm((rows + 0.5) / height, (columns + 0.5) / width)  # [N, 3]
-        values, weights = np.zeros((2, 2, len(local)))
+        rows, columns = self._pixels(frame)
+        height, width = self.sweep.height, self.sweep.width
+        local = self.sweep.probe.points_mm((rows + 0.5) / height, (columns + 0.5) / width)  # [N, 3]
+        values, distances = np.zeros((2, len(local))), np.full((2, len(local)), np.inf)
         for side, beside in enumerate((frame - 1, frame + 1)):
             onto = np.linalg.inv(poses[beside]) @ poses[frame]
-            x, y, z = onto[:3, :3] @ local.T + onto[:3, 3:]
-            coordinates = np.stack(probe.image_coordinates(x, z))
-            (is_in,) = np.nonzero(~np.isnan(coordinates[0]))
-            places = pixel_places(probe, (height, width), *coordinates[:, is_in])
-            values[side, is_in] = interpolated_frames(images, beside, *places)
-            weights[side, is_in] = 1.0 / np.maximum(np.abs(y[is_in]), ON_PLANE_MM)
-        known = weights.sum(axis=0) > 0.0
-        predicted = (values * weights)[:, known].sum(axis=0) / weights[:, known].sum(axis=0)
-        return _psnr_db(predicted, self._shown(frame, rows, columns)[known])
+            points = local @ onto[:3, :3].T + onto[:3, 3]
+            inside, values[side, inside] = seen_by_frame(self.sweep, beside, points)
+            distances[side, inside] = np.abs(points[inside, 1])
+        predicted = blend_by_distance(values, distances)
+        known = ~np.isnan(predicted)
+        return _psnr_db(predicted[known], self._shown(frame, rows, columns)[known])
 
     def in_time_db(self) -> float:
-        """Of the pixels as the mean of the same pixels of the two frames."""
-        found = []
+        """Of the pixels as blends of the same pixels of the two frames, by their times."""
+        times, found = frame_times(self.sweep), []
         for frame in self.frames:
             before, shown, after = (self._shown(one, *self._pixels(frame)) for one in (frame - 1, frame, frame + 1))
-            found.append(_psnr_db((before + after) / 2.0, shown))
+            span = times[frame + 1] - times[frame - 1]
+            share = (times[frame] - times[frame - 1]) / span if span > 0.0 else 0.5
+            found.append(_psnr_db(blend_in_time(before, after, share), shown))
         return float(np.mean(found))
 
     def _pixels(self, frame: int) -> tuple[IntArray, IntArray]:  # [N] rows, [N] columns

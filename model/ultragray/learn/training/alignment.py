@@ -257,12 +257,12 @@ class _Match:
         steps = [np.linalg.norm(np.diff(middle, axis=0), axis=1) for middle in middles]
         self._gap_mm = LARGEST_GAP * float(np.median(np.concatenate(steps)))
 
-    def climb(self) -> FloatArray | None:  # [4, 4]
+    def climb(self, levels: Sequence[Level] = LEVELS) -> FloatArray | None:  # [4, 4]
         """The motion of the best correlation; None where the sides do not meet as they are, or little is gained."""
         here, gain = np.zeros(_OVERLAP_NUMBERS), 0.0
         if not _has_enough(self._crossings(here)):
             return None  # any agreement found elsewhere would be chance
-        for level in LEVELS:
+        for level in levels:
             correlation = partial(self._correlation, [_detail(sweep, *level.pixels) for sweep in self._sweeps])
             here = _climbed(correlation, here, level)
             gain = correlation(here) - correlation(np.zeros(_OVERLAP_NUMBERS))
@@ -306,6 +306,50 @@ class _Match:
 
     def _sampled(self, details: HalfArray, frames: IntArray, rows: FloatArray, columns: FloatArray) -> FloatArray:
         return interpolated_frames(details, frames, *pixel_places(self._probe, details.shape[1:], rows, columns))
+
+
+# The calibration from the image to the probe, where sweeps cross: with a wrong one, an image lies beside its place in
+# another direction after the probe was turned. It is searched as the motion of whole sweeps is, but moves both sides in
+# the frames of their probes. What the turns between the sweeps do not tell (along the axis that they turn about) stays
+# small by a prior.
+
+CALIBRATION_LEVELS = (Level((2.0, 10.0), (1.0, 0.5)), Level((0.0, 5.0), (0.5, 0.25, 0.125)))
+CALIBRATION_PRIOR = 1e-3  # of the correlation, for each mm² and degree²
+LEAST_CROSSING_DEG = 20.0  # sweeps that are turned less against each other hardly tell
+
+
+def found_calibration(sweep: Sweep, ranges: Sequence[range]) -> FloatArray:  # [4, 4]
+    """The motion in the frame of the probe, right-multiplied to all poses, with which crossing sweeps agree best.
+
+    The identity where none crosses the first, or none agrees clearly better than as calibrated.
+    """
+    means = np.stack([mean_axes(sweep.poses[frames]) for frames in ranges])
+    turns_deg = np.degrees(np.linalg.norm(turns_of(means[0].T @ means), axis=1))
+    crossing = [frames for frames, turn_deg in zip(ranges, turns_deg, strict=True) if turn_deg >= LEAST_CROSSING_DEG]
+    if not crossing:
+        return np.eye(4)
+    sides = (_portion(sweep, sweep.poses, np.concatenate(part)) for part in (crossing, ranges[:1]))
+    found = _CalibrationMatch(*sides).climb(CALIBRATION_LEVELS)
+    return np.eye(4) if found is None else found
+
+
+class _CalibrationMatch(_Match):
+    """The search for the motion of the images in the frame of their probe that makes two sides agree."""
+
+    def _motion(self, numbers: FloatArray) -> FloatArray:  # [6] degrees, mm -> [4, 4]
+        """About the middle of the image, and along its axes."""
+        motion, middle = np.eye(4), self._probe.corners_mm().mean(axis=0)
+        motion[:3, :3] = rotations_of(np.radians(numbers[:3])[None])[0]
+        motion[:3, 3] = middle - motion[:3, :3] @ middle + numbers[3:]
+        return motion
+
+    def _crossings(self, numbers: FloatArray) -> list[_Crossing]:
+        motion = self._motion(numbers)
+        poses = [sweep.poses @ motion for sweep in self._sweeps]
+        return [self._crossing(side, poses[side], poses[1 - side]) for side in range(2)]
+
+    def _correlation(self, details: Sequence[HalfArray], numbers: FloatArray) -> float:
+        return super()._correlation(details, numbers) - CALIBRATION_PRIOR * float(np.square(numbers).sum())
 
 
 def _has_enough(crossings: Sequence[_Crossing]) -> bool:

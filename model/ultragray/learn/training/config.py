@@ -131,7 +131,7 @@ class TrainingConfig(Contract):
     refine_poses: str = described(
         "Correction of the poses (docs/poses.md): none; path: that which neighbouring frames agree with; sweeps: each "
         "sweep as a whole; frames: all of it. Good poses are left alone.",
-        "none",
+        "path",
         choices=REFINEMENTS,
     )
     means_rate: float = described("Learning rate of the means, times the scene's scale in cm.", 2e-4, low=0.0, high=1.0)
@@ -300,8 +300,8 @@ PRESETS: dict[str, dict[str, Any]] = {
 
 
 PRESET_MEANINGS = (
-    "fast: minutes on two cores; best: fast, with the effort that frames left out ask for, in half an hour; paper: the "
-    "released recipe."
+    "fast: minutes on two cores; best: fast, with the effort that frames left out ask for, in half an hour or more; "
+    "paper: the released recipe."
 )
 
 

@@ -92,8 +92,10 @@ FRAMES_AT_ONCE = 64
 LEAST_RANGE = 1.5  # of the shift out of the plane, × the spacing of the frames
 PIXELS_PER_GAUSSIAN = 25
 STEPS_PER_FRAME = 15  # a frame that is seen more often is learned with its noise
-MIN_STEPS, MAX_STEPS = 250, 1_500  # fewer leave shadows unlearned
-MIN_GAUSSIANS, MAX_GAUSSIANS = 2_000, 150_000  # fewer hold no anatomy, more take longer than they are worth
+MIN_STEPS, USUAL_STEPS = 250, 1_500  # fewer leave shadows unlearned
+MIN_GAUSSIANS, USUAL_GAUSSIANS = 2_000, 150_000  # fewer hold no anatomy; enough unless much more is to be seen
+MAX_GAUSSIANS = 600_000  # of a large volume that is seen finely: ten minutes on two cores
+LEAST_LIT = 8  # grey value, of 255, of a pixel that shows something
 
 
 @dataclass(frozen=True)
@@ -109,6 +111,7 @@ class Geometry:
     pixel_mm: float  # geometric mean of the axial and the lateral size
     out_of_plane_mm: float  # full range of the shift of a batch along elevation that the frames tell of; 0: they do not
     pixel_count: int  # of all training frames
+    distinct_pixels: int  # of those, lit ones, and in frames that overlap along elevation each place once
     frame_count: int
 
     @classmethod
@@ -116,26 +119,33 @@ class Geometry:
         sweep, centre = dataset.train, dataset.centre_mm
         reach_mm = float(np.linalg.norm(sweep.corners_mm() - centre, axis=-1).max())
         axial, lateral = sweep.pixel_mm
-        spacing = frame_spacing_mm(sweep)
+        spacing, range_mm = frame_spacing_mm(sweep), out_of_plane_range_mm(sweep)
+        distinct = min(1.0, spacing / max(range_mm / 2.0, 1e-9))
         return cls(
             centre_mm=centre,
             scene_scale_cm=SCALE_MARGIN * reach_mm / 10.0,
             frame_spacing_mm=spacing,
             pixel_mm=(axial * lateral) ** 0.5,
-            out_of_plane_mm=out_of_plane_range_mm(sweep),
+            out_of_plane_mm=range_mm,
             pixel_count=sweep.images.size,
+            distinct_pixels=int(distinct * np.count_nonzero(sweep.images >= LEAST_LIT)),
             frame_count=len(sweep),
         )
 
     def gaussian_count(self, views_between: float) -> int:
-        """By the pixels of the frames, twice as many where what lies between them is learned too."""
-        count = _times(views_between) * self.pixel_count // PIXELS_PER_GAUSSIAN
-        return min(max(count, MIN_GAUSSIANS), MAX_GAUSSIANS)
+        """By the pixels of the frames, twice as many where what lies between them is learned too.
+
+        More than USUAL_GAUSSIANS only as distinct pixels ask for: those of large volumes that are seen finely.
+        """
+        per_pixel = _times(views_between) / PIXELS_PER_GAUSSIAN
+        usual = min(int(per_pixel * self.pixel_count), USUAL_GAUSSIANS)
+        return max(usual, min(int(per_pixel * self.distinct_pixels), MAX_GAUSSIANS), MIN_GAUSSIANS)
 
     def steps(self, views_between: float) -> int:
-        """By the frames, likewise."""
+        """By the frames, likewise; more than USUAL_STEPS as the square root of the Gaussians that are more."""
         times = _times(views_between)
-        return min(max(times * STEPS_PER_FRAME * self.frame_count, times * MIN_STEPS), MAX_STEPS)
+        most = USUAL_STEPS * math.sqrt(max(1.0, self.gaussian_count(views_between) / USUAL_GAUSSIANS))
+        return min(max(times * STEPS_PER_FRAME * self.frame_count, times * MIN_STEPS), round(most))
 
     def least_out_of_plane_mm(self, views_between: float) -> float:
         """Range of the shift that leaves no gap between frames, where no views between them fill it."""

@@ -1,4 +1,4 @@
-"""Poses that are trained with the scene, and scores of held-out frames whose own poses may be wrong.
+"""Poses that are trained with the scene.
 
 `PoseRefinement` begins with what `agreement` and `alignment` find. Then each group of frames, one frame or a whole
 sweep, has a twist ξ = (ω, t) in mm along the axes of its probe, and its poses are corrected by the motion
@@ -10,23 +10,18 @@ that of the first sweep, is taken to be none.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
-from typing import TypeAlias
+from dataclasses import replace
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from ultragray.errors import DatasetInvalid
 from ultragray.geometry.probe import FloatArray
-from ultragray.learn.evaluation.scoring import frames_at_once, require_frames
 from ultragray.learn.sweep import Dataset, Sweep
-from ultragray.learn.training.agreement import on_agreed_path
+from ultragray.learn.training.agreement import AgreedPath, Shares, agreed_path
 from ultragray.learn.training.alignment import register_sweeps, sweep_ranges
-from ultragray.learn.training.losses import SSIM_WINDOW, image_loss
 from ultragray.rendering.backends.inputs import ScenePoses
-from ultragray.rendering.frames import render
-from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.info import SceneInfo
 
 START = 0.1  # share of the run: before, there is no anatomy to compare with
@@ -140,11 +135,13 @@ _TRAINED: dict[str, type[TrainedCorrections]] = {"frames": FrameCorrections, "sw
 
 
 class PoseRefinement:
-    """The corrections of the training frames, left-multiplied to their poses; `dataset` is the one to train from."""
+    """The poses of the training frames, as tracked and in the tissue at rest; `dataset`, the one to train from, has
+    those at rest that the training begins with."""
 
-    def __init__(self, dataset: Dataset, tracked: FloatArray, trained: TrainedCorrections | None) -> None:
-        """`dataset` has the poses that the training begins with, `tracked` [F, 4, 4] (mm) are those of its frames."""
-        self.dataset, self._tracked, self._trained = dataset, tracked, trained
+    def __init__(self, dataset: Dataset, told: FloatArray) -> None:  # [F, 4, 4] mm, by the tracker
+        self.dataset, self._told = dataset, told
+        self._trained: TrainedCorrections | None = None
+        self._path: AgreedPath | None = None  # where tissue followed the probe, or the calibration was off
 
     @classmethod
     def of(cls, dataset: Dataset, mode: str) -> PoseRefinement:
@@ -155,19 +152,21 @@ class PoseRefinement:
         frame has a correction of its own. With `none`, and where the poses are good (neighbours and sweeps agree), they
         stay and none is trained.
         """
-        tracked = dataset.train.poses
-        if mode in WITH_PATH:
-            dataset = on_agreed_path(dataset)
+        found = cls(dataset, dataset.train.poses)
+        if mode in WITH_PATH and (path := agreed_path(dataset)) is not None:
+            found.dataset = path.of(dataset)
+            found._path = None if np.array_equal(path.train, path.tracked) else path
         if mode in ("none", "path"):
-            return cls(dataset, tracked, None)
-        ranges = sweep_ranges(dataset.train)
-        poses = dataset.train.poses.copy()
-        for frames, motion in zip(ranges, register_sweeps(dataset.train, ranges), strict=True):
+            return found
+        train = found.dataset.train
+        ranges = sweep_ranges(train)
+        poses = train.poses.copy()
+        for frames, motion in zip(ranges, register_sweeps(train, ranges), strict=True):
             poses[frames] = motion @ poses[frames]
-        if np.array_equal(poses, tracked):
-            return cls(dataset, tracked, None)
-        train = replace(dataset.train, poses=poses)
-        return cls(replace(dataset, train=train), tracked, _TRAINED[mode](train, ranges))
+        if not np.array_equal(poses, found._told):
+            found.dataset = replace(found.dataset, train=replace(train, poses=poses))
+            found._trained = _TRAINED[mode](found.dataset.train, ranges)
+        return found
 
     @property
     def group_count(self) -> int:
@@ -182,15 +181,22 @@ class PoseRefinement:
         if self._trained is not None:
             self._trained.step(done)
 
-    def poses(self) -> FloatArray:  # [F, 4, 4] mm
-        """The corrected poses of all training frames, as they are by now."""
-        poses = self.dataset.train.poses
-        return poses if self._trained is None else self._trained.all_motions() @ poses
+    def of_scene(self) -> dict[str, Any]:
+        """What a scene keeps of the poses, as they are by now: arguments of `GaussianScene.from_splats`."""
+        at_rest = self.dataset.train.poses
+        if self._trained is not None:
+            at_rest = self._trained.all_motions() @ at_rest
+        poses = at_rest if self._path is None else self._path.tracked
+        is_told = np.array_equal(poses, self._told)
+        return {
+            "training_poses": poses,
+            "pose_corrections": None if is_told else poses @ np.linalg.inv(self._told),
+            "rest_poses": None if self._path is None else at_rest,
+        }
 
-    def corrections(self) -> FloatArray | None:  # [F, 4, 4]
-        """The motions that are left-multiplied to the tracker's poses; None where these stay."""
-        poses = self.poses()
-        return None if np.array_equal(poses, self._tracked) else poses @ np.linalg.inv(self._tracked)
+    @property
+    def tissue_shares(self) -> Shares | None:
+        return None if self._path is None else self._path.shares
 
     def tensors(self) -> dict[str, Tensor]:
         return {} if self._trained is None else self._trained.tensors()
@@ -207,79 +213,5 @@ def held_out_on_path(dataset: Dataset, info: SceneInfo) -> Sweep | None:
     """
     if info.dataset_sha256 != dataset.sha256 or info.training.get("refine_poses") not in WITH_PATH:
         return None
-    placed = on_agreed_path(dataset)
-    return None if placed is dataset or not len(placed.val) else placed.val
-
-
-# Scores of held-out frames whose poses may be wrong: each is registered by one half and scored on the other half.
-#
-# A frame whose pose is off by a millimetre scores badly even in a perfect scene. Registering all of it first would
-# score the scene too well, so a frame is moved by its left half alone and scored on its right half, and the other way
-# round.
-
-STEPS = 60
-TEXTURE = 0.5  # share of SSIM in the loss that a frame is moved by
-HELD_OUT_RATE = 0.1  # mm a step, falling to 0
-
-
-@dataclass(frozen=True)
-class HalvesScore:
-    """Mean PSNR of the halves of held-out frames, dB, and by how much registration moved their middles, mm."""
-
-    as_given_psnr_db: float
-    registered_psnr_db: float
-    moved_mm: float
-
-    def to_dict(self) -> dict[str, float]:
-        return asdict(self)
-
-    def __str__(self) -> str:
-        return (
-            f"halves of frames: {self.as_given_psnr_db:.2f} dB as given, {self.registered_psnr_db:.2f} dB registered "
-            f"by the other half, which moved them by {self.moved_mm:.2f} mm"
-        )
-
-
-def score_halves(scene: GaussianScene, sweep: Sweep, *, backend: str = "auto") -> HalvesScore:
-    """Of all frames of a sweep. Raises DatasetInvalid where there are none, or halves are too narrow to compare."""
-    require_frames(sweep)
-    middle = sweep.width // 2
-    if min(middle, sweep.height) < SSIM_WINDOW:
-        raise DatasetInvalid(
-            f"{sweep.source}: to be registered by halves, frames must have at least {SSIM_WINDOW} rows and "
-            f"{2 * SSIM_WINDOW} columns, got {sweep.height}x{sweep.width}"
-        )
-    halves = (slice(0, middle), slice(middle, sweep.width))
-    given, registered, moved = [], [], []
-    count = frames_at_once(sweep.height, sweep.width)
-    for first in range(0, len(sweep), count):
-        some = sweep.select(np.arange(first, min(first + count, len(sweep))))
-        truth = torch.from_numpy(some.images).to(scene.means.device).float() / 255.0
-        as_given = _rendered(scene, some, torch.from_numpy(some.poses), backend).detach()
-        for fitted, scored in (halves, halves[::-1]):
-            poses = _fitted(scene, some, truth, fitted, backend)
-            given.append(_psnr_db(as_given[..., scored], truth[..., scored]))
-            registered.append(_psnr_db(_rendered(scene, some, poses, backend)[..., scored], truth[..., scored]))
-            centre = torch.from_numpy(np.append(sweep.probe.corners_mm().mean(axis=0), 1.0))
-            moved.append(((poses - torch.from_numpy(some.poses)) @ centre).norm(dim=1))
-    return HalvesScore(*(float(torch.cat(part).mean()) for part in (given, registered, moved)))
-
-
-def _fitted(scene: GaussianScene, sweep: Sweep, truth: Tensor, columns: slice, backend: str) -> Tensor:  # [F, 4, 4]
-    corrections = Corrections(sweep, [[place] for place in range(len(sweep))])
-    places = torch.arange(len(sweep))
-    target = truth[..., columns].contiguous()
-    for step in range(STEPS):
-        frames = _rendered(scene, sweep, corrections.corrected(places, sweep.poses), backend)
-        (len(sweep) * image_loss(frames[..., columns].contiguous(), target, TEXTURE)).backward()  # type: ignore[no-untyped-call]
-        corrections.update(HELD_OUT_RATE * (1.0 - step / STEPS))
-    return corrections.corrected(places, sweep.poses).detach()
-
-
-def _rendered(scene: GaussianScene, sweep: Sweep, poses: Tensor, backend: str) -> Tensor:  # [F, H, W]
-    height, width = sweep.height, sweep.width
-    return render(scene, sweep.probe, poses, height=height, width=width, outputs=("bmode",), backend=backend)["bmode"]
-
-
-def _psnr_db(frames: Tensor, truth: Tensor) -> Tensor:  # [F, H, W] both -> [F]
-    return -10.0 * (frames.detach() - truth).square().mean(dim=(1, 2)).clamp(min=1e-10).log10().cpu()
+    path = agreed_path(dataset)
+    return None if path is None or path.of(dataset) is dataset or not len(dataset.val) else path.of(dataset).val

@@ -153,8 +153,11 @@ def train(
             trainer.run(log, _with_fit(report, dataset, trainer.config), should_stop, checkpoint_interval_s)
         scene, is_finished, resolved = trainer.scene(), trainer.is_finished, trainer.config
     if is_finished:
-        refined = replace(dataset, train=replace(dataset.train, poses=scene.training_poses))
-        scene.info = replace(scene.info, speckle=fit_speckle(scene, refined.train, backend=backend))
+        rest = scene.at_rest()
+        refined = replace(dataset, train=replace(dataset.train, poses=rest.training_poses))
+        speckle = fit_speckle(rest, refined.train, backend=backend)
+        for one in (scene, rest):
+            one.info = replace(one.info, speckle=speckle)
     if resolved.confidence and is_finished:
         del trainer  # what it takes of the memory is free for the second training
         settled = replace(resolved, refine_poses="none")

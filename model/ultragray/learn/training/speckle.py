@@ -49,6 +49,8 @@ SKEWNESS = (-1.13, 1.2)  # that looks and floor can give
 def fit_speckle(scene: GaussianScene, sweep: Sweep, *, backend: str) -> SpeckleModel | None:
     """The speckle of the frames of `sweep`, from which the scene was trained; None where they show none.
 
+    Poses are in the tissue at rest, and so are those of the scene.
+
     In seconds: MOST_FRAMES of them are looked at, and as many pairs.
     """
     if min(sweep.height, sweep.width) < 2 * WINDOW_PIXELS:
@@ -271,7 +273,7 @@ def with_cells(model: SpeckleModel, sweep: Sweep) -> SpeckleModel:
 ANCHORS, PARTNERS = 12, 10  # frames that are compared, and those with which each is
 ELEVATION_MM = np.array([0.0, 0.1, 0.2, 0.35, 0.6, 1.0, 1.5, 2.5, 4.0])  # edges of the distances that are told apart
 ANGLE_DEG = np.array([0.0, 1.0, 2.5, 5.0, 10.0, 20.0])  # and of the angles
-SLICES = np.geomspace(0.7, 10.0, 11)  # widths that are tried, by the lateral one: few apertures are as wide across
+SLICES = np.geomspace(0.3, 10.0, 13)  # widths that are tried, by the lateral one
 WAVENUMBERS = (2.0, 4.0, 8.0, 14.0, 24.0, 40.0)  # per mm
 CLEARLY = 0.9  # of the error that is left: a carrier that leaves more is none
 LEAST_PAIRS = 60  # of windows

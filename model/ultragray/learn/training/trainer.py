@@ -389,14 +389,14 @@ class Trainer:
                 "the frames do not tell how thick they are: what was learned is thinner than the gaps between them; "
                 "give slice_thickness_mm, or leave learn_beam off"
             )
-        info = replace(self._info, beam=self._beam.found(), training={**self.config.to_dict(), "step": self.step})
-        scene = GaussianScene.from_splats(
-            splats,
-            info=info,
-            training_poses=self.refinement.poses(),
-            pose_corrections=self.refinement.corrections(),
+        info = replace(
+            self._info,
+            beam=self._beam.found(),
+            training={**self.config.to_dict(), "step": self.step},
+            tissue_shares=self.refinement.tissue_shares,
         )
+        scene = GaussianScene.from_splats(splats, info=info, **self.refinement.of_scene())
         if len(self.dataset.val) and self.is_finished:
-            measured = evaluate(scene.to(self._device), self.dataset.val, backend=self._backend)
+            measured = evaluate(scene.at_rest().to(self._device), self.dataset.val, backend=self._backend)
             scene.info.metrics.update(measured.mean.to_dict())
         return scene

@@ -43,13 +43,14 @@ ScenePoses: TypeAlias = FloatArray | Tensor  # [C, 4, 4]; a tensor, float64 on t
 def scene_poses(scene: GaussianScene, poses: Any) -> ScenePoses:  # [C, 4, 4] or [4, 4] mm -> [C, 4, 4] cm
     """Poses of the sweep's frame, made exactly rigid, in the scene's own; the graph of a tensor is kept.
 
-    Raises InvalidPose.
+    Where tissue followed the probe, its gradient is that of a probe that slides over it. Raises InvalidPose.
     """
     exact = check_poses(poses)
+    exact_cm = scene.poses_to_scene_cm(scene.poses_at_rest(exact))
     if isinstance(poses, Tensor) and poses.requires_grad and torch.is_grad_enabled():
-        made: Tensor = _Rigid.apply(poses, exact, scene.poses_to_scene_cm(exact))  # type: ignore[no-untyped-call]
+        made: Tensor = _Rigid.apply(poses, exact, exact_cm)  # type: ignore[no-untyped-call]
         return made
-    return scene.poses_to_scene_cm(exact)
+    return exact_cm
 
 
 def want_gradient(poses: ScenePoses) -> bool:
@@ -82,14 +83,16 @@ class _Rigid(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, poses: Tensor, exact: FloatArray, exact_cm: FloatArray) -> Tensor:
         ctx.like, ctx.rotations = poses.detach(), torch.from_numpy(exact[:, :3, :3])
+        ctx.rotations_cm = torch.from_numpy(exact_cm[:, :3, :3])
         return torch.from_numpy(exact_cm)
 
     @staticmethod
     def backward(ctx: Any, by_cm: Tensor) -> tuple[Tensor, None, None]:
         rotations, by_poses = ctx.rotations, torch.zeros_like(by_cm)
-        by_turn = rotations.transpose(1, 2) @ by_cm[:, :3, :3]
+        by_turn = ctx.rotations_cm.transpose(1, 2) @ by_cm[:, :3, :3]
         by_poses[:, :3, :3] = rotations @ (by_turn - by_turn.transpose(1, 2)) / 2.0
-        by_poses[:, :3, 3] = by_cm[:, :3, 3] / 10.0
+        back = rotations @ ctx.rotations_cm.transpose(1, 2)  # the identity, but where tissue followed the probe
+        by_poses[:, :3, 3] = torch.einsum("cij,cj->ci", back, by_cm[:, :3, 3]) / 10.0
         return by_poses.reshape(ctx.like.shape).to(ctx.like), None, None
 
 

@@ -10,7 +10,7 @@ from ultragray.geometry.rotations import turns_of
 from ultragray.learn.evaluation.scoring import evaluate
 from ultragray.learn.sweep import Dataset, corner_distances_mm
 from ultragray.learn.training import train
-from ultragray.learn.training.agreement import RIGID, agreed_path, on_agreed_path, with_shares
+from ultragray.learn.training.agreement import RIGID, agreed_path, with_shares
 from ultragray.learn.training.poses import held_out_on_path
 
 from .test_poses import PROBE, poses_of, seen, shaken
@@ -82,19 +82,34 @@ def test_a_scene_is_trained_and_measured_on_the_path(tiny_config):
     given = recording(with_shares(tracked, [range(FRAMES)], PROBE, (0.0, 0.0, 0.0)), tracked)
     scene = train(given, tiny_config(refine_poses="path"))
     path = agreed_path(given)
-    np.testing.assert_allclose(scene.training_poses, path.train, atol=1e-12)
-    np.testing.assert_allclose(scene.pose_corrections @ given.train.poses, path.train, atol=1e-9)
+    np.testing.assert_array_equal(scene.training_poses, given.train.poses)
+    np.testing.assert_array_equal(scene.rest_poses, path.train)
+    assert scene.info.tissue_shares == path.shares
     placed = held_out_on_path(given, scene.info)
     np.testing.assert_array_equal(placed.poses, path.val)
-    assert scene.info.metrics == evaluate(scene, placed).mean.to_dict()
+    assert scene.info.metrics == evaluate(scene.at_rest(), placed).mean.to_dict()
+    as_asked, as_tracked = (
+        corner_distances_mm(*(PROBE.corners_from(some) for some in (poses, placed.poses))).mean()
+        for poses in (scene.poses_at_rest(given.val.poses), given.val.poses)
+    )
+    assert as_asked < 0.1 * as_tracked
     assert held_out_on_path(replace(given, train=given.train.select(range(20))), scene.info) is None
-    assert held_out_on_path(given, train(given, tiny_config()).info) is None
+    assert held_out_on_path(given, train(given, tiny_config(refine_poses="none")).info) is None
+
+
+def test_a_path_without_noise_alone_is_that_of_the_scene(tiny_config):
+    truth = hand_path()
+    given = recording(truth, shaken(truth, 0.3, 0.2))
+    scene, path = train(given, tiny_config(steps=1)), agreed_path(given)
+    assert scene.tissue is None
+    np.testing.assert_allclose(scene.training_poses, path.train, atol=1e-12)
+    np.testing.assert_allclose(scene.pose_corrections @ given.train.poses, path.train, atol=1e-9)
 
 
 def test_exact_poses_of_rigid_tissue_stay():
     truth = hand_path()
     given = recording(truth, truth)
-    assert on_agreed_path(given) is given
+    assert agreed_path(given).of(given) is given
     assert agreed_path(given).shares == RIGID
 
 
@@ -129,6 +144,4 @@ def test_a_share_of_the_motion_within_the_plane():
 def test_sweeps_too_short_to_be_predicted_stay():
     poses = poses_of(np.zeros((2, 3)), [[0.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     given = seen(poses)
-    short = Dataset("short", given, given.select([]))
-    assert on_agreed_path(short) is short
-    assert agreed_path(short) is None
+    assert agreed_path(Dataset("short", given, given.select([]))) is None

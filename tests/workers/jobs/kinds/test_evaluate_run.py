@@ -8,7 +8,7 @@ import torch
 
 from ultragray import ConvexProbe, GaussianScene
 from ultragray.errors import DatasetInvalid
-from ultragray.learn.evaluation.baselines import BASELINES
+from ultragray.learn.evaluation.baselines import BY_POSE
 from ultragray.learn.evaluation.scoring import evaluate
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import DatasetNotFound, SceneNotFound
@@ -50,12 +50,14 @@ def test_scores_are_those_of_the_library(job_run, monkeypatch):
     assert [one["frame"] for one in document["frames"]] == held_out.frame_numbers.tolist()
     assert document["dataset_sha256"] == tiny_dataset().sha256
     assert document["baselines"] == {}
+    assert document["held_out"]["as_given"]["mean"] == document["mean"]
     assert sum(name.startswith("frame_") for name in outcome.artifacts) == len(held_out)
 
 
-def test_baselines_are_scored_beside_it(job_run):
+def test_baselines_are_scored_beside_it(job_run, capsys):
     outcome = evaluate_run.run(job_run(), EvaluateJob("tiny", "one", baselines=True))
-    assert {f"{method}_psnr_db" for method in BASELINES} < set(outcome.metrics)
+    assert {f"{method}_psnr_db" for method in BY_POSE} < set(outcome.metrics)
+    assert "of another recording: they have no neighbours in time" in capsys.readouterr().err
     assert all(np.isfinite(value) for value in outcome.metrics.values())
 
 

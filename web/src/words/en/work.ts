@@ -240,7 +240,12 @@ export const jobs = {
   stepAxis: "step",
   trainingSeries: "training",
   validationSeries: "validation",
-  classical: { linear: "linear between frames", median: "median compounding" } as Named,
+  classical: {
+    linear: "linear between frames", median: "median compounding", mean: "mean compounding", maximum: "maximum compounding",
+    nearest: "nearest training frame", "in-time": "neighbours in time",
+  } as Named,
+  scored: { "": "as given", on_path: "on the path", registered: "registered by halves" } as Named,
+  posesColumn: "Poses of the held-out frames",
   earlier: "Earlier runs of this sweep",
   earlierHint: (most: number): string => `Up to ${most} are laid over the curves, dashed.`,
   asItIs: "As it is now",

@@ -9,7 +9,8 @@ import time
 import numpy as np
 
 from ultragray.files import file_sha256
-from ultragray.learn.evaluation.baselines import affordable_voxel_mm, evaluate_baselines
+from ultragray.learn.evaluation.baselines import IN_TIME, affordable_voxel_mm, evaluate_baselines
+from ultragray.learn.evaluation.held_out import score_held_out
 from ultragray.learn.evaluation.metrics import FrameMetrics
 from ultragray.learn.evaluation.scoring import (
     Evaluation,
@@ -49,9 +50,12 @@ def run(job_run: JobRun, job: EvaluateJob) -> Outcome:
         sys.stderr.write(f"warning: {warning}\n")
     sys.stderr.write(f"scoring {job.scene} on {len(dataset.val):,} frames of {job.dataset} on {device}\n")
     evaluation = _scored(job_run, scene, dataset.val)
+    held_out = score_held_out(scene, dataset, evaluation, register=job.register)
     reliability = measure_reliability(scene, dataset.val)
     voxel_mm = affordable_voxel_mm(dataset.train)
     baselines = evaluate_baselines(dataset, voxel_mm=voxel_mm) if job.baselines else {}
+    if job.baselines and IN_TIME not in baselines:
+        sys.stderr.write("the held-out frames are of another recording: they have no neighbours in time\n")
     document = {
         "scene": job.scene,
         "scene_sha256": file_sha256(path),
@@ -59,11 +63,12 @@ def run(job_run: JobRun, job: EvaluateJob) -> Outcome:
         "dataset_sha256": dataset.sha256,
         "warnings": warnings,
         **evaluation.to_dict(),
+        "held_out": held_out.to_dict(),
         "uncertainty": None if reliability is None else reliability.to_dict(),
         "baselines": {method: found.to_dict() for method, found in baselines.items()},
         "voxel_mm": voxel_mm if baselines else None,
     }
-    metrics = evaluation.mean.to_dict() | evaluation.speckle.figures()
+    metrics = evaluation.mean.to_dict() | evaluation.speckle.figures() | held_out.figures()
     metrics |= {} if reliability is None else reliability.figures()
     for method, found in baselines.items():
         metrics |= {f"{method}_{name}": value for name, value in found.mean.to_dict().items()}

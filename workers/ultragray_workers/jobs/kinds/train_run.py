@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from ultragray.files import write_whole
-from ultragray.learn.evaluation.baselines import affordable_voxel_mm, evaluate_baselines
+from ultragray.learn.evaluation.baselines import IN_TIME, affordable_voxel_mm, evaluate_baselines
 from ultragray.learn.evaluation.scoring import evaluate_frames
 from ultragray.learn.evaluation.side_by_side import write_spread
 from ultragray.learn.report.page import THIS_SCENE, Prediction, ScenePage, render_page
@@ -36,7 +36,7 @@ from ultragray_workers.jobs.progress import Outcome, Progress
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 from ultragray_workers.scene_names import SUFFIX
 
-METHODS = ("linear", "median")
+METHODS = ("linear", "median", IN_TIME)
 MAX_PIXELS = 1 << 26  # of the sweep: about ten seconds; a larger one begins at once, without the lines
 
 
@@ -48,11 +48,12 @@ def write_baselines(dataset: Dataset, path: Path, should_stop: Callable[[], bool
     if path.exists() or not len(dataset.val) or dataset.train.images.size > MAX_PIXELS:
         return
     few = replace(dataset, val=dataset.val.select(spread_places(len(dataset.val), VALIDATION_FRAMES)))
-    voxel_mm, found = affordable_voxel_mm(dataset.train), {}
+    voxel_mm = affordable_voxel_mm(dataset.train)
+    found: dict[str, float] = {}
     for method in METHODS:
         if should_stop():
             return
-        found[method] = evaluate_baselines(few, (method,), voxel_mm)[method].mean.psnr_db
+        found |= {name: one.mean.psnr_db for name, one in evaluate_baselines(few, (method,), voxel_mm).items()}
     path.parent.mkdir(parents=True, exist_ok=True)
     write_whole(path, json.dumps(found) + "\n")
 

@@ -1,0 +1,70 @@
+"""The delay of a sweep's images behind its poses, by what neighbouring frames say. Read after `agreement`, which calls
+it. Free of torch.
+
+With the pose of another time a frame is predicted worse from those beside it, unless the probe moves evenly: a hand
+trembles, and tells a delay to some milliseconds. A path that is read between its poses is a smoother one, too, which
+may predict better whatever the delay; so a delay has to do better than its opposite.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+
+from ultragray.geometry.probe import FloatArray
+from ultragray.geometry.rotations import blended
+
+STEPS = (1.0, 0.5, 0.25, 0.125)  # of the usual time from one frame to the next
+MOST_S = 0.5
+LEAST_GAIN_DB = 0.01
+LEAST_STEPS = 0.2  # a delay of a smaller share of the usual time is none
+
+
+def with_delay(
+    poses: FloatArray,  # [F, 4, 4] mm
+    times_s: FloatArray,  # [F] ascending in each sweep
+    ranges: Sequence[range],
+    delay_s: float,
+) -> FloatArray:  # [F, 4, 4] mm
+    """The poses a delay before the times of the frames, each sweep by itself; beyond its ends it goes on evenly."""
+    found = poses.copy()
+    for frames in ranges:
+        own, own_s = poses[frames.start : frames.stop], times_s[frames.start : frames.stop]
+        if len(own) < 2:
+            continue
+        asked_s = own_s - delay_s
+        first = np.clip(np.searchsorted(own_s, asked_s, side="right") - 1, 0, len(own) - 2)
+        before, after = own[first], own[first + 1]
+        shares = (asked_s - own_s[first]) / (own_s[first + 1] - own_s[first])
+        moved = before + shares[:, None, None] * (after - before)
+        moved[:, :3, :3] = blended(before[:, :3, :3], after[:, :3, :3], shares)
+        found[frames.start : frames.stop] = moved
+    return found
+
+
+def found_delay_s(
+    psnr_db: Callable[[float], float],  # of frames predicted with a delay
+    times_s: FloatArray,  # [F]
+    ranges: Sequence[range],
+) -> float:
+    """The delay with which frames are predicted best; 0 where times repeat, and where none is clearly better."""
+    steps_s = np.concatenate([np.diff(times_s[frames.start : frames.stop]) for frames in ranges])
+    if not len(steps_s) or steps_s.min() <= 0.0:
+        return 0.0
+    tried: dict[float, float] = {}
+
+    def psnr_of(delay_s: float) -> float:
+        if abs(delay_s) > MOST_S:
+            return -np.inf
+        if delay_s not in tried:
+            tried[delay_s] = psnr_db(delay_s)
+        return tried[delay_s]
+
+    best_s, usual_s = 0.0, float(np.median(steps_s))
+    for step_s in usual_s * np.array(STEPS):
+        for onwards_s in (float(step_s), -float(step_s)):
+            while psnr_of(best_s + onwards_s) > psnr_of(best_s):
+                best_s += onwards_s
+    is_clear = psnr_of(best_s) >= max(psnr_of(0.0), psnr_of(-best_s)) + LEAST_GAIN_DB
+    return best_s if is_clear and abs(best_s) >= LEAST_STEPS * usual_s else 0.0
