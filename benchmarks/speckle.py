@@ -2,7 +2,8 @@
 
 Each set is trained by STEPS steps, without its held-out frames; a scene that lies in build/bench/speckle is taken as it
 is. Measured are the texture of the held-out frames, how windows at one place in space decorrelate from frame to frame,
-and how well a small classifier of windows, trained on half of these frames, tells rendered from true on the others.
+and how well a small classifier of windows, trained on the first half of these frames, tells rendered from true on the
+second.
 """
 
 from __future__ import annotations
@@ -149,12 +150,12 @@ def by_bins(values: FloatArray, edges: tuple[float, ...], moments: dict[str, Flo
 
 
 def area_under_curve(frames: FrameArray, true: FrameArray) -> float:
-    """Of a small network that tells rendered windows from true ones, on the frames that it was not trained on."""
+    """Of a small network that tells rendered windows from true ones; it is trained on the first half of the frames."""
     torch.manual_seed(0)
     places = [calmest(tiles_of(one), 1.0) for one in true]
     sets = []
     for first in (0, 1):
-        some = [(one, place) for one, place in enumerate(places) if one % 2 == first]
+        some = [(one, place) for one, place in enumerate(places) if (2 * one >= len(true)) == bool(first)]
         windows = [[tiles_of(kind[one])[place] for one, place in some] for kind in (true, frames)]
         shown, real = (np.concatenate(kind).astype(np.float32) for kind in windows[::-1])
         grey = torch.from_numpy(np.concatenate([shown, real]))[:, None]

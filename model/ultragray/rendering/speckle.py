@@ -137,7 +137,8 @@ def _power(
     planes = (1.0 + 2.0 * side**2)[:, None, None] * _shared(j)
     planes = planes + (2.0 * side)[:, None, None] * (_shared(j + 1.0) + _shared(j - 1.0))
     planes = planes + (side**2)[:, None, None] * (_shared(j + 2.0) + _shared(j - 2.0))
-    return np.einsum("hz,hx,hzx->h", *own, _shared(i) * _shared(k) * planes)
+    power: FloatArray = np.einsum("hz,hx,hzx->h", *own, _shared(i) * _shared(k) * planes)
+    return power
 
 
 def _shared(cells: FloatArray) -> FloatArray:

@@ -305,10 +305,13 @@ def fit_motion(scene: GaussianScene, sweep: Sweep, model: SpeckleModel, chosen: 
             some = (bands == band) & upright
             if some.sum() >= LEAST_PAIRS:
                 errors[place, band] = _error(windows.elevation_mm[some], ELEVATION_MM, own[some], wanted[some])
-    best = [float(widths[row.argmin()]) for row in errors.T if np.isfinite(row).any()]
-    if not best:
+    known = np.isfinite(errors).all(axis=0)
+    if not known.any():
         return model
-    known = np.isfinite(errors).any(axis=0)
+    counts = np.array([((bands == band) & upright).sum() for band in range(BANDS)])[known]
+    common = int((errors[:, known] @ counts).argmin())
+    near = slice(max(common - 1, 0), common + 2)  # a band alone is not trusted with more
+    best = widths[near][errors[near, known].argmin(axis=0)]
     slices = np.interp(np.arange(BANDS), np.flatnonzero(known), best)
     model = with_cells(replace(model, elevation_mm=tuple(slices.tolist())), sweep)
     tilted = ~upright & (windows.elevation_mm < np.array(model.elevation_mm)[bands])
