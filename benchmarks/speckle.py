@@ -8,6 +8,7 @@ second.
 
 from __future__ import annotations
 
+import math
 import statistics
 import time
 from dataclasses import replace
@@ -23,6 +24,7 @@ from torch import Tensor, nn
 from measuring import STAGE, Document, Lines, columns, measure_runs, teller
 from ultragray.datasets.source import load_dataset
 from ultragray.geometry.probe import FloatArray
+from ultragray.geometry.rotations import rotations_of
 from ultragray.learn.evaluation.scoring import evaluate
 from ultragray.learn.evaluation.speckle import (
     FrameArray,
@@ -34,10 +36,10 @@ from ultragray.learn.evaluation.speckle import (
     summarize,
     tiles_of,
 )
-from ultragray.learn.sweep import Dataset, Sweep, spread_places
+from ultragray.learn.sweep import Dataset, IntArray, Sweep, spread_places
 from ultragray.learn.training import TrainingConfig, train
 from ultragray.learn.training.speckle import fit_speckle, frame_pairs
-from ultragray.phantom import load_phantom
+from ultragray.phantom import load_phantom, simulate
 from ultragray.phantom.demo import demo_poses, load_demo_scene
 from ultragray.rendering.frames import render
 from ultragray.rendering.settings import Speckle
@@ -50,7 +52,9 @@ STEPS, MAX_GAUSSIANS = 500, 80_000
 MOST_FRAMES = 48
 GREYS = 32  # of the histograms
 ELEVATION_MM = (0.0, 0.2, 0.4, 0.7, 1.0, 1.5, 2.5, 4.0)
-ANGLE_DEG = (0.0, 1.0, 3.0, 6.0, 12.0)
+ANGLE_DEG = (0.0, 0.4, 0.8, 1.5, 3.0, 6.0, 12.0)
+BASES, SHIFTS_MM, TILTS_DEG = 5, (0.1, 0.3, 0.5, 0.8, 1.2, 2.0), (0.5, 1.0, 2.0, 4.0)
+UPRIGHT_DEG = 1.0
 LEAST_PAIRS = 100
 EPOCHS, BATCH = 12, 64
 SIDE = 512
@@ -75,7 +79,7 @@ def measure(name: str, data_folder: Path) -> Document:
         "model": model.__dict__ | {"strength": list(model.strength)},
         "psnr_db": evaluate(scene, held_out).mean.psnr_db,  # without speckle
         "texture": {value: texture(frames, true, held_out) for value, frames in shown.items()},
-        "decorrelation": decorrelation(scene, dataset),
+        "decorrelation": decorrelation(scene, *pairs_of_frames(name, dataset)),
         "area_under_curve": {value: area_under_curve(frames, true) for value, frames in shown.items()},
     }
 
@@ -110,27 +114,49 @@ def texture(frames: FrameArray, true: FrameArray, sweep: Sweep) -> Document:
     }
 
 
-def decorrelation(scene: GaussianScene, dataset: Dataset) -> Document:
-    """Correlations of pairs of windows by their distance and their angle, of true and of rendered frames.
-
-    Of pairs of frames of which one is held out, or of the held-out frames alone where these lie close enough.
-    """
+def pairs_of_frames(name: str, dataset: Dataset) -> tuple[Sweep, IntArray]:
+    """Frames that lie close together, [P, 2] of them at a time: of the phantom simulated, about held-out poses; else of
+    a recording, one of each pair held out."""
+    if name == PHANTOM:
+        poses = np.concatenate([about(pose) for pose in dataset.val.poses[:: len(dataset.val) // BASES][:BASES]])
+        images = simulate(poses, probe=dataset.probe, height=dataset.val.height, width=dataset.val.width)
+        count = len(poses) // BASES
+        pairs = [(base, base + other) for base in range(0, len(poses), count) for other in range(1, count)]
+        return Sweep(images, poses, dataset.probe, np.arange(len(poses)), name), np.array(pairs)
     both = Sweep(
         np.concatenate([dataset.val.images, dataset.train.images]),
         np.concatenate([dataset.val.poses, dataset.train.poses]),
         dataset.probe,
         np.arange(len(dataset.val) + len(dataset.train)),
-        dataset.name,
+        name,
     )
     pairs = frame_pairs(both)
     pairs = pairs[(pairs < len(dataset.val)).any(axis=1)]
     frames = np.unique(pairs)
-    part = both.select(frames)
+    return both.select(frames), np.searchsorted(frames, pairs)
+
+
+def about(pose: FloatArray) -> FloatArray:  # [4, 4] mm -> [K, 4, 4]
+    """A pose, the same shifted along elevation, and tilted about the lateral axis in the middle of the image."""
+    moved = [np.eye(4)]
+    for shift_mm in SHIFTS_MM:
+        moved.append(np.eye(4))
+        moved[-1][1, 3] = shift_mm
+    middle = np.array([0.0, 0.0, 30.0])
+    for tilt_deg in TILTS_DEG:
+        moved.append(np.eye(4))
+        moved[-1][:3, :3] = rotations_of(np.array([[math.radians(tilt_deg), 0.0, 0.0]]))[0]
+        moved[-1][:3, 3] = middle - moved[-1][:3, :3] @ middle
+    return pose @ np.stack(moved)
+
+
+def decorrelation(scene: GaussianScene, part: Sweep, pairs: IntArray) -> Document:
+    """Correlations of pairs of windows by their distance and their angle, of true and of rendered frames."""
     true = part.images.astype(np.float32) / 255.0
-    windows = WindowPairs.between(true, part.poses, part.probe, np.searchsorted(frames, pairs))
+    windows = WindowPairs.between(true, part.poses, part.probe, pairs)
     shown = {"true": true, **{one.value: drawn(scene, part, one) for one in Speckle}}
     moments = {name: windows.moments(one) for name, one in shown.items()}
-    upright = windows.angle_deg < ANGLE_DEG[1]
+    upright = windows.angle_deg < UPRIGHT_DEG
     near = windows.elevation_mm < ELEVATION_MM[2]
     return {
         "elevation_mm": by_bins(windows.elevation_mm, ELEVATION_MM, moments, upright),
@@ -185,7 +211,7 @@ def flipped(windows: Tensor) -> Tensor:
 
 
 def cost(_: Path) -> Document:
-    """Milliseconds that speckle adds to a frame of 512x512 of the demo scene, in turn with the frame without it."""
+    """Processor time, in ms, of a frame of 512x512 of the demo scene without speckle and with it, in turn."""
     scene, poses = load_demo_scene(), demo_poses(ROUNDS)
     probe = scene.info.probe_or(None)
     pixel = probe.scan_line_length_mm / SIDE
@@ -206,9 +232,9 @@ def cost(_: Path) -> Document:
         took: dict[Speckle, list[float]] = {one: [] for one in Speckle}
         for pose in poses:
             for one in Speckle:
-                began = time.perf_counter()
+                began = time.thread_time()
                 render(scene, None, pose, height=SIDE, width=SIDE, outputs=("bmode",), speckle=one)
-                took[one].append(1e3 * (time.perf_counter() - began))
+                took[one].append(1e3 * (time.thread_time() - began))
         differences = [on - off for off, on in zip(*took.values(), strict=True)]
         found[name] = {
             "frame_ms": statistics.median(took[Speckle.OFF]),

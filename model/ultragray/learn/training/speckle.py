@@ -10,6 +10,7 @@ windows at the same place in space decorrelate with the distance along elevation
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -31,7 +32,7 @@ from ultragray.learn.sweep import IntArray, Sweep, spread_places
 from ultragray.rendering.frames import render
 from ultragray.rendering.speckle import Compression, kernel_speckle, sweep_axes
 from ultragray.scene.gaussians import GaussianScene
-from ultragray.scene.speckle import BANDS, LEVELS, SpeckleModel
+from ultragray.scene.speckle import BANDS, LARGEST_MM, LEVELS, SMALLEST_MM, SpeckleModel
 
 SEED = 40
 MOST_FRAMES = 24
@@ -112,27 +113,25 @@ class _Fit:
         rows = sweep.height // WINDOW_PIXELS
         columns = sweep.width // WINDOW_PIXELS
         self._bands = np.repeat(np.arange(rows) * BANDS // rows, columns)  # [T]
+        probe = sweep.probe
+        middles = probe.near_mm + (np.arange(BANDS) + 0.5) / BANDS * probe.scan_line_length_mm
+        breadths = np.array([probe.lines.breadth_mm(float(depth)) for depth in middles])
+        axial = np.full(BANDS, probe.scan_line_length_mm / sweep.height)
+        self._pixels_mm = {"axial": _limited(axial), "lateral": _limited(breadths / sweep.width)}
 
     def start(self) -> SpeckleModel:
         """Speckle of about a pixel."""
-        axial, lateral = self._sweep.pixel_mm
-        beside = [self._sweep.probe.lines.breadth_mm(depth) / self._sweep.width for depth in self._band_depths()]
         return with_cells(
             SpeckleModel(
                 seed=SEED,
-                axial_mm=(axial,) * BANDS,
-                lateral_mm=tuple(beside),
-                elevation_mm=(max(axial, lateral),) * BANDS,
+                axial_mm=tuple(self._pixels_mm["axial"].tolist()),
+                lateral_mm=tuple(self._pixels_mm["lateral"].tolist()),
+                elevation_mm=tuple(self._pixels_mm["lateral"].tolist()),
                 cell_mm=(1.0, 1.0, 1.0),
                 strength=(0.05,) * LEVELS,
             ),
             self._sweep,
         )
-
-    def _band_depths(self) -> FloatArray:
-        probe = self._sweep.probe
-        middles: FloatArray = probe.near_mm + (np.arange(BANDS) + 0.5) / BANDS * probe.scan_line_length_mm
-        return middles
 
     def statistics(self, frames: FrameArray) -> _Statistics | None:  # [C, H, W]
         """None where there are too few windows. Those of the first call, which are calm, are kept for the others."""
@@ -182,33 +181,32 @@ class _Fit:
         for _ in range(CORRECTIONS):
             shown = self.statistics(self.with_speckle(model))
             assert shown is not None
-            widths = {}
-            for name, least in (("axial", self._sweep.pixel_mm[0]), ("lateral", None)):
-                pixels = [
-                    least or self._sweep.probe.lines.breadth_mm(depth) / self._sweep.width
-                    for depth in self._band_depths()
-                ]
+            widths: dict[str, Any] = {}
+            for name, pixels_mm in self._pixels_mm.items():
                 own, wanted, without = (getattr(one, name) for one in (shown, truth, plain))
                 ratios = _width(wanted - without) / _width(own - without)
-                now = np.array(getattr(model, f"{name}_mm")) * np.clip(
-                    np.where(np.isfinite(ratios), ratios, 1.0), 0.6, 1.6
-                )
-                widths[name] = tuple(np.clip(now / pixels, SMALLEST_PIXELS, LARGEST_PIXELS) * pixels)
+                ratios = np.clip(np.where(np.isfinite(ratios), ratios, 1.0), 0.6, 1.6)
+                pixels = np.clip(getattr(model, f"{name}_mm") * ratios / pixels_mm, SMALLEST_PIXELS, LARGEST_PIXELS)
+                widths[f"{name}_mm"] = tuple(_limited(pixels * pixels_mm).tolist())
             strength = _strength(model, truth, plain, shown)
             skewness = float(np.clip(skewness + truth.skewness - shown.skewness, *SKEWNESS))
             looks, floor = looks_and_floor(skewness)
             model = with_cells(
                 replace(
                     model,
-                    axial_mm=widths["axial"],
-                    lateral_mm=widths["lateral"],
-                    strength=tuple(strength),
+                    **widths,
+                    strength=tuple(strength.tolist()),
                     looks=looks,
                     floor=floor,
                 ),
                 self._sweep,
             )
         return model
+
+
+def _limited(widths_mm: FloatArray) -> FloatArray:
+    """What a model may have."""
+    return np.clip(widths_mm, SMALLEST_MM, LARGEST_MM)
 
 
 def _width(covariance: FloatArray) -> FloatArray:  # [BANDS, MAX_LAG + 1] -> [BANDS] pixels; NaN: not to be told
@@ -258,14 +256,12 @@ def with_cells(model: SpeckleModel, sweep: Sweep) -> SpeckleModel:
     """Cells by the narrowest point-spread function, and no shorter than a pixel."""
     axial, lateral = (min(widths) for widths in (model.axial_mm, model.lateral_mm))
     pixel = sweep.pixel_mm
-    return replace(
-        model,
-        cell_mm=(
-            max(CELLS_PER_SIGMA * lateral, min(pixel[1], 3.0 * lateral)),
-            max(model.elevation_mm) / 0.75,
-            max(CELLS_PER_SIGMA * axial, min(pixel[0], 3.0 * axial)),
-        ),
+    cells = (
+        max(CELLS_PER_SIGMA * lateral, min(pixel[1], 3.0 * lateral)),
+        max(model.elevation_mm) / 0.75,
+        max(CELLS_PER_SIGMA * axial, min(pixel[0], 3.0 * axial)),
     )
+    return replace(model, cell_mm=tuple(_limited(np.array(cells)).tolist()))
 
 
 # How speckle changes as the probe moves: the width of the slice, and the carrier.
@@ -297,7 +293,7 @@ def fit_motion(scene: GaussianScene, sweep: Sweep, model: SpeckleModel, chosen: 
 
     bands = np.minimum((windows.depth * BANDS).astype(int), BANDS - 1)
     upright = windows.angle_deg < ANGLE_DEG[1]
-    widths = SLICES * float(np.mean(model.lateral_mm))
+    widths = _limited(SLICES * float(np.mean(model.lateral_mm)))
     errors = np.full((len(widths), BANDS), np.inf)
     for place, width in enumerate(widths):
         own = shown(with_cells(replace(model, elevation_mm=(float(width),) * BANDS), sweep))
