@@ -14,10 +14,8 @@ inline Words scattered(Words x) {
     return x ^ (x >> 16);
 }
 
-// A byte of each word, its mean taken off.
-inline Floats byte_of(Words bits, int byte) {
-    return __builtin_convertvector((Ints)(bits >> (8 * byte) & 255u), Floats) - 127.5f;
-}
+// A byte of each word.
+inline Ints byte_of(Words bits, int byte) { return (Ints)(bits >> (8 * byte) & 255u); }
 
 // log2 of positive numbers, to 1e-5.
 inline Floats fast_log2(Floats x) {
@@ -32,27 +30,36 @@ inline Floats fast_log2(Floats x) {
     return exponent + p * (m - 1.0f);
 }
 
+// The four bytes of what scatters in the cells of samples in one of the three planes.
+inline Words scatterer(const SpeckleGrid& grid, const SpeckleView& view, const Words (&place)[3], int plane) {
+    const uint32_t p = uint32_t(plane);
+    const Words x = (place[0] + p * view.beside[0]) & 0xffff0000u, y = (place[1] + p * view.beside[1]) >> 16,
+                z = (place[2] + p * view.beside[2]) >> 16;
+    return scattered(((x | y) ^ z * 0x9e3779b1u) + grid.seed);
+}
+
 // The real and imaginary parts of both looks at all columns of a row of samples: `out` is [4, stride].
 inline void sample_row(const SpeckleGrid& grid, const SpeckleView& view, int row, int stride, float* out) {
     const int columns = grid.columns;
     const float middle = grid.plane_weights[2 * row], beside = grid.plane_weights[2 * row + 1];
     const float along = beside * view.plane_cosine, across = beside * view.plane_sine;
+    const float mean = 127.5f * (middle + 2.0f * along);  // of the bytes
     for (int c = 0; c < columns; c += kLanes) {
         Words place[3];
         for (int axis = 0; axis < 3; ++axis)
             place[axis] =
                 load<Words>(view.starts + axis * columns + c) + uint32_t(row) * load<Words>(view.steps + axis * columns + c);
-        Floats a1{}, b1{}, a2{}, b2{};
-        for (int plane = -1; plane <= 1; ++plane) {
-            const uint32_t p = uint32_t(plane);
-            const Words x = (place[0] + p * view.beside[0]) >> 16, y = (place[1] + p * view.beside[1]) >> 16,
-                        z = (place[2] + p * view.beside[2]) >> 16;
-            const Words bits = scattered(x * 0x9e3779b1u + y * 0x85ebca77u + z * 0xc2b2ae3du + grid.seed);
-            const Floats n1 = byte_of(bits, 0), n2 = byte_of(bits, 1), n3 = byte_of(bits, 2), n4 = byte_of(bits, 3);
-            const float wr = plane == 0 ? middle : along, wi = float(plane) * across;
-            a1 += wr * n1 - wi * n2, b1 += wr * n2 + wi * n1;
-            a2 += wr * n3 - wi * n4, b2 += wr * n4 + wi * n3;
+        const Words before = scatterer(grid, view, place, -1), at = scatterer(grid, view, place, 0),
+                    after = scatterer(grid, view, place, 1);
+        Floats parts[4], turned[4];
+        for (int k = 0; k < 4; ++k) {
+            const Ints first = byte_of(before, k), last = byte_of(after, k);
+            parts[k] = middle * __builtin_convertvector(byte_of(at, k), Floats) +
+                       along * __builtin_convertvector(first + last, Floats) - mean;
+            turned[k] = across * __builtin_convertvector(last - first, Floats);
         }
+        const Floats a1 = parts[0] - turned[1], b1 = parts[1] + turned[0];
+        const Floats a2 = parts[2] - turned[3], b2 = parts[3] + turned[2];
         const Floats cosine = load<Floats>(view.column_phases + c), sine = load<Floats>(view.column_phases + columns + c);
         store(out + c, a1 * cosine - b1 * sine), store(out + stride + c, b1 * cosine + a1 * sine);
         store(out + 2 * stride + c, a2 * cosine - b2 * sine), store(out + 3 * stride + c, b2 * cosine + a2 * sine);

@@ -37,11 +37,12 @@ from ultragray.scene.speckle import BANDS, LEVELS, SpeckleModel
 
 FloatRows = npt.NDArray[np.float32]
 IntRows = npt.NDArray[np.int32]
+Words = npt.NDArray[np.uint32]
 
 TURN_RAD = 0.47  # of the cells within the image plane
 SHEAR = (0.618, 0.324)  # of cells along elevation, by the cells in the two other directions
 SUBCELL_BITS = 16
-CELL_NUMBERS = np.array([0x9E3779B1, 0x85EBCA77, 0xC2B2AE3D], np.uint32)  # odd: neighbours get numbers far apart
+CELL_NUMBER = np.uint32(0x9E3779B1)  # odd: neighbours get numbers far apart
 SAMPLES_PER_SIGMA = 1.0  # of the narrowest point-spread function
 REACH = 2.4  # of the point-spread function, in standard deviations
 LEAST_SIGMA_PIXELS = 0.3
@@ -221,7 +222,9 @@ def sums(model: SpeckleModel, samples: Samples, places: Places, size: tuple[int,
         turn = complex(*places.plane_phases[pose].tolist())
         for plane, weight in ((-1, side * turn.conjugate()), (0, np.ones_like(side)), (1, side * turn)):
             cells = (start + number * step + np.uint32(plane % 2**32) * beside) >> np.uint32(SUBCELL_BITS)
-            numbers = (cells * CELL_NUMBERS[:, None, None]).sum(axis=0, dtype=np.uint32) + np.uint32(model.seed)
+            numbers = ((cells[0] << np.uint32(16) | cells[1]) ^ cells[2] * CELL_NUMBER) + np.uint32(
+                _scattered_seed(model)
+            )
             echoes += weight * phasors(numbers)
         cosine, sine = places.column_phases[pose].astype(np.float64)
         echoes *= cosine + 1j * sine
@@ -234,15 +237,26 @@ def sums(model: SpeckleModel, samples: Samples, places: Places, size: tuple[int,
     return np.asarray(sum(weights[..., tap] * down[..., place + tap] for tap in range(weights.shape[-1])))
 
 
-def phasors(numbers: npt.NDArray[np.uint32]) -> npt.NDArray[np.complex128]:  # [...] -> [2, ...]
-    """The scatterer of each look: two bytes each of a hash of 32 bits (lowbias32 of C. Wellons), less their mean."""
-    mixed = numbers ^ (numbers >> np.uint32(16))
-    mixed = mixed * np.uint32(0x7FEB352D)
-    mixed ^= mixed >> np.uint32(15)
-    mixed = mixed * np.uint32(0x846CA68B)
-    mixed ^= mixed >> np.uint32(16)
+def phasors(numbers: Words) -> npt.NDArray[np.complex128]:  # [...] -> [2, ...]
+    """The scatterer of each look: two bytes each of a hash, less their mean."""
+    mixed = scattered(numbers)
     parts = [((mixed >> np.uint32(8 * byte)) & np.uint32(255)) - 127.5 for byte in range(4)]
     return np.stack([parts[0] + 1j * parts[1], parts[2] + 1j * parts[3]])
+
+
+def scattered(numbers: Words) -> Words:
+    """A hash of 32 bits (lowbias32 of C. Wellons)."""
+    mixed: Words = numbers ^ (numbers >> np.uint32(16))
+    mixed = mixed * np.uint32(0x7FEB352D)
+    mixed = mixed ^ (mixed >> np.uint32(15))
+    mixed = mixed * np.uint32(0x846CA68B)
+    mixed = mixed ^ (mixed >> np.uint32(16))
+    return mixed
+
+
+def _scattered_seed(model: SpeckleModel) -> int:
+    """Seeds beside each other would else be the same speckle, shifted by a cell."""
+    return int(scattered(np.array([model.seed], np.uint32))[0])
 
 
 @dataclass(frozen=True)
@@ -361,7 +375,7 @@ def kernel_speckle(
         out.numpy(),
         alone=alone,
         strength=np.array(model.strength, np.float32),
-        seed=model.seed,
+        seed=_scattered_seed(model),
         first_look=compressed.first_look,
         floor=model.floor,
         mean=compressed.mean,
