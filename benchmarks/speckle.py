@@ -56,7 +56,7 @@ ANGLE_DEG = (0.0, 0.4, 0.8, 1.5, 3.0, 6.0, 12.0)
 BASES, SHIFTS_MM, TILTS_DEG = 5, (0.1, 0.3, 0.5, 0.8, 1.2, 2.0), (0.5, 1.0, 2.0, 4.0)
 UPRIGHT_DEG = 1.0
 LEAST_PAIRS = 100
-EPOCHS, BATCH = 12, 64
+BATCHES, BATCH = 500, 128
 SIDE = 512
 ROUNDS = 60
 
@@ -176,34 +176,47 @@ def by_bins(values: FloatArray, edges: tuple[float, ...], moments: dict[str, Flo
 
 
 def area_under_curve(frames: FrameArray, true: FrameArray) -> float:
-    """Of a small network that tells rendered windows from true ones; it is trained on the first half of the frames."""
+    """Of a small network that tells rendered windows from true ones; it is trained on the first half of the frames.
+
+    It sees windows without their means, for it is to tell texture.
+    """
     torch.manual_seed(0)
-    places = [calmest(tiles_of(one), 1.0) for one in true]
-    sets = []
-    for first in (0, 1):
-        some = [(one, place) for one, place in enumerate(places) if (2 * one >= len(true)) == bool(first)]
-        windows = [[tiles_of(kind[one])[place] for one, place in some] for kind in (true, frames)]
-        shown, real = (np.concatenate(kind).astype(np.float32) for kind in windows[::-1])
-        grey = torch.from_numpy(np.concatenate([shown, real]))[:, None]
-        sets.append((grey, torch.cat([torch.ones(len(shown)), torch.zeros(len(real))])))
-    (grey, labels), (unseen, told) = sets
+    (grey, labels), (unseen, told) = (labelled(frames[half], true[half]) for half in halves(len(true)))
+    scale = grey.std()
     network = nn.Sequential(
         nn.Conv2d(1, 16, 3), nn.ReLU(), nn.Conv2d(16, 32, 3, stride=2), nn.ReLU(),
         nn.Conv2d(32, 32, 3), nn.ReLU(), nn.AdaptiveAvgPool2d(1), nn.Flatten(), nn.Linear(32, 1),
     )  # fmt: skip
-    optimizer = torch.optim.Adam(network.parameters(), 2e-3)
-    for _ in range(EPOCHS):
-        for batch in torch.randperm(len(grey)).split(BATCH):
-            optimizer.zero_grad()
-            loss = nn.functional.binary_cross_entropy_with_logits(network(flipped(grey[batch]))[:, 0], labels[batch])
-            loss.backward()
-            optimizer.step()
+    optimizer = torch.optim.Adam(network.parameters(), 3e-3)
+    for _ in range(BATCHES):
+        batch = torch.randint(len(grey), (BATCH,))
+        optimizer.zero_grad()
+        scores = network(flipped(grey[batch]) / scale)[:, 0]
+        nn.functional.binary_cross_entropy_with_logits(scores, labels[batch]).backward()
+        optimizer.step()
     with torch.no_grad():
-        scores = network(unseen)[:, 0].numpy()
-    order = scores.argsort(kind="stable").argsort(kind="stable") + 1
+        found = network(unseen / scale)[:, 0].numpy()
+    order = found.argsort(kind="stable").argsort(kind="stable") + 1
     positive = told.numpy() > 0.5
     count = int(positive.sum())
     return float((order[positive].sum() - count * (count + 1) / 2) / (count * (len(order) - count)))
+
+
+def halves(count: int) -> tuple[slice, slice]:
+    return slice(0, count // 2), slice(count // 2, count)
+
+
+def labelled(frames: FrameArray, true: FrameArray) -> tuple[Tensor, Tensor]:  # [N, 1, n, n], [N]
+    """Windows of rendered frames, 1, and of true ones at the same places, 0."""
+    places = [calmest(tiles_of(one), 1.0) for one in true]
+    windows = [
+        np.concatenate([tiles_of(one)[place] for one, place in zip(kind, places, strict=True)])
+        for kind in (frames, true)
+    ]
+    grey = torch.from_numpy(np.concatenate(windows).astype(np.float32))[:, None]
+    return grey - grey.mean(dim=(2, 3), keepdim=True), torch.arange(2).flip(0).repeat_interleave(
+        len(windows[0])
+    ).float()
 
 
 def flipped(windows: Tensor) -> Tensor:
