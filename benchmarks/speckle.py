@@ -97,7 +97,7 @@ def drawn(scene: GaussianScene, sweep: Sweep, speckle: Speckle) -> FrameArray:  
     asked = {"height": sweep.height, "width": sweep.width, "outputs": ("bmode",), "speckle": speckle}
     with torch.no_grad():
         frames = [render(scene, sweep.probe, pose, **asked)["bmode"] for pose in sweep.poses]
-    return np.asarray(torch.cat(frames).numpy())
+    return np.asarray(torch.cat(frames).mul(255.0).round().div(255.0).numpy())  # in 8 bits, as true frames are
 
 
 def texture(frames: FrameArray, true: FrameArray, sweep: Sweep) -> Document:
@@ -214,9 +214,8 @@ def labelled(frames: FrameArray, true: FrameArray) -> tuple[Tensor, Tensor]:  # 
         for kind in (frames, true)
     ]
     grey = torch.from_numpy(np.concatenate(windows).astype(np.float32))[:, None]
-    return grey - grey.mean(dim=(2, 3), keepdim=True), torch.arange(2).flip(0).repeat_interleave(
-        len(windows[0])
-    ).float()
+    labels = torch.cat([torch.ones(len(windows[0])), torch.zeros(len(windows[1]))])
+    return grey - grey.mean(dim=(2, 3), keepdim=True), labels
 
 
 def flipped(windows: Tensor) -> Tensor:
