@@ -30,7 +30,7 @@ FRAMES ?= 100000
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-notebooks test-console test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results methods ablations poses localization confidence speckle environment ros figures demo-scene docs generate packages clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-notebooks test-console test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results methods ablations poses hand localization confidence speckle environment ros figures demo-scene docs generate packages clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -188,6 +188,12 @@ poses: $(VENV)/installed-dev  ## train with errors added to poses, with and with
 	$(BIN)/python benchmarks/poses.py $(DATA) $(ARGS)
 	@$(BIN)/python benchmarks/figures.py show poses
 	$(KEEP) poses
+
+hand: $(VENV)/installed-dev  ## the sweep of a hand in silico: what errors of its poses cost, and what is regained; takes half an hour, without its trainings a third (ARGS='--only one two')
+	$(READY)
+	$(BIN)/python benchmarks/hand.py $(DATA) $(ARGS)
+	@$(BIN)/python benchmarks/figures.py show hand
+	$(KEEP) hand
 
 localization: $(VENV)/installed-dev  ## find held-out frames again from 3 mm and 5° away; trains first, half an hour
 	$(READY)

@@ -24,6 +24,7 @@ from pathlib import Path
 
 import ablations
 import confidence
+import hand
 import localization
 import measuring
 import methods_tables
@@ -44,7 +45,10 @@ TARGETS = {
     **dict.fromkeys(("cuda", "cuda_training"), "bench-cuda"),
     "results_tables": "results",
     "methods_tables": "methods",
-    **{name: name for name in ("ablations", "poses", "localization", "confidence", "speckle", "environment", "ros")},
+    **{
+        name: name
+        for name in ("ablations", "poses", "hand", "localization", "confidence", "speckle", "environment", "ros")
+    },
     "shards": "test-shards",
     **{f"{name}-run": f"test-{name}" for name in ("long", "soak", "replicas", "overload")},
 }
@@ -310,6 +314,8 @@ BLOCKS = {
     "methods": Block("methods_tables", methods_tables.methods),
     "ablations": Block("ablations", ablations.trained_without),
     "poses": Block("poses", poses.refined_poses),
+    "hand": Block("hand", hand.predicted, hand.of_paths),
+    "scenes of a hand": Block("hand", hand.trained, hand.of_scenes),
     "localization": Block("localization", localization.found_frames),
     "confidence": Block("confidence", confidence.confidence_and_uncertainty),
     "speckle": Block("speckle", speckle.textures),

@@ -38,7 +38,10 @@ from ultragray.datasets.mcap import read_mcap_sweep
 from ultragray.exchange import ros_messages as ros
 from ultragray.exchange.rendering import render_to_file
 from ultragray.geometry.pose import pose_from_position_quaternion
+from ultragray.geometry.probe import LinearProbe
+from ultragray.learn.evaluation.baselines import compound
 from ultragray.learn.registration import register_frames
+from ultragray.learn.training.agreement import agreed_path
 from ultragray.phantom import PHANTOM_PROBE, freehand_poses, simulate
 from ultragray.phantom.demo import DEMO_FILE
 from ultragray.rendering.display import Display
@@ -51,6 +54,7 @@ from ultragray.rendering.volumes import VOLUME_FIELDS, VolumeGrid
 from ultragray.samplers import AroundSampler
 from ultragray.scene.confidence import Assessor, supported
 from ultragray_studies.gym import StandardPlaneEnv
+from ultragray_studies.hand import Errors, HandSweep
 
 IMAGES = Path(__file__).resolve().parent / "images"
 EXAMPLES = IMAGES.parents[1] / "examples"
@@ -79,6 +83,7 @@ def main() -> None:
     draw_recorded_sweep(scene, IMAGES / "mcap_sweep.png")
     draw_live_in_volume(scene, IMAGES / "slicer.png")
     draw_registration(scene, IMAGES / "registration.png")
+    draw_hand(IMAGES / "hand.png")
     for folder in sys.argv[1:]:
         shrink(Path(folder) / "sweep.png", IMAGES / "tutorial_sweep.png", width=1000)
         shrink(Path(folder) / "pictures" / "frame_00007.png", IMAGES / "tutorial_eval.png", width=1000)
@@ -465,6 +470,32 @@ def draw_registration(scene: GaussianScene, path: Path) -> None:
         panel.imshow(image, cmap="gray", vmin=0.0, vmax=1.0, extent=EXTENT_MM)
         panel.contour(np.flipud(edges), levels=[128], colors="#edae49", linewidths=0.6, extent=EXTENT_MM)
         panel.set_title(title)
+    save(figure, path)
+
+
+def draw_hand(path: Path) -> None:
+    """A plane along the sweep of a hand, compounded by three kinds of poses: a tracker that shakes, and a calibration
+    that is off."""
+    along = np.array([[0.0, -1.0, 0.0, 8.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 1.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
+    probe = LinearProbe(width_mm=50.0, near_mm=0.0, far_mm=45.0)
+    rows = {
+        "a tracker that shakes by 0.3 mm and 0.5°": (((0.0,), 121), Errors(noise_mm=0.3, noise_deg=0.5)),
+        "a calibration off by 1 mm and 2°": (((0.0, 80.0), 81), Errors(calibration_mm=1.0, calibration_deg=2.0)),
+    }
+    titles = ("as given", "on the path", "by the true poses")
+    figure, panels = panel_row(rows=len(rows), columns=len(titles))
+    for row, (name, (passes, errors)) in enumerate(rows.items()):
+        sweep = HandSweep.of(*passes)
+        given = sweep.recorded(errors)
+        path = agreed_path(given)
+        on_path = given if path is None else path.of(given)
+        sweeps = [one.train for one in (given, on_path, sweep.recorded(Errors()))]
+        for column, (title, one) in enumerate(zip(titles, sweeps, strict=True)):
+            panel = panels[row * len(titles) + column]
+            image = compound(one, "mean", 0.25).reslice(probe, along[None], SIDE, SIDE)[0]
+            panel.imshow(image, cmap="gray", vmin=0.0, vmax=1.0, extent=(-25.0, 25.0, 45.0, 0.0))
+            panel.set_title(title, fontsize=8)
+        panels[row * len(titles)].set_ylabel(name, fontsize=8)
     save(figure, path)
 
 

@@ -171,10 +171,11 @@ def _print_table(comparison: Comparison) -> None:
     from rich.table import Table
 
     from ultragray.learn.report.tables import METRICS, rank, shown_value
-    from ultragray_studies.comparison.tables import budget_text, steps_text
+    from ultragray_studies.comparison.tables import PATH_HEADING, budget_text, path_texts, steps_text
 
     table = Table(box=None, pad_edge=False)
-    heads = ("", *(metric.label for metric in METRICS), "steps", "training, s", "frame, ms", "MB", "mean rank")
+    scores = (*(metric.label for metric in METRICS), *([PATH_HEADING] if comparison.has_path else []))
+    heads = ("", *scores, "steps", "training, s", "frame, ms", "MB", "mean rank")
     for place, head in enumerate(heads):
         table.add_column(head, justify="right" if place else "left", no_wrap=True)
     ranks = rank(comparison.measured)
@@ -184,6 +185,7 @@ def _print_table(comparison: Comparison) -> None:
             table.add_row(
                 escape(one.title),
                 *(shown_value(metric.name, means[metric.name]) for metric in METRICS),
+                *path_texts(comparison, one),
                 steps_text(one),
                 f"{one.cost.seconds:,.1f}",
                 f"{one.frame_ms:,.1f}",

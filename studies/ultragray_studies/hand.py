@@ -21,11 +21,10 @@ from ultragray.phantom import simulate
 
 PROBE, HEIGHT, WIDTH = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=45.0), 192, 144
 SPACING_MM, FRAME_S = 0.7, 0.05
-BAND = 12  # frames in a row that are held out, in the middle of a pass
 TICK_S = 0.005  # of the hand's motion
 MARGIN_S = 1.0  # of it, before the first frame and after the last
-TISSUE_DEPTH_MM = 22.0  # at which tissue follows the probe by 1/e
-TISSUE_S = 0.6  # a hand's motion that is slower than that moves over the tissue
+TISSUE_DEPTH_MM = 40.0  # at which tissue follows the probe by 1/e
+TISSUE_S = 3.0  # a hand's motion that is slower than that moves over the tissue
 
 # A hand's motion about its way: standard deviations along and about x, y, z of the probe (mm, degrees), and seconds
 SWAYS = (((2.0, 0.0, 0.8), (1.5, 1.0, 1.0), 1.25), ((0.25, 0.2, 0.2), (0.2, 0.2, 0.15), 0.15))
@@ -58,17 +57,18 @@ class Hand:
         self._sways, self._axes = sways, rotations_of(np.radians([[0.0, 0.0, angle_deg]]))[0]
 
     def poses(self, times_s: FloatArray) -> FloatArray:  # [F] -> [F, 4, 4] mm
-        sways, along_mm = self._at(self._sways, times_s), self._at(self._along_mm[:, None], times_s)[:, 0]
+        sways, along_mm = self.at(self._sways, times_s), self.at(self._along_mm[:, None], times_s)[:, 0]
         poses = np.tile(np.eye(4), (len(times_s), 1, 1))
         poses[:, :3, :3] = self._axes @ rotations_of(np.radians(sways[:, 3:]))
         poses[:, :3, 3] = (sways[:, :3] + along_mm[:, None] * (0.0, 1.0, 0.0)) @ self._axes.T
         return poses
 
-    def quick_sways_mm(self, times_s: FloatArray) -> FloatArray:  # [F] -> [F, 3]
-        """Along the axes of the probe: what tissue follows, since it slips back under slower motion."""
-        return self._at(self._sways[:, :3] - _smoothed(self._sways[:, :3], TISSUE_S), times_s)
+    def dragging_mm(self, times_s: FloatArray) -> FloatArray:  # [F] -> [F, 3]
+        """The sways along the axes of the probe that drag the tissue, which slips back under slower ones."""
+        return self.at(self._sways[:, :3] - _smoothed(self._sways[:, :3], TISSUE_S), times_s)
 
-    def _at(self, values: FloatArray, times_s: FloatArray) -> FloatArray:  # [T, K], [F] -> [F, K]
+    def at(self, values: FloatArray, times_s: FloatArray) -> FloatArray:  # [T, K], [F] -> [F, K]
+        """What changes with the hand's `seconds`, at other times."""
         return np.stack([np.interp(times_s, self.seconds, column) for column in values.T], axis=1)
 
 
@@ -104,11 +104,10 @@ class HandSweep:
         return cls(hands, count, poses, simulate(poses, probe=PROBE, height=HEIGHT, width=WIDTH))
 
     def recorded(self, errors: Errors, seed: int = 1) -> Dataset:
-        """As a tracker records it, with these errors: every second frame held out, and a band in the middle of each
-        pass."""
+        """As a tracker records it, with these errors: every second frame held out."""
         images = self.images
         if errors.tissue:
-            sways = np.concatenate([hand.quick_sways_mm(_times_s(self.count)) for hand in self.hands])
+            sways = np.concatenate([hand.dragging_mm(_times_s(self.count)) for hand in self.hands])
             images = np.stack([_dragged(*pair) for pair in zip(images, errors.tissue * sways, strict=True)])
         return self._dataset(images, self._tracked(errors, np.random.default_rng(seed)))
 
@@ -116,7 +115,7 @@ class HandSweep:
         times_s = _times_s(self.count) + errors.delay_ms / 1000.0
         passes = []
         for hand in self.hands:
-            wander = hand._at(_smooth_noise(random, len(hand.seconds), 1.0), times_s)
+            wander = hand.at(_smooth_noise(random, len(hand.seconds), 1.0), times_s)
             noise = random.normal(size=(self.count, 6))
             sizes = [(errors.noise_mm, errors.noise_deg), (errors.wander_mm, errors.wander_deg)]
             found = sum(part * ([mm] * 3 + [deg] * 3) for part, (mm, deg) in zip((noise, wander), sizes, strict=True))

@@ -20,7 +20,14 @@ from ultragray.learn.report.tables import LABELS, Row, by_mean_rank, metric_rows
 from ultragray.learn.sweep import Dataset, Distances
 from ultragray_studies.comparison.result import RESULT_FILE, Comparison, MethodResult
 from ultragray_studies.comparison.run import frames_of
-from ultragray_studies.comparison.tables import budget_text, cost_texts, latex_table, steps_text
+from ultragray_studies.comparison.tables import (
+    PATH_HEADING,
+    budget_text,
+    cost_texts,
+    latex_table,
+    path_texts,
+    steps_text,
+)
 from ultragray_studies.methods.gaussians import SceneMethod
 
 DISTANCE_BINS, LEAST_IN_BIN = 8, 3  # frames in fewer bins where there are not many
@@ -99,7 +106,10 @@ def render_comparison(comparison: Comparison, dataset: Dataset, folder: Path) ->
     evaluations = {titles[name]: comparison.measured[name] for name in by_mean_rank(comparison.measured)}
     scene, ranks = titles.get(SceneMethod.name), rank(evaluations)
     scene_first = {title: evaluations[title] for title in sorted(evaluations, key=lambda title: title != scene)}
-    notes = {title: [f"{ranks[title].mean:.2f}", *cost_texts(by_title[title])] for title in evaluations}
+    notes = {
+        title: [*path_texts(comparison, by_title[title]), f"{ranks[title].mean:.2f}", *cost_texts(by_title[title])]
+        for title in evaluations
+    }
     failed = [Row(title, failure=one.failure) for title, one in by_title.items() if one.failure is not None]
 
     def with_anchors(rows: list[Row]) -> list[Row]:
@@ -107,6 +117,7 @@ def render_comparison(comparison: Comparison, dataset: Dataset, folder: Path) ->
 
     values = {
         "comparison": comparison,
+        "path_headings": [PATH_HEADING] if comparison.has_path else [],
         "facts": _facts(comparison),
         "rows": with_anchors([*metric_rows(evaluations, notes), *failed]),
         "ranks": with_anchors(rank_rows(evaluations)),

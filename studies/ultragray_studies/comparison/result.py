@@ -32,6 +32,7 @@ class MethodResult:
     cost: Cost = NO_COST
     frame_ms: float = 0.0  # of one held-out frame rendered alone, the median of some
     evaluation: Evaluation | None = None
+    on_path: FrameMetrics | None = None  # the means on the path that neighbours agree with; None: not measured there
     failure: str | None = None
 
     @property
@@ -50,6 +51,7 @@ class MethodResult:
             **asdict(self.cost),
             "frame_ms": self.frame_ms,
             "evaluation": found and {**found.to_dict(), "frame_speckle": [asdict(one) for one in found.frame_speckle]},
+            "on_path": self.on_path and self.on_path.to_dict(),
             "failure": self.failure,
         }
 
@@ -70,11 +72,13 @@ class MethodResult:
                 found["ms_ssim_scales"],
                 _SPECKLE.validate_python(found["frame_speckle"]),
             ),
+            on_path=None if document.get("on_path") is None else _MEAN.validate_python(document["on_path"]),
             failure=document["failure"],
         )
 
 
 _DESCRIPTION, _COST = TypeAdapter(Description), TypeAdapter(Cost)
+_MEAN = TypeAdapter(FrameMetrics)
 _METRICS, _SPECKLE = TypeAdapter(list[FrameMetrics]), TypeAdapter(list[FrameSpeckle])
 
 
@@ -95,6 +99,11 @@ class Comparison:
     def measured(self) -> dict[str, Evaluation]:
         """The scores of those that did not fail, by name."""
         return {one.name: one.evaluation for one in self.results if one.evaluation is not None}
+
+    @property
+    def has_path(self) -> bool:
+        """Whether some were measured on the path that neighbouring frames agree with, too."""
+        return any(one.on_path is not None for one in self.results)
 
     @property
     def failures(self) -> dict[str, str]:

@@ -15,7 +15,7 @@ import json
 import os
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -29,6 +29,7 @@ from ultragray.learn.evaluation.methods import BudgetKind, ComparisonSettings
 from ultragray.learn.evaluation.scoring import evaluate_frames, require_frames
 from ultragray.learn.report.tables import DatasetFacts
 from ultragray.learn.sweep import ByteArray, Dataset, Distances, Sweep, spread_places
+from ultragray.learn.training.agreement import agreed_path
 from ultragray.learn.training.memory import machine_in_words, training_device
 from ultragray.rendering.pixels import to_uint8
 from ultragray_studies.comparison.result import FORMAT_VERSION, Comparison, MethodResult
@@ -138,6 +139,8 @@ def compare_methods(
         if SCENE in methods or seconds is None:
             methods = {SCENE: SceneMethod(), **methods}
     results = []
+    path = agreed_path(dataset)
+    placed = dataset if path is None else path.of(dataset)
     for number, (name, method) in enumerate(methods.items(), 1):
         if should_stop():
             return None
@@ -152,7 +155,7 @@ def compare_methods(
             follow(None)
             own_s = seconds if seconds is None or name == SCENE else seconds * settings.times
             run = FitRun(folder / name, device, settings.seed, follow, should_stop)
-            result = _measured(name, method, dataset, Budget(kind, own_s, paces), run, place)
+            result = _measured(name, method, dataset, placed, Budget(kind, own_s, paces), run, place)
         if result is None:
             return None
         if needs_time and name == SCENE and result.failure is None and seconds is None:
@@ -190,9 +193,11 @@ def _learns_within_a_time(method: Method) -> bool:
 
 
 def _measured(
-    name: str, method: Method, dataset: Dataset, budget: Budget, run: FitRun, place: Place
+    name: str, method: Method, dataset: Dataset, placed: Dataset, budget: Budget, run: FitRun, place: Place
 ) -> MethodResult | None:
     """The row of a method, which is fitted unless it has one already; None where it was told to stop.
+
+    `placed` is the dataset on the path that neighbouring frames agree with, itself where that is as tracked.
 
     A failure is a row too, but is not kept: the same comparison tries the method again.
     """
@@ -204,6 +209,9 @@ def _measured(
         if fitted is None:
             return None
         result, frames = measure(name, method, fitted, dataset.val, machine_in_words(run.device))
+        on_path = method.predict_on_path(dataset, placed, fitted) if placed is not dataset else None
+        if on_path is not None:
+            result = replace(result, on_path=evaluate_frames(on_path, dataset.val).mean)
     except UltragrayError as error:
         return _failed(name, method, run.device, str(error))
     except (MemoryError, RuntimeError) as error:  # of memory on the CPU torch raises a plain RuntimeError

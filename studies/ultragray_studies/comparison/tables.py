@@ -3,10 +3,17 @@
 from __future__ import annotations
 
 from ultragray.learn.evaluation.methods import BudgetKind
-from ultragray.learn.report.tables import METRICS, by_mean_rank, metric_rows, rank
+from ultragray.learn.report.tables import METRICS, by_mean_rank, metric_rows, rank, shown_value
 from ultragray_studies.comparison.result import Comparison, MethodResult
 
+PATH_HEADING = "on the path, dB"
 COST_HEADINGS = ("steps", "training", "ms a frame", "MB")
+
+
+def path_texts(comparison: Comparison, result: MethodResult) -> list[str]:
+    """The PSNR on the path that neighbours agree with: one text where the comparison has it of some method."""
+    found = result.on_path
+    return ["–" if found is None else shown_value("psnr_db", found.psnr_db)] if comparison.has_path else []
 
 
 def cost_texts(result: MethodResult) -> list[str]:
@@ -69,7 +76,8 @@ def latex_table(comparison: Comparison) -> str:
     """A `table` environment: best mean rank first, the best of each column bold, failures at the end."""
     by_name = {one.name: one for one in comparison.results}
     ranks, facts = rank(comparison.measured), comparison.dataset
-    headings = ["method", *(metric.heading for metric in METRICS), "mean rank", *COST_HEADINGS]
+    path_heading = [PATH_HEADING] if comparison.has_path else []
+    headings = ["method", *(metric.heading for metric in METRICS), *path_heading, "mean rank", *COST_HEADINGS]
     caption = (
         f"{facts.name}: mean ± standard deviation over {facts.val_frames} held-out frames; "
         f"budget: {budget_text(comparison)}; {comparison.machine}."
@@ -82,7 +90,7 @@ def latex_table(comparison: Comparison) -> str:
     for row in metric_rows({name: comparison.measured[name] for name in by_mean_rank(comparison.measured)}):
         one = by_name[row.name]
         cells = [rf"\textbf{{{escaped(text)}}}" if best else escaped(text) for text, best in row.cells]
-        notes = [f"{ranks[row.name].mean:.2f}", *cost_texts(one)]
+        notes = [*path_texts(comparison, one), f"{ranks[row.name].mean:.2f}", *cost_texts(one)]
         lines.append(line(escaped(one.title), *cells, *map(escaped, notes)))
     for name, failure in comparison.failures.items():
         reason = rf"\multicolumn{{{len(headings) - 1}}}{{l}}{{failed: {escaped(failure)}}}"

@@ -50,6 +50,9 @@ class Compounding(Method):
         size = volume.values.numel() * (volume.values.element_size() + 1)
         return _Compounded(volume, Cost(time.perf_counter() - began_s, 0, None, size))
 
+    def predict_on_path(self, dataset: Dataset, placed: Dataset, fitted: Fitted) -> FrameArray:
+        return self.fit(placed, Budget.author()).predict(placed.val)
+
 
 @dataclass(frozen=True, eq=False)
 class _Compounded(Fitted):
@@ -76,6 +79,9 @@ class FromFrames(Method):
 
     def fit(self, dataset: Dataset, budget: Budget, run: FitRun | None = None) -> _Frames:
         return _Frames(dataset.train, self.name, Cost(0.0, 0, None, dataset.train.images.nbytes))
+
+    def predict_on_path(self, dataset: Dataset, placed: Dataset, fitted: Fitted) -> FrameArray:
+        return predict(placed.train, placed.val.poses, self.name)
 
 
 @dataclass(frozen=True, eq=False)

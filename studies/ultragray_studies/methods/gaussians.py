@@ -16,6 +16,7 @@ from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import Progress, TrainingConfig, train
 from ultragray.learn.training.checkpointing import read_checkpoint_header
 from ultragray.learn.training.memory import training_device
+from ultragray.learn.training.poses import held_out_on_path
 from ultragray.learn.training.trainer import CHECKPOINT_FILE
 from ultragray.rendering.frames import render
 from ultragray.scene.gaussians import GaussianScene
@@ -92,6 +93,11 @@ class SceneMethod(Method):
         scene.save(folder / SCENE_FILE)
         (folder / CHECKPOINT_FILE).unlink(missing_ok=True)
         return self._fitted(scene, folder, run.device)
+
+    def predict_on_path(self, dataset: Dataset, placed: Dataset, fitted: Fitted) -> FrameArray | None:
+        assert isinstance(fitted, SceneFit)
+        held_out = held_out_on_path(dataset, fitted.scene.info)
+        return None if held_out is None else fitted.predict(held_out)
 
     def _fitted(self, scene: GaussianScene, folder: Path, device: str) -> SceneFit:
         seconds = float(json.loads((folder / SECONDS_FILE).read_text(encoding="utf-8")))

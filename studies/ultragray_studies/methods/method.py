@@ -213,3 +213,10 @@ class Method(ABC):
 
         Raises DatasetInvalid, MemoryExceeded, TrainingDiverged, TrainingStateInvalid for a folder of another fit.
         """
+
+    def predict_on_path(self, dataset: Dataset, placed: Dataset, fitted: Fitted) -> FrameArray | None:
+        """The held-out frames that it expects where all frames lie on the path that neighbours agree with (`placed`).
+
+        None where it has learned from the poses of the dataset.
+        """
+        return None

@@ -246,6 +246,8 @@ class _Crossing(NamedTuple):
 class _Match:
     """The search for the motion of one side, `moving`, that makes it agree with the other, which stays."""
 
+    _least_correlation = -1.0
+
     def __init__(self, moving: Sweep, placed: Sweep) -> None:
         self._probe, self._sweeps = moving.probe, (moving, placed)
         rng = np.random.default_rng(0)
@@ -259,14 +261,15 @@ class _Match:
 
     def climb(self, levels: Sequence[Level] = LEVELS) -> FloatArray | None:  # [4, 4]
         """The motion of the best correlation; None where the sides do not meet as they are, or little is gained."""
-        here, gain = np.zeros(_OVERLAP_NUMBERS), 0.0
+        here, reached, gain = np.zeros(_OVERLAP_NUMBERS), 0.0, 0.0
         if not _has_enough(self._crossings(here)):
             return None  # any agreement found elsewhere would be chance
         for level in levels:
             correlation = partial(self._correlation, [_detail(sweep, *level.pixels) for sweep in self._sweeps])
             here = _climbed(correlation, here, level)
-            gain = correlation(here) - correlation(np.zeros(_OVERLAP_NUMBERS))
-        return self._motion(here) if gain >= LEAST_GAIN else None
+            reached = correlation(here)
+            gain = reached - correlation(np.zeros(_OVERLAP_NUMBERS))
+        return self._motion(here) if gain >= LEAST_GAIN and reached >= self._least_correlation else None
 
     def _motion(self, numbers: FloatArray) -> FloatArray:  # [6] degrees, mm -> [4, 4]
         motion = np.eye(4)
@@ -315,6 +318,7 @@ class _Match:
 
 CALIBRATION_LEVELS = (Level((2.0, 10.0), (1.0, 0.5)), Level((0.0, 5.0), (0.5, 0.25, 0.125)))
 CALIBRATION_PRIOR = 1e-3  # of the correlation, for each mm² and degree²
+LEAST_CORRELATION = 0.5  # with the right one; less is left over where something else is wrong
 LEAST_CROSSING_DEG = 20.0  # sweeps that are turned less against each other hardly tell
 
 
@@ -335,6 +339,8 @@ def found_calibration(sweep: Sweep, ranges: Sequence[range]) -> FloatArray:  # [
 
 class _CalibrationMatch(_Match):
     """The search for the motion of the images in the frame of their probe that makes two sides agree."""
+
+    _least_correlation = LEAST_CORRELATION
 
     def _motion(self, numbers: FloatArray) -> FloatArray:  # [6] degrees, mm -> [4, 4]
         """About the middle of the image, and along its axes."""

@@ -17,7 +17,7 @@ from ultragray.geometry.rotations import blended
 
 STEPS = (1.0, 0.5, 0.25, 0.125)  # of the usual time from one frame to the next
 MOST_S = 0.5
-LEAST_GAIN_DB = 0.01
+LEAST_GAIN_DB = 0.03  # tissue that goes along feigns a delay that gains 0.01
 LEAST_STEPS = 0.2  # a delay of a smaller share of the usual time is none
 
 
