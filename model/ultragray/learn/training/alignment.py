@@ -22,10 +22,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from ultragray.geometry.pose import mean_axes
 from ultragray.geometry.probe import FloatArray
 from ultragray.geometry.rotations import rotations_of, turns_of
 from ultragray.geometry.scan_conversion import FloatImage, interpolated_frames, pixel_places
-from ultragray.learn.sweep import IntArray, Sweep, corner_distances_mm, mean_axes, spread_places
+from ultragray.learn.sweep import IntArray, Sweep, corner_distances_mm, spread_places
 
 
 def likelihood_terms(bends: FloatArray, ratios: FloatArray) -> tuple[FloatArray, FloatArray]:
