@@ -30,7 +30,7 @@ FRAMES ?= 100000
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-notebooks test-console test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results methods ablations poses hand localization confidence environment ros figures demo-scene docs generate packages clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-notebooks test-console test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results methods ablations poses hand localization confidence speckle environment ros figures demo-scene docs generate packages clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -206,6 +206,12 @@ confidence: $(VENV)/installed-dev  ## how true confidence and uncertainty are, s
 	$(BIN)/python benchmarks/confidence.py $(DATA) $(ARGS)
 	@$(BIN)/python benchmarks/figures.py show confidence
 	$(KEEP) confidence
+
+speckle: $(VENV)/installed-dev  ## how true natural speckle is, scene by scene, and what it costs; trains first, half an hour
+	$(READY)
+	$(BIN)/python benchmarks/speckle.py $(DATA) $(ARGS)
+	@$(BIN)/python benchmarks/figures.py show speckle
+	$(KEEP) speckle
 
 environment: $(VENV)/installed-dev  ## steps a second of the gymnasium environment with a random policy
 	$(READY)

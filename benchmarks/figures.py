@@ -30,6 +30,7 @@ import measuring
 import methods_tables
 import poses
 import results_tables
+import speckle
 from measuring import Document, Lines, columns, described, heads, kept, read, staged, table
 from ultragray.files import write_whole
 from ultragray_studies.bench.report import DIRTY, changed_sources, commit
@@ -44,7 +45,10 @@ TARGETS = {
     **dict.fromkeys(("cuda", "cuda_training"), "bench-cuda"),
     "results_tables": "results",
     "methods_tables": "methods",
-    **{name: name for name in ("ablations", "poses", "hand", "localization", "confidence", "environment", "ros")},
+    **{
+        name: name
+        for name in ("ablations", "poses", "hand", "localization", "confidence", "speckle", "environment", "ros")
+    },
     "shards": "test-shards",
     **{f"{name}-run": f"test-{name}" for name in ("long", "soak", "replicas", "overload")},
 }
@@ -314,6 +318,9 @@ BLOCKS = {
     "scenes of a hand": Block("hand", hand.trained, hand.of_scenes),
     "localization": Block("localization", localization.found_frames),
     "confidence": Block("confidence", confidence.confidence_and_uncertainty),
+    "speckle": Block("speckle", speckle.textures),
+    "decorrelation": Block("speckle", speckle.decorrelations),
+    "cost of speckle": Block("speckle", speckle.costs),
 }
 
 

@@ -47,7 +47,7 @@ from ultragray.phantom.demo import DEMO_FILE
 from ultragray.rendering.display import Display
 from ultragray.rendering.frames import show
 from ultragray.rendering.pixels import to_uint8
-from ultragray.rendering.settings import Contact, Encoding, FrameSettings
+from ultragray.rendering.settings import Contact, Encoding, FrameSettings, Speckle
 from ultragray.rendering.tools import DEFAULT_LABEL, Box, Cylinder, Needle, Tool, ToolFrame
 from ultragray.rendering.volume_fields import sample_slice
 from ultragray.rendering.volumes import VOLUME_FIELDS, VolumeGrid
@@ -75,6 +75,7 @@ def main() -> None:
     draw_confidence(scene, IMAGES / "confidence_off_the_sweep.png")
     draw_augmentation(scene, IMAGES / "augmentation.png")
     draw_contact(scene, IMAGES / "contact.png")
+    draw_speckle(scene, IMAGES / "speckle.png")
     draw_tools(scene, IMAGES / "tools.png")
     draw_standard_plane(scene, IMAGES / "standard_plane.png")
     draw_slices(scene, IMAGES / "volume_slices.png")
@@ -202,6 +203,21 @@ def draw_contact(scene: GaussianScene, path: Path) -> None:
             panel.imshow(image, cmap="gray", vmin=0.0, vmax=1.0, extent=EXTENT_MM)
             told = caption if frames.touch is None else f"contact {frames.touch.shares[column]:.0%}"
             panel.set_title(told, fontsize=8)
+    save(figure, path)
+
+
+def draw_speckle(scene: GaussianScene, path: Path) -> None:
+    """A frame of a sweep that the scene was not trained from: true, rendered, and rendered with natural speckle."""
+    pose = freehand_poses(24, tilt_deg=5.0, offset_mm=1.0, unrest=3.0)[9]
+    true = simulate(pose[None], probe=PHANTOM_PROBE, height=SIDE, width=SIDE)[0] / 255.0
+    asked: dict[str, Any] = {"height": SIDE, "width": SIDE, "outputs": ("bmode",)}
+    frames = [render(scene, None, pose, **asked, speckle=one)["bmode"][0].numpy() for one in Speckle]
+    figure, panels = panel_row(rows=1, columns=3)
+    titles = ("true frame, held out", "rendered", "rendered, natural speckle")
+    for panel, title, frame in zip(panels, titles, (true, *frames), strict=True):
+        panel.imshow(frame, cmap="gray", vmin=0.0, vmax=1.0, interpolation="nearest")
+        panel.set_title(title)
+    figure.set_size_inches(10.0, 3.6)
     save(figure, path)
 
 

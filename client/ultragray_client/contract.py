@@ -44,6 +44,7 @@ __all__ = [
     "Shaft",
     "SliceSettings",
     "Specification",
+    "Speckle",
     "SplineSampler",
     "SteeredProbe",
     "Tool",
@@ -181,6 +182,13 @@ class Needle(Shaft):
 Tool: TypeAlias = Box | Cylinder | Needle
 
 
+class Speckle(str, Enum):
+    """The speckle of a frame (`ultragray.rendering.speckle`)."""
+
+    OFF = "off"
+    NATURAL = "natural"
+
+
 @dataclass(frozen=True)
 class Display:
     """Settings of a display. The defaults show frames as they are.
@@ -216,6 +224,9 @@ class FrameSettings:
     # Second echo: share of what is heard beyond the first strong interface that is the mirror image of what lies
     # before it. Default: 0.
     ghost: float | None = None
+    # natural: bmode has the speckle that scatterers in the tissue give a scanner's frames. Other outputs are as
+    # without.
+    speckle: Speckle = Speckle.OFF
     display: Display | None = None  # Gain, depth, scan conversion ...; default: as rendered.
     # Some of bmode, echo, transmittance, coverage, attenuation, labels, uncertainty.
     outputs: tuple[str, ...] = ("bmode",)
@@ -251,6 +262,7 @@ class Additions:
     contact: Contact | None = None  # As used; null: it was assumed.
     tools: tuple[Tool, ...] = ()  # As used.
     ghost: float = 0.0  # As used; 0: none.
+    speckle: Speckle = Speckle.OFF  # As used.
     registration: str | None = None  # That led the pose into the scene; null: none, it was sent as it is.
 
 

@@ -69,6 +69,7 @@ class Scene:
     label_names: Mapping[int, str]  # what the values of the output labels mean
     beam: ElevationBeam | None  # of the frames it was trained on; None: they are taken for planes
     confidence: ConfidenceFit | None  # None: it cannot tell the confidence of its frames
+    speckle: bool  # whether its frames can have natural speckle
     owner: str | None  # None: nobody
     private: bool  # others do not see it
 

@@ -11,6 +11,7 @@
 
 #include "loss.hpp"
 #include "render.hpp"
+#include "speckle.hpp"
 
 namespace nb = nanobind;
 using namespace ultragray;
@@ -29,6 +30,8 @@ using OptionalPlanes = std::optional<FreePlanes>;
 using Flag = nb::ndarray<const int64_t, nb::shape<1>, nb::c_contig, nb::device::cpu>;
 using BeamNumbers = std::array<double, 4>;  // of a Beam
 using FreeBeam = nb::ndarray<double, nb::shape<3>, nb::c_contig, nb::device::cpu>;
+using Cells = nb::ndarray<const int32_t, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
+using Offsets = nb::ndarray<const int32_t, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
 using FreeCounts = nb::ndarray<int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
 // B, E, T, coverage, S and the sum of I*w, each [C, H, W] or null.
@@ -217,6 +220,66 @@ NB_MODULE(_cpu, m) {
         },
         nb::arg("x").noconvert(), nb::arg("y").noconvert(), nb::arg("gradient").noconvert(), nb::arg("texture"),
         nb::arg("threads"), nb::arg("instruction_set"));
+
+    m.def(
+        "add_speckle",
+        [](ImageBatch bmode, FreePlanes out, bool alone, Matrix row_weights, ImageBatch column_weights, Matrix plane_weights,
+           Vector strength, uint32_t seed, float first_look, float floor, float mean, float scale, int row_step,
+           Cells starts, Cells steps, Offsets beside, Matrix plane_phases, ImageBatch column_phases, int threads,
+           const std::string& instruction_set) {
+            const size_t count = out.shape(0), height = out.shape(1), width = out.shape(2), columns = starts.shape(2);
+            const size_t rows = plane_weights.shape(0), taps = row_weights.shape(1), wide = column_weights.shape(2);
+            const size_t column_step = column_weights.shape(1);
+            for (size_t d = 0; d < 3; ++d)
+                if (bmode.shape(d) != out.shape(d) || steps.shape(d) != starts.shape(d))
+                    throw std::invalid_argument("the shapes of frames or of places do not agree");
+            if (row_weights.shape(0) != height || column_weights.shape(0) != height || plane_weights.shape(1) != 2 ||
+                strength.shape(0) != size_t(kSpeckleLevels) || starts.shape(0) != count || starts.shape(1) != 3 ||
+                beside.shape(0) != count || plane_phases.shape(0) != count || plane_phases.shape(1) != 2 ||
+                column_phases.shape(0) != count || column_phases.shape(1) != 2 || column_phases.shape(2) != columns)
+                throw std::invalid_argument("the shapes of the speckle do not agree");
+            if (columns % kMaxLanes || taps > size_t(kSpeckleTaps) || wide > size_t(kSpeckleTaps) || row_step < 1 ||
+                column_step < 1 || height < 1 || width < 1 || (height - 1) / row_step + taps > rows ||
+                (width - 1) / column_step + wide > columns)
+                throw std::invalid_argument("the samples of speckle do not reach to the borders of the frame");
+            const SpeckleGrid grid{int(height),
+                                   int(width),
+                                   int(rows),
+                                   int(columns),
+                                   row_step,
+                                   int(column_step),
+                                   int(taps),
+                                   int(wide),
+                                   row_weights.data(),
+                                   column_weights.data(),
+                                   plane_weights.data(),
+                                   strength.data(),
+                                   seed,
+                                   first_look,
+                                   floor,
+                                   mean,
+                                   scale};
+            std::vector<SpeckleView> views;
+            for (size_t k = 0; k < count; ++k) {
+                const int32_t* off = beside.data() + 3 * k;
+                const float* phase = plane_phases.data() + 2 * k;
+                views.push_back({starts.data() + 3 * columns * k,
+                                 steps.data() + 3 * columns * k,
+                                 {uint32_t(off[0]), uint32_t(off[1]), uint32_t(off[2])},
+                                 phase[0],
+                                 phase[1],
+                                 column_phases.data() + 2 * columns * k});
+            }
+            nb::gil_scoped_release release;
+            add_speckle(grid, views.data(), int(count), threads, instruction_set, alone ? nullptr : bmode.data(),
+                        out.data());
+        },
+        nb::arg("bmode").noconvert(), nb::arg("out").noconvert(), nb::arg("alone"), nb::arg("row_weights").noconvert(),
+        nb::arg("column_weights").noconvert(), nb::arg("plane_weights").noconvert(), nb::arg("strength").noconvert(),
+        nb::arg("seed"), nb::arg("first_look"), nb::arg("floor"), nb::arg("mean"), nb::arg("scale"), nb::arg("row_step"),
+        nb::arg("starts").noconvert(), nb::arg("steps").noconvert(), nb::arg("beside").noconvert(),
+        nb::arg("plane_phases").noconvert(), nb::arg("column_phases").noconvert(), nb::arg("threads"),
+        nb::arg("instruction_set"));
 
     m.def("instruction_sets", &instruction_sets);
 }

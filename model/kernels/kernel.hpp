@@ -159,6 +159,39 @@ inline int64_t loss_scratch(int height, int width) {
     return (int64_t(height) + 10 + 1) * 5 * loss_stride(width) + kMaxLanes;
 }
 
+inline constexpr int kSpeckleLevels = 9;  // grey levels of which the strength is known, from 0 to 1
+inline constexpr int kSpeckleTaps = 64;   // the most weights along a column, and along a row
+
+// What the speckle of frames of one size has in common. Samples lie at every `row_step`-th row and `column_step`-th scan
+// line, and on either side of the image: row i is the sum of samples i / row_step … of `row_taps` weights, scan lines
+// likewise.
+struct SpeckleGrid {
+    // `columns` is a multiple of kMaxLanes.
+    int height, width, rows, columns, row_step, column_step, row_taps, column_taps;
+    const float* row_weights;     // [H, row_taps]
+    const float* column_weights;  // [H, column_step, column_taps]
+    const float* plane_weights;   // [rows, 2]: the plane in the middle of the slice, and those beside it
+    const float* strength;        // [kSpeckleLevels]
+    uint32_t seed;
+    float first_look;          // share of the power
+    float floor, mean, scale;  // speckle is (log2(power + floor) - mean) * scale
+};
+
+// One pose: places of samples in cells of tissue, with 16 bits after the point.
+struct SpeckleView {
+    const int32_t* starts;           // [3, columns] of the first row
+    const int32_t* steps;            // [3, columns] from row to row
+    uint32_t beside[3];              // from plane to plane
+    float plane_cosine, plane_sine;  // phase from plane to plane
+    const float* column_phases;      // [2, columns] cosine and sine
+};
+
+// Floats that speckle needs as scratch, and the length of its rows.
+inline int speckle_stride(const SpeckleGrid& grid) { return grid.columns + kMaxLanes; }
+inline int64_t speckle_scratch(const SpeckleGrid& grid) {
+    return (int64_t(grid.row_taps) * 4 + 4 + 2 * grid.column_step) * speckle_stride(grid) + kMaxLanes;
+}
+
 // What each instruction set provides.
 struct Kernels {
     const char* name;
@@ -175,6 +208,8 @@ struct Kernels {
     // Writes `by_l1` times the gradient of sum |x - y| plus `by_ssim` times that of the sum of SSIM; `window` sums to 1.
     ImageLoss (*image_loss)(const float* x, const float* y, int height, int width, const float* window, float* scratch,
                             float by_l1, float by_ssim, float* gradient);
+    void (*speckle)(const SpeckleGrid&, const SpeckleView&, int first, int last, const float* bmode, float* scratch,
+                    float* out);
 };
 
 // The kernels of an instruction set that this processor can run; "auto" takes the best. Throws std::invalid_argument.

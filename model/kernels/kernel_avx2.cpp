@@ -8,11 +8,13 @@ using namespace ultragray;
 #include "gather.inl"
 #include "loss.inl"
 #include "slice.inl"
+#include "speckle.inl"
 
 namespace ultragray {
 
 const Kernels& kernels_avx2() {
-    static constexpr Kernels kernels{"avx2", slice_clusters, draw, count_work, finish, differentiate, gather, image_loss};
+    static constexpr Kernels kernels{"avx2",        slice_clusters, draw,       count_work, finish,
+                                     differentiate, gather,         image_loss, speckle};
     return kernels;
 }
 

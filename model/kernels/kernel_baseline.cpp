@@ -8,12 +8,13 @@ using namespace ultragray;
 #include "gather.inl"
 #include "loss.inl"
 #include "slice.inl"
+#include "speckle.inl"
 
 namespace ultragray {
 
 const Kernels& kernels_baseline() {
-    static constexpr Kernels kernels{"baseline", slice_clusters, draw,   count_work,
-                                     finish,     differentiate,  gather, image_loss};
+    static constexpr Kernels kernels{"baseline",    slice_clusters, draw,       count_work, finish,
+                                     differentiate, gather,         image_loss, speckle};
     return kernels;
 }
 

@@ -14,6 +14,7 @@ from typing import TypeVar
 import numpy as np
 
 from ultragray.errors import UltragrayError
+from ultragray.geometry.pose import mean_axes
 from ultragray.geometry.probe import FloatArray
 from ultragray.geometry.rotations import turns_of
 from ultragray.learn.evaluation.baselines import FOLDS as VOLUME_METHODS
@@ -22,7 +23,7 @@ from ultragray.learn.evaluation.metrics import FrameMetrics
 from ultragray.learn.evaluation.scoring import Evaluation, evaluate, require_frames
 from ultragray.learn.report.page import Prediction, ScenePage, render_page
 from ultragray.learn.report.tables import Row, metric_rows
-from ultragray.learn.sweep import Dataset, Distances, IntArray, Sweep, mean_axes
+from ultragray.learn.sweep import Dataset, Distances, IntArray, Sweep
 from ultragray.learn.training import Progress, TrainingConfig, train
 from ultragray.learn.training.progress import Course
 from ultragray.scene.gaussians import GaussianScene

@@ -182,7 +182,11 @@ def test_members_of_a_family_by_themselves():
 
 def test_defaults_are_left_out():
     assert to_message(RenderSettings(), rendering_pb2.RenderSettings, scene="a") == rendering_pb2.RenderSettings(
-        scene="a", outputs=["OUTPUT_BMODE"], encoding="ENCODING_UINT8", below_min_confidence="BELOW_CONFIDENCE_REFUSE"
+        scene="a",
+        outputs=["OUTPUT_BMODE"],
+        encoding="ENCODING_UINT8",
+        below_min_confidence="BELOW_CONFIDENCE_REFUSE",
+        speckle="SPECKLE_OFF",
     )
     assert from_message(rendering_pb2.RenderSettings(scene="a"), RenderSettings) == RenderSettings()
 

@@ -32,6 +32,7 @@ from ultragray.rendering.display import Display
 from ultragray.rendering.frames import show
 from ultragray.rendering.settings import Contact, RenderSettings
 from ultragray.rendering.tools import MAX_TOOLS, Box, Cylinder, Needle
+from ultragray.scene.speckle import BANDS, LEVELS, SpeckleModel
 from ultragray_proto.codec import to_message
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc, scenes_pb2, scenes_pb2_grpc
 from ultragray_service.igtl.contents import unpack_image
@@ -63,6 +64,14 @@ PROBES = (
     RadialProbe(near_mm=1.0, far_mm=30.0),
     SteeredProbe(40.0, 25.0, near_mm=0.0, far_mm=40.0),
 )
+SPECKLE = SpeckleModel(
+    seed=3,
+    axial_mm=(0.8,) * BANDS,
+    lateral_mm=(1.0,) * BANDS,
+    elevation_mm=(1.0,) * BANDS,
+    cell_mm=(2.0, 1.3, 1.6),
+    strength=(0.1,) * LEVELS,
+)
 DISPLAY = Display(gain_db=6.0, dynamic_range_db=50.0, tgc_db=(0.0, 3.0), depth_mm=25.0, flip=True, pixel_mm=0.9)
 RAW, NPZ = {"Accept": "application/octet-stream"}, {"Accept": "application/x-npz"}
 
@@ -75,6 +84,7 @@ CASES = {
     "a thick slice": ({"slice_thickness_mm": 6.0}, {"beam": replace(BEAM, thickness_mm=6.0)}),
     "tools": ({"tools": to_dict(TOOLS)}, {"tools": TOOLS}),
     "a needle and a ghost": ({"tools": to_dict((NEEDLE,)), "ghost": 0.5}, {"tools": (NEEDLE,), "ghost": 0.5}),
+    "natural speckle": ({"speckle": "natural"}, {"speckle": "natural"}),
     "labels": ({"outputs": ["labels", "bmode"], "tools": to_dict(TOOLS)}, {"tools": TOOLS}),
     "display": ({"probe": to_dict(FAN), "display": to_dict(DISPLAY)}, {"probe": FAN, "display": DISPLAY}),
     **{one.kind: ({"probe": to_dict(one)}, {"probe": one}) for one in PROBES},
@@ -86,7 +96,7 @@ EACH = pytest.mark.parametrize("name", CASES)
 def scene():
     plain = make_scene(probe=DEMO_PROBE)
     labels = torch.tensor([0, 1, 200, 200], dtype=torch.uint8).repeat(100)
-    info = SceneInfo(centre_mm=plain.info.centre_mm, probe=DEMO_PROBE, beam=BEAM, label_names=NAMES)
+    info = SceneInfo(centre_mm=plain.info.centre_mm, probe=DEMO_PROBE, beam=BEAM, label_names=NAMES, speckle=SPECKLE)
     return GaussianScene.from_splats(plain.splats, info=info, labels=labels, training_poses=plain.training_poses)
 
 
@@ -137,6 +147,7 @@ def told(headers):
         "contact": headers.get("X-Ultragray-Contact"),
         "tools": json.loads(headers.get("X-Ultragray-Tools", "[]")),
         "ghost": float(headers.get("X-Ultragray-Ghost", 0.0)),
+        "speckle": headers.get("X-Ultragray-Speckle", "off"),
         "dtype": headers["X-Ultragray-Dtype"],
         "outputs": headers["X-Ultragray-Outputs"].split(","),
     }
@@ -183,7 +194,7 @@ def test_the_other_doors_give_the_same(served, renders, scene, name):
     frame = renders.Render(rendering_pb2.RenderRequest(settings=message_of(asked), pose=pose_message()), timeout=120)
     np.testing.assert_allclose(np.frombuffer(frame.data, "<f4").reshape(truth.shape), truth, atol=1e-5)
     wanted = message_of(asked)
-    for field in ("probe", "contact", "tools", "ghost", "display"):
+    for field in ("probe", "contact", "tools", "ghost", "speckle", "display"):
         if field in asked:
             assert getattr(frame, field) == getattr(wanted, field)
     with connect(served.stream_url("rich"), compression=None) as stream:
@@ -282,6 +293,7 @@ def test_the_other_doors_refuse_by_name(served, renders):
 def test_a_scene_without_what_a_setting_needs_refuses_it(http):
     for asked, field, words in (
         ({"contact": "air"}, "contact", "knows its training poses"),
+        ({"speckle": "natural"}, "speckle", "fitted the speckle of its frames"),
         ({"outputs": ["labels"]}, "outputs", "carry labels"),
     ):
         answer = http.post("scenes/poor/render", json=body(asked, dtype=None))
@@ -305,6 +317,7 @@ def test_labels_are_numbers_in_every_form(http, scene):
 def test_a_scene_tells_what_it_has(http, served):
     rich, poor = http.get("scenes/rich").json(), http.get("scenes/poor").json()
     assert (rich["beam"], poor["beam"]) == (to_dict(BEAM), None)
+    assert (rich["speckle"], poor["speckle"]) == (True, False)
     assert (rich["label_names"], poor["label_names"]) == ({"1": "bone", "200": "vessel"}, {})
     with served.channel() as channel:
         stub = scenes_pb2_grpc.SceneServiceStub(channel)

@@ -460,10 +460,12 @@ def _shaken(dataset: Dataset) -> list[str]:
         return found
     noise, gain_db = path.noise, path.found_db - path.tracked_db
     remedy = f"; a training corrects {gain_db:.1f} dB of it" if gain_db else ""
+    lateral_mm, elevation_mm, axial_mm = noise.axes_mm
     found.append(
         f"the two neighbours in time predict a frame {path.in_time_db - path.tracked_db:.1f} dB better than by their "
-        f"poses: the tracker shakes (by {noise.position_mm:.2f} mm and {noise.turn_deg:.2f}°, as the path has it), or "
-        f"tissue moves with the probe{remedy}"
+        f"poses: the tracker shakes (by {noise.position_mm:.2f} mm and {noise.turn_deg:.2f}°, as the path has it; "
+        f"laterally {lateral_mm:.2f}, axially {axial_mm:.2f}, in elevation at most {elevation_mm:.2f} mm), or tissue "
+        f"moves with the probe{remedy}"
     )
     return found
 

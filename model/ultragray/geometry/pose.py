@@ -143,3 +143,10 @@ def turn_angles_rad(rotations: FloatArray, others: FloatArray) -> FloatArray:  #
     half_chords = np.linalg.norm(rotations - others, axis=(-2, -1)) / math.sqrt(8.0)  # sin(angle / 2)
     radians: FloatArray = 2.0 * np.arcsin(np.clip(half_chords, 0.0, 1.0))
     return radians
+
+
+def mean_axes(poses: FloatArray) -> FloatArray:  # [F, 4, 4] -> [3, 3]
+    """The rotation nearest to the mean of the poses' rotations."""
+    left, _, right = np.linalg.svd(poses[:, :3, :3].mean(axis=0))
+    rotation: FloatArray = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
+    return rotation

@@ -194,13 +194,6 @@ def pixel_positions_mm(probe: Probe, height: int, width: int) -> FloatArray:  # 
     return positions.reshape(-1, 3)
 
 
-def mean_axes(poses: FloatArray) -> FloatArray:  # [F, 4, 4] -> [3, 3]
-    """The rotation nearest to the mean of the poses' rotations."""
-    left, _, right = np.linalg.svd(poses[:, :3, :3].mean(axis=0))
-    rotation: FloatArray = left @ np.diag([1.0, 1.0, np.linalg.det(left @ right)]) @ right
-    return rotation
-
-
 def nearest_frames(sweep: Sweep, poses: FloatArray) -> IntArray:  # [C]
     """The place of the sweep's frame whose corners lie nearest on average, for each pose [C, 4, 4] (mm)."""
     corners = sweep.corners_mm()

@@ -17,6 +17,7 @@ from ultragray.geometry.probe import BoolArray, FloatArray, Probe
 from ultragray.rendering.backends.inputs import ScenePoses, as_array
 from ultragray.rendering.limits import Limits
 from ultragray.rendering.overlays import GHOST_PLANES, ToolsInView, add_ghosts
+from ultragray.rendering.speckle import with_speckle
 from ultragray.scene.confidence import DepthBands, TrainingViews, read_model
 from ultragray.scene.gaussians import GaussianScene
 
@@ -38,12 +39,16 @@ class Drawing:
         touching: BoolArray | None = None,
         tools: ToolsInView | None = None,
         ghost: float = 0.0,
+        speckle_by: str | None = None,
     ) -> None:
-        """`beam`: [3] in cm; `touching`: [C, W], whether scan lines have contact, None: all have."""
+        """`beam`: [3] in cm; `touching`: [C, W], whether scan lines have contact, None: all have; `speckle_by`: the
+        backend that puts speckle into B-mode, None: there is none.
+        """
         self.scene = scene
         self.shape = (len(view[1]), view[2], view[3])
         self._draw, self._view, self._limits, self._beam = draw, view, limits, beam
         self._touching, self._tools, self._ghost = touching, tools, ghost
+        self._speckle_by = speckle_by
         self._planes: dict[str, Tensor] = {}
 
     @property
@@ -64,8 +69,7 @@ class Drawing:
             self._tools.draw(self._planes, self.shape[1], self.scene.means)
         if self._touching is not None and not self._touching.all():
             for name in set(ENDED_BY_AIR) & set(self._planes):
-                plane = self._planes[name]
-                self._planes[name] = plane * torch.from_numpy(self._touching).to(plane)[:, None]
+                self._planes[name] = self._heard(self._planes[name])
         if self._ghost and "bmode" in self._planes:
             add_ghosts(self._planes, self.probe, self._ghost)
 
@@ -77,8 +81,19 @@ class Drawing:
             return tuple(dict.fromkeys((*planes, "transmittance")))
         return planes
 
+    def _heard(self, plane: Tensor) -> Tensor:  # [C, H, W] -> [C, H, W]
+        """A plane that is 0 along scan lines without contact."""
+        return plane if self._touching is None else plane * torch.from_numpy(self._touching).to(plane)[:, None]
+
     def plane(self, name: str) -> Tensor:  # [C, H, W]
         return self._planes[name]
+
+    def bmode(self) -> Tensor:  # [C, H, W]
+        """B-mode with its speckle, which what follows from the plane does not have."""
+        plane = self._planes["bmode"]
+        if self._speckle_by is None:
+            return plane
+        return self._heard(with_speckle(self.scene, plane, self.probe, self.poses_mm, backend=self._speckle_by))
 
     def plane_of(self, part: GaussianScene, name: str) -> Tensor:  # [C, H, W]
         """A plane of some of the scene's Gaussians alone."""

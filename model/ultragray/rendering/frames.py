@@ -31,7 +31,7 @@ from ultragray.rendering.display import AS_RENDERED, FRAME_RANGE_DB, Display
 from ultragray.rendering.limits import UNLIMITED, Limits
 from ultragray.rendering.outputs import OUTPUTS, PLANES, check_available, check_outputs
 from ultragray.rendering.overlays import ToolsInView
-from ultragray.rendering.settings import Contact, Resolved
+from ultragray.rendering.settings import Contact, Resolved, Speckle, check_speckle
 from ultragray.rendering.tools import ScanView, Tool
 from ultragray.scene.gaussians import GaussianScene
 
@@ -83,6 +83,7 @@ def render(
     contact: Contact | None = None,
     tools: Sequence[Tool] = (),
     ghost: float = 0.0,
+    speckle: Speckle = Speckle.OFF,
 ) -> Frames:
     """Frames [C, height, width] of a scene seen by `probe` (None: the probe the scene was trained with) from `poses`.
 
@@ -99,11 +100,14 @@ def render(
     `tools`, such as needles, are drawn into the frames (`ultragray.rendering.tools`); labels then are there for every
     scene. `ghost`, 0 to 1, is the share that a mirror image has of what is heard beyond the first strong interface
     (`ultragray.rendering.overlays`). Both are the same on every backend, have no gradient, and let that of the planes
-    pass. `limits` bound the cost of each frame and can end the rendering (`ultragray.rendering.limits`), but for frames
+    pass. `speckle` natural puts into B-mode, and nothing else, the speckle of scatterers that are fixed in the tissue
+    (`ultragray.rendering.speckle`): the same for a pose, whatever frames are beside it; the gradient is that without.
+    `limits` bound the cost of each frame and can end the rendering (`ultragray.rendering.limits`), but for frames
     with gradients: FrameTooCostly, GivenUp.
     Raises InvalidPose, InvalidProbe, InvalidImageSize, UnknownOutput (also for labels of a scene that carries none),
     BackendUnavailable, MemoryExceeded where the GPU's memory does not suffice, and InvalidArgument for a contact that
-    is none, and where contact is asked for and the scene knows no skin.
+    is none, where contact is asked for and the scene knows no skin, and for speckle of a scene that does not know its
+    own.
     """
     chosen = check_outputs(outputs)
     check_available(chosen, scene.info, with_tools=bool(tools))
@@ -114,7 +118,9 @@ def render(
         int(height),
         int(width),
     )
-    draw = BACKENDS[choose_backend(backend, scene)].draw
+    chosen_backend = choose_backend(backend, scene)
+    draw = BACKENDS[chosen_backend].draw
+    speckle_by = chosen_backend if _checked_speckle(speckle, scene) is Speckle.NATURAL else None
     contact = _checked_contact(contact)
     planes = list(dict.fromkeys(plane for name in chosen for plane in OUTPUTS[name].planes))
     touch = touch_of(scene, view[0], poses, view[3]) if contact is not None else None
@@ -122,7 +128,7 @@ def render(
     for first, seen, touching in _views(view, touch, compressed=contact is Contact.PRESSURE):
         shown = beam_cm(scene.info.beam if beam is None else beam, seen[0])
         sight = _tools_in_view(tools, view, poses, slice(first, first + len(seen[1])), shown)
-        drawing = Drawing(draw, scene, seen, limits.after(first), shown, touching, sight, ghost)
+        drawing = Drawing(draw, scene, seen, limits.after(first), shown, touching, sight, ghost, speckle_by)
         drawing.draw(planes)
         drawn.append({name: OUTPUTS[name].derive(drawing) for name in chosen})
     whole = drawn[0] if len(drawn) == 1 else {name: torch.cat([one[name] for one in drawn]) for name in chosen}
@@ -150,6 +156,16 @@ def _checked_contact(contact: Any) -> Contact | None:
     except ValueError:
         words = ", ".join(one.value for one in Contact)
         raise InvalidArgument(f"contact must be one of {words}, or None, got {contact!r}", field="contact") from None
+
+
+def _checked_speckle(speckle: Any, scene: GaussianScene) -> Speckle:
+    try:
+        chosen = Speckle(speckle)
+    except ValueError:
+        words = ", ".join(one.value for one in Speckle)
+        raise InvalidArgument(f"speckle must be one of {words}, got {speckle!r}", field="speckle") from None
+    check_speckle(chosen, scene.info)
+    return chosen
 
 
 def touch_of(scene: GaussianScene, probe: Probe, poses: Any, width: int) -> Touch:  # [C, 4, 4] or [4, 4] mm
@@ -229,6 +245,7 @@ def render_shown(
         contact=settings.contact,
         tools=settings.tools,
         ghost=settings.ghost,
+        speckle=settings.speckle,
     )
     blackened = None if support is None else support.look(frames["coverage"], frames.touch)
     rendered = {name: frames[name] for name in names}

@@ -103,7 +103,11 @@ def _uncertainty(drawing: Drawing) -> Tensor:
     return deviations(drawing, UNCERTAINTY.planes)
 
 
-BMODE = _register("bmode", "B = E T, what a scanner shows", is_toned=True)
+def _bmode(drawing: Drawing) -> Tensor:
+    return drawing.bmode()
+
+
+BMODE = _register("bmode", "B = E T, what a scanner shows", derive=_bmode, is_toned=True)
 ECHO = _register("echo", "E, the reflected intensity")
 TRANSMITTANCE = _register("transmittance", "T, what is left of the beam at that depth")
 COVERAGE = _register("coverage", "1 - exp(-S): how far Gaussians support the pixel", tells_support=True)

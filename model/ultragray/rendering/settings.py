@@ -59,6 +59,22 @@ class Contact(str, Enum):
     PRESSURE = "pressure"
 
 
+class Speckle(str, Enum):
+    """The speckle of a frame (`ultragray.rendering.speckle`)."""
+
+    OFF = "off"
+    NATURAL = "natural"
+
+
+def check_speckle(speckle: Speckle, info: SceneInfo) -> None:
+    """Raises InvalidArgument for speckle of a scene that does not know it."""
+    if speckle is Speckle.NATURAL and info.speckle is None:
+        raise InvalidArgument(
+            "speckle natural needs a scene whose training fitted the speckle of its frames; this one has none",
+            field="speckle",
+        )
+
+
 def _least_confidence(settings: FrameSettings | Additions) -> float | None:
     """The confidence without which frames are refused, or left out by a sampler; None: any."""
     return settings.min_confidence if settings.below_min_confidence is Below.REFUSE else None
@@ -106,6 +122,11 @@ class FrameSettings(Contract):
         low=0.0,
         high=1.0,
     )
+    speckle: Speckle = described(
+        "natural: bmode has the speckle that scatterers in the tissue give a scanner's frames. Other outputs are as "
+        "without.",
+        Speckle.OFF,
+    )
     display: Display | None = described("Gain, depth, scan conversion ...; default: as rendered.", None)
     outputs: tuple[str, ...] = described(f"Some of {', '.join(OUTPUTS)}.", ("bmode",), error=UnknownOutput)
 
@@ -119,8 +140,8 @@ class FrameSettings(Contract):
         """The settings for a scene, with nothing left open.
 
         Raises InvalidProbe where neither side knows a probe, InvalidImageSize beyond `max_image_side`, UnknownOutput
-        for outputs that the scene cannot give, InvalidArgument for a confidence that it cannot tell and for an encoding
-        that cannot hold the outputs.
+        for outputs that the scene cannot give, InvalidArgument for a confidence that it cannot tell, for speckle that
+        it does not know, and for an encoding that cannot hold the outputs.
         """
         check_available(self.outputs, info, with_tools=bool(self.tools))
         height, width = info.image_size_or(self.height, self.width)
@@ -131,6 +152,7 @@ class FrameSettings(Contract):
                 "min_confidence needs a scene that knows the confidence of its frames; this one was trained without",
                 field="min_confidence",
             )
+        check_speckle(self.speckle, info)
         given = {one.name: getattr(self, one.name, None) for one in fields(Additions)}
         return Resolved(
             probe=info.probe_or(self.probe),
@@ -182,6 +204,7 @@ class Additions:
     contact: Contact | None = described("As used; null: it was assumed.", None)
     tools: tuple[Tool, ...] = described("As used.", ())
     ghost: float = described("As used; 0: none.", 0.0)
+    speckle: Speckle = described("As used.", Speckle.OFF)
     registration: str | None = described("That led the pose into the scene; null: none, it was sent as it is.", None)
     least_confidence = property(_least_confidence)
 

@@ -24,6 +24,7 @@ from ultragray.geometry.image_size import DEFAULT_IMAGE_SIDE
 from ultragray.geometry.pose import MAX_POSITION_MM, check_poses
 from ultragray.geometry.probe import PLANE, ElevationBeam, FloatArray, Probe
 from ultragray.scene.confidence import read_model
+from ultragray.scene.speckle import SpeckleModel
 
 FORMAT_VERSION = 1
 METADATA_KEY = "ultragray"
@@ -63,6 +64,7 @@ class SceneInfo(Contract):
     confidence: dict[str, Any] = described("Of ultragray.scene.confidence.ConfidenceModel; empty: none.", factory=dict)
     label_names: dict[int, str] = described("By label, 1 to 255; empty: the scene carries none.", factory=dict)
     beam: ElevationBeam | None = described("Of the frames it was trained on; none: as thick as its Gaussians.", None)
+    speckle: SpeckleModel | None = described("Of the frames it was trained on; none: not known.", None)
     tissue_shares: Vector | None = described(
         "Of the probe's motion within the image plane (lateral, axial, turn) that tissue did not go along with, each "
         "from 0 to 1; none: tissue is rigid, and poses lead into it as they are.",
@@ -121,7 +123,7 @@ def _label_names(names: Any) -> dict[int, str]:
 
 def info_to_json(info: SceneInfo) -> str:
     document = {"format_version": FORMAT_VERSION, **to_dict(info)}
-    for name in ("label_names", "beam", "tissue_shares"):
+    for name in ("label_names", "beam", "speckle", "tissue_shares"):
         if not document[name]:
             del document[name]  # a scene without them keeps its bytes, and its hash
     return json.dumps(document, allow_nan=False, sort_keys=True)
@@ -144,6 +146,8 @@ def info_from_json(text: str) -> SceneInfo:
         document["probe"] = from_dict(Probe, document["probe"])
     if document.get("beam") is not None:
         document["beam"] = from_dict(ElevationBeam, document["beam"])
+    if document.get("speckle") is not None:
+        document["speckle"] = from_dict(SpeckleModel, document["speckle"])
     return SceneInfo(**document)
 
 

@@ -34,6 +34,12 @@ class Contact(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     CONTACT_AIR: _ClassVar[Contact]
     CONTACT_PRESSURE: _ClassVar[Contact]
 
+class Speckle(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
+    __slots__ = ()
+    SPECKLE_UNSPECIFIED: _ClassVar[Speckle]
+    SPECKLE_OFF: _ClassVar[Speckle]
+    SPECKLE_NATURAL: _ClassVar[Speckle]
+
 class BelowConfidence(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
     BELOW_CONFIDENCE_UNSPECIFIED: _ClassVar[BelowConfidence]
@@ -61,6 +67,9 @@ ENCODING_JPEG: Encoding
 CONTACT_UNSPECIFIED: Contact
 CONTACT_AIR: Contact
 CONTACT_PRESSURE: Contact
+SPECKLE_UNSPECIFIED: Speckle
+SPECKLE_OFF: Speckle
+SPECKLE_NATURAL: Speckle
 BELOW_CONFIDENCE_UNSPECIFIED: BelowConfidence
 BELOW_CONFIDENCE_REFUSE: BelowConfidence
 BELOW_CONFIDENCE_MASK: BelowConfidence
@@ -69,7 +78,7 @@ STREAM_MODE_ORDERED: StreamMode
 STREAM_MODE_LATEST: StreamMode
 
 class RenderSettings(_message.Message):
-    __slots__ = ("scene", "height", "width", "outputs", "encoding", "probe", "display", "min_confidence", "below_min_confidence", "slice_thickness_mm", "contact", "tools", "ghost", "registration")
+    __slots__ = ("scene", "height", "width", "outputs", "encoding", "probe", "display", "min_confidence", "below_min_confidence", "slice_thickness_mm", "contact", "tools", "ghost", "registration", "speckle")
     SCENE_FIELD_NUMBER: _ClassVar[int]
     HEIGHT_FIELD_NUMBER: _ClassVar[int]
     WIDTH_FIELD_NUMBER: _ClassVar[int]
@@ -84,6 +93,7 @@ class RenderSettings(_message.Message):
     TOOLS_FIELD_NUMBER: _ClassVar[int]
     GHOST_FIELD_NUMBER: _ClassVar[int]
     REGISTRATION_FIELD_NUMBER: _ClassVar[int]
+    SPECKLE_FIELD_NUMBER: _ClassVar[int]
     scene: str
     height: int
     width: int
@@ -98,7 +108,8 @@ class RenderSettings(_message.Message):
     tools: _containers.RepeatedCompositeFieldContainer[_geometry_pb2.Tool]
     ghost: float
     registration: str
-    def __init__(self, scene: _Optional[str] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., min_confidence: _Optional[float] = ..., below_min_confidence: _Optional[_Union[BelowConfidence, str]] = ..., slice_thickness_mm: _Optional[float] = ..., contact: _Optional[_Union[Contact, str]] = ..., tools: _Optional[_Iterable[_Union[_geometry_pb2.Tool, _Mapping]]] = ..., ghost: _Optional[float] = ..., registration: _Optional[str] = ...) -> None: ...
+    speckle: Speckle
+    def __init__(self, scene: _Optional[str] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., min_confidence: _Optional[float] = ..., below_min_confidence: _Optional[_Union[BelowConfidence, str]] = ..., slice_thickness_mm: _Optional[float] = ..., contact: _Optional[_Union[Contact, str]] = ..., tools: _Optional[_Iterable[_Union[_geometry_pb2.Tool, _Mapping]]] = ..., ghost: _Optional[float] = ..., registration: _Optional[str] = ..., speckle: _Optional[_Union[Speckle, str]] = ...) -> None: ...
 
 class Extrapolation(_message.Message):
     __slots__ = ("distance_mm", "angle_deg", "confidence", "supported_share", "contact_share")
@@ -345,7 +356,7 @@ class RenderStreamRequest(_message.Message):
     def __init__(self, sequence: _Optional[int] = ..., settings: _Optional[_Union[RenderSettings, _Mapping]] = ..., pose: _Optional[_Union[_geometry_pb2.Pose, _Mapping]] = ..., mode: _Optional[_Union[StreamMode, str]] = ..., timeout_ms: _Optional[float] = ..., client_time_ns: _Optional[int] = ..., window: _Optional[int] = ..., acknowledged: _Optional[int] = ..., shared_memory: _Optional[_Union[SharedMemory, _Mapping]] = ...) -> None: ...
 
 class Frame(_message.Message):
-    __slots__ = ("sequence", "data", "shared_data", "timings", "error", "dropped", "client_time_ns", "scene", "scene_sha256", "renderer", "pose", "probe", "height", "width", "outputs", "encoding", "display", "picture", "rendered_height", "rendered_width", "extrapolation", "slice_thickness_mm", "contact", "tools", "ghost", "registration", "min_confidence", "below_min_confidence")
+    __slots__ = ("sequence", "data", "shared_data", "timings", "error", "dropped", "client_time_ns", "scene", "scene_sha256", "renderer", "pose", "probe", "height", "width", "outputs", "encoding", "display", "picture", "rendered_height", "rendered_width", "extrapolation", "slice_thickness_mm", "contact", "tools", "ghost", "registration", "min_confidence", "below_min_confidence", "speckle")
     SEQUENCE_FIELD_NUMBER: _ClassVar[int]
     DATA_FIELD_NUMBER: _ClassVar[int]
     SHARED_DATA_FIELD_NUMBER: _ClassVar[int]
@@ -374,6 +385,7 @@ class Frame(_message.Message):
     REGISTRATION_FIELD_NUMBER: _ClassVar[int]
     MIN_CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
     BELOW_MIN_CONFIDENCE_FIELD_NUMBER: _ClassVar[int]
+    SPECKLE_FIELD_NUMBER: _ClassVar[int]
     sequence: int
     data: bytes
     shared_data: SharedData
@@ -402,7 +414,8 @@ class Frame(_message.Message):
     registration: str
     min_confidence: float
     below_min_confidence: BelowConfidence
-    def __init__(self, sequence: _Optional[int] = ..., data: _Optional[bytes] = ..., shared_data: _Optional[_Union[SharedData, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., error: _Optional[_Union[_scenes_pb2.Error, _Mapping]] = ..., dropped: _Optional[int] = ..., client_time_ns: _Optional[int] = ..., scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., renderer: _Optional[str] = ..., pose: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., picture: _Optional[_Union[Picture, _Mapping]] = ..., rendered_height: _Optional[int] = ..., rendered_width: _Optional[int] = ..., extrapolation: _Optional[_Union[Extrapolation, _Mapping]] = ..., slice_thickness_mm: _Optional[float] = ..., contact: _Optional[_Union[Contact, str]] = ..., tools: _Optional[_Iterable[_Union[_geometry_pb2.Tool, _Mapping]]] = ..., ghost: _Optional[float] = ..., registration: _Optional[str] = ..., min_confidence: _Optional[float] = ..., below_min_confidence: _Optional[_Union[BelowConfidence, str]] = ...) -> None: ...
+    speckle: Speckle
+    def __init__(self, sequence: _Optional[int] = ..., data: _Optional[bytes] = ..., shared_data: _Optional[_Union[SharedData, _Mapping]] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., error: _Optional[_Union[_scenes_pb2.Error, _Mapping]] = ..., dropped: _Optional[int] = ..., client_time_ns: _Optional[int] = ..., scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., renderer: _Optional[str] = ..., pose: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., outputs: _Optional[_Iterable[_Union[Output, str]]] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., display: _Optional[_Union[Display, _Mapping]] = ..., picture: _Optional[_Union[Picture, _Mapping]] = ..., rendered_height: _Optional[int] = ..., rendered_width: _Optional[int] = ..., extrapolation: _Optional[_Union[Extrapolation, _Mapping]] = ..., slice_thickness_mm: _Optional[float] = ..., contact: _Optional[_Union[Contact, str]] = ..., tools: _Optional[_Iterable[_Union[_geometry_pb2.Tool, _Mapping]]] = ..., ghost: _Optional[float] = ..., registration: _Optional[str] = ..., min_confidence: _Optional[float] = ..., below_min_confidence: _Optional[_Union[BelowConfidence, str]] = ..., speckle: _Optional[_Union[Speckle, str]] = ...) -> None: ...
 
 class SharedData(_message.Message):
     __slots__ = ("slot", "bytes")

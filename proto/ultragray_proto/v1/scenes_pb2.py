@@ -25,7 +25,7 @@ _sym_db = _symbol_database.Default()
 from ultragray_proto.v1 import geometry_pb2 as ultragray_dot_v1_dot_geometry__pb2
 
 
-DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19ultragray/v1/scenes.proto\x12\x0cultragray.v1\x1a\x1bultragray/v1/geometry.proto\":\n\x11ListScenesRequest\x12\x11\n\tpage_size\x18\x01 \x01(\x05\x12\x12\n\npage_token\x18\x02 \x01(\t\"W\n\x12ListScenesResponse\x12(\n\x06scenes\x18\x01 \x03(\x0b\x32\x18.ultragray.v1.SceneEntry\x12\x17\n\x0fnext_page_token\x18\x02 \x01(\t\"\xd5\x02\n\nSceneEntry\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06loaded\x18\x02 \x01(\x08\x12\x16\n\x0egaussian_count\x18\x03 \x01(\x03\x12\x14\n\x0cimage_height\x18\x04 \x01(\x05\x12\x13\n\x0bimage_width\x18\x05 \x01(\x05\x12\x12\n\nfile_bytes\x18\x06 \x01(\x03\x12\"\n\x05\x65rror\x18\x07 \x01(\x0b\x32\x13.ultragray.v1.Error\x12\r\n\x05owner\x18\x08 \x01(\t\x12\x0f\n\x07private\x18\t \x01(\x08\x12\x12\n\nprobe_kind\x18\n \x01(\t\x12\x36\n\x07metrics\x18\x0b \x03(\x0b\x32%.ultragray.v1.SceneEntry.MetricsEntry\x12\x12\n\nchanged_at\x18\x0c \x01(\t\x1a.\n\x0cMetricsEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x01:\x02\x38\x01\" \n\x0fGetSceneRequest\x12\r\n\x05scene\x18\x01 \x01(\t\"\x98\x06\n\x05Scene\x12-\n\rbounds_min_mm\x18\t \x01(\x0b\x32\x16.ultragray.v1.Position\x12-\n\rbounds_max_mm\x18\n \x01(\x0b\x32\x16.ultragray.v1.Position\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06loaded\x18\x02 \x01(\x08\x12\x18\n\x10loaded_processes\x18\x03 \x01(\x05\x12\x12\n\nfile_bytes\x18\x04 \x01(\x03\x12\x16\n\x0egaussian_count\x18\x05 \x01(\x03\x12\x11\n\tsh_degree\x18\x06 \x01(\x05\x12\x11\n\tintensity\x18\x07 \x01(\t\x12)\n\tcentre_mm\x18\x08 \x01(\x0b\x32\x16.ultragray.v1.Position\x12\"\n\x05probe\x18\x0b \x01(\x0b\x32\x13.ultragray.v1.Probe\x12\x14\n\x0cimage_height\x18\x0c \x01(\x05\x12\x13\n\x0bimage_width\x18\r \x01(\x05\x12\x33\n\x0etraining_poses\x18\x0e \x01(\x0b\x32\x1b.ultragray.v1.TrainingPoses\x12\x31\n\x07metrics\x18\x0f \x03(\x0b\x32 .ultragray.v1.Scene.MetricsEntry\x12\x14\n\x0c\x64\x61taset_name\x18\x10 \x01(\t\x12\x16\n\x0e\x64\x61taset_sha256\x18\x11 \x01(\t\x12\x38\n\x0blabel_names\x18\x12 \x03(\x0b\x32#.ultragray.v1.Scene.LabelNamesEntry\x12/\n\nconfidence\x18\x13 \x01(\x0b\x32\x1b.ultragray.v1.ConfidenceFit\x12\r\n\x05owner\x18\x14 \x01(\t\x12\x0f\n\x07private\x18\x15 \x01(\x08\x12)\n\x04\x62\x65\x61m\x18\x16 \x01(\x0b\x32\x1b.ultragray.v1.ElevationBeam\x1a.\n\x0cMetricsEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x01:\x02\x38\x01\x1a\x31\n\x0fLabelNamesEntry\x12\x0b\n\x03key\x18\x01 \x01(\r\x12\r\n\x05value\x18\x02 \x01(\t:\x02\x38\x01\"1\n\rConfidenceFit\x12\r\n\x05\x65rror\x18\x01 \x01(\x01\x12\x11\n\tfitted_on\x18\x02 \x01(\x05\"\xef\x01\n\rTrainingPoses\x12\r\n\x05\x63ount\x18\x01 \x01(\x05\x12/\n\x0fposition_min_mm\x18\x02 \x01(\x0b\x32\x16.ultragray.v1.Position\x12/\n\x0fposition_max_mm\x18\x03 \x01(\x0b\x32\x16.ultragray.v1.Position\x12#\n\x05\x66irst\x18\x04 \x01(\x0b\x32\x14.ultragray.v1.Matrix\x12$\n\x06middle\x18\x05 \x01(\x0b\x32\x14.ultragray.v1.Matrix\x12\"\n\x04last\x18\x06 \x01(\x0b\x32\x14.ultragray.v1.Matrix\"!\n\x10LoadSceneRequest\x12\r\n\x05scene\x18\x01 \x01(\t\"<\n\x11LoadSceneResponse\x12\r\n\x05scene\x18\x01 \x01(\t\x12\x18\n\x10loaded_processes\x18\x02 \x01(\x05\"#\n\x12UnloadSceneRequest\x12\r\n\x05scene\x18\x01 \x01(\t\">\n\x13UnloadSceneResponse\x12\r\n\x05scene\x18\x01 \x01(\t\x12\x18\n\x10loaded_processes\x18\x02 \x01(\x05\"6\n\x05\x45rror\x12\x0e\n\x06reason\x18\x01 \x01(\t\x12\r\n\x05\x66ield\x18\x02 \x01(\t\x12\x0e\n\x06\x64\x65tail\x18\x03 \x01(\t2\xc1\x02\n\x0cSceneService\x12O\n\nListScenes\x12\x1f.ultragray.v1.ListScenesRequest\x1a .ultragray.v1.ListScenesResponse\x12>\n\x08GetScene\x12\x1d.ultragray.v1.GetSceneRequest\x1a\x13.ultragray.v1.Scene\x12L\n\tLoadScene\x12\x1e.ultragray.v1.LoadSceneRequest\x1a\x1f.ultragray.v1.LoadSceneResponse\x12R\n\x0bUnloadScene\x12 .ultragray.v1.UnloadSceneRequest\x1a!.ultragray.v1.UnloadSceneResponseb\x06proto3')
+DESCRIPTOR = _descriptor_pool.Default().AddSerializedFile(b'\n\x19ultragray/v1/scenes.proto\x12\x0cultragray.v1\x1a\x1bultragray/v1/geometry.proto\":\n\x11ListScenesRequest\x12\x11\n\tpage_size\x18\x01 \x01(\x05\x12\x12\n\npage_token\x18\x02 \x01(\t\"W\n\x12ListScenesResponse\x12(\n\x06scenes\x18\x01 \x03(\x0b\x32\x18.ultragray.v1.SceneEntry\x12\x17\n\x0fnext_page_token\x18\x02 \x01(\t\"\xd5\x02\n\nSceneEntry\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06loaded\x18\x02 \x01(\x08\x12\x16\n\x0egaussian_count\x18\x03 \x01(\x03\x12\x14\n\x0cimage_height\x18\x04 \x01(\x05\x12\x13\n\x0bimage_width\x18\x05 \x01(\x05\x12\x12\n\nfile_bytes\x18\x06 \x01(\x03\x12\"\n\x05\x65rror\x18\x07 \x01(\x0b\x32\x13.ultragray.v1.Error\x12\r\n\x05owner\x18\x08 \x01(\t\x12\x0f\n\x07private\x18\t \x01(\x08\x12\x12\n\nprobe_kind\x18\n \x01(\t\x12\x36\n\x07metrics\x18\x0b \x03(\x0b\x32%.ultragray.v1.SceneEntry.MetricsEntry\x12\x12\n\nchanged_at\x18\x0c \x01(\t\x1a.\n\x0cMetricsEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x01:\x02\x38\x01\" \n\x0fGetSceneRequest\x12\r\n\x05scene\x18\x01 \x01(\t\"\xa9\x06\n\x05Scene\x12-\n\rbounds_min_mm\x18\t \x01(\x0b\x32\x16.ultragray.v1.Position\x12-\n\rbounds_max_mm\x18\n \x01(\x0b\x32\x16.ultragray.v1.Position\x12\x0c\n\x04name\x18\x01 \x01(\t\x12\x0e\n\x06loaded\x18\x02 \x01(\x08\x12\x18\n\x10loaded_processes\x18\x03 \x01(\x05\x12\x12\n\nfile_bytes\x18\x04 \x01(\x03\x12\x16\n\x0egaussian_count\x18\x05 \x01(\x03\x12\x11\n\tsh_degree\x18\x06 \x01(\x05\x12\x11\n\tintensity\x18\x07 \x01(\t\x12)\n\tcentre_mm\x18\x08 \x01(\x0b\x32\x16.ultragray.v1.Position\x12\"\n\x05probe\x18\x0b \x01(\x0b\x32\x13.ultragray.v1.Probe\x12\x14\n\x0cimage_height\x18\x0c \x01(\x05\x12\x13\n\x0bimage_width\x18\r \x01(\x05\x12\x33\n\x0etraining_poses\x18\x0e \x01(\x0b\x32\x1b.ultragray.v1.TrainingPoses\x12\x31\n\x07metrics\x18\x0f \x03(\x0b\x32 .ultragray.v1.Scene.MetricsEntry\x12\x14\n\x0c\x64\x61taset_name\x18\x10 \x01(\t\x12\x16\n\x0e\x64\x61taset_sha256\x18\x11 \x01(\t\x12\x38\n\x0blabel_names\x18\x12 \x03(\x0b\x32#.ultragray.v1.Scene.LabelNamesEntry\x12/\n\nconfidence\x18\x13 \x01(\x0b\x32\x1b.ultragray.v1.ConfidenceFit\x12\r\n\x05owner\x18\x14 \x01(\t\x12\x0f\n\x07private\x18\x15 \x01(\x08\x12)\n\x04\x62\x65\x61m\x18\x16 \x01(\x0b\x32\x1b.ultragray.v1.ElevationBeam\x12\x0f\n\x07speckle\x18\x17 \x01(\x08\x1a.\n\x0cMetricsEntry\x12\x0b\n\x03key\x18\x01 \x01(\t\x12\r\n\x05value\x18\x02 \x01(\x01:\x02\x38\x01\x1a\x31\n\x0fLabelNamesEntry\x12\x0b\n\x03key\x18\x01 \x01(\r\x12\r\n\x05value\x18\x02 \x01(\t:\x02\x38\x01\"1\n\rConfidenceFit\x12\r\n\x05\x65rror\x18\x01 \x01(\x01\x12\x11\n\tfitted_on\x18\x02 \x01(\x05\"\xef\x01\n\rTrainingPoses\x12\r\n\x05\x63ount\x18\x01 \x01(\x05\x12/\n\x0fposition_min_mm\x18\x02 \x01(\x0b\x32\x16.ultragray.v1.Position\x12/\n\x0fposition_max_mm\x18\x03 \x01(\x0b\x32\x16.ultragray.v1.Position\x12#\n\x05\x66irst\x18\x04 \x01(\x0b\x32\x14.ultragray.v1.Matrix\x12$\n\x06middle\x18\x05 \x01(\x0b\x32\x14.ultragray.v1.Matrix\x12\"\n\x04last\x18\x06 \x01(\x0b\x32\x14.ultragray.v1.Matrix\"!\n\x10LoadSceneRequest\x12\r\n\x05scene\x18\x01 \x01(\t\"<\n\x11LoadSceneResponse\x12\r\n\x05scene\x18\x01 \x01(\t\x12\x18\n\x10loaded_processes\x18\x02 \x01(\x05\"#\n\x12UnloadSceneRequest\x12\r\n\x05scene\x18\x01 \x01(\t\">\n\x13UnloadSceneResponse\x12\r\n\x05scene\x18\x01 \x01(\t\x12\x18\n\x10loaded_processes\x18\x02 \x01(\x05\"6\n\x05\x45rror\x12\x0e\n\x06reason\x18\x01 \x01(\t\x12\r\n\x05\x66ield\x18\x02 \x01(\t\x12\x0e\n\x06\x64\x65tail\x18\x03 \x01(\t2\xc1\x02\n\x0cSceneService\x12O\n\nListScenes\x12\x1f.ultragray.v1.ListScenesRequest\x1a .ultragray.v1.ListScenesResponse\x12>\n\x08GetScene\x12\x1d.ultragray.v1.GetSceneRequest\x1a\x13.ultragray.v1.Scene\x12L\n\tLoadScene\x12\x1e.ultragray.v1.LoadSceneRequest\x1a\x1f.ultragray.v1.LoadSceneResponse\x12R\n\x0bUnloadScene\x12 .ultragray.v1.UnloadSceneRequest\x1a!.ultragray.v1.UnloadSceneResponseb\x06proto3')
 
 _globals = globals()
 _builder.BuildMessageAndEnumDescriptors(DESCRIPTOR, _globals)
@@ -49,25 +49,25 @@ if not _descriptor._USE_C_DESCRIPTORS:
   _globals['_GETSCENEREQUEST']._serialized_start=565
   _globals['_GETSCENEREQUEST']._serialized_end=597
   _globals['_SCENE']._serialized_start=600
-  _globals['_SCENE']._serialized_end=1392
+  _globals['_SCENE']._serialized_end=1409
   _globals['_SCENE_METRICSENTRY']._serialized_start=517
   _globals['_SCENE_METRICSENTRY']._serialized_end=563
-  _globals['_SCENE_LABELNAMESENTRY']._serialized_start=1343
-  _globals['_SCENE_LABELNAMESENTRY']._serialized_end=1392
-  _globals['_CONFIDENCEFIT']._serialized_start=1394
-  _globals['_CONFIDENCEFIT']._serialized_end=1443
-  _globals['_TRAININGPOSES']._serialized_start=1446
-  _globals['_TRAININGPOSES']._serialized_end=1685
-  _globals['_LOADSCENEREQUEST']._serialized_start=1687
-  _globals['_LOADSCENEREQUEST']._serialized_end=1720
-  _globals['_LOADSCENERESPONSE']._serialized_start=1722
-  _globals['_LOADSCENERESPONSE']._serialized_end=1782
-  _globals['_UNLOADSCENEREQUEST']._serialized_start=1784
-  _globals['_UNLOADSCENEREQUEST']._serialized_end=1819
-  _globals['_UNLOADSCENERESPONSE']._serialized_start=1821
-  _globals['_UNLOADSCENERESPONSE']._serialized_end=1883
-  _globals['_ERROR']._serialized_start=1885
-  _globals['_ERROR']._serialized_end=1939
-  _globals['_SCENESERVICE']._serialized_start=1942
-  _globals['_SCENESERVICE']._serialized_end=2263
+  _globals['_SCENE_LABELNAMESENTRY']._serialized_start=1360
+  _globals['_SCENE_LABELNAMESENTRY']._serialized_end=1409
+  _globals['_CONFIDENCEFIT']._serialized_start=1411
+  _globals['_CONFIDENCEFIT']._serialized_end=1460
+  _globals['_TRAININGPOSES']._serialized_start=1463
+  _globals['_TRAININGPOSES']._serialized_end=1702
+  _globals['_LOADSCENEREQUEST']._serialized_start=1704
+  _globals['_LOADSCENEREQUEST']._serialized_end=1737
+  _globals['_LOADSCENERESPONSE']._serialized_start=1739
+  _globals['_LOADSCENERESPONSE']._serialized_end=1799
+  _globals['_UNLOADSCENEREQUEST']._serialized_start=1801
+  _globals['_UNLOADSCENEREQUEST']._serialized_end=1836
+  _globals['_UNLOADSCENERESPONSE']._serialized_start=1838
+  _globals['_UNLOADSCENERESPONSE']._serialized_end=1900
+  _globals['_ERROR']._serialized_start=1902
+  _globals['_ERROR']._serialized_end=1956
+  _globals['_SCENESERVICE']._serialized_start=1959
+  _globals['_SCENESERVICE']._serialized_end=2280
 # @@protoc_insertion_point(module_scope)

@@ -65,7 +65,7 @@ class GetSceneRequest(_message.Message):
     def __init__(self, scene: _Optional[str] = ...) -> None: ...
 
 class Scene(_message.Message):
-    __slots__ = ("bounds_min_mm", "bounds_max_mm", "name", "loaded", "loaded_processes", "file_bytes", "gaussian_count", "sh_degree", "intensity", "centre_mm", "probe", "image_height", "image_width", "training_poses", "metrics", "dataset_name", "dataset_sha256", "label_names", "confidence", "owner", "private", "beam")
+    __slots__ = ("bounds_min_mm", "bounds_max_mm", "name", "loaded", "loaded_processes", "file_bytes", "gaussian_count", "sh_degree", "intensity", "centre_mm", "probe", "image_height", "image_width", "training_poses", "metrics", "dataset_name", "dataset_sha256", "label_names", "confidence", "owner", "private", "beam", "speckle")
     class MetricsEntry(_message.Message):
         __slots__ = ("key", "value")
         KEY_FIELD_NUMBER: _ClassVar[int]
@@ -102,6 +102,7 @@ class Scene(_message.Message):
     OWNER_FIELD_NUMBER: _ClassVar[int]
     PRIVATE_FIELD_NUMBER: _ClassVar[int]
     BEAM_FIELD_NUMBER: _ClassVar[int]
+    SPECKLE_FIELD_NUMBER: _ClassVar[int]
     bounds_min_mm: _geometry_pb2.Position
     bounds_max_mm: _geometry_pb2.Position
     name: str
@@ -124,7 +125,8 @@ class Scene(_message.Message):
     owner: str
     private: bool
     beam: _geometry_pb2.ElevationBeam
-    def __init__(self, bounds_min_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., bounds_max_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., name: _Optional[str] = ..., loaded: _Optional[bool] = ..., loaded_processes: _Optional[int] = ..., file_bytes: _Optional[int] = ..., gaussian_count: _Optional[int] = ..., sh_degree: _Optional[int] = ..., intensity: _Optional[str] = ..., centre_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., training_poses: _Optional[_Union[TrainingPoses, _Mapping]] = ..., metrics: _Optional[_Mapping[str, float]] = ..., dataset_name: _Optional[str] = ..., dataset_sha256: _Optional[str] = ..., label_names: _Optional[_Mapping[int, str]] = ..., confidence: _Optional[_Union[ConfidenceFit, _Mapping]] = ..., owner: _Optional[str] = ..., private: _Optional[bool] = ..., beam: _Optional[_Union[_geometry_pb2.ElevationBeam, _Mapping]] = ...) -> None: ...
+    speckle: bool
+    def __init__(self, bounds_min_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., bounds_max_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., name: _Optional[str] = ..., loaded: _Optional[bool] = ..., loaded_processes: _Optional[int] = ..., file_bytes: _Optional[int] = ..., gaussian_count: _Optional[int] = ..., sh_degree: _Optional[int] = ..., intensity: _Optional[str] = ..., centre_mm: _Optional[_Union[_geometry_pb2.Position, _Mapping]] = ..., probe: _Optional[_Union[_geometry_pb2.Probe, _Mapping]] = ..., image_height: _Optional[int] = ..., image_width: _Optional[int] = ..., training_poses: _Optional[_Union[TrainingPoses, _Mapping]] = ..., metrics: _Optional[_Mapping[str, float]] = ..., dataset_name: _Optional[str] = ..., dataset_sha256: _Optional[str] = ..., label_names: _Optional[_Mapping[int, str]] = ..., confidence: _Optional[_Union[ConfidenceFit, _Mapping]] = ..., owner: _Optional[str] = ..., private: _Optional[bool] = ..., beam: _Optional[_Union[_geometry_pb2.ElevationBeam, _Mapping]] = ..., speckle: _Optional[bool] = ...) -> None: ...
 
 class ConfidenceFit(_message.Message):
     __slots__ = ("error", "fitted_on")

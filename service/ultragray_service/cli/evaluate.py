@@ -168,14 +168,16 @@ def print_metrics(title: str, evaluations: Mapping[str, Evaluation]) -> None:
 def print_speckle(evaluations: Mapping[str, Evaluation]) -> None:
     from rich.markup import escape
 
-    table = _table("speckle", "contrast", "axial, mm", "lateral, mm", "histogram distance")
-    summaries = {name: evaluation.speckle for name, evaluation in evaluations.items()}
+    from ultragray.learn.report.tables import SPECKLE_COLUMNS, speckle_summaries
+
+    table = _table("speckle", *SPECKLE_COLUMNS, "histogram distance")
+    summaries = speckle_summaries(evaluations)
     true = next(iter(summaries.values())).true
     rows = {
         "true frames": (true, ""),
         **{n: (one.rendered, f"{one.histogram_distance:.4f}") for n, one in summaries.items()},
     }
     for name, (speckle, distance) in rows.items():
-        figures = ("–",) * 3 if speckle is None else [f"{value:.3f}" for value in astuple(speckle)]
+        figures = ("–",) * len(SPECKLE_COLUMNS) if speckle is None else [f"{value:.3f}" for value in astuple(speckle)]
         table.add_row(escape(name), *figures, distance)
     wide_console().print(table)

@@ -304,6 +304,7 @@ class Scene:
     label_names: dict[int, str] = described("What the values of the output labels mean; empty: it has none.")
     beam: ElevationBeam | None = described("Of the frames it was trained on; null: they are taken for planes.")
     confidence: ConfidenceFit | None = described("null: the scene cannot tell the confidence of its frames.")
+    speckle: bool = described("Whether its frames can have natural speckle.")
     owner: str | None = described("Who imported or trained it; null: nobody.")
     private: bool = described("Whether others may not see it.")
 
@@ -339,6 +340,7 @@ class Scene:
             label_names=info.label_names,
             beam=info.beam,
             confidence=None if model is None else ConfidenceFit(model.error, model.fitted_on),
+            speckle=info.speckle is not None,
             owner=ownership.owner,
             private=ownership.private,
         )

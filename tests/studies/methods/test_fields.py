@@ -8,9 +8,9 @@ import torch
 
 from ultragray import ConvexProbe
 from ultragray.errors import InvalidArgument
+from ultragray.geometry.pose import mean_axes
 from ultragray.learn.evaluation.baselines import predict
 from ultragray.learn.evaluation.methods import NAMES
-from ultragray.learn.sweep import mean_axes
 from ultragray_studies.methods.implicitvol import (
     FieldLearner,
     FramePoses,

@@ -21,7 +21,7 @@ from torch import Tensor
 from torch.nn import functional
 
 from ultragray.errors import InvalidArgument
-from ultragray.geometry.pose import check_poses
+from ultragray.geometry.pose import check_poses, mean_axes
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.learn.evaluation.scoring import Evaluation, evaluate_frames, require_frames
 from ultragray.learn.prediction import NeighboursInTime, blend_by_distance, seen_by_frame
@@ -31,7 +31,6 @@ from ultragray.learn.sweep import (
     IntArray,
     Sweep,
     corner_distances_mm,
-    mean_axes,
     nearest_frames,
     pixel_positions_mm,
 )

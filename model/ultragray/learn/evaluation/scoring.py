@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -16,6 +16,7 @@ from ultragray.learn.evaluation.speckle import FrameSpeckle, SpeckleSummary, com
 from ultragray.learn.sweep import Dataset, IntArray, Sweep
 from ultragray.rendering.frames import Frames, render
 from ultragray.rendering.outputs import UNCERTAINTY
+from ultragray.rendering.speckle import with_speckle
 from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.info import SceneInfo
 
@@ -31,6 +32,7 @@ class Evaluation:
     frame_numbers: IntArray  # [F] as the sweep numbers them
     ms_ssim_scales: int
     frame_speckle: list[FrameSpeckle]
+    frame_natural: list[FrameSpeckle] = field(default_factory=list)  # with natural speckle; of scenes that know it
 
     @property
     def mean(self) -> FrameMetrics:
@@ -44,13 +46,20 @@ class Evaluation:
     def speckle(self) -> SpeckleSummary:
         return summarize(self.frame_speckle)
 
+    @property
+    def natural(self) -> SpeckleSummary | None:
+        """The speckle of frames with natural speckle, which metrics do not see; None where the scene knows none."""
+        return summarize(self.frame_natural) if self.frame_natural else None
+
     def to_dict(self) -> dict[str, Any]:
-        """A JSON object: `mean`, `std`, `ms_ssim_scales`, `speckle` and the `frames` with their numbers."""
+        """A JSON object: `mean`, `std`, `ms_ssim_scales`, `speckle`, `natural` where it is known, and the
+        `frames` with their numbers."""
         return {
             "mean": self.mean.to_dict(),
             "std": self.std.to_dict(),
             "ms_ssim_scales": self.ms_ssim_scales,
             "speckle": self.speckle.to_dict(),
+            **({"natural": self.natural.to_dict()} if self.natural else {}),
             "frames": [
                 {"frame": int(number), **metrics.to_dict()}
                 for number, metrics in zip(self.frame_numbers, self.frames, strict=True)
@@ -63,8 +72,17 @@ def evaluate(scene: GaussianScene, sweep: Sweep, *, backend: str = "auto") -> Ev
 
     Raises DatasetInvalid where the sweep has no frames, InvalidImageSize below 11x11 pixels, BackendUnavailable.
     """
-    parts = rendered_parts(scene, sweep, ("bmode",), backend)
-    return _measured((frames["bmode"].cpu().numpy() for _, frames in parts), sweep)
+    natural: list[FrameSpeckle] = []
+
+    def predictions() -> Iterator[npt.NDArray[np.float32]]:
+        for some, frames in rendered_parts(scene, sweep, ("bmode",), backend):
+            bmode = frames["bmode"].float().cpu()
+            if scene.info.speckle is not None:
+                shown = with_speckle(scene, bmode, some.probe, scene.poses_at_rest(some.poses), backend=backend)
+                natural.extend(compare_speckle(shown.numpy(), some.images.astype(np.float32) / 255.0, some.probe))
+            yield bmode.numpy()
+
+    return replace(_measured(predictions(), sweep), frame_natural=natural)
 
 
 def evaluate_frames(frames: npt.NDArray[np.float32], sweep: Sweep) -> Evaluation:  # [F, H, W] in [0, 1]

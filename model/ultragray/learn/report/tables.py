@@ -10,7 +10,7 @@ from ultragray.learn.sweep import Dataset
 
 if TYPE_CHECKING:
     from ultragray.learn.evaluation.scoring import Evaluation
-    from ultragray.learn.evaluation.speckle import Speckle
+    from ultragray.learn.evaluation.speckle import Speckle, SpeckleSummary
 
 
 @dataclass(frozen=True)
@@ -124,7 +124,7 @@ def rank_rows(evaluations: Mapping[str, Evaluation]) -> list[Row]:
 
 def speckle_rows(evaluations: Mapping[str, Evaluation]) -> list[tuple[str, list[str]]]:
     """The statistics of speckle: the true frames, then one row a method, as texts."""
-    summaries = {name: evaluation.speckle for name, evaluation in evaluations.items()}
+    summaries = speckle_summaries(evaluations)
     if not summaries:
         return []
     true = next(iter(summaries.values())).true
@@ -134,8 +134,21 @@ def speckle_rows(evaluations: Mapping[str, Evaluation]) -> list[tuple[str, list[
     ]
 
 
+def speckle_summaries(evaluations: Mapping[str, Evaluation]) -> dict[str, SpeckleSummary]:
+    """By what was measured: each method, and after it the same with natural speckle where that is known."""
+    found = {}
+    for name, evaluation in evaluations.items():
+        found[name] = evaluation.speckle
+        if evaluation.natural is not None:
+            found[f"{name}, natural speckle"] = evaluation.natural
+    return found
+
+
+SPECKLE_COLUMNS = ("contrast", "axial, mm", "lateral, mm", "axial gradient", "lateral gradient")
+
+
 def _speckle_texts(speckle: Speckle | None) -> list[str]:
-    return ["–"] * 3 if speckle is None else [f"{value:.3f}" for value in astuple(speckle)]
+    return ["–"] * len(SPECKLE_COLUMNS) if speckle is None else [f"{value:.3f}" for value in astuple(speckle)]
 
 
 @dataclass(frozen=True)

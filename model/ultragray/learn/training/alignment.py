@@ -22,10 +22,11 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
+from ultragray.geometry.pose import mean_axes
 from ultragray.geometry.probe import FloatArray
 from ultragray.geometry.rotations import rotations_of, turns_of
 from ultragray.geometry.scan_conversion import FloatImage, interpolated_frames, pixel_places
-from ultragray.learn.sweep import IntArray, Sweep, corner_distances_mm, mean_axes, spread_places
+from ultragray.learn.sweep import IntArray, Sweep, corner_distances_mm, spread_places
 
 
 def likelihood_terms(bends: FloatArray, ratios: FloatArray) -> tuple[FloatArray, FloatArray]:
@@ -85,10 +86,12 @@ _NUMBERS = 6
 
 @dataclass(frozen=True)
 class TrackerNoise:
-    """Standard deviations, along each axis, of a tracker's errors from frame to frame."""
+    """Standard deviations of a tracker's errors from frame to frame: along and about each axis, the least of three, and
+    what each axis of the probe seems to have by itself."""
 
     position_mm: float
     turn_deg: float
+    axes_mm: tuple[float, float, float]  # lateral, elevation (with what the hand goes unevenly), axial
 
 
 def sweep_ranges(sweep: Sweep) -> list[range]:
@@ -109,8 +112,9 @@ def path_ranges(corners: FloatArray) -> list[range]:  # [F, K, 3] mm
 
 def tracker_noise(poses: FloatArray, ranges: Sequence[range]) -> TrackerNoise:  # [F, 4, 4] mm
     """The tracker's errors, estimated from the path alone; 0 where the path is too short for an estimate."""
-    position, turn = _Likelihood.of(_coordinates(poses, ranges), ranges).noise_variances()
-    return TrackerNoise(float(np.sqrt(position)), float(np.sqrt(turn)))
+    likelihood = _Likelihood.of(_coordinates(poses, ranges), ranges)
+    (position, turn), axes = likelihood.noise_variances(), np.sqrt(likelihood.variances_by_axis()[:3]).tolist()
+    return TrackerNoise(float(np.sqrt(position)), float(np.sqrt(turn)), (axes[0], axes[1], axes[2]))
 
 
 def without_noise(poses: FloatArray, ranges: Sequence[range]) -> FloatArray:  # [F, 4, 4] mm -> [F, 4, 4] mm
@@ -167,10 +171,14 @@ class _Likelihood:
 
     def noise_variances(self) -> tuple[float, float]:
         """The likeliest r: of position, mm², and of turn, degrees²."""
+        best = self.variances_by_axis()
+        return float(best[:3].min()), float(best[3:].min())
+
+    def variances_by_axis(self) -> FloatArray:  # [6] mm², degrees²
         variances = self.squares / max(self.count, 1)
         costs = self.count * np.log(np.maximum(variances, TINY)) + self.log_determinants[:, None]
-        best = variances[costs.argmin(axis=0), np.arange(_NUMBERS)]
-        return float(best[:3].min()), float(best[3:].min())
+        best: FloatArray = variances[costs.argmin(axis=0), np.arange(_NUMBERS)]
+        return best
 
 
 # The registration of whole sweeps that cross: each is moved until its frames agree with those of the sweeps before

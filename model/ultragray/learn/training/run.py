@@ -22,6 +22,7 @@ from ultragray.learn.training.checkpointing import read_checkpoint_header
 from ultragray.learn.training.confidence import LEAST_HELD_OUT, fit_confidence, held_out_frames, shorter, steps_of_fit
 from ultragray.learn.training.config import USUAL_EFFORT, TrainingConfig
 from ultragray.learn.training.progress import Progress, require_tensorboard
+from ultragray.learn.training.speckle import fit_speckle
 from ultragray.learn.training.trainer import CHECKPOINT_FILE, Trainer
 from ultragray.scene.gaussians import GaussianScene
 
@@ -122,6 +123,7 @@ def train(
     it came. Where the configuration leaves the effort open, trainings on a part of the frames choose it before; stopped
     there, the scene has step 0, and the next `train` in the folder goes on with the choice. A finished run trains once
     more, shorter, to fit the scene's confidence (`config.confidence`); stopped there, the scene is whole but for that.
+    The speckle of the frames is fitted before that, in seconds.
     Raises TrainingDiverged and MemoryExceeded (the last good checkpoint stays), TrainingStateInvalid, DatasetInvalid,
     BackendUnavailable, and InvalidArgument for a TensorBoard that is not installed; what can be known before the first
     step is, before `folder` is made.
@@ -150,9 +152,14 @@ def train(
         with trainer.logs(tensorboard) as log:
             trainer.run(log, _with_fit(report, dataset, trainer.config), should_stop, checkpoint_interval_s)
         scene, is_finished, resolved = trainer.scene(), trainer.is_finished, trainer.config
+    if is_finished:
+        rest = scene.at_rest()
+        refined = replace(dataset, train=replace(dataset.train, poses=rest.training_poses))
+        speckle = fit_speckle(rest, refined.train, backend=backend)
+        for one in (scene, rest):
+            one.info = replace(one.info, speckle=speckle)
     if resolved.confidence and is_finished:
         del trainer  # what it takes of the memory is free for the second training
-        refined = replace(dataset, train=replace(dataset.train, poses=scene.at_rest().training_poses))
         settled = replace(resolved, refine_poses="none")
         scene.info.confidence.update(_fitted_confidence(refined, settled, apart))
     return scene

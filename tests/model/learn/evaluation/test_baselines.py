@@ -9,6 +9,7 @@ from ultragray import ConvexProbe, LinearProbe, PhasedProbe, RadialProbe, Steere
 from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.source import load_dataset
 from ultragray.errors import DatasetInvalid, InvalidArgument
+from ultragray.geometry.pose import mean_axes
 from ultragray.learn.evaluation import baselines as compounding
 from ultragray.learn.evaluation.baselines import (
     BASELINES,
@@ -18,7 +19,7 @@ from ultragray.learn.evaluation.baselines import (
     interpolate_planes,
     predict,
 )
-from ultragray.learn.sweep import mean_axes, nearest_frames, pixel_positions_mm
+from ultragray.learn.sweep import nearest_frames, pixel_positions_mm
 
 LINEAR = LinearProbe(width_mm=8.0, near_mm=0.0, far_mm=10.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=8.0, far_mm=20.0)

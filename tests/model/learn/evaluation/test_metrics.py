@@ -159,6 +159,8 @@ def test_a_blurred_rendering_has_less_contrast_and_larger_speckle():
     summary = summarize(compare_speckle(blurred, truth, PROBE))
     assert summary.rendered.contrast < 0.5 * summary.true.contrast
     assert summary.rendered.axial_mm > 1.5 * summary.true.axial_mm
+    assert summary.rendered.axial_gradient < 0.5 * summary.true.axial_gradient
+    assert summary.rendered.lateral_gradient < 0.8 * summary.true.lateral_gradient
     assert summary.histogram_distance > 0.02
 
 
@@ -201,10 +203,10 @@ def test_a_flat_rendering_of_any_size_has_numbers_that_json_holds():
 
 
 def test_means_are_over_the_frames_that_have_windows():
-    one, other = Speckle(0.5, 0.2, 0.4), Speckle(0.3, 0.4, 0.8)
+    one, other = Speckle(0.5, 0.2, 0.4, 0.02, 0.01), Speckle(0.3, 0.4, 0.8, 0.04, 0.02)
     frames = [FrameSpeckle(one, other, 0.1), FrameSpeckle(None, None, 0.3), FrameSpeckle(other, other, 0.2)]
     summary = summarize(frames)
-    assert summary.true == Speckle(0.4, pytest.approx(0.3), pytest.approx(0.6))
+    assert summary.true == Speckle(0.4, *map(pytest.approx, (0.3, 0.6, 0.03, 0.015)))
     assert (summary.rendered, summary.frames) == (other, 2)
     assert summary.histogram_distance == pytest.approx(0.2)
     assert summary.figures()["true_speckle_contrast"] == 0.4

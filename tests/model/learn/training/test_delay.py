@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from ultragray.datasets.checks import check_dataset
 from ultragray.learn.sweep import Dataset
 from ultragray.learn.training.agreement import agreed_path
 from ultragray.learn.training.alignment import found_calibration, sweep_ranges
@@ -34,6 +35,7 @@ def test_a_delay_is_found_and_taken_off():
     given = recorded(1.0, times_s=SPACING_S * np.arange(FRAMES))
     path, truth = agreed_path(given), trembling_path(np.arange(FRAMES))
     assert path.delay_s == pytest.approx(SPACING_S, abs=0.2 * SPACING_S)
+    assert f"{1000.0 * path.delay_s:.0f} ms later than their poses" in " ".join(check_dataset(given).warnings)
     for poses, tracked, true in ((path.train, given.train, truth[::2]), (path.val, given.val, truth[1::2])):
         assert error_mm(poses, true) < 0.3 * error_mm(tracked.poses, true)
     assert agreed_path(recorded(0.0, times_s=SPACING_S * np.arange(FRAMES))).delay_s == 0.0
@@ -57,5 +59,7 @@ def test_a_calibration_that_is_off_is_found_where_sweeps_cross():
     found = off @ found_calibration(given, ranges)
     left, before = (PROBE.corners_from(one[None]) - PROBE.corners_mm() for one in (found, off))
     assert np.linalg.norm(left, axis=-1).mean() < 0.3 * np.linalg.norm(before, axis=-1).mean()
+    told = " ".join(check_dataset(Dataset("crossing", given, given.select([]))).warnings)
+    assert "calibration from the image to the probe seems to be off by" in told
     np.testing.assert_array_equal(found_calibration(images, ranges), np.eye(4))
     np.testing.assert_array_equal(found_calibration(given, [range(60)]), np.eye(4))  # one sweep tells none

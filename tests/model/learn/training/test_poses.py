@@ -79,6 +79,7 @@ def test_the_noise_of_a_tracker_is_measured_and_removed(mm, deg):
     true = freehand_path(120)
     given, ranges = shaken(true, mm, deg), [range(120)]
     noise = tracker_noise(given, ranges)
+    assert min(noise.axes_mm) == noise.position_mm
     assert noise.position_mm == pytest.approx(mm, rel=0.25)
     assert noise.turn_deg == pytest.approx(deg, rel=0.25)
     found = without_noise(given, ranges)

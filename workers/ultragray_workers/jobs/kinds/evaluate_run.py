@@ -82,6 +82,7 @@ def _scored(job_run: JobRun, scene: GaussianScene, sweep: Sweep) -> Evaluation:
     started, portion = time.monotonic(), frames_at_once(sweep.height, sweep.width)
     frames: list[FrameMetrics] = []
     speckle: list[FrameSpeckle] = []
+    natural: list[FrameSpeckle] = []
     scales = 0
     while len(frames) < len(sweep):
         if job_run.should_stop():
@@ -89,7 +90,8 @@ def _scored(job_run: JobRun, scene: GaussianScene, sweep: Sweep) -> Evaluation:
         scored = evaluate(scene, sweep.select(np.arange(len(frames), min(len(frames) + portion, len(sweep)))))
         frames, scales = frames + scored.frames, scored.ms_ssim_scales
         speckle += scored.frame_speckle
+        natural += scored.frame_natural
         rate = len(frames) / (time.monotonic() - started)
         left_s = (len(sweep) - len(frames)) / rate
         job_run.report(Progress(frames_done=len(frames), frames=len(sweep), rate_per_s=rate, seconds_left=left_s))
-    return Evaluation(frames, sweep.frame_numbers, scales, speckle)
+    return Evaluation(frames, sweep.frame_numbers, scales, speckle, natural)
