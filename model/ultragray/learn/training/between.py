@@ -213,9 +213,6 @@ class Places:
     shares: FloatArray  # [V] of the way from the first frame to the second
     beyond_mm: FloatArray  # [V] along the elevation axis of the first; 0 between frames
 
-    def select(self, which: IntArray) -> Places:
-        return Places(self.frames[which], self.shares[which], self.beyond_mm[which])
-
     @property
     def nearer(self) -> IntArray:  # [V]
         return np.where(self.shares > 0.5, self.frames[:, 1], self.frames[:, 0])

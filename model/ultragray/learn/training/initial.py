@@ -1,11 +1,10 @@
 """The Gaussians that a training starts from, as raw parameters (docs/physics.md §2), lengths in cm.
 
-An informed start samples the volume as the frames saw it, more densely where they show detail: a plane is drawn
-between neighbouring frames, a pixel on it, and the Gaussian there gets the turn of the nearer frame, the elevation of
-a slice and the brightness that both frames show. A pixel in shadow shows B = E·T with T < 1; as the start absorbs
-hardly anything, its echo is estimated as B / T from the share of the beam that the frame itself says is left, at most
-1.5 times the smoothed tissue, and where nearly nothing is left the smoothed tissue itself. A floor under it makes
-what lies above learn to absorb.
+An informed start samples the volume as the frames saw it: a plane is drawn between neighbouring frames, a pixel on it,
+and the Gaussian there gets the turn of the nearer frame, the elevation of a slice and the brightness that both frames
+show. A pixel in shadow shows B = E·T with T < 1; as the start absorbs hardly anything, its echo is estimated as B / T
+from the share of the beam that the frame itself says is left, at most 1.5 times the smoothed tissue, and where nearly
+nothing is left the smoothed tissue itself. A floor under it makes what lies above learn to absorb.
 """
 
 from __future__ import annotations
@@ -13,14 +12,13 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import cv2
 import numpy as np
 import torch
 from torch import Tensor
 
 from ultragray.geometry.pose import quaternion_from_pose
 from ultragray.geometry.probe import FloatArray
-from ultragray.learn.sweep import Dataset, IntArray, Sweep
+from ultragray.learn.sweep import Dataset, IntArray
 from ultragray.learn.training.between import Neighbours, draw_places
 from ultragray.learn.training.config import TrainingConfig
 from ultragray.learn.training.geometry import SPENT, Geometry, Shadows
@@ -35,9 +33,6 @@ RELEASED_CUBE = 0.8  # half-side of the released start, × scene scale
 BEYOND_ELEVATION = 0.5  # standard deviation along elevation beyond an end, × the distance from it
 UNPRUNED = 0.9  # of the standard deviation above which a refinement prunes
 MOST_LIT = 1.5  # × the smoothed brightness: what noise in a shadow may be brightened to
-CANDIDATES = 3  # pixels for each Gaussian, of which those with detail are likelier to get one
-EVEN = 0.3  # of the likelihood is the same for all
-DETAIL_PIXELS = 9  # a side of the window whose deviation is the detail
 
 
 class Start(NamedTuple):
@@ -115,10 +110,8 @@ def _on_planes(
     dataset: Dataset, neighbours: Neighbours, count: int, shadows: Shadows | None, generator: torch.Generator
 ) -> _Pixels:
     sweep, probe = dataset.train, dataset.probe
-    places = draw_places(neighbours, CANDIDATES * count, generator)
-    across, deep = torch.rand((2, CANDIDATES * count), generator=generator, dtype=torch.float64).numpy()  # of the image
-    kept = _by_detail(sweep, places.nearer, deep, across, count, generator)
-    places, deep, across = places.select(kept), deep[kept], across[kept]
+    places = draw_places(neighbours, count, generator)
+    across, deep = torch.rand((2, count), generator=generator, dtype=torch.float64).numpy()  # share of the image
     points_mm = probe.points_mm(deep, across)
     poses = places.poses(sweep)
     tracked_mm = np.einsum("nij,nj->ni", poses[:, :3, :3], points_mm) + poses[:, :3, 3]
@@ -145,22 +138,3 @@ def _on_planes(
         brightness=brightness[nearer],
         unshadowed=unshadowed[nearer],
     )
-
-
-def _by_detail(
-    sweep: Sweep, frames: IntArray, deep: FloatArray, across: FloatArray, count: int, generator: torch.Generator
-) -> IntArray:  # [M], [M], [M] -> [count] ascending
-    """`count` of the pixels at these shares of frames, drawn without replacement; detail makes them likelier.
-
-    Of keys log(u)/w, u uniform in (0, 1), the largest are a draw with weights w (Efraimidis and Spirakis 2006).
-    """
-    rows, columns = (deep * sweep.height).astype(np.int64), (across * sweep.width).astype(np.int64)
-    detail, window = np.empty(len(frames)), (DETAIL_PIXELS, DETAIL_PIXELS)
-    for frame in np.unique(frames):
-        (own,) = np.nonzero(frames == frame)
-        image = sweep.images[frame].astype(np.float32)
-        variance = cv2.blur(np.square(image), window) - np.square(cv2.blur(image, window))
-        detail[own] = np.sqrt(np.maximum(variance[rows[own], columns[own]], 0.0))
-    weights = EVEN + (1.0 - EVEN) * detail / max(float(detail.mean()), 1e-9)
-    keys = torch.rand(len(frames), generator=generator, dtype=torch.float64).clamp(min=1e-300).log().numpy() / weights
-    return np.sort(np.argpartition(-keys, count - 1)[:count])

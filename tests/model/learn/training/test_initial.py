@@ -69,17 +69,6 @@ def test_informed_start_lies_on_pixels_of_that_brightness(tiny_dataset, tiny_con
     assert shares.min() > 0.6 * shares.mean(), "no gap stays empty"
 
 
-def test_where_frames_show_detail_gaussians_begin_more_densely(tiny_dataset, tiny_config):
-    dataset = tiny_dataset(height=40, width=40)
-    images = np.full_like(dataset.train.images, 128)
-    images[..., 20:] = np.random.default_rng(0).integers(64, 192, size=(*images.shape[:2], 20))
-    dataset = replace(dataset, train=replace(dataset.train, images=images))
-    parameters = start_of(dataset, tiny_config(max_gaussians=2_000, transmittance=False))
-    x = parameters["means"][:, 0].numpy() * 10.0 + Geometry.of(dataset).centre_mm[0] - dataset.train.poses[0, 0, 3]
-    share = (x > 0.0).mean()
-    assert 0.68 < share < 0.8, "of those with detail; three candidates for each keep the calm half from being empty"
-
-
 def test_random_start_is_the_released_cube(tiny_dataset, tiny_config):
     dataset = tiny_dataset()
     half_side = 0.8 * Geometry.of(dataset).scene_scale_cm
