@@ -315,6 +315,7 @@ BLOCKS = {
     "ablations": Block("ablations", ablations.trained_without),
     "poses": Block("poses", poses.refined_poses),
     "hand": Block("hand", hand.predicted, hand.of_paths),
+    "scenes of a hand": Block("hand", hand.trained, hand.of_scenes),
     "localization": Block("localization", localization.found_frames),
     "confidence": Block("confidence", confidence.confidence_and_uncertainty),
     "speckle": Block("speckle", speckle.textures),
