@@ -28,7 +28,10 @@ SPLATS = {name: torch.ones(shape) for name, shape in scene_info.expected_shapes(
 
 def test_scene_file(tmp_path):
     poses = np.tile(np.eye(4), (2, 1, 1))
-    scene = GaussianScene.from_splats(SPLATS, training_poses=poses, labels=LABELS, pose_corrections=poses)
+    info = SceneInfo(probe=PhasedProbe(60, 50), tissue_shares=(1.0, 0.5, 0.0))
+    scene = GaussianScene.from_splats(
+        SPLATS, info=info, training_poses=poses, labels=LABELS, pose_corrections=poses, rest_poses=poses
+    )
     scene.save(tmp_path / "scene.ugr")
     with safe_open(tmp_path / "scene.ugr", framework="numpy") as bundle:
         parts = {name: bundle.get_slice(name) for name in bundle.keys()}  # noqa: SIM118 (no mapping)
