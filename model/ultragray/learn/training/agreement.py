@@ -95,10 +95,14 @@ def agreed_path(dataset: Dataset) -> AgreedPath | None:
         found, found_db = cleaned, db
     delay_s, found = _without_delay(judge, found, _times_of(whole), order, ranges, on_path)
     tracked = found  # in the tracker's frame, by the calibration that was given
-    calibration = found_calibration(replace(train, poses=found[on_path]), sweep_ranges(train))
-    if delay_s or not np.array_equal(calibration, np.eye(4)):
-        found = found @ calibration
+    if delay_s:
         found_db = judge.psnr_db(found[on_path])
+    calibration = found_calibration(replace(train, poses=found[on_path]), sweep_ranges(train))
+    if not np.array_equal(calibration, np.eye(4)):
+        if (db := judge.psnr_db((found @ calibration)[on_path])) >= found_db - LEAST_GAIN_DB:
+            found, found_db = found @ calibration, db
+        else:
+            calibration = np.eye(4)  # what makes neighbouring frames predict each other worse is none
     rigid = found
     shares, moved, db = _best_shares(judge, rigid, ranges, on_path, found_db)
     if db < found_db + GAIN_OF_SHARES_DB:

@@ -9,7 +9,7 @@ from ultragray.datasets.checks import check_dataset
 from ultragray.geometry.rotations import turns_of
 from ultragray.learn.evaluation.scoring import evaluate
 from ultragray.learn.sweep import Dataset, corner_distances_mm
-from ultragray.learn.training import train
+from ultragray.learn.training import agreement, train
 from ultragray.learn.training.agreement import RIGID, agreed_path, with_shares
 from ultragray.learn.training.poses import held_out_on_path
 
@@ -111,6 +111,16 @@ def test_exact_poses_of_rigid_tissue_stay():
     given = recording(truth, truth)
     assert agreed_path(given).of(given) is given
     assert agreed_path(given).shares == RIGID
+
+
+def test_a_calibration_by_which_neighbours_predict_each_other_worse_is_not_taken(monkeypatch):
+    truth, turned = hand_path(), np.eye(4)
+    turned[:3, :3] = poses_of(np.array([[0.0, 90.0, 0.0]]), np.zeros((1, 3)))[0, :3, :3]
+    given = recording(truth, truth)
+    for calibration, is_taken in ((turned, False), (poses_of(np.zeros((1, 3)), np.full((1, 3), 0.1))[0], True)):
+        monkeypatch.setattr(agreement, "found_calibration", lambda sweep, ranges, one=calibration: one)
+        path = agreed_path(given)
+        np.testing.assert_array_equal(path.calibration, calibration if is_taken else np.eye(4))
 
 
 def test_held_out_frames_of_another_file_move_with_the_frames_about_them():
