@@ -151,9 +151,12 @@ def test_the_scene_file_keeps_it(followed, tmp_path):
     np.testing.assert_array_equal(read_ply(tmp_path / "at_rest.ply").training_poses, followed.rest_poses)
 
 
-@pytest.mark.parametrize("missing", ["tissue_shares", "rest_poses"])
+@pytest.mark.parametrize("missing", ["tissue_shares", "rest_poses", "poses", "probe"])
 def test_half_of_what_tells_of_it_is_refused(followed, tmp_path, missing):
     info = replace(followed.info, tissue_shares=None if missing == "tissue_shares" else SHARES)
+    info = replace(info, probe=None if missing == "probe" else PROBE)
+    if missing == "poses":
+        followed = replace(followed, training_poses=followed.training_poses[:0], rest_poses=followed.rest_poses[:0])
     rest = None if missing == "rest_poses" else followed.rest_poses
     with pytest.raises(InvalidArgument, match="belong together"):
         GaussianScene.from_splats(followed.splats, info=info, training_poses=followed.training_poses, rest_poses=rest)

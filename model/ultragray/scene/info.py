@@ -213,11 +213,13 @@ def check_beside(name: str, motions: Any, count: int) -> FloatArray:  # [P, 4, 4
 
 
 def check_tissue(info: SceneInfo, rest_poses: FloatArray | None) -> None:
-    """Raises InvalidArgument where only one is known of the two that say how tissue follows, or no probe is."""
-    if (info.tissue_shares is None) != (rest_poses is None) or (rest_poses is not None and info.probe is None):
+    """Raises InvalidArgument where some is missing of what says how tissue follows the probe."""
+    if info.tissue_shares is None and rest_poses is None:
+        return
+    if info.tissue_shares is None or rest_poses is None or not len(rest_poses) or info.probe is None:
         raise InvalidArgument(
-            f"tissue_shares, {REST_TENSOR} and a probe belong together: a scene has all three, or neither of the first "
-            "two",
+            f"tissue_shares, {REST_TENSOR} (one or more) and a probe belong together: a scene has all, or neither of "
+            "the first two",
             field="tissue_shares",
         )
 
