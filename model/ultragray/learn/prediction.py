@@ -5,7 +5,7 @@ same in space for whole batches on a GPU).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -62,21 +62,25 @@ class NeighboursInTime:
 
     @classmethod
     def of(cls, dataset: Dataset) -> NeighboursInTime:
-        """By the times of the frames, or by their numbers where some have no times.
+        """By the times of the frames, by their numbers where some have none, by their places where files differ.
 
         Raises DatasetInvalid where held-out frames are of another recording than the training frames, and where a
         held-out frame has the time of a training frame.
         """
         train, val = dataset.train, dataset.val
-        if not dataset.is_one_recording:
+        if (places := dataset.places) is None:
             raise DatasetInvalid(
                 f"{dataset.name}: held-out frames are of another recording ({val.source}) than the training frames "
                 f"({train.source}): they have no neighbours in time"
             )
-        if train.times_s is None or val.times_s is None:
-            train, val = (_without_times(part) for part in (train, val))
-        order = np.argsort(frame_times(train), kind="stable")
-        times, asked = frame_times(train)[order], frame_times(val)
+        if not dataset.is_one_recording:
+            known, asked = np.split(places.astype(np.float64), [len(train)])
+        elif train.times_s is None or val.times_s is None:
+            known, asked = (part.frame_numbers.astype(np.float64) for part in (train, val))
+        else:
+            known, asked = train.times_s, val.times_s
+        order = np.argsort(known, kind="stable")
+        times = known[order]
         if len(twice := np.flatnonzero(np.isin(asked, times))):
             raise DatasetInvalid(
                 f"{dataset.name}: held-out frames {frame_list(val.frame_numbers[twice])} have the times of training "
@@ -93,7 +97,3 @@ class NeighboursInTime:
         for blend, (first, second), share in zip(found, self.frames, self.shares, strict=True):
             blend[:] = blend_in_time(sweep.images[first], sweep.images[second], share) / 255.0
         return found
-
-
-def _without_times(sweep: Sweep) -> Sweep:
-    return replace(sweep, times_s=None)

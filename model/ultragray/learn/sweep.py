@@ -9,6 +9,7 @@ import json
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass, replace
+from functools import cached_property
 from typing import TypeAlias
 
 import numpy as np
@@ -201,6 +202,34 @@ def nearest_frames(sweep: Sweep, poses: FloatArray) -> IntArray:  # [C]
     return np.array([corner_distances_mm(corners, own).argmin() for own in asked], np.int64)
 
 
+ON_PATH = 0.5  # of the usual step from frame to frame: as far beside the path between two frames lies one of its own
+IN_ORDER = 0.8  # of the steps of such frames lead onwards
+LONGEST_STEP = 6.0  # usual steps: a longer one leads from one sweep to another
+
+
+def _along_path(sweep: Sweep, others: Sweep) -> FloatArray | None:  # [V]
+    """Where other frames lie on the path of a sweep: the place of the frame before, and the share of the step from it.
+
+    In their own order, which poses that shake may contradict. None where they do not lie on it, or not in their order.
+    """
+    starts, ends = sweep.corners_mm()[:-1], sweep.corners_mm()[1:]  # [F − 1, K, 3]
+    steps, lengths = ends - starts, corner_distances_mm(ends, starts)
+    usual_mm = float(np.median(lengths))
+    if not len(others) or usual_mm == 0.0:
+        return None
+    squares = np.square(steps).sum(axis=(1, 2))
+    found, beside_mm = np.empty((2, len(others)))
+    for place, own in enumerate(others.corners_mm()):
+        ways = own - starts
+        shares = np.clip((ways * steps).sum(axis=(1, 2)) / np.maximum(squares, 1e-12), 0.0, 1.0)
+        distances = corner_distances_mm(starts + shares[:, None, None] * steps, own)
+        distances[lengths > LONGEST_STEP * usual_mm] = np.inf
+        nearest = int(distances.argmin())
+        found[place], beside_mm[place] = nearest + shares[nearest], distances[nearest]
+    is_on = np.median(beside_mm) < ON_PATH * usual_mm
+    return np.sort(found) if is_on and (np.diff(found) >= 0.0).mean() >= IN_ORDER else None
+
+
 @dataclass(frozen=True, eq=False)
 class Dataset:
     """Frames to train from and frames held out to measure with (there may be none), of one probe and image size.
@@ -232,6 +261,21 @@ class Dataset:
     def is_one_recording(self) -> bool:
         """Whether both parts are frames of one recording, in the order of their numbers."""
         return self.train.source == self.val.source and not set(self.train.frame_numbers) & set(self.val.frame_numbers)
+
+    @cached_property
+    def places(self) -> IntArray | None:  # [F + V]
+        """The place of each frame, training frames first, in the recording that both parts are of.
+
+        By the numbers of the frames, if these are of one source. Frames of another file are taken to be of the same
+        recording if they lie on the path between the training frames, in their order. None: they do not.
+        """
+        if self.is_one_recording:
+            numbers = np.concatenate([self.train.frame_numbers, self.val.frame_numbers]).astype(np.float64)
+        elif (along := _along_path(self.train, self.val)) is not None:
+            numbers = np.concatenate([np.arange(len(self.train)), along])
+        else:
+            return None
+        return np.argsort(np.argsort(numbers, kind="stable"), kind="stable")
 
     @property
     def centre_mm(self) -> FloatArray:  # [3]

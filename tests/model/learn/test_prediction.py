@@ -44,11 +44,20 @@ def test_poses_do_not_matter():
 
 def test_frames_of_another_recording_have_no_neighbours():
     given = recording()
-    apart = replace(given, val=replace(given.val, source="another file"))
+    aside = given.val.poses + 10.0 * np.eye(4)[:, 3] * np.eye(4)[0][:, None]
+    apart = replace(given, val=replace(given.val, source="another file", poses=aside))
     with pytest.raises(DatasetInvalid, match=r"another recording \(another file\) than the training frames \(tiny\)"):
         NeighboursInTime.of(apart)
     assert set(evaluate_baselines(apart, ("nearest", IN_TIME))) == {"nearest"}
     assert set(evaluate_baselines(given)) == set(BASELINES)
+
+
+def test_frames_of_another_file_that_lie_between_the_others_have_them_as_neighbours():
+    given = recording()
+    between = given.val.poses.copy()
+    between[:, 1, 3] += 0.1  # shaken
+    other = replace(given, val=replace(given.val, source="another file", frame_numbers=np.arange(3), poses=between))
+    assert NeighboursInTime.of(other).frames.tolist() == NeighboursInTime.of(given).frames.tolist()
 
 
 def test_a_time_that_comes_twice_is_told():

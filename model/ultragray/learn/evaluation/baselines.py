@@ -258,7 +258,7 @@ def evaluate_baselines(
     return {
         method: evaluate_frames(predict_held_out(dataset, method, voxel_mm=voxel_mm), dataset.val)
         for method in methods
-        if method != IN_TIME or dataset.is_one_recording
+        if method != IN_TIME or dataset.places is not None
     }
 
 

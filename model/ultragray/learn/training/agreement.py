@@ -77,15 +77,16 @@ class AgreedPath:
 def agreed_path(dataset: Dataset) -> AgreedPath | None:
     """The path of all frames, judged by the training frames alone; None where no sweep has three frames in a row.
 
-    Poses are those of the dataset where no other path agrees better. Held-out frames of the same recording take part in
-    the path by their poses. Those of another file are moved as the training frames about them are.
+    Poses are those of the dataset where no other path agrees better. Held-out frames of the same recording
+    (`Dataset.places`) take part in the path by their poses. Others are moved as the training frames about them are.
     """
     train, val = dataset.train, dataset.val
     if (judge := _Judge.of(train, sweep_ranges(train))) is None:
         return None
-    whole = [train, val] if dataset.is_one_recording else [train]
-    order = np.argsort(np.concatenate([part.frame_numbers for part in whole]), kind="stable")
-    places = np.argsort(order, kind="stable")  # of each frame on the path
+    known = dataset.places
+    whole = [train] if known is None else [train, val]
+    places = np.argsort(np.argsort(train.frame_numbers)) if known is None else known  # of each frame on the path
+    order = np.argsort(places)
     on_path = places[: len(train)]
     given = np.concatenate([part.poses for part in whole])[order]
     ranges = path_ranges(train.probe.corners_from(given))
@@ -113,7 +114,7 @@ def agreed_path(dataset: Dataset) -> AgreedPath | None:
     figures = judge.in_time_db(), tracked_db, found_db, shares, noise, delay_s, calibration
     if found is given:
         return AgreedPath(train.poses, val.poses, train.poses, *figures)
-    if dataset.is_one_recording:
+    if known is not None:
         return AgreedPath(found[on_path], found[places[len(train) :]], tracked[on_path], *figures)
     held_out = val.poses
     if delay_s and val.times_s is not None:

@@ -126,10 +126,24 @@ def test_a_calibration_by_which_neighbours_predict_each_other_worse_is_not_taken
 def test_held_out_frames_of_another_file_move_with_the_frames_about_them():
     tracked = hand_path()
     given = recording(with_shares(tracked, [range(FRAMES)], PROBE, (0.0, 0.0, 0.0)), tracked)
-    together = agreed_path(given)
-    apart = agreed_path(replace(given, val=replace(given.val, source="another file")))
-    assert error_mm(apart.val, together.val) < 0.2 * error_mm(given.val.poses, together.val)
+    aside = given.val.poses.copy()
+    aside[:, :3, 3] += 2.0 * aside[:, :3, 0]
+    apart = agreed_path(replace(given, val=replace(given.val, source="another file", poses=aside)))
+    together = agreed_path(given).val.copy()
+    together[:, :3, 3] += 2.0 * together[:, :3, 0]
+    assert error_mm(apart.val, together) < 0.5 * error_mm(aside, together)
     np.testing.assert_allclose(apart.train, agreed_path(replace(given, val=given.val.select([]))).train)
+
+
+def test_held_out_frames_of_another_file_that_lie_between_the_others_are_of_the_same_path():
+    truth = hand_path()
+    given = recording(truth, shaken(truth, 0.15, 0.1))
+    without_numbers = replace(given.val, source="another file", frame_numbers=np.arange(len(given.val)))
+    without_numbers_of_train = replace(given.train, frame_numbers=np.arange(len(given.train)))
+    other = Dataset("hand", without_numbers_of_train, without_numbers)
+    together, apart = agreed_path(given), agreed_path(other)
+    np.testing.assert_array_equal(apart.train, together.train)
+    np.testing.assert_array_equal(apart.val, together.val)
 
 
 def test_a_share_of_the_motion_within_the_plane():
