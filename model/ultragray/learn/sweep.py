@@ -203,7 +203,7 @@ def nearest_frames(sweep: Sweep, poses: FloatArray) -> IntArray:  # [C]
 
 
 ON_PATH = 0.5  # of the usual step from frame to frame: as far beside the path between two frames lies one of its own
-IN_ORDER = 0.8  # of the steps of such frames lead onwards
+IN_ORDER = 0.8  # of such frames lie beyond the one before
 LONGEST_STEP = 6.0  # usual steps: a longer one leads from one sweep to another
 
 
@@ -226,8 +226,9 @@ def _along_path(sweep: Sweep, others: Sweep) -> FloatArray | None:  # [V]
         distances[lengths > LONGEST_STEP * usual_mm] = np.inf
         nearest = int(distances.argmin())
         found[place], beside_mm[place] = nearest + shares[nearest], distances[nearest]
-    is_on = np.median(beside_mm) < ON_PATH * usual_mm
-    return np.sort(found) if is_on and (np.diff(found) >= 0.0).mean() >= IN_ORDER else None
+    back = np.count_nonzero(np.diff(found) < 0.0)
+    is_on = np.median(beside_mm) < ON_PATH * usual_mm and back <= (1.0 - IN_ORDER) * len(others)
+    return np.sort(found) if is_on else None
 
 
 @dataclass(frozen=True, eq=False)

@@ -58,6 +58,8 @@ def test_frames_of_another_file_that_lie_between_the_others_have_them_as_neighbo
     between[:, 1, 3] += 0.1  # shaken
     other = replace(given, val=replace(given.val, source="another file", frame_numbers=np.arange(3), poses=between))
     assert NeighboursInTime.of(other).frames.tolist() == NeighboursInTime.of(given).frames.tolist()
+    alone = replace(other, val=other.val.select([1]))
+    assert NeighboursInTime.of(alone).frames.tolist() == NeighboursInTime.of(given).frames[1:2].tolist()
 
 
 def test_a_time_that_comes_twice_is_told():

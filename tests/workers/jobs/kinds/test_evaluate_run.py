@@ -8,8 +8,9 @@ import torch
 
 from ultragray import ConvexProbe, GaussianScene
 from ultragray.errors import DatasetInvalid
-from ultragray.learn.evaluation.baselines import BY_POSE
+from ultragray.learn.evaluation.baselines import BY_POSE, IN_TIME
 from ultragray.learn.evaluation.scoring import evaluate
+from ultragray.learn.sweep import Dataset
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import DatasetNotFound, SceneNotFound
 from ultragray_workers.jobs.folder import JobFolder
@@ -54,10 +55,14 @@ def test_scores_are_those_of_the_library(job_run, monkeypatch):
     assert sum(name.startswith("frame_") for name in outcome.artifacts) == len(held_out)
 
 
-def test_baselines_are_scored_beside_it(job_run, capsys):
+@pytest.mark.parametrize("is_of_another", [False, True])
+def test_baselines_are_scored_beside_it(job_run, capsys, monkeypatch, is_of_another):
+    if is_of_another:
+        monkeypatch.setattr(Dataset, "places", None)
     outcome = evaluate_run.run(job_run(), EvaluateJob("tiny", "one", baselines=True))
     assert {f"{method}_psnr_db" for method in BY_POSE} < set(outcome.metrics)
-    assert "of another recording: they have no neighbours in time" in capsys.readouterr().err
+    assert (f"{IN_TIME}_psnr_db" in outcome.metrics) != is_of_another
+    assert ("of another recording: they have no neighbours in time" in capsys.readouterr().err) == is_of_another
     assert all(np.isfinite(value) for value in outcome.metrics.values())
 
 
