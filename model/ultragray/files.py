@@ -11,8 +11,8 @@ import hashlib
 import io
 import math
 import os
+import secrets
 import shutil
-import tempfile
 from collections.abc import Iterator
 from pathlib import Path
 from tokenize import TokenError
@@ -29,11 +29,10 @@ _OF_WRITING = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS)
 def atomic_path(path: str | Path) -> Iterator[Path]:
     """A temporary path beside `path`; on success it is synced and renamed to `path`, on failure removed."""
     path = Path(path)
-    temporary: Path | None = None
+    # Named before it is made: a signal that comes between the two leaves nothing.
+    temporary = path.with_name(f".{path.name}.{secrets.token_hex(8)}{TEMPORARY_SUFFIX}")
     try:
-        descriptor, name = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.", suffix=TEMPORARY_SUFFIX)
-        os.close(descriptor)
-        temporary = Path(name)
+        temporary.touch(mode=0o600, exist_ok=False)
         yield temporary
         mask = os.umask(0)
         os.umask(mask)
@@ -46,7 +45,7 @@ def atomic_path(path: str | Path) -> Iterator[Path]:
             raise
         raise OSError(error.errno, error.strerror, str(path)) from error  # the caller knows of no other file
     finally:
-        if temporary is not None:
+        with contextlib.suppress(NotADirectoryError):
             temporary.unlink(missing_ok=True)
 
 
