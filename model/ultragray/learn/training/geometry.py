@@ -94,7 +94,7 @@ PIXELS_PER_GAUSSIAN = 25
 STEPS_PER_FRAME = 15  # a frame that is seen more often is learned with its noise
 MIN_STEPS, USUAL_STEPS = 250, 1_500  # fewer leave shadows unlearned
 MIN_GAUSSIANS, USUAL_GAUSSIANS = 2_000, 150_000  # fewer hold no anatomy; enough unless much more is to be seen
-MAX_GAUSSIANS = 600_000  # of a large volume that is seen finely: ten minutes on two cores
+MAX_GAUSSIANS = 600_000  # of a large volume that is seen finely
 LEAST_LIT = 8  # grey value, of 255, of a pixel that shows something
 
 

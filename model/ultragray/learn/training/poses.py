@@ -213,5 +213,7 @@ def held_out_on_path(dataset: Dataset, info: SceneInfo) -> Sweep | None:
     """
     if info.dataset_sha256 != dataset.sha256 or info.training.get("refine_poses") not in WITH_PATH:
         return None
-    path = agreed_path(dataset)
-    return None if path is None or path.of(dataset) is dataset or not len(dataset.val) else path.of(dataset).val
+    if not len(dataset.val) or (path := agreed_path(dataset)) is None:
+        return None
+    placed = path.of(dataset)
+    return None if placed is dataset else placed.val
