@@ -153,7 +153,8 @@ def test_bytes_are_taken_as_they_are():
     assert in_type(frame[None], Encoding.UINT8.pixel_type).tolist() == [frame.tolist()]
     floats = in_type(frame[None], Encoding.FLOAT32.pixel_type)
     assert (floats.dtype.str, floats.tolist()) == ("<f4", [frame.tolist()])
-    assert cv2.imdecode(encoded_image(frame, Encoding.PNG), cv2.IMREAD_UNCHANGED).tolist() == frame.tolist()
+    file = np.frombuffer(encoded_image(frame, Encoding.PNG), np.uint8)
+    assert cv2.imdecode(file, cv2.IMREAD_UNCHANGED).tolist() == frame.tolist()
 
 
 FOCUSED = ElevationBeam(thickness_mm=2.0, focus_mm=30.0, depth_of_field_mm=20.0)

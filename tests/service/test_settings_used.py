@@ -20,12 +20,13 @@ from ultragray.rendering.settings import Additions, Resolved, SettingsUsed, sett
 from ultragray.rendering.tools import Needle
 from ultragray.scene.confidence import Extrapolation
 from ultragray_client.frames import frame_from_message, origin_of
+from ultragray_proto.v1 import rendering_pb2
 from ultragray_service.core.open_streams import StreamAnswer
 from ultragray_service.http.routes.rendering import render_headers
 from ultragray_service.http.routes.streams import frame_bytes
 from ultragray_service.igtl.frames import Frame, PoseMessage, image_of
 from ultragray_service.igtl.messages import Message
-from ultragray_service.rpc.messages import frame_message
+from ultragray_service.rpc.messages import serialized_frame
 from ultragray_workers.pool.messages import RenderResult
 
 HEIGHT, WIDTH = 12, 10
@@ -94,8 +95,8 @@ def websocket(settings):
 
 
 def grpc(settings):
-    message = frame_message(result(settings), 1)
-    return origin_of(frame_from_message(type(message).FromString(message.SerializeToString())))
+    message = rendering_pb2.Frame.FromString(serialized_frame(result(settings), 1))
+    return origin_of(frame_from_message(message))
 
 
 def igtl(settings):
