@@ -102,9 +102,11 @@ def _at(path: str, convert: _Convert, value: Any) -> Any:
 
 
 def _written(descriptor: Descriptor, value: Any, others: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    get, cls = (value.get, dict) if isinstance(value, Mapping) else (partial(_attribute, value), type(value))
+    is_mapping = isinstance(value, Mapping)
+    get = value.get if is_mapping else partial(_attribute, value)
     found = dict(others or {})
-    steps, oneofs = _writers(descriptor, None if cls is dict else cls)
+    cls: Any = None if is_mapping else type(value)
+    steps, oneofs = _writers(descriptor, cls)
     for name, convert, default in steps:
         if name in found or (one := get(name)) is None or (default is not None and one == default):
             continue

@@ -1,7 +1,8 @@
 """Every door tells every setting of a frame as it was used: none of them has a list of its own."""
 
 import json
-from dataclasses import fields
+import pickle
+from dataclasses import fields, replace
 from enum import Enum
 from pathlib import Path
 from typing import get_args, get_type_hints
@@ -149,6 +150,18 @@ def test_what_was_not_asked_for_may_be_left_out(door):
     assert {name: told[name] for name in expected.keys() - left_out} == {
         name: expected[name] for name in expected.keys() - left_out
     }
+
+
+@pytest.mark.parametrize("size", [0, 1, 127, 128, 16_383, 16_384, 3 * 2**20])
+def test_grpc_carries_pixels_of_any_number(size):
+    pixels = bytes(range(256)) * (size // 256) + bytes(range(size % 256))
+    sent = serialized_frame(replace(result(PLAIN), data=pixels), 5, dropped=2)
+    frame = rendering_pb2.Frame.FromString(sent)
+    assert (frame.data, frame.sequence, frame.dropped) == (pixels, 5, 2)
+
+
+def test_settings_cross_to_another_process_whole():
+    assert pickle.loads(pickle.dumps(SETTINGS)) == SETTINGS
 
 
 def test_every_setting_has_a_value_of_its_own_here():

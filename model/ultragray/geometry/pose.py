@@ -54,7 +54,7 @@ def check_poses(poses: Any, *, field: str = "poses") -> FloatArray:  # [C, 4, 4]
 
 
 def _is_exact(rows: list[list[float]]) -> bool:  # of a pose [4, 4]
-    """Whether a pose is exact already. A pose of a stream is, whenever it comes by here again: numpy would take 50 µs."""
+    """Whether a pose is exact already, as one is that comes by here again; numpy would take 50 µs to tell."""
     (a, b, c, x), (d, e, f, y), (g, h, i, z), last = rows
     products = (a * b + d * e + g * h, a * c + d * f + g * i, b * c + e * f + h * i)
     lengths = (a * a + d * d + g * g, b * b + e * e + h * h, c * c + f * f + i * i)

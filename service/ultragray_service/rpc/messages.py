@@ -23,7 +23,6 @@ from ultragray_workers.jobs.kinds import KINDS, Specification
 from ultragray_workers.jobs.record import Job
 from ultragray_workers.pool.messages import RenderResult
 
-
 _LENGTH_DELIMITED = 2  # the wire type of bytes
 
 
@@ -102,8 +101,7 @@ def serialized_frame(result: RenderResult, sequence: int, **others: Any) -> byte
 @lru_cache(maxsize=256)
 def _settings_bytes(settings: Resolved) -> bytes:
     """The part of a frame that is the same for all frames of a stream."""
-    message: rendering_pb2.Frame = to_message(settings_used(settings), rendering_pb2.Frame)
-    return message.SerializeToString()
+    return bytes(to_message(settings_used(settings), rendering_pb2.Frame).SerializeToString())
 
 
 @lru_cache(maxsize=256)

@@ -24,7 +24,7 @@ from ultragray_service.core.poses import check_pose_count, exact_poses
 from ultragray_service.core.rendering import Plan
 from ultragray_service.core.streams import MAX_WINDOW, FrameStream, Message, StreamMode, checked_s, unreadable
 from ultragray_service.errors import Refusal
-from ultragray_service.rpc.messages import serialized_frame, read, read_pose, read_settings, read_word, slice_message
+from ultragray_service.rpc.messages import read, read_pose, read_settings, read_word, serialized_frame, slice_message
 from ultragray_service.rpc.shared_memory import SharedMemory
 from ultragray_service.service import Service
 from ultragray_service.views.poses import locate, sought_frame
