@@ -237,6 +237,7 @@ class Encoding(str, Enum):
 
     UINT8 = "uint8"
     FLOAT32 = "float32"
+    FLOAT16 = "float16"
     PNG = "png"
     JPEG = "jpeg"
     NPZ = "npz"

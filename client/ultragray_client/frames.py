@@ -23,6 +23,7 @@ from ultragray_proto.v1 import rendering_pb2
 _PIXEL_TYPES: dict[str, np.dtype[Any]] = {
     Encoding.UINT8: np.dtype("u1"),
     Encoding.FLOAT32: np.dtype("<f4"),
+    Encoding.FLOAT16: np.dtype("<f2"),
 }
 _ENCODINGS = words(rendering_pb2.Encoding.DESCRIPTOR)
 _OUTPUTS = words(rendering_pb2.Output.DESCRIPTOR)
@@ -41,7 +42,7 @@ class Timings:
 class Frame(SettingsUsed):
     """A frame, and all that is needed to render it again. `frame["bmode"]` is one of its arrays."""
 
-    arrays: Mapping[str, npt.NDArray[Any]]  # by output, each [H, W], read-only: uint8 of 0 to 255, or float32 of 0 to 1
+    arrays: Mapping[str, npt.NDArray[Any]]  # by output, each [H, W], read-only: uint8 of 0 to 255, or floats of 0 to 1
     pose: FloatArray  # [4, 4] mm, as used
     scene: str
     scene_sha256: str  # of the scene file

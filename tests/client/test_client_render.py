@@ -46,16 +46,15 @@ def moved(x_mm):
     return pose
 
 
-def test_a_frame_is_what_the_library_renders(client, demo_scene):
-    frame = client.render(
-        "demo", moved(2.0), RenderSettings(outputs=("transmittance", "bmode"), encoding=Encoding.FLOAT32)
-    )
+@pytest.mark.parametrize(("encoding", "within"), [(Encoding.FLOAT32, 1e-5), (Encoding.FLOAT16, 6e-4)])
+def test_a_frame_is_what_the_library_renders(client, demo_scene, encoding, within):
+    frame = client.render("demo", moved(2.0), RenderSettings(outputs=("transmittance", "bmode"), encoding=encoding))
     expected = render(demo_scene, None, moved(2.0), height=HEIGHT, width=WIDTH, outputs=("bmode", "transmittance"))
     assert list(frame.arrays) == ["transmittance", "bmode"]
     for name in ("transmittance", "bmode"):
-        assert frame[name].dtype == np.float32
+        assert frame[name].dtype == np.dtype(encoding.value)
         assert not frame[name].flags.writeable
-        np.testing.assert_allclose(frame[name], getattr(expected, name)[0], atol=1e-5)
+        np.testing.assert_allclose(frame[name], getattr(expected, name)[0], atol=within)
     np.testing.assert_array_equal(frame.pose, moved(2.0))
     assert frame.probe == LinearProbe(DEMO_PROBE.width_mm, DEMO_PROBE.near_mm, DEMO_PROBE.far_mm)
     assert (frame.scene, len(frame.scene_sha256), frame.sequence, frame.dropped) == ("demo", 64, 0, 0)

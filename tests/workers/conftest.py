@@ -86,8 +86,8 @@ def expect_frames(scene_folder):
         bytes_ = np.round(np.clip(floats, 0, 1) * np.float32(255)).astype(np.uint8)
         if asked.encoding is Encoding.UINT8:
             assert result.data == bytes_.tobytes()
-        elif asked.encoding is Encoding.FLOAT32:
-            assert result.data == floats.astype("<f4").tobytes()
+        elif asked.encoding in (Encoding.FLOAT32, Encoding.FLOAT16):
+            assert result.data == floats.astype(asked.encoding.pixel_type).tobytes()
         elif asked.encoding is Encoding.PNG:
             assert result.data.startswith(b"\x89PNG")
             decoded = cv2.imdecode(np.frombuffer(result.data, np.uint8), cv2.IMREAD_UNCHANGED)

@@ -29,6 +29,7 @@ class Encoding(str, Enum):
 
     UINT8 = "uint8"
     FLOAT32 = "float32"
+    FLOAT16 = "float16"  # half the bytes, to 3 digits
     PNG = "png"
     JPEG = "jpeg"
     NPZ = "npz"
@@ -38,8 +39,13 @@ class Encoding(str, Enum):
         return self in (Encoding.PNG, Encoding.JPEG)
 
     @property
+    def is_raw(self) -> bool:
+        """Whether it is nothing but pixels, one after another."""
+        return self in (Encoding.UINT8, Encoding.FLOAT32, Encoding.FLOAT16)
+
+    @property
     def pixel_type(self) -> np.dtype[Any]:
-        return np.dtype("<f4") if self in (Encoding.FLOAT32, Encoding.NPZ) else np.dtype("u1")
+        return np.dtype({"float16": "<f2", "float32": "<f4", "npz": "<f4"}.get(self.value, "u1"))
 
 
 FRAME_ENCODINGS = tuple(one.value for one in Encoding if one is not Encoding.NPZ)

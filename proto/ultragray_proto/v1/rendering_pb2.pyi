@@ -27,6 +27,7 @@ class Encoding(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     ENCODING_FLOAT32: _ClassVar[Encoding]
     ENCODING_PNG: _ClassVar[Encoding]
     ENCODING_JPEG: _ClassVar[Encoding]
+    ENCODING_FLOAT16: _ClassVar[Encoding]
 
 class Contact(int, metaclass=_enum_type_wrapper.EnumTypeWrapper):
     __slots__ = ()
@@ -64,6 +65,7 @@ ENCODING_UINT8: Encoding
 ENCODING_FLOAT32: Encoding
 ENCODING_PNG: Encoding
 ENCODING_JPEG: Encoding
+ENCODING_FLOAT16: Encoding
 CONTACT_UNSPECIFIED: Contact
 CONTACT_AIR: Contact
 CONTACT_PRESSURE: Contact

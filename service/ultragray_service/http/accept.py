@@ -18,7 +18,7 @@ NPY = "application/x-npy"
 MEDIA_TYPES = (PNG, JPEG, RAW, NPZ, DICOM)
 SLICE_TYPES = (PNG, NPY, RAW)
 
-RAW_ENCODINGS = {"uint8": Encoding.UINT8, "float32": Encoding.FLOAT32}
+RAW_ENCODINGS = {one.value: one for one in Encoding if one.is_raw}
 _ENCODINGS = {PNG: Encoding.PNG, JPEG: Encoding.JPEG, NPZ: Encoding.NPZ, DICOM: Encoding.UINT8}
 
 

@@ -207,7 +207,7 @@ class RenderBody(FrameSettings):
     pose: Pose | None = described("One pose; rendered before frames of `poses` that wait.", None, error=InvalidPose)
     poses: list[Pose] | None = described("Many poses, answered together, in order.", None, error=InvalidPose)
     registration: str | None = registration_field()
-    dtype: Literal["uint8", "float32"] | None = described(
+    dtype: Literal["uint8", "float32", "float16"] | None = described(
         "Of application/octet-stream; a dtype in the Accept header goes first. Default: uint8.", None
     )
     timeout_ms: float | None = described(

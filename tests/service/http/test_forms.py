@@ -36,6 +36,7 @@ from ultragray_workers.storage.local import LocalStorage
         ("application/*", RAW, Encoding.UINT8),
         ("application/octet-stream", RAW, Encoding.UINT8),
         ("application/octet-stream;dtype=float32", RAW, Encoding.FLOAT32),
+        ("application/octet-stream;dtype=float16", RAW, Encoding.FLOAT16),
         ('application/octet-stream; dtype="float32"; q=0.7, text/html', RAW, Encoding.FLOAT32),
         ("text/html, application/xhtml+xml, */*;q=0.8", PNG, Encoding.PNG),
         ("nonsense, ;;q=, image/jpeg;q=x, application/x-npz", NPZ, Encoding.NPZ),

@@ -153,7 +153,7 @@ class SceneChangedError(Exception):
 class RenderResult(Generic[S]):
     """Frames or slices, and all it takes to render them again. H and W are those of the picture.
 
-    `data` holds, by encoding: uint8 (round(255·x)) and float32: the outputs one after another, each
+    `data` holds, by encoding: uint8 (round(255·x)), float32 and float16: the outputs one after another, each
     [C, H, W] in C order, little endian; png and jpeg: one image file [H, W]; npz: an archive with one array
     [C, H, W] per output, float32 (labels: uint8), `poses` [C, 4, 4] float64 mm, and the strings `scene`,
     `scene_sha256`, `renderer`. In each, labels are the numbers themselves, and none are in a jpeg.

@@ -196,7 +196,7 @@ class WaitingQueue:
         patient_s = time.monotonic() - self._last_batch_turn
         if patient_s >= _BATCH_PATIENCE_S and self._last_priority is not Priority.BATCH:
             priorities.reverse()
-        for priority in priorities:
+        for priority in filter(self._has_work, priorities):
             while (ticket := next(self._in_turn(priority), None)) is not None:
                 if ticket.expired:
                     self.expire(ticket)
@@ -289,6 +289,9 @@ class WaitingQueue:
         """The error that tells when all that waits now will be rendered."""
         return QueueFull(detail, retry_after_s=max(_LEAST_RETRY_S, turns.work_s / self.workers))
 
+    def _has_work(self, priority: Priority) -> bool:
+        return bool(self._again[priority]) or self._turns[priority].frames > 0
+
     def _in_turn(self, priority: Priority) -> Iterator[Ticket]:
         yield from list(self._again[priority])
         yield from self._turns[priority]
@@ -304,7 +307,8 @@ class WaitingQueue:
             return []
         room = self._poses_together(first.ticket) - first.frames
         company: list[Part] = []
-        for ticket in list(self._in_turn(first.ticket.request.priority)) if room > 0 else ():
+        priority = first.ticket.request.priority
+        for ticket in list(self._in_turn(priority)) if room > 0 and self._has_work(priority) else ():
             if ticket.batch_key != first.ticket.batch_key or ticket.expired:
                 continue
             while ticket.waiting and room > 0:

@@ -49,7 +49,7 @@ RENDER_HEADERS = {
     "X-Ultragray-Scene-Sha256": "SHA-256 of the scene file.",
     "X-Ultragray-Renderer": "Name, version and backend of the renderer.",
     "X-Ultragray-Shape": "Outputs, poses, height, width: 1,1,512,512.",
-    "X-Ultragray-Dtype": "uint8 or float32 (little endian).",
+    "X-Ultragray-Dtype": "uint8, float32 or float16 (little endian).",
     "X-Ultragray-Pose": "One pose only: the 4x4 matrix that was used, JSON. Of many, npz holds `poses`.",
     "X-Ultragray-Confidence": "Of each pose, with commas; empty where the scene cannot tell.",
     "X-Ultragray-Extrapolation": "One pose only: distance_mm, angle_deg, confidence, supported_share, contact_share, "
@@ -67,8 +67,8 @@ _OPENAPI: dict[str, Any] = {
     **body_schema(RenderBody, RENDER_EXAMPLES),
 }
 _ANSWER = answer(
-    "The frames. image/png and image/jpeg: one pose, one output. application/octet-stream (parameter dtype=uint8 or "
-    "float32): the outputs one after another, each [C, H, W]. application/x-npz holds one float32 array [C, H, W] per "
+    "The frames. image/png and image/jpeg: one pose, one output. application/octet-stream (parameter dtype=uint8, "
+    "float32 or float16): the outputs one after another, each [C, H, W]. application/x-npz holds one float32 array [C, H, W] per "
     "output, `poses` [C, 4, 4], and the strings scene, scene_sha256 and renderer. application/dicom: a multi-frame "
     "ultrasound image of bmode, true to scale: fans are scan-converted. `*/*` gives PNG where it can hold the request, "
     "else npz.",
