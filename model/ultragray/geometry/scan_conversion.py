@@ -5,6 +5,7 @@ Interpolation is bilinear, pixels outside the image are 0. `frames.show` does th
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -16,6 +17,7 @@ FloatImage: TypeAlias = npt.NDArray[np.float32]
 ByteImage: TypeAlias = npt.NDArray[np.uint8]
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
 IntArray: TypeAlias = npt.NDArray[np.int64]
+Interpolate: TypeAlias = Callable[[npt.NDArray[Any], int, FloatArray, FloatArray], FloatArray]
 _NOT_ONE_MORE = 1.0 + 1e-9  # pixel, by rounding
 
 
@@ -76,3 +78,16 @@ def interpolated_frames(
     lower = frames[which, below, j] * (1 - right) + frames[which, below, beside] * right
     values: FloatArray = upper * (1 - down) + lower * down
     return values
+
+
+def interpolated_sharply(
+    frames: npt.NDArray[Any], which: int, rows: FloatArray, columns: FloatArray
+) -> FloatArray:  # [F, H, W], [P] each -> [P]
+    """A frame between its pixels by cubic polynomials, which blur less than `interpolated_frames` does."""
+    import cv2
+
+    if not len(rows):
+        return np.zeros(0)
+    x, y = (some.astype(np.float32)[:, None] for some in (columns, rows))
+    found = cv2.remap(frames[which].astype(np.float32), x, y, cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(found[:, 0], np.float64)

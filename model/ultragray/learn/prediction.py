@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from ultragray.errors import DatasetInvalid
 from ultragray.geometry.probe import FloatArray
-from ultragray.geometry.scan_conversion import interpolated_frames, pixel_places
+from ultragray.geometry.scan_conversion import Interpolate, interpolated_frames, pixel_places
 from ultragray.learn.sweep import Dataset, IntArray, Sweep, frame_list
 
 ON_PLANE_MM = 1e-6  # distances are at least that: the nearer frame then has all the weight
@@ -23,12 +23,13 @@ def seen_by_frame(
     sweep: Sweep,
     frame: int,
     local: FloatArray,  # [P, 3] mm, in the frame of its probe
+    interpolate: Interpolate = interpolated_frames,
 ) -> tuple[npt.NDArray[np.bool_], FloatArray]:  # [P], [M] of 255
     """Which points fall into an image when projected onto its plane along its normal, and what it shows there."""
     rows, columns = sweep.probe.image_coordinates(local[:, 0], local[:, 2])
     inside = ~np.isnan(rows)
     places = pixel_places(sweep.probe, sweep.images.shape[1:], rows[inside], columns[inside])
-    return inside, interpolated_frames(sweep.images, frame, *places)
+    return inside, interpolate(sweep.images, frame, *places)
 
 
 def blend_by_distance(values: FloatArray, distances_mm: FloatArray) -> FloatArray:  # [2, P] both -> [P]

@@ -2,8 +2,7 @@
 
 A tracker errs from frame to frame, and tissue goes along with the probe that presses and drags it. Both make an image
 move less from one frame to the next, within its plane, than the poses say. Which path is right the images tell: each
-frame is predicted from the two beside it in its sweep, in space, and of these paths that one is taken that predicts
-best:
+frame is predicted from two about it in its sweep, in space, and of these paths that one is taken that predicts best:
 
 - as tracked;
 - without the tracker's noise (`alignment.without_noise`);
@@ -22,6 +21,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import TypeAlias
 
 import numpy as np
@@ -29,6 +29,7 @@ import numpy as np
 from ultragray.geometry.pose import mean_axes
 from ultragray.geometry.probe import FloatArray, Probe
 from ultragray.geometry.rotations import blended, rotations_of, turns_of
+from ultragray.geometry.scan_conversion import interpolated_sharply
 from ultragray.learn.prediction import blend_by_distance, blend_in_time, frame_times, seen_by_frame
 from ultragray.learn.sweep import Dataset, IntArray, Sweep, corner_distances_mm, spread_places
 from ultragray.learn.training.alignment import (
@@ -45,6 +46,7 @@ FRAMES, PIXELS = 96, 2048  # that are predicted, of each: enough to tell one pat
 LEAST_GAIN_DB = 0.05  # of a path without noise
 GAIN_OF_SHARES_DB = 0.3  # tissue is rigid unless the images say clearly that it is not
 SHARE_STEP = 0.25
+FAR = 4  # frames away from the one that is predicted
 
 Shares: TypeAlias = tuple[float, float, float]  # of the motion within the plane: lateral, axial, turn
 RIGID: Shares = (1.0, 1.0, 1.0)
@@ -105,11 +107,10 @@ def agreed_path(dataset: Dataset) -> AgreedPath | None:
         else:
             calibration = np.eye(4)  # what makes neighbouring frames predict each other worse is none
     rigid = found
-    shares, moved, db = _best_shares(judge, rigid, ranges, on_path, found_db)
-    if db < found_db + GAIN_OF_SHARES_DB:
-        shares = RIGID
-    else:
-        found, found_db = moved, db
+    shares = _found_shares(judge, rigid, ranges, on_path)
+    if shares != RIGID:
+        found = with_shares(rigid, ranges, train.probe, shares)
+        found_db = judge.psnr_db(found[on_path])
     noise = tracker_noise(given, ranges)
     figures = judge.in_time_db(), tracked_db, found_db, shares, noise, delay_s, calibration
     if found is given:
@@ -147,17 +148,17 @@ def _without_delay(
     return delay_s, with_delay(poses, ordered_s, ranges, delay_s) if delay_s else poses
 
 
-def _best_shares(
-    judge: _Judge, poses: FloatArray, ranges: Sequence[range], places: IntArray, rigid_db: float
-) -> tuple[Shares, FloatArray, float]:
-    """The shares of the best prediction, the path with them, and its PSNR: first alike for all three, then each."""
-    tried: dict[Shares, float] = {RIGID: rigid_db}
-    probe = judge.sweep.probe
+def _found_shares(judge: _Judge, poses: FloatArray, ranges: Sequence[range], places: IntArray) -> Shares:
+    """The shares that predict frames best, first alike for all three, then each; RIGID where they gain little.
 
+    Frames are predicted from their neighbours and from those FAR away. A slow hand hardly moves within the plane from
+    one frame to the next: then far ones tell. They show less of the same anatomy, and alone they would err.
+    """
+
+    @cache
     def psnr_db(shares: Shares) -> float:
-        if shares not in tried:
-            tried[shares] = judge.psnr_db(with_shares(poses, ranges, probe, shares)[places])
-        return tried[shares]
+        path = with_shares(poses, ranges, judge.sweep.probe, shares)[places]
+        return (judge.psnr_db(path) + judge.psnr_db(path, FAR)) / 2.0
 
     common = np.arange(1.0, -SHARE_STEP / 2, -SHARE_STEP).tolist()
     best: Shares = max(((share, share, share) for share in common), key=psnr_db)
@@ -166,7 +167,7 @@ def _best_shares(
             other = _stepped(best, number, step)
             while psnr_db(other) > psnr_db(best):
                 best, other = other, _stepped(other, number, step)
-    return best, with_shares(poses, ranges, probe, best), psnr_db(best)
+    return best if psnr_db(best) >= psnr_db(RIGID) + GAIN_OF_SHARES_DB else RIGID
 
 
 def _stepped(shares: Shares, number: int, step: float) -> Shares:
@@ -230,33 +231,40 @@ def _carried(
 
 @dataclass(frozen=True, eq=False)
 class _Judge:
-    """Pixels of frames that are predicted from the two frames beside them in their sweep; mean PSNR of the frames."""
+    """Pixels of frames that are predicted from two frames about them in their sweep; mean PSNR of the frames."""
 
     sweep: Sweep
     frames: IntArray  # [P] their places
+    far: IntArray  # [Q] those that have frames FAR before and behind them
 
     @classmethod
     def of(cls, sweep: Sweep, ranges: Sequence[range]) -> _Judge | None:
-        frames = np.concatenate([np.arange(some.start + 1, some.stop - 1) for some in ranges])
-        return cls(sweep, frames[spread_places(len(frames), FRAMES)]) if len(frames) else None
+        frames, far = (
+            np.concatenate([np.arange(some.start + reach, some.stop - reach) for some in ranges]) for reach in (1, FAR)
+        )
+        return cls(sweep, *(some[spread_places(len(some), FRAMES)] for some in (frames, far))) if len(frames) else None
 
-    def psnr_db(self, poses: FloatArray) -> float:  # [F, 4, 4] mm
-        """Of the pixels as predicted in space by these poses.
+    def psnr_db(self, poses: FloatArray, reach: int = 1) -> float:  # [F, 4, 4] mm
+        """Of the pixels as predicted in space by these poses, from the frames `reach` (1, or FAR where there are such)
+        before and behind.
 
         A pixel is projected onto both planes along their normals; what these show there counts in inverse proportion to
-        the distances. One that is projected beside an image is predicted by the other alone, or left out.
+        the distances. One that is projected beside an image is predicted by the other alone, or left out. Between
+        pixels, planes are interpolated sharply: blurring would speak for frames that do not move.
         """
-        return float(np.mean([self._predicted_db(poses, frame) for frame in self.frames]))
+        if reach == 1 or not len(self.far):
+            return float(np.mean([self._predicted_db(poses, frame, 1) for frame in self.frames]))
+        return float(np.mean([self._predicted_db(poses, frame, reach) for frame in self.far]))
 
-    def _predicted_db(self, poses: FloatArray, frame: int) -> float:
+    def _predicted_db(self, poses: FloatArray, frame: int, reach: int) -> float:
         rows, columns = self._pixels(frame)
         height, width = self.sweep.height, self.sweep.width
         local = self.sweep.probe.points_mm((rows + 0.5) / height, (columns + 0.5) / width)  # [N, 3]
         values, distances = np.zeros((2, len(local))), np.full((2, len(local)), np.inf)
-        for side, beside in enumerate((frame - 1, frame + 1)):
+        for side, beside in enumerate((frame - reach, frame + reach)):
             onto = np.linalg.inv(poses[beside]) @ poses[frame]
             points = local @ onto[:3, :3].T + onto[:3, 3]
-            inside, values[side, inside] = seen_by_frame(self.sweep, beside, points)
+            inside, values[side, inside] = seen_by_frame(self.sweep, beside, points, interpolated_sharply)
             distances[side, inside] = np.abs(points[inside, 1])
         predicted = blend_by_distance(values, distances)
         known = ~np.isnan(predicted)

@@ -67,6 +67,19 @@ def test_tissue_that_follows_the_probe_is_found(share):
     assert error_mm(path.train, shown[::2]) < 0.35 * error_mm(given.train.poses, shown[::2])
 
 
+@pytest.mark.parametrize("share", [0.25, 1.0])
+def test_a_slow_hand_is_told_from_tissue_that_follows(share):
+    """Frames move by a fraction of a pixel from one to the next: neighbours fit whatever the tissue does."""
+    t = np.arange(80) / 3.0
+    turns = np.stack([2.0 * np.sin(t / 9.0), 3.0 * np.sin(t / 7.0), 2.0 * np.cos(t / 11.0)], axis=1)
+    places = np.stack([3.0 * np.sin(t / 8.0), 0.6 * t, 2.0 * np.sin(t / 6.0)], axis=1)
+    tracked = poses_of(turns, places)
+    shown = with_shares(tracked, [range(len(t))], PROBE, (share,) * 3)
+    whole = replace(seen(shown), poses=tracked)
+    given = Dataset("hand", train=whole.select(np.arange(0, 80, 2)), val=whole.select(np.arange(1, 80, 2)))
+    assert agreed_path(given).shares == (share,) * 3
+
+
 def test_a_check_tells_of_it():
     truth = hand_path()
     given = recording(with_shares(truth, [range(FRAMES)], PROBE, (0.0, 0.0, 0.0)), shaken(truth, 0.3, 0.2))
