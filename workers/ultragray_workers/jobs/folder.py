@@ -46,6 +46,7 @@ class Request:
     storage: str  # location of the datasets and of the files of jobs
     max_footprint_pixels: int | None = None  # of a frame, see ultragray.rendering.limits; None: no limit
     max_copies_bytes: int = DEFAULT_MAX_BYTES  # of copies of datasets on this host
+    longest_share_s: float = float("inf")  # then a share of a batch ends, where other jobs wait
 
 
 class JobFolder:

@@ -331,16 +331,16 @@ def finished_ago(engine: sa.Engine, age_s: float, but: set[str], limit: int) -> 
         return list(connection.execute(old.where(JOBS.c.id.not_in(but)).limit(limit)).scalars())
 
 
-def add_share(engine: sa.Engine, batch: Row, share: str) -> None:
+def add_share(engine: sa.Engine, batch: str, share: str) -> None:
     """Puts a share of a batch into the queue, unless one waits there."""
-    waits = sa.select(JOBS.c.id).where(JOBS.c.batch == batch.id, JOBS.c.state == _QUEUED).limit(1)
+    waits = sa.select(JOBS.c.id).where(JOBS.c.batch == batch, JOBS.c.state == _QUEUED).limit(1)
     copied = ("priority", "owner", "private", "asked", "summary", "specification", "dataset", "demand", "most_running")
     values = {
         **{name: JOBS.c[name] for name in (*copied, "trace")},
         "id": sa.literal(share),
         "kind": sa.literal(SHARE),
         "state": sa.literal(_QUEUED),
-        "batch": sa.literal(batch.id),
+        "batch": sa.literal(batch),
         "created_ms": sa.literal(_now_ms(), sa.BigInteger),
         "attempt": sa.literal(0),
         "run_s": sa.literal(0.0),
@@ -350,7 +350,7 @@ def add_share(engine: sa.Engine, batch: Row, share: str) -> None:
         if connection.execute(waits).first() is not None:
             return
     with engine.begin() as connection:
-        of_batch = sa.select(*values.values()).where(JOBS.c.id == batch.id, _IS_UNFINISHED)
+        of_batch = sa.select(*values.values()).where(JOBS.c.id == batch, _IS_UNFINISHED)
         connection.execute(sa.insert(JOBS).from_select(list(values), of_batch, include_defaults=False))
 
 

@@ -68,7 +68,7 @@ sa.Index(  # two jobs never make a scene of one name
     sqlite_where=sa.text("state IN ('queued', 'running') AND batch IS NULL"),
     postgresql_where=sa.text("state IN ('queued', 'running') AND batch IS NULL"),
 )
-SHARDS = sa.Table(  # of batches; see jobs.shards.desk
+SHARDS = sa.Table(  # of batches; see jobs.shards
     "shards",
     TABLES,
     sa.Column("job", sa.Text, primary_key=True),

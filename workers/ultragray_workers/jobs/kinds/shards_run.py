@@ -22,7 +22,7 @@ from ultragray_workers.errors import StorageUnavailable
 from ultragray_workers.jobs.files import batch_prefix
 from ultragray_workers.jobs.kinds.render import RenderJob
 from ultragray_workers.jobs.progress import Outcome, Progress
-from ultragray_workers.jobs.shards.channel import BatchFailed, ShardQueue
+from ultragray_workers.jobs.shards import BatchFailed, ShardQueue
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 from ultragray_workers.scene_names import SUFFIX
 from ultragray_workers.storage.location import open_storage
@@ -36,25 +36,25 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
 
     Raises Stopped, what `BatchPlan.prepared` and `ShardRenderer` raise, and OSError.
     """
-    assert job_run.channel is not None
     request = job_run.request
     batch, is_batch = request.batch or job_run.folder.job_id, request.batch is None
     storage = open_storage(request.storage, patience_s=_PATIENCE_S)
     scene_file = job_run.folder.path / f"{job.scene}{SUFFIX}"
     plan = job.plan(read_header(scene_file), file_sha256(scene_file))
     place = ShardPlace(storage, batch_prefix(batch), plan)
-    queue = ShardQueue(job_run.channel)
-    if is_batch:
-        if place.is_finished():  # by a process that died before it said so
-            return _complete(job_run, plan)
-        if request.retry_of is not None and not place.whole():
-            place.take_over(ShardPlace(storage, batch_prefix(request.retry_of), plan))
-        queue.lay_out(plan, done := place.whole())
-        sys.stderr.write(f"{plan.frames:,} frames in {plan.shard_count:,} shards, {len(done):,} of them are there\n")
+    if is_batch and place.is_finished():  # by a process that died before it said so
+        return _complete(job_run, plan)
     try:
-        _make_shards(job_run, queue, place, scene_file)
+        with ShardQueue(job_run, storage) as queue:
+            if is_batch:
+                if request.retry_of is not None and not place.whole():
+                    place.take_over(ShardPlace(storage, batch_prefix(request.retry_of), plan))
+                queue.lay_out(plan.frames, plan.shard_frames, done := place.whole())
+                there = f"{plan.shard_count:,} shards, {len(done):,} of them are there"
+                sys.stderr.write(f"{plan.frames:,} frames in {there}\n")
+            _make_shards(job_run, queue, place, scene_file)
     except BatchFailed as error:
-        return Outcome(error=error.failed.error, reason=error.failed.reason)
+        return Outcome(error=error.error, reason=error.reason)
     if not is_batch:
         return Outcome()
     place.finish()

@@ -12,7 +12,6 @@ from ultragray_workers.datasets.store import open_datasets
 from ultragray_workers.errors import StorageUnavailable
 from ultragray_workers.jobs.folder import JobFolder, Request
 from ultragray_workers.jobs.progress import Progress
-from ultragray_workers.jobs.shards.channel import Channel
 
 if TYPE_CHECKING:
     from ultragray.datasets import Dataset
@@ -26,11 +25,8 @@ class Stopped(Exception):
 
 
 class JobRun:
-    def __init__(
-        self, folder: JobFolder, request: Request, should_stop: Callable[[], bool], channel: Channel | None = None
-    ) -> None:
-        """`channel`: to the worker, of a job in shards."""
-        self.folder, self.request, self.should_stop, self.channel = folder, request, should_stop, channel
+    def __init__(self, folder: JobFolder, request: Request, should_stop: Callable[[], bool]) -> None:
+        self.folder, self.request, self.should_stop = folder, request, should_stop
         self.progress = folder.progress()
         self._reported_at = float("-inf")
 

@@ -29,13 +29,12 @@ from ultragray_workers.errors import (
     SceneExists,
     StorageFull,
 )
-from ultragray_workers.jobs import queue
+from ultragray_workers.jobs import queue, shards
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.demand import demand_of_key
 from ultragray_workers.jobs.folder import JobFolder, Request
 from ultragray_workers.jobs.progress import Outcome
 from ultragray_workers.jobs.record import Files, Row
-from ultragray_workers.jobs.shards.desk import BatchOver, ShardDesk
 from ultragray_workers.jobs.specification import has_checkpoints, is_in_shards
 from ultragray_workers.jobs.worker.device import DeviceLock, Gate
 from ultragray_workers.jobs.worker.process import (
@@ -53,6 +52,7 @@ from ultragray_workers.storage.cache import DEFAULT_MAX_BYTES
 from ultragray_workers.storage.storage import Storage
 
 WATCH_INTERVAL_S = 0.25
+LONGEST_SHARE_S = 60.0  # of a batch; then a share ends, where other jobs wait
 STUCK_AFTER_S = 60.0  # in which the supervision itself has not moved, such as on a share that does not answer
 _POLL_INTERVAL_S = 0.05
 _PAUSE_S = 5.0  # before the next look for a job, after one that could not be begun or went on
@@ -156,7 +156,6 @@ class _JobAtHand:
             filter(None, [row.summary.get("max_run_s") or 0.0, self._config.max_run_s]), default=float("inf")
         )
         self._run_s, self._unsaved_s = row.run_s, 0.0
-        self._desk: ShardDesk | None = None
         self._device: DeviceLock
 
     def do(self) -> Outcome:
@@ -164,12 +163,13 @@ class _JobAtHand:
         with self._hold_device():
             try:
                 outcome, files = self._end()
-                if outcome.error is not None and (desk := self._desk) is not None:
-                    self._ask(lambda: desk.fail(outcome))
-                if not self._ask(lambda: queue.finish(self._engine, self._row, outcome, files)):
+                row = self._row
+                if outcome.error is not None and is_in_shards(row.summary):
+                    self._ask(lambda: shards.blame(self._engine, row.batch or row.id, row.id, outcome))
+                if not self._ask(lambda: queue.finish(self._engine, row, outcome, files)):
                     raise Superseded
-                if is_in_shards(self._row.summary) and self._row.batch is None:
-                    self._ask(lambda: queue.cancel_shares(self._engine, self._row.id))
+                if is_in_shards(row.summary) and row.batch is None:
+                    self._ask(lambda: queue.cancel_shares(self._engine, row.id))
                 self._telling.remove_others()
                 return outcome
             except Interrupted:
@@ -249,6 +249,7 @@ class _JobAtHand:
                 storage=config.storage.location,
                 max_footprint_pixels=config.max_footprint_pixels,
                 max_copies_bytes=config.max_copies_bytes,
+                longest_share_s=LONGEST_SHARE_S,
             )
         )
         attempt, crashes, kills, furthest = row.attempt, 0, 0, _furthest(folder)
@@ -283,12 +284,7 @@ class _JobAtHand:
     def _run_process(self) -> int:
         """Runs the job's process to its end, or to that of its time; its exit code. Raises Interrupted, JobStalled."""
         supervisor, row, config = self._supervisor, self._row, self._config
-        with (
-            self._desk_of_batch() as desk,
-            job_process(
-                self._folder, self._device.fileno(), config.threads, None if desk is None else desk.descriptor
-            ) as process,
-        ):
+        with job_process(self._folder, self._device.fileno(), config.threads, supervisor.jobs.url) as process:
             watchdog = Watchdog(process.pid, config.stall_timeout_s)
             watched_at_s = float("-inf")
             is_given_back = False
@@ -317,33 +313,13 @@ class _JobAtHand:
                         with suppress(DatabaseUnavailable):  # the work goes on meanwhile
                             self._raise_unless_held()
                         watched_at_s = time.monotonic()
-                    if desk is None:
-                        time.sleep(_POLL_INTERVAL_S)
-                    else:
-                        desk.attend(_POLL_INTERVAL_S)
+                    time.sleep(_POLL_INTERVAL_S)
             finally:
                 self._add_run_time(watchdog.look())
-            if desk is not None:
-                desk.settle()
             if is_given_back:
                 self._telling.tell_last()
                 self._give_back()
         return process.returncode
-
-    @contextmanager
-    def _desk_of_batch(self) -> Iterator[ShardDesk | None]:
-        if not is_in_shards(self._row.summary):
-            yield None
-            return
-        desk = self._desk = self._ask(lambda: ShardDesk(self._engine, self._row))
-        try:
-            yield desk
-        except BatchOver:
-            _log.info(f"the batch of {self._row.id} is over: its process is ended")
-            self._ask(lambda: queue.finish(self._engine, self._row, Outcome(), self._row.files))
-            raise Interrupted from None
-        finally:
-            desk.close()
 
     def _publish(self, scene: str, outcome: Outcome, files: Files) -> Outcome:
         """Serves the scene, unless the job was cancelled first; how the job ended then. Raises Superseded."""
