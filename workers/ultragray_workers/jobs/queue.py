@@ -13,10 +13,8 @@ block, and raise DatabaseUnavailable where the database is away. Free of torch.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from datetime import datetime, timezone
 from typing import Any
 
@@ -27,8 +25,8 @@ from sqlalchemy.exc import IntegrityError
 from ultragray.errors import InvalidArgument
 from ultragray_workers.jobs.demand import Demand, demand_of_key
 from ultragray_workers.jobs.owners import Kind, Ownership, claim_of_job, forget_owner
-from ultragray_workers.jobs.progress import JobState, Outcome, Progress
-from ultragray_workers.jobs.record import COLUMNS, Files, Row
+from ultragray_workers.jobs.progress import Files, JobState, Outcome, Progress
+from ultragray_workers.jobs.record import COLUMNS, Row
 from ultragray_workers.jobs.tables import JOBS, SHARDS, USAGE, WORKERS
 
 SHARE = "share"  # the kind of a share of a batch
@@ -140,7 +138,7 @@ def tell(engine: sa.Engine, held: Row, progress: Progress | None, files: Files) 
     """
     is_its = JOBS.c.state.in_([_RUNNING, JobState.CANCELLED.value]), JOBS.c.worker == held.worker
     told = sa.update(JOBS).where(JOBS.c.id == held.id, *is_its, JOBS.c.attempt == held.attempt)
-    values = {"progress": None if progress is None else _json_of(progress), "files": files.to_json()}
+    values = {"progress": progress, "files": files}
     with engine.begin() as connection:
         return bool(connection.execute(told.values(values)).rowcount)
 
@@ -150,7 +148,7 @@ def publish(engine: sa.Engine, held: Row, outcome: Outcome, files: Files) -> boo
 
     False where it was cancelled first, or is not the attempt of `held` any more.
     """
-    return _change(engine, held, published=True, outcome=outcome.to_json(), files=files.to_json())
+    return _change(engine, held, published=True, outcome=outcome, files=files)
 
 
 def finish(engine: sa.Engine, held: Row, outcome: Outcome, files: Files) -> bool:
@@ -161,9 +159,9 @@ def finish(engine: sa.Engine, held: Row, outcome: Outcome, files: Files) -> bool
     state = JobState.SUCCEEDED if outcome.error is None else JobState.FAILED
     ended = {
         "state": state.value,
-        "outcome": outcome.to_json(),
-        "progress": _json_of(outcome.progress),
-        "files": files.to_json(),
+        "outcome": outcome,
+        "progress": outcome.progress,
+        "files": files,
         "finished_ms": _now_ms(),
     }
     with engine.begin() as connection:
@@ -213,9 +211,10 @@ def row_of(engine: sa.Engine, job_id: str) -> Row | None:
 
 def specification_of(engine: sa.Engine, job_id: str) -> dict[str, Any]:
     with engine.connect() as connection:
-        text = connection.execute(sa.select(JOBS.c.specification).where(JOBS.c.id == job_id)).scalar_one()
-    specification: dict[str, Any] = json.loads(text)
-    return specification
+        found: dict[str, Any] = connection.execute(
+            sa.select(JOBS.c.specification).where(JOBS.c.id == job_id)
+        ).scalar_one()
+    return found
 
 
 def page(
@@ -354,6 +353,15 @@ def add_share(engine: sa.Engine, batch: str, share: str) -> None:
         connection.execute(sa.insert(JOBS).from_select(list(values), of_batch, include_defaults=False))
 
 
+def blame_shard(engine: sa.Engine, share: Row, outcome: Outcome) -> None:
+    """Blames the first shard that a job or share had at hand for the end of its work; nothing where it had none."""
+    mine = SHARDS.c.job == (share.batch or share.id), SHARDS.c.share == share.id, ~SHARDS.c.done
+    values = {"share": None, "error": outcome.error, "reason": outcome.reason or outcome.error}
+    with engine.begin() as connection:
+        number = connection.execute(sa.select(sa.func.min(SHARDS.c.number)).where(*mine)).scalar()
+        connection.execute(sa.update(SHARDS).where(*mine, SHARDS.c.number == number).values(values))
+
+
 def add_run_time(engine: sa.Engine, held: Row, device: str, seconds: float) -> None:
     """Counts time that a job's process ran, for the job and for its owner."""
     key: dict[str, Any] = {
@@ -399,10 +407,6 @@ def _is_run_by(worker: str | None) -> sa.ColumnElement[bool]:
 
 def _insert(connection: sa.Connection, table: sa.Table) -> Any:
     return (sqlite if connection.dialect.name == "sqlite" else postgresql).insert(table)
-
-
-def _json_of(progress: Progress) -> str:
-    return json.dumps(asdict(progress))
 
 
 def _now_ms() -> int:

@@ -1,6 +1,6 @@
 """The jobs as the service sees them: submitted, listed, watched, cancelled, retried, deleted. Free of torch.
 
-`submit` checks what the job needs (`Requirements`) and writes its row; the workers take it from there. All that is
+`submit` checks what the job needs and writes its row; the workers take it from there. All that is
 told of a job is its row (`jobs.record`) and the objects that the row names (`jobs.files`).
 """
 
@@ -14,7 +14,7 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -27,7 +27,7 @@ from ultragray.errors import InvalidArgument
 from ultragray.exchange.batches import stands_for
 from ultragray.geometry.image_size import MAX_IMAGE_SIDE
 from ultragray.geometry.registration import Registration
-from ultragray.scene.info import SceneHeader, read_header
+from ultragray.scene.info import read_header
 from ultragray_workers.claims import storage_full
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import (
@@ -156,14 +156,9 @@ class JobStore:
         self._engine = self.database.engine
         self._queue_limit = queue_limit
         self.files = JobFiles(self._storage, lambda job_id: queue.row_of(self._engine, job_id), self._artifact_folder)
-        self._requirements = Requirements(
-            datasets=datasets or DatasetStore(self._artifact_folder, self._storage),
-            scenes=scenes or SceneStore(self._artifact_folder / SCENES_FOLDER),
-            registration=registration,
-            files=self.files,
-            free_bytes=self._storage.free_bytes,
-            max_image_side=max_image_side,
-        )
+        self._datasets = datasets or DatasetStore(self._artifact_folder, self._storage)
+        self._scenes = scenes or SceneStore(self._artifact_folder / SCENES_FOLDER)
+        self._registration, self._max_image_side = registration, max_image_side
         self._submitting = threading.Lock()  # so that one service keeps the queue limit to the job
 
     def submit(
@@ -181,8 +176,9 @@ class JobStore:
         `admit` is called before a new one is made, one at a time: it raises what keeps it out, or tells how many jobs
         of the owner may run at once; None: any number.
 
-        Raises JobConflict where that one asked for something else, JobQueueFull, ArtifactFolderUnavailable, and what
-        `Requirements.placed` and `Requirements.provide` raise.
+        Raises JobConflict where that one asked for something else, JobQueueFull, ArtifactFolderUnavailable,
+        DatasetNotFound, DatasetInvalid, SceneExists, SceneNotFound, SceneFileInvalid, RegistrationNotFound,
+        StorageFull, StorageUnavailable, and what `check` of the specification raises.
         """
         if abs(priority) > MAX_PRIORITY:
             raise InvalidArgument(
@@ -203,9 +199,8 @@ class JobStore:
             if queue.count_waiting(self._engine) >= self._queue_limit:
                 raise JobQueueFull(f"{self._queue_limit} jobs wait already: try again later, or cancel some")
             most_running = admit(self)
-            placed = self._requirements.placed(asked.specification)
-            self._requirements.provide(placed, asked.id, asked.retry_of)
-            used = self._requirements.taken(placed, asked.retry_of)
+            placed = self._placed(asked.specification)
+            used = self._provide(placed, asked.id, asked.retry_of)
             private = asked.private | self._are_private(used, asked)
             made = value_in(asked.summary, "makes_scene")
             trace: dict[str, str] = {}
@@ -219,13 +214,13 @@ class JobStore:
                 "request_id": asked.request_id,
                 "asked": asked.asked,
                 "retry_of": asked.retry_of,
-                "summary": json.dumps(asked.summary),
-                "specification": json.dumps(to_dict(placed)),
+                "summary": asked.summary,
+                "specification": to_dict(placed),
                 "dataset": value_in(asked.summary, "needs_dataset"),
                 "makes_scene": made,
                 "demand": Demand.of(asked.summary).key,
                 "most_running": most_running,
-                "trace": json.dumps(trace),
+                "trace": trace,
             }
 
             def claim_scene(connection: sa.Connection) -> None:
@@ -249,13 +244,57 @@ class JobStore:
                     field=asked.specification.makes_scene,
                 ) from None
             try:  # again, now that a deletion of the dataset would see the job: one that came in between has won
-                self._requirements.require_dataset(placed)
+                if (dataset := _named(placed, placed.needs_dataset)) is not None:
+                    self._datasets.get(dataset)
                 self._are_private(used, asked)
             except (DatasetNotFound, SceneNotFound):
                 queue.cancel(self._engine, asked.id)
                 queue.forget(self._engine, asked.id)
                 raise
         return self.get(asked.id), True
+
+    def _placed(self, specification: Specification) -> Specification:
+        """The job with its poses brought into its scene by the registration that it names, as that is now.
+
+        Raises SceneNotFound, RegistrationNotFound, and InvalidArgument for one of another scene.
+        """
+        name = _named(specification, specification.needs_registration)
+        if name is None:
+            return specification
+        scene = _named(specification, specification.needs_scene)
+        self._scenes.path(scene)
+        return specification.registered(self._registration(name, scene))
+
+    def _provide(self, specification: Specification, job_id: str, before: str | None) -> list[tuple[Kind, str]]:
+        """Keeps the scene that the job needs, as it is now, for the job, once the job can be done.
+
+        `before`: the job that it replaces, whose scene is taken where it is still there. Returns the dataset and the
+        scene that the job takes, but for a scene that the job before has kept.
+        """
+        taken = []
+        if (dataset := _named(specification, specification.needs_dataset)) is not None:
+            self._datasets.get(dataset)
+            taken.append((Kind.DATASET, dataset))
+        made = _named(specification, specification.makes_scene)
+        if made is not None and made in self._scenes.names():
+            raise SceneExists(
+                f"there is already a scene {made!r}: choose another name", field=specification.makes_scene
+            )
+        free_bytes, name = self._storage.free_bytes(), _named(specification, specification.needs_scene)
+        if name is None:
+            specification.check(Surroundings(None, free_bytes, self._max_image_side))
+            return taken
+        with nullcontext() if before is None else self.files.kept_scene(before, name) as kept:
+            path = self._scenes.path(name) if kept is None else kept
+            header = self._scenes.header(name) if kept is None else read_header(kept)
+            with storage_full("the scene of the job"):
+                specification.check(Surroundings(header, free_bytes, self._max_image_side))
+                try:
+                    self.files.keep_scene(path, name, job_id)
+                except FileNotFoundError:
+                    self._scenes.path(name)  # raises SceneNotFound where the scene has just gone
+                    raise
+        return taken if kept is not None else [*taken, (Kind.SCENE, base_name(name))]
 
     def _are_private(self, used: list[tuple[Kind, str]], asked: _Submission) -> bool:
         """Whether any of the datasets and scenes that a job takes is private.
@@ -439,7 +478,7 @@ class JobStore:
             holder = read_owner(connection, Kind.SCENE, scene)
         if holder == NOBODYS or self._storage.is_claimed(str(holder.claim)):
             return
-        if self.makes_scene(scene) is None and scene not in self._requirements.scenes.names():
+        if self.makes_scene(scene) is None and scene not in self._scenes.names():
             with self._engine.begin() as connection:
                 forget_owner(connection, Kind.SCENE, scene, holder)
 
@@ -489,83 +528,6 @@ def _id_of(text: str, owner: str | None) -> str:
     """The id of the one job of an owner that a text without NUL stands for."""
     named = text if owner is None else f"{text}\0{owner}"
     return hashlib.sha256(named.encode("utf-8", "surrogatepass")).hexdigest()[:24]
-
-
-@dataclass(frozen=True)
-class Requirements:
-    """The datasets, scenes and registrations that jobs name."""
-
-    datasets: DatasetStore
-    scenes: SceneStore
-    registration: Callable[[str, str], Registration]  # finds that of a name, for a scene
-    files: JobFiles
-    free_bytes: Callable[[], int | None]  # of the storage of the files; None: not known
-    max_image_side: int
-
-    def provide(self, specification: Specification, job_id: str, before: str | None) -> None:
-        """Keeps the scene that the job needs, as it is now, for the job, once the job can be done.
-
-        `before`: the job that it replaces, whose scene is taken where it is still there. Raises DatasetNotFound,
-        DatasetInvalid, SceneExists, SceneNotFound, SceneFileInvalid, StorageFull, StorageUnavailable and what `check`
-        of the specification raises.
-        """
-        self.require_dataset(specification)
-        made = _named(specification, specification.makes_scene)
-        if made is not None and made in self.scenes.names():
-            raise SceneExists(
-                f"there is already a scene {made!r}: choose another name", field=specification.makes_scene
-            )
-        name = _named(specification, specification.needs_scene)
-        if name is None:
-            specification.check(self._surroundings(None))
-            return
-        with self._kept(name, before) as old:
-            if old is not None:
-                path, header = old, read_header(old)
-            else:
-                path, header = self.scenes.path(name), self.scenes.header(name)
-            with storage_full("the scene of the job"):
-                specification.check(self._surroundings(header))
-                try:
-                    self.files.keep_scene(path, name, job_id)
-                except FileNotFoundError:
-                    self.scenes.path(name)  # raises SceneNotFound where the scene has just gone
-                    raise
-
-    def placed(self, specification: Specification) -> Specification:
-        """The job with its poses brought into its scene by the registration that it names, as that is now.
-
-        Raises SceneNotFound, RegistrationNotFound, and InvalidArgument for one of another scene.
-        """
-        name = _named(specification, specification.needs_registration)
-        if name is None:
-            return specification
-        scene = _named(specification, specification.needs_scene)
-        self.scenes.path(scene)
-        return specification.registered(self.registration(name, scene))
-
-    def taken(self, specification: Specification, before: str | None) -> list[tuple[Kind, str]]:
-        """The dataset and the scene that `provide` takes; not a scene that the job replaced has kept."""
-        dataset, scene = (
-            _named(specification, one) for one in (specification.needs_dataset, specification.needs_scene)
-        )
-        found = [] if dataset is None else [(Kind.DATASET, dataset)]
-        if scene is None:
-            return found
-        with self._kept(scene, before) as kept:
-            return found if kept is not None else [*found, (Kind.SCENE, base_name(scene))]
-
-    def require_dataset(self, specification: Specification) -> None:
-        """Raises DatasetNotFound, DatasetInvalid where the job's dataset is not there."""
-        if (dataset := _named(specification, specification.needs_dataset)) is not None:
-            self.datasets.get(dataset)
-
-    def _surroundings(self, scene: SceneHeader | None) -> Surroundings:
-        return Surroundings(scene, self.free_bytes(), self.max_image_side)
-
-    def _kept(self, scene: str, before: str | None) -> AbstractContextManager[Path | None]:
-        """The scene that was kept for the job that is replaced; None where it is not there."""
-        return nullcontext() if before is None else self.files.kept_scene(before, scene)
 
 
 def _named(specification: Specification, field: str | None) -> Any:

@@ -93,7 +93,7 @@ class Specification(Family):
 
     @classmethod
     def is_in_shards(cls, document: Mapping[str, Any]) -> bool:
-        """Whether a job of this JSON is a batch, whose shards many workers make, see `jobs.shards`."""
+        """Whether a job of this JSON is a batch, whose shards many workers make, see `kinds.shards_run`."""
         return False
 
     def run(self, job_run: JobRun) -> Outcome:

@@ -10,9 +10,9 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NoReturn, TypeVar
 
@@ -29,12 +29,12 @@ from ultragray_workers.errors import (
     SceneExists,
     StorageFull,
 )
-from ultragray_workers.jobs import queue, shards
+from ultragray_workers.jobs import queue
 from ultragray_workers.jobs.database import JobDatabase
-from ultragray_workers.jobs.demand import demand_of_key
+from ultragray_workers.jobs.demand import AUTO, demand_of_key
 from ultragray_workers.jobs.folder import JobFolder, Request
-from ultragray_workers.jobs.progress import Outcome
-from ultragray_workers.jobs.record import Files, Row
+from ultragray_workers.jobs.progress import Files, Outcome
+from ultragray_workers.jobs.record import Row
 from ultragray_workers.jobs.specification import has_checkpoints, is_in_shards
 from ultragray_workers.jobs.worker.device import DeviceLock, Gate
 from ultragray_workers.jobs.worker.process import (
@@ -68,17 +68,22 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class WorkerConfig:
-    """Settings of a worker, most of them for the processes of its jobs."""
+    """Settings of a worker."""
 
-    artifact_folder: Path
+    artifact_folder: Path  # with a storage elsewhere it is this host's own, with copies of datasets
     storage: Storage  # of the files of jobs, datasets and scenes that jobs make
-    name: str  # the same after a restart
+    database_url: str | None = None  # None: a SQLite file in the artifact folder
+    name: str | None = None  # its alone; one that is started again under its name goes on with its jobs at once
+    device: str = AUTO  # every GPU of the host, and its processor; cpu, cuda (every GPU) or cuda:N
+    labels: Mapping[str, str] = field(default_factory=dict)  # jobs that ask for others are left to other workers
     max_copies_bytes: int = DEFAULT_MAX_BYTES  # of copies of datasets on this host
-    threads: int = 1
+    threads: int = 0  # of a job; 0: all cores but one
     nice: int = 10
     max_footprint_pixels: int | None = None  # of a frame of a render job; None: no limit
-    stall_timeout_s: float = 0.0  # 0: no limit; likewise the next
-    max_run_s: float = 0.0
+    retention_days: float = 0.0  # then finished jobs are removed; 0: never, likewise the next
+    stall_timeout_s: float = 0.0  # a job fails whose process does not get on for so long
+    max_run_s: float = 0.0  # of all processes of a job
+    drain_timeout_s: float = 0.0  # for a job without checkpoints to end when the worker stops
 
 
 class Interrupted(Exception):
@@ -129,7 +134,7 @@ class Supervisor:
         self.moved_at_s = time.monotonic()
         self.job_at_hand = row.id
         try:
-            with _span(row, self.config.name) as span:
+            with _span(row) as span:
                 outcome = _JobAtHand(self, row).do()
                 if outcome.error is not None:
                     span.set_status(Status(StatusCode.ERROR, outcome.error))
@@ -165,7 +170,7 @@ class _JobAtHand:
                 outcome, files = self._end()
                 row = self._row
                 if outcome.error is not None and is_in_shards(row.summary):
-                    self._ask(lambda: shards.blame(self._engine, row.batch or row.id, row.id, outcome))
+                    self._ask(lambda: queue.blame_shard(self._engine, row, outcome))
                 if not self._ask(lambda: queue.finish(self._engine, row, outcome, files)):
                     raise Superseded
                 if is_in_shards(row.summary) and row.batch is None:
@@ -393,11 +398,11 @@ class _JobAtHand:
 
 
 @contextmanager
-def _span(row: Row, worker: str) -> Iterator[trace.Span]:
+def _span(row: Row) -> Iterator[trace.Span]:
     """A span for one attempt at a job, a part of the trace of the request that submitted it."""
     attributes: dict[str, str | int] = {
         "ultragray.job": row.id,
-        "ultragray.worker": worker,
+        "ultragray.worker": row.worker or "",
         "ultragray.attempt": row.attempt,
     }
     context, kind = propagate.extract(row.trace), trace.SpanKind.CONSUMER
