@@ -118,17 +118,15 @@ def put_back_of(engine: sa.Engine, worker: str | None = None) -> list[str]:
 
 
 def _put_back(engine: sa.Engine, condition: sa.ColumnElement[bool]) -> list[str]:
-    with engine.connect() as connection:  # a look locks nothing
-        if connection.execute(sa.select(JOBS.c.id).where(condition).limit(1)).first() is None:
-            return []
+    if not _read(engine, sa.select(JOBS.c.id).where(condition).limit(1)):  # a look locks nothing
+        return []
     with engine.begin() as connection:
         changed = sa.update(JOBS).where(condition).values(state=_QUEUED).returning(JOBS.c.id)
         return list(connection.execute(changed).scalars())
 
 
 def is_held(engine: sa.Engine, held: Row) -> bool:
-    with engine.connect() as connection:
-        return connection.execute(sa.select(JOBS.c.number).where(*_holds(held))).first() is not None
+    return bool(_read(engine, sa.select(JOBS.c.number).where(*_holds(held))))
 
 
 def tell(engine: sa.Engine, held: Row, progress: Progress | None, files: Files) -> bool:
@@ -138,9 +136,7 @@ def tell(engine: sa.Engine, held: Row, progress: Progress | None, files: Files) 
     """
     is_its = JOBS.c.state.in_([_RUNNING, JobState.CANCELLED.value]), JOBS.c.worker == held.worker
     told = sa.update(JOBS).where(JOBS.c.id == held.id, *is_its, JOBS.c.attempt == held.attempt)
-    values = {"progress": progress, "files": files}
-    with engine.begin() as connection:
-        return bool(connection.execute(told.values(values)).rowcount)
+    return _write(engine, told.values(progress=progress, files=files))
 
 
 def publish(engine: sa.Engine, held: Row, outcome: Outcome, files: Files) -> bool:
@@ -192,8 +188,7 @@ def _give_name_back(connection: sa.Connection, job_id: str, scene: str | None, o
 def cancel_shares(engine: sa.Engine, batch: str) -> None:
     """Ends the shares of a batch that is over: those that wait, and those that run within a second."""
     ended = {"state": JobState.CANCELLED.value, "finished_ms": _now_ms()}
-    with engine.begin() as connection:
-        connection.execute(sa.update(JOBS).where(JOBS.c.batch == batch, _IS_UNFINISHED).values(ended))
+    _write(engine, sa.update(JOBS).where(JOBS.c.batch == batch, _IS_UNFINISHED).values(ended))
 
 
 def forget(engine: sa.Engine, job_id: str) -> None:
@@ -204,17 +199,12 @@ def forget(engine: sa.Engine, job_id: str) -> None:
 
 
 def row_of(engine: sa.Engine, job_id: str) -> Row | None:
-    with engine.connect() as connection:
-        row = connection.execute(sa.select(*COLUMNS).where(JOBS.c.id == job_id)).one_or_none()
-    return None if row is None else Row.of(row)
+    return _job(engine, JOBS.c.id == job_id)
 
 
 def specification_of(engine: sa.Engine, job_id: str) -> dict[str, Any]:
-    with engine.connect() as connection:
-        found: dict[str, Any] = connection.execute(
-            sa.select(JOBS.c.specification).where(JOBS.c.id == job_id)
-        ).scalar_one()
-    return found
+    ((found,),) = _read(engine, sa.select(JOBS.c.specification).where(JOBS.c.id == job_id))
+    return dict(found)
 
 
 def page(
@@ -238,9 +228,8 @@ def page(
         chosen = chosen.where(JOBS.c.kind == kind)
     found: list[Row] = []
     while len(found) <= page_size:
-        with engine.connect() as connection:
-            some = connection.execute(chosen if before is None else chosen.where(JOBS.c.number < before)).all()
-        rows = [Row.of(row) for row in some]
+        following = chosen if before is None else chosen.where(JOBS.c.number < before)
+        rows = [Row.of(row) for row in _read(engine, following)]
         found += filter(shown, rows)
         if len(rows) <= page_size:
             break
@@ -258,8 +247,7 @@ def _read_token(token: str | None) -> int | None:
 
 def count_by_state(engine: sa.Engine) -> dict[JobState, int]:
     counted = sa.select(JOBS.c.state, sa.func.count()).where(_IS_JOB).group_by(JOBS.c.state)
-    with engine.connect() as connection:
-        return {JobState(state): count for state, count in connection.execute(counted)}
+    return {JobState(state): count for state, count in _read(engine, counted)}
 
 
 def count_waiting(engine: sa.Engine) -> int:
@@ -271,8 +259,8 @@ def count_of_owner(engine: sa.Engine, owner: str) -> int:
 
 
 def _count(engine: sa.Engine, condition: sa.ColumnElement[bool]) -> int:
-    with engine.connect() as connection:
-        return connection.execute(sa.select(sa.func.count()).select_from(JOBS).where(_IS_JOB, condition)).scalar_one()
+    ((count,),) = _read(engine, sa.select(sa.func.count()).select_from(JOBS).where(_IS_JOB, condition))
+    return int(count)
 
 
 def demands_waiting(engine: sa.Engine) -> list[str]:
@@ -281,41 +269,34 @@ def demands_waiting(engine: sa.Engine) -> list[str]:
     found = sa.select(sa.func.min(key).label("key")).where(waits).cte("found", recursive=True)
     following = sa.select(sa.func.min(key)).where(waits, key > found.c.key).scalar_subquery()
     found = found.union_all(sa.select(following).where(found.c.key.is_not(None)))
-    with engine.connect() as connection:
-        return list(connection.execute(sa.select(found.c.key).where(found.c.key.is_not(None))).scalars())
+    return [row.key for row in _read(engine, sa.select(found.c.key).where(found.c.key.is_not(None)))]
 
 
 def waiting(engine: sa.Engine) -> list[tuple[Demand, int, int]]:
     """Each demand of jobs that wait, how many there are, and when the first was submitted, ms since 1970."""
     grouped = sa.select(JOBS.c.demand, sa.func.count(), sa.func.min(JOBS.c.created_ms)).group_by(JOBS.c.demand)
-    with engine.connect() as connection:
-        rows = connection.execute(grouped.where(JOBS.c.state == _QUEUED, _IS_JOB)).all()
-    return [(demand_of_key(row[0]), row[1], row[2]) for row in rows]
+    rows = _read(engine, grouped.where(JOBS.c.state == _QUEUED, _IS_JOB))
+    return [(demand_of_key(key), count, oldest_ms) for key, count, oldest_ms in rows]
 
 
 def find(engine: sa.Engine, *, needs_dataset: str | None = None, makes_scene: str | None = None) -> Row | None:
     """A job that waits or runs, and needs a dataset or makes a scene; None where there is none."""
     chosen = JOBS.c.dataset == needs_dataset if makes_scene is None else JOBS.c.makes_scene == makes_scene
-    with engine.connect() as connection:
-        row = connection.execute(sa.select(*COLUMNS).where(chosen, _IS_UNFINISHED, _IS_JOB).limit(1)).first()
-    return None if row is None else Row.of(row)
+    return _job(engine, chosen, _IS_UNFINISHED, _IS_JOB)
 
 
 def successor(engine: sa.Engine, job_id: str) -> str | None:
-    found = sa.select(JOBS.c.id).where(_IS_UNFINISHED, JOBS.c.retry_of == job_id).limit(1)
-    with engine.connect() as connection:
-        return connection.execute(found).scalar()
+    found = _job(engine, _IS_UNFINISHED, JOBS.c.retry_of == job_id)
+    return None if found is None else found.id
 
 
 def known_ids(engine: sa.Engine, ids: Sequence[str]) -> set[str]:
     """Those of the ids that are jobs or shares."""
-    with engine.connect() as connection:
-        return set(connection.execute(sa.select(JOBS.c.id).where(JOBS.c.id.in_(ids))).scalars())
+    return {row.id for row in _read(engine, sa.select(JOBS.c.id).where(JOBS.c.id.in_(ids)))}
 
 
 def ids_of_owner(engine: sa.Engine, owner: str) -> list[str]:
-    with engine.connect() as connection:
-        return list(connection.execute(sa.select(JOBS.c.id).where(_IS_JOB, JOBS.c.owner == owner)).scalars())
+    return [row.id for row in _read(engine, sa.select(JOBS.c.id).where(_IS_JOB, JOBS.c.owner == owner))]
 
 
 def finished_ago(engine: sa.Engine, age_s: float, but: set[str], limit: int) -> list[str]:
@@ -326,8 +307,7 @@ def finished_ago(engine: sa.Engine, age_s: float, but: set[str], limit: int) -> 
     other = JOBS.alias()
     goes_on = sa.select(other.c.id).where(other.c.retry_of == JOBS.c.id, other.c.state.in_([_QUEUED, _RUNNING]))
     old = sa.select(JOBS.c.id).where(_IS_JOB, JOBS.c.finished_ms < 1000 * (now_s(engine) - age_s), ~goes_on.exists())
-    with engine.connect() as connection:
-        return list(connection.execute(old.where(JOBS.c.id.not_in(but)).limit(limit)).scalars())
+    return [row.id for row in _read(engine, old.where(JOBS.c.id.not_in(but)).limit(limit))]
 
 
 def add_share(engine: sa.Engine, batch: str, share: str) -> None:
@@ -345,12 +325,9 @@ def add_share(engine: sa.Engine, batch: str, share: str) -> None:
         "run_s": sa.literal(0.0),
         "published": sa.false(),
     }
-    with engine.connect() as connection:
-        if connection.execute(waits).first() is not None:
-            return
-    with engine.begin() as connection:
+    if not _read(engine, waits):
         of_batch = sa.select(*values.values()).where(JOBS.c.id == batch, _IS_UNFINISHED)
-        connection.execute(sa.insert(JOBS).from_select(list(values), of_batch, include_defaults=False))
+        _write(engine, sa.insert(JOBS).from_select(list(values), of_batch, include_defaults=False))
 
 
 def blame_shard(engine: sa.Engine, share: Row, outcome: Outcome) -> None:
@@ -381,8 +358,7 @@ def usage_s(engine: sa.Engine, owner: str | None, since: datetime) -> dict[str, 
     """Seconds that the jobs of an owner ran since the day of `since` (UTC), by device: cpu, gpu."""
     chosen = sa.and_(USAGE.c.owner == (owner or ""), USAGE.c.day >= since.astimezone(timezone.utc).date())
     summed = sa.select(USAGE.c.device, sa.func.sum(USAGE.c.run_s)).where(chosen).group_by(USAGE.c.device)
-    with engine.connect() as connection:
-        return {"cpu": 0.0, "gpu": 0.0} | {row[0]: row[1] for row in connection.execute(summed)}
+    return {"cpu": 0.0, "gpu": 0.0} | dict(_read(engine, summed))
 
 
 def now_s(engine: sa.Engine) -> sa.ColumnElement[float]:
@@ -393,8 +369,23 @@ def now_s(engine: sa.Engine) -> sa.ColumnElement[float]:
 
 
 def _change(engine: sa.Engine, held: Row, **values: Any) -> bool:
+    return _write(engine, sa.update(JOBS).where(*_holds(held)).values(values))
+
+
+def _read(engine: sa.Engine, question: sa.Select[Any]) -> Sequence[Any]:
+    with engine.connect() as connection:
+        return connection.execute(question).all()
+
+
+def _write(engine: sa.Engine, change: sa.Update | sa.Insert) -> bool:
+    """Whether it changed any row."""
     with engine.begin() as connection:
-        return bool(connection.execute(sa.update(JOBS).where(*_holds(held)).values(values)).rowcount)
+        return bool(connection.execute(change).rowcount)
+
+
+def _job(engine: sa.Engine, *conditions: sa.ColumnElement[bool]) -> Row | None:
+    rows = _read(engine, sa.select(*COLUMNS).where(*conditions).limit(1))
+    return Row.of(rows[0]) if rows else None
 
 
 def _holds(held: Row) -> tuple[sa.ColumnElement[bool], ...]:

@@ -8,6 +8,7 @@ import torch
 
 from ultragray import ConvexProbe, GaussianScene
 from ultragray.errors import DatasetInvalid
+from ultragray.learn.evaluation import scoring
 from ultragray.learn.evaluation.baselines import BY_POSE, IN_TIME
 from ultragray.learn.evaluation.scoring import evaluate
 from ultragray.learn.sweep import Dataset
@@ -40,7 +41,7 @@ def job_run(artifact_folder, random_scene):
 
 
 def test_scores_are_those_of_the_library(job_run, monkeypatch):
-    monkeypatch.setattr(evaluate_run, "frames_at_once", lambda height, width: 1)
+    monkeypatch.setattr(scoring, "frames_at_once", lambda height, width: 1)
     asked = job_run()
     outcome = from_dict(asked.request.specification).run(asked)
     held_out = DatasetStore(asked.folder.artifact_folder).load("tiny").val

@@ -53,6 +53,19 @@ class JobRun:
                 raise Stopped
             time.sleep(_RETRY_S)
 
+    def counter(self, frames: int) -> Callable[[int], None]:
+        """A function that reports how many of the frames are done, since now. It raises Stopped."""
+        began_s = time.monotonic()
+
+        def count(done: int) -> None:
+            if self.should_stop():
+                raise Stopped
+            rate = done / (time.monotonic() - began_s)
+            left_s = (frames - done) / rate if done else None
+            self.report(Progress(frames_done=done, frames=frames, rate_per_s=rate or None, seconds_left=left_s))
+
+        return count
+
     def report(self, progress: Progress) -> None:
         """Writes how far the job is, at most twice a second, but the begin of each phase at once."""
         begins, self.progress = progress.phase != self.progress.phase, progress
