@@ -19,7 +19,6 @@ from datetime import datetime, timezone
 from typing import Any
 
 import sqlalchemy as sa
-from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import IntegrityError
 
 from ultragray.errors import InvalidArgument
@@ -27,7 +26,7 @@ from ultragray_workers.jobs.demand import Demand, demand_of_key
 from ultragray_workers.jobs.owners import Kind, Ownership, claim_of_job, forget_owner
 from ultragray_workers.jobs.progress import Files, JobState, Outcome, Progress
 from ultragray_workers.jobs.record import COLUMNS, Row
-from ultragray_workers.jobs.tables import JOBS, SHARDS, USAGE, WORKERS
+from ultragray_workers.jobs.tables import JOBS, SHARDS, USAGE, WORKERS, insert, read, write
 
 SHARE = "share"  # the kind of a share of a batch
 DEAD_AFTER_S = 10.0  # without a sign of life a worker is taken for dead
@@ -47,7 +46,7 @@ def submit(engine: sa.Engine, values: dict[str, Any], also: Callable[[sa.Connect
     """
     try:
         with engine.begin() as connection:
-            inserted = _insert(connection, JOBS).values(state=_QUEUED, created_ms=_now_ms(), **values)
+            inserted = insert(connection, JOBS).values(state=_QUEUED, created_ms=_now_ms(), **values)
             made = inserted.on_conflict_do_nothing(index_elements=["id"]).returning(JOBS.c.number)
             if connection.execute(made).first() is None:
                 return False
@@ -118,7 +117,7 @@ def put_back_of(engine: sa.Engine, worker: str | None = None) -> list[str]:
 
 
 def _put_back(engine: sa.Engine, condition: sa.ColumnElement[bool]) -> list[str]:
-    if not _read(engine, sa.select(JOBS.c.id).where(condition).limit(1)):  # a look locks nothing
+    if not read(engine, sa.select(JOBS.c.id).where(condition).limit(1)):  # a look locks nothing
         return []
     with engine.begin() as connection:
         changed = sa.update(JOBS).where(condition).values(state=_QUEUED).returning(JOBS.c.id)
@@ -126,7 +125,7 @@ def _put_back(engine: sa.Engine, condition: sa.ColumnElement[bool]) -> list[str]
 
 
 def is_held(engine: sa.Engine, held: Row) -> bool:
-    return bool(_read(engine, sa.select(JOBS.c.number).where(*_holds(held))))
+    return bool(read(engine, sa.select(JOBS.c.number).where(*_holds(held))))
 
 
 def tell(engine: sa.Engine, held: Row, progress: Progress | None, files: Files) -> bool:
@@ -136,7 +135,7 @@ def tell(engine: sa.Engine, held: Row, progress: Progress | None, files: Files) 
     """
     is_its = JOBS.c.state.in_([_RUNNING, JobState.CANCELLED.value]), JOBS.c.worker == held.worker
     told = sa.update(JOBS).where(JOBS.c.id == held.id, *is_its, JOBS.c.attempt == held.attempt)
-    return _write(engine, told.values(progress=progress, files=files))
+    return write(engine, told.values(progress=progress, files=files))
 
 
 def publish(engine: sa.Engine, held: Row, outcome: Outcome, files: Files) -> bool:
@@ -188,7 +187,7 @@ def _give_name_back(connection: sa.Connection, job_id: str, scene: str | None, o
 def cancel_shares(engine: sa.Engine, batch: str) -> None:
     """Ends the shares of a batch that is over: those that wait, and those that run within a second."""
     ended = {"state": JobState.CANCELLED.value, "finished_ms": _now_ms()}
-    _write(engine, sa.update(JOBS).where(JOBS.c.batch == batch, _IS_UNFINISHED).values(ended))
+    write(engine, sa.update(JOBS).where(JOBS.c.batch == batch, _IS_UNFINISHED).values(ended))
 
 
 def forget(engine: sa.Engine, job_id: str) -> None:
@@ -203,7 +202,7 @@ def row_of(engine: sa.Engine, job_id: str) -> Row | None:
 
 
 def specification_of(engine: sa.Engine, job_id: str) -> dict[str, Any]:
-    ((found,),) = _read(engine, sa.select(JOBS.c.specification).where(JOBS.c.id == job_id))
+    ((found,),) = read(engine, sa.select(JOBS.c.specification).where(JOBS.c.id == job_id))
     return dict(found)
 
 
@@ -229,7 +228,7 @@ def page(
     found: list[Row] = []
     while len(found) <= page_size:
         following = chosen if before is None else chosen.where(JOBS.c.number < before)
-        rows = [Row.of(row) for row in _read(engine, following)]
+        rows = [Row.of(row) for row in read(engine, following)]
         found += filter(shown, rows)
         if len(rows) <= page_size:
             break
@@ -247,7 +246,7 @@ def _read_token(token: str | None) -> int | None:
 
 def count_by_state(engine: sa.Engine) -> dict[JobState, int]:
     counted = sa.select(JOBS.c.state, sa.func.count()).where(_IS_JOB).group_by(JOBS.c.state)
-    return {JobState(state): count for state, count in _read(engine, counted)}
+    return {JobState(state): count for state, count in read(engine, counted)}
 
 
 def count_waiting(engine: sa.Engine) -> int:
@@ -259,7 +258,7 @@ def count_of_owner(engine: sa.Engine, owner: str) -> int:
 
 
 def _count(engine: sa.Engine, condition: sa.ColumnElement[bool]) -> int:
-    ((count,),) = _read(engine, sa.select(sa.func.count()).select_from(JOBS).where(_IS_JOB, condition))
+    ((count,),) = read(engine, sa.select(sa.func.count()).select_from(JOBS).where(_IS_JOB, condition))
     return int(count)
 
 
@@ -269,13 +268,13 @@ def demands_waiting(engine: sa.Engine) -> list[str]:
     found = sa.select(sa.func.min(key).label("key")).where(waits).cte("found", recursive=True)
     following = sa.select(sa.func.min(key)).where(waits, key > found.c.key).scalar_subquery()
     found = found.union_all(sa.select(following).where(found.c.key.is_not(None)))
-    return [row.key for row in _read(engine, sa.select(found.c.key).where(found.c.key.is_not(None)))]
+    return [row.key for row in read(engine, sa.select(found.c.key).where(found.c.key.is_not(None)))]
 
 
 def waiting(engine: sa.Engine) -> list[tuple[Demand, int, int]]:
     """Each demand of jobs that wait, how many there are, and when the first was submitted, ms since 1970."""
     grouped = sa.select(JOBS.c.demand, sa.func.count(), sa.func.min(JOBS.c.created_ms)).group_by(JOBS.c.demand)
-    rows = _read(engine, grouped.where(JOBS.c.state == _QUEUED, _IS_JOB))
+    rows = read(engine, grouped.where(JOBS.c.state == _QUEUED, _IS_JOB))
     return [(demand_of_key(key), count, oldest_ms) for key, count, oldest_ms in rows]
 
 
@@ -292,11 +291,11 @@ def successor(engine: sa.Engine, job_id: str) -> str | None:
 
 def known_ids(engine: sa.Engine, ids: Sequence[str]) -> set[str]:
     """Those of the ids that are jobs or shares."""
-    return {row.id for row in _read(engine, sa.select(JOBS.c.id).where(JOBS.c.id.in_(ids)))}
+    return {row.id for row in read(engine, sa.select(JOBS.c.id).where(JOBS.c.id.in_(ids)))}
 
 
 def ids_of_owner(engine: sa.Engine, owner: str) -> list[str]:
-    return [row.id for row in _read(engine, sa.select(JOBS.c.id).where(_IS_JOB, JOBS.c.owner == owner))]
+    return [row.id for row in read(engine, sa.select(JOBS.c.id).where(_IS_JOB, JOBS.c.owner == owner))]
 
 
 def finished_ago(engine: sa.Engine, age_s: float, but: set[str], limit: int) -> list[str]:
@@ -307,7 +306,7 @@ def finished_ago(engine: sa.Engine, age_s: float, but: set[str], limit: int) -> 
     other = JOBS.alias()
     goes_on = sa.select(other.c.id).where(other.c.retry_of == JOBS.c.id, other.c.state.in_([_QUEUED, _RUNNING]))
     old = sa.select(JOBS.c.id).where(_IS_JOB, JOBS.c.finished_ms < 1000 * (now_s(engine) - age_s), ~goes_on.exists())
-    return [row.id for row in _read(engine, old.where(JOBS.c.id.not_in(but)).limit(limit))]
+    return [row.id for row in read(engine, old.where(JOBS.c.id.not_in(but)).limit(limit))]
 
 
 def add_share(engine: sa.Engine, batch: str, share: str) -> None:
@@ -325,9 +324,9 @@ def add_share(engine: sa.Engine, batch: str, share: str) -> None:
         "run_s": sa.literal(0.0),
         "published": sa.false(),
     }
-    if not _read(engine, waits):
+    if not read(engine, waits):
         of_batch = sa.select(*values.values()).where(JOBS.c.id == batch, _IS_UNFINISHED)
-        _write(engine, sa.insert(JOBS).from_select(list(values), of_batch, include_defaults=False))
+        write(engine, sa.insert(JOBS).from_select(list(values), of_batch, include_defaults=False))
 
 
 def blame_shard(engine: sa.Engine, share: Row, outcome: Outcome) -> None:
@@ -349,7 +348,7 @@ def add_run_time(engine: sa.Engine, held: Row, device: str, seconds: float) -> N
     with engine.begin() as connection:
         of_job = sa.update(JOBS).where(JOBS.c.id == held.id).values(run_s=JOBS.c.run_s + seconds)
         connection.execute(of_job)
-        counted = _insert(connection, USAGE).values(**key, run_s=seconds)
+        counted = insert(connection, USAGE).values(**key, run_s=seconds)
         more = {"run_s": USAGE.c.run_s + seconds}
         connection.execute(counted.on_conflict_do_update(index_elements=list(key), set_=more))
 
@@ -358,7 +357,7 @@ def usage_s(engine: sa.Engine, owner: str | None, since: datetime) -> dict[str, 
     """Seconds that the jobs of an owner ran since the day of `since` (UTC), by device: cpu, gpu."""
     chosen = sa.and_(USAGE.c.owner == (owner or ""), USAGE.c.day >= since.astimezone(timezone.utc).date())
     summed = sa.select(USAGE.c.device, sa.func.sum(USAGE.c.run_s)).where(chosen).group_by(USAGE.c.device)
-    return {"cpu": 0.0, "gpu": 0.0} | dict(_read(engine, summed))
+    return {"cpu": 0.0, "gpu": 0.0} | dict(read(engine, summed))
 
 
 def now_s(engine: sa.Engine) -> sa.ColumnElement[float]:
@@ -369,22 +368,11 @@ def now_s(engine: sa.Engine) -> sa.ColumnElement[float]:
 
 
 def _change(engine: sa.Engine, held: Row, **values: Any) -> bool:
-    return _write(engine, sa.update(JOBS).where(*_holds(held)).values(values))
-
-
-def _read(engine: sa.Engine, question: sa.Select[Any]) -> Sequence[Any]:
-    with engine.connect() as connection:
-        return connection.execute(question).all()
-
-
-def _write(engine: sa.Engine, change: sa.Update | sa.Insert) -> bool:
-    """Whether it changed any row."""
-    with engine.begin() as connection:
-        return bool(connection.execute(change).rowcount)
+    return write(engine, sa.update(JOBS).where(*_holds(held)).values(values))
 
 
 def _job(engine: sa.Engine, *conditions: sa.ColumnElement[bool]) -> Row | None:
-    rows = _read(engine, sa.select(*COLUMNS).where(*conditions).limit(1))
+    rows = read(engine, sa.select(*COLUMNS).where(*conditions).limit(1))
     return Row.of(rows[0]) if rows else None
 
 
@@ -394,10 +382,6 @@ def _holds(held: Row) -> tuple[sa.ColumnElement[bool], ...]:
 
 def _is_run_by(worker: str | None) -> sa.ColumnElement[bool]:
     return sa.and_(JOBS.c.state == _RUNNING, JOBS.c.worker == worker)
-
-
-def _insert(connection: sa.Connection, table: sa.Table) -> Any:
-    return (sqlite if connection.dialect.name == "sqlite" else postgresql).insert(table)
 
 
 def _now_ms() -> int:

@@ -48,7 +48,7 @@ from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.demand import AUTO, CPU, CUDA, Demand, waits_for
 from ultragray_workers.jobs.files import Artifact, JobFiles
 from ultragray_workers.jobs.kinds import Specification
-from ultragray_workers.jobs.kinds.base import Surroundings
+from ultragray_workers.jobs.kinds.base import Surroundings, from_dict, in_short, to_dict, value_in
 from ultragray_workers.jobs.owners import (
     NOBODYS,
     Kind,
@@ -60,7 +60,6 @@ from ultragray_workers.jobs.owners import (
 )
 from ultragray_workers.jobs.progress import JobState
 from ultragray_workers.jobs.record import MAX_PRIORITY, Job, Row, job_of
-from ultragray_workers.jobs.specification import from_dict, in_short, to_dict, value_in
 from ultragray_workers.jobs.workers import Wanted, Worker, WorkerState
 from ultragray_workers.scene_names import base_name
 from ultragray_workers.scene_shelf import SCENES_FOLDER
@@ -99,25 +98,6 @@ class JobsOverview:
     # By the device that jobs ask for (auto, cpu, cuda): how long the one has waited that waits longest; 0: none waits.
     oldest_waiting_s: Mapping[str, float] = field(default_factory=dict)
     unfit: int = 0  # jobs that wait for a worker that is not there
-
-
-@dataclass(frozen=True)
-class _Submission:
-    id: str
-    specification: Specification
-    summary: Mapping[str, Any]  # as jobs tell it: before a registration brought its poses into the scene
-    priority: int
-    owner: str | None
-    private: bool  # as it was asked; a job is also private where it takes something private
-    request_id: str | None = None
-    retry_of: str | None = None
-    by: str | None = None  # who asks; None: the owner
-
-    @property
-    def asked(self) -> str:
-        """The hash of what is asked for: the same request_id must ask for the same."""
-        text = json.dumps([_plain(to_dict(self.specification)), self.priority, self.private], sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()
 
 
 class JobStore:
@@ -187,71 +167,85 @@ class JobStore:
         job_id = uuid.uuid4().hex[:24] if request_id is None else _id_of(f"request {request_id}", owner)
         if request_id is not None:
             _check_request_id(request_id)
-        summary = in_short(specification)
-        asked = _Submission(job_id, specification, summary, priority, owner, private, request_id)
-        return self._submit(asked, admit)
+        summary, whose = in_short(specification), Ownership(owner, private)
+        return self._submit(job_id, specification, summary, priority, whose, admit, request_id=request_id)
 
-    def _submit(self, asked: _Submission, admit: Admit) -> tuple[Job, bool]:
+    def _submit(
+        self,
+        job_id: str,
+        specification: Specification,
+        summary: dict[str, Any],  # as jobs tell it: before a registration brought its poses into the scene
+        priority: int,
+        whose: Ownership,  # as it was asked; a job is also private where it takes something private
+        admit: Admit,
+        *,
+        request_id: str | None = None,
+        retry_of: str | None = None,
+        by: str | None = None,  # who asks; None: the owner
+    ) -> tuple[Job, bool]:
+        owner = whose.owner
         self.database.identity.check()
+        text = json.dumps([_plain(to_dict(specification)), priority, whose.private], sort_keys=True)
+        asked = hashlib.sha256(text.encode()).hexdigest()  # the same request_id must ask for the same
         with self._submitting:
-            if queue.row_of(self._engine, asked.id) is not None:
-                return self._same(asked), False
+            if queue.row_of(self._engine, job_id) is not None:
+                return self._same(job_id, asked), False
             if queue.count_waiting(self._engine) >= self._queue_limit:
                 raise JobQueueFull(f"{self._queue_limit} jobs wait already: try again later, or cancel some")
             most_running = admit(self)
-            placed = self._placed(asked.specification)
-            used = self._provide(placed, asked.id, asked.retry_of)
-            private = asked.private | self._are_private(used, asked)
-            made = value_in(asked.summary, "makes_scene")
+            placed = self._placed(specification)
+            used = self._provide(placed, job_id, retry_of)
+            is_private = whose.private | self._are_private(used, owner, by)
+            made = value_in(summary, "makes_scene")
             trace: dict[str, str] = {}
             propagate.inject(trace)
             values = {
-                "id": asked.id,
-                "kind": asked.specification.kind,
-                "priority": asked.priority,
-                "owner": asked.owner,
-                "private": private,
-                "request_id": asked.request_id,
-                "asked": asked.asked,
-                "retry_of": asked.retry_of,
-                "summary": asked.summary,
+                "id": job_id,
+                "kind": specification.kind,
+                "priority": priority,
+                "owner": owner,
+                "private": is_private,
+                "request_id": request_id,
+                "asked": asked,
+                "retry_of": retry_of,
+                "summary": summary,
                 "specification": to_dict(placed),
-                "dataset": value_in(asked.summary, "needs_dataset"),
+                "dataset": value_in(summary, "needs_dataset"),
                 "makes_scene": made,
-                "demand": Demand.of(asked.summary).key,
+                "demand": Demand.of(summary).key,
                 "most_running": most_running,
                 "trace": trace,
             }
 
             def claim_scene(connection: sa.Connection) -> None:
-                if made is None or asked.owner is None:
+                if made is None or owner is None:
                     return
-                ownership = Ownership(asked.owner, private, claim_of_job(asked.id))
+                ownership = Ownership(owner, is_private, claim_of_job(job_id))
                 if not add_owner(connection, Kind.SCENE, made, ownership):
                     raise SceneExists(
                         f"a scene {made!r} is being imported: choose another name",
-                        field=asked.specification.makes_scene,
+                        field=specification.makes_scene,
                     )
 
             if made is not None:
                 self._forget_dead_claim(made)
             try:
                 if not queue.submit(self._engine, values, claim_scene):  # another service was quicker
-                    return self._same(asked), False
+                    return self._same(job_id, asked), False
             except queue.SceneTaken:
                 raise SceneExists(
                     f"another job that waits or runs makes the scene {made!r}: choose another name",
-                    field=asked.specification.makes_scene,
+                    field=specification.makes_scene,
                 ) from None
             try:  # again, now that a deletion of the dataset would see the job: one that came in between has won
                 if (dataset := _named(placed, placed.needs_dataset)) is not None:
                     self._datasets.get(dataset)
-                self._are_private(used, asked)
+                self._are_private(used, owner, by)
             except (DatasetNotFound, SceneNotFound):
-                queue.cancel(self._engine, asked.id)
-                queue.forget(self._engine, asked.id)
+                queue.cancel(self._engine, job_id)
+                queue.forget(self._engine, job_id)
                 raise
-        return self.get(asked.id), True
+        return self.get(job_id), True
 
     def _placed(self, specification: Specification) -> Specification:
         """The job with its poses brought into its scene by the registration that it names, as that is now.
@@ -296,7 +290,7 @@ class JobStore:
                     raise
         return taken if kept is not None else [*taken, (Kind.SCENE, base_name(name))]
 
-    def _are_private(self, used: list[tuple[Kind, str]], asked: _Submission) -> bool:
+    def _are_private(self, used: list[tuple[Kind, str]], owner: str | None, by: str | None) -> bool:
         """Whether any of the datasets and scenes that a job takes is private.
 
         Raises DatasetNotFound, SceneNotFound where somebody else asks for the job whose owner may not see one.
@@ -304,17 +298,17 @@ class JobStore:
         with self._engine.connect() as connection:
             whose = [(kind, name, read_owner(connection, kind, name)) for kind, name in used]
         for kind, name, holder in whose:
-            if asked.by not in (None, asked.owner) and holder.private and holder.owner != asked.owner:
+            if by not in (None, owner) and holder.private and holder.owner != owner:
                 not_found = DatasetNotFound if kind is Kind.DATASET else SceneNotFound
                 raise not_found(
                     f"the owner of the job may not see the {kind.value} {name!r}: it is private", field=kind.value
                 )
         return any(holder.private for _, _, holder in whose)
 
-    def _same(self, asked: _Submission) -> Job:
+    def _same(self, job_id: str, asked: str) -> Job:
         """The job that is there already. Raises JobConflict where it asks for something else."""
-        row = self._row(asked.id)
-        if row.asked != asked.asked:
+        row = self._row(job_id)
+        if row.asked != asked:
             raise JobConflict(
                 f"the request_id {row.request_id!r} was used for the job {row.id}, which asks for something else",
                 field="request_id",
@@ -376,17 +370,10 @@ class JobStore:
                 f"only a failed or cancelled job can be retried, the job {job_id} is {row.state.value}", field="job"
             )
         specification = from_dict(queue.specification_of(self._engine, job_id))
-        again = _Submission(
-            id=_id_of(f"retry {job_id}", row.owner),
-            specification=specification,
-            summary=row.summary,
-            priority=row.priority,
-            owner=row.owner,
-            private=row.private,
-            retry_of=job_id,
-            by=by,
+        new_id = _id_of(f"retry {job_id}", row.owner)
+        return self._submit(
+            new_id, specification, row.summary, row.priority, row.ownership, admit, retry_of=job_id, by=by
         )
-        return self._submit(again, admit)
 
     def delete(self, job_id: str) -> None:
         """Removes a finished job and its files; the scene that it made stays.

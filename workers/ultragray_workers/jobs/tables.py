@@ -9,11 +9,12 @@ from __future__ import annotations
 
 import fcntl
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from typing import Any
 
 import sqlalchemy as sa
+from sqlalchemy.dialects import postgresql, sqlite
 
 from ultragray_workers.errors import StartupFailed
 from ultragray_workers.jobs.progress import Files, Outcome, Progress, from_json, to_json
@@ -170,6 +171,23 @@ REGISTRATIONS = sa.Table(  # of robots and trackers to scenes
     sa.Column("private_to", sa.Text),  # the owner of the scene, which was private when this was put; NULL: it was not
 )
 SCHEMA_VERSION = sa.Table("schema_version", TABLES, sa.Column("version", sa.Integer, nullable=False))
+
+
+def insert(place: sa.Engine | sa.Connection, table: sa.Table) -> Any:
+    """An insertion that may say what it does where the row is there already."""
+    return (sqlite if place.dialect.name == "sqlite" else postgresql).insert(table)
+
+
+def read(engine: sa.Engine, question: sa.Select[Any]) -> Sequence[Any]:
+    with engine.connect() as connection:
+        return connection.execute(question).all()
+
+
+def write(engine: sa.Engine, change: sa.Update | sa.Insert | sa.Delete) -> bool:
+    """Whether it changed any row."""
+    with engine.begin() as connection:
+        return bool(connection.execute(change).rowcount)
+
 
 _LOCK_NUMBER = 0x756C7472  # of PostgreSQL's advisory locks
 _LOCK_POLL_S = 0.05

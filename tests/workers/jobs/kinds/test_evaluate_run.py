@@ -16,7 +16,7 @@ from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import DatasetNotFound, SceneNotFound
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.kinds import EvaluateJob, evaluate_run
-from ultragray_workers.jobs.specification import from_dict, to_dict
+from ultragray_workers.jobs.kinds.base import from_dict, to_dict
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 from ultragray_workers.scenes import SceneStore

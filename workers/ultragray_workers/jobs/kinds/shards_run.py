@@ -15,7 +15,7 @@ import os
 import sys
 import time
 import uuid
-from collections.abc import Callable, Collection, Iterator
+from collections.abc import Callable, Collection, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -39,7 +39,7 @@ from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.files import batch_prefix
 from ultragray_workers.jobs.kinds.render import RenderJob
 from ultragray_workers.jobs.progress import JobState, Outcome, Progress
-from ultragray_workers.jobs.tables import JOBS, SHARDS
+from ultragray_workers.jobs.tables import JOBS, SHARDS, insert, read
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 from ultragray_workers.jobs.worker.process import DATABASE_VARIABLE
 from ultragray_workers.scene_names import SUFFIX
@@ -48,7 +48,7 @@ from ultragray_workers.storage.location import open_storage
 MOST_TRIES = 20  # of one shard: after so many deaths of those who were at it, it is to blame
 _PATIENCE_S = 600.0  # of a small request to the storage
 _LOOK_EVERY_S, _POLL_S = 1.0, 0.2
-_ASK_AGAIN_S = 0.5  # while others are at the last shards, or the database or the storage is away
+_ASK_AGAIN_S = 0.5  # while others are at the last shards
 _AWAY = (DatabaseUnavailable, StartupFailed, StorageFull, OperationalError, StorageUnavailable)
 _ROWS = SHARDS.c
 _T = TypeVar("_T")
@@ -91,8 +91,7 @@ def _complete(job_run: JobRun, plan: BatchPlan) -> Outcome:
 
 def _make_shards(job_run: JobRun, shards: ShardQueue, place: ShardPlace, scene_file: Path, scratch: Path) -> None:
     renderer: ShardRenderer | None = None
-    meter = _Meter(job_run, shards, place.plan)
-    while (shard := shards.take(meter.look)) is not None:
+    while (shard := shards.take()) is not None:
         if place.entry(shard) is not None:  # made by a process that died before it said so
             shards.complete(shard)
             continue
@@ -104,9 +103,8 @@ def _make_shards(job_run: JobRun, shards: ShardQueue, place: ShardPlace, scene_f
             sys.stderr.write(f"rendering shards of {job_run.folder.job_id} on {device}\n")
         path = scratch / place.plan.file_name(shard)
         with _blamed(place.plan, shard):
-            entry = renderer.render(shard, path, meter.before_portion)
+            entry = renderer.render(shard, path, shards.report)
         shards.keep(path, shard, entry)
-        meter.finished(entry.frames)
     shards.wait_until_kept()
 
 
@@ -121,39 +119,6 @@ def _blamed(plan: BatchPlan, shard: int) -> Iterator[None]:
         raise type(error)(
             f"shard {shard} (frames {frames.start:,} to {frames.stop - 1:,}): {about}{error.detail}"
         ) from error
-
-
-class _Meter:
-    """The progress of the job: of the batch in its own process, of what it made itself in that of a share."""
-
-    def __init__(self, job_run: JobRun, shards: ShardQueue, plan: BatchPlan) -> None:
-        self._job_run, self._shards = job_run, shards
-        self._is_batch = job_run.request.batch is None
-        self._frames = plan.frames
-        self._finished = self._furthest = 0
-        self._since: tuple[float, int] | None = None  # a time, and the frames that were done then
-
-    def finished(self, frames: int) -> None:
-        self._finished += frames
-
-    def look(self) -> None:
-        """Tells how far others are. Raises Stopped, BatchFailed."""
-        self.before_portion(0)
-
-    def before_portion(self, done: int) -> None:
-        """Tells that so many frames of the shard at hand are done. Raises Stopped, BatchFailed."""
-        if self._job_run.should_stop():
-            raise Stopped
-        self._shards.look()
-        before_it = self._shards.frames_done if self._is_batch else self._finished
-        if before_it is None:
-            return
-        total = self._furthest = max(self._furthest, done + before_it)
-        now_s = time.monotonic()
-        since_s, before = self._since = self._since or (now_s, total)
-        rate = (total - before) / (now_s - since_s) if total > before else None
-        left_s = None if rate is None else (self._frames - total) / rate
-        self._job_run.report(Progress(frames_done=total, frames=self._frames, rate_per_s=rate, seconds_left=left_s))
 
 
 class BatchFailed(Exception):
@@ -176,14 +141,16 @@ class ShardQueue:
         self._share, self._batch = folder.job_id, request.batch or folder.job_id
         self._is_batch = request.batch is None
         self._leaves_at_s = time.monotonic() + request.longest_share_s
-        self._should_stop, self._is_left = job_run.should_stop, Event()
+        self._job_run, self._is_left = job_run, Event()
         self._place = place
         self._threads = ThreadPoolExecutor(3, "shards")
         self._keeping: Future[None] | None = None
         self._ahead: Future[int | None] | None = None
         self._looking: Future[None] | None = None
         self._looked_at_s = float("-inf")
-        self.frames_done: int | None = None  # of the whole batch; None: not known yet
+        self._of_batch: int | None = None  # frames that are done; None: not known yet
+        self._made = self._furthest = 0  # frames
+        self._since: tuple[float, int] | None = None  # a time, and the frames that were done then
         url = os.environ[DATABASE_VARIABLE]
         self._database = self._patiently(lambda: JobDatabase(folder.artifact_folder, url, place.storage))
         mine = sa.and_(_ROWS.job == self._batch, _ROWS.share == self._share)  # of a process that died
@@ -201,32 +168,16 @@ class ShardQueue:
         """Makes the rows of the batch, those that are `done` already included. Raises Stopped."""
         whole = set(done)
         rows = [
-            {
-                "job": self._batch,
-                "number": number,
-                "frames": len(plan.frames_of(number)),
-                "done": number in whole,
-                "tries": 0,
-            }
+            {"job": self._batch, "number": number, "frames": len(plan.frames_of(number)), "done": number in whole}
             for number in range(plan.shard_count)
         ]
+        self._change(insert(self._database.engine, SHARDS).values(tries=0).on_conflict_do_nothing(), rows)
 
-        def insert() -> None:
-            with self._database.engine.begin() as connection:
-                there = sa.select(_ROWS.number).where(_ROWS.job == self._batch).limit(1)
-                if connection.execute(there).first() is None:
-                    connection.execute(sa.insert(SHARDS), rows)
-
-        self._patiently(insert)
-
-    def take(self, meanwhile: Callable[[], None]) -> int | None:
-        """The next shard; None where this process is not needed any more.
-
-        `meanwhile` is called while there is nothing to do; to stop, it raises. Raises BatchFailed, Stopped.
-        """
+    def take(self) -> int | None:
+        """The next shard; None where this process is not needed any more. Raises BatchFailed, Stopped."""
         found = self._ahead or self._threads.submit(self._take)
         while not found.done():
-            meanwhile()
+            self.report()
             wait([found], _POLL_S)
         shard = found.result()
         self._ahead = None if shard is None else self._threads.submit(self._take)
@@ -236,6 +187,7 @@ class ShardQueue:
         """Lets a thread put a shard in its place, beside the rendering of the next one: at most one waits."""
         self.wait_until_kept()
         self._keeping = self._threads.submit(self._keep, path, shard, entry)
+        self._made += entry.frames
 
     def wait_until_kept(self) -> None:
         if self._keeping is not None:
@@ -251,19 +203,33 @@ class ShardQueue:
         made = sa.update(SHARDS).where(_ROWS.job == self._batch, _ROWS.number == shard)
         self._change(made.values(done=True, share=None, error=None, reason=None))
 
-    def look(self) -> None:
-        """Lets a thread count the frames that are done, and call for help where shards are free: once a second."""
-        if time.monotonic() - self._looked_at_s < _LOOK_EVERY_S or (self._looking and not self._looking.done()):
+    def report(self, done: int = 0) -> None:
+        """Reports how far the batch is, or what its share has made; `done`: frames of the shard at hand.
+
+        Once a second a thread counts the frames of the batch, and calls for help where shards are free. Raises
+        Stopped.
+        """
+        if self._job_run.should_stop():
+            raise Stopped
+        now_s = time.monotonic()
+        if now_s - self._looked_at_s >= _LOOK_EVERY_S and (self._looking is None or self._looking.done()):
+            if self._looking is not None:
+                self._looking.result()
+            self._looked_at_s, self._looking = now_s, self._threads.submit(self._look)
+        before_it = self._of_batch if self._is_batch else self._made
+        if before_it is None:
             return
-        if self._looking is not None:
-            self._looking.result()
-        self._looked_at_s = time.monotonic()
-        self._looking = self._threads.submit(self._look)
+        frames, total = self._place.plan.frames, max(self._furthest, done + before_it)
+        self._furthest = total
+        since_s, before = self._since = self._since or (now_s, total)
+        rate = (total - before) / (now_s - since_s) if total > before else None
+        left_s = None if rate is None else (frames - total) / rate
+        self._job_run.report(Progress(frames_done=total, frames=frames, rate_per_s=rate, seconds_left=left_s))
 
     def _look(self) -> None:
         with suppress(*_AWAY):
             counted = self._tally()
-            self.frames_done = counted.frames_done
+            self._of_batch = counted.frames_done
             if counted.free:
                 queue.add_share(self._database.engine, self._batch, f"{self._batch}-{uuid.uuid4().hex[:8]}")
 
@@ -272,7 +238,8 @@ class ShardQueue:
             shard, is_over = self._patiently(self._next)
             if shard is not None or is_over:
                 return shard
-            self._pause()
+            if self._is_left.wait(_ASK_AGAIN_S) or self._job_run.should_stop():
+                raise Stopped
 
     def _next(self) -> tuple[int | None, bool]:
         """The next shard that is free, and whether there will be none any more for this process."""
@@ -298,9 +265,7 @@ class ShardQueue:
             .order_by(_ROWS.number)
             .limit(1)
         )
-        with self._database.engine.connect() as connection:
-            row = connection.execute(found).one_or_none()
-        if row is not None:
+        for row in read(self._database.engine, found):
             why = row.reason or f"its process or worker died {MOST_TRIES} times"
             raise BatchFailed(row.error or "INTERNAL", why)
 
@@ -335,31 +300,23 @@ class ShardQueue:
         counted = sa.select(
             sa.func.count(), *(sa.func.coalesce(sa.func.sum(one), 0) for one in (free, done, done * _ROWS.frames))
         ).where(_ROWS.job == self._batch)
-        with self._database.engine.connect() as connection:
-            return _Tally(*(int(value) for value in connection.execute(counted).one()))
+        (row,) = read(self._database.engine, counted)
+        return _Tally(*map(int, row))
 
-    def _change(self, update: sa.Update) -> None:
+    def _change(self, statement: sa.Executable, rows: Sequence[dict[str, Any]] | None = None) -> None:
         def change() -> None:
             with self._database.engine.begin() as connection:
-                connection.execute(update)
+                connection.execute(statement, rows)
 
         self._patiently(change)
 
-    def _patiently(self, question: Callable[[], _T]) -> _T:
-        """The answer of a database or a storage that may be away for a while. Raises Stopped."""
-        is_away = False
-        while True:
-            try:
-                return question()
-            except _AWAY as error:
-                if not is_away:
-                    sys.stderr.write(f"waiting: {str(error).splitlines()[0]}\n")
-                is_away = True
-                self._pause()
+    def _patiently(self, work: Callable[[], _T]) -> _T:
+        def unless_left() -> _T:
+            if self._is_left.is_set():
+                raise Stopped
+            return work()
 
-    def _pause(self) -> None:
-        if self._is_left.wait(_ASK_AGAIN_S) or self._should_stop():
-            raise Stopped
+        return self._job_run.patiently(unless_left, *_AWAY)
 
 
 class _Tally(NamedTuple):

@@ -6,7 +6,7 @@ import sys
 import time
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, TypeVar
 
 from ultragray_workers.datasets.store import open_datasets
 from ultragray_workers.errors import StorageUnavailable
@@ -17,7 +17,8 @@ if TYPE_CHECKING:
     from ultragray.datasets import Dataset
 
 _PROGRESS_INTERVAL_S = 0.5
-_RETRY_S = 2.0  # while the storage of a dataset is away
+_RETRY_S = 1.0  # while a storage or the database is away
+_T = TypeVar("_T")
 
 
 class Stopped(Exception):
@@ -35,18 +36,23 @@ class JobRun:
 
         Raises Stopped, DatasetNotFound, DatasetInvalid.
         """
-        request, is_away = self.request, False
+        request = self.request
         datasets = open_datasets(self.folder.artifact_folder, request.storage, request.max_copies_bytes)
+        dataset = self.patiently(lambda: datasets.load(name), StorageUnavailable)
+        for text in self.patiently(lambda: datasets.get(name), StorageUnavailable).warnings:
+            sys.stderr.write(f"warning: {text}\n")
+        return dataset
+
+    def patiently(self, work: Callable[[], _T], *away: type[Exception]) -> _T:
+        """What the work gives, done again for as long as it raises one of `away`. Raises Stopped."""
+        is_told = False
         while True:
             try:
-                dataset = datasets.load(name)
-                for text in datasets.get(name).warnings:
-                    sys.stderr.write(f"warning: {text}\n")
-                return dataset
-            except StorageUnavailable as error:
-                if not is_away:
-                    sys.stderr.write(f"waiting for the dataset {name}: {error.detail}\n")
-                is_away = True
+                return work()
+            except away as error:
+                if not is_told:
+                    sys.stderr.write(f"waiting: {str(error).splitlines()[0]}\n")
+                is_told = True
             with suppress(OSError):
                 self.folder.write_progress(self.progress)  # a sign of life to the worker
             if self.should_stop():

@@ -7,7 +7,6 @@ that cannot be used (a share that has gone) with FOLDER_LOST: it may be started 
 
 from __future__ import annotations
 
-import fcntl
 import os
 import re
 import signal
@@ -19,10 +18,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from ultragray.errors import InvalidArgument, MemoryExceeded, UltragrayError
-from ultragray_workers.claims import is_no_room, storage_full
+from ultragray_workers.claims import is_no_room, storage_full, try_lock
 from ultragray_workers.jobs.folder import JobFolder
+from ultragray_workers.jobs.kinds.base import from_dict
 from ultragray_workers.jobs.progress import Outcome
-from ultragray_workers.jobs.specification import from_dict
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 from ultragray_workers.processes import end_with_parent, let_frames_go_first
 
@@ -44,7 +43,7 @@ def main(folder_path: str, worker_pid: str) -> int:
     job_id, _, attempt = path.name.rpartition(".")
     folder = JobFolder(path.parent.parent, job_id, int(attempt))
     with folder.lock.open("a") as lock:
-        while not _is_locked(lock.fileno()):  # another worker's process may still be at it, or have finished
+        while not try_lock(lock):  # another worker's process may still be at it, or have finished
             if received:
                 return STOPPED
             time.sleep(_LOCK_POLL_S)
@@ -71,14 +70,6 @@ def main(folder_path: str, worker_pid: str) -> int:
             _tell_traceback()
             return FOLDER_LOST
     return 0
-
-
-def _is_locked(descriptor: int) -> bool:
-    try:
-        fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
 
 
 def _outcome_of(job_run: JobRun) -> Outcome:

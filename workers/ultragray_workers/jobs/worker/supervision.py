@@ -33,9 +33,9 @@ from ultragray_workers.jobs import queue
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.demand import AUTO, demand_of_key
 from ultragray_workers.jobs.folder import JobFolder, Request
+from ultragray_workers.jobs.kinds.base import has_checkpoints, is_in_shards
 from ultragray_workers.jobs.progress import Files, Outcome
 from ultragray_workers.jobs.record import Row
-from ultragray_workers.jobs.specification import has_checkpoints, is_in_shards
 from ultragray_workers.jobs.worker.device import DeviceLock, Gate
 from ultragray_workers.jobs.worker.process import (
     STOP_WAIT_S,

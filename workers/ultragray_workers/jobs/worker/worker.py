@@ -7,7 +7,6 @@ thread "heartbeat": `jobs.workers`                thread "housekeeper": `Houseke
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import itertools
 import logging
 import os
@@ -24,7 +23,7 @@ from pathlib import Path
 from sqlalchemy.exc import SQLAlchemyError
 
 from ultragray.errors import InvalidArgument, UltragrayError
-from ultragray_workers.claims import remove_whole
+from ultragray_workers.claims import remove_whole, try_lock
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import StartupFailed, StorageUnavailable
 from ultragray_workers.jobs import queue
@@ -153,9 +152,7 @@ def claim_name(artifact_folder: Path, name: str | None, *, host_of_its_own: bool
         candidates = (f"{host}-{number}" for number in itertools.count())
     for candidate in candidates:
         with (folder / f"{candidate}.lock").open("a") as file:
-            try:
-                fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
+            if not try_lock(file):
                 continue
             yield candidate
             return
