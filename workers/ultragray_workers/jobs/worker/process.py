@@ -28,7 +28,7 @@ LONGEST_STEP_S = 2.0  # between two looks; what is longer, this worker itself wa
 
 @contextmanager
 def job_process(
-    folder: JobFolder, device_lock: int, threads: int, database_url: str
+    folder: JobFolder, device_lock: int, threads: int, database_url: str | None
 ) -> Iterator[subprocess.Popen[bytes]]:
     """A process at work in the folder, which inherits the lock of its device; killed with its group at the end.
 
@@ -45,7 +45,7 @@ def job_process(
                 "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
                 "OMP_NUM_THREADS": str(threads),
                 "OPENBLAS_NUM_THREADS": str(threads),
-                DATABASE_VARIABLE: database_url,
+                **({} if database_url is None else {DATABASE_VARIABLE: database_url}),
             },
             start_new_session=True,
             pass_fds=[device_lock],

@@ -289,7 +289,8 @@ class _JobAtHand:
     def _run_process(self) -> int:
         """Runs the job's process to its end, or to that of its time; its exit code. Raises Interrupted, JobStalled."""
         supervisor, row, config = self._supervisor, self._row, self._config
-        with job_process(self._folder, self._device.fileno(), config.threads, supervisor.jobs.url) as process:
+        url = supervisor.jobs.url if is_in_shards(row.summary) else None  # others do without the database
+        with job_process(self._folder, self._device.fileno(), config.threads, url) as process:
             watchdog = Watchdog(process.pid, config.stall_timeout_s)
             watched_at_s = float("-inf")
             is_given_back = False
@@ -367,8 +368,7 @@ class _JobAtHand:
 
     def _look_after(self) -> None:
         """Keeps a job at hand whose files are on their way. Raises Interrupted where it is not ours any more."""
-        self._supervisor.moved_at_s = time.monotonic()
-        if self._supervisor.stopping.is_set():
+        if self._supervisor.must_stop(self._row):
             self._give_back()
         with suppress(DatabaseUnavailable):
             self._raise_unless_held()
