@@ -216,20 +216,30 @@ inline void gather_group(const View& view, const Slice& s, const Course& course,
 
     // With a the line's normal in the plane and e its direction: m2 = across2 / q, s* = e.mean - k across / q and
     // variance = det / q, where q = a.C a, k = a.C e and det = det C.
-    const Floats dx = to_floats(load<Doubles>(view.dir_x + line)), dz = to_floats(load<Doubles>(view.dir_z + line));
     const Floats xx = splat(float(s.cov_xx)), xz = splat(float(s.cov_xz)), zz = splat(float(s.cov_zz));
-    const Floats k = dx * dz * (zz - xx) + xz * (dx * dx - dz * dz);
     const Floats variance = g.sigma * g.sigma, slant = g.across * g.spread;
     const Floats by_det = by_variance * g.spread;
     const Floats by_k = -by_star * slant;
-    const Floats by_across = 2.0f * by_m2 * slant - by_star * k * g.spread;
-    const Floats by_q = (by_star * k * slant - by_variance * variance) * g.spread - by_m2 * slant * slant;
+    const auto by_across = [&](Floats k) { return 2.0f * by_m2 * slant - by_star * k * g.spread; };
+    const auto by_q = [&](Floats k) {
+        return (by_star * k * slant - by_variance * variance) * g.spread - by_m2 * slant * slant;
+    };
     const auto add = [&](Floats& sum, Floats value) { sum += keep(g.touched, value); };
-    add(out.mean_x, dx * by_star - dz * by_across);
-    add(out.mean_z, dz * by_star + dx * by_across);
-    add(out.cov_xx, by_q * dz * dz - by_k * dx * dz + by_det * zz);
-    add(out.cov_xz, by_k * (dx * dx - dz * dz) - 2.0f * (by_q * dx * dz + by_det * xz));
-    add(out.cov_zz, by_q * dx * dx + by_k * dx * dz + by_det * xx);
+    if (view.fanned) {
+        const Floats dx = to_floats(load<Doubles>(view.dir_x + line)), dz = to_floats(load<Doubles>(view.dir_z + line));
+        const Floats k = dx * dz * (zz - xx) + xz * (dx * dx - dz * dz), across = by_across(k), q = by_q(k);
+        add(out.mean_x, dx * by_star - dz * across);
+        add(out.mean_z, dz * by_star + dx * across);
+        add(out.cov_xx, q * dz * dz - by_k * dx * dz + by_det * zz);
+        add(out.cov_xz, by_k * (dx * dx - dz * dz) - 2.0f * (q * dx * dz + by_det * xz));
+        add(out.cov_zz, q * dx * dx + by_k * dx * dz + by_det * xx);
+    } else {  // e is z
+        add(out.mean_x, -by_across(-xz));
+        add(out.mean_z, by_star);
+        add(out.cov_xx, by_q(-xz) + by_det * zz);
+        add(out.cov_xz, -by_k - 2.0f * by_det * xz);
+        add(out.cov_zz, by_det * xx);
+    }
     add(out.m2_plane, by_m2);
     add(out.intensity, sums.intensity);
     add(out.absorb, sums.absorb);
