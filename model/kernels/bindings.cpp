@@ -9,6 +9,7 @@
 #include <array>
 #include <optional>
 
+#include "adam.hpp"
 #include "between.hpp"
 #include "loss.hpp"
 #include "render.hpp"
@@ -36,6 +37,8 @@ using Offsets = nb::ndarray<const int32_t, nb::shape<-1, 3>, nb::c_contig, nb::d
 using GreyImages = nb::ndarray<const uint8_t, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 using Pairs = nb::ndarray<const int64_t, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
 using PairsOfMaps = nb::ndarray<const float, nb::shape<-1, 2, 3, 3>, nb::c_contig, nb::device::cpu>;
+using Floats = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
+using FreeFloats = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
 using FreeCounts = nb::ndarray<int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
 // B, E, T, coverage, S and the sum of I*w, each [C, H, W] or null.
@@ -224,6 +227,26 @@ NB_MODULE(_cpu, m) {
         },
         nb::arg("x").noconvert(), nb::arg("y").noconvert(), nb::arg("gradient").noconvert(), nb::arg("texture"),
         nb::arg("threads"), nb::arg("instruction_set"));
+
+    m.def(
+        "adam",
+        [](const std::vector<FreeFloats>& values, const std::vector<Floats>& gradients, const std::vector<FreeFloats>& first,
+           const std::vector<FreeFloats>& second, const std::vector<int64_t>& steps, const std::vector<double>& rates,
+           const std::vector<double>& penalties, double beta1, double beta2, double eps, int threads,
+           const std::string& instruction_set) {
+            std::vector<AdamParameter> parameters;
+            for (size_t k = 0; k < values.size(); ++k) {
+                for (const size_t size : {gradients.at(k).size(), first.at(k).size(), second.at(k).size()})
+                    if (size != values[k].size()) throw std::invalid_argument("sizes of a parameter do not agree");
+                parameters.push_back({values[k].data(), gradients[k].data(), first[k].data(), second[k].data(),
+                                      int64_t(values[k].size()), steps.at(k), rates.at(k), penalties.at(k)});
+            }
+            nb::gil_scoped_release release;
+            return adam(parameters, beta1, beta2, eps, threads, instruction_set);
+        },
+        nb::arg("values").noconvert(), nb::arg("gradients").noconvert(), nb::arg("first").noconvert(),
+        nb::arg("second").noconvert(), nb::arg("steps"), nb::arg("rates"), nb::arg("penalties"), nb::arg("beta1"),
+        nb::arg("beta2"), nb::arg("eps"), nb::arg("threads"), nb::arg("instruction_set"));
 
     m.def(
         "blend_between",
