@@ -25,7 +25,7 @@ from ultragray.phantom import load_phantom, tissue_at
 from ultragray.phantom.demo import DEMO_FILE, LABEL_NAMES, labels_of
 from ultragray.rendering.display import true_to_scale
 from ultragray.rendering.frames import render, show
-from ultragray.rendering.pixels import image_file
+from ultragray.rendering.pixels import png_file
 from ultragray.scene.gaussians import GaussianScene
 
 DATASET_NAME = "demo lumbar spine (in silico)"
@@ -110,7 +110,7 @@ def write_pictures(scene: GaussianScene, folder: Path) -> None:
         probe = scene.info.probe_or(asked)
         frames = render(scene, probe, pose, height=PICTURE_SIDE, width=PICTURE_SIDE, outputs=("bmode",))
         shown = show(frames, probe, true_to_scale(probe, PICTURE_SIDE, PICTURE_SIDE))["bmode"]
-        write_whole(folder / f"demo_{view}.png", image_file(shown[0].numpy(), ".png").tobytes())
+        write_whole(folder / f"demo_{view}.png", png_file(shown[0].numpy()))
 
 
 if __name__ == "__main__":

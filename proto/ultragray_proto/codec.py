@@ -26,7 +26,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Iterable, Mapping
-from dataclasses import MISSING, fields
+from dataclasses import MISSING, fields, is_dataclass
 from enum import Enum
 from functools import cache, partial, reduce
 from operator import or_
@@ -102,16 +102,16 @@ def _at(path: str, convert: _Convert, value: Any) -> Any:
 
 
 def _written(descriptor: Descriptor, value: Any, others: Mapping[str, Any] | None = None) -> dict[str, Any]:
-    get, cls = (value.get, dict) if isinstance(value, Mapping) else (partial(_attribute, value), type(value))
+    is_mapping = isinstance(value, Mapping)
+    get = value.get if is_mapping else partial(_attribute, value)
     found = dict(others or {})
-    for name, convert, is_message in _writers(descriptor):
-        if name in found or (one := get(name)) is None:
-            continue
-        default = getattr(cls, name, None) if is_message else None  # where the class has one
-        if default is not None and one == default:
+    cls: Any = None if is_mapping else type(value)
+    steps, oneofs = _writers(descriptor, cls)
+    for name, convert, default in steps:
+        if name in found or (one := get(name)) is None or (default is not None and one == default):
             continue
         found[name] = _at(name, convert, one)
-    for name, kinds in _oneofs(descriptor).items():
+    for name, kinds in oneofs:
         if kinds.keys().isdisjoint(found) and (one := get(name)) is not None:
             found |= _member_written(kinds, one)
     return found
@@ -122,16 +122,27 @@ def _attribute(value: Any, name: str) -> Any:
 
 
 @cache
-def _writers(descriptor: Descriptor) -> tuple[tuple[str, _Convert, bool], ...]:
-    """Each field, how its value is written, and whether that is one message, which its default leaves out."""
+def _writers(descriptor: Descriptor, cls: type | None) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+    """What is written of a class (None: of a mapping).
+
+    Each field that it may have, how its value is written, and the default that leaves a message out, None where there
+    is none; then the oneofs.
+    """
     found = []
     for field in descriptor.fields:
+        if not _may_have(cls, field.name):
+            continue
         convert = dict if _is_map(field) else _value_writer(field)
         is_message = field.message_type is not None and not field.is_repeated
         if field.is_repeated and not _is_map(field):
             convert = partial(_list_of, convert)
-        found.append((field.name, convert, is_message))
-    return tuple(found)
+        found.append((field.name, convert, getattr(cls, field.name, None) if is_message else None))
+    return tuple(found), tuple(one for one in _oneofs(descriptor).items() if _may_have(cls, one[0]))
+
+
+def _may_have(cls: type | None, name: str) -> bool:
+    """Whether values of a class may have an attribute; of one that is no dataclass, nobody knows."""
+    return cls is None or not is_dataclass(cls) or name in cls.__dataclass_fields__ or hasattr(cls, name)
 
 
 def _list_of(convert: _Convert, values: Iterable[Any]) -> list[Any]:

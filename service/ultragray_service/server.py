@@ -153,7 +153,9 @@ _HEALTH_POLL_S = 0.2
 _CANCEL_WAIT_S = 1.0
 _FLUSH_S = 2  # for the last bytes of answers, after the last frame
 _M_MMAP_THRESHOLD = -3  # of malloc.h
-_LARGE_BLOCK_BYTES = 2**20
+_M_TRIM_THRESHOLD = -1
+_LARGE_BLOCK_BYTES = 8 * 2**20
+_KEPT_BYTES = 64 * 2**20  # at the end of the heap
 _LOOPBACK = "127.0.0.1"
 _DOORS = 3
 _OTHER_FILES = 1024
@@ -245,10 +247,14 @@ def _tell_where(doors: Doors, asks_for_keys: bool) -> None:
 
 
 def _return_large_blocks() -> None:
-    """Make glibc hand freed blocks of a MiB and more back to the system; by itself it stops after the first ones."""
+    """Make glibc hand freed blocks of 8 MiB and more back to the system; by itself it stops after the first ones.
+
+    Smaller ones, such as frames, it keeps for the next: new pages cost more than what is written into them.
+    """
     mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
     if mallopt is not None:
         mallopt(_M_MMAP_THRESHOLD, _LARGE_BLOCK_BYTES)
+        mallopt(_M_TRIM_THRESHOLD, _KEPT_BYTES)
 
 
 class _StopSignals:

@@ -153,7 +153,22 @@ def test_bytes_are_taken_as_they_are():
     assert in_type(frame[None], Encoding.UINT8.pixel_type).tolist() == [frame.tolist()]
     floats = in_type(frame[None], Encoding.FLOAT32.pixel_type)
     assert (floats.dtype.str, floats.tolist()) == ("<f4", [frame.tolist()])
-    assert cv2.imdecode(encoded_image(frame, Encoding.PNG), cv2.IMREAD_UNCHANGED).tolist() == frame.tolist()
+    assert decoded(encoded_image(frame, Encoding.PNG)).tolist() == frame.tolist()
+
+
+def decoded(file):
+    return cv2.imdecode(np.frombuffer(file, np.uint8), cv2.IMREAD_UNCHANGED)
+
+
+@pytest.mark.parametrize("size", [(1, 1), (1, 7), (7, 1), (96, 128)], ids=str)
+def test_a_png_file_holds_every_pixel(size):
+    frame = np.random.default_rng(0).integers(0, 256, size, dtype=np.uint8)
+    np.testing.assert_array_equal(decoded(encoded_image(frame, Encoding.PNG)), frame)
+
+
+def test_what_is_no_image_file_is_refused():
+    with pytest.raises(ValueError, match="uint8 is no image file"):
+        encoded_image(np.zeros((2, 2), np.uint8), Encoding.UINT8)
 
 
 FOCUSED = ElevationBeam(thickness_mm=2.0, focus_mm=30.0, depth_of_field_mm=20.0)

@@ -48,6 +48,14 @@ def test_a_nearly_exact_rotation_is_made_exact():
     np.testing.assert_array_equal(noisy, before)
 
 
+@pytest.mark.parametrize("roughness", [0.0, 1e-13, 1e-6])
+def test_a_pose_alone_becomes_what_it_becomes_in_a_batch(roughness):
+    for degrees in range(0, 360, 7):
+        pose = turned_about_z(float(degrees)) @ np.linalg.inv(turned_about_z(11.0))
+        pose[:3, :3] += roughness * np.arange(9).reshape(3, 3)
+        np.testing.assert_array_equal(check_poses(pose)[0], check_poses(np.stack([pose, np.eye(4)]))[0])
+
+
 @pytest.mark.parametrize(
     ("pose", "message"),
     [

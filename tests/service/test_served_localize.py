@@ -9,7 +9,7 @@ import pytest
 
 from ultragray import render
 from ultragray.phantom.demo import DEMO_FILE, demo_poses, load_demo_scene
-from ultragray.rendering.pixels import image_file, to_uint8
+from ultragray.rendering.pixels import png_file, to_uint8
 from ultragray_client import Client
 
 from ..waiting import Deadline
@@ -45,7 +45,7 @@ def pixels():  # [SIDE, SIDE] uint8
 
 @pytest.fixture(scope="module")
 def png(pixels):
-    return image_file(pixels, ".png").tobytes()
+    return png_file(pixels)
 
 
 def start():

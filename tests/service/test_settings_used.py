@@ -1,7 +1,8 @@
 """Every door tells every setting of a frame as it was used: none of them has a list of its own."""
 
 import json
-from dataclasses import fields
+import pickle
+from dataclasses import fields, replace
 from enum import Enum
 from pathlib import Path
 from typing import get_args, get_type_hints
@@ -20,12 +21,13 @@ from ultragray.rendering.settings import Additions, Resolved, SettingsUsed, sett
 from ultragray.rendering.tools import Needle
 from ultragray.scene.confidence import Extrapolation
 from ultragray_client.frames import frame_from_message, origin_of
+from ultragray_proto.v1 import rendering_pb2
 from ultragray_service.core.open_streams import StreamAnswer
 from ultragray_service.http.routes.rendering import render_headers
 from ultragray_service.http.routes.streams import frame_bytes
 from ultragray_service.igtl.frames import Frame, PoseMessage, image_of
 from ultragray_service.igtl.messages import Message
-from ultragray_service.rpc.messages import frame_message
+from ultragray_service.rpc.messages import serialized_frame
 from ultragray_workers.pool.messages import RenderResult
 
 HEIGHT, WIDTH = 12, 10
@@ -94,8 +96,8 @@ def websocket(settings):
 
 
 def grpc(settings):
-    message = frame_message(result(settings), 1)
-    return origin_of(frame_from_message(type(message).FromString(message.SerializeToString())))
+    message = rendering_pb2.Frame.FromString(serialized_frame(result(settings), 1))
+    return origin_of(frame_from_message(message))
 
 
 def igtl(settings):
@@ -148,6 +150,18 @@ def test_what_was_not_asked_for_may_be_left_out(door):
     assert {name: told[name] for name in expected.keys() - left_out} == {
         name: expected[name] for name in expected.keys() - left_out
     }
+
+
+@pytest.mark.parametrize("size", [0, 1, 127, 128, 16_383, 16_384, 3 * 2**20])
+def test_grpc_carries_pixels_of_any_number(size):
+    pixels = bytes(range(256)) * (size // 256) + bytes(range(size % 256))
+    sent = serialized_frame(replace(result(PLAIN), data=pixels), 5, dropped=2)
+    frame = rendering_pb2.Frame.FromString(sent)
+    assert (frame.data, frame.sequence, frame.dropped) == (pixels, 5, 2)
+
+
+def test_settings_cross_to_another_process_whole():
+    assert pickle.loads(pickle.dumps(SETTINGS)) == SETTINGS
 
 
 def test_every_setting_has_a_value_of_its_own_here():

@@ -66,4 +66,4 @@ def supported_shares(coverage: Tensor) -> Tensor:  # [C, H, W] -> [C]
     if coverage.is_cuda:
         return (coverage >= SUPPORT_COVERAGE).flatten(1).float().mean(dim=1)
     supported = coverage.numpy() >= SUPPORT_COVERAGE  # numpy: torch's threads would fight with the kernel's
-    return torch.tensor([np.count_nonzero(frame) / frame.size for frame in supported])
+    return torch.from_numpy(np.array([np.count_nonzero(frame) / frame.size for frame in supported], np.float32))

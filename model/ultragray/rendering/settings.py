@@ -6,6 +6,7 @@ A request's settings are checked and completed once, by `resolved`; what comes a
 from __future__ import annotations
 
 import json
+import pickle
 from dataclasses import MISSING, dataclass, fields
 from enum import Enum
 from functools import cached_property, lru_cache
@@ -236,6 +237,20 @@ class Resolved(Additions):
         """The number of pixels rendered or shown for one pose, whichever is more, over all outputs."""
         picture = self.picture
         return max(self.height * self.width, picture.height * picture.width) * len(self.outputs)
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickled once, and made once of the same bytes: a stream's settings go to a process with each of its poses."""
+        return _unpickled, (_pickled(self),)
+
+
+@lru_cache(maxsize=256)
+def _pickled(settings: Resolved) -> bytes:
+    return pickle.dumps({one.name: getattr(settings, one.name) for one in fields(settings)})
+
+
+@lru_cache(maxsize=256)
+def _unpickled(data: bytes) -> Resolved:
+    return Resolved(**pickle.loads(data))
 
 
 _SHOWING = tuple(one.name for one in fields(Resolved) if one.name not in ("outputs", "encoding", "registration"))

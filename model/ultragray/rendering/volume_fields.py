@@ -25,7 +25,7 @@ from ultragray.files import atomic_path, npy_bytes, write_whole
 from ultragray.rendering.backends import cpu
 from ultragray.rendering.derived import heaviest_labels, label_parts
 from ultragray.rendering.limits import UNLIMITED, Limits
-from ultragray.rendering.pixels import image_file
+from ultragray.rendering.pixels import png_file
 from ultragray.rendering.volumes import SLICE_SUFFIXES, VOLUME_SUFFIXES, VolumeGrid, as_grey, check_field
 from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.info import SceneInfo
@@ -167,7 +167,7 @@ def write_slice(path: str | Path, scene: GaussianScene, field: str, grid: Volume
         raise InvalidArgument(f"a slice must end in {', '.join(SLICE_SUFFIXES)}, got {path.name!r}", field="output")
     pixels = sample_slice(scene, field, grid)
     is_picture = path.suffix == ".png"
-    write_whole(path, image_file(as_grey(pixels, field), ".png").tobytes() if is_picture else npy_bytes(pixels))
+    write_whole(path, png_file(as_grey(pixels, field)) if is_picture else npy_bytes(pixels))
 
 
 def volume_facts(info: SceneInfo, field: str, grid: VolumeGrid) -> dict[str, Any]:

@@ -282,7 +282,7 @@ class Rendering:
 
 def _png_of(view: SliceView, data: bytes) -> bytes:
     values = np.frombuffer(data, numbers_of(view.field).pixel_type).reshape(view.height, view.width)
-    return encoded_image(as_grey(values, view.field), Encoding.PNG).tobytes()
+    return encoded_image(as_grey(values, view.field), Encoding.PNG)
 
 
 @lru_cache(maxsize=256)

@@ -23,6 +23,8 @@ from ultragray_workers.jobs.kinds import KINDS, Specification
 from ultragray_workers.jobs.record import Job
 from ultragray_workers.pool.messages import RenderResult
 
+_LENGTH_DELIMITED = 2  # the wire type of bytes
+
 
 def read(message: Any, cls: Any, **others: Any) -> Any:
     """The contract's dataclass of a message. Raises its own errors, and InvalidArgument, with the path of the field."""
@@ -84,18 +86,35 @@ def read_poses(messages: Sequence[geometry_pb2.Pose], field: str) -> FloatArray:
     return np.stack([read_pose(pose, f"{field}[{index}]") for index, pose in enumerate(messages)])
 
 
-def frame_message(result: RenderResult, sequence: int, **others: Any) -> rendering_pb2.Frame:
+def serialized_frame(result: RenderResult, sequence: int, **others: Any) -> bytes:
+    """A Frame as it is sent. Its pixels are copied once, into these bytes: a message would copy them three times.
+
+    The fields of a message may be written in any order and in several pieces.
+    """
     if (place := result.place) is not None:
         others["shared_data"] = rendering_pb2.SharedData(slot=place.slot, bytes=place.size)
-    frame = to_message(FrameFacts.of(result), rendering_pb2.Frame, sequence=sequence, data=result.data, **others)
-    frame.MergeFrom(_settings_message(result.settings))
-    return frame
+    facts = to_message(FrameFacts.of(result), rendering_pb2.Frame, sequence=sequence, **others)
+    pieces = (_settings_bytes(result.settings), facts.SerializeToString(), _data_key(len(result.data)), result.data)
+    return b"".join(pieces)
 
 
 @lru_cache(maxsize=256)
-def _settings_message(settings: Resolved) -> rendering_pb2.Frame:
+def _settings_bytes(settings: Resolved) -> bytes:
     """The part of a frame that is the same for all frames of a stream."""
-    return to_message(settings_used(settings), rendering_pb2.Frame)
+    return bytes(to_message(settings_used(settings), rendering_pb2.Frame).SerializeToString())
+
+
+@lru_cache(maxsize=256)
+def _data_key(size: int) -> bytes:
+    """What stands before the bytes of Frame.data, so many of them (protobuf.dev/programming-guides/encoding)."""
+    field = rendering_pb2.Frame.DESCRIPTOR.fields_by_name["data"].number
+    return _varint(field << 3 | _LENGTH_DELIMITED) + _varint(size)
+
+
+def _varint(number: int) -> bytes:
+    """A whole number, seven bits a byte, the lowest first; all bytes but the last have the highest bit set."""
+    groups = [number >> shift & 0x7F for shift in range(0, max(1, number.bit_length()), 7)]
+    return bytes([*(group | 0x80 for group in groups[:-1]), groups[-1]])
 
 
 def slice_message(result: RenderResult[SliceView]) -> rendering_pb2.Slice:

@@ -24,7 +24,7 @@ from ultragray_service.core.poses import check_pose_count, exact_poses
 from ultragray_service.core.rendering import Plan
 from ultragray_service.core.streams import MAX_WINDOW, FrameStream, Message, StreamMode, checked_s, unreadable
 from ultragray_service.errors import Refusal
-from ultragray_service.rpc.messages import frame_message, read, read_pose, read_settings, read_word, slice_message
+from ultragray_service.rpc.messages import read, read_pose, read_settings, read_word, serialized_frame, slice_message
 from ultragray_service.rpc.shared_memory import SharedMemory
 from ultragray_service.service import Service
 from ultragray_service.views.poses import locate, sought_frame
@@ -106,7 +106,7 @@ class CallTransport:
             error = to_message(Refusal.of(answer.outcome), scenes_pb2.Error)
             await self._context.write(rendering_pb2.Frame(sequence=answer.sequence, error=error, **about))
         else:
-            await self._context.write(frame_message(answer.outcome, answer.sequence, **about))
+            await self._context.write(serialized_frame(answer.outcome, answer.sequence, **about))
 
     hand_over = send  # of streams without a window, which are ordered ones here
 
@@ -127,7 +127,7 @@ class RenderService:
     def __init__(self, service: Service) -> None:
         self._service = service
 
-    async def Render(self, request: rendering_pb2.RenderRequest, context: Context) -> rendering_pb2.Frame:
+    async def Render(self, request: rendering_pb2.RenderRequest, context: Context) -> bytes:  # of a Frame
         deadline = self._service.planner.deadline(context.time_remaining())
         begin_by = None
         if request.HasField("max_queue_ms"):
@@ -138,7 +138,7 @@ class RenderService:
         pose = plan.placed(read_pose(request.pose, "pose"))
         await self._service.limits.take_frames(1, deadline)
         result = await self._service.rendering.render(plan, pose[None], deadline=deadline, begin_by=begin_by)
-        return frame_message(result, 0)
+        return serialized_frame(result, 0)
 
     async def RenderBatch(self, request: rendering_pb2.RenderBatchRequest, context: Context) -> None:
         planner = self._service.planner
@@ -162,7 +162,7 @@ class RenderService:
                     field = f"poses[{sequence}]"
                     raise type(error)(error.detail.replace("pose", field, 1), field=field) from None
                 in_flight.popleft()
-                await context.write(frame_message(result, sequence))
+                await context.write(serialized_frame(result, sequence))
         finally:
             for task in in_flight:
                 task.cancel()

@@ -57,7 +57,12 @@ def _handler(service: Service, rendering: RenderService, method: MethodDescripto
     else:
         run = partial(STREAMS[name], service) if name in STREAMS else getattr(rendering, method.name)
     streaming = method.client_streaming, method.server_streaming
-    return make_handler(streaming, run, GetMessageClass(method.input_type).FromString, answer_class.SerializeToString)
+    return make_handler(streaming, run, GetMessageClass(method.input_type).FromString, _bytes_of)
+
+
+def _bytes_of(answer: Message | bytes) -> bytes:
+    """An answer as it is sent: frames come as bytes already."""
+    return answer if isinstance(answer, bytes) else answer.SerializeToString()
 
 
 class GrpcServer:

@@ -123,7 +123,7 @@ class Prepared:
             found = [picture for picture in pictures if picture is not None]
             if len(found) < len(names):
                 return None
-            return encoded_image(np.concatenate(found, axis=1), Encoding.PNG).tobytes()
+            return encoded_image(np.concatenate(found, axis=1), Encoding.PNG)
 
         return await asyncio.to_thread(read)
 

@@ -11,7 +11,7 @@ from ultragray import GaussianScene, LinearProbe, phantom, render
 from ultragray.datasets.source import load_dataset
 from ultragray.geometry.registration import load_registration
 from ultragray.phantom.demo import DEMO_FILE, copy_demo_scene, demo_poses, load_demo_scene
-from ultragray.rendering.pixels import image_file
+from ultragray.rendering.pixels import png_file
 from ultragray_workers.datasets.intake import check_files
 from ultragray_workers.storage.location import open_storage
 
@@ -185,7 +185,7 @@ def frame(tmp_path):
     pose = demo_poses(3)[1]
     pixels = render(load_demo_scene(), None, pose, height=192, width=192, outputs=("bmode",))["bmode"][0]
     path = tmp_path / "frame.png"
-    path.write_bytes(image_file(pixels.detach().numpy(), ".png").tobytes())
+    path.write_bytes(png_file(pixels.detach().numpy()))
     start = pose.copy()
     start[:3, 3] += (1.5, -1.0, 1.0)
     np.save(tmp_path / "start.npy", start)

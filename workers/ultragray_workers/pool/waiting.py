@@ -8,6 +8,7 @@ import time
 from collections import OrderedDict, deque
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any
 
 from ultragray.geometry.probe import FloatArray
@@ -41,7 +42,7 @@ class Ticket:
     memory: int | None = None  # descriptor of the file that its frames are written to, once it is begun
     archive: int | None = None  # and of the .npz that is made of them, where that is asked for
 
-    @property
+    @cached_property
     def batch_key(self) -> tuple[Any, ...]:
         """Requests that agree in this can be rendered together."""
         return (self.request.scene, self.request.version, *self.request.settings.view)

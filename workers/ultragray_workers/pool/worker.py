@@ -329,8 +329,8 @@ def _write_part(
     pixel_type = encoding.pixel_type
     if encoding.is_image_file:
         image = encoded_image(frames.take(outputs[0], pixel_type, begin, end)[0], encoding)
-        write_at(memory, image.data, 0)
-        size = image.nbytes
+        write_at(memory, memoryview(image), 0)
+        size = len(image)
     else:
         for first in range(begin, end, CHUNK_POSES):  # each is written while the next one arrives
             for number, name in enumerate(outputs):

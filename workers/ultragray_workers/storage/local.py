@@ -9,6 +9,7 @@ import secrets
 import shutil
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 from ultragray.files import TEMPORARY_SUFFIX, link_or_copy, sync
@@ -39,6 +40,12 @@ class FileVersion:
     @classmethod
     def _of(cls, status: os.stat_result) -> FileVersion:
         return cls(mtime_ns=status.st_mtime_ns, size=status.st_size, inode=status.st_ino)
+
+
+@lru_cache(maxsize=1024)
+def _joined(folder: Path, key: str) -> Path:
+    """The path of a key. Raises InvalidArgument for one that would leave the folder."""
+    return folder / check_key(key)
 
 
 class LocalStorage:
@@ -163,7 +170,7 @@ class LocalStorage:
         return self.folder / check_key(prefix) if prefix else self.folder
 
     def _path(self, key: str) -> Path:
-        return self.folder / check_key(key)
+        return _joined(self.folder, key)
 
     @contextlib.contextmanager
     def _open(self, key: str, version: str | None = None) -> Iterator[int]:

@@ -19,7 +19,7 @@ from ultragray.exchange.exports.exporter import Exporter, ExportHeader
 from ultragray.exchange.exports.formats import Add
 from ultragray.files import atomic_path, npy_bytes
 from ultragray.rendering.outputs import OUTPUTS
-from ultragray.rendering.pixels import PixelArray, image_file
+from ultragray.rendering.pixels import PixelArray, png_file
 from ultragray.scene.confidence import Extrapolation
 
 
@@ -73,7 +73,7 @@ class TarExporter(Exporter):
             for name in self._header.settings.outputs:
                 frame = frames[name][place]
                 is_grey = frame.dtype == np.uint8
-                suffix, data = ("png", image_file(frame, ".png").tobytes()) if is_grey else ("npy", npy_bytes(frame))
+                suffix, data = ("png", png_file(frame)) if is_grey else ("npy", npy_bytes(frame))
                 self._member(f"{number:06d}.{name}.{suffix}", data)
             figures = self._extrapolations[number].figures()
             document = {"pose": self._header.poses[number].tolist(), **figures, **self._header.origin()}
@@ -98,8 +98,8 @@ def export_pngs(folder: Path, header: ExportHeader) -> Iterator[Add]:
         for place, extrapolation in enumerate(extrapolations):
             number = len(documents)
             for name in header.settings.outputs:
-                data = image_file(OUTPUTS[name].shares(frames[name][place]), ".png")
-                (folder / f"frame_{number:05d}_{name}.png").write_bytes(data.tobytes())
+                data = png_file(OUTPUTS[name].shares(frames[name][place]))
+                (folder / f"frame_{number:05d}_{name}.png").write_bytes(data)
             documents.append({"frame": number, "pose": header.poses[number].tolist(), **extrapolation.figures()})
 
     yield add

@@ -14,7 +14,7 @@ from ultragray.geometry.scan_conversion import with_square_pixels
 from ultragray.learn.evaluation.metrics import FrameMetrics
 from ultragray.learn.evaluation.scoring import Evaluation, render_sweep
 from ultragray.learn.sweep import Sweep, spread_places
-from ultragray.rendering.pixels import ByteArray, image_file, to_uint8
+from ultragray.rendering.pixels import ByteArray, png_file, to_uint8
 from ultragray.scene.gaussians import GaussianScene
 
 MAX_SIDE_PIXELS = 512  # of one panel
@@ -43,7 +43,7 @@ def write_side_by_side(
         )
         picture = _row({title: images[place] for title, images in panels.items()}, sweep, caption)
         paths.append(folder / f"frame_{number:05d}.png")
-        write_whole(paths[-1], image_file(picture, ".png").tobytes())
+        write_whole(paths[-1], png_file(picture))
     return paths
 
 

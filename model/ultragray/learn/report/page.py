@@ -22,7 +22,7 @@ from ultragray.learn.report.plots import plot_frames, plot_training, svg
 from ultragray.learn.report.tables import METRICS, DatasetFacts, Row, metric_rows, rank_rows, speckle_rows
 from ultragray.learn.sweep import Dataset, Sweep, spread_places
 from ultragray.learn.training.progress import Course
-from ultragray.rendering.pixels import ByteArray, image_file, to_uint8
+from ultragray.rendering.pixels import ByteArray, png_file, to_uint8
 from ultragray.scene.gaussians import GaussianScene
 
 MADE_OF = ("echo", "transmittance")  # what the rendering is made of
@@ -89,7 +89,7 @@ def telling_places(evaluation: Evaluation) -> dict[int, str]:
 
 def _address(frame: npt.NDArray[np.float32], sweep: Sweep) -> str:  # [H, W]
     picture = as_picture(frame, sweep, PICTURE_PIXELS)
-    return "data:image/png;base64," + base64.b64encode(image_file(picture, ".png").tobytes()).decode()
+    return "data:image/png;base64," + base64.b64encode(png_file(picture)).decode()
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from ultragray.files import write_whole
 from ultragray.learn.evaluation.side_by_side import as_picture
 from ultragray.learn.sweep import Sweep
-from ultragray.rendering.pixels import image_file
+from ultragray.rendering.pixels import png_file
 
 FrameArray: TypeAlias = npt.NDArray[np.float32]
 MAX_SIDE_PIXELS = 256
@@ -31,4 +31,4 @@ def pictures_in(folder: Path) -> list[Path]:
 
 
 def _write(picture: FrameArray, frame: Sweep, path: Path) -> None:
-    write_whole(path, image_file(as_picture(picture, frame, MAX_SIDE_PIXELS), ".png").tobytes())
+    write_whole(path, png_file(as_picture(picture, frame, MAX_SIDE_PIXELS)))

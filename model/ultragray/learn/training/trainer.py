@@ -32,7 +32,7 @@ from ultragray.learn.training.checkpointing import (
 from ultragray.learn.training.config import TrainingConfig
 from ultragray.learn.training.geometry import BatchSampler, Geometry, Shadows, out_of_plane_shift_mm, shift_out_of_plane
 from ultragray.learn.training.initial import initial_parameters
-from ultragray.learn.training.intensity import project_sh0
+from ultragray.learn.training.intensity import least_sh0, project_sh0
 from ultragray.learn.training.losses import SSIM_WINDOW, image_loss
 from ultragray.learn.training.memory import (
     check_comparison_memory,
@@ -124,7 +124,10 @@ class Trainer:
     def _begin_with(self, parameters: dict[str, Tensor], floor: Tensor) -> None:  # [N]
         self.parameters = self._trainable(parameters)
         self._floor = floor.to(self._device)
-        self._optimizer = Optimizer(self.parameters, batch_size=self._batch_size)
+        self._least_sh0 = least_sh0(self._floor, self.config.intensity)
+        self._optimizer = Optimizer(
+            self.parameters, batch_size=self._batch_size, scale_penalty=self.config.scale_penalty
+        )
         self._pull = PullStatistics.empty(len(parameters["means"]), self._device)
 
     def _trainable(self, parameters: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -241,15 +244,16 @@ class Trainer:
         image.backward()  # type: ignore[no-untyped-call]
         self.refinement.step(self.step / self._schedule.steps)
         with torch.no_grad():
-            parts = torch.stack([image.detach(), self._add_scale_penalty()])
-            means_gradient = self.parameters["means"].grad
-            assert means_gradient is not None
-            self._pull.add(means_gradient)
-            self._optimizer.step(self._schedule.rates(self.step))
+            if self.config.refinements:
+                means_gradient = self.parameters["means"].grad
+                assert means_gradient is not None
+                self._pull.add(means_gradient)
+            penalty = self._optimizer.step(self._schedule.rates(self.step))
             self._beam.step(self.step / self._schedule.steps)
             self._project(self.parameters["sh0"])
-            image_part, scale_part = parts.tolist()  # waits for a GPU: all work of the step is queued by now
-        loss: float = image_part + scale_part
+            (loss,) = (image.detach() + penalty)[
+                None
+            ].tolist()  # waits for a GPU: all work of the step is queued by now
         if not math.isfinite(loss):
             raise self._diverged(self.step + 1, f"the loss is {loss}")
         self.step += 1
@@ -282,15 +286,7 @@ class Trainer:
         return GaussianScene(**tensors, info=info)
 
     def _project(self, sh0: Tensor) -> None:
-        project_sh0(sh0, self.config.intensity, self._floor if self._schedule.has_floor(self.step) else None)
-
-    def _add_scale_penalty(self) -> Tensor:
-        """λ·mean(exp(scales)), a scalar; its gradient is added to that of the scales."""
-        scales = self.parameters["scales"]
-        deviations = scales.exp()
-        assert scales.grad is not None
-        scales.grad.add_(deviations, alpha=self.config.scale_penalty / deviations.numel())
-        return self.config.scale_penalty * deviations.mean()
+        project_sh0(sh0, self.config.intensity, self._least_sh0 if self._schedule.has_floor(self.step) else None)
 
     def _refine(self, limit: int) -> None:
         with torch.no_grad():
@@ -305,6 +301,7 @@ class Trainer:
             if not len(refined.parameters["means"]):
                 raise self._diverged(self.step, "refinement pruned every Gaussian")
             self._floor = self._floor[refined.parent]
+            self._least_sh0 = least_sh0(self._floor, self.config.intensity)
             self._project(refined.parameters["sh0"])
         self.parameters = self._trainable(refined.parameters)
         self._optimizer.replace(self.parameters, refined.origin)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import asyncio
 import io
 import json
-from dataclasses import asdict, fields
+from dataclasses import fields
 from functools import lru_cache
 from typing import Any
 
@@ -145,7 +145,7 @@ def render_headers(result: RenderResult) -> dict[str, str]:
     }
     if len(poses) == 1:
         headers["X-Ultragray-Pose"] = json.dumps(poses[0].tolist())
-        headers["X-Ultragray-Extrapolation"] = json.dumps(asdict(result.extrapolations[0]))
+        headers["X-Ultragray-Extrapolation"] = json.dumps(vars(result.extrapolations[0]))
     return headers
 
 
