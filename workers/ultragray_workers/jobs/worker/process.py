@@ -117,21 +117,19 @@ class Account:
     io_bytes: int = 0
     is_ready: bool = False  # at work, or waiting for a core
 
-    def __add__(self, other: Account) -> Account:
-        return Account(self.cpu_s + other.cpu_s, self.io_bytes + other.io_bytes, self.is_ready or other.is_ready)
-
 
 def account_of(pid: int) -> Account:
     """The account of a process and all below it; of one that has ended, nothing."""
-    total = Account()
-    with suppress(OSError, ValueError):
-        state, fields = _status(pid)
-        cpu_s = (int(fields[11]) + int(fields[12])) * _TICK_S  # utime, stime
-        total += Account(cpu_s, _io_bytes(pid), state == "R")
-        for children in (_PROC / str(pid) / "task").glob("*/children"):
-            for child in children.read_text(encoding="ascii").split():
-                total += account_of(int(child))
-    return total
+    ticks, io_bytes, is_ready, pids = 0, 0, False, [pid]
+    for one in pids:  # children are added on the way
+        with suppress(OSError, ValueError):
+            state, fields = _status(one)
+            ticks += int(fields[11]) + int(fields[12])  # utime, stime
+            io_bytes += _io_bytes(one)
+            is_ready |= state == "R"
+            for children in (_PROC / str(one) / "task").glob("*/children"):
+                pids += map(int, children.read_text(encoding="ascii").split())
+    return Account(ticks * _TICK_S, io_bytes, is_ready)
 
 
 def is_stopped(pid: int) -> bool:
