@@ -65,6 +65,14 @@ def _is_abandoned(folder: Path) -> bool:
     return False
 
 
+def age_s(path: Path) -> float:
+    """The seconds since a file or folder was changed; 0 where it is gone."""
+    try:
+        return time.time() - path.stat().st_mtime
+    except FileNotFoundError:
+        return 0.0
+
+
 def try_lock(file: IO[Any]) -> bool:
     """Whether the file is locked by us alone now, until it is closed here and in all processes that inherited it."""
     try:

@@ -23,7 +23,7 @@ from pathlib import Path
 from sqlalchemy.exc import SQLAlchemyError
 
 from ultragray.errors import InvalidArgument, UltragrayError
-from ultragray_workers.claims import remove_whole, try_lock
+from ultragray_workers.claims import age_s, remove_whole, try_lock
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import StartupFailed, StorageUnavailable
 from ultragray_workers.jobs import queue
@@ -205,7 +205,7 @@ class Housekeeper:
                     kept.add(job_id)
             self._stop.wait(STEP_PAUSE_S)
         removed += self._remove_unknown(self._stored_ids(), self._files.remove)
-        folders = {path.name: path for path in (self._artifact_folder / WORK).glob("*") if _age_s(path) > DAY_S}
+        folders = {path.name: path for path in (self._artifact_folder / WORK).glob("*") if age_s(path) > DAY_S}
         by_id = {name.partition(".")[0]: path for name, path in folders.items()}
         removed += self._remove_unknown(by_id, lambda job_id: remove_whole(by_id[job_id]))
         return removed + DatasetStore(self._artifact_folder, self._storage).remove_stray_files()
@@ -238,10 +238,3 @@ class Housekeeper:
                 except (UltragrayError, SQLAlchemyError, OSError) as error:
                     _log.warning(f"old jobs are kept for now: {str(error).splitlines()[0]}")
             self._stop.wait(INTERVAL_S)
-
-
-def _age_s(path: Path) -> float:
-    try:
-        return time.time() - path.stat().st_mtime
-    except FileNotFoundError:
-        return 0.0
