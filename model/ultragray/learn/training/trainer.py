@@ -248,9 +248,8 @@ class Trainer:
             penalty = self._optimizer.step(self._schedule.rates(self.step))
             self._beam.step(self.step / self._schedule.steps)
             self._project(self.parameters["sh0"])
-            (loss,) = (image.detach() + penalty)[
-                None
-            ].tolist()  # waits for a GPU: all work of the step is queued by now
+            both = (image.detach() + penalty)[None]
+            loss = float(both.tolist()[0])  # waits for a GPU: all work of the step is queued by now
         if not math.isfinite(loss):
             raise self._diverged(self.step + 1, f"the loss is {loss}")
         self.step += 1
