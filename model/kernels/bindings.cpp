@@ -214,8 +214,8 @@ NB_MODULE(_cpu, m) {
 
     m.def(
         "image_loss",
-        [](ImageBatch x, ImageBatch y, std::optional<ImageBatch> weights, FreePlanes gradient, double texture, int threads,
-           const std::string& instruction_set) {
+        [](ImageBatch x, ImageBatch y, FreePlanes gradient, double texture, int threads, const std::string& instruction_set,
+           std::optional<ImageBatch> weights) {
             const size_t count = x.shape(0), height = x.shape(1), width = x.shape(2);
             for (size_t d = 0; d < 3; ++d)
                 if (y.shape(d) != x.shape(d) || gradient.shape(d) != x.shape(d) ||
@@ -226,8 +226,8 @@ NB_MODULE(_cpu, m) {
             return image_loss(x.data(), y.data(), int(count), int(height), int(width), weights ? weights->data() : nullptr,
                               weights ? int(weights->shape(0)) : 0, texture, threads, instruction_set, gradient.data());
         },
-        nb::arg("x").noconvert(), nb::arg("y").noconvert(), nb::arg("weights").noconvert().none(),
-        nb::arg("gradient").noconvert(), nb::arg("texture"), nb::arg("threads"), nb::arg("instruction_set"));
+        nb::arg("x").noconvert(), nb::arg("y").noconvert(), nb::arg("gradient").noconvert(), nb::arg("texture"),
+        nb::arg("threads"), nb::arg("instruction_set"), nb::arg("weights").noconvert().none() = nb::none());
 
     m.def(
         "absorption_loss",

@@ -41,11 +41,11 @@ class _ImageLoss(_Loss):
         value = _cpu.image_loss(
             x.numpy(),
             truth.contiguous().numpy(),
-            None if weights is None else weights.contiguous().numpy(),
             ctx.gradient.numpy(),
             texture,
             torch.get_num_threads(),
             instruction_set,
+            None if weights is None else weights.contiguous().numpy(),
         )
         return x.new_tensor(value)
 
