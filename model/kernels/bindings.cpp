@@ -214,19 +214,39 @@ NB_MODULE(_cpu, m) {
 
     m.def(
         "image_loss",
-        [](ImageBatch x, ImageBatch y, FreePlanes gradient, double texture, int threads,
-           const std::string& instruction_set) {
+        [](ImageBatch x, ImageBatch y, FreePlanes gradient, double texture, int threads, const std::string& instruction_set,
+           std::optional<ImageBatch> weights) {
             const size_t count = x.shape(0), height = x.shape(1), width = x.shape(2);
             for (size_t d = 0; d < 3; ++d)
-                if (y.shape(d) != x.shape(d) || gradient.shape(d) != x.shape(d))
+                if (y.shape(d) != x.shape(d) || gradient.shape(d) != x.shape(d) ||
+                    (weights && (d ? weights->shape(d) != x.shape(d) : weights->shape(d) > count)))
                     throw std::invalid_argument("the images' shapes do not agree");
             if (count == 0 || height < 11 || width < 11) throw std::invalid_argument("images must be at least 11x11 pixels");
             nb::gil_scoped_release release;
-            return image_loss(x.data(), y.data(), int(count), int(height), int(width), texture, threads, instruction_set,
-                              gradient.data());
+            return image_loss(x.data(), y.data(), int(count), int(height), int(width), weights ? weights->data() : nullptr,
+                              weights ? int(weights->shape(0)) : 0, texture, threads, instruction_set, gradient.data());
         },
         nb::arg("x").noconvert(), nb::arg("y").noconvert(), nb::arg("gradient").noconvert(), nb::arg("texture"),
-        nb::arg("threads"), nb::arg("instruction_set"));
+        nb::arg("threads"), nb::arg("instruction_set"), nb::arg("weights").noconvert().none() = nb::none());
+
+    m.def(
+        "absorption_loss",
+        [](ImageBatch transmittance, GreyImages shadowed, Pairs neighbours, double factor, int threads,
+           FreePlanes gradient) {
+            const size_t count = transmittance.shape(0);
+            for (size_t d = 0; d < 3; ++d)
+                if (gradient.shape(d) != transmittance.shape(d) || (d && shadowed.shape(d) != transmittance.shape(d)))
+                    throw std::invalid_argument("the images' shapes do not agree");
+            if (neighbours.shape(0) != count) throw std::invalid_argument("there must be two neighbours per frame");
+            for (size_t k = 0; k < 2 * count; ++k)
+                if (neighbours.data()[k] < 0 || neighbours.data()[k] >= int64_t(shadowed.shape(0)))
+                    throw std::invalid_argument("there is no such frame");
+            nb::gil_scoped_release release;
+            return absorption_loss(transmittance.data(), shadowed.data(), neighbours.data(), int(count),
+                                   int64_t(shadowed.shape(1) * shadowed.shape(2)), factor, threads, gradient.data());
+        },
+        nb::arg("transmittance").noconvert(), nb::arg("shadowed").noconvert(), nb::arg("neighbours").noconvert(),
+        nb::arg("price"), nb::arg("threads"), nb::arg("gradient").noconvert());
 
     m.def(
         "adam",

@@ -214,8 +214,9 @@ struct Kernels {
     void (*gather)(const SceneView&, const View&, const Slice*, int64_t count, const PixelGradients&, GaussianGradient*,
                    float* sh, BeamMoments&, ViewGradient*);
     // Writes `by_l1` times the gradient of sum |x - y| plus `by_ssim` times that of the sum of SSIM; `window` sums to 1.
-    ImageLoss (*image_loss)(const float* x, const float* y, int height, int width, const float* window, float* scratch,
-                            float by_l1, float by_ssim, float* gradient);
+    // With a weight (not null) x is y + weight (x - y).
+    ImageLoss (*image_loss)(const float* x, const float* y, const float* weight, int height, int width, const float* window,
+                            float* scratch, float by_l1, float by_ssim, float* gradient);
     void (*speckle)(const SpeckleGrid&, const SpeckleView&, int first, int last, const float* bmode, float* scratch,
                     float* out);
     double (*adam)(float* values, const float* gradient, float* first, float* second, int64_t count, const AdamStep&,

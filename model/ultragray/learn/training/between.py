@@ -259,10 +259,6 @@ class Views(NamedTuple):
     images: Tensor  # [V, H, W] in [0, 1]
     weights: Tensor  # [V, H, W] in [0, 1], by how far the two frames agree
 
-    def weighted(self, rendered: Tensor) -> Tensor:  # [V, H, W] -> [V, H, W]
-        """A rendering to be compared with the images: mixed with them, so that it counts as much as the weights say."""
-        return torch.lerp(self.images, rendered, self.weights)
-
 
 class ViewsBetween:
     """Draws views with their expected images."""

@@ -33,7 +33,7 @@ from ultragray.learn.training.config import TrainingConfig
 from ultragray.learn.training.geometry import BatchSampler, Geometry, Shadows, out_of_plane_shift_mm, shift_out_of_plane
 from ultragray.learn.training.initial import initial_parameters
 from ultragray.learn.training.intensity import least_sh0, project_sh0
-from ultragray.learn.training.losses import SSIM_WINDOW, image_loss
+from ultragray.learn.training.losses import SSIM_WINDOW, absorption_loss, image_loss
 from ultragray.learn.training.memory import (
     check_comparison_memory,
     check_memory,
@@ -223,24 +223,21 @@ class Trainer:
         """One batch, one update, and the refinement that is due after it; returns the loss."""
         batch = self._sampler.next_batch()
         poses, neighbours = self.dataset.train.poses[batch.numpy()], batch[:, None].expand(-1, 2)
-        truth = self._images[cuda.upload(batch, self._device)].float().div_(255.0)
+        truth, weights = self._images[cuda.upload(batch, self._device)].float().div_(255.0), None
         if self._views_between is not None:
             between = self._views_between.draw(self._between_count, self._generator)
             batch = torch.cat([batch, torch.from_numpy(between.places.nearer)])
             neighbours = torch.cat([neighbours, torch.from_numpy(between.places.frames)])
             poses = np.concatenate([poses, between.poses])
+            truth, weights = torch.cat([truth, between.images]), between.weights
         if self.config.out_of_plane_mm:
             poses = shift_out_of_plane(poses, out_of_plane_shift_mm(self.config.out_of_plane_mm, self._generator))
         frames = self._rendered(self.refinement.corrected(batch, poses), self._schedule.sh_degree(self.step))
-        rendered = frames["bmode"]
-        if self._views_between is not None:
-            own, others = rendered[: len(truth)], rendered[len(truth) :]
-            rendered, truth = torch.cat([own, between.weighted(others)]), torch.cat([truth, between.images])
-        image = image_loss(rendered, truth, self._texture)
+        image = image_loss(frames["bmode"], truth, self._texture, weights)
         if self._shadowed is not None:
-            # λ·mean(1 − T), in which pixels count 0 where one of the frames on either side shows a shadow
-            is_free = self._shadowed[cuda.upload(neighbours, self._device)].any(dim=1)
-            image = image + self.config.absorption_penalty * ((1.0 - frames["transmittance"]) * ~is_free).mean()
+            neighbours = cuda.upload(neighbours, self._device)
+            price = self.config.absorption_penalty
+            image = image + absorption_loss(frames["transmittance"], self._shadowed, neighbours, price)
         image.backward()  # type: ignore[no-untyped-call]
         self.refinement.step(self.step / self._schedule.steps)
         with torch.no_grad():
@@ -251,9 +248,8 @@ class Trainer:
             penalty = self._optimizer.step(self._schedule.rates(self.step))
             self._beam.step(self.step / self._schedule.steps)
             self._project(self.parameters["sh0"])
-            (loss,) = (image.detach() + penalty)[
-                None
-            ].tolist()  # waits for a GPU: all work of the step is queued by now
+            both = (image.detach() + penalty)[None]
+            loss = float(both.tolist()[0])  # waits for a GPU: all work of the step is queued by now
         if not math.isfinite(loss):
             raise self._diverged(self.step + 1, f"the loss is {loss}")
         self.step += 1

@@ -161,7 +161,7 @@ def test_where_neighbours_disagree_a_blend_counts_less(tiny_dataset, with_probe)
     drawn = views.draw(40, torch.Generator().manual_seed(3))
     between = torch.from_numpy((drawn.poses[:, 1, 3] > 0.0) & (drawn.poses[:, 1, 3] < len(sweep) - 1))
     rendered = (0.9 * drawn.images + 0.07).requires_grad_()
-    image_loss(drawn.weighted(rendered), drawn.images, texture=0.0).backward()
+    image_loss(rendered, drawn.images, 0.0, drawn.weights).backward()
     pull = rendered.grad
     in_doubt, agreed = pull[between][:, 26:34, 10:15].abs().mean(), pull[between][:, :14, 26:].abs().mean()
     assert float(in_doubt) < 0.4 * float(agreed)

@@ -187,10 +187,10 @@ def test_a_checkpoint_with_other_tensors_is_refused(tiny_dataset, tiny_config, s
 def test_divergence_keeps_the_last_good_checkpoint(tiny_dataset, tiny_config, tmp_path, monkeypatch):
     true_loss, calls = trainer.image_loss, 0
 
-    def loss_that_breaks(rendered, truth, texture):
+    def loss_that_breaks(rendered, truth, *settings):
         nonlocal calls
         calls += 1
-        return true_loss(rendered, truth, texture) * (float("nan") if calls == 6 else 1.0)
+        return true_loss(rendered, truth, *settings) * (float("nan") if calls == 6 else 1.0)
 
     monkeypatch.setattr(trainer, "image_loss", loss_that_breaks)
     with pytest.raises(TrainingDiverged, match="in step 6: the loss is nan; the last good checkpoint is kept"):
