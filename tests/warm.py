@@ -26,6 +26,7 @@ import threading
 import time
 import uuid
 import weakref
+import zlib
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -93,14 +94,16 @@ class WarmServer:
 
     def __init__(self, *modules):
         self._modules = modules
-        self._run = os.environ.get("PYTEST_XDIST_TESTRUNUID") or uuid.uuid4().hex
+        run = os.environ.get("PYTEST_XDIST_TESTRUNUID") or uuid.uuid4().hex
+        tree = zlib.crc32(__file__.encode())  # a test may run those of a copy of the tree
+        self._folder = Path(tempfile.gettempdir(), f"ultragray-warm-{run}-{tree:08x}")
 
     def path(self):
         """Where the process listens."""
-        socket_path = Path(tempfile.gettempdir(), f"ultragray-warm-{self._run}", "socket")
+        socket_path = self._folder / "socket"
         if not socket_path.exists():
-            socket_path.parent.mkdir(mode=0o700, exist_ok=True)
-            with (socket_path.parent / "lock").open("w") as lock:
+            self._folder.mkdir(mode=0o700, exist_ok=True)
+            with (self._folder / "lock").open("w") as lock:
                 fcntl.flock(lock, fcntl.LOCK_EX)  # until it listens
                 if not socket_path.exists():
                     self._start(socket_path)
