@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gc
 import json
 import math
 import os
@@ -39,6 +40,8 @@ __all__ = [
     "working_folder",
 ]
 
+gc.disable()  # until the tests have been collected: modules and tests are no garbage, and looking at them takes seconds
+
 if not torch.cuda.is_available():
     os.environ.setdefault("TRITON_INTERPRET", "1")  # before any kernel is imported: they run on the CPU then
 
@@ -48,8 +51,8 @@ hypothesis.settings.register_profile("untimed", deadline=None)  # others may kee
 hypothesis.settings.load_profile("untimed")
 torch.set_num_threads(1)  # also for fixtures of more than one test
 
-RUN = f"PYTEST_RUN={os.getpid()}\0"  # in the environment of every process that these tests start
-os.environ["PYTEST_RUN"] = str(os.getpid())
+os.environ["PYTEST_RUN"] = f"{os.getpid():012}"  # always as long: warm.py writes it into the environment of another
+RUN = f"PYTEST_RUN={os.environ['PYTEST_RUN']}\0"  # in the environment of every process that these tests start
 
 BEGAN = time.monotonic()
 SHARED = ROOT.parent / "shared"
@@ -179,6 +182,13 @@ def random_poses():
 _LONG_FOLDERS = {
     ROOT / "tests" / name for name in ("batches", "faults", "fuzz", "hosts", "overload", "replicas", "soak")
 }
+
+
+@pytest.hookimpl(hookwrapper=True)
+def pytest_collection():
+    yield
+    gc.freeze()
+    gc.enable()
 
 
 def pytest_ignore_collect(collection_path, config):

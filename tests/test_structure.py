@@ -53,11 +53,18 @@ def tree(name):
 
 
 @cache
+def nodes_of(name):
+    """All nodes of a module that the tests look at: imports, calls and comparisons."""
+    kinds = ast.Import, ast.ImportFrom, ast.Call, ast.Compare
+    return [node for node in ast.walk(tree(name)) if isinstance(node, kinds)]
+
+
+@cache
 def imports_of(name):
     """The product's modules that a module names in imports, wherever they stand: in functions and for types too."""
     is_package = modules()[name].stem == "__init__"
     found = set()
-    for node in ast.walk(tree(name)):
+    for node in nodes_of(name):
         if isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
@@ -123,7 +130,7 @@ def test_nobody_outside_its_module_asks_for_the_kind_of_a_probe():
         f"{name}:{node.lineno}"
         for name in modules()
         if name != PROBE_MODULE
-        for node in ast.walk(tree(name))
+        for node in nodes_of(name)
         if isinstance(node, (ast.Call, ast.Compare)) and asks_for_a_kind(node)
     ]
     assert found == []

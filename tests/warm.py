@@ -1,12 +1,15 @@
 """Processes forked from one that has imported what they need, where a test would else wait for a second of imports.
 
-Run as a program, it is that process: `python warm.py SOCKET MODULE…` imports the modules, then forks for each client.
+Run as a program, it is that process: `python warm.py SOCKET RUN MODULE…` imports the modules, then forks for each
+client, until the process RUN ends.
 A fork begins as the program would after its imports: with the folder, the environment and the files of its request.
 Tests about starting itself use real processes.
 """
 
 import atexit
 import contextlib
+import ctypes
+import fcntl
 import gc
 import importlib
 import json
@@ -21,7 +24,9 @@ import sys
 import tempfile
 import threading
 import time
+import uuid
 import weakref
+import zlib
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -29,6 +34,7 @@ SOURCE_FOLDERS = ("model", "proto", "workers", "service", "client", "studies")
 _MAX_REQUEST_BYTES = 2**17
 _STANDARD_FILES = 3
 _START_TIMEOUT_S = 120.0
+_IS_ONE_OF_SEVERAL = "PYTEST_XDIST_WORKER" in os.environ  # the process of the run is the parent of this one
 
 
 class WarmProcess:
@@ -84,38 +90,43 @@ class WarmHelper(WarmProcess):
 
 
 class WarmServer:
-    """Starts the process that forks when it is first asked, and ends it with the tests."""
+    """Starts the process that forks when it is first asked; the test processes of a run share it."""
 
     def __init__(self, *modules):
         self._modules = modules
-        self._folder = None
+        run = os.environ.get("PYTEST_XDIST_TESTRUNUID") or uuid.uuid4().hex
+        tree = zlib.crc32(__file__.encode())  # a test may run those of a copy of the tree
+        self._folder = Path(tempfile.gettempdir(), f"ultragray-warm-{run}-{tree:08x}")
 
     def path(self):
         """Where the process listens."""
-        if self._folder is None:
-            self._folder = Path(tempfile.mkdtemp(prefix="ultragray-warm-"))
-            process = subprocess.Popen(
-                [sys.executable, __file__, self._folder / "socket", *self._modules],
-                stdin=subprocess.PIPE,  # its end is that of the process
-                env={
-                    **os.environ,
-                    "OMP_NUM_THREADS": "1",
-                    "OPENBLAS_NUM_THREADS": "1",  # a process with threads must not be forked
-                    "PYTHONPATH": os.pathsep.join(str(Path(__file__).parents[1] / folder) for folder in SOURCE_FOLDERS),
-                },
-            )
-            atexit.register(self._stop, process, self._folder)
-            end = time.monotonic() + _START_TIMEOUT_S
-            while not (self._folder / "socket").exists():
-                assert process.poll() is None, "the process that forks others did not start"
-                assert time.monotonic() < end, f"the process that forks others is not ready after {_START_TIMEOUT_S} s"
-                time.sleep(0.01)
-        return self._folder / "socket"
+        socket_path = self._folder / "socket"
+        if not socket_path.exists():
+            self._folder.mkdir(mode=0o700, exist_ok=True)
+            with (self._folder / "lock").open("w") as lock:
+                fcntl.flock(lock, fcntl.LOCK_EX)  # until it listens
+                if not socket_path.exists():
+                    self._start(socket_path)
+        return socket_path
 
-    @staticmethod
-    def _stop(process, folder):
-        process.communicate()
-        shutil.rmtree(folder)
+    def _start(self, socket_path):
+        run_pid = os.getppid() if _IS_ONE_OF_SEVERAL else os.getpid()
+        self._process = subprocess.Popen(
+            [sys.executable, __file__, socket_path, str(run_pid), *self._modules],
+            stdin=subprocess.DEVNULL,
+            start_new_session=True,  # what is sent to the group of one test process is not for it
+            env={
+                **os.environ,
+                "OMP_NUM_THREADS": "1",
+                "OPENBLAS_NUM_THREADS": "1",  # a process with threads must not be forked
+                "PYTHONPATH": os.pathsep.join(str(Path(__file__).parents[1] / folder) for folder in SOURCE_FOLDERS),
+            },
+        )
+        end = time.monotonic() + _START_TIMEOUT_S
+        while not socket_path.exists():
+            assert self._process.poll() is None, "the process that forks others did not start"
+            assert time.monotonic() < end, f"the process that forks others is not ready after {_START_TIMEOUT_S} s"
+            time.sleep(0.01)
 
 
 def fork(path, function, arguments, *, environment, folder, files, kind=WarmProcess, **more):
@@ -256,20 +267,21 @@ def job(folder, device_lock, *descriptors):
 FUNCTIONS = {one.__name__: one for one in (template, service, helper, worker, job)}
 
 
-def serve(path):
-    """Forks for whoever connects, until stdin ends. In a fork, the exit code of what it was forked for."""
+def serve(path, run_pid):
+    """Forks for whoever connects, until the run has ended."""
     running, bound = {}, {}  # connections by process; processes that end with those who asked for them
     ended, wake = socket.socketpair()
     wake.setblocking(False)
     signal.set_wakeup_fd(wake.fileno(), warn_on_full_buffer=False)
     signal.signal(signal.SIGCHLD, lambda *_: None)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    run = os.pidfd_open(run_pid)
     listener = socket.socket(socket.AF_UNIX, socket.SOCK_SEQPACKET)
     listener.bind(f"{path}.new")
     listener.listen(64)
     os.rename(f"{path}.new", path)
     while True:
-        readable = select.select([sys.stdin, listener, ended, *bound], [], [])[0]
+        readable = select.select([run, listener, ended, *bound], [], [])[0]
         if ended in readable:
             ended.recv(4096)
             with contextlib.suppress(ChildProcessError):
@@ -290,14 +302,16 @@ def serve(path):
                 connection.send(str(os.getpid()).encode())  # from now on its group can be killed
                 for ours in (listener, ended, wake, connection, *running.values()):
                     ours.close()
-                return begin(request, files)
+                os.close(run)
+                leave(begin(request, files))
             for file in files:
                 os.close(file)
             running[pid] = connection
             if "end_with" in request:
                 bound[connection] = pid, request["end_with"]
-        if sys.stdin in readable:
-            return 0
+        if run in readable:
+            shutil.rmtree(Path(path).parent)
+            return
 
 
 def begin(request, files):
@@ -305,6 +319,7 @@ def begin(request, files):
     signal.set_wakeup_fd(-1)
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.default_int_handler)
+    _show_run(request["environment"]["PYTEST_RUN"])
     os.environ.clear()
     os.environ.update(request["environment"])
     os.chdir(str(request["folder"]))
@@ -314,10 +329,26 @@ def begin(request, files):
     return FUNCTIONS[str(request["function"])](*request["arguments"], *files[_STANDARD_FILES:])
 
 
+def leave(code):
+    """Ends a fork as the interpreter would, but for its slow farewell to all that was imported: a third of a second."""
+    threading._shutdown()
+    atexit._run_exitfuncs()
+    for stream in (sys.stdout, sys.stderr):
+        stream.flush()
+    os._exit(code or 0)
+
+
+def _show_run(run):
+    """Writes into /proc/PID/environ, which is that of the process that forks, whose tests a fork belongs to."""
+    getenv = ctypes.CDLL(None).getenv
+    getenv.restype = ctypes.c_void_p
+    ctypes.memmove(getenv(b"PYTEST_RUN"), run.encode(), len(run))
+
+
 if __name__ == "__main__":
-    for module in sys.argv[2:]:
+    for module in sys.argv[3:]:
         importlib.import_module(module)
     gc.collect()
     gc.freeze()
     assert len(os.listdir("/proc/self/task")) == 1, "a process with threads must not be forked"
-    sys.exit(serve(sys.argv[1]))
+    serve(sys.argv[1], int(sys.argv[2]))

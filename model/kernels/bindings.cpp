@@ -9,6 +9,8 @@
 #include <array>
 #include <optional>
 
+#include "adam.hpp"
+#include "between.hpp"
 #include "loss.hpp"
 #include "render.hpp"
 #include "speckle.hpp"
@@ -32,6 +34,11 @@ using BeamNumbers = std::array<double, 4>;  // of a Beam
 using FreeBeam = nb::ndarray<double, nb::shape<3>, nb::c_contig, nb::device::cpu>;
 using Cells = nb::ndarray<const int32_t, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 using Offsets = nb::ndarray<const int32_t, nb::shape<-1, 3>, nb::c_contig, nb::device::cpu>;
+using GreyImages = nb::ndarray<const uint8_t, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
+using Pairs = nb::ndarray<const int64_t, nb::shape<-1, 2>, nb::c_contig, nb::device::cpu>;
+using PairsOfMaps = nb::ndarray<const float, nb::shape<-1, 2, 3, 3>, nb::c_contig, nb::device::cpu>;
+using Floats = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
+using FreeFloats = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
 using FreeCounts = nb::ndarray<int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
 // B, E, T, coverage, S and the sum of I*w, each [C, H, W] or null.
@@ -207,19 +214,88 @@ NB_MODULE(_cpu, m) {
 
     m.def(
         "image_loss",
-        [](ImageBatch x, ImageBatch y, FreePlanes gradient, double texture, int threads,
-           const std::string& instruction_set) {
+        [](ImageBatch x, ImageBatch y, FreePlanes gradient, double texture, int threads, const std::string& instruction_set,
+           std::optional<ImageBatch> weights) {
             const size_t count = x.shape(0), height = x.shape(1), width = x.shape(2);
             for (size_t d = 0; d < 3; ++d)
-                if (y.shape(d) != x.shape(d) || gradient.shape(d) != x.shape(d))
+                if (y.shape(d) != x.shape(d) || gradient.shape(d) != x.shape(d) ||
+                    (weights && (d ? weights->shape(d) != x.shape(d) : weights->shape(d) > count)))
                     throw std::invalid_argument("the images' shapes do not agree");
             if (count == 0 || height < 11 || width < 11) throw std::invalid_argument("images must be at least 11x11 pixels");
             nb::gil_scoped_release release;
-            return image_loss(x.data(), y.data(), int(count), int(height), int(width), texture, threads, instruction_set,
-                              gradient.data());
+            return image_loss(x.data(), y.data(), int(count), int(height), int(width), weights ? weights->data() : nullptr,
+                              weights ? int(weights->shape(0)) : 0, texture, threads, instruction_set, gradient.data());
         },
         nb::arg("x").noconvert(), nb::arg("y").noconvert(), nb::arg("gradient").noconvert(), nb::arg("texture"),
-        nb::arg("threads"), nb::arg("instruction_set"));
+        nb::arg("threads"), nb::arg("instruction_set"), nb::arg("weights").noconvert().none() = nb::none());
+
+    m.def(
+        "absorption_loss",
+        [](ImageBatch transmittance, GreyImages shadowed, Pairs neighbours, double factor, int threads,
+           FreePlanes gradient) {
+            const size_t count = transmittance.shape(0);
+            for (size_t d = 0; d < 3; ++d)
+                if (gradient.shape(d) != transmittance.shape(d) || (d && shadowed.shape(d) != transmittance.shape(d)))
+                    throw std::invalid_argument("the images' shapes do not agree");
+            if (neighbours.shape(0) != count) throw std::invalid_argument("there must be two neighbours per frame");
+            for (size_t k = 0; k < 2 * count; ++k)
+                if (neighbours.data()[k] < 0 || neighbours.data()[k] >= int64_t(shadowed.shape(0)))
+                    throw std::invalid_argument("there is no such frame");
+            nb::gil_scoped_release release;
+            return absorption_loss(transmittance.data(), shadowed.data(), neighbours.data(), int(count),
+                                   int64_t(shadowed.shape(1) * shadowed.shape(2)), factor, threads, gradient.data());
+        },
+        nb::arg("transmittance").noconvert(), nb::arg("shadowed").noconvert(), nb::arg("neighbours").noconvert(),
+        nb::arg("price"), nb::arg("threads"), nb::arg("gradient").noconvert());
+
+    m.def(
+        "adam",
+        [](const std::vector<FreeFloats>& values, const std::vector<Floats>& gradients, const std::vector<FreeFloats>& first,
+           const std::vector<FreeFloats>& second, const std::vector<int64_t>& steps, const std::vector<double>& rates,
+           const std::vector<double>& penalties, double beta1, double beta2, double eps, int threads,
+           const std::string& instruction_set) {
+            std::vector<AdamParameter> parameters;
+            for (size_t k = 0; k < values.size(); ++k) {
+                for (const size_t size : {gradients.at(k).size(), first.at(k).size(), second.at(k).size()})
+                    if (size != values[k].size()) throw std::invalid_argument("sizes of a parameter do not agree");
+                parameters.push_back({values[k].data(), gradients[k].data(), first[k].data(), second[k].data(),
+                                      int64_t(values[k].size()), steps.at(k), rates.at(k), penalties.at(k)});
+            }
+            nb::gil_scoped_release release;
+            return adam(parameters, beta1, beta2, eps, threads, instruction_set);
+        },
+        nb::arg("values").noconvert(), nb::arg("gradients").noconvert(), nb::arg("first").noconvert(),
+        nb::arg("second").noconvert(), nb::arg("steps"), nb::arg("rates"), nb::arg("penalties"), nb::arg("beta1"),
+        nb::arg("beta2"), nb::arg("eps"), nb::arg("threads"), nb::arg("instruction_set"));
+
+    m.def(
+        "blend_between",
+        [](GreyImages images, Pairs frames, Vector shares, std::optional<PairsOfMaps> onto, std::optional<Matrix> pixels,
+           bool fanned, bool wrap, float along_x, float along_z, float start, float span, float near_mm, float length_mm,
+           float least_mm, int smoothed, float doubtful, float nothing, int threads, FreePlanes blends, FreePlanes weights) {
+            const size_t count = frames.shape(0), height = images.shape(1), width = images.shape(2);
+            if (shares.shape(0) != count || (onto && onto->shape(0) != count) || onto.has_value() != pixels.has_value() ||
+                (pixels && (pixels->shape(0) != 2 || pixels->shape(1) != height * width)))
+                throw std::invalid_argument("the shapes of frames, shares and maps do not agree");
+            for (const FreePlanes& out : {blends, weights})
+                if (out.shape(0) != count || out.shape(1) != height || out.shape(2) != width)
+                    throw std::invalid_argument("an output's shape is not [V, H, W]");
+            for (size_t k = 0; k < 2 * count; ++k)
+                if (frames.data()[k] < 0 || frames.data()[k] >= int64_t(images.shape(0)))
+                    throw std::invalid_argument("there is no such frame");
+            const FrameLines lines{
+                fanned,  wrap, along_x, along_z, start, span, near_mm, length_mm, pixels ? pixels->data() : nullptr,
+                least_mm};
+            nb::gil_scoped_release release;
+            blend_between(images.data(), int(height), int(width), frames.data(), int(count), shares.data(),
+                          onto ? onto->data() : nullptr, lines, {smoothed, doubtful, nothing}, threads, blends.data(),
+                          weights.data());
+        },
+        nb::arg("images").noconvert(), nb::arg("frames").noconvert(), nb::arg("shares").noconvert(),
+        nb::arg("onto").noconvert().none(), nb::arg("pixels").noconvert().none(), nb::arg("fanned"), nb::arg("wrap"),
+        nb::arg("along_x"), nb::arg("along_z"), nb::arg("start"), nb::arg("span"), nb::arg("near_mm"), nb::arg("length_mm"),
+        nb::arg("least_mm"), nb::arg("smoothed"), nb::arg("doubtful"), nb::arg("nothing"), nb::arg("threads"),
+        nb::arg("blends").noconvert(), nb::arg("weights").noconvert());
 
     m.def(
         "add_speckle",

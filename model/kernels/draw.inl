@@ -21,40 +21,41 @@ constexpr float kMinVariance = 1e-32f;  // cm2; thinner ones touch no row
 constexpr float kNode = 0.7745966692f;  // Gauss-Legendre: nodes 0, +-sqrt(0.6)
 constexpr int kRestartRows = 32;
 
-// G of docs/physics.md §3 for unclipped windows, constant beyond the ends of its fit.
+// G of docs/physics.md §3 for unclipped windows, or its slope, looked up: constant beyond the ends of the table.
 #if defined(__AVX512F__)
-// A table of parabolas, looked up within registers; constant beyond its ends.
-inline Floats looked_up(const ProfileTable& table, Floats u) {
-    const Floats v = limited(u - ProfileTable::kMiddle, splat(3.1999f));
-    const __m512i step = (__m512i)_mm512_fmadd_round_ps((__m512)v, _mm512_set1_ps(5.0f), _mm512_set1_ps(12582912.0f),
-                                                        _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC);  // in its low bits
+inline Floats looked_up(const FineProfile& table, Floats u) {
+    const Floats v = limited(u - FineProfile::kMiddle, splat(3.1999f));
+    const __m512i piece = (__m512i)_mm512_fmadd_round_ps((__m512)v, _mm512_set1_ps(5.0f), _mm512_set1_ps(12582912.0f),
+                                                         _MM_FROUND_TO_NEG_INF | _MM_FROUND_NO_EXC);  // in its low bits
     const auto coefficient = [&](int power) {
-        const float* row = table.parabola[power];
-        return (Floats)_mm512_permutex2var_ps(_mm512_load_ps(row), step, _mm512_load_ps(row + 16));
+        const float* row = table.term[power];
+        return (Floats)_mm512_permutex2var_ps(_mm512_load_ps(row), piece, _mm512_load_ps(row + 16));
     };
     return (coefficient(2) * v + coefficient(1)) * v + coefficient(0);
 }
 
-// Within 3e-5; the kink at 0 lies between two steps.
-inline Floats absorption_profile(Floats u) { return looked_up(kProfile, u); }
+inline Floats absorption_profile(Floats u) { return looked_up(kFineProfile, u); }  // within 3e-5
+inline Floats profile_slope(Floats u) { return keep(less_equal(u, splat(3.0f)), looked_up(kFineProfileSlope, u)); }
 #else
-// A minimax polynomial in u, within 3.2e-4.
-inline Floats absorption_profile(Floats u) {
-    const Floats v = (minimum(maximum(u, splat(-3.34f)), splat(3.0f)) + 0.17f) * (1.0f / 3.17f);
-    Floats p = splat(-1.17912165f);
-    p = p * v - 1.08363338f;
-    p = p * v + 4.49129112f;
-    p = p * v + 4.48426945f;
-    p = p * v - 6.86307471f;
-    p = p * v - 8.09939924f;
-    p = p * v + 5.18377769f;
-    p = p * v + 8.18838f;
-    p = p * v - 2.00312422f;
-    p = p * v - 5.11385445f;
-    p = p * v + 0.737662447f;
-    p = p * v + 3.06877651f;
-    return p * v + 1.0784183f;
+inline Floats looked_up(const CoarseProfile& table, Floats u) {
+    constexpr int kPieces = CoarseProfile::kPieces;
+    const Floats v = minimum(maximum(u, splat(-3.3999f)), splat(3.0f));
+    const Ints piece = __builtin_convertvector(v * (1.0f / CoarseProfile::kWidth) + float(kPieces), Ints);  // mod kPieces
+    const auto coefficient = [&](int power) {
+        const float* row = table.term[power];
+#if defined(__AVX2__)
+        return (Floats)_mm256_permutevar8x32_ps(_mm256_load_ps(row), (__m256i)piece);
+#else
+        Floats found;
+        for (int k = 0; k < kLanes; ++k) found[k] = row[piece[k] & (kPieces - 1)];
+        return found;
+#endif
+    };
+    return (((coefficient(4) * v + coefficient(3)) * v + coefficient(2)) * v + coefficient(1)) * v + coefficient(0);
 }
+
+inline Floats absorption_profile(Floats u) { return looked_up(kCoarseProfile, u); }  // within 3e-5
+inline Floats profile_slope(Floats u) { return keep(less_equal(u, splat(3.0f)), looked_up(kCoarseProfileSlope, u)); }
 #endif
 
 // G where depth 0, at u = zero, clips the window (or not): the three-point Gauss-Legendre rule of §3.

@@ -97,26 +97,27 @@ inline ProfileSlopes clipped_slopes(Floats u, Floats zero) {
             select(degenerate, -density - bend, by_low * low_by_zero + by_high * high_by_zero)};
 }
 
-inline Floats profile_slope(Floats u) {
-    const Mask crossing = less_equal(u, splat(3.0f));
-#if defined(__AVX512F__)
-    return keep(crossing, looked_up(kProfileSlope, u));
-#else
-    return keep(crossing, clipped_slopes(minimum(maximum(u, splat(-8.0f)), splat(3.0f)), splat(-1e3f)).by_u);
-#endif
-}
-
 // Sums over the rows of a group, each a derivative of the loss with respect to what it is named after.
 struct LineSums {
     Floats intensity{}, absorb{};
     Floats u{}, u_times_u{};  // by u of each row; that times u
     Floats weight{}, psi{};   // by each weight and psi, times its value
     Floats zero{};
+
+    void operator+=(const LineSums& other) {
+        intensity += other.intensity, absorb += other.absorb;
+        u += other.u, u_times_u += other.u_times_u;
+        weight += other.weight, psi += other.psi;
+        zero += other.zero;
+    }
 };
 
-template <Profile profile>
-inline void gather_rows(const Group& g, const Slice& s, const PixelGradients& pixels, int line, int top, int end,
-                        LineSums& sums) {
+// `simple` as in draw_rows.
+template <Profile profile, bool simple>
+inline LineSums gather_rows(const Group& group, const Slice& s, const PixelGradients& pixels, int line, int top, int end) {
+    const Group g = group;  // its own: what is loaded below could be anything to the compiler
+    LineSums sums;
+    constexpr bool capped = profile != Profile::Thin;  // else alpha stays far below its limit
     const int period = restart_period(g);
     const Floats q = exponential(-g.du * g.du);
     const Floats intensity = splat(s.intensity), absorb = splat(s.absorb);
@@ -127,48 +128,47 @@ inline void gather_rows(const Group& g, const Slice& s, const PixelGradients& pi
         Floats r = exponential(-g.du * (u + 0.5f * g.du));
         const int stop = block + period < end ? block + period : end;
         for (int i = block; i < stop; ++i) {
-            const Mask near = less_equal(u * u, g.window2);
             ProfileSlopes shape{};
-            Floats psi{}, alpha{};
+            Floats psi{};
             if (profile == Profile::Clipped)
                 shape = clipped_slopes(u, g.zero);
             else if (profile != Profile::None)
                 shape = {absorption_profile(u), profile_slope(u), Floats{}};
             if (profile != Profile::None) psi = g.peak * shape.value;
-            const Mask counted = profile == Profile::None ? near : either(near, less_equal(splat(kMinPsi), psi));
+            const Mask near = less_equal(u * u, g.window2);
+            const Mask counted = simple                     ? within(g.first, u, g.last)
+                                 : profile == Profile::None ? near
+                                                            : either(near, less_equal(splat(kMinPsi), psi));
 
             const int64_t at = int64_t(i) * pixels.stride + line;
             const Floats by_intensity = load<Floats>(pixels.intensity + at);
-            const Floats weight = keep(counted, minimum(w, splat(kMaxWeight)));
+            const Floats weight = keep(counted, simple ? w : minimum(w, splat(kMaxWeight)));
             sums.intensity += by_intensity * weight;
-            const Floats by_weight = load<Floats>(pixels.weight + at) + intensity * by_intensity;
-            const Floats weighed = keep(less_equal(w, splat(kMaxWeight)), by_weight * weight);
+            Floats weighed = (load<Floats>(pixels.weight + at) + intensity * by_intensity) * weight;
+            if (!simple) weighed = keep(less_equal(w, splat(kMaxWeight)), weighed);
             sums.weight += weighed;
-            if (profile == Profile::None) {
-                sums.u -= u * weighed;
-                sums.u_times_u -= u * u * weighed;
-            } else {
-                if (profile == Profile::Thin)
-                    alpha = psi * (1.0f - psi * (0.5f - psi * (1.0f / 6.0f)));
-                else
-                    alpha = 1.0f - exponential(-psi);
-                const Floats capped = minimum(alpha, splat(kMaxWeight));
+            Floats by_u = -(u * weighed);
+            if (profile != Profile::None) {
+                const Floats alpha = capped ? 1.0f - exponential(-psi) : psi * (1.0f - psi * (0.5f - psi * (1.0f / 6.0f)));
+                const Floats stopped = capped ? minimum(alpha, splat(kMaxWeight)) : alpha;
                 const Floats by_factor =
-                    keep(counted, load<Floats>(pixels.log_transmittance + at) / (1.0f - absorb * capped));
-                sums.absorb -= by_factor * capped;
-                const Floats by_psi = keep(less_equal(alpha, splat(kMaxWeight)), -absorb * by_factor * (1.0f - alpha));
+                    keep(counted, load<Floats>(pixels.log_transmittance + at) / (1.0f - absorb * stopped));
+                sums.absorb -= by_factor * stopped;
+                Floats by_psi = -absorb * by_factor * (1.0f - alpha);
+                if (capped) by_psi = keep(less_equal(alpha, splat(kMaxWeight)), by_psi);
                 sums.psi += psi * by_psi;
-                const Floats by_u = by_psi * g.peak * shape.by_u - u * weighed;
-                sums.u += by_u;
-                sums.u_times_u += by_u * u;
+                by_u += by_psi * g.peak * shape.by_u;
                 if (profile == Profile::Clipped) sums.zero += by_psi * g.peak * shape.by_zero;
             }
+            sums.u += by_u;
+            sums.u_times_u += by_u * u;
             w *= r;
             r *= q;
             steps += 1.0f;
             u = g.u + steps * g.du;
         }
     }
+    return sums;
 }
 
 // With respect to a slice, summed over lanes.
@@ -182,15 +182,18 @@ inline void gather_group(const View& view, const Slice& s, const Course& course,
     if (!any(g.touched)) return;
     const Extent extent = extent_of(view, g);
     const int top = extent.top, clear = extent.clear, end = extent.end;
+    const auto rows = [&](auto profile, int from, int to) {
+        return (extent.simple ? gather_rows<profile, true> : gather_rows<profile, false>)(g, s, pixels, line, from, to);
+    };
+    __builtin_prefetch(pixels.below + int64_t(end) * pixels.stride + line);
     LineSums sums;
-    if (!view.absorbs && top < end) gather_rows<Profile::None>(g, s, pixels, line, top, end, sums);
-    if (view.absorbs && top < clear) gather_rows<Profile::Clipped>(g, s, pixels, line, top, clear, sums);
-    if (view.absorbs && clear < end) {
-        if (extent.thick)
-            gather_rows<Profile::Thick>(g, s, pixels, line, clear, end, sums);
-        else
-            gather_rows<Profile::Thin>(g, s, pixels, line, clear, end, sums);
-    }
+    if (!view.absorbs)
+        sums = rows(std::integral_constant<Profile, Profile::None>{}, top, end);
+    else if (extent.thick)
+        sums = rows(std::integral_constant<Profile, Profile::Thick>{}, clear, end);
+    else
+        sums = rows(std::integral_constant<Profile, Profile::Thin>{}, clear, end);
+    if (view.absorbs && top < clear) sums += gather_rows<Profile::Clipped, false>(g, s, pixels, line, top, clear);
     if (end < view.height && any(g.opaque)) {
         ProfileSlopes shape = {splat(kFullG), Floats{}, Floats{}};
         if (extent.clipped) shape = clipped_slopes(extent.whole + 1.0f, g.zero);  // constant in u there
@@ -213,33 +216,33 @@ inline void gather_group(const View& view, const Slice& s, const Course& course,
 
     // With a the line's normal in the plane and e its direction: m2 = across2 / q, s* = e.mean - k across / q and
     // variance = det / q, where q = a.C a, k = a.C e and det = det C.
-    const Floats dx = to_floats(load<Doubles>(view.dir_x + line)), dz = to_floats(load<Doubles>(view.dir_z + line));
     const Floats xx = splat(float(s.cov_xx)), xz = splat(float(s.cov_xz)), zz = splat(float(s.cov_zz));
-    const Floats k = dx * dz * (zz - xx) + xz * (dx * dx - dz * dz);
     const Floats variance = g.sigma * g.sigma, slant = g.across * g.spread;
     const Floats by_det = by_variance * g.spread;
     const Floats by_k = -by_star * slant;
-    const Floats by_across = 2.0f * by_m2 * slant - by_star * k * g.spread;
-    const Floats by_q = (by_star * k * slant - by_variance * variance) * g.spread - by_m2 * slant * slant;
+    const auto by_across = [&](Floats k) { return 2.0f * by_m2 * slant - by_star * k * g.spread; };
+    const auto by_q = [&](Floats k) {
+        return (by_star * k * slant - by_variance * variance) * g.spread - by_m2 * slant * slant;
+    };
     const auto add = [&](Floats& sum, Floats value) { sum += keep(g.touched, value); };
-    add(out.mean_x, dx * by_star - dz * by_across);
-    add(out.mean_z, dz * by_star + dx * by_across);
-    add(out.cov_xx, by_q * dz * dz - by_k * dx * dz + by_det * zz);
-    add(out.cov_xz, by_k * (dx * dx - dz * dz) - 2.0f * (by_q * dx * dz + by_det * xz));
-    add(out.cov_zz, by_q * dx * dx + by_k * dx * dz + by_det * xx);
+    if (view.fanned) {
+        const Floats dx = to_floats(load<Doubles>(view.dir_x + line)), dz = to_floats(load<Doubles>(view.dir_z + line));
+        const Floats k = dx * dz * (zz - xx) + xz * (dx * dx - dz * dz), across = by_across(k), q = by_q(k);
+        add(out.mean_x, dx * by_star - dz * across);
+        add(out.mean_z, dz * by_star + dx * across);
+        add(out.cov_xx, q * dz * dz - by_k * dx * dz + by_det * zz);
+        add(out.cov_xz, by_k * (dx * dx - dz * dz) - 2.0f * (q * dx * dz + by_det * xz));
+        add(out.cov_zz, q * dx * dx + by_k * dx * dz + by_det * xx);
+    } else {  // e is z
+        add(out.mean_x, -by_across(-xz));
+        add(out.mean_z, by_star);
+        add(out.cov_xx, by_q(-xz) + by_det * zz);
+        add(out.cov_xz, -by_k - 2.0f * by_det * xz);
+        add(out.cov_zz, by_det * xx);
+    }
     add(out.m2_plane, by_m2);
     add(out.intensity, sums.intensity);
     add(out.absorb, sums.absorb);
-}
-
-inline float total(Floats a) {
-#if defined(__AVX512F__)
-    return _mm512_reduce_add_ps((__m512)a);
-#else
-    float sum = 0;
-    for (int k = 0; k < kLanes; ++k) sum += a[k];
-    return sum;
-#endif
 }
 
 // The same for kLanes slices, one a lane.
@@ -274,7 +277,7 @@ inline HarmonicsGradient differentiate_harmonics(const SceneView& scene, const H
         scene.intensity == Intensity::Sigmoid ? 4.0f * activated * (1.0f - activated) : keep(inside, splat(1.0f));
     const Floats by_value = by_intensity * slope;
 
-    HarmonicsGradient out{};
+    HarmonicsGradient out;
     Floats* c = out.coefficients;
     Floats gx{}, gy{}, gz{};
     c[0] = splat(0.28209479177387814f);
@@ -311,26 +314,29 @@ inline HarmonicsGradient differentiate_harmonics(const SceneView& scene, const H
     return out;
 }
 
-// From kLanes slices to their Gaussians: `place` and the conditioning on the plane, backwards.
+// From kLanes slices to their Gaussians: `place` and the conditioning on the plane, backwards. In float, but with a beam:
+// then its terms, with fourth powers of scales, do not fit.
 template <bool thick>
 inline void differentiate_slices(const SceneView& scene, const View& view, const Candidates& c, const SliceGradients& by,
                                  GaussianGradient* gradients, float* sh_gradients, BeamMoments& moments,
                                  ViewGradient* by_view) {
-    const auto widen = [](const float* p) { return __builtin_convertvector(load<Floats>(p), Doubles); };
-    Placed p = place(scene, view, c);
+    using Reals = std::conditional_t<thick, Doubles, Floats>;
+    const auto convert = [](auto vector) { return __builtin_convertvector(vector, Reals); };
+    const auto take = [&](const float* p) { return convert(load<Floats>(p)); };
+    Placed<Reals> p = place<Reals>(scene, view, c);
     Spread spread;
-    if (thick) spread = spread_along_elevation(view, p);
-    const Doubles mean_x = widen(by.mean_x), mean_z = widen(by.mean_z), m2 = widen(by.m2_plane);
-    const Doubles cov_xx = widen(by.cov_xx), cov_xz = widen(by.cov_xz), cov_zz = widen(by.cov_zz);
-    const Doubles inverse = 1.0 / p.yy, height = p.mu[1] * inverse, tilt_x = p.xy * inverse, tilt_z = p.yz * inverse;
-    Doubles by_mu[3] = {mean_x, 2.0 * height * m2 - tilt_x * mean_x - tilt_z * mean_z, mean_z};
-    const Doubles by_xy = -2.0 * tilt_x * cov_xx - tilt_z * cov_xz - height * mean_x;
-    const Doubles by_yz = -2.0 * tilt_z * cov_zz - tilt_x * cov_xz - height * mean_z;
-    const Doubles by_yy = tilt_x * tilt_x * cov_xx + tilt_x * tilt_z * cov_xz + tilt_z * tilt_z * cov_zz -
-                          height * height * m2 + height * (tilt_x * mean_x + tilt_z * mean_z);
+    if constexpr (thick) spread = spread_along_elevation(view, p);
+    const Reals mean_x = take(by.mean_x), mean_z = take(by.mean_z), m2 = take(by.m2_plane);
+    const Reals cov_xx = take(by.cov_xx), cov_xz = take(by.cov_xz), cov_zz = take(by.cov_zz);
+    const Reals inverse = 1 / p.yy, height = p.mu[1] * inverse, tilt_x = p.xy * inverse, tilt_z = p.yz * inverse;
+    Reals by_mu[3] = {mean_x, 2 * height * m2 - tilt_x * mean_x - tilt_z * mean_z, mean_z};
+    const Reals by_xy = -2 * tilt_x * cov_xx - tilt_z * cov_xz - height * mean_x;
+    const Reals by_yz = -2 * tilt_z * cov_zz - tilt_x * cov_xz - height * mean_z;
+    const Reals by_yy = tilt_x * tilt_x * cov_xx + tilt_x * tilt_z * cov_xz + tilt_z * tilt_z * cov_zz -
+                        height * height * m2 + height * (tilt_x * mean_x + tilt_z * mean_z);
 
-    Doubles by_precision{};
-    if (thick) {
+    Reals by_precision{};
+    if constexpr (thick) {
         by_precision = m2 * spread.variance / spread.ratio;
         const Doubles by_variance = by_yy + m2 * spread.precision / spread.ratio;
         const Doubles by_depth = 2.0 * view.beam.slope2 * by_variance * spread.offset,
@@ -346,36 +352,38 @@ inline void differentiate_slices(const SceneView& scene, const View& view, const
         }
     }
 
-    Doubles by_axes[3][3], by_log_scale[3];  // by_axes[d][k]: axis k along d, in the scene's axes
+    Lane<Reals> axes[3][3];
+    for (int a = 0; a < 3; ++a)
+        for (int d = 0; d < 3; ++d) axes[a][d] = static_cast<Lane<Reals>>(view.axes[a][d]);
+    const auto in_scene = [&](const Reals* v, int d) { return axes[0][d] * v[0] + axes[1][d] * v[1] + axes[2][d] * v[2]; };
+    Reals by_axes[3][3], by_log_scale[3];  // by_axes[d][k]: axis k along d, in the scene's axes
     for (int k = 0; k < 3; ++k) {
-        const Doubles* s = p.spoke[k];
-        Doubles by_spoke[3] = {2.0 * s[0] * cov_xx + s[1] * by_xy + s[2] * cov_xz,
-                               2.0 * s[1] * by_yy + s[0] * by_xy + s[2] * by_yz,
-                               2.0 * s[2] * cov_zz + s[0] * cov_xz + s[1] * by_yz};
+        const Reals* s = p.spoke[k];
+        Reals by_spoke[3] = {2 * s[0] * cov_xx + s[1] * by_xy + s[2] * cov_xz,
+                             2 * s[1] * by_yy + s[0] * by_xy + s[2] * by_yz,
+                             2 * s[2] * cov_zz + s[0] * cov_xz + s[1] * by_yz};
         by_log_scale[k] = by_spoke[0] * s[0] + by_spoke[1] * s[1] + by_spoke[2] * s[2];
-        if (thick) {  // the precision is the sum of (spoke / scale^2)^2 along elevation
-            const Doubles pull = 2.0 * by_precision * s[1] / (p.scale[k] * p.scale[k] * p.scale[k] * p.scale[k]);
+        if constexpr (thick) {  // the precision is the sum of (spoke / scale^2)^2 along elevation
+            const Reals pull = 2 * by_precision * s[1] / (p.scale[k] * p.scale[k] * p.scale[k] * p.scale[k]);
             by_spoke[1] += pull;
             by_log_scale[k] -= pull * s[1];
         }
-        for (int d = 0; d < 3; ++d)
-            by_axes[d][k] =
-                p.scale[k] * (view.axes[0][d] * by_spoke[0] + view.axes[1][d] * by_spoke[1] + view.axes[2][d] * by_spoke[2]);
+        for (int d = 0; d < 3; ++d) by_axes[d][k] = p.scale[k] * in_scene(by_spoke, d);
     }
-    const Doubles w = p.quat[0], x = p.quat[1], y = p.quat[2], z = p.quat[3];
+    const Reals w = p.quat[0], x = p.quat[1], y = p.quat[2], z = p.quat[3];
     const auto& m = by_axes;
-    const Doubles by_quat[4] = {
-        2.0 * (x * (m[2][1] - m[1][2]) + y * (m[0][2] - m[2][0]) + z * (m[1][0] - m[0][1])),
-        2.0 * (w * (m[2][1] - m[1][2]) + y * (m[0][1] + m[1][0]) + z * (m[0][2] + m[2][0]) - 2.0 * x * (m[1][1] + m[2][2])),
-        2.0 * (w * (m[0][2] - m[2][0]) + x * (m[0][1] + m[1][0]) + z * (m[1][2] + m[2][1]) - 2.0 * y * (m[0][0] + m[2][2])),
-        2.0 * (w * (m[1][0] - m[0][1]) + x * (m[0][2] + m[2][0]) + y * (m[1][2] + m[2][1]) - 2.0 * z * (m[0][0] + m[1][1])),
+    const Reals by_quat[4] = {
+        2 * (x * (m[2][1] - m[1][2]) + y * (m[0][2] - m[2][0]) + z * (m[1][0] - m[0][1])),
+        2 * (w * (m[2][1] - m[1][2]) + y * (m[0][1] + m[1][0]) + z * (m[0][2] + m[2][0]) - 2 * x * (m[1][1] + m[2][2])),
+        2 * (w * (m[0][2] - m[2][0]) + x * (m[0][1] + m[1][0]) + z * (m[1][2] + m[2][1]) - 2 * y * (m[0][0] + m[2][2])),
+        2 * (w * (m[1][0] - m[0][1]) + x * (m[0][2] + m[2][0]) + y * (m[1][2] + m[2][1]) - 2 * z * (m[0][0] + m[1][1])),
     };
     const HarmonicsGradient harmonics =
         differentiate_harmonics(scene, load_harmonics(scene, c), direction_of(p.offset), load<Floats>(by.intensity));
-    Doubles by_place[3], by_mean[3];  // by the mean as the probe sees it, and in all
+    Reals by_place[3], by_mean[3];  // by the mean as the probe sees it, and in all
     for (int d = 0; d < 3; ++d) {
-        by_place[d] = view.axes[0][d] * by_mu[0] + view.axes[1][d] * by_mu[1] + view.axes[2][d] * by_mu[2];
-        by_mean[d] = by_place[d] + __builtin_convertvector(harmonics.mean[d], Doubles);
+        by_place[d] = in_scene(by_mu, d);
+        by_mean[d] = by_place[d] + convert(harmonics.mean[d]);
     }
 
     const int terms = (scene.sh_degree + 1) * (scene.sh_degree + 1);
@@ -392,9 +400,9 @@ inline void differentiate_slices(const SceneView& scene, const View& view, const
     // depends on the direction of view in the scene's axes.
     for (int d = 0; d < 3; ++d) {
         const int e = (d + 1) % 3, f = (d + 2) % 3;
-        const Doubles turn = p.offset[e] * by_place[f] - p.offset[f] * by_place[e] +
-                             0.5 * (w * by_quat[d + 1] - p.quat[d + 1] * by_quat[0] + p.quat[e + 1] * by_quat[f + 1] -
-                                    p.quat[f + 1] * by_quat[e + 1]);
+        const Reals spin = w * by_quat[d + 1] - p.quat[d + 1] * by_quat[0] + p.quat[e + 1] * by_quat[f + 1] -
+                           p.quat[f + 1] * by_quat[e + 1];
+        const Reals turn = p.offset[e] * by_place[f] - p.offset[f] * by_place[e] + spin / 2;
         for (int k = 0; k < c.count; ++k) by_view->shift[d] -= by_mean[d][k], by_view->turn[d] -= turn[k];
     }
 }
@@ -403,7 +411,8 @@ void gather(const SceneView& scene, const View& view, const Slice* slices, int64
             GaussianGradient* gradients, float* sh_gradients, BeamMoments& moments, ViewGradient* by_view) {
     for (int64_t first = 0; first < count; first += kLanes) {
         Candidates c;
-        SliceGradients by{};
+        SliceGradients by;
+        if (count - first < kLanes) by = {};  // the last lanes are of no slice
         for (; c.count < kLanes && first + c.count < count; ++c.count) {
             const Slice& s = slices[first + c.count];
             gather_slice(view, s, pixels, by, c.count);

@@ -153,6 +153,14 @@ struct ImageLoss {
     double l1, ssim;
 };
 
+// The numbers of one step of Adam.
+struct AdamStep {
+    float beta1, beta2;
+    float rate;     // over 1 - beta1^t
+    float by_root;  // 1 / sqrt(1 - beta2^t)
+    float eps;
+};
+
 // Floats that image_loss needs as scratch, and the length of its rows.
 inline int loss_stride(int width) { return (width + 10 + kMaxLanes - 1) / kMaxLanes * kMaxLanes + kMaxLanes; }
 inline int64_t loss_scratch(int height, int width) {
@@ -206,10 +214,13 @@ struct Kernels {
     void (*gather)(const SceneView&, const View&, const Slice*, int64_t count, const PixelGradients&, GaussianGradient*,
                    float* sh, BeamMoments&, ViewGradient*);
     // Writes `by_l1` times the gradient of sum |x - y| plus `by_ssim` times that of the sum of SSIM; `window` sums to 1.
-    ImageLoss (*image_loss)(const float* x, const float* y, int height, int width, const float* window, float* scratch,
-                            float by_l1, float by_ssim, float* gradient);
+    // With a weight (not null) x is y + weight (x - y).
+    ImageLoss (*image_loss)(const float* x, const float* y, const float* weight, int height, int width, const float* window,
+                            float* scratch, float by_l1, float by_ssim, float* gradient);
     void (*speckle)(const SpeckleGrid&, const SpeckleView&, int first, int last, const float* bmode, float* scratch,
                     float* out);
+    double (*adam)(float* values, const float* gradient, float* first, float* second, int64_t count, const AdamStep&,
+                   float by_sum);
 };
 
 // The kernels of an instruction set that this processor can run; "auto" takes the best. Throws std::invalid_argument.

@@ -4,6 +4,7 @@
 
 using namespace ultragray;
 
+#include "adam.inl"
 #include "draw.inl"
 #include "gather.inl"
 #include "loss.inl"
@@ -14,7 +15,7 @@ namespace ultragray {
 
 const Kernels& kernels_avx2() {
     static constexpr Kernels kernels{"avx2",        slice_clusters, draw,       count_work, finish,
-                                     differentiate, gather,         image_loss, speckle};
+                                     differentiate, gather,         image_loss, speckle,    adam};
     return kernels;
 }
 

@@ -4,6 +4,7 @@
 
 using namespace ultragray;
 
+#include "adam.inl"
 #include "draw.inl"
 #include "gather.inl"
 #include "loss.inl"
@@ -14,7 +15,7 @@ namespace ultragray {
 
 const Kernels& kernels_baseline() {
     static constexpr Kernels kernels{"baseline",    slice_clusters, draw,       count_work, finish,
-                                     differentiate, gather,         image_loss, speckle};
+                                     differentiate, gather,         image_loss, speckle,    adam};
     return kernels;
 }
 

@@ -65,8 +65,8 @@ inline double ssim_and_derivatives(const LossScratch& s, int height, int width, 
     return total;
 }
 
-ImageLoss image_loss(const float* x, const float* y, int height, int width, const float* window, float* scratch, float by_l1,
-                     float by_ssim, float* gradient) {
+ImageLoss image_loss(const float* x, const float* y, const float* weight, int height, int width, const float* window,
+                     float* scratch, float by_l1, float by_ssim, float* gradient) {
     const int stride = loss_stride(width), rows = height + kWindow - 1;
     const int64_t plane = int64_t(rows) * stride;
     const LossScratch s{
@@ -74,8 +74,12 @@ ImageLoss image_loss(const float* x, const float* y, int height, int width, cons
         stride};
     __builtin_memset(scratch, 0, loss_scratch(height, width) * sizeof(float));
     for (int i = 0; i < height; ++i) {
-        __builtin_memcpy(s.x + int64_t(i) * stride, x + int64_t(i) * width, width * sizeof(float));
-        __builtin_memcpy(s.y + int64_t(i) * stride, y + int64_t(i) * width, width * sizeof(float));
+        const int64_t from = int64_t(i) * width, to = int64_t(i) * stride;
+        __builtin_memcpy(s.y + to, y + from, width * sizeof(float));
+        if (weight == nullptr)
+            __builtin_memcpy(s.x + to, x + from, width * sizeof(float));
+        else
+            for (int j = 0; j < width; ++j) s.x[to + j] = y[from + j] + weight[from + j] * (x[from + j] - y[from + j]);
     }
     ImageLoss loss{0, ssim_and_derivatives(s, height, width, window)};
     for (int i = 0; i < height; ++i) {
@@ -108,6 +112,8 @@ ImageLoss image_loss(const float* x, const float* y, int height, int width, cons
             }
         }
         for (int k = 0; k < kLanes; ++k) loss.l1 += row_total[k];
+        const int64_t at = int64_t(i) * width;
+        for (int j = 0; weight != nullptr && j < width; ++j) gradient[at + j] *= weight[at + j];
     }
     return loss;
 }

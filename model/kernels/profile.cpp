@@ -6,6 +6,8 @@
 namespace ultragray {
 namespace {
 
+constexpr double kPi = 3.14159265358979323846, kLow = -3.4, kHigh = 3.0;
+
 double absorption_profile(double u) {
     const double low = std::min(u, 0.0) - 3.0, high = std::min(u, low + 6.0);
     const double half = 0.5 * (high - low), middle = 0.5 * (high + low), node = half * std::sqrt(0.6);
@@ -24,25 +26,37 @@ double absorption_slope(double u) {
     return slope;
 }
 
-// Interpolates at the Chebyshev nodes of each step: next to the best parabola there.
-ProfileTable make_table(double (*function)(double)) {
-    ProfileTable table;
-    for (int n = -ProfileTable::kSteps / 2; n < ProfileTable::kSteps / 2; ++n) {
-        const double centre = 0.2 * n + 0.1, node = 0.1 * std::sqrt(0.75);
-        const auto at = [&](double v) { return function(v + double(ProfileTable::kMiddle)); };
-        const double left = at(centre - node), mid = at(centre), right = at(centre + node);
-        const int k = n & (ProfileTable::kSteps - 1);
-        const double slope = (right - left) / (2 * node), bend = (right - 2 * mid + left) / (2 * node * node);
-        table.parabola[0][k] = static_cast<float>(mid - slope * centre + bend * centre * centre);
-        table.parabola[1][k] = static_cast<float>(slope - 2 * bend * centre);
-        table.parabola[2][k] = static_cast<float>(bend);
+// Interpolates at the Chebyshev nodes of each piece: next to the best polynomial there.
+template <class Table>
+Table make_table(double (*function)(double)) {
+    constexpr int terms = Table::kTerms, pieces = Table::kPieces;
+    const double width = Table::kWidth, middle = Table::kMiddle;
+    Table table;
+    for (int n = -pieces / 2; n < pieces / 2; ++n) {
+        const double low = std::max(n * width, kLow - middle), high = std::min((n + 1) * width, kHigh - middle);
+        double nodes[terms], values[terms], polynomial[terms] = {};
+        for (int k = 0; k < terms; ++k) {
+            nodes[k] = 0.5 * (low + high) + 0.5 * (high - low) * std::cos((k + 0.5) * kPi / terms);
+            values[k] = function(nodes[k] + middle);
+        }
+        for (int order = 1; order < terms; ++order)  // Newton's divided differences
+            for (int k = terms - 1; k >= order; --k) values[k] = (values[k] - values[k - 1]) / (nodes[k] - nodes[k - order]);
+        for (int k = terms - 1; k >= 0; --k) {  // multiplied out
+            for (int power = terms - 1; power > 0; --power)
+                polynomial[power] = polynomial[power - 1] - nodes[k] * polynomial[power];
+            polynomial[0] = values[k] - nodes[k] * polynomial[0];
+        }
+        for (int power = 0; power < terms; ++power)
+            table.term[power][n & (pieces - 1)] = static_cast<float>(polynomial[power]);
     }
     return table;
 }
 
 }  // namespace
 
-const ProfileTable kProfile = make_table(absorption_profile);
-const ProfileTable kProfileSlope = make_table(absorption_slope);
+const FineProfile kFineProfile = make_table<FineProfile>(absorption_profile);
+const FineProfile kFineProfileSlope = make_table<FineProfile>(absorption_slope);
+const CoarseProfile kCoarseProfile = make_table<CoarseProfile>(absorption_profile);
+const CoarseProfile kCoarseProfileSlope = make_table<CoarseProfile>(absorption_slope);
 
 }  // namespace ultragray

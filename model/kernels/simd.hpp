@@ -5,6 +5,7 @@
 
 #include <cstdint>
 #include <cstring>
+#include <type_traits>
 #if defined(__AVX2__)  // AVX-512 includes it
 #include <immintrin.h>
 #endif
@@ -25,7 +26,12 @@ typedef double Doubles __attribute__((vector_size(kLanes * sizeof(double))));
 
 inline Floats splat(float x) { return x - Floats{}; }
 inline Doubles splat_double(double x) { return x - Doubles{}; }
-inline Floats to_floats(Doubles x) { return __builtin_convertvector(x, Floats); }
+template <class Reals>
+inline Floats to_floats(Reals x) {
+    return __builtin_convertvector(x, Floats);
+}
+template <class Vector>
+using Lane = std::decay_t<decltype(Vector{}[0])>;
 
 template <class Vector, class Scalar>
 inline Vector load(const Scalar* p) {
@@ -60,6 +66,7 @@ inline Floats maximum(Floats a, Floats b) { return (Floats)_mm512_max_ps((__m512
 inline Floats square_root(Floats a) { return (Floats)_mm512_sqrt_ps((__m512)a); }
 inline float smallest(Floats a) { return _mm512_reduce_min_ps((__m512)a); }
 inline float largest(Floats a) { return _mm512_reduce_max_ps((__m512)a); }
+inline float total(Floats a) { return _mm512_reduce_add_ps((__m512)a); }
 #else
 typedef Ints Mask;
 inline Mask less_equal(Floats a, Floats b) { return a <= b; }
@@ -80,10 +87,32 @@ inline int how_many(Mask m) {
     for (int k = 0; k < kLanes; ++k) found += m[k] != 0;
     return found;
 }
-inline Floats select(Mask m, Floats a, Floats b) { return (Floats)((m & (Ints)a) | (~m & (Ints)b)); }
 inline Floats keep(Mask m, Floats a) { return (Floats)(m & (Ints)a); }
 inline Mask within(Floats low, Floats x, Floats high) { return (low <= x) & (x <= high); }
 inline Floats keep_product(Mask m, Floats a, Floats b) { return keep(m, a * b); }
+#if defined(__AVX2__)
+inline Floats select(Mask m, Floats a, Floats b) { return (Floats)_mm256_blendv_ps((__m256)b, (__m256)a, (__m256)m); }
+inline Floats minimum(Floats a, Floats b) { return (Floats)_mm256_min_ps((__m256)a, (__m256)b); }
+inline Floats maximum(Floats a, Floats b) { return (Floats)_mm256_max_ps((__m256)a, (__m256)b); }
+inline Floats square_root(Floats a) { return (Floats)_mm256_sqrt_ps((__m256)a); }
+// Combines all lanes, halves first.
+template <class Operation>
+inline float reduced(Floats a, Operation combine) {
+    const __m128 four = combine(_mm256_castps256_ps128((__m256)a), _mm256_extractf128_ps((__m256)a, 1));
+    const __m128 two = combine(four, _mm_movehl_ps(four, four));
+    return _mm_cvtss_f32(combine(two, _mm_movehdup_ps(two)));
+}
+inline float smallest(Floats a) {
+    return reduced(a, [](__m128 x, __m128 y) { return _mm_min_ps(x, y); });
+}
+inline float largest(Floats a) {
+    return reduced(a, [](__m128 x, __m128 y) { return _mm_max_ps(x, y); });
+}
+inline float total(Floats a) {
+    return reduced(a, [](__m128 x, __m128 y) { return _mm_add_ps(x, y); });
+}
+#else
+inline Floats select(Mask m, Floats a, Floats b) { return (Floats)((m & (Ints)a) | (~m & (Ints)b)); }
 inline Floats minimum(Floats a, Floats b) { return select(less_equal(a, b), a, b); }
 inline Floats maximum(Floats a, Floats b) { return select(less_equal(a, b), b, a); }
 inline Floats square_root(Floats a) {
@@ -100,6 +129,12 @@ inline float largest(Floats a) {
     for (int k = 1; k < kLanes; ++k) found = a[k] > found ? a[k] : found;
     return found;
 }
+inline float total(Floats a) {
+    float sum = 0;
+    for (int k = 0; k < kLanes; ++k) sum += a[k];
+    return sum;
+}
+#endif
 #endif
 
 // exp(x) within 2 units in the last place for x in [-87, 88]; clamped outside: 1e-38 below, 1.6e38 above.

@@ -16,9 +16,11 @@ struct Harmonics {
 
 inline Harmonics load_harmonics(const SceneView& scene, const Candidates& c) {
     const int terms = (scene.sh_degree + 1) * (scene.sh_degree + 1);
-    Harmonics sh{};
-    for (int k = 0; k < c.count; ++k)
-        for (int t = 0; t < terms; ++t) sh.coefficients[t][k] = scene.sh[c.ids[k] * terms + t];
+    Harmonics sh;
+    for (int t = 0; t < terms; ++t) {
+        sh.coefficients[t] = Floats{};
+        for (int k = 0; k < c.count; ++k) sh.coefficients[t][k] = scene.sh[c.ids[k] * terms + t];
+    }
     return sh;
 }
 
@@ -99,40 +101,49 @@ inline bool inside_planes(const View& view, double x, double z) {
 }
 
 // kLanes Gaussians seen in the probe frame.
+template <class Reals>
 struct Placed {
-    Doubles quat[4];
-    Doubles offset[3];   // of the mean from the probe's origin, in the scene's axes
-    Doubles mu[3];       // the mean, in the probe's axes
-    Doubles axes[3][3];  // columns: the Gaussian's own axes, in the scene's
-    Doubles scale[3];
-    Doubles spoke[3][3];             // each own axis times its scale, in the probe's axes
-    Doubles xx, xy, xz, yy, yz, zz;  // covariance: the sum of the spokes' outer products
+    Reals quat[4];
+    Reals offset[3];   // of the mean from the probe's origin, in the scene's axes
+    Reals mu[3];       // the mean, in the probe's axes
+    Reals axes[3][3];  // columns: the Gaussian's own axes, in the scene's
+    Reals scale[3];
+    Reals spoke[3][3];             // each own axis times its scale, in the probe's axes
+    Reals xx, xy, xz, yy, yz, zz;  // covariance: the sum of the spokes' outer products
 };
 
-inline Placed place(const SceneView& scene, const View& view, const Candidates& c) {
-    float mean[3][kLanes] = {}, scale[3][kLanes] = {}, quat[4][kLanes] = {};
-    for (int k = 0; k < c.count; ++k) {
-        const Gaussian& g = scene.gaussians[c.ids[k]];
+template <class Reals>
+inline Placed<Reals> place(const SceneView& scene, const View& view, const Candidates& c) {
+    float mean[3][kLanes], scale[3][kLanes], quat[4][kLanes];
+    for (int k = 0; k < kLanes; ++k) {
+        const Gaussian& g = scene.gaussians[c.ids[k < c.count ? k : 0]];
         for (int d = 0; d < 3; ++d) mean[d][k] = g.mean[d], scale[d][k] = g.scale[d];
         for (int d = 0; d < 4; ++d) quat[d][k] = g.quat[d];
     }
-    const auto widen = [](const float* p) { return __builtin_convertvector(load<Floats>(p), Doubles); };
-    Placed p{};
-    for (int d = 0; d < 3; ++d) p.offset[d] = widen(mean[d]) - view.origin[d];
+    const auto convert = [](auto vector) { return __builtin_convertvector(vector, Reals); };
+    Placed<Reals> p;
+    Doubles offset[3];  // a small difference of large numbers, and so are the mean's places
+    for (int d = 0; d < 3; ++d) {
+        offset[d] = __builtin_convertvector(load<Floats>(mean[d]), Doubles) - view.origin[d];
+        p.offset[d] = convert(offset[d]);
+    }
     for (int d = 0; d < 3; ++d)
-        p.mu[d] = view.axes[d][0] * p.offset[0] + view.axes[d][1] * p.offset[1] + view.axes[d][2] * p.offset[2];
+        p.mu[d] = convert(view.axes[d][0] * offset[0] + view.axes[d][1] * offset[1] + view.axes[d][2] * offset[2]);
 
-    for (int d = 0; d < 4; ++d) p.quat[d] = widen(quat[d]);
-    const Doubles w = p.quat[0], x = p.quat[1], y = p.quat[2], z = p.quat[3];
+    for (int d = 0; d < 4; ++d) p.quat[d] = convert(load<Floats>(quat[d]));
+    const Reals w = p.quat[0], x = p.quat[1], y = p.quat[2], z = p.quat[3];
     p.axes[0][0] = 1 - 2 * (y * y + z * z), p.axes[0][1] = 2 * (x * y - w * z), p.axes[0][2] = 2 * (x * z + w * y);
     p.axes[1][0] = 2 * (x * y + w * z), p.axes[1][1] = 1 - 2 * (x * x + z * z), p.axes[1][2] = 2 * (y * z - w * x);
     p.axes[2][0] = 2 * (x * z - w * y), p.axes[2][1] = 2 * (y * z + w * x), p.axes[2][2] = 1 - 2 * (x * x + y * y);
+    p.xx = p.xy = p.xz = p.yy = p.yz = p.zz = Reals{};
     for (int k = 0; k < 3; ++k) {
-        p.scale[k] = widen(scale[k]);
-        for (int d = 0; d < 3; ++d)
-            p.spoke[k][d] = p.scale[k] * (view.axes[d][0] * p.axes[0][k] + view.axes[d][1] * p.axes[1][k] +
-                                          view.axes[d][2] * p.axes[2][k]);
-        const Doubles* s = p.spoke[k];
+        p.scale[k] = convert(load<Floats>(scale[k]));
+        for (int d = 0; d < 3; ++d) {
+            const Lane<Reals> along[3] = {Lane<Reals>(view.axes[d][0]), Lane<Reals>(view.axes[d][1]),
+                                          Lane<Reals>(view.axes[d][2])};
+            p.spoke[k][d] = p.scale[k] * (along[0] * p.axes[0][k] + along[1] * p.axes[1][k] + along[2] * p.axes[2][k]);
+        }
+        const Reals* s = p.spoke[k];
         p.xx += s[0] * s[0], p.xy += s[0] * s[1], p.xz += s[0] * s[2];
         p.yy += s[1] * s[1], p.yz += s[1] * s[2], p.zz += s[2] * s[2];
     }
@@ -147,7 +158,7 @@ struct Spread {
     Doubles ratio;      // |S'| / |S|
 };
 
-inline Spread spread_along_elevation(const View& view, Placed& p) {
+inline Spread spread_along_elevation(const View& view, Placed<Doubles>& p) {
     Spread t{};
     t.offset = p.mu[2];
     if (view.fanned)
@@ -168,7 +179,8 @@ struct Direction {
     Floats x, y, z, inverse_length;
 };
 
-inline Direction direction_of(const Doubles offset[3]) {
+template <class Reals>
+inline Direction direction_of(const Reals offset[3]) {
     const Floats x = to_floats(offset[0]), y = to_floats(offset[1]), z = to_floats(offset[2]);
     const Floats inverse_length = 1.0f / square_root(maximum(x * x + y * y + z * z, splat(1e-36f)));
     return {x * inverse_length, y * inverse_length, z * inverse_length, inverse_length};
@@ -177,7 +189,7 @@ inline Direction direction_of(const Doubles offset[3]) {
 // Apart for a slice without thickness, so that it costs nothing there.
 template <bool thick>
 void slice_candidates(const SceneView& scene, const View& view, const Candidates& c, SliceList& out) {
-    Placed p = place(scene, view, c);
+    Placed<Doubles> p = place<Doubles>(scene, view, c);
     Doubles lost{};  // what m2 grows by, as the beam's weight spreads, and by a Gaussian's own weight
     if (thick) {
         const Spread spread = spread_along_elevation(view, p);

@@ -11,7 +11,7 @@ from ultragray.errors import TrainingDiverged
 from ultragray_studies.comparison.page import write_comparison
 from ultragray_studies.comparison.run import ComparisonProgress, compare_methods
 from ultragray_studies.methods.registry import chosen_methods
-from ultragray_workers.jobs.kinds.compare import CompareJob
+from ultragray_workers.jobs.kinds.evaluate import CompareJob
 from ultragray_workers.jobs.progress import Outcome, Progress
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 

@@ -68,12 +68,12 @@ def test_a_robot_that_sees_nothing_any_more_stops(servo):
 
 @pytest.mark.slow
 def test_the_robot_converges_and_follows(servo, demo_service):
-    record = asyncio.run(servo.servo(demo_service.grpc, seconds=6.0))
+    record = asyncio.run(servo.servo(demo_service.grpc, seconds=4.0))
     assert 0.1 < record.found_after_s < at_this_load(2.0)
-    assert len(record.errors_mm) > 60
+    assert len(record.errors_mm) > 40
     assert np.sqrt(np.mean(np.square(record.errors_mm))) < 1.0
     assert record.lost <= 0.05 * len(record.errors_mm)
-    assert len(record.latencies_ms) + record.dropped + record.late == record.sent == 600
+    assert len(record.latencies_ms) + record.dropped + record.late == record.sent == 400
     with Client(demo_service.grpc, timeout_s=60.0) as client:
         checked = record.poses[:: len(record.poses) // 8]
         assert np.mean([abs(vessel_mm(client, pose)[0]) for pose in checked]) < 1.2

@@ -224,9 +224,8 @@ def stale(poses):
     return poses
 
 
-@pytest.mark.parametrize(("seed", "noise"), [(0, (0.0, 0.0)), (1, (0.3, 0.2))])
-@pytest.mark.parametrize("is_mounting_given", [True, False])
-def test_each_mistake_is_named(seed, noise, is_mounting_given):
+@pytest.mark.parametrize(("is_mounting_given", "seed", "noise"), [(True, 0, (0.0, 0.0)), (False, 1, (0.3, 0.2))])
+def test_each_mistake_is_named(is_mounting_given, seed, noise):
     flanges, probes, mounting = samples(seed, *noise)
 
     def told(flanges, probes, mounting=mounting):

@@ -19,7 +19,7 @@ from .conftest import ROOT, SOURCE_FOLDERS
 from .rpc.test_grpc_render import Conversation, error_info, moved
 
 IDENTITY = {"position_mm": {"x": 0, "y": 0, "z": 0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}
-SMALL = {"height": 80, "width": 80}
+SMALL = {"height": 48, "width": 48}
 WAITING = "ultragray_waiting_frames "
 SLOW = {"backend": "reference", "max_batch_poses": 1}  # so that frames still wait when a test looks
 
@@ -34,7 +34,7 @@ def render(service, client, **body):
 
 
 def test_sigterm_answers_what_is_in_flight_and_exits_cleanly(start_service):
-    service = start_service(cold=True, **SLOW)
+    service = start_service(**SLOW)
     frames = rendering_pb2.RenderSettings(scene="demo", **SMALL)
     with service.channel() as channel, httpx.Client(timeout=60) as client, ThreadPoolExecutor(8) as threads:
         stub = rendering_pb2_grpc.RenderServiceStub(channel)
@@ -75,7 +75,7 @@ def test_sigint_stops_an_idle_service_at_once(start_service):
 def test_a_second_signal_stops_at_once(start_service):
     service = start_service(**SLOW)
     with httpx.Client(timeout=60) as client, ThreadPoolExecutor(4) as threads:
-        pending = [threads.submit(render, service, client, height=256, width=256) for _ in range(4)]
+        pending = [threads.submit(render, service, client, height=160, width=160) for _ in range(4)]
         wait_until(lambda: service.metric(WAITING))
         service.process.send_signal(signal.SIGTERM)
         while not any("stopping" in record["message"] for record in service.log()):
@@ -165,7 +165,7 @@ def test_frames_of_a_client_that_has_gone_are_dropped(slow):
     with httpx.Client(timeout=60) as client:
         host, port = slow.http.removeprefix("http://").split(":")
         body = (
-            b'{"height": 80, "width": 80, "poses": ['
+            b'{"height": 48, "width": 48, "poses": ['
             + b", ".join(
                 [b'{"position_mm": {"x": 0, "y": 0, "z": 0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}'] * 100
             )
@@ -186,7 +186,7 @@ def test_interactive_frames_go_before_a_batch(slow):
     with slow.channel() as channel, httpx.Client(timeout=60) as client:
         stub = rendering_pb2_grpc.RenderServiceStub(channel)
         settings = rendering_pb2.RenderSettings(scene="demo", **SMALL)
-        batch = rendering_pb2.RenderBatchRequest(settings=settings, poses=[moved(0)] * 12)
+        batch = rendering_pb2.RenderBatchRequest(settings=settings, poses=[moved(0)] * 10)
         received = []
         reader = threading.Thread(target=lambda: received.extend(f.sequence for f in stub.RenderBatch(batch)))
         reader.start()
@@ -195,7 +195,7 @@ def test_interactive_frames_go_before_a_batch(slow):
         done_before = len(received)
         reader.join()
         assert done_before <= 4
-        assert received == list(range(12))
+        assert received == list(range(10))
 
 
 def test_a_port_in_use_is_one_clear_error(start_service, service):

@@ -6,7 +6,7 @@ import pytest
 from ultragray.geometry.rotations import turns_of
 from ultragray_studies.hand import FRAME_S, PROBE, SPACING_MM, Errors, HandSweep, held_out_places
 
-FRAMES = 7
+FRAMES = 5
 
 
 @pytest.fixture(scope="module")

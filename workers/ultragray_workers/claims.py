@@ -13,6 +13,7 @@ import shutil
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import IO, Any
 
 from ultragray_workers.errors import StorageFull
 
@@ -55,14 +56,30 @@ def remove_abandoned(parent: Path, prefix: str) -> int:
 def _is_abandoned(folder: Path) -> bool:
     try:
         with (folder / LOCK_NAME).open("rb+") as lock:
-            fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        return True
+            return try_lock(lock)
     except FileNotFoundError:
         with contextlib.suppress(FileNotFoundError):
             return time.time() - folder.stat().st_ctime > UNLOCKED_S
-    except OSError:  # it is locked
+    except OSError:
         pass
     return False
+
+
+def age_s(path: Path) -> float:
+    """The seconds since a file or folder was changed; 0 where it is gone."""
+    try:
+        return time.time() - path.stat().st_mtime
+    except FileNotFoundError:
+        return 0.0
+
+
+def try_lock(file: IO[Any]) -> bool:
+    """Whether the file is locked by us alone now, until it is closed here and in all processes that inherited it."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    return True
 
 
 def is_no_room(error: OSError) -> bool:

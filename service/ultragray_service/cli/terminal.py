@@ -301,7 +301,8 @@ def interrupted_by_sigterm() -> Iterator[None]:
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        if signal.getsignal(signal.SIGTERM) is interrupt:  # else the process is stopping, and ignores it to its end
+            signal.signal(signal.SIGTERM, before)
 
 
 @contextlib.contextmanager

@@ -60,6 +60,7 @@ def run_worker(
     from opentelemetry import trace
 
     from ultragray_service.telemetry.logs import configure_logging, start_tracing
+    from ultragray_workers.jobs.worker.supervision import WorkerConfig
     from ultragray_workers.jobs.worker.worker import work
     from ultragray_workers.storage.location import open_storage
 
@@ -76,16 +77,14 @@ def run_worker(
     stop, hurry = threading.Event(), threading.Event()
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, lambda received, frame: (hurry if stop.is_set() else stop).set())
-    work(
+    config = WorkerConfig(
         settings.working_folder,
+        open_storage(settings.artifacts),
         settings.database_url,
-        stop,
-        storage=open_storage(settings.artifacts),
+        name,
+        device,
+        labels,
         max_copies_bytes=settings.max_cache_bytes,
-        hurry=hurry,
-        name=name,
-        device=device,
-        labels=labels,
         threads=settings.training_threads,
         nice=settings.job_nice,
         max_footprint_pixels=settings.max_footprint_pixels,
@@ -93,6 +92,11 @@ def run_worker(
         stall_timeout_s=settings.job_stall_timeout_s,
         max_run_s=settings.job_max_run_s,
         drain_timeout_s=settings.job_drain_timeout_s,
+    )
+    work(
+        config,
+        stop,
+        hurry=hurry,
         ready=lambda: manager.tell(READY),
         alive_every_s=manager.alive_every_s,
         tell_alive=lambda: manager.tell(ALIVE),

@@ -14,7 +14,6 @@ from functools import lru_cache
 from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import sqlalchemy as sa
-from sqlalchemy.dialects import postgresql, sqlite
 
 from ultragray.contract import described, from_dict, shown, to_dict
 from ultragray.errors import InvalidArgument, UltragrayError
@@ -27,7 +26,7 @@ from ultragray_service.core.scenes import SceneCatalog, page_of_names
 from ultragray_service.errors import LimitReached, PermissionDenied
 from ultragray_workers.errors import RegistrationNotFound
 from ultragray_workers.jobs.owners import Kind, Ownership, tell_change
-from ultragray_workers.jobs.tables import REGISTRATIONS
+from ultragray_workers.jobs.tables import REGISTRATIONS, insert
 from ultragray_workers.scene_names import base_name
 
 
@@ -103,9 +102,12 @@ def write_registration(
     with engine.begin() as connection:
         if most is not None:
             _require_room(connection, name, writer, most)
-        insert = (sqlite if connection.dialect.name == "sqlite" else postgresql).insert(REGISTRATIONS)
-        kept = insert.values(name=name, owner=writer.name, **values).on_conflict_do_update(
-            index_elements=[_COLUMNS.name], set_={**values, "owner": owner}, where=_may_change(writer)
+        kept = (
+            insert(connection, REGISTRATIONS)
+            .values(name=name, owner=writer.name, **values)
+            .on_conflict_do_update(
+                index_elements=[_COLUMNS.name], set_={**values, "owner": owner}, where=_may_change(writer)
+            )
         )
         row = connection.execute(kept.returning(*_COLUMNS)).one_or_none()
         if row is None:

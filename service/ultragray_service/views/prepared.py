@@ -34,7 +34,7 @@ from ultragray_service.core.poses import MatrixRows
 from ultragray_service.core.scenes import SceneCatalog
 from ultragray_service.core.threads import HelperProcesses, in_own_thread, to_its_end
 from ultragray_service.settings import Settings
-from ultragray_workers.claims import claimed_folder, remove_abandoned, remove_whole, storage_full
+from ultragray_workers.claims import age_s, claimed_folder, remove_abandoned, remove_whole, storage_full
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import ArtifactNotFound, DatasetNotFound, Draining
 from ultragray_workers.helpers import PROGRESS_NAME, read_picture
@@ -227,7 +227,7 @@ class Prepared:
         remove_abandoned(self.folder, _PREFIX)
 
     def _remove_oldest(self, newest: str) -> None:
-        others = sorted((folder for folder in self._kept() if folder.name != newest), key=_age_s)
+        others = sorted((folder for folder in self._kept() if folder.name != newest), key=age_s)
         held_bytes = 0
         for count, folder in enumerate(others, 2):
             held_bytes += _size_bytes(folder)
@@ -236,13 +236,6 @@ class Prepared:
 
     def _kept(self) -> list[Path]:
         return [path for path in self.folder.glob("*") if not path.name.startswith(".")]
-
-
-def _age_s(path: Path) -> float:
-    try:
-        return time.time() - path.stat().st_mtime
-    except FileNotFoundError:
-        return 0.0
 
 
 def _size_bytes(folder: Path) -> int:

@@ -223,10 +223,14 @@ def test_extreme_gaussians(name, kernel, assert_agrees):
     assert_agrees(Frames(drawn(kernel, EXTREMES[name], *view, size=(40, 40))), exact, tolerance=5e-4)
 
 
-# Of the released implementation, in ../shared/golden; the reference takes a minute for a scene of 5,000 Gaussians.
+# Of the released implementation, in ../shared/golden. Scenes of thousands of Gaussians take the reference a minute:
+# `make test` draws these with the CPU kernel alone, which the cases above hold to the reference.
 GOLDEN = [
     pytest.param(
-        name, backend, id=f"{backend}-{name}", marks=[pytest.mark.long] * ((name, backend) == ("g06", "reference"))
+        name,
+        backend,
+        id=f"{backend}-{name}",
+        marks=[pytest.mark.long] * (backend == "reference" and name in ("g05", "g06", "g08")),
     )
     for name in ("g01", "g03", "g05", "g06", "g08")
     for backend in ("reference", "cpu", "cuda")

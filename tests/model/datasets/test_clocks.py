@@ -57,8 +57,10 @@ def report_of(sweep):
     return check_dataset(Dataset("it", sweep.select(np.flatnonzero(~held_out)), sweep.select(np.flatnonzero(held_out))))
 
 
-@pytest.mark.parametrize("motion", [there_and_back, one_way_and_unevenly])
-@pytest.mark.parametrize("delay_ms", [-180, -70, 50, 120, 300])
+@pytest.mark.parametrize(
+    ("motion", "delay_ms"),
+    [(there_and_back, -180), (there_and_back, 50), (one_way_and_unevenly, -70), (one_way_and_unevenly, 300)],
+)
 def test_the_delay_of_the_images_is_told_with_its_number(motion, delay_ms):
     report = report_of(recorded(motion, delay_ms / 1000))
     assert report.image_delay_ms == pytest.approx(delay_ms, abs=12)
@@ -67,13 +69,9 @@ def test_the_delay_of_the_images_is_told_with_its_number(motion, delay_ms):
     assert ("after their poses" if delay_ms > 0 else "before their poses") in told
 
 
-@pytest.mark.parametrize("motion", [there_and_back, one_way_and_unevenly, evenly])
-def test_no_delay_is_told_where_there_is_none(motion):
-    assert report_of(recorded(motion, 0.0)).image_delay_ms is None
-
-
-def test_an_even_motion_tells_no_delay():
-    assert report_of(recorded(evenly, 0.15)).image_delay_ms is None
+@pytest.mark.parametrize(("motion", "delay_s"), [(there_and_back, 0.0), (one_way_and_unevenly, 0.0), (evenly, 0.15)])
+def test_no_delay_is_told_where_there_is_none_or_an_even_motion(motion, delay_s):
+    assert report_of(recorded(motion, delay_s)).image_delay_ms is None
 
 
 def test_steps_back_and_stamps_that_come_twice():

@@ -9,7 +9,6 @@ import numpy as np
 import pydicom
 import pytest
 from pydicom.encaps import encapsulate
-from pydicom.pixels import convert_color_space
 from pydicom.pixels.decoders.base import Decoder
 from pydicom.uid import UID, DeflatedExplicitVRLittleEndian, JPEGBaseline8Bit, JPEGLosslessSV1, RLELossless
 
@@ -59,18 +58,6 @@ def test_compressed_frames_are_read_where_there_is_a_decoder(write):
     data.compress(RLELossless)
     data.save_as(path)
     np.testing.assert_array_equal(load_dataset(path).val.images, FRAMES[[2, 7], 2:22, 4:24])
-
-
-@pytest.mark.parametrize("interpretation", ["RGB", "YBR_FULL"])
-def test_colours_become_their_luma(write, interpretation):
-    colours = np.random.default_rng(5).integers(0, 256, (*FRAMES.shape, 3), dtype=np.uint8)
-    stored = colours if interpretation == "RGB" else convert_color_space(colours, "RGB", interpretation)
-    path = write(
-        SamplesPerPixel=3, PhotometricInterpretation=interpretation, PlanarConfiguration=0, data=stored.tobytes()
-    )
-    luma = colours @ [0.299, 0.587, 0.114]
-    found = load_dataset(path).val.images
-    assert np.abs(found - luma[[2, 7], 2:22, 4:24]).max() <= 2  # YBR rounds on the way
 
 
 def test_the_fan_of_a_convex_probe_becomes_scan_lines(write):

@@ -73,8 +73,8 @@ def test_help_is_instant_it_imports_nothing_heavy():
         "told = CliRunner().invoke(app, ['--help']).stdout\n"
         f"assert all(word in told for word in {FIRST_WORDS!r})\n"
         "assert not {'torch', 'fastapi', 'grpc', 'cv2', 'uvicorn'} & set(sys.modules)\n"
-        f"for line in {list(COMMANDS)!r}:\n"
-        "    CliRunner().invoke(app, [*line.split(), '--help']); assert 'torch' not in sys.modules, line"
+        f"for word in {FIRST_WORDS!r}:  # loads the module of the command\n"
+        "    CliRunner().invoke(app, [word, '--help']); assert 'torch' not in sys.modules, word"
     )
     done = subprocess.run(python(program), capture_output=True, text=True)
     assert done.returncode == 0, done.stderr

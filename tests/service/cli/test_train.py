@@ -104,12 +104,12 @@ def test_says_what_is_missing_without_a_gpu(dataset, tmp_path, monkeypatch, opti
 def test_running_out_of_memory_leaves_the_last_good_scene(dataset, tmp_path, monkeypatch):
     true_loss, calls = trainer.image_loss, 0
 
-    def loss_that_runs_out(rendered, truth, texture):
+    def loss_that_runs_out(rendered, truth, *settings):
         nonlocal calls
         calls += 1
         if calls == 6:
             raise torch.OutOfMemoryError("CUDA out of memory.")
-        return true_loss(rendered, truth, texture)
+        return true_loss(rendered, truth, *settings)
 
     monkeypatch.setattr(trainer, "image_loss", loss_that_runs_out)
     output = tmp_path / "scene.ugr"

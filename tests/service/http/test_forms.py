@@ -18,7 +18,7 @@ from ultragray_service.http.bodies import FileParts
 from ultragray_service.http.middleware import LimitBody
 from ultragray_service.http.routes.jobs import SHOWN, artifact_response
 from ultragray_workers.jobs.files import Artifact
-from ultragray_workers.jobs.record import StoredFile
+from ultragray_workers.jobs.progress import StoredFile
 from ultragray_workers.storage.local import LocalStorage
 
 

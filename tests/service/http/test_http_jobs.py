@@ -13,7 +13,7 @@ from ultragray_service.core.jobs import TAIL_BYTES
 from ultragray_service.http.bodies import SPECIFICATIONS
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.kinds import Specification
-from ultragray_workers.jobs.record import Files, Piece
+from ultragray_workers.jobs.progress import Files, Piece
 from ultragray_workers.jobs.tables import JOBS
 from ultragray_workers.storage.local import LocalStorage
 
@@ -217,7 +217,7 @@ class ToldLog:
         self._pieces.append(piece)
         jobs = JobDatabase(self._folder, None)
         with jobs.engine.begin() as connection:
-            files = Files(log=tuple(self._pieces)).to_json()
+            files = Files(log=tuple(self._pieces))
             connection.execute(sa.update(JOBS).where(JOBS.c.id == self._job).values(files=files))
         jobs.close()
         self.text += text

@@ -15,8 +15,7 @@ from ultragray_workers.backup.restoring import restore
 from ultragray_workers.errors import BackupInvalid, RestoreRefused
 from ultragray_workers.jobs import queue
 from ultragray_workers.jobs.kinds import RenderJob
-from ultragray_workers.jobs.progress import JobState
-from ultragray_workers.jobs.record import Files, StoredFile
+from ultragray_workers.jobs.progress import Files, JobState, StoredFile
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.tables import JOBS
 from ultragray_workers.scenes import SceneStore
@@ -51,7 +50,7 @@ def test_everything_comes_back_and_what_ran_waits_again(
     checkpoint = StoredFile(f"jobs/{running.id}/2-1/run-1/checkpoint.safetensors", 3, "")
     LocalStorage(folders.artifacts).write(checkpoint.key, b"far")
     files = Files(run={"checkpoint.safetensors": checkpoint})
-    set_row(database, running, state="running", worker="gone", attempt=1, files=files.to_json())
+    set_row(database, running, state="running", worker="gone", attempt=1, files=files)
     set_row(database, done, state="cancelled")
     (folders.artifacts / "work" / f"{running.id}.1").mkdir(parents=True)
     (folders.artifacts / "work" / f"{running.id}.1" / "reserve").write_bytes(bytes(100))

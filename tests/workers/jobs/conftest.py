@@ -32,17 +32,19 @@ PROGRAM = """
 import json, os, signal, socket, sys, threading
 from pathlib import Path
 from ultragray_workers.jobs import queue
-from ultragray_workers.jobs.shards import desk
+from ultragray_workers.jobs.worker import supervision
 from ultragray_workers.jobs.worker.worker import work
+from ultragray_workers.storage.local import LocalStorage
 queue.DEAD_AFTER_S = 3.0
 stop = threading.Event()
 signal.signal(signal.SIGTERM, lambda number, frame: stop.set())
 options = json.loads(sys.argv[3])
 host = options.pop("host", socket.gethostname())
-desk.LONGEST_SHARE_S = options.pop("longest_share_s", desk.LONGEST_SHARE_S)
+supervision.LONGEST_SHARE_S = options.pop("longest_share_s", supervision.LONGEST_SHARE_S)
 socket.gethostname = lambda: host
 settings = {"device": "cpu", "threads": 1, "nice": 0, **options}
-work(Path(sys.argv[1]), os.environ.get("DATABASE_URL"), stop, name=sys.argv[2], **settings)
+folder, url = Path(sys.argv[1]), os.environ.get("DATABASE_URL")
+work(supervision.WorkerConfig(folder, LocalStorage(folder), url, sys.argv[2], **settings), stop)
 os._exit(0)
 """
 

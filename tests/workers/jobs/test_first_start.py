@@ -11,7 +11,9 @@ WORKERS, ROUNDS = 4, 10
 PROGRAM = f"""
 import logging, os, sys, threading, traceback
 from pathlib import Path
+from ultragray_workers.jobs.worker.supervision import WorkerConfig
 from ultragray_workers.jobs.worker.worker import work
+from ultragray_workers.storage.local import LocalStorage
 
 def start(url, number, ready, go):
     logging.basicConfig(stream=sys.stdout, format="%(levelname)s %(message)s")
@@ -20,7 +22,8 @@ def start(url, number, ready, go):
     os.write(ready, b".")
     os.read(go, 1)
     try:
-        work(Path(sys.argv[1]), url or None, stop, name=f"worker-{{number}}", device="cpu")
+        folder, name = Path(sys.argv[1]), f"worker-{{number}}"
+        work(WorkerConfig(folder, LocalStorage(folder), url or None, name, device="cpu"), stop)
         print("stopped", flush=True)
     except BaseException:
         traceback.print_exc(file=sys.stdout)

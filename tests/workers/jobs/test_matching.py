@@ -13,7 +13,7 @@ from ultragray_workers.jobs.demand import (
     waits_for,
 )
 from ultragray_workers.jobs.kinds import EvaluateJob, RenderJob, TrainJob
-from ultragray_workers.jobs.specification import to_dict
+from ultragray_workers.jobs.kinds.base import to_dict
 
 PROCESSOR = WorkerDevice(name="cpu", model="a processor", memory_bytes=64 * 10**9, cores=8)
 SMALL_GPU = WorkerDevice(name="cuda:0", model="a GPU", memory_bytes=8_400_000_000)

@@ -12,8 +12,7 @@ from ultragray_workers.jobs import queue, tables, workers
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.demand import Demand
 from ultragray_workers.jobs.owners import Kind, read_owners
-from ultragray_workers.jobs.progress import JobState, Outcome, Progress
-from ultragray_workers.jobs.record import Files, Piece, StoredFile
+from ultragray_workers.jobs.progress import Files, JobState, Outcome, Piece, Progress, StoredFile
 from ultragray_workers.jobs.tables import SCHEMA_VERSION
 from ultragray_workers.jobs.workers import Heartbeat
 

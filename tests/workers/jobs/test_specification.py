@@ -9,7 +9,7 @@ from ultragray.rendering.display import Display
 from ultragray.rendering.settings import Below
 from ultragray.samplers import AroundSampler, FanSampler, SplineSampler, TrainingSampler
 from ultragray_workers.jobs.kinds import RenderJob, TrainJob
-from ultragray_workers.jobs.specification import from_dict, in_short, to_dict
+from ultragray_workers.jobs.kinds.base import from_dict, in_short, to_dict
 
 POSES = np.tile(np.eye(4), (3, 1, 1)).tolist()
 

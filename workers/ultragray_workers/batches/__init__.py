@@ -1,1 +1,1 @@
-"""Batches beyond one process: where their files are kept, and the engine Ray; that of the queue is in jobs.shards."""
+"""Batches beyond one process: where their files are kept, and the engine Ray; the queue is in kinds.shards_run."""

@@ -88,10 +88,11 @@ class JobDatabase:
                 field="database_url",
             ) from error
         self._opened = _inode(self._file) if self._file else None
-        sa.event.listen(engine, "handle_error", self._raise_as_ours)
         if self._file:
-            # SQLite would make an empty file in place of one that was removed.
-            sa.event.listen(engine, "do_connect", lambda *_: self._require_same_file())
+            # SQLite calls a file that was moved read-only, and makes an empty one in place of one that was removed.
+            for event in ("handle_error", "do_connect"):
+                sa.event.listen(engine, event, lambda *_: self._require_same_file())
+        sa.event.listen(engine, "handle_error", _raise_as_ours)
 
     def check(self) -> None:
         """Raises DatabaseUnavailable or StorageFull unless a row could be written now: one is written and taken back.
@@ -108,10 +109,6 @@ class JobDatabase:
 
     def close(self) -> None:
         self.engine.dispose()
-
-    def _raise_as_ours(self, context: ExceptionContext) -> None:
-        self._require_same_file()  # SQLite calls one that was moved read-only
-        _raise_as_ours(context)
 
     def _require_same_file(self) -> None:
         if self._file and _inode(self._file) != self._opened:

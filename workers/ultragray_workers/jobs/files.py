@@ -1,6 +1,6 @@
 """The files of jobs as services read and remove them: objects of the storage, by what the row of the job names.
 
-What a worker writes is in `worker.telling`; where an object lies is said by `jobs.record.Files`. Free of torch.
+What a worker writes is in `worker.telling`; where an object lies is said by `jobs.progress.Files`. Free of torch.
 """
 
 from __future__ import annotations
@@ -11,7 +11,8 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from ultragray_workers.jobs.record import Files, Piece, Row, StoredFile
+from ultragray_workers.jobs.progress import Files, Piece, StoredFile
+from ultragray_workers.jobs.record import Row
 from ultragray_workers.scene_names import SUFFIX
 from ultragray_workers.storage.storage import Entry, NotThere, Storage
 

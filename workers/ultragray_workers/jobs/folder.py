@@ -17,18 +17,18 @@ The worker puts into the storage what others are to have (`worker.telling`), and
 from __future__ import annotations
 
 import contextlib
-import json
 import shutil
-from collections.abc import Iterator, Mapping
-from dataclasses import asdict, dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from ultragray.files import remove_stale_temporaries, sync, write_whole
-from ultragray_workers.jobs.progress import Outcome, Progress
+from ultragray_workers.jobs.progress import Outcome, Progress, from_json, to_json
 from ultragray_workers.storage.cache import DEFAULT_MAX_BYTES
 
 WORK = "work"  # of the artifact folder
+_T = TypeVar("_T")
 
 
 @dataclass(frozen=True)
@@ -46,6 +46,7 @@ class Request:
     storage: str  # location of the datasets and of the files of jobs
     max_footprint_pixels: int | None = None  # of a frame, see ultragray.rendering.limits; None: no limit
     max_copies_bytes: int = DEFAULT_MAX_BYTES  # of copies of datasets on this host
+    longest_share_s: float = float("inf")  # then a share of a batch ends, where other jobs wait
 
 
 class JobFolder:
@@ -66,10 +67,7 @@ class JobFolder:
         self._outcome = self.path / "outcome.json"
 
     def request(self) -> Request | None:
-        document = _read(self._request)
-        with contextlib.suppress(TypeError):
-            return None if document is None else Request(**document)
-        return None
+        return _read(Request, self._request)
 
     @property
     def attempt(self) -> int:
@@ -88,23 +86,22 @@ class JobFolder:
         shutil.rmtree(self.path, ignore_errors=True)
 
     def write_request(self, request: Request) -> None:
-        _write(self._request, json.dumps(asdict(request)))
+        _write(self._request, request)
 
     def progress(self) -> Progress:
-        document = _read(self._progress)
-        return Progress() if document is None else Progress.from_dict(document)
+        return _read(Progress, self._progress) or Progress()
 
     def write_progress(self, progress: Progress) -> None:
-        _write(self._progress, json.dumps(asdict(progress)))
+        _write(self._progress, progress)
 
     def outcome(self) -> Outcome | None:
         try:
-            return Outcome.from_json(self._outcome.read_text(encoding="utf-8"))
+            return from_json(Outcome, self._outcome.read_bytes())
         except FileNotFoundError:
             return None
 
     def write_outcome(self, outcome: Outcome) -> None:
-        _write(self._outcome, outcome.to_json())
+        _write(self._outcome, outcome)
 
     @contextlib.contextmanager
     def new_artifacts(self) -> Iterator[Path]:
@@ -145,13 +142,12 @@ class JobFolder:
         return tuple(sorted(path.name for path in self.artifacts.iterdir()))
 
 
-def _read(path: Path) -> Mapping[str, Any] | None:
+def _read(kind: type[_T], path: Path) -> _T | None:
     try:
-        document = json.loads(path.read_text(encoding="utf-8"))
+        return from_json(kind, path.read_bytes())
     except (OSError, ValueError):
         return None
-    return document if isinstance(document, dict) else None
 
 
-def _write(path: Path, text: str) -> None:
-    write_whole(path, text + "\n")
+def _write(path: Path, document: object) -> None:
+    write_whole(path, to_json(document) + "\n")

@@ -6,9 +6,8 @@ from dataclasses import dataclass
 from enum import Enum
 
 import sqlalchemy as sa
-from sqlalchemy.dialects import postgresql, sqlite
 
-from ultragray_workers.jobs.tables import CHANGES, OWNERS
+from ultragray_workers.jobs.tables import CHANGES, OWNERS, insert
 
 
 class Kind(str, Enum):
@@ -40,9 +39,9 @@ def claim_of_job(job_id: str) -> str:
 
 def add_owner(connection: sa.Connection, kind: Kind, name: str, ownership: Ownership) -> bool:
     """Whether a dataset or scene is now this owner's; False where the name is somebody's already."""
-    insert = (sqlite if connection.dialect.name == "sqlite" else postgresql).insert(OWNERS)
     values = {"owner": ownership.owner, "private": ownership.private, "claim": ownership.claim}
-    adding = insert.values(kind=kind.value, name=name, **values).on_conflict_do_nothing().returning(OWNERS.c.name)
+    new = insert(connection, OWNERS).values(kind=kind.value, name=name, **values)
+    adding = new.on_conflict_do_nothing().returning(OWNERS.c.name)
     if connection.execute(adding).first() is None:
         return False
     tell_change(connection)

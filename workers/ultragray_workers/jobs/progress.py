@@ -1,15 +1,19 @@
-"""The state of a job, how far it is, and how its work ended: what its process says, and its row keeps."""
+"""The state of a job, how far it is, how its work ended, and its files: what its row keeps as JSON."""
 
 from __future__ import annotations
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field, fields
+from dataclasses import asdict, dataclass, field
 from enum import Enum
-from typing import Any, ClassVar
+from functools import cache
+from typing import Any, ClassVar, TypeVar
+
+from pydantic import TypeAdapter
 
 from ultragray.contract import described
 
+_T = TypeVar("_T")
 PHASES = ("baselines", "effort", "training", "evaluation", "confidence", "report")
 
 
@@ -58,10 +62,6 @@ class Progress:
         choices=PHASES,
     )
 
-    @classmethod
-    def from_dict(cls, document: Mapping[str, Any]) -> Progress:
-        return cls(**{item.name: document.get(item.name) for item in fields(cls)})
-
 
 @dataclass(frozen=True)
 class Outcome:
@@ -74,12 +74,55 @@ class Outcome:
     progress: Progress = Progress()
     attempts: int = 1  # how often a process was started for it
 
-    def to_json(self) -> str:
-        return json.dumps(asdict(self))
 
-    @classmethod
-    def from_json(cls, text: str) -> Outcome:
-        values = json.loads(text)
-        values["artifacts"] = tuple(values["artifacts"])
-        values["progress"] = Progress.from_dict(values["progress"])
-        return cls(**values)
+@dataclass(frozen=True)
+class StoredFile:
+    key: str
+    bytes: int
+    sha256: str
+
+
+@dataclass(frozen=True)
+class Piece:
+    """A part of a file that grows: the first bytes of an object, which may have more already."""
+
+    key: str
+    bytes: int
+
+
+@dataclass(frozen=True)
+class Files:
+    """The objects of a job that count. Others under its keys are half written, or of an attempt that was cut off.
+
+    jobs/ID/NAME.ugr            the scene that the job needs, as it was when the job was submitted
+    jobs/ID/ATTEMPT/log-N       pieces of the log; the last of an attempt grows; likewise journal-N, of a training
+    jobs/ID/ATTEMPT/run-N/      a checkpoint, with all that a process needs to go on from it
+    jobs/ID/ATTEMPT/artifacts/  what can be downloaded
+    jobs/ID/batch/              what can be downloaded of a batch, see `batches.place`: many workers write it
+    """
+
+    log: tuple[Piece, ...] = ()
+    journal: tuple[Piece, ...] = ()  # of the attempt at hand
+    run: Mapping[str, StoredFile] = field(default_factory=dict)  # the newest checkpoint, by the paths of its files
+    artifacts: Mapping[str, StoredFile] = field(default_factory=dict)
+
+    def keys(self) -> set[str]:
+        pieces = {piece.key for piece in (*self.log, *self.journal)}
+        return pieces | {file.key for file in (*self.run.values(), *self.artifacts.values())}
+
+
+def to_json(value: Any) -> str:
+    """One of these classes as its row, and the folder of its attempt, keep it; or plain values."""
+    return json.dumps(value, default=asdict)
+
+
+def from_json(kind: type[_T], text: str | bytes) -> _T:
+    """Inverse of `to_json`; what is left out keeps its default. Raises ValueError."""
+    reader: Any = kind  # mypy takes no class for what a cache can hold
+    found: _T = _adapter(reader).validate_python(json.loads(text))
+    return found
+
+
+@cache
+def _adapter(kind: Any) -> TypeAdapter[Any]:
+    return TypeAdapter(kind)

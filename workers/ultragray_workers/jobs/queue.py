@@ -13,23 +13,20 @@ block, and raise DatabaseUnavailable where the database is away. Free of torch.
 
 from __future__ import annotations
 
-import json
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from datetime import datetime, timezone
 from typing import Any
 
 import sqlalchemy as sa
-from sqlalchemy.dialects import postgresql, sqlite
 from sqlalchemy.exc import IntegrityError
 
 from ultragray.errors import InvalidArgument
 from ultragray_workers.jobs.demand import Demand, demand_of_key
 from ultragray_workers.jobs.owners import Kind, Ownership, claim_of_job, forget_owner
-from ultragray_workers.jobs.progress import JobState, Outcome, Progress
-from ultragray_workers.jobs.record import COLUMNS, Files, Row
-from ultragray_workers.jobs.tables import JOBS, SHARDS, USAGE, WORKERS
+from ultragray_workers.jobs.progress import Files, JobState, Outcome, Progress
+from ultragray_workers.jobs.record import COLUMNS, Row
+from ultragray_workers.jobs.tables import JOBS, SHARDS, USAGE, WORKERS, insert, read, write
 
 SHARE = "share"  # the kind of a share of a batch
 DEAD_AFTER_S = 10.0  # without a sign of life a worker is taken for dead
@@ -49,7 +46,7 @@ def submit(engine: sa.Engine, values: dict[str, Any], also: Callable[[sa.Connect
     """
     try:
         with engine.begin() as connection:
-            inserted = _insert(connection, JOBS).values(state=_QUEUED, created_ms=_now_ms(), **values)
+            inserted = insert(connection, JOBS).values(state=_QUEUED, created_ms=_now_ms(), **values)
             made = inserted.on_conflict_do_nothing(index_elements=["id"]).returning(JOBS.c.number)
             if connection.execute(made).first() is None:
                 return False
@@ -120,17 +117,15 @@ def put_back_of(engine: sa.Engine, worker: str | None = None) -> list[str]:
 
 
 def _put_back(engine: sa.Engine, condition: sa.ColumnElement[bool]) -> list[str]:
-    with engine.connect() as connection:  # a look locks nothing
-        if connection.execute(sa.select(JOBS.c.id).where(condition).limit(1)).first() is None:
-            return []
+    if not read(engine, sa.select(JOBS.c.id).where(condition).limit(1)):  # a look locks nothing
+        return []
     with engine.begin() as connection:
         changed = sa.update(JOBS).where(condition).values(state=_QUEUED).returning(JOBS.c.id)
         return list(connection.execute(changed).scalars())
 
 
 def is_held(engine: sa.Engine, held: Row) -> bool:
-    with engine.connect() as connection:
-        return connection.execute(sa.select(JOBS.c.number).where(*_holds(held))).first() is not None
+    return bool(read(engine, sa.select(JOBS.c.number).where(*_holds(held))))
 
 
 def tell(engine: sa.Engine, held: Row, progress: Progress | None, files: Files) -> bool:
@@ -140,9 +135,7 @@ def tell(engine: sa.Engine, held: Row, progress: Progress | None, files: Files) 
     """
     is_its = JOBS.c.state.in_([_RUNNING, JobState.CANCELLED.value]), JOBS.c.worker == held.worker
     told = sa.update(JOBS).where(JOBS.c.id == held.id, *is_its, JOBS.c.attempt == held.attempt)
-    values = {"progress": None if progress is None else _json_of(progress), "files": files.to_json()}
-    with engine.begin() as connection:
-        return bool(connection.execute(told.values(values)).rowcount)
+    return write(engine, told.values(progress=progress, files=files))
 
 
 def publish(engine: sa.Engine, held: Row, outcome: Outcome, files: Files) -> bool:
@@ -150,7 +143,7 @@ def publish(engine: sa.Engine, held: Row, outcome: Outcome, files: Files) -> boo
 
     False where it was cancelled first, or is not the attempt of `held` any more.
     """
-    return _change(engine, held, published=True, outcome=outcome.to_json(), files=files.to_json())
+    return _change(engine, held, published=True, outcome=outcome, files=files)
 
 
 def finish(engine: sa.Engine, held: Row, outcome: Outcome, files: Files) -> bool:
@@ -161,9 +154,9 @@ def finish(engine: sa.Engine, held: Row, outcome: Outcome, files: Files) -> bool
     state = JobState.SUCCEEDED if outcome.error is None else JobState.FAILED
     ended = {
         "state": state.value,
-        "outcome": outcome.to_json(),
-        "progress": _json_of(outcome.progress),
-        "files": files.to_json(),
+        "outcome": outcome,
+        "progress": outcome.progress,
+        "files": files,
         "finished_ms": _now_ms(),
     }
     with engine.begin() as connection:
@@ -194,8 +187,7 @@ def _give_name_back(connection: sa.Connection, job_id: str, scene: str | None, o
 def cancel_shares(engine: sa.Engine, batch: str) -> None:
     """Ends the shares of a batch that is over: those that wait, and those that run within a second."""
     ended = {"state": JobState.CANCELLED.value, "finished_ms": _now_ms()}
-    with engine.begin() as connection:
-        connection.execute(sa.update(JOBS).where(JOBS.c.batch == batch, _IS_UNFINISHED).values(ended))
+    write(engine, sa.update(JOBS).where(JOBS.c.batch == batch, _IS_UNFINISHED).values(ended))
 
 
 def forget(engine: sa.Engine, job_id: str) -> None:
@@ -206,16 +198,12 @@ def forget(engine: sa.Engine, job_id: str) -> None:
 
 
 def row_of(engine: sa.Engine, job_id: str) -> Row | None:
-    with engine.connect() as connection:
-        row = connection.execute(sa.select(*COLUMNS).where(JOBS.c.id == job_id)).one_or_none()
-    return None if row is None else Row.of(row)
+    return _job(engine, JOBS.c.id == job_id)
 
 
 def specification_of(engine: sa.Engine, job_id: str) -> dict[str, Any]:
-    with engine.connect() as connection:
-        text = connection.execute(sa.select(JOBS.c.specification).where(JOBS.c.id == job_id)).scalar_one()
-    specification: dict[str, Any] = json.loads(text)
-    return specification
+    ((found,),) = read(engine, sa.select(JOBS.c.specification).where(JOBS.c.id == job_id))
+    return dict(found)
 
 
 def page(
@@ -239,9 +227,8 @@ def page(
         chosen = chosen.where(JOBS.c.kind == kind)
     found: list[Row] = []
     while len(found) <= page_size:
-        with engine.connect() as connection:
-            some = connection.execute(chosen if before is None else chosen.where(JOBS.c.number < before)).all()
-        rows = [Row.of(row) for row in some]
+        following = chosen if before is None else chosen.where(JOBS.c.number < before)
+        rows = [Row.of(row) for row in read(engine, following)]
         found += filter(shown, rows)
         if len(rows) <= page_size:
             break
@@ -259,8 +246,7 @@ def _read_token(token: str | None) -> int | None:
 
 def count_by_state(engine: sa.Engine) -> dict[JobState, int]:
     counted = sa.select(JOBS.c.state, sa.func.count()).where(_IS_JOB).group_by(JOBS.c.state)
-    with engine.connect() as connection:
-        return {JobState(state): count for state, count in connection.execute(counted)}
+    return {JobState(state): count for state, count in read(engine, counted)}
 
 
 def count_waiting(engine: sa.Engine) -> int:
@@ -272,8 +258,8 @@ def count_of_owner(engine: sa.Engine, owner: str) -> int:
 
 
 def _count(engine: sa.Engine, condition: sa.ColumnElement[bool]) -> int:
-    with engine.connect() as connection:
-        return connection.execute(sa.select(sa.func.count()).select_from(JOBS).where(_IS_JOB, condition)).scalar_one()
+    ((count,),) = read(engine, sa.select(sa.func.count()).select_from(JOBS).where(_IS_JOB, condition))
+    return int(count)
 
 
 def demands_waiting(engine: sa.Engine) -> list[str]:
@@ -282,41 +268,34 @@ def demands_waiting(engine: sa.Engine) -> list[str]:
     found = sa.select(sa.func.min(key).label("key")).where(waits).cte("found", recursive=True)
     following = sa.select(sa.func.min(key)).where(waits, key > found.c.key).scalar_subquery()
     found = found.union_all(sa.select(following).where(found.c.key.is_not(None)))
-    with engine.connect() as connection:
-        return list(connection.execute(sa.select(found.c.key).where(found.c.key.is_not(None))).scalars())
+    return [row.key for row in read(engine, sa.select(found.c.key).where(found.c.key.is_not(None)))]
 
 
 def waiting(engine: sa.Engine) -> list[tuple[Demand, int, int]]:
     """Each demand of jobs that wait, how many there are, and when the first was submitted, ms since 1970."""
     grouped = sa.select(JOBS.c.demand, sa.func.count(), sa.func.min(JOBS.c.created_ms)).group_by(JOBS.c.demand)
-    with engine.connect() as connection:
-        rows = connection.execute(grouped.where(JOBS.c.state == _QUEUED, _IS_JOB)).all()
-    return [(demand_of_key(row[0]), row[1], row[2]) for row in rows]
+    rows = read(engine, grouped.where(JOBS.c.state == _QUEUED, _IS_JOB))
+    return [(demand_of_key(key), count, oldest_ms) for key, count, oldest_ms in rows]
 
 
 def find(engine: sa.Engine, *, needs_dataset: str | None = None, makes_scene: str | None = None) -> Row | None:
     """A job that waits or runs, and needs a dataset or makes a scene; None where there is none."""
     chosen = JOBS.c.dataset == needs_dataset if makes_scene is None else JOBS.c.makes_scene == makes_scene
-    with engine.connect() as connection:
-        row = connection.execute(sa.select(*COLUMNS).where(chosen, _IS_UNFINISHED, _IS_JOB).limit(1)).first()
-    return None if row is None else Row.of(row)
+    return _job(engine, chosen, _IS_UNFINISHED, _IS_JOB)
 
 
 def successor(engine: sa.Engine, job_id: str) -> str | None:
-    found = sa.select(JOBS.c.id).where(_IS_UNFINISHED, JOBS.c.retry_of == job_id).limit(1)
-    with engine.connect() as connection:
-        return connection.execute(found).scalar()
+    found = _job(engine, _IS_UNFINISHED, JOBS.c.retry_of == job_id)
+    return None if found is None else found.id
 
 
 def known_ids(engine: sa.Engine, ids: Sequence[str]) -> set[str]:
     """Those of the ids that are jobs or shares."""
-    with engine.connect() as connection:
-        return set(connection.execute(sa.select(JOBS.c.id).where(JOBS.c.id.in_(ids))).scalars())
+    return {row.id for row in read(engine, sa.select(JOBS.c.id).where(JOBS.c.id.in_(ids)))}
 
 
 def ids_of_owner(engine: sa.Engine, owner: str) -> list[str]:
-    with engine.connect() as connection:
-        return list(connection.execute(sa.select(JOBS.c.id).where(_IS_JOB, JOBS.c.owner == owner)).scalars())
+    return [row.id for row in read(engine, sa.select(JOBS.c.id).where(_IS_JOB, JOBS.c.owner == owner))]
 
 
 def finished_ago(engine: sa.Engine, age_s: float, but: set[str], limit: int) -> list[str]:
@@ -327,31 +306,36 @@ def finished_ago(engine: sa.Engine, age_s: float, but: set[str], limit: int) -> 
     other = JOBS.alias()
     goes_on = sa.select(other.c.id).where(other.c.retry_of == JOBS.c.id, other.c.state.in_([_QUEUED, _RUNNING]))
     old = sa.select(JOBS.c.id).where(_IS_JOB, JOBS.c.finished_ms < 1000 * (now_s(engine) - age_s), ~goes_on.exists())
-    with engine.connect() as connection:
-        return list(connection.execute(old.where(JOBS.c.id.not_in(but)).limit(limit)).scalars())
+    return [row.id for row in read(engine, old.where(JOBS.c.id.not_in(but)).limit(limit))]
 
 
-def add_share(engine: sa.Engine, batch: Row, share: str) -> None:
+def add_share(engine: sa.Engine, batch: str, share: str) -> None:
     """Puts a share of a batch into the queue, unless one waits there."""
-    waits = sa.select(JOBS.c.id).where(JOBS.c.batch == batch.id, JOBS.c.state == _QUEUED).limit(1)
+    waits = sa.select(JOBS.c.id).where(JOBS.c.batch == batch, JOBS.c.state == _QUEUED).limit(1)
     copied = ("priority", "owner", "private", "asked", "summary", "specification", "dataset", "demand", "most_running")
     values = {
         **{name: JOBS.c[name] for name in (*copied, "trace")},
         "id": sa.literal(share),
         "kind": sa.literal(SHARE),
         "state": sa.literal(_QUEUED),
-        "batch": sa.literal(batch.id),
+        "batch": sa.literal(batch),
         "created_ms": sa.literal(_now_ms(), sa.BigInteger),
         "attempt": sa.literal(0),
         "run_s": sa.literal(0.0),
         "published": sa.false(),
     }
-    with engine.connect() as connection:
-        if connection.execute(waits).first() is not None:
-            return
+    if not read(engine, waits):
+        of_batch = sa.select(*values.values()).where(JOBS.c.id == batch, _IS_UNFINISHED)
+        write(engine, sa.insert(JOBS).from_select(list(values), of_batch, include_defaults=False))
+
+
+def blame_shard(engine: sa.Engine, share: Row, outcome: Outcome) -> None:
+    """Blames the first shard that a job or share had at hand for the end of its work; nothing where it had none."""
+    mine = SHARDS.c.job == (share.batch or share.id), SHARDS.c.share == share.id, ~SHARDS.c.done
+    values = {"share": None, "error": outcome.error, "reason": outcome.reason or outcome.error}
     with engine.begin() as connection:
-        of_batch = sa.select(*values.values()).where(JOBS.c.id == batch.id, _IS_UNFINISHED)
-        connection.execute(sa.insert(JOBS).from_select(list(values), of_batch, include_defaults=False))
+        number = connection.execute(sa.select(sa.func.min(SHARDS.c.number)).where(*mine)).scalar()
+        connection.execute(sa.update(SHARDS).where(*mine, SHARDS.c.number == number).values(values))
 
 
 def add_run_time(engine: sa.Engine, held: Row, device: str, seconds: float) -> None:
@@ -364,7 +348,7 @@ def add_run_time(engine: sa.Engine, held: Row, device: str, seconds: float) -> N
     with engine.begin() as connection:
         of_job = sa.update(JOBS).where(JOBS.c.id == held.id).values(run_s=JOBS.c.run_s + seconds)
         connection.execute(of_job)
-        counted = _insert(connection, USAGE).values(**key, run_s=seconds)
+        counted = insert(connection, USAGE).values(**key, run_s=seconds)
         more = {"run_s": USAGE.c.run_s + seconds}
         connection.execute(counted.on_conflict_do_update(index_elements=list(key), set_=more))
 
@@ -373,8 +357,7 @@ def usage_s(engine: sa.Engine, owner: str | None, since: datetime) -> dict[str, 
     """Seconds that the jobs of an owner ran since the day of `since` (UTC), by device: cpu, gpu."""
     chosen = sa.and_(USAGE.c.owner == (owner or ""), USAGE.c.day >= since.astimezone(timezone.utc).date())
     summed = sa.select(USAGE.c.device, sa.func.sum(USAGE.c.run_s)).where(chosen).group_by(USAGE.c.device)
-    with engine.connect() as connection:
-        return {"cpu": 0.0, "gpu": 0.0} | {row[0]: row[1] for row in connection.execute(summed)}
+    return {"cpu": 0.0, "gpu": 0.0} | dict(read(engine, summed))
 
 
 def now_s(engine: sa.Engine) -> sa.ColumnElement[float]:
@@ -385,8 +368,12 @@ def now_s(engine: sa.Engine) -> sa.ColumnElement[float]:
 
 
 def _change(engine: sa.Engine, held: Row, **values: Any) -> bool:
-    with engine.begin() as connection:
-        return bool(connection.execute(sa.update(JOBS).where(*_holds(held)).values(values)).rowcount)
+    return write(engine, sa.update(JOBS).where(*_holds(held)).values(values))
+
+
+def _job(engine: sa.Engine, *conditions: sa.ColumnElement[bool]) -> Row | None:
+    rows = read(engine, sa.select(*COLUMNS).where(*conditions).limit(1))
+    return Row.of(rows[0]) if rows else None
 
 
 def _holds(held: Row) -> tuple[sa.ColumnElement[bool], ...]:
@@ -395,14 +382,6 @@ def _holds(held: Row) -> tuple[sa.ColumnElement[bool], ...]:
 
 def _is_run_by(worker: str | None) -> sa.ColumnElement[bool]:
     return sa.and_(JOBS.c.state == _RUNNING, JOBS.c.worker == worker)
-
-
-def _insert(connection: sa.Connection, table: sa.Table) -> Any:
-    return (sqlite if connection.dialect.name == "sqlite" else postgresql).insert(table)
-
-
-def _json_of(progress: Progress) -> str:
-    return json.dumps(asdict(progress))
 
 
 def _now_ms() -> int:

@@ -1,14 +1,13 @@
 """The record of a job: its row in the table `jobs`, and the job as callers see it.
 
 A job waits (queued), is done by a worker (running), and ends (succeeded, failed or cancelled). `jobs.queue` has every
-change of a row; what a row says of progress, files and outcome is JSON of the classes here. Free of torch.
+change of a row. Free of torch.
 """
 
 from __future__ import annotations
 
-import json
-from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass, field, fields, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from datetime import datetime, timezone
 from typing import Any
 
@@ -18,60 +17,10 @@ from ultragray.contract import described
 from ultragray_workers.jobs.demand import LivingWorker, demand_of_key, waits_for
 from ultragray_workers.jobs.kinds import KINDS
 from ultragray_workers.jobs.owners import Ownership
-from ultragray_workers.jobs.progress import JobState, Outcome, Progress
+from ultragray_workers.jobs.progress import Files, JobState, Outcome, Progress
 from ultragray_workers.jobs.tables import JOBS
 
 MAX_PRIORITY = 1000
-
-
-@dataclass(frozen=True)
-class StoredFile:
-    key: str
-    bytes: int
-    sha256: str
-
-
-@dataclass(frozen=True)
-class Piece:
-    """A part of a file that grows: the first bytes of an object, which may have more already."""
-
-    key: str
-    bytes: int
-
-
-@dataclass(frozen=True)
-class Files:
-    """The objects of a job that count. Others under its keys are half written, or of an attempt that was cut off.
-
-    jobs/ID/NAME.ugr            the scene that the job needs, as it was when the job was submitted
-    jobs/ID/ATTEMPT/log-N       pieces of the log; the last of an attempt grows; likewise journal-N, of a training
-    jobs/ID/ATTEMPT/run-N/      a checkpoint, with all that a process needs to go on from it
-    jobs/ID/ATTEMPT/artifacts/  what can be downloaded
-    jobs/ID/batch/              what can be downloaded of a batch, see `batches.place`: many workers write it
-    """
-
-    log: tuple[Piece, ...] = ()
-    journal: tuple[Piece, ...] = ()  # of the attempt at hand
-    run: Mapping[str, StoredFile] = field(default_factory=dict)  # the newest checkpoint, by the paths of its files
-    artifacts: Mapping[str, StoredFile] = field(default_factory=dict)
-
-    def keys(self) -> set[str]:
-        pieces = {piece.key for piece in (*self.log, *self.journal)}
-        return pieces | {file.key for file in (*self.run.values(), *self.artifacts.values())}
-
-    def to_json(self) -> str:
-        return json.dumps(asdict(self))
-
-    @classmethod
-    def from_json(cls, text: str | None) -> Files:
-        if text is None:
-            return cls()
-        values = json.loads(text)
-        log, journal = (tuple(Piece(**piece) for piece in values[name]) for name in ("log", "journal"))
-        run, artifacts = (
-            {path: StoredFile(**one) for path, one in values[name].items()} for name in ("run", "artifacts")
-        )
-        return cls(log, journal, run, artifacts)
 
 
 @dataclass(frozen=True)
@@ -112,17 +61,7 @@ class Row:
     @classmethod
     def of(cls, row: sa.Row[Any]) -> Row:
         values = dict(row._mapping)
-        return cls(
-            **{
-                **values,
-                "state": JobState(values["state"]),
-                "summary": json.loads(values["summary"]),
-                "trace": json.loads(values["trace"]),
-                "progress": None if values["progress"] is None else Progress.from_dict(json.loads(values["progress"])),
-                "files": Files.from_json(values["files"]),
-                "outcome": None if values["outcome"] is None else Outcome.from_json(values["outcome"]),
-            }
-        )
+        return cls(**{**values, "state": JobState(values["state"]), "files": values["files"] or Files()})
 
 
 COLUMNS = tuple(JOBS.c[item.name] for item in fields(Row))

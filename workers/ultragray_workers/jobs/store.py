@@ -1,6 +1,6 @@
 """The jobs as the service sees them: submitted, listed, watched, cancelled, retried, deleted. Free of torch.
 
-`submit` checks what the job needs (`Requirements`) and writes its row; the workers take it from there. All that is
+`submit` checks what the job needs and writes its row; the workers take it from there. All that is
 told of a job is its row (`jobs.record`) and the objects that the row names (`jobs.files`).
 """
 
@@ -14,7 +14,7 @@ import threading
 import time
 import uuid
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, nullcontext
+from contextlib import nullcontext
 from dataclasses import dataclass, field, replace
 from datetime import datetime
 from pathlib import Path
@@ -27,7 +27,7 @@ from ultragray.errors import InvalidArgument
 from ultragray.exchange.batches import stands_for
 from ultragray.geometry.image_size import MAX_IMAGE_SIDE
 from ultragray.geometry.registration import Registration
-from ultragray.scene.info import SceneHeader, read_header
+from ultragray.scene.info import read_header
 from ultragray_workers.claims import storage_full
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import (
@@ -48,7 +48,7 @@ from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.demand import AUTO, CPU, CUDA, Demand, waits_for
 from ultragray_workers.jobs.files import Artifact, JobFiles
 from ultragray_workers.jobs.kinds import Specification
-from ultragray_workers.jobs.kinds.base import Surroundings
+from ultragray_workers.jobs.kinds.base import Surroundings, from_dict, in_short, to_dict, value_in
 from ultragray_workers.jobs.owners import (
     NOBODYS,
     Kind,
@@ -60,7 +60,6 @@ from ultragray_workers.jobs.owners import (
 )
 from ultragray_workers.jobs.progress import JobState
 from ultragray_workers.jobs.record import MAX_PRIORITY, Job, Row, job_of
-from ultragray_workers.jobs.specification import from_dict, in_short, to_dict, value_in
 from ultragray_workers.jobs.workers import Wanted, Worker, WorkerState
 from ultragray_workers.scene_names import base_name
 from ultragray_workers.scene_shelf import SCENES_FOLDER
@@ -101,25 +100,6 @@ class JobsOverview:
     unfit: int = 0  # jobs that wait for a worker that is not there
 
 
-@dataclass(frozen=True)
-class _Submission:
-    id: str
-    specification: Specification
-    summary: Mapping[str, Any]  # as jobs tell it: before a registration brought its poses into the scene
-    priority: int
-    owner: str | None
-    private: bool  # as it was asked; a job is also private where it takes something private
-    request_id: str | None = None
-    retry_of: str | None = None
-    by: str | None = None  # who asks; None: the owner
-
-    @property
-    def asked(self) -> str:
-        """The hash of what is asked for: the same request_id must ask for the same."""
-        text = json.dumps([_plain(to_dict(self.specification)), self.priority, self.private], sort_keys=True)
-        return hashlib.sha256(text.encode()).hexdigest()
-
-
 class JobStore:
     """The jobs of a database and a storage. Its methods block; they may be called from any thread."""
 
@@ -156,14 +136,9 @@ class JobStore:
         self._engine = self.database.engine
         self._queue_limit = queue_limit
         self.files = JobFiles(self._storage, lambda job_id: queue.row_of(self._engine, job_id), self._artifact_folder)
-        self._requirements = Requirements(
-            datasets=datasets or DatasetStore(self._artifact_folder, self._storage),
-            scenes=scenes or SceneStore(self._artifact_folder / SCENES_FOLDER),
-            registration=registration,
-            files=self.files,
-            free_bytes=self._storage.free_bytes,
-            max_image_side=max_image_side,
-        )
+        self._datasets = datasets or DatasetStore(self._artifact_folder, self._storage)
+        self._scenes = scenes or SceneStore(self._artifact_folder / SCENES_FOLDER)
+        self._registration, self._max_image_side = registration, max_image_side
         self._submitting = threading.Lock()  # so that one service keeps the queue limit to the job
 
     def submit(
@@ -181,8 +156,9 @@ class JobStore:
         `admit` is called before a new one is made, one at a time: it raises what keeps it out, or tells how many jobs
         of the owner may run at once; None: any number.
 
-        Raises JobConflict where that one asked for something else, JobQueueFull, ArtifactFolderUnavailable, and what
-        `Requirements.placed` and `Requirements.provide` raise.
+        Raises JobConflict where that one asked for something else, JobQueueFull, ArtifactFolderUnavailable,
+        DatasetNotFound, DatasetInvalid, SceneExists, SceneNotFound, SceneFileInvalid, RegistrationNotFound,
+        StorageFull, StorageUnavailable, and what `check` of the specification raises.
         """
         if abs(priority) > MAX_PRIORITY:
             raise InvalidArgument(
@@ -191,73 +167,130 @@ class JobStore:
         job_id = uuid.uuid4().hex[:24] if request_id is None else _id_of(f"request {request_id}", owner)
         if request_id is not None:
             _check_request_id(request_id)
-        summary = in_short(specification)
-        asked = _Submission(job_id, specification, summary, priority, owner, private, request_id)
-        return self._submit(asked, admit)
+        summary, whose = in_short(specification), Ownership(owner, private)
+        return self._submit(job_id, specification, summary, priority, whose, admit, request_id=request_id)
 
-    def _submit(self, asked: _Submission, admit: Admit) -> tuple[Job, bool]:
+    def _submit(
+        self,
+        job_id: str,
+        specification: Specification,
+        summary: dict[str, Any],  # as jobs tell it: before a registration brought its poses into the scene
+        priority: int,
+        whose: Ownership,  # as it was asked; a job is also private where it takes something private
+        admit: Admit,
+        *,
+        request_id: str | None = None,
+        retry_of: str | None = None,
+        by: str | None = None,  # who asks; None: the owner
+    ) -> tuple[Job, bool]:
+        owner = whose.owner
         self.database.identity.check()
+        text = json.dumps([_plain(to_dict(specification)), priority, whose.private], sort_keys=True)
+        asked = hashlib.sha256(text.encode()).hexdigest()  # the same request_id must ask for the same
         with self._submitting:
-            if queue.row_of(self._engine, asked.id) is not None:
-                return self._same(asked), False
+            if queue.row_of(self._engine, job_id) is not None:
+                return self._same(job_id, asked), False
             if queue.count_waiting(self._engine) >= self._queue_limit:
                 raise JobQueueFull(f"{self._queue_limit} jobs wait already: try again later, or cancel some")
             most_running = admit(self)
-            placed = self._requirements.placed(asked.specification)
-            self._requirements.provide(placed, asked.id, asked.retry_of)
-            used = self._requirements.taken(placed, asked.retry_of)
-            private = asked.private | self._are_private(used, asked)
-            made = value_in(asked.summary, "makes_scene")
+            placed = self._placed(specification)
+            used = self._provide(placed, job_id, retry_of)
+            is_private = whose.private | self._are_private(used, owner, by)
+            made = value_in(summary, "makes_scene")
             trace: dict[str, str] = {}
             propagate.inject(trace)
             values = {
-                "id": asked.id,
-                "kind": asked.specification.kind,
-                "priority": asked.priority,
-                "owner": asked.owner,
-                "private": private,
-                "request_id": asked.request_id,
-                "asked": asked.asked,
-                "retry_of": asked.retry_of,
-                "summary": json.dumps(asked.summary),
-                "specification": json.dumps(to_dict(placed)),
-                "dataset": value_in(asked.summary, "needs_dataset"),
+                "id": job_id,
+                "kind": specification.kind,
+                "priority": priority,
+                "owner": owner,
+                "private": is_private,
+                "request_id": request_id,
+                "asked": asked,
+                "retry_of": retry_of,
+                "summary": summary,
+                "specification": to_dict(placed),
+                "dataset": value_in(summary, "needs_dataset"),
                 "makes_scene": made,
-                "demand": Demand.of(asked.summary).key,
+                "demand": Demand.of(summary).key,
                 "most_running": most_running,
-                "trace": json.dumps(trace),
+                "trace": trace,
             }
 
             def claim_scene(connection: sa.Connection) -> None:
-                if made is None or asked.owner is None:
+                if made is None or owner is None:
                     return
-                ownership = Ownership(asked.owner, private, claim_of_job(asked.id))
+                ownership = Ownership(owner, is_private, claim_of_job(job_id))
                 if not add_owner(connection, Kind.SCENE, made, ownership):
                     raise SceneExists(
                         f"a scene {made!r} is being imported: choose another name",
-                        field=asked.specification.makes_scene,
+                        field=specification.makes_scene,
                     )
 
             if made is not None:
                 self._forget_dead_claim(made)
             try:
                 if not queue.submit(self._engine, values, claim_scene):  # another service was quicker
-                    return self._same(asked), False
+                    return self._same(job_id, asked), False
             except queue.SceneTaken:
                 raise SceneExists(
                     f"another job that waits or runs makes the scene {made!r}: choose another name",
-                    field=asked.specification.makes_scene,
+                    field=specification.makes_scene,
                 ) from None
             try:  # again, now that a deletion of the dataset would see the job: one that came in between has won
-                self._requirements.require_dataset(placed)
-                self._are_private(used, asked)
+                if (dataset := _named(placed, placed.needs_dataset)) is not None:
+                    self._datasets.get(dataset)
+                self._are_private(used, owner, by)
             except (DatasetNotFound, SceneNotFound):
-                queue.cancel(self._engine, asked.id)
-                queue.forget(self._engine, asked.id)
+                queue.cancel(self._engine, job_id)
+                queue.forget(self._engine, job_id)
                 raise
-        return self.get(asked.id), True
+        return self.get(job_id), True
 
-    def _are_private(self, used: list[tuple[Kind, str]], asked: _Submission) -> bool:
+    def _placed(self, specification: Specification) -> Specification:
+        """The job with its poses brought into its scene by the registration that it names, as that is now.
+
+        Raises SceneNotFound, RegistrationNotFound, and InvalidArgument for one of another scene.
+        """
+        name = _named(specification, specification.needs_registration)
+        if name is None:
+            return specification
+        scene = _named(specification, specification.needs_scene)
+        self._scenes.path(scene)
+        return specification.registered(self._registration(name, scene))
+
+    def _provide(self, specification: Specification, job_id: str, before: str | None) -> list[tuple[Kind, str]]:
+        """Keeps the scene that the job needs, as it is now, for the job, once the job can be done.
+
+        `before`: the job that it replaces, whose scene is taken where it is still there. Returns the dataset and the
+        scene that the job takes, but for a scene that the job before has kept.
+        """
+        taken = []
+        if (dataset := _named(specification, specification.needs_dataset)) is not None:
+            self._datasets.get(dataset)
+            taken.append((Kind.DATASET, dataset))
+        made = _named(specification, specification.makes_scene)
+        if made is not None and made in self._scenes.names():
+            raise SceneExists(
+                f"there is already a scene {made!r}: choose another name", field=specification.makes_scene
+            )
+        free_bytes, name = self._storage.free_bytes(), _named(specification, specification.needs_scene)
+        if name is None:
+            specification.check(Surroundings(None, free_bytes, self._max_image_side))
+            return taken
+        with nullcontext() if before is None else self.files.kept_scene(before, name) as kept:
+            path = self._scenes.path(name) if kept is None else kept
+            header = self._scenes.header(name) if kept is None else read_header(kept)
+            with storage_full("the scene of the job"):
+                specification.check(Surroundings(header, free_bytes, self._max_image_side))
+                try:
+                    self.files.keep_scene(path, name, job_id)
+                except FileNotFoundError:
+                    self._scenes.path(name)  # raises SceneNotFound where the scene has just gone
+                    raise
+        return taken if kept is not None else [*taken, (Kind.SCENE, base_name(name))]
+
+    def _are_private(self, used: list[tuple[Kind, str]], owner: str | None, by: str | None) -> bool:
         """Whether any of the datasets and scenes that a job takes is private.
 
         Raises DatasetNotFound, SceneNotFound where somebody else asks for the job whose owner may not see one.
@@ -265,17 +298,17 @@ class JobStore:
         with self._engine.connect() as connection:
             whose = [(kind, name, read_owner(connection, kind, name)) for kind, name in used]
         for kind, name, holder in whose:
-            if asked.by not in (None, asked.owner) and holder.private and holder.owner != asked.owner:
+            if by not in (None, owner) and holder.private and holder.owner != owner:
                 not_found = DatasetNotFound if kind is Kind.DATASET else SceneNotFound
                 raise not_found(
                     f"the owner of the job may not see the {kind.value} {name!r}: it is private", field=kind.value
                 )
         return any(holder.private for _, _, holder in whose)
 
-    def _same(self, asked: _Submission) -> Job:
+    def _same(self, job_id: str, asked: str) -> Job:
         """The job that is there already. Raises JobConflict where it asks for something else."""
-        row = self._row(asked.id)
-        if row.asked != asked.asked:
+        row = self._row(job_id)
+        if row.asked != asked:
             raise JobConflict(
                 f"the request_id {row.request_id!r} was used for the job {row.id}, which asks for something else",
                 field="request_id",
@@ -337,17 +370,10 @@ class JobStore:
                 f"only a failed or cancelled job can be retried, the job {job_id} is {row.state.value}", field="job"
             )
         specification = from_dict(queue.specification_of(self._engine, job_id))
-        again = _Submission(
-            id=_id_of(f"retry {job_id}", row.owner),
-            specification=specification,
-            summary=row.summary,
-            priority=row.priority,
-            owner=row.owner,
-            private=row.private,
-            retry_of=job_id,
-            by=by,
+        new_id = _id_of(f"retry {job_id}", row.owner)
+        return self._submit(
+            new_id, specification, row.summary, row.priority, row.ownership, admit, retry_of=job_id, by=by
         )
-        return self._submit(again, admit)
 
     def delete(self, job_id: str) -> None:
         """Removes a finished job and its files; the scene that it made stays.
@@ -439,7 +465,7 @@ class JobStore:
             holder = read_owner(connection, Kind.SCENE, scene)
         if holder == NOBODYS or self._storage.is_claimed(str(holder.claim)):
             return
-        if self.makes_scene(scene) is None and scene not in self._requirements.scenes.names():
+        if self.makes_scene(scene) is None and scene not in self._scenes.names():
             with self._engine.begin() as connection:
                 forget_owner(connection, Kind.SCENE, scene, holder)
 
@@ -489,83 +515,6 @@ def _id_of(text: str, owner: str | None) -> str:
     """The id of the one job of an owner that a text without NUL stands for."""
     named = text if owner is None else f"{text}\0{owner}"
     return hashlib.sha256(named.encode("utf-8", "surrogatepass")).hexdigest()[:24]
-
-
-@dataclass(frozen=True)
-class Requirements:
-    """The datasets, scenes and registrations that jobs name."""
-
-    datasets: DatasetStore
-    scenes: SceneStore
-    registration: Callable[[str, str], Registration]  # finds that of a name, for a scene
-    files: JobFiles
-    free_bytes: Callable[[], int | None]  # of the storage of the files; None: not known
-    max_image_side: int
-
-    def provide(self, specification: Specification, job_id: str, before: str | None) -> None:
-        """Keeps the scene that the job needs, as it is now, for the job, once the job can be done.
-
-        `before`: the job that it replaces, whose scene is taken where it is still there. Raises DatasetNotFound,
-        DatasetInvalid, SceneExists, SceneNotFound, SceneFileInvalid, StorageFull, StorageUnavailable and what `check`
-        of the specification raises.
-        """
-        self.require_dataset(specification)
-        made = _named(specification, specification.makes_scene)
-        if made is not None and made in self.scenes.names():
-            raise SceneExists(
-                f"there is already a scene {made!r}: choose another name", field=specification.makes_scene
-            )
-        name = _named(specification, specification.needs_scene)
-        if name is None:
-            specification.check(self._surroundings(None))
-            return
-        with self._kept(name, before) as old:
-            if old is not None:
-                path, header = old, read_header(old)
-            else:
-                path, header = self.scenes.path(name), self.scenes.header(name)
-            with storage_full("the scene of the job"):
-                specification.check(self._surroundings(header))
-                try:
-                    self.files.keep_scene(path, name, job_id)
-                except FileNotFoundError:
-                    self.scenes.path(name)  # raises SceneNotFound where the scene has just gone
-                    raise
-
-    def placed(self, specification: Specification) -> Specification:
-        """The job with its poses brought into its scene by the registration that it names, as that is now.
-
-        Raises SceneNotFound, RegistrationNotFound, and InvalidArgument for one of another scene.
-        """
-        name = _named(specification, specification.needs_registration)
-        if name is None:
-            return specification
-        scene = _named(specification, specification.needs_scene)
-        self.scenes.path(scene)
-        return specification.registered(self.registration(name, scene))
-
-    def taken(self, specification: Specification, before: str | None) -> list[tuple[Kind, str]]:
-        """The dataset and the scene that `provide` takes; not a scene that the job replaced has kept."""
-        dataset, scene = (
-            _named(specification, one) for one in (specification.needs_dataset, specification.needs_scene)
-        )
-        found = [] if dataset is None else [(Kind.DATASET, dataset)]
-        if scene is None:
-            return found
-        with self._kept(scene, before) as kept:
-            return found if kept is not None else [*found, (Kind.SCENE, base_name(scene))]
-
-    def require_dataset(self, specification: Specification) -> None:
-        """Raises DatasetNotFound, DatasetInvalid where the job's dataset is not there."""
-        if (dataset := _named(specification, specification.needs_dataset)) is not None:
-            self.datasets.get(dataset)
-
-    def _surroundings(self, scene: SceneHeader | None) -> Surroundings:
-        return Surroundings(scene, self.free_bytes(), self.max_image_side)
-
-    def _kept(self, scene: str, before: str | None) -> AbstractContextManager[Path | None]:
-        """The scene that was kept for the job that is replaced; None where it is not there."""
-        return nullcontext() if before is None else self.files.kept_scene(before, scene)
 
 
 def _named(specification: Specification, field: str | None) -> Any:

@@ -9,16 +9,36 @@ from __future__ import annotations
 
 import fcntl
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import sqlalchemy as sa
+from sqlalchemy.dialects import postgresql, sqlite
 
 from ultragray_workers.errors import StartupFailed
+from ultragray_workers.jobs.progress import Files, Outcome, Progress, from_json, to_json
 
 SCHEMA = "ultragray"  # on PostgreSQL; none on SQLite
 VERSION = 1
 _NUMBER = sa.BigInteger().with_variant(sa.Integer, "sqlite")  # which SQLite counts on by itself
+
+
+class Json(sa.types.TypeDecorator[Any]):
+    """A column of text with JSON of a class of `jobs.progress`, or of plain values."""
+
+    impl, cache_ok = sa.Text, True
+
+    def __init__(self, kind: type) -> None:
+        super().__init__()
+        self.kind = kind
+
+    def process_bind_param(self, value: Any, dialect: sa.Dialect) -> str | None:
+        return None if value is None else to_json(value)
+
+    def process_result_value(self, value: str | None, dialect: sa.Dialect) -> Any:
+        return None if value is None else from_json(self.kind, value)
+
 
 TABLES = sa.MetaData(schema=SCHEMA)
 JOBS = sa.Table(
@@ -36,13 +56,13 @@ JOBS = sa.Table(
     sa.Column("asked", sa.Text, nullable=False),  # hash of the specification and its surroundings as they were sent
     sa.Column("retry_of", sa.Text),
     sa.Column("batch", sa.Text),  # of a share: the job that it helps
-    sa.Column("summary", sa.Text, nullable=False),  # JSON: the specification, of poses only their number
-    sa.Column("specification", sa.Text, nullable=False),  # JSON, whole
+    sa.Column("summary", Json(dict), nullable=False),  # the specification, of poses only their number
+    sa.Column("specification", Json(dict), nullable=False),  # whole
     sa.Column("dataset", sa.Text),  # which the job needs
     sa.Column("makes_scene", sa.Text),
     sa.Column("demand", sa.Text, nullable=False),  # key of the demand for a worker
     sa.Column("most_running", sa.Integer),  # jobs of the owner at once; NULL: any number
-    sa.Column("trace", sa.Text, nullable=False),  # JSON
+    sa.Column("trace", Json(dict), nullable=False),
     sa.Column("created_ms", sa.BigInteger, nullable=False),
     # Who does it. Each attempt of a worker has a number, and what it writes holds for that attempt alone.
     sa.Column("worker", sa.Text),
@@ -50,10 +70,10 @@ JOBS = sa.Table(
     sa.Column("started_ms", sa.BigInteger),
     sa.Column("run_s", sa.Double, nullable=False, default=0.0),  # of all its processes
     # What has come of it.
-    sa.Column("progress", sa.Text),  # JSON of Progress
-    sa.Column("files", sa.Text),  # JSON of Files
+    sa.Column("progress", Json(Progress)),
+    sa.Column("files", Json(Files)),
     sa.Column("published", sa.Boolean, nullable=False, default=False),  # its scene is served: no cancellation any more
-    sa.Column("outcome", sa.Text),  # JSON of Outcome
+    sa.Column("outcome", Json(Outcome)),
     sa.Column("finished_ms", sa.BigInteger),
 )
 sa.Index("jobs_waiting", JOBS.c.state, JOBS.c.demand, JOBS.c.priority, JOBS.c.number)
@@ -68,7 +88,7 @@ sa.Index(  # two jobs never make a scene of one name
     sqlite_where=sa.text("state IN ('queued', 'running') AND batch IS NULL"),
     postgresql_where=sa.text("state IN ('queued', 'running') AND batch IS NULL"),
 )
-SHARDS = sa.Table(  # of batches; see jobs.shards.desk
+SHARDS = sa.Table(  # of batches; see jobs.kinds.shards_run
     "shards",
     TABLES,
     sa.Column("job", sa.Text, primary_key=True),
@@ -151,6 +171,23 @@ REGISTRATIONS = sa.Table(  # of robots and trackers to scenes
     sa.Column("private_to", sa.Text),  # the owner of the scene, which was private when this was put; NULL: it was not
 )
 SCHEMA_VERSION = sa.Table("schema_version", TABLES, sa.Column("version", sa.Integer, nullable=False))
+
+
+def insert(place: sa.Engine | sa.Connection, table: sa.Table) -> Any:
+    """An insertion that may say what it does where the row is there already."""
+    return (sqlite if place.dialect.name == "sqlite" else postgresql).insert(table)
+
+
+def read(engine: sa.Engine, question: sa.Select[Any]) -> Sequence[Any]:
+    with engine.connect() as connection:
+        return connection.execute(question).all()
+
+
+def write(engine: sa.Engine, change: sa.Update | sa.Insert | sa.Delete) -> bool:
+    """Whether it changed any row."""
+    with engine.begin() as connection:
+        return bool(connection.execute(change).rowcount)
+
 
 _LOCK_NUMBER = 0x756C7472  # of PostgreSQL's advisory locks
 _LOCK_POLL_S = 0.05

@@ -26,7 +26,7 @@ from ultragray.errors import UltragrayError
 from ultragray_workers.errors import WorkerNotFound, known_names
 from ultragray_workers.jobs import queue
 from ultragray_workers.jobs.demand import NO_OFFER, LivingWorker, Offer, WorkerDevice, offer_of_json
-from ultragray_workers.jobs.tables import WORKERS
+from ultragray_workers.jobs.tables import WORKERS, read, write
 from ultragray_workers.rounds import Rounds
 
 BEAT_INTERVAL_S = 1.0
@@ -86,26 +86,23 @@ class Worker:
 def list_workers(engine: sa.Engine) -> list[Worker]:
     """The workers that live, are wanted to rest, or were lost within a day, by name."""
     age_s = queue.now_s(engine) - WORKERS.c.seen_at_s
-    with engine.connect() as connection:
-        rows = connection.execute(sa.select(WORKERS, age_s.label("age_s")).order_by(WORKERS.c.name)).all()
-    return [_worker_of(row) for row in rows]
+    found = read(engine, sa.select(WORKERS, age_s.label("age_s")).order_by(WORKERS.c.name))
+    return [_worker_of(row) for row in found]
 
 
 def living_workers(engine: sa.Engine) -> list[LivingWorker]:
     is_alive = WORKERS.c.seen_at_s > queue.now_s(engine) - queue.DEAD_AFTER_S
     found = sa.select(WORKERS.c.name, WORKERS.c.offer, WORKERS.c.wanted).where(is_alive).order_by(WORKERS.c.name)
-    with engine.connect() as connection:
-        return [
-            LivingWorker(row.name, offer_of_json(row.offer), _wanted_of(row.wanted) is not Wanted.WORK)
-            for row in connection.execute(found)
-        ]
+    return [
+        LivingWorker(row.name, offer_of_json(row.offer), _wanted_of(row.wanted) is not Wanted.WORK)
+        for row in read(engine, found)
+    ]
 
 
 def want(engine: sa.Engine, name: str, wanted: Wanted) -> Worker:
     """Tells a worker what is wanted of it, which it does within a second or two. Raises WorkerNotFound."""
     kept = None if wanted is Wanted.WORK else wanted.value
-    with engine.begin() as connection:
-        connection.execute(sa.update(WORKERS).where(WORKERS.c.name == name).values(wanted=kept))
+    write(engine, sa.update(WORKERS).where(WORKERS.c.name == name).values(wanted=kept))
     workers = {worker.name: worker for worker in list_workers(engine)}
     if name not in workers:
         known = known_names("worker", list(workers))
@@ -164,11 +161,8 @@ class Heartbeat:
         for job_id in lost:
             _log.warning(f"no worker is at the job {job_id} any more: it waits again")
         long_ago = WORKERS.c.seen_at_s < queue.now_s(self._engine) - _FORGET_AFTER_S, WORKERS.c.wanted.is_(None)
-        with self._engine.connect() as connection:
-            is_any = connection.execute(sa.select(WORKERS.c.name).where(*long_ago).limit(1)).first() is not None
-        if is_any:
-            with self._engine.begin() as connection:
-                connection.execute(sa.delete(WORKERS).where(*long_ago))
+        if read(self._engine, sa.select(WORKERS.c.name).where(*long_ago).limit(1)):  # a look locks nothing
+            write(self._engine, sa.delete(WORKERS).where(*long_ago))
         return lost
 
     def stop(self) -> None:

@@ -24,7 +24,7 @@ from pathlib import Path, PurePosixPath
 from typing import IO
 
 from ultragray.files import TEMPORARY_SUFFIX, file_sha256, link_or_copy, remove_stale_temporaries
-from ultragray_workers.claims import claimed_folder, remove_abandoned
+from ultragray_workers.claims import claimed_folder, remove_abandoned, try_lock
 from ultragray_workers.errors import StorageFull
 from ultragray_workers.storage.storage import Damaged, NotThere, Storage
 
@@ -35,7 +35,7 @@ _WAIT_FOR_ROOM_S, _LOOK_EVERY_S = 30.0, 0.1
 _AT_ONCE = 8  # objects of a folder
 
 
-@dataclass(frozen=True)
+@dataclass
 class CacheCounts:
     """What a process has asked of its cache since it began."""
 
@@ -84,7 +84,10 @@ class Cache:
         with self._alone_fetching(name):
             if (pin := self.held(name)) is None:
                 pin, size = self._fetch(name, storage, key, version, sha256)
-                self._count(misses=1, fetched_bytes=size, fetch_s=time.monotonic() - began)
+                with self._counting:
+                    self.counts.misses += 1
+                    self.counts.fetched_bytes += size
+                    self.counts.fetch_s += time.monotonic() - began
             return pin
 
     @contextlib.contextmanager
@@ -125,7 +128,8 @@ class Cache:
             fcntl.flock(file, fcntl.LOCK_SH)
             if _is_at(file, path):  # else it was removed before it was locked
                 os.utime(file.fileno(), ns=(time.time_ns(), os.fstat(file.fileno()).st_mtime_ns))  # used last
-                self._count(hits=int(counts))
+                with self._counting:
+                    self.counts.hits += counts
                 return Pin(path, file)
             file.close()
 
@@ -202,7 +206,7 @@ class Cache:
         if path.name.endswith(_PART):
             name = path.name[1:].removesuffix(_PART)
             with self._lock_of_fetch(name) as lock:
-                if not _try_lock(lock):
+                if not try_lock(lock):
                     return False
                 remove_stale_temporaries(path)
                 path.unlink(missing_ok=True)
@@ -211,7 +215,7 @@ class Cache:
         if time.time() - used_at_s < self._keep_s:
             return False
         with contextlib.suppress(FileNotFoundError), path.open("rb") as file:
-            if not _try_lock(file):
+            if not try_lock(file):
                 return False
             path.unlink()
         return True
@@ -237,13 +241,6 @@ class Cache:
         self._fetching.mkdir(parents=True, exist_ok=True)
         return (self._fetching / name).open("ab")
 
-    def _count(self, hits: int = 0, misses: int = 0, fetched_bytes: int = 0, fetch_s: float = 0.0) -> None:
-        with self._counting:
-            was = self.counts
-            self.counts = CacheCounts(
-                was.hits + hits, was.misses + misses, was.fetched_bytes + fetched_bytes, was.fetch_s + fetch_s
-            )
-
 
 def cache_name(storage: Storage, key: str, version: str, sha256: str | None) -> str:
     """The name under which a cache keeps an object: by its content where that is known, with the suffix of its key."""
@@ -262,11 +259,3 @@ def _is_at(file: IO[bytes], path: Path) -> bool:
         return os.path.samestat(os.fstat(file.fileno()), path.stat())
     except FileNotFoundError:
         return False
-
-
-def _try_lock(file: IO[bytes]) -> bool:
-    try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True

@@ -7,13 +7,13 @@ import fcntl
 import os
 import secrets
 import shutil
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
 from ultragray.files import TEMPORARY_SUFFIX, link_or_copy, sync
-from ultragray_workers.claims import remove_whole
+from ultragray_workers.claims import remove_whole, try_lock
 from ultragray_workers.storage.storage import Entry, NotThere, check_key
 
 _CLAIMS = "claims"  # prefix of keys; a claim is locked as long as its process lives
@@ -88,30 +88,28 @@ class LocalStorage:
             return file.read(-1 if length is None else length)
 
     def write(self, key: str, data: bytes, *, if_absent: bool = False) -> bool:
+        def fill(made: Path) -> None:
+            made.write_bytes(data)
+            sync(made)
+
+        return self._put(key, fill, if_absent) or self._path(key).read_bytes() == data
+
+    def upload(self, path: Path, key: str, *, if_absent: bool = False) -> bool:
+        if if_absent and self._path(key).exists():
+            return False
+        return self._put(key, lambda made: link_or_copy(path, made), if_absent)
+
+    def _put(self, key: str, fill: Callable[[Path], object], if_absent: bool) -> bool:
+        """Whether what `fill` writes is the object now; False: `if_absent`, and there is one."""
         path = self._path(key)
         path.parent.mkdir(parents=True, exist_ok=True)
         with self._whole(path) as made:
-            made.write_bytes(data)
-            sync(made)
+            fill(made)
             if not if_absent:
                 made.replace(path)
             elif not self._place_new(made, path):
-                return path.read_bytes() == data
-        sync(path.parent)
-        return True
-
-    def upload(self, path: Path, key: str, *, if_absent: bool = False) -> bool:
-        target = self._path(key)
-        target.parent.mkdir(parents=True, exist_ok=True)
-        if if_absent and target.exists():
-            return False
-        with self._whole(target) as made:
-            link_or_copy(path, made)
-            if not if_absent:
-                made.replace(target)
-            elif not self._place_new(made, target):
                 return False
-        sync(target.parent)
+        sync(path.parent)
         return True
 
     def download(self, key: str, path: Path, *, version: str | None = None) -> Entry:
@@ -155,9 +153,8 @@ class LocalStorage:
     def is_claimed(self, token: str) -> bool:
         try:
             with self._path(f"{_CLAIMS}/{token}").open("rb+") as lock:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            return True
+                if not try_lock(lock):
+                    return True
         except (FileNotFoundError, NotADirectoryError):
             return False
         self.delete(f"{_CLAIMS}/{token}")  # of a process that died

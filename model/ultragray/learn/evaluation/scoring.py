@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
@@ -67,8 +67,16 @@ class Evaluation:
         }
 
 
-def evaluate(scene: GaussianScene, sweep: Sweep, *, backend: str = "auto") -> Evaluation:
+def evaluate(
+    scene: GaussianScene,
+    sweep: Sweep,
+    *,
+    backend: str = "auto",
+    after_portion: Callable[[int], object] = lambda done: None,
+) -> Evaluation:
     """Renders the scene at the sweep's poses with the sweep's probe and measures against its frames, a few at a time.
+
+    `after_portion` is told how many frames are done; to stop, it raises.
 
     Raises DatasetInvalid where the sweep has no frames, InvalidImageSize below 11x11 pixels, BackendUnavailable.
     """
@@ -82,7 +90,7 @@ def evaluate(scene: GaussianScene, sweep: Sweep, *, backend: str = "auto") -> Ev
                 natural.extend(compare_speckle(shown.numpy(), some.images.astype(np.float32) / 255.0, some.probe))
             yield bmode.numpy()
 
-    return replace(_measured(predictions(), sweep), frame_natural=natural)
+    return replace(_measured(predictions(), sweep, after_portion), frame_natural=natural)
 
 
 def evaluate_frames(frames: npt.NDArray[np.float32], sweep: Sweep) -> Evaluation:  # [F, H, W] in [0, 1]
@@ -95,7 +103,11 @@ def evaluate_frames(frames: npt.NDArray[np.float32], sweep: Sweep) -> Evaluation
     return _measured((frames[places] for places in _chunks(sweep)), sweep)
 
 
-def _measured(predictions: Iterable[npt.NDArray[np.float32]], sweep: Sweep) -> Evaluation:
+def _measured(
+    predictions: Iterable[npt.NDArray[np.float32]],
+    sweep: Sweep,
+    after_portion: Callable[[int], object] = lambda done: None,
+) -> Evaluation:
     require_frames(sweep)
     scales = ms_ssim_scales(sweep.height, sweep.width)
     measured: list[FrameMetrics] = []
@@ -104,6 +116,7 @@ def _measured(predictions: Iterable[npt.NDArray[np.float32]], sweep: Sweep) -> E
         truth = torch.from_numpy(sweep.images[places]).float().div_(255.0)
         measured += frame_metrics(torch.from_numpy(predicted), truth)
         speckle += compare_speckle(predicted, truth.numpy(), sweep.probe)
+        after_portion(len(measured))
     return Evaluation(measured, sweep.frame_numbers, scales, speckle)
 
 

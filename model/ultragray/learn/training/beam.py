@@ -34,7 +34,7 @@ class TrainedBeam:
             focus, depth_of_field = 0.5 * length, length
         start = math.log(thickness), focus / length, math.log(depth_of_field)
         self._raw = torch.tensor(start, dtype=torch.float64, requires_grad=config.learn_beam)
-        self._adam = torch.optim.Adam([self._raw], betas=BETAS)
+        self._adam = torch.optim.Adam([self._raw], betas=BETAS) if config.learn_beam else None
         depths = math.log(LEAST_LENGTHS * length), math.log(MOST_LENGTHS * length)
         widths = math.log(MIN_THICKNESS_MM), math.log(MAX_THICKNESS_MM)
         self._low, self._high = torch.tensor([widths, (0.0, 2.0), depths], dtype=torch.float64).unbind(dim=1)
@@ -49,7 +49,7 @@ class TrainedBeam:
 
     def step(self, share: float) -> None:
         """One update of the learned numbers, after a share of the run, at a rate that decays like all rates."""
-        if not self._config.learn_beam:
+        if self._adam is None:
             return
         if share < BEGIN:
             self._raw.grad = torch.zeros_like(self._raw)  # the beam is held, but Adam counts the step
@@ -71,12 +71,12 @@ class TrainedBeam:
         return self._config.learn_beam and found is not None and found.thickness_mm < 0.5 * frame_spacing_mm
 
     def tensors(self) -> dict[str, Tensor]:
-        if not self._config.learn_beam:
+        if self._adam is None:
             return {}
         return {"raw": self._raw.detach(), **self._adam.state[self._raw]}
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
-        if self._config.learn_beam:
+        if self._adam is not None:
             self._raw.data.copy_(tensors["raw"])
             self._adam.state[self._raw] = {name: tensors[name].clone() for name in tensors if name != "raw"}
 

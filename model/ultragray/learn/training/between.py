@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
+from ultragray import _cpu
 from ultragray.geometry.pose import rotation_angles_deg
 from ultragray.geometry.probe import FloatArray, Lines, ParallelLines, Probe
 from ultragray.geometry.rotations import blended
@@ -167,14 +168,19 @@ def _projected(
 ) -> tuple[Tensor, Tensor, Tensor]:  # three of [P, H, W]
     """Where each pixel of an image falls on another one: row and column, from 0 to 1, and its distance (mm)."""
     height, width = like.shape[-2:]
-    turns = np.einsum("pji,pjk->pik", onto[:, :3, :3], poses[:, :3, :3])
-    shifts = np.einsum("pji,pj->pi", onto[:, :3, :3], poses[:, :3, 3] - onto[:, :3, 3])
-    affine = np.stack([turns[:, :, 0], turns[:, :, 2], shifts], axis=-1)  # [P, 3, 3]: of x, of z, and the shift
-    local = cuda.upload(torch.from_numpy(affine).float(), like.device) @ _pixels(probe, height, width, like.device)
+    maps = cuda.upload(torch.from_numpy(_maps(onto, poses)).float(), like.device)
+    local = maps @ _pixels(probe, height, width, like.device)
     x, y, z = local.reshape(-1, 3, height, width).unbind(1)
     depth, across = _on_lines(probe.lines, x, z)
     rows = (depth - probe.near_mm) / probe.scan_line_length_mm
     return rows, (across - probe.lines.start) / probe.lines.span, y.abs()
+
+
+def _maps(onto: FloatArray, poses: FloatArray) -> FloatArray:  # [P, 4, 4] both, mm -> [P, 3, 3]
+    """From the x and the z of a point in the plane of a pose, and 1, to its place as `onto` has it."""
+    turns = np.einsum("pji,pjk->pik", onto[:, :3, :3], poses[:, :3, :3])
+    shifts = np.einsum("pji,pj->pi", onto[:, :3, :3], poses[:, :3, 3] - onto[:, :3, 3])
+    return np.stack([turns[:, :, 0], turns[:, :, 2], shifts], axis=-1)
 
 
 @lru_cache(maxsize=4)
@@ -253,10 +259,6 @@ class Views(NamedTuple):
     images: Tensor  # [V, H, W] in [0, 1]
     weights: Tensor  # [V, H, W] in [0, 1], by how far the two frames agree
 
-    def weighted(self, rendered: Tensor) -> Tensor:  # [V, H, W] -> [V, H, W]
-        """A rendering to be compared with the images: mixed with them, so that it counts as much as the weights say."""
-        return torch.lerp(self.images, rendered, self.weights)
-
 
 class ViewsBetween:
     """Draws views with their expected images."""
@@ -270,11 +272,15 @@ class ViewsBetween:
         """`count` views at places drawn by `draw_places`."""
         places = draw_places(self._neighbours, count, generator)
         poses = places.poses(self._sweep)
+        shown = self.shown if self._images.device.type == "cpu" else self.plainly_shown
+        return Views(places, poses, *shown(places, poses))
+
+    def plainly_shown(self, places: Places, poses: FloatArray) -> tuple[Tensor, Tensor]:  # [V, H, W] both
+        """The expected images of views and their weights, on any device: the definition of `shown`."""
         blend = self._blend(places, poses)
         differences = smoothed_sizes(blend.differences)
         usual = differences.mean(dim=(1, 2), keepdim=True).clamp(min=EXACT)  # the farther the frames, the more
-        weights = blend.is_seen / (1.0 + (differences / (DOUBTFUL * usual)).square())
-        return Views(places, poses, blend.images, weights)
+        return blend.images, blend.is_seen / (1.0 + (differences / (DOUBTFUL * usual)).square())
 
     def _blend(self, places: Places, poses: FloatArray) -> Blend:
         frames = cuda.upload(torch.from_numpy(places.frames), self._images.device)
@@ -283,6 +289,40 @@ class ViewsBetween:
             return blend_by_pixel(images, places.shares)
         sweep = self._sweep
         return blend_in_space(images, sweep.poses[places.frames], poses, sweep.probe)
+
+    def shown(self, places: Places, poses: FloatArray) -> tuple[Tensor, Tensor]:  # [V, H, W] both
+        """The same by the C++ kernel, for images on the CPU."""
+        sweep, lines = self._sweep, self._sweep.probe.lines
+        onto, pixels = None, None
+        if not self.follow_probe:
+            maps = _maps(sweep.poses[places.frames].reshape(-1, 4, 4), np.repeat(poses, 2, axis=0))
+            onto = maps.reshape(-1, 2, 3, 3).astype(np.float32)
+            pixels = _pixels(sweep.probe, sweep.height, sweep.width, self._images.device)[:2].numpy()
+        images, weights = torch.empty((2, len(poses), sweep.height, sweep.width))
+        along_x, along_z = lines.direction if isinstance(lines, ParallelLines) else (0.0, 1.0)
+        _cpu.blend_between(
+            images=self._images.numpy(),
+            frames=places.frames,
+            shares=places.shares.astype(np.float32),
+            onto=onto,
+            pixels=pixels,
+            fanned=not isinstance(lines, ParallelLines),
+            wrap=lines.wrap,
+            along_x=along_x,
+            along_z=along_z,
+            start=lines.start,
+            span=lines.span,
+            near_mm=sweep.probe.near_mm,
+            length_mm=sweep.probe.scan_line_length_mm,
+            least_mm=ON_PLANE_MM,
+            smoothed=SMOOTHED,
+            doubtful=DOUBTFUL,
+            nothing=EXACT,
+            threads=torch.get_num_threads(),
+            blends=images.numpy(),
+            weights=weights.numpy(),
+        )
+        return images, weights
 
 
 def smoothed_sizes(differences: Tensor) -> Tensor:  # [V, H, W] -> [V, H, W]

@@ -33,11 +33,15 @@ def sh0_of_intensity(brightness: Tensor, intensity: str) -> Tensor:  # [N] in [0
     return value / SH_C0
 
 
-def project_sh0(sh0: Tensor, intensity: str, floor: Tensor | None) -> None:  # [N, 1, 1], [N]
-    """Puts sh0 back, in place, to where the activation has a gradient and its intensity is at least the floor."""
+def least_sh0(floor: Tensor, intensity: str) -> Tensor:  # [N] -> [N]
+    """The sh0 at which the intensity is at its floor; −∞ where that is 0."""
+    return torch.where(floor > 0.0, sh0_of_intensity(floor, intensity), -math.inf)
+
+
+def project_sh0(sh0: Tensor, intensity: str, least: Tensor | None) -> None:  # [N, 1, 1], [N]
+    """Puts sh0 back, in place, to where the activation has a gradient, and to at least `least`."""
     if intensity == "released":
         low, high = RELEASED_RANGE
         sh0.clamp_((low - 1.0) / SH_C0, (high - 1.0) / SH_C0)
-    if floor is not None:
-        least = torch.where(floor > 0.0, sh0_of_intensity(floor, intensity), -math.inf)
-        sh0.copy_(sh0.maximum(least.reshape(sh0.shape)))
+    if least is not None:
+        sh0.clamp_(min=least.reshape(sh0.shape))

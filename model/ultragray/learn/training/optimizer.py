@@ -11,6 +11,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
+from ultragray import _cpu
 from ultragray.learn.training.config import TrainingConfig
 from ultragray.rendering.backends.inputs import spatial_order
 
@@ -67,7 +68,7 @@ class Schedule:
         return config.initial_gaussians + round(share * (config.max_gaussians - config.initial_gaussians))
 
 
-MOMENTS = ("exp_avg", "exp_avg_sq")
+MOMENTS, STEP = ("exp_avg", "exp_avg_sq"), "step"
 
 
 def is_trained(name: str, shape: Sequence[int], config: TrainingConfig) -> bool:
@@ -77,55 +78,102 @@ def is_trained(name: str, shape: Sequence[int], config: TrainingConfig) -> bool:
 class Optimizer:
     """Adam with the released settings for batches of b: betas 1 − 0.1·b and 1 − 0.001·b, eps 1e-15/√b.
 
-    torch's fused kernel: one pass over memory, 2.4 times as fast as separate operations for 500,000 Gaussians. Only
-    parameters that require a gradient are trained.
+    One pass over memory: by the C++ kernel on a CPU, by torch's fused one elsewhere. That is called as it is:
+    torch.optim.Adam loads torch's compiler first, which takes seconds. Only parameters that require a gradient are
+    trained.
     """
 
-    def __init__(self, parameters: Mapping[str, Tensor], *, batch_size: int) -> None:
-        trained = {name: tensor for name, tensor in parameters.items() if tensor.requires_grad}
-        self._adam = torch.optim.Adam(
-            [{"params": [tensor], "lr": 0.0} for tensor in trained.values()],
-            betas=(max(0.0, 1.0 - 0.1 * batch_size), max(0.0, 1.0 - 0.001 * batch_size)),
-            eps=1e-15 / batch_size**0.5,
-            fused=True,
-        )
-        self._groups = dict(zip(trained, self._adam.param_groups, strict=True))
+    def __init__(self, parameters: Mapping[str, Tensor], *, batch_size: int, scale_penalty: float = 0.0) -> None:
+        """`scale_penalty`: λ of λ·mean(exp(scales)), a part of the loss whose gradient is added here."""
+        self._trained = {name: tensor for name, tensor in parameters.items() if tensor.requires_grad}
+        self._betas = max(0.0, 1.0 - 0.1 * batch_size), max(0.0, 1.0 - 0.001 * batch_size)
+        self._eps, self._scale_penalty = 1e-15 / batch_size**0.5, scale_penalty
+        self._state: dict[str, dict[str, Tensor]] = {}  # by parameter: MOMENTS and the number of steps
 
-    def step(self, rates: Mapping[str, float]) -> None:
-        """One update in place, with a rate for each parameter; those without a gradient stay."""
-        for name, group in self._groups.items():
-            group["lr"] = rates[name]
-        self._adam.step()
-        self._adam.zero_grad(set_to_none=True)
+    def step(self, rates: Mapping[str, float]) -> Tensor | float:
+        """One update in place, with a rate for each parameter; those without a gradient stay.
+
+        Returns the penalty of the scales before it.
+        """
+        updated = {name: tensor for name, tensor in self._trained.items() if tensor.grad is not None}
+        for name, parameter in updated.items():
+            if name not in self._state:
+                self._state[name] = {moment: torch.zeros_like(parameter) for moment in MOMENTS}
+                self._state[name][STEP] = torch.zeros((), device=parameter.device)
+            self._state[name][STEP] += 1
+        on_cpu = all(parameter.device.type == "cpu" for parameter in updated.values())
+        penalty = self._step_by_kernel(updated, rates) if on_cpu else self._step_by_torch(updated, rates)
+        for parameter in updated.values():
+            parameter.grad = None
+        return penalty
+
+    def _step_by_kernel(self, updated: Mapping[str, Tensor], rates: Mapping[str, float]) -> float:
+        states = [self._state[name] for name in updated]
+        penalties: list[float] = _cpu.adam(
+            values=[parameter.detach().numpy() for parameter in updated.values()],
+            gradients=[_gradient(parameter).contiguous().numpy() for parameter in updated.values()],
+            first=[state[MOMENTS[0]].numpy() for state in states],
+            second=[state[MOMENTS[1]].numpy() for state in states],
+            steps=[int(state[STEP].numpy()) for state in states],
+            rates=[rates[name] for name in updated],
+            penalties=[self._scale_penalty if name == "scales" else 0.0 for name in updated],
+            beta1=self._betas[0],
+            beta2=self._betas[1],
+            eps=self._eps,
+            threads=torch.get_num_threads(),
+            instruction_set="auto",
+        )
+        return sum(penalties)
+
+    def _step_by_torch(self, updated: Mapping[str, Tensor], rates: Mapping[str, float]) -> Tensor | float:
+        penalty: Tensor | float = 0.0
+        for name, parameter in updated.items():
+            state, gradient = self._state[name], _gradient(parameter)
+            if name == "scales" and self._scale_penalty:
+                deviations = parameter.detach().exp()
+                gradient = gradient.add(deviations, alpha=self._scale_penalty / deviations.numel())
+                penalty = self._scale_penalty * deviations.mean()
+            torch._fused_adam_(
+                [parameter.detach()],
+                [gradient],
+                [state[MOMENTS[0]]],
+                [state[MOMENTS[1]]],
+                [],
+                [state[STEP]],
+                lr=rates[name],
+                beta1=self._betas[0],
+                beta2=self._betas[1],
+                weight_decay=0.0,
+                eps=self._eps,
+                amsgrad=False,
+                maximize=False,
+            )
+        return penalty
 
     def replace(self, parameters: Mapping[str, Tensor], origin: Tensor) -> None:
         """Goes on with new tensors: row i was row `origin[i]` of the old, or is a new Gaussian where that is −1."""
-        for name, group in self._groups.items():
-            (old,), new = group["params"], parameters[name]
-            state = self._adam.state.pop(old, None)
-            group["params"] = [new]
-            if state:
-                for moment in MOMENTS:
-                    moved = state[moment][origin.clamp(min=0)]
-                    moved[origin < 0] = 0.0
-                    state[moment] = moved
-                self._adam.state[new] = state
+        self._trained = {name: parameters[name] for name in self._trained}
+        for state in self._state.values():
+            for moment in MOMENTS:
+                moved = state[moment][origin.clamp(min=0)]
+                moved[origin < 0] = 0.0
+                state[moment] = moved
 
     def tensors(self) -> dict[str, Tensor]:
-        found = {}
-        for name, group in self._groups.items():
-            for key, value in self._adam.state.get(group["params"][0], {}).items():
-                found[f"{name}.{key}"] = value
-        return found
+        return {f"{name}.{key}": value for name, state in self._state.items() for key, value in state.items()}
 
     def load(self, tensors: Mapping[str, Tensor]) -> None:
         """Inverse of `tensors`, which may lie on another device than the parameters."""
-        for name, group in self._groups.items():
-            (parameter,) = group["params"]
-            stored = {key: tensors.get(f"{name}.{key}") for key in (*MOMENTS, "step")}
+        for name, parameter in self._trained.items():
+            stored = {key: tensors.get(f"{name}.{key}") for key in (*MOMENTS, STEP)}
             state = {key: value.to(parameter.device) for key, value in stored.items() if value is not None}
             if state:
-                self._adam.state[parameter] = state
+                self._state[name] = state
+
+
+def _gradient(parameter: Tensor) -> Tensor:
+    assert parameter.grad is not None
+    return parameter.grad
 
 
 SPLIT_SHRINK = 1.6  # standard deviations of the halves of a split Gaussian are divided by this

@@ -32,8 +32,8 @@ from ultragray.learn.training.checkpointing import (
 from ultragray.learn.training.config import TrainingConfig
 from ultragray.learn.training.geometry import BatchSampler, Geometry, Shadows, out_of_plane_shift_mm, shift_out_of_plane
 from ultragray.learn.training.initial import initial_parameters
-from ultragray.learn.training.intensity import project_sh0
-from ultragray.learn.training.losses import SSIM_WINDOW, image_loss
+from ultragray.learn.training.intensity import least_sh0, project_sh0
+from ultragray.learn.training.losses import SSIM_WINDOW, absorption_loss, image_loss
 from ultragray.learn.training.memory import (
     check_comparison_memory,
     check_memory,
@@ -124,7 +124,10 @@ class Trainer:
     def _begin_with(self, parameters: dict[str, Tensor], floor: Tensor) -> None:  # [N]
         self.parameters = self._trainable(parameters)
         self._floor = floor.to(self._device)
-        self._optimizer = Optimizer(self.parameters, batch_size=self._batch_size)
+        self._least_sh0 = least_sh0(self._floor, self.config.intensity)
+        self._optimizer = Optimizer(
+            self.parameters, batch_size=self._batch_size, scale_penalty=self.config.scale_penalty
+        )
         self._pull = PullStatistics.empty(len(parameters["means"]), self._device)
 
     def _trainable(self, parameters: dict[str, Tensor]) -> dict[str, Tensor]:
@@ -220,36 +223,33 @@ class Trainer:
         """One batch, one update, and the refinement that is due after it; returns the loss."""
         batch = self._sampler.next_batch()
         poses, neighbours = self.dataset.train.poses[batch.numpy()], batch[:, None].expand(-1, 2)
-        truth = self._images[cuda.upload(batch, self._device)].float().div_(255.0)
+        truth, weights = self._images[cuda.upload(batch, self._device)].float().div_(255.0), None
         if self._views_between is not None:
             between = self._views_between.draw(self._between_count, self._generator)
             batch = torch.cat([batch, torch.from_numpy(between.places.nearer)])
             neighbours = torch.cat([neighbours, torch.from_numpy(between.places.frames)])
             poses = np.concatenate([poses, between.poses])
+            truth, weights = torch.cat([truth, between.images]), between.weights
         if self.config.out_of_plane_mm:
             poses = shift_out_of_plane(poses, out_of_plane_shift_mm(self.config.out_of_plane_mm, self._generator))
         frames = self._rendered(self.refinement.corrected(batch, poses), self._schedule.sh_degree(self.step))
-        rendered = frames["bmode"]
-        if self._views_between is not None:
-            own, others = rendered[: len(truth)], rendered[len(truth) :]
-            rendered, truth = torch.cat([own, between.weighted(others)]), torch.cat([truth, between.images])
-        image = image_loss(rendered, truth, self._texture)
+        image = image_loss(frames["bmode"], truth, self._texture, weights)
         if self._shadowed is not None:
-            # λ·mean(1 − T), in which pixels count 0 where one of the frames on either side shows a shadow
-            is_free = self._shadowed[cuda.upload(neighbours, self._device)].any(dim=1)
-            image = image + self.config.absorption_penalty * ((1.0 - frames["transmittance"]) * ~is_free).mean()
+            neighbours = cuda.upload(neighbours, self._device)
+            price = self.config.absorption_penalty
+            image = image + absorption_loss(frames["transmittance"], self._shadowed, neighbours, price)
         image.backward()  # type: ignore[no-untyped-call]
         self.refinement.step(self.step / self._schedule.steps)
         with torch.no_grad():
-            parts = torch.stack([image.detach(), self._add_scale_penalty()])
-            means_gradient = self.parameters["means"].grad
-            assert means_gradient is not None
-            self._pull.add(means_gradient)
-            self._optimizer.step(self._schedule.rates(self.step))
+            if self.config.refinements:
+                means_gradient = self.parameters["means"].grad
+                assert means_gradient is not None
+                self._pull.add(means_gradient)
+            penalty = self._optimizer.step(self._schedule.rates(self.step))
             self._beam.step(self.step / self._schedule.steps)
             self._project(self.parameters["sh0"])
-            image_part, scale_part = parts.tolist()  # waits for a GPU: all work of the step is queued by now
-        loss: float = image_part + scale_part
+            both = (image.detach() + penalty)[None]
+            loss = float(both.tolist()[0])  # waits for a GPU: all work of the step is queued by now
         if not math.isfinite(loss):
             raise self._diverged(self.step + 1, f"the loss is {loss}")
         self.step += 1
@@ -282,15 +282,7 @@ class Trainer:
         return GaussianScene(**tensors, info=info)
 
     def _project(self, sh0: Tensor) -> None:
-        project_sh0(sh0, self.config.intensity, self._floor if self._schedule.has_floor(self.step) else None)
-
-    def _add_scale_penalty(self) -> Tensor:
-        """λ·mean(exp(scales)), a scalar; its gradient is added to that of the scales."""
-        scales = self.parameters["scales"]
-        deviations = scales.exp()
-        assert scales.grad is not None
-        scales.grad.add_(deviations, alpha=self.config.scale_penalty / deviations.numel())
-        return self.config.scale_penalty * deviations.mean()
+        project_sh0(sh0, self.config.intensity, self._least_sh0 if self._schedule.has_floor(self.step) else None)
 
     def _refine(self, limit: int) -> None:
         with torch.no_grad():
@@ -305,6 +297,7 @@ class Trainer:
             if not len(refined.parameters["means"]):
                 raise self._diverged(self.step, "refinement pruned every Gaussian")
             self._floor = self._floor[refined.parent]
+            self._least_sh0 = least_sh0(self._floor, self.config.intensity)
             self._project(refined.parameters["sh0"])
         self.parameters = self._trainable(refined.parameters)
         self._optimizer.replace(self.parameters, refined.origin)

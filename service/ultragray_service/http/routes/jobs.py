@@ -36,9 +36,9 @@ from ultragray_service.http.dependencies import JOB_EXAMPLES, Answers, PageToken
 from ultragray_service.views.prepared import TrainingCurve
 from ultragray_workers.jobs.files import Artifact
 from ultragray_workers.jobs.kinds import KINDS, Specification
+from ultragray_workers.jobs.kinds.base import from_dict
 from ultragray_workers.jobs.progress import JobState
 from ultragray_workers.jobs.record import Job
-from ultragray_workers.jobs.specification import from_dict
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.workers import Wanted, Worker
 

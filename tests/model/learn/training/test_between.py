@@ -161,7 +161,7 @@ def test_where_neighbours_disagree_a_blend_counts_less(tiny_dataset, with_probe)
     drawn = views.draw(40, torch.Generator().manual_seed(3))
     between = torch.from_numpy((drawn.poses[:, 1, 3] > 0.0) & (drawn.poses[:, 1, 3] < len(sweep) - 1))
     rendered = (0.9 * drawn.images + 0.07).requires_grad_()
-    image_loss(drawn.weighted(rendered), drawn.images, texture=0.0).backward()
+    image_loss(rendered, drawn.images, 0.0, drawn.weights).backward()
     pull = rendered.grad
     in_doubt, agreed = pull[between][:, 26:34, 10:15].abs().mean(), pull[between][:, :14, 26:].abs().mean()
     assert float(in_doubt) < 0.4 * float(agreed)
@@ -292,3 +292,29 @@ def test_absorption_costs_nothing_where_frames_show_a_shadow(tiny_dataset, tiny_
     transmittance = render_sweep(scene, dataset.train, output="transmittance")
     assert transmittance[:, 35:, 18:27].mean() < 0.3
     assert transmittance[:, :, 38:].mean() > 0.97
+
+
+@pytest.mark.parametrize("probe", PROBES, ids=lambda probe: probe.kind)
+@pytest.mark.parametrize("by_pixel", [True, False])
+def test_the_kernel_draws_views_as_torch_does(probe, by_pixel):
+    sweep = two_frames(probe)
+    views = ViewsBetween(sweep, neighbours_of(sweep), torch.tensor(sweep.images))
+    views.follow_probe = by_pixel
+    places = Places(np.array([[0, 1], [0, 1], [0, 0]]), np.array([0.2, 0.7, 0.0]), np.array([0.0, 0.0, -3.0]))
+    poses = places.poses(sweep)
+    for own, expected in zip(views.shown(places, poses), views.plainly_shown(places, poses), strict=True):
+        errors = (own - expected).abs()
+        assert expected.std() > 0.01
+        assert float(errors.quantile(0.999)) < 1e-4  # at the outline, pixels may fall inside here and outside there
+
+
+def test_the_thread_count_does_not_change_a_view(tiny_dataset):
+    sweep = drifting(tiny_dataset().train, with_probe=False)
+    views = ViewsBetween(sweep, neighbours_of(sweep), torch.tensor(sweep.images))
+    before, found = torch.get_num_threads(), []
+    for threads in (1, 3):
+        torch.set_num_threads(threads)
+        found.append(views.draw(5, torch.Generator().manual_seed(0)))
+    torch.set_num_threads(before)
+    assert torch.equal(found[0].images, found[1].images)
+    assert torch.equal(found[0].weights, found[1].weights)

@@ -22,7 +22,7 @@ from ultragray.learn.training.geometry import (
     shift_out_of_plane,
 )
 from ultragray.learn.training.initial import initial_parameters
-from ultragray.learn.training.intensity import project_sh0, sh0_of_intensity
+from ultragray.learn.training.intensity import least_sh0, project_sh0, sh0_of_intensity
 from ultragray.learn.training.optimizer import rotate
 from ultragray.rendering.backends import reference
 from ultragray.scene.info import expected_shapes
@@ -156,7 +156,7 @@ def test_released_gaussian_beyond_an_end_has_a_gradient_again():
 
 def test_sigmoid_is_left_alone():
     sh0 = torch.tensor([-50.0, 50.0]).reshape(2, 1, 1)
-    project_sh0(sh0, "sigmoid", torch.zeros(2))
+    project_sh0(sh0, "sigmoid", least_sh0(torch.zeros(2), "sigmoid"))
     assert sh0.flatten().tolist() == [-50.0, 50.0]
 
 
@@ -165,7 +165,7 @@ def test_a_floor_is_the_least_intensity(name):
     sh0 = torch.tensor([-5.0, 0.5, -0.4]).reshape(3, 1, 1)
     free = sh0.clone()
     project_sh0(free, name, None)
-    project_sh0(sh0, name, torch.tensor([0.6, 0.6, 0.0]))
+    project_sh0(sh0, name, least_sh0(torch.tensor([0.6, 0.6, 0.0]), name))
     assert intensity_of(sh0, name)[0].item() == pytest.approx(0.6)
     assert torch.equal(sh0[1:], free[1:])
 

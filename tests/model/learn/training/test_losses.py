@@ -4,7 +4,7 @@ import pytest
 import torch
 from pytorch_msssim import ssim as other_ssim
 
-from ultragray.learn.training.losses import image_loss, kernel_image_loss, plain_image_loss, ssim
+from ultragray.learn.training.losses import absorption_loss, image_loss, kernel_image_loss, plain_image_loss, ssim
 from ultragray.rendering.backends import cpu
 
 
@@ -70,6 +70,36 @@ def test_value_and_gradient(shape, instruction_set, texture):
     assert torch.allclose(
         rendered.grad.double(), 3.0 * exact.grad, rtol=1e-3, atol=1e-6 * exact.grad.abs().max().item()
     )
+
+
+@pytest.mark.parametrize("instruction_set", cpu.INSTRUCTION_SETS)
+def test_weights_count_for_the_last_images(instruction_set):
+    rendered, truth = torch.rand((2, 3, 17, 21), generator=torch.Generator().manual_seed(5))
+    weights = torch.rand((2, 17, 21), generator=torch.Generator().manual_seed(6))
+    exact = rendered.double().requires_grad_()
+    expected = plain_image_loss(exact, truth.double(), 0.3, weights.double())
+    expected.backward()
+    loss = kernel_image_loss(rendered.requires_grad_(), truth, 0.3, weights, instruction_set=instruction_set)
+    loss.backward()
+    assert loss.item() == pytest.approx(expected.item(), abs=1e-6)
+    assert torch.allclose(rendered.grad.double(), exact.grad, rtol=1e-3, atol=1e-6 * exact.grad.abs().max().item())
+    assert loss.item() != pytest.approx(plain_image_loss(exact, truth.double(), 0.3).item(), abs=1e-3)
+
+
+def test_absorption_has_a_price_where_neither_neighbour_shows_a_shadow():
+    transmittance = torch.rand((3, 5, 7), generator=torch.Generator().manual_seed(7))
+    shadowed = torch.rand((4, 5, 7), generator=torch.Generator().manual_seed(8)) < 0.3
+    neighbours = torch.tensor([[0, 0], [1, 3], [2, 1]])
+    exact = transmittance.double().requires_grad_()
+    expected = absorption_loss(exact, shadowed, neighbours, 0.2)
+    (2.0 * expected).backward()
+    loss = absorption_loss(transmittance.requires_grad_(), shadowed, neighbours, 0.2)
+    (2.0 * loss).backward()
+    free = ~(shadowed[neighbours[:, 0]] | shadowed[neighbours[:, 1]])
+    by_hand = 0.2 * (1.0 - exact.detach())[free].sum().item() / exact.numel()
+    assert expected.item() == pytest.approx(by_hand, abs=1e-9)
+    assert loss.item() == pytest.approx(by_hand, abs=1e-6)
+    assert torch.allclose(transmittance.grad.double(), exact.grad, atol=1e-7)
 
 
 @pytest.mark.parametrize("shape", [(1, 10, 20), (1, 20, 10), (0, 20, 20)])

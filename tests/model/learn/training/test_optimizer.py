@@ -5,8 +5,10 @@ import math
 import pytest
 import torch
 
+from ultragray import _cpu
 from ultragray.learn.training import TrainingConfig
-from ultragray.learn.training.optimizer import Optimizer, PullStatistics, Schedule, refine, rotate
+from ultragray.learn.training.optimizer import MOMENTS, STEP, Optimizer, PullStatistics, Schedule, refine, rotate
+from ultragray.rendering.backends import cpu
 
 RATES = {"means": 0.1, "sh0": 0.01}
 
@@ -48,6 +50,47 @@ def test_steps_of_adam_for_a_batch():
         assert torch.allclose(given[name].detach().double(), expected[name], atol=1e-5)
         assert given[name].grad is None
     assert bool((given["quats"] == 1).all())
+
+
+def test_the_kernel_updates_as_torch_does_and_adds_the_penalty_of_the_scales():
+    generator, count = torch.Generator().manual_seed(1), 40_007  # no multiple of a vector, and more than one stretch
+    first = {name: torch.randn((count, 3), generator=generator).requires_grad_() for name in ("means", "scales")}
+    second = {name: value.detach().clone().requires_grad_() for name, value in first.items()}
+    by_kernel, by_torch = (Optimizer(one, batch_size=4, scale_penalty=0.7) for one in (first, second))
+    rates = {"means": 0.1, "scales": 0.02}
+    for t in (1, 2, 3):
+        set_gradients(first, t), set_gradients(second, t)
+        expected = 0.7 * float(first["scales"].detach().double().exp().mean())
+        assert by_kernel.step(rates) == pytest.approx(expected, rel=1e-5)
+        for name in second:
+            by_torch._state.setdefault(name, {moment: torch.zeros(count, 3) for moment in MOMENTS})
+            by_torch._state[name][STEP] = torch.tensor(float(t))
+        assert float(by_torch._step_by_torch(second, rates)) == pytest.approx(expected, rel=1e-5)
+        for name, value in first.items():
+            assert torch.allclose(value.detach(), second[name].detach(), rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("instruction_set", cpu.INSTRUCTION_SETS)
+def test_the_thread_count_does_not_change_an_update(instruction_set):
+    found = []
+    for threads in (1, 3):
+        values, gradient, *moments = torch.randn((4, 50_001), generator=torch.Generator().manual_seed(0)).abs().numpy()
+        penalty = _cpu.adam(
+            values=[values],
+            gradients=[gradient],
+            first=[moments[0]],
+            second=[moments[1]],
+            steps=[3],
+            rates=[0.1],
+            penalties=[1.0],
+            beta1=0.6,
+            beta2=0.99,
+            eps=1e-15,
+            threads=threads,
+            instruction_set=instruction_set,
+        )
+        found.append((penalty, values.tobytes(), moments[0].tobytes(), moments[1].tobytes()))
+    assert found[0] == found[1]
 
 
 def test_moments_follow_the_gaussians():

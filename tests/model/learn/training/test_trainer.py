@@ -3,6 +3,7 @@
 import json
 import os
 import random
+import shutil
 import signal
 import subprocess
 import sys
@@ -31,6 +32,7 @@ from ultragray.learn.training.run import scene_of_checkpoint
 from ultragray.scene import info as scene_info
 
 from ....waiting import Deadline
+from ..conftest import make_tiny_config, make_tiny_dataset
 
 
 def learned(dataset, config, **options):
@@ -139,6 +141,14 @@ def test_folder_of_another_run_is_refused(tiny_dataset, tiny_config, tmp_path):
         train(tiny_dataset(spacing_mm=0.9), config, folder=tmp_path, resume=True)
 
 
+@pytest.fixture(scope="module")
+def stopped_run(tmp_path_factory):
+    """The folder of a run that was stopped after two steps."""
+    folder, stop = tmp_path_factory.mktemp("stopped"), iter([False, True])
+    train(make_tiny_dataset(), make_tiny_config(), folder=folder, should_stop=lambda: next(stop))
+    return folder
+
+
 def spoilt(path, **changed):
     """The checkpoint with some tensors changed, or left out where they are None; `__` stands for a dot."""
     with safe_open(path, framework="pt") as bundle:
@@ -167,9 +177,8 @@ def spoilt(path, **changed):
         ({"generator": torch.full((5056,), 255, dtype=torch.uint8)}, r"generator is no generator's state"),
     ],
 )
-def test_a_checkpoint_with_other_tensors_is_refused(tiny_dataset, tiny_config, tmp_path, changed, reason):
-    stop = iter([False, True])
-    train(tiny_dataset(), tiny_config(), folder=tmp_path, should_stop=lambda: next(stop))
+def test_a_checkpoint_with_other_tensors_is_refused(tiny_dataset, tiny_config, stopped_run, tmp_path, changed, reason):
+    shutil.copytree(stopped_run, tmp_path, dirs_exist_ok=True)
     spoilt(tmp_path / "checkpoint.safetensors", **changed)
     with pytest.raises(TrainingStateInvalid, match=rf"checkpoint\.safetensors: .*{reason}"):
         train(tiny_dataset(), tiny_config(), folder=tmp_path, resume=True)
@@ -178,10 +187,10 @@ def test_a_checkpoint_with_other_tensors_is_refused(tiny_dataset, tiny_config, t
 def test_divergence_keeps_the_last_good_checkpoint(tiny_dataset, tiny_config, tmp_path, monkeypatch):
     true_loss, calls = trainer.image_loss, 0
 
-    def loss_that_breaks(rendered, truth, texture):
+    def loss_that_breaks(rendered, truth, *settings):
         nonlocal calls
         calls += 1
-        return true_loss(rendered, truth, texture) * (float("nan") if calls == 6 else 1.0)
+        return true_loss(rendered, truth, *settings) * (float("nan") if calls == 6 else 1.0)
 
     monkeypatch.setattr(trainer, "image_loss", loss_that_breaks)
     with pytest.raises(TrainingDiverged, match="in step 6: the loss is nan; the last good checkpoint is kept"):

@@ -17,8 +17,8 @@ from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import DatasetNotFound
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.kinds import CompareJob, base
+from ultragray_workers.jobs.kinds.base import from_dict, to_dict
 from ultragray_workers.jobs.progress import JobState
-from ultragray_workers.jobs.specification import from_dict, to_dict
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 
 from ..conftest import request_of

@@ -8,6 +8,7 @@ import torch
 
 from ultragray import ConvexProbe, GaussianScene
 from ultragray.errors import DatasetInvalid
+from ultragray.learn.evaluation import scoring
 from ultragray.learn.evaluation.baselines import BY_POSE, IN_TIME
 from ultragray.learn.evaluation.scoring import evaluate
 from ultragray.learn.sweep import Dataset
@@ -15,7 +16,7 @@ from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import DatasetNotFound, SceneNotFound
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.kinds import EvaluateJob, evaluate_run
-from ultragray_workers.jobs.specification import from_dict, to_dict
+from ultragray_workers.jobs.kinds.base import from_dict, to_dict
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 from ultragray_workers.scenes import SceneStore
@@ -40,7 +41,7 @@ def job_run(artifact_folder, random_scene):
 
 
 def test_scores_are_those_of_the_library(job_run, monkeypatch):
-    monkeypatch.setattr(evaluate_run, "frames_at_once", lambda height, width: 1)
+    monkeypatch.setattr(scoring, "frames_at_once", lambda height, width: 1)
     asked = job_run()
     outcome = from_dict(asked.request.specification).run(asked)
     held_out = DatasetStore(asked.folder.artifact_folder).load("tiny").val

@@ -20,7 +20,7 @@ from ultragray.samplers import AroundSampler, CoveredSampler, FanSampler, Spline
 from ultragray.scene.confidence import Assessor, ConfidenceModel, Support, figure_arrays
 from ultragray_workers.jobs.folder import JobFolder
 from ultragray_workers.jobs.kinds import RenderJob, render_run
-from ultragray_workers.jobs.specification import from_dict, to_dict
+from ultragray_workers.jobs.kinds.base import from_dict, to_dict
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 
 from ..conftest import request_of

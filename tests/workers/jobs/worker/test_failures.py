@@ -29,9 +29,9 @@ import sys
 if "ultragray_workers.jobs.worker.run_job" in sys.orig_argv:
     from ultragray.learn.training import trainer
     image_loss, calls = trainer.image_loss, []
-    def broken(rendered, truth, texture):
+    def broken(rendered, truth, *settings):
         calls.append(None)
-        return image_loss(rendered, truth, texture) * (float("nan") if len(truth) == 3 and len(calls) > 2 else 1.0)
+        return image_loss(rendered, truth, *settings) * (float("nan") if len(truth) == 3 and len(calls) > 2 else 1.0)
     trainer.image_loss = broken
 """
 

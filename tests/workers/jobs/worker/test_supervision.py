@@ -67,7 +67,7 @@ def alone(store, artifact_folder):
     jobs = JobDatabase(artifact_folder, None)
     folder = artifact_folder.resolve()
     gate = Gate(jobs.identity, [DeviceLock(folder, device, "me") for device in devices_of("cpu")], (), list)
-    supervisor = Supervisor(supervision.WorkerConfig(folder, LocalStorage(folder), "me"), jobs, gate)
+    supervisor = Supervisor(supervision.WorkerConfig(folder, LocalStorage(folder), threads=1), jobs, gate)
 
     def do():
         row = queue.take(jobs.engine, "me", queue.demands_waiting(jobs.engine))

@@ -4,8 +4,7 @@ Modules that end in `_run` do the work of a kind and are imported in the job's p
 """
 
 from ultragray_workers.jobs.kinds.base import Specification
-from ultragray_workers.jobs.kinds.compare import CompareJob
-from ultragray_workers.jobs.kinds.evaluate import EvaluateJob
+from ultragray_workers.jobs.kinds.evaluate import CompareJob, EvaluateJob
 from ultragray_workers.jobs.kinds.render import RenderJob
 from ultragray_workers.jobs.kinds.train import TrainJob
 from ultragray_workers.jobs.kinds.voxelize import VoxelizeJob

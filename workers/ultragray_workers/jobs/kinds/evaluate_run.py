@@ -4,30 +4,22 @@ from __future__ import annotations
 
 import json
 import sys
-import time
-
-import numpy as np
 
 from ultragray.files import file_sha256
 from ultragray.learn.evaluation.baselines import IN_TIME, affordable_voxel_mm, evaluate_baselines
 from ultragray.learn.evaluation.held_out import score_held_out
-from ultragray.learn.evaluation.metrics import FrameMetrics
 from ultragray.learn.evaluation.scoring import (
-    Evaluation,
     check_same_origin,
     evaluate,
-    frames_at_once,
     measure_reliability,
     require_frames,
 )
 from ultragray.learn.evaluation.side_by_side import write_spread
-from ultragray.learn.evaluation.speckle import FrameSpeckle
-from ultragray.learn.sweep import Sweep
 from ultragray.learn.training.memory import training_device
 from ultragray.scene.gaussians import GaussianScene
 from ultragray_workers.jobs.kinds.evaluate import EvaluateJob
-from ultragray_workers.jobs.progress import Outcome, Progress
-from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
+from ultragray_workers.jobs.progress import Outcome
+from ultragray_workers.jobs.worker.job_run import JobRun
 from ultragray_workers.scene_names import SUFFIX
 
 RESULT_FILE = "evaluation.json"
@@ -49,7 +41,7 @@ def run(job_run: JobRun, job: EvaluateJob) -> Outcome:
     for warning in warnings:
         sys.stderr.write(f"warning: {warning}\n")
     sys.stderr.write(f"scoring {job.scene} on {len(dataset.val):,} frames of {job.dataset} on {device}\n")
-    evaluation = _scored(job_run, scene, dataset.val)
+    evaluation = evaluate(scene, dataset.val, after_portion=job_run.counter(len(dataset.val)))
     held_out = score_held_out(scene, dataset, evaluation, register=job.register)
     reliability = measure_reliability(scene, dataset.val)
     voxel_mm = affordable_voxel_mm(dataset.train)
@@ -76,22 +68,3 @@ def run(job_run: JobRun, job: EvaluateJob) -> Outcome:
         (folder / RESULT_FILE).write_text(json.dumps(document, indent=1) + "\n", encoding="utf-8")
         write_spread(scene, dataset.val, evaluation, folder, PICTURES)
     return Outcome(artifacts=job_run.folder.artifact_names(), metrics=metrics)
-
-
-def _scored(job_run: JobRun, scene: GaussianScene, sweep: Sweep) -> Evaluation:
-    started, portion = time.monotonic(), frames_at_once(sweep.height, sweep.width)
-    frames: list[FrameMetrics] = []
-    speckle: list[FrameSpeckle] = []
-    natural: list[FrameSpeckle] = []
-    scales = 0
-    while len(frames) < len(sweep):
-        if job_run.should_stop():
-            raise Stopped
-        scored = evaluate(scene, sweep.select(np.arange(len(frames), min(len(frames) + portion, len(sweep)))))
-        frames, scales = frames + scored.frames, scored.ms_ssim_scales
-        speckle += scored.frame_speckle
-        natural += scored.frame_natural
-        rate = len(frames) / (time.monotonic() - started)
-        left_s = (len(sweep) - len(frames)) / rate
-        job_run.report(Progress(frames_done=len(frames), frames=len(sweep), rate_per_s=rate, seconds_left=left_s))
-    return Evaluation(frames, sweep.frame_numbers, scales, speckle, natural)

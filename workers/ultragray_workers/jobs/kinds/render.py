@@ -32,7 +32,7 @@ from ultragray.samplers.confident import require_drawn
 from ultragray.scene.confidence import Assessor, Extrapolation, require_confidence
 from ultragray.scene.info import SceneHeader
 from ultragray_workers.errors import StorageFull
-from ultragray_workers.jobs.kinds.base import Specification, Surroundings
+from ultragray_workers.jobs.kinds.base import Specification, Surroundings, to_dict
 
 ASSESSED_AT_ONCE = 250_000  # poses times training poses that submissions wait for: about a fifth of a second
 _MEMBER_BYTES = 1024  # of a shard, around the pixels of a member
@@ -97,8 +97,6 @@ class RenderJob(FrameSettings, Specification):
         check_format(self.file_format.name, self.outputs, self.dtype)
 
     def __eq__(self, other: object) -> bool:
-        from ultragray_workers.jobs.specification import to_dict  # imports the kinds
-
         return isinstance(other, RenderJob) and to_dict(self) == to_dict(other)
 
     __hash__ = None  # type: ignore[assignment]

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import shutil
 import sys
-import time
 
 from ultragray.exchange.rendering import assess_by_rendering, render_to_file
 from ultragray.files import file_sha256
@@ -18,7 +17,7 @@ from ultragray.scene.gaussians import GaussianScene
 from ultragray.scene.info import SceneHeader, read_header
 from ultragray_workers.jobs.kinds import shards_run
 from ultragray_workers.jobs.kinds.render import RenderJob
-from ultragray_workers.jobs.progress import Outcome, Progress
+from ultragray_workers.jobs.progress import Outcome
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 from ultragray_workers.scene_names import SUFFIX
 
@@ -47,16 +46,6 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
     job.check_room(len(poses), job.file_format.shown(settings).picture, free)
     size = f"{settings.height}x{settings.width}"
     sys.stderr.write(f"rendering {len(poses):,} frames of {size} of {job.scene} on {device}\n")
-    started = time.monotonic()
-
-    def before_portion(done: int) -> None:
-        if job_run.should_stop():
-            raise Stopped
-        rate = done / (time.monotonic() - started)
-        left_s = (len(poses) - done) / rate if done else None
-        progress = Progress(frames_done=done, frames=len(poses), rate_per_s=rate or None, seconds_left=left_s)
-        job_run.report(progress)
-
     with job_run.folder.new_artifacts() as folder:
         render_to_file(
             folder / f"frames{job.file_format.suffix}",
@@ -69,7 +58,7 @@ def run(job_run: JobRun, job: RenderJob) -> Outcome:
             scene_name=job.scene,
             scene_sha256=file_sha256(path),
             limits=limits,
-            before_portion=before_portion,
+            before_portion=job_run.counter(len(poses)),
         )
     return Outcome(artifacts=job_run.folder.artifact_names())
 

@@ -37,6 +37,8 @@ from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 from ultragray_workers.scene_names import SUFFIX
 
 METHODS = ("linear", "median", IN_TIME)
+CHECKPOINT_INTERVAL_S = 10.0
+_LINES = 20  # of the log in a run
 MAX_PIXELS = 1 << 26  # of the sweep: about ten seconds; a larger one begins at once, without the lines
 
 
@@ -59,8 +61,6 @@ def write_baselines(dataset: Dataset, path: Path, should_stop: Callable[[], bool
 
 
 # The time that a training takes after its steps, by what it takes here to render a frame and to score one.
-
-
 STEP_RENDERINGS = 3.0  # what a view of a step costs, with its gradients, in renderings of a frame
 CONFIDENCE_RENDERINGS = 4.0  # of a frame by which the confidence is fitted: image, coverage and uncertainty
 PLOTS_S = 5.0  # of the report, whatever it is about
@@ -105,13 +105,6 @@ def _scoring_s(dataset: Dataset) -> float:
     started = time.perf_counter()
     evaluate_frames((frame.images / 255.0).astype(np.float32), frame)
     return time.perf_counter() - started
-
-
-# The work of a training job: a dataset becomes a scene, its metrics, its curve and a few pictures.
-
-
-CHECKPOINT_INTERVAL_S = 10.0
-_LINES = 20  # of the log in a run
 
 
 def run(job_run: JobRun, job: TrainJob) -> Outcome:

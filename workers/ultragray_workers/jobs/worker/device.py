@@ -6,7 +6,6 @@ torch, which a process of its own asks about GPUs.
 
 from __future__ import annotations
 
-import fcntl
 import json
 import logging
 import os
@@ -24,6 +23,7 @@ from typing import IO
 
 from ultragray.errors import InvalidArgument
 from ultragray.installation import memory_bytes, processor_name
+from ultragray_workers.claims import try_lock
 from ultragray_workers.errors import ArtifactFolderUnavailable, DatabaseUnavailable, StartupFailed
 from ultragray_workers.jobs import queue
 from ultragray_workers.jobs.database import StoreIdentity
@@ -112,9 +112,7 @@ class DeviceLock:
             return True
         self.path.parent.mkdir(parents=True, exist_ok=True)
         file = self.path.open("a+")
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
+        if not try_lock(file):
             file.close()
             return False
         file.truncate(0)
@@ -175,7 +173,8 @@ class Gate:
             return []
         fitting: dict[str, set[str]] = {}
         with suppress(DatabaseUnavailable):
-            fitting = {key: self._fitting(demand_of_key(key)) for key in self._waiting()}
+            for key in self._waiting():
+                fitting[key] = {device.name for device in self.offer.fitting(demand_of_key(key))}
         wanted = set().union(*fitting.values())  # which one it will be is known when the job is
         held = {name for name, lock in self._locks.items() if name in wanted and self._takes(lock)}
         if not held:
@@ -199,9 +198,6 @@ class Gate:
         self._closed_until_s = max(self._closed_until_s, time.monotonic() + for_s)
         for lock in self._locks.values():
             lock.release()
-
-    def _fitting(self, demand: Demand) -> set[str]:
-        return {device.name for device in self.offer.fitting(demand)}
 
     def _takes(self, lock: DeviceLock) -> bool:
         """Whether the device of a lock is held now."""

@@ -17,6 +17,7 @@ from pathlib import Path
 
 from ultragray_workers.jobs.folder import JobFolder
 
+DATABASE_VARIABLE = "JOBS_DATABASE_URL"  # of the environment of a job's process
 STOP_WAIT_S = 10.0  # for the checkpoint of a training that is to stop
 _KILL_WAIT_S, _KILL_POLL_S = 5.0, 0.02
 _PROC = Path("/proc")
@@ -27,19 +28,15 @@ LONGEST_STEP_S = 2.0  # between two looks; what is longer, this worker itself wa
 
 @contextmanager
 def job_process(
-    folder: JobFolder, device_lock: int, threads: int, descriptor: int | None = None
+    folder: JobFolder, device_lock: int, threads: int, database_url: str | None
 ) -> Iterator[subprocess.Popen[bytes]]:
     """A process at work in the folder, which inherits the lock of its device; killed with its group at the end.
 
-    `descriptor`: its end of a channel to this worker; this process has it no more.
+    `database_url`: of the jobs, for one that takes shards; it may hold a password, and so stands in no file.
     """
-    descriptors = [] if descriptor is None else [descriptor]
     with folder.log.open("ab") as log:
         process = subprocess.Popen(
-            [
-                *(sys.executable, "-m", "ultragray_workers.jobs.worker.run_job", str(folder.path), str(os.getpid())),
-                *map(str, descriptors),
-            ],
+            [sys.executable, "-m", "ultragray_workers.jobs.worker.run_job", str(folder.path), str(os.getpid())],
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
@@ -48,12 +45,11 @@ def job_process(
                 "PYTHONPATH": os.pathsep.join(path for path in sys.path if path),
                 "OMP_NUM_THREADS": str(threads),
                 "OPENBLAS_NUM_THREADS": str(threads),
+                **({} if database_url is None else {DATABASE_VARIABLE: database_url}),
             },
             start_new_session=True,
-            pass_fds=[device_lock, *descriptors],
+            pass_fds=[device_lock],
         )
-    if descriptor is not None:
-        os.close(descriptor)
     try:
         yield process
     finally:
@@ -121,21 +117,19 @@ class Account:
     io_bytes: int = 0
     is_ready: bool = False  # at work, or waiting for a core
 
-    def __add__(self, other: Account) -> Account:
-        return Account(self.cpu_s + other.cpu_s, self.io_bytes + other.io_bytes, self.is_ready or other.is_ready)
-
 
 def account_of(pid: int) -> Account:
     """The account of a process and all below it; of one that has ended, nothing."""
-    total = Account()
-    with suppress(OSError, ValueError):
-        state, fields = _status(pid)
-        cpu_s = (int(fields[11]) + int(fields[12])) * _TICK_S  # utime, stime
-        total += Account(cpu_s, _io_bytes(pid), state == "R")
-        for children in (_PROC / str(pid) / "task").glob("*/children"):
-            for child in children.read_text(encoding="ascii").split():
-                total += account_of(int(child))
-    return total
+    ticks, io_bytes, is_ready, pids = 0, 0, False, [pid]
+    for one in pids:  # children are added on the way
+        with suppress(OSError, ValueError):
+            state, fields = _status(one)
+            ticks += int(fields[11]) + int(fields[12])  # utime, stime
+            io_bytes += _io_bytes(one)
+            is_ready |= state == "R"
+            for children in (_PROC / str(one) / "task").glob("*/children"):
+                pids += map(int, children.read_text(encoding="ascii").split())
+    return Account(ticks * _TICK_S, io_bytes, is_ready)
 
 
 def is_stopped(pid: int) -> bool:

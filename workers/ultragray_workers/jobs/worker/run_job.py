@@ -1,6 +1,4 @@
-"""The process of a job: `python -m ultragray_workers.jobs.worker.run_job JOB_FOLDER WORKER_PID [CHANNEL]`.
-
-CHANNEL is the descriptor of a channel to the worker, of a job in shards.
+"""The process of a job: `python -m ultragray_workers.jobs.worker.run_job JOB_FOLDER WORKER_PID`.
 
 It dies with its worker, works alone in the folder, and as its last act says in outcome.json how the job ended. A job
 that fails is a process that ends well; SIGTERM ends it with exit code STOPPED and a checkpoint to go on from, and files
@@ -9,7 +7,6 @@ that cannot be used (a share that has gone) with FOLDER_LOST: it may be started 
 
 from __future__ import annotations
 
-import fcntl
 import os
 import re
 import signal
@@ -21,11 +18,10 @@ from dataclasses import replace
 from pathlib import Path
 
 from ultragray.errors import InvalidArgument, MemoryExceeded, UltragrayError
-from ultragray_workers.claims import is_no_room, storage_full
+from ultragray_workers.claims import is_no_room, storage_full, try_lock
 from ultragray_workers.jobs.folder import JobFolder
+from ultragray_workers.jobs.kinds.base import from_dict
 from ultragray_workers.jobs.progress import Outcome
-from ultragray_workers.jobs.shards.channel import Channel
-from ultragray_workers.jobs.specification import from_dict
 from ultragray_workers.jobs.worker.job_run import JobRun, Stopped
 from ultragray_workers.processes import end_with_parent, let_frames_go_first
 
@@ -35,7 +31,7 @@ _FOLDERS = re.compile(r"(?<![\w./:])/(?:[^\s/:,;'\"()]+/)+")  # of an absolute p
 _OOM_SCORE_ADJ = "500"  # of 1000: where memory runs out, jobs go before the service and its workers
 
 
-def main(folder_path: str, worker_pid: str, *descriptors: str) -> int:
+def main(folder_path: str, worker_pid: str) -> int:
     """The exit code: 0 where outcome.json says how the job ended."""
     end_with_parent(signal.SIGKILL)
     if os.getppid() != int(worker_pid):  # it died before the line above
@@ -47,7 +43,7 @@ def main(folder_path: str, worker_pid: str, *descriptors: str) -> int:
     job_id, _, attempt = path.name.rpartition(".")
     folder = JobFolder(path.parent.parent, job_id, int(attempt))
     with folder.lock.open("a") as lock:
-        while not _is_locked(lock.fileno()):  # another worker's process may still be at it, or have finished
+        while not try_lock(lock):  # another worker's process may still be at it, or have finished
             if received:
                 return STOPPED
             time.sleep(_LOCK_POLL_S)
@@ -61,8 +57,7 @@ def main(folder_path: str, worker_pid: str, *descriptors: str) -> int:
             return FOLDER_LOST
         let_frames_go_first(request.nice)
         Path("/proc/self/oom_score_adj").write_text(_OOM_SCORE_ADJ, encoding="ascii")
-        channel = Channel(int(descriptors[0])) if descriptors else None
-        job_run = JobRun(folder, request, lambda: bool(received), channel)
+        job_run = JobRun(folder, request, lambda: bool(received))
         try:
             outcome = _outcome_of(job_run)
             folder.write_progress(outcome.progress)
@@ -75,14 +70,6 @@ def main(folder_path: str, worker_pid: str, *descriptors: str) -> int:
             _tell_traceback()
             return FOLDER_LOST
     return 0
-
-
-def _is_locked(descriptor: int) -> bool:
-    try:
-        fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
 
 
 def _outcome_of(job_run: JobRun) -> Outcome:

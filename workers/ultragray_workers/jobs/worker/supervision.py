@@ -10,9 +10,9 @@ import os
 import signal
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import NoReturn, TypeVar
 
@@ -31,12 +31,11 @@ from ultragray_workers.errors import (
 )
 from ultragray_workers.jobs import queue
 from ultragray_workers.jobs.database import JobDatabase
-from ultragray_workers.jobs.demand import demand_of_key
+from ultragray_workers.jobs.demand import AUTO, demand_of_key
 from ultragray_workers.jobs.folder import JobFolder, Request
-from ultragray_workers.jobs.progress import Outcome
-from ultragray_workers.jobs.record import Files, Row
-from ultragray_workers.jobs.shards.desk import BatchOver, ShardDesk
-from ultragray_workers.jobs.specification import has_checkpoints, is_in_shards
+from ultragray_workers.jobs.kinds.base import has_checkpoints, is_in_shards
+from ultragray_workers.jobs.progress import Files, Outcome
+from ultragray_workers.jobs.record import Row
 from ultragray_workers.jobs.worker.device import DeviceLock, Gate
 from ultragray_workers.jobs.worker.process import (
     STOP_WAIT_S,
@@ -53,6 +52,7 @@ from ultragray_workers.storage.cache import DEFAULT_MAX_BYTES
 from ultragray_workers.storage.storage import Storage
 
 WATCH_INTERVAL_S = 0.25
+LONGEST_SHARE_S = 60.0  # of a batch; then a share ends, where other jobs wait
 STUCK_AFTER_S = 60.0  # in which the supervision itself has not moved, such as on a share that does not answer
 _POLL_INTERVAL_S = 0.05
 _PAUSE_S = 5.0  # before the next look for a job, after one that could not be begun or went on
@@ -68,17 +68,22 @@ _T = TypeVar("_T")
 
 @dataclass(frozen=True)
 class WorkerConfig:
-    """Settings of a worker, most of them for the processes of its jobs."""
+    """Settings of a worker."""
 
-    artifact_folder: Path
+    artifact_folder: Path  # with a storage elsewhere it is this host's own, with copies of datasets
     storage: Storage  # of the files of jobs, datasets and scenes that jobs make
-    name: str  # the same after a restart
+    database_url: str | None = None  # None: a SQLite file in the artifact folder
+    name: str | None = None  # its alone; one that is started again under its name goes on with its jobs at once
+    device: str = AUTO  # every GPU of the host, and its processor; cpu, cuda (every GPU) or cuda:N
+    labels: Mapping[str, str] = field(default_factory=dict)  # jobs that ask for others are left to other workers
     max_copies_bytes: int = DEFAULT_MAX_BYTES  # of copies of datasets on this host
-    threads: int = 1
+    threads: int = 0  # of a job; 0: all cores but one
     nice: int = 10
     max_footprint_pixels: int | None = None  # of a frame of a render job; None: no limit
-    stall_timeout_s: float = 0.0  # 0: no limit; likewise the next
-    max_run_s: float = 0.0
+    retention_days: float = 0.0  # then finished jobs are removed; 0: never, likewise the next
+    stall_timeout_s: float = 0.0  # a job fails whose process does not get on for so long
+    max_run_s: float = 0.0  # of all processes of a job
+    drain_timeout_s: float = 0.0  # for a job without checkpoints to end when the worker stops
 
 
 class Interrupted(Exception):
@@ -129,7 +134,7 @@ class Supervisor:
         self.moved_at_s = time.monotonic()
         self.job_at_hand = row.id
         try:
-            with _span(row, self.config.name) as span:
+            with _span(row) as span:
                 outcome = _JobAtHand(self, row).do()
                 if outcome.error is not None:
                     span.set_status(Status(StatusCode.ERROR, outcome.error))
@@ -156,7 +161,6 @@ class _JobAtHand:
             filter(None, [row.summary.get("max_run_s") or 0.0, self._config.max_run_s]), default=float("inf")
         )
         self._run_s, self._unsaved_s = row.run_s, 0.0
-        self._desk: ShardDesk | None = None
         self._device: DeviceLock
 
     def do(self) -> Outcome:
@@ -164,12 +168,13 @@ class _JobAtHand:
         with self._hold_device():
             try:
                 outcome, files = self._end()
-                if outcome.error is not None and (desk := self._desk) is not None:
-                    self._ask(lambda: desk.fail(outcome))
-                if not self._ask(lambda: queue.finish(self._engine, self._row, outcome, files)):
+                row = self._row
+                if outcome.error is not None and is_in_shards(row.summary):
+                    self._ask(lambda: queue.blame_shard(self._engine, row, outcome))
+                if not self._ask(lambda: queue.finish(self._engine, row, outcome, files)):
                     raise Superseded
-                if is_in_shards(self._row.summary) and self._row.batch is None:
-                    self._ask(lambda: queue.cancel_shares(self._engine, self._row.id))
+                if is_in_shards(row.summary) and row.batch is None:
+                    self._ask(lambda: queue.cancel_shares(self._engine, row.id))
                 self._telling.remove_others()
                 return outcome
             except Interrupted:
@@ -249,6 +254,7 @@ class _JobAtHand:
                 storage=config.storage.location,
                 max_footprint_pixels=config.max_footprint_pixels,
                 max_copies_bytes=config.max_copies_bytes,
+                longest_share_s=LONGEST_SHARE_S,
             )
         )
         attempt, crashes, kills, furthest = row.attempt, 0, 0, _furthest(folder)
@@ -283,12 +289,8 @@ class _JobAtHand:
     def _run_process(self) -> int:
         """Runs the job's process to its end, or to that of its time; its exit code. Raises Interrupted, JobStalled."""
         supervisor, row, config = self._supervisor, self._row, self._config
-        with (
-            self._desk_of_batch() as desk,
-            job_process(
-                self._folder, self._device.fileno(), config.threads, None if desk is None else desk.descriptor
-            ) as process,
-        ):
+        url = supervisor.jobs.url if is_in_shards(row.summary) else None  # others do without the database
+        with job_process(self._folder, self._device.fileno(), config.threads, url) as process:
             watchdog = Watchdog(process.pid, config.stall_timeout_s)
             watched_at_s = float("-inf")
             is_given_back = False
@@ -317,33 +319,13 @@ class _JobAtHand:
                         with suppress(DatabaseUnavailable):  # the work goes on meanwhile
                             self._raise_unless_held()
                         watched_at_s = time.monotonic()
-                    if desk is None:
-                        time.sleep(_POLL_INTERVAL_S)
-                    else:
-                        desk.attend(_POLL_INTERVAL_S)
+                    time.sleep(_POLL_INTERVAL_S)
             finally:
                 self._add_run_time(watchdog.look())
-            if desk is not None:
-                desk.settle()
             if is_given_back:
                 self._telling.tell_last()
                 self._give_back()
         return process.returncode
-
-    @contextmanager
-    def _desk_of_batch(self) -> Iterator[ShardDesk | None]:
-        if not is_in_shards(self._row.summary):
-            yield None
-            return
-        desk = self._desk = self._ask(lambda: ShardDesk(self._engine, self._row))
-        try:
-            yield desk
-        except BatchOver:
-            _log.info(f"the batch of {self._row.id} is over: its process is ended")
-            self._ask(lambda: queue.finish(self._engine, self._row, Outcome(), self._row.files))
-            raise Interrupted from None
-        finally:
-            desk.close()
 
     def _publish(self, scene: str, outcome: Outcome, files: Files) -> Outcome:
         """Serves the scene, unless the job was cancelled first; how the job ended then. Raises Superseded."""
@@ -386,8 +368,7 @@ class _JobAtHand:
 
     def _look_after(self) -> None:
         """Keeps a job at hand whose files are on their way. Raises Interrupted where it is not ours any more."""
-        self._supervisor.moved_at_s = time.monotonic()
-        if self._supervisor.stopping.is_set():
+        if self._supervisor.must_stop(self._row):
             self._give_back()
         with suppress(DatabaseUnavailable):
             self._raise_unless_held()
@@ -417,11 +398,11 @@ class _JobAtHand:
 
 
 @contextmanager
-def _span(row: Row, worker: str) -> Iterator[trace.Span]:
+def _span(row: Row) -> Iterator[trace.Span]:
     """A span for one attempt at a job, a part of the trace of the request that submitted it."""
     attributes: dict[str, str | int] = {
         "ultragray.job": row.id,
-        "ultragray.worker": worker,
+        "ultragray.worker": row.worker or "",
         "ultragray.attempt": row.attempt,
     }
     context, kind = propagate.extract(row.trace), trace.SpanKind.CONSUMER

@@ -32,9 +32,9 @@ from ultragray_workers.jobs.files import (
     scene_key,
 )
 from ultragray_workers.jobs.folder import JobFolder
-from ultragray_workers.jobs.progress import Outcome
-from ultragray_workers.jobs.record import Files, Piece, Row, StoredFile
-from ultragray_workers.jobs.specification import is_in_shards, value_in
+from ultragray_workers.jobs.kinds.base import is_in_shards, value_in
+from ultragray_workers.jobs.progress import Files, Outcome, Piece, StoredFile
+from ultragray_workers.jobs.record import Row
 from ultragray_workers.jobs.worker.process import end_process_of_another_worker
 from ultragray_workers.scene_names import SUFFIX
 from ultragray_workers.storage.storage import NotThere, Storage

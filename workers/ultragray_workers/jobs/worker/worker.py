@@ -7,7 +7,6 @@ thread "heartbeat": `jobs.workers`                thread "housekeeper": `Houseke
 from __future__ import annotations
 
 import contextlib
-import fcntl
 import itertools
 import logging
 import os
@@ -16,15 +15,15 @@ import secrets
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
+from dataclasses import replace
 from itertools import islice
 from pathlib import Path
-from types import MappingProxyType
 
 from sqlalchemy.exc import SQLAlchemyError
 
 from ultragray.errors import InvalidArgument, UltragrayError
-from ultragray_workers.claims import remove_whole
+from ultragray_workers.claims import age_s, remove_whole, try_lock
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import StartupFailed, StorageUnavailable
 from ultragray_workers.jobs import queue
@@ -36,7 +35,6 @@ from ultragray_workers.jobs.worker.device import DeviceLock, Gate, devices_of
 from ultragray_workers.jobs.worker.supervision import Supervisor, WorkerConfig
 from ultragray_workers.jobs.workers import Heartbeat, Wanted
 from ultragray_workers.rounds import Rounds
-from ultragray_workers.storage.cache import DEFAULT_MAX_BYTES
 from ultragray_workers.storage.local import LocalStorage
 from ultragray_workers.storage.storage import Storage
 from ultragray_workers.store import OpenStore
@@ -50,69 +48,35 @@ _log = logging.getLogger("ultragray.jobs")
 
 
 def work(
-    artifact_folder: Path,
-    database_url: str | None,
+    config: WorkerConfig,
     stop: threading.Event,
     *,
-    storage: Storage | None = None,
-    max_copies_bytes: int = DEFAULT_MAX_BYTES,
     hurry: threading.Event | None = None,
-    name: str | None = None,
-    device: str = "auto",
-    labels: Mapping[str, str] = MappingProxyType({}),
-    threads: int = 0,
-    nice: int = 10,
-    max_footprint_pixels: int | None = None,
-    retention_days: float = 0.0,
-    stall_timeout_s: float = 0.0,
-    max_run_s: float = 0.0,
-    drain_timeout_s: float = 0.0,
     ready: Callable[[], None] = lambda: None,
     alive_every_s: float | None = None,
     tell_alive: Callable[[], None] = lambda: None,
 ) -> None:
     """Does jobs until `stop` is set; then the one at hand is put back into the queue with a checkpoint.
 
-    One that has no checkpoints gets `drain_timeout_s` to end first, or until `hurry` is set. `ready` is called when
-    jobs are taken, and `tell_alive` every `alive_every_s` while the worker is not stuck.
-
-    `device`: auto (every GPU of the host, and its processor), cpu, cuda (every GPU) or cuda:N. Jobs that ask for
-    another one, for more memory than it has, or for other labels than `labels` are left to other workers.
-
-    `storage` has datasets, the files of jobs and the scenes that they make; None: the artifact folder has. With another
-    one the artifact folder is this host's own, with copies of datasets of at most `max_copies_bytes`. No other worker
-    may have the `name` (None: that of the host, numbered); a worker that is started again under its name goes on with
-    its jobs at once. `threads` 0: all cores but one. A render job fails at a frame that costs more than
-    `max_footprint_pixels`, see ultragray.rendering.limits. Finished jobs are removed after `retention_days`; a job
-    fails whose process does not get on for `stall_timeout_s`, or that runs for `max_run_s` in all; 0: never. Raises
-    StartupFailed.
+    One that has no checkpoints gets the time to drain to end first, or until `hurry` is set. `ready` is called when
+    jobs are taken, and `tell_alive` every `alive_every_s` while the worker is not stuck. Raises StartupFailed.
     """
     try:
-        check_labels(labels, "label")
+        check_labels(config.labels, "label")
     except InvalidArgument as error:
         raise StartupFailed(error.detail, field="label") from None
-    devices = devices_of(device)
-    is_alone = storage is not None and storage.location != str(artifact_folder)  # workers elsewhere see it not
+    devices, storage = devices_of(config.device), config.storage
+    is_alone = storage.location != str(config.artifact_folder)  # workers elsewhere see it not
     with (
-        contextlib.closing(OpenStore(artifact_folder)),
-        claim_name(artifact_folder, name, host_of_its_own=is_alone) as worker,
+        contextlib.closing(OpenStore(config.artifact_folder)),
+        claim_name(config.artifact_folder, config.name, host_of_its_own=is_alone) as worker,
     ):
-        folder = artifact_folder.resolve()
-        storage = storage or LocalStorage(folder)
-        jobs = JobDatabase(artifact_folder, database_url, storage)
-        config = WorkerConfig(
-            artifact_folder=folder,
-            storage=storage,
-            name=worker,
-            max_copies_bytes=max_copies_bytes,
-            threads=threads or max(1, (os.cpu_count() or 1) - 1),
-            nice=nice,
-            max_footprint_pixels=max_footprint_pixels,
-            stall_timeout_s=stall_timeout_s,
-            max_run_s=max_run_s,
-        )
+        folder, threads = config.artifact_folder.resolve(), config.threads or max(1, (os.cpu_count() or 1) - 1)
+        config = replace(config, artifact_folder=folder, threads=threads)
+        jobs = JobDatabase(folder, config.database_url, storage)
         locks = [DeviceLock(folder, one, worker) for one in devices]
-        gate = Gate(jobs.identity, locks, tuple(sorted(labels.items())), lambda: queue.demands_waiting(jobs.engine))
+        labels = tuple(sorted(config.labels.items()))
+        gate = Gate(jobs.identity, locks, labels, lambda: queue.demands_waiting(jobs.engine))
         supervisor = Supervisor(config, jobs, gate)
 
         def obey(wanted: Wanted) -> None:
@@ -126,7 +90,7 @@ def work(
             worker,
             job_at_hand=lambda: supervisor.job_at_hand,
             is_stuck=lambda: supervisor.is_stuck,
-            device=device,
+            device=config.device,
             offer=gate.offer,
             obey=obey,
         )
@@ -136,17 +100,17 @@ def work(
             target=_take_jobs, args=(jobs, worker, gate, supervisor, stop), name="jobs", daemon=True
         )
         thread.start()
-        housekeeper = Housekeeper(jobs, folder, storage, retention_days)
-        if retention_days:
+        housekeeper = Housekeeper(jobs, folder, storage, config.retention_days)
+        if config.retention_days:
             housekeeper.start()
-        fields = {"worker": worker, "threads": config.threads, "offer": str(gate.offer)}
+        fields = {"worker": worker, "threads": threads, "offer": str(gate.offer)}
         _log.info(f"worker {worker} takes jobs", extra={"fields": fields})
         ready()
         while not stop.wait(alive_every_s):
             if not supervisor.is_stuck:
                 tell_alive()
         housekeeper.stop()
-        supervisor.stop(drain_timeout_s, hurry or threading.Event())
+        supervisor.stop(config.drain_timeout_s, hurry or threading.Event())
         thread.join(POLLING_INTERVAL_S)
         heartbeat.stop()
         jobs.close()
@@ -188,9 +152,7 @@ def claim_name(artifact_folder: Path, name: str | None, *, host_of_its_own: bool
         candidates = (f"{host}-{number}" for number in itertools.count())
     for candidate in candidates:
         with (folder / f"{candidate}.lock").open("a") as file:
-            try:
-                fcntl.lockf(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-            except BlockingIOError:
+            if not try_lock(file):
                 continue
             yield candidate
             return
@@ -243,7 +205,7 @@ class Housekeeper:
                     kept.add(job_id)
             self._stop.wait(STEP_PAUSE_S)
         removed += self._remove_unknown(self._stored_ids(), self._files.remove)
-        folders = {path.name: path for path in (self._artifact_folder / WORK).glob("*") if _age_s(path) > DAY_S}
+        folders = {path.name: path for path in (self._artifact_folder / WORK).glob("*") if age_s(path) > DAY_S}
         by_id = {name.partition(".")[0]: path for name, path in folders.items()}
         removed += self._remove_unknown(by_id, lambda job_id: remove_whole(by_id[job_id]))
         return removed + DatasetStore(self._artifact_folder, self._storage).remove_stray_files()
@@ -276,10 +238,3 @@ class Housekeeper:
                 except (UltragrayError, SQLAlchemyError, OSError) as error:
                     _log.warning(f"old jobs are kept for now: {str(error).splitlines()[0]}")
             self._stop.wait(INTERVAL_S)
-
-
-def _age_s(path: Path) -> float:
-    try:
-        return time.time() - path.stat().st_mtime
-    except FileNotFoundError:
-        return 0.0

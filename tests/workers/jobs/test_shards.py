@@ -11,7 +11,7 @@ from ultragray_workers.jobs.kinds import RenderJob
 from ultragray_workers.jobs.progress import JobState
 from ultragray_workers.jobs.tables import JOBS, SHARDS
 
-from ..conftest import train_job
+from .conftest import train_job
 
 SEED = 11
 
