@@ -70,8 +70,8 @@ _ANSWER = answer(
     "The frames. image/png and image/jpeg: one pose, one output. application/octet-stream (parameter dtype=uint8, "
     "float32 or float16): the outputs one after another, each [C, H, W]. application/x-npz holds one float32 array "
     "[C, H, W] per output, `poses` [C, 4, 4], and the strings scene, scene_sha256 and renderer. application/dicom: a "
-    "multi-frame ultrasound image of bmode, true to scale: fans are scan-converted. `*/*` gives PNG where it can hold the request, "
-    "else npz.",
+    "multi-frame ultrasound image of bmode, true to scale: fans are scan-converted. `*/*` gives PNG where it can hold "
+    "the request, else npz.",
     *(PNG, JPEG, RAW, NPZ, DICOM),
     headers=RENDER_HEADERS,
 )
