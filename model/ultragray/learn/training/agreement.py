@@ -47,6 +47,7 @@ LEAST_GAIN_DB = 0.05  # of a path without noise
 GAIN_OF_SHARES_DB = 0.3  # tissue is rigid unless the images say clearly that it is not
 SHARE_STEP = 0.25
 FAR = 4  # frames away from the one that is predicted
+LEAST_PREDICTED = 8  # frames: fewer may fit any shares by chance
 
 Shares: TypeAlias = tuple[float, float, float]  # of the motion within the plane: lateral, axial, turn
 RIGID: Shares = (1.0, 1.0, 1.0)
@@ -149,7 +150,8 @@ def _without_delay(
 
 
 def _found_shares(judge: _Judge, poses: FloatArray, ranges: Sequence[range], places: IntArray) -> Shares:
-    """The shares that predict frames best, first alike for all three, then each; RIGID where they gain little.
+    """The shares that predict frames best, first alike for all three, then each; RIGID where they gain little, or where
+    few frames can be predicted.
 
     Frames are predicted from their neighbours and from those FAR away. A slow hand hardly moves within the plane from
     one frame to the next: then far ones tell. They show less of the same anatomy, and alone they would err.
@@ -160,6 +162,8 @@ def _found_shares(judge: _Judge, poses: FloatArray, ranges: Sequence[range], pla
         path = with_shares(poses, ranges, judge.sweep.probe, shares)[places]
         return (judge.psnr_db(path) + judge.psnr_db(path, FAR)) / 2.0
 
+    if len(judge.frames) < LEAST_PREDICTED:
+        return RIGID
     common = np.arange(1.0, -SHARE_STEP / 2, -SHARE_STEP).tolist()
     best: Shares = max(((share, share, share) for share in common), key=psnr_db)
     for number in range(3):

@@ -80,6 +80,13 @@ def test_a_slow_hand_is_told_from_tissue_that_follows(share):
     assert agreed_path(given).shares == (share,) * 3
 
 
+def test_a_few_frames_do_not_tell_of_tissue():
+    tracked = hand_path()
+    given = recording(with_shares(tracked, [range(FRAMES)], PROBE, (0.0, 0.0, 0.0)), tracked)
+    few = replace(given, train=given.train.select(np.arange(9)), val=given.val.select(np.arange(8)))
+    assert agreed_path(few).shares == RIGID
+
+
 def test_a_check_tells_of_it():
     truth = hand_path()
     given = recording(with_shares(truth, [range(FRAMES)], PROBE, (0.0, 0.0, 0.0)), shaken(truth, 0.3, 0.2))
