@@ -1,4 +1,4 @@
-// Adam (docs/physics.md §6) over a stretch of a parameter, in one pass over memory.
+// Adam (docs/physics.md §7) over a stretch of a parameter, in one pass over memory.
 
 #pragma once
 
