@@ -45,9 +45,17 @@ class Encoding(str, Enum):
 
     @property
     def pixel_type(self) -> np.dtype[Any]:
-        return np.dtype({"float16": "<f2", "float32": "<f4", "npz": "<f4"}.get(self.value, "u1"))
+        return _PIXEL_TYPES[self]
 
 
+_PIXEL_TYPES = {
+    Encoding.UINT8: np.dtype("u1"),
+    Encoding.FLOAT32: np.dtype("<f4"),
+    Encoding.FLOAT16: np.dtype("<f2"),
+    Encoding.PNG: np.dtype("u1"),
+    Encoding.JPEG: np.dtype("u1"),
+    Encoding.NPZ: np.dtype("<f4"),
+}
 FRAME_ENCODINGS = tuple(one.value for one in Encoding if one is not Encoding.NPZ)
 """Those of one frame; npz is an archive of many."""
 
