@@ -48,7 +48,7 @@ class Encoding(str, Enum):
         return _PIXEL_TYPES[self]
 
 
-_PIXEL_TYPES = {
+_PIXEL_TYPES: dict[Encoding, np.dtype[Any]] = {
     Encoding.UINT8: np.dtype("u1"),
     Encoding.FLOAT32: np.dtype("<f4"),
     Encoding.FLOAT16: np.dtype("<f2"),
