@@ -173,7 +173,7 @@ def test_what_did_not_change_is_not_sent_again(http, artifacts):
 
 
 def test_who_stops_during_the_check_gets_no_scene(service, http, artifacts):
-    whole = make_scene(probe=DEMO_PROBE, seed=8).to_bytes()
+    whole = make_scene(300_000, probe=DEMO_PROBE, seed=8).to_bytes()  # whose check takes long enough to be seen
     url = httpx.URL(service.http)
     with socket.create_connection((url.host, url.port)) as connection:
         head = f"PUT /v1/scenes/stopped HTTP/1.1\r\nHost: {url.host}\r\nContent-Length: {len(whole)}\r\n\r\n"
