@@ -186,7 +186,7 @@ def test_interactive_frames_go_before_a_batch(slow):
     with slow.channel() as channel, httpx.Client(timeout=60) as client:
         stub = rendering_pb2_grpc.RenderServiceStub(channel)
         settings = rendering_pb2.RenderSettings(scene="demo", **SMALL)
-        batch = rendering_pb2.RenderBatchRequest(settings=settings, poses=[moved(0)] * 10)
+        batch = rendering_pb2.RenderBatchRequest(settings=settings, poses=[moved(0)] * 60)
         received = []
         reader = threading.Thread(target=lambda: received.extend(f.sequence for f in stub.RenderBatch(batch)))
         reader.start()
@@ -194,8 +194,8 @@ def test_interactive_frames_go_before_a_batch(slow):
         assert render(slow, client, **SMALL).status_code == 200
         done_before = len(received)
         reader.join()
-        assert done_before <= 4
-        assert received == list(range(10))
+        assert done_before < len(received) / 2  # after the batch, it would have come behind all of it
+        assert received == list(range(60))
 
 
 def test_a_port_in_use_is_one_clear_error(start_service, service):
