@@ -1,71 +1,37 @@
-"""Poses at 60 Hz through a door, and how old the frames are when a reader takes them, however slowly."""
+"""Whether frames of a latest stream are of the newest poses when a reader takes them, however seldom it does."""
 
 from __future__ import annotations
 
-import threading
-import time
-from dataclasses import dataclass
 from typing import Protocol
 
-from .waiting import at_this_load
-
-PERIOD_S = 1 / 60
-SPARE_S = 0.15  # beside the reader's own period
-# Between one reading and the next: at once, quickly, slowly, after a long stall, and slowly again.
-PAUSES_S = (*[0.0] * 20, *[0.05] * 5, *[0.3] * 2, 1.0, *[0.05] * 5)
+# How many poses are sent between one reading and the next: at once, quickly, slowly, after a long stall, slowly again.
+POSES = (*[1] * 20, *[3] * 5, *[20] * 2, 200, *[5] * 10)
 
 
 class Door(Protocol):
     """One client's latest stream."""
 
-    def send(self):
-        """Sends a pose, with the time as it is."""
+    def send(self, number: int) -> None:
+        """Sends the pose of a number."""
 
-    def receive(self):
-        """Takes a frame; the time.monotonic() of its pose."""
-
-
-@dataclass(frozen=True)
-class Reading:
-    """One frame that was taken."""
-
-    pause_s: float  # since the reading before
-    age_s: float  # of its pose
+    def receive(self) -> int:
+        """Takes a frame; the number of its pose."""
 
 
-def read_slowly(door):
-    """The frames that a reader takes, with pauses, while poses come at 60 Hz."""
-    stop = threading.Event()
+def check_fresh(door, ahead=1):
+    """Each frame was rendered after the reader had taken the one that was so many before it, from the newest pose.
 
-    def send():
-        while not stop.wait(PERIOD_S):
-            door.send()
-
-    sender = threading.Thread(target=send)
-    sender.start()
-    try:
-        door.receive()  # the scene is loaded by then
-        readings, last = [], time.monotonic()
-        for pause_s in PAUSES_S:
-            time.sleep(pause_s)
-            begun = time.monotonic()
-            measured = door.receive()
-            now = time.monotonic()
-            readings.append(Reading(begun - last, now - measured))
-            last = now
-        return readings
-    finally:
-        stop.set()
-        sender.join()
-
-
-def check_fresh(door, pauses=1):
-    """No frame is older than the reader's own pause, or so many of its last pauses, and 150 ms."""
-    readings = read_slowly(door)
-    spare_s = at_this_load(SPARE_S)
+    `ahead`: 1 where the service knows what the reader has taken; else what lies in buffers on the way counts, too.
+    """
+    sent, taken = 0, []
+    for count in POSES:
+        for _ in range(count):
+            sent += 1
+            door.send(sent)
+        taken.append((door.receive(), sent))
     old = {}
-    for index, one in enumerate(readings):
-        last = readings[max(0, index + 1 - pauses) : index + 1]
-        if one.age_s > sum(reading.pause_s for reading in last) + spare_s:
-            old[index] = one
-    assert not old, f"older than {pauses} pauses and {spare_s:.3f} s: {old}"
+    for index, (number, _) in enumerate(taken[ahead:]):
+        _, sent_before = taken[index]
+        if number < sent_before:
+            old[index + ahead] = number, sent_before
+    assert not old, f"frames by their place, each of an older pose than was sent before: {old}"

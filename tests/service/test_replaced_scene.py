@@ -56,13 +56,14 @@ def service(start_service, changing, folder):
 def check(changing, ask):
     """Both contents are seen while they are swapped, at most once during an answer, each with its own probe only."""
     seen = set()
-    answered = threading.Semaphore(0)
-    done = threading.Event()
+    may_swap, idle, done = threading.Event(), threading.Event(), threading.Event()
 
     def swap():
         for _ in range(SWAPS):
-            assert answered.acquire(timeout=60)
-            time.sleep(BETWEEN_SWAPS_S)
+            idle.set()
+            assert may_swap.wait(60)
+            may_swap.clear()
+            time.sleep(BETWEEN_SWAPS_S)  # into this answer or a later one
             changing.swap()
         done.set()
 
@@ -70,8 +71,10 @@ def check(changing, ask):
     swapping.start()
     try:
         while not done.is_set() or seen != changing.known:
+            if idle.is_set():
+                idle.clear()
+                may_swap.set()
             seen.update(ask())
-            answered.release()
             assert seen <= changing.known
             if done.is_set():
                 changing.swap()

@@ -133,7 +133,7 @@ def test_a_search_ends_at_its_deadline_and_with_its_caller(http, png):
     assert late.status_code == 504
     asked = body(png, within_mm=20, within_deg=30)
     with pytest.raises(httpx.ReadTimeout):
-        http.post("/v1/scenes/spine:localize", json=asked, timeout=0.05)
+        http.post("/v1/scenes/spine:localize", json=asked, timeout=httpx.Timeout(60.0, read=0.05))
     end = Deadline(60.0)
     while http.get("/v1/statistics").json()["busy_processes"]:
         assert not end.passed

@@ -27,7 +27,7 @@ from ultragray_service.settings import load_settings
 from ultragray_workers.jobs.database import JobDatabase
 from ultragray_workers.jobs.tables import USAGE
 
-from ...waiting import SkippingLoop, wait_until
+from ...waiting import wait_until
 from ..cli.command_line import run
 from ..conftest import RunningService, split
 from ..igtl.conftest import Peer, address_of
@@ -61,16 +61,6 @@ def test_a_key_keeps_limits_of_its_own(tmp_path):
     refused = run("keys", "create", "carol", "--role", "reader", "--limit", "frames=3", *where)
     assert refused.exit_code == 2
     assert "got 'frames=3'" in refused.stderr
-
-
-@pytest.fixture
-def clock(monkeypatch):
-    """An event loop whose time is everybody's."""
-    loop = SkippingLoop()
-    for name in ("time", "monotonic"):
-        monkeypatch.setattr(time, name, loop.time)
-    yield loop
-    loop.close()
 
 
 def test_a_client_has_so_many_in_any_second_and_is_told_when_there_are_more(clock):

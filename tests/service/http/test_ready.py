@@ -96,9 +96,8 @@ def test_a_service_whose_sqlite_file_is_read_only_is_not_ready(service, folder):
 def test_a_service_without_its_share_is_not_ready(service, folder, tmp_path):
     folder.rename(tmp_path / "unmounted")
     folder.mkdir()
-    components = wait_for(service, 503)["components"]
-    wait_until(lambda: not ready(service)[1]["components"]["artifacts"]["ready"])
-    assert not components["jobs"]["ready"]
+    wait_for(service, 503)
+    wait_until(lambda: not any(ready(service)[1]["components"][name]["ready"] for name in ("artifacts", "jobs")))
     assert str(tmp_path) not in str(ready(service))
 
 
