@@ -102,6 +102,11 @@ class RunningService:
         lines = httpx.get(f"{self.http}/metrics", timeout=60).text.splitlines()
         return sum(float(line.rpartition(" ")[2]) for line in lines if line.startswith(names))
 
+    def poses_from(self, port):
+        """How many have come over the stream of a client at a port of this machine."""
+        streams = httpx.get(f"{self.http}/v1/streams", timeout=60).json()["streams"]
+        return next((one["poses"] for one in streams if one["client"].endswith(f":{port}")), 0)
+
     def stream_url(self, scene="demo"):
         """The WebSocket of a scene."""
         return f"{self.http.replace('http', 'ws', 1)}/v1/scenes/{scene}/stream"

@@ -11,6 +11,7 @@ from websockets.sync.client import connect
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2
 
 from ..freshness import check_fresh
+from ..waiting import wait_until
 from .conftest import split
 
 IDENTITY = geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=np.eye(4).ravel().tolist()))
@@ -52,12 +53,14 @@ class GrpcDoor:
 class WebSocketDoor:
     """A client that reads a WebSocket."""
 
-    def __init__(self, connection, settings):
-        self._connection = connection
+    def __init__(self, service, connection, settings):
+        self._connection, port = connection, connection.local_address[1]
+        self._poses = lambda: service.poses_from(port)
         connection.send(json.dumps({"mode": "latest", "settings": settings}))
 
     def send(self, number):
         self._connection.send(json.dumps({"pose": {"matrix": np.eye(4).tolist()}, "sequence": number}))
+        wait_until(lambda: self._poses() == number)
 
     def receive(self):
         about, _ = split(self._connection.recv(timeout=60))
@@ -85,7 +88,7 @@ def test_grpc(open_grpc, settings):
 @pytest.mark.parametrize("settings", [SMALL, pytest.param(LARGE, marks=pytest.mark.long)], ids=["small", "large"])
 def test_websocket_without_acknowledgements(service, settings):
     with connect(service.stream_url(), compression=None, max_size=None, close_timeout=0.2) as connection:
-        check_fresh(WebSocketDoor(connection, settings), ahead=3)
+        check_fresh(WebSocketDoor(service, connection, settings))
 
 
 def test_no_more_answers_come_than_the_window_has_room_for(open_grpc, service):

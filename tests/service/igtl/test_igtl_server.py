@@ -20,6 +20,7 @@ from ultragray_service.igtl.contents import (
 )
 
 from ...freshness import check_fresh
+from ...waiting import wait_until
 from ..conftest import DEMO_PROBE, HEIGHT, WIDTH
 from ..rpc.test_grpc_render import matrix_pose
 from .conftest import address_of, moved, pyigtl_client, random_pose
@@ -200,11 +201,13 @@ def test_a_port_in_use_stops_the_start(start_service, igtl_service):
 class SlowPeer:
     """A client that acknowledges nothing; timestamps number its poses."""
 
-    def __init__(self, peer, device_name):
-        self._peer, self._device_name = peer, device_name
+    def __init__(self, service, peer, device_name):
+        self._peer, self._device_name, port = peer, device_name, peer.socket.getsockname()[1]
+        self._poses = lambda: service.poses_from(port)
 
     def send(self, number):
         self._peer.send_pose(moved(0.0), self._device_name, timestamp=number << 32)
+        wait_until(lambda: self._poses() == number)
 
     def receive(self):
         message = self._peer.receive()
@@ -215,5 +218,5 @@ class SlowPeer:
 @pytest.mark.parametrize(
     "scene", ["demo", *(pytest.param(scene, marks=pytest.mark.long) for scene in ("medium", "large"))]
 )
-def test_a_slow_reader_gets_no_old_image(peer, scene):
-    check_fresh(SlowPeer(peer, scene), ahead=3)
+def test_a_slow_reader_gets_no_old_image(igtl_service, peer, scene):
+    check_fresh(SlowPeer(igtl_service, peer, scene))
