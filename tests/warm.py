@@ -33,7 +33,7 @@ from types import SimpleNamespace
 SOURCE_FOLDERS = ("model", "proto", "workers", "service", "client", "studies")
 _MAX_REQUEST_BYTES = 2**17
 _STANDARD_FILES = 3
-_START_TIMEOUT_S = 120.0
+_START_TIMEOUT_S = 300.0
 _IS_ONE_OF_SEVERAL = "PYTEST_XDIST_WORKER" in os.environ  # the process of the run is the parent of this one
 
 

@@ -15,6 +15,7 @@ import httpx
 import numpy as np
 import pytest
 import torch
+from websockets.sync.client import connect
 
 from ultragray import GaussianScene, LinearProbe, SceneInfo
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc, scenes_pb2_grpc
@@ -23,8 +24,10 @@ from ..waiting import Deadline
 from ..warm import SOURCE_FOLDERS, WARM, WarmProcess, fork, pool_processes
 
 ROOT = Path(__file__).resolve().parents[2]
-START_TIMEOUT_S = 120.0
-STOP_TIMEOUT_S = 60.0
+START_TIMEOUT_S = 300.0
+STOP_TIMEOUT_S = 300.0
+
+connect.__kwdefaults__.update(open_timeout=STOP_TIMEOUT_S, ping_timeout=STOP_TIMEOUT_S)  # others may keep it busy
 
 HEIGHT, WIDTH = 64, 48  # of the training images of the test scene
 _numbers = itertools.count()  # of services
@@ -99,12 +102,12 @@ class RunningService:
 
     def metric(self, *names):
         """The sum of all lines of /metrics, at one moment, that begin with one of the names."""
-        lines = httpx.get(f"{self.http}/metrics", timeout=60).text.splitlines()
+        lines = httpx.get(f"{self.http}/metrics", timeout=300).text.splitlines()
         return sum(float(line.rpartition(" ")[2]) for line in lines if line.startswith(names))
 
     def poses_from(self, port):
         """How many have come over the stream of a client at a port of this machine."""
-        streams = httpx.get(f"{self.http}/v1/streams", timeout=60).json()["streams"]
+        streams = httpx.get(f"{self.http}/v1/streams", timeout=300).json()["streams"]
         return next((one["poses"] for one in streams if one["client"].endswith(f":{port}")), 0)
 
     def stream_url(self, scene="demo"):
@@ -234,7 +237,7 @@ def service(start_shared_service):
 
 @pytest.fixture(scope="session")
 def http(service):
-    with httpx.Client(base_url=service.http, timeout=120) as client:
+    with httpx.Client(base_url=service.http, timeout=300) as client:
         yield client
 
 

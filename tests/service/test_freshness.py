@@ -63,7 +63,7 @@ class WebSocketDoor:
         wait_until(lambda: self._poses() == number)
 
     def receive(self):
-        about, _ = split(self._connection.recv(timeout=60))
+        about, _ = split(self._connection.recv(timeout=300))
         return about["sequence"]
 
 

@@ -25,7 +25,7 @@ from ultragray_service.telemetry.logs import HumanFormatter
 from ..waiting import at_this_load
 from .cli.command_line import python
 
-WAIT_S = 60.0
+WAIT_S = 300.0
 
 
 @pytest.fixture

@@ -22,7 +22,7 @@ from ..waiting import Deadline, wait_until
 from ..warm import WARM, pool_processes, start_template
 from .asking import HEIGHT, PROBE, WIDTH
 
-TIME_LIMIT_S = 180.0
+TIME_LIMIT_S = 600.0
 
 T = TypeVar("T")
 
@@ -136,7 +136,7 @@ def open_channels_and_memories():
 
 @pytest.fixture
 def until():
-    async def wait(condition, timeout_s=60.0):
+    async def wait(condition, timeout_s=300.0):
         """Returns once the condition holds."""
         give_up = Deadline(timeout_s)
         while not condition():

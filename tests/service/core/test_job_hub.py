@@ -10,7 +10,7 @@ from ultragray_workers.jobs.progress import JobState, Progress
 from ultragray_workers.jobs.record import Job
 
 INTERVAL_S = 0.02
-WAIT_S = 60.0
+WAIT_S = 300.0
 
 
 @pytest.fixture(autouse=True)

@@ -25,7 +25,7 @@ OTHER_KEYS = (f"{KEY}-2", f"{KEY}-3")
 KEY_HEADER = {"X-API-Key": KEY}
 LIMIT_BYTES = 200_000
 ZIP = "application/zip"
-WAIT_S = 120.0
+WAIT_S = 300.0
 
 
 def sweep(count, offset_mm, seed=0):
@@ -109,7 +109,7 @@ def service(start_service, artifacts):
 
 @pytest.fixture(scope="module")
 def http(service):
-    with httpx.Client(base_url=service.http, headers=KEY_HEADER, timeout=120) as client:
+    with httpx.Client(base_url=service.http, headers=KEY_HEADER, timeout=300) as client:
         yield client
 
 

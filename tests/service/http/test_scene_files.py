@@ -28,7 +28,7 @@ def service(start_service, artifacts):
 
 @pytest.fixture(scope="module")
 def http(service):
-    with httpx.Client(base_url=service.http, timeout=60) as client:
+    with httpx.Client(base_url=service.http, timeout=300) as client:
         yield client
 
 

@@ -32,7 +32,7 @@ def over_grpc(service, scene, pose):
     with service.channel() as channel:
         stub = rendering_pb2_grpc.RenderServiceStub(channel)
         settings = rendering_pb2.RenderSettings(scene=scene)
-        frame = stub.Render(rendering_pb2.RenderRequest(settings=settings, pose=matrix_pose(pose)), timeout=60)
+        frame = stub.Render(rendering_pb2.RenderRequest(settings=settings, pose=matrix_pose(pose)), timeout=300)
         return np.frombuffer(frame.data, np.uint8).reshape(frame.height, frame.width)
 
 
@@ -46,7 +46,7 @@ def test_pyigtl_gets_the_frame_of_its_pose_in_its_place(igtl_service, version):
     theirs.header_version = version
     with pyigtl_client(address_of(igtl_service)) as client:
         client.send_message(theirs)
-        answer = client.wait_for_message("Image_Reference", timeout=60)
+        answer = client.wait_for_message("Image_Reference", timeout=300)
     assert isinstance(answer, pyigtl.ImageMessage)
     assert (answer.timestamp, answer.header_version) == (1234.5, version)
     assert np.array_equal(answer.image[0], over_grpc(igtl_service, "demo", pose))
@@ -192,7 +192,7 @@ def test_a_stop_answers_what_was_asked_and_is_told(start_service, igtl_folder, c
 
 def test_a_port_in_use_stops_the_start(start_service, igtl_service):
     service = start_service(wait=False, igtl_port=address_of(igtl_service).rpartition(":")[2])
-    assert service.process.wait(60) != 0
+    assert service.process.wait(300) != 0
     assert (
         "the port is in use; give another one with --igtl-port or ULTRAGRAY_IGTL_PORT" in service.log_path.read_text()
     )

@@ -12,7 +12,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from ...waiting import wait_until
 
 TOTAL, PER_ADDRESS = 40, 10
-TIMEOUT_S = 60.0
+TIMEOUT_S = 300.0
 PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + b"\0\0\0\4\0\0\0\0\0"  # with empty SETTINGS
 
 

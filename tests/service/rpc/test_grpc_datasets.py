@@ -52,7 +52,7 @@ def parts(files, chunk_bytes=1000):
 
 
 def upload(stub, *messages):
-    return stub.UploadDataset(iter(messages), metadata=METADATA, timeout=120)
+    return stub.UploadDataset(iter(messages), metadata=METADATA, timeout=300)
 
 
 def refusal(call, *arguments, **keywords):

@@ -32,7 +32,7 @@ class SlowStorage(LocalStorage):
     def download(self, key, path, *, version=None):
         self.asked.append(key)
         if key.startswith("slow"):
-            assert self.go.wait(60)
+            assert self.go.wait(300)
         return super().download(key, path, version=version)
 
 
@@ -146,7 +146,7 @@ Cache(Path(sys.argv[1]), 3000, 0.0).pin(storage, "a", storage.entry("a").version
 
 
 def test_a_process_that_dies_while_it_fetches_leaves_nothing_that_stays(cache, source):
-    assert subprocess.run([sys.executable, "-c", DIES, cache.folder, source.folder], timeout=60).returncode == 7
+    assert subprocess.run([sys.executable, "-c", DIES, cache.folder, source.folder], timeout=300).returncode == 7
     assert cache.held_bytes() == SIZE  # its space
     for key in ("b", "c", "d", "a"):
         assert fetch(cache, source, key) == key.encode() * SIZE

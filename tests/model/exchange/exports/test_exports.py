@@ -169,7 +169,7 @@ def test_a_portion_is_written_while_the_next_is_rendered():
     may_write = threading.Event()
 
     def write(number):
-        assert may_write.wait(60)
+        assert may_write.wait(300)
         written.append(number)
 
     def give():

@@ -40,7 +40,7 @@ def poses(count):
     return np.tile(np.eye(4), (count, 1, 1)).tolist()  # type: ignore[no-any-return]
 
 
-def process_of(worker, *, not_=None, timeout_s=60.0):
+def process_of(worker, *, not_=None, timeout_s=300.0):
     """The process of the worker's job, once there is one."""
     end = Deadline(timeout_s)
     while (process := worker.job_process()) in (None, not_):
