@@ -117,6 +117,7 @@ class WarmServer:
             start_new_session=True,  # what is sent to the group of one test process is not for it
             env={
                 **os.environ,
+                "PYTEST_RUN": "",  # a fork belongs to the tests that asked for it
                 "OMP_NUM_THREADS": "1",
                 "OPENBLAS_NUM_THREADS": "1",  # a process with threads must not be forked
                 "PYTHONPATH": os.pathsep.join(str(Path(__file__).parents[1] / folder) for folder in SOURCE_FOLDERS),
