@@ -101,6 +101,25 @@ def grey_frames(frames: npt.NDArray[Any], source: str) -> ByteArray:  # [F, H, W
     return grey
 
 
+def eight_bits(stored: npt.NDArray[Any], source: str) -> tuple[ByteArray, tuple[str, ...]]:  # [F, …]
+    """Frames of 8 or 16 bits as 8, and what is to be told of it.
+
+    Of 16 bits the power of two above the largest value becomes 256, so that recordings of one scanner are scaled alike.
+    Raises DatasetInvalid for values below 0.
+    """
+    if stored.dtype == np.uint8:
+        return stored, ()
+    if int(stored.min()) < 0:
+        raise DatasetInvalid(
+            f"{source}: 16-bit pixels must not be below 0, the smallest is {stored.min()}: RF data, not B-mode?"
+        )
+    surplus = max(0, int(stored.max()).bit_length() - 8)
+    pixels = np.empty(stored.shape, np.uint8)
+    for frame, out in zip(stored, pixels, strict=True):
+        out[:] = frame >> surplus
+    return pixels, (f"pixels of 16 bits were made 8: {(256 << surplus) - 1} became 255",)
+
+
 def frame_size(shape: tuple[int, ...]) -> tuple[int, int] | None:
     """Height and width of frames stored in an array of this shape; None where it cannot hold frames."""
     if 0 in shape:

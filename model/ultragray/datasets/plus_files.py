@@ -16,7 +16,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from ultragray.datasets.images import MAX_PIXEL_BYTES
+from ultragray.datasets.images import MAX_PIXEL_BYTES, eight_bits
 from ultragray.errors import DatasetInvalid
 from ultragray.learn.sweep import ByteArray
 
@@ -125,7 +125,7 @@ class Payload:
             raise DatasetInvalid(f"{self.header}: {len(paths)} files cannot hold {shape[0]} frames in equal shares")
         shares = [self._share(path, expected // len(paths)) for path in paths]
         stored = (shares[0] if len(shares) == 1 else np.concatenate(shares)).view(self.dtype).reshape(shape)
-        return (np.asarray(stored, np.uint8), ()) if width == 1 else _eight_bits(stored, self.header)
+        return eight_bits(stored, str(self.header))
 
     def _share(self, path: Path, expected: int) -> ByteArray:
         size = path.stat().st_size
@@ -144,18 +144,6 @@ class Payload:
             pixels = _inflate(file.read(deflated_limit), path, expected)
         _require_size(path, self.header, len(pixels), expected)
         return np.frombuffer(pixels, np.uint8)
-
-
-def _eight_bits(stored: np.ndarray, header: Path) -> tuple[ByteArray, tuple[str, ...]]:
-    if int(stored.min()) < 0:
-        raise DatasetInvalid(
-            f"{header}: 16-bit pixels must not be below 0, the smallest is {stored.min()}: RF data, not B-mode?"
-        )
-    surplus = max(0, int(stored.max()).bit_length() - 8)
-    pixels = np.empty(stored.shape, np.uint8)
-    for frame, out in zip(stored, pixels, strict=True):
-        out[:] = frame >> surplus
-    return pixels, (f"pixels of 16 bits were made 8: {(256 << surplus) - 1} became 255",)
 
 
 def _inflate(data: bytes, path: Path, expected: int) -> bytes:

@@ -49,7 +49,10 @@ def test_poses_in_json_and_a_scale_without_regions(write, tmp_path):
     (tmp_path / "sweep.poses.json").write_text(json.dumps(POSES[:, :3].tolist()))
     dataset = load_dataset(path)
     assert dataset.probe == LinearProbe(12.8, 0.0, 4.8)
-    assert dataset.train.notes == ("the file does not name its transducer: taken as a linear one",)
+    assert dataset.train.notes == (
+        "no region in centimetres: the whole image of 32 x 24 pixels is taken as ultrasound",
+        "the file does not name its transducer: taken as a linear one",
+    )
 
 
 def test_compressed_frames_are_read_where_there_is_a_decoder(write):
