@@ -205,16 +205,18 @@ def _value(path: Path, header: Any, name: str) -> Any:
 def _shape(path: Path, header: Any, *, is_fan: bool) -> tuple[int, int, int]:  # frames, rows, columns
     """The size of the frames. Raises DatasetInvalid for what is no cine loop of 8 bits in grey or colour, and for a
     probe that is not linear unless its fan is known."""
-    bits, stored = _value(path, header, "BitsAllocated"), header.get("BitsStored", 8)
+    bits, interpretation = _value(path, header, "BitsAllocated"), str(_value(path, header, "PhotometricInterpretation"))
+    with _in_our_words(path):
+        stored = int(header.get("BitsStored", 8))
+        high = int(header.get("HighBit", stored - 1))
     if bits not in (8, 16) or header.get("PixelRepresentation", 0) != 0:
         raise DatasetInvalid(
             f"{path}: pixels must have 8 or 16 bits (BitsAllocated) without a sign, got {str(bits)[:40]}"
         )
-    interpretation = str(_value(path, header, "PhotometricInterpretation"))
     samples = _value(path, header, "SamplesPerPixel")
-    if header.get("HighBit", stored - 1) != stored - 1:
-        raise DatasetInvalid(f"{path}: HighBit must be BitsStored - 1, {stored - 1}, got {str(header.HighBit)[:40]}")
-    if INTERPRETATIONS.get(interpretation) != samples or not 1 <= int(stored) <= bits:
+    if high != stored - 1:
+        raise DatasetInvalid(f"{path}: HighBit must be BitsStored - 1, {stored - 1}, got {high}")
+    if INTERPRETATIONS.get(interpretation) != samples or not 1 <= stored <= bits:
         raise DatasetInvalid(
             f"{path}: PhotometricInterpretation must be {', '.join(INTERPRETATIONS)} with SamplesPerPixel 1 or 3, got "
             f"{interpretation[:40]} with {str(samples)[:40]}"

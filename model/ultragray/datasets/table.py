@@ -136,7 +136,7 @@ def _read_calibration(path: Path) -> TableCalibration:
         order = found.euler_order
         if order is not None and "".join(sorted(order)) not in ("XYZ", "xyz"):
             raise ValueError(f"euler_order must be the three letters XYZ or xyz in an order, got {order[:20]!r}")
-    except (ValueError, TypeError, RecursionError) as error:
+    except (ValueError, TypeError, OverflowError, RecursionError) as error:
         raise DatasetInvalid(f"{path}: the calibration cannot be read: {error}") from error
     return found
 

@@ -103,6 +103,7 @@ COMPRESSED = encapsulate([b"\xff\xd8\xff\xd9"] * len(FRAMES))
         ({"poses": POSES * 2.0}, r"sweep\.poses\.npy: frame 0: its pose must end in the row"),
         ({"SamplesPerPixel": 3}, r"with SamplesPerPixel 1 or 3, got MONOCHROME2 with 3"),
         ({"PhotometricInterpretation": "CMYK"}, r"must be MONOCHROME1, MONOCHROME2, PALETTE COLOR, .* got CMYK with 1"),
+        ({"BitsStored": [8, 8]}, r"it cannot be read as DICOM"),
         ({"BitsAllocated": 32}, r"pixels must have 8 or 16 bits \(BitsAllocated\) without a sign, got 32"),
         ({"TransducerType": "CURVED LINEAR"}, r"TransducerType is CURVED LINEAR: say with fan"),
         ({"NumberOfFrames": None}, r"it lacks NumberOfFrames"),

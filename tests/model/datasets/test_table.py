@@ -142,6 +142,11 @@ def test_rows_without_a_pose_are_left_out(write):
         ("time,x_mm,y_mm,z_mm,qw,qx,qy,qz", {"euler_order": "XX"}, "euler_order must be the three letters XYZ"),
         ("time,x_mm,y_mm,z_mm,qw,qx,qy,qz", {"euler_order": "ZYZ"}, "euler_order must be the three letters XYZ"),
         ("time,x_mm,y_mm,z_mm,qw,qx,qy,qz", {"image_to_sensor": [1, 2]}, "image_to_sensor must be 16 finite numbers"),
+        (
+            "time,x_mm,y_mm,z_mm,qw,qx,qy,qz",
+            {"image_to_sensor": [10**400] * 16},
+            "the calibration cannot be read: int too large",
+        ),
         ("time,x_mm,y_mm,z_mm,qw,qx,qy,qz", {"position_unit": "inch"}, "the calibration cannot be read: position_unit"),
         (
             "time,x_mm,y_mm,z_mm,qw,qx,qy,qz",
