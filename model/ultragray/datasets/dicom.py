@@ -309,8 +309,8 @@ def _region(path: Path, header: Any, shape: tuple[int, int, int], crop: str | No
 
 def _pixel_spacing(header: Any) -> tuple[float, float] | None:
     """Lateral and axial size of a pixel, mm; of an enhanced file among the measures that its frames share."""
-    shared = next(iter(header.get("SharedFunctionalGroupsSequence", [])), {})
-    measures = next(iter(shared.get("PixelMeasuresSequence", [])), {})
+    shared: Any = next(iter(header.get("SharedFunctionalGroupsSequence", [])), {})
+    measures: Any = next(iter(shared.get("PixelMeasuresSequence", [])), {})
     spacing = header.get("PixelSpacing") or measures.get("PixelSpacing")
     return (float(spacing[1]), float(spacing[0])) if spacing else None
 

@@ -111,9 +111,9 @@ class Payload:
     def read(self, shape: tuple[int, ...]) -> tuple[ByteArray, tuple[str, ...]]:
         """uint8 pixels of `shape`, and notes of what was changed.
 
-        Of 16 bits the power of two above the largest value of the file becomes 256, so that sequences of one scanner
-        are scaled alike. Raises DatasetInvalid, naming the file, where there are fewer or more bytes than the shape
-        holds, the deflated bytes are damaged or values lie below 0; what is inflated never exceeds the shape.
+        16 bits are made 8 (`eight_bits`). Raises DatasetInvalid, naming the file, where there are fewer or more bytes
+        than the shape holds, the deflated bytes are damaged or values lie below 0; what is inflated never exceeds the
+        shape.
         """
         paths = [_beside(self.header, name) for name in self.files] or [self.header]
         width = np.dtype(self.dtype).itemsize
@@ -168,8 +168,9 @@ def _inflate(data: bytes, path: Path, expected: int) -> bytes:
             raise DatasetInvalid(
                 f"{path}: truncated: its compressed pixels end after {len(pixels)} of {expected} bytes"
             )
-        is_member = inflater.unused_data.startswith(_GZIP) and len(pixels) <= expected
-        data = inflater.unused_data if is_member else b""
+        if len(pixels) > expected or not inflater.unused_data.startswith(_GZIP):
+            break
+        data = inflater.unused_data
     return bytes(pixels)
 
 
