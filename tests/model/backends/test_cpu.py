@@ -97,7 +97,6 @@ def test_a_caller_bound_to_one_processor_renders_the_same(random_scene):
         bound = render(scene, PROBE, poses(1), height=64, width=128, backend="cpu")
     finally:
         os.sched_setaffinity(0, before)
-    assert free.bmode is not None
     assert bound.bmode is not None
     assert torch.equal(free.bmode, bound.bmode)
 
@@ -141,7 +140,6 @@ def test_a_scene_that_shares_tensors_has_its_own_preparation(random_scene):
     sigmoid = replace(scene, info=replace(scene.info, intensity="sigmoid"))
     echo = render(sigmoid, PROBE, poses(1), height=16, width=16, outputs=("echo",)).echo
     exact = render(sigmoid.to(torch.float64), PROBE, poses(1), height=16, width=16, outputs=("echo",)).echo
-    assert echo is not None
     assert exact is not None
     assert (echo - exact).abs().max() < 5e-4
 
