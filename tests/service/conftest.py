@@ -20,7 +20,7 @@ from websockets.sync.client import connect
 from ultragray import GaussianScene, LinearProbe, SceneInfo
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc, scenes_pb2_grpc
 
-from ..waiting import Deadline
+from ..waiting import Deadline, wait_until
 from ..warm import SOURCE_FOLDERS, WARM, WarmProcess, fork, pool_processes
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -110,6 +110,10 @@ class RunningService:
         streams = httpx.get(f"{self.http}/v1/streams", timeout=300).json()["streams"]
         return next((one["poses"] for one in streams if one["client"].endswith(f":{port}")), 0)
 
+    def wait_until_idle(self):
+        """Returns once nothing is left of what the tests before asked for."""
+        wait_until(lambda: self.metric("ultragray_waiting_frames ", "ultragray_busy_processes ") == 0)
+
     def stream_url(self, scene="demo"):
         """The WebSocket of a scene."""
         return f"{self.http.replace('http', 'ws', 1)}/v1/scenes/{scene}/stream"
@@ -198,8 +202,9 @@ def service_starter(tmp_path_factory, data_folder):
     """Starts services with settings as keywords: `start_service(max_image_side=128)`; all are stopped at the end."""
     with ExitStack() as started:
 
-        def start(*, wait=True, cold=False, **settings):
+        def start(*, wait=True, cold=False, waits=None, **settings):
             environment = {f"ULTRAGRAY_{name.upper()}": str(value) for name, value in settings.items()}
+            environment["PYTEST_WAITS"] = json.dumps(waits or {})  # beside SHORT_WAITS
             log_path = tmp_path_factory.mktemp("service") / "log"
             service = started.enter_context(RunningService(data_folder, log_path, environment, cold=cold))
             if wait:

@@ -10,7 +10,7 @@ from websockets.sync.client import connect
 
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2
 
-from ..freshness import check_fresh
+from ..freshness import WAITS, check_fresh
 from ..waiting import wait_until
 from .conftest import split
 
@@ -67,6 +67,11 @@ class WebSocketDoor:
         return about["sequence"]
 
 
+@pytest.fixture(scope="module")
+def patient(start_service):
+    return start_service(waits=WAITS)
+
+
 @pytest.fixture
 def open_grpc(renders):
     doors = []
@@ -86,9 +91,9 @@ def test_grpc(open_grpc, settings):
 
 
 @pytest.mark.parametrize("settings", [SMALL, pytest.param(LARGE, marks=pytest.mark.long)], ids=["small", "large"])
-def test_websocket_without_acknowledgements(service, settings):
-    with connect(service.stream_url(), compression=None, max_size=None, close_timeout=0.2) as connection:
-        check_fresh(WebSocketDoor(service, connection, settings))
+def test_websocket_without_acknowledgements(patient, settings):
+    with connect(patient.stream_url(), compression=None, max_size=None, close_timeout=0.2) as connection:
+        check_fresh(WebSocketDoor(patient, connection, settings))
 
 
 def test_no_more_answers_come_than_the_window_has_room_for(open_grpc, service):
@@ -96,6 +101,7 @@ def test_no_more_answers_come_than_the_window_has_room_for(open_grpc, service):
     for number in range(1, 4):
         door.send(number)
         door.take()
+    service.wait_until_idle()
     frames = service.metric("ultragray_frames_total")
     for number in range(4, 24):
         door.send(number)

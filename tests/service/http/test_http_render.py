@@ -253,7 +253,8 @@ def sample(exposition, name):
     return sum(float(line.split()[-1]) for line in lines)
 
 
-def test_metrics_count_frames_and_keep_the_three_times_apart(http):
+def test_metrics_count_frames_and_keep_the_three_times_apart(http, service):
+    service.wait_until_idle()
     identity = {"position_mm": {"x": 0, "y": 0, "z": 0}, "quaternion": {"w": 1, "x": 0, "y": 0, "z": 0}}
     before = http.get("/metrics").text
     assert http.post("/v1/scenes/demo/render", json={"poses": [identity] * 3}).status_code == 200

@@ -19,7 +19,7 @@ from ultragray_service.igtl.contents import (
     unpack_transform,
 )
 
-from ...freshness import check_fresh
+from ...freshness import WAITS, check_fresh
 from ...waiting import wait_until
 from ..conftest import DEMO_PROBE, HEIGHT, WIDTH
 from ..rpc.test_grpc_render import matrix_pose
@@ -218,5 +218,6 @@ class SlowPeer:
 @pytest.mark.parametrize(
     "scene", ["demo", *(pytest.param(scene, marks=pytest.mark.long) for scene in ("medium", "large"))]
 )
-def test_a_slow_reader_gets_no_old_image(igtl_service, peer, scene):
-    check_fresh(SlowPeer(igtl_service, peer, scene))
+def test_a_slow_reader_gets_no_old_image(start_service, igtl_folder, connect, scene):
+    service = start_service(data_folder=igtl_folder, igtl_port=0, igtl_scene="demo", waits=WAITS)
+    check_fresh(SlowPeer(service, connect(address_of(service)), scene))
