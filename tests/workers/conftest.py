@@ -5,7 +5,6 @@ import contextlib
 import io
 import os
 from pathlib import Path
-from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -24,8 +23,6 @@ from ..warm import WARM, pool_processes, start_template
 from .asking import HEIGHT, PROBE, WIDTH
 
 TIME_LIMIT_S = 600.0
-
-T = TypeVar("T")
 
 
 @pytest.fixture

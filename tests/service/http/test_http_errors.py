@@ -121,14 +121,6 @@ def test_bodies_that_are_not_json(http, name, value):
     assert_problem(answer, 415, "UNSUPPORTED_MEDIA_TYPE", name)
 
 
-def test_body_too_large(http):
-    body = b" " * (8 * 2**20 + 1)
-    headers = {"Content-Type": "application/json"}
-    answer = http.post("/v1/scenes/demo/render", content=body, headers=headers)
-    problem = assert_problem(answer, 413, "BODY_TOO_LARGE", "body")
-    assert str(8 * 2**20) in problem["detail"]
-
-
 def test_unknown_route_and_method(http):
     assert_problem(http.get("/v1/nothing"), 404, "ROUTE_NOT_FOUND", None)
     answer = http.patch("/v1/scenes/demo")
