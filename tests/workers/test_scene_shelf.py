@@ -137,7 +137,7 @@ def test_scenes_that_an_operator_copied_are_served_and_replaced(new_host, scene_
 
 
 def test_headers_are_read_without_the_gaussians(new_host, storage, random_scene, tmp_path):
-    random_scene(20_000).save(tmp_path / "large.ugr")  # type: ignore[attr-defined]
+    random_scene(20_000).save(tmp_path / "large.ugr")
     host = new_host()
     host.shelf.publish(tmp_path / "large.ugr", "large")
     header, whole = host.store.header("large"), read_header(tmp_path / "large.ugr")
