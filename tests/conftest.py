@@ -29,6 +29,7 @@ from ultragray_studies.bench.report import measured
 from .object_storage import new_bucket, object_proxy, object_server
 from .postgres import new_database, postgres
 from .surroundings import ROOT, forget_the_users_environment, home_of_the_tests, working_folder
+from .waiting import SkippingLoop
 
 __all__ = [
     "home_of_the_tests",
@@ -51,8 +52,7 @@ hypothesis.settings.register_profile("untimed", deadline=None)  # others may kee
 hypothesis.settings.load_profile("untimed")
 torch.set_num_threads(1)  # also for fixtures of more than one test
 
-os.environ["PYTEST_RUN"] = f"{os.getpid():012}"  # always as long: warm.py writes it into the environment of another
-RUN = f"PYTEST_RUN={os.environ['PYTEST_RUN']}\0"  # in the environment of every process that these tests start
+os.environ["PYTEST_RUN"] = str(os.getpid())  # in the environment of every process that these tests start
 
 BEGAN = time.monotonic()
 SHARED = ROOT.parent / "shared"
@@ -73,6 +73,16 @@ def one_torch_thread():
     torch.set_num_threads(1)
     yield
     torch.set_num_threads(before)
+
+
+@pytest.fixture
+def clock(monkeypatch):
+    """An event loop whose time is everybody's, and goes on without anybody waiting."""
+    loop = SkippingLoop()
+    for name in ("time", "monotonic"):
+        monkeypatch.setattr(time, name, loop.time)
+    yield loop
+    loop.close()
 
 
 @pytest.fixture

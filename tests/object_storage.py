@@ -19,7 +19,7 @@ import pytest
 from .waiting import Deadline
 
 AWAY_S = float(os.environ.get("ULTRAGRAY_AWAY_S", "6"))  # that tests take the server away; make test-replicas: a minute
-_START_TIMEOUT_S = 120.0
+_START_TIMEOUT_S = 300.0
 _SLOW_DOWN = (
     b"<?xml version='1.0'?><Error><Code>SlowDown</Code><Message>Please reduce your request rate.</Message></Error>"
 )
@@ -68,7 +68,7 @@ class ObjectServer:
 
     def remove(self):
         self._process.kill()
-        self._process.wait(60)
+        self._process.wait(300)
 
     def _ask(self, method, path):
         request = urllib.request.Request(f"http://127.0.0.1:{self.port}/{path}", method=method)

@@ -21,7 +21,7 @@ from .waiting import Deadline
 NewDatabase = Callable[[], str | None]
 
 PASSWORD = "s3cret/with@signs"
-_START_TIMEOUT_S = 120.0
+_START_TIMEOUT_S = 300.0
 _UNPRIVILEGED = "nobody"  # PostgreSQL refuses to run as root
 
 
@@ -85,7 +85,7 @@ class PostgresServer:
     def stop(self):
         """Ends all connections, as a restart of the server does."""
         self._process.send_signal(signal.SIGINT)
-        self._process.wait(60)
+        self._process.wait(300)
 
     def pause(self):
         """Whoever is connected hears nothing any more, and is not told why."""
@@ -140,7 +140,7 @@ class PostgresServer:
             password=PASSWORD,
             dbname="postgres",
             autocommit=True,
-            connect_timeout=60,
+            connect_timeout=300,
         )
 
 

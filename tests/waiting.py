@@ -22,7 +22,7 @@ class Deadline:
         return elapsed > self._seconds and elapsed > at_this_load(self._seconds)
 
 
-def wait_until(condition, *, within_s=60, every_s=0.01):
+def wait_until(condition, *, within_s=300, every_s=0.01):
     """The first true answer of `condition`; an AssertionError where none comes before the Deadline of `within_s`."""
     deadline = Deadline(within_s)
     while not (found := condition()):

@@ -8,11 +8,11 @@ Tests about starting itself use real processes.
 
 import atexit
 import contextlib
-import ctypes
 import fcntl
 import gc
 import importlib
 import json
+import mmap
 import os
 import re
 import select
@@ -33,7 +33,7 @@ from types import SimpleNamespace
 SOURCE_FOLDERS = ("model", "proto", "workers", "service", "client", "studies")
 _MAX_REQUEST_BYTES = 2**17
 _STANDARD_FILES = 3
-_START_TIMEOUT_S = 120.0
+_START_TIMEOUT_S = 300.0
 _IS_ONE_OF_SEVERAL = "PYTEST_XDIST_WORKER" in os.environ  # the process of the run is the parent of this one
 
 
@@ -117,6 +117,7 @@ class WarmServer:
             start_new_session=True,  # what is sent to the group of one test process is not for it
             env={
                 **os.environ,
+                "PYTEST_RUN": "",  # a fork belongs to the tests that asked for it
                 "OMP_NUM_THREADS": "1",
                 "OPENBLAS_NUM_THREADS": "1",  # a process with threads must not be forked
                 "PYTHONPATH": os.pathsep.join(str(Path(__file__).parents[1] / folder) for folder in SOURCE_FOLDERS),
@@ -240,11 +241,38 @@ def popen(path, command, *, env, stdout=None, stderr=None, pass_fds=(), **_):
         return fork(path, "job", [command[3]], files=files, end_with=signal.SIGKILL, **common)
 
 
+class Hold:
+    """Keeps the next helper process that is asked for a work from beginning it, until this context ends."""
+
+    def __init__(self, work):
+        self._file = Path.home() / f"held-{work}"  # the home of the tests of one process
+
+    def __enter__(self):
+        self._file.touch()
+        return self
+
+    def __exit__(self, *_):
+        self._file.unlink()
+
+    @property
+    def pid(self):
+        """The process that is held; None: there is none yet."""
+        told = self._file.read_text()
+        return int(told) if told else None
+
+    def keep(self):
+        """What the helper process does."""
+        if self._file.exists():
+            self._file.write_text(str(os.getpid()))
+        while self._file.exists():
+            time.sleep(0.01)
+
+
 def helper(module, work):
-    """A helper process of a service, which is called by its work."""
+    """A helper process of a service."""
     from ultragray_workers.helpers import answer_request
 
-    Path("/proc/self/comm").write_text(work)
+    Hold(work).keep()
     answer_request(getattr(importlib.import_module(module), work))
     return 0
 
@@ -319,7 +347,7 @@ def begin(request, files):
     signal.set_wakeup_fd(-1)
     signal.signal(signal.SIGCHLD, signal.SIG_DFL)
     signal.signal(signal.SIGINT, signal.default_int_handler)
-    _show_run(request["environment"]["PYTEST_RUN"])
+    _mark(request["environment"]["PYTEST_RUN"])
     os.environ.clear()
     os.environ.update(request["environment"])
     os.chdir(str(request["folder"]))
@@ -338,11 +366,40 @@ def leave(code):
     os._exit(code or 0)
 
 
-def _show_run(run):
-    """Writes into /proc/PID/environ, which is that of the process that forks, whose tests a fork belongs to."""
-    getenv = ctypes.CDLL(None).getenv
-    getenv.restype = ctypes.c_void_p
-    ctypes.memmove(getenv(b"PYTEST_RUN"), run.encode(), len(run))
+_marks = []
+
+
+def _mark(run):
+    """Shows in /proc/PID/maps, also of what a fork forks, whose tests it belongs to: its environment is another's."""
+    descriptor = os.memfd_create(mark_of(run))
+    os.ftruncate(descriptor, mmap.PAGESIZE)
+    _marks.append(mmap.mmap(descriptor, mmap.PAGESIZE))
+    os.close(descriptor)
+
+
+def mark_of(run):
+    return f"pytest-run-{run}."
+
+
+def belongs_to(run, folder):
+    """Whether the process of a folder of /proc was started by the tests of a run, as a fork or as a program."""
+    started = f"PYTEST_RUN={run}\0".encode() in (folder / "environ").read_bytes()
+    return started or mark_of(run) in (folder / "maps").read_text()
+
+
+_TEMPLATE = b"ultragray_workers.pool.template"
+
+
+def pool_processes(run):
+    """Workers and templates of render pools of a run by process id; one that has just started is called `python`."""
+    found = {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        with contextlib.suppress(FileNotFoundError, PermissionError, ProcessLookupError):
+            name = (folder / "comm").read_text().strip()
+            is_pools = name in ("ug-worker", "ug-template") or _TEMPLATE in (folder / "cmdline").read_bytes()
+            if is_pools and belongs_to(run, folder):
+                found[int(folder.name)] = name
+    return found
 
 
 if __name__ == "__main__":

@@ -9,6 +9,7 @@ import ctypes
 import mmap
 import os
 import secrets
+import socket
 import time
 import weakref
 from collections import deque
@@ -31,13 +32,14 @@ _FOLDER = Path("/dev/shm")
 _HEADER_BYTES = 4096
 _TOKEN_BYTES = 32
 _FREE = 1
+_SOCKET = ".socket"  # behind the name of the file
 
 
 class SharedMemory:
-    """A file that the service writes frames into.
+    """A file that the service writes frames into, and a socket beside it, which it connects to.
 
     A slot is free again when no array refers to it any more. The service removes the name of the file when it has
-    opened it; `close`, or the end of this object, removes that of a file that it did not open.
+    opened it; `close`, or the end of this object, removes that of a file that it did not open, and the socket's.
     """
 
     def __init__(self) -> None:
@@ -47,13 +49,16 @@ class SharedMemory:
         size = _HEADER_BYTES + SLOTS * SLOT_BYTES
         try:
             descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
-            self._remove = weakref.finalize(self, _remove, path)
+            self.listener = socket.socket(socket.AF_UNIX)
+            self._remove = weakref.finalize(self, _remove, path, self.listener)
             try:
                 os.ftruncate(descriptor, size)
                 os.pwrite(descriptor, self._token + bytes([_FREE]) * SLOTS, 0)
                 self._map = mmap.mmap(descriptor, size)
             finally:
                 os.close(descriptor)
+            self.listener.bind(f"{path}{_SOCKET}")
+            self.listener.listen(1)
         except OSError as error:
             raise InvalidArgument(
                 f"shared_memory cannot be had on this system: {error}", field="shared_memory"
@@ -64,7 +69,9 @@ class SharedMemory:
 
     def message(self) -> rendering_pb2.SharedMemory:
         """The file, as the service is told of it."""
-        return rendering_pb2.SharedMemory(name=self._name, token=self._token, slots=SLOTS, slot_bytes=SLOT_BYTES)
+        return rendering_pb2.SharedMemory(
+            name=self._name, token=self._token, slots=SLOTS, slot_bytes=SLOT_BYTES, has_socket=True
+        )
 
     def taken(self, message: rendering_pb2.Frame) -> Any:
         """The pixels of a frame, a buffer whose slot is not free while anything refers to it; None: the message has
@@ -83,7 +90,7 @@ class SharedMemory:
             self._free(message.shared_data.slot)
 
     def close(self) -> None:
-        """Removes the name of the file, should it still be there; frames stay as they are."""
+        """Removes the names that are still there; frames stay as they are."""
         self._remove()
 
     def _free(self, slot: int) -> None:
@@ -91,9 +98,11 @@ class SharedMemory:
             self._map[_TOKEN_BYTES + slot] = _FREE
 
 
-def _remove(path: Path) -> None:
-    with suppress(OSError):
-        path.unlink()
+def _remove(path: Path, listener: socket.socket) -> None:
+    listener.close()
+    for name in (path, f"{path}{_SOCKET}"):
+        with suppress(OSError):
+            os.unlink(name)
 
 
 # The messages of a stream, there and back.
@@ -162,6 +171,11 @@ class PoseExchange:
         return rendering_pb2.RenderStreamRequest(
             settings=self._settings, mode=mode, window=window, shared_memory=memory
         )
+
+    @property
+    def listener(self) -> socket.socket | None:
+        """Where the service connects to for the messages of a connection that was opened; None: they go through it."""
+        return None if self._memory is None else self._memory.listener
 
     def acknowledgement(self, sequence: int) -> rendering_pb2.RenderStreamRequest:
         """The message that the answer of that sequence was taken: a newer one may come."""

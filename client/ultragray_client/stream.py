@@ -28,6 +28,7 @@ from ultragray_client.exchange import (
 )
 from ultragray_client.frames import Frame
 from ultragray_client.geometry import PoseLike
+from ultragray_client.local import AsyncLocalCall, LocalCall
 
 Start = Callable[..., Any]  # a call of RenderStream
 
@@ -182,7 +183,9 @@ class FrameStream(_PoseStream):
         with self._changed:
             self._opening = self._begin_call()
             self._acknowledgement = None
-            self._call = call = self._start(self._messages(self._unsent))
+            messages, listener = self._messages(self._unsent), self._exchange.listener
+            call = self._start(messages) if listener is None else LocalCall(self._start, messages, listener)
+            self._call = call
             self._changed.notify_all()
         if not call.add_callback(partial(self._ended, call)):
             self._ended(call)
@@ -385,8 +388,9 @@ class AsyncFrameStream(_PoseStream):
     def _open(self) -> None:
         """Starts a call for the poses that have no answer."""
         self._begin_call()
-        self._call = self._start()
-        self._call._cython_call = _CallThatKeepsItsStatus(self._call._cython_call)
+        call, listener = self._start(), self._exchange.listener
+        call._cython_call = _CallThatKeepsItsStatus(call._cython_call)
+        self._call = call if listener is None else AsyncLocalCall(call, listener)
 
     async def _send_waiting(self) -> bool:
         """Sends what waits; False where the call is over: reading says why."""

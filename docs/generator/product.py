@@ -29,7 +29,6 @@ from ultragray_service.core import scenes as catalog
 from ultragray_service.core import streams as pose_stream
 from ultragray_service.core import uploads as dataset_uploads
 from ultragray_service.errors import STATUSES, statuses_of
-from ultragray_service.http import protocol as http_server
 from ultragray_service.igtl import connection
 from ultragray_service.igtl import frames as waiting
 from ultragray_service.rpc import server as grpc_server
@@ -178,7 +177,7 @@ def fixed_limits() -> str:
         ("Their bytes, if there are several", _bytes(pose_stream.MAX_BYTES_IN_FLIGHT)),
         ("Window of a latest stream", f"{pose_stream.MAX_WINDOW} frames"),
         ("Memory that a stream shares", _bytes(shared_memory.MAX_BYTES)),
-        ("Message to the WebSocket", _bytes(http_server.MAX_STREAM_MESSAGE_BYTES)),
+        ("Message to the WebSocket, or through a socket of the host", _bytes(pose_stream.MAX_MESSAGE_BYTES)),
         ("gRPC message, if `ULTRAGRAY_MAX_BODY_BYTES` is less", _bytes(grpc_server.LEAST_MAX_MESSAGE_BYTES)),
         ("Time between keepalive pings of a gRPC client, at least", f"{grpc_server.LEAST_PING_INTERVAL_MS:,} ms"),
         ("TLS handshake", f"{HANDSHAKE_TIMEOUT_S:g} s"),

@@ -14,6 +14,7 @@
 #include "loss.hpp"
 #include "render.hpp"
 #include "speckle.hpp"
+#include "views.hpp"
 
 namespace nb = nanobind;
 using namespace ultragray;
@@ -39,6 +40,7 @@ using Pairs = nb::ndarray<const int64_t, nb::shape<-1, 2>, nb::c_contig, nb::dev
 using PairsOfMaps = nb::ndarray<const float, nb::shape<-1, 2, 3, 3>, nb::c_contig, nb::device::cpu>;
 using Floats = nb::ndarray<const float, nb::c_contig, nb::device::cpu>;
 using FreeFloats = nb::ndarray<float, nb::c_contig, nb::device::cpu>;
+using FreeGrey = nb::ndarray<uint8_t, nb::ndim<3>, nb::c_contig, nb::device::cpu>;
 using FreeCounts = nb::ndarray<int64_t, nb::ndim<1>, nb::c_contig, nb::device::cpu>;
 
 // B, E, T, coverage, S and the sum of I*w, each [C, H, W] or null.
@@ -50,7 +52,7 @@ Outputs planes_of(const std::array<OptionalPlanes, 6>& arrays, size_t count, int
             throw std::invalid_argument("an output's shape is not [C, height, width]");
         planes[k] = arrays[k]->data();
     }
-    return {planes[0], planes[1], planes[2], planes[3], planes[4], planes[5]};
+    return {planes[0], planes[1], planes[2], planes[3], planes[4], planes[5], nullptr, nullptr, 0.0f};
 }
 
 Beam beam_of(const BeamNumbers& numbers) { return {numbers[0], numbers[1], numbers[2], numbers[3]}; }
@@ -120,18 +122,27 @@ NB_MODULE(_cpu, m) {
         [](const PreparedScene& scene, bool fanned, bool wrap, double start, double span, double near_cm, double far_cm,
            double cull_far_cm, BeamNumbers beam, Poses poses, int height, int width, int threads,
            const std::string& instruction_set, OptionalPlanes bmode, OptionalPlanes echo, OptionalPlanes transmittance,
-           OptionalPlanes coverage, OptionalPlanes weight_sum, OptionalPlanes intensity_sum, bool uncut,
-           std::optional<int64_t> footprint_pixels, std::optional<Flag> flag, int64_t number) {
-            const Outputs outputs =
-                planes_of({bmode, echo, transmittance, coverage, weight_sum, intensity_sum}, poses.shape(0), height, width);
+           OptionalPlanes coverage, OptionalPlanes weight_sum, OptionalPlanes intensity_sum, std::optional<FreeGrey> grey,
+           std::optional<FreeCounts> supported, float least_coverage, bool uncut, std::optional<int64_t> footprint_pixels,
+           std::optional<Flag> flag, int64_t number) {
+            const size_t count = poses.shape(0);
+            Outputs outputs =
+                planes_of({bmode, echo, transmittance, coverage, weight_sum, intensity_sum}, count, height, width);
+            if ((grey && (grey->shape(0) != count || grey->shape(1) != size_t(height) || grey->shape(2) != size_t(width))) ||
+                (supported && supported->shape(0) != count))
+                throw std::invalid_argument("the shapes of grey frames and counts are not [C, height, width] and [C]");
+            outputs.grey = grey ? grey->data() : nullptr;
+            outputs.supported = supported ? supported->data() : nullptr;
+            outputs.least_coverage = least_coverage;
             const ProbeGeometry probe{fanned, wrap, start, span, near_cm, far_cm, cull_far_cm, beam_of(beam), uncut};
             const Limits limits = limits_of(footprint_pixels, flag, number);
             nb::gil_scoped_release release;
             render(scene, probe, poses.data(), int(poses.shape(0)), height, width, threads, instruction_set, outputs,
                    limits);
         },
-        RENDER_ARGUMENTS, nb::arg("uncut") = false, nb::arg("footprint_pixels") = nb::none(),
-        nb::arg("flag").noconvert().none() = nb::none(), nb::arg("number") = 0);
+        RENDER_ARGUMENTS, nb::arg("grey").noconvert().none() = nb::none(),
+        nb::arg("supported").noconvert().none() = nb::none(), nb::arg("least_coverage") = 0.0f, nb::arg("uncut") = false,
+        nb::arg("footprint_pixels") = nb::none(), nb::arg("flag").noconvert().none() = nb::none(), nb::arg("number") = 0);
 
     m.def(
         "footprints",
@@ -356,6 +367,31 @@ NB_MODULE(_cpu, m) {
         nb::arg("starts").noconvert(), nb::arg("steps").noconvert(), nb::arg("beside").noconvert(),
         nb::arg("plane_phases").noconvert(), nb::arg("column_phases").noconvert(), nb::arg("threads"),
         nb::arg("instruction_set"));
+
+    m.def(
+        "measure_views",
+        [](Matrix points, Floats axes, Matrix offsets, Vector angles, Vector facing, bool fanned, float slope, float scale,
+           float across, float half, float by_z, float near_mm, float far_mm, float least_mm, float most_mm,
+           float mm_by_degree, const std::string& instruction_set, FreeFloats measures, FreeCounts nearest,
+           FreeFloats around) {
+            const size_t count = points.shape(0), views = offsets.shape(1);
+            if (points.shape(1) != 3 || offsets.shape(0) != 3 || axes.size() != 9 * views || angles.shape(0) != views ||
+                facing.shape(0) != views || around.size() != views || measures.size() != 3 * count ||
+                nearest.shape(0) != count || views % kMaxLanes || views == 0)
+                throw std::invalid_argument("the shapes of points and views do not agree");
+            const ViewImages images{axes.data(), offsets.data(), int64_t(views), fanned,  slope, scale,
+                                    across,      half,           by_z,           near_mm, far_mm};
+            float* out = measures.data();
+            choose_kernels(instruction_set)
+                .measure_views(points.data(), int(count), angles.data(), facing.data(), images,
+                               {least_mm, most_mm, mm_by_degree},
+                               {out, out + count, out + 2 * count, nearest.data(), around.data()});
+        },
+        nb::arg("points").noconvert(), nb::arg("axes").noconvert(), nb::arg("offsets").noconvert(),
+        nb::arg("angles").noconvert(), nb::arg("facing").noconvert(), nb::arg("fanned"), nb::arg("slope"), nb::arg("scale"),
+        nb::arg("across"), nb::arg("half"), nb::arg("by_z"), nb::arg("near_mm"), nb::arg("far_mm"), nb::arg("least_mm"),
+        nb::arg("most_mm"), nb::arg("mm_by_degree"), nb::arg("instruction_set"), nb::arg("measures").noconvert(),
+        nb::arg("nearest").noconvert(), nb::arg("around").noconvert());
 
     m.def("instruction_sets", &instruction_sets);
 }

@@ -318,20 +318,22 @@ void count_work(const View& view, const Slice* slices, int64_t count, int first,
 }
 
 // B = E T, E = (1 - exp(-S)) sum(I w) / (S + 1e-8), and the cumulative product of the steps down each scan line.
-void finish(const View& view, const Strip& strip, const FramePointers& frame, const SavedPlanes& saved) {
-    const auto put = [&](float* plane, int row, int column, Floats value) {
+void finish(const View& view, const Strip& strip, const Outputs& frame, const SavedPlanes& saved) {
+    const auto put = [&](auto* plane, int row, int column, auto values) {
         if (plane == nullptr) return;
-        float* to = plane + int64_t(row) * view.lines + strip.first + column;
+        auto* to = plane + int64_t(row) * view.lines + strip.first + column;
         if (column + kLanes <= strip.lines) {
-            store(to, value);
+            store(to, values);
         } else {
-            float lanes[kLanes];
-            store(lanes, value);
+            Lane<decltype(values)> lanes[kLanes];
+            store(lanes, values);
             for (int k = 0; column + k < strip.lines; ++k) to[k] = lanes[k];
         }
     };
+    int64_t supported = 0;
     for (int column = 0; column < strip.lines; column += kLanes) {
-        Floats passed = splat(1.0f);
+        Floats passed = splat(1.0f), least = splat(frame.least_coverage);
+        for (int k = strip.lines - column; k < kLanes; ++k) least[k] = __builtin_inff();
         for (int row = 0; row < view.height; ++row) {
             const int64_t at = int64_t(row) * strip.stride + column;
             passed *= load<Floats>(strip.below + at);
@@ -346,6 +348,9 @@ void finish(const View& view, const Strip& strip, const FramePointers& frame, co
             put(frame.coverage, row, column, coverage);
             put(frame.weight_sum, row, column, sum);
             put(frame.intensity_sum, row, column, load<Floats>(strip.intensity + at));
+            if (frame.grey != nullptr)
+                put(frame.grey, row, column, to_bytes(minimum(echo * transmittance, splat(1.0f)) * 255.0f));
+            if (frame.supported != nullptr) supported += how_many(less_equal(least, coverage));
             if (saved.weight == nullptr) continue;
             const int64_t kept = int64_t(row) * saved.stride + strip.first + column;
             store(saved.weight + kept, sum);
@@ -353,6 +358,7 @@ void finish(const View& view, const Strip& strip, const FramePointers& frame, co
             store(saved.transmittance + kept, transmittance);
         }
     }
+    if (frame.supported != nullptr) __atomic_fetch_add(frame.supported, supported, __ATOMIC_RELAXED);
 }
 
 }  // namespace

@@ -26,7 +26,7 @@ inline EchoFactor echo_factor(Floats sum) {
     return {ratio * share, ratio_slope * share + ratio * (1e-8f * guarded * guarded)};
 }
 
-void differentiate(const View& view, int first, int lines, const SavedPlanes& saved, const FramePointers& gradients,
+void differentiate(const View& view, int first, int lines, const SavedPlanes& saved, const Outputs& gradients,
                    const PixelGradients& out) {
     const auto take = [&](const float* plane, int row, int line) {
         if (plane == nullptr) return Floats{};

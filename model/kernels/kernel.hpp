@@ -6,6 +6,8 @@
 #include <cstdint>
 #include <string>
 
+#include "views.hpp"
+
 namespace ultragray {
 
 inline constexpr double kMaxM2 = 11.0825270903;  // -2 log(1/255): w < 1/255 beyond, and alpha too
@@ -101,9 +103,20 @@ class SliceList {
     int64_t size_ = 0, capacity_ = 0;
 };
 
-// The outputs of one pose, S and the sum of I*w, each [H, W] or null where it was not asked for.
-struct FramePointers {
-    float *bmode, *echo, *transmittance, *coverage, *weight_sum, *intensity_sum;
+// The outputs of poses, one after another; null where one was not asked for.
+struct Outputs {
+    float *bmode, *echo, *transmittance, *coverage, *weight_sum, *intensity_sum;  // [H, W]; the last are S and sum of I*w
+    uint8_t* grey;       // [H, W]: 255 min(B, 1) to the nearest whole number, of two the even one
+    int64_t* supported;  // the number of pixels with a coverage of at least the one below; added to
+    float least_coverage;
+
+    // Those from a pose on.
+    Outputs from(int64_t pose, int64_t frame_size) const {
+        const auto at = [&](auto* plane) { return plane ? plane + pose * frame_size : nullptr; };
+        return {at(bmode),      at(echo),          at(transmittance), at(coverage),
+                at(weight_sum), at(intensity_sum), at(grey),          supported ? supported + pose : nullptr,
+                least_coverage};
+    }
 };
 
 // What the backward pass needs of one pose, rows of `stride` floats; null where no gradient is wanted.
@@ -206,10 +219,10 @@ struct Kernels {
     void (*slice)(const SceneView&, const View&, int64_t first_cluster, int64_t last_cluster, SliceList&);
     void (*draw)(const View&, const Slice*, int64_t count, const Strip&);
     void (*count)(const View&, const Slice*, int64_t count, int first, int lines, Work&);  // of drawing a strip; added to
-    void (*finish)(const View&, const Strip&, const FramePointers&, const SavedPlanes&);
+    void (*finish)(const View&, const Strip&, const Outputs&, const SavedPlanes&);
     // The backward pass: pixels of `lines` scan lines from `first` on, then slices; [N], sh [N, K], the beam's moments and,
     // where it is not null, the gradient by the view are added to.
-    void (*differentiate)(const View&, int first, int lines, const SavedPlanes&, const FramePointers& gradients,
+    void (*differentiate)(const View&, int first, int lines, const SavedPlanes&, const Outputs& gradients,
                           const PixelGradients&);
     void (*gather)(const SceneView&, const View&, const Slice*, int64_t count, const PixelGradients&, GaussianGradient*,
                    float* sh, BeamMoments&, ViewGradient*);
@@ -221,6 +234,8 @@ struct Kernels {
                     float* out);
     double (*adam)(float* values, const float* gradient, float* first, float* second, int64_t count, const AdamStep&,
                    float by_sum);
+    void (*measure_views)(const float* points, int count, const float* angles, const float* facing, const ViewImages&,
+                          const ViewLimits&, const ViewDistances&);
 };
 
 // The kernels of an instruction set that this processor can run; "auto" takes the best. Throws std::invalid_argument.

@@ -10,12 +10,13 @@ using namespace ultragray;
 #include "loss.inl"
 #include "slice.inl"
 #include "speckle.inl"
+#include "views.inl"
 
 namespace ultragray {
 
 const Kernels& kernels_avx512() {
-    static constexpr Kernels kernels{"avx512",      slice_clusters, draw,       count_work, finish,
-                                     differentiate, gather,         image_loss, speckle,    adam};
+    static constexpr Kernels kernels{"avx512", slice_clusters, draw,    count_work, finish,       differentiate,
+                                     gather,   image_loss,     speckle, adam,       measure_views};
     return kernels;
 }
 

@@ -87,12 +87,6 @@ class StripBuffer {
     float* floats_;
 };
 
-FramePointers frame_of(const Outputs& outputs, int64_t offset) {
-    const auto at = [offset](float* plane) { return plane ? plane + offset : nullptr; };
-    return {at(outputs.bmode),    at(outputs.echo),       at(outputs.transmittance),
-            at(outputs.coverage), at(outputs.weight_sum), at(outputs.intensity_sum)};
-}
-
 // Some poses on their way from Gaussians to pixels.
 class Batch {
  public:
@@ -157,7 +151,7 @@ class Batch {
                            const int c = task / strips(), first = task % strips() * kStripLines;
                            const View& view = views_[c];
                            kernels_.differentiate(view, first, std::min(kStripLines, view.lines - first), saved[c],
-                                                  frame_of(gradients, c * frame_size()), pixels[c]);
+                                                  gradients.from(c, frame_size()), pixels[c]);
                        }};
         std::vector<BeamMoments> moments(parts());
         Phase by_gaussian{parts(), [&](int part) {
@@ -219,7 +213,7 @@ class Batch {
                 kernels_.draw(view, list.data() + i, std::min(at_once, list.size() - i), strip);
             }
         }
-        kernels_.finish(view, strip, frame_of(outputs, c * frame_size()), saved);
+        kernels_.finish(view, strip, outputs.from(c, frame_size()), saved);
     }
 
     const Kernels& kernels_;
@@ -280,9 +274,7 @@ void render(const PreparedScene& scene, const ProbeGeometry& probe, const double
     const int64_t frame_size = int64_t(height) * width;
     for (int first = 0; first < count; first += kPosesAtOnce) {
         Batch batch(scene, probe, poses + 16 * first, std::min(kPosesAtOnce, count - first), height, width, kernels);
-        const FramePointers from = frame_of(outputs, first * frame_size);
-        batch.render({from.bmode, from.echo, from.transmittance, from.coverage, from.weight_sum, from.intensity_sum}, {},
-                     threads, limits, first);
+        batch.render(outputs.from(first, frame_size), {}, threads, limits, first);
     }
 }
 

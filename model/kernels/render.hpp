@@ -5,6 +5,7 @@
 #include <string>
 #include <vector>
 
+#include "kernel.hpp"
 #include "limits.hpp"
 #include "scene.hpp"
 
@@ -17,11 +18,6 @@ struct ProbeGeometry {
     double near, far, cull_far;
     Beam beam;
     bool uncut = false;  // Gaussians count wherever their means lie
-};
-
-// Planes of many poses, each [C, H, W] or null; the last two are S, the sum of w, and that of I*w.
-struct Outputs {
-    float *bmode, *echo, *transmittance, *coverage, *weight_sum, *intensity_sum;
 };
 
 // Renders C poses [4, 4] (row-major, cm, probe to scene; columns 0 and 2 may be those of a plane that is sheared such that

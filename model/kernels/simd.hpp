@@ -23,6 +23,7 @@ constexpr int kLanes = 4;
 typedef float Floats __attribute__((vector_size(kLanes * sizeof(float))));
 typedef int32_t Ints __attribute__((vector_size(kLanes * sizeof(int32_t))));
 typedef double Doubles __attribute__((vector_size(kLanes * sizeof(double))));
+typedef uint8_t Bytes __attribute__((vector_size(kLanes)));
 
 inline Floats splat(float x) { return x - Floats{}; }
 inline Doubles splat_double(double x) { return x - Doubles{}; }
@@ -83,9 +84,13 @@ inline bool any(Mask m) {
 #endif
 }
 inline int how_many(Mask m) {
+#if defined(__AVX2__)
+    return __builtin_popcount(_mm256_movemask_ps((__m256)m));
+#else
     int found = 0;
     for (int k = 0; k < kLanes; ++k) found += m[k] != 0;
     return found;
+#endif
 }
 inline Floats keep(Mask m, Floats a) { return (Floats)(m & (Ints)a); }
 inline Mask within(Floats low, Floats x, Floats high) { return (low <= x) & (x <= high); }
@@ -136,6 +141,19 @@ inline float total(Floats a) {
 }
 #endif
 #endif
+
+// Whole numbers from 0 to 255: the nearest, of two the even one.
+inline Bytes to_bytes(Floats x) {
+#if defined(__AVX512F__)
+    const Ints whole = (Ints)_mm512_cvtps_epi32((__m512)x);
+#elif defined(__AVX2__)
+    const Ints whole = (Ints)_mm256_cvtps_epi32((__m256)x);
+#else
+    Ints whole;
+    for (int k = 0; k < kLanes; ++k) whole[k] = static_cast<int32_t>(__builtin_lrintf(x[k]));
+#endif
+    return __builtin_convertvector(whole, Bytes);
+}
 
 // exp(x) within 2 units in the last place for x in [-87, 88]; clamped outside: 1e-38 below, 1.6e38 above.
 inline Floats exponential(Floats x) {

@@ -112,7 +112,7 @@ def make_client(request, event_loop_thread):
 
 @pytest.fixture
 def client(make_client, client_service):
-    return make_client(client_service.grpc, api_key=KEY, timeout_s=60.0)
+    return make_client(client_service.grpc, api_key=KEY, timeout_s=300.0)
 
 
 @pytest.fixture
@@ -126,4 +126,4 @@ def proxy(client_service):
 @pytest.fixture
 def far_client(make_client, proxy):
     """A client that reaches the service by that way."""
-    return make_client(proxy.address, api_key=KEY, timeout_s=60.0)
+    return make_client(proxy.address, api_key=KEY, timeout_s=300.0)

@@ -26,11 +26,19 @@ class Proxy:
         """Breaks the connection after so many bytes; the one that follows after as many as the next count says."""
         self._left = list(counts)
 
+    def cut(self):
+        """Breaks the connections that are open."""
+        self._shut(self._open[1:])
+
     def close(self):
-        for one in self._open:
+        self._shut(list(self._open))
+
+    def _shut(self, ends):
+        for one in ends:
             with suppress(OSError):  # it is shut already
                 one.shutdown(socket.SHUT_RDWR)  # closing alone would not wake those that wait for it
             one.close()
+            self._open.remove(one)
 
     def _accept(self):
         while True:

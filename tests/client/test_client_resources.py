@@ -231,7 +231,7 @@ def test_a_recording_is_the_file_of_the_job_that_renders_the_same(client, tmp_pa
         "ghost": 0.2,
     }
     job = client.jobs.submit(RenderJob(scene="demo", poses=POSES, format="mcap", **settings))
-    client.jobs.wait(job.id, timeout_s=120.0)
+    client.jobs.wait(job.id, timeout_s=300.0)
     client.jobs.download(job.id, "frames.mcap", tmp_path / "job.mcap")
     with Recording(tmp_path / "recorded.mcap") as recording:
         for frame in client.render_batch("demo", POSES, RenderSettings(**settings)):

@@ -5,6 +5,7 @@ import gc
 import os
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 from contextlib import suppress
@@ -144,10 +145,11 @@ def is_shared(frame):
 
 
 @pytest.fixture
-def folder(monkeypatch, tmp_path):
+def folder(monkeypatch):
     """A folder in place of /dev/shm, so that nobody else makes files there; the service does not look there."""
-    monkeypatch.setattr(shared_memory, "_FOLDER", tmp_path)
-    return tmp_path
+    with tempfile.TemporaryDirectory() as name:  # a short one, as names of sockets must be
+        monkeypatch.setattr(shared_memory, "_FOLDER", Path(name))
+        yield Path(name)
 
 
 @pytest.mark.parametrize(("mode", "encoding"), [("ordered", "uint8"), ("latest", "float32")])
@@ -230,7 +232,8 @@ def test_a_system_without_such_memory_is_told(client, monkeypatch, tmp_path):
 
 def test_a_memory_that_is_not_used_leaves_no_file(folder):
     memory = SharedMemory()
-    (file,) = folder.iterdir()
+    file, listener = sorted(folder.iterdir())
+    assert listener.is_socket()
     assert file.stat().st_mode & 0o777 == 0o600
     assert file.stat().st_blocks * 512 <= 2 * 4096  # pages that nothing was written to take no memory
     del memory

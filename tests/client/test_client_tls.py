@@ -30,7 +30,7 @@ def mutual_service(start_shared_service, mounted):
 
 
 def test_frames_come_over_tls(tls_service, mounted, make_client):
-    client = make_client(tls_service.grpc, tls=Tls(root_certificates=mounted.root), timeout_s=60.0)
+    client = make_client(tls_service.grpc, tls=Tls(root_certificates=mounted.root), timeout_s=300.0)
     assert client.render("demo", np.eye(4))["bmode"].any()
     with client.stream("demo") as stream:
         stream.send(np.eye(4))
@@ -40,7 +40,7 @@ def test_frames_come_over_tls(tls_service, mounted, make_client):
 def test_mutual_tls_takes_a_certificate_and_its_key(mutual_service, mounted, make_client, tmp_path):
     certificate, key = write_client(mounted.authority, tmp_path)
     tls = Tls(root_certificates=mounted.root, certificate=certificate, key=key)
-    assert make_client(mutual_service.grpc, tls=tls, timeout_s=60.0).scenes.list()
+    assert make_client(mutual_service.grpc, tls=tls, timeout_s=300.0).scenes.list()
     without = make_client(mutual_service.grpc, tls=Tls(root_certificates=mounted.root), timeout_s=1.0)
     with pytest.raises(errors.Unreachable, match="may want TLS, or a client's certificate"):
         without.scenes.list()
@@ -54,7 +54,7 @@ def test_a_name_of_the_certificate_in_place_of_the_address(start_service, make_c
     with pytest.raises(errors.TlsFailed, match=r"certificate of another name.*tls.server_name"):
         make_client(service.grpc, tls=Tls(root_certificates=roots)).scenes.list()
     tls = Tls(root_certificates=roots, server_name="ultragray.hospital.example")
-    assert make_client(service.grpc, tls=tls, timeout_s=60.0).scenes.list()
+    assert make_client(service.grpc, tls=tls, timeout_s=300.0).scenes.list()
 
 
 def test_sides_that_do_not_fit_are_told_at_once(tls_service, client_service, mounted, make_client, tmp_path):

@@ -16,10 +16,10 @@ export const PYTHON = process.env.ULTRAGRAY_TEST_PYTHON ?? path.join(ROOT, ".ven
 export const SOURCES = ["model", "proto", "workers", "service"].map((folder) => path.join(ROOT, folder)).join(":");
 const CHROMIUM = process.env.ULTRAGRAY_TEST_CHROMIUM ?? "/usr/bin/chromium";
 const CHROMIUM_FLAGS = ["--headless", "--no-sandbox", "--disable-gpu", "--disable-background-networking"];
-const START_TIMEOUT_MS = 90_000;
+const START_TIMEOUT_MS = 600_000;
 export const SCREENSHOTS = path.join(ROOT, "build/console-screenshots");
-export const TIMEOUT_MS = 30_000; // of what a page should show: the machine may be busy
-export const BACKGROUND_TIMEOUT_MS = 180_000; // of jobs and checks of sweeps and scenes: their processes come last on a busy machine
+export const TIMEOUT_MS = 120_000; // of what a page should show: the machine may be busy
+export const BACKGROUND_TIMEOUT_MS = 600_000; // of jobs and checks of sweeps and scenes: their processes come last on a busy machine
 
 /** A free port, below those that the system gives to connections: the service must come back on the same one. */
 function freePort() {
@@ -45,7 +45,12 @@ export class Service {
     service.port = await freePort();
     service.url = `http://127.0.0.1:${service.port}`;
     service.environment = environment;
-    await service.up();
+    try {
+      await service.up();
+    } catch (error) {
+      service.process.kill("SIGKILL"); // else it would keep this process from ending
+      throw error;
+    }
     return service;
   }
 
@@ -92,7 +97,7 @@ export class Service {
 }
 
 export function launch() {
-  return chromium.launch({ executablePath: CHROMIUM, args: CHROMIUM_FLAGS });
+  return chromium.launch({ executablePath: CHROMIUM, args: CHROMIUM_FLAGS, timeout: TIMEOUT_MS });
 }
 
 /** A page that remembers what went wrong in it: `page.faults` (errors, refused sources) and `page.foreign` (requests elsewhere).

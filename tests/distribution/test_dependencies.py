@@ -119,7 +119,7 @@ app()
 
 
 def core_alone(*arguments):
-    return subprocess.run([sys.executable, "-c", CORE_ALONE, *arguments], capture_output=True, text=True, timeout=120)
+    return subprocess.run([sys.executable, "-c", CORE_ALONE, *arguments], capture_output=True, text=True, timeout=300)
 
 
 @pytest.mark.long

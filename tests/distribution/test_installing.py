@@ -158,9 +158,9 @@ def test_a_service_of_wheels_shows_console_and_demo_scene(built, environment, li
     client = Environment(tmp_path / "client", libraries)
     client.install(wheel_of(built, "ultragray-client"), wheel_of(built, "ultragray-proto"))
     with serving(environment, working_folder) as (http, grpc):
-        with urllib.request.urlopen(f"{http}/", timeout=60) as answer:
+        with urllib.request.urlopen(f"{http}/", timeout=300) as answer:
             assert b"/assets/" in answer.read()  # the page that says how to build the console has none
-        with urllib.request.urlopen(f"{http}/v1/scenes", timeout=60) as answer:
+        with urllib.request.urlopen(f"{http}/v1/scenes", timeout=300) as answer:
             assert [scene["name"] for scene in json.load(answer)["scenes"]] == ["demo"]
         assert succeeds([client.python, "-c", RENDERING, grpc], tmp_path) == "(256, 256)\n"
 

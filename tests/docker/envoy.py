@@ -66,7 +66,7 @@ class Envoy:
 
     def __exit__(self, *_):
         self._process.terminate()
-        self._process.wait(60)
+        self._process.wait(300)
 
     def wait_for(self, healthy=None):
         """Until so many replicas are healthy at every door, as all threads of Envoy know; None: all."""

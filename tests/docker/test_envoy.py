@@ -113,13 +113,13 @@ def start(tmp_path):
 
 
 def over_http(envoy, path, method="GET"):
-    return httpx.request(method, envoy.http + path, timeout=30).raise_for_status().text
+    return httpx.request(method, envoy.http + path, timeout=300).raise_for_status().text
 
 
 def over_grpc(envoy, method, scene=None):
     metadata = () if scene is None else (("x-ultragray-scene", scene),)
     with grpc.insecure_channel(envoy.grpc) as channel:
-        answer = channel.unary_unary(f"/ultragray.v1.{method}")(b"", metadata=metadata, timeout=30)
+        answer = channel.unary_unary(f"/ultragray.v1.{method}")(b"", metadata=metadata, timeout=300)
     return answer.decode()
 
 
@@ -180,7 +180,7 @@ def test_what_changes_something_is_never_sent_twice(start):
     for stub in stubs:
         stub.breaks = True
     for method, path in (("POST", "/v1/jobs"), ("POST", "/v1/scenes/demo:load"), ("POST", "/v1/jobs/7:cancel")):
-        assert httpx.request(method, envoy.http + path, timeout=30).status_code == 503
+        assert httpx.request(method, envoy.http + path, timeout=300).status_code == 503
         assert sum(stub.asked.count(f"{method} {path}") for stub in stubs) == 1
     with pytest.raises(grpc.RpcError):
         over_grpc(envoy, "JobService/SubmitJob")

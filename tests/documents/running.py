@@ -31,7 +31,7 @@ else:
     import tomli as tomllib
 
 COMMAND_TIMEOUT_S = 1200.0  # a training, on a machine that is busy with other tests
-START_TIMEOUT_S = 120.0
+START_TIMEOUT_S = 300.0
 PORTS = {"8000": "http", "50051": "grpc", "18944": "igtl"}  # as documents write them
 _ADDRESS = re.compile(r"((?:localhost|127\.0\.0\.1)[\"']?[:,] ?|port[ =])(8000|50051|18944)\b")
 _PARSERS = {"json": json.loads, "toml": tomllib.loads, "yaml": yaml.safe_load}
@@ -144,7 +144,7 @@ class PageRun:
             with contextlib.suppress(ProcessLookupError):
                 os.killpg(self.served.pid, signal.SIGTERM)
             try:
-                self.served.wait(60)
+                self.served.wait(300)
             except subprocess.TimeoutExpired:
                 os.killpg(self.served.pid, signal.SIGKILL)
                 self.served.wait()

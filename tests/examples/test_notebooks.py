@@ -74,7 +74,7 @@ def test_a_scene_is_served_for_as_long_as_the_block_runs(running_service, tmp_pa
     scene_file = tmp_path / "spine.ugr"
     scene_file.symlink_to(DEMO_FILE)
     with running_service.serving(scene_file) as address, Client(address) as client:
-        assert [scene.name for scene in client.scenes.list(timeout_s=60.0)] == ["spine"]
+        assert [scene.name for scene in client.scenes.list(timeout_s=300.0)] == ["spine"]
     with Client(address) as client, pytest.raises(Unavailable):
         client.scenes.list(timeout_s=1.0)
 

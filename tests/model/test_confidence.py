@@ -5,12 +5,13 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from ultragray import ConvexProbe, LinearProbe, PhasedProbe, RadialProbe, SceneInfo, SteeredProbe, read_header
 from ultragray.errors import InvalidArgument, InvalidPose, LowConfidence, SceneFileInvalid
+from ultragray.rendering.backends import cpu
 from ultragray.scene.confidence import (
     FIGURES,
-    MAX_VIEWS,
     POINTS_PER_SIDE,
     SUPPORT_COVERAGE,
     Assessor,
@@ -284,13 +285,37 @@ def test_weights_are_those_of_the_views_around():
     assert far.argmax() == 2
 
 
-def test_of_very_many_views_those_around_a_pose_count():
-    """The nearest are found among ten times as many as are looked at, and the measures are those of all."""
-    poses = moved(*np.linspace(0.0, 100.0, 10 * MAX_VIEWS))
-    near = np.abs(poses[:, 1, 3] - 40.0) < 5.0
-    asked = moved(40.013, 40.02, -8.0, 107.0)
-    many, few = (TrainingViews(some, PROBE).measure(asked, PROBE) for some in (poses, poses[near]))
-    for name in ("nearest_mm", "distance_mm", "interpolation_mm", "angle_deg"):
-        np.testing.assert_allclose(getattr(many, name)[:2], getattr(few, name)[:2], atol=1e-9)
-    assert many.nearest_mm[2:].mean(axis=1) == pytest.approx([8.0, 7.0])
-    np.testing.assert_allclose(many.weights.sum(axis=1), 1.0)
+@pytest.mark.parametrize("probe", [PROBE, CONVEX, PHASED, RADIAL, STEERED])
+@pytest.mark.parametrize("instruction_set", cpu.INSTRUCTION_SETS)
+def test_the_kernel_measures_as_it_is_defined(probe, instruction_set):
+    """Point by point and view by view, in double precision."""
+    rng = np.random.default_rng(0)
+    views, asked = (moved(*rng.normal(0.0, 10.0, count)) for count in (37, 3))
+    for pose in (*views, *asked):
+        pose[:3, :3] = Rotation.from_rotvec(rng.normal(0.0, 1.0, 3)).as_matrix()
+    training = TrainingViews(views, probe, instruction_set=instruction_set)
+    measured = training.measure(asked, probe)
+    middle, reach = (probe.near_mm + probe.far_mm) / 2, probe.scan_line_length_mm / 2
+    rows, columns = np.meshgrid((np.arange(6) + 0.5) / 6, (np.arange(6) + 0.5) / 6, indexing="ij")
+    points = probe.points_mm(rows, columns).reshape(-1, 3)
+    _, slope, scale, across, half, _ = probe.lines.edges
+    for c, pose in enumerate(asked):
+        turned = np.array(
+            [np.degrees(Rotation.from_matrix(view[:3, :3].T @ pose[:3, :3]).magnitude()) for view in views]
+        )
+        squares = np.zeros(len(views))
+        for k, point in enumerate(points @ pose[:3, :3].T + pose[:3, 3]):
+            x, y, z = ((point - views[:, :3, 3])[:, None] @ views[:, :3, :3])[:, 0].T
+            depth = np.hypot(x, z) if probe.lines.edges.fanned else z * probe.lines.edges.by_z
+            lateral = np.maximum(scale * np.abs(x - slope * z) - across * z - half, 0.0)
+            away = np.sqrt(y**2 + lateral**2 + np.maximum(np.abs(depth - middle) - reach, 0.0) ** 2)
+            front = y * (views[:, :3, 1] @ pose[:3, 1]) >= 0.0
+            before, behind = (away[side].min(initial=2e4) for side in (front, ~front))
+            nearest = np.argmin(away + 0.02 * turned)
+            assert measured.nearest_mm[c, k] == pytest.approx(away[nearest], abs=1e-4)
+            assert measured.angle_deg[c, k] == pytest.approx(turned[nearest], abs=1e-3)
+            between = before * behind / (before + behind)
+            assert measured.interpolation_mm[c, k] == pytest.approx(min(between, 20.0), abs=1e-4)
+            squares += away**2
+        around = np.sqrt(squares / len(points))
+        np.testing.assert_allclose(training.mean_distances_mm(pose[None], probe)[0], around, rtol=1e-5)

@@ -39,8 +39,9 @@ def test_image_coordinates_and_back(probe: Probe) -> None:
     points = probe.points_mm(rows, columns)
     found = probe.image_coordinates(points[:, 0], points[:, 2])
     np.testing.assert_allclose(found, [rows, columns], atol=1e-9)
-    lateral, depth = probe.lines.beside(points[:, 0], points[:, 2])
-    assert (lateral <= 0.0).all()
+    (x, _, z), edges = points.T, probe.lines.edges
+    assert (edges.scale * np.abs(x - edges.slope * z) - edges.across * z - edges.half <= 1e-9).all()
+    depth = np.hypot(x, z) if edges.fanned else edges.by_z * z
     np.testing.assert_allclose(depth, probe.near_mm + rows * probe.scan_line_length_mm)
 
 

@@ -245,6 +245,9 @@ def test_each_mistake_is_named(is_mounting_given, seed, noise):
     assert "flange are inverted" in told(np.linalg.inv(flanges), probes)
     assert "probe are inverted" in told(flanges, np.linalg.inv(probes))
     assert "positions in metres?" in told(metres(flanges), metres(probes), metres(mounting))
+    for far_mm in (7.0, 20.0):  # the residuals of the first are within what hands measure
+        slipped = probes + np.linspace(0, far_mm, SAMPLES)[:, None, None] * np.outer([0.6, 0.8, 0, 0], [0, 0, 0, 1])
+        assert "the probe slipped or a tracker drifts, by " in told(flanges, slipped)
     assert "flange is one sample late" in told(np.concatenate([flanges[:1], flanges[:-1]]), probes)
     if is_mounting_given:
         assert "probe_to_flange are inverted" in told(flanges, probes, np.linalg.inv(mounting))

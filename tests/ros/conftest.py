@@ -150,7 +150,7 @@ class RunningNode:
     def stop(self):
         """The exit code after an interrupt."""
         self.process.send_signal(2)
-        return self.process.wait(60)
+        return self.process.wait(300)
 
 
 @pytest.fixture
@@ -165,4 +165,4 @@ def start_node(ros, tmp_path):
     for node in started:
         if node.process.poll() is None:
             node.process.terminate()
-            node.process.wait(60)
+            node.process.wait(300)

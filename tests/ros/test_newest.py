@@ -94,7 +94,7 @@ class Taker:
 
     def take(self, frame, tag, replaced):
         self.frames.append((frame, tag, replaced))
-        self.may_go_on.wait(60)
+        self.may_go_on.wait(300)
 
     def tags(self):
         return [tag for _, tag, _ in self.frames]
@@ -106,7 +106,7 @@ def client(ros_service):
         yield client
 
 
-def newest(client, taker, scene="demo", timeout_s=60.0):
+def newest(client, taker, scene="demo", timeout_s=300.0):
     return NewestFrames(client, scene, SMALL, timeout_s=timeout_s, take=taker.take, tell=taker.errors.append)
 
 

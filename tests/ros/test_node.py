@@ -154,7 +154,7 @@ def test_the_node_is_a_lifecycle_node(start_node, peer, ros_service):
 )
 def test_a_node_that_cannot_start_says_why(start_node, parameters, told):
     node = start_node(**parameters)
-    assert node.process.wait(60) == 1
+    assert node.process.wait(300) == 1
     assert told in node.log()
     assert "Traceback" not in node.log()
 

@@ -1,12 +1,13 @@
 """A real service in a process of its own, on free ports."""
 
+import itertools
 import json
 import os
 import signal
 import subprocess
 import sys
 import time
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 
 import grpc
@@ -14,18 +15,22 @@ import httpx
 import numpy as np
 import pytest
 import torch
+from websockets.sync.client import connect
 
 from ultragray import GaussianScene, LinearProbe, SceneInfo
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2, rendering_pb2_grpc, scenes_pb2_grpc
 
 from ..waiting import Deadline
-from ..warm import SOURCE_FOLDERS, WARM, WarmProcess, fork
+from ..warm import SOURCE_FOLDERS, WARM, WarmProcess, fork, pool_processes
 
 ROOT = Path(__file__).resolve().parents[2]
-START_TIMEOUT_S = 120.0
-STOP_TIMEOUT_S = 60.0
+START_TIMEOUT_S = 300.0
+STOP_TIMEOUT_S = 300.0
+
+connect.__kwdefaults__.update(open_timeout=STOP_TIMEOUT_S, ping_timeout=STOP_TIMEOUT_S)  # others may keep it busy
 
 HEIGHT, WIDTH = 64, 48  # of the training images of the test scene
+_numbers = itertools.count()  # of services
 
 
 class RunningService:
@@ -36,6 +41,7 @@ class RunningService:
     def __init__(self, data_folder, log_path, environment, *, cold=False):
         """`cold` starts `python -m ultragray_service`; else it is forked from a process with the imports done."""
         self.data_folder = data_folder
+        self._run = f"{os.environ['PYTEST_RUN']}-{next(_numbers)}"
         self.log_path = log_path
         settings = {
             "ULTRAGRAY_DATA_FOLDER": str(data_folder),
@@ -44,7 +50,9 @@ class RunningService:
             "ULTRAGRAY_THREADS_PER_PROCESS": "1",
             "ULTRAGRAY_EMBEDDED_WORKER": "false",
             "ULTRAGRAY_JOB_NICE": "0",  # no frames wait for the processors
-            "ULTRAGRAY_DEFAULT_TIMEOUT_S": "120",  # others may keep the machine busy
+            "ULTRAGRAY_DEFAULT_TIMEOUT_S": "600",  # others may keep the machine busy
+            "ULTRAGRAY_WORKER_GRACE_S": "600",
+            "PYTEST_RUN": self._run,
             "PYTHONPATH": os.pathsep.join(str(ROOT / folder) for folder in SOURCE_FOLDERS),
         }
         whole = {**os.environ, **settings, **environment}
@@ -66,6 +74,10 @@ class RunningService:
     def log(self):
         whole = self.log_path.read_text().rpartition("\n")[0]  # the last line may be half written
         return [json.loads(line) for line in whole.split("\n") if line.startswith("{")]
+
+    def logged(self, *words):
+        """Whether one line of the log has all these words."""
+        return any(all(word in record["message"] for word in words) for record in self.log())
 
     def wait_until_serving(self):
         end = Deadline(START_TIMEOUT_S)
@@ -90,12 +102,31 @@ class RunningService:
 
     def metric(self, *names):
         """The sum of all lines of /metrics, at one moment, that begin with one of the names."""
-        lines = httpx.get(f"{self.http}/metrics", timeout=60).text.splitlines()
+        lines = httpx.get(f"{self.http}/metrics", timeout=300).text.splitlines()
         return sum(float(line.rpartition(" ")[2]) for line in lines if line.startswith(names))
+
+    def poses_from(self, port):
+        """How many have come over the stream of a client at a port of this machine."""
+        streams = httpx.get(f"{self.http}/v1/streams", timeout=300).json()["streams"]
+        return next((one["poses"] for one in streams if one["client"].endswith(f":{port}")), 0)
 
     def stream_url(self, scene="demo"):
         """The WebSocket of a scene."""
         return f"{self.http.replace('http', 'ws', 1)}/v1/scenes/{scene}/stream"
+
+    @contextmanager
+    def without_rendering(self):
+        """Whatever is asked for waits until this context ends: the processes that render are stopped."""
+        workers = [pid for pid, name in pool_processes(self._run).items() if name == "ug-worker"]
+        assert workers
+        for pid in workers:
+            os.kill(pid, signal.SIGSTOP)
+        try:
+            yield
+        finally:
+            for pid in workers:
+                with suppress(ProcessLookupError):
+                    os.kill(pid, signal.SIGCONT)
 
     def resident_bytes(self):
         pages = int(Path(f"/proc/{self.process.pid}/statm").read_text().split()[1])
@@ -206,7 +237,7 @@ def service(start_shared_service):
 
 @pytest.fixture(scope="session")
 def http(service):
-    with httpx.Client(base_url=service.http, timeout=120) as client:
+    with httpx.Client(base_url=service.http, timeout=300) as client:
         yield client
 
 

@@ -17,7 +17,7 @@ LARGE = rendering_pb2.RenderSettings(
     scene="demo", height=600, width=600, encoding=rendering_pb2.ENCODING_FLOAT32, outputs=[1, 2]
 )  # 2.9 MB a frame
 CALM_BYTES = 64 * 2**20
-TIMEOUT_S = 120.0
+TIMEOUT_S = 300.0
 
 
 def rendered(service):

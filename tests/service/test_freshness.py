@@ -2,7 +2,6 @@
 
 import json
 import queue
-import time
 
 import grpc
 import numpy as np
@@ -12,6 +11,7 @@ from websockets.sync.client import connect
 from ultragray_proto.v1 import geometry_pb2, rendering_pb2
 
 from ..freshness import check_fresh
+from ..waiting import wait_until
 from .conftest import split
 
 IDENTITY = geometry_pb2.Pose(matrix=geometry_pb2.Matrix(values=np.eye(4).ravel().tolist()))
@@ -25,7 +25,6 @@ class GrpcDoor:
 
     def __init__(self, renders, settings, window=1):
         self._messages = queue.Queue()
-        self._sequence = 0
         self.frames = renders.RenderStream(iter(self._messages.get, None))
         asked = {**settings, "encoding": f"ENCODING_{settings['encoding'].upper()}"}
         self.put(settings=rendering_pb2.RenderSettings(scene="demo", **asked), mode=LATEST, window=window)
@@ -33,9 +32,8 @@ class GrpcDoor:
     def put(self, **fields):
         self._messages.put(rendering_pb2.RenderStreamRequest(**fields))
 
-    def send(self):
-        self._sequence += 1
-        self.put(sequence=self._sequence, pose=IDENTITY, client_time_ns=time.monotonic_ns())
+    def send(self, number):
+        self.put(sequence=number, pose=IDENTITY)
 
     def take(self):
         frame = next(self.frames)
@@ -45,7 +43,7 @@ class GrpcDoor:
     def receive(self):
         frame = self.take()
         self.put(acknowledged=frame.sequence)
-        return float(frame.client_time_ns / 1e9)
+        return frame.sequence
 
     def close(self):
         self._messages.put(None)
@@ -55,17 +53,18 @@ class GrpcDoor:
 class WebSocketDoor:
     """A client that reads a WebSocket."""
 
-    def __init__(self, connection, settings):
-        self._connection = connection
+    def __init__(self, service, connection, settings):
+        self._connection, port = connection, connection.local_address[1]
+        self._poses = lambda: service.poses_from(port)
         connection.send(json.dumps({"mode": "latest", "settings": settings}))
 
-    def send(self):
-        pose = {"matrix": np.eye(4).tolist()}
-        self._connection.send(json.dumps({"pose": pose, "client_time_ms": 1000 * time.monotonic()}))
+    def send(self, number):
+        self._connection.send(json.dumps({"pose": {"matrix": np.eye(4).tolist()}, "sequence": number}))
+        wait_until(lambda: self._poses() == number)
 
     def receive(self):
-        about, _ = split(self._connection.recv(timeout=60))
-        return float(about["client_time_ms"] / 1000)
+        about, _ = split(self._connection.recv(timeout=300))
+        return about["sequence"]
 
 
 @pytest.fixture
@@ -89,17 +88,17 @@ def test_grpc(open_grpc, settings):
 @pytest.mark.parametrize("settings", [SMALL, pytest.param(LARGE, marks=pytest.mark.long)], ids=["small", "large"])
 def test_websocket_without_acknowledgements(service, settings):
     with connect(service.stream_url(), compression=None, max_size=None, close_timeout=0.2) as connection:
-        check_fresh(WebSocketDoor(connection, settings))
+        check_fresh(WebSocketDoor(service, connection, settings))
 
 
 def test_no_more_answers_come_than_the_window_has_room_for(open_grpc, service):
     door = open_grpc(SMALL, window=3)
-    for _ in range(3):
-        door.send()
+    for number in range(1, 4):
+        door.send(number)
         door.take()
     frames = service.metric("ultragray_frames_total")
-    for _ in range(20):
-        door.send()
+    for number in range(4, 24):
+        door.send(number)
     door.put()  # neither pose nor settings: its refusal comes after all that was to come
     refusal = next(door.frames)
     assert (refusal.error.field, refusal.dropped) == ("pose", 19)

@@ -90,7 +90,7 @@ def test_messages_of_streams(service, text):
             with connect(address) as stream:
                 stream.send(text)
                 stream.send('{"pose": {"matrix": null}}')
-                check(service, str(stream.recv(timeout=120)))
+                check(service, str(stream.recv(timeout=300)))
         except Exception as error:
             check(service, str(error))
 

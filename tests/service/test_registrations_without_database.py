@@ -1,7 +1,6 @@
 """Frames go on by the registrations that a service has copied, while the database that keeps them is away."""
 
 import json
-import time
 from typing import Any, cast
 
 import httpx
@@ -16,7 +15,6 @@ from ultragray_workers.jobs.owners import tell_change
 from ultragray_workers.jobs.tables import REGISTRATIONS
 
 from ..waiting import at_this_load, wait_until
-from ..warm import SHORT_WAITS
 
 PATH = "/v1/registrations/robot"
 TOO_LATE_S = 30.0  # whoever waits for the database waits for ten
@@ -64,8 +62,10 @@ def test_frames_go_on_by_a_registration_that_was_read_while_the_database_is_away
         put(http, 3.0)
         assert_shifted(render(elsewhere, pose_body, "robot"), 3.0)
         put(http, 4.0)
-        # An answer does not tell whether it is from the copy yet.
-        time.sleep(at_this_load(2 * SHORT_WAITS["access.keys.INTERVAL_S"]))
+        database = JobDatabase(tmp_path, shared["database_url"])
+        add_unreadable(database)  # an answer does not tell whether it is from the copy yet
+        database.close()
+        wait_until(lambda: other.logged(UNREADABLE))
         take_away()
         try:
             for _ in range(2):
@@ -84,17 +84,25 @@ def test_frames_go_on_by_a_registration_that_was_read_while_the_database_is_away
         wait_until(lambda: render(elsewhere, pose_body, "robot").status_code == 404)
 
 
+UNREADABLE = "the registration 'odd' cannot be read"
+
+
+def add_unreadable(database):
+    """A registration that is told in the log whenever a service copies them all."""
+    with database.engine.begin() as connection:
+        row = {"name": "odd", "scene": "demo", "owner": "local:", "changed_at_s": 0.0, "document": '{"later": 1}'}
+        connection.execute(sa.insert(REGISTRATIONS).values(row))
+        tell_change(connection)
+
+
 def test_one_that_cannot_be_read_hinders_no_other(start_service, tmp_path, pose_body):
     service = start_service(artifact_folder=tmp_path)
     with httpx.Client(base_url=service.http, timeout=TOO_LATE_S) as http:
         put(http, 3.0)
         database = JobDatabase(tmp_path, None)
-        with database.engine.begin() as connection:
-            row = {"name": "odd", "scene": "demo", "owner": "local:", "changed_at_s": 0.0, "document": '{"later": 1}'}
-            connection.execute(sa.insert(REGISTRATIONS).values(row))
-            tell_change(connection)
+        add_unreadable(database)
         database.close()
-        wait_until(lambda: "the registration 'odd' cannot be read" in service.log_path.read_text())
+        wait_until(lambda: service.logged(UNREADABLE))
         assert [one["name"] for one in http.get("/v1/registrations").json()["registrations"]] == ["robot"]
         assert_shifted(render(http, pose_body, "robot"), 3.0)
 

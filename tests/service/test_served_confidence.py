@@ -50,7 +50,7 @@ def knowing_service(start_service, knowing, data_folder, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def client(knowing_service):
-    with httpx.Client(base_url=f"{knowing_service.http}/v1/scenes/", timeout=60) as client:
+    with httpx.Client(base_url=f"{knowing_service.http}/v1/scenes/", timeout=300) as client:
         yield client
 
 

@@ -40,13 +40,13 @@ def kept(start_service, artifacts):
 
 @pytest.fixture(scope="module")
 def client(kept):
-    with Client(kept.grpc, timeout_s=60.0) as one:
+    with Client(kept.grpc, timeout_s=300.0) as one:
         yield one
 
 
 @pytest.fixture(scope="module")
 def http(kept):
-    with httpx.Client(base_url=kept.http, timeout=60.0) as one:
+    with httpx.Client(base_url=kept.http, timeout=300.0) as one:
         yield one
 
 
@@ -100,7 +100,7 @@ def test_http_and_websocket_take_it_too(kept, http):
     message = {"settings": {**SIZE, "registration": "robot"}, "pose": {"matrix": FLANGE.tolist()}}
     with connect(kept.stream_url()) as socket:
         socket.send(dumps(message))
-        answered = socket.recv(timeout=60)
+        answered = socket.recv(timeout=300)
     np.testing.assert_allclose(split(answered)[0]["pose"], POSE, atol=1e-9)
 
 
@@ -135,7 +135,7 @@ def test_owners_alone_replace_and_delete_and_readers_use(start_service, tmp_path
     keys = {name: KeyStore(database.engine).create(name, role, 1.0)[1] for name, role in ROLES.items()}
     database.close()
     service = start_service(artifact_folder=tmp_path)
-    clients = {name: Client(service.grpc, api_key=key, timeout_s=60.0) for name, key in keys.items()}
+    clients = {name: Client(service.grpc, api_key=key, timeout_s=300.0) for name, key in keys.items()}
     clients["alice"].registrations.put("arm", "demo", BASE_TO_SCENE, MOUNTING)
     with pytest.raises(errors.PermissionDenied, match="somebody else's"):
         clients["bob"].registrations.put("arm", "demo", np.eye(4))
@@ -157,7 +157,7 @@ def flange_job(**changes):
 
 def test_a_job_keeps_the_registration_that_it_was_accepted_with(start_service, tmp_path):
     first = start_service(artifact_folder=tmp_path)
-    with Client(first.grpc, timeout_s=60.0) as client:
+    with Client(first.grpc, timeout_s=300.0) as client:
         client.registrations.put("robot", "demo", BASE_TO_SCENE, MOUNTING)
         plain = client.render("demo", POSE, RenderSettings(**SIZE))
         job = client.jobs.submit(flange_job(), request_id="mine")
@@ -171,7 +171,7 @@ def test_a_job_keeps_the_registration_that_it_was_accepted_with(start_service, t
         retried = client.jobs.retry(job.id)
         assert (retried.specification.registration, retried.pose_count) == ("robot", 1)
     first.terminate()
-    with Client(start_service(artifact_folder=tmp_path, embedded_worker=True).grpc, timeout_s=120.0) as client:
+    with Client(start_service(artifact_folder=tmp_path, embedded_worker=True).grpc, timeout_s=300.0) as client:
         assert client.jobs.wait(retried.id).state is JobState.SUCCEEDED
         client.jobs.download(retried.id, "frames.npz", tmp_path / "frames.npz")
     with np.load(tmp_path / "frames.npz") as archive:

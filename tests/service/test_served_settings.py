@@ -112,7 +112,7 @@ def served(start_service, scene, tmp_path_factory):
 
 @pytest.fixture(scope="module")
 def http(served):
-    with httpx.Client(base_url=f"{served.http}/v1/", timeout=120) as client:
+    with httpx.Client(base_url=f"{served.http}/v1/", timeout=300) as client:
         yield client
 
 
@@ -191,7 +191,7 @@ def test_http_has_the_pixels_of_the_library_and_tells_how_to_render_them_again(h
 def test_the_other_doors_give_the_same(served, renders, scene, name):
     asked, _ = CASES[name]
     truth = expected(scene, name)
-    frame = renders.Render(rendering_pb2.RenderRequest(settings=message_of(asked), pose=pose_message()), timeout=120)
+    frame = renders.Render(rendering_pb2.RenderRequest(settings=message_of(asked), pose=pose_message()), timeout=300)
     np.testing.assert_allclose(np.frombuffer(frame.data, "<f4").reshape(truth.shape), truth, atol=1e-5)
     wanted = message_of(asked)
     for field in ("probe", "contact", "tools", "ghost", "speckle", "display"):
@@ -200,7 +200,7 @@ def test_the_other_doors_give_the_same(served, renders, scene, name):
     with connect(served.stream_url("rich"), compression=None) as stream:
         settings = {"height": HEIGHT, "width": WIDTH, "encoding": "float32", **asked}
         stream.send(json.dumps({"settings": settings, "pose": POSE_BODY}))
-        answer = stream.recv(timeout=120)
+        answer = stream.recv(timeout=300)
     header, pixels = split(answer)
     assert pixels == frame.data
     assert {key: header[key] for key in asked} == asked
@@ -287,7 +287,7 @@ def test_the_other_doors_refuse_by_name(served, renders):
         renders.Render(rendering_pb2.RenderRequest(settings=settings, pose=pose_message()))
     with connect(served.stream_url("rich")) as stream:
         stream.send(json.dumps({"settings": {"display": {"flip": 1}}}))
-        assert json.loads(stream.recv(timeout=60))["error"]["field"] == "settings.display.flip"
+        assert json.loads(stream.recv(timeout=300))["error"]["field"] == "settings.display.flip"
 
 
 def test_a_scene_without_what_a_setting_needs_refuses_it(http):
@@ -321,5 +321,5 @@ def test_a_scene_tells_what_it_has(http, served):
     assert (rich["label_names"], poor["label_names"]) == ({"1": "bone", "200": "vessel"}, {})
     with served.channel() as channel:
         stub = scenes_pb2_grpc.SceneServiceStub(channel)
-        message = stub.GetScene(scenes_pb2.GetSceneRequest(scene="rich"), timeout=60)
+        message = stub.GetScene(scenes_pb2.GetSceneRequest(scene="rich"), timeout=300)
     assert (dict(message.label_names), message.beam.thickness_mm) == (NAMES, 3.0)

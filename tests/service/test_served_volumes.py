@@ -44,13 +44,13 @@ def volume_service(start_service, tmp_path_factory, scene):
 
 @pytest.fixture(scope="module")
 def http(volume_service):
-    with httpx.Client(base_url=volume_service.http, timeout=120) as client:
+    with httpx.Client(base_url=volume_service.http, timeout=300) as client:
         yield client
 
 
 @pytest.fixture(scope="module")
 def client(volume_service):
-    with Client(volume_service.grpc, timeout_s=120) as client:
+    with Client(volume_service.grpc, timeout_s=300) as client:
         yield client
 
 
@@ -161,7 +161,7 @@ def test_a_slice_counts_as_a_frame(http, volume_service):
 
 def test_a_volume_is_made_by_a_job_of_the_client(client, scene, tmp_path):
     job = client.jobs.submit(VoxelizeJob("labelled", field="labels", spacing_mm=2.0, format="nrrd"))
-    done = client.jobs.wait(job.id, timeout_s=120)
+    done = client.jobs.wait(job.id, timeout_s=300)
     assert (done.state.value, done.kind) == ("succeeded", "voxelize"), done.error
     assert set(done.artifacts) == {"labels.nrrd", "volume.json"}
     client.jobs.download(job.id, "labels.nrrd", tmp_path / "labels.nrrd")

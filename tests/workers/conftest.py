@@ -18,12 +18,11 @@ from ultragray_workers import PoolConfig, RenderPool, SceneStore
 from ultragray_workers.pool import processes as launcher
 from ultragray_workers.pool import waiting
 
-from ..conftest import RUN
 from ..waiting import Deadline, wait_until
-from ..warm import WARM, start_template
+from ..warm import WARM, pool_processes, start_template
 from .asking import HEIGHT, PROBE, WIDTH
 
-TIME_LIMIT_S = 180.0
+TIME_LIMIT_S = 600.0
 
 T = TypeVar("T")
 
@@ -62,7 +61,8 @@ def scene_folder(tmp_path, random_scene):
 def open_pool(scene_folder):
     @contextlib.asynccontextmanager
     async def open_(**settings):
-        pool = RenderPool(SceneStore(scene_folder), PoolConfig(**{"threads_per_process": 1, **settings}))
+        usual = {"threads_per_process": 1, "worker_grace_s": 600.0}  # others may keep the machine busy
+        pool = RenderPool(SceneStore(scene_folder), PoolConfig(**{**usual, **settings}))
         await pool.start()
         try:
             yield pool
@@ -114,8 +114,7 @@ def expect_frames(scene_folder):
 @pytest.fixture
 def processes():
     """The workers and templates that this test has started and that live, by process id."""
-    before = set(_pool_processes())  # servers of other tests
-    return lambda: {pid: name for pid, name in _pool_processes().items() if pid not in before}
+    return lambda: pool_processes(os.environ["PYTEST_RUN"])
 
 
 @pytest.fixture(autouse=True)
@@ -135,29 +134,9 @@ def open_channels_and_memories():
     return {link for link in links if link.startswith(("socket:", "/memfd:"))}
 
 
-_NAMES = ("ug-worker", "ug-template")
-_TEMPLATE = b"ultragray_workers.pool.template"
-
-
-def _pool_processes():
-    """Workers and templates of this test process, by process id; one that has just been started is called `python`."""
-    found = {}
-    for folder in Path("/proc").iterdir():
-        if not folder.name.isdigit():
-            continue
-        try:
-            name = (folder / "comm").read_text().strip()
-            is_pools = name in _NAMES or _TEMPLATE in (folder / "cmdline").read_bytes()
-            if is_pools and RUN.encode() in (folder / "environ").read_bytes():
-                found[int(folder.name)] = name
-        except (FileNotFoundError, PermissionError, ProcessLookupError):
-            continue
-    return found
-
-
 @pytest.fixture
 def until():
-    async def wait(condition, timeout_s=60.0):
+    async def wait(condition, timeout_s=300.0):
         """Returns once the condition holds."""
         give_up = Deadline(timeout_s)
         while not condition():

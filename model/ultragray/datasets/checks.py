@@ -15,7 +15,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from ultragray.datasets.clocks import DelayEstimate, clock_warnings, estimate_delay
+from ultragray.datasets.clocks import DelayEstimate, clock_warnings, estimate_delay, goes_to_and_fro_mm
 from ultragray.datasets.images import CropBox
 from ultragray.geometry.pose import rotation_angles_deg
 from ultragray.geometry.probe import Fan, FloatArray, Probe
@@ -81,6 +81,7 @@ def _plane_points(probe: Probe, spacing_mm: float) -> FloatArray:  # [P, 3]
 JUMP_FACTOR = 5.0  # times the usual step
 JUMP_SPREADS = 8.0  # standard deviations, estimated from the median
 SMALLEST_JUMP_MM = 1.0
+SMALLEST_TURN_DEG = 20.0
 SATURATED_SHARE = 0.05
 DARKEST_PEAK = 16  # of 255
 SAME_POSE_MM = 1e-6
@@ -258,8 +259,10 @@ def _warnings(frames: _Frames) -> Iterator[str]:
     if frames.times_s is not None:
         yield from clock_warnings(frames.times_s, frames.numbers)
     yield from _moved_far(frames)
+    yield from _to_and_fro(frames)
     jumps = list(_jumps(frames))
     yield from (text for _, text in jumps)
+    yield from _turned(frames, {place for place, _ in jumps})
     yield from _repeats(frames)
     yield from _odd_images(frames)
     yield from _cuts(frames, {place for place, _ in jumps})
@@ -275,6 +278,29 @@ def _moved_far(frames: _Frames) -> Iterator[str]:
             f"the probe goes {usual:.0f} mm from frame to frame, {steps_mm.sum() / 1000:.3g} m in all: positions in "
             "millimetres where metres are expected?"
         )
+
+
+def _to_and_fro(frames: _Frames) -> Iterator[str]:
+    far_mm = goes_to_and_fro_mm(frames.corners.mean(axis=1))
+    if far_mm:
+        yield (
+            f"the probe goes {far_mm:.3g} mm to and fro from frame to frame: two trackers, or two sweeps, recorded in "
+            "turn?"
+        )
+
+
+def _turned(frames: _Frames, jumps: set[int]) -> Iterator[str]:
+    """Single frames turned against both neighbours, which agree: of a small image, or beside long steps, the corners
+    do not tell it."""
+    turns = [rotation_angles_deg(a[None], b[None])[0, 0] for a, b in pairwise(frames.poses)]
+    limit = max(SMALLEST_TURN_DEG, JUMP_FACTOR * float(np.median(turns))) if turns else 0.0
+    for place in range(1, len(turns)):
+        around = rotation_angles_deg(frames.poses[[place - 1]], frames.poses[[place + 1]])[0, 0]
+        if min(turns[place - 1 : place + 1]) > max(limit, 2 * around) and not jumps & {place - 1, place}:
+            yield (
+                f"frame {frames.numbers[place]} is turned by {turns[place - 1]:.0f}° against the frame before and by "
+                f"{turns[place]:.0f}° against the one after it: a wrong pose?"
+            )
 
 
 def _jumps(frames: _Frames) -> Iterator[tuple[int, str]]:

@@ -22,6 +22,7 @@ from ultragray.learn.sweep import IntArray, frame_list
 
 NS_PER_S, NS_PER_MS = 1_000_000_000, 1_000_000
 MAX_GAP_NS = 200_000_000  # a hand that moves on goes another way within a longer time
+LEAST_TO_AND_FRO, SMALLEST_TO_AND_FRO_MM = 8, 1.0
 MAX_DELAY_MS = 1e12  # a clock that was never set is decades off
 
 BoolArray: TypeAlias = npt.NDArray[np.bool_]
@@ -72,6 +73,18 @@ class PoseTrack:
         found[:, :3, :3] = blended(first[:, :3, :3], second[:, :3, :3], shares)
         found[:, :3, 3] += shares[:, None] * (second[:, :3, 3] - first[:, :3, 3])
         return found, known
+
+
+def goes_to_and_fro_mm(positions: FloatArray) -> float:  # [N, 3]
+    """How far a probe jumps from pose to pose, and back with the next; 0: it does not.
+
+    Two trackers that are recorded as one tell their poses in turn. A hand that shakes by itself does not come back to
+    where it was.
+    """
+    if len(positions) < LEAST_TO_AND_FRO:
+        return 0.0
+    one, two = (float(np.median(np.linalg.norm(positions[apart:] - positions[:-apart], axis=1))) for apart in (1, 2))
+    return one if one > SMALLEST_TO_AND_FRO_MM and two < one / 2 else 0.0
 
 
 def poses_before(

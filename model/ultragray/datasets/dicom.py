@@ -52,6 +52,8 @@ INTERPRETATIONS = {**dict.fromkeys(GREY, 1), **dict.fromkeys((*RGB, *YBR), 3)}  
 PERSON = ("PatientName", "PatientID", "PatientBirthDate", "OtherPatientIDs", "AccessionNumber")
 NOBODY = re.compile(r"(?i)\W*|.*(anon|unknown|phantom|test).*")
 GREY_LEVELS = 10  # by which the samples of a grey pixel may differ: of lossy JPEG they do
+OTHER = 0.02  # relative, by which two sizes of a pixel may differ
+UNUSED_BITS = 3  # which a scanner that says how many bits it stores does not leave
 LEAST_GREY = 0.25  # of the pixels of ultrasound beside its flow; read wrongly, less than half of them stay grey
 
 
@@ -140,9 +142,11 @@ def _header_notes(path: Path, header: Any) -> tuple[str, ...]:
     with _in_our_words(path):
         named = [name for name in PERSON if not NOBODY.fullmatch(str(header.get(name, "")))]
         is_burnt_in = str(header.get("BurnedInAnnotation", "")).upper() == "YES"
-        transducer = header.get("TransducerType")
+        slope, intercept = (float(header.get(f"Rescale{name}", one)) for name, one in (("Slope", 1), ("Intercept", 0)))
+    is_rescaled = (slope, intercept) != (1.0, 0.0)
     notes = (
-        "" if transducer is not None else "the file does not name its transducer: taken as a linear one",
+        "" if _transducer(path, header) is not None else "the file does not name its transducer: taken as a linear one",
+        f"its values are stored times {slope:g} plus {intercept:g}: taken as stored" if is_rescaled else "",
         f"its header names a person ({', '.join(named)}): convert --anonymize leaves it out" if named else "",
         "the file says that its pixels name a person (BurnedInAnnotation YES): crop them" if is_burnt_in else "",
     )
@@ -201,21 +205,24 @@ def _value(path: Path, header: Any, name: str) -> Any:
 def _shape(path: Path, header: Any, *, is_fan: bool) -> tuple[int, int, int]:  # frames, rows, columns
     """The size of the frames. Raises DatasetInvalid for what is no cine loop of 8 bits in grey or colour, and for a
     probe that is not linear unless its fan is known."""
-    bits, stored = _value(path, header, "BitsAllocated"), header.get("BitsStored", 8)
+    bits, interpretation = _value(path, header, "BitsAllocated"), str(_value(path, header, "PhotometricInterpretation"))
+    with _in_our_words(path):
+        stored = int(header.get("BitsStored", 8))
+        high = int(header.get("HighBit", stored - 1))
     if bits not in (8, 16) or header.get("PixelRepresentation", 0) != 0:
         raise DatasetInvalid(
             f"{path}: pixels must have 8 or 16 bits (BitsAllocated) without a sign, got {str(bits)[:40]}"
         )
-    interpretation = str(_value(path, header, "PhotometricInterpretation"))
     samples = _value(path, header, "SamplesPerPixel")
-    if INTERPRETATIONS.get(interpretation) != samples or not 1 <= int(stored) <= bits:
+    if high != stored - 1:
+        raise DatasetInvalid(f"{path}: HighBit must be BitsStored - 1, {stored - 1}, got {high}")
+    if INTERPRETATIONS.get(interpretation) != samples or not 1 <= stored <= bits:
         raise DatasetInvalid(
             f"{path}: PhotometricInterpretation must be {', '.join(INTERPRETATIONS)} with SamplesPerPixel 1 or 3, got "
             f"{interpretation[:40]} with {str(samples)[:40]}"
         )
-    with _in_our_words(path):
-        transducer = str(header.get("TransducerType", "LINEAR"))
-    if transducer not in ("LINEAR", "") and not is_fan:
+    transducer = _transducer(path, header)
+    if transducer not in ("LINEAR", "", None) and not is_fan:
         raise DatasetInvalid(
             f"{path}: the probe is not linear, TransducerType is {transducer[:40]}: say with fan where it lies on the "
             "screen"
@@ -223,11 +230,23 @@ def _shape(path: Path, header: Any, *, is_fan: bool) -> tuple[int, int, int]:  #
     names = ("NumberOfFrames", "Rows", "Columns")
     with _in_our_words(path):
         frames, rows, columns = (int(_value(path, header, name)) for name in names)
-    if min(frames, rows, columns) < 1 or frames * rows * columns * int(samples) > MAX_PIXEL_BYTES:
+    if min(frames, rows, columns) < 1 or frames * rows * columns * int(samples) * bits // 8 > MAX_PIXEL_BYTES:
         raise DatasetInvalid(
-            f"{path}: it must have 1 to {MAX_PIXEL_BYTES:,} pixels, its header says {frames} x {rows} x {columns}"
+            f"{path}: it must have 1 to {MAX_PIXEL_BYTES:,} bytes of pixels, its header says {frames} x {rows} x "
+            f"{columns}"
         )
     return frames, rows, columns
+
+
+def _transducer(path: Path, header: Any) -> str | None:
+    """TransducerType, or of an enhanced volume the meaning of its code; None where the file says neither."""
+    with _in_our_words(path):
+        if (kind := header.get("TransducerType")) is not None:
+            return str(kind)
+        for code in header.get("TransducerGeometryCodeSequence", []):
+            meaning = str(code.get("CodeMeaning", "")).upper()
+            return "LINEAR" if meaning.startswith("LINEAR") else meaning
+    return None
 
 
 @dataclass(frozen=True)
@@ -251,14 +270,19 @@ def _region(path: Path, header: Any, shape: tuple[int, int, int], crop: str | No
         regions = [one for one in header.get("SequenceOfUltrasoundRegions", []) if _is_tissue(one)]
         echoes = [one for one in regions if one.get("RegionDataType") == TISSUE]
         found = list(dict.fromkeys(_read_region(path, one) for one in echoes or regions))
+        spacing = _pixel_spacing(header)
+        notes = _other_sizes(header, found, spacing)
         if not found:
-            if "PixelSpacing" not in header:
+            if spacing is None:
                 raise DatasetInvalid(
                     f"{path}: it does not say how large a pixel is: no region of SequenceOfUltrasoundRegions in "
                     "centimetres, and no PixelSpacing"
                 )
-            axial_mm, lateral_mm = (float(spacing) for spacing in header.PixelSpacing)
-            found = [_Region(CropBox(0, columns, 0, rows), (lateral_mm, axial_mm), "PixelSpacing")]
+            found = [_Region(CropBox(0, columns, 0, rows), spacing, "PixelSpacing")]
+            if crop is None:
+                notes += (
+                    f"no region in centimetres: the whole image of {columns} x {rows} pixels is taken as ultrasound",
+                )
     if len(found) > 1:
         listed = "; ".join(
             f"{one.crop} (pixels of {one.pixel_mm[0]:.4g} x {one.pixel_mm[1]:.4g} mm)" for one in found[:8]
@@ -278,9 +302,35 @@ def _region(path: Path, header: Any, shape: tuple[int, int, int], crop: str | No
             "with crop which part to take"
         )
     if beyond != 1:
-        return region, ()
+        return region, notes
     note = f"its region, columns and rows {region.crop}, ends one pixel beyond the image: clipped by that pixel"
-    return replace(region, box=clipped), (note,)
+    return replace(region, box=clipped), (*notes, note)
+
+
+def _pixel_spacing(header: Any) -> tuple[float, float] | None:
+    """Lateral and axial size of a pixel, mm; of an enhanced file among the measures that its frames share."""
+    shared: Any = next(iter(header.get("SharedFunctionalGroupsSequence", [])), {})
+    measures: Any = next(iter(shared.get("PixelMeasuresSequence", [])), {})
+    spacing = header.get("PixelSpacing") or measures.get("PixelSpacing")
+    return (float(spacing[1]), float(spacing[0])) if spacing else None
+
+
+def _other_sizes(header: Any, regions: list[_Region], spacing: tuple[float, float] | None) -> tuple[str, ...]:
+    """What else the file says of lengths, where its regions say otherwise."""
+    sizes = " or ".join(f"{one.pixel_mm[0]:.4g} x {one.pixel_mm[1]:.4g}" for one in regions)
+    found = []
+    if spacing and regions and not any(np.allclose(one.pixel_mm, spacing, rtol=OTHER) for one in regions):
+        found.append(
+            f"PixelSpacing says pixels of {spacing[0]:.4g} x {spacing[1]:.4g} mm, its regions {sizes}: these count"
+        )
+    depth_mm = float(header.get("DepthOfScanField") or 0.0)
+    depths_mm = [one.box.height * one.pixel_mm[1] for one in regions]
+    if depth_mm and depths_mm and not any(depth_mm / 2 < one < depth_mm * 2 for one in depths_mm):
+        found.append(
+            f"the file says that it sees {depth_mm:g} mm deep (DepthOfScanField), its region is {depths_mm[0]:.4g} mm "
+            "high: a length in another unit?"
+        )
+    return tuple(found)
 
 
 def _holds(outer: CropBox, inner: CropBox) -> bool:
@@ -330,10 +380,11 @@ def _read_frames(
     path: Path, header: Any, shape: tuple[int, int, int], chosen: IntArray
 ) -> tuple[ByteArray, tuple[str, ...]]:
     """The chosen frames [C, rows, columns], decoded one at a time, and notes; colours become their luma."""
-    frames = np.empty((len(chosen), *shape[1:]), np.uint8)
-    interpretation = str(header.PhotometricInterpretation)
+    interpretation, bits = str(header.PhotometricInterpretation), int(header.get("BitsStored", 8))
+    is_wide = bits > 8 and interpretation in GREY[:2]
+    frames = np.empty((len(chosen), *shape[1:]), np.uint16 if is_wide else np.uint8)
     syntax = header.file_meta.TransferSyntaxUID
-    if syntax in JPEG and int(header.get("BitsStored", 8)) == 8 and interpretation != "PALETTE COLOR":
+    if syntax in JPEG and bits == 8 and interpretation != "PALETTE COLOR":
         return _read_jpeg(path, header, shape, chosen)
     said: tuple[str, ...] = ()
     with _in_our_words(path):
@@ -345,15 +396,17 @@ def _read_frames(
             raise DatasetInvalid(f"{path}: pixels compressed as {syntax.name} cannot be read") from None
         if decoder is not None and not decoder.is_available:
             raise DatasetInvalid(f"{path}: pixels compressed as {syntax.name} cannot be read: install python-gdcm")
-        surplus = max(0, int(header.get("BitsStored", 8)) - 8)
+        surplus = max(0, bits - 8)
         if decoder is not None and syntax in JPEG and surplus and "pylibjpeg" not in decoder.available_plugins:
             raise DatasetInvalid(
-                f"{path}: {header.BitsStored} bits compressed as {syntax.name} cannot be read: install "
+                f"{path}: {bits} bits compressed as {syntax.name} cannot be read: install "
                 "pylibjpeg-libjpeg (GPL), or save the file without compression"
             )
-        if decoder is None and interpretation == "YBR_FULL_422" and path.stat().st_size < 3 * math.prod(shape):
-            raise DatasetInvalid(f"{path}: pixels that share their colours (YBR_FULL_422) cannot be read uncompressed")
-        pixels = iter_pixels(path, indices=[int(number) for number in chosen], raw=True)
+        is_shared = decoder is None and interpretation == "YBR_FULL_422" and path.stat().st_size < 3 * math.prod(shape)
+        if is_shared:  # pydicom seeks other frames of these
+            pixels = _shared_colours(path, shape, chosen)
+        else:
+            pixels = iter_pixels(path, indices=[int(number) for number in chosen], raw=True)
         is_ybr = interpretation in YBR
         for number, out in zip(chosen, frames, strict=True):
             with _in_our_words(f"{path}: frame {number}"):
@@ -366,6 +419,9 @@ def _read_frames(
                 raise DatasetInvalid(
                     f"{path}: frame {number} must be unsigned {list(expected)}, got {frame.dtype} {list(frame.shape)}"
                 )
+            if is_wide:
+                np.bitwise_and(frame, (1 << bits) - 1, out=out, casting="same_kind")
+                continue
             frame = np.asarray(frame >> surplus if surplus else frame, np.uint8)
             if number == chosen[0] and frame.ndim == 3 and interpretation != "PALETTE COLOR":
                 as_ybr = convert_color_space(frame, "YBR_FULL", "RGB")
@@ -374,11 +430,35 @@ def _read_frames(
                     said = (_other_colours(interpretation, "YBR_FULL" if is_ybr else "RGB"),)
             frame = convert_color_space(frame, "YBR_FULL", "RGB") if is_ybr else frame
             out[:] = grey_frames(frame[None], str(path))[0]
-            if interpretation == "MONOCHROME1":
-                np.subtract(255, out, out=out)
+    if is_wide and (used := int(frames.max()).bit_length()) <= bits - UNUSED_BITS:
+        said, surplus = (f"only {used} of the {bits} bits of its pixels are used",), max(0, used - 8)
     if surplus:
-        said = (*said, f"pixels of {header.BitsStored} bits were made 8: {(256 << surplus) - 1} became 255")
-    return frames, said
+        said = (*said, f"pixels of {bits} bits were made 8: {(256 << surplus) - 1} became 255")
+    grey = (frames >> surplus).astype(np.uint8) if is_wide else frames
+    return 255 - grey if interpretation == "MONOCHROME1" else grey, said
+
+
+def _shared_colours(path: Path, shape: tuple[int, int, int], chosen: IntArray) -> Iterator[ByteArray]:
+    """Uncompressed frames [rows, columns, 3] of YBR_FULL_422: two pixels, then the colours of both (PS3.3 C.7.6.3.1.2).
+
+    Raises DatasetInvalid for an odd number of columns and where the file ends before.
+    """
+    import pydicom
+
+    _, rows, columns = shape
+    with path.open("rb") as file:
+        header = pydicom.dcmread(file, stop_before_pixels=True)
+        begin = file.tell() + (8 if header.file_meta.TransferSyntaxUID.is_implicit_VR else 12)
+        for number in chosen:
+            file.seek(begin + 2 * int(number) * rows * columns)
+            data = file.read(2 * rows * columns)
+            if len(data) < 2 * rows * columns or columns % 2:
+                raise DatasetInvalid(f"{path}: frame {number}: truncated, or with half of a pair of pixels")
+            pairs = np.frombuffer(data, np.uint8).reshape(rows, columns // 2, 4)
+            frame = np.empty((rows, columns, 3), np.uint8)
+            frame[:, 0::2, 0], frame[:, 1::2, 0] = pairs[..., 0], pairs[..., 1]
+            frame[:, 0::2, 1:] = frame[:, 1::2, 1:] = pairs[..., 2:]
+            yield frame
 
 
 def _is_otherwise(as_said: ByteArray, as_other: ByteArray) -> bool:  # [rows, columns, 3]

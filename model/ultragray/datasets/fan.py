@@ -22,6 +22,7 @@ from ultragray.contract import from_dict
 from ultragray.datasets.images import (
     CropBox,
     check_pixel_mm,
+    near_sensor,
     parse_crop,
     pixel_size_mm,
     poses_from_image_transforms,
@@ -141,6 +142,10 @@ def find_path(names: Iterable[TransformName], start: str, goal: str) -> list[tup
 SQUARE_TOLERANCE = 0.01
 SMALLEST_PIXEL_MM = 1e-6
 SMALLEST_SHARE = 0.5  # of the fan that must lie in the image
+FAN_NAMES = (  # of the fan that PLUS clips to, and of versions before 2.4: angles, apex, end and face
+    ("FanAnglesDeg", "FanOriginPixel", "FanRadiusStopPixel", "FanRadiusStartPixel"),
+    ("FanAngles", "FanOrigin", "FanDepth"),
+)
 EXPECTED = "fan must be opening angle (degrees), radius of the face, radius of the end (mm), column, row of the apex"
 
 
@@ -212,16 +217,16 @@ def fan_of_device_set(device_set: DeviceSet, pixel_mm: tuple[float, float]) -> F
             fans.add(FanGeometry(start, stop, near, far, column, row - near / axial_mm))
     for element in () if fans else root.iter("VolumeReconstruction"):
         number = _reader(element, path)
-        if element.get("FanAnglesDeg") is None or len(set(number("FanAnglesDeg", 2))) == 1:
+        names = next((names for names in FAN_NAMES if element.get(names[0]) is not None), None)
+        if names is None or len(set(number(names[0], 2))) == 1:
             continue  # PLUS clips to no fan
         if abs(lateral_mm / axial_mm - 1.0) > SQUARE_TOLERANCE:
             raise DatasetInvalid(
                 f"{path}: the radii of its fan are in pixels, which must be square: they are {lateral_mm:g} x "
                 f"{axial_mm:g} mm; give the fan in mm"
             )
-        start, stop = number("FanAnglesDeg", 2)
-        column, row = number("FanOriginPixel", 2)
-        (near,), (far,) = number("FanRadiusStartPixel", 1), number("FanRadiusStopPixel", 1)
+        (start, stop), (column, row), (far,) = number(names[0], 2), number(names[1], 2), number(names[2], 1)
+        (near,) = number(names[3], 1) if len(names) > 3 else (0.0,)
         fans.add(FanGeometry(start, stop, near * axial_mm, far * axial_mm, column, row))
     if len(fans) > 1:
         raise DatasetInvalid(f"{path}: it has {len(fans)} fans that differ; give the one of these images as fan")
@@ -402,5 +407,5 @@ def tracked_sweep(
     if crop is None and fan is None:
         notes += (f"no crop was given: the whole image of {size[1]} x {size[0]} pixels is taken as ultrasound",)
     region = region_of(size, shown.box, pixel_mm, image_to_sensor)
-    notes = (*notes, *shown.notes)
+    notes = (*notes, *near_sensor(image_to_sensor), *shown.notes)
     return Sweep(shown.frames, shown.poses, shown.probe, numbers, str(path), notes, region, chain, times_s)

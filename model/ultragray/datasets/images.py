@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -101,6 +102,25 @@ def grey_frames(frames: npt.NDArray[Any], source: str) -> ByteArray:  # [F, H, W
     return grey
 
 
+def eight_bits(stored: npt.NDArray[Any], source: str) -> tuple[ByteArray, tuple[str, ...]]:  # [F, …]
+    """Frames of 8 or 16 bits as 8, and what is to be told of it.
+
+    Of 16 bits the power of two above the largest value becomes 256, so that recordings of one scanner are scaled alike.
+    Raises DatasetInvalid for values below 0.
+    """
+    if stored.dtype == np.uint8:
+        return stored, ()
+    if int(stored.min()) < 0:
+        raise DatasetInvalid(
+            f"{source}: 16-bit pixels must not be below 0, the smallest is {stored.min()}: RF data, not B-mode?"
+        )
+    surplus = max(0, int(stored.max()).bit_length() - 8)
+    pixels = np.empty(stored.shape, np.uint8)
+    for frame, out in zip(stored, pixels, strict=True):
+        out[:] = frame >> surplus
+    return pixels, (f"pixels of 16 bits were made 8: {(256 << surplus) - 1} became 255",)
+
+
 def frame_size(shape: tuple[int, ...]) -> tuple[int, int] | None:
     """Height and width of frames stored in an array of this shape; None where it cannot hold frames."""
     if 0 in shape:
@@ -141,6 +161,7 @@ def _luma(frame: ByteArray, size: tuple[int, int]) -> ByteArray:
 
 SCALE_TOLERANCE = 1e-3  # relative; trackers write six digits
 SMALLEST_ANGLE_DEG = 45.0
+NEAR_SENSOR_MM = 1.0
 SMALLEST_PIXEL_MM, LARGEST_PIXEL_MM, LARGEST_IMAGE_MM = 2e-3, 10.0, 1000.0
 
 
@@ -190,6 +211,21 @@ def check_pixel_mm(pixel_mm: tuple[float, float], side: int, where: str) -> None
         raise DatasetInvalid(
             f"{where} makes a pixel {pixel_mm[0]:.5g} x {pixel_mm[1]:.5g} mm (width x height), it must be "
             f"{SMALLEST_PIXEL_MM:g} to {LARGEST_PIXEL_MM:g} mm{unit}"
+        )
+
+
+def near_sensor(image_to_sensor: FloatArray | None) -> Iterator[str]:  # [4, 4]
+    """What is odd about a calibration whose first pixel lies within a millimetre of the sensor, but not within a pixel:
+    a translation in metres is so."""
+    if image_to_sensor is None:
+        return
+    away_mm = float(np.linalg.norm(image_to_sensor[:3, 3]))
+    in_pixels = np.linalg.lstsq(image_to_sensor[:3, :2], image_to_sensor[:3, 3], rcond=None)
+    is_half = np.abs(in_pixels[0] * 2 - np.round(in_pixels[0] * 2)).max() < 1e-3 and not in_pixels[1].sum() > 1e-9
+    if 0.0 < away_mm < NEAR_SENSOR_MM and not is_half:
+        yield (
+            f"the calibration puts the first pixel {away_mm:.3g} mm from the sensor: is its translation in metres, and "
+            "its pixels in millimetres?"
         )
 
 

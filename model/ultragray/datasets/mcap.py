@@ -25,10 +25,11 @@ from ultragray.datasets.clocks import (
     BoolArray,
     PoseTrack,
     delay_note,
+    goes_to_and_fro_mm,
     parse_delay_ns,
 )
 from ultragray.datasets.fan import FanGeometry, FanLines, TransformName, find_path
-from ultragray.datasets.images import MAX_PIXEL_BYTES, parse_crop, poses_from_image_transforms, region_of
+from ultragray.datasets.images import MAX_PIXEL_BYTES, eight_bits, parse_crop, poses_from_image_transforms, region_of
 from ultragray.datasets.mcap_messages import KINDS, MessageFile, StoredMessage, grey_image, time_of
 from ultragray.errors import DatasetInvalid, InvalidArgument, InvalidPose
 from ultragray.exchange.ros_fields import TRANSFORM, TRANSFORMS, pose_of_parts
@@ -215,6 +216,7 @@ class TrackedPoses:
         self._frames: dict[str, Counter[str]] = {}  # that the poses of a topic are in
         self._tracked: dict[str, set[TransformName]] = {}  # what the transforms of a topic are of, by topic
         self._transforms: dict[TransformName, list[_Stamped]] = {}  # from child to parent
+        self._told_by: dict[TransformName, set[str]] = {}  # the topics of tf that tell a moving one
         self._fixed: dict[TransformName, list[_Stamped]] = {}
 
     @property
@@ -235,9 +237,12 @@ class TrackedPoses:
             self._poses.setdefault(message.topic, []).append(_stamped(transform, message))
             self._tracked.setdefault(message.topic, set()).add(_name_of(transform))
         elif message.kind == TRANSFORMS:
-            kept = self._fixed if message.topic.endswith("_static") else self._transforms
+            is_static = message.topic.endswith("_static")
+            kept = self._fixed if is_static else self._transforms
             for transform in message.decode().transforms:
                 kept.setdefault(_name_of(transform), []).append(_stamped(transform, message))
+                if not is_static:
+                    self._told_by.setdefault(_name_of(transform), set()).add(message.topic)
 
     def way(self, topic: str, frame: str, transform: str | None) -> Way:
         """The poses of a topic, or of tf those between two frames that `transform` names, such as probeTobase.
@@ -294,6 +299,11 @@ class TrackedPoses:
         notes: list[str] = []
         for name, is_inverted in way:
             called, is_tracked = "To".join(name), name in self._transforms
+            if len(topics := self._told_by.get(name, set())) > 1:
+                raise DatasetInvalid(
+                    f"{self._path}: {called} is told on {' and on '.join(sorted(topics))}: record the tf of one robot, "
+                    "or give their frames names of their own"
+                )
             track, found = self._track((self._transforms if is_tracked else self._fixed)[name], called)
             notes += found
             is_constant = np.ptp(track.poses, axis=0).max() < SAME
@@ -361,7 +371,15 @@ class TrackedPoses:
         times = sorted(found)
         track = PoseTrack(np.array(times, np.int64), np.array([found[time_ns] for time_ns in times]))
         lost = len({time_ns for time_ns, *_ in stamped} - set(times))
+        to_and_fro_mm = goes_to_and_fro_mm(track.poses[:, :3, 3])
+        unstamped = sum(time_ns == written_ns for time_ns, written_ns, *_ in stamped)
         notes = (
+            f"{unstamped} poses of {name} have no stamp: taken for those of the time that they were written at"
+            if unstamped == len(stamped) > 1
+            else "",
+            f"the poses of {name} go {to_and_fro_mm:.3g} mm to and fro from one to the next: do two sources tell them?"
+            if to_and_fro_mm
+            else "",
             f"{lost} poses of {name} are none, such as of a probe that was lost, and were passed over" if lost else "",
             f"{twice} poses of {name} have the stamp of another one: the last of them is taken" if twice else "",
             f"the stamps of {name} step back {back} times: its poses were put in their order" if back else "",
@@ -427,9 +445,14 @@ def read_mcap_sweep(
         raise DatasetInvalid(f"{path}: none of {len(known)} images has a pose: {_why_none(times, delay_ns, way)}")
     with_pose = times.numbers[known]
     geometry, geometry_source = contents.geometry_of(topic, times.log_times_ns[known], with_pose)
-    images = _read_images(file, topic, with_pose)
+    images, pixel_notes = _read_images(file, topic, with_pose)
     is_guessed = source == TF and transform is None
-    notes = (*_notes(file, way, is_guessed, times.numbers[~known]), *_path_notes(times, way), *delay_note(delay_ns))
+    notes = (
+        *_notes(file, way, is_guessed, times.numbers[~known]),
+        *_path_notes(times, way),
+        *pixel_notes,
+        *delay_note(delay_ns),
+    )
     sweep = geometry.sweep(images, poses[known], with_pose, path, notes, crop)
     pixels = Link("pixels", way.links[0].origin, "geometry", geometry_source)
     seconds = (times.times_ns[known] - times.times_ns.min()) / NS_PER_S
@@ -529,18 +552,23 @@ class _ImageTimes:
         return int(np.median(self.log_times_ns - self.times_ns))
 
 
-def _read_images(file: MessageFile, topic: str, numbers: IntArray) -> ByteArray:  # [F, rows, columns]
-    """Raises DatasetInvalid, naming the frame, where the size changes, or all of them are too large."""
-    images: ByteArray | None = None
+def _read_images(
+    file: MessageFile, topic: str, numbers: IntArray
+) -> tuple[ByteArray, tuple[str, ...]]:  # [F, rows, columns]
+    """The frames, and what is to be told of them. Raises DatasetInvalid, naming the frame, where the size changes, or
+    all of them are too large."""
+    images: np.ndarray | None = None
     for place, (number, message) in enumerate(_chosen_images(file, topic, numbers)):
         image = grey_image(message.decode(), message.kind, f"{file.path}: frame {number}")
         if images is None:
-            if image.size * len(numbers) > MAX_PIXEL_BYTES:
+            if image.nbytes * len(numbers) > MAX_PIXEL_BYTES:
                 raise DatasetInvalid(
                     f"{file.path}: its frames must have at most {MAX_PIXEL_BYTES:,} pixels, {len(numbers)} of "
                     f"{image.shape[1]} x {image.shape[0]} have more: choose some with frames"
                 )
-            images = np.empty((len(numbers), *image.shape), np.uint8)
+            images = np.empty((len(numbers), *image.shape), image.dtype)
+        if image.dtype != images.dtype:
+            raise DatasetInvalid(f"{file.path}: frame {number} is of {image.dtype}, frame {numbers[0]} {images.dtype}")
         if image.shape != images.shape[1:]:
             first = numbers[0]
             raise DatasetInvalid(
@@ -549,7 +577,7 @@ def _read_images(file: MessageFile, topic: str, numbers: IntArray) -> ByteArray:
             )
         images[place] = image
     assert images is not None  # there are numbers
-    return images
+    return eight_bits(images, str(file.path))
 
 
 def _why_none(times: _ImageTimes, delay_ns: int, way: Way) -> str:

@@ -20,7 +20,6 @@ from ultragray.datasets.images import grey_frames
 from ultragray.errors import DatasetInvalid
 from ultragray.exchange.ros_fields import COMPRESSED, check_fields
 from ultragray.exchange.ros_messages import IMAGE
-from ultragray.learn.sweep import ByteArray
 
 MAX_RECORD_BYTES = 1 << 30  # of a chunk, compressed or not
 MAX_TIME_NS = (1 << 63) - 1
@@ -123,12 +122,14 @@ def time_of(header: Any, log_time_ns: int) -> int:
 
 
 KINDS = (IMAGE, COMPRESSED)
-_FLAGS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_IGNORE_ORIENTATION
+_FLAGS = cv2.IMREAD_GRAYSCALE | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
 
 # Channels, and the place of red, green and blue among them; a float is of 0 to 1.
 _ENCODINGS: dict[str, tuple[int, tuple[int, ...]]] = {
     "mono8": (1, (0,)),
     "8UC1": (1, (0,)),
+    "mono16": (1, (0,)),
+    "16UC1": (1, (0,)),
     "32FC1": (1, (0,)),
     "rgb8": (3, (0, 1, 2)),
     "rgba8": (4, (0, 1, 2)),
@@ -137,9 +138,10 @@ _ENCODINGS: dict[str, tuple[int, tuple[int, ...]]] = {
     "bgra8": (4, (2, 1, 0)),
     "8UC4": (4, (2, 1, 0)),
 }
+_KINDS = {"32FC1": "f4", "mono16": "u2", "16UC1": "u2"}  # of numbers; else bytes
 
 
-def grey_image(message: Any, kind: str, where: str) -> ByteArray:  # [H, W]
+def grey_image(message: Any, kind: str, where: str) -> np.ndarray:  # [H, W] uint8 or uint16
     """The pixels of a message; colours become their luma. Raises DatasetInvalid, naming `where`."""
     if kind == COMPRESSED:
         return _decompressed(message, where)
@@ -149,7 +151,7 @@ def grey_image(message: Any, kind: str, where: str) -> ByteArray:  # [H, W]
             f"{where}: its encoding must be one of {', '.join(_ENCODINGS)}, got {message.encoding[:40]!r}"
         )
     channels, colours = known
-    pixel = np.dtype((">" if message.is_bigendian else "<") + "f4") if message.encoding == "32FC1" else np.dtype("u1")
+    pixel = np.dtype((">" if message.is_bigendian else "<") + _KINDS.get(message.encoding, "u1"))
     height, width, step = int(message.height), int(message.width), int(message.step)
     row_bytes = width * channels * pixel.itemsize
     data = np.frombuffer(message.data, np.uint8)
@@ -160,18 +162,21 @@ def grey_image(message: Any, kind: str, where: str) -> ByteArray:  # [H, W]
         )
     rows = np.lib.stride_tricks.as_strided(data, (height, row_bytes), (step, 1), writeable=False)
     pixels = np.ascontiguousarray(rows).view(pixel).reshape(height, width, channels)[:, :, colours]
-    frame: ByteArray = grey_frames(pixels[None], where)[0]
-    return frame
+    return (
+        pixels[:, :, 0].astype(np.uint16)
+        if pixel.kind == "u" and pixel.itemsize == 2
+        else grey_frames(pixels[None], where)[0]
+    )
 
 
-def _decompressed(message: Any, where: str) -> ByteArray:
+def _decompressed(message: Any, where: str) -> np.ndarray:
     data = np.frombuffer(message.data, np.uint8)
     try:
         found = cv2.imdecode(data, _FLAGS) if len(data) else None
     except cv2.error:
         found = None
-    if found is None:
+    if found is None or found.dtype not in (np.uint8, np.uint16):
         raise DatasetInvalid(
             f"{where}: it must hold a JPEG or PNG file, got {len(data)} bytes of format {message.format[:40]!r}"
         )
-    return np.asarray(found, np.uint8)
+    return np.asarray(found)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -34,6 +34,7 @@ from ultragray.datasets.images import (
     CropBox,
     check_pixel_mm,
     grey_frames,
+    near_sensor,
     parse_crop,
     pixel_size_mm,
     poses_from_image_transforms,
@@ -50,8 +51,9 @@ IMAGE, PROBE, WORLDS = "Image", "Probe", ("Reference", "Tracker", "World")
 _TRANSFORM, _STATUS = "Transform", "TransformStatus"
 _IMAGE_STATUSES = ("ImageStatus", "Status")  # as MetaImage and NRRD sequences call it
 _TIMES = ("Timestamp", "UnfilteredTimestamp")
-_DEPTH = re.compile(r"(?i).*depth(mm|cm)?")
+_DEPTH = re.compile(r"(?i).*depth_?(mm|cm)?")
 _PERSON = re.compile(r"(?i)(.*[^a-z])?(patient|subject|mrn|accession|birth).*")
+SAME_SPACING = 0.02  # relative
 SAME_MM = 0.01  # by which two ways between frames may differ: trackers write six digits
 
 
@@ -123,6 +125,7 @@ def read_plus_sweep(
             *stored.notes,
             *_notes(stored, numbers, orientation, size if is_whole else None, left_out),
             *notes,
+            *_odd_lengths(stored, calibration, pixel_mm),
             *shown.notes,
             *delay_note(delay_ns),
         ),
@@ -328,7 +331,8 @@ def _steps(
     for world in WORLDS:
         if way := find_path(sources, pixels, world):
             return tuple(way)
-    hint = "" if device_set else " (give the device set that holds ImageToProbe)"
+    is_calibrated = any(part.endswith(IMAGE) for name in sources for part in name)
+    hint = " (say with transform which to take)" if is_calibrated else " (give the device set that holds ImageToProbe)"
     raise DatasetInvalid(
         f"{stored.path}: no transforms lead from {pixels} to {', '.join(WORLDS[:-1])} or {WORLDS[-1]}; there are "
         f"{known}{hint}"
@@ -436,6 +440,23 @@ def _clip_of(
         elif not is_whole:
             notes.append(f"the rectangle of {element} in the device set is not taken: --crop {words} does")
     return found, notes
+
+
+def _odd_lengths(
+    stored: StoredSequence, calibration: FloatArray | None, pixel_mm: tuple[float, float]
+) -> Iterator[str]:
+    """Lengths of the file that contradict each other, or are in another unit than their neighbours."""
+    spacing = [abs(float(word)) for word in re.findall(r"[-+.\deE]+", _field(stored, "ElementSpacing"))[:2]]
+    if (
+        len(spacing) == 2
+        and spacing != [1.0, 1.0]
+        and not np.allclose(sorted(spacing), sorted(pixel_mm), rtol=SAME_SPACING)
+    ):
+        yield (
+            f"ElementSpacing says pixels of {spacing[0]:.4g} x {spacing[1]:.4g} mm, the calibration "
+            f"{pixel_mm[0]:.4g} x {pixel_mm[1]:.4g}: this one is taken"
+        )
+    yield from near_sensor(calibration)
 
 
 def _notes(

@@ -16,7 +16,7 @@ from typing import BinaryIO
 
 import numpy as np
 
-from ultragray.datasets.images import MAX_PIXEL_BYTES
+from ultragray.datasets.images import MAX_PIXEL_BYTES, eight_bits
 from ultragray.errors import DatasetInvalid
 from ultragray.learn.sweep import ByteArray
 
@@ -24,6 +24,7 @@ MAX_HEADER_BYTES = 256 << 20
 MAX_LINE_BYTES = 1 << 20
 MAX_BARE_FRAMES = 1_000  # without a field of their own: a few may lack a pose, but a frame costs memory
 _ZLIB_OR_GZIP = 47  # zlib's window bits for either kind of header
+_GZIP = b"\x1f\x8b"  # the beginning of a member
 _FRAME_FIELD = re.compile(r"Seq_Frame(\d{1,9})_(\w+)")
 
 
@@ -105,13 +106,14 @@ class Payload:
     dtype: str  # such as u1 or >i2
     deflated: bool
     deflated_bytes: int | None = None
+    lines: int = 0  # of text before the offset, in each file
 
     def read(self, shape: tuple[int, ...]) -> tuple[ByteArray, tuple[str, ...]]:
         """uint8 pixels of `shape`, and notes of what was changed.
 
-        Of 16 bits the power of two above the largest value of the file becomes 256, so that sequences of one scanner
-        are scaled alike. Raises DatasetInvalid, naming the file, where there are fewer or more bytes than the shape
-        holds, the deflated bytes are damaged or values lie below 0; what is inflated never exceeds the shape.
+        16 bits are made 8 (`eight_bits`). Raises DatasetInvalid, naming the file, where there are fewer or more bytes
+        than the shape holds, the deflated bytes are damaged or values lie below 0; what is inflated never exceeds the
+        shape.
         """
         paths = [_beside(self.header, name) for name in self.files] or [self.header]
         width = np.dtype(self.dtype).itemsize
@@ -125,12 +127,12 @@ class Payload:
             raise DatasetInvalid(f"{self.header}: {len(paths)} files cannot hold {shape[0]} frames in equal shares")
         shares = [self._share(path, expected // len(paths)) for path in paths]
         stored = (shares[0] if len(shares) == 1 else np.concatenate(shares)).view(self.dtype).reshape(shape)
-        return (np.asarray(stored, np.uint8), ()) if width == 1 else _eight_bits(stored, self.header)
+        return eight_bits(stored, str(self.header))
 
     def _share(self, path: Path, expected: int) -> ByteArray:
         size = path.stat().st_size
         if self.offset >= 0:
-            offset = self.offset
+            offset = self.offset + self._after_lines(path)
         elif self.deflated and self.deflated_bytes is None:
             raise DatasetInvalid(f"{self.header}: HeaderSize -1 of compressed pixels needs CompressedDataSize")
         else:
@@ -145,28 +147,31 @@ class Payload:
         _require_size(path, self.header, len(pixels), expected)
         return np.frombuffer(pixels, np.uint8)
 
-
-def _eight_bits(stored: np.ndarray, header: Path) -> tuple[ByteArray, tuple[str, ...]]:
-    if int(stored.min()) < 0:
-        raise DatasetInvalid(
-            f"{header}: 16-bit pixels must not be below 0, the smallest is {stored.min()}: RF data, not B-mode?"
-        )
-    surplus = max(0, int(stored.max()).bit_length() - 8)
-    pixels = np.empty(stored.shape, np.uint8)
-    for frame, out in zip(stored, pixels, strict=True):
-        out[:] = frame >> surplus
-    return pixels, (f"pixels of 16 bits were made 8: {(256 << surplus) - 1} became 255",)
+    def _after_lines(self, path: Path) -> int:
+        with path.open("rb") as file:
+            for _ in range(self.lines):
+                if not file.readline(MAX_LINE_BYTES).endswith(b"\n"):
+                    raise DatasetInvalid(f"{path}: it does not begin with {self.lines} lines to skip")
+            return file.tell()
 
 
 def _inflate(data: bytes, path: Path, expected: int) -> bytes:
-    inflater = zlib.decompressobj(_ZLIB_OR_GZIP)
-    try:
-        pixels = inflater.decompress(data, expected + 1)
-    except zlib.error as error:
-        raise DatasetInvalid(f"{path}: its compressed pixels are damaged: {error}") from error
-    if not inflater.eof and len(pixels) <= expected:
-        raise DatasetInvalid(f"{path}: truncated: its compressed pixels end after {len(pixels)} of {expected} bytes")
-    return pixels
+    """At most one byte more than is expected; of gzip every member, one after the other."""
+    pixels = bytearray()
+    while data:
+        inflater = zlib.decompressobj(_ZLIB_OR_GZIP)
+        try:
+            pixels += inflater.decompress(data, expected + 1 - len(pixels))
+        except zlib.error as error:
+            raise DatasetInvalid(f"{path}: its compressed pixels are damaged: {error}") from error
+        if not inflater.eof and len(pixels) <= expected:
+            raise DatasetInvalid(
+                f"{path}: truncated: its compressed pixels end after {len(pixels)} of {expected} bytes"
+            )
+        if len(pixels) > expected or not inflater.unused_data.startswith(_GZIP):
+            break
+        data = inflater.unused_data
+    return bytes(pixels)
 
 
 def _require_size(path: Path, header: Path, found: int, expected: int) -> None:
@@ -193,6 +198,7 @@ def _beside(header: Path, file_name: str) -> Path:
 _DTYPES = {"MET_UCHAR": "u1", "MET_UCHAR_ARRAY": "u1", "MET_USHORT": "u2", "MET_SHORT": "i2"}
 _MOST_SIGNIFICANT_FIRST = ("BinaryDataByteOrderMSB", "ElementByteOrderMSB")
 MAX_FILES = 100_000
+MAX_SKIPPED_LINES = 10_000
 
 
 def read_meta_image(path: Path) -> StoredSequence:
@@ -250,7 +256,7 @@ def _data_files(path: Path, value: str, following: Iterator[str]) -> tuple[str, 
         if not files:
             raise DatasetInvalid(f"{path}: its ElementDataFile is a LIST, but no file follows")
         return tuple(files)
-    pattern = re.fullmatch(r"(\S*%0?\d?d\S*)((?: \d{1,9}){2,3})", " ".join(words))
+    pattern = re.fullmatch(r"(\S*%0?\d?d\S*)((?: \d{1,9}){2,4})", " ".join(words))
     if pattern is None:
         return (value,)
     first, last, step = (*map(int, pattern[2].split()), 1)[:3]
@@ -292,14 +298,17 @@ def read_nrrd(path: Path) -> StoredSequence:
     if encoding not in ("raw", "gzip", "gz"):
         raise DatasetInvalid(f"{path}: encoding must be raw or gzip, got {encoding or 'none'}")
     skipped = fields.get("byte skip", fields.get("byteskip", "0"))
-    if fields.get("line skip", fields.get("lineskip", "0")) != "0" or (skipped != "0" and encoding != "raw"):
-        raise DatasetInvalid(f"{path}: a line skip, and a byte skip of compressed pixels, cannot be read")
+    lines = whole_numbers(path, "line skip", fields.get("line skip", fields.get("lineskip", "0")))[0]
+    if lines > MAX_SKIPPED_LINES or (skipped != "0" and encoding != "raw"):
+        raise DatasetInvalid(
+            f"{path}: over {MAX_SKIPPED_LINES} skipped lines, and a byte skip of compressed pixels, cannot be read"
+        )
     file_fields, frame_fields = split_fields(path, own, layout.shape[0])
     data_file = fields.get("data file", fields.get("datafile"))
     files = () if data_file is None else _data_files(path, data_file, iter(listed))
     order = ">" if fields.get("endian", "little").lower() == "big" else "<"
     begin = -1 if skipped == "-1" else (0 if files else offset) + whole_numbers(path, "byte skip", skipped)[0]
-    payload = Payload(path, files, begin, order + dtype, encoding != "raw")
+    payload = Payload(path, files, begin, order + dtype, encoding != "raw", lines=lines)
     stored, notes = payload.read(layout.stored)
     pixels = np.ascontiguousarray(stored.transpose(layout.axes)).reshape(layout.shape)
     return StoredSequence(path, pixels, file_fields, frame_fields, notes)

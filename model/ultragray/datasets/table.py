@@ -10,8 +10,10 @@ from __future__ import annotations
 import csv
 import json
 import re
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import takewhile
 from pathlib import Path
 from typing import Literal
 
@@ -21,7 +23,7 @@ import numpy as np
 from ultragray.contract import Contract, described, from_dict
 from ultragray.datasets.clocks import NS_PER_S, BoolArray, PoseTrack, delay_note, parse_delay_ns
 from ultragray.datasets.fan import tracked_sweep
-from ultragray.datasets.images import MAX_PIXEL_BYTES, grey_frames
+from ultragray.datasets.images import MAX_PIXEL_BYTES, eight_bits
 from ultragray.errors import DatasetInvalid, InvalidPose
 from ultragray.geometry.pose import pose_from_position_quaternion
 from ultragray.geometry.probe import FloatArray
@@ -36,8 +38,15 @@ SECONDS = {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9}
 _FILE = ("file", "filename", "image", "frame_file")
 _TIME = ("time", "timestamp", "stamp", "t")
 _POSITIONS = (("x", "y", "z"), ("tx", "ty", "tz"), ("px", "py", "pz"), ("pos_x", "pos_y", "pos_z"))
-_QUATERNIONS = (("qw", "qx", "qy", "qz"), ("q_w", "q_x", "q_y", "q_z"), ("quat_w", "quat_x", "quat_y", "quat_z"))
+_QUATERNIONS = (
+    ("qw", "qx", "qy", "qz"),
+    ("q0", "qx", "qy", "qz"),  # NDI's
+    ("q_w", "q_x", "q_y", "q_z"),
+    ("quat_w", "quat_x", "quat_y", "quat_z"),
+)
 _EULER = (("rx", "ry", "rz"), ("roll", "pitch", "yaw"), ("euler_x", "euler_y", "euler_z"))
+_BRACKETS = re.compile(r"\s*[\[(](.*)[\])]$")  # around a unit: "x [mm]"
+LONGEST_STEP_S = 2.0  # from row to row: times without a unit that go further are no seconds
 
 
 @dataclass(frozen=True)
@@ -94,8 +103,9 @@ def read_table_sweep(
             Link("sensor", "tracker", f"pose ({table.words(known)})", table_path.name, is_tracked=True),
         )
     )
+    images, pixel_notes = _read_pictures([pictures[number] for number in numbers])
     sweep = tracked_sweep(
-        _read_pictures([pictures[number] for number in numbers]),
+        images,
         poses[numbers],
         np.array(known.image_to_sensor).reshape(4, 4),
         numbers,
@@ -104,7 +114,7 @@ def read_table_sweep(
         fan=fan,
         calibration=f"{calibration_name}: image_to_sensor",
         chain=chain,
-        notes=notes,
+        notes=notes + pixel_notes,
         times_s=None if image_times_s is None or not np.isfinite(image_times_s).all() else image_times_s[numbers],
     )
     return sweep, count
@@ -123,9 +133,10 @@ def _read_calibration(path: Path) -> TableCalibration:
         matrix = np.array(found.image_to_sensor, float)
         if matrix.shape != (16,) or not np.isfinite(matrix).all() or matrix[12:].tolist() != [0, 0, 0, 1]:
             raise ValueError("image_to_sensor must be 16 finite numbers that end in 0 0 0 1")
-        if found.euler_order is not None and not re.fullmatch(r"[XYZ]{3}|[xyz]{3}", found.euler_order):
-            raise ValueError(f"euler_order must be three of XYZ or of xyz, got {found.euler_order[:20]!r}")
-    except (ValueError, TypeError, RecursionError) as error:
+        order = found.euler_order
+        if order is not None and "".join(sorted(order)) not in ("XYZ", "xyz"):
+            raise ValueError(f"euler_order must be the three letters XYZ or xyz in an order, got {order[:20]!r}")
+    except (ValueError, TypeError, OverflowError, RecursionError) as error:
         raise DatasetInvalid(f"{path}: the calibration cannot be read: {error}") from error
     return found
 
@@ -134,25 +145,50 @@ def _read_calibration(path: Path) -> TableCalibration:
 class _Table:
     path: Path
     columns: Mapping[str, int]  # by the name in lower case
+    repeated: frozenset[str]  # names that several columns have
     rows: Sequence[Sequence[str]]
+    has_decimal_commas: bool
 
     @classmethod
     def read(cls, path: Path) -> _Table:
+        """A row of names and rows of cells, between semicolons, tabs, commas or spaces.
+
+        Names may stand in a comment before the rows, as TUM's tools write it. Raises DatasetInvalid.
+        """
         if not path.is_file() or path.stat().st_size > MAX_TABLE_BYTES:
             raise DatasetInvalid(f"{path}: no table that can be read: it is missing, or too large")
         try:
-            text = path.read_text(encoding="utf-8-sig")
-            dialect = csv.Sniffer().sniff(text[:4096].partition("\n")[0], delimiters=",;\t ")
-            first, *rows = (row for row in csv.reader(text.splitlines(), dialect) if row)
-        except (UnicodeDecodeError, csv.Error, ValueError) as error:
+            lines = [line for line in path.read_text(encoding="utf-8-sig").splitlines() if line.strip()]
+        except UnicodeDecodeError as error:
+            raise DatasetInvalid(f"{path}: it cannot be read as a table of UTF-8: {error}") from error
+        comments = list(takewhile(lambda line: line.lstrip().startswith("#"), lines))
+        rest = [line for line in lines[len(comments) :] if not line.lstrip().startswith("#")]
+        if comments and (not rest or re.match(r"\s*[-+.\d]", rest[0])):
+            rest = [comments[-1].lstrip("# "), *rest]
+        separator = next((one for one in ";\t," if rest and one in rest[0]), None)
+        try:
+            cells = (line.split() for line in rest) if separator is None else csv.reader(rest, delimiter=separator)
+            first, *rows = cells
+        except (csv.Error, ValueError) as error:
             raise DatasetInvalid(f"{path}: it cannot be read as a table with a row of names: {error}") from error
-        return cls(path, {name.strip().lower(): place for place, name in enumerate(first)}, rows)
+        for number, row in enumerate(rows, 2):
+            if any(cell.strip() for cell in row[len(first) :]):
+                raise DatasetInvalid(
+                    f"{path}: row {number}: it has {len(row)} cells under {len(first)} names: commas in its numbers?"
+                )
+        names = [_BRACKETS.sub(r"_\1", name.strip().lower()).replace("°", "deg") for name in first]
+        repeated = frozenset(name for name, count in Counter(names).items() if count > 1)
+        return cls(path, {name: place for place, name in enumerate(names)}, repeated, rows, separator != ",")
 
     def find(self, names: Sequence[str], units: Mapping[str, float]) -> tuple[list[int], str | None] | None:
         """The columns of these names, bare or all with one unit at their end; None where they are not all there."""
         for unit in (None, *units):
             wanted = [name if unit is None else f"{name}_{unit}" for name in names]
             if all(name in self.columns for name in wanted):
+                if twice := self.repeated & {*wanted}:
+                    raise DatasetInvalid(
+                        f"{self.path}: several columns are called {min(twice)}: leave those of one tracked thing"
+                    )
                 return [self.columns[name] for name in wanted], unit
         return None
 
@@ -160,9 +196,11 @@ class _Table:
         found = np.full((len(self.rows), len(places)), np.nan)
         for number, row in enumerate(self.rows):
             try:
-                cells = [row[place].strip() for place in places]
+                cells = [row[place].strip() if place < len(row) else "" for place in places]
+                if self.has_decimal_commas:
+                    cells = [cell.replace(",", ".") for cell in cells]
                 found[number] = [float(cell) if cell and cell.lower() != "null" else np.nan for cell in cells]
-            except (IndexError, ValueError):
+            except ValueError:
                 raise DatasetInvalid(f"{self.path}: row {number + 2}: it must have numbers, got {row!r:.80}") from None
         return found
 
@@ -171,9 +209,18 @@ class _Table:
         return None if place is None else [row[place].strip() if place < len(row) else "" for row in self.rows]
 
     def times_s(self) -> FloatArray | None:  # [N]
+        """Raises DatasetInvalid for times without a unit that are no seconds by their steps."""
         for name in _TIME:
-            if (found := self.find([name], SECONDS)) is not None:
-                return self.values(found[0])[:, 0] * SECONDS[found[1] or "s"]
+            if (found := self.find([name], SECONDS)) is None:
+                continue
+            times = self.values(found[0])[:, 0]
+            usual = float(np.median(np.abs(np.diff(times[np.isfinite(times)])))) if len(times) > 2 else 0.0
+            if found[1] is None and usual > LONGEST_STEP_S:
+                raise DatasetInvalid(
+                    f"{self.path}: its column {name} has no unit and steps of {usual:.6g}, which are no seconds: name "
+                    f"it {name}_ms, {name}_us or {name}_ns (or {name}_s, if they are)"
+                )
+            return times * SECONDS[found[1] or "s"]
         return None
 
     def words(self, known: TableCalibration) -> str:
@@ -261,7 +308,9 @@ def _matched(
     by_name = {path.name: path for path in pictures} | {str(path.relative_to(folder)): path for path in pictures}
     stamped = _Table.read(folder / TIMES) if (folder / TIMES).is_file() else None
     files = (stamped or table).texts(_FILE)
-    if files is not None:
+    if files is None:
+        _check_order(folder, pictures)
+    else:
         if missing := [name for name in files if name not in by_name]:
             raise DatasetInvalid(f"{(stamped or table).path}: the picture {missing[0][:80]!r} was not found beside it")
         pictures = [by_name[name] for name in files]
@@ -297,31 +346,40 @@ def _pictures(folder: Path) -> list[Path]:
     raise DatasetInvalid(f"{folder}: it holds no pictures ({', '.join(PICTURES)})")
 
 
+def _check_order(folder: Path, pictures: Sequence[Path]) -> None:
+    """Refuse names such as 12.5.png and 12.25.png, which are in another order as fractions and as whole numbers."""
+    found = [re.search(r"\d+\.\d+$", path.stem) for path in pictures]
+    times = [float(match[0]) for match in found if match]
+    if len(times) == len(pictures) and times != sorted(times):
+        raise DatasetInvalid(
+            f"{folder}: the order of its pictures cannot be told from names such as {pictures[0].name[:80]}: name them "
+            "in a column file"
+        )
+
+
 def _parts(name: str) -> list[str]:
     """Words and numbers in turn, so that 9 comes before 10."""
     return re.split(r"(\d+)", name)
 
 
-def _read_pictures(paths: Sequence[Path]) -> ByteArray:  # [F, rows, columns]
-    images: ByteArray | None = None
+def _read_pictures(paths: Sequence[Path]) -> tuple[ByteArray, tuple[str, ...]]:  # [F, rows, columns]
+    """Pictures of one size as grey ones of 8 bits, and what is to be told of it."""
+    images: np.ndarray | None = None
     for place, path in enumerate(paths):
         found = cv2.imread(str(path), cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
         if found is None or found.dtype not in (np.uint8, np.uint16):
             raise DatasetInvalid(f"{path}: it cannot be read as a picture of 8 or 16 bits")
-        if found.dtype == np.uint16:
-            found = (found // 256).astype(np.uint8)
         if found.ndim == 3:
-            found = found[:, :, 2::-1] if found.shape[2] >= 3 else found[:, :, :1]
-        grey = grey_frames(found[None], str(path))[0]
+            found = cv2.cvtColor(np.ascontiguousarray(found[:, :, :3]), cv2.COLOR_BGR2GRAY)
         if images is None:
-            if grey.size * len(paths) > MAX_PIXEL_BYTES:
+            if found.nbytes * len(paths) > MAX_PIXEL_BYTES:
                 raise DatasetInvalid(f"{path.parent}: its pictures have over {MAX_PIXEL_BYTES >> 30} GiB")
-            images = np.empty((len(paths), *grey.shape), np.uint8)
-        if grey.shape != images.shape[1:]:
+            images = np.empty((len(paths), *found.shape), found.dtype)
+        if found.shape != images.shape[1:] or found.dtype != images.dtype:
             raise DatasetInvalid(
-                f"{path}: it has {grey.shape[1]} x {grey.shape[0]} pixels, {paths[0].name} {images.shape[2]} x "
-                f"{images.shape[1]}"
+                f"{path}: it has {found.shape[1]} x {found.shape[0]} pixels of {found.dtype}, {paths[0].name} "
+                f"{images.shape[2]} x {images.shape[1]} of {images.dtype}"
             )
-        images[place] = grey
+        images[place] = found
     assert images is not None  # there are paths
-    return images
+    return eight_bits(images, str(paths[0].parent))

@@ -102,7 +102,14 @@ def render_to_file(
     found: list[Extrapolation] = []
     exporting = export_pngs(path, header) if format is None else export_to(path, format, header)
     portions = render_portions(
-        scene, settings, poses, extrapolations, backend=backend, limits=limits, before_portion=before_portion
+        scene,
+        settings,
+        poses,
+        extrapolations,
+        backend=backend,
+        limits=limits,
+        before_portion=before_portion,
+        in_bytes=header.dtype == "uint8",
     )
     with exporting as add, written_behind(add) as write:
         for frames, figures in portions:
@@ -121,12 +128,13 @@ def render_portions(
     limits: Limits = UNLIMITED,
     before_portion: Callable[[int], object] | None = None,
     assessor: Assessor | None = None,
+    in_bytes: bool = False,
 ) -> Iterator[tuple[dict[str, PixelArray], list[Extrapolation]]]:  # [B, H, W] by output, [B]
     """The frames of many poses as they are shown, a portion at a time, with all figures of each.
 
     `before_portion` is told how many frames are done, at last all of them; to stop, it raises. `assessor`: the scene's,
-    where the caller has one. Raises what `render` raises, and LowConfidence for a frame that turns out to be below the
-    least confidence of the settings.
+    where the caller has one. `in_bytes`: as `render_shown`. Raises what `render` raises, and LowConfidence for a frame
+    that turns out to be below the least confidence of the settings.
     """
     support = SupportWatch(assessor or Assessor(scene.info, scene.training_poses), extrapolations, settings)
     portion = frames_at_once(settings.height, settings.width)
@@ -135,7 +143,10 @@ def render_portions(
             before_portion(first)
         some = poses[first : first + portion]
         with torch.no_grad():
-            shown = render_shown(scene, settings, some, backend=backend, limits=limits.after(first), support=support)
+            after = limits.after(first)
+            shown = render_shown(
+                scene, settings, some, backend=backend, limits=after, support=support, in_bytes=in_bytes
+            )
         figures = support.completed(first, first + len(some))
         require_confidence(figures, settings.least_confidence, first=first)
         yield {name: pixels.cpu().numpy() for name, pixels in shown.items()}, figures

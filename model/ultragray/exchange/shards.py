@@ -179,6 +179,7 @@ class ShardRenderer:
                     limits=self._limits.after(numbers.start),
                     before_portion=before_portion,
                     assessor=self._assessor,
+                    in_bytes=plan.dtype == "uint8",
                 ):
                     later(frames, figures)
             digest = tar.finish()

@@ -29,6 +29,8 @@ SMALLEST_SPAN_MM = 2.0  # of the samples: a metre of a robot's way, taken as mil
 CURED = 0.2  # of the residuals: a mistake whose undoing leaves no more is the likely cause
 MOST_EXCHANGED = 12  # samples, the worst, among which two exchanged ones are looked for
 LEAST_TO_LEAVE_ONE_OUT = 5
+LEAST_TO_DRIFT, DRIFT_FITS = 8, 12
+SMALLEST_DRIFT_MM, CLEAR_DRIFT = 2.0, 5.0  # the second in standard errors of the slope
 FLOOR_MM = 1e-3  # residuals below it are alike
 UNITS = {1000.0: "metres", 10.0: "centimetres"}
 
@@ -44,17 +46,21 @@ def pose_contradiction(
     if is_mounting_given:
         given["probe_to_flange"] = fit.probe_to_flange[None]
 
-    def score(given: _Given) -> _Score:
+    def fitted(given: _Given) -> PoseFit:
         poses = given["flange"], given["probe"]
-        found = (
+        return (
             register_poses(*poses, given["probe_to_flange"][0])
             if is_mounting_given
             else register_poses_and_mounting(*poses)
         )
+
+    def score(given: _Given) -> _Score:
+        found = fitted(given)
         mounted_mm = float(np.linalg.norm(found.probe_to_flange[:3, 3]))
         return _root_mean_square(found.residuals_mm, found.residuals_deg), mounted_mm
 
-    return _explained(given, fit.residuals_mm, fit.residuals_deg, score)
+    drift = _drift(given, fitted) if len(given["probe"]) >= LEAST_TO_DRIFT else None
+    return _explained(given, fit.residuals_mm, fit.residuals_deg, score, drift)
 
 
 def point_contradiction(fit: PointFit, in_base: Any, in_scene: Any) -> str | None:
@@ -70,7 +76,36 @@ def _root_mean_square(mm: FloatArray, deg: FloatArray) -> float:
     return float(np.sqrt(np.mean(mm**2 + (LEVER_MM * np.radians(deg)) ** 2)))
 
 
-def _explained(given: _Given, mm: FloatArray, deg: FloatArray, score: Callable[[_Given], _Score]) -> str | None:
+def _drift(given: _Given, fitted: Callable[[_Given], PoseFit]) -> tuple[str, float] | None:
+    """A probe that is measured further off with every sample, evenly, in words, and the residuals without it in mm.
+
+    The slope of the residuals over the samples is taken off the positions, and the poses are fitted again, until no
+    slope is left: a fit takes a part of the drift for its own. None where the slope is not far beyond its own standard
+    error.
+    """
+    since, drift_mm, off = np.linspace(-0.5, 0.5, len(given["probe"])), np.zeros(3), np.zeros((0, 3))
+    for _ in range(DRIFT_FITS):
+        probes = given["probe"].copy()
+        probes[:, :3, 3] -= since[:, None] * drift_mm
+        try:
+            fit = fitted({**given, "probe": probes})
+        except UltragrayError:
+            return None
+        off = probes[:, :3, 3] - (fit.base_to_scene @ given["flange"] @ fit.probe_to_flange)[:, :3, 3]
+        drift_mm = drift_mm + since @ off / (since @ since)
+    far_mm, left_mm = float(np.linalg.norm(drift_mm)), float(np.sqrt(np.square(off).sum(axis=1).mean()))
+    if far_mm < max(SMALLEST_DRIFT_MM, CLEAR_DRIFT * left_mm / float(np.sqrt(since @ since))):
+        return None
+    return f"the probe slipped or a tracker drifts, by {far_mm:.2g} mm from the first sample to the last", left_mm
+
+
+def _explained(
+    given: _Given,
+    mm: FloatArray,
+    deg: FloatArray,
+    score: Callable[[_Given], _Score],
+    drift: tuple[str, float] | None = None,
+) -> str | None:
     spans_mm = [float(np.ptp(_positions(samples), axis=0).max()) for samples in list(given.values())[:2]]
     if max(spans_mm) < SMALLEST_SPAN_MM:
         return f"all samples lie within {max(spans_mm):.2g} mm: are their positions in metres?"
@@ -85,6 +120,8 @@ def _explained(given: _Given, mm: FloatArray, deg: FloatArray, score: Callable[[
             continue
         if (max(FLOOR_MM, left), mounted_mm) < best:
             best, cause = (max(FLOOR_MM, left), mounted_mm), text
+    if not cause and drift is not None:
+        cause, best = drift[0], (drift[1], 0.0)
     if not cause and mm.max() <= LARGEST_MM and deg.max() <= LARGEST_DEG:
         return None
     worst = int(weights.argmax())
@@ -97,7 +134,7 @@ def _explained(given: _Given, mm: FloatArray, deg: FloatArray, score: Callable[[
 
 
 def _mistakes(given: _Given, worst_first: np.ndarray) -> Iterator[tuple[str, Mapping[str, FloatArray]]]:
-    """Each likely mistake, and what was given as it would be without it."""
+    """Each likely mistake of single samples, of units and of directions."""
     (one_name, one), (other_name, other), *mounting = given.items()
     both = (one_name, other_name)
     for names in (*((name,) for name in given), both):

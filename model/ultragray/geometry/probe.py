@@ -48,6 +48,20 @@ class Box(NamedTuple):
         return max(self.right - self.left, self.bottom - self.top)
 
 
+class Edges(NamedTuple):
+    """The outermost lines of a bundle: a point x, z mm is `scale`·|x − slope·z| − across·z − half mm off them.
+
+    Less than 0 is between them. Its depth is `by_z`·z or, where lines are `fanned` out, its distance to the origin.
+    """
+
+    fanned: bool
+    slope: float
+    scale: float
+    across: float
+    half: float
+    by_z: float
+
+
 class ScanLines(ABC):
     """The base of the bundles. Lengths are in mm."""
 
@@ -72,9 +86,10 @@ class ScanLines(ABC):
     def coordinates(self, x: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
         """Depth and across of points; a depth of NaN where no line of the bundle, however wide, comes by."""
 
+    @property
     @abstractmethod
-    def beside(self, x: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """Distance of points from the outermost lines, 0 or less between them, and their depth."""
+    def edges(self) -> Edges:
+        """Where the outermost lines are."""
 
     @abstractmethod
     def box(self, near_mm: float, far_mm: float) -> Box:
@@ -116,9 +131,10 @@ class ParallelLines(ScanLines):
         along_x, along_z = self.direction
         return z / along_z, x - z * (along_x / along_z)
 
-    def beside(self, x: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-        depth, across = self.coordinates(x, z)
-        return (np.abs(across) - self.span / 2) * self.direction[1], depth
+    @property
+    def edges(self) -> Edges:
+        along_x, along_z = self.direction
+        return Edges(False, along_x / along_z, along_z, 0.0, self.span / 2 * along_z, 1.0 / along_z)
 
     def box(self, near_mm: float, far_mm: float) -> Box:
         along_x, along_z = self.direction
@@ -158,9 +174,10 @@ class FannedLines(_Angular):
     def coordinates(self, x: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
         return np.where(z > 0, np.hypot(x, z), np.nan), np.degrees(np.arctan2(x, z))
 
-    def beside(self, x: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
+    @property
+    def edges(self) -> Edges:
         half = math.radians(self.span / 2)
-        return np.abs(x) * math.cos(half) - z * math.sin(half), np.sqrt(x * x + z * z)
+        return Edges(True, 0.0, math.cos(half), math.sin(half), 0.0, 1.0)
 
     def box(self, near_mm: float, far_mm: float) -> Box:
         half = math.radians(self.span / 2)
@@ -180,9 +197,9 @@ class RadialLines(_Angular):
     def coordinates(self, x: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
         return np.hypot(x, z), np.degrees(np.arctan2(x, z)) % self.span
 
-    def beside(self, x: FloatArray, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-        depth = np.sqrt(x * x + z * z)
-        return np.zeros_like(depth), depth
+    @property
+    def edges(self) -> Edges:
+        return Edges(True, 0.0, 0.0, 0.0, 0.0, 1.0)  # there are none
 
     def box(self, near_mm: float, far_mm: float) -> Box:
         return Box(-far_mm, far_mm, -far_mm, far_mm)

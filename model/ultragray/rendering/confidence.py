@@ -31,6 +31,7 @@ class SupportWatch:
     def __init__(self, assessor: Assessor, extrapolations: Sequence[Extrapolation], settings: Resolved) -> None:
         """`extrapolations`: of all poses, from the poses alone."""
         self._mask_below = settings.min_confidence if settings.below_min_confidence is Below.MASK else None
+        self.masks = self._mask_below is not None  # pixels of frames with less
         self._assessor, self._extrapolations = assessor, extrapolations
         self._shares: list[Tensor] = []
         self._contacts: list[FloatArray] = []
@@ -40,16 +41,21 @@ class SupportWatch:
         """A mask of the pixels of the next C poses that are to be black; None where none are."""
         if touch is not None:
             self._contacts.append(touch.shares)
-        first, self._count = self._count, self._count + len(coverage)
         shares = supported_shares(coverage)
-        self._shares.append(shares)
+        self.note(shares)
         if self._mask_below is None:
             return None
-        found = self._assessor.with_support(self._extrapolations[first : self._count], shares.tolist())
+        extrapolations = self._extrapolations[self._count - len(shares) : self._count]
+        found = self._assessor.with_support(extrapolations, shares.tolist())
         masked = [not is_confident(one, self._mask_below) for one in found]
         if not any(masked):
             return None
         return torch.tensor(masked, device=coverage.device)[:, None, None] & (coverage < SUPPORT_COVERAGE)
+
+    def note(self, shares: Tensor) -> None:  # [C]
+        """Takes the shares of pixels with support of the next C poses."""
+        self._count += len(shares)
+        self._shares.append(shares)
 
     def completed(self, first: int, stop: int) -> list[Extrapolation]:
         """The extrapolations of some frames with what was seen of them; waits for a GPU to have rendered."""

@@ -33,6 +33,7 @@ from ultragray.rendering.outputs import OUTPUTS, PLANES, check_available, check_
 from ultragray.rendering.overlays import ToolsInView
 from ultragray.rendering.settings import Contact, Resolved, Speckle, check_speckle
 from ultragray.rendering.tools import ScanView, Tool
+from ultragray.scene.confidence import SUPPORT_COVERAGE
 from ultragray.scene.gaussians import GaussianScene
 
 _CACHED_PICTURES = 8  # at 9 bytes a pixel
@@ -225,13 +226,23 @@ def render_shown(
     backend: str = "auto",
     limits: Limits = UNLIMITED,
     support: SupportWatch | None = None,
+    in_bytes: bool = False,
 ) -> dict[str, Tensor]:  # [C, H', W'] by output
     """Frames as settings have them shown: the one way from the settings of a request to pixels, of pool and files.
 
     `outputs`: instead of those of the settings. With `support` it sees the coverage of each frame, and pixels are black
-    where it masks them. Raises what `render` raises.
+    where it masks them. `in_bytes`: B-mode alone may come rounded to uint8. Raises what `render` raises.
     """
     names = settings.outputs if outputs is None else tuple(outputs)
+    if in_bytes and names == ("bmode",) and _is_plain(settings) and not (support is not None and support.masks):
+        draw = BACKENDS[choose_backend(backend, scene)].draw_grey
+        if draw is not None:
+            beam = beam_cm(scene.info.beam if settings.beam is None else settings.beam, settings.probe)
+            size = settings.height, settings.width
+            grey, shares = draw(scene, settings.probe, scene_poses(scene, poses), *size, SUPPORT_COVERAGE, limits, beam)
+            if support is not None:
+                support.note(shares)
+            return {"bmode": grey}
     frames = render(
         scene,
         settings.probe,
@@ -252,6 +263,12 @@ def render_shown(
     if settings.display == AS_RENDERED and blackened is None:
         return rendered
     return show(rendered, settings.probe, settings.display, blackened)
+
+
+def _is_plain(settings: Resolved) -> bool:
+    """Whether nothing is put into frames once they are drawn."""
+    added = settings.contact is not None or settings.tools or settings.ghost or settings.speckle is not Speckle.OFF
+    return settings.display == AS_RENDERED and not added
 
 
 def show(

@@ -324,16 +324,18 @@ class Slice(_message.Message):
     def __init__(self, data: _Optional[bytes] = ..., timings: _Optional[_Union[Timings, _Mapping]] = ..., scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., field: _Optional[str] = ..., height: _Optional[int] = ..., width: _Optional[int] = ..., encoding: _Optional[_Union[Encoding, str]] = ..., pixel_to_scene: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ...) -> None: ...
 
 class SharedMemory(_message.Message):
-    __slots__ = ("name", "token", "slots", "slot_bytes")
+    __slots__ = ("name", "token", "slots", "slot_bytes", "has_socket")
     NAME_FIELD_NUMBER: _ClassVar[int]
     TOKEN_FIELD_NUMBER: _ClassVar[int]
     SLOTS_FIELD_NUMBER: _ClassVar[int]
     SLOT_BYTES_FIELD_NUMBER: _ClassVar[int]
+    HAS_SOCKET_FIELD_NUMBER: _ClassVar[int]
     name: str
     token: bytes
     slots: int
     slot_bytes: int
-    def __init__(self, name: _Optional[str] = ..., token: _Optional[bytes] = ..., slots: _Optional[int] = ..., slot_bytes: _Optional[int] = ...) -> None: ...
+    has_socket: bool
+    def __init__(self, name: _Optional[str] = ..., token: _Optional[bytes] = ..., slots: _Optional[int] = ..., slot_bytes: _Optional[int] = ..., has_socket: _Optional[bool] = ...) -> None: ...
 
 class RenderStreamRequest(_message.Message):
     __slots__ = ("sequence", "settings", "pose", "mode", "timeout_ms", "client_time_ns", "window", "acknowledged", "shared_memory")

@@ -22,6 +22,7 @@ from ultragray_workers.pool.waiting import Turn
 
 MAX_FRAMES_IN_FLIGHT = 8  # of an ordered stream; then it stops reading
 MAX_BYTES_IN_FLIGHT = 32 * 2**20  # of their frames, if there is more than one
+MAX_MESSAGE_BYTES = 2**16  # of a client, on a WebSocket or through a socket of the host
 MAX_WINDOW = 16  # answers of a latest stream that its client may have yet to acknowledge
 
 _log = logging.getLogger("ultragray.stream")

@@ -25,6 +25,7 @@ from websockets.frames import Frame
 from websockets.http11 import Request
 
 from ultragray.errors import UltragrayError
+from ultragray_service.core.streams import MAX_MESSAGE_BYTES
 from ultragray_service.core.unread import hold_little
 from ultragray_service.errors import HeadersTooLarge, RequestMalformed, RequestTooSlow, TargetTooLong, statuses_of
 from ultragray_service.http.problems import problem_response
@@ -430,7 +431,6 @@ MAX_EMPTY_FRAMES, EMPTY_FRAMES_PER_S = 100, 10.0  # of a WebSocket's client
 _PIECE_BYTES = 1024  # that are parsed before what they hold is counted
 _POLICY_VIOLATION = 1008
 
-MAX_STREAM_MESSAGE_BYTES = 2**16  # of a client, on a WebSocket
 _TICKS_PER_LOOK = 10  # of 0.1 s
 
 
@@ -445,7 +445,7 @@ class HttpServer(uvicorn.Server):
                 app,
                 http=BoundedHttp,
                 ws=PromptWebSocket,
-                ws_max_size=MAX_STREAM_MESSAGE_BYTES,
+                ws_max_size=MAX_MESSAGE_BYTES,
                 ws_per_message_deflate=False,  # speckle does not shrink
                 lifespan="off",
                 log_config=None,

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import asyncio
+import socket
+import struct
 import time
 from collections import deque
 from collections.abc import Awaitable, Callable
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import partial
 from typing import Any, TypeAlias
 
 import grpc
+from google.protobuf.message import DecodeError
 
 from ultragray.contract import under
 from ultragray.errors import FrameTooCostly, InvalidArgument, LowConfidence, UltragrayError
@@ -22,7 +26,15 @@ from ultragray_proto.v1 import rendering_pb2, scenes_pb2
 from ultragray_service.core.open_streams import StreamAnswer
 from ultragray_service.core.poses import check_pose_count, exact_poses
 from ultragray_service.core.rendering import Plan
-from ultragray_service.core.streams import MAX_WINDOW, FrameStream, Message, StreamMode, checked_s, unreadable
+from ultragray_service.core.streams import (
+    MAX_MESSAGE_BYTES,
+    MAX_WINDOW,
+    FrameStream,
+    Message,
+    StreamMode,
+    checked_s,
+    unreadable,
+)
 from ultragray_service.errors import Refusal
 from ultragray_service.rpc.messages import read, read_pose, read_settings, read_word, serialized_frame, slice_message
 from ultragray_service.rpc.shared_memory import SharedMemory
@@ -32,25 +44,32 @@ from ultragray_workers.errors import QueueFull
 from ultragray_workers.pool.messages import Priority, RenderResult
 
 Context: TypeAlias = grpc.aio.ServicerContext
+_LENGTH = struct.Struct("<I")
 
 
 class CallTransport:
-    """One call of RenderStream; a context manager. Its mode is read from the first message that can be read."""
+    """One call of RenderStream; a context manager. Its mode is read from the first message that can be read.
+
+    The messages of a client of this host may go through a socket that it shares with its memory (`_Socket`).
+    """
 
     def __init__(self, context: Context) -> None:
         self._context = context
+        self._socket: _Socket | None = None
         self.destination: SharedMemory | None = None
 
-    def __enter__(self) -> CallTransport:
+    async def __aenter__(self) -> CallTransport:
         return self
 
-    def __exit__(self, *_: object) -> None:
+    async def __aexit__(self, kind: type[BaseException] | None, *_: object) -> None:
         if self.destination is not None:
             self.destination.close()
+        if self._socket is not None:
+            await self._socket.close(at_once=kind is asyncio.CancelledError)
 
     async def receive(self) -> Message | None:
         try:
-            message = await self._context.read()
+            message = await (self._context if self._socket is None else self._socket).read()
         except InvalidArgument as error:  # bytes that are no RenderStreamRequest
             return unreadable(error)
         if message is grpc.aio.EOF:
@@ -96,19 +115,63 @@ class CallTransport:
             )
         if first.HasField("shared_memory"):
             self.destination = SharedMemory(first.shared_memory, self._context.peer())
+            if self.destination.socket is not None:
+                self._socket = _Socket(self.destination.socket)
         return mode
 
     async def send(self, answer: StreamAnswer) -> None:
         about: dict[str, Any] = {"dropped": answer.dropped}
         if answer.client_time is not None:
             about["client_time_ns"] = int(answer.client_time)
+        message: rendering_pb2.Frame | bytes
         if isinstance(answer.outcome, UltragrayError):
             error = to_message(Refusal.of(answer.outcome), scenes_pb2.Error)
-            await self._context.write(rendering_pb2.Frame(sequence=answer.sequence, error=error, **about))
+            message = rendering_pb2.Frame(sequence=answer.sequence, error=error, **about)
         else:
-            await self._context.write(serialized_frame(answer.outcome, answer.sequence, **about))
+            message = serialized_frame(answer.outcome, answer.sequence, **about)
+        await (self._context if self._socket is None else self._socket).write(message)
 
     hand_over = send  # of streams without a window, which are ordered ones here
+
+
+class _Socket:
+    """The messages of a stream through a socket, each behind its length; read and written as those of a call."""
+
+    def __init__(self, end: socket.socket) -> None:
+        self._is_over = False  # no more messages are read
+        self._opening = asyncio.ensure_future(asyncio.open_unix_connection(sock=end))
+
+    async def read(self) -> Any:  # rendering_pb2.RenderStreamRequest | grpc.aio.EOF
+        """Raises InvalidArgument for what is no message, and for one that is too large, which ends the messages."""
+        reader, _ = await asyncio.shield(self._opening)
+        if self._is_over:
+            return grpc.aio.EOF
+        try:
+            (size,) = _LENGTH.unpack(await reader.readexactly(_LENGTH.size))
+            if size > MAX_MESSAGE_BYTES:
+                self._is_over = True
+                raise InvalidArgument(f"a message may have at most {MAX_MESSAGE_BYTES} bytes, got {size}")
+            return rendering_pb2.RenderStreamRequest.FromString(await reader.readexactly(size))
+        except (asyncio.IncompleteReadError, OSError):
+            return grpc.aio.EOF
+        except DecodeError:
+            raise InvalidArgument("the bytes are not a message of the type that the method takes") from None
+
+    async def write(self, message: rendering_pb2.Frame | bytes) -> None:
+        _, writer = await asyncio.shield(self._opening)
+        data = message if isinstance(message, bytes) else message.SerializeToString()
+        with suppress(OSError):  # the client is gone, which ends its call, too
+            writer.write(_LENGTH.pack(len(data)) + data)
+            await writer.drain()
+
+    async def close(self, *, at_once: bool) -> None:
+        """Ends the messages, unless `at_once` when those that were written are with the client."""
+        _, writer = await self._opening
+        if at_once:
+            writer.transport.abort()
+        writer.close()
+        with suppress(OSError):
+            await writer.wait_closed()
 
 
 _RETRY_S = 0.02
@@ -172,8 +235,9 @@ class RenderService:
         told = {key: value for key, value in context.invocation_metadata() or () if isinstance(value, str)}
         name = told.get(_STREAM_NAME) or told.get("user-agent", "")
         streams = self._service.streams
-        with self._service.limits.stream(), streams.opened("grpc", name) as noted, CallTransport(context) as transport:
-            await FrameStream(self._service.rendering, transport, record=noted).run()
+        with self._service.limits.stream(), streams.opened("grpc", name) as noted:
+            async with CallTransport(context) as transport:
+                await FrameStream(self._service.rendering, transport, record=noted).run()
 
     async def AssessPoses(
         self, request: rendering_pb2.AssessPosesRequest, context: Context

@@ -5,7 +5,9 @@ from __future__ import annotations
 import hmac
 import os
 import re
+import socket
 import stat
+import struct
 from contextlib import suppress
 
 from ultragray.errors import InvalidArgument
@@ -23,6 +25,8 @@ MAX_BYTES = 256 * 2**20  # of all slots of one stream
 MAX_SLOT_BYTES = 16 * 2**20  # copied within the event loop: some milliseconds
 
 _FIELD = "shared_memory"
+_SOCKET = ".socket"  # behind the name of the file
+_CREDENTIALS = struct.Struct("3i")  # process, user, group (unix(7))
 _NAME = re.compile(r"ultragray-[0-9a-f]{32}")
 FREE, _LENT = b"\1", b"\0"
 
@@ -38,6 +42,7 @@ class SharedMemory:
             )
         _check_sizes(asked)
         self._slots, self._slot_bytes = asked.slots, asked.slot_bytes
+        self.socket: socket.socket | None = None  # for the messages of the stream
         path = f"{FOLDER}/{asked.name}"
         try:
             self._descriptor = os.open(path, os.O_RDWR | os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC)
@@ -45,6 +50,8 @@ class SharedMemory:
             raise _refused(asked, f"the service cannot open it: {error.strerror}") from None
         try:
             self._check_file(asked)
+            if asked.has_socket:
+                self.socket = _connected(asked, f"{path}{_SOCKET}")
         except BaseException:
             self.close()
             raise
@@ -84,6 +91,24 @@ class SharedMemory:
         """Lets go of the memory; frames that the client has stay where they are. Nothing is put there any more."""
         descriptor, self._descriptor = self._descriptor, -1
         os.close(descriptor)
+
+
+def _connected(asked: rendering_pb2.SharedMemory, path: str) -> socket.socket:
+    """The service's end of the client's socket. Raises InvalidArgument."""
+    end = socket.socket(socket.AF_UNIX)
+    try:
+        end.setblocking(False)
+        end.connect(path)
+        _, user, _ = _CREDENTIALS.unpack(end.getsockopt(socket.SOL_SOCKET, socket.SO_PEERCRED, _CREDENTIALS.size))
+    except OSError as error:
+        end.close()
+        raise _refused(asked, f"the service cannot connect to its socket: {error.strerror}") from None
+    if user != os.geteuid():
+        end.close()
+        raise _refused(asked, "its socket must be one of the user that the service runs as")
+    with suppress(OSError):
+        os.unlink(path)
+    return end
 
 
 def _check_sizes(asked: rendering_pb2.SharedMemory) -> None:

@@ -13,6 +13,12 @@ import torch
 from ultragray import GaussianScene, LinearProbe, render
 from ultragray.errors import BackendUnavailable
 from ultragray.rendering.backends import cpu
+from ultragray.rendering.confidence import supported_shares
+from ultragray.rendering.display import Display
+from ultragray.rendering.frames import render_shown
+from ultragray.rendering.pixels import to_uint8
+from ultragray.rendering.settings import Resolved
+from ultragray.scene.confidence import SUPPORT_COVERAGE
 
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 
@@ -45,6 +51,30 @@ def test_the_number_of_threads_does_not_change_a_bit(random_scene, instruction_s
     assert frames[0].max() > 0.1
     assert torch.equal(frames[0], frames[1])
     assert torch.equal(frames[0], frames[2])
+
+
+@pytest.mark.usefixtures("threads")
+@pytest.mark.parametrize("instruction_set", cpu.INSTRUCTION_SETS)
+@pytest.mark.parametrize("size", [(65, 193), (3, 5)])
+def test_bytes_of_one_pass_are_those_of_the_planes(random_scene, instruction_set, size):
+    scene = random_scene(count=5000)
+    inside = scene.poses_to_scene_cm(poses(11))
+    planes = cpu.render_outputs(scene, PROBE, inside, *size, ("bmode", "coverage"), instruction_set=instruction_set)
+    for count in (1, 3):
+        torch.set_num_threads(count)
+        grey, shares = cpu.render_grey(scene, PROBE, inside, *size, SUPPORT_COVERAGE, instruction_set=instruction_set)
+        assert np.array_equal(grey.numpy(), to_uint8(planes["bmode"].numpy()))
+        assert torch.equal(shares, supported_shares(planes["coverage"]))
+    assert 0.0 < shares.min() < 1.0
+
+
+def test_frames_that_nothing_is_put_into_come_in_bytes_at_once(random_scene):
+    scene, at = random_scene(count=500), poses(2)
+    plain = Resolved(PROBE, 16, 20)
+    for settings in (plain, replace(plain, display=Display(gain_db=6.0)), replace(plain, ghost=0.3)):
+        grey = render_shown(scene, settings, at, in_bytes=True)["bmode"]
+        assert np.array_equal(to_uint8(grey.numpy()), to_uint8(render_shown(scene, settings, at)["bmode"].numpy()))
+        assert (grey.dtype == torch.uint8) == (settings is plain)
 
 
 @pytest.mark.long

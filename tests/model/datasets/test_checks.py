@@ -2,8 +2,10 @@
 
 import json
 import math
+import re
 import tracemalloc
 from dataclasses import replace
+from itertools import product
 
 import cv2
 import numpy as np
@@ -16,6 +18,7 @@ from ultragray.datasets import Dataset, Sweep
 from ultragray.datasets.checks import MAX_VOXELS, check_dataset, check_sweep, swept_volume, without_names
 from ultragray.datasets.pictures import _draw_planes, draw_dataset
 from ultragray.datasets.source import load_dataset
+from ultragray.geometry.rotations import rotations_of
 
 
 def test_a_straight_sweep(make_sweep):
@@ -125,6 +128,27 @@ def test_a_picture_that_changes_at_once_is_named(make_sweep):
     assert "the picture changes at once from frame 11 to 12" in told
     assert "was the depth or another setting changed?" in told
     assert told.count("at once") == 1
+
+
+def test_a_frame_turned_in_place_is_named_however_small_its_image_is(make_sweep):
+    probe = LinearProbe(width_mm=4.0, near_mm=0.0, far_mm=5.0)
+    for axis, step_mm in product(np.eye(3), (0.5, 5.0)):
+        sweep = make_sweep(20, step_mm=step_mm, probe=probe)
+        assert not any("wrong pose" in one for one in check_sweep(sweep).warnings)
+        sweep.poses[7, :3, :3] = rotations_of(np.pi / 2 * axis[None])[0]
+        warnings = [one for one in check_sweep(sweep).warnings if "wrong pose" in one]
+        assert len(warnings) == 1, (axis, step_mm)
+        assert warnings[0].startswith("frame 7 ")
+
+
+@pytest.mark.parametrize("apart_mm", [5.0, 30.0])
+def test_two_trackers_in_turn_are_named(make_sweep, apart_mm):
+    sweep = make_sweep(20)
+    sweep.poses[:, :3, 3] += np.random.default_rng(0).normal(0, 3.0, (20, 3))
+    assert not any("to and fro" in one for one in check_sweep(sweep).warnings)
+    sweep = make_sweep(20)
+    sweep.poses[::2, 0, 3] += apart_mm
+    assert any(re.search(r"the probe goes [\d.]+ mm to and fro from frame", one) for one in check_sweep(sweep).warnings)
 
 
 def test_a_gap_is_named_but_frames_that_were_left_out_are_none(make_sweep):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from ultragray import LinearProbe
-from ultragray.datasets import Dataset, Sweep
+from ultragray.datasets import Dataset, Sweep, checks
 from ultragray.datasets.checks import check_dataset
 from ultragray.datasets.clocks import PoseTrack, clock_warnings, parse_delay_ns
 from ultragray.datasets.plus import read_plus_sweep
@@ -52,11 +52,18 @@ def recorded(motion, delay_s, count=160):
     return Sweep(tissue(motion(times_s - delay_s)), poses, PROBE, np.arange(count), "it", times_s=times_s)
 
 
+@pytest.fixture
+def quick_checks(monkeypatch):
+    """Without what the images say of the path: that takes seconds, and has tests of its own."""
+    monkeypatch.setattr(checks, "_dataset_warnings", lambda dataset: ())
+
+
 def report_of(sweep):
     held_out = np.arange(len(sweep)) % 5 == 2
     return check_dataset(Dataset("it", sweep.select(np.flatnonzero(~held_out)), sweep.select(np.flatnonzero(held_out))))
 
 
+@pytest.mark.usefixtures("quick_checks")
 @pytest.mark.parametrize(
     ("motion", "delay_ms"),
     [(there_and_back, -180), (there_and_back, 50), (one_way_and_unevenly, -70), (one_way_and_unevenly, 300)],
@@ -69,6 +76,7 @@ def test_the_delay_of_the_images_is_told_with_its_number(motion, delay_ms):
     assert ("after their poses" if delay_ms > 0 else "before their poses") in told
 
 
+@pytest.mark.usefixtures("quick_checks")
 @pytest.mark.parametrize(("motion", "delay_s"), [(there_and_back, 0.0), (one_way_and_unevenly, 0.0), (evenly, 0.15)])
 def test_no_delay_is_told_where_there_is_none_or_an_even_motion(motion, delay_s):
     assert report_of(recorded(motion, delay_s)).image_delay_ms is None

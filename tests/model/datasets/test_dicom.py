@@ -49,7 +49,10 @@ def test_poses_in_json_and_a_scale_without_regions(write, tmp_path):
     (tmp_path / "sweep.poses.json").write_text(json.dumps(POSES[:, :3].tolist()))
     dataset = load_dataset(path)
     assert dataset.probe == LinearProbe(12.8, 0.0, 4.8)
-    assert dataset.train.notes == ("the file does not name its transducer: taken as a linear one",)
+    assert dataset.train.notes == (
+        "no region in centimetres: the whole image of 32 x 24 pixels is taken as ultrasound",
+        "the file does not name its transducer: taken as a linear one",
+    )
 
 
 def test_compressed_frames_are_read_where_there_is_a_decoder(write):
@@ -100,6 +103,7 @@ COMPRESSED = encapsulate([b"\xff\xd8\xff\xd9"] * len(FRAMES))
         ({"poses": POSES * 2.0}, r"sweep\.poses\.npy: frame 0: its pose must end in the row"),
         ({"SamplesPerPixel": 3}, r"with SamplesPerPixel 1 or 3, got MONOCHROME2 with 3"),
         ({"PhotometricInterpretation": "CMYK"}, r"must be MONOCHROME1, MONOCHROME2, PALETTE COLOR, .* got CMYK with 1"),
+        ({"BitsStored": [8, 8]}, r"it cannot be read as DICOM"),
         ({"BitsAllocated": 32}, r"pixels must have 8 or 16 bits \(BitsAllocated\) without a sign, got 32"),
         ({"TransducerType": "CURVED LINEAR"}, r"TransducerType is CURVED LINEAR: say with fan"),
         ({"NumberOfFrames": None}, r"it lacks NumberOfFrames"),

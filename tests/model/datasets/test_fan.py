@@ -89,6 +89,9 @@ def test_the_fan_that_plus_clips_to(tmp_path, plus_files, device_set):
     )
     clipped, _ = read_plus_sweep(path, device_set=clipping)
     assert clipped.probe == ConvexProbe(60.0, 10.0, 26.0)
+    old = clipping.read_text().replace("FanAnglesDeg", "FanAngles").replace("FanOriginPixel", "FanOrigin")
+    clipping.write_text(old.replace("FanRadiusStopPixel", "FanDepth").replace('FanRadiusStartPixel="100"', ""))
+    assert read_plus_sweep(path, device_set=clipping)[0].probe == PhasedProbe(60.0, 26.0)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """MCAP recordings as sweeps: our own, and such as other programs write."""
 
 import json
+import re
 import sys
 from functools import partial
 
@@ -139,8 +140,10 @@ def test_the_time_of_writing_stands_for_a_stamp_that_is_missing(bag):
         bag.write("/us/image", ros.IMAGE, image_message(image_at(number), 0), image_time_ns(number))
     dataset = load_dataset(bag.finish())
     check_whole(dataset)
-    (told,) = dataset.train.notes
-    assert told == f"{COUNT} images have no stamp: taken for those of the time that they were written at"
+    assert dataset.train.notes == (
+        "51 poses of /pose have no stamp: taken for those of the time that they were written at",
+        f"{COUNT} images have no stamp: taken for those of the time that they were written at",
+    )
 
 
 GREY = image_at(3)
@@ -159,6 +162,8 @@ ALPHA = np.full((*GREY.shape, 1), 9, np.uint8)
         ("rgba8", np.concatenate([COLOUR, ALPHA], axis=-1), LUMA),
         ("bgra8", np.concatenate([COLOUR[..., ::-1], ALPHA], axis=-1), LUMA),
         ("32FC1", (GREY / 255).astype("<f4"), GREY),
+        ("mono16", (255 - GREY).astype("<u2") << 8, 255 - GREY),
+        ("16UC1", (255 - GREY).astype("<u2") << 4, 255 - GREY),
     ],
 )
 def test_every_encoding_becomes_grey(bag, encoding, stored, expected):
@@ -169,18 +174,19 @@ def test_every_encoding_becomes_grey(bag, encoding, stored, expected):
     np.testing.assert_array_equal(parts(load_dataset(bag.finish()))[1], [expected] * 3)
 
 
-@pytest.mark.parametrize(("suffix", "tolerance"), [(".png", 0), (".jpg", 6)])
-def test_compressed_images_are_read(path, suffix, tolerance):
+@pytest.mark.parametrize(("suffix", "tolerance", "shift"), [(".png", 0, 0), (".png", 0, 4), (".jpg", 6, 0)])
+def test_compressed_images_are_read(path, suffix, tolerance, shift):
     bag = Bag(path)
     bag.geometry(topic="/us/image/geometry")
     bag.poses()
     for number in range(COUNT):
         time_ns = image_time_ns(number)
-        data = cv2.imencode(suffix, image_at(number))[1].tobytes()
+        stored = 255 - image_at(number)
+        data = cv2.imencode(suffix, stored.astype(np.uint16) << shift if shift else stored)[1].tobytes()
         message = {"header": ros.header(time_ns, "probe"), "format": f"mono8; {suffix[1:]} compressed ", "data": data}
         bag.write("/us/image/compressed", COMPRESSED, message, time_ns)
     images = parts(load_dataset(bag.finish()))[1]
-    truth = np.array([image_at(number) for number in range(COUNT)])
+    truth = np.array([255 - image_at(number) for number in range(COUNT)])
     for region in (np.s_[:, :6, :6], np.s_[:, 10:, 10:]):  # a JPEG rings at the edge of the corner
         assert np.abs(images[region].astype(int) - truth[region]).max() <= tolerance
 
@@ -308,6 +314,28 @@ IN_MILLIMETRES[:3, 3] *= 1000.0
 def test_what_is_odd_about_a_static_transform_is_named(robot, other, told):
     mount(robot, other, time_ns=START_NS + SECOND)
     assert told in load_dataset(robot.finish()).train.notes
+
+
+@pytest.mark.parametrize("second", ["/robot2/tf", "/tf"])
+def test_two_sources_of_one_transform_are_named(bag, path, second):
+    """Two robots whose frames have the same names, or two programs that both tell a transform."""
+    elsewhere = plus_offset(30.0)
+    track(bag, "/tf", TRANSFORMS, arm)
+    track(bag, second, TRANSFORMS, lambda pose, time_ns: arm(elsewhere @ pose, time_ns + 10_000_000))
+    mount(bag)
+    bag.images()
+    bag.finish()
+    if second != "/tf":
+        with pytest.raises(DatasetInvalid, match="flangeTobase is told on /robot2/tf and on /tf: record the tf of one"):
+            load_dataset(path)
+        return
+    assert re.search(r"the poses of flangeTobase go [\d.]+ mm to and fro", "; ".join(load_dataset(path).train.notes))
+
+
+def plus_offset(x_mm):
+    matrix = np.eye(4)
+    matrix[0, 3] = x_mm
+    return matrix
 
 
 def test_a_parent_that_changes_is_named_with_both(bag, path):

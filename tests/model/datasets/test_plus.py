@@ -1,5 +1,7 @@
 """PLUS sequences: poses as the toolkit defines them, everything a recording may hold, files that SimpleITK wrote."""
 
+import gzip
+
 import numpy as np
 import pytest
 import SimpleITK
@@ -10,6 +12,7 @@ from ultragray.datasets.source import SourceOptions, load_dataset
 from ultragray.errors import DatasetInvalid, InvalidArgument
 from ultragray.geometry.pose import rotation_angles_deg
 
+from .conftest import DEVICE_SET
 from .test_fan import FAN, of_both, screen
 
 ROWS, COLUMNS = 30, 20
@@ -170,7 +173,7 @@ def test_what_is_missing_is_told(tmp_path, plus_files, device_set):
     with pytest.raises(DatasetInvalid, match=r"no transforms lead .*there are ProbeToTracker .*give the device set"):
         read_plus_sweep(path)
     path = plus_files.write_mha(tmp_path / "s.mha", stored, {})
-    with pytest.raises(DatasetInvalid, match=r"there are ImageToProbe$"):
+    with pytest.raises(DatasetInvalid, match=r"there are ImageToProbe \(say with transform which"):
         read_plus_sweep(path, device_set=device_set)
     path = plus_files.write_mha(tmp_path / "s.mha", stored, plus_files.tracked_fields(3))
     with pytest.raises(InvalidArgument, match=r"crop must lie within columns 0:20 and rows 0:30"):
@@ -218,3 +221,64 @@ def test_a_fan_has_the_geometry_that_it_was_written_with(tmp_path, plus_files, d
     assert sweep.probe == expected.probe == ConvexProbe(60.0, 10.0, 26.0)
     np.testing.assert_array_equal(sweep.images, expected.images)
     np.testing.assert_array_equal(sweep.poses, expected.poses)
+
+
+def as_crlf(data):
+    head, mark, pixels = data.partition(b"ElementDataFile = LOCAL\n")
+    return (head + mark).replace(b"\n", b"\r\n") + pixels
+
+
+def test_one_recording_as_other_writers_have_it(tmp_path, plus_files, device_set):
+    """MetaIO's and PLUS's own spellings, sizes, statuses and directions give the same poses and pixels."""
+    stored, tracked = plus_files.speckle(4, ROWS, COLUMNS), plus_files.tracked_fields(4)
+    tracked["UltrasoundImageOrientation"] = "MF"
+    expected = read_plus_sweep(plus_files.write_mha(tmp_path / "s.mha", stored, tracked), device_set=device_set)[0]
+    inverse = {"UltrasoundImageOrientation": "MF"}
+    for frame in range(4):
+        matrix = plus_files.numbers(plus_files.translation(-10, -frame, 0))
+        inverse[f"Seq_Frame{frame:04d}_TrackerToProbeTransform"] = matrix
+    whole = stored.tobytes()
+    others = {
+        "lower case": {key: value.lower() for key, value in tracked.items()},
+        "no statuses": {key: value for key, value in tracked.items() if not key.endswith("Status")},
+        "from the tracker": inverse,
+        "to a reference": {key.replace("Tracker", "Reference"): value for key, value in tracked.items()},
+        "volumes of a slice": {**tracked, "NDims": "4", "DimSize": f"{COLUMNS} {ROWS} 1 4"},
+        "lines end as in Windows": tracked,
+        "two members of gzip": {**tracked, "CompressedData": "True", "CompressedDataSize": "0"},
+        "another tracked thing": {
+            **tracked,
+            **{f"Seq_Frame000{frame}_StylusToTrackerTransform": plus_files.numbers(np.eye(4)) for frame in range(4)},
+        },
+    }
+    for name, fields in others.items():
+        path = plus_files.write_mha(tmp_path / "other.igs.mha", stored, fields, deflate=False)
+        data = path.read_bytes()
+        if name.startswith("lines"):
+            path.write_bytes(as_crlf(data))
+        if name.startswith("two members"):
+            path.write_bytes(data.removesuffix(whole) + gzip.compress(whole[:100]) + gzip.compress(whole[100:]))
+        found, _ = read_plus_sweep(path, device_set=device_set)
+        assert np.abs(found.poses - expected.poses).max() < 1e-9, name
+        np.testing.assert_array_equal(found.images, expected.images)
+
+
+def test_lengths_that_contradict_each_other_are_told(tmp_path, plus_files, device_set):
+    def notes(fields, calibration=plus_files.image_to_probe):
+        device_set.write_text(DEVICE_SET.format(matrix=plus_files.numbers(calibration)))
+        path = plus_files.write_mha(tmp_path / "s.mha", plus_files.speckle(3, ROWS, COLUMNS), fields)
+        return "; ".join(read_plus_sweep(path, device_set=device_set)[0].notes)
+
+    tracked = plus_files.tracked_fields(3)
+    told = r"ElementSpacing says pixels of 0.5 x 0.5 mm, the calibration 0.2 x 0.1: this one is taken"
+    assert told in notes({**tracked, "ElementSpacing": "0.5 0.5 1"})
+    assert "ElementSpacing" not in notes({**tracked, "ElementSpacing": "0.2 0.1 1"}) + notes(tracked)
+    metres, halves = plus_files.image_to_probe.copy(), plus_files.image_to_probe.copy()
+    metres[:3, 3] /= 1000
+    halves[:3, 3] = halves[:3, :2] @ (0.5, 0.5)
+    assert "the calibration puts the first pixel 0.00374 mm from the sensor: is its translation in metres" in notes(
+        tracked, metres
+    )
+    assert "from the sensor" not in notes(tracked, halves) + notes(tracked)
+    halves[:3, 3] = 0
+    assert "from the sensor" not in notes(tracked, halves)

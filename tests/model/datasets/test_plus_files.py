@@ -1,6 +1,8 @@
 """MetaImage and NRRD sequences as PLUS and 3D Slicer write them and as they arrive damaged; stored orientations."""
 
+import gzip
 import zlib
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -241,9 +243,35 @@ def test_a_list_of_files_and_bytes_to_skip(tmp_path, plus_files):
     for number, frame in enumerate(stored):
         (tmp_path / f"f{number}.raw").write_bytes(b"head" + frame.tobytes())
     header = "NRRD0004\ntype: uchar\ndimension: 3\nsizes: 7 5 3\nencoding: raw\nbyte skip: {}\ndata file: {}\n"
-    for skip, files in (("4", "LIST\nf0.raw\nf1.raw\nf2.raw"), ("-1", "f%d.raw 0 2 1")):
+    lists = "LIST\nf0.raw\nf1.raw\nf2.raw", "LIST 2\nf0.raw\nf1.raw\nf2.raw", "f%d.raw 0 2 1", "f%d.raw 0 2 1 2"
+    for skip, files in product(("4", "-1", "3\nline skip: 2"), lists):
+        for number, frame in enumerate(stored):
+            head = b"a line\nand another\n\r\0x" if "line" in skip else b"head"
+            (tmp_path / f"f{number}.raw").write_bytes(head + frame.tobytes())
         (tmp_path / "s.nhdr").write_text(header.format(skip, files))
         np.testing.assert_array_equal(read_nrrd(tmp_path / "s.nhdr").pixels, stored)
+    (tmp_path / "s.nhdr").write_text(header.format("0\nline skip: 20000", lists[0]))
+    with pytest.raises(DatasetInvalid, match="over 10000 skipped lines"):
+        read_nrrd(tmp_path / "s.nhdr")
+    (tmp_path / "s.nhdr").write_text(header.format("0\nline skip: 90", lists[0]))
+    with pytest.raises(DatasetInvalid, match="does not begin with 90 lines"):
+        read_nrrd(tmp_path / "s.nhdr")
+
+
+def test_several_members_of_gzip_are_one_picture(tmp_path, plus_files):
+    stored = plus_files.speckle(3, 5, 7)
+    path, data = plus_files.write_nrrd(tmp_path / "s.nrrd", stored, {}, encoding="raw"), stored.tobytes()
+    header = path.read_bytes().removesuffix(data).replace(b"encoding: raw", b"encoding: gzip")
+    members = [gzip.compress(data[:40]), gzip.compress(data[40:41]), gzip.compress(data[41:])]
+    for rest in (b"", b"\0\0"):
+        path.write_bytes(header + b"".join(members) + rest)
+        np.testing.assert_array_equal(read_nrrd(path).pixels, stored)
+    path.write_bytes(header + b"".join([*members, gzip.compress(b"more")]))
+    with pytest.raises(DatasetInvalid, match="more pixels than the 105 bytes"):
+        read_nrrd(path)
+    path.write_bytes(header + members[0] + members[1])
+    with pytest.raises(DatasetInvalid, match="truncated: 41 bytes of pixels"):
+        read_nrrd(path)
 
 
 @pytest.mark.parametrize(

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import io
 import json
 
 import cv2
 import numpy as np
 import pytest
+from PIL import Image
 from scipy.spatial.transform import Rotation
 
 from ultragray.datasets.source import SourceOptions, load_dataset
@@ -137,8 +139,14 @@ def test_rows_without_a_pose_are_left_out(write):
         ("time,x_mm,y_mm,q,qw,qx,qy,qz", {}, r"it lacks columns of a position \(x, y, z\), it has time, x_mm"),
         ("time,x_mm,y_mm,z_mm,qw,qx,qy,other", {}, "it lacks columns of a quaternion"),
         ("time,x_mm,y_mm,z_mm,qx,qy,qz,qw", {}, None),
-        ("time,x_mm,y_mm,z_mm,qw,qx,qy,qz", {"euler_order": "XX"}, "euler_order must be three of XYZ"),
+        ("time,x_mm,y_mm,z_mm,qw,qx,qy,qz", {"euler_order": "XX"}, "euler_order must be the three letters XYZ"),
+        ("time,x_mm,y_mm,z_mm,qw,qx,qy,qz", {"euler_order": "ZYZ"}, "euler_order must be the three letters XYZ"),
         ("time,x_mm,y_mm,z_mm,qw,qx,qy,qz", {"image_to_sensor": [1, 2]}, "image_to_sensor must be 16 finite numbers"),
+        (
+            "time,x_mm,y_mm,z_mm,qw,qx,qy,qz",
+            {"image_to_sensor": [10**400] * 16},
+            "the calibration cannot be read: int too large",
+        ),
         ("time,x_mm,y_mm,z_mm,qw,qx,qy,qz", {"position_unit": "inch"}, "the calibration cannot be read: position_unit"),
         (
             "time,x_mm,y_mm,z_mm,qw,qx,qy,qz",
@@ -162,8 +170,138 @@ def test_pictures_that_do_not_go_with_it(write):
     with pytest.raises(InvalidArgument, match="fan must be given without crop"):
         load_dataset(folder, SourceOptions(crop="0:9,0:9", fan="60,40,90,1,1"))
     cv2.imwrite(str(folder / "frame_5.png"), FRAMES[5][:20])
-    with pytest.raises(DatasetInvalid, match=r"frame_5\.png: it has 60 x 20 pixels, frame_0\.png 60 x 40"):
+    with pytest.raises(DatasetInvalid, match=r"frame_5\.png: it has 60 x 20 pixels of uint8, frame_0\.png 60 x 40"):
         load_dataset(folder)
     (folder / "frame_5.png").write_bytes(b"no picture")
     with pytest.raises(DatasetInvalid, match=r"frame_5\.png: it cannot be read as a picture"):
+        load_dataset(folder)
+
+
+def text_of(header, rows, separator, spell=repr):
+    return "\n".join([header, *(separator.join(map(spell, row)) for row in rows)])
+
+
+def turned_by(order, unit):  # [N, 3] about x, y, z
+    angles = TURNS.as_euler(order, degrees=unit == "deg")
+    return np.stack([angles[:, order.lower().index(axis)] for axis in "xyz"], axis=1)
+
+
+WHOLE = table(TIMES, PLACES, quaternions())
+NAMES = "time,x_mm,y_mm,z_mm,qw,qx,qy,qz"
+
+
+@pytest.mark.parametrize(
+    ("text", "calibration"),
+    [
+        (text_of(NAMES.replace(",", ";"), WHOLE, ";", lambda value: repr(value).replace(".", ",")), {}),
+        (text_of(NAMES.replace(",", "\t"), WHOLE, "\t", lambda value: f" {value!r} "), {}),
+        (
+            "# ground truth\n# a tracker's\n"
+            + text_of(
+                "# timestamp tx ty tz qx qy qz qw",
+                table(TIMES, PLACES / 1000, TURNS.as_quat()),
+                " ",
+                lambda value: f"{value:14.9f}",
+            ),
+            {"position_unit": "m"},
+        ),
+        (text_of("Tx,Ty,Tz,Q0,Qx,Qy,Qz,", table(PLACES, quaternions()), ","), {"position_unit": "mm"}),
+        (
+            text_of(
+                "\ufeffT [us], X [cm], Y [cm], Z [cm],qw,qx,qy,qz", table(TIMES * 1e6, PLACES / 10, quaternions()), ","
+            ),
+            {},
+        ),
+        (
+            text_of("t_ns,x(m),y(m),z(m),qw,qx,qy,qz", table(TIMES * 1e9, PLACES / 1e3, quaternions()), ",") + "\n\n",
+            {},
+        ),
+        (
+            text_of(
+                "x_mm,y_mm,z_mm,yaw (°),pitch (°),roll (°)", table(PLACES, turned_by("ZYX", "deg")[:, ::-1]), ","
+            ),
+            {"euler_order": "ZYX"},
+        ),
+        (
+            text_of("x_mm,y_mm,z_mm,rx,ry,rz", table(PLACES, turned_by("zxy", "rad")), ","),
+            {"euler_order": "zxy", "angle_unit": "rad"},
+        ),
+        (text_of(NAMES, WHOLE, ",", lambda value: f'"{value!r}"').replace("\n", ",\r\n"), {}),
+    ],
+    ids=["decimal commas", "tabs", "TUM", "NDI", "brackets", "SI", "yaw first", "fixed axes", "quoted"],
+)  # fmt: skip
+def test_tables_as_other_tools_write_them(write, text, calibration):
+    folder = write("", [], **calibration)
+    (folder / "poses.csv").write_bytes(text.encode())
+    check(folder)
+    times_s = load_dataset(folder).train.times_s
+    numbers = load_dataset(folder).train.frame_numbers
+    assert times_s is None or np.abs(times_s - TIMES[numbers]).max() < 1e-3
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        (
+            text_of(NAMES, WHOLE, ",", lambda value: repr(value).replace(".", ",")),
+            "row 2: it has 16 cells under 8 names: commas in its numbers",
+        ),
+        (
+            text_of(f"{NAMES},qw,qx,qy,qz", [row + row[4:] for row in WHOLE], ","),
+            "several columns are called qw: leave",
+        ),
+        (
+            text_of(NAMES, table(TIMES * 1e3, PLACES, quaternions()), ","),
+            "its column time has no unit and steps of 50, which are no seconds: name it time_ms",
+        ),
+    ],
+    ids=["decimal commas between commas", "two tools", "milliseconds without a word"],
+)
+def test_tables_that_would_be_read_wrongly_are_refused(write, text, message):
+    folder = write("", [])
+    (folder / "poses.csv").write_text(text)
+    with pytest.raises(DatasetInvalid, match=message):
+        load_dataset(folder)
+
+
+def test_pictures_of_other_kinds_have_the_same_pixels(write):
+    folder = write(NAMES, WHOLE)
+    kinds = {
+        "12 bits.png": lambda frame: cv2.imencode(".png", frame.astype(np.uint16) << 4)[1],
+        "16 bits.tif": lambda frame: cv2.imencode(".tif", frame.astype(np.uint16) << 8)[1],
+        "grey.bmp": lambda frame: cv2.imencode(".bmp", frame)[1],
+        "colour.tiff": lambda frame: cv2.imencode(".tiff", np.repeat(frame[..., None], 3, axis=2))[1],
+        "alpha.png": lambda frame: cv2.imencode(".png", np.dstack([frame, frame, frame, 255 - frame]))[1],
+        "palette.png": lambda frame: saved(Image.fromarray(frame).quantize(256, dither=Image.Dither.NONE)),
+        "grey and alpha.png": lambda frame: saved(
+            Image.merge("LA", (Image.fromarray(frame), Image.new("L", (60, 40))))
+        ),
+        "white is zero.tif": lambda frame: saved(Image.fromarray(frame), "TIFF", tiffinfo={262: 0}),
+    }
+    for name, encode in kinds.items():
+        for number, frame in enumerate(FRAMES):
+            for old in folder.glob(f"{number:03d} *"):
+                old.unlink()
+            (folder / f"frame_{number}.png").unlink(missing_ok=True)
+            (folder / f"{number:03d} {name}").write_bytes(bytes(encode(frame)))
+        train = load_dataset(folder).train
+        assert np.abs(train.images.astype(int) - FRAMES[train.frame_numbers]).max() <= 1, name
+        assert ("bits" in name) == any("pixels of 16 bits were made 8" in note for note in train.notes)
+
+
+def saved(picture, kind="PNG", **described):
+    out = io.BytesIO()
+    picture.save(out, kind, **described)
+    return out.getvalue()
+
+
+def test_pictures_named_by_times_are_in_their_order_or_refused(write):
+    rows = table(TIMES, PLACES, quaternions())
+    folder = write(NAMES, rows, names="nothing.png")
+    (folder / "nothing.png").unlink()
+    for number, frame in enumerate(FRAMES):
+        cv2.imwrite(str(folder / f"us_{TIMES[number]:.2f}.png"), frame)
+    check(folder)
+    (folder / "us_3.50.png").rename(folder / "us_3.5.png")
+    with pytest.raises(DatasetInvalid, match="the order of its pictures cannot be told from names such as us_3"):
         load_dataset(folder)

@@ -162,3 +162,35 @@ def test_files_that_are_no_hdf5(tmp_path: Path, write: Callable[..., Path], monk
     monkeypatch.setitem(sys.modules, "h5py", None)
     with pytest.raises(ExtraMissing, match=r"ultragray\[hdf5\]"):
         load_dataset(path)
+
+
+def test_one_scan_as_other_writers_have_it(write: Callable[..., Path], tmp_path: Path) -> None:
+    """Other types, orders of bytes, chunks, matrices and lines give the same poses and pixels."""
+    expected = load_dataset(write()).train
+    first, second = CALIBRATION.split("spatial")
+    others = {
+        "big endian": write("a", tforms=TFORMS.astype(">f8")),
+        "one channel": write("b", frames=FRAMES[..., None]),
+        "in colour": write("c", frames=np.repeat(FRAMES[..., None], 3, axis=-1)),
+        "matrices in another order": write("d"),
+        "lines of Windows": write("e"),
+    }
+    calibrations = {
+        "matrices in another order": f"spatial{second}{first}",
+        "lines of Windows": "\ufeff" + CALIBRATION.replace("\n", "\r\n").replace("spatial", "\r\nspatial"),
+    }
+    with h5py.File(write("g", frames=None), "a") as file:
+        file.create_dataset("frames", data=FRAMES, chunks=(1, 16, 16), compression="gzip", shuffle=True)
+    others["compressed"] = tmp_path / "g" / "RH_Par_L_DtP.h5"
+    for name, path in others.items():
+        (tmp_path / "calib_matrix.csv").write_text(calibrations.get(name, CALIBRATION))
+        found = load_dataset(path).train
+        assert np.abs(found.poses[:, :3, 3] - expected.poses[:, :3, 3]).max() < 1e-3, name
+        np.testing.assert_array_equal(found.images, expected.images)
+    for frames, tforms in ((FRAMES.transpose(2, 1, 0), TFORMS.transpose(2, 1, 0)), (FRAMES, TFORMS.transpose(0, 2, 1))):
+        with pytest.raises(DatasetInvalid):  # as MATLAB turns axes round, and of rows instead of columns
+            load_dataset(write("h", frames=frames, tforms=tforms))
+    small = TOOL.copy()
+    small[:3, 3] /= 1000
+    metres = f"scaling\n{rows(SCALE)}\nspatial_calibration\n{rows(small)}\n"
+    assert any("is its translation in metres" in note for note in load_dataset(write("i", metres)).train.notes)

@@ -56,7 +56,7 @@ def keyed(start_service, artifacts):
         connection.execute(sa.update(KEYS).where(KEYS.c.name == "expired").values(expires_at_s=time.time()))
     database.close()
     service = start_service(artifact_folder=folder)
-    with httpx.Client(base_url=service.http, timeout=60) as client:
+    with httpx.Client(base_url=service.http, timeout=300) as client:
         yield Keyed(service, keys, client, folder)
 
 

@@ -39,7 +39,7 @@ def held_back(keyed, who, path, content):
         yield content[100:]
 
     def put():
-        return httpx.put(f"{keyed.service.http}{path}", content=parts(), headers=keyed.headers(who), timeout=60)
+        return httpx.put(f"{keyed.service.http}{path}", content=parts(), headers=keyed.headers(who), timeout=300)
 
     with ThreadPoolExecutor(1) as executor:
         try:

@@ -94,7 +94,7 @@ def test_frames_of_private_scenes_go_to_nobody_else(start_service, tmp_path, key
     service = serve(start_service, tmp_path)
     headers = {"X-API-Key": key}
     url = f"{service.http}/v1/scenes/kept"
-    assert httpx.put(f"{url}?private=true", content=scene_bytes, headers=headers, timeout=60).status_code == 201
+    assert httpx.put(f"{url}?private=true", content=scene_bytes, headers=headers, timeout=300).status_code == 201
     with ExitStack() as opened:
         admin, watching_admin, reader = (Peer(address_of(service), source=f"127.0.0.{host}") for host in (2, 2, 3))
         for peer in (admin, watching_admin, reader):
@@ -111,7 +111,7 @@ def test_frames_of_private_scenes_go_to_nobody_else(start_service, tmp_path, key
         assert reader.ask("GET_IMAGE", "").content, "the newest that it may see"
         assert reader.ask("GET_TRANSFORM", "kept").content == b""
         assert watching_admin.ask("GET_IMAGE", "kept").content
-        assert httpx.delete(url, headers=headers, timeout=60).status_code == 204
+        assert httpx.delete(url, headers=headers, timeout=300).status_code == 204
         assert reader.ask("GET_IMAGE", "kept").content == b"", "the scene has gone, its frame is private all the same"
         reader.send_pose(moved(0.0), "ProbeToReference")
         assert reader.receive().device_name == "Image_Reference"  # nothing else was sent to it
@@ -133,5 +133,5 @@ def test_a_connection_from_before_the_first_key_is_closed(start_service, tmp_pat
         opened.callback(again.socket.close)
         again.send_pose(moved(0.0))
         assert again.image().pixels.size
-        entries = httpx.get(f"{service.http}/v1/me", headers={"X-API-Key": key}, timeout=60).json()
+        entries = httpx.get(f"{service.http}/v1/me", headers={"X-API-Key": key}, timeout=300).json()
         assert entries["key_required"]

@@ -117,7 +117,7 @@ def call(channel, name, things, metadata):
     invoke = getattr(channel, kind)(name, type(request).SerializeToString, answers.FromString)
     answer = None
     try:
-        answer = invoke(iter([request]) if method.client_streaming else request, metadata=metadata, timeout=120)
+        answer = invoke(iter([request]) if method.client_streaming else request, metadata=metadata, timeout=300)
         return next(answer, None) if method.server_streaming else answer
     except grpc.RpcError as error:
         return error

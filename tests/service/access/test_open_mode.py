@@ -132,7 +132,7 @@ def test_with_keys_any_name_will_do_and_pages_need_a_key(status_of):
 
 def test_a_public_address_without_keys_is_refused(start_service, tmp_path):
     service = start_service(wait=False, artifact_folder=tmp_path, host="0.0.0.0")
-    assert service.process.wait(60) != 0
+    assert service.process.wait(300) != 0
     text = service.log_path.read_text()
     for words in ("0.0.0.0", "ultragray keys create", "ULTRAGRAY_API_KEYS", "ULTRAGRAY_INSECURE"):
         assert words in text

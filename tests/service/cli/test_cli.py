@@ -217,7 +217,7 @@ def served(folder, *arguments):
 
 
 def names_of_scenes(address):
-    with urllib.request.urlopen(f"{address}/v1/scenes", timeout=60) as answer:
+    with urllib.request.urlopen(f"{address}/v1/scenes", timeout=300) as answer:
         return [scene["name"] for scene in json.load(answer)["scenes"]]
 
 
@@ -238,7 +238,7 @@ def test_serve_serves_the_given_file_alone_until_sigterm(scene_file, used_folder
     with served(used_folder, scene_file) as (service, address):
         assert names_of_scenes(address) == ["scene"]
         service.send_signal(signal.SIGTERM)
-        said, _ = service.communicate(timeout=60)
+        said, _ = service.communicate(timeout=300)
         assert service.returncode == 0
     assert "Traceback" not in said
     assert scene_file.exists()

@@ -22,7 +22,7 @@ from ...waiting import wait_until
 from ...workers.jobs.conftest import store_dataset
 from ..conftest import ROOT, SOURCE_FOLDERS
 
-WAIT_S = 120.0
+WAIT_S = 300.0
 KEY = "0123456789abcdef-jobs"
 
 
@@ -204,7 +204,7 @@ def test_worker_command_takes_jobs_until_it_is_stopped(tmp_path):
         assert (worker.name, worker.pid, worker.device, worker.state) == ("mine", process.pid, "cpu", WorkerState.IDLE)
     finally:
         process.send_signal(signal.SIGTERM)
-        _, told = process.communicate(timeout=60)
+        _, told = process.communicate(timeout=300)
     assert process.returncode == 0, told
     messages = [json.loads(line)["message"] for line in told.splitlines()]
     assert "worker mine takes jobs" in messages

@@ -21,7 +21,7 @@ def test_sigterm_leaves_no_file_behind(scene_file, tmp_path):
     process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
     wait_until(lambda: any(folder.iterdir()))
     process.send_signal(signal.SIGTERM)
-    _, told = process.communicate(timeout=60)
+    _, told = process.communicate(timeout=300)
     assert process.returncode == 130, told
     assert list(folder.iterdir()) == []
 

@@ -142,7 +142,7 @@ def test_stopped_run_leaves_a_scene_and_goes_on(dataset, tmp_path, number):
     process = start(dataset, "-o", output, *small)
     wait_for_lines(tmp_path / "scene.ugr.run" / "metrics.jsonl", 5, process)
     process.send_signal(number)
-    _, told = process.communicate(timeout=60)
+    _, told = process.communicate(timeout=300)
     assert process.returncode == 130
     stopped_at = GaussianScene.load(output).info.training["step"]
     assert 5 <= stopped_at < 300

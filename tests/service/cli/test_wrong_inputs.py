@@ -189,7 +189,7 @@ def test_a_process_ends_with_one_line(line, place, busy_port):
     arguments = line.replace("BUSY", str(busy_port)).split()
     program = "from ultragray_service.cli.app import app; app()"
     ended = subprocess.run(
-        python(program, *arguments), cwd=place, env=clean_environment(), capture_output=True, text=True, timeout=120
+        python(program, *arguments), cwd=place, env=clean_environment(), capture_output=True, text=True, timeout=300
     )
     log = [one for one in ended.stderr.splitlines() if not one.startswith(("{", "Datasets and jobs end"))]
     check(line, ended.returncode, ended.stdout, "\n".join(log))

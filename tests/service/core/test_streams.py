@@ -147,6 +147,7 @@ def test_a_watcher_that_has_gone_is_told_nothing():
     asyncio.run(main())
 
 
+@pytest.mark.usefixtures("clock")
 def test_a_summary_counts_what_came_and_what_was_answered():
     stream = OpenStream(name="UR5 \n" + "x" * 200)
     for sequence in range(3):

@@ -23,7 +23,7 @@ from .test_http_datasets import zipped
 
 RAW = {"Content-Type": "application/octet-stream"}
 PROBE = LinearProbe(40.0, 0.0, 40.0)
-WAIT_S = 60.0
+WAIT_S = 300.0
 
 
 def sweep(count, offset_mm):
@@ -58,7 +58,7 @@ def upload(client, name, dataset, folder):
 
 @pytest.fixture(scope="module")
 def http(service, tmp_path_factory):
-    with httpx.Client(base_url=service.http, timeout=60) as client:
+    with httpx.Client(base_url=service.http, timeout=300) as client:
         for dataset in (DATASET, replace(DATASET, name="whole", val=DATASET.val.select(np.arange(0)))):
             upload(client, dataset.name, dataset, tmp_path_factory.mktemp("dataset"))
             client.put(f"/v1/scenes/of-{dataset.name}", content=scene_of(dataset).to_bytes(), headers=RAW)

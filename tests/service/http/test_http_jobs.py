@@ -20,7 +20,7 @@ from ultragray_workers.storage.local import LocalStorage
 from ...waiting import wait_until
 
 RENDER = {"kind": "render", "specification": {"scene": "demo", "sampler": {"kind": "training"}}}
-WAIT_S = 120.0
+WAIT_S = 300.0
 
 
 @pytest.fixture(scope="module")
@@ -31,7 +31,7 @@ def jobs_service(start_service, artifacts):
 
 @pytest.fixture(scope="module")
 def client(jobs_service):
-    with httpx.Client(base_url=jobs_service.http, timeout=120) as client:
+    with httpx.Client(base_url=jobs_service.http, timeout=300) as client:
         yield client
 
 

@@ -280,9 +280,11 @@ def test_pages_of_allowed_origins_may_call(start_service):
     service = start_service(cors_origins="https://console.example")
     asked = {"Access-Control-Request-Method": "POST", "Access-Control-Request-Headers": "content-type"}
     for origin, allowed in (("https://console.example", True), ("https://other.example", False)):
-        answer = httpx.options(f"{service.http}/v1/scenes/demo/render", headers={"Origin": origin, **asked})
+        answer = httpx.options(
+            f"{service.http}/v1/scenes/demo/render", headers={"Origin": origin, **asked}, timeout=300
+        )
         assert (answer.headers.get("access-control-allow-origin") == origin) is allowed
-    answer = httpx.get(f"{service.http}/v1/scenes", headers={"Origin": "https://console.example"}, timeout=60)
+    answer = httpx.get(f"{service.http}/v1/scenes", headers={"Origin": "https://console.example"}, timeout=300)
     assert "X-Ultragray-Shape" in answer.headers["access-control-expose-headers"]
 
 

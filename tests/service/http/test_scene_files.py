@@ -13,8 +13,8 @@ from ultragray import GaussianScene
 from ultragray_service.core.scene_points import even_selection
 
 from ...waiting import wait_until
+from ...warm import Hold
 from ..conftest import DEMO_PROBE, make_scene
-from .test_http_datasets import helper_process
 
 MAX_BYTES = 20_000_000
 RAW = {"Content-Type": "application/octet-stream"}
@@ -28,7 +28,7 @@ def service(start_service, artifacts):
 
 @pytest.fixture(scope="module")
 def http(service):
-    with httpx.Client(base_url=service.http, timeout=60) as client:
+    with httpx.Client(base_url=service.http, timeout=300) as client:
         yield client
 
 
@@ -173,13 +173,14 @@ def test_what_did_not_change_is_not_sent_again(http, artifacts):
 
 
 def test_who_stops_during_the_check_gets_no_scene(service, http, artifacts):
-    whole = make_scene(300_000, probe=DEMO_PROBE, seed=8).to_bytes()  # whose check takes long enough to be seen
+    whole = make_scene(probe=DEMO_PROBE, seed=8).to_bytes()
     url = httpx.URL(service.http)
-    with socket.create_connection((url.host, url.port)) as connection:
+    with Hold("check_scene_file") as held, socket.create_connection((url.host, url.port)) as connection:
         head = f"PUT /v1/scenes/stopped HTTP/1.1\r\nHost: {url.host}\r\nContent-Length: {len(whole)}\r\n\r\n"
         connection.sendall(head.encode() + whole)
-        checking = wait_until(lambda: helper_process("check_scene_file"))
-    wait_until(lambda: not Path(f"/proc/{checking}").exists(), within_s=20)
+        checking = wait_until(lambda: held.pid)
+        connection.close()
+        wait_until(lambda: not Path(f"/proc/{checking}").exists())
     wait_until(lambda: not list((artifacts / "scenes").glob(".*")))
     assert http.get("/v1/scenes/stopped").status_code == 404
     assert http.put("/v1/scenes/stopped", content=whole, headers=RAW).status_code == 201

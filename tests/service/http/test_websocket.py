@@ -19,7 +19,7 @@ from ultragray_service.http.routes.streams import FrameMessage, RefusalMessage
 from ...waiting import wait_until
 from ..conftest import HEIGHT, WIDTH, split
 
-TIMEOUT_S = 120.0
+TIMEOUT_S = 300.0
 KEY = "a-key-of-twenty-chars"
 
 

@@ -15,7 +15,7 @@ from ultragray_service.igtl.messages import HEADER_BYTES, Message, pack_message,
 from ...waiting import wait_until
 from ..conftest import DEMO_PROBE, make_scene
 
-TIMEOUT_S = 60.0
+TIMEOUT_S = 300.0
 FAN = ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0)
 
 

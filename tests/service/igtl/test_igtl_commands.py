@@ -63,16 +63,16 @@ def value_of(peer, parameter):
 def test_pyigtl_sets_the_depth_by_a_string_and_gets_shorter_images(igtl_service):
     with pyigtl_client(address_of(igtl_service)) as client:
         client.send_message(pyigtl.TransformMessage(np.eye(4), device_name="demo"))
-        whole = client.wait_for_message("Image_demo", timeout=60).image[0]
+        whole = client.wait_for_message("Image_demo", timeout=300).image[0]
         client.send_message(pyigtl.StringMessage(SET_DEPTH, device_name="CMD_17"))
-        reply = ElementTree.fromstring(client.wait_for_message("ACK_17", timeout=60).string)
+        reply = ElementTree.fromstring(client.wait_for_message("ACK_17", timeout=300).string)
         assert (reply.tag, reply.get("Status"), reply[0].attrib) == (
             "CommandReply",
             "SUCCESS",
             {"Name": "DepthMm", "Success": "true"},
         )
         client.send_message(pyigtl.TransformMessage(np.eye(4), device_name="demo"))
-        cut = client.wait_for_message("Image_demo", timeout=60).image[0]
+        cut = client.wait_for_message("Image_demo", timeout=300).image[0]
     assert len(cut) == round(len(whole) * 20 / (DEMO_PROBE.far_mm - DEMO_PROBE.near_mm))
     assert np.array_equal(cut, whole[: len(cut)])
 
@@ -89,7 +89,7 @@ def test_gain_range_and_compensation_are_those_of_the_display_settings(peer, igt
     settings = rendering_pb2.RenderSettings(scene="demo", display=display)
     with igtl_service.channel() as channel:
         request = rendering_pb2.RenderRequest(settings=settings, pose=matrix_pose(moved(1)))
-        frame = rendering_pb2_grpc.RenderServiceStub(channel).Render(request, timeout=60)
+        frame = rendering_pb2_grpc.RenderServiceStub(channel).Render(request, timeout=300)
     pixels = unpack_image(answer.content).pixels
     assert np.array_equal(pixels, np.frombuffer(frame.data, np.uint8).reshape(frame.height, frame.width))
     assert not np.array_equal(pixels, over_grpc(igtl_service, "demo", moved(1)))

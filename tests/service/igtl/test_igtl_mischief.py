@@ -117,11 +117,11 @@ def held(service, peers):
 @pytest.mark.long
 def test_a_reader_that_stops_for_long_is_cut_off(connect, igtl_service):
     peers = [connect(SO_RCVBUF=4096), connect(SO_RCVBUF=4096)]
+    wait_until(lambda: held(igtl_service, peers) == 2)
     for count in range(60):  # more images than the kernel's buffers hold
         for peer in peers:
             peer.send_pose(moved(count / 1000), "large")
         time.sleep(0.1)
-    assert held(igtl_service, peers) == 2
     peers[1].socket.sendall(bytes(HEADER_BYTES))  # dismissed, but it does not take the reason
     wait_until(lambda: not held(igtl_service, peers), within_s=SEND_TIMEOUT_S + 20, every_s=0.5)
 

@@ -31,7 +31,7 @@ def placed(x_mm, z_mm, turn_deg=0.0):  # [4, 4] mm, turned about y
 
 def with_tools(service, *tools, scene="demo", pose=None):  # [H, W]
     """The pixels of a frame with tools that lie in the scene, over gRPC."""
-    with Client(service.grpc, timeout_s=60.0) as client:
+    with Client(service.grpc, timeout_s=300.0) as client:
         frame = client.render(scene, np.eye(4) if pose is None else pose, RenderSettings(tools=tools))
     return frame["bmode"]
 
@@ -146,7 +146,7 @@ def service(start_service, artifacts):
     """Tracks by `tracker` unless a client says otherwise."""
     folder = artifacts
     service = start_service(artifact_folder=folder, igtl_port=0, igtl_scene="demo", igtl_registration="tracker")
-    with Client(service.grpc, timeout_s=60.0) as client:
+    with Client(service.grpc, timeout_s=300.0) as client:
         client.registrations.put("tracker", "demo", TRACKER_TO_SCENE, PROBE_TO_MARKER)
         client.registrations.put("plain", "second", np.eye(4))
     return service
@@ -162,7 +162,7 @@ def tracked(service):
 def test_pyigtl_tracks_a_probe_and_gets_the_frame_in_the_frame_of_the_tracker(service):
     with pyigtl_client(address_of(service)) as client:
         client.send_message(pyigtl.TransformMessage(MARKER_TO_TRACKER, device_name="ProbeToTracker"))
-        image = client.wait_for_message("Image_Tracker", timeout=60)
+        image = client.wait_for_message("Image_Tracker", timeout=300)
     expected = over_grpc(service, "demo", POSE)
     np.testing.assert_allclose(image.image[0].astype(int), expected, atol=2)  # TRANSFORM has 24 bits
     first = np.array([-20.0 + 20.0 / 48, 0.0, 0.0, 1.0])  # the first pixel in the probe
@@ -208,7 +208,7 @@ def test_a_registration_that_is_not_there_or_of_another_scene_is_told(tracked, s
     assert "there is no registration 'nobody'" in str(reply.get("Error"))
     tracked.send_pose(MARKER_TO_TRACKER, "ProbeTosecond")
     assert "registration must be one of the scene 'second'" in tracked.status().text
-    with Client(service.grpc, timeout_s=60.0) as client:
+    with Client(service.grpc, timeout_s=300.0) as client:
         client.registrations.put("brief", "demo", np.eye(4))
         set_to(tracked, Registration="brief")
         client.registrations.delete("brief")

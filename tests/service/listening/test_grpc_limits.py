@@ -12,7 +12,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from ...waiting import wait_until
 
 TOTAL, PER_ADDRESS = 40, 10
-TIMEOUT_S = 60.0
+TIMEOUT_S = 300.0
 PREFACE = b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + b"\0\0\0\4\0\0\0\0\0"  # with empty SETTINGS
 
 
@@ -98,14 +98,10 @@ def test_a_want_of_open_files_does_not_end_the_watch_over_connections(start_serv
     limits = resource.prlimit(service.process.pid, resource.RLIMIT_NOFILE)
     resource.prlimit(service.process.pid, resource.RLIMIT_NOFILE, (3, limits[1]))
     try:
-        wait_until(lambda: logged(service, "connections to port", "failed, and goes on"))
+        wait_until(lambda: service.logged("connections to port", "failed, and goes on"))
     finally:
         resource.prlimit(service.process.pid, resource.RLIMIT_NOFILE, limits)
-    wait_until(lambda: logged(service, "connections to port", "is in order again"))
+    wait_until(lambda: service.logged("connections to port", "is in order again"))
     with contextlib.ExitStack() as opened:
         sockets = [opened.enter_context(open_socket(service, "127.0.0.2")) for _ in range(PER_ADDRESS + 3)]
         wait_until(lambda: sum(map(is_open, sockets)) == PER_ADDRESS)
-
-
-def logged(service, *words):
-    return any(all(word in record["message"] for word in words) for record in service.log())

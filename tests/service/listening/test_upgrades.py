@@ -8,7 +8,7 @@ from urllib.parse import urlsplit
 import pytest
 from websockets.sync.client import connect
 
-TIMEOUT_S = 60.0
+TIMEOUT_S = 300.0
 REQUEST = b"GET /v1/health/live HTTP/1.1\r\nHost: localhost\r\n\r\n"
 HANDSHAKE = (
     b"GET /v1/scenes/demo/stream HTTP/1.1\r\nHost: localhost\r\nConnection: Upgrade\r\nUpgrade: websocket\r\n"

@@ -10,7 +10,6 @@ from ...waiting import wait_until
 from ..http.test_http_datasets import KEY, LIMIT_BYTES, poisoned_files, released_files, uploads_under_way
 from .test_grpc_render import error_info
 
-IDLE_TIMEOUT_S = 2.0
 METADATA = (("x-api-key", KEY),)
 Message = datasets_pb2.UploadDatasetRequest
 
@@ -18,7 +17,7 @@ Message = datasets_pb2.UploadDatasetRequest
 @pytest.fixture(scope="module")
 def service(start_service, artifacts):
     return start_service(
-        artifact_folder=artifacts, max_dataset_bytes=LIMIT_BYTES, upload_idle_timeout_s=IDLE_TIMEOUT_S, api_keys=KEY
+        artifact_folder=artifacts, max_dataset_bytes=LIMIT_BYTES, upload_idle_timeout_s=3600.0, api_keys=KEY
     )
 
 
@@ -53,7 +52,7 @@ def parts(files, chunk_bytes=1000):
 
 
 def upload(stub, *messages):
-    return stub.UploadDataset(iter(messages), metadata=METADATA, timeout=120)
+    return stub.UploadDataset(iter(messages), metadata=METADATA, timeout=300)
 
 
 def refusal(call, *arguments, **keywords):

@@ -11,7 +11,7 @@ from ultragray_workers.jobs.kinds import TrainJob
 
 from .test_grpc_render import error_info
 
-WAIT_S = 120.0
+WAIT_S = 300.0
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ from ultragray_proto.v1 import geometry_pb2, rendering_pb2
 
 from ..conftest import HEIGHT
 
-TIMEOUT_S = 120
+TIMEOUT_S = 300
 
 
 def error_info(error):

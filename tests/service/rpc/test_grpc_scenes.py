@@ -26,13 +26,13 @@ def test_health_and_reflection(channel):
         request = health_pb2.HealthCheckRequest(service=name)
 
         def is_serving(request=request):
-            status = health.Check(request, timeout=120).status
+            status = health.Check(request, timeout=300).status
             return bool(status == health_pb2.HealthCheckResponse.SERVING)
 
         wait_until(is_serving)
     reflection = reflection_pb2_grpc.ServerReflectionStub(channel)
     request = reflection_pb2.ServerReflectionRequest(list_services="*")
-    (answer,) = reflection.ServerReflectionInfo(iter([request]), timeout=120)
+    (answer,) = reflection.ServerReflectionInfo(iter([request]), timeout=300)
     names = {service.name for service in answer.list_services_response.service}
     assert {"ultragray.v1.RenderService", "ultragray.v1.SceneService", "grpc.health.v1.Health"} <= names
 
@@ -56,7 +56,7 @@ def test_bytes_that_are_no_message_are_refused_in_our_words(service, channel, ki
     garbage = b"\x0a\x05ab"  # a text of five bytes, of which two are there
     call = getattr(channel, kind)(f"/ultragray.v1.{method}")
     with pytest.raises(grpc.RpcError) as caught:
-        list(call(iter([garbage]) if kind.startswith("stream") else garbage, timeout=120))
+        list(call(iter([garbage]) if kind.startswith("stream") else garbage, timeout=300))
     assert caught.value.code() == grpc.StatusCode.INVALID_ARGUMENT
     assert error_info(caught.value)[0].reason == "INVALID_ARGUMENT"
     assert "DecodeError" not in str(caught.value.details())
@@ -71,12 +71,12 @@ def test_one_setting_bounds_bodies_and_messages(start_service, settings_message,
     with service.channel() as channel:
         render = rendering_pb2_grpc.RenderServiceStub(channel).RenderBatch
         request.MergeFromString(b"\xfa\x7f\x80\x80\xc0\x01" + bytes(3 * 2**20))  # a field that nobody knows, of 3 MiB
-        assert len(list(render(request, timeout=60))) == 1
+        assert len(list(render(request, timeout=300))) == 1
         request.MergeFromString(b"\xfa\x7f\x80\x80\x80\x01" + bytes(2 * 2**20))
         with pytest.raises(grpc.RpcError) as refused:
-            list(render(request, timeout=60))
+            list(render(request, timeout=300))
     assert refused.value.code() is grpc.StatusCode.RESOURCE_EXHAUSTED
-    answer = httpx.post(f"{service.http}/v1/scenes/demo/render", content=b" " * (limit_bytes + 1), timeout=60)
+    answer = httpx.post(f"{service.http}/v1/scenes/demo/render", content=b" " * (limit_bytes + 1), timeout=300)
     assert answer.json()["detail"] == f"the body must be at most {limit_bytes} bytes"
 
 

@@ -2,6 +2,7 @@
 
 import os
 import secrets
+import socket
 from pathlib import Path
 
 import grpc
@@ -10,11 +11,13 @@ import pytest
 
 from ultragray.errors import InvalidArgument
 from ultragray_proto.v1 import rendering_pb2
+from ultragray_service.core.streams import MAX_MESSAGE_BYTES
 from ultragray_service.rpc.calls import address_of
 from ultragray_service.rpc.shared_memory import FOLDER, SharedMemory
 from ultragray_workers.pool.messages import Place
 
 from ...file_sizes import files_of_at_most
+from ...waiting import wait_until
 from .test_grpc_render import Conversation, error_info, moved
 
 SLOT_BYTES = 2**20
@@ -61,6 +64,99 @@ def memory():
     made = ClientMemory()
     yield made
     made.close()
+
+
+class ClientSocket:
+    """The socket beside a client's file, by the words of rendering.proto."""
+
+    def __init__(self, memory):
+        self.path = f"{memory.path}.socket"
+        memory.message.has_socket = True
+        self._listener = socket.socket(socket.AF_UNIX)
+        self._listener.bind(self.path)
+        self._listener.listen(1)
+        self._listener.settimeout(60)
+
+    def accept(self):
+        self._end, _ = self._listener.accept()
+        self._end.settimeout(60)
+        self._received = self._end.makefile("rb")
+
+    def send(self, data):
+        self._end.sendall(len(data).to_bytes(4, "little") + data)
+
+    def ask(self, sequence, **fields):
+        self.send(rendering_pb2.RenderStreamRequest(sequence=sequence, **fields).SerializeToString())
+        return self.receive()
+
+    def receive(self):
+        """The next frame; None after the last one."""
+        length = self._received.read(4)
+        return rendering_pb2.Frame.FromString(self._received.read(int.from_bytes(length, "little"))) if length else None
+
+    def done_sending(self):
+        self._end.shutdown(socket.SHUT_WR)
+
+    def close(self):
+        self._received.close()
+        self._end.close()
+        self._listener.close()
+
+
+@pytest.fixture
+def talk(renders, memory):
+    """A stream whose messages go through a socket: its call, and the socket."""
+    through = ClientSocket(memory)
+    conversation = opened(renders, memory)
+    through.accept()
+    yield conversation.call, through
+    through.close()
+
+
+def test_messages_go_through_a_socket_and_the_call_ends_with_them(talk, memory):
+    call, through = talk
+    frames = [through.ask(k, pose=moved(k)) for k in range(5)]
+    assert [frame.sequence for frame in frames] == list(range(5))
+    assert [frame.HasField("shared_data") for frame in frames] == [True] * 3 + [False] * 2
+    assert len({memory.pixels(frame) for frame in frames[:3]} | {frame.data for frame in frames[3:]}) == 5
+    assert through.ask(5, pose=moved(0), timeout_ms=-1.0).error.field == "timeout_ms"
+    through.done_sending()
+    assert through.receive() is None
+    assert list(call) == []
+    assert call.code() == grpc.StatusCode.OK
+    assert not Path(through.path).exists()
+
+
+def test_what_is_no_message_is_told_and_too_large_a_one_ends_the_poses(talk):
+    call, through = talk
+    through.send(b"\xff" * 10)
+    assert "not a message" in through.receive().error.detail
+    assert through.ask(2, pose=moved(0)).sequence == 2
+    through.send(b"\0" * (MAX_MESSAGE_BYTES + 1))
+    assert "at most 65536 bytes, got 65537" in through.receive().error.detail
+    assert through.receive() is None
+    assert call.code() == grpc.StatusCode.OK
+
+
+def test_a_client_that_is_gone_or_cancels_ends_the_stream(service, renders, memory):
+    for end in (lambda call, through: through.close(), lambda call, through: call.cancel()):
+        made = ClientMemory()
+        through = ClientSocket(made)
+        conversation = opened(renders, made)
+        through.accept()
+        assert through.ask(1, pose=moved(0)).sequence == 1
+        wait_until(lambda: service.metric("ultragray_open_streams") == 1)
+        end(conversation.call, through)
+        wait_until(lambda: service.metric("ultragray_open_streams") == 0)
+        through.close()
+        made.close()
+
+
+def test_a_socket_that_is_not_there_is_refused(renders, memory):
+    memory.message.has_socket = True
+    told, detail = refused(renders, memory.message)
+    assert told == "shared_memory.name"
+    assert "cannot connect to its socket: No such file" in detail
 
 
 def opened(renders, memory, **settings):

@@ -35,8 +35,8 @@ def expressions():
 def labels_of(service, module_pose):
     """The labels of each sample that a service has told once it rendered, answered and refused."""
     render = f"{service.http}/v1/scenes/demo/render"
-    assert httpx.post(render, json={"pose": module_pose}, timeout=60).status_code == 200
-    text = httpx.get(f"{service.http}/metrics", timeout=60).text
+    assert httpx.post(render, json={"pose": module_pose}, timeout=300).status_code == 200
+    text = httpx.get(f"{service.http}/metrics", timeout=300).text
     found = {"ultragray_certificate_expires_timestamp_seconds": set()}  # only with TLS
     for family in text_string_to_metric_families(text):
         found.setdefault(family.name, set())

@@ -77,7 +77,7 @@ def traced(collector, data_folder, tmp_path):
 
 def test_request_of_http_is_a_span_with_the_stages_of_the_pool_below(traced, collector, pose_body):
     url = f"{traced.http}/v1/scenes/demo/render"
-    answer = httpx.post(url, json={"pose": pose_body}, headers={**CALLER, "X-Request-Id": "scan-7"}, timeout=60)
+    answer = httpx.post(url, json={"pose": pose_body}, headers={**CALLER, "X-Request-Id": "scan-7"}, timeout=300)
     assert answer.status_code == 200, answer.text
     found = wait_until(lambda: collector.whole_trace(len(STAGES) + 1))
     door = found["POST /v1/scenes/{scene}/render"]
@@ -91,7 +91,7 @@ def test_request_of_http_is_a_span_with_the_stages_of_the_pool_below(traced, col
 def test_refused_request_is_a_span_that_failed(traced, collector):
     request = rendering_pb2.RenderRequest(settings=rendering_pb2.RenderSettings(scene="nowhere"))
     with traced.channel() as channel, pytest.raises(grpc.RpcError):
-        rendering_pb2_grpc.RenderServiceStub(channel).Render(request, metadata=tuple(CALLER.items()), timeout=60)
+        rendering_pb2_grpc.RenderServiceStub(channel).Render(request, metadata=tuple(CALLER.items()), timeout=300)
     found = wait_until(lambda: collector.whole_trace(1))
     assert found["ultragray.v1.RenderService/Render"].status.code == Status.STATUS_CODE_ERROR
 
@@ -106,7 +106,7 @@ def test_job_is_a_span_of_its_worker_in_the_trace_of_its_submission(collector, d
     job = {"kind": "render", "specification": {"scene": "demo", "sampler": {"kind": "training"}}}
     with RunningService(data_folder, tmp_path / "log", environment) as service:
         service.wait_until_serving()
-        answer = httpx.post(f"{service.http}/v1/jobs", json=job, headers=CALLER, timeout=60)
+        answer = httpx.post(f"{service.http}/v1/jobs", json=job, headers=CALLER, timeout=300)
         assert answer.status_code == 201, answer.text
         found = wait_until(lambda: collector.whole_trace(2), within_s=120)
     span = found["job render"]
@@ -117,8 +117,8 @@ def test_job_is_a_span_of_its_worker_in_the_trace_of_its_submission(collector, d
 
 def test_health_is_not_traced_nor_a_service_without_an_endpoint(traced, collector, service, pose_body):
     for running in (traced, service):
-        assert httpx.get(f"{running.http}/v1/health/ready", headers=CALLER, timeout=60).status_code == 200
-    httpx.post(f"{service.http}/v1/scenes/demo/render", json={"pose": pose_body}, headers=CALLER, timeout=60)
+        assert httpx.get(f"{running.http}/v1/health/ready", headers=CALLER, timeout=300).status_code == 200
+    httpx.post(f"{service.http}/v1/scenes/demo/render", json={"pose": pose_body}, headers=CALLER, timeout=300)
     traced.terminate()  # sends what has not been sent
     assert collector.spans == []
 

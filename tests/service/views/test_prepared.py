@@ -21,7 +21,7 @@ from ultragray_workers.errors import ArtifactNotFound, DatasetNotFound, Deadline
 from ultragray_workers.views import lay_out
 
 from ...file_sizes import files_of_at_most
-from ...warm import WARM, warm_subprocess
+from ...warm import WARM, Hold, warm_subprocess
 from ...workers.jobs.conftest import store_dataset, tiny_dataset
 
 DATASET = tiny_dataset()
@@ -134,11 +134,12 @@ def test_that_a_name_is_gone_says_nothing_of_the_content(tmp_path, wanted):
 def test_who_waits_for_what_is_being_made_sees_its_end(tmp_path, wanted):
     async def ask():
         made = views(tmp_path)
-        asking = asyncio.ensure_future(made.path("job-1", **wanted))
-        while not (tmp_path / "views").is_dir():
-            await asyncio.sleep(0.01)
-        await made.settled(lambda key: key.startswith("other-"))
-        assert not (tmp_path / "views" / "job-1").exists()
+        with Hold("lay_out") as held:
+            asking = asyncio.ensure_future(made.path("job-1", **wanted))
+            while held.pid is None:
+                await asyncio.sleep(0.01)
+            await made.settled(lambda key: key.startswith("other-"))
+            assert not (tmp_path / "views" / "job-1").exists()
         await made.settled(lambda key: key.startswith("job-"))
         assert (tmp_path / "views" / "job-1").exists()
         await asking
@@ -154,7 +155,7 @@ async def end_of(made, wanted):
 
 def test_what_no_one_foresaw_is_a_failure_as_well(tmp_path, wanted, caplog):
     (tmp_path / "views").symlink_to(tmp_path / "nowhere")
-    failed = asyncio.run(asyncio.wait_for(end_of(views(tmp_path), wanted), 10))
+    failed = asyncio.run(end_of(views(tmp_path), wanted))
     assert failed.state == "failed"
     assert failed.error.detail == "laying out failed unexpectedly, see the log"
     assert "FileExistsError" in caplog.text
@@ -163,7 +164,7 @@ def test_what_no_one_foresaw_is_a_failure_as_well(tmp_path, wanted, caplog):
 def test_a_disk_without_room_is_told(tmp_path, wanted, monkeypatch):
     monkeypatch.setattr(threads, "subprocess", subprocess)  # has the limits of this process
     with files_of_at_most(DATASET.train.images.size):
-        failed = asyncio.run(asyncio.wait_for(end_of(views(tmp_path), wanted), 30))
+        failed = asyncio.run(end_of(views(tmp_path), wanted))
     assert isinstance(failed.error, StorageFull)
     assert names(tmp_path) == []
 
@@ -173,7 +174,7 @@ def test_what_is_stopped_leaves_nothing(tmp_path, wanted, stop):
     async def ask():
         made = views(tmp_path)
         asking = asyncio.ensure_future(made.path("key", **wanted))
-        while not (tmp_path / "views").is_dir() or not names(tmp_path):
+        while held.pid is None:
             await asyncio.sleep(0.01)
         if stop == "end":
             made.end()
@@ -184,7 +185,8 @@ def test_what_is_stopped_leaves_nothing(tmp_path, wanted, stop):
         with pytest.raises(Draining if stop == "end" else ArtifactNotFound):
             await asking
 
-    asyncio.run(ask())
+    with Hold("lay_out") as held:
+        asyncio.run(ask())
     assert names(tmp_path) == []
 
 

@@ -22,7 +22,7 @@ def http(start_service, tmp_path_factory, artifacts):
     folder = tmp_path_factory.mktemp("dataset")
     write_released(DATASET, folder)
     service = start_service(artifact_folder=artifacts, embedded_worker=True, training_threads=1)
-    with httpx.Client(base_url=service.http, timeout=60) as client:
+    with httpx.Client(base_url=service.http, timeout=300) as client:
         packed = zipped({path.name: path.read_bytes() for path in folder.iterdir()})
         answer = client.put("/v1/datasets/tiny", content=packed, headers={"Content-Type": "application/zip"})
         assert answer.status_code == 201, answer.text

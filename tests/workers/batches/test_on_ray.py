@@ -88,7 +88,7 @@ def head(tmp_path):
         yield f"ray://127.0.0.1:{client_port}"
     finally:
         process.terminate()
-        process.wait(60)
+        process.wait(300)
 
 
 def _answers(port):

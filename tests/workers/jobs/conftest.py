@@ -142,7 +142,7 @@ class RunningWorker:
         with ExitStack() as stack:
             if self._database_url is None:
                 database = stack.enter_context(
-                    closing(sqlite3.connect(self._artifact_folder / SQLITE_FILE, timeout=60))
+                    closing(sqlite3.connect(self._artifact_folder / SQLITE_FILE, timeout=300))
                 )
                 database.execute("BEGIN IMMEDIATE")  # once nobody else writes
             self.process.send_signal(signal.SIGSTOP)
@@ -155,7 +155,7 @@ class RunningWorker:
     def terminate(self):
         """As a service manager does."""
         self.process.send_signal(signal.SIGTERM)
-        return self.process.wait(60)
+        return self.process.wait(300)
 
     def job_process(self):
         """The process of the job at hand."""

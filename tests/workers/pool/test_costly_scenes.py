@@ -4,6 +4,7 @@ import asyncio
 import os
 import signal
 import time
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -15,12 +16,12 @@ from ultragray.phantom.demo import DEMO_FILE
 from ultragray.rendering.frames import footprint_pixels
 from ultragray_workers import PoolConfig, Priority
 from ultragray_workers.errors import DeadlineExceeded
-from ultragray_workers.pool import dispatcher
+from ultragray_workers.pool import dispatcher, processes
 
 from ..asking import HEIGHT, PROBE, WIDTH, asking
 
 POSE = np.eye(4)[None]
-SOON_S = 60.0  # how long to wait at the most for what does not take the minutes that its frame would
+HOUR_S = 3600.0
 
 
 def save_wide(folder, name, *, count, log_scale):
@@ -98,7 +99,7 @@ async def test_a_frame_past_its_deadline_is_given_up_and_frees_the_worker(open_p
         await asyncio.gather(pool.load("minutes"), pool.load("a"))
         with pytest.raises(DeadlineExceeded):
             await pool.render(large("minutes", deadline=time.monotonic() + 0.5))
-        await pool.render(asking("a", random_poses(1), deadline=time.monotonic() + SOON_S))
+        await pool.render(asking("a", random_poses(1), deadline=time.monotonic() + HOUR_S))
         assert pool.statistics().restarts_total == pool.statistics().kills_total == 0
 
 
@@ -109,55 +110,90 @@ async def test_a_frame_whose_client_has_gone_is_given_up(open_pool, costly_folde
         await until(lambda: pool.statistics().busy == 1)
         await asyncio.sleep(0.2)  # into the frame
         task.cancel()
-        await until(lambda: pool.statistics().busy == 0, timeout_s=SOON_S)
+        await until(lambda: pool.statistics().busy == 0)
         await pool.render(asking("a", random_poses(1)))
         assert pool.statistics().restarts_total == pool.statistics().kills_total == 0
 
 
+@pytest.fixture
+def until_killed(monkeypatch):
+    """Lets hours pass for whoever watches the workers, until so many have been killed."""
+
+    async def wait(pool, count):
+        passed_s = 0.0
+        while pool.statistics().kills_total < count:
+            passed_s += HOUR_S
+            ahead = SimpleNamespace(monotonic=lambda passed_s=passed_s: time.monotonic() + passed_s)
+            monkeypatch.setattr(processes, "time", ahead)
+            await asyncio.sleep(0.05)
+
+    return wait
+
+
 @pytest.mark.parametrize("priority", list(Priority))
-async def test_a_stopped_worker_is_killed_and_its_work_done_again(open_pool, random_poses, expect_frames, priority):
-    request = asking("a", random_poses(3), priority=priority, deadline=time.monotonic() + 60.0)
-    async with open_pool(worker_grace_s=2.0) as pool:
+async def test_a_stopped_worker_is_killed_and_its_work_done_again(
+    open_pool, random_poses, expect_frames, priority, until_killed
+):
+    request = asking("a", random_poses(3), priority=priority, deadline=time.monotonic() + 99 * HOUR_S)
+    async with open_pool() as pool:
         (worker,) = pool.statistics().pids
         os.kill(worker, signal.SIGSTOP)
-        result = await pool.render(request)  # long before its deadline: the task was not even taken up
+        rendering = asyncio.create_task(pool.render(request))
+        await until_killed(pool, 1)
+        found = await rendering  # long before its deadline: the task was not even taken up
         statistics = pool.statistics()
         assert (statistics.kills_total, statistics.restarts_total) == (1, 0)
         assert statistics.pids != (worker,)
-        found = result
     expect_frames(request, found)
 
 
 async def test_a_worker_stopped_in_the_middle_of_a_frame_is_killed_after_its_deadline(
-    open_pool, costly_folder, random_poses, until
+    open_pool, costly_folder, random_poses, until, until_killed
 ):
-    async with open_pool(max_footprint_pixels=2**62, worker_grace_s=2.0) as pool:
+    async with open_pool(max_footprint_pixels=2**62) as pool:
         await pool.load("minutes")
         (worker,) = pool.statistics().pids
-        late = asyncio.create_task(pool.render(large("minutes", deadline=time.monotonic() + 1.5)))
+        late = asyncio.create_task(pool.render(large("minutes", deadline=time.monotonic() + 3.0)))
         await until(lambda: pool.statistics().busy == 1)
-        await asyncio.sleep(0.3)  # into the frame
+        await asyncio.sleep(0.1)  # into the frame
         os.kill(worker, signal.SIGSTOP)
         next_one = asyncio.create_task(pool.render(asking("a", random_poses(1))))
         with pytest.raises(DeadlineExceeded):
             await late
+        await until_killed(pool, 1)
         await next_one
         assert pool.statistics().kills_total == 1
 
 
-async def test_a_request_with_which_two_workers_hang_fails_alone(open_pool, costly_folder, random_poses, until):
-    async with open_pool(max_footprint_pixels=2**62, worker_timeout_s=2.0) as pool:
+async def test_a_request_with_which_two_workers_hang_fails_alone(open_pool, costly_folder, random_poses, until_killed):
+    async with open_pool(max_footprint_pixels=2**62) as pool:
+        rendering = asyncio.create_task(pool.render(large("minutes")))
+        await until_killed(pool, 2)
         with pytest.raises(RenderFailed, match="2 worker processes hung"):
-            await pool.render(large("minutes"))  # without a deadline: silence is all there is to go by
+            await rendering  # without a deadline: silence is all there is to go by
         await pool.render(asking("b", random_poses(1)))
         assert (pool.statistics().kills_total, pool.statistics().restarts_total) == (2, 0)
 
 
-async def test_a_load_that_hangs_is_ended(open_pool, until):
-    async with open_pool(worker_grace_s=2.0, worker_timeout_s=2.0) as pool:
+async def test_a_request_that_kills_every_worker_fails_alone(open_pool, costly_folder, random_poses, until):
+    async with open_pool(max_footprint_pixels=2**62) as pool:
+        task = asyncio.create_task(pool.render(large("minutes")))
+        for deaths in range(1, 6):
+            await until(lambda: pool.statistics().busy == 1)
+            os.kill(pool.statistics().pids[0], signal.SIGKILL)
+            await until(lambda deaths=deaths: pool.statistics().restarts_total == deaths)
+        with pytest.raises(RenderFailed, match="died 5 times"):
+            await task
+        await pool.render(asking("b", random_poses(1)))
+
+
+async def test_a_load_that_hangs_is_ended(open_pool, until_killed):
+    async with open_pool() as pool:
         (worker,) = pool.statistics().pids
         os.kill(worker, signal.SIGSTOP)
-        await pool.load("a")
+        loading = asyncio.create_task(pool.load("a"))
+        await until_killed(pool, 1)
+        await loading
         assert pool.statistics().kills_total == 1
         assert pool.loaded() == {"a": 1}
 
@@ -165,7 +201,7 @@ async def test_a_load_that_hangs_is_ended(open_pool, until):
 async def test_a_pool_whose_workers_are_stuck_is_not_ready(open_pool, random_poses, until, monkeypatch):
     monkeypatch.setattr("ultragray_workers.pool.dispatcher.STUCK_AFTER_S", 0.5)
     assert dispatcher.STUCK_AFTER_S <= 10.0
-    async with open_pool(worker_grace_s=30.0) as pool:
+    async with open_pool() as pool:
         (worker,) = pool.statistics().pids
         assert pool.ready
         os.kill(worker, signal.SIGSTOP)

@@ -80,7 +80,7 @@ def patch_workers(cold_templates, tmp_path, monkeypatch):
     def patch(code):
         folder = tmp_path / "patches"
         folder.mkdir()
-        imports = "import torch\nfrom ultragray_workers.pool import worker\nfrom ultragray.rendering import frames"
+        imports = "import torch\nfrom ultragray_workers.pool import worker"
         (folder / "sitecustomize.py").write_text(f"{imports}\n{code}")
         monkeypatch.setenv("PYTHONPATH", os.pathsep.join([str(folder), *filter(None, sys.path)]))
 
@@ -113,14 +113,14 @@ async def test_each_gpu_gets_a_process_where_no_number_is_given(open_pool, patch
 
 
 OUT_OF_MEMORY = """
-render = frames.render
+render = worker.render_shown
 
-def render_few(scene, probe, poses, **options):
-    if len(poses) * options["height"] > 60:
+def render_few(scene, settings, poses, **options):
+    if len(poses) * settings.height > 60:
         raise torch.OutOfMemoryError("CUDA out of memory")
-    return render(scene, probe, poses, **options)
+    return render(scene, settings, poses, **options)
 
-frames.render = render_few
+worker.render_shown = render_few
 """
 
 
@@ -151,14 +151,14 @@ async def test_out_of_memory_fails_the_request_and_no_more(
 
 
 FULL_GPU = """
-render = frames.render
+render = worker.render_shown
 
-def render_in_little(scene, probe, poses, **options):
+def render_in_little(scene, settings, poses, **options):
     torch.cuda.empty_cache()
-    torch.cuda.set_per_process_memory_fraction(0.0 if options["height"] > 60 else 1.0)
-    return render(scene, probe, poses, **options)
+    torch.cuda.set_per_process_memory_fraction(0.0 if settings.height > 60 else 1.0)
+    return render(scene, settings, poses, **options)
 
-frames.render = render_in_little
+worker.render_shown = render_in_little
 """
 
 
@@ -177,7 +177,7 @@ async def test_a_full_gpu_fails_the_request_and_no_more(open_pool, random_poses,
 
 LOST_GPU = """
 import pathlib
-render = frames.render
+render = worker.render_shown
 
 def lose(*_):
     raise RuntimeError("CUDA error: an illegal memory access was encountered")
@@ -189,7 +189,7 @@ def lose_once(scene, *arguments, **options):
         lose()
     return render(scene, *arguments, **options)
 
-frames.render = lose_once
+worker.render_shown = lose_once
 """
 
 

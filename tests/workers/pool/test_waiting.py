@@ -11,7 +11,6 @@ from ultragray.rendering.settings import Encoding
 from ultragray.rendering.volumes import SliceView
 from ultragray_workers import Priority
 from ultragray_workers.errors import DeadlineExceeded, QueueFull
-from ultragray_workers.pool import waiting
 from ultragray_workers.pool.waiting import Expiry, Part, Ticket, Turn, WaitingQueue
 
 from ..asking import asking
@@ -67,30 +66,28 @@ def test_only_what_can_be_rendered_together_is(make_ticket):
     ]
 
 
-def test_batches_get_a_part_rendered_now_and_then(make_ticket, monkeypatch):
+def test_batches_get_a_part_rendered_now_and_then(make_ticket, clock):
     queue = WaitingQueue(limit_frames=100, max_batch_poses=4)
     batch = make_ticket(2, priority=Priority.BATCH)
     interactive = [make_ticket(scene=name) for name in "abc"]
     for ticket in (batch, *interactive):
         queue.add(ticket)
     assert taken(queue) == [(interactive[0], 0, 1)]
-    now = time.monotonic()
-    monkeypatch.setattr(waiting.time, "monotonic", lambda: now + 1.1)
+    clock.now += 1.1
     assert taken(queue) == [(batch, 0, 1)]
     assert taken(queue) == [(interactive[1], 0, 1)]
 
 
-def test_slow_batches_let_interactive_requests_pass_between_their_parts(make_ticket, monkeypatch):
+def test_slow_batches_let_interactive_requests_pass_between_their_parts(make_ticket, clock):
     queue = WaitingQueue(limit_frames=100, max_batch_poses=4)
     batch = make_ticket(3, priority=Priority.BATCH)
     interactive = [make_ticket(scene=name) for name in "ab"]
     queue.add(batch)
     for ticket in interactive:
         queue.add(ticket)
-    now = time.monotonic()
     order = []
-    for second in range(2, 12, 2):  # each part takes two
-        monkeypatch.setattr(waiting.time, "monotonic", lambda second=second: now + second)
+    for _ in range(5):
+        clock.now += 2.0  # each part takes so long
         order += [part.ticket for part in queue.take_batch()]
     assert order == [batch, interactive[0], batch, interactive[1], batch]
 
@@ -180,7 +177,7 @@ def test_a_newer_pose_takes_the_place_of_one_that_waits(make_ticket):
     assert first.request.poses is newer
 
 
-def test_a_deadline_that_was_brought_forward_expires_earlier(make_ticket):
+def test_a_deadline_that_was_brought_forward_expires_earlier(make_ticket, clock):
     async def wait():
         queue = WaitingQueue(limit_frames=100, max_batch_poses=1)
         ticket = make_ticket(deadline=time.monotonic() + 60.0)
@@ -191,10 +188,10 @@ def test_a_deadline_that_was_brought_forward_expires_earlier(make_ticket):
         assert queue.frames == 0
         assert isinstance(ticket.done.exception(), DeadlineExceeded)
 
-    asyncio.run(wait())
+    clock.run_until_complete(wait())
 
 
-def test_a_deadline_that_was_put_off_expires_later(make_ticket):
+def test_a_deadline_that_was_put_off_expires_later(make_ticket, clock):
     async def wait():
         queue = WaitingQueue(limit_frames=100, max_batch_poses=1)
         ticket = make_ticket(deadline=time.monotonic() + 0.02)
@@ -207,9 +204,10 @@ def test_a_deadline_that_was_put_off_expires_later(make_ticket):
         assert queue.frames == 0
         assert isinstance(ticket.done.exception(), DeadlineExceeded)
 
-    asyncio.run(wait())
+    clock.run_until_complete(wait())
 
 
+@pytest.mark.usefixtures("clock")
 def test_what_cannot_begin_in_time_is_refused_at_once_and_told_when_it_could(make_ticket):
     queue = WaitingQueue(limit_frames=100, max_batch_poses=1)
     queue.settle([Part(make_ticket(), 0, 1)], 10.0, typical=True)
@@ -220,7 +218,7 @@ def test_what_cannot_begin_in_time_is_refused_at_once_and_told_when_it_could(mak
     queue.add(make_ticket(begin_by=time.monotonic() + 15.0))
 
 
-def test_what_has_not_begun_in_time_is_refused_and_what_has_goes_on(make_ticket):
+def test_what_has_not_begun_in_time_is_refused_and_what_has_goes_on(make_ticket, clock):
     async def main():
         queue = WaitingQueue(limit_frames=100, max_batch_poses=1)
         begun, waits = make_ticket(2), make_ticket()
@@ -231,10 +229,10 @@ def test_what_has_not_begun_in_time_is_refused_and_what_has_goes_on(make_ticket)
         expiries = [Expiry(ticket, queue) for ticket in (begun, waits)]
         begun.memory = 0  # a worker has the first part of it
         with pytest.raises(QueueFull, match="max_queue_ms"):
-            await asyncio.wait_for(waits.done, 60)
+            await waits.done
         assert not begun.done.done()
         assert queue.frames == 2
         for expiry in expiries:
             expiry.cancel()
 
-    asyncio.run(main())
+    clock.run_until_complete(main())

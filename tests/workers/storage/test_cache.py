@@ -32,7 +32,7 @@ class SlowStorage(LocalStorage):
     def download(self, key, path, *, version=None):
         self.asked.append(key)
         if key.startswith("slow"):
-            assert self.go.wait(20)
+            assert self.go.wait(300)
         return super().download(key, path, version=version)
 
 
@@ -69,11 +69,11 @@ def test_an_object_is_fetched_once(cache, source):
 def test_many_that_ask_at_once_wait_for_one_fetch_and_others_do_not(cache, source):
     with ThreadPoolExecutor(8) as threads:
         asked = [threads.submit(fetch, cache, source, "slow") for _ in range(6)]
-        wait_until(lambda: source.asked == ["slow"], within_s=10)
+        wait_until(lambda: source.asked == ["slow"])
         assert fetch(cache, source, "a") == b"a" * SIZE
         assert not any(one.done() for one in asked)
         source.go.set()
-        assert {one.result(20) for one in asked} == {b"slow" * (SIZE // 4)}
+        assert {one.result() for one in asked} == {b"slow" * (SIZE // 4)}
     assert source.asked == ["slow", "a"]
 
 
@@ -146,7 +146,7 @@ Cache(Path(sys.argv[1]), 3000, 0.0).pin(storage, "a", storage.entry("a").version
 
 
 def test_a_process_that_dies_while_it_fetches_leaves_nothing_that_stays(cache, source):
-    assert subprocess.run([sys.executable, "-c", DIES, cache.folder, source.folder], timeout=60).returncode == 7
+    assert subprocess.run([sys.executable, "-c", DIES, cache.folder, source.folder], timeout=300).returncode == 7
     assert cache.held_bytes() == SIZE  # its space
     for key in ("b", "c", "d", "a"):
         assert fetch(cache, source, key) == key.encode() * SIZE
@@ -173,8 +173,9 @@ def test_several_processes_share_the_bound(cache, source):
     processes = [
         subprocess.Popen([sys.executable, "-c", FETCHES, cache.folder, source.folder, str(first)]) for first in range(3)
     ]
-    most = 0
-    while any(process.poll() is None for process in processes):
+    most, is_over = 0, False
+    while not is_over:
+        is_over = all(process.poll() is not None for process in processes)
         most = max(most, cache.held_bytes())
         time.sleep(0.001)
     assert [process.returncode for process in processes] == [0, 0, 0]

@@ -245,6 +245,7 @@ class _Worker:
         limits: Limits = UNLIMITED,
     ) -> Arriving:
         outputs = tuple(wanted)
+        in_bytes = set().union(*wanted.values()) == {Encoding.UINT8.pixel_type}
         done = 0
 
         def shown(some: FloatArray) -> dict[str, Tensor]:  # [C, 4, 4] -> each [C, H, W] of the picture
@@ -258,6 +259,7 @@ class _Worker:
                 backend=self._backend,
                 limits=limits.after(done - len(some)),
                 support=support,
+                in_bytes=in_bytes,
             )
 
         try:

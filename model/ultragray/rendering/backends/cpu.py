@@ -87,6 +87,42 @@ def render_outputs(
     return planes
 
 
+def render_grey(
+    scene: GaussianScene,
+    probe: Probe,
+    poses_cm: FloatArray,  # [C, 4, 4] about the scene's centre
+    height: int,
+    width: int,
+    least_coverage: float,
+    limits: Limits = UNLIMITED,
+    beam: Tensor | None = None,  # [3] cm
+    *,
+    instruction_set: str = "auto",
+) -> tuple[Tensor, Tensor]:  # [C, H, W] uint8, [C] float32
+    """B-mode as `ultragray.rendering.pixels.to_uint8` rounds it, and the share of each frame's pixels with at least so
+    much coverage: in one pass, which never writes the planes. The scene is one that it supports.
+
+    Raises FrameTooCostly, GivenUp.
+    """
+    view = _view_arguments(probe, poses_cm, height, width, beam)
+    grey = torch.empty((len(poses_cm), height, width), dtype=torch.uint8, device="cpu")
+    supported = np.zeros(len(poses_cm), np.int64)
+    with _limited(limits):
+        _cpu.render(
+            _sorted(scene),
+            **view,
+            **_arrays({}),
+            instruction_set=instruction_set,
+            grey=grey.numpy(),
+            supported=supported,
+            least_coverage=least_coverage,
+            footprint_pixels=limits.footprint_pixels,
+            flag=limits.flag,
+            number=limits.number,
+        )
+    return grey, torch.from_numpy((supported / (height * width)).astype(np.float32))
+
+
 def plane_sums(
     scene: GaussianScene,
     corners_cm: FloatArray,  # [C, 4, 4] about the scene's centre

@@ -29,6 +29,8 @@ class Backend:
 
     # planes by name, [C, H, W] each: scene, probe, poses in cm [C, 4, 4], height, width, planes, limits, beam
     draw: Callable[..., dict[str, Tensor]]
+    # B-mode in 8 bits and shares of supported pixels, as `cpu.render_grey`; None: by way of planes
+    draw_grey: Callable[..., tuple[Tensor, Tensor]] | None = None
     # whether it can draw a scene, which depends on where its tensors lie, and of which type they are
     supports: Callable[[GaussianScene], bool] = lambda _: True
     require: Callable[[], None] = lambda: None  # raises BackendUnavailable where it cannot draw here
@@ -40,6 +42,7 @@ BACKENDS: dict[str, Backend] = {
     "reference": Backend(reference.render_outputs),
     "cpu": Backend(
         cpu.render_outputs,
+        cpu.render_grey,
         supports=cpu.supports,
         place=lambda: "on the CPU",
         renderer=lambda _: f"cpu-{cpu.INSTRUCTION_SETS[0]}",

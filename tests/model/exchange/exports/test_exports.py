@@ -169,7 +169,7 @@ def test_a_portion_is_written_while_the_next_is_rendered():
     may_write = threading.Event()
 
     def write(number):
-        may_write.wait(10)
+        assert may_write.wait(300)
         written.append(number)
 
     def give():
@@ -181,9 +181,10 @@ def test_a_portion_is_written_while_the_next_is_rendered():
     giving = threading.Thread(target=give)
     giving.start()
     giving.join(0.3)
-    assert (given, written) == ([0], [])  # it is being written; the next has to wait
+    assert len(given) < 2  # the first is being written; the next has to wait
+    assert not written
     may_write.set()
-    giving.join(10)
+    giving.join()
     assert written == [0, 1, 2, 3]
 
 

@@ -114,7 +114,7 @@ def test_a_second_signal_ends_the_drain_of_a_worker_at_once(store, artifact_fold
         with pytest.raises(subprocess.TimeoutExpired):
             worker.wait(1)  # the job has an hour to end
         worker.send_signal(signal.SIGINT)
-        assert worker.wait(60) == 0
+        assert worker.wait(300) == 0
         assert store.get(job.id).state is JobState.QUEUED
     finally:
         worker.kill()

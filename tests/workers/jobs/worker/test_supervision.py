@@ -62,8 +62,13 @@ def test_what_was_made_is_served_and_what_was_left_is_removed(store, artifact_fo
 
 
 @pytest.fixture
-def alone(store, artifact_folder):
-    """Takes a job and does it, in this process; its row as it was taken."""
+def alone(store, artifact_folder, monkeypatch):
+    """Takes a job whose process had finished and says how it ended, in this process; its row as it was taken."""
+
+    def start(*_):
+        raise AssertionError("what is done is not done again")
+
+    monkeypatch.setattr(supervision, "job_process", start)
     jobs = JobDatabase(artifact_folder, None)
     folder = artifact_folder.resolve()
     gate = Gate(jobs.identity, [DeviceLock(folder, device, "me") for device in devices_of("cpu")], (), list)
