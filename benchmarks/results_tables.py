@@ -94,8 +94,8 @@ def measure(name: str, data_folder: Path) -> Document:
 
 
 def _on_path(scene: GaussianScene, dataset: Dataset) -> dict[str, Evaluation]:
-    """The scene and linear interpolation by the path that neighbouring frames agree with, in which no image of a held-out
-    frame has a part; empty where the poses are on it."""
+    """The scene and linear interpolation by the path that neighbouring frames agree with, which takes no image of a
+    held-out frame; empty where the poses are on it."""
     path = agreed_path(dataset)
     if path is None or (placed := path.of(dataset)) is dataset:
         return {}
