@@ -30,7 +30,7 @@ FRAMES ?= 100000
 unexport PYTHONDONTWRITEBYTECODE
 
 .DEFAULT_GOAL := help
-.PHONY: ALWAYS help serve console test test-fast test-long test-notebooks test-console test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros test-newcomer check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results methods ablations poses hand localization confidence speckle environment ros figures demo-scene docs generate packages clean
+.PHONY: ALWAYS help serve console test test-fast test-long test-notebooks test-console test-faults test-fuzz test-soak test-overload test-shards test-image test-replicas test-ros check check-lint check-types check-generated check-web check-figures format bench bench-record bench-console console-picture bench-cuda results methods ablations poses hand localization confidence speckle environment ros figures demo-scene docs generate packages clean
 
 help:  ## say what there is
 	@grep -hE '^[a-z-]+:.*## ' $(MAKEFILE_LIST) | sed 's/:.*## /\t/' | expand -t 14
@@ -98,9 +98,6 @@ test-shards: $(VENV)/installed-dev  ## a batch of FRAMES (100000) in 200 shards:
 	$(READY)
 	ULTRAGRAY_SHARDS_FRAMES=$(FRAMES) ULTRAGRAY_SHARDS_RECORD=$(FIGURES)/shards.json $(BIN)/pytest -m long tests/batches $(ARGS)
 	$(KEEP) shards
-
-test-newcomer: $(VENV)/installed-dev $(CONSOLE)  ## play a newcomer with Debian's Python: clone, serve, the documents, the tests, the wheels; takes twenty minutes
-	$(BIN)/python tests/newcomer/play.py $(ARGS)
 
 check: $(VENV)/installed-dev  ## lint, types, formatting, and whether what is generated is current; all at the same time
 	@$(MAKE) --no-print-directory --keep-going --jobs --output-sync=target check-lint check-types check-generated check-web check-figures

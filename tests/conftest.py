@@ -1,7 +1,5 @@
 """Fixtures shared by all tests: golden files, random scenes, and the rule by which two renders agree."""
 
-from __future__ import annotations
-
 import gc
 import json
 import math

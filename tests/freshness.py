@@ -1,7 +1,5 @@
 """Whether frames of a latest stream are of the newest poses when a reader takes them, however seldom it does."""
 
-from __future__ import annotations
-
 from typing import Protocol
 
 # How many poses come between one reading and the next: the reader keeps up, is slow, stalls, and is slow again.

@@ -1,7 +1,5 @@
 """An S3 server (moto's, in a process of its own), and a proxy before it that breaks what a test tells it to break."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import signal

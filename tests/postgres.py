@@ -8,7 +8,6 @@ import socket
 import subprocess
 import tempfile
 import time
-from collections.abc import Callable
 from pathlib import Path
 from urllib.parse import quote
 
@@ -17,8 +16,6 @@ import pytest
 from psycopg import sql
 
 from .waiting import Deadline
-
-NewDatabase = Callable[[], str | None]
 
 PASSWORD = "s3cret/with@signs"
 _START_TIMEOUT_S = 300.0

@@ -1,7 +1,5 @@
 """What the processes of a service take: resident memory and open descriptors, of each that lives."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import statistics

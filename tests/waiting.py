@@ -4,9 +4,6 @@ import asyncio
 import os
 import time
 from pathlib import Path
-from typing import TypeVar
-
-Found = TypeVar("Found")
 
 
 class Deadline:

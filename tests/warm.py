@@ -6,6 +6,7 @@ A fork begins as the program would after its imports: with the folder, the envir
 Tests about starting itself use real processes.
 """
 
+import asyncio
 import atexit
 import contextlib
 import fcntl
@@ -194,6 +195,7 @@ SHORT_WAITS = {
 def service(path):
     """The service, whose processes are forked at `path`."""
     from ultragray_service.__main__ import main
+    from ultragray_workers import RenderPool
     from ultragray_workers.pool import processes as launcher
 
     for place, seconds in SHORT_WAITS.items():
@@ -202,6 +204,8 @@ def service(path):
         assert isinstance(getattr(owner, name), float), place
         setattr(owner, name, seconds)
     launcher.start_template = lambda descriptor: start_template(path, descriptor)
+    if Hold("start").is_wanted:
+        RenderPool.start = lambda pool: asyncio.Event().wait()
     work_warmly(path)
     return main()
 
@@ -242,7 +246,7 @@ def popen(path, command, *, env, stdout=None, stderr=None, pass_fds=(), **_):
 
 
 class Hold:
-    """Keeps the next helper process that is asked for a work from beginning it, until this context ends."""
+    """Keeps helper processes of a work from beginning it until this context ends; `start`: services, for ever."""
 
     def __init__(self, work):
         self._file = Path.home() / f"held-{work}"  # the home of the tests of one process
@@ -260,11 +264,15 @@ class Hold:
         told = self._file.read_text()
         return int(told) if told else None
 
+    @property
+    def is_wanted(self):
+        return self._file.exists()
+
     def keep(self):
         """What the helper process does."""
-        if self._file.exists():
+        if self.is_wanted:
             self._file.write_text(str(os.getpid()))
-        while self._file.exists():
+        while self.is_wanted:
             time.sleep(0.01)
 
 

@@ -1,7 +1,5 @@
 """A checkout of their own for the scripts that measure, and a folder of data."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from dataclasses import dataclass

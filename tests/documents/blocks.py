@@ -1,7 +1,5 @@
 """The code blocks of a Markdown page in their order, with the comments that steer their test (see README.md)."""
 
-from __future__ import annotations
-
 import re
 import shlex
 from dataclasses import dataclass, field

@@ -4,8 +4,6 @@ A comment before a code block says where it goes: `<!-- file: PATH -->` is a new
 (or `before`) lines beside one that is there once.
 """
 
-from __future__ import annotations
-
 import re
 import shutil
 import subprocess

@@ -1,7 +1,5 @@
 """The size of a fuzzing run, its seed, and the loop that tries one door's inputs."""
 
-from __future__ import annotations
-
 import os
 import time
 import warnings

@@ -2,7 +2,6 @@
 
 import random
 import shutil
-from collections.abc import Callable
 
 import pytest
 
@@ -12,7 +11,6 @@ from .fuzzed import CONTROL_SCENE, FuzzedService
 
 __all__ = ["data_folder", "demo_scene"]
 
-EnterDoor = Callable[[str], Door]
 _TRIED = "fuzz_inputs"
 
 

@@ -1,7 +1,5 @@
 """Every method of gRPC: messages made from the descriptors, messages nearly right, and bytes that are no messages."""
 
-from __future__ import annotations
-
 import pkgutil
 from dataclasses import dataclass
 from importlib import import_module

@@ -1,7 +1,5 @@
 """The contract's dataclasses: checks by annotation and limits, families, JSON, and what pydantic reads."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 from typing import Literal

@@ -368,7 +368,6 @@ def test_gradients_reach_the_scene_and_the_pose(scene, backend):
         assert float(tensor.grad.norm()) > 0
     plain = replace(scene, sh0=scene.sh0.clone().requires_grad_())
     render(plain, LINEAR, np.eye(4), **SIZE, outputs=("bmode",), backend=backend)["bmode"].sum().backward()
-    assert plain.sh0.grad is not None
     assert leaf.sh0.grad is not None
     assert not torch.equal(plain.sh0.grad, leaf.sh0.grad)  # shadows take light from what lies in them
 

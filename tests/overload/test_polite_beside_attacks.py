@@ -66,7 +66,7 @@ def slices(http, _):
 
 
 def huge_bodies(http, _):
-    body = json.dumps({"poses": [POSE] * 15_000}).encode()  # 1 MB, the most that this route takes
+    body = json.dumps({"poses": [POSE] * 10_000}).encode()  # 1 MB, the most that this route takes
     return repeated(http, posted("/v1/scenes/demo:assess", body))
 
 

@@ -15,6 +15,7 @@ from grpc_health.v1 import health_pb2, health_pb2_grpc
 from ultragray_proto.v1 import rendering_pb2, rendering_pb2_grpc
 
 from ..waiting import at_this_load, wait_until
+from ..warm import Hold
 from .conftest import ROOT, SOURCE_FOLDERS
 from .rpc.test_grpc_render import Conversation, error_info, moved
 
@@ -121,10 +122,11 @@ def not_ready(service, client):
 
 
 def test_sigterm_while_starting(start_service):
-    service = start_service(wait=False)
-    wait_until(service.log)
-    assert service.terminate() == 0
-    assert not any("grpc" in record for record in service.log()), "it was ready before it was stopped"
+    with Hold("start"):
+        service = start_service(wait=False)
+        wait_until(lambda: service.logged("starting to serve"))
+        assert service.terminate() == 0
+    assert not any("grpc" in record for record in service.log())
 
 
 def test_a_full_queue_is_told_with_a_time_to_retry(start_service):

@@ -140,14 +140,9 @@ def test_other_types_of_answers_are_not_acceptable(http):
 def test_refusals_over_grpc_name_the_field(client):
     with pytest.raises(SceneNotFound):
         client.render_slice("absent", SliceSettings(origin_mm=(0, 0, 0), size_mm=(10, 10)))
-    for plane, field in (
-        (SliceSettings(origin_mm=(0, 0, 0), size_mm=(10, 10), down=(1, 0, 0)), "slice.down"),
-        (SliceSettings(origin_mm=(0, 0, 0), size_mm=(1000, 10)), "slice.spacing_mm"),
-        (SliceSettings(origin_mm=(0, 0, 0), size_mm=(10, 10), field="bmode"), "slice.field"),
-    ):
-        with pytest.raises(InvalidArgument) as caught:
-            client.render_slice("labelled", plane)
-        assert caught.value.field == field
+    with pytest.raises(InvalidArgument) as caught:
+        client.render_slice("labelled", SliceSettings(origin_mm=(0, 0, 0), size_mm=(10, 10), down=(1, 0, 0)))
+    assert caught.value.field == "slice.down"
 
 
 def test_a_slice_counts_as_a_frame(http, volume_service):

@@ -5,7 +5,6 @@ import contextlib
 import io
 import os
 from pathlib import Path
-from typing import TypeVar
 
 import cv2
 import numpy as np
@@ -17,6 +16,7 @@ from ultragray.scene.confidence import FIGURES
 from ultragray_workers import PoolConfig, RenderPool, SceneStore
 from ultragray_workers.pool import processes as launcher
 from ultragray_workers.pool import waiting
+from ultragray_workers.pool.messages import Priority
 
 from ..waiting import Deadline, wait_until
 from ..warm import WARM, pool_processes, start_template
@@ -24,13 +24,11 @@ from .asking import HEIGHT, PROBE, WIDTH
 
 TIME_LIMIT_S = 600.0
 
-T = TypeVar("T")
-
 
 @pytest.fixture
 def batches_of_any_length(monkeypatch):
     """However long others wait for them."""
-    monkeypatch.setattr(waiting, "_LONGEST_BATCH_S", 60.0)
+    monkeypatch.setattr(waiting, "_LONGEST_BATCH_S", dict.fromkeys(Priority, 60.0))
 
 
 @pytest.fixture(autouse=True)

@@ -35,7 +35,6 @@ def test_only_what_a_dead_process_claimed_is_abandoned(tmp_path):
     holder = subprocess.Popen(
         [sys.executable, "-c", HOLD, str(tmp_path)], stdin=subprocess.PIPE, stdout=subprocess.PIPE
     )
-    assert holder.stdout is not None
     holder.stdout.readline()
     assert remove_abandoned(tmp_path, ".making-") == 0
     os.kill(holder.pid, signal.SIGKILL)

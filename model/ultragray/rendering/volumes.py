@@ -22,6 +22,7 @@ from ultragray.rendering.settings import Encoding
 from ultragray.scene.info import SceneInfo
 
 PIECE_PIXELS = 1 << 17  # of a slice, which is sampled in pieces between which frames go
+CROWDED_PIECE_PIXELS = 1 << 15  # of one that others wait for
 MOST_PIECES = 128
 LESS_FOR_A_PIECE = 8  # so many times less than a frame may it cost
 

@@ -23,6 +23,7 @@ from ultragray.geometry.registration import Registration
 from ultragray.rendering.pixels import encoded_image
 from ultragray.rendering.settings import Encoding, FrameSettings, Resolved
 from ultragray.rendering.volumes import (
+    CROWDED_PIECE_PIXELS,
     MOST_PIECES,
     PIECE_PIXELS,
     SliceSettings,
@@ -47,6 +48,8 @@ from ultragray_workers.pool.pool import MAX_SCENE_CHANGES, RenderPool
 from ultragray_workers.pool.waiting import Turn
 from ultragray_workers.scene_names import base_name
 from ultragray_workers.storage.local import FileVersion
+
+CROWDED_QUEUE_MS = 3.0  # a piece of a slice that nobody else is in the way of begins sooner
 
 
 class Plan(Generic[S]):
@@ -242,11 +245,13 @@ class Rendering:
     ) -> RenderResult[SliceView]:
         """A slice at a pose [4, 4] mm, some rows at a time: frames of others go between.
 
-        Rows that cost too much for one piece come in smaller ones. Raises FrameTooCostly where these would be more than
-        MOST_PIECES, and what `render` raises.
+        After a piece that had to wait, as where others ask, the next ones are smaller, though the slice takes longer.
+        Rows that cost too much for one piece come in smaller ones, too. Raises FrameTooCostly where these would be more
+        than MOST_PIECES, and what `render` raises.
         """
         view, numbers = plan.settings, numbers_of(plan.settings.field)
-        rows, first = max(1, PIECE_PIXELS // view.width), 0
+        most = rows = max(1, PIECE_PIXELS // view.width)
+        first = 0
         pieces: list[RenderResult[SliceView]] = []
         while first < view.height:
             piece = replace(view, height=min(rows, view.height - first), encoding=numbers)
@@ -255,8 +260,8 @@ class Rendering:
             try:
                 result = await self.render(plan, place[None], deadline=deadline, settings=piece)
             except FrameTooCostly as error:
-                rows = piece.height // 2
-                if len(pieces) * rows + view.height - first > MOST_PIECES * rows:
+                most = rows = piece.height // 2
+                if view.height > MOST_PIECES * rows:
                     raise FrameTooCostly(
                         "the Gaussians are too wide for the size of this slice; ask for fewer pixels", field=error.field
                     ) from None
@@ -266,7 +271,10 @@ class Rendering:
                 continue
             pieces.append(result)
             first += piece.height
-        data, began = b"".join(piece.data for piece in pieces), time.monotonic()
+            is_crowded = result.queue_ms > CROWDED_QUEUE_MS
+            rows = min(most, max(1, CROWDED_PIECE_PIXELS // view.width)) if is_crowded else most
+        began = time.monotonic()
+        data = await asyncio.to_thread(b"".join, [piece.data for piece in pieces])  # megabytes, as others' frames wait
         if view.encoding is Encoding.PNG:
             data = await asyncio.to_thread(_png_of, view, data)
         return replace(

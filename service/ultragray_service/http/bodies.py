@@ -5,6 +5,7 @@ from __future__ import annotations
 import asyncio
 import json
 import math
+import re
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import Field, dataclass, field, make_dataclass, replace
@@ -57,9 +58,13 @@ class Apart:
 
 
 async def read_large(body: bytes, cls: type[T], apart: Apart | None) -> T:
-    if apart is not None and len(body) > apart.max_bytes:
-        raise BodyTooLarge(f"this body must be at most {apart.max_bytes} bytes, got {len(body)}", field="body")
+    _require_size(len(body), apart)
     return await asyncio.get_running_loop().run_in_executor(_READER, _read, body, cls, apart)
+
+
+def _require_size(count: int, apart: Apart | None) -> None:
+    if apart is not None and count > apart.max_bytes:
+        raise BodyTooLarge(f"this body must be at most {apart.max_bytes} bytes, got {count}", field="body")
 
 
 def _read(body: bytes, cls: type[T], apart: Apart | None) -> T:
@@ -76,7 +81,10 @@ def _read(body: bytes, cls: type[T], apart: Apart | None) -> T:
 
 
 def _decoded(body: bytes, max_values: float) -> Any:
-    if body.count(b",") + body.count(b"[") + body.count(b"{") > max_values:
+    if re.match(rb"\s*\{", body) is None:
+        raise InvalidArgument("the body must be a JSON object")
+    letters = np.frombuffer(body, np.uint8)  # bytes.count takes ten times as long where there are many
+    if sum(int(np.count_nonzero(letters == letter)) for letter in b",[{") > max_values:
         raise InvalidArgument(
             f"a body must hold at most {max_values} values; many poses of a job are sent in base64, or over gRPC",
             field="body",
@@ -141,6 +149,8 @@ async def read_json_body(request: Request, cls: type[T], apart: Apart | None = N
     if media_type != "application/json" and not media_type.endswith("+json"):
         raise UnsupportedMediaType(f"Content-Type must be application/json, got {content_type!r}", field="Content-Type")
     require_uncompressed(request)
+    announced = request.headers.get("content-length", "")
+    _require_size(int(announced) if announced.isdigit() else 0, apart)  # before it is read
     body = await request.body()
     return read_json(body, cls) if len(body) <= INLINE_BYTES else await read_large(body, cls, apart)
 
@@ -154,7 +164,7 @@ def read_json(text: str | bytes, cls: type[T]) -> T:
     return value
 
 
-_POSE_BYTES = 1024  # with room for indentation
+_POSE_BYTES, _POSE_VALUES = 1024, 32  # with room for indentation, and for what makes a pose none
 
 
 def _many_poses(limit: int) -> Apart:
@@ -165,7 +175,7 @@ def _many_poses(limit: int) -> Apart:
         InvalidPose,
         lambda count: check_pose_count(count, limit),
         max_bytes=INLINE_BYTES + limit * _POSE_BYTES,
-        max_values=math.inf,
+        max_values=2 * _SMALL_VALUES + limit * _POSE_VALUES,
     )
 
 

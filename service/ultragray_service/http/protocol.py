@@ -331,8 +331,11 @@ class _BoundedWebSocket(PromptWebSocket):
     """One connection. `look` must be called every second or so.
 
     Frames that carry nothing are counted: pings, pongs that answer none of ours, empty fragments. Whoever sends more
-    than MAX_EMPTY_FRAMES at once, and EMPTY_FRAMES_PER_S in the long run, is closed with 1008 before the rest is read.
+    than MAX_EMPTY_FRAMES at once, and EMPTY_FRAMES_PER_S in the long run, is closed with 1008. The rest is not read,
+    and the connection keeps its place for a moment: a client that comes again at once would cost a handshake each time.
     """
+
+    _is_over = False
 
     def __init__(self, *arguments: Any, limits: Settings, refused: Refused, place: Place, **options: Any) -> None:
         super().__init__(*arguments, **options)
@@ -343,7 +346,7 @@ class _BoundedWebSocket(PromptWebSocket):
 
     def data_received(self, data: bytes) -> None:
         for start in range(0, len(data), _PIECE_BYTES):
-            if self.transport.is_closing():
+            if self._is_over or self.transport.is_closing():
                 return
             super().data_received(data[start : start + _PIECE_BYTES])
 
@@ -365,10 +368,12 @@ class _BoundedWebSocket(PromptWebSocket):
         now = self.loop.time()
         left = self._empty_frames - EMPTY_FRAMES_PER_S * (now - self._counted_at)
         self._empty_frames, self._counted_at = max(0.0, left) + 1.0, now
-        if self._empty_frames > MAX_EMPTY_FRAMES and not self.transport.is_closing():
+        if self._empty_frames > MAX_EMPTY_FRAMES and not self._is_over and not self.transport.is_closing():
+            self._is_over = True
             self.conn.fail(_POLICY_VIOLATION, "too many pings, pongs or empty frames")
             self._write()
-            self.transport.close()
+            self.transport.pause_reading()
+            self.loop.call_later(_LINGER_S, self.transport.close)
 
     def connection_lost(self, exc: Exception | None) -> None:
         self._place.close()

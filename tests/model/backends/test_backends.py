@@ -1,7 +1,5 @@
 """Every backend and instruction set renders what the reference does in float64, and the released implementation."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """What the words of a DICOM header say of its pixels, against what the stream holds."""
 
-from __future__ import annotations
-
 import io
 import re
 from collections.abc import Callable

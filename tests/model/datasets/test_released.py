@@ -1,7 +1,5 @@
 """The released layout: whatever it may hold is read alike, what cannot be used is named, and writing gives it back."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Pictures in a folder with a table of poses."""
 
-from __future__ import annotations
-
 import io
 import json
 

@@ -1,7 +1,5 @@
 """Scans of TUS-REC, in files as the challenge publishes them."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Options made of contract dataclasses: names, help, defaults, and the way back."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from enum import Enum
 from pathlib import Path

@@ -121,8 +121,21 @@ def test_running_out_of_memory_leaves_the_last_good_scene(dataset, tmp_path, mon
     assert run("train", dataset, "-o", output, "--resume").exit_code == 0
 
 
-def start(*arguments):
-    program = f"import sys; sys.path[:0] = {sys.path!r}; from ultragray_service.cli.app import app; app()"
+SIGNALLED = """
+import os
+from ultragray.learn.training import trainer
+true_loss, calls = trainer.image_loss, []
+def loss(*arguments):
+    calls.append(None)
+    if len(calls) == 6:
+        os.kill(os.getpid(), {number})
+    return true_loss(*arguments)
+trainer.image_loss = loss
+"""
+
+
+def start(*arguments, before=""):
+    program = f"import sys; sys.path[:0] = {sys.path!r}\n{before}\nfrom ultragray_service.cli.app import app; app()"
     command = [sys.executable, "-c", program, "train", *map(str, arguments)]
     return subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env={**os.environ, "OMP_NUM_THREADS": "1"})
 
@@ -138,17 +151,15 @@ def wait_for_lines(path, count, process):
 @pytest.mark.long
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_stopped_run_leaves_a_scene_and_goes_on(dataset, tmp_path, number):
-    output, small = tmp_path / "scene.ugr", ("--steps", 300, "--max-gaussians", 60, "--threads", 1)
-    process = start(dataset, "-o", output, *small)
-    wait_for_lines(tmp_path / "scene.ugr.run" / "metrics.jsonl", 5, process)
-    process.send_signal(number)
+    output, small = tmp_path / "scene.ugr", ("--steps", 12, "--max-gaussians", 60, "--threads", 1)
+    process = start(dataset, "-o", output, *small, before=SIGNALLED.format(number=int(number)))
     _, told = process.communicate(timeout=300)
     assert process.returncode == 130
     stopped_at = GaussianScene.load(output).info.training["step"]
-    assert 5 <= stopped_at < 300
-    assert f"stopped after step {stopped_at} of 300; wrote {output} as it is" in told
+    assert 5 <= stopped_at < 12
+    assert f"stopped after step {stopped_at} of 12; wrote {output} as it is" in told
     assert "unfinished run: --resume continues it, --force begins anew" in refused_run(dataset, "-o", output, *small)
-    assert "steps is 300 there, 50 here" in refused_run(dataset, "-o", output, "--resume", "--steps", 50)
+    assert "steps is 12 there, 50 here" in refused_run(dataset, "-o", output, "--resume", "--steps", 50)
     resumed = run("train", dataset, "-o", output, "--resume")  # the settings are those of the run
     assert resumed.exit_code == 0, resumed.output
     assert run("train", dataset, "-o", tmp_path / "undisturbed.ugr", *small).exit_code == 0

@@ -72,20 +72,13 @@ def test_npz_holds_frames_poses_and_origin(http, service, demo_scene, pose_body,
     assert str(arrays["scene_sha256"]) == answer.headers["x-ultragray-scene-sha256"] == sha256
 
 
-def test_headers_let_the_frame_be_rendered_again(http, pose_body):
+def test_headers_tell_the_pose_as_it_was_rendered_and_the_times(http, pose_body):
     nearly = {"position_mm": pose_body["position_mm"], "quaternion": {"w": 0.9999, "x": 0.0, "y": 0.0, "z": 0.004}}
-    answer = post(http, {"pose": nearly})
-    headers = answer.headers
+    headers = post(http, {"pose": nearly}).headers
     pose = np.array(json.loads(headers["x-ultragray-pose"]))
     np.testing.assert_allclose(pose[:3, :3].T @ pose[:3, :3], np.eye(3), atol=1e-12)
-    assert json.loads(headers["x-ultragray-probe"])["kind"] == "linear"
-    assert headers["x-ultragray-scene"] == "demo"
-    assert headers["x-ultragray-renderer"].startswith("ultragray/")
-    timings = [float(headers[f"x-ultragray-{stage}-ms"]) for stage in ("queue", "render", "encode")]
-    assert min(timings) >= 0
+    assert min(float(headers[f"x-ultragray-{stage}-ms"]) for stage in ("queue", "render", "encode")) >= 0
     assert headers["server-timing"].count("dur=") == 3
-    again = post(http, {"pose": {"matrix": pose.tolist()}})
-    assert again.content == answer.content
 
 
 def test_a_scene_without_a_probe_renders_when_one_is_given(http, pose_body):

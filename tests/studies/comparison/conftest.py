@@ -1,7 +1,5 @@
 """A sweep and methods that are small enough to compare in a moment."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 

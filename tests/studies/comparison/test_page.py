@@ -55,7 +55,6 @@ def test_the_page_has_every_method_and_needs_nothing_else(dataset, methods, pace
 def test_a_comparison_in_which_all_fail_has_a_page(dataset, methods, tmp_path):
     settings = ComparisonSettings()
     found = compare_methods(dataset, {"failing": methods["failing"]}, settings, folder=tmp_path)
-    assert found is not None
     text = write_comparison(found, dataset, tmp_path)[2].read_text()
     Checked(text)
     assert "it needs 9 GB &amp; more" in text

@@ -123,7 +123,6 @@ def test_the_scene_is_fitted_where_the_equal_time_is_not_known_and_only_there(da
     first = compare_methods(dataset, {"level": level}, settings, folder=tmp_path / "one", paces=paces)
     assert [row.name for row in first.results] == ["level"], "the scene is no row: nobody asked for it"
     assert (tmp_path / "one" / "scene" / "scene.ugr").exists()
-    assert first.budget_s is not None
     assert paces.known(EQUAL_TIME) == Pace(first.budget_s, 0.0)
     second = compare_methods(dataset, {"level": level}, settings, folder=tmp_path / "two", paces=paces)
     assert second is not None

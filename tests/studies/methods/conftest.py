@@ -1,7 +1,5 @@
 """A small sweep, and a method of a moment, for tests of what all methods share."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Ultra-NeRF: its field, its renderer against products by hand, its variants."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import fields, replace
 

@@ -20,7 +20,7 @@ def zip_of(path, entries):
 
 
 def tar_of(path, entries, mode="w"):
-    with tarfile.open(path, mode) as archive:  # type: ignore[call-overload]
+    with tarfile.open(path, mode) as archive:
         for name, content in entries.items():
             entry = tarfile.TarInfo(name)
             entry.size = len(content)

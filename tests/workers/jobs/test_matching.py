@@ -92,7 +92,7 @@ def test_every_kind_of_job_demands_what_its_specification_says():
 )
 def test_a_demand_that_no_worker_could_meet_is_refused_with_its_field(asked, field):
     with pytest.raises(InvalidArgument, match=f"^{field} must be") as caught:
-        EvaluateJob("liver", "liver", **asked)  # type: ignore[arg-type]
+        EvaluateJob("liver", "liver", **asked)
     assert caught.value.field == field
 
 

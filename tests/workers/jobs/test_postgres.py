@@ -11,8 +11,6 @@ from ultragray_workers.jobs.store import JobStore
 
 from ...postgres import PASSWORD
 
-# `ultragray worker`, less patient with the dead.
-
 
 @pytest.fixture
 def database_url(postgres):
@@ -53,7 +51,7 @@ def test_role_that_sees_no_other_database_is_enough(postgres, database_url, tmp_
     postgres.execute("REVOKE CONNECT ON DATABASE postgres FROM PUBLIC")
     with pytest.raises(StartupFailed, match="permission denied"):
         JobStore(tmp_path, postgres.url(name, user="modest", password="modest"))
-    postgres.execute(f"GRANT CREATE ON DATABASE {name} TO modest")  # type: ignore[arg-type]
+    postgres.execute(f"GRANT CREATE ON DATABASE {name} TO modest")
     with caplog.at_level(logging.WARNING):
         JobStore(tmp_path, postgres.url(name, user="modest", password="modest")).close()
     assert caplog.text == ""

@@ -84,7 +84,6 @@ def test_no_process_outlives_the_service(tmp_path):
     with subprocess.Popen(
         [sys.executable, "-c", program, str(tmp_path)], stdout=subprocess.PIPE, env=environment
     ) as service:
-        assert service.stdout is not None
         assert service.stdout.readline() == b"started\n"
         service.kill()
     # the autouse fixture waits for the processes of this group to be gone

@@ -111,6 +111,7 @@ def test_turns_are_of_time_so_that_costly_frames_come_less_often(make_ticket):
     assert order.count("b") >= 200
 
 
+@pytest.mark.usefixtures("batches_of_any_length")
 def test_company_is_taken_in_turns(make_ticket):
     queue = queue_of(max_batch_poses=8)
     for _ in range(50):
@@ -126,7 +127,7 @@ def test_slow_frames_make_small_batches(make_ticket):
     queue = queue_of(max_batch_poses=8)
     for _ in range(20):
         queue.add(make_ticket())
-    assert len(queue.take_batch()) == 8
+    assert len(queue.take_batch()) == 4  # others wait 20 ms at the most, where frames are thought to take 5
     rendered(queue, 1, frame_s=1.0)
     assert len(queue.take_batch()) == 1
 

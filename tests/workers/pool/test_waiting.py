@@ -110,7 +110,7 @@ def test_large_images_make_smaller_batches(make_ticket):
 
 
 @pytest.mark.parametrize(
-    ("priority", "frame_s", "together"), [("INTERACTIVE", 0.02, 2), ("BATCH", 0.02, 2), ("BATCH", 0.002, 4)]
+    ("priority", "frame_s", "together"), [("INTERACTIVE", 0.01, 2), ("BATCH", 0.02, 2), ("BATCH", 0.002, 4)]
 )
 def test_slow_frames_make_smaller_batches(make_ticket, priority, frame_s, together):
     queue = WaitingQueue(limit_frames=100, max_batch_poses=16)

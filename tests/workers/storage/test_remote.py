@@ -69,7 +69,7 @@ def test_a_torn_download_goes_on_where_it_was(bucket, object_proxy, tmp_path):
 
 def test_a_server_that_is_silent_is_asked_again(new_bucket, object_proxy, monkeypatch):
     monkeypatch.setattr(remote, "_SILENCE_TIMEOUT_S", 1)
-    storage = open_storage(new_bucket(), patience_s=60)  # type: ignore[operator]
+    storage = open_storage(new_bucket(), patience_s=60)
     storage.write("a", b"one")
     object_proxy.faults.append(Fault("silence", "GET"))
     object_proxy.requests.clear()

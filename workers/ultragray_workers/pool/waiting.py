@@ -22,7 +22,7 @@ _FULL_BATCH_PIXELS_PER_POSE = 512 * 512
 _ATTEMPTS_IN_COMPANY = 2
 _BATCH_PRIORITY_SHARE = 4  # an interactive request may have to wait for a part of a batch: a smaller one
 _BATCH_PATIENCE_S = 1.0
-_LONGEST_BATCH_S = 0.05  # that others may have to wait for, where that is known
+_LONGEST_BATCH_S = {Priority.INTERACTIVE: 0.02, Priority.BATCH: 0.05}  # that others may have to wait for, where known
 _LEAST_RETRY_S = 0.1
 
 
@@ -345,7 +345,7 @@ class WaitingQueue:
         pixels = settings.height * settings.width * len(settings.outputs)
         fitting = self._max_batch_poses * _FULL_BATCH_PIXELS_PER_POSE // pixels
         if (frame_s := self._forecast.frame_s(ticket.batch_key)) > 0.0:
-            fitting = min(fitting, int(_LONGEST_BATCH_S / frame_s))
+            fitting = min(fitting, int(_LONGEST_BATCH_S[ticket.request.priority] / frame_s))
         return max(1, min(self._max_batch_poses // share, fitting))
 
 

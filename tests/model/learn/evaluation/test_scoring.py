@@ -38,7 +38,6 @@ def sweep(scene, probe, random_poses):
     """What the scene itself shows, in 8 bits."""
     poses = random_poses(5)
     frames = render(scene, probe, poses, height=24, width=20, outputs=("bmode",)).bmode
-    assert frames is not None
     return Sweep((frames * 255).round().byte().numpy(), poses, probe, np.array([3, 7, 8, 20, 21]), "rendered")
 
 

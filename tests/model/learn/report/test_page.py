@@ -73,6 +73,5 @@ def test_the_page_of_a_scene_alone_with_frames_from_end_to_end(page, tmp_path):
     assert text.count("<img ") == 2 * 5  # truth, the scene and how far it is off, what it is made of
     read_from_a_file = render_page(replace(page, course=None))
     assert re.findall(r"<h2>(.*?)</h2>", read_from_a_file) == ["Held-out frames", "Pictures"]
-    assert page.course is not None
     write_training_curve(page.course, tmp_path / "curve.png")
     assert (tmp_path / "curve.png").read_bytes().startswith(b"\x89PNG")

@@ -1,7 +1,5 @@
 """The confidence that a training ends with: what is left out, what is fitted, and that it is true of others."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

@@ -150,7 +150,6 @@ def test_released_gaussian_beyond_an_end_has_a_gradient_again():
     project_sh0(sh0, "released", None)
     sh0.requires_grad_()
     intensity_of(sh0, "released").sum().backward()
-    assert sh0.grad is not None
     assert bool((sh0.grad > 0.28).all())
 
 

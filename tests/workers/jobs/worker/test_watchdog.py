@@ -21,7 +21,6 @@ from ..conftest import is_training, train_job
 
 FOR_EVER = 1_000_000  # steps
 LONGEST_S = 1000.0
-# Trainings of the scene `sleeps` never come to their second step.
 
 
 @contextmanager
@@ -30,7 +29,6 @@ def running(program):
     process = subprocess.Popen(
         [sys.executable, "-c", f"print(flush=True)\n{program}"], stdout=-1, start_new_session=True
     )
-    assert process.stdout is not None
     process.stdout.readline()
     yield process.pid
     kill_group(process.pid)
@@ -83,7 +81,6 @@ def test_a_stopped_process_is_noticed_and_keeps_no_device(store, start_worker, u
     job, _ = store.submit(train_job("one", steps=FOR_EVER))
     until(job, is_training)
     process = worker.job_process()
-    assert process is not None
     os.kill(process, signal.SIGTERM)  # leaves a checkpoint
     process = wait_until(lambda: found if (found := worker.job_process()) != process else None)
     until(job, lambda job: "from a checkpoint" in store.log_tail(job.id))
