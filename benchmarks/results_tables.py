@@ -16,9 +16,10 @@ from in_silico import IN_SILICO
 from measuring import Document, Lines, columns, measure_runs, table, teller
 from ultragray.datasets.source import PHANTOM, SourceOptions, load_dataset
 from ultragray.learn.evaluation.baselines import BASELINES, IN_TIME, affordable_voxel_mm, evaluate_baselines, predict
-from ultragray.learn.evaluation.scoring import render_sweep
+from ultragray.learn.evaluation.scoring import Evaluation, evaluate, evaluate_frames, render_sweep
 from ultragray.learn.sweep import Dataset
 from ultragray.learn.training import TrainingConfig
+from ultragray.learn.training.agreement import agreed_path
 from ultragray.scene.gaussians import GaussianScene
 from ultragray_studies.report import train_and_evaluate
 
@@ -68,7 +69,7 @@ def measure(name: str, data_folder: Path) -> Document:
     baselines = evaluate_baselines(dataset, BASELINES, voxel_mm)
     config = TrainingConfig.preset(run.preset, **run.settings)
     trained = train_and_evaluate(dataset, config, report=teller(name))
-    evaluations = {"scene": trained.evaluation, **baselines}
+    evaluations = {"scene": trained.evaluation, **baselines, **_on_path(trained.scene, dataset)}
     figures = {
         "train_frames": len(dataset.train),
         "val_frames": len(dataset.val),
@@ -90,6 +91,19 @@ def measure(name: str, data_folder: Path) -> Document:
     if run.source == PHANTOM:
         figures["shadow"] = measure_shadow(trained.scene, dataset, voxel_mm)
     return figures
+
+
+def _on_path(scene: GaussianScene, dataset: Dataset) -> dict[str, Evaluation]:
+    """The scene and linear interpolation by the path that neighbouring frames agree with, which takes no image of a
+    held-out frame; empty where the poses are on it."""
+    path = agreed_path(dataset)
+    if path is None or (placed := path.of(dataset)) is dataset:
+        return {}
+    linear = predict(placed.train, placed.val.poses, "linear")
+    return {
+        "scene_on_path": evaluate(scene.at_rest(), placed.val),
+        "linear_on_path": evaluate_frames(linear, placed.val),
+    }
 
 
 def _source(run: Run, data_folder: Path) -> Dataset:
@@ -127,6 +141,8 @@ ROW_NAMES = {
     "linear": "linear between frames",
     "nearest": "nearest training frame",
     IN_TIME: "neighbours in time",
+    "scene_on_path": "**scene, on the path**",
+    "linear_on_path": "linear, on the path",
 }
 README_ROWS = {
     "ultranerf_liver": "simulated liver, trained on two sweeps",

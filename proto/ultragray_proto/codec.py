@@ -103,22 +103,22 @@ def _at(path: str, convert: _Convert, value: Any) -> Any:
 
 def _written(descriptor: Descriptor, value: Any, others: Mapping[str, Any] | None = None) -> dict[str, Any]:
     is_mapping = isinstance(value, Mapping)
-    get = value.get if is_mapping else partial(_attribute, value)
     found = dict(others or {})
     cls: Any = None if is_mapping else type(value)
     steps, oneofs = _writers(descriptor, cls)
     for name, convert, default in steps:
-        if name in found or (one := get(name)) is None or (default is not None and one == default):
+        one = value.get(name) if is_mapping else getattr(value, name, None)
+        if one is None or name in found or (default is not None and one == default):
             continue
-        found[name] = _at(name, convert, one)
+        try:
+            found[name] = convert(one)
+        except MessageInvalid as error:
+            raise error.under(name) from error.original
     for name, kinds in oneofs:
-        if kinds.keys().isdisjoint(found) and (one := get(name)) is not None:
+        one = value.get(name) if is_mapping else getattr(value, name, None)
+        if one is not None and kinds.keys().isdisjoint(found):
             found |= _member_written(kinds, one)
     return found
-
-
-def _attribute(value: Any, name: str) -> Any:
-    return getattr(value, name, None)
 
 
 @cache

@@ -3,8 +3,12 @@
 import pytest
 
 from ultragray.datasets.source import SourceOptions
+from ultragray.learn.evaluation.baselines import evaluate_baselines
 from ultragray.learn.evaluation.methods import ComparisonSettings
+from ultragray.learn.training.agreement import with_shares
 
+from ..model.learn.training.test_agreement import FRAMES, hand_path, recording
+from ..model.learn.training.test_poses import PROBE
 from ..scripts import benchmark
 
 results, methods, ablations = map(benchmark, ("results_tables", "methods_tables", "ablations"))
@@ -25,6 +29,16 @@ def test_a_training_is_measured_beside_classical_methods(data, monkeypatch):
     assert text.count("| nearest training frame |") == 1
     *_, row = results.results_at_a_glance(results.glanced_at({**figures, "other": {}}))
     assert row.startswith(f"| a ball, the other half | {figures['two']['total_s']:.0f} s |")
+
+
+def test_scores_on_the_path_stand_beside_those_as_given(random_scene):
+    tracked, scene = hand_path(), random_scene(info={"probe": PROBE})
+    given = recording(with_shares(tracked, [range(FRAMES)], PROBE, (0.0, 0.0, 0.0)), tracked)
+    found = results._on_path(scene, given)
+    as_given = evaluate_baselines(given, ("linear",))["linear"]
+    assert found["linear_on_path"].mean.psnr_db > as_given.mean.psnr_db + 1.0
+    assert set(found) < set(results.ROW_NAMES)
+    assert results._on_path(scene, recording(tracked, tracked)) == {}
 
 
 def test_methods_are_compared_and_what_failed_is_a_row_with_its_reason(data, monkeypatch, tmp_path):

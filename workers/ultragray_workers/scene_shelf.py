@@ -28,7 +28,7 @@ from typing import Any
 from ultragray.errors import SceneFileInvalid
 from ultragray.files import file_sha256
 from ultragray.scene.info import (
-    CORRECTIONS_TENSOR,
+    BESIDE,
     SceneHeader,
     SceneInfo,
     check_header_size,
@@ -439,7 +439,7 @@ def fetch_header(storage: Storage, key: str, file_bytes: int, name: str) -> Scen
         if header_bytes > len(start):
             start += storage.read(key, start=len(start), length=header_bytes - len(start))
         tensors = json.loads(start[_LENGTH_BYTES:header_bytes])
-        parts = [tensors[one]["data_offsets"] for one in ("training_poses", CORRECTIONS_TENSOR) if one in tensors]
+        parts = [tensors[one]["data_offsets"] for one in ("training_poses", *BESIDE) if one in tensors]
         ranges = [(header_bytes + int(first), header_bytes + int(stop)) for first, stop in parts]
     except (ValueError, KeyError, TypeError) as error:
         raise scene_file_invalid(name, error) from error

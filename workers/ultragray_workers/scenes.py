@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager, nullcontext
+from contextlib import contextmanager
 from pathlib import Path
 
 from ultragray.errors import SceneFileInvalid
 from ultragray.files import file_sha256
 from ultragray.scene.info import SceneHeader, SceneInfo, read_header, scene_file_invalid
 from ultragray_workers.errors import SceneNotFound, known_names
-from ultragray_workers.scene_names import SUFFIX, SceneReference, base_name, check_scene_name
+from ultragray_workers.scene_names import SUFFIX, SceneReference, base_name, check_scene_name, is_scene_name
 from ultragray_workers.scene_shelf import KeptHeaders, SceneShelf, floats_per_gaussian
 from ultragray_workers.storage.local import FileVersion, LocalStorage
 
@@ -125,9 +125,12 @@ class SceneStore:
     @contextmanager
     def hold(self, name: str) -> Iterator[Path | None]:
         """The file of a scene, which stays on this host during the body; None where it is not on this host now."""
-        shelf = next((shelf for shelf in self.shelves if shelf.knows(name)), None)
-        with nullcontext() if shelf is None else shelf.hold(name) as path:
-            yield path
+        for shelf in self.shelves if is_scene_name(name) else ():
+            with shelf.hold(name) as path:
+                if path is not None or shelf.knows(name):
+                    yield path
+                    return
+        yield None
 
     def sha256(self, text: str) -> str:
         """The hash of the content that a scene has now, its file fetched where nothing else tells it.

@@ -4,6 +4,7 @@ import socket
 from contextlib import ExitStack
 
 import httpx
+import numpy as np
 import pytest
 
 from ultragray.errors import InvalidArgument
@@ -14,6 +15,7 @@ from ultragray_service.settings import load_settings
 from ultragray_workers.jobs.database import JobDatabase
 
 from ..igtl.conftest import Peer, address_of, moved
+from ..igtl.test_igtl_commands import ask, command
 
 KEY = "0123456789abcdef"
 
@@ -135,3 +137,36 @@ def test_a_connection_from_before_the_first_key_is_closed(start_service, tmp_pat
         assert again.image().pixels.size
         entries = httpx.get(f"{service.http}/v1/me", headers={"X-API-Key": key}, timeout=300).json()
         assert entries["key_required"]
+
+
+def test_registrations_of_private_scenes_are_not_there_for_others(start_service, tmp_path, keys, scene_bytes):
+    """Neither a choice of a parameter nor a pose that is led by it shows a reader that there is one."""
+    _, alice = keys.create("alice", Role.OPERATOR, None)
+    service = serve(start_service, tmp_path)
+
+    def put(path, **body):
+        answer = httpx.put(f"{service.http}/v1/{path}", headers={"X-API-Key": alice}, timeout=300, **body)
+        assert answer.status_code in (200, 201), answer.text
+
+    put("scenes/kept?private=true", content=scene_bytes)
+    put("registrations/alices-arm", json={"scene": "kept", "base_to_scene": np.eye(4).tolist()})
+    put("registrations/open-arm", json={"scene": "demo", "base_to_scene": np.eye(4).tolist()})
+    with ExitStack() as opened:
+        reader, admin = (Peer(address_of(service), source=f"127.0.0.{host}") for host in (3, 2))
+        for peer in (reader, admin):
+            opened.callback(peer.socket.close)
+        for name in ("alices-arm", "nobodys-arm"):
+            reply = ask(reader, command("SetUsParameter", ("Registration", name)))
+            assert reply.get("Status") != "SUCCESS"
+            assert f"there is no registration '{name}'" in str(reply.get("Error"))
+            assert "kept" not in str(reply.attrib)
+        for name in ("kept", "nothing"):
+            reply = ask(reader, command("SetUsParameter", ("Scene", name)))
+            assert reply.get("Status") != "SUCCESS"
+            assert f"there is no scene '{name}'" in str(reply.get("Error")).replace("called ", "")
+            reader.send_pose(moved(0.0), name, version=2)
+            assert reader.receive().metadata["scene"] == "demo"
+        assert ask(reader, command("SetUsParameter", ("Registration", "open-arm"))).get("Status") == "SUCCESS"
+        assert ask(admin, command("SetUsParameter", ("Registration", "alices-arm"))).get("Status") == "SUCCESS"
+        admin.send_pose(moved(0.0), "ProbeToTracker", version=2)
+        assert admin.receive().metadata["scene"] == "kept"

@@ -121,6 +121,14 @@ class Turns(Generic[Item]):
         waiting = sorted((c for c in self._clients.values() if c.frames), key=lambda client: client.turn)
         return _alternate([_in_turn(client) for client in waiting])
 
+    def first(self) -> Item | None:
+        """The item whose turn is next; None where nothing waits."""
+        if not self.frames:
+            return None
+        client = min((one for one in self._clients.values() if one.frames), key=lambda one: one.turn)
+        connection = min((one for one in client.connections.values() if one.items), key=lambda one: one.turn)
+        return next(iter(connection.items))
+
     def heads(self) -> Iterator[tuple[float, Item]]:
         """The first item of each connection, and since when it waits for others only (time.monotonic())."""
         for client in self._clients.values():

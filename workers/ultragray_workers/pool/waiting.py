@@ -6,9 +6,9 @@ import asyncio
 import math
 import time
 from collections import OrderedDict, deque
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, lru_cache
 from typing import Any
 
 from ultragray.geometry.probe import FloatArray
@@ -24,6 +24,12 @@ _BATCH_PRIORITY_SHARE = 4  # an interactive request may have to wait for a part 
 _BATCH_PATIENCE_S = 1.0
 _LONGEST_BATCH_S = {Priority.INTERACTIVE: 0.02, Priority.BATCH: 0.05}  # that others may have to wait for, where known
 _LEAST_RETRY_S = 0.1
+
+
+@lru_cache(maxsize=4096)
+def _kind(*_: Hashable) -> Hashable:
+    """One object for what is equal: hashing all of the settings takes its time."""
+    return object()
 
 
 @dataclass(eq=False)
@@ -43,9 +49,9 @@ class Ticket:
     archive: int | None = None  # and of the .npz that is made of them, where that is asked for
 
     @cached_property
-    def batch_key(self) -> tuple[Any, ...]:
-        """Requests that agree in this can be rendered together."""
-        return (self.request.scene, self.request.version, *self.request.settings.view)
+    def kind(self) -> Hashable:
+        """Requests of one kind can be rendered together, and take about as long."""
+        return _kind(self.request.scene, self.request.version, *self.request.settings.view)
 
     @property
     def give_up_at(self) -> float:
@@ -171,7 +177,7 @@ class WaitingQueue:
         if request.priority is Priority.BATCH and not turns.frames:
             self._last_batch_turn = time.monotonic()
         count, size = len(request.poses), self._poses_together(ticket)
-        frame_s = self._forecast.frame_s(ticket.batch_key)
+        frame_s = self._forecast.frame_s(ticket.kind)
         for first in range(0, count, size):
             stop = min(first + size, count)
             ticket.waiting.append(Part(ticket, first, stop, work_s=(stop - first) * frame_s))
@@ -197,7 +203,7 @@ class WaitingQueue:
         if patient_s >= _BATCH_PATIENCE_S and self._last_priority is not Priority.BATCH:
             priorities.reverse()
         for priority in filter(self._has_work, priorities):
-            while (ticket := next(self._in_turn(priority), None)) is not None:
+            while (ticket := next(iter(self._again[priority]), self._turns[priority].first())) is not None:
                 if ticket.expired:
                     self.expire(ticket)
                     continue
@@ -210,7 +216,7 @@ class WaitingQueue:
     def settle(self, steps: Sequence[Part], seconds: float, *, typical: bool) -> None:
         """Takes note of what a worker took for steps together; `typical`: such frames will take as long again."""
         frames = sum(step.frames for step in steps)
-        kind = steps[0].ticket.batch_key
+        kind = steps[0].ticket.kind
         if frames and (typical or seconds / frames > self._forecast.frame_s(kind)):
             self._forecast.learn(kind, frames, seconds)
         for step in steps:
@@ -309,7 +315,7 @@ class WaitingQueue:
         company: list[Part] = []
         priority = first.ticket.request.priority
         for ticket in list(self._in_turn(priority)) if room > 0 and self._has_work(priority) else ():
-            if ticket.batch_key != first.ticket.batch_key or ticket.expired:
+            if ticket.kind != first.ticket.kind or ticket.expired:
                 continue
             while ticket.waiting and room > 0:
                 step = ticket.waiting[0]
@@ -344,7 +350,7 @@ class WaitingQueue:
             return 1
         pixels = settings.height * settings.width * len(settings.outputs)
         fitting = self._max_batch_poses * _FULL_BATCH_PIXELS_PER_POSE // pixels
-        if (frame_s := self._forecast.frame_s(ticket.batch_key)) > 0.0:
+        if (frame_s := self._forecast.frame_s(ticket.kind)) > 0.0:
             fitting = min(fitting, int(_LONGEST_BATCH_S[ticket.request.priority] / frame_s))
         return max(1, min(self._max_batch_poses // share, fitting))
 

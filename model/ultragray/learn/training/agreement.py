@@ -10,16 +10,18 @@ frame is predicted from two about it in its sweep, in space, and of these paths 
 - that, with another calibration from the image to the probe, where sweeps cross (`alignment.found_calibration`);
 - that, but of the motion within the image plane only a share: of the shifts along the lateral and the axial axis, and
   of the turn about the elevation axis. 1: tissue is rigid; 0: it stays where it is in the image, and the frames are a
-  straight stack along their path.
+  straight stack along their path;
+- that, evened out across the image plane: where images have no exact times, or a tracker repeats its poses, the probe
+  seems to hasten and to halt from one frame to the next, which is no white noise.
 
-Another path than the tracked one has to predict better, by LEAST_GAIN_DB or GAIN_OF_SHARES_DB. Of motion across the
-plane the images of one sweep say little: there the smoothness of the path is the only evidence. Free of torch, since
-data sets are checked without it.
+Another path than the tracked one has to predict better, by LEAST_GAIN_DB, GAIN_OF_SHARES_DB or GAIN_OF_EVENNESS_DB. Of
+motion across the plane the images of one sweep say little: there the smoothness of the path is most of the evidence.
+Free of torch, since data sets are checked without it.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import cache
 from typing import TypeAlias
@@ -44,6 +46,8 @@ from ultragray.learn.training.delay import found_delay_s, with_delay
 
 FRAMES, PIXELS = 96, 2048  # that are predicted, of each: enough to tell one path from another
 LEAST_GAIN_DB = 0.05  # of a path without noise
+EVEN_FRAMES = 4.0  # standard deviation of the Gaussian that evens out the steps from frame to frame
+GAIN_OF_EVENNESS_DB = 0.03  # where poses are exact, it loses
 GAIN_OF_SHARES_DB = 0.3  # tissue is rigid unless the images say clearly that it is not
 SHARE_STEP = 0.25
 FAR = 4  # frames away from the one that is predicted
@@ -51,6 +55,7 @@ LEAST_PREDICTED = 8  # frames: fewer may fit any shares by chance
 
 Shares: TypeAlias = tuple[float, float, float]  # of the motion within the plane: lateral, axial, turn
 RIGID: Shares = (1.0, 1.0, 1.0)
+_ACROSS = (1, 3, 5)  # of a step: shift along the elevation axis, turns about the lateral and the axial one
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,6 +117,9 @@ def agreed_path(dataset: Dataset) -> AgreedPath | None:
     if shares != RIGID:
         found = with_shares(rigid, ranges, train.probe, shares)
         found_db = judge.psnr_db(found[on_path])
+    even = evened(found, ranges, train.probe)
+    if (db := judge.psnr_db(even[on_path])) > found_db + GAIN_OF_EVENNESS_DB:
+        found, found_db = even, db
     noise = tracker_noise(given, ranges)
     figures = judge.in_time_db(), tracked_db, found_db, shares, noise, delay_s, calibration
     if found is given:
@@ -180,25 +188,50 @@ def _stepped(shares: Shares, number: int, step: float) -> Shares:
 
 
 def with_shares(poses: FloatArray, ranges: Sequence[range], probe: Probe, shares: Shares) -> FloatArray:
-    """The paths [F, 4, 4], mm, with a share of their motion within the image plane.
-
-    The motion from one frame to the next is a turn and a shift of the middle of the image along the probe's axes. The
-    middle of all images and their mean orientation stay for each sweep.
-    """
+    """The paths [F, 4, 4], mm, with a share of their motion within the image plane."""
     if shares == RIGID:
         return poses
-    middle = probe.corners_mm().mean(axis=0)
     lateral, axial, turn = shares
+    return _with_steps(poses, ranges, probe, lambda steps: steps * (lateral, 1.0, axial, 1.0, turn, 1.0))
+
+
+def evened(poses: FloatArray, ranges: Sequence[range], probe: Probe) -> FloatArray:
+    """The paths [F, 4, 4], mm, with steps across the image plane that change slowly from frame to frame."""
+    reach = round(4.0 * EVEN_FRAMES)
+    weights = np.exp(-0.5 * np.square(np.arange(-reach, reach + 1) / EVEN_FRAMES))
+
+    def slow(steps: FloatArray) -> FloatArray:  # [N, 6] -> [N, 6]
+        found = steps.copy()
+        for number in _ACROSS:
+            longer = np.pad(steps[:, number], reach, mode="edge")
+            found[:, number] = np.convolve(longer, weights / weights.sum(), mode="valid")
+        return found
+
+    return _with_steps(poses, ranges, probe, slow)
+
+
+def _with_steps(
+    poses: FloatArray, ranges: Sequence[range], probe: Probe, changed: Callable[[FloatArray], FloatArray]
+) -> FloatArray:  # [F, 4, 4] mm -> [F, 4, 4] mm
+    """The paths with other steps from one frame to the next.
+
+    A step [6] is a shift of the middle of the image, mm, and a turn about it, rad, along the axes of the probe. The
+    middle of all images and their mean orientation stay for each sweep.
+    """
+    middle = probe.corners_mm().mean(axis=0)
     found = poses.copy()
     for frames in ranges:
         own = poses[frames.start : frames.stop]
-        steps = np.linalg.inv(own[:-1]) @ own[1:]
-        shifts = steps[:, :3, :3] @ middle + steps[:, :3, 3] - middle
-        steps[:, :3, :3] = rotations_of(turns_of(steps[:, :3, :3]) * (1.0, turn, 1.0))
-        steps[:, :3, 3] = middle + shifts * (lateral, 1.0, axial) - steps[:, :3, :3] @ middle
+        if len(own) < 2:
+            continue
+        motions = np.linalg.inv(own[:-1]) @ own[1:]
+        shifts = motions[:, :3, :3] @ middle + motions[:, :3, 3] - middle
+        steps = changed(np.concatenate([shifts, turns_of(motions[:, :3, :3])], axis=1))
+        motions[:, :3, :3] = rotations_of(steps[:, 3:])
+        motions[:, :3, 3] = middle + steps[:, :3] - motions[:, :3, :3] @ middle
         moved = own.copy()
-        for place, step in enumerate(steps):
-            moved[place + 1] = moved[place] @ step
+        for place, motion in enumerate(motions):
+            moved[place + 1] = moved[place] @ motion
         back = np.eye(4)
         back[:3, :3] = mean_axes(own @ np.linalg.inv(moved))
         from_middle, to_middle = ((path[:, :3, :3] @ middle + path[:, :3, 3]).mean(axis=0) for path in (moved, own))

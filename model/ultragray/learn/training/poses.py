@@ -141,7 +141,7 @@ class PoseRefinement:
     def __init__(self, dataset: Dataset, told: FloatArray) -> None:  # [F, 4, 4] mm, by the tracker
         self.dataset, self._told = dataset, told
         self._trained: TrainedCorrections | None = None
-        self._path: AgreedPath | None = None  # where tissue followed the probe, or the calibration was off
+        self._path: AgreedPath | None = None  # where poses at rest are others than as tracked
 
     @classmethod
     def of(cls, dataset: Dataset, mode: str) -> PoseRefinement:

@@ -80,6 +80,29 @@ def test_a_slow_hand_is_told_from_tissue_that_follows(share):
     assert agreed_path(given).shares == (share,) * 3
 
 
+def test_a_path_with_inexact_times_is_evened_out_across_the_plane():
+    """Noise along the way alone may be a hand that goes unevenly: only images tell."""
+    truth = hand_path()
+    tracked = truth.copy()
+    tracked[:, :3, 3] += np.random.default_rng(5).normal(0.0, 0.15, (FRAMES, 1)) * truth[:, :3, 1]
+    given = recording(truth, tracked)
+    path = agreed_path(given)
+    assert path.shares == RIGID
+    for found, told, at in ((path.train, given.train.poses, truth[::2]), (path.val, given.val.poses, truth[1::2])):
+        assert error_mm(found, at) < 0.3 * error_mm(told, at)
+    np.testing.assert_array_equal(path.tracked, given.train.poses)
+    assert path.found_db > path.tracked_db + agreement.GAIN_OF_EVENNESS_DB
+
+
+@pytest.mark.parametrize("slow", [1.0, 3.0])
+def test_a_hand_that_goes_unevenly_keeps_its_path(slow):
+    truth = hand_path()
+    uneven = 0.3 * np.sin(np.arange(FRAMES) * 2.0 / slow) + 0.1 * np.cos(np.arange(FRAMES) ** 2)
+    truth[:, :3, 3] += uneven[:, None] * truth[:, :3, 1]
+    given = recording(truth, truth)
+    np.testing.assert_array_equal(agreed_path(given).train, given.train.poses)
+
+
 def test_a_few_frames_do_not_tell_of_tissue():
     tracked = hand_path()
     given = recording(with_shares(tracked, [range(FRAMES)], PROBE, (0.0, 0.0, 0.0)), tracked)
