@@ -58,6 +58,7 @@ class SharedMemory:
             finally:
                 os.close(descriptor)
             self.listener.bind(f"{path}{_SOCKET}")
+            os.chmod(f"{path}{_SOCKET}", 0o600)
             self.listener.listen(1)
         except OSError as error:
             raise InvalidArgument(
