@@ -186,8 +186,6 @@ SHORT_WAITS = {
     "core.jobs.COUNT_INTERVAL_S": 0.5,
     "core.readiness.CHECK_INTERVAL_S": 0.5,
     "core.uploads._POLL_INTERVAL_S": 0.05,
-    "listening.HANDSHAKE_TIMEOUT_S": 2.0,
-    "rpc.server.HANDSHAKE_TIMEOUT_S": 2.0,
     "tls._POLL_S": 0.2,
 }
 
