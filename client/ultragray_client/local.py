@@ -62,6 +62,8 @@ class LocalCall:
             with self._listener:
                 end, _ = self._listener.accept()
             self._received, self._socket = end.makefile("rb"), end
+            if not self._call.is_active():
+                self._hang_up()
         except OSError:  # the call is over: reading tells why
             return
         finally:
@@ -151,6 +153,8 @@ class AsyncLocalCall:
                 await asyncio.wait({accepting})
                 if not accepting.cancelled():
                     self._streams = await asyncio.open_unix_connection(sock=accepting.result()[0])
+                    if self._call.done():
+                        self._hang_up(self._call)
         finally:
             accepting.cancel()
 
