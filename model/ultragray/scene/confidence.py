@@ -128,11 +128,6 @@ def _image_points(probe: Probe, per_side: int) -> FloatArray:  # [K, 3] mm, prob
     return points.reshape(-1, 3)
 
 
-def _root_mean_square(values: FloatArray) -> FloatArray:  # [B, K, P] -> [B, P]
-    root: FloatArray = np.sqrt(np.einsum("bkp,bkp->bp", values, values) / values.shape[1]).astype(np.float64)
-    return root
-
-
 # The model behind the output `uncertainty`: the variances that add up to that of a pixel's error. Needs no torch.
 #
 # σ² = Σ cₖ·vₖ, cₖ ≥ 0

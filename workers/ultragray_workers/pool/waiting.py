@@ -202,7 +202,7 @@ class WaitingQueue:
         patient_s = time.monotonic() - self._last_batch_turn
         if patient_s >= _BATCH_PATIENCE_S and self._last_priority is not Priority.BATCH:
             priorities.reverse()
-        for priority in filter(self._has_work, priorities):
+        for priority in priorities:
             while (ticket := next(iter(self._again[priority]), self._turns[priority].first())) is not None:
                 if ticket.expired:
                     self.expire(ticket)

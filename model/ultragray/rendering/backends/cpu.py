@@ -75,15 +75,7 @@ def render_outputs(
         )
         return dict(zip(outputs, frames, strict=True))
     planes = _empty_planes(view, outputs)
-    with _limited(limits):
-        _cpu.render(
-            _sorted(scene, weighted),
-            **view,
-            **_arrays(planes),
-            footprint_pixels=limits.footprint_pixels,
-            flag=limits.flag,
-            number=limits.number,
-        )
+    _draw(_sorted(scene, weighted), view, planes, limits)
     return planes
 
 
@@ -104,22 +96,11 @@ def render_grey(
 
     Raises FrameTooCostly, GivenUp.
     """
-    view = _view_arguments(probe, poses_cm, height, width, beam)
+    view = {**_view_arguments(probe, poses_cm, height, width, beam), "instruction_set": instruction_set}
     grey = torch.empty((len(poses_cm), height, width), dtype=torch.uint8, device="cpu")
     supported = np.zeros(len(poses_cm), np.int64)
-    with _limited(limits):
-        _cpu.render(
-            _sorted(scene),
-            **view,
-            **_arrays({}),
-            instruction_set=instruction_set,
-            grey=grey.numpy(),
-            supported=supported,
-            least_coverage=least_coverage,
-            footprint_pixels=limits.footprint_pixels,
-            flag=limits.flag,
-            number=limits.number,
-        )
+    counted = {"grey": grey.numpy(), "supported": supported, "least_coverage": least_coverage}
+    _draw(_sorted(scene), view, {}, limits, **counted)
     return grey, torch.from_numpy((supported / (height * width)).astype(np.float32))
 
 
@@ -139,17 +120,17 @@ def plane_sums(
     probe = LinearProbe(10.0 * spacing_cm * columns, 0.0, 10.0 * spacing_cm * rows)
     view = _view_arguments(probe, corners_cm, rows, columns, None) | {"start": 0.0, "instruction_set": "auto"}
     planes = _empty_planes(view, SUMS)
-    with _limited(limits):
-        _cpu.render(
-            _sorted(scene, weighted=True),
-            **view,
-            **_arrays(planes),
-            uncut=True,
-            footprint_pixels=limits.footprint_pixels,
-            flag=limits.flag,
-            number=limits.number,
-        )
+    _draw(_sorted(scene, weighted=True), view, planes, limits, uncut=True)
     return planes[WEIGHT_SUM], planes[INTENSITY_SUM]
+
+
+def _draw(
+    scene: _cpu.PreparedScene, view: dict[str, Any], planes: dict[str, Tensor], limits: Limits, **more: Any
+) -> None:
+    """Has the kernel fill planes [C, H, W], and what `more` asks for. Raises FrameTooCostly, GivenUp."""
+    bounds = {"footprint_pixels": limits.footprint_pixels, "flag": limits.flag, "number": limits.number}
+    with _limited(limits):
+        _cpu.render(scene, **view, **_arrays(planes), **bounds, **more)
 
 
 @contextmanager
