@@ -231,8 +231,11 @@ class DatasetUpload:
             block, self._block = bytes(self._block), bytearray()
             await asyncio.to_thread(self._incoming.write, block)
 
-    async def finish(self) -> tuple[DatasetRecord, bool]:
-        """Checks what was sent and makes it a dataset; its record, and whether it is new. Raises DatasetInvalid."""
+    async def finish(self, *, simulated: bool = False) -> tuple[DatasetRecord, bool]:
+        """Checks what was sent and makes it a dataset; its record, and whether it is new. Raises DatasetInvalid.
+
+        `simulated`: the built-in phantom, where nothing was sent.
+        """
         async with self._finishing, self._claim.held():
             await self._flush()
             await asyncio.to_thread(self._incoming.finish)
@@ -241,6 +244,7 @@ class DatasetUpload:
                 "name": self._name,
                 "options": self._options,
                 "max_bytes": self._max_bytes,
+                "simulated": simulated,
             }
             await self._take_name()
             await self._checks.run(
