@@ -291,7 +291,7 @@ class _Judge:
         pixels, planes are interpolated sharply: blurring would speak for frames that do not move.
         """
         frames, reach = (self.frames, 1) if reach == 1 or not len(self.far) else (self.far, reach)
-        inverses: FloatArray = np.linalg.inv(poses)
+        inverses = np.asarray(np.linalg.inv(poses), np.float64)
         return float(np.mean([self._predicted_db(poses, inverses, frame, reach) for frame in frames]))
 
     def _predicted_db(self, poses: FloatArray, inverses: FloatArray, frame: int, reach: int) -> float:
