@@ -6,7 +6,6 @@ from functools import cache
 import numpy as np
 import pytest
 
-from ultragray.datasets import checks
 from ultragray.datasets.checks import check_dataset
 from ultragray.geometry.rotations import turns_of
 from ultragray.learn.evaluation.scoring import evaluate
@@ -123,12 +122,11 @@ def test_a_few_frames_do_not_tell_of_tissue():
     assert agreed_path(few).shares == RIGID
 
 
-def test_a_check_tells_of_it(monkeypatch):
-    paths, truth = [], hand_path()
-    monkeypatch.setattr(checks, "agreed_path", lambda dataset: paths.append(agreed_path(dataset)) or paths[-1])
+def test_a_check_tells_of_it(found_paths):
+    truth = hand_path()
     given = recording(with_shares(truth, [range(FRAMES)], PROBE, (0.0, 0.0, 0.0)), shaken(truth, 0.3, 0.2))
     (told,) = (text for text in check_dataset(given).warnings if "neighbours in time" in text)
-    (path,) = paths
+    (path,) = found_paths
     assert f"{path.in_time_db - path.tracked_db:.1f} dB better than by their poses" in told
     assert f"shakes (by {path.noise.position_mm:.2f} mm and {path.noise.turn_deg:.2f}°" in told
     assert not any("neighbours in time" in text for text in check_dataset(known("exact")[0]).warnings)
