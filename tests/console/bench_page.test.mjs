@@ -102,6 +102,8 @@ describe("a data set", () => {
     const thumbnails = page.getByRole("region", { name: "A few of them" }).locator("img");
     await until(() => thumbnails.count(), (count) => count === 6, "there are no examples");
     await page.getByText("256 of 1,000").waitFor();
+    for (const label of ["Depth samples", "Scan lines"])
+      assert.equal(await page.getByLabel(label, { exact: true }).getAttribute("placeholder"), "256");
     await page.getByLabel("Count").fill("400000");
     await page.getByLabel("Count").press("Tab");
     await estimate.getByText("400,000").waitFor();
