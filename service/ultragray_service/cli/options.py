@@ -177,7 +177,8 @@ def _parameter(
     if choices := [one.value for one in kind] if is_enum else item.metadata.get("choices"):
         meaning += f" One of {', '.join(choices)}."
     if isinstance(kind, type) and issubclass(kind, Family):
-        meaning += f" As JSON, a kind with its numbers: {'; '.join(map(_signature, kind.members.values()))}."
+        named = f" One of {', '.join(kind.named)}, or as" if kind.named else " As"
+        meaning += f"{named} JSON, a kind with its numbers: {'; '.join(map(_signature, kind.members.values()))}."
     is_switch, is_table = kind is bool, get_origin(kind) is dict
     parsed: Any = list[str] if is_table else Path if item.name in _FILES else kind if kind in _PARSED else str
     flags = FLAGS.get(item.name, (_flag(f"no_{item.name}" if item.default is True else item.name),))
@@ -235,6 +236,17 @@ def _part(cls: Any, name: str, given: Mapping[str, Any]) -> Any:
     options = dict.fromkeys(item.name for member in cls.members.values() for item, _ in _fields(member))
     document = {option: given[option] for option in options if given[option] is not None}
     if given[name] is not None:
+        if (member := cls.members.get(given[name])) is None:
+            raise InvalidArgument(
+                f"{_flag(name)} must be one of {', '.join(cls.members)}, got {given[name]!r}", field=name
+            )
+        taken = {item.name: item for item, _ in _fields(member)}
+        for option, item in taken.items():
+            if _is_required(item) and option not in document:
+                raise InvalidArgument(f"{_flag(name)} {given[name]} needs {_flag(option)}", field=option)
+        for option in document:
+            if option not in taken:
+                raise InvalidArgument(f"{_flag(name)} {given[name]} takes no {_flag(option)}", field=option)
         return from_dict(cls, {"kind": given[name], **document})
     for option in document:
         raise InvalidArgument(f"{_flag(option)} is of a {name}: name it with {_flag(name)}", field=option)
@@ -249,15 +261,17 @@ def _read(value: Any, kind: Any, name: str) -> Any:
     if get_origin(kind) is dict:
         return pairs_of(value, FLAGS[name][0]) if get_args(kind)[1] is str else parse_settings(value)
     if isinstance(kind, type) and issubclass(kind, Family):
-        return from_dict(kind, _parsed_json(value, name))
+        return kind.named[value] if value in kind.named else from_dict(kind, _parsed_json(value, kind, name))
     return value
 
 
-def _parsed_json(text: str, name: str) -> Any:
+def _parsed_json(text: str, family: type[Family], name: str) -> Any:
     try:
         return json.loads(text)
     except (json.JSONDecodeError, RecursionError) as error:
-        raise InvalidArgument(f"{_flag(name)} must be a JSON object: {error}", field=name) from error
+        names = "".join(f"{one}, " for one in family.named)
+        what = f"one of {names}or a JSON object" if names else "a JSON object"
+        raise InvalidArgument(f"{_flag(name)} must be {what}: {error}", field=name) from error
 
 
 def parse_settings(settings: list[str]) -> dict[str, Any]:

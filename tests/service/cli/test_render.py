@@ -117,7 +117,7 @@ def test_render_draws_the_tools_of_a_file(scene_file, tmp_path):
         assert json.loads(str(frames["tools"])) == to_dict((needle,))
     file.write_text('[{"kind": "needle", "tip_mm": [0, 0, 1]}]')
     told = refused(*arguments, "--force")
-    assert f"{file}: tools[0].hub_mm is required by kind needle" in told
+    assert f"{file}: tools[0].hub_mm is required by the tool needle" in told
     file.write_text(json.dumps(to_dict((needle,) * 9)))
     assert "tools must be a list of at most 8 values, got 9" in refused(*arguments, "--force")
 
