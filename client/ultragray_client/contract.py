@@ -13,7 +13,6 @@ from typing import Any, Literal, TypeAlias
 from .geometry import Picture, PoseLike
 
 __all__ = [
-    "PROBES",
     "Additions",
     "AroundSampler",
     "Below",
@@ -36,6 +35,7 @@ __all__ = [
     "ImageRegion",
     "LinearProbe",
     "Needle",
+    "PROBES",
     "PhasedProbe",
     "Probe",
     "RadialProbe",
@@ -216,6 +216,11 @@ class Display:
     flip: bool = False  # Left and right change places.
     pixel_mm: float | None = None  # Scan conversion to square pixels of this size.
     edge: float = 0.0  # Edge enhancement: how much of what a blur over 3x3 samples takes away is added.
+    # Two numbers between which the gain of each frame is drawn at random, instead of gain_db.
+    gain_db_between: tuple[float, ...] = ()
+    # Two numbers between which the dynamic range of each frame is drawn at random, instead of dynamic_range_db.
+    dynamic_range_db_between: tuple[float, ...] = ()
+    display_seed: int = 0  # Of what is drawn at random: the same seed and pose are the same frame, at every door.
 
 
 @dataclass(frozen=True, kw_only=True)
