@@ -13,6 +13,7 @@ from typing import Any, Literal, TypeAlias
 from .geometry import Picture, PoseLike
 
 __all__ = [
+    "PROBES",
     "Additions",
     "AroundSampler",
     "Below",
@@ -35,7 +36,6 @@ __all__ = [
     "ImageRegion",
     "LinearProbe",
     "Needle",
-    "PROBES",
     "PhasedProbe",
     "Probe",
     "RadialProbe",
