@@ -160,8 +160,9 @@ def generate_contract(output_folder: Path) -> Path:
     sources: dict[str, str] = {}
     for name, cls in ROOTS.items():
         _add(sources, cls, name)
+    names = sorted(sources, key=lambda name: (not name.isupper(), name))  # constants first
     target = output_folder / "contract.py"
-    target.write_text("\n".join([_CONTRACT_HEADER, f"__all__ = {sorted(sources)!r}", *sources.values()]))
+    target.write_text("\n".join([_CONTRACT_HEADER, f"__all__ = {names!r}", *sources.values()]))
     return formatted([target])[0]
 
 
