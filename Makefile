@@ -5,7 +5,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 # A file of tests belongs to one process, which shares its services among them. Most of the time they wait for others: four fit two cores.
 # As nice as the helpers of a service, for which they wait: those would get what is left over.
-PYTEST := nice -n 10 $(BIN)/pytest --numprocesses 4 --dist loadfile --no-loadscope-reorder
+# One thread for matrix products: two, beside other processes, wait for each other in a loop and take up to four times the processor time.
+PYTEST := OMP_NUM_THREADS=1 OPENBLAS_NUM_THREADS=1 nice -n 10 $(BIN)/pytest --numprocesses 4 --dist loadfile --no-loadscope-reorder
 KERNEL_SOURCES := $(wildcard model/kernels/*) CMakeLists.txt
 PACKAGES := . proto client ros studies
 PACKAGE_SOURCES := $(KERNEL_SOURCES) $(PACKAGES:%=%/pyproject.toml) $(wildcard distribution/*.py)

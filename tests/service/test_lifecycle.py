@@ -177,7 +177,7 @@ def test_interactive_frames_go_before_a_batch(slow):
     with slow.channel() as channel, httpx.Client(timeout=300) as client:
         stub = rendering_pb2_grpc.RenderServiceStub(channel)
         settings = rendering_pb2.RenderSettings(scene="demo", **SMALL)
-        batch = rendering_pb2.RenderBatchRequest(settings=settings, poses=[moved(0)] * 60)
+        batch = rendering_pb2.RenderBatchRequest(settings=settings, poses=[moved(0)] * 12)
         received, lines_before = [], len(slow.log())
 
         def ended():
@@ -193,7 +193,7 @@ def test_interactive_frames_go_before_a_batch(slow):
             wait_until(lambda: slow.metric(WAITING) > waiting)
         assert answer.result().status_code == 200
         reader.join()
-        assert received == list(range(60))
+        assert received == list(range(12))
         wait_until(lambda: "RenderBatch" in ended())
         assert ended().index("render") < ended().index("RenderBatch")
 

@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from ultragray import ConvexProbe, LinearProbe, PhasedProbe
 from ultragray.contract import to_dict
-from ultragray.datasets import Dataset, Sweep
+from ultragray.datasets import Dataset, Sweep, checks
 from ultragray.datasets.checks import MAX_VOXELS, check_dataset, check_sweep, swept_volume, without_names
 from ultragray.datasets.pictures import _draw_planes, draw_dataset
 from ultragray.datasets.source import load_dataset
@@ -59,7 +59,7 @@ def test_a_pose_off_its_neighbours_is_named(make_sweep):
     assert "\n" not in text
 
 
-def test_a_lost_pose_is_named_whichever_part_it_is_in(make_sweep):
+def test_a_lost_pose_is_named_whichever_part_it_is_in(make_sweep, without_path):
     """A tracker that lost the probe says that it lies at its own origin, 2 m away."""
     for lost in (4, 7, 0):
         poses = make_sweep(30).poses.copy()
@@ -91,8 +91,14 @@ def moving_texture(count=20):  # [count, 96, 128]
     return np.clip(110 + 300 * np.stack([*frames, ends[2]]), 1, 250).astype(np.uint8)
 
 
+@pytest.fixture
+def without_path(monkeypatch):
+    """No other path is looked for, which takes a second: tests of the path itself are beside the training's."""
+    monkeypatch.setattr(checks, "agreed_path", lambda dataset: None)
+
+
 @pytest.mark.parametrize("height", [12, 24])
-def test_text_that_is_burnt_in_is_named_with_its_place_and_made_black(make_sweep, height):
+def test_text_that_is_burnt_in_is_named_with_its_place_and_made_black(make_sweep, without_path, height):
     plain = moving_texture()
     images = plain.copy()
     for image in images:
@@ -237,7 +243,7 @@ def test_poses_in_other_units_are_named(make_sweep, scale, turn_deg, told):
     assert warnings == (() if told is None else (f"the poses of all 40 training frames {told}",))
 
 
-def test_images_are_compared_without_a_copy_of_them(make_sweep):
+def test_images_are_compared_without_a_copy_of_them(make_sweep, without_path):
     images = np.random.default_rng(0).integers(0, 250, (64, 256, 256), dtype=np.uint8)
     small = LinearProbe(width_mm=4.0, near_mm=0.0, far_mm=5.0)
     sweep = make_sweep(64, images=images, probe=small, step_mm=0.1)
@@ -255,7 +261,7 @@ def test_images_are_compared_without_a_copy_of_them(make_sweep):
     [("spine_phantom", 17, 2.0, 0), ("ultranerf_liver", 180, 14.9, 1)],  # the latter is two sweeps: one jump
 )
 def test_real_sets(data_folder, name, frames, tilt_deg, warnings):
-    report = check_dataset(load_dataset(data_folder / name)).train
+    report = check_sweep(load_dataset(data_folder / name).train)
     assert report.frames == frames
     assert report.tilt_deg == pytest.approx(tilt_deg, abs=0.1)
     assert len(report.warnings) == warnings

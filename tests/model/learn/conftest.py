@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 
 from ultragray import ConvexProbe, LinearProbe
+from ultragray.datasets import checks
 from ultragray.learn.sweep import Dataset, Sweep
 from ultragray.learn.training import TrainingConfig
+from ultragray.learn.training.agreement import agreed_path
 
 LINEAR = LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=25.0)
 CONVEX = ConvexProbe(opening_angle_deg=60.0, near_mm=20.0, far_mm=60.0)
@@ -48,3 +50,11 @@ def tiny_config():
 @pytest.fixture(params=[LINEAR, CONVEX], ids=["linear", "convex"])
 def probe(request):
     return request.param
+
+
+@pytest.fixture
+def found_paths(monkeypatch):
+    """Those that a check found."""
+    paths = []
+    monkeypatch.setattr(checks, "agreed_path", lambda dataset: paths.append(agreed_path(dataset)) or paths[-1])
+    return paths

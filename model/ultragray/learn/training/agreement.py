@@ -22,7 +22,7 @@ Free of torch, since data sets are checked without it.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cache
 from typing import TypeAlias
 
@@ -273,6 +273,7 @@ class _Judge:
     sweep: Sweep
     frames: IntArray  # [P] their places
     far: IntArray  # [Q] those that have frames FAR before and behind them
+    _known_points: dict[int, tuple[FloatArray, FloatArray]] = field(default_factory=dict, init=False)
 
     @classmethod
     def of(cls, sweep: Sweep, ranges: Sequence[range]) -> _Judge | None:
@@ -289,23 +290,21 @@ class _Judge:
         the distances. One that is projected beside an image is predicted by the other alone, or left out. Between
         pixels, planes are interpolated sharply: blurring would speak for frames that do not move.
         """
-        if reach == 1 or not len(self.far):
-            return float(np.mean([self._predicted_db(poses, frame, 1) for frame in self.frames]))
-        return float(np.mean([self._predicted_db(poses, frame, reach) for frame in self.far]))
+        frames, reach = (self.frames, 1) if reach == 1 or not len(self.far) else (self.far, reach)
+        inverses = np.asarray(np.linalg.inv(poses), np.float64)
+        return float(np.mean([self._predicted_db(poses, inverses, frame, reach) for frame in frames]))
 
-    def _predicted_db(self, poses: FloatArray, frame: int, reach: int) -> float:
-        rows, columns = self._pixels(frame)
-        height, width = self.sweep.height, self.sweep.width
-        local = self.sweep.probe.points_mm((rows + 0.5) / height, (columns + 0.5) / width)  # [N, 3]
+    def _predicted_db(self, poses: FloatArray, inverses: FloatArray, frame: int, reach: int) -> float:
+        local, shown = self._points(frame)
         values, distances = np.zeros((2, len(local))), np.full((2, len(local)), np.inf)
         for side, beside in enumerate((frame - reach, frame + reach)):
-            onto = np.linalg.inv(poses[beside]) @ poses[frame]
+            onto = inverses[beside] @ poses[frame]
             points = local @ onto[:3, :3].T + onto[:3, 3]
             inside, values[side, inside] = seen_by_frame(self.sweep, beside, points, interpolated_sharply)
             distances[side, inside] = np.abs(points[inside, 1])
         predicted = blend_by_distance(values, distances)
         known = ~np.isnan(predicted)
-        return _psnr_db(predicted[known], self._shown(frame, rows, columns)[known])
+        return _psnr_db(predicted[known], shown[known])
 
     def in_time_db(self) -> float:
         """Of the pixels as blends of the same pixels of the two frames, by their times."""
@@ -316,6 +315,15 @@ class _Judge:
             share = (times[frame] - times[frame - 1]) / span if span > 0.0 else 0.5
             found.append(_psnr_db(blend_in_time(before, after, share), shown))
         return float(np.mean(found))
+
+    def _points(self, frame: int) -> tuple[FloatArray, FloatArray]:  # [N, 3] mm, [N]
+        """Pixels of a frame, in the frame of its probe, and what it shows there; kept for the next path."""
+        if frame not in self._known_points:
+            rows, columns = self._pixels(frame)
+            sweep = self.sweep
+            local = sweep.probe.points_mm((rows + 0.5) / sweep.height, (columns + 0.5) / sweep.width)
+            self._known_points[frame] = local, self._shown(frame, rows, columns)
+        return self._known_points[frame]
 
     def _pixels(self, frame: int) -> tuple[IntArray, IntArray]:  # [N] rows, [N] columns
         random = np.random.default_rng(frame)

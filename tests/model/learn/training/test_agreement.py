@@ -1,6 +1,7 @@
 """The path that neighbouring frames agree with: shaking and dragging come out, exact poses of rigid tissue stay."""
 
 from dataclasses import replace
+from functools import cache
 
 import numpy as np
 import pytest
@@ -32,17 +33,29 @@ def recording(shown, tracked):
     return Dataset("hand", train=whole.select(np.arange(0, FRAMES, 2)), val=whole.select(np.arange(1, FRAMES, 2)))
 
 
+@cache
+def known(kind):
+    """A recording that several tests look at, and its path."""
+    truth = hand_path()
+    shown, tracked = {
+        "exact": lambda: (truth, truth),
+        "shaking": lambda: (truth, shaken(truth, 0.3, 0.2)),
+        "shaking little": lambda: (truth, shaken(truth, 0.1, 0.1)),
+        "following": lambda: (with_shares(truth, [range(FRAMES)], PROBE, (0.0, 0.0, 0.0)), truth),
+    }[kind]()
+    given = recording(shown, tracked)
+    return given, agreed_path(given)
+
+
 def error_mm(poses, truth):
     """The mean error of the steps from frame to frame, which no common motion of all changes."""
     steps = [np.linalg.inv(some[:-1]) @ some[1:] for some in (poses, truth)]
     return corner_distances_mm(*(PROBE.corners_from(one) for one in steps)).mean()
 
 
-@pytest.mark.parametrize(("mm", "deg"), [(0.1, 0.1), (0.3, 0.2)])
-def test_a_shaking_tracker_is_smoothed_also_where_frames_are_held_out(mm, deg):
-    truth = hand_path()
-    given = recording(truth, shaken(truth, mm, deg))
-    path = agreed_path(given)
+@pytest.mark.parametrize("kind", ["shaking little", "shaking"])
+def test_a_shaking_tracker_is_smoothed_also_where_frames_are_held_out(kind):
+    truth, (given, path) = hand_path(), known(kind)
     assert path.shares == RIGID
     assert path.found_db > path.tracked_db + 0.2
     for poses, tracked, true in ((path.train, given.train, truth[::2]), (path.val, given.val, truth[1::2])):
@@ -50,10 +63,9 @@ def test_a_shaking_tracker_is_smoothed_also_where_frames_are_held_out(mm, deg):
 
 
 def test_no_image_of_a_held_out_frame_is_used():
-    truth = hand_path()
-    given = recording(truth, shaken(truth, 0.3, 0.2))
+    given, path = known("shaking")
     changed = replace(given, val=replace(given.val, images=given.val.images[::-1]))
-    np.testing.assert_array_equal(agreed_path(changed).val, agreed_path(given).val)
+    np.testing.assert_array_equal(agreed_path(changed).val, path.val)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25])
@@ -61,7 +73,7 @@ def test_tissue_that_follows_the_probe_is_found(share):
     tracked = hand_path()
     shown = with_shares(tracked, [range(FRAMES)], PROBE, (share,) * 3)
     given = recording(shown, tracked)
-    path = agreed_path(given)
+    path = agreed_path(given) if share else known("following")[1]
     assert path.shares == pytest.approx((share,) * 3, abs=0.3)
     assert path.in_time_db > path.tracked_db
     assert error_mm(path.train, shown[::2]) < 0.35 * error_mm(given.train.poses, shown[::2])
@@ -110,21 +122,19 @@ def test_a_few_frames_do_not_tell_of_tissue():
     assert agreed_path(few).shares == RIGID
 
 
-def test_a_check_tells_of_it():
+def test_a_check_tells_of_it(found_paths):
     truth = hand_path()
     given = recording(with_shares(truth, [range(FRAMES)], PROBE, (0.0, 0.0, 0.0)), shaken(truth, 0.3, 0.2))
     (told,) = (text for text in check_dataset(given).warnings if "neighbours in time" in text)
-    path = agreed_path(given)
+    (path,) = found_paths
     assert f"{path.in_time_db - path.tracked_db:.1f} dB better than by their poses" in told
     assert f"shakes (by {path.noise.position_mm:.2f} mm and {path.noise.turn_deg:.2f}°" in told
-    assert not any("neighbours in time" in text for text in check_dataset(recording(truth, truth)).warnings)
+    assert not any("neighbours in time" in text for text in check_dataset(known("exact")[0]).warnings)
 
 
 def test_a_scene_is_trained_and_measured_on_the_path(tiny_config):
-    tracked = hand_path()
-    given = recording(with_shares(tracked, [range(FRAMES)], PROBE, (0.0, 0.0, 0.0)), tracked)
+    given, path = known("following")
     scene = train(given, tiny_config(refine_poses="path"))
-    path = agreed_path(given)
     np.testing.assert_array_equal(scene.training_poses, given.train.poses)
     np.testing.assert_array_equal(scene.rest_poses, path.train)
     assert scene.info.tissue_shares == path.shares
@@ -141,25 +151,22 @@ def test_a_scene_is_trained_and_measured_on_the_path(tiny_config):
 
 
 def test_a_path_without_noise_alone_is_that_of_the_scene(tiny_config):
-    truth = hand_path()
-    given = recording(truth, shaken(truth, 0.3, 0.2))
-    scene, path = train(given, tiny_config(steps=1)), agreed_path(given)
+    given, path = known("shaking")
+    scene = train(given, tiny_config(steps=1))
     assert scene.tissue is None
     np.testing.assert_allclose(scene.training_poses, path.train, atol=1e-12)
     np.testing.assert_allclose(scene.pose_corrections @ given.train.poses, path.train, atol=1e-9)
 
 
 def test_exact_poses_of_rigid_tissue_stay():
-    truth = hand_path()
-    given = recording(truth, truth)
-    assert agreed_path(given).of(given) is given
-    assert agreed_path(given).shares == RIGID
+    given, path = known("exact")
+    assert path.of(given) is given
+    assert path.shares == RIGID
 
 
 def test_a_calibration_by_which_neighbours_predict_each_other_worse_is_not_taken(monkeypatch):
-    truth, turned = hand_path(), np.eye(4)
+    turned, (given, _) = np.eye(4), known("exact")
     turned[:3, :3] = poses_of(np.array([[0.0, 90.0, 0.0]]), np.zeros((1, 3)))[0, :3, :3]
-    given = recording(truth, truth)
     for calibration, is_taken in ((turned, False), (poses_of(np.zeros((1, 3)), np.full((1, 3), 0.1))[0], True)):
         monkeypatch.setattr(agreement, "found_calibration", lambda sweep, ranges, one=calibration: one)
         path = agreed_path(given)
@@ -167,24 +174,22 @@ def test_a_calibration_by_which_neighbours_predict_each_other_worse_is_not_taken
 
 
 def test_held_out_frames_of_another_file_move_with_the_frames_about_them():
-    tracked = hand_path()
-    given = recording(with_shares(tracked, [range(FRAMES)], PROBE, (0.0, 0.0, 0.0)), tracked)
+    given, path = known("following")
     aside = given.val.poses.copy()
     aside[:, :3, 3] += 2.0 * aside[:, :3, 0]
     apart = agreed_path(replace(given, val=replace(given.val, source="another file", poses=aside)))
-    together = agreed_path(given).val.copy()
+    together = path.val.copy()
     together[:, :3, 3] += 2.0 * together[:, :3, 0]
     assert error_mm(apart.val, together) < 0.5 * error_mm(aside, together)
     np.testing.assert_allclose(apart.train, agreed_path(replace(given, val=given.val.select([]))).train)
 
 
 def test_held_out_frames_of_another_file_that_lie_between_the_others_are_of_the_same_path():
-    truth = hand_path()
-    given = recording(truth, shaken(truth, 0.15, 0.1))
+    given, together = known("shaking little")
     without_numbers = replace(given.val, source="another file", frame_numbers=np.arange(len(given.val)))
     without_numbers_of_train = replace(given.train, frame_numbers=np.arange(len(given.train)))
     other = Dataset("hand", without_numbers_of_train, without_numbers)
-    together, apart = agreed_path(given), agreed_path(other)
+    apart = agreed_path(other)
     np.testing.assert_array_equal(apart.train, together.train)
     np.testing.assert_array_equal(apart.val, together.val)
 

@@ -203,7 +203,7 @@ def trying(effort):
 
 def test_a_run_whose_choice_is_stopped_goes_on_with_it(tiny_dataset, tmp_path):
     dataset, seen = tiny_dataset(frames=40), list[Progress]()
-    config = TrainingConfig(effort=None, steps=12, batch_size=3, confidence=False)
+    config = TrainingConfig(effort=None, steps=12, batch_size=3, confidence=False, refine_poses="none")
     stopped = train(
         dataset, config, folder=tmp_path, report=seen.append, should_stop=lambda: seen[-1].beside == trying(2.0)
     )

@@ -31,11 +31,12 @@ def recorded(delay_frames, **more):
     return Dataset("hand", train=whole.select(np.arange(0, FRAMES, 2)), val=whole.select(np.arange(1, FRAMES, 2)))
 
 
-def test_a_delay_is_found_and_taken_off():
+def test_a_delay_is_found_and_taken_off(found_paths):
     given = recorded(1.0, times_s=SPACING_S * np.arange(FRAMES))
-    path, truth = agreed_path(given), trembling_path(np.arange(FRAMES))
+    told, truth = " ".join(check_dataset(given).warnings), trembling_path(np.arange(FRAMES))
+    (path,) = found_paths
     assert path.delay_s == pytest.approx(SPACING_S, abs=0.2 * SPACING_S)
-    assert f"{1000.0 * path.delay_s:.0f} ms later than their poses" in " ".join(check_dataset(given).warnings)
+    assert f"{1000.0 * path.delay_s:.0f} ms later than their poses" in told
     for poses, tracked, true in ((path.train, given.train, truth[::2]), (path.val, given.val, truth[1::2])):
         assert error_mm(poses, true) < 0.3 * error_mm(tracked.poses, true)
     assert agreed_path(recorded(0.0, times_s=SPACING_S * np.arange(FRAMES))).delay_s == 0.0
@@ -48,7 +49,7 @@ def test_poses_of_another_time_lie_on_the_path():
     np.testing.assert_allclose(moved[:, :3, 3], steady[:, :3, 3] - [2.5, 5.0, 0.0], atol=1e-9)
 
 
-def test_a_calibration_that_is_off_is_found_where_sweeps_cross():
+def test_a_calibration_that_is_off_is_found_where_sweeps_cross(found_paths):
     middle = poses_of(np.zeros((30, 3)), np.arange(30)[:, None] * [[0.0, 0.5, 0.0]] - [0.0, 7.5, 0.0])
     truth = np.concatenate([middle, poses_of([[0.0, 0.0, 90.0]], np.zeros((1, 3))) @ middle])
     off = poses_of([[1.0, -1.0, 0.0]], [[0.8, -0.8, 0.0]])[0]
@@ -56,10 +57,10 @@ def test_a_calibration_that_is_off_is_found_where_sweeps_cross():
     given = replace(images, poses=truth @ off)
     ranges = [range(30), range(30, 60)]
     assert sweep_ranges(given) == ranges
-    found = off @ found_calibration(given, ranges)
-    left, before = (PROBE.corners_from(one[None]) - PROBE.corners_mm() for one in (found, off))
-    assert np.linalg.norm(left, axis=-1).mean() < 0.3 * np.linalg.norm(before, axis=-1).mean()
     told = " ".join(check_dataset(Dataset("crossing", given, given.select([]))).warnings)
     assert "calibration from the image to the probe seems to be off by" in told
+    found = off @ found_paths[0].calibration
+    left, before = (PROBE.corners_from(one[None]) - PROBE.corners_mm() for one in (found, off))
+    assert np.linalg.norm(left, axis=-1).mean() < 0.3 * np.linalg.norm(before, axis=-1).mean()
     np.testing.assert_array_equal(found_calibration(images, ranges), np.eye(4))
     np.testing.assert_array_equal(found_calibration(given, [range(60)]), np.eye(4))  # one sweep tells none

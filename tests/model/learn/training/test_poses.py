@@ -21,6 +21,8 @@ from ultragray.learn.training.alignment import (
 )
 from ultragray.learn.training.poses import PoseRefinement, SweepCorrections, turned_by
 
+from ..conftest import make_tiny_config, make_tiny_dataset
+
 PROBE = LinearProbe(width_mm=40.0, near_mm=0.0, far_mm=50.0)
 
 
@@ -126,9 +128,15 @@ def noisy(dataset):
     return replace(dataset, train=replace(dataset.train, poses=shaken(dataset.train.poses, 0.6, 0.6)))
 
 
-def test_corrections_are_trained_and_stored(tiny_dataset, tiny_config, tmp_path):
-    dataset = noisy(tiny_dataset(frames=40))
-    scene = train(dataset, tiny_config(refine_poses="frames"))
+@pytest.fixture(scope="module")
+def corrected():
+    """A dataset with noisy poses, the settings that correct them, and the scene."""
+    dataset, config = noisy(make_tiny_dataset(frames=40)), make_tiny_config(refine_poses="frames")
+    return dataset, config, train(dataset, config)
+
+
+def test_corrections_are_trained_and_stored(corrected, tmp_path):
+    dataset, _, scene = corrected
     np.testing.assert_allclose(scene.pose_corrections @ dataset.train.poses, scene.training_poses, atol=1e-9)
     before_training = PoseRefinement.of(dataset, "frames").of_scene()["training_poses"]
     assert np.abs(scene.training_poses - before_training).max() > 1e-5
@@ -182,10 +190,8 @@ def test_a_scene_without_corrections_holds_no_tensor_of_them(tiny_dataset, tiny_
     assert b"pose_corrections" not in scene.to_bytes()
 
 
-def test_a_resumed_run_gives_the_same_corrections(tiny_dataset, tiny_config, tmp_path):
-    dataset, config = noisy(tiny_dataset(frames=40)), tiny_config(refine_poses="frames")
-    whole = train(dataset, config)
-    steps = []
+def test_a_resumed_run_gives_the_same_corrections(corrected, tmp_path):
+    (dataset, config, whole), steps = corrected, []
 
     def seen_step(progress):
         steps.append(progress)
