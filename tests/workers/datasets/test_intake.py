@@ -165,13 +165,16 @@ def changed_config(files, **changes):
         ),
         (
             lambda _, files: {name: files[name] for name in files if name != "conf.json"},
-            r"^the upload must hold a folder with conf.json .* or a PLUS sequence .*, it holds images_train.npy, ",
+            r"^the upload must hold a folder with conf.json .* or a PLUS sequence .*; it holds images_train.npy, ",
         ),
         (
             lambda _, files: {name: files[name] for name in files if name != "poses_val.npy"},
             r"^conf.json: poses_file_val names .* which is not in the upload",
         ),
-        (lambda _, files: {**files, "b/conf.json": b"{}"}, r"must hold one dataset, it holds b/conf.json, conf.json"),
+        (
+            lambda _, files: {"a/conf.json": files["conf.json"], "b/conf.json": b"{}"},
+            r"must hold one dataset, it holds a/conf.json, b/conf.json",
+        ),
         (lambda _, files: {**files, "conf.json": b"{"}, r"^conf.json: not JSON"),
         (lambda _, files: {}, r"it holds no files"),
     ],

@@ -15,6 +15,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import IO
 
+from ultragray.datasets.source import find_source, load_dataset, options_of
 from ultragray.errors import DatasetInvalid, UltragrayError
 from ultragray.files import sync
 from ultragray_workers.claims import claimed_folder, remove_abandoned, storage_full
@@ -23,7 +24,6 @@ from ultragray_workers.datasets.store import (
     FILES_NAME,
     DatasetRecord,
     DatasetStore,
-    find_source,
     write_manifest,
 )
 from ultragray_workers.datasets.unpack import FileBudget, create_below, unpack
@@ -157,14 +157,14 @@ def check_files(files: Path, name: str, options: dict[str, str], contact_sheet: 
     from ultragray.datasets.checks import check_dataset
     from ultragray.datasets.pictures import draw_dataset
 
-    uploaded = find_source(files)
-    uploaded.format.check_upload(uploaded.path, files)
-    dataset = replace(uploaded.load(options), name=name)
+    source = find_source(files)
+    source.format.check_upload(source.path, files)
+    dataset = replace(load_dataset(files, options_of(options)), name=name)
     report = check_dataset(dataset)
     draw_dataset(dataset, contact_sheet)
     return DatasetRecord(
         name=name,
-        kind=uploaded.format.name,
+        kind=source.format.name,
         sha256=dataset.sha256,
         bytes=sum(path.stat().st_size for path in files.rglob("*") if path.is_file()),
         created_at=datetime.now(timezone.utc).isoformat(timespec="seconds"),

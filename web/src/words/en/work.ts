@@ -228,7 +228,7 @@ export const jobs = {
   steps: "Steps",
   frames: "Frames",
   loss: (value: string): string => `Loss ${value}`,
-  heldOut: (value: string): string => `Held out ${value} dB`,
+  heldOut: (value: string): string => `${value} dB on some held-out frames`,
   gaussians: (count: string): string => `${count} Gaussians`,
   stepsPerSecond: (rate: string): string => `${rate} steps/s`,
   framesPerSecond: (rate: string): string => `${rate} frames/s`,
