@@ -190,6 +190,15 @@ def clients(measured: Document) -> Lines:
     return table(("Client", "Measured"), ((what, filled(p, by_client[name])) for what, (name, p) in shown.items()))
 
 
+def seats(measured: Document) -> Lines:
+    """How many clients a machine serves, by their rate: of what eight had together, a third left free."""
+    frames_per_s = measured["clients"]["WebSocket, 8 client(s)"]["frames_per_s"]
+    rates = (60, 30, 15, 5)
+    rows = ((f"{rate} frames/s", f"{frames_per_s / rate * 2 / 3:.0f}", f"{frames_per_s / rate:.0f}") for rate in rates)
+    side = measured["extent"]["side"]
+    return table((f"Rate of each, {side}x{side}", "Seats", "Seats at most, with nothing left free"), rows)
+
+
 def control_loop(measured: Document) -> Lines:
     """What a robot waits for."""
     names = {
@@ -304,6 +313,7 @@ BLOCKS = {
     ),
     "clients": Block("clients", clients),
     "control loop": Block("clients", control_loop),
+    "seats": Block("clients", seats),
     "jobs": Block("jobs", jobs),
     "shards": Block("shards", shards),
     "console": Block("console", console),

@@ -21,7 +21,7 @@ from ultragray.contract import Contract, Family, annotated_fields
 from ultragray.datasets.source import SourceOptions
 from ultragray.errors import error_classes
 from ultragray.exchange import ros_messages, ros_recording
-from ultragray.geometry.pose import quaternion_from_pose
+from ultragray.geometry import pose
 from ultragray.geometry.probe import ElevationBeam
 from ultragray.rendering.settings import RenderSettings, SettingsUsed
 from ultragray.rendering.volumes import SliceSettings
@@ -66,11 +66,16 @@ OWN_ERRORS = {  # of the client, by their reason: base, meaning
     "TLS_FAILED": ("ClientError", "The service shows no certificate to trust, or does not speak TLS."),
     "STREAM_ENDED": ("ClientError", "A stream of poses that is over was asked to go on."),
 }
-RECORDING = {"messages": ros_messages, "writer": ros_recording}  # modules that the client has as they are, by its names
+COPIES = {  # modules that the client has as they are, by its names
+    "poses": pose,
+    "recording/messages": ros_messages,
+    "recording/writer": ros_recording,
+}
 OWN_IMPORTS = {  # what they import, as the client has it
-    "from ultragray.geometry.probe import FloatArray\n": "from ..geometry import FloatArray\n",
-    "from ultragray.geometry.pose import quaternion_from_pose\n": "import numpy as np\n",  # it stands at the end
-    "from ultragray.exchange import ros_messages as ros\n": "from . import messages as ros\n",
+    "from ultragray.errors import": "from ultragray_client.errors import",
+    "from ultragray.geometry.probe import FloatArray\n": "from ultragray_client.geometry import FloatArray\n",
+    "from ultragray.geometry.pose import": "from ultragray_client.poses import",
+    "from ultragray.exchange import ros_messages as ros\n": "from ultragray_client.recording import messages as ros\n",
 }
 _ALSO = {"InvalidArgument": ["ValueError"], "DeadlineExceeded": ["TimeoutError"]}  # what they are beside
 
@@ -92,15 +97,16 @@ _CONTRACT_HEADER = '''# Generated from the dataclasses of ultragray by client/ge
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from dataclasses import field as field_of
 from enum import Enum
+from types import MappingProxyType
 from typing import Any, Literal, TypeAlias
 
 from .geometry import Picture, PoseLike
 '''
-_RECORDING_HEADER = "# Generated from {module} by client/generate.py; change that.\n"
+_COPY_HEADER = "# Generated from {module} by client/generate.py; change that.\n"
 _RAISES = re.compile(r"\s*\bRaises\s.*?(?=\n\n|\Z)", flags=re.DOTALL)
 
 
@@ -154,21 +160,21 @@ def generate_contract(output_folder: Path) -> Path:
     sources: dict[str, str] = {}
     for name, cls in ROOTS.items():
         _add(sources, cls, name)
+    names = sorted(sources, key=lambda name: (not name.isupper(), name))  # constants first
     target = output_folder / "contract.py"
-    target.write_text("\n".join([_CONTRACT_HEADER, f"__all__ = {sorted(sources)!r}", *sources.values()]))
+    target.write_text("\n".join([_CONTRACT_HEADER, f"__all__ = {names!r}", *sources.values()]))
     return formatted([target])[0]
 
 
-def generate_recording(output_folder: Path) -> list[Path]:
-    """Writes the modules that write MCAP files, and returns their paths."""
+def generate_copies(output_folder: Path) -> list[Path]:
+    """Writes the modules that the client has as they are, and returns their paths."""
     written = []
-    for name, module in RECORDING.items():
-        text = _RECORDING_HEADER.format(module=module.__name__) + inspect.getsource(module)
-        if quaternion_from_pose.__name__ in text:
-            text += "\n\n" + inspect.getsource(quaternion_from_pose)
+    for name, module in COPIES.items():
+        text = _COPY_HEADER.format(module=module.__name__) + inspect.getsource(module)
         for theirs, own in OWN_IMPORTS.items():
             text = text.replace(theirs, own)
         target = output_folder / f"{name}.py"
+        target.parent.mkdir(exist_ok=True)
         target.write_text(text)
         written.append(target)
     return formatted(written)
@@ -184,6 +190,9 @@ def _add(sources: dict[str, str], cls: Any, name: str) -> None:
         for member in cls.members.values():
             _add(sources, member, member.__name__)
         sources[name] = f"{name}: TypeAlias = {' | '.join(member.__name__ for member in cls.members.values())}"
+        if cls.named:
+            entries = ", ".join(f"{called!r}: {member!r}" for called, member in cls.named.items())
+            sources[f"{name.upper()}S"] = f"{name.upper()}S: Mapping[str, {name}] = MappingProxyType({{{entries}}})"
     else:
         bases = [base for base in cls.__bases__ if is_dataclass(base) and Family not in base.__bases__]
         for other in (*bases, *_classes_in(get_type_hints(cls).values())):
@@ -264,4 +273,4 @@ def formatted(paths: list[Path]) -> list[Path]:
 if __name__ == "__main__":
     generate_errors(PACKAGE)
     generate_contract(PACKAGE)
-    generate_recording(PACKAGE / "recording")
+    generate_copies(PACKAGE)

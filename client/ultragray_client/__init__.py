@@ -15,6 +15,8 @@ from ultragray_client.errors import ClientError
 from ultragray_client.exchange import StreamMode
 from ultragray_client.frames import Frame, Localization, Slice, Timings
 from ultragray_client.geometry import Picture, Placement, PoseLike, Quaternion
+from ultragray_client.holding import HoldStill
+from ultragray_client.poses import check_poses, pose_from_position_quaternion, quaternion_from_pose
 from ultragray_client.recording.recording import Recording
 from ultragray_client.records import (
     AuditEntry,
@@ -44,6 +46,7 @@ __all__ = [
     "ConfidenceFit",
     "Frame",
     "FrameStream",
+    "HoldStill",
     "Job",
     "JobError",
     "JobEvent",
@@ -67,6 +70,9 @@ __all__ = [
     "Worker",
     "WorkerDevice",
     "WorkerState",
+    "check_poses",
     "errors",
+    "pose_from_position_quaternion",
+    "quaternion_from_pose",
 ]
 __all__ += contract.__all__

@@ -489,7 +489,7 @@ class _Client(Group[AnyConnection]):
 
 
 class Client(_Client[Connection]):
-    """A service at `address` (HOST:PORT), encrypted where `tls` is given.
+    """A service at `address`, HOST:PORT of its gRPC, encrypted where `tls` is given; or http:// or https:// before it.
 
     `api_key` is a key or a token that the service knows, or a function that is called before each call and gives one
     that is valid then, at once: a token that will soon expire is best renewed elsewhere.

@@ -125,10 +125,10 @@ class Terms:
     """What goes with every call of a client: address, key, and how long it may take. Raises InvalidArgument."""
 
     def __init__(self, address: str, api_key: ApiKey | None, tls: Tls | None, timeout_s: float) -> None:
-        self.address = check_address(address)
+        self.address, self.tls = target_of(address, tls)
         self._api_key, self._timeout_s = api_key, check_timeout(timeout_s)
-        if api_key is not None and tls is None:
-            warn_of_open_key(address)
+        if api_key is not None and self.tls is None:
+            warn_of_open_key(self.address)
 
     def metadata(self, request: Any) -> Metadata:
         """The metadata of a call; `request` as in `metadata_of`."""
@@ -209,6 +209,8 @@ def _unreachable(sentence: str, address: str) -> ClientError:
     for part, meaning in _TLS_FAILURES.items():
         if part in sentence:
             return TlsFailed(f"{address} {meaning} ({sentence})")
+    if _HTTP_1 in sentence:
+        return Unreachable(f"{address} is a port of HTTP: give that of gRPC, 50051 unless the service has another")
     hint = ""
     if any(part in sentence for part in _CUT_OFF):
         hint = "; it may want TLS, or a client's certificate: see tls"
@@ -249,8 +251,9 @@ def _text(message: bytes, number: int) -> str:
 
 
 # Encrypted channels: the certificates of both sides, and a warning where a key would travel in the open.
-_URL = re.compile(r"(?:https?|grpcs?)://")
+_URL = re.compile(r"(?:(https?)://)([^/]*)(.*)")
 _TARGET = re.compile(r"(?:dns:(?://[^/]*/)?|ipv[46]:)?(\[[^]]*\]|[^:]*)")  # of gRPC: the host
+_HTTP_1 = "http1.x server"  # in gRPC's words
 _LOCAL_SCHEMES = ("unix:", "unix-abstract:")
 
 
@@ -303,14 +306,20 @@ def _blamed(field: str, what: object) -> Iterator[None]:
         raise InvalidArgument(f"{field}: {what} cannot be read ({error.strerror})", field=field) from None
 
 
-def check_address(address: str) -> str:
-    """Raises InvalidArgument for a URL: gRPC has an address of its own."""
-    if _URL.match(address):
+def target_of(address: str, tls: Tls | None) -> tuple[str, Tls | None]:
+    """What gRPC connects to, and its certificates: of a URL the host and port, and of https those of the system.
+
+    Raises InvalidArgument for an http URL with `tls`, for one with a path, and for an empty address.
+    """
+    found = _URL.fullmatch(address)
+    scheme, host, path = ("", address, "") if found is None else found.groups()
+    if not host or path.strip("/") or (scheme == "http" and tls is not None):
         raise InvalidArgument(
-            f"address must be HOST:PORT of the service's gRPC, got {address!r}; for TLS give tls=Tls(...)",
+            f"address must be HOST:PORT of the service's gRPC, http:// before it without TLS or https:// with it, "
+            f"got {address!r}{'' if tls is None else ' and tls'}",
             field="address",
         )
-    return address
+    return host, Tls() if scheme == "https" and tls is None else tls
 
 
 def warn_of_open_key(address: str) -> None:

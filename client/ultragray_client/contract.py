@@ -3,15 +3,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from dataclasses import field as field_of
 from enum import Enum
+from types import MappingProxyType
 from typing import Any, Literal, TypeAlias
 
 from .geometry import Picture, PoseLike
 
 __all__ = [
+    "PROBES",
     "Additions",
     "AroundSampler",
     "Below",
@@ -108,6 +110,16 @@ class SteeredProbe:
 
 
 Probe: TypeAlias = ConvexProbe | LinearProbe | PhasedProbe | RadialProbe | SteeredProbe
+PROBES: Mapping[str, Probe] = MappingProxyType(
+    {
+        "C5-2": ConvexProbe(opening_angle_deg=70.0, near_mm=50.0, far_mm=200.0),
+        "C9-4": ConvexProbe(opening_angle_deg=130.0, near_mm=11.0, far_mm=91.0),
+        "L7-4": LinearProbe(width_mm=38.0, near_mm=0.0, far_mm=80.0),
+        "L12-4": LinearProbe(width_mm=38.0, near_mm=0.0, far_mm=60.0),
+        "L15-7": LinearProbe(width_mm=25.0, near_mm=0.0, far_mm=40.0),
+        "P4-2": PhasedProbe(opening_angle_deg=90.0, far_mm=160.0),
+    }
+)
 
 
 class Below(str, Enum):
@@ -204,6 +216,11 @@ class Display:
     flip: bool = False  # Left and right change places.
     pixel_mm: float | None = None  # Scan conversion to square pixels of this size.
     edge: float = 0.0  # Edge enhancement: how much of what a blur over 3x3 samples takes away is added.
+    # Two numbers between which the gain of each frame is drawn at random, instead of gain_db.
+    gain_db_between: tuple[float, ...] = ()
+    # Two numbers between which the dynamic range of each frame is drawn at random, instead of dynamic_range_db.
+    dynamic_range_db_between: tuple[float, ...] = ()
+    display_seed: int = 0  # Of what is drawn at random: the same seed and pose are the same frame, at every door.
 
 
 @dataclass(frozen=True, kw_only=True)

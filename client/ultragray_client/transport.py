@@ -40,10 +40,10 @@ class Connection(Terms):
 
     def __init__(self, address: str, api_key: ApiKey | None, tls: Tls | None, timeout_s: float) -> None:
         super().__init__(address, api_key, tls, timeout_s)
-        if tls is None:
-            self._channel = self._grpc.insecure_channel(address, options=CHANNEL_OPTIONS)
+        if self.tls is None:
+            self._channel = self._grpc.insecure_channel(self.address, options=CHANNEL_OPTIONS)
         else:
-            self._channel = self._grpc.secure_channel(address, tls.credentials(), options=tls.options())
+            self._channel = self._grpc.secure_channel(self.address, self.tls.credentials(), options=self.tls.options())
         self._methods: dict[str, Any] = {}
 
     def close(self) -> Any:

@@ -19,7 +19,7 @@ from enum import Enum
 from functools import cache, partial
 from operator import is_
 from pathlib import Path, PurePath
-from types import NoneType, UnionType
+from types import MappingProxyType, NoneType, UnionType
 from typing import Annotated, Any, ClassVar, Literal, NoReturn, TypeVar, Union, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -110,6 +110,7 @@ class Family(Contract):
     """
 
     members: ClassVar[dict[str, type[Any]]]
+    named: ClassVar[Mapping[str, Any]] = MappingProxyType({})  # members that have a name, which stands for their JSON
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -148,10 +149,22 @@ class Family(Contract):
         """The schema by which pydantic reads the family, as the member that `kind` names."""
         if Family not in cls.__bases__:
             return handler(source)
-        from pydantic import Discriminator  # called by pydantic only
+        from pydantic import BeforeValidator, Discriminator  # called by pydantic only
 
         union: Any = Union.__getitem__(tuple(cls.members.values()))
-        return handler.generate_schema(Annotated[union, Discriminator("kind")])
+        if not cls.named:
+            return handler.generate_schema(Annotated[union, Discriminator("kind")])
+        return handler.generate_schema(Annotated[union, Discriminator("kind"), BeforeValidator(cls._spelled_out)])
+
+    @classmethod
+    def _spelled_out(cls, document: Any) -> Any:
+        """The JSON of a member: of the one that has this name, else as given. Raises the family's error."""
+        if not isinstance(document, str):
+            return document
+        if document not in cls.named:
+            names = ", ".join(cls.named)
+            raise cls.error(f"must be an object or one of {names}, got {shown(document)}")
+        return to_dict(cls.named[document])
 
 
 def kind_field(kind: str) -> Any:
@@ -219,6 +232,8 @@ def from_dict(cls: type[_T], document: Any) -> _T:
     Raises the error of the class, with a path as its field, for unknown and missing keys and for values that cannot be.
     """
     error: type[InvalidArgument] = getattr(cls, "error", InvalidArgument)
+    if issubclass(cls, Family) and cls.named:
+        document = cls._spelled_out(document)
     if not isinstance(document, Mapping):
         raise error(f"must be an object, got {shown(document)}")
     is_family = issubclass(cls, Family)
@@ -268,8 +283,9 @@ def blamed(cls: Any, location: Iterable[str | int]) -> tuple[str, type[InvalidAr
 
 
 def _title(cls: Any) -> str:
-    kind = getattr(cls, "kind", None)
-    return cls.__name__ if kind is None else f"kind {kind}"
+    """A class as messages say it: "the sampler around" of a member of the family `Sampler`."""
+    family = next((one for one in cls.__mro__ if Family in one.__bases__), None)
+    return cls.__name__ if family is None else f"the {family.__name__.lower()} {cls.kind}"
 
 
 def _read(value: Any, annotation: Any) -> Any:

@@ -1,8 +1,8 @@
 """The settings of a frame as ROS parameters: one for each field of RenderSettings, `display.` before those of Display.
 
 A parameter of ROS is never None: −1 and the empty text leave a setting to the scene, [0.0] stands for no numbers. A
-probe is written as JSON, such as `{"kind": "convex", "opening_angle_deg": 60, "near_mm": 40, "far_mm": 95}`, and tools
-as a list of such objects.
+probe is written by its name, such as `C5-2`, or as JSON, such as `{"kind": "convex", "opening_angle_deg": 60,
+"near_mm": 40, "far_mm": 95}`, and tools as a list of such objects.
 Free of ROS.
 """
 
@@ -15,7 +15,7 @@ from enum import Enum
 from types import NoneType
 from typing import Any, TypeAlias, get_args, get_origin, get_type_hints
 
-from ultragray_client import Display, RenderSettings
+from ultragray_client import PROBES, Display, RenderSettings
 from ultragray_client.errors import InvalidArgument
 
 Value: TypeAlias = bool | int | float | str | list[str] | list[float]
@@ -69,6 +69,8 @@ def _read(name: str, kind: Any, value: Any) -> Any:
     inner = [one for one in get_args(kind) if one is not NoneType] or [kind]
     if NoneType in get_args(kind) and value == _left_open(kind):
         return None
+    if name == "probe" and value in PROBES:
+        return PROBES[value]
     if is_dataclass(inner[0]):
         return _member(name, inner, _document(name, inner, value))
     if get_origin(inner[0]) is tuple and is_dataclass((kinds := get_args(get_args(inner[0])[0]))[0]):

@@ -7,6 +7,7 @@ import sys
 import tempfile
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -27,6 +28,7 @@ from ultragray_service.cli.terminal import (
     command_group,
     examples,
     output_option,
+    print_table,
     progress_bars,
     stop_on_signal,
     to_json,
@@ -47,6 +49,7 @@ command_app = command_group()
     epilog=examples(
         "ultragray compare sweep/ --methods median,mean,linear,nearest  # seconds",
         "ultragray compare sweep/ -o comparison.html  # every method, as long as a scene takes",
+        "ultragray compare sweep/ --seeds 5 -o comparison.html  # mean and deviation over five seeds, with a plot",
         "ultragray compare sweep/ --methods scene,median --json | jq '.results[].name'",
     )
 )
@@ -69,6 +72,16 @@ def compare(
         str, typer.Option(help="cpu, or a GPU: cuda, or cuda:N for one of several.", rich_help_panel=COMPUTE)
     ] = "cpu",
     threads: Threads = 0,
+    seeds: Annotated[
+        int,
+        typer.Option(
+            help="How many seeds, from --seed on: figures are then mean ± standard deviation over them, and a plot "
+            "with error bars (.svg) is written beside the page, which is of the first.",
+            min=1,
+            max=100,
+            rich_help_panel=ComparisonSettings.__topic__,
+        ),
+    ] = 1,
     *,
     settings: ComparisonSettings,
     source: SourceOptions,
@@ -94,12 +107,12 @@ def compare(
     if output is not None:
         if force:
             shutil.rmtree(run_folder(output), ignore_errors=True)
-        _compare(read, settings, device, run_folder(output), output, as_json=json)
+        _compare(read, settings, seeds, device, run_folder(output), output, as_json=json)
         return
     if any(method.describe().published_steps is not None for method in chosen_methods(settings.methods).values()):
         typer.echo("what the methods learn is not kept; with --output PAGE.html it is, and a page is written", err=True)
     with tempfile.TemporaryDirectory(prefix="ultragray-compare-") as folder:
-        _compare(read, settings, device, Path(folder), None, as_json=json)
+        _compare(read, settings, seeds, device, Path(folder), None, as_json=json)
 
 
 def run_folder(output: Path) -> Path:
@@ -124,13 +137,22 @@ def _check_output(output: Path, *, force: bool) -> None:
 
 
 def _compare(
-    dataset: Dataset, settings: ComparisonSettings, device: str, run: Path, output: Path | None, *, as_json: bool
+    dataset: Dataset,
+    settings: ComparisonSettings,
+    seeds: int,
+    device: str,
+    run: Path,
+    output: Path | None,
+    *,
+    as_json: bool,
 ) -> None:
     from ultragray.files import write_whole
     from ultragray_studies.comparison.run import compare_methods
+    from ultragray_studies.comparison.seeds import over_seeds, plot_seeds, seeds_document
     from ultragray_studies.methods.registry import chosen_methods
 
     at, written = "stopped before the first method", []
+    comparisons: list[Comparison] = []  # by seed
     with stop_on_signal() as should_stop, _progress_bar() as show:
 
         def report(state: ComparisonProgress) -> None:
@@ -141,28 +163,66 @@ def _compare(
             show(state)
 
         methods = chosen_methods(settings.methods)
-        comparison = compare_methods(
-            dataset, methods, settings, folder=run, device=device, report=report, should_stop=should_stop
-        )
-        if comparison is not None and output is not None:
+        for seed in range(settings.seed, settings.seed + seeds):
+            found = compare_methods(
+                dataset,
+                methods,
+                replace(settings, seed=seed),
+                folder=run if seed == settings.seed else run / f"seed-{seed}",
+                device=device,
+                report=report,
+                should_stop=should_stop,
+            )
+            if found is None:
+                break
+            comparisons.append(found)
+        is_whole = len(comparisons) == seeds
+        if is_whole and output is not None:
             from ultragray_studies.comparison.page import write_comparison
 
-            for made in write_comparison(comparison, dataset, run):
+            for made in write_comparison(comparisons[0], dataset, run):
                 written.append(output.with_suffix(made.suffix))
                 write_whole(written[-1], made.read_bytes())
-    if comparison is None:
+            if seeds > 1:
+                write_whole(output.with_suffix(".json"), to_json(seeds_document(comparisons)) + "\n")
+                written.append(output.with_suffix(".svg"))
+                write_whole(written[-1], plot_seeds(over_seeds(comparisons)))
+    if not is_whole:
         typer.echo(f"{at}; {'nothing is kept' if output is None else 'go on with the same command'}", err=True)
         raise typer.Exit(INTERRUPTED)
+    comparison = comparisons[0]
     if as_json:
-        typer.echo(to_json(comparison.to_dict() | {"written": written}))
+        document = comparison.to_dict() if seeds == 1 else seeds_document(comparisons)
+        typer.echo(to_json(document | {"written": written}))
     else:
-        _print_table(comparison)
+        if seeds == 1:
+            _print_table(comparison)
+        else:
+            _print_seeds(comparisons)
         if comparison.measured:
             print_speckle({one.title: one.evaluation for one in comparison.results if one.evaluation is not None})
         for path in written:
             typer.echo(f"wrote {path}")
     if not comparison.measured:
         raise typer.Exit(1)
+
+
+def _print_seeds(comparisons: list[Comparison]) -> None:
+    """A table of the scores of each method over all seeds: mean ± standard deviation."""
+    from ultragray.learn.report.tables import METRICS, shown_value
+    from ultragray_studies.comparison.seeds import over_seeds
+    from ultragray_studies.comparison.tables import budget_text
+
+    first = comparisons[0]
+    rows = [
+        [title, *(" ± ".join(shown_value(metric.name, value) for value in spread[metric.name]) for metric in METRICS)]
+        for title, spread in over_seeds(comparisons).items()
+    ]
+    typer.echo(
+        f"{first.dataset.name}, {first.dataset.val_frames} val frames, {len(comparisons)} seeds from {first.seed}, "
+        f"{first.machine}; budget: {budget_text(first)}"
+    )
+    print_table(["", *(metric.label for metric in METRICS)], rows)
 
 
 def _print_table(comparison: Comparison) -> None:

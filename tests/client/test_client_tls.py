@@ -10,6 +10,7 @@ from ultragray_client import Tls, errors
 from ultragray_client.connection import warn_of_open_key
 
 from ..certificates import Mounted, write_client
+from .conftest import KEY
 
 
 @pytest.fixture(scope="module")
@@ -83,8 +84,17 @@ def test_files_and_addresses_that_cannot_be_used(mounted, make_client, tmp_path)
     ):
         with pytest.raises(errors.InvalidArgument, match=expected):
             make_client("localhost:1", tls=tls)
-    with pytest.raises(errors.InvalidArgument, match=r"address must be HOST:PORT .* give tls=Tls"):
-        make_client("https://localhost:8000")
+    for address, tls in (("https://localhost:1/v1", None), ("http://localhost:1", Tls()), ("", None)):
+        with pytest.raises(errors.InvalidArgument, match=r"address must be HOST:PORT .* https:// with it"):
+            make_client(address, tls=tls)
+
+
+def test_an_address_may_be_a_url(client_service, tls_service, make_client):
+    assert make_client(f"http://{client_service.grpc}", api_key=KEY).scenes.list()
+    with pytest.raises(errors.TlsFailed, match="no trusted authority signed"):  # TLS by the system's authorities
+        make_client(f"https://{tls_service.grpc}").scenes.list()
+    with pytest.raises(errors.Unreachable, match=r"is a port of HTTP: give that of gRPC"):
+        make_client(client_service.http, timeout_s=1.0).scenes.list()
 
 
 @pytest.mark.parametrize(

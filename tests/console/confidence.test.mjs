@@ -99,7 +99,7 @@ describe("confidence", () => {
 
   it("costs few frames: as many a second at 512 x 512 as the screen is given without it", async (t) => {
     const { page } = await openScan(at);
-    await page.getByRole("combobox", { name: "Samples" }).selectOption("512");
+    await page.getByRole("combobox", { name: "Image size" }).selectOption("512");
     await until(() => canvasState(page, IMAGE), ({ width }) => width === 512, "no 512 scan lines");
     await enterPose(page, AWAY);
     await page.getByTestId("support-layer").waitFor();

@@ -40,7 +40,7 @@ describe("contact with the skin", () => {
     await page.getByRole("button", { name: "Home" }).click();
     await until(() => share(page).textContent(), (text) => text === "100 %", "a view of the sweep has no contact");
 
-    await choice(page).selectOption({ label: "As on it" });
+    await choice(page).selectOption({ label: "Contact assumed" });
     await share(page).waitFor({ state: "detached" });
     assert.deepEqual([page.faults, page.foreign], [[], []]);
   });

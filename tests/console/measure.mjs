@@ -59,7 +59,7 @@ try {
   const page = await openPage({ browser, service }, "#/scan/demo");
   await until(() => canvasState(page, IMAGE), ({ mean }) => mean > 5, "no frame came"); // a scene that is not known yet begins anew
   await page.getByTestId("legend").waitFor();
-  await page.getByRole("combobox", { name: "Samples" }).selectOption("512");
+  await page.getByRole("combobox", { name: "Image size" }).selectOption("512");
   await until(() => canvasState(page, IMAGE), ({ width }) => width === 512, "no 512 scan lines");
   await page.evaluate(() => {
     const put = CanvasRenderingContext2D.prototype.putImageData;

@@ -204,14 +204,14 @@ describe("a refused pose", () => {
     });
     await page.goto(`${at.service.url}/#/scan/demo`);
     const first = await until(() => canvasState(page, IMAGE), ({ mean }) => mean > 5, "no frame came");
-    await page.getByRole("combobox", { name: "Samples" }).selectOption("768");
+    await page.getByRole("combobox", { name: "Image size" }).selectOption("768");
     await page.getByTestId("refusal").waitFor();
     const before = refusals.length;
     for (const y of ["0", "1", "2"]) await page.getByLabel("Position Y", { exact: true }).fill(y);
     await until(() => refusals.length, (count) => count >= before + 2, "the moves were not refused");
     await page.getByTestId("refusal").waitFor();
     assert.equal((await canvasState(page, IMAGE)).print, first.print, "an image with the settings before was shown");
-    await page.getByRole("combobox", { name: "Samples" }).selectOption("256");
+    await page.getByRole("combobox", { name: "Image size" }).selectOption("256");
     await page.getByTestId("refusal").waitFor({ state: "detached" });
   });
 });

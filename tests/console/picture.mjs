@@ -12,7 +12,7 @@ const service = await Service.start();
 const browser = await launch();
 try {
   const { page } = await openScan({ browser, service }, { scheme: "dark" });
-  await page.getByRole("combobox", { name: "Samples" }).selectOption("512");
+  await page.getByRole("combobox", { name: "Image size" }).selectOption("512");
   const { print } = await until(() => canvasState(page, IMAGE), ({ mean }) => mean > 5, "no frame came");
   await page.getByRole("combobox", { name: "Probe" }).selectOption("steered");
   await changed(page, print);

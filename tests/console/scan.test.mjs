@@ -60,7 +60,7 @@ describe("scan", () => {
     await page.getByRole("button", { name: "Reset" }).click();
     await page.getByLabel("Flip").check();
     await page.locator('[data-testid="orientation-marker"][data-side="right"]').waitFor();
-    await page.getByRole("combobox", { name: "Samples" }).selectOption("512");
+    await page.getByRole("combobox", { name: "Image size" }).selectOption("512");
     await until(() => canvasState(page, IMAGE), ({ width }) => width === 512, "no 512 scan lines");
     await page.getByRole("combobox", { name: "Probe" }).selectOption("convex");
     await until(() => canvasState(page, IMAGE), ({ width }) => width === 640, "no sector came");

@@ -2,7 +2,7 @@
 
 import re
 import shlex
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 
 from markdown_it import MarkdownIt
@@ -12,7 +12,7 @@ PARSED = {"json", "toml", "yaml"}
 INERT = {"text", "html", "javascript", "ini", "proto", "xml", "c", "http"}
 LANGUAGES = {*SHELL, "python", *PARSED, *INERT}
 
-_STEERING = re.compile(r"^<!-- (needs|not run|prepare|serves)(?:: (.*?))? -->$", flags=re.MULTILINE)
+_STEERING = re.compile(r"^<!-- (needs|not run|serves)(?:: (.*?))? -->$", flags=re.MULTILINE)
 
 
 class PageInvalid(Exception):
@@ -27,7 +27,6 @@ class Block:
     language: str
     code: str
     not_run: str | None = None  # the reason
-    prepare: tuple[str, ...] = ()  # commands that run before it
     serves: bool = False
 
     def script(self):
@@ -72,7 +71,6 @@ class _Steering:
     """The comments since the last block."""
 
     not_run: str | None = None
-    prepare: list[str] = field(default_factory=list)
     serves: bool = False
 
 
@@ -90,8 +88,6 @@ def read_page(path):
                     if not value:
                         raise PageInvalid(f"{path}:{line}: a block that is not run says why")
                     steering.not_run = value
-                elif word == "prepare":
-                    steering.prepare.append(value)
                 else:
                     steering.serves = True
         elif token.type == "code_block":
@@ -100,9 +96,7 @@ def read_page(path):
             language = token.info.strip()
             if language not in LANGUAGES:
                 raise PageInvalid(f"{path}:{line}: a block in {language!r}; known are {', '.join(sorted(LANGUAGES))}")
-            blocks.append(
-                Block(line + 1, language, token.content, steering.not_run, tuple(steering.prepare), steering.serves)
-            )
+            blocks.append(Block(line + 1, language, token.content, steering.not_run, steering.serves))
             if language in SHELL and not blocks[-1].script().strip():
                 raise PageInvalid(f"{path}:{line}: a block without a command; one of output alone is text")
             steering = _Steering()

@@ -13,7 +13,6 @@ from ..surroundings import ROOT
 from .blocks import read_page
 from .running import PageRun
 
-DEMO_SERVICE = "demo service"
 TUTORIAL = ROOT / "docs" / "tutorial.md"
 
 
@@ -52,13 +51,13 @@ def run_page(shared_ports, tmp_path, monkeypatch):
 
     def run(path):
         page = read_page(path)
-        for need in set(page.needs) - {DEMO_SERVICE}:
+        for need in page.needs:
             if shutil.which(need) is None:
                 pytest.skip(f"{need} is not installed")
         folder = tmp_path / "page"
         folder.mkdir()
         monkeypatch.chdir(folder)
-        with PageRun(page, folder, shared_ports() if DEMO_SERVICE in page.needs else None) as page_run:
+        with PageRun(page, folder, shared_ports) as page_run:
             for name, value in page_run.environment().items():
                 monkeypatch.setenv(name, value)
             for block in page.runs:

@@ -11,6 +11,7 @@ import doctest
 import json
 import os
 import re
+import shlex
 import signal
 import socket
 import subprocess
@@ -30,6 +31,7 @@ if sys.version_info >= (3, 11):
 else:
     import tomli as tomllib
 
+SHARED = ("ultragray serve", "ultragray serve --igtl-port 18944", "make serve")  # what the service of all pages does
 COMMAND_TIMEOUT_S = 1200.0  # a training, on a machine that is busy with other tests
 START_TIMEOUT_S = 300.0
 PORTS = {"8000": "http", "50051": "grpc", "18944": "igtl"}  # as documents write them
@@ -40,9 +42,9 @@ _PARSERS = {"json": json.loads, "toml": tomllib.loads, "yaml": yaml.safe_load}
 class PageRun:
     """The run of a page: its folder, the names of its Python blocks, and the service that it started."""
 
-    def __init__(self, page, folder, ports):
-        """`ports`: those of the shared service by door, where the page needs it."""
-        self.page, self.folder, self.ports = page, folder, ports
+    def __init__(self, page, folder, shared_ports):
+        """`shared_ports` gives those of the service of all pages, by door; it is asked where a page starts one."""
+        self.page, self.folder, self.ports, self._shared_ports = page, folder, None, shared_ports
         self.names = {"__name__": "__main__"}
         self.served = None
 
@@ -53,15 +55,15 @@ class PageRun:
         self._stop_serving()
 
     def run(self, block):
-        for command in block.prepare:
-            self._shell(command, block)
         code = self._with_ports(block.code)
         if block.language in _PARSERS:
             _PARSERS[block.language](code)
         elif block.language == "python":
             self._python(code, block)
         elif block.language in SHELL and block.not_run is None:
-            if block.serves:
+            if block.serves and shlex.join(shlex.split(block.script(), comments=True)) in SHARED:
+                self.ports = self._shared_ports()
+            elif block.serves:
                 self._serve(block)
             else:
                 self._shell(self._with_ports(block.script()), block)
@@ -171,7 +173,7 @@ def _answers(port):
 def main(page, folder):
     folder.mkdir()
     os.chdir(folder)
-    with PageRun(read_page(page), folder, {door: int(port) for port, door in PORTS.items()}) as run:
+    with PageRun(read_page(page), folder, lambda: {door: int(port) for port, door in PORTS.items()}) as run:
         os.environ.update(run.environment())
         for block in run.page.runs:
             run.run(block)

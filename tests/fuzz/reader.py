@@ -15,14 +15,13 @@ import torch
 
 from ultragray import GaussianScene, LinearProbe, render
 from ultragray.datasets.checks import check_dataset
-from ultragray.datasets.source import SourceOptions, load_dataset
+from ultragray.datasets.source import SourceOptions, find_source, load_dataset
 from ultragray.errors import UltragrayError
 from ultragray.exchange.checkpoint import import_checkpoint
 from ultragray.exchange.ply import read_ply
 from ultragray.exchange.poses import load_poses
 from ultragray.learn.training.checkpointing import check_tensors, read_checkpoint
 from ultragray.scene.info import read_header
-from ultragray_workers.datasets.store import find_source
 from ultragray_workers.datasets.unpack import unpack
 
 ADDRESS_SPACE_BYTES = 8 << 30
@@ -56,7 +55,7 @@ def read_folder(path):
     """As an upload is read."""
     source = find_source(path)
     source.format.check_upload(source.path, path)
-    check_dataset(source.load({}))
+    check_dataset(load_dataset(path))
 
 
 def read_sequence(path):

@@ -90,7 +90,7 @@ def test_json_and_back():
         ({"size": 3}, "size", "size is not a known key: Drawing takes shape, colour"),
         ({"shape": {"kind": "line"}}, "shape.kind", "shape.kind must be one of square, circle, got 'line'"),
         ({"shape": {}}, "shape.kind", "shape.kind must be one of square, circle, got null"),
-        ({"shape": {"kind": "circle"}}, "shape.radius_mm", "shape.radius_mm is required by kind circle"),
+        ({"shape": {"kind": "circle"}}, "shape.radius_mm", "shape.radius_mm is required by the shape circle"),
         ({"shape": {"kind": "circle", "radius_mm": -1}}, "shape.radius_mm", "shape.radius_mm must be a finite number"),
         ({"shape": 3}, "shape", "shape must be an object, got 3"),
     ],

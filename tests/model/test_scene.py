@@ -253,7 +253,7 @@ def test_json_round_trip(info):
         ({"beam": {"thickness_mm": -1.0}}, "thickness_mm must be a finite number from 0"),
         ({"beam": {"thickness_mm": 1.0, "focus_mm": 9.0}}, "depth_of_field_mm must be given"),
         ({"beam": {"thickness_mm": 1.0, "depth_of_field_mm": 9.0}}, "focus_mm must be given"),
-        ({"probe": {"kind": "linear"}}, "width_mm is required by kind linear"),
+        ({"probe": {"kind": "linear"}}, "width_mm is required by the probe linear"),
     ],
 )
 def test_a_wrong_entry_is_named(change, message):

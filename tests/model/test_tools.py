@@ -68,7 +68,7 @@ def test_a_file_gives_back_the_tools_that_were_written(tmp_path):
         ("[", "Expecting value"),
         ("[" * 100_000, "recursion"),
         ('[{"kind": "saw"}]', r"tools\[0\].kind must be one of box, cylinder, needle, got 'saw'"),
-        ('[{"kind": "box", "centre_mm": [0, 0, 0]}]', r"tools\[0\].size_mm is required by kind box"),
+        ('[{"kind": "box", "centre_mm": [0, 0, 0]}]', r"tools\[0\].size_mm is required by the tool box"),
         ('[{"kind": "box", "centre_mm": [0, 0, NaN], "size_mm": [1, 1, 1]}]', r"tools\[0\].centre_mm\[2\] must be a"),
     ],
 )

@@ -11,10 +11,10 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
 import numpy.typing as npt
 
-from ..geometry import FloatArray
+from ultragray_client.geometry import FloatArray
+from ultragray_client.poses import quaternion_from_pose
 
 MM_PER_M = 1000.0
 NS_PER_S = 1_000_000_000
@@ -137,22 +137,3 @@ def geometry_document(origin: Mapping[str, Any], frame_id: str) -> dict[str, Any
 def geometry_message(origin: Mapping[str, Any]) -> dict[str, Any]:
     """A std_msgs/String with the geometry of frames as JSON."""
     return {"data": json.dumps(geometry_document(origin, PROBE_FRAME), sort_keys=True)}
-
-
-def quaternion_from_pose(pose: FloatArray) -> tuple[float, float, float, float]:
-    """Unit quaternion (w, x, y, z), w >= 0, of a pose [4, 4]."""
-    r = pose[:3, :3]
-    trace = float(np.trace(r))
-    four_squares = np.array([1 + trace, *(1 + 2 * r[k, k] - trace for k in range(3))])  # 4w², 4x², 4y², 4z²
-    largest = int(np.argmax(four_squares))
-    products = np.array(  # 4·q_a·q_b for the largest component a
-        [
-            [four_squares[0], r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]],
-            [r[2, 1] - r[1, 2], four_squares[1], r[0, 1] + r[1, 0], r[0, 2] + r[2, 0]],
-            [r[0, 2] - r[2, 0], r[0, 1] + r[1, 0], four_squares[2], r[1, 2] + r[2, 1]],
-            [r[1, 0] - r[0, 1], r[0, 2] + r[2, 0], r[1, 2] + r[2, 1], four_squares[3]],
-        ]
-    )[largest]
-    q = products / np.linalg.norm(products)
-    w, x, y, z = (float(v) for v in (q if q[0] >= 0 else -q))
-    return w, x, y, z

@@ -13,8 +13,8 @@ from typing import IO, Any
 import numpy.typing as npt
 from mcap_ros2.writer import Writer
 
-from ..geometry import FloatArray
-from . import messages as ros
+from ultragray_client.geometry import FloatArray
+from ultragray_client.recording import messages as ros
 
 TOPICS = "/ultragray"
 METADATA = "ultragray"  # the record of the origin: its objects as JSON

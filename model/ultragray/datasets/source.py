@@ -72,6 +72,12 @@ class SourceOptions(Contract):
                 )
 
 
+def options_of(words: dict[str, str]) -> SourceOptions:
+    """The options of an upload."""
+    given: dict[str, Any] = dict(words)
+    return SourceOptions(**given)
+
+
 @dataclass(frozen=True)
 class DatasetFormat:
     """A format of tracked sweeps.
@@ -140,13 +146,18 @@ def load_dataset(source: str | Path, options: SourceOptions | None = None) -> Da
     Every fifth frame of a sequence is held out unless `options` says otherwise. Raises DatasetInvalid, naming the file,
     the frame and the reason; InvalidArgument, naming the field, for options that cannot be met.
     """
-    options = options or SourceOptions()
+    options, name = options or SourceOptions(), Path(source).name
+    if Path(source).is_dir():
+        found = find_source(Path(source))
+        source = found.path
+        beside: dict[str, Any] = {n: path for n, path in found.companions.items() if getattr(options, n) is None}
+        options = replace(options, **beside)
     chosen = format_of(source)
     for item in fields(options):
         if getattr(options, item.name) is not None and item.name not in (*EVERY_FORMAT_TAKES, *chosen.options):
             *takers, last = (f"{one.noun}s" for one in FORMATS.values() if item.name in one.options)
             listed = f"{', '.join(takers)} and {last}" if takers else last
-            raise InvalidArgument(f"{item.name} is for {listed}, {Path(source).name} is none", field=item.name)
+            raise InvalidArgument(f"{item.name} is for {listed}, {name} is none", field=item.name)
     dataset = chosen.load(str(source), options)
     if options.image_size is None:
         return dataset
@@ -160,9 +171,11 @@ def load_dataset(source: str | Path, options: SourceOptions | None = None) -> Da
 def format_of(source: str | Path) -> DatasetFormat:
     """The format that a source is in, by its name; nothing is read. Raises DatasetInvalid where there is none."""
     path = Path(source)
+    if path.is_dir():
+        return find_source(path).format
     for one in FORMATS.values():
         if one.is_source(str(source)):
-            if one.files and not (path.is_file() or path.is_dir()):  # a pipe would never end
+            if one.files and not path.is_file():  # a pipe would never end
                 break
             return one
     if not path.is_file():
@@ -171,6 +184,50 @@ def format_of(source: str | Path) -> DatasetFormat:
     raise DatasetInvalid(f"{path}: a dataset is {', '.join(meanings)} or {last}")
 
 
+@dataclass(frozen=True)
+class FoundSource:
+    """The file by which the dataset of a folder is known, and the files beside it that are options of it."""
+
+    format: DatasetFormat
+    path: Path
+    companions: dict[str, Path]  # by the name of the option
+
+
+def find_source(folder: Path) -> FoundSource:
+    """The dataset of a folder, of an upload or of a user, nearest to its top; a whole folder goes before a file in it.
+
+    Hidden files are passed over. Raises DatasetInvalid, naming files from that folder, where there is not one dataset.
+    """
+    paths = sorted(path.relative_to(folder) for path in folder.rglob("*") if path.is_file())
+    plain = [path for path in paths if not any(part.startswith((".", "__MACOSX")) for part in path.parts)]
+    formats = [one for one in FORMATS.values() if one.files]
+    ranked = [
+        ((len(path.parts), not one.is_folder), one, path) for one in formats for path in plain if one.is_file(path)
+    ]
+    if not ranked:
+        expected = " or ".join(one.upload_meaning for one in formats)
+        raise DatasetInvalid(f"{folder} must hold {expected}; it holds {_listed(plain) or 'no files'}")
+    least = min(rank for rank, _, _ in ranked)
+    sources = [(one, path) for rank, one, path in ranked if rank == least]
+    if len(sources) > 1:
+        raise DatasetInvalid(f"{folder} must hold one dataset, it holds {_listed([path for _, path in sources])}")
+    ((found, source),) = sources
+    companions = {}
+    for option, pattern in found.companions.items():
+        matching = [path for path in plain if fnmatchcase(path.name.lower(), pattern)]
+        if len(matching) > 1:
+            raise DatasetInvalid(f"{folder} must hold at most one {option} ({pattern}), it holds {_listed(matching)}")
+        if matching:
+            companions[option] = folder / matching[0]
+    return FoundSource(found, folder / source, companions)
+
+
+def _listed(paths: list[Path]) -> str:
+    shown = ", ".join(map(str, paths[:_NAMES_IN_MESSAGE]))
+    return shown + (f" and {len(paths) - _NAMES_IN_MESSAGE} more" if len(paths) > _NAMES_IN_MESSAGE else "")
+
+
+_NAMES_IN_MESSAGE = 5
 PLUS_SUFFIXES = (".mha", ".mhd", ".nrrd", ".nhdr")
 FORMATS: Mapping[str, DatasetFormat] = {
     one.name: one
@@ -179,10 +236,7 @@ FORMATS: Mapping[str, DatasetFormat] = {
             name="released",
             noun="folder of the released layout",
             meaning="a folder with conf.json and .npy files (or its conf.json)",
-            is_source=lambda source: (
-                (Path(source).is_dir() and not (Path(source) / "poses.csv").is_file())
-                or source.lower().endswith(".json")
-            ),
+            is_source=lambda source: source.lower().endswith(".json"),
             reader="ultragray.datasets.released:read_released",
             files=("conf.json",),
             is_folder=True,
@@ -224,7 +278,7 @@ FORMATS: Mapping[str, DatasetFormat] = {
             name="table",
             noun="pose table",
             meaning="a folder of pictures with their poses.csv and calibration.json (or its poses.csv)",
-            is_source=lambda source: source.lower().endswith(".csv") or (Path(source) / "poses.csv").is_file(),
+            is_source=lambda source: source.lower().endswith(".csv"),
             reader="ultragray.datasets.table:read_table_sweep",
             files=("poses.csv",),
             options=("frames", "crop", "fan", "calibration", "image_delay_ms"),

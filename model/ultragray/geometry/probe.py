@@ -17,6 +17,7 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 from typing import Any, ClassVar, Literal, NamedTuple, TypeAlias
 
 import numpy as np
@@ -539,6 +540,19 @@ class SteeredProbe(Probe):
     def lines(self) -> ParallelLines:
         return ParallelLines(self.width_mm, self.steering_deg)
 
+
+# Probes by the names that makers give theirs: the lowest and highest frequency, MHz, after a letter for the shape.
+# Widths, radii and angles are typical of probes of that name, and depths of their use: those of one's own differ.
+Probe.named = MappingProxyType(
+    {
+        "C5-2": ConvexProbe(opening_angle_deg=70.0, near_mm=50.0, far_mm=200.0),  # abdomen
+        "C9-4": ConvexProbe(opening_angle_deg=130.0, near_mm=11.0, far_mm=91.0),  # endocavity
+        "L7-4": LinearProbe(width_mm=38.0, near_mm=0.0, far_mm=80.0),  # vessels
+        "L12-4": LinearProbe(width_mm=38.0, near_mm=0.0, far_mm=60.0),  # small parts, muscles, vessels
+        "L15-7": LinearProbe(width_mm=25.0, near_mm=0.0, far_mm=40.0),  # near the skin, hockey stick
+        "P4-2": PhasedProbe(opening_angle_deg=90.0, far_mm=160.0),  # heart
+    }
+)
 
 FWHM_PER_SIGMA = 2.0 * math.sqrt(2.0 * math.log(2.0))
 MAX_THICKNESS_MM = 100.0

@@ -6,6 +6,7 @@ Interpolation is bilinear, pixels outside the image are 0. `frames.show` does th
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import lru_cache
 from typing import Any, TypeAlias
 
 import numpy as np
@@ -23,8 +24,30 @@ _NOT_ONE_MORE = 1.0 + 1e-9  # pixel, by rounding
 
 def scan_convert(frame: npt.NDArray[Any], probe: Probe, pixel_mm: float) -> FloatImage:  # [H, W] -> [H', W']
     """A frame as the picture `probe.picture(pixel_mm)`."""
-    rows, columns, inside = samples(probe, frame.shape, pixel_mm)
-    return np.where(inside, interpolated(frame, rows, columns), 0.0).astype(np.float32)
+    inside, here, below, beside, down, right = _pixels(probe, frame.shape, pixel_mm)
+    values = frame.ravel().astype(np.float32, copy=False)
+    upper, lower = values.take(here), values.take(here + below)
+    upper += (values.take(here + beside) - upper) * right
+    lower += (values.take(here + below + beside) - lower) * right
+    picture = np.zeros(inside.shape, np.float32)
+    picture[inside] = upper + (lower - upper) * down
+    return picture
+
+
+@lru_cache(maxsize=1)  # one frame after another has the same
+def _pixels(probe: Probe, shape: tuple[int, int], pixel_mm: float) -> tuple[npt.NDArray[Any], ...]:
+    """Of a picture: which pixels [H', W'] lie in a frame; of each that does its sample, the steps to those below and
+    beside it, and its shares of them.
+    """
+    rows, columns, inside = samples(probe, shape, pixel_mm)
+    rows, columns = rows[inside], columns[inside]
+    i, j = np.floor(rows).astype(np.int32), np.floor(columns).astype(np.int32)
+    down, right = (rows - i).astype(np.float32), (columns - j).astype(np.float32)
+    height, width = shape
+    j %= width  # of scan lines all the way round the last is before the first
+    below = np.where(i < height - 1, width, 0).astype(np.int32)
+    beside = np.where(j < width - 1, 1, 1 - width).astype(np.int32)
+    return inside, i * width + j, below, beside, down, right
 
 
 def scan_convert_labels(labels: ByteImage, probe: Probe, pixel_mm: float) -> ByteImage:  # [H, W] -> [H', W']

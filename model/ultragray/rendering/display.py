@@ -5,12 +5,14 @@ Free of torch: doors take them. `show` of `ultragray.rendering.frames` applies t
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import hashlib
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
 from ultragray.contract import Contract, described
-from ultragray.errors import InvalidImageSize
+from ultragray.errors import InvalidArgument, InvalidImageSize
 from ultragray.geometry.image_size import MAX_IMAGE_SIDE
 from ultragray.geometry.probe import FloatArray, Picture, Probe, length_field
 
@@ -42,6 +44,51 @@ class Display(Contract):
     edge: float = described(
         "Edge enhancement: how much of what a blur over 3x3 samples takes away is added.", 0.0, low=0.0, high=4.0
     )
+    gain_db_between: tuple[float, ...] = described(
+        "Two numbers between which the gain of each frame is drawn at random, instead of gain_db.",
+        (),
+        low=-100.0,
+        high=100.0,
+        most=2,
+    )
+    dynamic_range_db_between: tuple[float, ...] = described(
+        "Two numbers between which the dynamic range of each frame is drawn at random, instead of dynamic_range_db.",
+        (),
+        low=1.0,
+        high=200.0,
+        most=2,
+    )
+    display_seed: int = described(
+        "Of what is drawn at random: the same seed and pose are the same frame, at every door.", 0, low=0, high=2**53
+    )
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        for name in _DRAWN:
+            between = getattr(self, f"{name}_between")
+            if between and (len(between) != 2 or between[0] > between[1]):
+                raise InvalidArgument(
+                    f"{name}_between must be two numbers, the lower one first, got {list(between)}",
+                    field=f"{name}_between",
+                )
+
+    @property
+    def varies(self) -> bool:
+        """Whether frames of different poses are shown differently."""
+        return any(getattr(self, f"{name}_between") for name in _DRAWN)
+
+    def of_frame(self, pose: FloatArray) -> Display:  # [4, 4] mm
+        """The settings of the frame of a pose, with what is drawn at random: uniform, from a hash of seed and pose.
+
+        So nothing depends on which frames are rendered beside it, nor in which order.
+        """
+        key = hashlib.sha256(self.display_seed.to_bytes(8, "little") + (pose + 0.0).astype("<f8").tobytes()).digest()
+        drawn = dict(zip(_DRAWN, np.random.default_rng(list(key)).random(len(_DRAWN)), strict=True))
+        settled: dict[str, Any] = {f"{name}_between": () for name in _DRAWN}
+        for name, share in drawn.items():
+            if between := getattr(self, f"{name}_between"):
+                settled[name] = float(between[0] + share * (between[1] - between[0]))
+        return replace(self, **settled)
 
     @property
     def changes_tone(self) -> bool:
@@ -74,6 +121,7 @@ class Display(Contract):
         return gains
 
 
+_DRAWN = ("gain_db", "dynamic_range_db")  # fields that have one of the same name and `_between`
 AS_RENDERED = Display()
 
 

@@ -262,7 +262,15 @@ def render_shown(
     rendered = {name: frames[name] for name in names}
     if settings.display == AS_RENDERED and blackened is None:
         return rendered
-    return show(rendered, settings.probe, settings.display, blackened)
+    if not settings.display.varies:
+        return show(rendered, settings.probe, settings.display, blackened)
+    shown = []
+    for place, pose in enumerate(poses):
+        one = slice(place, place + 1)
+        mask = None if blackened is None else blackened[one]
+        frame = {name: pixels[one] for name, pixels in rendered.items()}
+        shown.append(show(frame, settings.probe, settings.display.of_frame(pose), mask))
+    return {name: torch.cat([frame[name] for frame in shown]) for name in rendered}
 
 
 def _is_plain(settings: Resolved) -> bool:

@@ -270,6 +270,9 @@ def scene_file_invalid(path: str | Path, error: Exception) -> SceneFileInvalid:
         return SceneFileInvalid(f"{path}: no such file")
     if isinstance(error, RecursionError):
         return SceneFileInvalid(f"{path}: not a scene file: its metadata nests too deeply")
+    if isinstance(error, SafetensorError):
+        is_cut = "incomplete metadata" in str(error)
+        return SceneFileInvalid(f"{path}: {'cut off: its header tells of more' if is_cut else 'not a scene file'}")
     reason = error.strerror if isinstance(error, OSError) and error.strerror else error  # the whole would name the path
     return SceneFileInvalid(f"{path}: not a scene file that can be read: {reason}")
 

@@ -210,7 +210,7 @@ class LocalizeResponse(_message.Message):
     def __init__(self, scene: _Optional[str] = ..., scene_sha256: _Optional[str] = ..., renderer: _Optional[str] = ..., pose: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., similarity: _Optional[float] = ..., is_found: _Optional[bool] = ..., position_std_mm: _Optional[_Union[AlongAxes, _Mapping]] = ..., angle_std_deg: _Optional[_Union[AlongAxes, _Mapping]] = ..., shift_mm: _Optional[float] = ..., turn_deg: _Optional[float] = ..., queue_ms: _Optional[float] = ..., search_ms: _Optional[float] = ..., flange_to_base: _Optional[_Union[_geometry_pb2.Matrix, _Mapping]] = ..., registration: _Optional[str] = ...) -> None: ...
 
 class Display(_message.Message):
-    __slots__ = ("gain_db", "dynamic_range_db", "tgc_db", "depth_mm", "flip", "pixel_mm", "edge")
+    __slots__ = ("gain_db", "dynamic_range_db", "tgc_db", "depth_mm", "flip", "pixel_mm", "edge", "gain_db_between", "dynamic_range_db_between", "display_seed")
     GAIN_DB_FIELD_NUMBER: _ClassVar[int]
     DYNAMIC_RANGE_DB_FIELD_NUMBER: _ClassVar[int]
     TGC_DB_FIELD_NUMBER: _ClassVar[int]
@@ -218,6 +218,9 @@ class Display(_message.Message):
     FLIP_FIELD_NUMBER: _ClassVar[int]
     PIXEL_MM_FIELD_NUMBER: _ClassVar[int]
     EDGE_FIELD_NUMBER: _ClassVar[int]
+    GAIN_DB_BETWEEN_FIELD_NUMBER: _ClassVar[int]
+    DYNAMIC_RANGE_DB_BETWEEN_FIELD_NUMBER: _ClassVar[int]
+    DISPLAY_SEED_FIELD_NUMBER: _ClassVar[int]
     gain_db: float
     dynamic_range_db: float
     tgc_db: _containers.RepeatedScalarFieldContainer[float]
@@ -225,7 +228,10 @@ class Display(_message.Message):
     flip: bool
     pixel_mm: float
     edge: float
-    def __init__(self, gain_db: _Optional[float] = ..., dynamic_range_db: _Optional[float] = ..., tgc_db: _Optional[_Iterable[float]] = ..., depth_mm: _Optional[float] = ..., flip: _Optional[bool] = ..., pixel_mm: _Optional[float] = ..., edge: _Optional[float] = ...) -> None: ...
+    gain_db_between: _containers.RepeatedScalarFieldContainer[float]
+    dynamic_range_db_between: _containers.RepeatedScalarFieldContainer[float]
+    display_seed: int
+    def __init__(self, gain_db: _Optional[float] = ..., dynamic_range_db: _Optional[float] = ..., tgc_db: _Optional[_Iterable[float]] = ..., depth_mm: _Optional[float] = ..., flip: _Optional[bool] = ..., pixel_mm: _Optional[float] = ..., edge: _Optional[float] = ..., gain_db_between: _Optional[_Iterable[float]] = ..., dynamic_range_db_between: _Optional[_Iterable[float]] = ..., display_seed: _Optional[int] = ...) -> None: ...
 
 class Picture(_message.Message):
     __slots__ = ("column_unit", "first_column", "first_row_mm", "column_step", "row_step_mm")

@@ -103,10 +103,11 @@ class Connection:
     """
 
     def __init__(self, address: str, api_key: str | None = None, tls: ssl.SSLContext | None = None) -> None:
+        address = address if "://" in address else f"http://{address}"
         self._parts = urlsplit(address)
         if self._parts.scheme not in ("http", "https") or not self._parts.netloc:
             raise InvalidArgument(
-                f"--address must be a URL such as http://127.0.0.1:8000, got {address!r}", field="address"
+                f"--address must be HOST:PORT or a URL such as http://127.0.0.1:8000, got {address!r}", field="address"
             )
         self.address = address.rstrip("/")
         self._tls = tls
@@ -227,6 +228,9 @@ class Connection:
     def _unreachable(self, reason: object) -> UltragrayError:
         if (problem := tls_problem(self.address, reason)) is not None:
             return UltragrayError(problem)
+        if isinstance(reason, http.client.BadStatusLine) and not isinstance(reason, http.client.RemoteDisconnected):
+            hint = cut_off_hint(self.address, reason)
+            return UltragrayError(f"{self.address} does not speak HTTP; if it is the port of gRPC, give HTTP's{hint}")
         return NotReady(
             f"no service answers at {self.address} ({_in_words(reason)}); start one with `ultragray serve`, or name it "
             f"with --address{cut_off_hint(self.address, reason)}"
@@ -260,7 +264,10 @@ class _Counted:
 
 
 def route(*parts: str, suffix: str = "") -> str:
-    """The path of a resource, below /v1; `suffix` stands behind it as it is."""
+    """The path of a resource, below /v1; `suffix` stands behind it as it is. Raises InvalidArgument for no name."""
+    for name in parts[1:2]:
+        if not name or "/" in name:
+            raise InvalidArgument(f"{parts[0]} have names of letters, digits, '.', '_' and '-', got {name!r}")
     return "/v1/" + "/".join(quote(part, safe="") for part in parts) + suffix
 
 
@@ -290,8 +297,8 @@ def _connected(
     client_key: Annotated[Path | None, _option("Its key (PEM), not encrypted.", CLIENT_KEY, TLS)] = None,
 ) -> Connection:
     connection = Connection(address, api_key, client_context(ca, client_certificate, client_key))
-    if api_key is not None and exposes_key(address):
-        warn(f"the API key travels unencrypted to {address}, and whoever is on the way can read it")
+    if api_key is not None and exposes_key(connection.address):
+        warn(f"the API key travels unencrypted to {connection.address}, and whoever is on the way can read it")
     return connection
 
 

@@ -44,6 +44,7 @@ FLAGS = {
 _WITH_AN_OPTION_A_FIELD = (Sampler,)  # of all families
 _PARSED = (bool, int, float, Path)
 _FILES = ("poses", "tools")  # fields that are read from a file
+_BETWEEN = "_between"  # ends the name of the field that an option fills in which is given as LOW:HIGH
 
 
 class FieldsOf:
@@ -110,7 +111,8 @@ def parameters_of(cls: Any, name: str = "") -> list[inspect.Parameter]:
         elif item is argument:
             found.insert(0, _parameter(item, kind, topic=None, is_argument=True))
         else:
-            found.append(_parameter(item, kind, topic=cls.__topic__))
+            varies = " LOW:HIGH: drawn at random for each frame." if _may_vary(cls, item) else ""
+            found.append(_parameter(item, str if varies else kind, topic=cls.__topic__, more=varies))
     return found
 
 
@@ -131,6 +133,9 @@ def values_of(cls: Any, given: Mapping[str, Any]) -> dict[str, Any]:
             value = (not item.default) if given[item.name] else None
         elif _is_within(kind):
             value = _part(kind, item.name, given)
+        elif _may_vary(cls, item) and ":" in (given[item.name] or ""):
+            found[item.name + _BETWEEN] = from_text(given[item.name].replace(":", ","), tuple[float, ...])
+            continue
         else:
             value = None if given[item.name] is None else _read(given[item.name], kind, item.name)
         if value is not None:
@@ -140,8 +145,12 @@ def values_of(cls: Any, given: Mapping[str, Any]) -> dict[str, Any]:
 
 def _fields(cls: Any) -> Iterator[tuple[Field[Any], Any]]:
     for item, annotation in annotated_fields(cls):
-        if item.name != "kind":
+        if item.name != "kind" and not item.name.endswith(_BETWEEN):
             yield item, optional_of(annotation)[0]
+
+
+def _may_vary(cls: Any, item: Field[Any]) -> bool:
+    return hasattr(cls, item.name + _BETWEEN)
 
 
 def _is_within(kind: Any) -> bool:
@@ -161,7 +170,13 @@ def _family_parameters(family: Any, name: str) -> Iterator[inspect.Parameter]:
 
 
 def _parameter(
-    item: Field[Any], kind: Any, *, topic: str | None, is_argument: bool = False, takers: Sequence[str] = ()
+    item: Field[Any],
+    kind: Any,
+    *,
+    topic: str | None,
+    is_argument: bool = False,
+    takers: Sequence[str] = (),
+    more: str = "",
 ) -> inspect.Parameter:
     """The option of a field, in the panel of its own topic, else of `topic`; `takers`: the kinds that take it."""
     meaning = str(item.metadata["description"])
@@ -176,8 +191,10 @@ def _parameter(
     is_enum = isinstance(kind, type) and issubclass(kind, Enum)
     if choices := [one.value for one in kind] if is_enum else item.metadata.get("choices"):
         meaning += f" One of {', '.join(choices)}."
+    meaning += more
     if isinstance(kind, type) and issubclass(kind, Family):
-        meaning += f" As JSON, a kind with its numbers: {'; '.join(map(_signature, kind.members.values()))}."
+        named = f" One of {', '.join(kind.named)}, or as" if kind.named else " As"
+        meaning += f"{named} JSON, a kind with its numbers: {'; '.join(map(_signature, kind.members.values()))}."
     is_switch, is_table = kind is bool, get_origin(kind) is dict
     parsed: Any = list[str] if is_table else Path if item.name in _FILES else kind if kind in _PARSED else str
     flags = FLAGS.get(item.name, (_flag(f"no_{item.name}" if item.default is True else item.name),))
@@ -235,6 +252,17 @@ def _part(cls: Any, name: str, given: Mapping[str, Any]) -> Any:
     options = dict.fromkeys(item.name for member in cls.members.values() for item, _ in _fields(member))
     document = {option: given[option] for option in options if given[option] is not None}
     if given[name] is not None:
+        if (member := cls.members.get(given[name])) is None:
+            raise InvalidArgument(
+                f"{_flag(name)} must be one of {', '.join(cls.members)}, got {given[name]!r}", field=name
+            )
+        taken = {item.name: item for item, _ in _fields(member)}
+        for option, item in taken.items():
+            if _is_required(item) and option not in document:
+                raise InvalidArgument(f"{_flag(name)} {given[name]} needs {_flag(option)}", field=option)
+        for option in document:
+            if option not in taken:
+                raise InvalidArgument(f"{_flag(name)} {given[name]} takes no {_flag(option)}", field=option)
         return from_dict(cls, {"kind": given[name], **document})
     for option in document:
         raise InvalidArgument(f"{_flag(option)} is of a {name}: name it with {_flag(name)}", field=option)
@@ -249,15 +277,17 @@ def _read(value: Any, kind: Any, name: str) -> Any:
     if get_origin(kind) is dict:
         return pairs_of(value, FLAGS[name][0]) if get_args(kind)[1] is str else parse_settings(value)
     if isinstance(kind, type) and issubclass(kind, Family):
-        return from_dict(kind, _parsed_json(value, name))
-    return value
+        return kind.named[value] if value in kind.named else from_dict(kind, _parsed_json(value, kind, name))
+    return from_text(value, kind) if isinstance(value, str) else value
 
 
-def _parsed_json(text: str, name: str) -> Any:
+def _parsed_json(text: str, family: type[Family], name: str) -> Any:
     try:
         return json.loads(text)
     except (json.JSONDecodeError, RecursionError) as error:
-        raise InvalidArgument(f"{_flag(name)} must be a JSON object: {error}", field=name) from error
+        names = "".join(f"{one}, " for one in family.named)
+        what = f"one of {names}or a JSON object" if names else "a JSON object"
+        raise InvalidArgument(f"{_flag(name)} must be {what}: {error}", field=name) from error
 
 
 def parse_settings(settings: list[str]) -> dict[str, Any]:

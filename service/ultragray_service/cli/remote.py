@@ -15,7 +15,7 @@ from urllib.parse import urlencode
 import numpy as np
 
 from ultragray.contract import from_dict, to_dict
-from ultragray.datasets.source import COMPANIONS, UPLOAD_OPTIONS, UPLOADED_FORMATS, SourceOptions
+from ultragray.datasets.source import COMPANIONS, UPLOAD_OPTIONS, UPLOADED_FORMATS, SourceOptions, find_source
 from ultragray.errors import DatasetInvalid, InvalidArgument
 from ultragray.exchange.poses import load_poses
 from ultragray.files import write_whole
@@ -351,11 +351,8 @@ def archive_of(source: Path, companions: Mapping[str, Path] | None = None) -> It
 
 def _files_of(source: Path) -> list[Path]:
     if source.is_dir():
-        files = sorted(path for path in source.rglob("*") if path.is_file() and not _is_hidden(path, source))
-        if not any(one.is_file(path) for one in UPLOADED_FORMATS for path in files):
-            expected = "; ".join(one.meaning for one in UPLOADED_FORMATS)
-            raise DatasetInvalid(f"{source}: no sweep lies in this folder; expected is one of: {expected}")
-        return files
+        find_source(source)
+        return sorted(path for path in source.rglob("*") if path.is_file() and not _is_hidden(path, source))
     if not source.is_file():
         raise DatasetInvalid(f"{source}: no such file or folder")
     if _is_of_a_folder(source):

@@ -1,5 +1,6 @@
 """Every kind of source behind one call."""
 
+import shutil
 from dataclasses import fields
 
 import numpy as np
@@ -44,6 +45,21 @@ def test_a_sequence(tmp_path, plus_files, device_set):
     assert chosen.val.frame_numbers.tolist() == [6, 7]
 
 
+def test_a_folder_is_read_as_an_upload_of_it_is(tmp_path, plus_files, device_set, folder):
+    place = tmp_path / "recorded" / "raw"
+    place.mkdir(parents=True)
+    plus_files.write_mha(place / "name.igs.mha", plus_files.speckle(12, 30, 20), plus_files.tracked_fields(12))
+    shutil.copy(device_set, place)
+    (place / ".hidden.igs.mha").touch()
+    dataset = load_dataset(tmp_path / "recorded")
+    assert (dataset.name, len(dataset.train)) == ("name", 10)
+    shutil.copytree(folder, tmp_path / "recorded" / "converted")
+    assert load_dataset(tmp_path / "recorded").name == load_dataset(folder).name  # a whole folder before a file
+    shutil.copytree(folder, tmp_path / "recorded" / "again")
+    with pytest.raises(DatasetInvalid, match=r"recorded must hold one dataset, it holds again/conf.json, converted/"):
+        load_dataset(tmp_path / "recorded")
+
+
 def test_the_word_phantom(monkeypatch, make_sweep):
     made = Dataset("phantom", make_sweep(6), make_sweep(2))
     monkeypatch.setattr(phantom, "load_phantom", lambda: made)
@@ -55,7 +71,7 @@ def test_sources_that_are_none_are_refused(folder, tmp_path):
     with pytest.raises(DatasetInvalid, match="nowhere: no such file or folder"):
         load_dataset(tmp_path / "nowhere")
     (tmp_path / "empty").mkdir()
-    with pytest.raises(DatasetInvalid, match=r"empty/conf\.json: no such file"):
+    with pytest.raises(DatasetInvalid, match=r"empty must hold a folder with conf\.json .*; it holds no files"):
         load_dataset(tmp_path / "empty")
     (tmp_path / "a.txt").write_text("")
     with pytest.raises(DatasetInvalid, match=r"a\.txt: a dataset is a folder with conf\.json"):

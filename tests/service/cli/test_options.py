@@ -95,10 +95,10 @@ def test_help_has_the_meaning_the_limits_and_the_default() -> None:
         (("--number", 10), "number must be an integer from 1 to 9, got 10"),
         (("--gains", "1,b"), r"gains\[1\] must be a finite number, got 'b'"),
         (("--way", "up"), "way must be one of there, back, got 'up'"),
-        (("--probe", "{"), "--probe must be a JSON object"),
+        (("--probe", "{"), "--probe must be one of C5-2, C9-4, "),
         (("--pixel-mm", 0.1), "pixel_mm must be a finite number of at least 0.5, got 0.1"),
         (("--tilt-deg", 3), "--tilt-deg is of a sampler: name it with --sampler"),
-        (("--sampler", "fan", "--tilt-deg", 3), "step_deg is required"),
+        (("--sampler", "fan", "--tilt-deg", 3), "--sampler fan needs --step-deg"),
     ],
 )
 def test_mistakes_are_named(arguments: tuple[object, ...], told: str) -> None:

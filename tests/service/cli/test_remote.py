@@ -120,9 +120,15 @@ def test_a_folder_becomes_a_dataset(server, sweep):
     assert "tiny" in refused(server, "datasets", "show", "tiny")
 
 
+def test_the_port_of_grpc_is_told_from_that_of_http(server):
+    told = refused(server, "scenes", "list", "--address", server.grpc)
+    assert told.startswith(f"error: http://{server.grpc} does not speak HTTP; if it is the port of gRPC, give HTTP's")
+    assert told.strip().isprintable()
+
+
 def test_what_is_no_sweep_is_not_sent(server, tmp_path):
     (tmp_path / "notes.txt").write_text("nothing")
-    assert "no sweep lies in this folder" in refused(server, "datasets", "upload", tmp_path)
+    assert "must hold a folder with conf.json" in refused(server, "datasets", "upload", tmp_path)
     (tmp_path / "a.zip").write_bytes(b"no zip at all")
     assert refused(server, "datasets", "upload", tmp_path / "a.zip")
     assert json.loads(done(server, "datasets", "list", "--json")) == []

@@ -11,10 +11,12 @@ import torch
 
 import ultragray
 from ultragray import GaussianScene, LinearProbe, render
-from ultragray.contract import to_dict
+from ultragray.contract import from_dict, to_dict
 from ultragray.datasets.plus import read_plus_sweep
 from ultragray.files import file_sha256
 from ultragray.rendering.backends import cpu
+from ultragray.rendering.display import Display
+from ultragray.rendering.frames import show
 from ultragray.rendering.settings import SettingsUsed
 from ultragray.rendering.tools import Needle, ToolFrame
 from ultragray.samplers import FanSampler
@@ -54,6 +56,20 @@ def test_without_poses_the_training_views_are_rendered_as_trained(scene_file, tm
     assert run("render", scene_file, "-o", tmp_path / "f.npz").exit_code == 0
     with np.load(tmp_path / "f.npz") as frames:
         assert frames["bmode"].shape == (5, 24, 20)
+
+
+def test_display_settings_vary_within_a_batch_and_are_told(scene_file, tmp_path):
+    output = tmp_path / "f.npz"
+    line = ("render", scene_file, "--gain-db", "-6:6", "--display-seed", 3, "--height", 16, "--width", 12, "-o", output)
+    assert run(*line).exit_code == 0
+    with np.load(output) as frames:
+        display = from_dict(Display, json.loads(str(frames["display"])))
+        assert display == Display(gain_db_between=(-6.0, 6.0), display_seed=3)
+        scene = GaussianScene.load(scene_file)
+        for pose, bmode in zip(frames["poses"], frames["bmode"], strict=True):
+            plain = render(scene, None, pose, height=16, width=12, outputs=("bmode",))
+            expected = show(plain, scene.info.probe, display.of_frame(pose))["bmode"]
+            np.testing.assert_allclose(bmode, expected[0].numpy(), atol=1e-6)
 
 
 def test_render_writes_pngs(scene_file, tmp_path):
@@ -117,7 +133,7 @@ def test_render_draws_the_tools_of_a_file(scene_file, tmp_path):
         assert json.loads(str(frames["tools"])) == to_dict((needle,))
     file.write_text('[{"kind": "needle", "tip_mm": [0, 0, 1]}]')
     told = refused(*arguments, "--force")
-    assert f"{file}: tools[0].hub_mm is required by kind needle" in told
+    assert f"{file}: tools[0].hub_mm is required by the tool needle" in told
     file.write_text(json.dumps(to_dict((needle,) * 9)))
     assert "tools must be a list of at most 8 values, got 9" in refused(*arguments, "--force")
 

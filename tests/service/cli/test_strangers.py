@@ -91,7 +91,7 @@ def test_a_folder_is_uploaded_without_what_is_hidden(tmp_path):
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(b"x")
     assert archived(tmp_path) == ["conf.json", "images_train.npy"]
-    with pytest.raises(DatasetInvalid, match="no sweep lies in this folder"), archive_of(tmp_path / ".git"):
+    with pytest.raises(DatasetInvalid, match="must hold a folder with"), archive_of(tmp_path / ".git"):
         pass
 
 

@@ -314,6 +314,23 @@ def test_a_page_with_its_table_as_json_and_latex(dataset, tmp_path):
     assert f"wrote {page}\n" in result.stdout
 
 
+def test_a_comparison_over_seeds_has_error_bars(dataset, tmp_path):
+    page = tmp_path / "ball.html"
+    line = ("compare", dataset, "--methods", "linear,nearest", "--seeds", 2, "--seed", 7, "-o", page)
+    result = run(*line)
+    assert result.exit_code == 0, result.output
+    assert "2 seeds from 7" in result.stdout
+    assert re.search(r"linear between frames +\d+\.\d\d ± 0\.00 +\d\.\d{3} ± 0\.000", result.stdout)
+    document = json.loads((tmp_path / "ball.json").read_text())
+    assert [one["seed"] for one in document["seeds"]] == [7, 8]
+    means = [one["results"][0]["evaluation"]["mean"]["psnr_db"] for one in document["seeds"]]
+    assert document["over_seeds"]["linear between frames"]["psnr_db"]["mean"] == pytest.approx(np.mean(means))
+    assert (tmp_path / "ball.svg").read_text().startswith("<svg")
+    assert run(*line).exit_code == 0  # goes on with what is there
+    means = json.loads(run(*line[:-2], "--json").stdout)["over_seeds"]
+    assert means == document["over_seeds"]
+
+
 def test_a_comparison_of_which_nothing_could_be_measured_ends_with_an_error(tmp_path):
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[:, 1, 3] = [0.0, 10_000.0, 20_000.0, 30_000.0]  # mm: no volume of voxels holds that

@@ -29,14 +29,16 @@ WRONG = {  # the command line, and a part of the line that it gives
     # Values of options.
     "render scene.ugr -o a.npz --height tall": "--height must be a valid integer, got 'tall'",
     "render scene.ugr -o a.npz --height 0": "height must be an integer from 1",
-    "render scene.ugr -o a.npz --sampler orbit": "kind must be one of around",
-    "render scene.ugr -o a.npz --probe {": "--probe must be a JSON object",
+    "render scene.ugr -o a.npz --sampler orbit": "--sampler must be one of around",
+    "render scene.ugr -o a.npz --probe {": "P4-2, or a JSON object",
     "render scene.ugr -o a.npz --backend gpu": "backend must be one of",
     'render scene.ugr -o a.npz --probe {"kind":"sector"}': "kind must be one of convex, linear, phased",
     "render scene.ugr -o a.npz --tgc-db 1,two": "tgc_db[1] must be a finite number from -100 to 100, got 'two'",
     "render scene.ugr -o a.dcm --outputs echo": "bmode alone in format dicom",
     "render scene.ugr -o pictures --dtype uint8": "--dtype must be left out for PNGs",
     "render scene.ugr -o a.npz --seed 3": "--seed is of a sampler",
+    "render scene.ugr -o a.npz --sampler around": "--sampler around needs --count",
+    "render scene.ugr -o a.npz --sampler around --count 3 --step-deg 2": "--sampler around takes no --step-deg",
     "render scene.ugr -o a.npz --sampler around --count 100001": "count 100,001 is more than the 100,000 poses",
     "render scene.ugr -o a --sampler around --count 20 --shard-frames 5": "--shard-frames is of shards: name an engine",
     "render scene.ugr -o a --sampler around --count 20 --on spark": "on must be ray or ray://HEAD:PORT, got 'spark'",
@@ -85,6 +87,10 @@ WRONG = {  # the command line, and a part of the line that it gives
     "import notes.ply -o a.ugr": "notes.ply",
     "import notes.pt -o a.ugr": "--config must be given",
     "serve notes.ugr": "notes.ugr: not a scene file",
+    "show cut.ugr": "cut.ugr: cut off",
+    "show begun.ugr": "begun.ugr: not a scene file",
+    "train notes -o a.ugr": "notes must hold a folder with conf.json",
+    "datasets upload notes": "notes must hold a folder with conf.json",
     "datasets upload none": "none: no such file or folder",
     "datasets upload notes.txt": "an upload is an archive",
     "localize scene.ugr notes.txt --start pose.npy": "must end in .png or .npy",
@@ -120,7 +126,10 @@ WRONG = {  # the command line, and a part of the line that it gives
     f"scenes render demo -o a.png --registration arm --address {NOBODY}": "a registration leads the poses of a file",
     f"jobs download 7 name -o none/name --address {NOBODY}": "output must lie in a folder that exists",
     # A service that is not there.
-    "scenes list --address localhost:8000": "--address must be a URL such as http://127.0.0.1:8000",
+    "scenes list --address ftp://localhost": "--address must be HOST:PORT or a URL such as http://127.0.0.1:8000",
+    "scenes list --address 127.0.0.1:9": f"no service answers at {NOBODY} (connection refused)",
+    "scenes show a/b": "scenes have names of letters, digits, '.', '_' and '-', got 'a/b'",
+    "jobs cancel a/b": "jobs have names",
     f"scenes list --address {NOBODY}": f"no service answers at {NOBODY} (connection refused)",
     f"datasets upload sweep --address {NOBODY}": f"no service answers at {NOBODY}",
     f"jobs watch 7 --address {NOBODY}": f"no service answers at {NOBODY}",
@@ -146,6 +155,11 @@ def place(tmp_path_factory):
     """A folder with a scene, a sweep, and files that are something else."""
     folder = tmp_path_factory.mktemp("place")
     copy_demo_scene(folder / "scene.ugr")
+    whole = (folder / "scene.ugr").read_bytes()
+    (folder / "cut.ugr").write_bytes(whole[: len(whole) // 2])
+    (folder / "begun.ugr").write_bytes(whole[:20])
+    (folder / "notes").mkdir()
+    (folder / "notes" / "notes.txt").touch()
     noise_sweep(folder / "sweep")
     np.save(folder / "pose.npy", np.eye(4))
     for name in ("notes.txt", "notes.ugr", "notes.ply", "notes.pt", "kept.npz"):

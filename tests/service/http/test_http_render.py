@@ -86,6 +86,23 @@ def test_a_scene_without_a_probe_renders_when_one_is_given(http, pose_body):
     assert post(http, {"pose": pose_body, "probe": probe}, scene="probeless").status_code == 200
 
 
+def test_a_probe_may_be_given_by_name(http, pose_body):
+    named, spelled_out = (
+        post(http, {"pose": pose_body, "probe": probe}, "image/png")
+        for probe in ("L12-4", {"kind": "linear", "width_mm": 38.0, "near_mm": 0.0, "far_mm": 60.0})
+    )
+    assert (named.status_code, named.content) == (200, spelled_out.content)
+    assert json.loads(named.headers["x-ultragray-probe"])["width_mm"] == 38.0
+    for probe in ("L12-5", 3):
+        refused = post(http, {"pose": pose_body, "probe": probe})
+        assert (refused.status_code, refused.json()["field"], refused.json()["reason"]) == (
+            422,
+            "probe",
+            "INVALID_PROBE",
+        )
+        assert "got" in refused.json()["detail"]
+
+
 def test_request_id_is_echoed_or_made(http, pose_body):
     headers = {"X-Request-Id": "robot-7.42"}
     answer = http.post("/v1/scenes/demo/render", json={"pose": pose_body}, headers=headers)

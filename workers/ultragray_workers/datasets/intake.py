@@ -15,6 +15,7 @@ from datetime import datetime, timezone
 from pathlib import Path
 from typing import IO
 
+from ultragray.datasets.source import find_source, load_dataset, options_of
 from ultragray.errors import DatasetInvalid, UltragrayError
 from ultragray.files import sync
 from ultragray_workers.claims import claimed_folder, remove_abandoned, storage_full
@@ -23,7 +24,6 @@ from ultragray_workers.datasets.store import (
     FILES_NAME,
     DatasetRecord,
     DatasetStore,
-    find_source,
     write_manifest,
 )
 from ultragray_workers.datasets.unpack import FileBudget, create_below, unpack
@@ -121,9 +121,10 @@ def remove_stale(store: DatasetStore) -> int:
     return remove_abandoned(store.folder, PREFIX)
 
 
-def take_in(folder: str, name: str, options: dict[str, str], max_bytes: int) -> None:
+def take_in(folder: str, name: str, options: dict[str, str], max_bytes: int, *, simulated: bool = False) -> None:
     """Complete the dataset in the folder of an IncomingDataset: unpacked, checked, with contact sheet and manifest.
 
+    `simulated`: it holds nothing, and gets the built-in phantom.
     Raises DatasetInvalid with the file and the frame, InvalidArgument for an option, UploadTooLarge, StorageFull.
     """
     incoming = Path(folder).resolve()
@@ -134,10 +135,21 @@ def take_in(folder: str, name: str, options: dict[str, str], max_bytes: int) -> 
         if archive.exists():
             unpack(archive, files, max_bytes)
             archive.unlink()
+        if simulated:
+            _simulate(files, max_bytes)
         record = check_files(files, name, options, dataset_folder / CONTACT_SHEET_NAME)
         for path in (*(path for path in files.rglob("*") if path.is_dir()), files):
             sync(path)
         write_manifest(record, dataset_folder)
+
+
+def _simulate(files: Path, max_bytes: int) -> None:
+    """Writes the built-in phantom. Raises UploadTooLarge."""
+    from ultragray.datasets.released import write_released
+    from ultragray.phantom import load_phantom
+
+    write_released(load_phantom(), files)
+    FileBudget(max_bytes).take_bytes(sum(path.stat().st_size for path in files.iterdir()))
 
 
 def check_files(files: Path, name: str, options: dict[str, str], contact_sheet: Path) -> DatasetRecord:
@@ -145,14 +157,14 @@ def check_files(files: Path, name: str, options: dict[str, str], contact_sheet: 
     from ultragray.datasets.checks import check_dataset
     from ultragray.datasets.pictures import draw_dataset
 
-    uploaded = find_source(files)
-    uploaded.format.check_upload(uploaded.path, files)
-    dataset = replace(uploaded.load(options), name=name)
+    source = find_source(files)
+    source.format.check_upload(source.path, files)
+    dataset = replace(load_dataset(files, options_of(options)), name=name)
     report = check_dataset(dataset)
     draw_dataset(dataset, contact_sheet)
     return DatasetRecord(
         name=name,
-        kind=uploaded.format.name,
+        kind=source.format.name,
         sha256=dataset.sha256,
         bytes=sum(path.stat().st_size for path in files.rglob("*") if path.is_file()),
         created_at=datetime.now(timezone.utc).isoformat(timespec="seconds"),

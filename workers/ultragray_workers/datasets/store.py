@@ -19,12 +19,11 @@ import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, fields, replace
-from fnmatch import fnmatchcase
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 from ultragray.contract import Contract, described, from_dict, to_dict
-from ultragray.datasets.source import UPLOADED_FORMATS, DatasetFormat, SourceOptions, load_dataset
+from ultragray.datasets.source import UPLOADED_FORMATS, load_dataset, options_of
 from ultragray.errors import DatasetInvalid, InvalidArgument, UltragrayError
 from ultragray.files import file_sha256, require_version, write_whole
 from ultragray.geometry.probe import Probe
@@ -46,49 +45,9 @@ FORMAT_VERSION = 1  # of the manifest
 _NOT_KEPT = ("owner", "private")  # in the manifest: they are the database's
 _STORED = "stored"  # key of the manifest
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]{0,127}")
-_NAMES_IN_MESSAGE = 5
 _AT_ONCE = 8  # files
 _LISTED_FOR_S = 1.0  # after which a data set that was listed is asked for again
 _STRAY_AFTER_S = 86_400.0  # longer than any upload may take
-
-
-@dataclass(frozen=True)
-class UploadedSource:
-    """The file by which the dataset is known, and the files that are options of it."""
-
-    format: DatasetFormat
-    path: Path
-    companions: dict[str, Path]  # by the name of the option
-
-    def load(self, options: dict[str, str]) -> Dataset:
-        given: dict[str, Any] = {**options, **self.companions}
-        return load_dataset(self.path, SourceOptions(**given))
-
-
-def find_source(files: Path) -> UploadedSource:
-    """The dataset below a folder. Raises DatasetInvalid, naming files from that folder, where there is not one."""
-    relative = sorted(path.relative_to(files) for path in files.rglob("*") if path.is_file())
-    plain = [path for path in relative if not any(part.startswith((".", "__MACOSX")) for part in path.parts)]
-    sources = [(one, path) for one in UPLOADED_FORMATS for path in plain if one.is_file(path)]
-    if not sources:
-        expected = " or ".join(one.upload_meaning for one in UPLOADED_FORMATS)
-        raise DatasetInvalid(f"the upload must hold {expected}, it holds {_listed(plain) or 'no files'}")
-    if len(sources) > 1:
-        raise DatasetInvalid(f"the upload must hold one dataset, it holds {_listed([path for _, path in sources])}")
-    ((found, source),) = sources
-    companions = {}
-    for option, pattern in found.companions.items():
-        matching = [path for path in plain if fnmatchcase(path.name.lower(), pattern)]
-        if len(matching) > 1:
-            raise DatasetInvalid(f"the upload must hold at most one {option} ({pattern}), it holds {_listed(matching)}")
-        if matching:
-            companions[option] = files / matching[0]
-    return UploadedSource(found, files / source, companions)
-
-
-def _listed(paths: list[Path]) -> str:
-    shown = ", ".join(map(str, paths[:_NAMES_IN_MESSAGE]))
-    return shown + (f" and {len(paths) - _NAMES_IN_MESSAGE} more" if len(paths) > _NAMES_IN_MESSAGE else "")
 
 
 @dataclass(frozen=True)
@@ -201,7 +160,7 @@ class DatasetStore:
         """Read a data set as it was when it was accepted. Raises DatasetNotFound, DatasetInvalid."""
         record = self.get(name)
         with self.files(name) as folder:
-            return replace(find_source(folder / FILES_NAME).load(record.options), name=name)
+            return replace(load_dataset(folder / FILES_NAME, options_of(record.options)), name=name)
 
     def contact_sheet(self, name: str) -> bytes:
         self._require_shown(name)
@@ -263,8 +222,12 @@ class DatasetStore:
     def present(self, folder: Path, name: str) -> DatasetRecord:
         """The data set `name`, where it is the one in a complete folder. Raises DatasetExists for another."""
         record = DatasetRecord.from_json((folder / MANIFEST_NAME).read_text(encoding="utf-8"))
+        return self.held(name, record.sha256, record.options)
+
+    def held(self, name: str, sha256: str | None, options: dict[str, str]) -> DatasetRecord:
+        """The data set `name`, where it has that content and those options. Raises DatasetExists for another."""
         present = self._read(name)
-        if (present.sha256, present.options) == (record.sha256, record.options) and not self.hides(name):
+        if (present.sha256, present.options) == (sha256, options) and not self.hides(name):
             return present
         raise DatasetExists(
             f"there is already a dataset {name!r} with another content or other options: delete it first, or choose "

@@ -41,7 +41,9 @@ class Progress:
     step: int | None = described("Steps that are done of a training, or of the method at hand of a comparison.", None)
     steps: int | None = None
     loss: float | None = None
-    val_psnr_db: float | None = described("On the held-out frames, the last time it was measured.", None)
+    val_psnr_db: float | None = described(
+        "On some held-out frames, the last time it was measured; metrics are of all of them.", None
+    )
     gaussians: int | None = None
     frames_done: int | None = described(
         "Frames that are done, such as those of a render job in its archive; of a volume: layers of voxels.", None

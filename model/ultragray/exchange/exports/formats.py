@@ -117,6 +117,15 @@ _ALL: tuple[Format, ...] = (
         dtypes=("uint8", "float32"),
         package="mcap_ros2",
     ),
+    Format(
+        "parquet",
+        ".parquet",
+        "Parquet in the layout of Hugging Face datasets: a row a frame, with each output as a PNG, pose, figures and "
+        "the scene's name; origin as metadata",
+        f"{_HERE}.parquet:ParquetExporter",
+        dtypes=("uint8",),
+        package="pyarrow",
+    ),
     *(point.load() for point in entry_points(group="ultragray.exporters")),
 )
 FORMATS: dict[str, Format] = {format.name: format for format in _ALL}

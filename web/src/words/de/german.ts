@@ -12,7 +12,7 @@ const PLURALS = { reader: "Leser", operator: "Bediener", admin: "Verwalter" };
 const MARKS: Record<string, string> = { distance: "Strecke", ellipse: "Ellipse", angle: "Winkel", text: "Text" };
 
 const written = (value: number): string => String(value).replace(".", ",");
-const points = (count: number): string => `${count} ${count === 1 ? "Punkt" : "Punkte"}`;
+const points = (count: number): string => `${count} ${count === 1 ? "Prozentpunkt" : "Prozentpunkte"}`;
 
 const sentences: Translated<Words> = {
   connect: {
