@@ -10,6 +10,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from ultragray.errors import UltragrayError
+from ultragray.phantom.demo import simulated_sha256
 from ultragray_service.access.audit import AuditLog
 from ultragray_service.access.credentials import Guard, Sessions
 from ultragray_service.access.keys import KnownKeys, Snapshot
@@ -32,7 +33,7 @@ from ultragray_service.settings import Settings
 from ultragray_service.telemetry.logs import Tracing
 from ultragray_service.telemetry.metrics import Metrics
 from ultragray_service.views.poses import Assessing
-from ultragray_service.views.prepared import Comparisons, DatasetViews, TrainingViews, simulated_sha256
+from ultragray_service.views.prepared import Comparisons, DatasetViews, TrainingViews
 from ultragray_workers.errors import StartupFailed
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.pool.pool import RenderPool

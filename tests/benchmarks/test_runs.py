@@ -1,17 +1,24 @@
 """What `make results`, `methods` and `ablations` measure, and the tables that come of it."""
 
+import numpy as np
 import pytest
+import torch
 
 from ultragray.datasets.source import SourceOptions
 from ultragray.learn.evaluation.baselines import evaluate_baselines
 from ultragray.learn.evaluation.methods import ComparisonSettings
+from ultragray.learn.sweep import Sweep
 from ultragray.learn.training.agreement import with_shares
+from ultragray.phantom.demo import demo_poses, load_demo_scene
+from ultragray.rendering.frames import render
 
 from ..model.learn.training.test_agreement import FRAMES, hand_path, recording
 from ..model.learn.training.test_poses import PROBE
 from ..scripts import benchmark
 
-results, methods, ablations = map(benchmark, ("results_tables", "methods_tables", "ablations"))
+results, methods, ablations, localization = map(
+    benchmark, ("results_tables", "methods_tables", "ablations", "localization")
+)
 SETTINGS = {"steps": 3, "max_gaussians": 40}
 
 
@@ -54,3 +61,18 @@ def test_methods_are_compared_and_what_failed_is_a_row_with_its_reason(data, mon
     psnr = one["methods"]["median"]["mean"]["psnr_db"]
     assert any(line.startswith("| median compounding") and f"{psnr:.2f}" in line for line in lines)
     assert any(line.startswith("| Other | failed: the loss is nan") for line in lines)
+
+
+def test_frames_that_were_found_are_judged_by_the_true_poses_too():
+    scene, true = load_demo_scene(), demo_poses(3)[1:2]
+    bmode = render(scene, None, true, height=128, width=96, outputs=("bmode",))["bmode"].detach()
+    recorded = true.copy()
+    recorded[:, :3, 3] += 2.0 * true[:, :3, 1]  # mm across the image plane
+    images = (255.0 * bmode).round().to(torch.uint8).numpy()
+    sweep = Sweep(images, recorded, scene.info.probe_or(None), np.arange(1), "one frame")
+    run = localization.row(localization.HeldOut(scene, sweep, true=true))
+    assert (run["recorded"]["within"], run["on_path"], run["true"]["within"]) == (0.0, None, 1.0)
+    assert 1.8 < run["recorded"]["median_mm"] < 2.2
+    *_, row = localization.found_frames({"phantom": run})
+    assert row.startswith("| phantom | 1 | 0%: ")
+    assert "° |  | 100%: 0.0" in row

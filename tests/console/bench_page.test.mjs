@@ -3,7 +3,7 @@
 import assert from "node:assert/strict";
 import { describe, it } from "node:test";
 
-import { laidOut, openPage, picture, seriousFindings, until } from "./harness.mjs";
+import { BACKGROUND_TIMEOUT_MS, laidOut, openPage, picture, seriousFindings, until } from "./harness.mjs";
 import { makeSequence, REGION } from "./make_sequence.mjs";
 import { tested } from "./tested.mjs";
 
@@ -28,6 +28,14 @@ describe("a console without a sweep", () => {
     ]);
     assert.equal(chooser.isMultiple(), true);
     await picture(page, "train-empty");
+    await page.getByRole("button", { name: "Simulate one over the built-in phantom" }).click();
+    await page.getByText("The phantom is simulated").waitFor();
+    await page.getByRole("link", { name: "Maps", exact: true }).click();
+    await page.getByRole("link", { name: "Train", exact: true }).click();
+    await page.getByText("211 to train from, 24 held out").waitFor({ timeout: BACKGROUND_TIMEOUT_MS });
+    await picture(page, "train-phantom");
+    const { url } = at.service;
+    assert.equal((await fetch(`${url}/v1/datasets/phantom`, { method: "DELETE" })).status, 204);
     await page.getByRole("navigation", { name: "Sections" }).getByRole("link", { name: /^Jobs/ }).click();
     await page.getByText("No jobs yet.").waitFor();
     assert.deepEqual(await seriousFindings(page), []);
@@ -94,6 +102,8 @@ describe("a data set", () => {
     const thumbnails = page.getByRole("region", { name: "A few of them" }).locator("img");
     await until(() => thumbnails.count(), (count) => count === 6, "there are no examples");
     await page.getByText("256 of 1,000").waitFor();
+    for (const label of ["Depth samples", "Scan lines"])
+      assert.equal(await page.getByLabel(label, { exact: true }).getAttribute("placeholder"), "256");
     await page.getByLabel("Count").fill("400000");
     await page.getByLabel("Count").press("Tab");
     await estimate.getByText("400,000").waitFor();
@@ -112,7 +122,7 @@ describe("a data set", () => {
     await page.getByTestId("waits-for").waitFor();
     const [{ specification }] = await jobsOfService();
     assert.deepEqual(specification.sampler, { kind: "fan", tilt_deg: 10, step_deg: 5 });
-    assert.deepEqual([specification.outputs, specification.format], [["bmode", "echo"], "tar"]);
+    assert.deepEqual([specification.outputs, specification.format, specification.min_confidence], [["bmode", "echo"], "tar", 0.7]);
     assert.deepEqual([page.faults, page.foreign], [[], []]);
   });
 

@@ -104,9 +104,9 @@ export function launch() {
  *
  * `init`: what runs in it before its own scripts; `touch`: whether it is worked with fingers.
  */
-export async function openPage({ browser, service }, hash, { width = 1280, height = 800, scheme = "light", touch = false, init } = {}) {
+export async function openPage({ browser, service }, hash, { width = 1280, height = 800, scheme = "light", touch = false, locale = "en-US", init } = {}) {
   const viewed = { viewport: { width, height }, colorScheme: scheme, acceptDownloads: true };
-  const context = await browser.newContext({ ...viewed, hasTouch: touch, isMobile: touch });
+  const context = await browser.newContext({ ...viewed, hasTouch: touch, isMobile: touch, locale });
   await context.grantPermissions(["clipboard-read", "clipboard-write"], { origin: service.url });
   const page = await context.newPage();
   page.setDefaultTimeout(TIMEOUT_MS);

@@ -50,6 +50,15 @@ describe("the header", () => {
   });
 });
 
+describe("a console that nobody has set", () => {
+  it("speaks the first of the browser's languages that it knows", async () => {
+    for (const [locale, view] of [["de-AT", "Karten"], ["fr-FR", "Maps"]]) {
+      const page = await openPage(at, "", { locale });
+      await page.getByRole("link", { name: view, exact: true }).waitFor();
+    }
+  });
+});
+
 describe("a slider", () => {
   it("says what it takes where something else is typed, and takes nothing of it", async () => {
     const { page } = await openScan(at);

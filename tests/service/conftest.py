@@ -51,6 +51,7 @@ class RunningService:
             "ULTRAGRAY_EMBEDDED_WORKER": "false",
             "ULTRAGRAY_JOB_NICE": "0",  # no frames wait for the processors
             "ULTRAGRAY_DEFAULT_TIMEOUT_S": "600",  # others may keep the machine busy
+            "ULTRAGRAY_MAX_QUEUE_MS": "600000",
             "ULTRAGRAY_WORKER_GRACE_S": "600",
             "PYTEST_RUN": self._run,
             "PYTHONPATH": os.pathsep.join(str(ROOT / folder) for folder in SOURCE_FOLDERS),

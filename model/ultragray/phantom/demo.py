@@ -10,6 +10,7 @@ vertebrae are 35 mm apart.
 from __future__ import annotations
 
 import shutil
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -20,6 +21,7 @@ from ultragray.files import atomic_path
 from ultragray.geometry.probe import FloatArray
 from ultragray.phantom import PHANTOM_IMAGE_SIDE, PHANTOM_PROBE, Tissue, freehand_poses
 from ultragray.phantom.anatomy import LabelArray
+from ultragray.scene.info import read_header
 
 if TYPE_CHECKING:
     from ultragray.scene.gaussians import GaussianScene
@@ -39,6 +41,12 @@ def load_demo_scene() -> GaussianScene:
     from ultragray.scene.gaussians import GaussianScene
 
     return GaussianScene.load(DEMO_FILE)
+
+
+@cache
+def simulated_sha256() -> str | None:
+    """Of the phantom's dataset, without simulating it: the demo scene was trained from it."""
+    return read_header(DEMO_FILE).info.dataset_sha256
 
 
 def copy_demo_scene(path: str | Path) -> None:

@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -33,7 +34,8 @@ class SupportWatch:
         self._mask_below = settings.min_confidence if settings.below_min_confidence is Below.MASK else None
         self.masks = self._mask_below is not None  # pixels of frames with less
         self._assessor, self._extrapolations = assessor, extrapolations
-        self._shares: list[Tensor] = []
+        self._noted: list[Tensor | npt.NDArray[np.float32]] = []  # each [C]: shares that a GPU may be at work on
+        self._shares: list[float] = []  # those before
         self._contacts: list[FloatArray] = []
         self._count = 0
 
@@ -52,15 +54,16 @@ class SupportWatch:
             return None
         return torch.tensor(masked, device=coverage.device)[:, None, None] & (coverage < SUPPORT_COVERAGE)
 
-    def note(self, shares: Tensor) -> None:  # [C]
+    def note(self, shares: Tensor | npt.NDArray[np.float32]) -> None:  # [C]
         """Takes the shares of pixels with support of the next C poses."""
         self._count += len(shares)
-        self._shares.append(shares)
+        self._noted.append(shares)
 
     def completed(self, first: int, stop: int) -> list[Extrapolation]:
         """The extrapolations of some frames with what was seen of them; waits for a GPU to have rendered."""
-        shares = torch.cat(self._shares)[first:stop].tolist()
-        found = self._assessor.with_support(self._extrapolations[first:stop], shares)
+        self._shares.extend(share for some in self._noted for share in some.tolist())
+        self._noted.clear()
+        found = self._assessor.with_support(self._extrapolations[first:stop], self._shares[first:stop])
         if not self._contacts:
             return found
         contacts = np.concatenate(self._contacts)[first:stop].tolist()

@@ -110,7 +110,13 @@ OPERATIONS = (
         "DatasetService/GetDataset",
         "DatasetService/GetContactSheet",
     ),
-    _operation("dataset.upload", _OPERATOR, "PUT /v1/datasets/{dataset}", "DatasetService/UploadDataset"),
+    _operation(
+        "dataset.upload",
+        _OPERATOR,
+        "PUT /v1/datasets/{dataset}",
+        "POST /v1/datasets/{dataset}:simulate",
+        "DatasetService/UploadDataset",
+    ),
     _operation(
         "dataset.delete", _OPERATOR, "DELETE /v1/datasets/{dataset}", "DatasetService/DeleteDataset", owned=True
     ),

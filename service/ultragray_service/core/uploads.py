@@ -18,6 +18,7 @@ from ultragray.contract import from_dict
 from ultragray.datasets.source import SourceOptions
 from ultragray.errors import DatasetInvalid, SceneFileInvalid, UltragrayError
 from ultragray.files import sync
+from ultragray.phantom.demo import simulated_sha256
 from ultragray.scene.info import SceneHeader, read_header
 from ultragray_service.access.audit import account
 from ultragray_service.access.limits import Limits, Slots
@@ -231,8 +232,11 @@ class DatasetUpload:
             block, self._block = bytes(self._block), bytearray()
             await asyncio.to_thread(self._incoming.write, block)
 
-    async def finish(self) -> tuple[DatasetRecord, bool]:
-        """Checks what was sent and makes it a dataset; its record, and whether it is new. Raises DatasetInvalid."""
+    async def finish(self, *, simulated: bool = False) -> tuple[DatasetRecord, bool]:
+        """Checks what was sent and makes it a dataset; its record, and whether it is new. Raises DatasetInvalid.
+
+        `simulated`: the built-in phantom, where nothing was sent.
+        """
         async with self._finishing, self._claim.held():
             await self._flush()
             await asyncio.to_thread(self._incoming.finish)
@@ -241,8 +245,12 @@ class DatasetUpload:
                 "name": self._name,
                 "options": self._options,
                 "max_bytes": self._max_bytes,
+                "simulated": simulated,
             }
-            await self._take_name()
+            if not await self._take_name() and simulated:
+                store, sha256 = self._incoming.store, await asyncio.to_thread(simulated_sha256)
+                if await asyncio.to_thread(store.is_taken, self._name):
+                    return await asyncio.to_thread(store.held, self._name, sha256, {}), False
             await self._checks.run(
                 take_in,
                 arguments,

@@ -246,6 +246,11 @@ class BoundedHttp(HttpToolsProtocol):
     def send_400_response(self, msg: str) -> None:
         self._refuse(self._refused_for or RequestMalformed("this is no HTTP request that can be read"))
 
+    def timeout_keep_alive_handler(self) -> None:
+        """Closes a connection that waits for a request. Of one that has begun, `look` says what is wrong."""
+        if self._head_since is None:
+            super().timeout_keep_alive_handler()
+
     def look(self, now: float) -> None:
         elapsed_s, self._looked_at = now - self._looked_at, now
         body_bytes, self._body_bytes = self._body_bytes, 0

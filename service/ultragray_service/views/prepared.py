@@ -15,7 +15,6 @@ import time
 from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass
-from functools import cache
 from pathlib import Path
 from typing import ClassVar, Literal
 
@@ -25,10 +24,9 @@ from ultragray.contract import described
 from ultragray.datasets.source import PHANTOM
 from ultragray.errors import DatasetInvalid, TrainingStateInvalid, UltragrayError
 from ultragray.files import sync
-from ultragray.phantom.demo import DEMO_FILE
+from ultragray.phantom.demo import simulated_sha256
 from ultragray.rendering.pixels import encoded_image
 from ultragray.rendering.settings import Encoding
-from ultragray.scene.info import read_header
 from ultragray_service.core.jobs import Jobs
 from ultragray_service.core.poses import MatrixRows
 from ultragray_service.core.scenes import SceneCatalog
@@ -490,9 +488,3 @@ class Comparisons(Prepared):
         path = await asyncio.to_thread(self._scenes.path, scene)
         scene_sha256 = await in_own_thread(lambda: self._scenes.sha256(scene))
         return f"{_FORMAT}-{scene_sha256}-{wanted}", present.get(str(wanted)), path
-
-
-@cache
-def simulated_sha256() -> str | None:
-    """Of the dataset that the demo scene was trained from: it needs no upload, since it can be simulated."""
-    return read_header(DEMO_FILE).info.dataset_sha256

@@ -85,7 +85,8 @@ def requests_about(name):
     """Of each route that a thing can be asked for by its name, and of those that take the name in their body."""
     named = dict.fromkeys([kind.value for kind in PRIVATE], name) | {"index": 0, "what": "truth", "part": "train"}
     for method, template, operation in HttpRules().routes():
-        if operation.about in PRIVATE and method not in ("PUT", WEBSOCKET):
+        makes = method == "PUT" or template.endswith(":simulate")
+        if operation.about in PRIVATE and not makes and method != WEBSOCKET:
             body = next((one for end, one in BODIES.items() if template.endswith(end)), None)
             yield method, template.format(**named), body
     for method, path, body in NAMING:

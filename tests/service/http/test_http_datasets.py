@@ -149,6 +149,7 @@ def test_the_life_of_a_dataset(http, files, tmp_path):
     assert (again.status_code, again.json()) == (200, dataset)
     other = zipped(released_files(tmp_path / "other", seed=1))
     assert_problem(put(http, "liver", other), 409, "DATASET_EXISTS")
+    assert_problem(http.post("/v1/datasets/liver:simulate"), 409, "DATASET_EXISTS")
     assert http.get("/v1/datasets/liver").json() == dataset
 
     sheet = http.get("/v1/datasets/liver/contact-sheet")

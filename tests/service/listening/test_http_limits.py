@@ -39,7 +39,7 @@ def limited(start_service):
 def hasty(start_service):
     """A service whose patience a test reaches in moments."""
     return start_service(
-        api_keys=KEY, header_timeout_s=1, idle_timeout_s=2, min_bytes_per_s=1000, transfer_patience_s=1
+        api_keys=KEY, header_timeout_s=1, idle_timeout_s=1, min_bytes_per_s=1000, transfer_patience_s=1
     )
 
 

@@ -15,7 +15,7 @@ from ultragray.errors import DatasetInvalid, InvalidArgument
 from ultragray_workers import claims
 from ultragray_workers.datasets.intake import IncomingDataset, remove_stale, take_in
 from ultragray_workers.datasets.store import DatasetStore, check_dataset_name
-from ultragray_workers.errors import DatasetExists, DatasetInUse, DatasetNotFound
+from ultragray_workers.errors import DatasetExists, DatasetInUse, DatasetNotFound, UploadTooLarge
 
 from ...dicom_files import write_cine
 
@@ -95,6 +95,18 @@ def test_an_upload_becomes_a_dataset_that_training_reads(drawn, store, receive, 
     assert record.probe == LinearProbe(40.0, 0.0, 50.0)
     assert store.load("tiny").sha256 == record.sha256
     assert store.contact_sheet("tiny").startswith(b"\x89PNG")
+
+
+def test_the_built_in_phantom_is_written_where_nothing_was_sent(drawn, store, receive, monkeypatch):
+    made = Dataset("phantom", sweep(8, 0.0), sweep(3, 0.5))
+    monkeypatch.setattr("ultragray.phantom.load_phantom", lambda: made)  # half a minute
+    incoming = receive({})
+    take_in(**arguments(incoming, name="mine"), simulated=True)
+    record, _ = incoming.accept("mine")
+    assert (record.name, record.kind, record.train_frames, record.val_frames) == ("mine", "released", 8, 3)
+    assert np.array_equal(store.load("mine").train.images, made.train.images)
+    with pytest.raises(UploadTooLarge, match="100"):
+        take_in(**{**arguments(receive({})), "max_bytes": 100}, simulated=True)
 
 
 def test_warnings_of_the_check_are_kept(store, receive, files, tmp_path):

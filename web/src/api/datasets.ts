@@ -1,6 +1,6 @@
 /** Data sets: uploaded, checked, looked at. */
 
-import { address, getJson, keyHeaders, refusalOf, remove, type Schemas, Unreachable } from "./client";
+import { address, getJson, keyHeaders, postJson, refusalOf, remove, type Schemas, Unreachable } from "./client";
 
 /** Shares of the body that were sent, 0 to 1; 1 while the service checks what it got. */
 export type Told = (share: number) => void;
@@ -57,6 +57,9 @@ export function uploadDataset(
   for (const file of files) form.append("files", file, file.webkitRelativePath || file.name);
   return putFile(path, form, told, signal);
 }
+
+/** Has the service simulate a sweep over its built-in phantom, in about half a minute. */
+export const simulateDataset = (dataset: string): Promise<Dataset> => postJson("/v1/datasets/{dataset}:simulate", { dataset });
 
 export function datasetPoses(dataset: string, signal: AbortSignal): Promise<DatasetPoses> {
   return getJson("/v1/datasets/{dataset}/poses", { dataset }, { signal });

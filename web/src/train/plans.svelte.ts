@@ -124,6 +124,8 @@ const STARTS: Record<string, Record<string, unknown>> = {
 /** Those of its fields that say how frames are rendered, not where and into what. */
 const OF_JOB = ["scene", "poses", "sampler", "format", "dtype", "shard_frames", "outputs", "max_run_s", "device", "min_memory_gb", "worker_labels", "min_confidence", "below_min_confidence"];
 
+const ADVISED_CONFIDENCE = 0.7; // as the tutorial has it
+
 /** The data set that is prepared: its scene, sampler and files, and what the service expects of it. It outlives the view. */
 class RenderPlan {
   scene = $state("");
@@ -138,6 +140,8 @@ class RenderPlan {
   estimate = $state.raw<JobEstimate | null>(null);
   problem = $state<string | null>(null);
   asking = $state(false);
+  /** Whether nobody has said yet how little confidence will do. */
+  #advises = true;
 
   readonly specification = $derived.by<Record<string, unknown> | null>(() => {
     if (this.scene === "") return null;
@@ -160,6 +164,7 @@ class RenderPlan {
     this.description = found;
     const kept = this.outputs.filter((one) => found === null || found.outputs.some((output) => output === one));
     this.outputs = kept.length > 0 ? kept : ["bmode"];
+    if (this.#advises) this.given = withoutNull({ ...this.given, min_confidence: found?.confidence ? ADVISED_CONFIDENCE : null });
   }
 
   choose(kind: string): void {
@@ -172,6 +177,7 @@ class RenderPlan {
   }
 
   set(name: string, value: unknown): void {
+    if (name === "min_confidence") this.#advises = false;
     const { [name]: _, ...others } = this.given;
     this.given = value === null || value === FIELDS[name]?.default ? others : { ...others, [name]: value };
   }
@@ -189,6 +195,7 @@ class RenderPlan {
     this.sampler = withoutNull(settings);
     this.outputs = (outputs as string[] | undefined) ?? ["bmode"];
     this.given = withoutNull(given);
+    this.#advises = false;
     this.others = "";
   }
 

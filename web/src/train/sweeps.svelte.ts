@@ -1,7 +1,7 @@
 /** Sweeps on their way to the service: what their files say, where they are cropped, how they are sent, and which there are. */
 
-import { type Dataset, type DatasetOptions, listDatasets, uploadDataset } from "../api/datasets";
-import { Listed, Sending } from "../shared/asking.svelte";
+import { type Dataset, type DatasetOptions, listDatasets, simulateDataset, uploadDataset } from "../api/datasets";
+import { Attempt, Listed, Sending } from "../shared/asking.svelte";
 import { nameOfFile } from "../shared/text";
 
 export interface Size {
@@ -180,6 +180,16 @@ class Datasets extends Listed<Dataset[]> {
 }
 
 export const datasets = new Datasets();
+
+/** The sweep over the built-in phantom, for who has none. It goes on when the page shows another view. */
+class Simulation extends Attempt {
+  async start(): Promise<void> {
+    await this.run(() => simulateDataset("phantom"));
+    await datasets.refresh();
+  }
+}
+
+export const simulation = new Simulation();
 
 /** The sweep that is chosen and sent in Train. */
 class SweepUpload extends Sending {

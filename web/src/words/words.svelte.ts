@@ -18,7 +18,7 @@ class Language {
   catalogue = $state.raw<Words>(english);
 
   constructor() {
-    void this.#take(remembered()).catch(() => undefined); // English stays where the other cannot be loaded
+    void this.#take(wanted()).catch(() => undefined); // English stays where the other cannot be loaded
   }
 
   /** Takes a language and remembers it. Throws where its catalogue cannot be loaded. */
@@ -34,9 +34,10 @@ class Language {
   }
 }
 
-function remembered(): LanguageName {
-  const name = localStorage.getItem(STORAGE) ?? "";
-  return name in LANGUAGES ? (name as LanguageName) : "en";
+/** The language that was chosen here, else the first of the browser's that the console speaks. */
+function wanted(): LanguageName {
+  const names = [localStorage.getItem(STORAGE) ?? "", ...navigator.languages.map((tag) => tag.slice(0, 2).toLowerCase())];
+  return (names.find((name) => name in LANGUAGES) as LanguageName | undefined) ?? "en";
 }
 
 export const language = new Language();

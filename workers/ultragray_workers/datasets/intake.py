@@ -121,9 +121,10 @@ def remove_stale(store: DatasetStore) -> int:
     return remove_abandoned(store.folder, PREFIX)
 
 
-def take_in(folder: str, name: str, options: dict[str, str], max_bytes: int) -> None:
+def take_in(folder: str, name: str, options: dict[str, str], max_bytes: int, *, simulated: bool = False) -> None:
     """Complete the dataset in the folder of an IncomingDataset: unpacked, checked, with contact sheet and manifest.
 
+    `simulated`: it holds nothing, and gets the built-in phantom.
     Raises DatasetInvalid with the file and the frame, InvalidArgument for an option, UploadTooLarge, StorageFull.
     """
     incoming = Path(folder).resolve()
@@ -134,10 +135,21 @@ def take_in(folder: str, name: str, options: dict[str, str], max_bytes: int) -> 
         if archive.exists():
             unpack(archive, files, max_bytes)
             archive.unlink()
+        if simulated:
+            _simulate(files, max_bytes)
         record = check_files(files, name, options, dataset_folder / CONTACT_SHEET_NAME)
         for path in (*(path for path in files.rglob("*") if path.is_dir()), files):
             sync(path)
         write_manifest(record, dataset_folder)
+
+
+def _simulate(files: Path, max_bytes: int) -> None:
+    """Writes the built-in phantom. Raises UploadTooLarge."""
+    from ultragray.datasets.released import write_released
+    from ultragray.phantom import load_phantom
+
+    write_released(load_phantom(), files)
+    FileBudget(max_bytes).take_bytes(sum(path.stat().st_size for path in files.iterdir()))
 
 
 def check_files(files: Path, name: str, options: dict[str, str], contact_sheet: Path) -> DatasetRecord:

@@ -222,8 +222,12 @@ class DatasetStore:
     def present(self, folder: Path, name: str) -> DatasetRecord:
         """The data set `name`, where it is the one in a complete folder. Raises DatasetExists for another."""
         record = DatasetRecord.from_json((folder / MANIFEST_NAME).read_text(encoding="utf-8"))
+        return self.held(name, record.sha256, record.options)
+
+    def held(self, name: str, sha256: str | None, options: dict[str, str]) -> DatasetRecord:
+        """The data set `name`, where it has that content and those options. Raises DatasetExists for another."""
         present = self._read(name)
-        if (present.sha256, present.options) == (record.sha256, record.options) and not self.hides(name):
+        if (present.sha256, present.options) == (sha256, options) and not self.hides(name):
             return present
         raise DatasetExists(
             f"there is already a dataset {name!r} with another content or other options: delete it first, or choose "

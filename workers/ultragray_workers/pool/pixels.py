@@ -65,7 +65,7 @@ class _OnHost:
 
     def __init__(self, frames: Mapping[str, Tensor], wanted: Wanted) -> None:
         self._frames = {
-            name: frames[name].to("cpu", torch.uint8 if frames[name].dtype == torch.uint8 else torch.float32).numpy()
+            name: (frames[name] if frames[name].dtype == torch.uint8 else frames[name].float()).numpy()
             for name in wanted
         }
 

@@ -10,6 +10,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor
 
@@ -30,7 +32,7 @@ class Backend:
     # planes by name, [C, H, W] each: scene, probe, poses in cm [C, 4, 4], height, width, planes, limits, beam
     draw: Callable[..., dict[str, Tensor]]
     # B-mode in 8 bits and shares of supported pixels, as `cpu.render_grey`; None: by way of planes
-    draw_grey: Callable[..., tuple[Tensor, Tensor]] | None = None
+    draw_grey: Callable[..., tuple[Tensor, npt.NDArray[np.float32]]] | None = None
     # whether it can draw a scene, which depends on where its tensors lie, and of which type they are
     supports: Callable[[GaussianScene], bool] = lambda _: True
     require: Callable[[], None] = lambda: None  # raises BackendUnavailable where it cannot draw here

@@ -119,6 +119,24 @@ async def put_dataset(
     return service.datasets.with_owner(record)
 
 
+@router.post(
+    "/{dataset}:simulate",
+    status_code=201,
+    responses=_PRESENT | problems(401, 403, 409, 413, 422, 429, 500, 501, 503, 504, 507),
+)
+async def simulate_dataset(
+    request: Request, response: Response, service: ServiceDep, dataset: DatasetName, private: Private = False
+) -> DatasetRecord:
+    """Simulates a sweep over the built-in phantom, in about half a minute, and keeps it as a dataset."""
+    service.life.require_serving()
+    async with service.uploads.receive(dataset, {}, private=private) as upload:
+        deadline = time.monotonic() + PATIENCE_S
+        finishing = upload.finish(simulated=True)
+        record, is_new = await finish_or_abandon(finishing, request.receive, deadline)
+    response.status_code = 201 if is_new else 200
+    return service.datasets.with_owner(record)
+
+
 @router.get("", responses=problems(401, 422, 503))
 async def list_datasets(
     service: ServiceDep, page_size: PageSize = DEFAULT_PAGE_SIZE, page_token: PageToken = ""

@@ -18,6 +18,8 @@ export const train = {
   firstSweep: "No sweep yet",
   firstSweepHint: "A sweep is a series of B-mode images with the tracked pose of each: a PLUS or 3D Slicer sequence (.mha, .nrrd) with its device set, a DICOM cine loop with its poses, a recording of ROS 2 (.mcap), a scan of TUS-REC (.h5) with its calibration, pictures with a poses.csv, or a folder with conf.json.",
   chooseFiles: "Upload one",
+  simulate: "Simulate one over the built-in phantom",
+  simulating: "The phantom is simulated, in about half a minute …",
   frames: (count: number, isPrivate: boolean): string => `${count} frames${isPrivate ? ", private" : ""}`,
   otherJobs: "Other jobs",
   upload: {
