@@ -223,7 +223,7 @@ def pytest_collection_modifyitems(items):
     """Tests marked `gpu` are skipped where there is none; tests that start processes are `slow`.
 
     Files go to the test processes whole and in this order, which is that of pytest-randomly but for two things: those
-    with a test that takes minutes come first, then those with the most tests, so that none is left for the end.
+    with a lengthy test come first, then those with the most tests, so that none is left for the end.
     """
     without_gpu = pytest.mark.skip(reason="there is no CUDA device")
     for item in items:

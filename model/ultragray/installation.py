@@ -28,7 +28,7 @@ MODULES_OF_EXTRAS = {
     "parquet": ("pyarrow",),
     "ray": ("ray",),
     "storage": ("obstore",),
-    "tensorboard": ("tensorboard",),
+    "tensorboard": ("tensorboardX",),
     "tracing": ("opentelemetry.exporter", "opentelemetry.sdk"),
     "zarr": ("zarr",),
 }

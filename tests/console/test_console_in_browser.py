@@ -49,6 +49,7 @@ def test_bundle_is_small():
     assert 0 < total < MAX_BUNDLE_BYTES
 
 
+@pytest.mark.lengthy
 @pytest.mark.slow
 def test_view_of_every_run():
     outcome = subprocess.run(

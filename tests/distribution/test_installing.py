@@ -35,9 +35,8 @@ with Client(sys.argv[1]) as client:
 
 def run(command, cwd, **environment):
     shown = [str(part) for part in command]
-    return subprocess.run(
-        shown, cwd=cwd, env={**os.environ, **environment}, capture_output=True, text=True, timeout=900
-    )
+    ours = {name: value for name, value in os.environ.items() if name != "SSL_CERT_FILE"}  # what builds is downloaded
+    return subprocess.run(shown, cwd=cwd, env=ours | environment, capture_output=True, text=True, timeout=900)
 
 
 def succeeds(command, cwd, **environment):

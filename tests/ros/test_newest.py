@@ -47,6 +47,7 @@ def test_no_default_is_of_a_type_that_ros_lacks():
             {"probe": '{"kind": "convex", "opening_angle_deg": 60, "near_mm": 40, "far_mm": 95}'},
             RenderSettings(probe=ConvexProbe(60, 40, 95)),
         ),
+        ({"probe": "C5-2"}, RenderSettings(probe=ConvexProbe(70, 50, 200))),
         (
             {
                 "tools": '[{"kind": "needle", "tip_mm": [5, 0, 30], "hub_mm": [-9, 0, 4], "frame": "probe"}]',

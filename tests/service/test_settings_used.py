@@ -52,7 +52,7 @@ SETTINGS = Resolved(
     HEIGHT,
     WIDTH,
     beam=ElevationBeam(1.5),
-    display=Display(flip=True, depth_mm=18.0),
+    display=Display(flip=True, depth_mm=18.0, gain_db_between=(-3.0, 3.0), display_seed=5),
     **{one.name: example(HINTS[one.name], one.default) for one in fields(Additions)},
 )
 PLAIN = Resolved(LinearProbe(width_mm=20.0, near_mm=0.0, far_mm=24.0), HEIGHT, WIDTH)

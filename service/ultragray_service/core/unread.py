@@ -14,8 +14,12 @@ UNSENT_BYTES = 16 * 1024  # that the kernel may hold of a connection, beside tho
 
 
 def hold_little(transport: asyncio.BaseTransport) -> None:
-    """Has a transport ask to wait while it buffers anything, and the kernel take no more than it can send soon."""
-    cast(asyncio.WriteTransport, transport).set_write_buffer_limits(high=0)
+    """Has a transport ask to wait while it buffers anything, and the kernel take no more than it can send soon.
+
+    The limit is one byte: at a limit of none a transport of TLS asks to wait even while it buffers nothing, and then
+    says that one may go on when something comes from the client, which may be never.
+    """
+    cast(asyncio.WriteTransport, transport).set_write_buffer_limits(high=1)
     if (endpoint := transport.get_extra_info("socket")) is not None:
         endpoint.setsockopt(socket.IPPROTO_TCP, socket.TCP_NOTSENT_LOWAT, UNSENT_BYTES)
 

@@ -183,9 +183,9 @@ def test_further_signals_do_not_stop_the_scene_from_being_written(dataset, tmp_p
 
 
 def test_tensorboard_that_is_missing_is_said(dataset, tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
+    monkeypatch.setitem(sys.modules, "tensorboardX", None)
     told = refused_run(dataset, "-o", tmp_path / "scene.ugr", *SMALL, "--tensorboard")
-    assert f"TensorBoard is not installed: {install_advice('tensorboard')}" in told
+    assert f"tensorboardX is not installed: {install_advice('tensorboard')}" in told
     assert not (tmp_path / "scene.ugr.run").exists()
 
 

@@ -108,12 +108,12 @@ def _lines_until(path: Path, steps_done: int) -> list[bytes]:
 
 
 def require_tensorboard() -> None:
-    """Raises InvalidArgument where TensorBoard is not installed."""
+    """Raises InvalidArgument where tensorboardX, which writes what TensorBoard reads, is not installed."""
     try:
-        import torch.utils.tensorboard  # noqa: F401
+        import tensorboardX  # noqa: F401
     except ImportError as error:
         raise InvalidArgument(
-            f"TensorBoard is not installed: {install_advice('tensorboard')}", field="tensorboard"
+            f"tensorboardX is not installed: {install_advice('tensorboard')}", field="tensorboard"
         ) from error
 
 
@@ -121,11 +121,13 @@ class Board:
     """Writes the numbers of each step beside the journal."""
 
     def __init__(self, folder: Path, *, steps_done: int) -> None:
-        """Raises InvalidArgument where TensorBoard is not installed. Later steps of an earlier run are hidden."""
+        """Raises InvalidArgument where tensorboardX is not installed. Later steps of an earlier run are hidden."""
         require_tensorboard()
-        from torch.utils.tensorboard import SummaryWriter
+        from tensorboardX import SummaryWriter
 
-        self._writer = SummaryWriter(str(folder), purge_step=steps_done + 1 if steps_done else None)
+        purge = steps_done + 1 if steps_done else None
+        suffix = f".{steps_done:08d}"  # names have the time in seconds only, and are read in their order
+        self._writer = SummaryWriter(str(folder), purge_step=purge, filename_suffix=suffix)
 
     def write(self, line: Mapping[str, float]) -> None:
         for name, value in line.items():

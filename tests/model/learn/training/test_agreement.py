@@ -171,6 +171,7 @@ def test_a_calibration_by_which_neighbours_predict_each_other_worse_is_not_taken
         monkeypatch.setattr(agreement, "found_calibration", lambda sweep, ranges, one=calibration: one)
         path = agreed_path(given)
         np.testing.assert_array_equal(path.calibration, calibration if is_taken else np.eye(4))
+        np.testing.assert_allclose(path.train, given.train.poses @ path.calibration, atol=1e-9)
 
 
 def test_held_out_frames_of_another_file_move_with_the_frames_about_them():

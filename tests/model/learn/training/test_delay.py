@@ -49,6 +49,7 @@ def test_poses_of_another_time_lie_on_the_path():
     np.testing.assert_allclose(moved[:, :3, 3], steady[:, :3, 3] - [2.5, 5.0, 0.0], atol=1e-9)
 
 
+@pytest.mark.lengthy
 def test_a_calibration_that_is_off_is_found_where_sweeps_cross(found_paths):
     middle = poses_of(np.zeros((30, 3)), np.arange(30)[:, None] * [[0.0, 0.5, 0.0]] - [0.0, 7.5, 0.0])
     truth = np.concatenate([middle, poses_of([[0.0, 0.0, 90.0]], np.zeros((1, 3))) @ middle])

@@ -77,15 +77,15 @@ def write(folder, losses, *, steps_done):
 
 
 def test_a_resumed_run_hides_the_steps_that_it_takes_again(tmp_path):
-    pytest.importorskip("tensorboard", reason="the extra tensorboard is not installed")
+    pytest.importorskip("tensorboardX", reason="the extra tensorboard is not installed")
     write(tmp_path, {1: 0.5, 2: 0.25, 3: 0.125}, steps_done=0)
     write(tmp_path, {2: 0.75, 3: 0.625}, steps_done=1)
     assert shown(tmp_path, "loss") == [(1, 0.5), (2, 0.75), (3, 0.625)]
 
 
 def test_says_what_to_install(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "torch.utils.tensorboard", None)
-    with pytest.raises(InvalidArgument, match=r"TensorBoard is not installed: .*'ultragray\[tensorboard\]'"):
+    monkeypatch.setitem(sys.modules, "tensorboardX", None)
+    with pytest.raises(InvalidArgument, match=r"tensorboardX is not installed: .*'ultragray\[tensorboard\]'"):
         Board(tmp_path, steps_done=0)
 
 
