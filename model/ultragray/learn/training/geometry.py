@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -13,7 +13,10 @@ import torch
 from torch import Tensor
 
 from ultragray.geometry.probe import FloatArray
+from ultragray.geometry.scan_conversion import interpolated_sharply
+from ultragray.learn.prediction import seen_by_frame
 from ultragray.learn.sweep import Dataset, IntArray, Sweep, corner_distances_mm, spread_places
+from ultragray.learn.training.between import neighbours_of
 
 TELLING_NEIGHBOURS = 8  # with fewer, PSNR only says that speckle averages out
 MAX_SLICE_MM = 8.0  # no probe's slice is thicker
@@ -90,7 +93,8 @@ def shift_out_of_plane(poses: FloatArray, shift_mm: float) -> FloatArray:  # [C,
 SCALE_MARGIN = 1.1  # of the released recipe
 FRAMES_AT_ONCE = 64
 LEAST_RANGE = 1.5  # of the shift out of the plane, × the spacing of the frames
-PIXELS_PER_GAUSSIAN = 25
+PIXELS_PER_GAUSSIAN, LEAST_PIXELS = 25, 12  # the latter, of distinct ones, where neighbours share their detail
+DIFFERENT_DETAIL, SAME_DETAIL = 0.25, 0.5  # correlation of that of neighbours, up to which and from which on
 STEPS_PER_FRAME = 15  # a frame that is seen more often is learned with its noise
 MIN_STEPS, USUAL_STEPS = 250, 1_500  # fewer leave shadows unlearned
 MIN_GAUSSIANS, USUAL_GAUSSIANS = 2_000, 150_000  # fewer hold no anatomy; enough unless much more is to be seen
@@ -112,6 +116,7 @@ class Geometry:
     out_of_plane_mm: float  # full range of the shift of a batch along elevation that the frames tell of; 0: they do not
     pixel_count: int  # of all training frames
     distinct_pixels: int  # of those, lit ones, and in frames that overlap along elevation each place once
+    shared_detail: float  # as `shared_detail` has it
     frame_count: int
 
     @classmethod
@@ -129,17 +134,22 @@ class Geometry:
             out_of_plane_mm=range_mm,
             pixel_count=sweep.images.size,
             distinct_pixels=int(distinct * np.count_nonzero(sweep.images >= LEAST_LIT)),
+            shared_detail=shared_detail(sweep),
             frame_count=len(sweep),
         )
 
     def gaussian_count(self, views_between: float) -> int:
         """By the pixels of the frames, twice as many where what lies between them is learned too.
 
-        More than USUAL_GAUSSIANS only as distinct pixels ask for: those of large volumes that are seen finely.
+        More than USUAL_GAUSSIANS only as distinct pixels ask for: those of large volumes that are seen finely. Of these
+        a Gaussian has LEAST_PIXELS where neighbouring frames share their detail: it is tissue, and lies between them,
+        too. Detail that the next frame does not show is noise for it, and Gaussians that hold it show noise there.
         """
-        per_pixel = _times(views_between) / PIXELS_PER_GAUSSIAN
-        usual = min(int(per_pixel * self.pixel_count), USUAL_GAUSSIANS)
-        return max(usual, min(int(per_pixel * self.distinct_pixels), MAX_GAUSSIANS), MIN_GAUSSIANS)
+        times = _times(views_between)
+        usual = min(int(times / PIXELS_PER_GAUSSIAN * self.pixel_count), USUAL_GAUSSIANS)
+        detail = DIFFERENT_DETAIL, SAME_DETAIL
+        pixels = float(np.interp(self.shared_detail, detail, (PIXELS_PER_GAUSSIAN, LEAST_PIXELS)))
+        return max(usual, min(int(times / pixels * self.distinct_pixels), MAX_GAUSSIANS), MIN_GAUSSIANS)
 
     def steps(self, views_between: float) -> int:
         """By the frames, likewise; more than USUAL_STEPS as the square root of the Gaussians that are more."""
@@ -181,6 +191,38 @@ def frame_spacing_mm(sweep: Sweep) -> float:
         offsets = corners[travel.argmin(axis=1)] - corners[some]  # [f, K, 3]
         gaps.extend(np.abs(np.einsum("fkc,fc->fk", offsets, elevations[some])).mean(axis=1).tolist())
     return float(np.median(gaps))
+
+
+COMPARED_PAIRS, COMPARED_PIXELS = 32, 4096  # of neighbours, of each: enough, ρ errs by 0.02 at most
+DETAIL_PIXELS = 1.0  # standard deviation of the Gaussian beyond which structure is no detail
+
+
+def shared_detail(sweep: Sweep) -> float:
+    """The mean correlation of the detail of neighbouring frames; 0 where no frame has a neighbour.
+
+    Detail is what an image loses when it is smoothed by a pixel. Pixels of a frame are projected onto the plane of the
+    other along its normal; what lies beside it does not count, nor do frames without detail.
+    """
+    pairs, found = neighbours_of(sweep).pairs, []
+    pairs = pairs[pairs[:, 0] != pairs[:, 1]]
+    for first, second in pairs[spread_places(len(pairs), COMPARED_PAIRS)]:
+        random = np.random.default_rng(first)
+        rows, columns = (random.integers(size, size=COMPARED_PIXELS) for size in (sweep.height, sweep.width))
+        local = sweep.probe.points_mm((rows + 0.5) / sweep.height, (columns + 0.5) / sweep.width)
+        onto = np.linalg.inv(sweep.poses[second]) @ sweep.poses[first]
+        inside, there = seen_by_frame(sweep, second, local @ onto[:3, :3].T + onto[:3, 3], _interpolated_detail)
+        here = _interpolated_detail(sweep.images, first, rows[inside], columns[inside])
+        if len(here) and here.std() * there.std() > 0.0:
+            found.append(float(np.corrcoef(here, there)[0, 1]))
+    return float(np.mean(found)) if found else 0.0
+
+
+def _interpolated_detail(
+    frames: npt.NDArray[np.uint8], which: IntArray | int, rows: npt.NDArray[Any], columns: npt.NDArray[Any]
+) -> FloatArray:  # [F, H, W], [P] each -> [P]
+    image = frames[which].astype(np.float32)
+    detail = image - cv2.GaussianBlur(image, (0, 0), DETAIL_PIXELS, borderType=cv2.BORDER_REPLICATE)
+    return interpolated_sharply(detail[None], 0, rows, columns)
 
 
 # The shadows that training frames show: the evidence for what absorbs.

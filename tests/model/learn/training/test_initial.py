@@ -19,6 +19,7 @@ from ultragray.learn.training.geometry import (
     frame_spacing_mm,
     out_of_plane_range_mm,
     out_of_plane_shift_mm,
+    shared_detail,
     shift_out_of_plane,
 )
 from ultragray.learn.training.initial import initial_parameters
@@ -187,13 +188,37 @@ def test_lengths_of_a_straight_sweep(tiny_dataset):
 
 
 def test_a_large_volume_that_is_seen_finely_gets_more_gaussians_and_steps():
-    usual = Geometry(np.zeros(3), 10.0, 1.0, 0.2, 0.0, pixel_count=14_000_000, distinct_pixels=0, frame_count=200)
+    usual = Geometry(
+        np.zeros(3), 10.0, 1.0, 0.2, 0.0, 14_000_000, distinct_pixels=0, shared_detail=0.0, frame_count=200
+    )
     assert (usual.gaussian_count(0.5), usual.steps(0.5)) == (150_000, 1_500)
     large = replace(usual, distinct_pixels=12_000_000)
     assert (large.gaussian_count(0.5), large.steps(0.5)) == (600_000, 3_000)
     assert large.gaussian_count(0.0) == 480_000
     assert replace(large, distinct_pixels=3_000_000).gaussian_count(0.5) == 240_000
     assert replace(large, frame_count=20).steps(0.5) == 600
+
+
+@pytest.mark.parametrize(("shared", "pixels_per_gaussian"), [(0.0, 25.0), (0.375, 18.5), (1.0, 12.0)])
+def test_frames_with_the_same_detail_get_more_gaussians(tiny_dataset, probe, shared, pixels_per_gaussian):
+    dataset = tiny_dataset(frames=9, height=160, width=128, probe=probe)
+    train = dataset.train
+    white = np.random.default_rng(5).normal(0.0, 20.0, (len(train) + 1, *train.images.shape[1:]))
+    images = 128.0 + shared**0.5 * white[-1] + (1.0 - shared) ** 0.5 * white[:-1]
+    geometry = Geometry.of(replace(dataset, train=replace(train, images=images.round().astype(np.uint8))))
+    assert geometry.shared_detail == pytest.approx(shared, abs=0.01)
+    assert geometry.gaussian_count(0.5) == pytest.approx(2 * train.images.size / pixels_per_gaussian, rel=0.02)
+
+
+def test_detail_is_compared_where_the_poses_say_that_it_lies(tiny_dataset):
+    train = tiny_dataset(frames=9, height=160, width=128).train
+    white = np.random.default_rng(5).integers(90, 170, train.images.shape[1:], np.uint8)
+    shaken = np.stack([np.roll(white, place % 2, axis=0) for place in range(len(train))])
+    poses = train.poses.copy()
+    poses[1::2, :3, 3] -= train.pixel_mm[0] * poses[1::2, :3, 2]
+    assert shared_detail(replace(train, images=shaken, poses=poses)) > 0.95
+    assert shared_detail(replace(train, images=shaken)) < 0.1
+    assert shared_detail(train.select([0])) == 0.0
 
 
 def test_pixels_that_are_black_or_seen_again_are_not_distinct(tiny_dataset, monkeypatch):
