@@ -65,3 +65,15 @@ for (const view of Object.keys(VIEWS)) {
     });
   });
 }
+
+describe("a phone", () => {
+  it("shows a large image, with one line over it", async () => {
+    const page = await openPage(at, "#/scan/demo", { width: 390, height: 844, touch: true });
+    await VIEWS.scan[1](page);
+    const { width } = await page.locator('[aria-label="Live image"] canvas').first().boundingBox();
+    assert.ok(width > 0.8 * 390, `the image is ${width} of 390 pixels wide`);
+    const badge = await page.getByTestId("confidence-badge").boundingBox();
+    assert.ok(badge.height < 24, `the words over it are ${badge.height} pixels high`);
+    await picture(page, "phone-scan");
+  });
+});

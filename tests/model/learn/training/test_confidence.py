@@ -86,7 +86,8 @@ def test_nothing_of_what_is_left_out_is_trained_from(tiny_dataset):
 
     def train_part(part):
         parts.append(part)
-        return train(part, TrainingConfig.preset("fast", steps=5, max_gaussians=50, confidence=False))
+        settings = {"steps": 5, "max_gaussians": 50, "confidence": False, "refine_poses": "none"}
+        return train(part, TrainingConfig.preset("fast", **settings))
 
     model = fit_confidence(dataset, train_part, backend="auto")
     (part,) = parts
@@ -137,7 +138,7 @@ def test_a_calibration_that_diverges_costs_no_scene(tiny_dataset, tiny_config, m
         raise TrainingDiverged("training diverged in step 3: the loss is nan")
 
     monkeypatch.setattr(run, "fit_confidence", diverge)
-    scene = train(tiny_dataset(frames=40), tiny_config(confidence=True))
+    scene = train(tiny_dataset(frames=40), tiny_config(confidence=True, refine_poses="none"))
     assert scene.info.confidence == {}
     assert "the scene gets no confidence: training diverged in step 3" in caplog.text
 
