@@ -296,7 +296,8 @@ class _Judge:
         if not len(frames):
             return None
         passes = np.repeat(np.arange(len(ranges)), [len(some) for some in ranges])
-        return cls(sweep, *(some[spread_places(len(some), FRAMES)] for some in (frames, far)), passes)
+        frames, far = (some[spread_places(len(some), FRAMES)] for some in (frames, far))
+        return cls(sweep, frames, far, passes)
 
     def psnr_db(self, poses: FloatArray, reach: int = 1) -> float:  # [F, 4, 4] mm
         """Of the pixels as predicted in space by these poses, from the frames `reach` (1, or FAR where there are such)
