@@ -41,7 +41,7 @@ def test_truth_of_another_dtype_does_not_reach_the_kernel():
 
 
 def test_windows_are_not_left_to_cudnn(monkeypatch):
-    """It would round to ten bits, and a variance is the small difference of two means; where a gradient, or a GPU, is asked for, see `metrics._smooth`."""
+    """It would round to ten bits, and a variance is the small difference of two means; see `metrics._smooth`."""
     true_conv2d, groups = torch.nn.functional.conv2d, []
 
     def watched(fields, window, **options):
