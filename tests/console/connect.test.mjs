@@ -2,7 +2,7 @@
 
 import assert from "node:assert/strict";
 import { execFileSync, spawn } from "node:child_process";
-import { mkdtempSync, readFileSync, renameSync, rmSync, writeFileSync } from "node:fs";
+import { existsSync, mkdtempSync, readFileSync, renameSync, rmSync, writeFileSync } from "node:fs";
 import { tmpdir } from "node:os";
 import path from "node:path";
 import { createInterface } from "node:readline";
@@ -97,7 +97,7 @@ async function follow(page, name) {
 }
 
 describe("connect", () => {
-  it("gives programs that run as they stand: curl, Python, gRPC, WebSocket, OpenIGTLink, ROS 2", async () => {
+  it("gives programs that run as they stand: curl, Python, JavaScript, gRPC, WebSocket, OpenIGTLink, ROS 2", async () => {
     const { page } = await openScan(at);
     await page.getByLabel("Gain", { exact: true }).fill("6");
     await page.getByRole("combobox", { name: "Probe" }).selectOption("convex");
@@ -113,6 +113,8 @@ describe("connect", () => {
     const asking = await program(page, "python");
     assert.match(asking, /tools=\(Needle\(.*frame=ToolFrame\.PROBE\), Box\(/);
     assert.match(run(PYTHON, written("ask.py", asking)), new RegExp(`bmode ${height}x${width}`));
+    const fetched = run(process.execPath, written("ask.mjs", await program(page, "javascript")));
+    assert.match(fetched, new RegExp(`^${height} ${width} ${height * width} {`));
     const call = written("grpcurl.sh", await program(page, "grpc"));
     assert.equal(run(PYTHON, "-c", GRPCURL, call).trim(), `${height} ${width} ${height * width} ['needle', 'box']`);
     const streamed = run(PYTHON, written("stream.py", await program(page, "websocket"))).trim().split("\n");
@@ -123,6 +125,13 @@ describe("connect", () => {
     assert.deepEqual(image, [height, width, 6, "convex", ["needle", "box"]]);
     await picture(page, "connect");
     assert.deepEqual(page.faults, []);
+  });
+
+  it("gives a program in C# that runs as it stands", { skip: existsSync("/usr/bin/mcs") ? false : "there is no C# compiler (Debian's mono-mcs)" }, async () => {
+    const { page } = await openScan(at);
+    await page.getByRole("button", { name: "Add a needle" }).click();
+    run("mcs", "-r:System.Net.Http.dll", written("Ask.cs", await program(page, "csharp")));
+    assert.match(run("mono", "Ask.exe"), /^1,1,256,256 65536 {"distance_mm"/);
   });
 
   it("gives the programs the poses of a robot where its registration is chosen, and they render the same image", async () => {

@@ -46,9 +46,10 @@ type ToldTool = Given & Pick<Tool, "kind">;
 const KEY = "YOUR_KEY";
 const MOST_DEVICE_NAME = 20; // letters, in OpenIGTLink
 const LARGEST_MESSAGE = 64 * 2 ** 20;
+const GRPC_ENUMS = { below_min_confidence: "BELOW_CONFIDENCE", contact: "CONTACT", speckle: "SPECKLE" };
 const WHOLE_PARAMETERS = ["height", "width"]; // of the ROS 2 node
 
-const PROGRAMS = { curl, python, grpc, websocket, igtl, ros };
+const PROGRAMS = { curl, python, javascript, csharp, grpc, websocket, igtl, ros };
 export type Language = keyof typeof PROGRAMS;
 export const LANGUAGES = Object.keys(PROGRAMS) as Language[];
 
@@ -57,13 +58,69 @@ export function snippet(language: Language, target: Target, asked: Asked): strin
   return PROGRAMS[language](target, asked);
 }
 
-function curl({ origin, scene, key_required }: Target, { pose, settings }: Asked): string {
-  const key = key_required ? ` -H 'X-API-Key: ${KEY}'` : "";
-  const parts = Object.entries({ pose: placement(pose), ...known(settings) });
-  const body = `{\n${parts.map(([name, value]) => `    ${JSON.stringify(name)}: ${JSON.stringify(value)}`).join(",\n")}\n  }`;
-  return `curl -sS --fail-with-body ${origin}/v1/scenes/${encodeURIComponent(scene)}/render${key} \\
+function curl(target: Target, asked: Asked): string {
+  const key = target.key_required ? ` -H 'X-API-Key: ${KEY}'` : "";
+  return `curl -sS --fail-with-body ${renderAddress(target)}${key} \\
   -H 'Content-Type: application/json' -H 'Accept: image/png' -o frame.png \\
-  -d '${body}'
+  -d '${body(asked, "  ")}'
+`;
+}
+
+/** The JSON that asks for the frame, a line a member, its last line indented. */
+function body({ pose, settings }: Asked, indent: string): string {
+  const parts = Object.entries({ pose: placement(pose), ...known(settings) });
+  return `{\n${parts.map(([name, value]) => `${indent}  ${JSON.stringify(name)}: ${JSON.stringify(value)}`).join(",\n")}\n${indent}}`;
+}
+
+function renderAddress({ origin, scene }: Target): string {
+  return `${origin}/v1/scenes/${encodeURIComponent(scene)}/render`;
+}
+
+function javascript(target: Target, asked: Asked): string {
+  const key = target.key_required ? `\n    "X-API-Key": "${KEY}",` : "";
+  return `const answer = await fetch("${renderAddress(target)}", {
+  method: "POST",
+  headers: {${key}
+    "Content-Type": "application/json",
+    Accept: "application/octet-stream",
+  },
+  body: JSON.stringify(${body(asked, "  ")}),
+});
+if (!answer.ok) throw new Error((await answer.json()).detail);
+const [, , height, width] = answer.headers.get("X-Ultragray-Shape").split(",").map(Number);
+const pixels = new Uint8Array(await answer.arrayBuffer()); // row by row
+console.log(height, width, pixels.length, JSON.parse(answer.headers.get("X-Ultragray-Extrapolation")));
+`;
+}
+
+function csharp(target: Target, asked: Asked): string {
+  const key = target.key_required ? `\n            request.Headers.Add("X-API-Key", "${KEY}");` : "";
+  return `using System;
+using System.Linq;
+using System.Net.Http;
+using System.Text;
+using System.Threading.Tasks;
+
+public static class Example
+{
+    public static async Task Main()
+    {
+        var body = @"${body(asked, "        ").replaceAll('"', '""')}";
+        using (var http = new HttpClient())
+        using (var request = new HttpRequestMessage(HttpMethod.Post, "${renderAddress(target)}"))
+        {
+            request.Headers.Add("Accept", "application/octet-stream");${key}
+            request.Content = new StringContent(body, Encoding.UTF8, "application/json");
+            using (var answer = await http.SendAsync(request))
+            {
+                var pixels = await answer.Content.ReadAsByteArrayAsync(); // row by row
+                if (!answer.IsSuccessStatusCode) throw new Exception(Encoding.UTF8.GetString(pixels));
+                var shape = answer.Headers.GetValues("X-Ultragray-Shape").First(); // outputs, poses, height, width
+                Console.WriteLine(shape + " " + pixels.Length + " " + answer.Headers.GetValues("X-Ultragray-Extrapolation").First());
+            }
+        }
+    }
+}
 `;
 }
 
@@ -101,16 +158,15 @@ np.save("frame.npy", frame["bmode"])
 }
 
 function grpc(target: Target, { pose, settings }: Asked): string {
-  const { probe, outputs, below_min_confidence, contact, tools, ...plain } = known(settings) as Given & {
+  const { probe, outputs, tools, ...plain } = known(settings) as Given & {
     probe?: Given;
     outputs?: string[];
     tools?: ToldTool[];
   };
   const message: Given = { scene: target.scene, ...plain };
   if (outputs !== undefined) message.outputs = outputs.map((output) => `OUTPUT_${output.toUpperCase()}`);
-  if (below_min_confidence !== undefined)
-    message.below_min_confidence = `BELOW_CONFIDENCE_${String(below_min_confidence).toUpperCase()}`;
-  if (contact !== undefined) message.contact = `CONTACT_${String(contact).toUpperCase()}`;
+  for (const [name, prefix] of Object.entries(GRPC_ENUMS))
+    if (message[name] !== undefined) message[name] = `${prefix}_${String(message[name]).toUpperCase()}`;
   if (probe !== undefined) {
     const { kind, ...numbers } = probe;
     message.probe = { [String(kind)]: numbers };

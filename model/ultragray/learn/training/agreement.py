@@ -52,6 +52,9 @@ GAIN_OF_SHARES_DB = 0.3  # tissue is rigid unless the images say clearly that it
 SHARE_STEP = 0.25
 FAR = 4  # frames away from the one that is predicted
 LEAST_PREDICTED = 8  # frames: fewer may fit any shares by chance
+CROSSING_FRAMES, CROSSING_PIXELS = 48, 512  # that are looked at in other passes, of each
+CROSSING_MM = 1.0  # of a pixel from a frame of another pass: it shows the same
+LEAST_CROSSING = 1000  # pixels that other passes show: fewer say little
 
 Shares: TypeAlias = tuple[float, float, float]  # of the motion within the plane: lateral, axial, turn
 RIGID: Shares = (1.0, 1.0, 1.0)
@@ -161,6 +164,10 @@ def _found_shares(judge: _Judge, poses: FloatArray, ranges: Sequence[range], pla
     """The shares that predict frames best, first alike for all three, then each; RIGID where they gain little, or where
     few frames can be predicted.
 
+    Nor do they hold where passes that cross show less of the same with them: tissue that follows the probe is shown
+    alike by two passes once it is at rest. Within one pass images can be fitted by shares that are none: those of a
+    probe that glides over layers, which look as if they followed.
+
     Frames are predicted from their neighbours and from those FAR away. A slow hand hardly moves within the plane from
     one frame to the next: then far ones tell. They show less of the same anatomy, and alone they would err.
     """
@@ -179,7 +186,12 @@ def _found_shares(judge: _Judge, poses: FloatArray, ranges: Sequence[range], pla
             other = _stepped(best, number, step)
             while psnr_db(other) > psnr_db(best):
                 best, other = other, _stepped(other, number, step)
-    return best if psnr_db(best) >= psnr_db(RIGID) + GAIN_OF_SHARES_DB else RIGID
+    if psnr_db(best) < psnr_db(RIGID) + GAIN_OF_SHARES_DB:
+        return RIGID
+    still, moved = (
+        judge.crossing_db(with_shares(poses, ranges, judge.sweep.probe, one)[places]) for one in (RIGID, best)
+    )
+    return RIGID if still is not None and (moved is None or moved < still - LEAST_GAIN_DB) else best
 
 
 def _stepped(shares: Shares, number: int, step: float) -> Shares:
@@ -273,6 +285,7 @@ class _Judge:
     sweep: Sweep
     frames: IntArray  # [P] their places
     far: IntArray  # [Q] those that have frames FAR before and behind them
+    passes: IntArray  # [F] the pass of each frame
     _known_points: dict[int, tuple[FloatArray, FloatArray]] = field(default_factory=dict, init=False)
 
     @classmethod
@@ -280,7 +293,11 @@ class _Judge:
         frames, far = (
             np.concatenate([np.arange(some.start + reach, some.stop - reach) for some in ranges]) for reach in (1, FAR)
         )
-        return cls(sweep, *(some[spread_places(len(some), FRAMES)] for some in (frames, far))) if len(frames) else None
+        if not len(frames):
+            return None
+        passes = np.repeat(np.arange(len(ranges)), [len(some) for some in ranges])
+        frames, far = (some[spread_places(len(some), FRAMES)] for some in (frames, far))
+        return cls(sweep, frames, far, passes)
 
     def psnr_db(self, poses: FloatArray, reach: int = 1) -> float:  # [F, 4, 4] mm
         """Of the pixels as predicted in space by these poses, from the frames `reach` (1, or FAR where there are such)
@@ -305,6 +322,27 @@ class _Judge:
         predicted = blend_by_distance(values, distances)
         known = ~np.isnan(predicted)
         return _psnr_db(predicted[known], shown[known])
+
+    def crossing_db(self, poses: FloatArray) -> float | None:  # [F, 4, 4] mm
+        """Of the pixels that frames of other passes show, too, as the nearest of those does; None where few are."""
+        inverses, normals = np.linalg.inv(poses), poses[:, :3, 1]
+        offsets = np.einsum("fi,fi->f", normals, poses[:, :3, 3])
+        predicted, shown = [], []
+        for frame in self.frames[spread_places(len(self.frames), CROSSING_FRAMES)]:
+            local, own = (some[:CROSSING_PIXELS] for some in self._points(frame))
+            places = local @ poses[frame, :3, :3].T + poses[frame, :3, 3]
+            heights = np.abs(places @ normals.T - offsets)  # [N, F]
+            heights[:, self.passes == self.passes[frame]] = np.inf
+            nearest = np.where(heights.min(axis=1) <= CROSSING_MM, heights.argmin(axis=1), -1)
+            for beside in np.unique(nearest[nearest >= 0]):
+                some, onto = nearest == beside, inverses[beside]
+                points = places[some] @ onto[:3, :3].T + onto[:3, 3]
+                inside, values = seen_by_frame(self.sweep, beside, points, interpolated_sharply)
+                predicted.append(values)
+                shown.append(own[some][inside])
+        if sum(map(len, shown)) < LEAST_CROSSING:
+            return None
+        return _psnr_db(np.concatenate(predicted), np.concatenate(shown))
 
     def in_time_db(self) -> float:
         """Of the pixels as blends of the same pixels of the two frames, by their times."""

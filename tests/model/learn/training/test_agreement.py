@@ -115,6 +115,32 @@ def test_a_hand_that_goes_unevenly_keeps_its_path(slow):
     np.testing.assert_array_equal(agreed_path(given).train, given.train.poses)
 
 
+def two_passes(share):
+    """Tissue of which a share of the motion within the plane is seen, in two passes that cross; and the true path."""
+    other = poses_of(np.tile([8.0, 0.0, 0.0], (FRAMES, 1)), np.tile([1.0, 0.0, 0.0], (FRAMES, 1)))
+    tracked = np.concatenate([hand_path(), hand_path() @ other])
+    rest = with_shares(tracked, [range(FRAMES), range(FRAMES, 2 * FRAMES)], PROBE, (share,) * 3)
+    whole = replace(seen(rest), poses=tracked)
+    return Dataset("hand", train=whole, val=whole.select([])), rest
+
+
+@pytest.mark.parametrize("share", [0.25, 1.0])
+def test_passes_that_cross_agree_on_the_true_path(share):
+    given, rest = two_passes(share)
+    judge = agreement._Judge.of(given.train, agreement.sweep_ranges(given.train))
+    other = with_shares(given.train.poses, agreement.sweep_ranges(given.train), PROBE, (1.25 - share,) * 3)
+    assert judge.crossing_db(rest) > judge.crossing_db(other) + 1.0
+    assert agreed_path(given).shares == pytest.approx((share,) * 3, abs=0.3)
+
+
+def test_no_share_is_taken_that_passes_which_cross_contradict(monkeypatch):
+    given, path = known("following")
+    assert path.shares != RIGID
+    crossing_db = iter([21.0, 20.0])
+    monkeypatch.setattr(agreement._Judge, "crossing_db", lambda judge, poses: next(crossing_db))
+    assert agreed_path(given).shares == RIGID
+
+
 def test_a_few_frames_do_not_tell_of_tissue():
     tracked = hand_path()
     given = recording(with_shares(tracked, [range(FRAMES)], PROBE, (0.0, 0.0, 0.0)), tracked)

@@ -41,7 +41,7 @@ def test_truth_of_another_dtype_does_not_reach_the_kernel():
 
 
 def test_windows_are_not_left_to_cudnn(monkeypatch):
-    """It would round to ten bits, and a variance is the small difference of two means; see `_blurred`."""
+    """It would round to ten bits, and a variance is the small difference of two means; see `metrics._smooth`."""
     true_conv2d, groups = torch.nn.functional.conv2d, []
 
     def watched(fields, window, **options):
@@ -49,7 +49,7 @@ def test_windows_are_not_left_to_cudnn(monkeypatch):
         return true_conv2d(fields, window, **options)
 
     monkeypatch.setattr(torch.nn.functional, "conv2d", watched)
-    ssim(torch.rand(2, 12, 13), torch.rand(2, 12, 13))
+    ssim(torch.rand(2, 12, 13, requires_grad=True), torch.rand(2, 12, 13))
     assert groups == [(5, 5), (5, 5)]
 
 

@@ -188,6 +188,8 @@ export const connect = {
     languages: {
       curl: "curl",
       python: "Python",
+      javascript: "JavaScript",
+      csharp: "C#",
       grpc: "gRPC",
       websocket: "WebSocket",
       igtl: "OpenIGTLink",
@@ -196,6 +198,8 @@ export const connect = {
     needs: {
       curl: "Saves one frame as frame.png.",
       python: "Needs the package ultragray-client.",
+      javascript: "Needs Node 18 or newer, or a page of this service.",
+      csharp: "Needs .NET Framework 4.5, Mono, .NET or Unity.",
       grpc: "Needs grpcurl. The service describes its own messages.",
       websocket: "Needs the packages websockets and numpy. For live images from a moving probe.",
       igtl: "Needs the package pyigtl. A device named after the scene gets its images back.",
