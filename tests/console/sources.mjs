@@ -20,6 +20,7 @@ const runes = {
 };
 
 globalThis.localStorage ??= { getItem: () => null }; // the language that a browser remembers
+globalThis.navigator ??= { languages: ["en"] }; // and those that it was set to
 
 /** What modules of web/src export, by their paths without an ending. */
 export function built(...modules) {
