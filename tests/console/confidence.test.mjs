@@ -37,10 +37,10 @@ describe("confidence", () => {
   it("stands in the corner of the image, in words and never as ±", async () => {
     const { page } = await openScan(at);
     const badge = page.getByTestId("confidence-badge");
-    await until(() => badge.textContent(), (text) => /Well supported\s*expected similarity \d+ %, mean error \d+ points?/.test(text), "no badge");
+    await until(() => badge.textContent(), (text) => /Well supported\s*expected similarity \d+ %, mean error \d+ percentage points/.test(text), "no badge");
     assert.equal(await page.getByTestId("confidence-frame").count(), 0);
     assert.match(await page.getByTestId("similarity").textContent(), /^\d+ %$/);
-    assert.match(await page.getByTestId("similarity-error").textContent(), /^\d+ points$/);
+    assert.match(await page.getByTestId("similarity-error").textContent(), /^\d+ percentage points$/);
     assert.equal(await page.getByText("±").count(), 0);
   });
 

@@ -117,7 +117,7 @@ describe("the image", () => {
   it("is black where nothing supports it, if that is asked for, and tells how sure its figure is", async () => {
     const { page, first } = await openScan(at);
     const { confidence } = await (await fetch(`${at.service.url}/v1/scenes/demo`)).json();
-    await page.getByTestId("similarity-error").getByText(`${Math.round(confidence.error * 100)} points`).waitFor();
+    await page.getByTestId("similarity-error").getByText(`${Math.round(confidence.error * 100)} percentage points`).waitFor();
     await page.getByLabel("Tilt, about the lateral axis", { exact: true }).fill("60");
     const tilted = await changed(page, first.print);
     await page.getByLabel("Black where nothing supports it").check();

@@ -22,7 +22,7 @@ import {
 import { changed, IMAGE, poseOf } from "./scan_page.mjs";
 import { makeSweep } from "./sweep.mjs";
 
-const MINUTES_MS = 240_000; // a training and ten thousand frames on a busy machine
+const MINUTES_MS = 900_000; // a training and ten thousand frames on a busy machine
 const RENDERED = 10_000;
 const ENVIRONMENT = { ...process.env, PYTHONPATH: `${SOURCES}:${path.join(ROOT, "client")}` };
 
