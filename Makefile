@@ -58,7 +58,7 @@ test-long: $(VENV)/collected  ## those that make test leaves out (RECORD=1: what
 test-notebooks: $(VENV)/installed-dev  ## run every notebook of examples/notebooks from top to bottom; takes ten minutes
 	$(BIN)/pytest tests/examples/test_notebooks.py $(ARGS)
 
-test-console: $(VENV)/installed-dev $(CONSOLE)  ## the console in Debian's Chromium and Firefox (apt-get install chromium firefox-esr) against a real service; leaves screenshots in build
+test-console: $(VENV)/installed-dev $(CONSOLE)  ## the console in Debian's Chromium and Firefox (apt-get install chromium firefox-esr; mono-mcs mono-runtime libmono-system-net-http4.0-cil for the example in C#) against a real service; leaves screenshots in build
 	node --test --test-concurrency=1 tests/console/*.test.mjs
 
 test-faults: $(VENV)/installed-dev  ## processes killed at random: render workers under load, then everything while jobs run

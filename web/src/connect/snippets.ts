@@ -47,7 +47,7 @@ const KEY = "YOUR_KEY";
 const MOST_DEVICE_NAME = 20; // letters, in OpenIGTLink
 const LARGEST_MESSAGE = 64 * 2 ** 20;
 const GRPC_ENUMS = { below_min_confidence: "BELOW_CONFIDENCE", contact: "CONTACT", speckle: "SPECKLE" };
-const WHOLE_PARAMETERS = ["height", "width"]; // of the ROS 2 node
+const WHOLE_PARAMETERS = ["height", "width", "display.display_seed"]; // of the ROS 2 node
 
 const PROGRAMS = { curl, python, javascript, csharp, grpc, websocket, igtl, ros };
 export type Language = keyof typeof PROGRAMS;
@@ -103,7 +103,12 @@ using System.Threading.Tasks;
 
 public static class Example
 {
-    public static async Task Main()
+    public static void Main()
+    {
+        Ask().GetAwaiter().GetResult();
+    }
+
+    static async Task Ask()
     {
         var body = @"${body(asked, "        ").replaceAll('"', '""')}";
         using (var http = new HttpClient())
