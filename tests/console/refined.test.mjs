@@ -28,6 +28,7 @@ async function openMaps(options) {
 function tooWide(page) {
   return page.evaluate(() => [...document.querySelectorAll("*")]
     .filter((one) => ["auto", "scroll", "hidden"].includes(getComputedStyle(one).overflowX) || one === document.documentElement)
+    .filter((one) => one.wrap !== "off") // a program, whose lines are not broken
     .filter((one) => one.clientWidth > 1 && one.scrollWidth > one.clientWidth + 1 && getComputedStyle(one).textOverflow !== "ellipsis")
     .map((one) => one.className || one.localName));
 }

@@ -242,7 +242,6 @@ function ros(target: Target, { pose, settings }: Asked): string {
   if (tools !== undefined) given.tools = JSON.stringify(tools);
   for (const [name, value] of Object.entries(display ?? {})) given[`display.${name}`] = value;
   const parameters = Object.entries(given)
-    .filter(([, value]) => !(Array.isArray(value) && value.length === 0))
     .map(([name, value]) => ` \\\n  -p '${name}:=${parameter(name, value).replaceAll("'", "'\\''")}'`);
   return `# Then publish the pose of now: ros2 topic pub --once /ultragray/probe_pose geometry_msgs/msg/PoseStamped '{header: {frame_id: ${frame}}, pose: {${place}}}'
 ${target.key_required ? `ULTRAGRAY_API_KEY=${KEY} ` : ""}ultragray-ros --ros-args${parameters.join("")}
@@ -272,7 +271,7 @@ function known(settings: StreamSettings): Given {
   const given = Object.fromEntries(Object.entries(others).filter(([, value]) => value !== null));
   if (given.min_confidence === undefined) delete given.below_min_confidence;
   if (tools) given.tools = tools.map(differingFields);
-  const shown = Object.entries(display ?? {}).filter(([, value]) => value !== null);
+  const shown = Object.entries(display ?? {}).filter(([, value]) => value !== null && !(Array.isArray(value) && value.length === 0));
   return shown.length > 0 ? { ...given, display: Object.fromEntries(shown) } : given;
 }
 
