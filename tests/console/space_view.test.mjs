@@ -235,7 +235,7 @@ describe("contact", () => {
   it("keeps the face on the skin, and tells how far it is pressed", async () => {
     const { page } = await openRoom();
     const height = async () => (await poseOf(page)).position_mm.z;
-    await page.getByLabel("Contact").check();
+    await page.getByRole("checkbox", { name: "Contact" }).check();
     await page.getByRole("region", { name: "Live image" }).click();
     await page.evaluate(() => document.activeElement.blur());
     const start = await poseOf(page);
@@ -260,7 +260,7 @@ describe("contact", () => {
 
   it("is where the probe is dragged by its body, or put by a double click on the skin", async () => {
     const { page, room } = await openRoom();
-    await page.getByLabel("Contact").check();
+    await page.getByRole("checkbox", { name: "Contact" }).check();
     await page.getByRole("button", { name: "Top", exact: true }).click();
     await rest(page);
     const before = await poseOf(page);
