@@ -162,11 +162,10 @@ def _without_delay(
 
 def _found_shares(judge: _Judge, poses: FloatArray, ranges: Sequence[range], places: IntArray) -> Shares:
     """The shares that predict frames best, first alike for all three, then each; RIGID where they gain little, or where
-    few frames can be predicted.
+    few frames can be predicted, and where passes that cross contradict them.
 
-    Nor do they hold where passes that cross show less of the same with them: tissue that follows the probe is shown
-    alike by two passes once it is at rest. Within one pass images can be fitted by shares that are none: those of a
-    probe that glides over layers, which look as if they followed.
+    Within one pass a probe that glides over layers looks as if they followed it. Two passes tell: tissue that follows
+    is shown alike by both once it is at rest, and rigid tissue is not.
 
     Frames are predicted from their neighbours and from those FAR away. A slow hand hardly moves within the plane from
     one frame to the next: then far ones tell. They show less of the same anatomy, and alone they would err.
