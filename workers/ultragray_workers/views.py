@@ -122,7 +122,7 @@ def compare(
     if dataset is None:
         trained, poses = phantom_poses()
         numbers = np.arange(len(trained), len(trained) + len(poses))
-        held_out = (scan_phantom(poses[[place]], first=number) for place, number in enumerate(numbers))
+        held_out = (scan_phantom(poses[[place]], first=len(trained) + place) for place in range(len(poses)))
     else:
         sweeps = open_datasets(artifact_folder, storage, max_copies_bytes).load(dataset)
         check_same_origin(scene.info, sweeps)

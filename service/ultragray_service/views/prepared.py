@@ -449,8 +449,8 @@ class Comparisons(Prepared):
             progress=sum(value is not None for value in scored) / max(1, len(scored)),
             dataset=dataset or PHANTOM,
             frames=frames,
-            reason=error and error.detail,
-            error=error and error.reason,
+            reason=None if error is None else error.detail,
+            error=None if error is None else error.reason,
         )
 
     def _frames(self, key: str) -> list[ComparedFrame]:
