@@ -6,7 +6,7 @@ export const scan = {
   close: "Close",
   room: "Scene in space",
   group: (name: string): string => `${name}: show or hide`,
-  groups: { confidence: "Confidence", display: "Image", tools: "Tools", pose: "Pose", locate: "Frame search", registrations: "Registrations", path: "Path", connect: "Connect" },
+  groups: { confidence: "Confidence", display: "Image", tools: "Tools", pose: "Pose", locate: "Frame search", labels: "Labels", registrations: "Registrations", path: "Path", connect: "Connect" },
   image: {
     label: "Live image",
     of: (scene: string): string => `B-mode image of ${scene}`,
