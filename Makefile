@@ -107,7 +107,7 @@ check-lint:
 	$(BIN)/ruff check $(PYTHON_SOURCES)
 	$(BIN)/ruff format --check $(PYTHON_SOURCES)
 	$(BIN)/clang-format --dry-run --Werror model/kernels/*.[ch]pp model/kernels/*.inl
-	$(BIN)/hadolint docker/Dockerfile
+	$(BIN)/hadolint docker/Dockerfile docker/ros.Dockerfile
 
 check-types:
 	$(BIN)/mypy

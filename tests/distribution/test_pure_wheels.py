@@ -17,6 +17,7 @@ PACKAGES = {
 }
 FOR_ROS = {
     "share/ament_index/resource_index/packages/ultragray_ros",
+    "share/ultragray_ros/foxglove/ultragray.json",
     "share/ultragray_ros/launch/ultragray.launch.xml",
     "share/ultragray_ros/package.xml",
 }

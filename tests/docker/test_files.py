@@ -9,6 +9,7 @@ import subprocess
 import sys
 from functools import cache
 from pathlib import Path, PurePosixPath
+from xml.etree import ElementTree
 
 import pytest
 import typer
@@ -26,13 +27,14 @@ from ..surroundings import ROOT
 from .envoy import FOLDER
 
 DOCKERFILE = (ROOT / "docker" / "Dockerfile").read_text()
+DOCKERFILE_OF_ROS = (ROOT / "docker" / "ros.Dockerfile").read_text()
 IGNORED = (ROOT / ".dockerignore").read_text().splitlines()
 
 
 def copied():
-    """What the build takes out of the checkout."""
-    lines = [line.split()[1:-1] for line in DOCKERFILE.splitlines() if re.match(r"COPY (?!--from)", line)]
-    return {source for sources in lines for source in sources}
+    """What the builds take out of the checkout."""
+    lines = (DOCKERFILE + DOCKERFILE_OF_ROS).splitlines()
+    return {source for line in lines if re.match(r"COPY (?!--from)", line) for source in line.split()[1:-1]}
 
 
 def test_what_is_copied_is_there_and_reaches_the_build():
@@ -61,7 +63,8 @@ SETS = {
     "cluster": ("compose.yaml", "compose.operation.yaml", "compose.cluster.yaml"),
 }
 SECRETS = dict.fromkeys((*OTHER_VARIABLES, "GRAFANA_PASSWORD"), "a-secret")
-OWN_IMAGES = ("ultragray:cpu", "ultragray:cuda")
+NODE_IMAGE = "ultragray:ros"
+OWN_IMAGES = ("ultragray:cpu", "ultragray:cuda", NODE_IMAGE)
 
 
 def compose(*files, **environment):
@@ -84,7 +87,7 @@ def services_of(name):
 
 @pytest.mark.parametrize("name", SETS)
 def test_compose_takes_the_files_and_settings_are_those_that_there_are(name):
-    services = services_of(name).values()
+    services = [one for one in services_of(name).values() if one["image"] != NODE_IMAGE]  # which has the clients' own
     given = {key for one in services for key in one.get("environment", {}) if key.startswith(ENVIRONMENT_PREFIX)}
     assert given <= {ENVIRONMENT_PREFIX + item.name.upper() for item, _ in annotated_fields(Settings)}
 
@@ -106,7 +109,8 @@ def test_own_containers_have_a_read_only_root_and_no_privileges(name):
         assert service["cap_drop"] == ["ALL"], key
         assert service["security_opt"] == ["no-new-privileges:true"], key
         assert service["tmpfs"] == ["/tmp"], key
-        assert "/var/cache/ultragray" in {mount["target"] for mount in service["volumes"]}, key
+        if service["image"] != NODE_IMAGE:
+            assert "/var/cache/ultragray" in {mount["target"] for mount in service["volumes"]}, key
 
 
 @pytest.mark.parametrize("name", SETS)
@@ -121,6 +125,20 @@ def test_ports_are_open_to_this_machine_alone_and_published_once(name):
     published = [port["published"] for port in ports]
     assert sorted(published) == sorted(set(published))
     assert {"8000", "50051"} <= set(published)
+
+
+def test_the_node_of_ros_is_heard_on_this_machine_and_starts_by_the_launch_file():
+    node = services_of("alone")["ros"]
+    assert (node["profiles"], node["network_mode"]) == (["ros"], "host")
+    (command,) = re.findall(r"^CMD (.+)$", DOCKERFILE_OF_ROS, re.MULTILINE)
+    program, verb, package, file, *arguments = json.loads(command)
+    assert (program, verb, package) == ("ros2", "launch", "ultragray_ros")
+    declared = {
+        one.attrib["name"]: one.attrib["default"] for one in ElementTree.parse(ROOT / "ros/launch" / file).iter("arg")
+    }
+    assert {one.partition(":=")[0] for one in arguments} <= set(declared)
+    assert declared["foxglove_address"] == "127.0.0.1"
+    assert declared["address"].partition(":")[2] == "50051"
 
 
 @pytest.mark.parametrize(("name", "missing"), [("operation", "DATABASE"), ("cluster", "STORAGE")])

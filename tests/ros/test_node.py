@@ -78,6 +78,7 @@ def test_the_command_of_the_launch_file_starts_the_node(start_node, peer, ros_se
     values = {one.attrib["name"]: one.attrib["default"] for one in launch.iter("arg")}
     values |= {"address": ros_service.grpc, "probe_frame": "transducer"}
     (executable,) = launch.iter("executable")
+    assert set(re.findall(r"\$\(var (\w+)\)", ElementTree.tostring(launch, "unicode"))) == set(values)
     program, flag, *words = re.sub(r"\$\(var (\w+)\)", lambda found: values[found[1]], executable.attrib["cmd"]).split()
     assert (program, flag) == ("ultragray-ros", "--ros-args")
     start_node(**dict(word.split(":=") for word in words[1::2]))

@@ -1,4 +1,4 @@
-"""Standard messages of ROS 2 as files hold them: their definitions, and what of ours becomes which. Needs no ROS.
+"""Messages of ROS 2 as files hold them: their definitions, and what of ours becomes which. Needs no ROS.
 
 ROS speaks metres: poses are converted here. A message is a dict of its fields. The Python client has a copy of this
 module (client/generate.py), so it imports no more than that has, too.
@@ -6,10 +6,12 @@ module (client/generate.py), so it imports no more than that has, too.
 
 from __future__ import annotations
 
+import colorsys
 import json
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
 import numpy.typing as npt
 
 from ultragray.geometry.pose import quaternion_from_pose
@@ -25,6 +27,8 @@ IMAGE = "sensor_msgs/msg/Image"
 POSE = "geometry_msgs/msg/PoseStamped"
 DIAGNOSTICS = "diagnostic_msgs/msg/DiagnosticArray"
 TEXT = "std_msgs/msg/String"
+ANNOTATIONS = "foxglove_msgs/msg/ImageAnnotations"
+LINE_LIST = 4  # of a PointsAnnotation: its points are ends of lines, two by two
 
 _SEPARATOR = "=" * 80
 _PARTS = {
@@ -37,31 +41,57 @@ _PARTS = {
         "byte level\nstring name\nstring message\nstring hardware_id\ndiagnostic_msgs/KeyValue[] values"
     ),
     "diagnostic_msgs/KeyValue": "string key\nstring value",
+    "foxglove_msgs/CircleAnnotation": (
+        "builtin_interfaces/Time timestamp\nfoxglove_msgs/Point2 position\nfloat64 diameter\nfloat64 thickness\n"
+        "foxglove_msgs/Color fill_color\nfoxglove_msgs/Color outline_color"
+    ),
+    "foxglove_msgs/PointsAnnotation": (
+        "builtin_interfaces/Time timestamp\nuint8 type\nfoxglove_msgs/Point2[] points\n"
+        "foxglove_msgs/Color outline_color\nfoxglove_msgs/Color[] outline_colors\nfoxglove_msgs/Color fill_color\n"
+        "float64 thickness"
+    ),
+    "foxglove_msgs/TextAnnotation": (
+        "builtin_interfaces/Time timestamp\nfoxglove_msgs/Point2 position\nstring text\nfloat64 font_size\n"
+        "foxglove_msgs/Color text_color\nfoxglove_msgs/Color background_color"
+    ),
+    "foxglove_msgs/Point2": "float64 x\nfloat64 y",
+    "foxglove_msgs/Color": "float64 r\nfloat64 g\nfloat64 b\nfloat64 a",
 }
-_OF_EVERY = ("std_msgs/Header", "builtin_interfaces/Time")
+_HEADER = "std_msgs/Header header\n"
+_OF_HEADERS = ("std_msgs/Header", "builtin_interfaces/Time")
 _OF_POSES = ("geometry_msgs/Pose", "geometry_msgs/Point", "geometry_msgs/Quaternion")
 _OF_DIAGNOSTICS = ("diagnostic_msgs/DiagnosticStatus", "diagnostic_msgs/KeyValue")
 
 
 def _definition(fields: str, *parts: str) -> str:
-    """The definition of a message with a header, followed by those of all that it is made of."""
-    whole = [f"std_msgs/Header header\n{fields}"]
-    whole += [f"MSG: {name}\n{_PARTS[name]}" for name in (*_OF_EVERY, *parts)]
+    """The definition of a message, followed by those of all that it is made of."""
+    whole = [fields, *(f"MSG: {name}\n{_PARTS[name]}" for name in parts)]
     return f"\n{_SEPARATOR}\n".join(whole) + "\n"
 
 
 DEFINITIONS = {
     IMAGE: _definition(
-        "uint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data",
+        _HEADER + "uint32 height\nuint32 width\nstring encoding\nuint8 is_bigendian\nuint32 step\nuint8[] data",
+        *_OF_HEADERS,
     ),
-    POSE: _definition("geometry_msgs/Pose pose", *_OF_POSES),
-    DIAGNOSTICS: _definition("diagnostic_msgs/DiagnosticStatus[] status", *_OF_DIAGNOSTICS),
+    POSE: _definition(_HEADER + "geometry_msgs/Pose pose", *_OF_HEADERS, *_OF_POSES),
+    DIAGNOSTICS: _definition(_HEADER + "diagnostic_msgs/DiagnosticStatus[] status", *_OF_HEADERS, *_OF_DIAGNOSTICS),
     TEXT: "string data\n",
+    ANNOTATIONS: _definition(
+        "foxglove_msgs/CircleAnnotation[] circles\nfoxglove_msgs/PointsAnnotation[] points\n"
+        "foxglove_msgs/TextAnnotation[] texts",
+        *(name for name in _PARTS if name.startswith("foxglove_msgs/")),
+        "builtin_interfaces/Time",
+    ),
 }
 
 
 def header(time_ns: int, frame_id: str) -> dict[str, Any]:
-    return {"stamp": {"sec": time_ns // NS_PER_S, "nanosec": time_ns % NS_PER_S}, "frame_id": frame_id}
+    return {"stamp": _stamp(time_ns), "frame_id": frame_id}
+
+
+def _stamp(time_ns: int) -> dict[str, int]:
+    return {"sec": time_ns // NS_PER_S, "nanosec": time_ns % NS_PER_S}
 
 
 def image_message(pixels: npt.NDArray[Any], time_ns: int) -> dict[str, Any]:  # [H, W] uint8 or little-endian float32
@@ -136,3 +166,61 @@ def geometry_document(origin: Mapping[str, Any], frame_id: str) -> dict[str, Any
 def geometry_message(origin: Mapping[str, Any]) -> dict[str, Any]:
     """A std_msgs/String with the geometry of frames as JSON."""
     return {"data": json.dumps(geometry_document(origin, PROBE_FRAME), sort_keys=True)}
+
+
+def annotations_message(labels: npt.NDArray[np.uint8], time_ns: int) -> dict[str, Any]:  # [H, W]
+    """A foxglove_msgs/ImageAnnotations that outlines each label but 0, with its number at its topmost pixel.
+
+    Coordinates are pixels from the top left corner of the image, so that the pixel (row, column) is the square from
+    (column, row) to (column + 1, row + 1). The lines run along the edges between pixels inside and outside.
+    """
+    stamp = _stamp(time_ns)
+    points, texts = [], []
+    for label in np.unique(labels[labels > 0]).tolist():
+        inside = labels == label
+        colour = _colour(label)
+        row, column = (int(first) for first in np.argwhere(inside)[0])
+        points.append(
+            {
+                "timestamp": stamp,
+                "type": LINE_LIST,
+                "points": [{"x": x, "y": y} for x, y in _outline(inside).tolist()],
+                "outline_color": colour,
+                "outline_colors": [],
+                "fill_color": _NOTHING,
+                "thickness": 1.0,
+            }
+        )
+        texts.append(
+            {
+                "timestamp": stamp,
+                "position": {"x": float(column), "y": float(row)},
+                "text": str(label),
+                "font_size": max(8.0, labels.shape[0] / 24),
+                "text_color": colour,
+                "background_color": _NOTHING,
+            }
+        )
+    return {"circles": [], "points": points, "texts": texts}
+
+
+_NOTHING = {"r": 0.0, "g": 0.0, "b": 0.0, "a": 0.0}
+_GOLDEN_RATIO = 0.618033988749895  # its multiples spread the hues of any number of labels
+
+
+def _colour(label: int) -> dict[str, float]:
+    red, green, blue = colorsys.hsv_to_rgb(label * _GOLDEN_RATIO % 1.0, 0.8, 1.0)
+    return {"r": red, "g": green, "b": blue, "a": 1.0}
+
+
+def _outline(inside: npt.NDArray[np.bool_]) -> npt.NDArray[np.float64]:  # [H, W] -> [N, 2]
+    """Ends x, y of the lines around what is inside, two by two; edges in a row are one line."""
+    padded = np.pad(inside, 1)
+    lines = []
+    for turned in (padded, padded.T):  # lines that lie, then lines that stand
+        edges = np.pad((turned[1:, 1:-1] != turned[:-1, 1:-1]).astype(np.int8), ((0, 0), (1, 1)))
+        steps = np.diff(edges, axis=1)
+        rows, starts = np.nonzero(steps == 1)
+        ends = np.nonzero(steps == -1)[1]
+        lines.append(np.stack([starts, rows, ends, rows], axis=1).reshape(-1, 2))
+    return np.concatenate([lines[0], lines[1][:, ::-1]]).astype(np.float64)

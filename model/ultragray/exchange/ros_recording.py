@@ -16,11 +16,13 @@ from ultragray.exchange import ros_messages as ros
 from ultragray.geometry.probe import FloatArray
 
 TOPICS = "/ultragray"
+LABELS = "labels"  # the output that is outlined
 METADATA = "ultragray"  # the record of the origin: its objects as JSON
 
 
 class RosRecording:
-    """A writer of /ultragray/OUTPUT, /ultragray/probe_pose, /ultragray/confidence and /ultragray/geometry.
+    """A writer of /ultragray/OUTPUT, /ultragray/probe_pose, /ultragray/confidence and /ultragray/geometry, and, of
+    frames with the output labels, of their outlines for Foxglove on /ultragray/annotations.
 
     The origin of the frames is a metadata record, and their geometry a message: of the first frame, and again where
     they change. Only `finish` makes the file whole; without it a reader that needs no index has all but the last chunk.
@@ -50,6 +52,8 @@ class RosRecording:
         self._write("confidence", ros.DIAGNOSTICS, told, time_ns)
         for output, pixels in images.items():
             self._write(output, ros.IMAGE, ros.image_message(pixels, time_ns), time_ns)
+        if LABELS in images:
+            self._write("annotations", ros.ANNOTATIONS, ros.annotations_message(images[LABELS], time_ns), time_ns)
         self._count += 1
 
     def finish(self) -> None:

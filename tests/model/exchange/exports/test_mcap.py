@@ -9,6 +9,7 @@ from mcap_ros2.decoder import DecoderFactory
 
 from ultragray import LinearProbe
 from ultragray.contract import to_dict
+from ultragray.exchange import ros_messages
 from ultragray.exchange.poses import load_poses
 from ultragray.rendering.settings import Resolved
 from ultragray.scene.confidence import FIGURES, Extrapolation
@@ -83,3 +84,71 @@ def test_figures_and_origin_are_in_the_file(tmp_path, random_poses):
         (metadata,) = reader.iter_metadata()
     assert metadata.metadata["scene"] == "one"
     assert json.loads(metadata.metadata["probe"]) == to_dict(PROBE)
+
+
+def test_outlines_of_labels_run_along_their_pixels_as_foxglove_reads_them(tmp_path, random_poses):
+    path = tmp_path / "frames.mcap"
+    frames = written(path, random_poses(FRAMES), "uint8")
+    told = messages(path, "/ultragray/annotations")
+    assert len(told) == FRAMES
+    for number, message in enumerate(told):
+        labels = frames["labels"][number]
+        image = image_annotations(message)
+        assert [one.text for one in image.texts] == [str(label) for label in np.unique(labels[labels > 0])]
+        for outline, name in zip(image.points, image.texts, strict=True):
+            assert outline.timestamp.ToNanoseconds() == name.timestamp.ToNanoseconds() == number * 40_000_000
+            assert outline.type == outline.LINE_LIST
+            ends = np.array([(one.x, one.y) for one in outline.points])
+            np.testing.assert_array_equal(inside_of(ends, labels.shape), labels == int(name.text))
+            assert labels[int(name.position.y), int(name.position.x)] == int(name.text)
+            assert outline.outline_color.a == 1.0
+            assert outline.fill_color.a == 0.0
+
+
+def test_a_file_without_labels_has_no_outlines(tmp_path, random_poses):
+    path = tmp_path / "frames.mcap"
+    header = header_of("mcap", Resolved(PROBE, 6, 7, ("bmode",)), dtype="uint8", poses=random_poses(1))
+    exported(path, "mcap", header, {"bmode": np.zeros((1, 6, 7), np.float32)}, [Extrapolation(None, None, None, 0.0)])
+    assert messages(path, "/ultragray/annotations") == []
+
+
+def test_edges_in_a_row_are_one_line():
+    labels = np.zeros((10, 12), np.uint8)
+    labels[2:7, 3:9] = 5
+    (outline,) = ros_messages.annotations_message(labels, 0)["points"]
+    lines = np.array([(one["x"], one["y"]) for one in outline["points"]]).reshape(-1, 4)
+    assert sorted(map(tuple, lines)) == [(3, 2, 3, 7), (3, 2, 9, 2), (3, 7, 9, 7), (9, 2, 9, 7)]
+
+
+def image_annotations(message):
+    """A message of the file as Foxglove's own schema has it, field by field."""
+    schema = pytest.importorskip(
+        "foxglove_schemas_protobuf.ImageAnnotations_pb2",
+        reason="Foxglove's schemas are not installed: pip install 'ultragray[dev]'",
+    )
+    return fill(schema.ImageAnnotations(), message)
+
+
+def fill(schema, message):
+    for name in message.__slots__:
+        value = getattr(message, name)
+        if isinstance(value, list):
+            for one in value:
+                fill(getattr(schema, name).add(), one)
+        elif name == "timestamp":
+            schema.timestamp.FromNanoseconds(value.sec * 1_000_000_000 + value.nanosec)
+        elif hasattr(value, "__slots__"):
+            fill(getattr(schema, name), value)
+        else:
+            setattr(schema, name, value)
+    schema.SetInParent()
+    return schema
+
+
+def inside_of(ends, shape):
+    """The pixels that lines enclose: a ray from the left has crossed an odd number of standing lines."""
+    crossed = np.zeros((shape[0], shape[1] + 1), int)
+    for (x, top), (other, bottom) in ends.reshape(-1, 2, 2).astype(int):
+        if x == other:
+            crossed[min(top, bottom) : max(top, bottom), x] += 1
+    return np.cumsum(crossed, axis=1)[:, :-1] % 2 == 1
