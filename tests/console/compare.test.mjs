@@ -4,7 +4,7 @@ import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
 import { describe, it } from "node:test";
 
-import { hold, openPage, picture, seriousFindings, until } from "./harness.mjs";
+import { BACKGROUND_TIMEOUT_MS, hold, openPage, picture, seriousFindings, until } from "./harness.mjs";
 import { cut } from "./reach.mjs";
 import { poseOf } from "./scan_page.mjs";
 import { put } from "./sweep.mjs";
@@ -34,6 +34,13 @@ function arrived(page, name) {
   return page.getByRole("region", { name, exact: true }).locator('[role="img"][aria-busy="false"]').waitFor();
 }
 
+/** Waits until every frame is measured, and gives what the service says of them. */
+async function measured(page, scene, timeout = BACKGROUND_TIMEOUT_MS) {
+  await page.getByTestId("comparison").waitFor({ timeout });
+  await page.getByTestId("working").waitFor({ state: "detached", timeout });
+  return (await fetch(`${at.service.url}/v1/scenes/${scene}/comparison`)).json();
+}
+
 const against = (page, label) => page.getByLabel("Compare the truth with").selectOption({ label });
 
 const rms = (a, b) => Math.sqrt(a.reduce((sum, value, i) => sum + (value - b[i]) ** 2, 0) / a.length);
@@ -41,8 +48,7 @@ const rms = (a, b) => Math.sqrt(a.reduce((sum, value, i) => sum + (value - b[i])
 describe("compare", () => {
   it("computes the comparison, then steps through the frames with their metrics", async () => {
     const page = await openPage(at, "#/compare/compared");
-    await page.getByTestId("comparison").waitFor();
-    const { frames } = await (await fetch(`${at.service.url}/v1/scenes/compared/comparison`)).json();
+    const { frames } = await measured(page, "compared");
     assert.equal(frames.length, HELD_OUT);
     const row = page.getByRole("row", { name: /^PSNR/ });
     await until(() => row.textContent(), (text) => text.includes(frames[0].psnr_db.toFixed(2)), "not its PSNR");
@@ -71,6 +77,38 @@ describe("compare", () => {
     await until(() => page.getByTestId("frame-number").textContent(), (text) => text === `Frame ${frames[0].frame_number}`, "no pick");
     assert.deepEqual([page.faults, page.foreign], [[], []]);
     await picture(page, "compare");
+  });
+
+  it("shows the first frame while the others are measured, and says which one it is at", async () => {
+    const page = await openPage(at, "#/scenes");
+    const { frames, ...whole } = await (await fetch(`${at.service.url}/v1/scenes/compared/comparison`)).json();
+    const unknown = ([name]) => !/_db|ssim|gms|distance/.test(name);
+    let known = 1; // frames that are rendered; of the first one the nearest frame, too
+    const soFar = frames.map((frame) => Object.fromEntries(Object.entries(frame).map((one) => (unknown(one) ? one : [one[0], null]))));
+    const answer = () => frames.map((frame, i) => ({
+      ...soFar[i],
+      ...(i < known && Object.fromEntries(Object.entries(frame).filter(([name]) => !/^(nearest|linear|median)_/.test(name)))),
+    }));
+    await page.route(/compared\/comparison$/, (route) => route.fulfill({ json: { ...whole, state: "running", progress: 0.1, frames: answer() } }));
+    let asked = 0;
+    page.on("request", (request) => (asked += /\/comparison\/0\/truth\.png$/.test(request.url())));
+    await page.goto(`${at.service.url}/#/compare/compared`);
+    await arrived(page, "Rendering");
+    await page.getByTestId("working").getByText(`Rendering: frame 2 of ${HELD_OUT}`).waitFor();
+    const row = page.getByRole("row", { name: /^PSNR/ });
+    assert.equal((await row.textContent()).match(/–/g).length, 6, "figures that nobody measured");
+    await page.getByRole("button", { name: "All methods" }).click();
+    assert.equal(await page.getByRole("region", { name: "Nearest frame" }).locator("canvas").count(), 0, "a picture that nobody drew");
+    assert.equal(await page.getByRole("button", { name: "Worst", exact: true }).isDisabled(), true);
+    await picture(page, "compare-under-way");
+    known = 3;
+    await page.getByTestId("working").getByText(`Rendering: frame 4 of ${HELD_OUT}`).waitFor();
+    assert.equal(asked, 1, "the same picture was fetched at each answer");
+    await page.unroute(/compared\/comparison$/);
+    await measured(page, "compared");
+    await arrived(page, "Median compounding");
+    assert.deepEqual([page.faults, page.foreign], [[], []]);
+    await picture(page, "compare-all");
   });
 
   it("tells a picture that is late or did not come, and gets it", async () => {
@@ -119,8 +157,7 @@ describe("compare", () => {
 
   it("compares the demo scene out of the box, with frames that are simulated", async () => {
     const page = await openPage(at, "#/compare/demo");
-    await page.getByTestId("comparison").waitFor({ timeout: DEMO_MS });
-    const { frames, dataset } = await (await fetch(`${at.service.url}/v1/scenes/demo/comparison`)).json();
+    const { frames, dataset } = await measured(page, "demo", DEMO_MS);
     const { metrics } = await (await fetch(`${at.service.url}/v1/scenes/demo`)).json();
     const mean = frames.reduce((sum, frame) => sum + frame.psnr_db, 0) / frames.length;
     assert.ok(Math.abs(mean - metrics.psnr_db) < 0.3, `${mean} dB, where the scene was measured at ${metrics.psnr_db}`);

@@ -5,7 +5,7 @@ import { describe, it } from "node:test";
 
 import { built } from "./sources.mjs";
 
-const { difference, similarity, valueAt, correlation, worstFirst } = await built("compare/pictures");
+const { difference, similarity, valueAt, correlation, meanOf, underWay, worstFirst } = await built("compare/pictures");
 
 const grey = (width, height, value) => ({
   width,
@@ -45,6 +45,17 @@ describe("statistics", () => {
     const frames = [{ psnr_db: 20, gmsd: 0.2 }, { psnr_db: 30, gmsd: 0.1 }, { psnr_db: 10, gmsd: 0.3 }];
     assert.deepEqual(worstFirst(frames, "rendering", "psnr_db"), [2, 0, 1]);
     assert.deepEqual(worstFirst(frames, "rendering", "gmsd"), [2, 0, 1]);
+  });
+
+  it("leave out what is not measured yet", () => {
+    const frame = (psnr_db, nearest_psnr_db) => ({ psnr_db, nearest_psnr_db, linear_psnr_db: 1, median_psnr_db: 1 });
+    const frames = [frame(20, 10), frame(null, null), frame(10, null)];
+    assert.equal(meanOf(frames, "rendering", "psnr_db"), 15);
+    assert.equal(meanOf([frame(null, null)], "rendering", "psnr_db"), null);
+    assert.deepEqual(worstFirst(frames, "rendering", "psnr_db"), [2, 0, 1]);
+    assert.deepEqual(underWay(frames), { way: "rendering", done: 2 });
+    assert.deepEqual(underWay([frame(1, 2), frame(1, null)]), { way: "nearest", done: 1 });
+    assert.equal(underWay([frame(1, 2)]), null);
   });
 
   it("correlate as Pearson does", () => {

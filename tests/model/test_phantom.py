@@ -336,18 +336,23 @@ def test_counts():
 
 
 def test_load_phantom_holds_out_a_sweep_at_a_tilt_of_its_own(monkeypatch):
-    def numbered(poses, *, height, width, **_):
+    def stamps(poses):
+        return np.round(128 + poses[:, 1, 3])
+
+    def stamped(poses, *, height, width, **_):
         frames = np.zeros((len(poses), height, width), dtype=np.uint8)
-        frames[:, 0, 0] = 1 + np.arange(len(poses)) % 255
+        frames[:, 0, 0] = stamps(poses)
         return frames
 
-    monkeypatch.setattr(sweeps, "simulate", numbered)
+    monkeypatch.setattr(sweeps, "simulate", stamped)
     dataset = load_phantom()
     assert (dataset.name, dataset.probe) == ("phantom", PHANTOM_PROBE)
     assert (len(dataset.train), len(dataset.val)) == (211, 24)
     assert (dataset.train.height, dataset.train.width) == (256, 256)
-    together = np.concatenate([dataset.train.images[:, 0, 0], dataset.val.images[:, 0, 0]])
-    np.testing.assert_array_equal(together, 1 + np.arange(235))
+    for part in (dataset.train, dataset.val):
+        np.testing.assert_array_equal(part.images[:, 0, 0], stamps(part.poses))
+    numbers = np.concatenate([dataset.train.frame_numbers, dataset.val.frame_numbers])
+    np.testing.assert_array_equal(numbers, np.arange(235))
     parts = np.split(dataset.train.poses, [91, 151])
     tilts = [float(tilts_deg(part).mean()) for part in (*parts, dataset.val.poses)]
     np.testing.assert_allclose(tilts, [0.0, 9.0, -9.0, 5.0], atol=1.0)

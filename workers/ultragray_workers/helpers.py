@@ -7,11 +7,12 @@ must be until the work begins.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import resource
 import signal
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +27,6 @@ from ultragray.rendering.pixels import to_uint8
 from ultragray_workers.claims import storage_full
 from ultragray_workers.processes import end_with_parent, let_frames_go_first
 
-PROGRESS_NAME = "progress"  # in the folder that a process fills
 NICE_LEVEL = 10
 
 
@@ -52,10 +52,12 @@ def answer_request(work: Callable[..., None]) -> None:
     sys.stdout.write(json.dumps(answer))
 
 
-def write_progress(folder: Path, share: float) -> None:
-    temporary = folder / f"{PROGRESS_NAME}.new"
-    temporary.write_text(str(share), encoding="utf-8")
-    temporary.replace(folder / PROGRESS_NAME)
+@contextlib.contextmanager
+def replaced(path: Path) -> Iterator[Path]:
+    """A path to write to in place of `path`, which others read meanwhile: it gets the name once it is whole."""
+    temporary = path.with_name(f"{path.name}.new")
+    yield temporary
+    temporary.replace(path)
 
 
 # Frames in a folder, uint8 [F, H, W] by name, as their probe samples them; read one at a time, as pictures.
@@ -69,9 +71,10 @@ PICTURE_SIDE = 512  # pixels, the longer one
 
 def write_stacks(folder: Path, stacks: Mapping[str, npt.NDArray[Any]], probe: Probe) -> None:
     """Writes frames of one probe, [F, H, W], uint8 or float32 in [0, 1]."""
-    (folder / PROBE_NAME).write_text(json.dumps(to_dict(probe)), encoding="utf-8")
+    with replaced(folder / PROBE_NAME) as path:
+        path.write_text(json.dumps(to_dict(probe)), encoding="utf-8")
     for name, frames in stacks.items():
-        with (folder / f"{name}{SUFFIX}").open("wb") as file:
+        with replaced(folder / f"{name}{SUFFIX}") as path, path.open("wb") as file:
             header = {"descr": "|u1", "fortran_order": False, "shape": frames.shape}
             np.lib.format.write_array_header_1_0(file, header)
             for frame in frames:  # np.save does not tell that a disk is full

@@ -5,11 +5,17 @@ scene beside held-out frames.
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
+import numpy as np
+import numpy.typing as npt
+
+from ultragray.geometry.probe import Probe
+from ultragray.rendering.pixels import to_uint8
 from ultragray_workers.datasets.store import open_datasets
-from ultragray_workers.helpers import write_progress, write_stacks
+from ultragray_workers.helpers import replaced, write_stacks
 from ultragray_workers.storage.cache import DEFAULT_MAX_BYTES
 
 if TYPE_CHECKING:
@@ -54,7 +60,6 @@ def draw_preview(
     The frame is the middle one of those held out, else of those trained from; the scene is that of `checkpoint`.
     Raises DatasetNotFound, DatasetInvalid, TrainingStateInvalid.
     """
-    import numpy as np
     import torch
 
     from ultragray.learn.evaluation.scoring import render_sweep
@@ -77,12 +82,17 @@ def draw_preview(
 
 
 # Work of a helper process: comparing a scene with the held-out frames of the dataset that it was trained from.
+#
+# What is known of a frame is written at once, for those who look meanwhile: `INDEX.npy` has as many of PICTURES as are
+# drawn, FRAMES_NAME a row a frame with the figures that are measured, and null for the others. A figure is there only
+# where its picture is.
 
 
 FRAMES_NAME = "frames.json"
-CLASSICAL = ("median", "linear", "nearest")  # of ultragray.learn.evaluation.baselines.BASELINES
-PICTURES = ("truth", "rendering", *CLASSICAL, "difference")
+CLASSICAL = ("nearest", "linear", "median")  # of ultragray.learn.evaluation.baselines.BASELINES; the slowest last
+PICTURES = ("truth", "rendering", "difference", *CLASSICAL)  # in the order in which they are drawn
 _COMPARED = ("psnr_db", "ms_ssim", "gms", "gmsd")
+_FIGURES = (*_COMPARED, "histogram_distance")
 
 
 def compare(
@@ -95,63 +105,84 @@ def compare(
 ) -> None:
     """Fill `folder` with metrics and pictures of a scene on the frames that the dataset of this name holds out.
 
-    None is the built-in phantom, which is simulated. It says meanwhile which share is done. Raises DatasetNotFound,
+    None is the built-in phantom, which is simulated frame by frame: those held out first. Raises DatasetNotFound,
     DatasetInvalid where the dataset holds out none, SceneFileInvalid, InvalidImageSize for frames too small to measure.
     """
-    import numpy as np
     import torch
 
-    from ultragray.learn.evaluation.baselines import affordable_voxel_mm, predict
+    from ultragray.learn.evaluation.baselines import affordable_voxel_mm, compound, predict
     from ultragray.learn.evaluation.scoring import check_same_origin, evaluate_frames, render_sweep, require_frames
     from ultragray.learn.evaluation.side_by_side import DIFFERENCE_GAIN
-    from ultragray.phantom import load_phantom
+    from ultragray.phantom.sweeps import phantom_poses, scan_phantom
     from ultragray.scene.confidence import Assessor
     from ultragray.scene.gaussians import GaussianScene
 
     torch.set_num_threads(1)
-    filled = Path(folder)
     scene = GaussianScene.load(scene_path)
     if dataset is None:
-        sweeps = load_phantom()
+        trained, poses = phantom_poses()
+        numbers = np.arange(len(trained), len(trained) + len(poses))
+        held_out = (scan_phantom(poses[[place]], first=len(trained) + place) for place in range(len(poses)))
     else:
         sweeps = open_datasets(artifact_folder, storage, max_copies_bytes).load(dataset)
         check_same_origin(scene.info, sweeps)
-    held_out = sweeps.val
-    require_frames(held_out)
-    write_progress(filled, 0.1)
-    voxel_mm = affordable_voxel_mm(sweeps.train)
-    predicted = {}  # [F, H, W] by name
-    for done, name in enumerate(CLASSICAL, 1):
-        predicted[name] = predict(sweeps.train, held_out.poses, name, voxel_mm=voxel_mm)
-        write_progress(filled, 0.1 + 0.1 * done)
-    predicted["rendering"] = render_sweep(scene, held_out, backend="cpu")
-    write_progress(filled, 0.7)
-    measured = {name: evaluate_frames(frames, held_out) for name, frames in predicted.items()}
-    coverage = render_sweep(scene, held_out, backend="cpu", output="coverage")
-    trusted = Assessor(scene.info, scene.training_poses).assess(held_out.poses, held_out.probe, coverage=coverage)
-    write_progress(filled, 0.9)
-    truth = (held_out.images / 255.0).astype(np.float32)
-    difference = np.minimum(np.abs(predicted["rendering"] - truth) * DIFFERENCE_GAIN, 1.0)
-    pictures = {"truth": truth, **predicted, "difference": difference}
-    write_stacks(filled, {name: pictures[name] for name in PICTURES}, sweeps.probe)
-    frames = [
-        {
-            "index": index,
-            "frame_number": int(number),
-            "pose": held_out.poses[index].tolist(),
-            "confidence": trusted[index].confidence,
-            **{
-                f"{'' if name == 'rendering' else f'{name}_'}{metric}": value
-                for name, evaluation in measured.items()
-                for metric, value in _metrics(evaluation, index).items()
-            },
-        }
-        for index, number in enumerate(held_out.frame_numbers)
-    ]
-    (filled / FRAMES_NAME).write_text(json.dumps(frames), encoding="utf-8")
+        require_frames(sweeps.val)
+        poses, numbers = sweeps.val.poses, sweeps.val.frame_numbers
+        held_out = (sweeps.val.select(np.array([place])) for place in range(len(poses)))
+    comparison = _Comparison(Path(folder), numbers.tolist(), poses.tolist())
+    assessor = Assessor(scene.info, scene.training_poses)
+    truths = []
+    for index, truth in enumerate(held_out):
+        truths.append(truth)
+        rendered = render_sweep(scene, truth, backend="cpu")
+        coverage = render_sweep(scene, truth, backend="cpu", output="coverage")
+        (trusted,) = assessor.assess(truth.poses, truth.probe, coverage=coverage)
+        difference = np.minimum(np.abs(rendered - truth.images / np.float32(255.0)) * DIFFERENCE_GAIN, 1.0)
+        pictures = (truth.images[0], rendered[0], difference[0])
+        measured = _metrics(evaluate_frames(rendered, truth))
+        comparison.add(index, truth.probe, pictures, {"confidence": trusted.confidence, **measured})
+    train = scan_phantom(trained) if dataset is None else sweeps.train
+    for name in CLASSICAL:
+        volume = compound(train, name, affordable_voxel_mm(train)) if name == "median" else None
+        for index, truth in enumerate(truths):
+            if volume is None:
+                expected = predict(train, truth.poses, name)
+            else:
+                expected = volume.reslice(train.probe, truth.poses, train.height, train.width)
+            measured = _metrics(evaluate_frames(expected, truth))
+            figures = {f"{name}_{metric}": value for metric, value in measured.items()}
+            comparison.add(index, truth.probe, (expected[0],), figures)
 
 
-def _metrics(evaluation: Evaluation, index: int) -> dict[str, float]:
-    frame = evaluation.frames[index]
-    own = {name: getattr(frame, name) for name in _COMPARED}
-    return {**own, "histogram_distance": evaluation.frame_speckle[index].histogram_distance}
+class _Comparison:
+    """The folder of a comparison under way."""
+
+    def __init__(self, folder: Path, numbers: list[int], poses: list[Any]) -> None:
+        self._folder = folder
+        prefixes = ("", *(f"{name}_" for name in CLASSICAL))
+        unknown = dict.fromkeys(("confidence", *(f"{prefix}{metric}" for prefix in prefixes for metric in _FIGURES)))
+        self._frames = [
+            {"index": index, "frame_number": number, "pose": pose, **unknown}
+            for index, (number, pose) in enumerate(zip(numbers, poses, strict=True))
+        ]
+        self._pictures: list[list[npt.NDArray[np.uint8]]] = [[] for _ in numbers]
+        self._write()
+
+    def add(
+        self, index: int, probe: Probe, pictures: Sequence[npt.NDArray[Any]], figures: Mapping[str, float | None]
+    ) -> None:
+        """Pictures [H, W], uint8 or float32 in [0, 1], that follow those of this frame, and what was measured."""
+        self._pictures[index] += map(to_uint8, pictures)
+        write_stacks(self._folder, {str(index): np.stack(self._pictures[index])}, probe)
+        self._frames[index].update(figures)
+        self._write()
+
+    def _write(self) -> None:
+        with replaced(self._folder / FRAMES_NAME) as path:
+            path.write_text(json.dumps(self._frames), encoding="utf-8")
+
+
+def _metrics(evaluation: Evaluation) -> dict[str, float]:
+    """Of the only frame."""
+    own = {name: getattr(evaluation.frames[0], name) for name in _COMPARED}
+    return {**own, "histogram_distance": evaluation.frame_speckle[0].histogram_distance}

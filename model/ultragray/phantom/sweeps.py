@@ -48,8 +48,8 @@ def _rotations(axis: int, angle_rad: FloatArray) -> FloatArray:  # [C] -> [C, 3,
     return rotations
 
 
-def load_phantom() -> Dataset:
-    """The dataset `phantom`, the same on every call, in about half a minute.
+def phantom_poses() -> tuple[FloatArray, FloatArray]:  # [T, 4, 4], [V, 4, 4] mm
+    """Those that the dataset `phantom` is trained from, and those that it holds out.
 
     A straight sweep and two tilted by ±9° and 3 mm to the sides to train from; held out, a sweep tilted by 5°.
     """
@@ -58,12 +58,16 @@ def load_phantom() -> Dataset:
         freehand_poses(60, tilt_deg=9.0, offset_mm=3.0, unrest=1.0),
         freehand_poses(60, tilt_deg=-9.0, offset_mm=-3.0, unrest=2.0),
     ]
-    poses = np.concatenate([*train, freehand_poses(24, tilt_deg=5.0, offset_mm=1.0, unrest=3.0)])
+    return np.concatenate(train), freehand_poses(24, tilt_deg=5.0, offset_mm=1.0, unrest=3.0)
+
+
+def scan_phantom(poses: FloatArray, first: int = 0) -> Sweep:
+    """The frames of the dataset `phantom` from poses [F, 4, 4], mm, numbered from `first`."""
     images = simulate(poses, probe=PHANTOM_PROBE, height=PHANTOM_IMAGE_SIDE, width=PHANTOM_IMAGE_SIDE)
-    sweep = Sweep(images, poses, PHANTOM_PROBE, np.arange(len(poses)), "phantom")
-    first_held_out = sum(len(part) for part in train)
-    return Dataset(
-        "phantom",
-        train=sweep.select(np.arange(first_held_out)),
-        val=sweep.select(np.arange(first_held_out, len(poses))),
-    )
+    return Sweep(images, poses, PHANTOM_PROBE, np.arange(first, first + len(poses)), "phantom")
+
+
+def load_phantom() -> Dataset:
+    """The dataset `phantom`, the same on every call, in about half a minute."""
+    train, val = phantom_poses()
+    return Dataset("phantom", train=scan_phantom(train), val=scan_phantom(val, first=len(train)))

@@ -35,11 +35,11 @@ from ultragray_service.settings import Settings
 from ultragray_workers.claims import age_s, claimed_folder, remove_abandoned, remove_whole, storage_full
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.errors import ArtifactNotFound, DatasetNotFound, Draining
-from ultragray_workers.helpers import PROGRESS_NAME, read_picture
+from ultragray_workers.helpers import read_picture
 from ultragray_workers.jobs.record import Job
 from ultragray_workers.jobs.store import JobStore
 from ultragray_workers.scenes import SceneStore
-from ultragray_workers.views import FRAMES_NAME, POSES_NAME, PREVIEW_PICTURES, compare, draw_preview, lay_out
+from ultragray_workers.views import FRAMES_NAME, PICTURES, POSES_NAME, PREVIEW_PICTURES, compare, draw_preview, lay_out
 
 TIMEOUT_S = 1800.0
 KEPT_FOLDERS = 32
@@ -51,10 +51,9 @@ _log = logging.getLogger("ultragray.service")
 
 @dataclass(frozen=True)
 class Preparation:
-    """The progress of a folder; `error` where it could not be made."""
+    """The state of a folder; `error` where it could not be made."""
 
     state: Literal["running", "ready", "failed"]
-    progress: float  # 0 to 1
     error: UltragrayError | None = None
 
 
@@ -73,9 +72,9 @@ class Prepared:
     fill: ClassVar[Callable[..., None]]  # a staticmethod
 
     def __init__(self, settings: Settings, processes: HelperProcesses) -> None:
-        self._places: dict[str, str | int] = {"artifact_folder": str(settings.working_folder)}
+        self._origins: dict[str, str | int] = {"artifact_folder": str(settings.working_folder)}
         if not isinstance(settings.artifacts, Path):
-            self._places |= {"storage": str(settings.artifacts), "max_copies_bytes": settings.max_cache_bytes}
+            self._origins |= {"storage": str(settings.artifacts), "max_copies_bytes": settings.max_cache_bytes}
         self.folder = settings.working_folder / self.name
         self._processes = processes
         self._kept_bytes = settings.max_dataset_bytes
@@ -85,13 +84,13 @@ class Prepared:
         self._ended = False
 
     async def prepare(self, key: str, **arguments: str | None) -> Preparation:
-        """Begin to make the folder unless it is there, or failed a minute ago; how far it is. Raises Draining."""
+        """Begin to make the folder unless it is there, or failed a minute ago. Raises Draining."""
         if await asyncio.to_thread(self._touch, key):
-            return Preparation("ready", 1.0)
+            return Preparation("ready")
         if (error := self._failure(key)) is not None:
-            return Preparation("failed", 0.0, error)
+            return Preparation("failed", error)
         self._task(key, arguments)
-        return Preparation("running", await asyncio.to_thread(self._progress, key))
+        return Preparation("running")
 
     async def path(self, key: str, **arguments: str | None) -> Path:
         """The folder, made first where it is not there.
@@ -114,14 +113,14 @@ class Prepared:
         return self.folder / key
 
     async def picture_png(self, key: str, index: int, *names: str) -> bytes | None:
-        """Frame `index` of the stacks of these names, side by side; None where one is not there (any more)."""
+        """Frame `index` of the stacks of these names, side by side; None where one is not there (yet, or any more)."""
 
         def read() -> bytes | None:
-            pictures = [read_picture(self.folder / key, name, index) for name in names]
-            found = [picture for picture in pictures if picture is not None]
-            if len(found) < len(names):
-                return None
-            return encoded_image(np.concatenate(found, axis=1), Encoding.PNG)
+            for folder in self._places(key):
+                pictures = [picture for name in names if (picture := read_picture(folder, name, index)) is not None]
+                if len(pictures) == len(names):
+                    return encoded_image(np.concatenate(pictures, axis=1), Encoding.PNG)
+            return None
 
         return await asyncio.to_thread(read)
 
@@ -174,7 +173,7 @@ class Prepared:
                 making = self._making[key] = await to_its_end(begin)
                 await self._processes.run(
                     self.fill,
-                    {**arguments, **self._places, "folder": str(making)},
+                    {**arguments, **self._origins, "folder": str(making)},
                     what=self.what,
                     timeout_s=TIMEOUT_S,
                     killed=DatasetInvalid,
@@ -205,12 +204,10 @@ class Prepared:
             return False
         return True
 
-    def _progress(self, key: str) -> float:
+    def _places(self, key: str) -> list[Path]:
+        """Where a folder can be read: while it is made, too. In this order, it is not missed as it gets its name."""
         making = self._making.get(key)
-        try:
-            return 0.0 if making is None else float((making / PROGRESS_NAME).read_text())
-        except (FileNotFoundError, ValueError):
-            return 0.0
+        return [*([] if making is None else [making]), self.folder / key]
 
     def _keep(self, making: Path, key: str) -> None:
         for path in (*making.iterdir(), making):
@@ -375,40 +372,40 @@ def _curve_of(journal: str | None) -> list[CurvePoint]:
     ]
 
 
-_FORMAT = 3  # of what is kept of a comparison
+_FORMAT = 4  # of what is kept of a comparison
 
 
 @dataclass(frozen=True, kw_only=True)
 class ComparedFrame:
     """How near the scene, and the classical ways (median compounding, linear between frames, the nearest frame), come.
 
-    To a held-out frame.
+    To a held-out frame. A figure is null until it is measured, and its picture then is there.
     """
 
     index: int
     frame_number: int = described("As the dataset numbers it.")
     pose: MatrixRows = described("Probe to scene, in mm.")
-    confidence: float | None = described("Expected MS-SSIM; null where the scene was trained without confidence.")
-    psnr_db: float
-    ms_ssim: float
-    gms: float
-    gmsd: float
-    histogram_distance: float = described("Between the grey values of both frames, in [0, 1].")
-    median_psnr_db: float
-    median_ms_ssim: float
-    median_gms: float
-    median_gmsd: float
-    median_histogram_distance: float
-    linear_psnr_db: float
-    linear_ms_ssim: float
-    linear_gms: float
-    linear_gmsd: float
-    linear_histogram_distance: float
-    nearest_psnr_db: float
-    nearest_ms_ssim: float
-    nearest_gms: float
-    nearest_gmsd: float
-    nearest_histogram_distance: float
+    confidence: float | None = described("Expected MS-SSIM; null where the scene was trained without confidence, too.")
+    psnr_db: float | None
+    ms_ssim: float | None
+    gms: float | None
+    gmsd: float | None
+    histogram_distance: float | None = described("Between the grey values of both frames, in [0, 1].")
+    median_psnr_db: float | None
+    median_ms_ssim: float | None
+    median_gms: float | None
+    median_gmsd: float | None
+    median_histogram_distance: float | None
+    linear_psnr_db: float | None
+    linear_ms_ssim: float | None
+    linear_gms: float | None
+    linear_gmsd: float | None
+    linear_histogram_distance: float | None
+    nearest_psnr_db: float | None
+    nearest_ms_ssim: float | None
+    nearest_gms: float | None
+    nearest_gmsd: float | None
+    nearest_histogram_distance: float | None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -416,9 +413,9 @@ class Comparison:
     """A scene beside the held-out frames of its dataset."""
 
     state: Literal["running", "ready", "failed"] = described("A failed one is tried again after a minute.")
-    progress: float = described("0 to 1.")
+    progress: float = described("The share of the figures that are measured, 0 to 1.")
     dataset: str = described(f"Its name; {PHANTOM}: the built-in phantom, simulated for the demo scene.")
-    frames: list[ComparedFrame] = described("Empty until it is ready.")
+    frames: list[ComparedFrame] = described("All held-out ones, as soon as they are known; empty where it failed.")
     reason: str | None = described("Why it failed: one sentence.")
     error: str | None = described("Why it failed: the stable reason, such as DATASET_INVALID.")
 
@@ -438,28 +435,29 @@ class Comparisons(Prepared):
         self._scenes, self._catalog, self._datasets = scenes, catalog, datasets
 
     async def get(self, scene: str) -> Comparison:
-        """Begin the comparison unless it is there; how far it is.
+        """Begin the comparison unless it is there; what is known of it.
 
         Raises SceneNotFound, SceneFileInvalid, DatasetNotFound where the service has not the scene's dataset.
         """
         key, dataset, path = await self._wanted(scene)
         preparation = await self.prepare(key, dataset=dataset, scene_path=str(path))
-        frames: list[ComparedFrame] = []
-        if preparation.state == "ready":
-            try:
-                document = await asyncio.to_thread((self.folder / key / FRAMES_NAME).read_bytes)
-                frames = [ComparedFrame(**frame) for frame in json.loads(document)]
-            except FileNotFoundError:  # it went this very moment
-                preparation = Preparation("running", 0.0)
-        reason, error = (preparation.error.detail, preparation.error.reason) if preparation.error else (None, None)
+        frames = await asyncio.to_thread(self._frames, key)
+        scored = [value for frame in frames for name, value in vars(frame).items() if name.endswith("psnr_db")]
+        error = preparation.error
         return Comparison(
-            state=preparation.state,
-            progress=preparation.progress,
+            state="running" if preparation.state == "ready" and not frames else preparation.state,  # it went just now
+            progress=sum(value is not None for value in scored) / max(1, len(scored)),
             dataset=dataset or PHANTOM,
             frames=frames,
-            reason=reason,
-            error=error,
+            reason=None if error is None else error.detail,
+            error=None if error is None else error.reason,
         )
+
+    def _frames(self, key: str) -> list[ComparedFrame]:
+        for folder in self._places(key):
+            with contextlib.suppress(FileNotFoundError):
+                return [ComparedFrame(**frame) for frame in json.loads((folder / FRAMES_NAME).read_bytes())]
+        return []
 
     async def key(self, scene: str) -> str:
         return (await self._wanted(scene))[0]
@@ -469,7 +467,7 @@ class Comparisons(Prepared):
 
         Raises ArtifactNotFound where there is none (yet).
         """
-        if (png := await self.picture_png(key, index, what)) is None:
+        if (png := await self.picture_png(key, PICTURES.index(what), str(index))) is None:
             raise ArtifactNotFound(f"the comparison is not ready, or has no frame {index}", field="index")
         return png
 

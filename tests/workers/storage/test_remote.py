@@ -67,6 +67,20 @@ def test_a_torn_download_goes_on_where_it_was(bucket, object_proxy, tmp_path):
     assert len(object_proxy.requests) == 3
 
 
+def test_a_download_torn_after_all_patience_goes_on_as_long_as_bytes_come(new_bucket, object_proxy, tmp_path):
+    content = os.urandom(LARGE)
+    (tmp_path / "large").write_bytes(content)
+    bucket = open_storage(new_bucket(), patience_s=0)  # a large object takes longer than any
+    bucket.upload(tmp_path / "large", "large")
+    object_proxy.faults += [Fault("cut_answer", "GET", bytes=9 * 2**20), Fault("cut_answer", "GET", bytes=2**20)]
+    bucket.download("large", tmp_path / "copy")
+    assert (tmp_path / "copy").read_bytes() == content
+    object_proxy.faults += [Fault("cut_answer", "GET", bytes=2**20), Fault("cut_answer", "GET", bytes=1)]
+    with pytest.raises(StorageUnavailable):
+        bucket.download("large", tmp_path / "torn")
+    assert not (tmp_path / "torn").exists()
+
+
 def test_a_server_that_is_silent_is_asked_again(new_bucket, object_proxy, monkeypatch):
     monkeypatch.setattr(remote, "_SILENCE_TIMEOUT_S", 1)
     storage = open_storage(new_bucket(), patience_s=60)

@@ -5,7 +5,7 @@ import { type ComparedFrame, type Comparison, comparisonOf, describeScene, type 
 import { router } from "../page/router.svelte";
 import { service } from "../page/service.svelte";
 import { METRICS } from "../shared/text";
-import { CLASSICAL, type Grey, type Measured, readGrey, worstFirst } from "./pictures";
+import { type Grey, MEASURED, type Measured, metricOf, readGrey, worstFirst } from "./pictures";
 
 const MOST = 16;
 const STEP = 1.25;
@@ -52,8 +52,9 @@ export class LoadedPicture {
 
   /** Follows `path`; null: there is none yet. Must be made while a component is being made; ends with it. */
   constructor(path: () => string | null) {
+    const followed = $derived(path());
     $effect(() => {
-      const wanted = path();
+      const wanted = followed;
       this.stale = true;
       if (wanted === null) return;
       return asking(
@@ -69,7 +70,7 @@ export class LoadedPicture {
 
 const MOST_ASKED = 40; // scenes
 
-/** Asks for a comparison until it is there, or failed. */
+/** Asks for a comparison until it is whole, or failed; `take` gets what is known of it each time. */
 async function followComparison(
   scene: string,
   take: (comparison: Comparison) => void,
@@ -85,20 +86,19 @@ async function followComparison(
   }
 }
 
-/** Has the service compare another scene with its held-out frames, too, until that is done. */
+/** Has the service compare another scene with its held-out frames, too. */
 export class Rival {
-  isReady = $state(false);
+  frames = $state.raw<readonly ComparedFrame[]>([]);
   problem = $state<string | null>(null);
 
   /** Follows `scene`; null: none. Must be made while a component is being made; ends with it. */
   constructor(scene: () => string | null) {
     $effect(() => {
       const wanted = scene();
-      this.isReady = false;
-      this.problem = null;
+      [this.frames, this.problem] = [[], null];
       if (wanted === null) return;
       return asking(
-        (signal, tell) => followComparison(wanted, ({ state, reason }) => ([this.isReady, this.problem] = [state === "ready", reason]), tell, signal),
+        (signal, tell) => followComparison(wanted, ({ frames, reason }) => ([this.frames, this.problem] = [frames, reason]), tell, signal),
         (error) => (this.problem = explain(error)),
       );
     });
@@ -113,7 +113,7 @@ export async function scenesOfSameSweep(scene: string): Promise<string[]> {
   return others.filter((_, place) => sweep !== null && described[place]?.dataset_sha256 === sweep).map(({ name }) => name);
 }
 
-export const MODES = ["side", "wipe", "flicker"] as const;
+export const MODES = ["side", "all", "wipe", "flicker"] as const;
 export type Mode = (typeof MODES)[number];
 export const ORDERS = ["sweep", "worst"] as const;
 export type Order = (typeof ORDERS)[number];
@@ -142,6 +142,8 @@ export class Bench {
   readonly frame = $derived(this.frames[this.index]);
   /** The way whose metrics decide what is worst; another scene has the rendering's. */
   readonly way = $derived<Measured>("way" in this.against ? this.against.way : "rendering");
+  /** Whether each frame has the metrics that decide it. */
+  readonly isRanked = $derived(this.frames.every((frame) => metricOf(frame, this.way, this.metric) !== null));
   readonly ranked = $derived(worstFirst(this.frames, this.way, this.metric));
   /** The places of the frames, as one steps through them. */
   readonly sequence = $derived(this.order === "worst" ? this.ranked : this.frames.map((_, place) => place));
@@ -205,7 +207,7 @@ export class Bench {
     this.metric = METRICS.find((one) => one === metric) ?? "psnr_db";
     this.mode = MODES.find((one) => one === look) ?? "side";
     this.order = ORDERS.find((one) => one === order) ?? "sweep";
-    const way = CLASSICAL.find((one) => one === other);
+    const way = MEASURED.find((one) => one === other);
     this.against = other.startsWith(SCENE) ? { scene: other.slice(SCENE.length) } : { way: way ?? "rendering" };
   }
 }

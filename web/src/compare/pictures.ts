@@ -119,25 +119,34 @@ export function pixels(width: number, height: number, colour: (index: number) =>
   return image;
 }
 
-/** What is measured against the truth: the scene's rendering, and the classical ways. */
-export const CLASSICAL = ["median", "linear", "nearest"] as const;
-export type Classical = (typeof CLASSICAL)[number];
-export const MEASURED = ["rendering", ...CLASSICAL] as const;
+/** What is measured against the truth, in this order: the scene's rendering, and the classical ways. */
+export const MEASURED = ["rendering", "nearest", "linear", "median"] as const;
 export type Measured = (typeof MEASURED)[number];
 
-/** The metric of a frame for one of MEASURED. */
-export function metricOf(frame: ComparedFrame, of: Measured, metric: Metric): number {
+/** The metric of a frame for one of MEASURED; null: not measured yet, and its picture is not there. */
+export function metricOf(frame: ComparedFrame, of: Measured, metric: Metric): number | null {
   return of === "rendering" ? frame[metric] : frame[`${of}_${metric}`];
 }
 
-export function meanOf(frames: readonly ComparedFrame[], of: Measured, metric: Metric): number {
-  return frames.reduce((sum, frame) => sum + metricOf(frame, of, metric), 0) / frames.length;
+/** Of the frames that are measured; null: none is. */
+export function meanOf(frames: readonly ComparedFrame[], of: Measured, metric: Metric): number | null {
+  const known = frames.map((frame) => metricOf(frame, of, metric)).filter((value) => value !== null);
+  return known.length === 0 ? null : known.reduce((sum, value) => sum + value, 0) / known.length;
 }
 
-/** The places of the frames from the worst of a metric to the best. */
+/** What is measured at the moment, and how many frames that is done for; null: all is. */
+export function underWay(frames: readonly ComparedFrame[]): { way: Measured; done: number } | null {
+  for (const way of MEASURED) {
+    const done = frames.filter((frame) => metricOf(frame, way, "psnr_db") !== null).length;
+    if (done < frames.length) return { way, done };
+  }
+  return null;
+}
+
+/** The places of the frames from the worst of a metric to the best; those that are not measured come last. */
 export function worstFirst(frames: readonly ComparedFrame[], of: Measured, metric: Metric): number[] {
   const sign = LABELS[metric].higherIsBetter ? 1 : -1;
-  const value = (place: number): number => sign * metricOf(frames[place]!, of, metric);
+  const value = (place: number): number => sign * (metricOf(frames[place]!, of, metric) ?? sign * Number.MAX_VALUE);
   return frames.map((_, place) => place).sort((a, b) => value(a) - value(b));
 }
 
@@ -158,7 +167,7 @@ export function csvOf(frames: readonly ComparedFrame[]): string {
   const columns = MEASURED.flatMap((of) => metrics.map((metric) => ({ of, metric })));
   const head = ["frame_number", "confidence", ...columns.map(({ of, metric }) => `${of}_${metric}`)];
   const lines = frames.map((frame) =>
-    [frame.frame_number, frame.confidence ?? "", ...columns.map(({ of, metric }) => metricOf(frame, of, metric))].join(","),
+    [frame.frame_number, frame.confidence ?? "", ...columns.map(({ of, metric }) => metricOf(frame, of, metric) ?? "")].join(","),
   );
   return [head.join(","), ...lines, ""].join("\n");
 }

@@ -29,6 +29,7 @@ _REQUEST_TIMEOUT_S = 3600  # of a whole request: the largest object over the slo
 _LONGEST_PAUSE_S = 5
 _SINGLE_REQUEST_BYTES = 16 * 2**20  # larger files are uploaded in parts
 _PART_BYTES, _MOST_PARTS, _PARTS_AT_ONCE = 8 * 2**20, 9000, 4  # S3 takes 10,000 parts
+_PIECE_BYTES = 2**18  # of a download: what is lost at most where it is torn
 _CLAIMS = "claims"  # prefix of keys: who claims a token says so again and again; the clock is the bucket's
 REFRESH_S, DEAD_AFTER_S = 10.0, 60.0
 _STATUS = re.compile(r"Server returned non-2xx status code: (\d{3}[ A-Za-z]*)")
@@ -135,24 +136,37 @@ class RemoteStorage:
         return True
 
     def download(self, key: str, path: Path, *, version: str | None = None) -> Entry:
+        with atomic_path(path) as temporary, temporary.open("wb") as file:
+            entry, pieces = self._stream(key, 0, version)
+            while (before := file.tell()) < entry.bytes:
+                try:
+                    while piece := self._next(key, pieces):
+                        file.write(piece)
+                except StorageUnavailable:
+                    # obstore goes on itself as long as its patience lasts, which it counts from the first byte on.
+                    if file.tell() == before:
+                        raise
+                    _, pieces = self._stream(key, file.tell(), entry.version)
+                    continue
+                if file.tell() != entry.bytes:
+                    raise StorageUnavailable(f"{self.location} sent {file.tell()} of the {entry.bytes} bytes of {key}")
+        return entry
+
+    def _stream(self, key: str, start: int, version: str | None) -> tuple[Entry, Iterator[Any]]:
+        """The bytes of an object from one on, in pieces. Raises NotThere where it is of another version by now."""
+        options: dict[str, Any] = {} if version is None else {"if_match": version}
+        if start:
+            options["range"] = {"offset": start}
         try:
             with self._asking(key):
-                options = {} if version is None else {"if_match": version}
                 result = self._obstore.get(self._store, check_key(key), options=options)
         except self._conflicts:
             raise NotThere(f"{key} in {self.location} is no longer of the version {version}") from None
-        entry, pieces = _entry(result.meta), iter(result.stream(min_chunk_size=_PART_BYTES))
-        with atomic_path(path) as temporary:
-            with temporary.open("wb") as file:
-                while True:
-                    with self._asking(key):
-                        piece = next(pieces, None)
-                    if piece is None:
-                        break
-                    file.write(piece)
-            if (got := temporary.stat().st_size) != entry.bytes:
-                raise StorageUnavailable(f"{self.location} sent {got} of the {entry.bytes} bytes of {key}")
-        return entry
+        return _entry(result.meta), iter(result.stream(min_chunk_size=_PIECE_BYTES))
+
+    def _next(self, key: str, pieces: Iterator[Any]) -> Any:
+        with self._asking(key):
+            return next(pieces, None)
 
     def delete(self, key: str) -> None:
         with contextlib.suppress(NotThere), self._asking(key):

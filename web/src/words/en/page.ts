@@ -157,8 +157,8 @@ export const maps = {
 
 export const compare = {
   asking: "Asking for the comparison …",
-  running: (dataset: string): string =>
-    `The held-out frames of ${dataset} are predicted and measured. This is done once and takes a minute or two.`,
+  running: (dataset: string): string => `The held-out frames of ${dataset} are predicted and measured. The first one is shown as soon as it is there.`,
+  working: (what: string, frame: number, frames: number): string => `${what}: frame ${frame} of ${frames}`,
   progress: "Comparison",
   anew: "The service begins anew once a minute has passed.",
   tryAgain: "Try again",
@@ -182,7 +182,7 @@ export const compare = {
   toolbar: "How pictures are compared",
   against: "Compare the truth with",
   mode: "Way of looking",
-  modes: { side: "Side by side", wipe: "Wipe", flicker: "Flicker" },
+  modes: { side: "Side by side", all: "All methods", wipe: "Wipe", flicker: "Flicker" },
   wipe: "Where the truth ends and the other begins",
   flicker: { shown: (title: string): string => `Shown: ${title}`, pause: "Hold (X swaps)", play: "Flicker" },
   zoom: { in: "Zoom in", out: "Zoom out", reset: "All of the picture", hint: "Wheel or +, − and 0: zoom of all pictures; dragging moves them." },
