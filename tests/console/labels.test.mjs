@@ -52,7 +52,8 @@ async function spread(page, button = "Spread") {
 
 const saved = (page, text) => page.getByTestId("label-state").getByText(text).waitFor({ timeout: BACKGROUND_TIMEOUT_MS });
 
-async function labelsOf(scene, pose) {
+/** The label that most pixels have where the tests paint: a Gaussian here and there may say otherwise. */
+async function labelOf(scene, pose) {
   const answer = await fetch(`${at.service.url}/v1/scenes/${scene}/render`, {
     method: "POST",
     headers: { "Content-Type": "application/json", Accept: "application/octet-stream" },
@@ -60,7 +61,13 @@ async function labelsOf(scene, pose) {
   });
   assert.equal(answer.status, 200);
   const labels = new Uint8Array(await answer.arrayBuffer());
-  return (x, y) => labels[Math.round(100 * y) * 100 + Math.round(100 * x)];
+  const counts = new Map();
+  for (let row = 27; row < 34; row++)
+    for (let column = 31; column < 40; column++) {
+      const label = labels[100 * row + column];
+      counts.set(label, (counts.get(label) ?? 0) + 1);
+    }
+  return [...counts].sort((a, b) => b[1] - a[1])[0][0];
 }
 
 const scene = async (name) => (await fetch(`${at.service.url}/v1/scenes/${name}`)).json();
@@ -80,8 +87,8 @@ describe("labels of a scene", () => {
     await picture(page, "labels-spread");
     assert.equal((await scene("demo-labelled")).label_names[LESION], "lesion");
     assert.equal((await scene("demo")).label_names[LESION], undefined);
-    assert.equal((await labelsOf("demo-labelled", first))(0.35, 0.3), LESION);
-    assert.equal((await labelsOf("demo", first))(0.35, 0.3), 2);
+    assert.equal(await labelOf("demo-labelled", first), LESION);
+    assert.equal(await labelOf("demo", first), 2);
 
     await panelOf(page).getByRole("button", { name: "Next frame" }).click();
     const { print } = await canvasState(page, IMAGE);
@@ -95,8 +102,8 @@ describe("labels of a scene", () => {
     await draw(page, [0.3, 0.3], [0.4, 0.3]);
     await spread(page);
     await saved(page, "2 frames painted, saved as demo-labelled.");
-    assert.equal((await labelsOf("demo-labelled", second))(0.35, 0.3), 2);
-    assert.equal((await labelsOf("demo-labelled", first))(0.35, 0.3), LESION);
+    assert.equal(await labelOf("demo-labelled", second), 2);
+    assert.equal(await labelOf("demo-labelled", first), LESION);
 
     await spread(page, "Take back");
     await saved(page, "One frame painted, saved as demo-labelled.");
