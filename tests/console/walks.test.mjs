@@ -137,8 +137,16 @@ describe("a sonographer", () => {
     await page.getByRole("button", { name: "More ways to store" }).click();
     await seen("stores");
     const loop = await download(page, () => page.getByRole("button", { name: /Cine loop, DICOM/ }).click());
-    const frames = "import pydicom, sys; print(pydicom.dcmread(sys.argv[1]).get('NumberOfFrames', 1))";
-    assert.ok(Number(python(frames, loop.path)) > 5, "the loop has hardly a frame");
+    const program = `
+import json, pydicom, shutil, subprocess, sys
+image = pydicom.dcmread(sys.argv[1])
+checked = subprocess.run(["dciodvfy", sys.argv[1]], capture_output=True, text=True).stderr if shutil.which("dciodvfy") else ""
+print(json.dumps([image.get("NumberOfFrames", 1), image.get("ImageComments"), checked.count("Error")]))
+`;
+    const [count, comments, errors] = JSON.parse(python(program, loop.path));
+    assert.ok(count > 5, "the loop has hardly a frame");
+    assert.match(comments, new RegExp(`A  ${diameter_mm.toFixed(1)} mm`));
+    assert.equal(errors, 0);
     assert.deepEqual(await poseOf(page), told);
     assert.deepEqual([page.faults, page.foreign], [[], []]);
   });
