@@ -29,7 +29,7 @@ from ultragray_service.settings import Settings
 from ultragray_service.telemetry.logs import Tracing, start_tracing
 from ultragray_service.telemetry.metrics import Metrics
 from ultragray_service.views.poses import Assessing
-from ultragray_service.views.prepared import Comparisons, DatasetViews, TrainingViews
+from ultragray_service.views.prepared import Comparisons, DatasetViews, Thumbnails, TrainingViews
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.jobs.owners import Kind
 from ultragray_workers.jobs.store import JobStore
@@ -74,8 +74,9 @@ def make_service(settings: Settings) -> Service:
         {Kind.JOB: lambda job: jobs.do(JobStore.ownership, job), Kind.REGISTRATION: registrations.ownership},
         {Kind.SCENE: scenes.require, Kind.DATASET: datasets.get},
     )
-    # Each process may take all the memory that settings allow to one: one checks at a time, and one makes pictures.
-    checks, pictures = (HelperProcesses(settings.dataset_memory_mb << 20) for _ in range(2))
+    # Each process may take all the memory that settings allow to one: one checks at a time, one makes pictures, and one
+    # thumbnails, which would wait behind pictures for minutes.
+    checks, pictures, thumbnails = (HelperProcesses(settings.dataset_memory_mb << 20) for _ in range(3))
     means = Means(settings, jobs, life.draining, checks, owners, quotas)
     return Service(
         settings=settings,
@@ -106,6 +107,7 @@ def make_service(settings: Settings) -> Service:
         assessing=Assessing(catalog, registrations),
         dataset_views=DatasetViews(datasets, settings, pictures),
         comparisons=Comparisons(scenes, catalog, datasets, settings, pictures),
+        thumbnails=Thumbnails(scenes, catalog, settings, thumbnails),
         training_views=TrainingViews(jobs, datasets, settings, pictures),
         readiness=Readiness(
             lambda: jobs.database,
