@@ -1,10 +1,13 @@
 /** The pose in numbers and as text, and paths of the probe: loaded, recorded, saved, rendered. */
 
 import assert from "node:assert/strict";
-import { readFileSync } from "node:fs";
+import { execFileSync } from "node:child_process";
+import { mkdtempSync, readFileSync, rmSync } from "node:fs";
+import { tmpdir } from "node:os";
+import path from "node:path";
 import { describe, it } from "node:test";
 
-import { BACKGROUND_TIMEOUT_MS, picture, seriousFindings, until } from "./harness.mjs";
+import { BACKGROUND_TIMEOUT_MS, picture, PYTHON, seriousFindings, until } from "./harness.mjs";
 import { enterPose, openScan, poseOf } from "./scan_page.mjs";
 import { tested } from "./tested.mjs";
 
@@ -131,6 +134,20 @@ describe("the path of the probe", () => {
     await page.getByTestId("path-job").click();
     await page.getByTestId("job-state").getByText("succeeded").waitFor({ timeout: BACKGROUND_TIMEOUT_MS });
     await page.getByRole("link", { name: "frames.npz" }).waitFor();
+    const rendered = page.getByRole("region", { name: "Rendered frames" });
+    await until(() => rendered.getByRole("img").count(), (count) => count === 6, "no examples");
+    await until(() => rendered.locator("figure img").evaluateAll((all) => all.every((one) => one.naturalWidth >= 200)), Boolean, "they are empty");
+    await rendered.getByText("Frame 0", { exact: true }).waitFor();
+    assert.match(await rendered.getByTestId("confidence-range").textContent(), /^Confidence 0\.\d\d to 0\.\d\d, mean 0\.\d\d$/);
+    assert.match(await rendered.getByTestId("rendered-settings").textContent(), /Format\s*npz/);
+    const [file] = await Promise.all([page.waitForEvent("download"), page.getByRole("link", { name: "frames.npz" }).click()]);
+    const folder = mkdtempSync(path.join(tmpdir(), "ultragray-frames-"));
+    await file.saveAs(path.join(folder, "frames.npz"));
+    const program = await rendered.getByLabel("How Python loads them").inputValue();
+    assert.match(execFileSync(PYTHON, ["-c", program], { cwd: folder, encoding: "utf8" }), /'bmode'.*\(\d+, 256, 256\)/);
+    rmSync(folder, { recursive: true });
+    assert.deepEqual(await seriousFindings(page), []);
+    await picture(page, "job-rendered");
     assert.deepEqual(page.faults, []);
   });
 
