@@ -30,6 +30,7 @@ MODULES_OF_EXTRAS = {
     "storage": ("obstore",),
     "tensorboard": ("tensorboardX",),
     "tracing": ("opentelemetry.exporter", "opentelemetry.sdk"),
+    "video": ("av",),
     "zarr": ("zarr",),
 }
 _SINCE_PYTHON_311 = {"serve", "zarr"}  # FastAPI and zarr have no releases for Python 3.10

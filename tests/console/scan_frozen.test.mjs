@@ -200,28 +200,148 @@ describe("a text", () => {
   });
 });
 
-describe("storing", () => {
-  it("writes a frame and the loop as DICOM that pydicom reads, with the right spacing", async () => {
+describe("enlarging", () => {
+  const box = (page) => page.locator(`${IMAGE} canvas`).first().boundingBox();
+  const told = (page) => page.getByRole("button", { name: /%, All of the picture/ }).textContent();
+
+  it("is for what stands; callipers are right in mm at every zoom, and a loupe shows what the finger covers", async () => {
     const { page } = await openFrozen();
+    await page.keyboard.press("d");
+    await drag(page, [0.25, 0.5], [0.75, 0.5]);
+    const [half] = await results(page);
+    const whole = await box(page);
+    const about = await placeOf(page, 0.5, 0.5);
+    await page.mouse.move(...about);
+    for (let step = 0; step < 5; step++) await page.mouse.wheel(0, -100);
+    await until(() => told(page), (text) => text === "305 %", "the wheel does not zoom");
+    const large = await box(page);
+    assert.ok(Math.abs(large.width / whole.width - 1.25 ** 5) < 0.01, `${large.width} of ${whole.width}`);
+    const now = await placeOf(page, 0.5, 0.5);
+    assert.ok(Math.hypot(now[0] - about[0], now[1] - about[1]) < 1.5, `the place under the pointer moved to ${now}`);
+    assert.deepEqual(await results(page), [half], "the distance is another one");
+    await drag(page, [0.45, 0.5], [0.55, 0.5]);
+    const [, tenth] = await results(page);
+    assert.ok(Math.abs(parseFloat(tenth) - PROBE_WIDTH_MM / 10) < 0.1, tenth);
+    await page.keyboard.press("Escape"); // the tool
+    assert.equal(await page.getByTestId("loupe").count(), 0);
+    const handle = page.getByLabel(/^B, distance, point 2/);
+    const { x, y, width, height } = await handle.boundingBox();
+    await page.mouse.move(x + width / 2, y + height / 2);
+    await page.mouse.down();
+    await page.mouse.move(x + width / 2 + 12, y + height / 2);
+    await page.getByTestId("loupe").waitFor();
+    const loupe = await page.getByTestId("loupe").boundingBox();
+    assert.ok(loupe.y + loupe.height < y, "the loupe lies under the finger");
+    const light = await page.getByTestId("loupe").evaluate((canvas) => {
+      const { data } = canvas.getContext("2d").getImageData(0, 0, canvas.width, canvas.height);
+      return data.reduce((sum, value, index) => sum + (index % 4 === 0 ? value : 0), 0) / (data.length / 4);
+    });
+    assert.ok(light > 5, "the loupe is empty");
+    await picture(page, "scan-loupe");
+    await page.mouse.up();
+    assert.equal(await page.getByTestId("loupe").count(), 0);
+    assert.deepEqual(page.faults, []);
+  });
+
+  it("goes by dragging, keys and buttons, and ends with the freeze", async () => {
+    const { page } = await openFrozen();
+    const whole = await box(page);
+    await page.locator(`${IMAGE} .steer`).focus();
+    await page.keyboard.press("+");
+    await page.getByRole("button", { name: "Zoom in" }).click();
+    await until(() => told(page), (text) => text === "156 %", "+ and the button do not zoom");
+    const before = await box(page);
+    await drag(page, [0.5, 0.5], [0.52, 0.53]);
+    const after = await box(page);
+    assert.ok(Math.abs(after.x - before.x - 0.02 * before.width) < 2, "dragging does not move it");
+    assert.equal(await page.getByTestId("frozen-notice").count(), 0, "what moves the picture is said to steer");
+    await page.locator(`${IMAGE} .steer`).focus();
+    await page.keyboard.press("ArrowLeft");
+    assert.ok((await box(page)).x > after.x + 10, "the arrow keys do not move it");
+    await page.keyboard.press("0");
+    assert.deepEqual(await box(page), whole);
+    await page.keyboard.press("+");
+    await page.keyboard.press("f");
+    assert.deepEqual([await told(page), await box(page)], ["100 %", whole]);
+  });
+
+  it("is done by a pinch", async () => {
+    const { page } = await openFrozen();
+    const whole = await box(page);
+    const [x, y] = await placeOf(page, 0.5, 0.5);
+    const fingers = await page.context().newCDPSession(page);
+    const touch = (type, apart) =>
+      fingers.send("Input.dispatchTouchEvent", { type, touchPoints: apart ? [{ x: x - apart, y, id: 1 }, { x: x + apart, y, id: 2 }] : [] });
+    await touch("touchStart", 40);
+    for (const apart of [50, 60, 70, 80]) await touch("touchMove", apart);
+    await touch("touchEnd", 0);
+    const { width } = await until(() => box(page), (now) => now.width > 1.5 * whole.width, "a pinch does not zoom");
+    assert.ok(Math.abs(width / whole.width - 2) < 0.1, `${width / whole.width}`);
+  });
+
+  it("leaves letters outside what they mark", async () => {
+    const { page } = await openFrozen();
+    await page.keyboard.press("e");
+    await drag(page, [0.35, 0.5], [0.6, 0.5]);
+    await page.mouse.click(...(await placeOf(page, 0.48, 0.6)));
+    await page.keyboard.press("d");
+    await drag(page, [0.6, 0.3], [0.8, 0.2]);
+    const over = await page.evaluate(() => {
+      const shapes = [...document.querySelectorAll("svg ellipse, svg polyline")];
+      return [...document.querySelectorAll('[data-testid="mark-letter"]')].flatMap((letter) => {
+        const { left, top, width, height } = letter.getBoundingClientRect();
+        const places = Array.from({ length: 81 }, (_, i) => [left + (width * (i % 9)) / 8, top + (height * Math.floor(i / 9)) / 8]);
+        return places.filter(([x, y]) =>
+          shapes.some((shape) => {
+            const point = new DOMPoint(x, y).matrixTransform(shape.getScreenCTM().inverse());
+            return (shape.tagName === "ellipse" && shape.isPointInFill(point)) || shape.isPointInStroke(point);
+          }),
+        );
+      });
+    });
+    assert.deepEqual(over, []);
+    assert.deepEqual(await page.getByTestId("mark-letter").allTextContents(), ["A", "B"]);
+    await picture(page, "scan-letters");
+  });
+});
+
+describe("storing", () => {
+  it("writes a frame and the loop as DICOM that pydicom and dicom3tools read, with spacing, times, date and measurements", async () => {
+    const { page } = await openFrozen();
+    const grey = await mean(page);
     const read = async (label) => {
       await page.getByRole("button", { name: "More ways to store" }).click();
       const [download] = await Promise.all([page.waitForEvent("download"), page.getByRole("button", { name: label }).click()]);
       const program = `
-import pydicom, sys
+import json, pydicom, shutil, subprocess, sys
 image = pydicom.dcmread(sys.argv[1])
 region = image.SequenceOfUltrasoundRegions[0]
-print(int(image.get("NumberOfFrames", 1)), image.Rows, image.Columns, region.PhysicalDeltaX * 10 * image.Columns, image.pixel_array.mean())
+checked = subprocess.run(["dciodvfy", sys.argv[1]], capture_output=True, text=True).stderr if shutil.which("dciodvfy") else ""
+print(json.dumps({
+  "storage": image.SOPClassUID.name, "frames": image.get("NumberOfFrames"), "size": [image.Rows, image.Columns],
+  "width_mm": region.PhysicalDeltaX * 10 * image.Columns, "grey": float(image.pixel_array.mean()), "date": image.ContentDate,
+  "times_ms": [float(one) for one in image.get("FrameTimeVector", [])], "said": image.get("ImageComments"), "errors": checked.count("Error"),
+}))
 `;
-      const told = execFileSync(PYTHON, ["-c", program, await download.path()]).toString().trim().split(" ").map(Number);
-      return [download.suggestedFilename(), ...told];
+      return [download.suggestedFilename(), JSON.parse(execFileSync(PYTHON, ["-c", program, await download.path()]))];
     };
-    const [name, frames, rows, columns, width_mm, grey] = await read("Frame, DICOM");
-    assert.deepEqual([name, frames, rows, columns], ["demo.dcm", 1, 256, 256]);
-    assert.ok(Math.abs(width_mm - PROBE_WIDTH_MM) < 0.5, `${width_mm} mm`);
-    assert.ok(Math.abs(grey - (await mean(page))) < 0.1, "it is another frame");
-    const [loop, count] = await read(/Cine loop, DICOM/);
-    const all = Number((await page.getByTestId("cine-place").textContent()).split("/")[1]);
-    assert.deepEqual([loop, count], ["demo-cine.dcm", all]);
+    const [name, one] = await read("Frame, DICOM");
+    assert.deepEqual([name, one.storage, one.frames, one.size], ["demo.dcm", "Ultrasound Image Storage", null, [256, 256]]);
+    assert.ok(Math.abs(one.width_mm - PROBE_WIDTH_MM) < 0.5, `${one.width_mm} mm`);
+    assert.ok(Math.abs(one.grey - grey) < 0.1, "it is another frame");
+    assert.ok(Math.abs(Date.now() - Date.parse(`${one.date.slice(0, 4)}-${one.date.slice(4, 6)}-${one.date.slice(6)}`)) < 2 * 86_400_000);
+    await page.keyboard.press("d");
+    await drag(page, [0.25, 0.5], [0.75, 0.5]);
+    const [length] = await results(page);
+    const [, measured] = await read("Frame, DICOM");
+    assert.deepEqual([measured.said, measured.size[1]], [`A  ${length}`, 768]);
+    assert.ok(measured.size[0] > 768, "the result does not stand below the picture");
+    const [loop, all] = await read("Cine loop, DICOM");
+    const count = Number((await page.getByTestId("cine-place").textContent()).split("/")[1]);
+    assert.deepEqual([loop, all.frames, all.times_ms.length, all.said], ["demo-cine.dcm", count, count, `A  ${length}`]);
+    assert.equal(all.times_ms[0], 0);
+    assert.ok(all.times_ms.slice(1).every((way) => way > 0) && new Set(all.times_ms).size > 2, `no true times: ${all.times_ms}`);
+    assert.deepEqual([one.errors, measured.errors, all.errors], [0, 0, 0]);
   });
 
   it("records the loop as a video", async () => {

@@ -185,6 +185,17 @@ describe("the volume", () => {
     assert.ok(sum(half) > 1.4 * sum(space.voxelise(gaussians(one), grid)));
   });
 
+  it("knows the labels of small things that let sound pass", () => {
+    const small = { deviations: [0.7, 0.7, 0.7] };
+    const rows = [
+      gaussian(0, 0, 0, { label: 1, deviations: [4, 4, 4] }),
+      gaussian(8, 0, 0, { label: 2, transmittance: 0.1, ...small }),
+      gaussian(0, 8, 0, { label: 3, ...small }),
+      gaussian(0, 0, 8, small),
+    ];
+    assert.deepEqual(space.smallLabels(space.voxelise(gaussians(...rows), grid)), [3]);
+  });
+
   it("gives a voxel the label that most of what is there has", () => {
     const volume = space.voxelise(gaussians(gaussian(0, 0, 0, { label: 1 }), gaussian(0.1, 0, 0, { label: 2 }), gaussian(0, 0.1, 0, { label: 2 })), grid);
     assert.equal(at(volume, 0, 0, 0)[3], 2);

@@ -56,7 +56,7 @@ function seen(page) {
     const { data } = copy.getImageData(0, 0, width, height);
     const box = { left: width, right: 0, top: height, bottom: 0 };
     const grey = [];
-    let bone = 0;
+    let [bone, vessel] = [0, 0];
     for (let i = 0; i < width * height; i++) {
       const [r, g, b] = data.subarray(4 * i, 4 * i + 3);
       grey.push(r);
@@ -68,8 +68,9 @@ function seen(page) {
         box.bottom = Math.max(box.bottom, y);
       }
       if (r > 90 && g > 80 && b > 65 && r > b + 12) bone += 1;
+      if (b > 90 && b > g + 20 && g > r + 5) vessel += 1;
     }
-    return { width, height, grey, box, bone: bone / (width * height) };
+    return { width, height, grey, box, bone: bone / (width * height), vessel: vessel / (width * height) };
   });
 }
 
@@ -144,6 +145,17 @@ describe("the scene", () => {
     };
     const [left, middle, right] = [share(0.02, 0.25), share(0.42, 0.58), share(0.75, 0.98)];
     assert.ok(middle > 0.2 && left < 0.3 * middle && right < 0.3 * middle, `bright: ${left}, ${middle}, ${right}`);
+  });
+
+  it("shows its vessels unless they are left out", async () => {
+    const { page } = await openRoom();
+    await page.getByRole("button", { name: "Side", exact: true }).click();
+    await rest(page);
+    await picture(page, "space-vessels");
+    const { vessel, bone } = await seen(page);
+    assert.ok(vessel > 0.002 && bone > 0.02, `${vessel} of the view are vessels, ${bone} bone`);
+    await page.getByTestId("legend").getByRole("button", { name: "vessel" }).click();
+    await until(() => seen(page), (now) => now.vessel < 0.1 * vessel, "vessels are not left out");
   });
 
   it("is shown in every form and colour, with a legend of what the scene has", async () => {

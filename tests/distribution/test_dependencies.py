@@ -26,7 +26,7 @@ BROUGHT_BY = {  # modules that are used with, and come with, what is required
     "websockets": "uvicorn",
 }
 NO_FEATURES = {"all", "dev", "docs", "envoy", "notebooks"}
-NOT_IN_ALL = {"parquet", "ray"}  # 130 and 260 MB, for those who share data sets or have a cluster
+NOT_IN_ALL = {"parquet", "ray", "video"}  # 130 and 260 MB, for those who share data sets or have a cluster; the GPL
 
 
 def imported():

@@ -104,6 +104,9 @@ POSES_PER_PROBE = 12
 OUTPUTS = ("bmode", "echo", "transmittance", "labels")
 
 
+THIN = ElevationBeam(0.05)  # thinner than every needle
+
+
 def shown(scene, *tools, probe=LINEAR, pose=ORIGIN, side=SIDE, **more):
     return render(scene, probe, pose, height=side, width=side, outputs=OUTPUTS, tools=tools, **more)
 
@@ -145,7 +148,9 @@ def test_the_tip_is_within_one_pixel_of_the_projected_one_over_random_poses(empt
 
 def test_a_needle_beside_the_slice_is_not_seen_and_a_thick_slice_shows_it(empty_scene):
     beside = Needle(tip_mm=(10.0, 2.0, 20.0), hub_mm=(-10.0, 2.0, 20.0))
-    assert shown(empty_scene, beside)["bmode"].max() == 0.0
+    assert shown(empty_scene, beside, beam=THIN)["bmode"].max() == 0.0
+    far_beside = replace(beside, tip_mm=(10.0, 5.0, 20.0), hub_mm=(-10.0, 5.0, 20.0))
+    assert shown(empty_scene, far_beside)["bmode"].max() == 0.0
     thick = shown(empty_scene, beside, beam=ElevationBeam(4.0))
     assert 0.1 < thick["bmode"].max() < 0.9
     focused = shown(empty_scene, beside, beam=ElevationBeam(1.0, focus_mm=45.0, depth_of_field_mm=5.0))
@@ -166,11 +171,28 @@ def test_brightness_falls_off_away_from_perpendicular(empty_scene):
 def test_the_shadow_follows_the_opacity_and_the_path_through_the_shaft(empty_scene):
     for opacity in (0.3, 0.6, 0.9):
         for angle in (0.0, 30.0, 60.0):
-            passed = middle(shown(empty_scene, tilted(angle, opacity=opacity))["transmittance"])
+            passed = middle(shown(empty_scene, tilted(angle, opacity=opacity), beam=THIN)["transmittance"])
             assert passed[0] == 1.0
-            assert passed[-1] == pytest.approx((1.0 - opacity) ** (1.0 / np.cos(np.radians(angle))), abs=1e-5)
+            assert passed[-1] == pytest.approx((1.0 - opacity) ** (1.0 / np.cos(np.radians(angle))), abs=1e-3)
     clear = shown(empty_scene, tilted(0.0, opacity=0.0, reverberation=0.0))
     assert (clear["transmittance"] == 1.0).all()
+
+
+@pytest.mark.parametrize(("beam", "width_mm"), [(None, 2.5), (ElevationBeam(4.0), 4.0), (THIN, 0.1 * 2.3548)])
+@pytest.mark.parametrize("diameter_mm", [0.7, 2.0])
+def test_a_needle_takes_from_the_beam_the_share_of_its_width_that_it_fills(empty_scene, beam, width_mm, diameter_mm):
+    filled = math.erf(0.5 * diameter_mm / (math.sqrt(2.0) * width_mm / 2.3548))
+    frames = shown(empty_scene, tilted(0.0, diameter_mm=diameter_mm, opacity=0.8), beam=beam)
+    assert middle(frames["transmittance"])[-1] == pytest.approx(1.0 - 0.8 * filled, abs=1e-4)
+    assert frames["echo"].max() == pytest.approx(1.0, abs=0.02)  # met head on in the middle of the beam
+
+
+def test_a_needle_across_the_plane_fills_the_width_of_the_beam(empty_scene):
+    across = Needle(tip_mm=(0.0, 20.0, 20.0), hub_mm=(0.0, -20.0, 20.0), opacity=0.8)
+    passed = shown(empty_scene, across)["transmittance"]
+    assert passed.min() == pytest.approx(0.2, abs=1e-4)
+    half = Needle(tip_mm=(0.0, 0.0, 20.0), hub_mm=(0.0, -20.0, 20.0), opacity=0.8)
+    assert shown(empty_scene, half)["transmittance"].min() == pytest.approx(0.6, abs=0.12)  # its tip in the plane
 
 
 def test_the_echoes_of_the_comet_tail_are_a_diameter_apart_and_each_weaker(empty_scene):

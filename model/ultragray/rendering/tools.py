@@ -28,9 +28,12 @@ from ultragray.geometry.pose import (
     pose_from_position_quaternion,
     quaternion_from_pose,
 )
-from ultragray.geometry.probe import MAX_LENGTH_MM, FloatArray, Probe, length_field
+from ultragray.geometry.probe import FWHM_PER_SIGMA, MAX_LENGTH_MM, FloatArray, Probe, length_field
 
-LEAST_SLICE_SIGMA_MM = 0.1  # of the slice that tools are seen in, where the frames show a thinner one
+BEAM_MM = (
+    2.5  # full width at half maximum of the slice that tools are seen in, where neither frame nor scene has a beam
+)
+LEAST_SLICE_SIGMA_MM = 0.1  # of that slice, where the frames show a thinner one
 _LEAST_SPACING_MM = 1e-6
 
 
@@ -41,7 +44,7 @@ class ScanView:
     probe: Probe
     poses: FloatArray  # [C, 4, 4] mm, probe→scene
     width: int
-    slice_sigma_mm: tuple[float, float, float] = (0.0, 0.0, np.inf)  # at the focus; depth of the focus; Rayleigh range
+    slice_sigma_mm: tuple[float, float, float] = (BEAM_MM / FWHM_PER_SIGMA, 0.0, np.inf)  # at the focus; its depth; z_R
 
     @cached_property
     def lines(self) -> tuple[FloatArray, FloatArray, FloatArray]:  # [W, 3] mm, [W, 3], [W, 3]
@@ -84,7 +87,7 @@ class ScanView:
 class Crossing:
     """Scan lines that meet a tool: all [K, C, W], K layers of the slice, whose effects are added up."""
 
-    cover: FloatArray  # share of the line's width and of the slice that meets the tool, 0 to 1
+    cover: FloatArray  # share of the line's width that meets it, times the slice's against a tool in its middle; 0 to 1
     first_mm: FloatArray  # depths between which the side that is met first lies
     last_mm: FloatArray
     filled_mm: FloatArray  # length of the line behind it that shows the tool's inside, not tissue
@@ -98,6 +101,16 @@ class Crossing:
 def covered(gap_mm: FloatArray, half_mm: float | FloatArray, spacing_mm: FloatArray) -> FloatArray:
     """The share of a scan line as wide as the spacing that lies within half_mm of a middle that is gap_mm away."""
     return np.clip((half_mm - gap_mm) / spacing_mm + 0.5, 0.0, 1.0)
+
+
+def beam_share(low_mm: FloatArray, high_mm: FloatArray, sigma_mm: FloatArray) -> FloatArray:  # [...] all -> [...]
+    """The share of a Gaussian beam that lies between two elevations."""
+    ends = (np.asarray(_erf(end / (math.sqrt(2.0) * sigma_mm)), np.float64) for end in (low_mm, high_mm))
+    below_low, below_high = ends
+    return 0.5 * (below_high - below_low)
+
+
+_erf = np.frompyfunc(math.erf, 1, 1)
 
 
 def dot(vectors: FloatArray, others: FloatArray) -> FloatArray:  # [..., 3] both -> [...]
@@ -367,6 +380,10 @@ class Needle(Shaft):
         With q the way from the tip along the shaft, the gap across the line is a + b·q and the elevation y + v·q. The
         point is where (gap / radius)² + (elevation / σ)² is least, σ that of the slice. Half a line's width and the
         slice bound the part of the shaft around it that the line sees: all of a shaft that runs along it.
+
+        Its brightness is that of a shaft in the middle of the beam, so its cover is counted against one there, and is
+        less beside the plane. Its shadow is that of the share of the beam that it fills: most of the beam passes a thin
+        needle on either side.
         """
         tip, hub = np.moveaxis(self.seen_by(view, (self.tip_mm, self.hub_mm)), 1, 0)[:, :, None]  # [C, 1, 3] each
         length = np.linalg.norm(hub - tip, axis=-1)  # [C, 1]
@@ -386,20 +403,22 @@ class Needle(Shaft):
         # Half a line more where the shaft runs along it: its end there is no edge of the shaft.
         steep = 1.0 - np.abs(b)
         inside = np.abs(b) * np.minimum(nearest - low, high - nearest) + 0.5 * spacing * steep
-        off = np.maximum(np.abs(y + v * q) - radius, 0.0)
-        cover = (
-            covered(np.abs(a + b * nearest), half, spacing)
-            * covered(-inside, 0.0, spacing)
-            * np.exp(-0.5 * (off / sigma) ** 2)
-        )
         # The part that is seen: |gap| ≤ room + q·widening, as lines of a fan are wider farther out.
         room = half + 0.5 * steep * spacing - 0.5 * (1.0 + steep) * wider * q
         widening = 0.5 * (1.0 + steep) * wider
         first_q, last_q = _bounded(low, high, b - widening, room - a)
         first_q, last_q = _bounded(first_q, last_q, -b - widening, room + a)
+        # Its elevations in the line's width: of a shaft in the plane a diameter, of one across the plane all.
+        first_q, last_q = np.minimum(first_q, q), np.maximum(last_q, q)
+        middle, reached = y + 0.5 * v * (first_q + last_q), radius + 0.5 * np.abs(v) * (last_q - first_q)
+        fills = beam_share(-reached, reached, sigma)
+        cover = (
+            covered(np.abs(a + b * nearest), half, spacing)
+            * covered(-inside, 0.0, spacing)
+            * (beam_share(middle - reached, middle + reached, sigma) / fills)
+        )
         reach = sigma / np.maximum(np.abs(v), _LEAST_NEEDLE)
-        first_q = np.minimum(np.maximum(first_q, q - reach), q)
-        last_q = np.maximum(np.minimum(last_q, q + reach), q)
+        first_q, last_q = np.maximum(first_q, q - reach), np.minimum(last_q, q + reach)
         ends = depth + deeper * first_q, depth + deeper * last_q
         first, last = np.minimum(*ends), np.maximum(*ends)
         path = np.minimum(
@@ -418,7 +437,7 @@ class Needle(Shaft):
             own_last_mm=np.maximum(last, at + np.minimum(0.5 * path, below))[None],
             path_mm=path[None],
             slant=np.minimum(np.abs(deeper), 1.0)[None],
-            stopped=self.stopped(path)[None],
+            stopped=(self.stopped(path) * fills)[None],
         )
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import Field, dataclass, field, make_dataclass, replace
 from functools import cache
+from itertools import pairwise
 from typing import Any, Literal, TypeVar, get_args
 
 import numpy as np
@@ -20,6 +21,7 @@ from starlette.requests import Request
 
 from ultragray.contract import Contract, annotated_fields, described, error_under
 from ultragray.errors import InvalidArgument, InvalidImageSize, InvalidPose, UltragrayError
+from ultragray.exchange.exports.exporter import Annotation
 from ultragray.geometry.image_size import MAX_IMAGE_SIDE
 from ultragray.geometry.probe import Probe
 from ultragray.geometry.registration import Registration
@@ -230,8 +232,25 @@ class RenderBody(FrameSettings):
         above=0,
         high=MAX_TIMEOUT_MS,
     )
+    frame_times_ms: tuple[float, ...] | None = described(
+        "Of application/dicom: when each frame was seen, from any beginning on. Default: 40 ms after each other.", None
+    )
+    annotations: tuple[Annotation, ...] = described("Of application/dicom: what is burnt into the frames.", ())
 
     many_poses = staticmethod(_many_poses)
+
+    def check_stored(self, count: int) -> None:
+        """Checks what a file of so many frames is told about them. Raises InvalidArgument."""
+        times = self.frame_times_ms
+        if times is not None and (len(times) != count or any(later < one for one, later in pairwise(times))):
+            raise InvalidArgument(
+                f"frame_times_ms must be a number for each of {count} poses, none below the one before it",
+                field="frame_times_ms",
+            )
+        for index, one in enumerate(self.annotations):
+            if one.frame >= count:
+                path = f"annotations[{index}].frame"
+                raise InvalidArgument(f"{path} must be below {count}, the number of poses, got {one.frame}", field=path)
 
     def poses_by_path(self, limit: int) -> Sequence[tuple[str, Pose]]:
         """The poses, each with its path in the body. Raises InvalidArgument, TooManyPoses."""

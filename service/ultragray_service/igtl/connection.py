@@ -31,10 +31,12 @@ from ultragray_service.igtl.contents import (
     unpack_interval_s,
     unpack_position,
     unpack_transform,
+    unpack_video_query,
 )
 from ultragray_service.igtl.frames import Feed, Frame, PoseMessage, Underway, WaitingPoses, render_frame
 from ultragray_service.igtl.messages import HEADER_BYTES, Header, Message, pack_message, unpack_header, unpack_message
 from ultragray_service.igtl.routes import SceneChooser
+from ultragray_service.igtl.video import VideoEncoder
 from ultragray_service.service import Service
 from ultragray_workers.pool.messages import RenderResult
 
@@ -162,20 +164,30 @@ class Connection:
             self._service.rendering.require_frames()
             await self._send(_reply("STATUS", message, pack_status(Status(OK, 0, "OK", "ready"))))
         elif prefix == "GET_":
-            await self._send(self._newest_frame(KINDS[suffix], message))
+            await self._send(await self._newest_frame(KINDS[suffix], message))
         else:
             if prefix == "STT_":
-                self.feed.start(KINDS[suffix], message.device_name, unpack_interval_s(message.content), message.version)
+                await self._subscribe(KINDS[suffix], message)
             else:
                 self.feed.stop(KINDS[suffix])
             await self._send(_reply(f"RTS_{suffix}", message, _ACCEPTED))
 
-    def _newest_frame(self, kind: str, query: Message) -> Message:
+    async def _subscribe(self, kind: str, query: Message) -> None:
+        encoder = None
+        if kind == "VIDEO":
+            codec, interval_s = unpack_video_query(query.content)
+            encoder = await asyncio.to_thread(VideoEncoder, codec)
+        else:
+            interval_s = unpack_interval_s(query.content)
+        self.feed.start(kind, query.device_name, interval_s, query.version, encoder)
+
+    async def _newest_frame(self, kind: str, query: Message) -> Message:
         """The newest frame as the query wants it; without content where there is none of that name."""
+        encoder = await asyncio.to_thread(VideoEncoder) if kind == "VIDEO" else None
         frame = self._newest_of_all()
         if frame is None or not frame.goes_by(query.device_name):
             return _reply(kind, query, b"")
-        return frame.message(kind, query.version, query.message_id, query.device_name)
+        return await asyncio.to_thread(frame.message, kind, query.version, query.message_id, query.device_name, encoder)
 
     async def _take_poses(self, message: Message, arrived: float) -> None:
         """Moves tools of devices, takes poses of others; where only tools moved, the last pose is rendered again."""
@@ -232,7 +244,8 @@ class Connection:
             self._publish(frame, self)
             self._note(frame.posed, frame.result)
             asked = frame.posed.message
-            await self._send(frame.message("IMAGE", asked.version, asked.message_id))
+            if not self.feed.films(frame):
+                await self._send(frame.message("IMAGE", asked.version, asked.message_id))
             self._count(asked.type_name, "OK", frame.posed.arrived)
 
     def _note(self, posed: PoseMessage, outcome: RenderResult | UltragrayError) -> None:

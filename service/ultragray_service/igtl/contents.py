@@ -31,6 +31,7 @@ COMMAND_TYPES = ("COMMAND", "STRING")
 
 KINDS: Mapping[str, str] = {  # by what stands behind GET_, STT_ and STP_: a type has at most 12 letters
     "IMAGE": "IMAGE",
+    "VIDEO": "VIDEO",
     "TRANSFOR": "TRANSFORM",
     "TRANS": "TRANSFORM",  # in older documents of the protocol
     "POSITION": "POSITION",
@@ -61,8 +62,12 @@ MAX_INSTRUMENTS = 32  # of one message: checking more would keep others waiting
 _POSE_BYTES = {"TDATA": 48, "QTDATA": 28}  # of an instrument: a matrix, or position and quaternion
 _IMAGE = struct.Struct(">HBBBB3H48s6H")
 _IMAGE_VERSION, _SCALAR, _UINT8, _LITTLE_ENDIAN, _RAS = 1, 1, 3, 2, 1
+_VIDEO = struct.Struct(">HB4sHB3H48s6H")
+_VIDEO_VERSION = 1
+_KEY, _FROM_OTHERS = 0x0100, 0x0300  # types of VIDEO frames; both tell that their luminance is grey
 _STATUS = struct.Struct(">Hq20s")
 _INTERVAL = struct.Struct(">I")
+_CODEC_BYTES = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -78,6 +83,17 @@ class Image:
     """A slice: `pixels` uint8 [J, I]; `matrix` [4, 4] takes the centre of pixel (i, j, k = 0, 1) to mm."""
 
     pixels: npt.NDArray[np.uint8]
+    matrix: FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class VideoFrame:
+    """An encoded slice: `size` I, J; `matrix` [4, 4] as that of an `Image`; the first frame of a stream is a key."""
+
+    codec: str  # of the protocol's list, such as VP90
+    data: bytes
+    is_key: bool
+    size: tuple[int, int]
     matrix: FloatArray
 
 
@@ -162,21 +178,49 @@ def unpack_image(content: bytes) -> Image:
     if (version, components, scalar, slices, part) != (_IMAGE_VERSION, _SCALAR, _UINT8, 1, whole):
         raise IgtlMessageInvalid("IMAGE must be one whole slice of one 8-bit component", field="body")
     _check_size("IMAGE", content, _IMAGE.size + rows * columns)
-    matrix = np.eye(4)
-    matrix[:3] = np.frombuffer(vectors, ">f4").reshape(4, 3).T
-    matrix[:3, 3] -= matrix[:3, :2] @ ((columns - 1) / 2, (rows - 1) / 2)
-    return Image(np.frombuffer(content, np.uint8, offset=_IMAGE.size).reshape(rows, columns), matrix)
+    pixels = np.frombuffer(content, np.uint8, offset=_IMAGE.size).reshape(rows, columns)
+    return Image(pixels, _unpack_place(vectors, columns, rows))
 
 
 def pack_image(image: Image) -> bytes:
-    """The content of an IMAGE. The protocol gives the position of the image's centre, not of its first pixel."""
+    """The content of an IMAGE."""
     rows, columns = image.pixels.shape
-    vectors = image.matrix[:3].copy()
-    vectors[:, 3] += vectors[:, :2] @ ((columns - 1) / 2, (rows - 1) / 2)
     size = (columns, rows, 1)
     kind = (_IMAGE_VERSION, _SCALAR, _UINT8, _LITTLE_ENDIAN, _RAS)
     part = (0, 0, 0, *size)  # the whole image
-    return _IMAGE.pack(*kind, *size, vectors.T.astype(">f4").tobytes(), *part) + image.pixels.tobytes()
+    return _IMAGE.pack(*kind, *size, _pack_place(image.matrix, columns, rows), *part) + image.pixels.tobytes()
+
+
+def unpack_video(content: bytes) -> VideoFrame:
+    if len(content) < _VIDEO.size:
+        raise IgtlMessageInvalid(f"VIDEO must hold {_VIDEO.size} bytes or more, got {len(content)}", field="body")
+    version, _, codec, kind, _, columns, rows, slices, vectors, *part = _VIDEO.unpack_from(content)
+    if (version, slices, part) != (_VIDEO_VERSION, 1, [0, 0, 0, columns, rows, slices]):
+        raise IgtlMessageInvalid("VIDEO must be one whole slice", field="body")
+    matrix = _unpack_place(vectors, columns, rows)
+    return VideoFrame(unpack_text(codec), content[_VIDEO.size :], kind == _KEY, (columns, rows), matrix)
+
+
+def pack_video(frame: VideoFrame) -> bytes:
+    """The content of a VIDEO."""
+    size = (*frame.size, 1)
+    kind = (_LITTLE_ENDIAN, frame.codec.encode(), _KEY if frame.is_key else _FROM_OTHERS, _RAS)
+    part = (0, 0, 0, *size)
+    return _VIDEO.pack(_VIDEO_VERSION, *kind, *size, _pack_place(frame.matrix, *frame.size), *part) + frame.data
+
+
+def _unpack_place(vectors: bytes, columns: int, rows: int) -> FloatArray:  # [4, 4]
+    matrix = np.eye(4)
+    matrix[:3] = np.frombuffer(vectors, ">f4").reshape(4, 3).T
+    matrix[:3, 3] -= matrix[:3, :2] @ ((columns - 1) / 2, (rows - 1) / 2)
+    return matrix
+
+
+def _pack_place(matrix: FloatArray, columns: int, rows: int) -> bytes:
+    """The matrix of an image; the protocol gives the position of the image's centre, not of its first pixel."""
+    vectors = matrix[:3].copy()
+    vectors[:, 3] += vectors[:, :2] @ ((columns - 1) / 2, (rows - 1) / 2)
+    return vectors.T.astype(">f4").tobytes()
 
 
 def unpack_status(content: bytes) -> Status:
@@ -194,8 +238,13 @@ def pack_capability(type_names: Iterable[str]) -> bytes:
     return b"".join(name.encode().ljust(TYPE_NAME_BYTES, b"\0") for name in type_names)
 
 
+def unpack_video_query(content: bytes) -> tuple[str, float]:
+    """Codec ("": not named) and least time between two messages, s, of an STT_VIDEO. Raises IgtlMessageInvalid."""
+    return unpack_text(content[:_CODEC_BYTES]), unpack_interval_s(content[_CODEC_BYTES:])
+
+
 def unpack_interval_s(content: bytes) -> float:
-    """The least time between two messages of an STT_TDATA or STT_QTDATA; none: 0. Raises IgtlMessageInvalid."""
+    """The least time between two messages of a subscription; not given: 0. Raises IgtlMessageInvalid."""
     if not content:
         return 0.0
     if len(content) < _INTERVAL.size:

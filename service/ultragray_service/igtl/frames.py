@@ -25,9 +25,11 @@ from ultragray_service.igtl.contents import (
     pack_instruments,
     pack_position,
     pack_transform,
+    pack_video,
 )
 from ultragray_service.igtl.messages import Message
 from ultragray_service.igtl.routes import SceneChooser, image_name
+from ultragray_service.igtl.video import VideoEncoder
 from ultragray_service.service import Service
 from ultragray_workers.errors import QueueFull
 from ultragray_workers.jobs.owners import Kind, Ownership
@@ -137,12 +139,17 @@ class Frame:
         """Whether a query for `name` means this frame; a query without a name means any."""
         return name in ("", self.posed.message.device_name, image_name(self.posed.message.device_name))
 
-    def message(self, kind: str, version: int, message_id: int = 0, name: str = "") -> Message:
+    def message(
+        self, kind: str, version: int, message_id: int = 0, name: str = "", encoder: VideoEncoder | None = None
+    ) -> Message:
+        """The message that tells the frame; a VIDEO is the next one of its encoder, and takes milliseconds."""
         device_name, pose = self.posed.message.device_name, self.result.poses[0]
         if self.registration is not None:
             pose = self.registration.flange_to_base(pose)
         if kind == "IMAGE":
             content, own_name = pack_image(self.image), image_name(device_name)
+        elif encoder is not None:
+            content, own_name = pack_video(encoder.encode(self.image)), image_name(device_name)
         elif kind in ("TDATA", "QTDATA"):
             content, own_name = pack_instruments(kind, [Instrument(device_name, pose)]), device_name
         else:
@@ -225,7 +232,13 @@ class _Subscription:
     name: str
     interval_s: float
     version: int
+    encoder: VideoEncoder | None
     due: float = 0.0  # time.monotonic(), s
+
+    async def message(self, kind: str, frame: Frame) -> Message:
+        if self.encoder is None:
+            return frame.message(kind, self.version)
+        return await asyncio.to_thread(frame.message, kind, self.version, encoder=self.encoder)
 
 
 class Feed:
@@ -238,9 +251,14 @@ class Feed:
         self._fresh: dict[str, Frame] = {}
         self._changed = asyncio.Event()
 
-    def start(self, kind: str, name: str, interval_s: float, version: int) -> None:
-        self._subscriptions[kind] = _Subscription(name, interval_s, version)
+    def start(self, kind: str, name: str, interval_s: float, version: int, encoder: VideoEncoder | None = None) -> None:
+        self._subscriptions[kind] = _Subscription(name, interval_s, version, encoder)
         self._changed.set()
+
+    def films(self, frame: Frame) -> bool:
+        """Whether the client gets this frame as VIDEO."""
+        subscription = self._subscriptions.get("VIDEO")
+        return subscription is not None and frame.goes_by(subscription.name)
 
     def stop(self, kind: str) -> None:
         self._subscriptions.pop(kind, None)
@@ -267,4 +285,6 @@ class Feed:
                     if (frame := self._fresh.pop(kind, None)) is not None:  # may have been stopped meanwhile
                         subscription = self._subscriptions[kind]
                         subscription.due = time.monotonic() + subscription.interval_s
-                        await self._send(frame.message(kind, subscription.version))
+                        message = await subscription.message(kind, frame)
+                        if self._subscriptions.get(kind) is subscription:
+                            await self._send(message)

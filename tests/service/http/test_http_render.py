@@ -1,5 +1,6 @@
 """Scenes and their frames over HTTP: every form of an answer, and what it tells."""
 
+import base64
 import hashlib
 import io
 import json
@@ -12,6 +13,8 @@ import httpx
 import numpy as np
 import pydicom
 import pytest
+from PIL import Image
+from pydicom.uid import UltrasoundImageStorage
 
 from ultragray import render
 from ultragray.scene.confidence import FIGURES
@@ -154,7 +157,28 @@ def test_one_frame_holds_the_pixels_and_their_spacing(http, pose_body):
     picture = json.loads(answer.headers["x-ultragray-picture"])
     region = image.SequenceOfUltrasoundRegions[0]
     assert (region.PhysicalDeltaX, region.PhysicalDeltaY) == pytest.approx([step / 10 for step in picture["step"]])
-    assert (image.NumberOfFrames, image.Rows, image.Columns) == (1, HEIGHT, WIDTH)
+    assert (image.SOPClassUID, image.Rows, image.Columns) == (UltrasoundImageStorage, HEIGHT, WIDTH)
+    assert "NumberOfFrames" not in image
+
+
+def test_a_file_holds_the_times_and_the_annotations_of_its_frames(http, pose_body):
+    file = io.BytesIO()
+    Image.new("LA", (WIDTH, HEIGHT), (255, 255)).save(file, "PNG")
+    mark = {"frame": 1, "picture": base64.b64encode(file.getvalue()).decode(), "text": "A  12.3 mm"}
+    body = {"poses": [pose_body, pose_body], "frame_times_ms": [5.0, 42.5], "annotations": [mark]}
+    _, image = stored(http, body)
+    assert [float(way) for way in image.FrameTimeVector] == [0.0, 37.5]
+    assert image.ImageComments == "A  12.3 mm"
+    assert image.pixel_array[1][: HEIGHT // 2].min() == 255 > image.pixel_array[0].min()
+    wrong = [
+        ({"frame_times_ms": [5.0]}, "frame_times_ms"),
+        ({"frame_times_ms": [5.0, 4.0]}, "frame_times_ms"),
+        ({"annotations": [{**mark, "frame": 2}]}, "annotations[0].frame"),
+        ({"annotations": [{**mark, "picture": "x"}]}, "annotations[0].picture"),
+    ]
+    for change, field in wrong:
+        answer = http.post("/v1/scenes/demo/render", json={**body, **change}, headers=DICOM)
+        assert (answer.status_code, answer.json()["field"]) == (422, field)
 
 
 def test_other_outputs_and_float_pixels_are_refused(http, pose_body):

@@ -4,9 +4,10 @@
  */
 
 import { address, poseBody, post, postJson, type Schemas } from "./client";
-import { type FrameHeader, type Probe, settingsAgain, type StreamSettings } from "./contract";
+import { type Probe, settingsAgain, type StreamSettings } from "./contract";
 import type { Described } from "./described";
 import { within } from "./generated/contract";
+import type { Frame } from "./stream";
 
 export type Extrapolation = Schemas["Extrapolation"];
 export type Located = Schemas["Located"];
@@ -30,14 +31,20 @@ export async function renderPicture(
   return { picture: await response.blob(), confidence: confidence === "" ? null : Number(confidence) };
 }
 
-export const MOST_DICOM_FRAMES = 100; // of one file: the service lets so many wait beside the live ones
+export type Annotation = Schemas["Annotation"];
 
-/** Frames of one setting and one scene file. `settings`: as they were asked for, where the frames do not tell. */
-export async function framesAsDicom(headers: readonly FrameHeader[], settings: StreamSettings): Promise<Blob> {
+/** Frames of one setting and one scene file, with what was set on them.
+ *
+ * `settings`: as they were asked for, where the frames do not tell.
+ */
+export async function framesAsDicom(
+  frames: readonly Frame[], annotations: readonly Annotation[], settings: StreamSettings,
+): Promise<Blob> {
+  const headers = frames.map(({ header }) => header);
   const [first] = headers;
   const { min_confidence, below_min_confidence } = settings;
   const poses = headers.map(({ pose }) => ({ matrix: pose }));
-  const body = { ...settingsAgain(first!), min_confidence, below_min_confidence, poses };
+  const body = { ...settingsAgain(first!), min_confidence, below_min_confidence, poses, frame_times_ms: frames.map(({ came_ms }) => came_ms), annotations };
   const path = address("/v1/scenes/{scene}/render", { scene: `${first!.scene}@${first!.scene_sha256}` });
   return await (await post(path, body, { accept: "application/dicom" })).blob();
 }

@@ -12,6 +12,8 @@ export interface Frame {
   pixels: Uint8Array<ArrayBuffer>;
   /** From asking to having it. */
   roundTrip_ms: number;
+  /** When it came, by the clock of the page. */
+  came_ms: number;
 }
 
 export interface StreamEvents {
@@ -212,8 +214,8 @@ const decoder = new TextDecoder();
 export function decodeFrame(message: ArrayBuffer): Frame {
   const length = new DataView(message).getUint32(0, true);
   const header = JSON.parse(decoder.decode(new Uint8Array(message, 4, length))) as FrameHeader;
-  const asked = header.client_time_ms ?? performance.now();
-  return { header, pixels: new Uint8Array(message, 4 + length), roundTrip_ms: performance.now() - asked };
+  const came_ms = performance.now();
+  return { header, pixels: new Uint8Array(message, 4 + length), roundTrip_ms: came_ms - (header.client_time_ms ?? came_ms), came_ms };
 }
 
 /** The pixels of one output of a frame; undefined where it was not asked for. */

@@ -7,43 +7,6 @@ import { service } from "../page/service.svelte";
 import { METRICS } from "../shared/text";
 import { type Grey, MEASURED, type Measured, metricOf, readGrey, worstFirst } from "./pictures";
 
-const MOST = 16;
-const STEP = 1.25;
-
-/** Where all pictures of the bench are enlarged, and where the pointer is: linked, in shares of width and height. */
-export class Lens {
-  zoom = $state(1);
-  /** The share that lies in the middle. */
-  x = $state(0.5);
-  y = $state(0.5);
-  cursor = $state.raw<{ u: number; v: number } | null>(null);
-
-  /** Enlarges about a place, which stays where it is. */
-  zoomBy(steps: number, about = { u: this.x, v: this.y }): void {
-    const zoom = Math.max(1, Math.min(MOST, this.zoom * STEP ** steps));
-    const kept = this.zoom / zoom;
-    [this.x, this.y] = [about.u + (this.x - about.u) * kept, about.v + (this.y - about.v) * kept];
-    this.zoom = zoom;
-    this.#stay();
-  }
-
-  /** Moves the pictures by shares of their enlarged size. */
-  moveBy(u: number, v: number): void {
-    [this.x, this.y] = [this.x - u, this.y - v];
-    this.#stay();
-  }
-
-  reset(): void {
-    [this.zoom, this.x, this.y] = [1, 0.5, 0.5];
-  }
-
-  #stay(): void {
-    const half = 0.5 / this.zoom;
-    this.x = Math.max(half, Math.min(1 - half, this.x));
-    this.y = Math.max(half, Math.min(1 - half, this.y));
-  }
-}
-
 /** A picture of the service that follows its address; the one before stays, told to be old, until it is there. */
 export class LoadedPicture {
   picture = $state.raw<Grey | null>(null);

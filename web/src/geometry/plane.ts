@@ -217,6 +217,14 @@ export function ellipseOf([a, b, c]: EllipsePoints): Ellipse {
   };
 }
 
+/** Points all around it. */
+export function rimOf([a, b, c]: EllipsePoints, count: number): PlanePoint[] {
+  const centre = middleOf(a, b);
+  const at = (turn: number, of: "x_mm" | "z_mm"): number =>
+    centre[of] + Math.cos(turn) * (b[of] - centre[of]) + Math.sin(turn) * (c[of] - centre[of]);
+  return Array.from({ length: count }, (_, index) => (2 * Math.PI * index) / count).map((turn) => ({ x_mm: at(turn, "x_mm"), z_mm: at(turn, "z_mm") }));
+}
+
 /** The end of the other axis, square to a–b, that is as far from it as a point. */
 export function squareTo(a: PlanePoint, b: PlanePoint, point: PlanePoint): PlanePoint {
   const centre = middleOf(a, b);

@@ -5,7 +5,7 @@ import { untrack } from "svelte";
 import type { Frame } from "../api/stream";
 import {
   angleAt_deg, area_mm2, type Box, carried, circumference_mm, distanceBetween_mm, ellipseOf, type EllipsePoints,
-  middleOf, placeLabels, type PlanePoint, squareTo,
+  middleOf, placeLabels, type PlanePoint, rimOf, squareTo,
 } from "../geometry/plane";
 import {
   flangePose, fromPositionQuaternion, type Place, placeIn, type Pose, position, probePose, quaternion,
@@ -15,6 +15,7 @@ import type { PoseForm } from "../geometry/pose_files";
 import { router } from "../page/router.svelte";
 import { followLink, isAsLinked, isLink, linkOf } from "../session/link";
 import { besideSession, type History, type Session } from "../session/session.svelte";
+import { Lens } from "../shared/lens.svelte";
 import { fixed } from "../shared/text";
 import { words } from "../words/words.svelte";
 
@@ -282,7 +283,7 @@ export interface Lettered {
   box: Box;
 }
 
-/** The letters of marks, each near its mark and none over another or over a point. */
+/** The letters of marks, each near its mark and none over another, or over what is marked. */
 export function lettersOf(
   shown: readonly Mark[],
   marks: Marks,
@@ -290,17 +291,43 @@ export function lettersOf(
   area: Box,
 ): Lettered[] {
   const lettered = shown.filter(({ kind }) => kind !== "text");
-  const points = shown.flatMap((mark) => mark.points.map(screenOf));
-  const taken = points.map(({ x, y }) => ({ left: x - 6, top: y - 6, width: 12, height: 12 }));
+  const taken = shown.flatMap((mark) => boxesOf(mark, screenOf));
   const labels = lettered.map((mark) => ({ ...screenOf(mark.points.at(mark.kind === "angle" ? 1 : 0)!), ...LETTER }));
   const boxes = placeLabels(labels, area, taken);
   return lettered.map((mark, index) => ({ letter: marks.letterOf(mark.id), box: boxes[index]! }));
+}
+
+const CROSS = 7; // half of the cross of a point, in pixels, and what is free beside it
+const LINE = 3; // what is free beside a line
+const PIECES = 24;
+
+/** Boxes that together cover what a mark consists of, and an ellipse what it surrounds. */
+function boxesOf({ kind, points }: Mark, screenOf: (point: PlanePoint) => { x: number; y: number }): Box[] {
+  const at = points.map(screenOf);
+  const crosses = at.map((point) => boxBetween(point, point, CROSS));
+  if (kind === "ellipse") {
+    const middle = screenOf(ellipseOf(points as EllipsePoints).centre);
+    return [...crosses, ...rimOf(points as EllipsePoints, PIECES).map((point) => boxBetween(middle, screenOf(point), LINE))];
+  }
+  const lines = at.slice(1).flatMap((to, index) => {
+    const from = at[index]!;
+    const along = (share: number) => ({ x: from.x + (to.x - from.x) * share, y: from.y + (to.y - from.y) * share });
+    return Array.from({ length: PIECES }, (_, piece) => boxBetween(along(piece / PIECES), along((piece + 1) / PIECES), LINE));
+  });
+  return [...crosses, ...lines];
+}
+
+function boxBetween(a: { x: number; y: number }, b: { x: number; y: number }, beside: number): Box {
+  const [left, top] = [Math.min(a.x, b.x) - beside, Math.min(a.y, b.y) - beside];
+  return { left, top, width: Math.abs(a.x - b.x) + 2 * beside, height: Math.abs(a.y - b.y) + 2 * beside };
 }
 
 /** What is kept of the Scan view of each scene while another view is shown: the frozen frames with what was set on them. */
 export class ScanState {
   readonly cine: CineLoop;
   readonly marks: Marks;
+  /** Of what stands; the live image is shown whole. */
+  readonly lens = new Lens();
 
   constructor(readonly session: Session) {
     this.cine = new CineLoop((frame) => session.lookAt(frame.header.pose.flat()));
@@ -369,6 +396,7 @@ export class ScanState {
     this.cine.clear();
     this.marks.restore([]);
     this.marks.tool = null;
+    this.lens.reset();
   }
 
   /** Only the newest frozen loop can be had back: they are large. */

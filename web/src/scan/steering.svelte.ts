@@ -2,6 +2,7 @@
 
 import type { Session } from "../session/session.svelte";
 import type { Steering } from "../session/steering.svelte";
+import type { Lens, Share } from "../shared/lens.svelte";
 import type { ScanState } from "./scan.svelte";
 import type { Store } from "./store.svelte";
 
@@ -82,8 +83,9 @@ const ALL = {
   snap: { keys: ["n"], run: ({ scan }) => scan.session.snap() },
   undo: { keys: ["ctrl+z"], goesOn: true, run: ({ scan }) => scan.session.history.undo() },
   redo: { keys: ["ctrl+shift+z", "ctrl+y"], goesOn: true, run: ({ scan }) => scan.session.history.redo() },
-  slower: { keys: ["-"], run: () => scanSettings.changeSpeed(-1) },
-  faster: { keys: ["+"], run: () => scanSettings.changeSpeed(1) },
+  slower: { keys: ["-"], run: ({ scan }) => (scan.session.frozen ? scan.lens.zoomBy(-1) : scanSettings.changeSpeed(-1)) },
+  faster: { keys: ["+"], run: ({ scan }) => (scan.session.frozen ? scan.lens.zoomBy(1) : scanSettings.changeSpeed(1)) },
+  whole: { keys: ["0"], run: ({ scan }) => scan.lens.reset() },
   large: { keys: ["l"], run: () => (scanSettings.large = !scanSettings.large) },
   keys: { keys: ["?"], run: ({ openKeys }) => openKeys() },
 } satisfies Record<string, KeyCommand>;
@@ -133,6 +135,10 @@ interface Options {
   session: Session;
   /** Millimetres of the image plane that a pixel of the screen shows; less than 0 where left and right are exchanged. */
   acrossPerPixel_mm: () => number;
+  /** Of what stands: dragging moves it where it is enlarged, a pinch enlarges it. */
+  lens: Lens;
+  /** Where the picture lies on the screen. */
+  boxOf: () => DOMRect | undefined;
 }
 
 /** What two fingers tell. */
@@ -145,9 +151,9 @@ interface Grip {
 type Listener = (event: PointerEvent & { currentTarget: HTMLElement }) => void;
 
 /** What an element does with its pointers. What lies on it and takes a press for itself stops it on its way. */
-export function steeringByDragging({ session, acrossPerPixel_mm }: Options): Record<"press" | "move" | "letGo", Listener> {
+export function steeringByDragging({ session, acrossPerPixel_mm, lens, boxOf }: Options): Record<"press" | "move" | "letGo", Listener> {
   const held = new Map<number, Place>();
-  let grip: (Grip & { depth_mm: number; pinching: boolean; twisting: boolean }) | null = null;
+  let grip: (Grip & { depth_mm: number; zoom: number; pinching: boolean; twisting: boolean }) | null = null;
   let turns = false;
 
   function press(event: PointerEvent & { currentTarget: HTMLElement }): void {
@@ -156,7 +162,7 @@ export function steeringByDragging({ session, acrossPerPixel_mm }: Options): Rec
     turns = event.button === 2 || event.shiftKey;
     held.set(event.pointerId, placeOf(event));
     event.currentTarget.setPointerCapture(event.pointerId);
-    grip = held.size === 2 ? { ...gripOf(held), depth_mm: depthOf(session), pinching: false, twisting: false } : null;
+    grip = held.size === 2 ? { ...gripOf(held), depth_mm: depthOf(session), zoom: lens.zoom, pinching: false, twisting: false } : null;
   }
 
   function move(event: PointerEvent): void {
@@ -169,6 +175,7 @@ export function steeringByDragging({ session, acrossPerPixel_mm }: Options): Rec
   }
 
   function slideOrTurn(dx: number, dy: number): void {
+    if (session.frozen && lens.zoom > 1) return pan(dx, dy);
     const across_mm = acrossPerPixel_mm();
     if (turns) session.turnBy([dy * TURN_DEG_PER_PIXEL, 0, dx * TURN_DEG_PER_PIXEL]);
     else session.moveBy([dx * across_mm, dy * Math.abs(across_mm), 0]);
@@ -178,14 +185,26 @@ export function steeringByDragging({ session, acrossPerPixel_mm }: Options): Rec
     const now = gripOf(held);
     const twist_deg = ((now.angle_deg - from.angle_deg + 540) % 360) - 180;
     const share = now.apart / from.apart;
+    if (session.frozen) {
+      const box = boxOf();
+      if (box) lens.zoomTo(from.zoom * share, shareIn(box, { clientX: now.middle.x, clientY: now.middle.y }));
+      pan(now.middle.x - from.middle.x, now.middle.y - from.middle.y);
+      from.middle = now.middle;
+      return;
+    }
     from.pinching ||= Math.abs(share - 1) > PINCH_SHARE && Math.abs(twist_deg) < TWIST_DEG;
     from.twisting ||= Math.abs(twist_deg) > TWIST_DEG;
-    if (from.pinching && !session.frozen) setDepth(session, from.depth_mm / share);
+    if (from.pinching) setDepth(session, from.depth_mm / share);
     const rock_deg = (now.middle.x - from.middle.x) * TURN_DEG_PER_PIXEL;
     const rotate_deg = from.twisting && !from.pinching ? twist_deg : 0;
     if (!from.pinching && (rock_deg !== 0 || rotate_deg !== 0)) session.turnBy([0, rock_deg, rotate_deg]);
     from.middle = now.middle;
     if (from.twisting) from.angle_deg = now.angle_deg;
+  }
+
+  function pan(dx: number, dy: number): void {
+    const box = boxOf();
+    if (box) lens.moveBy(dx / box.width, dy / box.height);
   }
 
   function letGo(event: PointerEvent): void {
@@ -194,6 +213,11 @@ export function steeringByDragging({ session, acrossPerPixel_mm }: Options): Rec
   }
 
   return { press, move, letGo };
+}
+
+/** The share of the picture at a place of the screen. */
+export function shareIn(box: DOMRect, { clientX, clientY }: { clientX: number; clientY: number }): Share {
+  return { u: (clientX - box.left) / box.width, v: (clientY - box.top) / box.height };
 }
 
 function placeOf({ clientX, clientY }: PointerEvent): Place {

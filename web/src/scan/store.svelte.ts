@@ -1,7 +1,7 @@
 /** Storing what is shown: drawn on a sheet as a picture or a video, or as DICOM that the service writes. */
 
 import { explain } from "../api/client";
-import { framesAsDicom, MOST_DICOM_FRAMES } from "../api/rendering";
+import { type Annotation, framesAsDicom } from "../api/rendering";
 import type { SceneDescription } from "../api/scenes";
 import { type Frame, outputPixels } from "../api/stream";
 import { depthTicks, ellipseOf, type EllipsePoints, extent_mm, pixelAt, type Placed, type PlanePoint } from "../geometry/plane";
@@ -16,6 +16,9 @@ import { words } from "../words/words.svelte";
 import { lettersOf, type Mark, type Marks, PLAYED_PER_SECOND, resultOf, type ScanState } from "./scan.svelte";
 
 const LONGER_SIDE = 1024;
+const BURNT_LONGER_SIDE = 768; // of one frame; a loop must stay small
+const BURNT_LOOP_SIDE = 512;
+const NO_MARGINS = { top: 0, right: 0, bottom: 0, left: 0 };
 const MARGINS = { top: 30, right: 56, bottom: 22, left: 16 };
 const LINE = 20;
 const FONT = "13px system-ui, sans-serif";
@@ -40,24 +43,44 @@ export class Sheet {
   readonly #width: number;
   readonly #height: number;
   readonly #scale: number;
+  readonly #margins: typeof MARGINS;
 
-  /** Large enough for each of the pages, whose frames are of one setting. Throws where the browser cannot draw. */
+  /** Large enough for each of the pages, whose frames are of one setting. Throws where the browser cannot draw.
+   *
+   * `burntWidth`: so wide, and without what stands around the picture: for `annotation` alone.
+   */
   constructor(
     private readonly placed: Placed,
     private readonly marks: Marks,
     private readonly description: SceneDescription | null,
     pages: readonly Page[],
+    private readonly burntWidth: number | null = null,
   ) {
     const context = this.canvas.getContext("2d");
     if (context === null) throw new Error(words.scan.store.noDrawing);
     this.#context = context;
     const { across, down } = extent_mm(placed);
-    this.#scale = LONGER_SIDE / Math.max(across, down);
+    this.#margins = burntWidth === null ? MARGINS : NO_MARGINS;
+    this.#scale = burntWidth === null ? LONGER_SIDE / Math.max(across, down) : burntWidth / across;
     [this.#width, this.#height] = [across * this.#scale, down * this.#scale];
     context.font = FONT;
     const lines = Math.max(...pages.map((page) => this.#lines(page).length));
-    this.canvas.width = even(this.#width + MARGINS.left + MARGINS.right);
-    this.canvas.height = even(this.#height + MARGINS.top + MARGINS.bottom + LINE * lines);
+    const margins = this.#margins;
+    this.canvas.width = burntWidth ?? even(this.#width + margins.left + margins.right);
+    this.canvas.height = even(this.#height + margins.top + margins.bottom + LINE * lines);
+  }
+
+  /** What was set on a page, to be burnt into its frame: white, edged in black, the results below the picture. */
+  annotation(page: Page, frame: number): Annotation {
+    const context = this.#context;
+    context.clearRect(0, 0, this.canvas.width, this.canvas.height);
+    context.font = FONT;
+    context.fillStyle = context.strokeStyle = "#fff";
+    [context.shadowColor, context.shadowBlur] = ["#000", 3];
+    this.#drawMarks(page);
+    this.#drawLines(page);
+    const [, picture] = this.canvas.toDataURL("image/png").split(",");
+    return { frame, picture: picture!, text: [...this.#measured(page), ...page.marks.map(({ text }) => text)].filter(Boolean).join("\n") };
   }
 
   draw(page: Page): void {
@@ -70,14 +93,31 @@ export class Sheet {
     this.#drawConfidence(page.frame);
     this.#drawMarker(page.frame.header.display.flip);
     context.fillStyle = context.strokeStyle = MEASURED;
-    for (const mark of page.marks) this.#drawMark(mark);
-    this.#drawLetters(page.marks);
+    this.#drawMarks(page);
     context.fillStyle = TEXT;
-    const bottom = MARGINS.top + this.#height + MARGINS.bottom;
-    for (const [index, line] of this.#lines(page).entries()) context.fillText(line, MARGINS.left, bottom + LINE * (index + 0.4));
+    this.#drawLines(page);
   }
 
-  #lines({ frame, marks }: Page): string[] {
+  #drawMarks({ marks }: Page): void {
+    for (const mark of marks) this.#drawMark(mark);
+    this.#drawLetters(marks);
+  }
+
+  #drawLines(page: Page): void {
+    const { left, top, bottom } = this.#margins;
+    const first = top + this.#height + bottom + LINE * (this.burntWidth === null ? 0.4 : 0.75);
+    for (const [index, line] of this.#lines(page).entries()) this.#context.fillText(line, left, first + LINE * index);
+  }
+
+  /** "A  12.0 mm" of each that has a result. */
+  #measured({ marks }: Page): string[] {
+    return marks.filter(({ kind }) => kind !== "text").map((mark) => `${this.marks.letterOf(mark.id)}  ${resultOf(mark)}`);
+  }
+
+  #lines(page: Page): string[] {
+    const { frame } = page;
+    const measured = this.#wrapped(this.#measured(page), GAP);
+    if (this.burntWidth !== null) return measured;
     const { scene, slice_thickness_mm, pose, tools, ghost } = frame.header;
     const warning = confidenceWords(frame.header, this.description)?.warning ?? "";
     const said = words.scan.store;
@@ -91,9 +131,8 @@ export class Sheet {
       ...(tools.length === 0 ? [] : [said.drawn(tools.map(({ kind }) => nameIn(words.tools.kinds, kind)).join(", "))]),
       ...(ghost === 0 ? [] : [words.tools.ghostMeans]),
     ];
-    const measured = marks.filter(({ kind }) => kind !== "text").map((mark) => `${this.marks.letterOf(mark.id)}  ${resultOf(mark)}`);
     return [
-      ...this.#wrapped(measured, GAP),
+      ...measured,
       ...this.#wrapped(told, GAP),
       ...this.#wrapped(poseJson(pose.flat()).split(/(?<=,)/), ""),
     ];
@@ -104,7 +143,7 @@ export class Sheet {
     const lines: string[] = [];
     for (const piece of pieces) {
       const longer = `${lines.at(-1)}${gap}${piece}`;
-      const fits = lines.length > 0 && this.#context.measureText(longer).width <= this.#width + MARGINS.right;
+      const fits = lines.length > 0 && this.#context.measureText(longer).width <= this.#width + this.#margins.right;
       if (fits) lines[lines.length - 1] = longer;
       else lines.push(piece);
     }
@@ -187,7 +226,7 @@ export class Sheet {
   }
 
   #drawLetters(marks: readonly Mark[]): void {
-    const area = { left: MARGINS.left, top: MARGINS.top, width: this.#width, height: this.#height };
+    const area = { left: this.#margins.left, top: this.#margins.top, width: this.#width, height: this.#height };
     for (const { letter, box } of lettersOf(marks, this.marks, this.#screenOf, area))
       this.#context.fillText(letter, box.left, box.top + box.height - 3);
   }
@@ -195,8 +234,8 @@ export class Sheet {
   readonly #screenOf = (point: PlanePoint): { x: number; y: number } => {
     const { column, row } = pixelAt(this.placed, point);
     return {
-      x: MARGINS.left + ((column + 0.5) / this.placed.width) * this.#width,
-      y: MARGINS.top + ((row + 0.5) / this.placed.height) * this.#height,
+      x: this.#margins.left + ((column + 0.5) / this.placed.width) * this.#width,
+      y: this.#margins.top + ((row + 0.5) / this.placed.height) * this.#height,
     };
   };
 }
@@ -238,23 +277,19 @@ export class Store {
   dicom(): Promise<void> {
     return this.#store(words.scan.store.asking, async () => {
       const frame = this.shown();
-      if (frame !== null) saveBlob(await this.#asDicom([frame]), `${this.#name}.dcm`);
+      if (frame !== null) saveBlob(await this.#asDicom([{ frame, marks: this.scan.shown }], BURNT_LONGER_SIDE), `${this.#name}.dcm`);
     });
   }
 
   loopAsDicom(): Promise<void> {
     return this.#store(words.scan.store.asking, async () => {
-      saveBlob(await this.#asDicom(this.scan.cine.frames.slice(-MOST_DICOM_FRAMES)), `${this.#name}-cine.dcm`);
+      saveBlob(await this.#asDicom(this.#loop, BURNT_LOOP_SIDE), `${this.#name}-cine.dcm`);
     });
   }
 
   loopAsVideo(): Promise<void> {
     return this.#store(words.scan.store.drawing, async () => {
-      const { cine, marks, session } = this.scan;
-      const pages = cine.frames.map((frame, index) => ({
-        frame,
-        marks: session.frozen ? marks.all.filter((mark) => mark.frame === index) : [],
-      }));
+      const pages = this.#loop;
       const told = (done: number): void => void (this.doing = words.scan.store.recording(done, pages.length));
       const sheet = this.#sheet(pages);
       const draw = (index: number): void => sheet.draw(pages[index]!);
@@ -263,19 +298,32 @@ export class Store {
     });
   }
 
+  get #loop(): Page[] {
+    const { cine, marks, session } = this.scan;
+    return cine.frames.map((frame, index) => ({
+      frame,
+      marks: session.frozen ? marks.all.filter((mark) => mark.frame === index) : [],
+    }));
+  }
+
   get #name(): string {
     return this.scan.session.name;
   }
 
-  #sheet(pages: readonly Page[]): Sheet {
+  #sheet(pages: readonly Page[], burntWidth: number | null = null): Sheet {
     const placed = pages[0] && planes.placed(pages[0].frame.header);
     if (!placed) throw new Error(words.scan.store.nothing);
-    return new Sheet(placed, this.scan.marks, this.scan.session.scene.description, pages);
+    return new Sheet(placed, this.scan.marks, this.scan.session.scene.description, pages, burntWidth);
   }
 
-  #asDicom(frames: readonly Frame[]): Promise<Blob> {
-    if (frames.length === 0) throw new Error(words.scan.store.nothing);
-    return framesAsDicom(frames.map(({ header }) => header), this.scan.session.settings(["bmode"]));
+  /** What is set on the pages is drawn in pixels that are a whole part of the frames'. */
+  #asDicom(pages: readonly Page[], side: number): Promise<Blob> {
+    const [first] = pages;
+    if (first === undefined) throw new Error(words.scan.store.nothing);
+    const { height, width } = first.frame.header;
+    const sheet = this.#sheet(pages, width * Math.max(1, Math.round(side / Math.max(height, width))));
+    const annotations = pages.flatMap((page, index) => (page.marks.length > 0 ? [sheet.annotation(page, index)] : []));
+    return framesAsDicom(pages.map(({ frame }) => frame), annotations, this.scan.session.settings(["bmode"]));
   }
 
   async #store(doing: string, work: () => Promise<void>): Promise<void> {

@@ -8,7 +8,7 @@ import {
 
 import type { Gaussians } from "../api/gaussians";
 import { type Appearance, type ColourBy, colourOf, ENTRIES, type Form, type SolidBy } from "./appearance";
-import { brightestOf, byteAt, covariancesOf, type Volume } from "./volume";
+import { brightestOf, byteAt, covariancesOf, smallLabels, type Volume } from "./volume";
 
 /** RGBA by share. */
 export function paletteTexture(): DataTexture {
@@ -173,8 +173,9 @@ export class Splats {
       return volume === null ? 1 : byteAt(volume, x!, y!, z!, CHANNEL_COVERAGE) / 255;
     };
     const chosen: number[] = [];
+    const small = volume === null ? [] : smallLabels(volume);
     for (let i = 0; i < this.gaussians.count; i++) {
-      const strength = solid === "shadow" ? 1 - transmittance[i]! : (intensity[i]! - low) / (high - low);
+      const strength = small.includes(label[i]!) ? 1 : solid === "shadow" ? 1 - transmittance[i]! : (intensity[i]! - low) / (high - low);
       if (strength < threshold || hidden.includes(label[i]!)) continue;
       chosen.push(i);
       const share = Math.min(1, 0.35 + (0.65 * (strength - threshold)) / Math.max(0.05, 1 - threshold));
@@ -229,7 +230,7 @@ void main() {
 const VOLUME_FRAGMENT = `
 precision highp sampler3D;
 uniform sampler3D volume;
-uniform sampler2D palette, shown, occluders;
+uniform sampler2D palette, shown, massive, occluders;
 uniform mat4 toScene;
 uniform vec2 view;
 uniform vec3 low, high;
@@ -252,6 +253,12 @@ float labelOf(vec3 point) {
 }
 float solid(vec4 v) { return solidBy == 1 ? v.b : min(1.0, v.r / brightest); }
 bool isShown(vec3 point) { return texelFetch(shown, ivec2(int(255.0 * labelOf(point) + 0.5), 0), 0).r > 0.5; }
+/** Small things are as solid as they are covered: vessels are shown as tubes. */
+float solidAt(vec3 point) {
+  vec4 v = voxel(point);
+  bool small = texelFetch(massive, ivec2(int(255.0 * labelOf(point) + 0.5), 0), 0).r < 0.5;
+  return small ? max(solid(v), v.g) : solid(v);
+}
 vec3 colour(vec4 v, vec3 point) {
   float value = v.r / brightest;
   if (colourBy == 1) value = v.g;
@@ -294,8 +301,8 @@ void main() {
     if (along >= to || sum.a > 0.97) break;
     vec3 point = eye + way * along;
     vec4 v = voxel(point);
-    float strength = solid(v);
     along += stride;
+    float strength = maximum ? solid(v) : solidAt(point);
     if (maximum) {
       if (strength > best && isShown(point)) { best = strength; bestPoint = point; found = true; }
       continue;
@@ -304,9 +311,9 @@ void main() {
     if (alpha < 0.02 || !isShown(point)) continue;
     vec3 e = vec3(stride, 0.0, 0.0);
     vec3 slope = vec3(
-      solid(voxel(point + e.xyy)) - solid(voxel(point - e.xyy)),
-      solid(voxel(point + e.yxy)) - solid(voxel(point - e.yxy)),
-      solid(voxel(point + e.yyx)) - solid(voxel(point - e.yyx)));
+      solidAt(point + e.xyy) - solidAt(point - e.xyy),
+      solidAt(point + e.yxy) - solidAt(point - e.yxy),
+      solidAt(point + e.yyx) - solidAt(point - e.yyx));
     float facing = length(slope) < 0.02 ? 0.7 : abs(dot(normalize(slope), way));
     float light = 0.28 + 0.72 * facing;
     alpha *= opacity;
@@ -323,6 +330,8 @@ void main() {
 export class VolumeLayer {
   readonly object: Mesh<BufferGeometry, ShaderMaterial>;
   #texture: Data3DTexture;
+  /** The labels that are not small. */
+  #massive = paletteTexture();
   #uniforms;
 
   constructor(volume: Volume, shared: CloudUniforms) {
@@ -331,10 +340,12 @@ export class VolumeLayer {
     this.#texture.format = RGBAFormat;
     this.#texture.minFilter = this.#texture.magFilter = LinearFilter;
     this.#texture.needsUpdate = true;
+    fillShown(this.#massive, smallLabels(volume));
     const low = new Vector3(...grid.low);
     const high = new Vector3(...grid.size).multiplyScalar(grid.voxel_mm).add(low);
     this.#uniforms = {
       volume: { value: this.#texture },
+      massive: { value: this.#massive },
       low: { value: low },
       high: { value: high },
       stride: { value: grid.voxel_mm },
@@ -363,6 +374,7 @@ export class VolumeLayer {
 
   dispose(): void {
     this.#texture.dispose();
+    this.#massive.dispose();
     this.object.geometry.dispose();
     this.object.material.dispose();
     this.object.removeFromParent();

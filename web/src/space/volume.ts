@@ -118,6 +118,23 @@ export function brightestOf({ voxels }: Volume): number {
   return 1;
 }
 
+const SMALL_SHARE = 0.05; // of what is labelled
+const MOST_SHADOW = 0.1;
+const COVERED = 64;
+
+/** The labels of small things that let sound pass, such as vessels: they hide nothing, and casting no shadow they would stay unseen. */
+export function smallLabels({ voxels }: Volume): number[] {
+  const sums = Array.from({ length: 256 }, () => ({ coverage: 0, shadow: 0 }));
+  for (let at = 0; at < voxels.length; at += 4) {
+    if (voxels[at + 3] === 0 || voxels[at + 1]! < COVERED) continue;
+    const sum = sums[voxels[at + 3]!]!;
+    sum.coverage += voxels[at + 1]!;
+    sum.shadow += voxels[at + 2]!;
+  }
+  const all = sums.reduce((sum, { coverage }) => sum + coverage, 0);
+  return sums.flatMap(({ coverage, shadow }, label) => (coverage < SMALL_SHARE * all && shadow < MOST_SHADOW * coverage ? [label] : []));
+}
+
 /** The byte of a channel of the voxel that holds a point; 0 outside. */
 export function byteAt({ grid: { low, voxel_mm, size }, voxels }: Volume, x: number, y: number, z: number, channel: number): number {
   const [i, j, k] = [x, y, z].map((value, axis) => Math.floor((value - low[axis]!) / voxel_mm)) as [number, number, number];

@@ -1,20 +1,20 @@
-"""DICOM: Ultrasound Multi-frame Image Storage (PS3.3 A.7), 8-bit MONOCHROME2, uncompressed. The extra `dicom`.
+"""DICOM: Ultrasound Image Storage of one frame (PS3.3 A.6), Ultrasound Multi-frame Image Storage of several (A.7).
 
-The one item of SequenceOfUltrasoundRegions (C.8.5.5) covers the
-whole image; its physical values are the probe frame in cm: x lateral, y depth. The patient is the same for every file
-and no person. The UIDs are 2.25 and a UUID (PS3.5 B.2) made of what the frames are made of: that of the study, of the
-scene's hash; those of the series and the image, also of the renderer, the probe, the size and the poses. So the same
-frames have the same UIDs wherever they are rendered. Of the creator ULTRAGRAY are the private elements (0019,1001), OD:
-the poses [C, 4, 4], mm, and (0019,1002), OF: the figures [C, 4] of each frame in the order of `confidence.FIGURES`
-(and a fifth, the share of contact, where that was asked for), NaN
-where one is not known, and (0019,1003), UT: the origin as JSON, probe and display settings included.
+8-bit MONOCHROME2, uncompressed. The extra `dicom`. The one item of SequenceOfUltrasoundRegions (C.8.5.5) covers the
+frame; its physical values are the probe frame in cm: x lateral, y depth. Frames have the times that the header tells,
+else 40 ms each; dates are UTC, when the file was made. Annotations are burnt in, and told by ImageComments. The patient
+is the same for every file and no person. The UIDs are 2.25 and a UUID (PS3.5 B.2): that of the study is made of the
+scene's hash and the date, those of the series and the image also of the time, the renderer, the probe, the size, the
+poses and the annotations. Of the creator ULTRAGRAY are the private elements (0019,1001), OD: the poses [C, 4, 4], mm,
+and (0019,1002), OF: the figures [C, 4] of each frame in the order of `confidence.FIGURES` (and a fifth, the share of
+contact, where that was asked for), NaN where one is not known, and (0019,1003), UT: the origin as JSON, probe and
+display settings included.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import math
 import struct
 import uuid
 from collections.abc import Mapping
@@ -22,9 +22,16 @@ from fractions import Fraction
 
 import numpy as np
 from pydicom.dataset import Dataset, FileDataset, FileMetaDataset
-from pydicom.uid import UID, ExplicitVRLittleEndian, UltrasoundMultiFrameImageStorage
+from pydicom.uid import (
+    UID,
+    ExplicitVRLittleEndian,
+    UltrasoundImageStorage,
+    UltrasoundMultiFrameImageStorage,
+)
 
+from ultragray.contract import to_dict
 from ultragray.errors import InvalidArgument
+from ultragray.exchange.exports.burning import AnnotatedPictures
 from ultragray.exchange.exports.exporter import FRAME_TIME_MS, Exporter
 from ultragray.rendering.pixels import PixelArray
 
@@ -32,6 +39,7 @@ PRIVATE_GROUP, PRIVATE_CREATOR, POSES_ELEMENT, FIGURES_ELEMENT, ORIGIN_ELEMENT =
 MAX_PIXEL_BYTES = 2**32 - 2  # the length of an element (PS3.5 7.1.1)
 TISSUE_2D, TISSUE, CENTIMETRES = 1, 1, 3  # C.8.5.5.1.1, .2, .15
 MAX_WORDS_BYTES = 64  # of a value of VR LO, with its padding
+MAX_COMMENTS = 10_240  # characters of a value of VR LT
 _UIDS = uuid.UUID("0f2bb0a1-93a5-5ab2-8a2c-5d1f1e4a7c60")
 
 
@@ -40,7 +48,8 @@ class DicomExporter(Exporter):
 
     def _open(self) -> None:
         header = self._header
-        self._bytes = math.prod(header.shape)
+        self._annotated = AnnotatedPictures(header.settings.picture, header.annotations)
+        self._bytes = len(header.poses) * self._annotated.rows * self._annotated.picture.width
         if self._bytes > MAX_PIXEL_BYTES:
             raise InvalidArgument(
                 f"format dicom holds at most {MAX_PIXEL_BYTES:,} pixels in a file, {len(header.poses):,} frames of "
@@ -53,7 +62,8 @@ class DicomExporter(Exporter):
         self._file.write(struct.pack("<HH2sHI", 0x7FE0, 0x0010, b"OB", 0, padded))  # PixelData
 
     def _write(self, frames: Mapping[str, PixelArray], count: int) -> None:
-        self._file.write(frames["bmode"].data)
+        for index, pixels in enumerate(frames["bmode"], self._done):
+            self._file.write(self._annotated.burnt(pixels, index).data)
 
     def _finish(self) -> None:
         self._file.write(b"\0" * (self._bytes % 2))
@@ -68,17 +78,19 @@ class DicomExporter(Exporter):
             header.settings.height,
             header.settings.width,
             hashlib.sha256(poses.tobytes()).hexdigest(),
+            [to_dict(one) for one in header.annotations],
         ]
-        own = json.dumps(made_of, sort_keys=True)
-        names = f"image {own}", f"series {own}", f"study {header.scene_sha256}"
+        own, day = f"{json.dumps(made_of, sort_keys=True)} {header.made_at}", f"{header.made_at:%Y%m%d}"
+        names = f"image {own}", f"series {own}", f"study {header.scene_sha256} {day}"
         image_uid, series_uid, study_uid = (UID(f"2.25.{uuid.uuid5(_UIDS, name).int}") for name in names)
+        storage = UltrasoundImageStorage if len(poses) == 1 else UltrasoundMultiFrameImageStorage
         meta = FileMetaDataset()
-        meta.MediaStorageSOPClassUID = UltrasoundMultiFrameImageStorage
+        meta.MediaStorageSOPClassUID = storage
         meta.MediaStorageSOPInstanceUID = image_uid
         meta.TransferSyntaxUID = ExplicitVRLittleEndian
         data = FileDataset(self._path, {}, file_meta=meta, preamble=b"\0" * 128)
         data.SpecificCharacterSet = "ISO_IR 192"
-        data.SOPClassUID, data.SOPInstanceUID = UltrasoundMultiFrameImageStorage, image_uid
+        data.SOPClassUID, data.SOPInstanceUID = storage, image_uid
         data.StudyInstanceUID, data.SeriesInstanceUID = study_uid, series_uid
         self._describe(data)
         self._describe_pixels(data)
@@ -96,7 +108,12 @@ class DicomExporter(Exporter):
         data.PatientName, data.PatientID = "UltraG-Ray^Simulated", "ULTRAGRAY"
         data.PatientBirthDate = data.PatientSex = ""
         data.PatientIdentityRemoved, data.DeidentificationMethod = "YES", "simulated, of no person"
-        data.StudyDate = data.StudyTime = data.ReferringPhysicianName = data.StudyID = data.AccessionNumber = ""
+        data.ReferringPhysicianName = data.AccessionNumber = ""
+        data.StudyID = "1"
+        day, time = f"{header.made_at:%Y%m%d}", f"{header.made_at:%H%M%S.%f}"
+        data.StudyDate = data.SeriesDate = data.AcquisitionDate = data.ContentDate = day
+        data.StudyTime, data.SeriesTime, data.AcquisitionTime, data.ContentTime = "", time, time, time
+        data.TimezoneOffsetFromUTC = "+0000"
         data.StudyDescription = _words(header.scene)
         data.Modality, data.SeriesNumber, data.Laterality = "US", 1, ""
         data.Manufacturer, data.ManufacturerModelName = "UltraG-Ray", "UltraG-Ray"
@@ -104,23 +121,40 @@ class DicomExporter(Exporter):
         data.InstanceNumber, data.PatientOrientation = 1, ""
         data.ImageType = ["DERIVED", "PRIMARY"]
         data.DerivationDescription = f"rendered from the scene with SHA-256 {header.scene_sha256}"
-        data.BurnedInAnnotation, data.LossyImageCompression = "NO", "00"
+        data.BurnedInAnnotation, data.LossyImageCompression = "YES" if header.annotations else "NO", "00"
+        comments = "\r\n".join(one.text for one in header.annotations if one.text)
+        if comments:
+            data.ImageComments = comments[:MAX_COMMENTS]
 
     def _describe_pixels(self, data: Dataset) -> None:
         """The modules Image Pixel, Cine, Multi-frame and US Image."""
-        picture = self._header.settings.picture
+        picture = self._annotated.picture
         data.SamplesPerPixel, data.PhotometricInterpretation, data.PixelRepresentation = 1, "MONOCHROME2", 0
         data.BitsAllocated, data.BitsStored, data.HighBit = 8, 8, 7
-        data.Rows, data.Columns = picture.height, picture.width
-        data.NumberOfFrames = len(self._header.poses)
-        data.FrameTime, data.FrameIncrementPointer = f"{FRAME_TIME_MS:g}", 0x00181063
-        data.RecommendedDisplayFrameRate = round(1000.0 / FRAME_TIME_MS)
+        data.Rows, data.Columns = self._annotated.rows, picture.width
+        if len(self._header.poses) > 1:
+            self._describe_frames(data)
         aspect = Fraction(picture.step[1] / abs(picture.step[0])).limit_denominator(10_000)
         if aspect != 1 and aspect != 0:
             data.PixelAspectRatio = [aspect.numerator, aspect.denominator]
 
+    def _describe_frames(self, data: Dataset) -> None:
+        """The modules Cine and Multi-frame: a time for all frames, or the time from each to the one before it."""
+        count, times = len(self._header.poses), self._header.frame_times_ms
+        data.NumberOfFrames = count
+        if times is None:
+            data.FrameTime, data.FrameIncrementPointer = f"{FRAME_TIME_MS:g}", 0x00181063
+            mean_ms = FRAME_TIME_MS
+        else:
+            data.FrameTimeVector, data.FrameIncrementPointer = (
+                [f"{way:.1f}" for way in np.diff(times, prepend=times[0])],
+                0x00181065,
+            )
+            mean_ms = max(1.0, (times[-1] - times[0]) / (count - 1))
+        data.RecommendedDisplayFrameRate = max(1, round(1000.0 / mean_ms))
+
     def _region(self) -> Dataset:
-        picture = self._header.settings.picture
+        picture = self._annotated.picture
         region = Dataset()
         region.RegionSpatialFormat, region.RegionDataType = TISSUE_2D, TISSUE
         region.RegionFlags = 0  # high priority, not protected from scaling

@@ -6,13 +6,15 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from ultragray.contract import Contract, described
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.probe import FloatArray
 from ultragray.rendering.outputs import OUTPUTS
@@ -23,9 +25,24 @@ from ultragray.scene.confidence import Extrapolation, figure_arrays
 FRAME_TIME_MS = 40.0  # rendered frames have no time of their own: formats that need one show 25 a second
 
 
+@dataclass(frozen=True, kw_only=True)
+class Annotation(Contract):
+    """Measurements and notes that a person set on a frame, as they are drawn."""
+
+    frame: int = described("Index of its frame among the poses.", 0, low=0)
+    picture: str = described(
+        "A PNG file in base64 with square pixels and opacity, as wide as the frame, which it lies over from the upper "
+        "left corner; what is taller stands below the frame. A finer one has the frames enlarged to its pixels."
+    )
+    text: str = described("The same in words, which ImageComments holds.", "")
+
+
 @dataclass(frozen=True)
 class ExportHeader:
-    """The facts that the frames of an export share, and all it takes to render them again."""
+    """The facts that the frames of an export share, and all it takes to render them again.
+
+    `frame_times_ms` [C], `annotations` and `made_at` are for formats that tell them, such as DICOM.
+    """
 
     settings: Resolved
     dtype: str  # "uint8": round(255·share of the scale), or "float32"; labels are uint8 as they are
@@ -33,6 +50,9 @@ class ExportHeader:
     scene: str
     scene_sha256: str
     renderer: str
+    frame_times_ms: Sequence[float] | None = None  # when each frame was seen, from any beginning
+    annotations: Sequence[Annotation] = ()
+    made_at: datetime = field(default_factory=lambda: datetime.now(timezone.utc))
 
     @property
     def shape(self) -> tuple[int, int, int]:

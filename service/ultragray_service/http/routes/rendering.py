@@ -69,9 +69,9 @@ _OPENAPI: dict[str, Any] = {
 _ANSWER = answer(
     "The frames. image/png and image/jpeg: one pose, one output. application/octet-stream (parameter dtype=uint8, "
     "float32 or float16): the outputs one after another, each [C, H, W]. application/x-npz holds one float32 array "
-    "[C, H, W] per output, `poses` [C, 4, 4], and the strings scene, scene_sha256 and renderer. application/dicom: a "
-    "multi-frame ultrasound image of bmode, true to scale: fans are scan-converted. `*/*` gives PNG where it can hold "
-    "the request, else npz.",
+    "[C, H, W] per output, `poses` [C, 4, 4], and the strings scene, scene_sha256 and renderer. application/dicom: an "
+    "ultrasound image of bmode, multi-frame of several poses, true to scale: fans are scan-converted. `*/*` gives PNG "
+    "where it can hold the request, else npz.",
     *(PNG, JPEG, RAW, NPZ, DICOM),
     headers=RENDER_HEADERS,
 )
@@ -103,6 +103,7 @@ async def render(request: Request) -> Response:
     is_dicom = choice.media_type == DICOM
     if is_dicom:
         check_format("dicom", body.outputs, body.dtype)
+        body.check_stored(len(poses))
         await asyncio.to_thread(exporter_class, "dicom")  # refused before anything is rendered
 
     def complete(settings: Resolved) -> Resolved:
@@ -118,13 +119,22 @@ async def render(request: Request) -> Response:
         return await service.rendering.render(plan, exact, priority=priority, deadline=deadline, begin_by=begin_by)
 
     result = await finish_or_abandon(rendered(), request.receive, deadline)
-    data = await asyncio.to_thread(_dicom_of, result) if is_dicom else result.data
+    data = await asyncio.to_thread(_dicom_of, result, body) if is_dicom else result.data
     return Response(data, 200, render_headers(result), choice.media_type)
 
 
-def _dicom_of(result: RenderResult) -> bytes:
+def _dicom_of(result: RenderResult, body: RenderBody) -> bytes:
     settings = result.settings
-    header = ExportHeader(settings, "uint8", result.poses, result.scene, result.scene_sha256, result.renderer)
+    header = ExportHeader(
+        settings,
+        "uint8",
+        result.poses,
+        result.scene,
+        result.scene_sha256,
+        result.renderer,
+        body.frame_times_ms,
+        body.annotations,
+    )
     frames = {"bmode": np.frombuffer(result.data, np.uint8).reshape(header.shape)}
     return export_bytes("dicom", header, frames, result.extrapolations)
 

@@ -1,16 +1,23 @@
 """The DICOM file, checked against the attributes that PS3.3 requires of an Ultrasound Multi-frame Image (A.7)."""
 
+import base64
 import dataclasses
+import io
 import json
+import shutil
+import subprocess
+from datetime import datetime, timezone
 
 import numpy as np
 import pydicom
 import pytest
-from pydicom.uid import ExplicitVRLittleEndian, UltrasoundMultiFrameImageStorage
+from PIL import Image
+from pydicom.uid import ExplicitVRLittleEndian, UltrasoundImageStorage, UltrasoundMultiFrameImageStorage
 
 from ultragray import ConvexProbe, LinearProbe
 from ultragray.errors import InvalidArgument
 from ultragray.exchange.exports import export_to
+from ultragray.exchange.exports.exporter import Annotation
 from ultragray.geometry.scan_conversion import scan_convert
 from ultragray.rendering.settings import Resolved
 from ultragray.scene.confidence import Extrapolation
@@ -78,7 +85,8 @@ def header(probe=LINEAR, **changes):
 
 
 def written(path, header):
-    exported(path, "dicom", header, {"bmode": FRAMES}, TOLD)
+    count = len(header.poses)
+    exported(path, "dicom", header, {"bmode": FRAMES[:count]}, TOLD[:count])
     data = pydicom.dcmread(path)
     for _ in data.iterall():  # reads and checks every value
         pass
@@ -109,6 +117,7 @@ def test_all_that_the_standard_requires_is_there(tmp_path, probe):
     assert data.ImageType[1] in ("PRIMARY", "SECONDARY")
     assert data.FrameIncrementPointer == pydicom.datadict.tag_for_keyword("FrameTime")
     assert (data.NumberOfFrames, float(data.FrameTime)) == (5, 40.0)
+    assert data.BurnedInAnnotation == "NO"
     [region] = data.SequenceOfUltrasoundRegions
     assert [name for name in OF_A_REGION if region.get(name) is None] == []
     assert (region.RegionSpatialFormat, region.RegionDataType) == (1, 1)
@@ -157,17 +166,113 @@ def test_pixels_and_their_places_of_a_convex_probe(tmp_path):
     assert (data.pixel_array[2][~inside] == 0).all()
 
 
-def test_poses_are_in_the_file_and_uids_follow_what_was_rendered(tmp_path):
-    one = written(tmp_path / "one.dcm", header())
+MADE = datetime(2026, 3, 4, 15, 6, 7, tzinfo=timezone.utc)
+
+
+def test_one_frame_is_an_ultrasound_image_without_frame_times(tmp_path):
+    data = written(tmp_path / "frame.dcm", header(poses=POSES[:1]))
+    assert data.file_meta.MediaStorageSOPClassUID == data.SOPClassUID == UltrasoundImageStorage
+    for name in ("NumberOfFrames", "FrameTime", "FrameTimeVector", "FrameIncrementPointer"):
+        assert name not in data
+    np.testing.assert_array_equal(data.pixel_array, np.rint(FRAMES[0] * 255))
+
+
+def test_the_date_is_when_the_file_was_made_in_utc(tmp_path):
+    data = written(tmp_path / "frames.dcm", dataclasses.replace(header(), made_at=MADE))
+    assert data.StudyDate == data.SeriesDate == data.AcquisitionDate == data.ContentDate == "20260304"
+    assert data.AcquisitionTime == data.ContentTime == data.SeriesTime == "150607.000000"
+    assert data.TimezoneOffsetFromUTC == "+0000"
+
+
+def test_frames_have_the_times_at_which_they_were_seen(tmp_path):
+    times = (1000.0, 1033.3, 1100.0, 1140.5, 1200.0)
+    data = written(tmp_path / "frames.dcm", dataclasses.replace(header(), frame_times_ms=times))
+    assert data.FrameIncrementPointer == pydicom.datadict.tag_for_keyword("FrameTimeVector")
+    assert [float(way) for way in data.FrameTimeVector] == pytest.approx([0.0, 33.3, 66.7, 40.5, 59.5])
+    assert data.RecommendedDisplayFrameRate == 20
+    assert "FrameTime" not in data
+
+
+def drawn(height, width, shows):
+    """A PNG file in base64, white and opaque where `shows`."""
+    pixels = np.zeros((height, width, 2), np.uint8)
+    pixels[shows] = 255
+    file = io.BytesIO()
+    Image.fromarray(pixels, "LA").save(file, "PNG")
+    return base64.b64encode(file.getvalue()).decode()
+
+
+def test_annotations_are_burnt_into_their_frames_and_told(tmp_path):
+    """One as fine as the frame, whose pixels are 2 mm wide and 50/21 mm high, and five of its rows below."""
+    below = round(5 * (50 / 21) / 2.0)
+    shows = np.zeros((25 + below, 19), bool)
+    shows[:, 4] = True
+    one = Annotation(frame=2, picture=drawn(*shows.shape, shows), text="A  12.3 mm × 8 mm")
+    asked = dataclasses.replace(header(), annotations=(one,), made_at=MADE)
+    data = written(tmp_path / "frames.dcm", asked)
+    assert data.BurnedInAnnotation == "YES"
+    assert data.ImageComments == "A  12.3 mm × 8 mm"
+    plain, pixels = np.rint(FRAMES * 255), data.pixel_array
+    assert pixels.shape == (5, 26, 19)
+    assert (pixels[2, :, 4] == 255).all()
+    others = np.arange(19) != 4
+    np.testing.assert_array_equal(pixels[2, :21][:, others], plain[2][:, others])
+    np.testing.assert_array_equal(pixels[[0, 1, 3, 4], :21], plain[[0, 1, 3, 4]])
+    assert (pixels[:, 21:][..., others] == 0).all()
+    [region] = data.SequenceOfUltrasoundRegions
+    assert region.RegionLocationMaxY1 == 20  # the band has no depth
+    assert data.SOPInstanceUID != written(tmp_path / "x.dcm", dataclasses.replace(asked, annotations=())).SOPInstanceUID
+
+
+def test_frames_are_enlarged_to_a_finer_annotation_and_stay_where_they_are(tmp_path):
+    fine = Annotation(frame=0, picture=drawn(75, 57, np.zeros((75, 57), bool)))
+    data = written(tmp_path / "frames.dcm", dataclasses.replace(header(), annotations=(fine,)))
+    np.testing.assert_array_equal(data.pixel_array[:, :63], np.rint(FRAMES * 255).repeat(3, 1).repeat(3, 2))
+    [region], [plain] = (one.SequenceOfUltrasoundRegions for one in (data, written(tmp_path / "plain.dcm", header())))
+    assert (region.RegionLocationMaxX1, region.RegionLocationMaxY1) == (56, 62)
+    assert position_cm(region, 3 * 7 + 1, 3 * 9 + 1) == pytest.approx(position_cm(plain, 7, 9))
+
+
+@pytest.mark.parametrize("picture", ["", "no base64", base64.b64encode(b"no PNG").decode(), drawn(4097, 1, 0)])
+def test_an_annotation_that_is_no_picture_is_refused(tmp_path, picture):
+    asked = dataclasses.replace(header(), annotations=(Annotation(picture=picture),))
+    with pytest.raises(InvalidArgument, match=r"annotations\[0\].picture must") as told:
+        written(tmp_path / "frames.dcm", asked)
+    assert told.value.field == "annotations[0].picture"
+
+
+@pytest.mark.skipif(shutil.which("dciodvfy") is None, reason="the validator of Debian's dicom3tools is not installed")
+@pytest.mark.parametrize("probe", [LINEAR, CONVEX])
+@pytest.mark.parametrize("count", [1, 5])
+def test_the_validator_of_dicom3tools_finds_no_error(tmp_path, probe, count):
+    mark = Annotation(picture=drawn(57, 57, slice(9, 12)), text="A  12.3 mm")
+    for place, more in enumerate(({}, {"annotations": (mark,), "frame_times_ms": [30.0 * i for i in range(count)]})):
+        path = tmp_path / f"{place}.dcm"
+        written(path, dataclasses.replace(header(probe=probe, poses=POSES[:count]), **more))
+        told = subprocess.run(["dciodvfy", path], capture_output=True, text=True, check=False)
+        assert "Error" not in told.stderr, told.stderr
+        assert told.returncode == 0
+        assert ("USImage" if count == 1 else "USMultiFrameImage") in told.stderr
+
+
+def test_poses_are_in_the_file_and_uids_follow_what_was_rendered_and_when(tmp_path):
+    def made(**changes):
+        at = changes.pop("made_at", MADE)
+        return written(tmp_path / "one.dcm", dataclasses.replace(header(**changes), made_at=at))
+
+    one = made()
     poses = np.frombuffer(one.private_block(0x0019, "ULTRAGRAY")[0x01].value, "<f8").reshape(-1, 4, 4)
     np.testing.assert_array_equal(poses, POSES)
-    again = written(tmp_path / "again.dcm", header())
+    again = made()
     assert (again.SOPInstanceUID, again.SeriesInstanceUID) == (one.SOPInstanceUID, one.SeriesInstanceUID)
-    moved = written(tmp_path / "moved.dcm", header(poses=POSES + np.eye(4, k=3)))
+    moved = made(poses=POSES + np.eye(4, k=3))
     assert moved.SOPInstanceUID != one.SOPInstanceUID
     assert moved.StudyInstanceUID == one.StudyInstanceUID
-    other = written(tmp_path / "other.dcm", header(scene_sha256="1" * 64))
-    assert other.StudyInstanceUID != one.StudyInstanceUID
+    later = made(made_at=MADE.replace(minute=7))
+    assert later.SOPInstanceUID != one.SOPInstanceUID
+    assert later.StudyInstanceUID == one.StudyInstanceUID
+    assert made(made_at=MADE.replace(day=5)).StudyInstanceUID != one.StudyInstanceUID
+    assert made(scene_sha256="1" * 64).StudyInstanceUID != one.StudyInstanceUID
     assert one.SOPInstanceUID != one.SeriesInstanceUID
 
 

@@ -95,6 +95,7 @@ export const shared = {
   nameValue: (line: string): string => `"${line}" must be written as name = value.`,
   metrics: "Metrics",
   better: (higher: boolean): string => (higher ? "higher is better" : "lower is better"),
+  zoom: { in: "Zoom in", out: "Zoom out", reset: "All of the picture", hint: "Wheel or +, − and 0 zoom, dragging moves" },
   slider: {
     value: "value",
     outside: (least: number, most: number, unit: string): string => `This takes ${limits(least, most, unit)}.`,
@@ -189,7 +190,6 @@ export const compare = {
   modes: { side: "Side by side", all: "All methods", wipe: "Wipe", flicker: "Flicker" },
   wipe: "Where the truth ends and the other begins",
   flicker: { shown: (title: string): string => `Shown: ${title}`, pause: "Hold (X swaps)", play: "Flicker" },
-  zoom: { in: "Zoom in", out: "Zoom out", reset: "All of the picture", hint: "Wheel or +, − and 0: zoom of all pictures; dragging moves them." },
   cursor: (truth: number, other: number): string => `truth ${truth}, other ${other} of 255`,
   noCursor: "Point at a picture to read its values",
   frame: "Frame",
