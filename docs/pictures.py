@@ -77,6 +77,7 @@ def main() -> None:
     draw_contact(scene, IMAGES / "contact.png")
     draw_speckle(scene, IMAGES / "speckle.png")
     draw_tools(scene, IMAGES / "tools.png")
+    draw_cases(scene, IMAGES / "cases.png")
     draw_standard_plane(scene, IMAGES / "standard_plane.png")
     draw_slices(scene, IMAGES / "volume_slices.png")
     draw_recording(scene, IMAGES / "mcap_recording.png")
@@ -249,6 +250,29 @@ def draw_tools(scene: GaussianScene, path: Path) -> None:
         panels[number].imshow(frames["bmode"][0].numpy(), cmap="gray", vmin=0.0, vmax=1.0, extent=EXTENT_MM)
         panels[number].set_title(caption, fontsize=8)
         draw_labels(panels[number + len(shown)], frames["labels"][0].numpy(), names)
+    save(figure, path)
+
+
+def draw_cases(scene: GaussianScene, path: Path) -> None:
+    """The cases of docs/howto/shadows.md: above B-mode, below the transmittance that tells what is a shadow."""
+    needle = Needle(tip_mm=(14.0, OVER_CANAL_MM, 21.0), hub_mm=(-30.0, OVER_CANAL_MM, 9.0))
+    tilted = pose_from_position_quaternion((-4.0, OVER_CANAL_MM, 0.0), (0.996917334, 0.0, -0.078459096, 0.0))
+    cases: list[tuple[Floats, dict[str, Any]]] = [
+        (along_spine(0.0), {}),
+        (along_spine(30.0), {}),
+        (along_spine(OVER_CANAL_MM), {}),
+        (along_spine(OVER_CANAL_MM), {"tools": (needle,)}),
+        (tilted, {"contact": Contact.AIR}),
+        (along_spine(6.0), {"ghost": 0.8}),
+    ]
+    figure, panels = panel_row(rows=2, columns=len(cases))
+    for number, (pose, more) in enumerate(cases):
+        outputs = ("bmode", "transmittance")
+        frames = render(scene, None, pose, height=SIDE, width=SIDE, outputs=outputs, **more)
+        for row, output in enumerate(outputs):
+            panel = panels[number + row * len(cases)]
+            panel.imshow(frames[output][0].numpy(), cmap="gray", vmin=0.0, vmax=1.0, extent=EXTENT_MM)
+        panels[number].set_title(str(number + 1))
     save(figure, path)
 
 

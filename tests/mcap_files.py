@@ -12,6 +12,7 @@ from ultragray.exchange import ros_messages as ros
 from ultragray.geometry.pose import pose_from_position_quaternion
 
 SECOND = 1_000_000_000
+WRITTEN_LATER_NS = 3_000_000  # than the stamp
 START_NS = 1_700_000_000 * SECOND
 COMPRESSED, TRANSFORM, TRANSFORMS = (
     "sensor_msgs/msg/CompressedImage",
@@ -99,7 +100,7 @@ class Bag:
         """Write a message some milliseconds after its stamp, as recorders do."""
         if kind not in self._schemas:
             self._schemas[kind] = self._writer.register_msgdef(kind, DEFINITIONS[kind])
-        self._writer.write_message(topic, self._schemas[kind], message, log_time=time_ns + 3_000_000)
+        self._writer.write_message(topic, self._schemas[kind], message, log_time=time_ns + WRITTEN_LATER_NS)
 
     def define(self, kind, fields):
         """From here on a kind of message has these fields."""

@@ -109,6 +109,11 @@ class UltrasoundNode(LifecycleNode):  # type: ignore[misc]
             self.get_logger().error(str(error))
             self._stop()
             return TransitionCallbackReturn.FAILURE
+        source, scene_frame, scene, address = map(self._value, ("source", "scene_frame", "scene", "address"))
+        self.get_logger().info(
+            f"takes poses from {source} in the frame {scene_frame!r}, and publishes frames of the scene {scene!r} by "
+            f"{address} below {self.get_fully_qualified_name()}"
+        )
         return super().on_activate(state)
 
     def on_deactivate(self, state: LifecycleState) -> TransitionCallbackReturn:

@@ -21,6 +21,7 @@ from ultragray_service.access.owners import Admission, Owners
 from ultragray_service.access.principals import is_loopback
 from ultragray_service.core.datasets import Datasets
 from ultragray_service.core.jobs import Jobs
+from ultragray_service.core.labelling import SceneLabels
 from ultragray_service.core.life import Life
 from ultragray_service.core.open_streams import OpenStreams
 from ultragray_service.core.readiness import Readiness
@@ -65,6 +66,7 @@ class Service:
     jobs: Jobs
     uploads: DatasetUploads
     imports: SceneImports
+    labels: SceneLabels
     # What is made of it.
     pool: RenderPool
     planner: RequestPlanner

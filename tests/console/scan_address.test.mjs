@@ -42,6 +42,29 @@ function withoutCapture() {
   Element.prototype.setPointerCapture = () => undefined;
 }
 
+describe("the worked cases", () => {
+  it("open views of the demo scene by their address, with answers behind a click", async () => {
+    const { page } = await openScan(at);
+    await page.getByRole("button", { name: "Cases: show or hide" }).click();
+    const cases = page.getByRole("region", { name: "What is this shadow?" });
+    const links = await cases.getByRole("link").all();
+    assert.equal(links.length, 6);
+    let { print } = await canvasState(page, IMAGE);
+    for (const [index, link] of links.entries()) {
+      const answer = cases.getByRole("listitem").nth(index).locator("details");
+      assert.equal(await answer.evaluate((element) => element.open), false, "the answer is told before it is asked for");
+      await link.click();
+      if (index > 0) ({ print } = await changed(page, print)); // the first is where the scene begins
+      assert.equal(await page.getByTestId("link-refused").count(), 0);
+    }
+    await cases.getByText("Answer").first().click();
+    const first = cases.locator("details").first();
+    assert.deepEqual([await first.evaluate(({ open }) => open), (await first.textContent()).includes("Bone: the spinous process")], [true, true]);
+    await picture(page, "scan-cases");
+    assert.deepEqual(page.faults, []);
+  });
+});
+
 describe("the address", () => {
   it("brings pose, probe and settings back after a reload and in another window", async () => {
     const { page, first } = await openScan(at);

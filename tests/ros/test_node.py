@@ -68,6 +68,7 @@ def test_a_pose_becomes_an_image_with_its_stamp_its_confidence_and_its_geometry(
     metres = np.array(geometry["pixel_to_probe_m"]) @ column_row
     np.testing.assert_allclose(metres[:3] * 1000.0, (matrix_mm @ column_row)[:3])
     assert (geometry["height"], geometry["width"]) == expected.shape
+    assert "takes poses from pose in the frame 'scene', and publishes frames of the scene 'demo' by " in node.log()
     assert node.stop() == 0
 
 

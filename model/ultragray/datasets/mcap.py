@@ -177,7 +177,8 @@ BESIDE = ".geometry.json"
 TF, STATIC = "/tf", "/tf_static"
 LONGEST_LINK_MM = 5_000.0  # between two frames that do not move against each other
 SLOW_PATH_NS = 50_000_000  # by which images may be written later after their stamps than poses
-_Stamped: TypeAlias = tuple[int, int, Any, Any]  # stamp and time of writing in ns, position in metres, orientation
+# Stamp and time of writing in ns, whether there was a stamp, position in metres, orientation.
+_Stamped: TypeAlias = tuple[int, int, bool, Any, Any]
 
 
 @dataclass(frozen=True)
@@ -229,8 +230,7 @@ class TrackedPoses:
         if message.kind == POSE:
             stamped = message.decode()
             parts = stamped.pose.position, stamped.pose.orientation
-            times = time_of(stamped.header, message.log_time_ns), message.log_time_ns
-            self._poses.setdefault(message.topic, []).append((*times, *parts))
+            self._poses.setdefault(message.topic, []).append((*_times_of(stamped.header, message), *parts))
             self._frames.setdefault(message.topic, Counter())[stamped.header.frame_id.lstrip("/")] += 1
         elif message.kind == TRANSFORM:
             transform = message.decode()
@@ -354,7 +354,7 @@ class TrackedPoses:
         problems: list[str] = []
         twice = back = 0
         latest = stamped[0][0]
-        for time_ns, _, position, turn in stamped:
+        for time_ns, _, _, position, turn in stamped:
             back, latest = back + (time_ns < latest), time_ns
             try:
                 pose = pose_of_parts(position, turn, field="a pose")
@@ -372,7 +372,7 @@ class TrackedPoses:
         track = PoseTrack(np.array(times, np.int64), np.array([found[time_ns] for time_ns in times]))
         lost = len({time_ns for time_ns, *_ in stamped} - set(times))
         to_and_fro_mm = goes_to_and_fro_mm(track.poses[:, :3, 3])
-        unstamped = sum(time_ns == written_ns for time_ns, written_ns, *_ in stamped)
+        unstamped = sum(not has_stamp for _, _, has_stamp, *_ in stamped)
         notes = (
             f"{unstamped} poses of {name} have no stamp: taken for those of the time that they were written at"
             if unstamped == len(stamped) > 1
@@ -399,7 +399,11 @@ def _name_of(transform: Any) -> TransformName:
 
 def _stamped(transform: Any, message: StoredMessage) -> _Stamped:
     parts = transform.transform.translation, transform.transform.rotation
-    return time_of(transform.header, message.log_time_ns), message.log_time_ns, *parts
+    return *_times_of(transform.header, message), *parts
+
+
+def _times_of(header: Any, message: StoredMessage) -> tuple[int, int, bool]:
+    return time_of(header, message.log_time_ns), message.log_time_ns, time_of(header, 0) != 0
 
 
 # A recorded sweep out of an MCAP file: one topic of images, the poses at their times, and their geometry.

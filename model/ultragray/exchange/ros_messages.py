@@ -176,10 +176,10 @@ def annotations_message(labels: npt.NDArray[np.uint8], time_ns: int) -> dict[str
     """
     stamp = _stamp(time_ns)
     points, texts = [], []
-    for label in np.unique(labels[labels > 0]).tolist():
+    for label in (1 + np.flatnonzero(np.bincount(labels.ravel())[1:])).tolist():
         inside = labels == label
         colour = _colour(label)
-        row, column = (int(first) for first in np.argwhere(inside)[0])
+        row, column = divmod(int(inside.argmax()), labels.shape[1])
         points.append(
             {
                 "timestamp": stamp,

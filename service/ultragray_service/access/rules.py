@@ -84,6 +84,13 @@ OPERATIONS = (
     _operation("scene.download", _READER, "GET /v1/scenes/{scene}/file"),
     _operation("scene.load", _OPERATOR, "POST /v1/scenes/{scene}:load", "SceneService/LoadScene"),
     _operation("scene.unload", _OPERATOR, "POST /v1/scenes/{scene}:unload", "SceneService/UnloadScene"),
+    _operation(
+        "scene.label",
+        _OPERATOR,
+        "POST /v1/scenes/{scene}:label",
+        "POST /v1/scenes/{scene}:label-by-map",
+        "SceneService/LabelScene",
+    ),
     _operation("scene.import", _OPERATOR, "PUT /v1/scenes/{scene}"),
     _operation("scene.delete", _OPERATOR, "DELETE /v1/scenes/{scene}", owned=True),
     _operation("registration.list", _READER, "GET /v1/registrations", "RegistrationService/ListRegistrations"),

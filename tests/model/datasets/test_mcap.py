@@ -32,6 +32,7 @@ from ...mcap_files import (
     START_NS,
     TRANSFORM,
     TRANSFORMS,
+    WRITTEN_LATER_NS,
     Bag,
     image_at,
     image_message,
@@ -144,6 +145,12 @@ def test_the_time_of_writing_stands_for_a_stamp_that_is_missing(bag):
         "51 poses of /pose have no stamp: taken for those of the time that they were written at",
         f"{COUNT} images have no stamp: taken for those of the time that they were written at",
     )
+
+
+def test_messages_that_were_written_at_the_time_of_their_stamps_have_stamps(bag):
+    track(bag, "/pose", ros.POSE, lambda pose, time_ns: pose_message(pose, time_ns + WRITTEN_LATER_NS))
+    bag.images()
+    assert load_dataset(bag.finish()).train.notes == ()
 
 
 GREY = image_at(3)

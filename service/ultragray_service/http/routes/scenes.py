@@ -32,7 +32,17 @@ from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE, Scen
 from ultragray_service.core.threads import PATIENCE_S
 from ultragray_service.core.uploads import arrivals
 from ultragray_service.http.accept import PNG, RAW
-from ultragray_service.http.bodies import LARGE_IMAGE, AssessBody, LocalizeBody, body_schema, read_json_body
+from ultragray_service.http.bodies import (
+    LABEL_MAP,
+    LARGE_IMAGE,
+    PAINTED_FRAMES,
+    AssessBody,
+    LabelBody,
+    LabelMapBody,
+    LocalizeBody,
+    body_schema,
+    read_json_body,
+)
 from ultragray_service.http.dependencies import (
     BINARY,
     NOT_MODIFIED,
@@ -97,11 +107,11 @@ async def localize(request: Request, service: ServiceDep, scene: SceneName) -> L
     return await finish_or_abandon(work, request.receive, deadline)
 
 
-def _bytes_of(text: str) -> bytes:
+def _bytes_of(text: str, field: str = "image") -> bytes:
     try:
         return base64.b64decode(text, validate=True)
     except ValueError:
-        raise InvalidArgument("image must be base64", field="image") from None
+        raise InvalidArgument(f"{field} must be base64", field=field) from None
 
 
 @router.post("/{scene}:load", responses=problems(401, 403, 404, 422, 503, 507))
@@ -114,6 +124,30 @@ async def load_scene(service: ServiceDep, scene: SceneName) -> SceneLoaded:
 async def unload_scene(service: ServiceDep, scene: SceneName) -> SceneLoaded:
     """Frees the scene's memory; no error where it is not loaded."""
     return await service.scenes.unload(scene)
+
+
+_LABELLED: Answers = problems(401, 403, 404, 409, 413, 415, 422, 429, 500, 503, 504, 507)
+
+
+@router.post("/{scene}:label", status_code=201, openapi_extra=body_schema(LabelBody), responses=_LABELLED)
+async def label_scene(request: Request, service: ServiceDep, scene: SceneName) -> Scene:
+    """Labels the Gaussians of a scene by frames that somebody painted on. The scene itself stays as it is."""
+    body = await read_json_body(request, LabelBody, PAINTED_FRAMES)
+    frames = [
+        (one.pose.exact(f"frames[{index}].pose"), _bytes_of(one.labels, f"frames[{index}].labels"))
+        for index, one in enumerate(body.frames)
+    ]
+    work = service.labels.by_frames(scene, body, frames, body.probe, body.registration)
+    return await finish_or_abandon(work, request.receive, time.monotonic() + PATIENCE_S)
+
+
+@router.post("/{scene}:label-by-map", status_code=201, openapi_extra=body_schema(LabelMapBody), responses=_LABELLED)
+async def label_scene_by_map(request: Request, service: ServiceDep, scene: SceneName) -> Scene:
+    """Labels the Gaussians of a scene by a NIfTI label map. The scene itself stays as it is."""
+    body = await read_json_body(request, LabelMapBody, LABEL_MAP)
+    nifti = await asyncio.to_thread(_bytes_of, body.label_map, "label_map")
+    work = service.labels.by_map(scene, body, nifti, body.registration)
+    return await finish_or_abandon(work, request.receive, time.monotonic() + PATIENCE_S)
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ export const scan = {
   close: "Close",
   room: "Scene in space",
   group: (name: string): string => `${name}: show or hide`,
-  groups: { confidence: "Confidence", display: "Image", tools: "Tools", pose: "Pose", locate: "Frame search", registrations: "Registrations", path: "Path", connect: "Connect" },
+  groups: { confidence: "Confidence", display: "Image", tools: "Tools", pose: "Pose", locate: "Frame search", labels: "Labels", registrations: "Registrations", cases: "Cases", path: "Path", connect: "Connect" },
   image: {
     label: "Live image",
     of: (scene: string): string => `B-mode image of ${scene}`,
@@ -77,6 +77,36 @@ export const scan = {
     drawn: (tools: string): string => `Drawn in: ${tools}`,
     slice: (mm: string): string => `slice ${mm} mm`,
     depthInCm: "depth in cm",
+  },
+  cases: {
+    title: "What is this shadow?",
+    answer: "Answer",
+    all: [
+      [
+        "A bright line in the middle, and black below it.",
+        "Bone: the spinous process and the laminae beside it. Bone reflects what comes and lets hardly anything pass, so that nothing below it is seen. In Maps the transmittance ends at the line.",
+      ],
+      [
+        "A black disc at the right, 2 cm deep.",
+        "No shadow, but a vessel: blood hardly echoes. The tissue below it is as bright as beside it, and the transmittance does not change. Slide along the spine: it stays round.",
+      ],
+      [
+        "Two black columns, and an oval between them.",
+        "The columns are shadows of the articular processes. Between two laminae sound gets into the spinal canal: the oval is the dural sac, and the bright line below it is the back of the vertebra. A needle for a lumbar puncture goes here.",
+      ],
+      [
+        "A straight bright line from the left.",
+        "A needle (Tools). It is thinner than the beam is wide, so that most of the sound passes it: the tissue below it is only a little darker.",
+      ],
+      [
+        "The left side is black from the top on.",
+        "The probe is tilted, and its left side is off the skin: no gel, no sound. A shadow begins at something bright, lost contact at the face.",
+      ],
+      [
+        "Tissue within the shadow of bone.",
+        "Mirror images (Tools, Ghosts): sound goes to and fro between the bone and what lies above it, and comes late. What is seen below bone is not there.",
+      ],
+    ] as const,
   },
   link: {
     copy: "Copy link",

@@ -254,6 +254,49 @@ export const connect = {
   },
 };
 
+export const labels = {
+  title: "Labels",
+  first: "Tissue 1",
+  another: (label: number): string => `Tissue ${label}`,
+  explain: "Freeze a frame, paint what you see, and spread it through the scene. The result is a new scene with labels.",
+  next: "Move the probe, and correct what is wrong in the next frame.",
+  start: "Paint on this frame",
+  layer: "Image to paint on; arrow keys move the brush, Enter paints",
+  paintWith: "Paint with",
+  choose: (name: string): string => `Paint with ${name}`,
+  nameOf: (label: number): string => `Name of label ${label}`,
+  none: "No label",
+  noneMeans: "Says that there is none of these here",
+  add: "Another label",
+  tools: "Tools to paint with",
+  brushes: { brush: "Brush", region: "Region", eraser: "Eraser" },
+  brushMeans: {
+    brush: "Paints where it is drawn",
+    region: "Paints what is as bright as the point that is pressed, as far as it hangs together",
+    eraser: "Takes paint away: nothing is said there",
+  },
+  undo: "Undo stroke",
+  size: "Brush",
+  sizeMeans: "Diameter of the brush",
+  tolerance: "Tolerance",
+  toleranceMeans: "Grey levels that a region may differ from the point that is pressed",
+  within: "Reach",
+  withinMeans: "How far labels spread to tissue that was not painted and echoes alike",
+  into: "New scene",
+  spread: "Spread",
+  spreadMeans: "Label the scene by all frames that were painted on",
+  spreading: "Labelling the scene…",
+  takeBack: "Take back",
+  takeBackMeans: "Forget the frame that was painted on last",
+  goOn: "Next frame",
+  otherProbe: "The frames before were painted with another probe: take that one again, or take them back.",
+  state: (frames: number, made: string | null): string => {
+    if (made === null) return "Nothing is saved yet.";
+    return `${frames === 1 ? "One frame" : `${frames} frames`} painted, saved as ${made}.`;
+  },
+  open: (scene: string): string => `Open ${scene}`,
+};
+
 export const locate = {
   title: "Where was this frame taken?",
   label: "Where a real frame was taken",
