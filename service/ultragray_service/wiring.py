@@ -75,8 +75,8 @@ def make_service(settings: Settings) -> Service:
         {Kind.JOB: lambda job: jobs.do(JobStore.ownership, job), Kind.REGISTRATION: registrations.ownership},
         {Kind.SCENE: scenes.require, Kind.DATASET: datasets.get},
     )
-    # Each process may take all the memory that settings allow to one: one checks at a time, one makes pictures, one labels
-    # a scene, and one draws thumbnails, which would wait behind pictures for minutes.
+    # Each process may take all the memory that settings allow to one: one checks at a time, one makes pictures, one
+    # labels a scene, and one draws thumbnails, which would wait behind pictures for minutes.
     checks, pictures, labelling, thumbnails = (HelperProcesses(settings.dataset_memory_mb << 20) for _ in range(4))
     means = Means(settings, jobs, life.draining, checks, owners, quotas)
     imports = SceneImports(scenes, places.made, means)
