@@ -30,7 +30,7 @@ from ultragray_service.settings import Settings
 from ultragray_service.telemetry.logs import Tracing, start_tracing
 from ultragray_service.telemetry.metrics import Metrics
 from ultragray_service.views.poses import Assessing
-from ultragray_service.views.prepared import Comparisons, DatasetViews, TrainingViews
+from ultragray_service.views.prepared import Comparisons, DatasetViews, Thumbnails, TrainingViews
 from ultragray_workers.datasets.store import DatasetStore
 from ultragray_workers.jobs.owners import Kind
 from ultragray_workers.jobs.store import JobStore
@@ -75,9 +75,9 @@ def make_service(settings: Settings) -> Service:
         {Kind.JOB: lambda job: jobs.do(JobStore.ownership, job), Kind.REGISTRATION: registrations.ownership},
         {Kind.SCENE: scenes.require, Kind.DATASET: datasets.get},
     )
-    # Each process may take all the memory that settings allow to one: one checks at a time, one makes pictures, and one
-    # labels a scene.
-    checks, pictures, labelling = (HelperProcesses(settings.dataset_memory_mb << 20) for _ in range(3))
+    # Each process may take all the memory that settings allow to one: one checks at a time, one makes pictures, one
+    # labels a scene, and one draws thumbnails, which would wait behind pictures for minutes.
+    checks, pictures, labelling, thumbnails = (HelperProcesses(settings.dataset_memory_mb << 20) for _ in range(4))
     means = Means(settings, jobs, life.draining, checks, owners, quotas)
     imports = SceneImports(scenes, places.made, means)
     return Service(
@@ -110,6 +110,7 @@ def make_service(settings: Settings) -> Service:
         assessing=Assessing(catalog, registrations),
         dataset_views=DatasetViews(datasets, settings, pictures),
         comparisons=Comparisons(scenes, catalog, datasets, settings, pictures),
+        thumbnails=Thumbnails(scenes, catalog, settings, thumbnails),
         training_views=TrainingViews(jobs, datasets, settings, pictures),
         readiness=Readiness(
             lambda: jobs.database,

@@ -192,7 +192,8 @@ describe("a robotics engineer", () => {
     const count = Number((await panel.getByTestId("path-summary").textContent()).match(/(\d+) poses/)[1]);
     assert.equal(python("import sys; print(sum(1 for _ in open(sys.argv[1])) - 1)", poses.path), String(count));
     await panel.getByRole("button", { name: "Render as a data set" }).click();
-    await panel.getByTestId("path-job").getByText("Done").waitFor({ timeout: MINUTES_MS });
+    await panel.getByTestId("path-job").click();
+    await page.getByTestId("job-state").getByText("succeeded").waitFor({ timeout: MINUTES_MS });
     await seen("rendered");
     assert.deepEqual([page.faults, page.foreign], [[], []]);
   });

@@ -208,7 +208,10 @@ class SceneShelf:
         Whoever reads the scene has the one or the other whole. Raises OSError.
         """
         if self.is_near:
+            there = self.look_up(name)
             self.storage.upload(file, self._key(f"{name}{SUFFIX}"))
+            if there is not None and there.sha256 is not None:  # of a folder that was copied from a bucket
+                self.storage.delete(self._entry_key(name))
         else:
             sha256, size = file_sha256(file), file.stat().st_size
             self._upload(file, self._object(sha256))

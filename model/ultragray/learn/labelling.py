@@ -21,7 +21,7 @@ from torch import Tensor
 from ultragray.errors import InvalidArgument
 from ultragray.geometry.image_size import check_image_size
 from ultragray.geometry.pose import check_poses
-from ultragray.geometry.probe import FloatArray, Probe
+from ultragray.geometry.probe import BoolArray, FloatArray, Probe
 from ultragray.rendering.backends.inputs import beam_cm, scene_poses
 from ultragray.rendering.backends.registry import BACKENDS, choose_backend
 from ultragray.rendering.frames import render
@@ -84,9 +84,9 @@ def label_by_frames(
             shown = _shown_labels(labelled, probe, frame, backend)
             weights[shown != frame.labels] = CORRECTION
         _add_votes(votes, painted, scene, probe, frame, weights, backend)
-        labels, decided = _decided(votes, painted, scene)
+        labels, voted = _decided(votes, painted, scene)
         labelled = _with_labels(scene, labels, known)  # the next frame is held against what these say
-    return _with_labels(scene, _spread(scene, labels, decided, within_mm), known)
+    return _with_labels(scene, _spread(scene, labels, voted, within_mm), known)
 
 
 def label_by_map(
@@ -128,7 +128,7 @@ def label_by_map(
     labels = _labels_of(scene)
     labels[inside] = volume[tuple(places[inside].T)]
     known |= {label: f"label {label}" for label in np.unique(labels).tolist() if label and label not in known}
-    return _with_labels(scene, _spread(scene, labels, inside | (labels > 0), within_mm), known)
+    return _with_labels(scene, _spread(scene, labels, inside, within_mm), known)
 
 
 def same_but_for_labels(one: GaussianScene, other: GaussianScene) -> bool:
@@ -227,21 +227,25 @@ def _decided(
     votes: Tensor,  # [N, L]
     painted: LabelArray,  # [L]
     scene: GaussianScene,
-) -> tuple[LabelArray, npt.NDArray[np.bool_]]:  # [N] both
-    """The label of most votes of each Gaussian, and whether it has one by a vote, or before it."""
+) -> tuple[LabelArray, BoolArray]:  # [N] both
+    """The label of each Gaussian, that of most votes or the one before, and whether it has votes."""
     most, place = votes.max(dim=1)
-    voted, before = (most > 0.0).cpu().numpy(), _labels_of(scene)
-    return np.where(voted, painted[place.cpu().numpy()], before), voted | (before > 0)
+    voted = (most > 0.0).cpu().numpy()
+    return np.where(voted, painted[place.cpu().numpy()], _labels_of(scene)), voted
 
 
 def _spread(
     scene: GaussianScene,
     labels: LabelArray,  # [N]
-    decided: npt.NDArray[np.bool_],  # [N]
+    voted: BoolArray,  # [N] whose labels are new
     within_mm: float,
 ) -> LabelArray:  # [N]
-    """Labels for Gaussians without: of the nearest that have been decided, nearer ones count more, up to within_mm."""
-    if within_mm == 0.0 or decided.all() or not decided.any():
+    """Labels for Gaussians without: of the nearest that have one, or votes; nearer ones count more, up to within_mm.
+
+    It is new labels that spread: where the winner among the neighbours is of old ones alone, nothing changes.
+    """
+    decided = voted | (labels > 0)
+    if within_mm == 0.0 or decided.all() or not voted.any():
         return labels
     means_mm = 10.0 * scene.means.detach().cpu().float().numpy()
     echo = _echo(scene)
@@ -256,8 +260,10 @@ def _spread(
     there, places = np.unique(labels[sources], return_inverse=True)  # [L], of each source
     votes = np.zeros((len(sought), len(there)), np.float32)
     np.add.at(votes, (np.arange(len(sought))[:, None], places[found]), weights)
+    winner = votes.argmax(axis=1)  # [M]
+    is_new = ((weights > 0.0) & voted[near] & (places[found] == winner[:, None])).any(axis=1)
     spread = labels.copy()
-    spread[sought] = np.where(votes.max(axis=1) > 0.0, there[votes.argmax(axis=1)], labels[sought])
+    spread[sought] = np.where(is_new, there[winner], labels[sought])
     return spread
 
 

@@ -74,6 +74,7 @@ OPERATIONS = (
         "GET /v1/scenes/{scene}",
         "GET /v1/scenes/{scene}/gaussians",
         "GET /v1/scenes/{scene}/training-poses",
+        "GET /v1/scenes/{scene}/thumbnail.png",
         "POST /v1/scenes/{scene}:assess",
         "GET /v1/scenes/{scene}/comparison",
         "GET /v1/scenes/{scene}/comparison/{index}/{what}.png",

@@ -101,6 +101,18 @@ def test_labels_stay_where_nothing_is_painted_and_go_no_further_than_said(scene)
     assert torch.cdist(means_mm[grown], means_mm[once.labels > 0]).min(dim=1).values.max() <= 3.0
 
 
+def test_of_a_scene_with_labels_only_the_surroundings_of_what_is_painted_change(labelled_scene):
+    (pose,), lesion = demo_poses(1), 5
+    frame = painted(pose, slice(60, 120), slice(40, 100), lesion)
+    now = label_by_frames(labelled_scene, [frame], names={lesion: "lesion"}, within_mm=4.0).labels
+    means_mm, before = 10 * labelled_scene.means, labelled_scene.labels
+    voted = label_by_frames(labelled_scene, [frame], names={lesion: "lesion"}).labels == lesion
+    changed = now != before
+    assert set(now[changed].tolist()) == {lesion}
+    assert torch.cdist(means_mm[changed], means_mm[voted]).min(dim=1).values.max() <= 4.0
+    assert not (changed & ~voted & (before > 0)).any()
+
+
 def test_a_brush_beside_a_gaussian_does_not_label_it(scene):
     (pose,) = demo_poses(1)
     once = label_by_frames(scene, [painted(pose, slice(60, 120), slice(40, 100), BONE)], names={BONE: "bone"})

@@ -31,7 +31,7 @@ from ultragray_service.core.scene_points import (
 from ultragray_service.core.scenes import DEFAULT_PAGE_SIZE, MAX_PAGE_SIZE, Scene, SceneLoaded, ScenePage
 from ultragray_service.core.threads import PATIENCE_S
 from ultragray_service.core.uploads import arrivals
-from ultragray_service.http.accept import RAW
+from ultragray_service.http.accept import PNG, RAW
 from ultragray_service.http.bodies import (
     LABEL_MAP,
     LARGE_IMAGE,
@@ -177,6 +177,7 @@ _POINTS = (
     | NOT_MODIFIED
 )
 _POSES: Answers = {200: {"model": ScenePoses}, **NOT_MODIFIED}
+_THUMBNAIL = answer("8-bit grey, square pixels, 128 on the longer side.", PNG) | NOT_MODIFIED
 _FILE = answer("The scene file.", RAW)
 _IMPORT: dict[str, Any] = {
     "requestBody": {"required": True, "description": "A scene file (.ugr).", "content": {RAW: BINARY}}
@@ -204,6 +205,18 @@ async def get_training_poses(request: Request, service: ServiceDep, scene: Scene
         return await asyncio.to_thread(_poses_json, await service.catalog.header(scene))
 
     return await revalidated(request, (await service.catalog.version(scene)).tag, poses, "application/json")
+
+
+@router.get(
+    "/{scene}/thumbnail.png",
+    response_class=Response,
+    responses=_THUMBNAIL | problems(401, 404, 422, 500, 503, 504, 507),
+)
+async def get_thumbnail(request: Request, service: ServiceDep, scene: SceneName) -> Response:
+    """A small frame from the middle of the training sweep; made at the first request, without loading the scene."""
+    service.life.require_serving()
+    key = await service.thumbnails.key(scene)
+    return await revalidated(request, f"{key}-thumbnail", partial(service.thumbnails.png, scene, key), PNG)
 
 
 @router.get("/{scene}/file", response_class=FileResponse, responses=_FILE | problems(401, 404, 422))

@@ -73,7 +73,6 @@ export const scan = {
     nothing: "There is no frame to store yet.",
     noDrawing: "This browser cannot draw the picture.",
     noPicture: "This browser cannot write the picture.",
-    noVideo: "This browser cannot record video. DICOM can hold the loop, too.",
     simulated: "Simulated, not for diagnosis.",
     drawn: (tools: string): string => `Drawn in: ${tools}`,
     slice: (mm: string): string => `slice ${mm} mm`,

@@ -2,7 +2,6 @@
 
 import type { Reference } from "../../geometry/pose";
 import { type FaultWords, POSE_SUFFIXES } from "../../geometry/pose_files";
-import type { Named } from "../translated";
 
 const poseError: FaultWords = {
   line: (line, fault) => `Line ${line}: ${fault}`,
@@ -169,17 +168,23 @@ export const connect = {
     recording: (seconds: string, count: number) => `${seconds} s, ${count} poses`,
     full: "The recording has reached its limit of 100,000 poses and was stopped.",
     recorded: (number: number) => `recording ${number}`,
-    none: "Record what the probe does, or load poses. They can then be played, saved and rendered as a data set.",
+    none: "Record what the probe does, add keyframes, or load poses. They can then be played, saved and rendered as a data set.",
     summary: (count: number, seconds: string | null, mm: string) =>
       `${count} poses, ${mm} mm long${seconds === null ? "" : `, ${seconds} s`}`,
     save: "Save poses",
     render: "Render as a data set",
     renderMeans: "Every pose becomes a frame, with the image settings of now, in the background",
     format: "Format of the data set",
-    progress: (done: number, all: number) => `${done} of ${all} frames`,
-    states: { queued: "Waits for its turn", running: "Rendering", succeeded: "Done", failed: "Failed", cancelled: "Cancelled" } as Named,
-    cancel: "Cancel",
-    download: (name: string) => `Download ${name}`,
+    job: "To the job",
+    keyframe: "Add keyframe",
+    keyframeMeans: "A smooth path leads through the poses that are added, and is played, saved, rendered and filmed as others",
+    keyframesOf: (count: number) => (count === 1 ? "1 keyframe" : `${count} keyframes`),
+    between: "Seconds between",
+    withoutLast: "Without the last keyframe",
+    withoutAll: "Without keyframes",
+    film: "Save as film",
+    filmMeans: "Every pose becomes a picture of a video, 30 a second, with the image settings of now",
+    filming: (done: number, all: number) => `Rendering: ${done} of ${all}`,
     may: "start jobs",
   },
   connection: {
@@ -208,7 +213,8 @@ export const connect = {
     intro: "How a program asks for this image:",
     copy: (language: string) => `Copy the example in ${language}`,
     copyShort: "Copy",
-    off: "This service has no OpenIGTLink port. Whoever runs it can open one.",
+    boxes: ["ROS 2: the node", "ROS 2: the pose of now"],
+    off: "This service has no OpenIGTLink port. Whoever runs it opens one: ultragray serve --igtl-port 18944, or ULTRAGRAY_IGTL_PORT=18944.",
     registered: (name: string) => `The pose is flange to base; the service leads it into the scene by ${name}.`,
     notRegistered: "The pose is that of the probe in the scene; a connection of OpenIGTLink names a registration by the parameter Registration.",
     localOnly: "OpenIGTLink answers only programs on the service's own machine.",
