@@ -22,7 +22,7 @@ MODULES_OF_EXTRAS = {
         *("fastcrc", "httptools", "starlette", "ultragray_proto", "uvicorn", "uvloop", "websockets"),
     ),
     "train": ("jinja2", "matplotlib"),
-    "dicom": ("pydicom",),
+    "dicom": ("pydicom", "PIL"),
     "hdf5": ("h5py",),
     "mcap": ("mcap", "mcap_ros2"),
     "nifti": ("nibabel",),
