@@ -30,9 +30,7 @@ from ultragray.geometry.pose import (
 )
 from ultragray.geometry.probe import FWHM_PER_SIGMA, MAX_LENGTH_MM, FloatArray, Probe, length_field
 
-BEAM_MM = (
-    2.5  # full width at half maximum of the slice that tools are seen in, where neither frame nor scene has a beam
-)
+BEAM_MM = 2.5  # full width at half maximum of the slice that tools are seen in, without a beam of frame or scene
 LEAST_SLICE_SIGMA_MM = 0.1  # of that slice, where the frames show a thinner one
 _LEAST_SPACING_MM = 1e-6
 
