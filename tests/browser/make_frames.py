@@ -1,7 +1,7 @@
 """Writes a page of the demo scene and random frames of it as the reference renders them.
 
-`make_frames.py FOLDER COUNT SEED`: beside the page, requests.json (pose and settings of each) and expected.bin, the
-float32 of all, one after another.
+`make_frames.py FOLDER COUNT SEED`: beside the page, requests.json (pose and settings of each, and by how much its
+display settings enlarge a difference) and expected.bin, the float32 of all, one after another.
 """
 
 import json
@@ -16,10 +16,11 @@ from ultragray.exchange.page import write_page
 from ultragray.geometry.probe import Probe
 from ultragray.geometry.rotations import random_directions, rotations_of
 from ultragray.phantom.demo import DEMO_FILE
+from ultragray.rendering.display import FRAME_RANGE_DB
 from ultragray.rendering.frames import render_shown
 from ultragray.rendering.settings import RenderSettings
 
-OUTPUTS = ("bmode", "echo", "transmittance", "coverage", "attenuation")
+OUTPUTS = ("bmode", "echo", "transmittance", "coverage")
 
 
 def random_settings(random):
@@ -67,7 +68,9 @@ def main(folder, count, seed):
             shown = render_shown(scene, resolved, pose[None], backend="reference")
             for name in resolved.outputs:
                 expected.write(shown[name].numpy().astype("<f4").tobytes())
-            requests.append({"pose": pose.ravel().tolist(), "settings": settings})
+            display = resolved.display
+            enlarged = max(1.0, FRAME_RANGE_DB / display.dynamic_range_db) * (1.0 + 2.0 * display.edge)
+            requests.append({"pose": pose.ravel().tolist(), "settings": settings, "enlarged": enlarged})
     (folder / "requests.json").write_text(json.dumps(requests))
 
 
